@@ -1,0 +1,55 @@
+"""APEX for OMPL: dual-arm planning with latent diffusion, real meshes and proven paths.
+
+``plan`` solves a problem, ``load_problem`` reads one, ``setup`` gives OMPL's SimpleSetup of one. Planners are in
+``apex_ompl.planners``, ready-made problems in ``apex_ompl.problems``.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from apex_ompl.api import load_problem, plan, setup
+    from apex_ompl.errors import ApexError
+    from apex_ompl.problem import Problem
+    from apex_ompl.result import PlanResult, PlanStatus
+    from apex_ompl.robot import Robot, load_robot
+
+__version__ = "0.1.0"
+
+_HOMES = {
+    "ApexError": "errors",
+    "PlanResult": "result",
+    "PlanStatus": "result",
+    "Problem": "problem",
+    "Robot": "robot",
+    "load_problem": "api",
+    "load_robot": "robot",
+    "plan": "api",
+    "setup": "api",
+}
+
+__all__ = [
+    "ApexError",
+    "PlanResult",
+    "PlanStatus",
+    "Problem",
+    "Robot",
+    "load_problem",
+    "load_robot",
+    "plan",
+    "setup",
+]
+
+
+def __getattr__(name: str) -> Any:
+    """Import public names when they are first used, so that importing the package costs nothing."""
+    if name in _HOMES:
+        return getattr(import_module(f"apex_ompl.{_HOMES[name]}"), name)
+    raise AttributeError(f"module 'apex_ompl' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    """Return the public names."""
+    return sorted([*__all__, "__version__"])

@@ -1,0 +1,272 @@
+"""The Python planning API: ``load_problem``, ``setup`` and ``plan``."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+import time
+from collections.abc import Mapping
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from ompl import base as ob
+from ompl import geometric as og
+from ompl import util as ou
+
+from apex_ompl import planners, problems
+from apex_ompl.assembly import PlanningSetup, assemble
+from apex_ompl.errors import ParameterError
+from apex_ompl.problem import Problem
+from apex_ompl.repair import repair
+from apex_ompl.result import PlanResult, PlanStatus
+from apex_ompl.simplify import simplify as shorten
+from apex_ompl.space import path_length, path_to_array
+from apex_ompl.validity import full_check
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+Array = NDArray[np.float64]
+
+DEFAULT_PLANNER = "rrtconnect"
+CLEARANCE_SAMPLES = 32
+
+
+def load_problem(name_or_path: str | os.PathLike[str]) -> Problem:
+    """Return a ready-made problem by name, or one from a YAML file.
+
+    Raises:
+        UnknownNameError: No ready-made problem of that name; the message lists the known ones.
+        MissingFileError: The file, or one that it names, cannot be read.
+        FileFormatError: The file does not follow the schema.
+    """
+    text = os.fspath(name_or_path)
+    if text.endswith((".yaml", ".yml")) or os.sep in text or Path(text).is_file():
+        return Problem.load(text)
+    return problems.load(text)
+
+
+def setup(problem: Problem | str | os.PathLike[str]) -> og.SimpleSetup:
+    """Return OMPL's SimpleSetup of a problem, for planners and tools of OMPL's own.
+
+    Space, verdict, motion validator, start, goals and a path length objective are set, and rrtconnect is
+    allocated unless another planner is set. Moving obstacles stand where they are at time 0.
+
+    Raises:
+        ApexError: The problem is unknown or faulty.
+    """
+    loaded = problem if isinstance(problem, Problem) else load_problem(problem)
+    simple_setup = assemble(loaded).simple_setup
+    simple_setup.setPlannerAllocator(planners.allocator(DEFAULT_PLANNER))
+    return simple_setup
+
+
+def plan(
+    problem: Problem | str | os.PathLike[str],
+    planner: str = DEFAULT_PLANNER,
+    *,
+    timeout: float = 5.0,
+    seed: int = 0,
+    simplify: bool = True,
+    params: Mapping[str, Any] | None = None,
+    snapshot: bool = False,
+) -> PlanResult:
+    """Plan a path and prove it by the full check.
+
+    Args:
+        problem: A problem, its name, or its file.
+        planner: Name of a planner, see ``apex_ompl.planners.names()``.
+        timeout: Seconds for finding and repairing a path; shortening comes after.
+        seed: Seed of all random numbers, 0 or more. The same seed gives the same path for planners that are
+            neither stopped by the clock nor threaded, as long as no other thread plans at the same time (OMPL
+            seeds one generator per process).
+        simplify: Whether to shorten the path that was found.
+        params: Parameters of the planner by name.
+        snapshot: Plan among moving obstacles as they stand at time 0.
+
+    Returns:
+        The result; it is true only for an exact path that passed the full check.
+
+    Raises:
+        ApexError: The problem, the planner or a parameter is unknown or faulty.
+        KeyboardInterrupt: Ctrl-C was pressed; planning ended in good order first.
+    """
+    started = time.perf_counter()
+    _check_arguments(timeout, seed)
+    parameters = planners.parameters(planner, **dict(params or {}))
+    loaded = problem if isinstance(problem, Problem) else load_problem(problem)
+    if loaded.moving and not snapshot:
+        expected = f"True, since the obstacle {loaded.moving[0]!r} moves and plans hold for one moment only"
+        raise ParameterError("snapshot", snapshot, expected)
+    with _quiet_ompl():
+        _seed_ompl(seed)
+        ready = assemble(loaded)
+        run = _Run(ready, planner, seed, time.perf_counter() - started, loaded.moving)
+        return run.finish(started, run.solve(parameters, timeout, simplify))
+
+
+class _Run:
+    """One call of ``plan`` on an assembled problem."""
+
+    def __init__(
+        self, ready: PlanningSetup, planner: str, seed: int, setup_time: float, moving: tuple[str, ...]
+    ) -> None:
+        self.ready = ready
+        self.planner = planner
+        self.times = {"setup": setup_time}
+        notes = (f"snapshot: {', '.join(moving)} taken to stand still",) if moving else ()
+        self.blank = PlanResult(
+            status=PlanStatus.UNKNOWN, reason="", problem=ready.problem.name, robot=ready.robot.name,
+            joint_names=ready.robot.joint_names, planner=planner, seed=seed, notes=notes,
+        )  # fmt: skip
+
+    def solve(self, parameters: planners.Parameters, timeout: float, simplify: bool) -> PlanResult:
+        """Return the result without what ``finish`` adds."""
+        ready = self.ready
+        if ready.start_fault:
+            return self._failed(PlanStatus.INVALID_START, ready.start_fault)
+        if all(ready.goal_faults):
+            return self._failed(PlanStatus.INVALID_GOAL, "; ".join(ready.goal_faults))
+        simple_setup = ready.simple_setup
+        simple_setup.setPlanner(parameters.build(simple_setup.getSpaceInformation()))
+        deadline = time.perf_counter() + timeout
+        # A condition made in C++: planners that run threads deadlock with one made in Python.
+        ptc = ob.timedPlannerTerminationCondition(timeout)
+        with _interruptible(ptc) as interrupted, self._timed("solve"):
+            status = PlanStatus.of(simple_setup.solve(ptc))
+        if interrupted.is_set():
+            raise KeyboardInterrupt
+        fault = ready.checker.fault or ready.motions.fault
+        if fault is not None:
+            return self._failed(PlanStatus.CRASH, f"the validity checker failed: {fault!r}")
+        if status is PlanStatus.APPROXIMATE_SOLUTION:
+            return self._approximate()
+        if status is not PlanStatus.EXACT_SOLUTION:
+            return self._failed(status, f"{self.planner} found no path in {timeout:g} s")
+        return self._proved(path_to_array(simple_setup.getSolutionPath(), ready.robot.dof), deadline, simplify)
+
+    def finish(self, started: float, result: PlanResult) -> PlanResult:
+        """Add clearance, length, counts and times."""
+        path = result.path
+        checks = self.ready.verdict.calls
+        if path is not None:
+            with self._timed("clearance"):
+                states = resample(path, CLEARANCE_SAMPLES)
+                clearance = min(self.ready.verdict.clearance(q) for q in states)
+            result = replace(result, length=path_length(path), clearance=clearance)
+        self.times["total"] = time.perf_counter() - started
+        return replace(result, checks=checks, times=dict(self.times))
+
+    def _proved(self, path: Array, deadline: float, simplify: bool) -> PlanResult:
+        """Put the exact start and goal in, shorten the path, prove it, and repair it where it fails.
+
+        When a shortened path can neither be proved nor repaired, the path as it was found has its turn.
+        """
+        candidates = [self._with_exact_ends(path)]
+        if simplify:
+            with self._timed("simplify"):
+                candidates.insert(0, shorten(self.ready.simple_setup, candidates[0]))
+        ready, reason = self.ready, ""
+        for candidate in candidates:
+            with self._timed("verify"):
+                check = full_check(ready.verdict, candidate, ready.start, ready.goals)
+            if check:
+                return self._exact(candidate, self.planner)
+            reason = reason or check.reason
+            with self._timed("repair"):
+                mended = repair(ready, candidate, check, deadline)
+            if mended is not None:
+                return self._exact(mended, f"{self.planner}+repair")
+        return self._failed(PlanStatus.TIMEOUT, f"the path found failed the full check and repair, {reason}")
+
+    def _exact(self, path: Array, solved_by: str) -> PlanResult:
+        return replace(self.blank, status=PlanStatus.EXACT_SOLUTION, path=path, solved_by=solved_by)
+
+    def _approximate(self) -> PlanResult:
+        ready = self.ready
+        simple_setup = ready.simple_setup
+        path = path_to_array(simple_setup.getSolutionPath(), ready.robot.dof)
+        path[0] = ready.start
+        gap = float(np.linalg.norm(ready.goals - path[-1], axis=1).min())
+        reason = f"the nearest state found is {gap:.3g} rad from the goal"
+        check = full_check(ready.verdict, path, ready.start)
+        if not check:
+            reason += f", and the path fails the full check, {check.reason}"
+        return replace(
+            self.blank, status=PlanStatus.APPROXIMATE_SOLUTION, reason=reason, path=path, solved_by=self.planner
+        )
+
+    def _with_exact_ends(self, path: Array) -> Array:
+        path = path.copy()
+        path[0] = self.ready.start
+        path[-1] = self.ready.goals[int(np.argmin(np.linalg.norm(self.ready.goals - path[-1], axis=1)))]
+        return path
+
+    def _failed(self, status: PlanStatus, reason: str) -> PlanResult:
+        return replace(self.blank, status=status, reason=reason)
+
+    @contextmanager
+    def _timed(self, stage: str) -> Iterator[None]:
+        begin = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.times[stage] = self.times.get(stage, 0.0) + time.perf_counter() - begin
+
+
+def resample(path: Array, count: int) -> Array:
+    """Return ``count`` states evenly spread by length over a path, shape (count, dof), its ends among them."""
+    steps = np.linalg.norm(np.diff(path, axis=0), axis=1)
+    along = np.concatenate([[0.0], np.cumsum(steps)])
+    wanted = np.linspace(0.0, along[-1], count)
+    return np.stack([np.interp(wanted, along, column) for column in path.T], axis=1)
+
+
+def _check_arguments(timeout: float, seed: int) -> None:
+    number = isinstance(timeout, (int, float)) and not isinstance(timeout, bool)
+    if not number or not 0.0 < timeout < float("inf"):
+        raise ParameterError("timeout", timeout, "a positive number of seconds")
+    if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or not 0 <= seed < 2**31:
+        raise ParameterError("seed", seed, "a whole number from 0 to 2147483647")
+
+
+def _seed_ompl(seed: int) -> None:
+    level = ou.getLogLevel()
+    ou.setLogLevel(ou.LogLevel.LOG_NONE)  # it complains when generators were in use, and reseeds all the same
+    ou.RNG.setSeed(int(seed) + 1)  # OMPL takes no seed 0
+    ou.setLogLevel(level)
+
+
+@contextmanager
+def _quiet_ompl() -> Iterator[None]:
+    """Keep OMPL's information messages off standard output; warnings still go to standard error."""
+    level = ou.getLogLevel()
+    ou.setLogLevel(ou.LogLevel.LOG_WARN)
+    try:
+        yield
+    finally:
+        ou.setLogLevel(level)
+
+
+@contextmanager
+def _interruptible(ptc: ob.PlannerTerminationCondition) -> Iterator[threading.Event]:
+    """Make Ctrl-C end the planner in good order: an exception inside its callbacks would end the process."""
+    pressed = threading.Event()
+
+    def handle(*_: object) -> None:
+        pressed.set()
+        ptc.terminate()
+
+    if threading.current_thread() is not threading.main_thread():
+        yield pressed
+        return
+    before = signal.signal(signal.SIGINT, handle)
+    try:
+        yield pressed
+    finally:
+        signal.signal(signal.SIGINT, before)

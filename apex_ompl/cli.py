@@ -1,0 +1,196 @@
+"""The command line ``apex-ompl``: argument parsing and printing only.
+
+Results go to standard output, logs and faults to standard error. Exit codes: 0 exact, 1 no plan, 2 usage or a
+faulty file, 3 invalid start or goal, 4 approximate, 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import platform
+import sys
+from collections.abc import Sequence
+from dataclasses import fields
+from importlib import metadata
+from pathlib import Path
+from typing import Any, NoReturn
+
+from apex_ompl.errors import ApexError, MissingFileError, ParameterError
+from apex_ompl.result import PlanResult, PlanStatus, check_suffix
+
+EXIT_CODES = {
+    PlanStatus.EXACT_SOLUTION: 0,
+    PlanStatus.INVALID_START: 3,
+    PlanStatus.INVALID_GOAL: 3,
+    PlanStatus.APPROXIMATE_SOLUTION: 4,
+}
+LIBRARIES = ("ompl", "pin", "coal", "numpy", "scipy", "pydantic", "example-robot-data", "torch", "ruckig")
+
+
+class _Parser(argparse.ArgumentParser):
+    """A parser whose faults are one sentence."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(2, f"{self.prog}: error: {message}\n")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line and return its exit code; ``arguments`` default to ``sys.argv[1:]``."""
+    parsed = _parser().parse_args(arguments)
+    try:
+        return int(parsed.run(parsed))
+    except ApexError as error:
+        print(f"apex-ompl: error: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("apex-ompl: interrupted", file=sys.stderr)
+        return 130
+    except BrokenPipeError:
+        sys.stderr.close()
+        return 1
+
+
+def _parser() -> _Parser:
+    parser = _Parser(prog="apex-ompl", description="Plan motions of two arms and hands through OMPL.")
+    parser.add_argument("--version", action="version", version=f"apex-ompl {metadata.version('apex-ompl')}")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+
+    plan = commands.add_parser("plan", help="plan a path for a problem")
+    plan.add_argument("problem", help="name of a ready-made problem, or a YAML file")
+    plan.add_argument("--planner", default="rrtconnect", help="see 'apex-ompl planners' (default: %(default)s)")
+    plan.add_argument("--timeout", type=float, default=5.0, metavar="SECONDS", help="default: %(default)s")
+    plan.add_argument("--seed", type=int, default=0, help="default: %(default)s")
+    plan.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="a planner parameter")
+    plan.add_argument("--no-simplify", action="store_true", help="keep the path as the planner found it")
+    plan.add_argument("--snapshot", action="store_true", help="take moving obstacles to stand still")
+    plan.add_argument("--out", type=Path, metavar="FILE", help="write the result: .npz, .csv, .json or .yaml")
+    plan.add_argument("--json", action="store_true", help="print the whole result as JSON")
+    plan.set_defaults(run=_plan)
+
+    check = commands.add_parser("check", help="validate a problem, and say whether start and goal are free")
+    check.add_argument("problem", help="name of a ready-made problem, or a YAML file")
+    check.set_defaults(run=_check)
+
+    for name, run, text in (
+        ("problems", _problems, "list the ready-made problems"),
+        ("planners", _planners, "list the planners and their parameters"),
+        ("info", _info, "print versions and robots"),
+        ("schema", _schema, "print the JSON schema of problem files"),
+    ):
+        commands.add_parser(name, help=text).set_defaults(run=run)
+    return parser
+
+
+def _plan(parsed: argparse.Namespace) -> int:
+    from apex_ompl.api import plan
+
+    if parsed.out is not None:
+        check_suffix(parsed.out)
+        if not parsed.out.parent.is_dir():
+            why = f"folder {str(parsed.out.parent)!r} does not exist"
+            raise MissingFileError(str(parsed.out), "output file", why)
+    result = plan(
+        parsed.problem,
+        planner=parsed.planner,
+        timeout=parsed.timeout,
+        seed=parsed.seed,
+        simplify=not parsed.no_simplify,
+        params=_settings(parsed.set),
+        snapshot=parsed.snapshot,
+    )
+    if parsed.out is not None:
+        result.save(parsed.out)
+    print(json.dumps(result.as_dict()) if parsed.json else _summary(result))
+    return EXIT_CODES.get(result.status, 1)
+
+
+def _settings(pairs: Sequence[str]) -> dict[str, Any]:
+    settings = {}
+    for pair in pairs:
+        name, equals, value = pair.partition("=")
+        if not equals or not name:
+            raise ParameterError("--set", pair, "NAME=VALUE")
+        settings[name.strip().replace("-", "_")] = value
+    return settings
+
+
+def _summary(result: PlanResult) -> str:
+    stages = ", ".join(f"{k} {v:.3f}" for k, v in result.times.items() if k != "total")
+    lines = [f"{result.problem}: {result.status}" + (f" by {result.solved_by}" if result.solved_by else "")]
+    if result.reason:
+        lines.append(f"  reason     {result.reason}")
+    lines.append(f"  time       {result.times['total']:.3f} s ({stages})")
+    if result.path is not None:
+        lines.append(f"  length     {result.length:.3f} rad over {len(result.path)} states")
+        lines.append(f"  clearance  {result.clearance * 1e3:.1f} mm")
+    lines.append(f"  checks     {result.checks} states judged, planner {result.planner}, seed {result.seed}")
+    lines += [f"  note       {note}" for note in result.notes]
+    return "\n".join(lines)
+
+
+def _check(parsed: argparse.Namespace) -> int:
+    from apex_ompl.api import load_problem
+    from apex_ompl.assembly import assemble
+
+    ready = assemble(load_problem(parsed.problem))
+    problem = ready.problem
+    print(f"{problem.name}: robot {ready.robot.name}, {ready.robot.dof} joints")
+    moving = f", moving: {', '.join(problem.moving)}" if problem.moving else ""
+    print(f"  scene      {len(problem.scene)} obstacles{moving}")
+    if problem.attached:
+        print("  held       " + ", ".join(f"{held.name} by {held.link}" for held in problem.attached))
+    print(f"  start      {ready.start_fault or 'free'}")
+    for k, fault in enumerate(ready.goal_faults):
+        label = "goal" if len(ready.goal_faults) == 1 else f"goal {k}"
+        print(f"  {label:<10} {fault or 'free'}")
+    return 3 if ready.start_fault or all(ready.goal_faults) else 0
+
+
+def _problems(_: argparse.Namespace) -> int:
+    from apex_ompl import problems
+
+    for name in problems.names():
+        problem = problems.load(name)
+        print(f"{name:<20} {problem.robot}, {len(problem.scene)} obstacles")
+    return 0
+
+
+def _planners(_: argparse.Namespace) -> int:
+    from apex_ompl import planners
+
+    for name in planners.names():
+        record = planners.parameters(name)
+        doc = (type(record).__doc__ or "").splitlines()[0]
+        print(f"{name:<16} {doc}")
+        for field in fields(record):
+            unit = field.metadata.get("unit", "")
+            print(f"    {field.name} = {getattr(record, field.name)}" + f" {unit}" * bool(unit))
+    return 0
+
+
+def _info(_: argparse.Namespace) -> int:
+    from apex_ompl.robot import load_robot, robot_names
+
+    print(f"apex-ompl {metadata.version('apex-ompl')}, Python {platform.python_version()}, {platform.machine()}")
+    for library in LIBRARIES:
+        try:
+            print(f"  {library:<20} {metadata.version(library)}")
+        except metadata.PackageNotFoundError:
+            print(f"  {library:<20} not installed")
+    print("robots")
+    for name in robot_names():
+        robot = load_robot(name)
+        print(f"  {name:<20} {robot.dof} joints: {', '.join(robot.joint_names)}")
+    return 0
+
+
+def _schema(_: argparse.Namespace) -> int:
+    from apex_ompl.problem import Problem
+
+    print(json.dumps(Problem.model_json_schema(by_alias=True), indent=1))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

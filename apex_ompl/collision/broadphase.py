@@ -1,0 +1,221 @@
+"""A scene compiled for Pinocchio: geometry, pairs, data and broadphase; objects are moved, not added."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import coal
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from apex_ompl.collision.containment import ANCHOR_RADIUS, Host, anchor_placement, may_contain
+from apex_ompl.collision.distance import HullDistances
+from apex_ompl.collision.shapes import is_shell
+from apex_ompl.problem import AttachedObject, Body
+from apex_ompl.robot import Robot
+from apex_ompl.robot.model import link_of
+
+Array = NDArray[np.float64]
+Manager = pin.BroadPhaseManager_DynamicAABBTreeCollisionManager
+
+
+@dataclass(frozen=True)
+class Contact:
+    """Two solids that overlap.
+
+    Attributes:
+        first: Link or held object.
+        second: Link, held object, obstacle or fixture.
+        depth: How deep they overlap [m], between convex hulls.
+    """
+
+    first: str
+    second: str
+    depth: float
+
+    def __str__(self) -> str:
+        """Return ``left_link5 <-> table_left, 4 mm deep``."""
+        return f"{self.first} <-> {self.second}, {self.depth * 1e3:.3g} mm deep"
+
+
+class CompiledScene:
+    """The robot, the obstacles and the held objects of one moment as one Pinocchio geometry model.
+
+    States are in Pinocchio's order here.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        obstacles: Mapping[str, Body],
+        attached: Mapping[str, AttachedObject],
+        shapes: Mapping[str, coal.CollisionGeometry],
+    ) -> None:
+        """Compile ``obstacles`` (fixtures among them) and ``attached``, whose geometry is in ``shapes``."""
+        self.model = robot.model
+        self.data = robot.model.createData()
+        self.geometry = robot.geometry.copy()
+        self.labels = [link_of(robot.model, item) for item in self.geometry.geometryObjects]
+        self.links = len(self.labels)
+        self.scene: dict[str, int] = {}
+        self.fixtures = frozenset(body.name for body in robot.fixtures)
+        for name, body in obstacles.items():
+            self.scene[name] = self._add(name, 0, 0, pin.SE3(body.pose), shapes[name])
+        self.held: dict[str, int] = {}
+        for name, held in attached.items():
+            frame = robot.model.frames[robot.link_frame(held.link)]
+            placement = frame.placement * pin.SE3(held.pose)
+            parent = robot.link_frame(held.link)
+            self.held[name] = self._add(name, frame.parentJoint, parent, placement, shapes[name])
+        self.touch: dict[str, frozenset[str]] = {}
+        for name, held in attached.items():
+            default = robot.part_links[robot.part_of(held.link)]
+            self.touch[name] = frozenset(default if held.touch_links is None else held.touch_links)
+        self._pair_up()
+        self.pairs = [(p.first, p.second) for p in self.geometry.collisionPairs]
+        self.same = list(range(self.geometry.ngeoms))  # geometry -> the geometry it stands for
+        self.hollow: list[tuple[int, int, Host]] = []
+        self._add_containment()
+        self.geometry_data, self.manager = self._broadphase(self.geometry)
+        self.second = self._second_stage()
+        self.lock = threading.Lock()
+        self._distances: dict[str, HullDistances] = {}
+
+    def _add(self, name: str, joint: int, frame: int, placement: pin.SE3, shape: coal.CollisionGeometry) -> int:
+        self.labels.append(name)
+        return int(self.geometry.addGeometryObject(pin.GeometryObject(name, joint, frame, placement, shape)))
+
+    def _pair_up(self) -> None:
+        """Pair obstacles with what moves, and held objects with everything they may not touch."""
+        items = self.geometry.geometryObjects
+        moving = [i for i in range(self.links) if items[i].parentJoint > 0]
+        held = list(self.held.values())
+        pairs = [(i, j) for i in (*moving, *held) for j in self.scene.values()]
+        for name, i in self.held.items():
+            for j in range(self.links):
+                apart = items[i].parentJoint != items[j].parentJoint or items[j].parentJoint == 0
+                if apart and self.labels[j] not in self.touch[name]:
+                    pairs.append((i, j))
+        pairs += [(i, j) for i in held for j in held if i < j and items[i].parentJoint != items[j].parentJoint]
+        for i, j in pairs:
+            self.geometry.addCollisionPair(pin.CollisionPair(i, j))
+
+    def _add_containment(self) -> None:
+        """For every pair in which one may be wholly inside the mesh of the other, pair hull and point."""
+        items = self.geometry.geometryObjects
+        hosts: dict[int, Host] = {}
+        hulls: dict[int, int] = {}
+        anchors: dict[int, int] = {}
+        for a, b in self.pairs:
+            if a < self.links and b < self.links:
+                continue
+            for h, g in ((a, b), (b, a)):
+                if not is_shell(items[h].geometry) or not may_contain(items[h].geometry, items[g].geometry):
+                    continue
+                if h not in hosts:
+                    hosts[h] = Host.of(items[h].geometry)
+                if not hosts[h].convex:
+                    self.hollow.append((h, g, hosts[h]))
+                    continue
+                if h not in hulls:
+                    hulls[h] = self._stand_in(h, "#hull", items[h].placement, hosts[h].hull)
+                if g not in anchors:
+                    point = anchor_placement(items[g])
+                    anchors[g] = self._stand_in(g, "#point", point, coal.Sphere(ANCHOR_RADIUS))
+                self.geometry.addCollisionPair(pin.CollisionPair(hulls[h], anchors[g]))
+
+    def _stand_in(self, index: int, suffix: str, placement: pin.SE3, shape: coal.CollisionGeometry) -> int:
+        item = self.geometry.geometryObjects[index]
+        self.same.append(index)
+        return self._add(item.name + suffix, item.parentJoint, item.parentFrame, placement, shape)
+
+    def _broadphase(self, geometry: pin.GeometryModel) -> tuple[pin.GeometryData, Any]:
+        # The manager does not keep its arguments alive; this object does.
+        data = geometry.createData()
+        return data, Manager(self.model, geometry, data)
+
+    def _second_stage(self) -> Any:
+        """Broadphase over hulls of hollow meshes and points: what it reports must be looked at exactly."""
+        if not self.hollow:
+            return None
+        geometry = pin.GeometryModel()
+        items = self.geometry.geometryObjects
+        for k, (h, g, host) in enumerate(self.hollow):
+            a, b = items[h], items[g]
+            point = coal.Sphere(ANCHOR_RADIUS)
+            hull = pin.GeometryObject(f"hull{k}", a.parentJoint, a.parentFrame, a.placement, host.hull)
+            guest = pin.GeometryObject(f"point{k}", b.parentJoint, b.parentFrame, anchor_placement(b), point)
+            pair = [geometry.addGeometryObject(item) for item in (hull, guest)]
+            geometry.addCollisionPair(pin.CollisionPair(*pair))
+        return geometry, *self._broadphase(geometry)
+
+    def place(self, name: str, placement: pin.SE3) -> None:
+        """Move one obstacle."""
+        index = self.scene[name]
+        items = self.geometry.geometryObjects
+        items[index].placement = placement
+        for k, original in enumerate(self.same):
+            if original == index and k != index:
+                hull = items[k].name.endswith("#hull")
+                items[k].placement = placement if hull else anchor_placement(items[index])
+        for k, (h, g, _) in enumerate(self.hollow):
+            if h == index:
+                self.second[0].geometryObjects[2 * k].placement = placement
+            if g == index:
+                self.second[0].geometryObjects[2 * k + 1].placement = anchor_placement(items[index])
+        self._distances.clear()
+
+    def collides(self, q: Array) -> bool:
+        """Whether anything overlaps at a state in Pinocchio's order."""
+        if pin.computeCollisions(self.model, self.data, self.manager, q, True):
+            return True
+        return self.second is not None and bool(self._contained(q))
+
+    def _contained(self, q: Array) -> list[tuple[int, int]]:
+        """Return the pairs (host, guest) of hollow meshes with something wholly inside."""
+        geometry, data, manager = self.second
+        with self.lock:
+            if not pin.computeCollisions(self.model, self.data, manager, q, True):
+                return []
+            found = []
+            for k, (h, g, host) in enumerate(self.hollow):
+                if pin.computeCollision(geometry, data, k):
+                    point = data.oMg[2 * k].actInv(data.oMg[2 * k + 1].translation)
+                    if host.contains(point):
+                        found.append((h, g))
+            return found
+
+    def contacts(self, q: Array) -> list[Contact]:
+        """Return all overlaps at a state in Pinocchio's order, the deepest first."""
+        with self.lock:
+            pin.computeCollisions(self.model, self.data, self.geometry, self.geometry_data, q, False)
+            hits = [
+                (self.same[p.first], self.same[p.second])
+                for p, result in zip(self.geometry.collisionPairs, self.geometry_data.collisionResults, strict=True)
+                if result.isCollision()
+            ]
+        if self.second is not None:
+            hits += self._contained(q)
+        deepest: dict[tuple[str, str], float] = {}
+        for first, second in hits:
+            pair = (first, second) if first < second else (second, first)
+            names = (self.labels[pair[0]], self.labels[pair[1]])
+            depth = -float(HullDistances(self.model, self.geometry, [pair], self.labels).values(q)[0])
+            deepest[names] = max(depth, deepest.get(names, 0.0))
+        found = [Contact(a, b, depth) for (a, b), depth in deepest.items()]
+        return sorted(found, key=lambda c: (-c.depth, c.first, c.second))
+
+    def distances(self, which: str) -> HullDistances:
+        """Return the distances of a set of pairs: ``scene``, ``all`` (with fixtures) or ``pairs``."""
+        if which not in self._distances:
+            if which == "pairs":
+                chosen = self.pairs
+            else:
+                targets = {i for n, i in self.scene.items() if which == "all" or n not in self.fixtures}
+                chosen = [(a, b) for a, b in self.pairs if b in targets]
+            self._distances[which] = HullDistances(self.model, self.geometry, chosen, self.labels)
+        return self._distances[which]

@@ -1,0 +1,79 @@
+"""Signed distances between convex shapes by GJK, and by EPA where they overlap."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from apex_ompl.collision.shapes import convex_hull
+
+
+@dataclass(frozen=True)
+class Distance:
+    """The closest pair at a state.
+
+    Attributes:
+        value: Signed distance [m]; negative is the depth of overlap; ``inf`` when there is no pair.
+        first: Link or held object.
+        second: Obstacle, fixture or link.
+        points: Nearest points on ``first`` and ``second`` in the world, shape (2, 3) [m].
+    """
+
+    value: float
+    first: str
+    second: str
+    points: NDArray[np.float64]
+
+
+NO_PAIR = Distance(float("inf"), "", "", np.full((2, 3), np.nan))
+
+
+class HullDistances:
+    """Distances of chosen pairs of geometries, each replaced by its convex hull.
+
+    A hull contains its mesh, so that the distance is never more than the true one; for boxes, spheres,
+    cylinders, capsules and convex meshes it is the true one.
+    """
+
+    def __init__(
+        self,
+        model: pin.Model,
+        geometry: pin.GeometryModel,
+        pairs: Sequence[tuple[int, int]],
+        labels: Sequence[str],
+    ) -> None:
+        """Prepare the hulls of the geometries that ``pairs`` name; ``labels`` name every geometry."""
+        self._model = model
+        self._data = model.createData()
+        self._hulls = pin.GeometryModel()
+        index: dict[int, int] = {}
+        self._labels: list[str] = []
+        for number in sorted({i for pair in pairs for i in pair}):
+            item = geometry.geometryObjects[number].copy()
+            item.geometry = convex_hull(item.geometry)
+            index[number] = self._hulls.addGeometryObject(item)
+            self._labels.append(labels[number])
+        self._pairs = [(index[a], index[b]) for a, b in pairs]
+        for a, b in self._pairs:
+            self._hulls.addCollisionPair(pin.CollisionPair(a, b))
+        self._hull_data = self._hulls.createData()
+
+    def values(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the signed distance of every pair at a state in Pinocchio's order, shape (pairs,) [m]."""
+        pin.computeDistances(self._model, self._data, self._hulls, self._hull_data, q)
+        return np.array([result.min_distance for result in self._hull_data.distanceResults])
+
+    def closest(self, q: NDArray[np.float64]) -> Distance:
+        """Return the closest pair at a state in Pinocchio's order."""
+        if not self._pairs:
+            return NO_PAIR
+        values = self.values(q)
+        k = int(np.argmin(values))
+        result = self._hull_data.distanceResults[k]
+        points = np.array([result.getNearestPoint1(), result.getNearestPoint2()])
+        first, second = (self._labels[i] for i in self._pairs[k])
+        return Distance(float(values[k]), first, second, points)

@@ -1,0 +1,108 @@
+"""Faults that a caller can mend, each said in one sentence.
+
+A planning failure is not among them: that is a status of the result. Every class here descends from
+:class:`ApexError`, carries the data of the fault as attributes, and prints one sentence that names the
+thing, the value found and what was expected.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class ApexError(Exception):
+    """Root of all errors raised on purpose by this package."""
+
+
+def nearest_name(name: str, known: Iterable[str]) -> str | None:
+    """Return the known name most like ``name``, or None when none is close."""
+    matches = difflib.get_close_matches(name, list(known), n=1, cutoff=0.6)
+    return matches[0] if matches else None
+
+
+class UnknownNameError(ApexError):
+    """A name that is not registered.
+
+    Attributes:
+        kind: What was looked up, for example ``planner``.
+        name: The name given.
+        known: The names that exist.
+    """
+
+    def __init__(self, kind: str, name: str, known: Iterable[str]) -> None:
+        """Compose the sentence from what was asked for and what exists."""
+        self.kind = kind
+        self.name = name
+        self.known = tuple(sorted(known))
+        near = nearest_name(name, self.known)
+        hint = f", did you mean {near!r}?" if near else ";"
+        shown = self.known[:30]
+        listing = ", ".join(shown) + (", ..." if len(shown) < len(self.known) else "") or "none"
+        super().__init__(f"unknown {kind} {name!r}{hint} known: {listing}")
+
+
+class FileFormatError(ApexError):
+    """A file whose content does not follow its schema.
+
+    Attributes:
+        file: Where the content came from.
+        field: Dotted path of the field at fault, or an empty string for the file as a whole.
+        value: The offending value.
+        expected: What the field should hold.
+    """
+
+    def __init__(self, file: str, field: str, value: object, expected: str) -> None:
+        """Compose the sentence ``file: field: expected ..., got ...``."""
+        self.file = file
+        self.field = field
+        self.value = value
+        self.expected = expected
+        where = f"{file}: {field}" if field else file
+        super().__init__(f"{where}: {expected}, got {_short(value)}")
+
+
+class MissingFileError(ApexError):
+    """A file that a problem, a robot or a caller names and that cannot be read.
+
+    Attributes:
+        file: The path.
+        role: What the file was wanted for.
+    """
+
+    def __init__(self, file: str, role: str, why: str = "no such file") -> None:
+        """Compose the sentence from the file, its role and why it cannot be had."""
+        self.file = file
+        self.role = role
+        super().__init__(f"{role} {file!r}: {why}")
+
+
+class ParameterError(ApexError):
+    """An argument outside its range or of the wrong kind.
+
+    Attributes:
+        name: The parameter.
+        value: The value given.
+        expected: What it should be.
+    """
+
+    def __init__(self, name: str, value: object, expected: str) -> None:
+        """Compose the sentence ``name: expected ..., got ...``."""
+        self.name = name
+        self.value = value
+        self.expected = expected
+        super().__init__(f"{name}: expected {expected}, got {_short(value)}")
+
+
+class RobotError(ApexError):
+    """A robot description that cannot be made into a robot."""
+
+
+class SceneError(ApexError):
+    """A scene change that makes no sense, such as removing an obstacle that is not there."""
+
+
+def _short(value: object, limit: int = 80) -> str:
+    """Return ``repr(value)`` cut to ``limit`` characters, on one line."""
+    text = " ".join(repr(value).split())
+    return text if len(text) <= limit else text[: limit - 3] + "..."

@@ -1,0 +1,298 @@
+"""Planning problems: the robot's name, a scene, held objects, a start and a goal; as records and as YAML.
+
+The file format is ``schema: apex-ompl/problem/1``. Joints go by name [rad; hand synergies 0 open to 1
+closed]; lengths are in metres, the world has z up, quaternions are ordered xyzw.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import AfterValidator, Field, PositiveFloat, field_validator, model_validator
+
+from apex_ompl.errors import FileFormatError, nearest_name
+from apex_ompl.schema import StrictModel, dump_yaml, read_yaml, validate, write_atomically
+
+SCHEMA = "apex-ompl/problem/1"
+MESH_SUFFIXES = (".stl", ".obj")
+
+
+def _unit_quaternion(q: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
+    if abs(float(np.linalg.norm(q)) - 1.0) > 1e-3:
+        raise ValueError("expected a unit quaternion [x, y, z, w]")
+    return q
+
+
+def _non_zero(v: tuple[float, float, float]) -> tuple[float, float, float]:
+    if float(np.linalg.norm(v)) < 1e-9:
+        raise ValueError("expected a direction that is not zero")
+    return v
+
+
+Vector = tuple[float, float, float]
+Direction = Annotated[Vector, AfterValidator(_non_zero)]
+Quaternion = Annotated[tuple[float, float, float, float], AfterValidator(_unit_quaternion)]
+Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_./-]*$")]
+
+
+class Sphere(StrictModel):
+    """A ball centred on the object's origin; radius [m]."""
+
+    radius: PositiveFloat
+
+
+class RoundBar(StrictModel):
+    """A cylinder along z centred on the origin, or a capsule whose ``length`` excludes its end caps [m]."""
+
+    radius: PositiveFloat
+    length: PositiveFloat
+
+
+class MeshFile(StrictModel):
+    """A closed triangle mesh from an STL or OBJ file; a relative path starts at the problem file."""
+
+    file: str
+    scale: Vector = (1.0, 1.0, 1.0)
+
+    @field_validator("file")
+    @classmethod
+    def _known_suffix(cls, file: str) -> str:
+        if not file.lower().endswith(MESH_SUFFIXES):
+            raise ValueError(f"expected a mesh file ending in {' or '.join(MESH_SUFFIXES)}")
+        return file
+
+    @field_validator("scale")
+    @classmethod
+    def _positive_scale(cls, scale: Vector) -> Vector:
+        if min(scale) <= 0.0:
+            raise ValueError("expected three positive factors")
+        return scale
+
+
+class HalfSpace(StrictModel):
+    """All points x of the object's frame with normal . x <= offset [m]; the normal points out of the solid."""
+
+    normal: Direction
+    offset: float = 0.0
+
+
+class Body(StrictModel):
+    """A named solid: exactly one shape, and its pose."""
+
+    name: Name
+    box: tuple[PositiveFloat, PositiveFloat, PositiveFloat] | None = None
+    sphere: Sphere | None = None
+    cylinder: RoundBar | None = None
+    capsule: RoundBar | None = None
+    mesh: MeshFile | None = None
+    half_space: HalfSpace | None = None
+    position: Vector = (0.0, 0.0, 0.0)
+    orientation: Quaternion = (0.0, 0.0, 0.0, 1.0)
+
+    @model_validator(mode="after")
+    def _one_shape(self) -> Self:
+        given = [k for k in SHAPES if getattr(self, k) is not None]
+        if len(given) != 1:
+            found = " and ".join(given) or "none"
+            raise ValueError(f"{self.name!r}: expected exactly one of {', '.join(SHAPES)}; found {found}")
+        return self
+
+    @property
+    def shape(self) -> str:
+        """The kind of the shape: one of ``SHAPES``."""
+        return next(k for k in SHAPES if getattr(self, k) is not None)
+
+    @property
+    def pose(self) -> NDArray[np.float64]:
+        """Homogeneous transform, shape (4, 4) [m]."""
+        return pose_matrix(self.position, self.orientation)
+
+
+SHAPES = ("box", "sphere", "cylinder", "capsule", "mesh", "half_space")
+
+
+class Obstacle(Body):
+    """A solid of the scene, in the world frame; ``velocity`` [m/s] makes it a moving one."""
+
+    velocity: Vector | None = None
+
+    @property
+    def moving(self) -> bool:
+        """Whether the obstacle has a velocity other than zero."""
+        return self.velocity is not None and any(v != 0.0 for v in self.velocity)
+
+
+class ContactFace(StrictModel):
+    """Where a held object meets another: face centre [m] and outward axis, in the object's frame."""
+
+    point: Vector = (0.0, 0.0, 0.0)
+    axis: Direction = (0.0, 0.0, 1.0)
+
+
+class AttachedObject(Body):
+    """A held solid, posed in the frame of the link that holds it.
+
+    ``touch_links`` are links it may touch; None means all links of the part (the hand) that holds it.
+    """
+
+    link: Name
+    touch_links: tuple[Name, ...] | None = None
+    contact: ContactFace | None = None
+
+    @model_validator(mode="after")
+    def _bounded(self) -> Self:
+        if self.half_space is not None:
+            raise ValueError(f"{self.name!r}: a half_space cannot be held")
+        return self
+
+
+JointValues = dict[str, float]
+
+
+class Goal(StrictModel):
+    """What is to be reached: one of several complete joint configurations."""
+
+    joints: Annotated[tuple[JointValues, ...], Field(min_length=1)]
+
+    @field_validator("joints", mode="before")
+    @classmethod
+    def _one_or_many(cls, value: Any) -> Any:
+        return [value] if isinstance(value, Mapping) else value
+
+
+class Problem(StrictModel):
+    """A motion planning problem.
+
+    Attributes:
+        name: Name of the problem.
+        robot: Name of a robot that ships with the package, or path of a robot file.
+        scene: Obstacles in the world frame, besides the robot's own fixtures.
+        attached: Held objects.
+        start: Joint name -> value of the start state.
+        goal: What is to be reached.
+    """
+
+    schema_id: Literal["apex-ompl/problem/1"] = Field(default="apex-ompl/problem/1", alias="schema")
+    name: Name
+    robot: str
+    scene: tuple[Obstacle, ...] = ()
+    attached: tuple[AttachedObject, ...] = ()
+    start: JointValues
+    goal: Goal
+
+    @field_validator("scene", "attached", mode="before")
+    @classmethod
+    def _nothing_is_empty(cls, value: Any) -> Any:
+        return () if value is None else value
+
+    @model_validator(mode="after")
+    def _unique_names(self) -> Self:
+        names = [body.name for body in (*self.scene, *self.attached)]
+        twice = sorted({n for n in names if names.count(n) > 1})
+        if twice:
+            raise ValueError(f"the name {twice[0]!r} is given to more than one object")
+        return self
+
+    @property
+    def moving(self) -> tuple[str, ...]:
+        """Names of the obstacles that move."""
+        return tuple(o.name for o in self.scene if o.moving)
+
+    def start_state(self, joint_names: Sequence[str]) -> NDArray[np.float64]:
+        """Return the start in the order of ``joint_names``, shape (dof,).
+
+        Raises:
+            FileFormatError: A joint is missing or unknown.
+        """
+        return _in_order(self.start, joint_names, self.name, "start")
+
+    def goal_states(self, joint_names: Sequence[str]) -> NDArray[np.float64]:
+        """Return the goals in the order of ``joint_names``, shape (goals, dof).
+
+        Raises:
+            FileFormatError: A joint is missing or unknown.
+        """
+        several = len(self.goal.joints) > 1
+        rows = []
+        for k, values in enumerate(self.goal.joints):
+            field = f"goal.joints.{k}" if several else "goal.joints"
+            rows.append(_in_order(values, joint_names, self.name, field))
+        return np.array(rows)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Problem:
+        """Read a problem file; the paths of meshes and of a robot file become absolute.
+
+        Raises:
+            MissingFileError: The file, or a mesh that it names, cannot be read.
+            FileFormatError: The file does not follow the schema; the message names the field.
+        """
+        path = Path(path)
+        data = read_yaml(path, "problem file")
+        if data.get("schema") != SCHEMA:
+            raise FileFormatError(str(path), "schema", data.get("schema"), f"expected {SCHEMA!r}")
+        problem = validate(cls, data, str(path))
+        return problem._located(path.resolve().parent)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the problem as YAML, under a temporary name first.
+
+        Raises:
+            MissingFileError: The folder is missing or cannot be written.
+        """
+        write_atomically(Path(path), self.to_yaml().encode())
+
+    def to_yaml(self) -> str:
+        """Return the YAML text of the problem."""
+        data = self.model_dump(by_alias=True, exclude_none=True, exclude_defaults=True)
+        head = {"schema": SCHEMA, "name": data.pop("name"), "robot": data.pop("robot")}
+        goals = data["goal"]["joints"]
+        data["goal"]["joints"] = goals[0] if len(goals) == 1 else list(goals)
+        return dump_yaml(head | data)
+
+    def _located(self, folder: Path) -> Problem:
+        def mesh_located(body: Any) -> Any:
+            if body.mesh is None:
+                return body
+            file = str((folder / body.mesh.file).resolve())  # an absolute path stays as it is
+            return body.model_copy(update={"mesh": body.mesh.model_copy(update={"file": file})})
+
+        update: dict[str, Any] = {
+            "scene": tuple(mesh_located(o) for o in self.scene),
+            "attached": tuple(mesh_located(o) for o in self.attached),
+        }
+        if self.robot.endswith((".yaml", ".yml")):
+            update["robot"] = str((folder / self.robot).resolve())
+        return self.model_copy(update=update)
+
+
+def pose_matrix(position: Sequence[float], orientation: Sequence[float]) -> NDArray[np.float64]:
+    """Return the homogeneous transform of a position [m] and a quaternion xyzw, shape (4, 4)."""
+    x, y, z, w = np.asarray(orientation, float) / np.linalg.norm(orientation)
+    pose = np.eye(4)
+    pose[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    pose[:3, 3] = position
+    return pose
+
+
+def _in_order(values: Mapping[str, float], joint_names: Sequence[str], source: str, field: str) -> NDArray[np.float64]:
+    unknown = [name for name in values if name not in joint_names]
+    if unknown:
+        near = nearest_name(unknown[0], joint_names)
+        hint = f"did you mean {near!r}?" if near else f"known: {', '.join(joint_names)}"
+        raise FileFormatError(source, field, unknown[0], f"unknown joint, {hint}")
+    missing = [name for name in joint_names if name not in values]
+    if missing:
+        raise FileFormatError(
+            source, field, f"{len(values)} of {len(joint_names)} joints", f"joint {missing[0]!r} is missing"
+        )
+    return np.array([values[name] for name in joint_names], float)

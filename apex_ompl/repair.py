@@ -1,0 +1,62 @@
+"""Mending a path that a planner found at its search resolution and that fails the full check."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+from numpy.typing import NDArray
+from ompl import base as ob
+from ompl import geometric as og
+
+from apex_ompl.assembly import PlanningSetup
+from apex_ompl.space import FULL_RESOLUTION, path_to_array, state_space, to_state
+from apex_ompl.validity import FullCheck, MotionCheck, VerdictChecker, VerdictMotionValidator, full_check
+
+Array = NDArray[np.float64]
+
+MAX_BRIDGES = 20
+
+
+def repair(ready: PlanningSetup, path: Array, fault: FullCheck, deadline: float) -> Array | None:
+    """Plan stretches that fail the full check anew, at the resolution of the full check.
+
+    Args:
+        ready: The problem.
+        path: States, shape (N, dof), each of them free.
+        fault: What the full check said of ``path``.
+        deadline: Value of ``time.perf_counter`` at which to give up [s].
+
+    Returns:
+        A path that passes the full check, or None.
+    """
+    for _ in range(MAX_BRIDGES):
+        left = deadline - time.perf_counter()
+        if left <= 0.0 or fault.segment is None:
+            return None
+        k = fault.segment
+        bridge = _bridge(ready, path[k], path[k + 1], left)
+        if bridge is None:
+            return None
+        path = np.concatenate([path[:k], bridge, path[k + 2 :]])
+        fault = full_check(ready.verdict, path, ready.start, ready.goals)
+        if fault:
+            return path
+    return None
+
+
+def _bridge(ready: PlanningSetup, a: Array, b: Array, timeout: float) -> Array | None:
+    """Return a path between two free states, judged at the resolution of the full check, or None."""
+    space = state_space(ready.robot)
+    setup = og.SimpleSetup(space)
+    si = setup.getSpaceInformation()
+    setup.setStateValidityChecker(VerdictChecker(si, ready.verdict))
+    si.setMotionValidator(VerdictMotionValidator(si, MotionCheck(ready.verdict, FULL_RESOLUTION)))
+    setup.setStartAndGoalStates(to_state(space, a), to_state(space, b))
+    setup.setPlanner(og.RRTConnect(si))
+    status = setup.solve(ob.timedPlannerTerminationCondition(timeout))
+    if status.getStatus() != ob.PlannerStatus.EXACT_SOLUTION:
+        return None
+    bridge = path_to_array(setup.getSolutionPath(), ready.robot.dof)
+    bridge[0], bridge[-1] = a, b
+    return bridge

@@ -1,0 +1,143 @@
+"""What planning returns, and its files."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from ompl import base as ob
+
+from apex_ompl.errors import ParameterError
+from apex_ompl.schema import dump_yaml, write_atomically
+
+SCHEMA = "apex-ompl/result/1"
+SUFFIXES = (".npz", ".csv", ".json", ".yaml")
+
+
+class PlanStatus(StrEnum):
+    """OMPL's planner status names."""
+
+    UNKNOWN = "UNKNOWN"
+    INVALID_START = "INVALID_START"
+    INVALID_GOAL = "INVALID_GOAL"
+    UNRECOGNIZED_GOAL_TYPE = "UNRECOGNIZED_GOAL_TYPE"
+    TIMEOUT = "TIMEOUT"
+    APPROXIMATE_SOLUTION = "APPROXIMATE_SOLUTION"
+    EXACT_SOLUTION = "EXACT_SOLUTION"
+    CRASH = "CRASH"
+    ABORT = "ABORT"
+    INFEASIBLE = "INFEASIBLE"
+
+    @classmethod
+    def of(cls, status: ob.PlannerStatus) -> PlanStatus:
+        """Return the name of an OMPL status; ``asString`` does not know all of them."""
+        return cls(status.getStatus().name)
+
+
+@dataclass(frozen=True)
+class PlanResult:
+    """Outcome of one call of ``plan``; true only when ``status`` is EXACT_SOLUTION.
+
+    Attributes:
+        status: OMPL's name; EXACT_SOLUTION only for a path that passed the full check.
+        reason: One sentence that explains a status other than EXACT_SOLUTION.
+        problem: Name of the problem.
+        robot: Name of the robot.
+        joint_names: Order of the columns of ``path``.
+        planner: Name of the planner.
+        seed: The seed used.
+        path: States to be joined by straight lines, shape (N, dof) [rad; synergies 0..1], or None.
+        times: Seconds per stage, and ``total``.
+        length: Sum of Euclidean joint-space steps [rad], NaN without a path.
+        clearance: Least distance of any checked pair at 32 states spread over the path [m], NaN without a path.
+        checks: How many states were judged.
+        solved_by: What found the path: the planner's name, with ``+repair`` when a stretch of it failed the
+            full check and was planned anew; empty without a path.
+        notes: What a user should know about this run, such as a snapshot of moving obstacles.
+    """
+
+    status: PlanStatus
+    reason: str
+    problem: str
+    robot: str
+    joint_names: tuple[str, ...]
+    planner: str
+    seed: int
+    path: NDArray[np.float64] | None = None
+    times: Mapping[str, float] = field(default_factory=dict)
+    length: float = float("nan")
+    clearance: float = float("nan")
+    checks: int = 0
+    solved_by: str = ""
+    notes: tuple[str, ...] = ()
+
+    def __bool__(self) -> bool:
+        """Whether there is an exact path that passed the full check."""
+        return self.status is PlanStatus.EXACT_SOLUTION
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the fields as plain data, ready for JSON; numbers that do not exist are None."""
+        return {
+            "schema": SCHEMA,
+            "status": str(self.status),
+            "reason": self.reason,
+            "problem": self.problem,
+            "robot": self.robot,
+            "planner": self.planner,
+            "seed": self.seed,
+            "solved_by": self.solved_by,
+            "length": None if np.isnan(self.length) else self.length,
+            "clearance": None if not np.isfinite(self.clearance) else self.clearance,
+            "checks": self.checks,
+            "times": dict(self.times),
+            "notes": list(self.notes),
+            "joint_names": list(self.joint_names),
+            "path": None if self.path is None else self.path.tolist(),
+        }
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the result by the suffix of ``path``: .npz, .json, .yaml (all fields) or .csv (the path).
+
+        Raises:
+            ParameterError: Another suffix, or a CSV without a path.
+            MissingFileError: The folder is missing or cannot be written.
+        """
+        path = Path(path)
+        write_atomically(path, self._encoded(check_suffix(path)))
+
+    def _encoded(self, suffix: str) -> bytes:
+        data = self.as_dict()
+        if suffix == ".json":
+            return (json.dumps(data, indent=1) + "\n").encode()
+        if suffix == ".yaml":
+            return dump_yaml(data).encode()
+        if suffix == ".csv":
+            if self.path is None:
+                raise ParameterError("output", suffix, "a result with a path")
+            rows = [",".join(self.joint_names)]
+            rows += [",".join(repr(float(v)) for v in q) for q in self.path]
+            return ("\n".join(rows) + "\n").encode()
+        buffer = io.BytesIO()
+        states = np.empty((0, len(self.joint_names))) if self.path is None else self.path
+        del data["path"]
+        np.savez(buffer, path=states, joint_names=np.array(self.joint_names), result=np.array(json.dumps(data)))
+        return buffer.getvalue()
+
+
+def check_suffix(path: Path) -> str:
+    """Return the suffix of an output file.
+
+    Raises:
+        ParameterError: It is none of ``SUFFIXES``.
+    """
+    if path.suffix not in SUFFIXES:
+        raise ParameterError("output", str(path), f"a file name ending in {', '.join(SUFFIXES)}")
+    return path.suffix

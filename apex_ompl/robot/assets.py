@@ -1,0 +1,51 @@
+"""Where the files of robots lie: this package's own data and the packages of installed robot data."""
+
+from __future__ import annotations
+
+import os
+from functools import cache
+from pathlib import Path
+
+from apex_ompl.errors import MissingFileError
+
+DATA = Path(__file__).parent / "data"
+
+
+@cache
+def package_roots() -> tuple[Path, ...]:
+    """Folders in which ``package://NAME/...`` is looked up, in order.
+
+    They are the entries of ``ROS_PACKAGE_PATH``, then the ``share`` folder that belongs to the installed
+    Pinocchio (the PyPI wheel of ``example-robot-data`` has no Python module and installs its files there).
+    """
+    import pinocchio
+
+    roots = [Path(p) for p in os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep) if p]
+    roots += [parent / "share" for parent in Path(pinocchio.__file__).resolve().parents]
+    return tuple(root for root in roots if root.is_dir())
+
+
+def resolve(uri: str, relative_to: Path, role: str) -> Path:
+    """Return the file that ``uri`` names.
+
+    Args:
+        uri: ``package://NAME/path``, ``file:///path``, an absolute path, or a path relative to
+            ``relative_to``.
+        relative_to: Folder for relative paths.
+        role: What the file is wanted for; it is named in the error.
+
+    Raises:
+        MissingFileError: No such file.
+    """
+    if uri.startswith("package://"):
+        rest = uri.removeprefix("package://")
+        for root in package_roots():
+            if (root / rest).is_file():
+                return root / rest
+        package = rest.split("/", 1)[0]
+        raise MissingFileError(uri, role, f"not under any package folder; is the package {package!r} installed?")
+    path = Path(uri.removeprefix("file://")).expanduser()
+    path = path if path.is_absolute() else relative_to / path
+    if not path.is_file():
+        raise MissingFileError(str(path), role)
+    return path

@@ -1,0 +1,181 @@
+"""One URDF out of several: renaming, pruning, locking, mounting, absolute mesh paths."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from xml.etree import ElementTree as ET
+
+import numpy as np
+import pinocchio as pin
+
+from apex_ompl.errors import MissingFileError, RobotError
+from apex_ompl.problem import pose_matrix
+from apex_ompl.robot.assets import resolve
+from apex_ompl.robot.config import Part, RobotConfig
+
+
+@dataclass(frozen=True)
+class Composition:
+    """A composed robot description.
+
+    Attributes:
+        urdf: The URDF text, with absolute mesh paths and root link ``world``.
+        disabled_pairs: Link pairs that the SRDFs of the parts disable.
+        part_links: Part name -> names of its links.
+    """
+
+    urdf: str
+    disabled_pairs: list[tuple[str, str]]
+    part_links: dict[str, tuple[str, ...]]
+
+
+def compose(config: RobotConfig, folder: Path) -> Composition:
+    """Compose the parts of a robot into one URDF.
+
+    Args:
+        config: The robot file.
+        folder: Folder for relative paths.
+
+    Raises:
+        MissingFileError: A URDF, SRDF or collision mesh is missing.
+        RobotError: A part cannot be composed; the message says which and why.
+    """
+    # Version 1.2 is the first in which URDF has capsules.
+    root = ET.Element("robot", name=config.name, version="1.2")
+    ET.SubElement(root, "link", name="world")
+    links = {"world"}
+    disabled: list[tuple[str, str]] = []
+    part_links: dict[str, tuple[str, ...]] = {}
+    for part in config.parts:
+        rename = _renamer(part)
+        tree = _parse(resolve(part.urdf, folder, f"URDF of part {part.name!r}"))
+        _prune(tree, part)
+        names = []
+        for element in [*tree.findall("link"), *tree.findall("joint")]:
+            _rename_element(element, rename)
+            _locate_meshes(element, folder, part)
+            if element.tag == "link":
+                names.append(element.get("name", ""))
+            root.append(element)
+        clash = links.intersection(names)
+        if clash:
+            raise RobotError(f"part {part.name!r}: the link {min(clash)!r} exists already; give a prefix")
+        children = {c.get("link") for c in root.iterfind("joint/child")}
+        if part.parent not in links:
+            raise RobotError(f"part {part.name!r}: no link {part.parent!r} to mount it on")
+        _mount(root, part, next(n for n in names if n not in children))
+        links.update(names)
+        part_links[part.name] = tuple(names)
+        if part.srdf:
+            srdf = _parse(resolve(part.srdf, folder, f"SRDF of part {part.name!r}"))
+            pairs = [(rename(e.get("link1", "")), rename(e.get("link2", ""))) for e in srdf.iter("disable_collisions")]
+            disabled += [(a, b) for a, b in pairs if a in names and b in names]
+    for name, value in config.locked.items():
+        _lock(root, name, value)
+    return Composition(ET.tostring(root, encoding="unicode"), disabled, part_links)
+
+
+def _parse(path: Path) -> ET.Element:
+    try:
+        return ET.parse(path).getroot()
+    except ET.ParseError as error:
+        raise RobotError(f"{path}: not valid XML ({error})") from error
+    except OSError as error:
+        raise MissingFileError(str(path), "robot description", str(error.strerror)) from error
+
+
+def _renamer(part: Part) -> Callable[[str], str]:
+    def rename(name: str) -> str:
+        for old, new in part.rename.items():
+            if name.startswith(old):
+                name = new + name.removeprefix(old)
+                break
+        return part.prefix + name
+
+    return rename
+
+
+def _prune(tree: ET.Element, part: Part) -> None:
+    """Remove the links of ``part.remove`` and everything below them."""
+    known = {link.get("name") for link in tree.findall("link")}
+    doomed = set(part.remove)
+    if doomed - known:
+        raise RobotError(f"part {part.name!r}: no link {min(doomed - known)!r} to remove")
+    edges = [(j, j.find("parent"), j.find("child")) for j in tree.findall("joint")]
+    arcs = [(j, p.get("link"), c.get("link")) for j, p, c in edges if p is not None and c is not None]
+    grown = True
+    while grown:
+        below = {str(child) for _, parent, child in arcs if parent in doomed}
+        grown = not below <= doomed
+        doomed |= below
+    for joint, _, child in arcs:
+        if child in doomed:
+            tree.remove(joint)
+    for link in tree.findall("link"):
+        if link.get("name") in doomed:
+            tree.remove(link)
+
+
+def _rename_element(element: ET.Element, rename: Callable[[str], str]) -> None:
+    element.set("name", rename(element.get("name", "")))
+    for tag, key in (("parent", "link"), ("child", "link"), ("mimic", "joint")):
+        for inner in element.findall(tag):
+            inner.set(key, rename(inner.get(key, "")))
+
+
+def _locate_meshes(element: ET.Element, folder: Path, part: Part) -> None:
+    for kind in ("visual", "collision"):
+        for holder in element.findall(kind):
+            for mesh in holder.iter("mesh"):
+                role = f"{kind} mesh of link {element.get('name')!r}"
+                try:
+                    mesh.set("filename", str(resolve(mesh.get("filename", ""), folder, role)))
+                except MissingFileError:
+                    if kind == "collision":
+                        raise
+                    element.remove(holder)
+                    break
+
+
+def _mount(root: ET.Element, part: Part, child: str) -> None:
+    joint = ET.SubElement(root, "joint", name=f"{part.name}_mount", type="fixed")
+    _set_origin(joint, pose_matrix(part.position, part.orientation))
+    ET.SubElement(joint, "parent", link=part.parent)
+    ET.SubElement(joint, "child", link=child)
+
+
+def _lock(root: ET.Element, name: str, value: float) -> None:
+    """Turn a revolute or prismatic joint into a fixed one at ``value`` [rad or m]."""
+    joint = next((j for j in root.findall("joint") if j.get("name") == name), None)
+    if joint is None:
+        raise RobotError(f"locked: no joint {name!r} in the URDF")
+    kind = joint.get("type")
+    if kind not in ("revolute", "continuous", "prismatic"):
+        raise RobotError(f"locked: the joint {name!r} is {kind}, expected revolute, continuous or prismatic")
+    axis_element = joint.find("axis")
+    text = "1 0 0" if axis_element is None else axis_element.get("xyz", "1 0 0")
+    axis = np.array([float(v) for v in text.split()])
+    axis /= np.linalg.norm(axis)
+    motion = np.eye(4)
+    if kind == "prismatic":
+        motion[:3, 3] = value * axis
+    else:
+        motion[:3, :3] = pin.exp3(value * axis)
+    origin = joint.find("origin")
+    placement = np.eye(4)
+    if origin is not None:
+        placement[:3, 3] = [float(v) for v in origin.get("xyz", "0 0 0").split()]
+        placement[:3, :3] = pin.rpy.rpyToMatrix(*[float(v) for v in origin.get("rpy", "0 0 0").split()])
+    for tag in ("origin", "axis", "limit", "mimic", "dynamics", "safety_controller"):
+        for element in joint.findall(tag):
+            joint.remove(element)
+    joint.set("type", "fixed")
+    _set_origin(joint, placement @ motion)
+
+
+def _set_origin(joint: ET.Element, pose: np.ndarray) -> None:
+    xyz, rpy = pose[:3, 3], pin.rpy.matrixToRpy(pose[:3, :3])
+    text = {"xyz": " ".join(f"{v:.17g}" for v in xyz), "rpy": " ".join(f"{v:.17g}" for v in rpy)}
+    joint.insert(0, ET.Element("origin", text))

@@ -1,0 +1,123 @@
+"""The file that describes a robot: URDF parts, state order, limits, fixtures, disabled pairs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, PositiveFloat, model_validator
+
+from apex_ompl.errors import FileFormatError
+from apex_ompl.problem import Body, Name, Quaternion, Vector
+from apex_ompl.schema import StrictModel, read_yaml, validate
+
+SCHEMA = "apex-ompl/robot/1"
+PAIRS_SCHEMA = "apex-ompl/disabled-pairs/1"
+
+
+class Part(StrictModel):
+    """A URDF that is mounted on the world or on a link of an earlier part.
+
+    Attributes:
+        name: Name of the part; its links touch what the part holds.
+        urdf: URDF file, as a ``package://`` URI or a path relative to the robot file.
+        srdf: SRDF file whose ``disable_collisions`` are taken over.
+        prefix: Put before the names of all links and joints.
+        rename: Text replaced at the start of names, before ``prefix`` is added.
+        remove: Links removed together with everything below them.
+        parent: ``world``, or the link of an earlier part that carries this one.
+        position: Placement of the part's root link in ``parent`` [m].
+        orientation: The same, quaternion xyzw.
+    """
+
+    name: Name
+    urdf: str
+    srdf: str | None = None
+    prefix: str = ""
+    rename: dict[str, str] = {}
+    remove: tuple[str, ...] = ()
+    parent: str = "world"
+    position: Vector = (0.0, 0.0, 0.0)
+    orientation: Quaternion = (0.0, 0.0, 0.0, 1.0)
+
+
+class Joint(StrictModel):
+    """A planned joint: limits [rad, rad/s, rad/s^2, rad/s^3]; a URDF's where it has them."""
+
+    home: float = 0.0
+    lower: float | None = None
+    upper: float | None = None
+    velocity: PositiveFloat | None = None
+    acceleration: PositiveFloat
+    jerk: PositiveFloat
+
+
+class RobotConfig(StrictModel):
+    """A whole robot file.
+
+    Attributes:
+        name: Name of the robot.
+        description: One line about it.
+        parts: The URDFs it is composed of.
+        fixtures: Solids that belong to the robot's place, such as the tables it stands on.
+        joints: The planned joints in state order.
+        locked: Joints held at a value; they become fixed joints.
+        groups: Named groups of planned joints.
+        disabled_pairs: File of further link pairs that are never checked.
+    """
+
+    schema_id: Literal["apex-ompl/robot/1"] = Field(alias="schema")
+    name: Name
+    description: str = ""
+    parts: Annotated[tuple[Part, ...], Field(min_length=1)]
+    fixtures: tuple[Body, ...] = ()
+    joints: Annotated[dict[str, Joint], Field(min_length=1)]
+    locked: dict[str, float] = {}
+    groups: dict[str, tuple[str, ...]] = {}
+    disabled_pairs: str | None = None
+
+    @model_validator(mode="after")
+    def _known_joints(self) -> Self:
+        for group, names in self.groups.items():
+            for name in names:
+                if name not in self.joints:
+                    raise ValueError(f"group {group!r} names the unknown joint {name!r}")
+        return self
+
+
+class DisabledPair(StrictModel):
+    """Two links that are not checked against each other, and why."""
+
+    links: tuple[str, str]
+    reason: str
+
+
+class DisabledPairs(StrictModel):
+    """A file of disabled pairs."""
+
+    schema_id: Literal["apex-ompl/disabled-pairs/1"] = Field(alias="schema")
+    pairs: tuple[DisabledPair, ...]
+
+
+def read_config(path: Path) -> RobotConfig:
+    """Read a robot file.
+
+    Raises:
+        MissingFileError: It cannot be read.
+        FileFormatError: It does not follow the schema.
+    """
+    data = read_yaml(path, "robot file")
+    if data.get("schema") != SCHEMA:
+        raise FileFormatError(str(path), "schema", data.get("schema"), f"expected {SCHEMA!r}")
+    return validate(RobotConfig, data, str(path))
+
+
+def read_disabled_pairs(path: Path) -> list[tuple[str, str]]:
+    """Read a file of disabled pairs.
+
+    Raises:
+        MissingFileError: It cannot be read.
+        FileFormatError: It does not follow the schema.
+    """
+    data = read_yaml(path, "file of disabled pairs")
+    return [pair.links for pair in validate(DisabledPairs, data, str(path)).pairs]

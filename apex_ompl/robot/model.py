@@ -1,0 +1,241 @@
+"""The robot: a Pinocchio model with a state order, limits, links and disabled pairs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from apex_ompl.errors import FileFormatError, RobotError, UnknownNameError
+from apex_ompl.problem import Body
+from apex_ompl.robot.assets import DATA, resolve
+from apex_ompl.robot.compose import compose
+from apex_ompl.robot.config import RobotConfig, read_config, read_disabled_pairs
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Limits of the planned joints, each of shape (dof,).
+
+    Attributes:
+        lower: Lowest position [rad; synergies 0..1].
+        upper: Highest position.
+        velocity: Largest speed [rad/s].
+        acceleration: Largest acceleration [rad/s^2].
+        jerk: Largest jerk [rad/s^3].
+    """
+
+    lower: Array
+    upper: Array
+    velocity: Array
+    acceleration: Array
+    jerk: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Robot:
+    """A robot ready to be planned for.
+
+    Attributes:
+        name: Name of the robot.
+        joint_names: Planned joints in state order, the order of every state outside this module.
+        limits: Limits in state order.
+        home: A comfortable free state, shape (dof,).
+        groups: Group name -> indices into a state.
+        model: Pinocchio model; its q has its own order, see :meth:`to_pinocchio`.
+        geometry: Collision geometry of the links with the pairs to check, without any scene.
+        fixtures: Solids of the robot's place, such as its tables.
+        part_links: Part name -> links; a held object may touch the links of the part that holds it.
+        urdf: The composed URDF with absolute mesh paths.
+    """
+
+    name: str
+    joint_names: tuple[str, ...]
+    limits: Limits
+    home: Array
+    groups: Mapping[str, NDArray[np.intp]]
+    model: pin.Model
+    geometry: pin.GeometryModel
+    fixtures: tuple[Body, ...]
+    part_links: Mapping[str, tuple[str, ...]]
+    urdf: str = field(repr=False)
+    _order: NDArray[np.intp] = field(repr=False)
+
+    @property
+    def dof(self) -> int:
+        """Number of planned joints."""
+        return len(self.joint_names)
+
+    @property
+    def link_names(self) -> tuple[str, ...]:
+        """Names of all links."""
+        return tuple(f.name for f in self.model.frames if f.type == pin.FrameType.BODY)
+
+    def to_pinocchio(self, q: Array) -> Array:
+        """Return a state, shape (dof,), or states, shape (N, dof), in Pinocchio's order, as a new array."""
+        return np.asarray(q, dtype=float)[..., self._order]
+
+    def link_frame(self, link: str) -> int:
+        """Return the Pinocchio frame of a link.
+
+        Raises:
+            UnknownNameError: No such link.
+        """
+        if not self.model.existBodyName(link):
+            raise UnknownNameError("link", link, self.link_names)
+        return int(self.model.getFrameId(link, pin.FrameType.BODY))
+
+    def link_pose(self, q: Array, link: str) -> Array:
+        """Return the pose of a link in the world at state ``q``, shape (4, 4) [m]."""
+        frame = self.link_frame(link)
+        data = self.model.createData()
+        pin.framesForwardKinematics(self.model, data, self.to_pinocchio(q))
+        return np.array(data.oMf[frame].homogeneous)
+
+    def part_of(self, link: str) -> str:
+        """Return the part that a link belongs to.
+
+        Raises:
+            UnknownNameError: No such link.
+        """
+        for part, links in self.part_links.items():
+            if link in links:
+                return part
+        raise UnknownNameError("link", link, self.link_names)
+
+    def limit_fault(self, q: Array) -> str | None:
+        """Return a sentence about the first joint of ``q`` outside its limits, or None when all hold."""
+        q = np.asarray(q, dtype=float)
+        if q.shape != (self.dof,):
+            return f"the state has shape {q.shape}, expected ({self.dof},)"
+        low, high = self.limits.lower, self.limits.upper
+        bad = ~((q >= low) & (q <= high))  # NaN is never inside
+        if not bad.any():
+            return None
+        k = int(np.argmax(bad))
+        return f"{self.joint_names[k]} = {q[k]:.6g} is outside its limits [{low[k]:.6g}, {high[k]:.6g}]"
+
+    def random_state(self, rng: np.random.Generator, size: int | None = None) -> Array:
+        """Return states drawn uniformly inside the limits, shape (dof,) or (size, dof)."""
+        shape = (self.dof,) if size is None else (size, self.dof)
+        return rng.uniform(self.limits.lower, self.limits.upper, shape)
+
+
+def robot_names() -> tuple[str, ...]:
+    """Names of the robots that ship with the package."""
+    return tuple(sorted(path.name.removesuffix(".robot.yaml") for path in DATA.glob("*.robot.yaml")))
+
+
+def load_robot(name_or_path: str | Path, relative_to: Path | None = None) -> Robot:
+    """Load a robot by name, or from a robot file.
+
+    Args:
+        name_or_path: A name out of :func:`robot_names`, or the path of a ``.yaml`` file.
+        relative_to: Folder for a relative path; the current one by default.
+
+    Raises:
+        UnknownNameError: No robot of that name ships with the package.
+        MissingFileError: The robot file, a URDF, an SRDF or a collision mesh is missing.
+        FileFormatError: A file does not follow its schema.
+        RobotError: The description cannot be made into a robot.
+    """
+    text = str(name_or_path)
+    if text in robot_names():
+        path = DATA / f"{text}.robot.yaml"
+    elif text.endswith((".yaml", ".yml")):
+        path = resolve(text, relative_to or Path.cwd(), "robot file")
+    else:
+        raise UnknownNameError("robot", text, robot_names())
+    return build_robot(read_config(path), path)
+
+
+def build_robot(config: RobotConfig, path: Path) -> Robot:
+    """Make a robot out of a robot file that was read from ``path``.
+
+    Raises:
+        MissingFileError: A URDF, an SRDF or a collision mesh is missing.
+        RobotError: The description cannot be made into a robot.
+    """
+    composition = compose(config, path.parent)
+    try:
+        model = pin.buildModelFromXML(composition.urdf, mimic=True)
+        geometry = pin.buildGeomFromUrdfString(model, composition.urdf, pin.GeometryType.COLLISION)
+    except Exception as error:  # Pinocchio's parser raises several kinds
+        raise RobotError(f"{path}: Pinocchio cannot read the composed URDF ({error})") from error
+    order = _state_order(config, model, path)
+    disabled = list(composition.disabled_pairs)
+    if config.disabled_pairs:
+        disabled += read_disabled_pairs(resolve(config.disabled_pairs, path.parent, "file of disabled pairs"))
+    _pair_up(model, geometry, disabled)
+    names = tuple(config.joints)
+    groups = {g: np.array([names.index(n) for n in members]) for g, members in config.groups.items()}
+    limits = _limits(config, model, path)
+    home = np.array([joint.home for joint in config.joints.values()])
+    outside = ~((home >= limits.lower) & (home <= limits.upper))
+    if outside.any():
+        name = names[int(np.argmax(outside))]
+        field_name, value = f"joints.{name}.home", config.joints[name].home
+        raise FileFormatError(str(path), field_name, value, "expected a value inside the limits")
+    for array in (home, *vars(limits).values(), *groups.values(), order):
+        array.flags.writeable = False
+    return Robot(
+        name=config.name, joint_names=names, limits=limits, home=home, groups=groups, model=model,
+        geometry=geometry, fixtures=config.fixtures, part_links=composition.part_links,
+        urdf=composition.urdf, _order=order,
+    )  # fmt: skip
+
+
+def link_of(model: pin.Model, item: pin.GeometryObject) -> str:
+    """Return the name of the link that a geometry belongs to."""
+    return str(model.frames[item.parentFrame].name)
+
+
+def _state_order(config: RobotConfig, model: pin.Model, path: Path) -> NDArray[np.intp]:
+    """Return ``order`` with ``q_pinocchio = q_state[order]``."""
+    order = np.full(model.nq, -1, dtype=np.intp)
+    for k, name in enumerate(config.joints):
+        if not model.existJointName(name):
+            known = list(model.names)[1:]
+            raise FileFormatError(str(path), "joints", name, f"expected joints of the URDF ({', '.join(known)})")
+        joint = model.joints[model.getJointId(name)]
+        if joint.nq != 1 or joint.idx_q < 0:
+            raise FileFormatError(str(path), "joints", name, "expected revolute or prismatic joints")
+        order[joint.idx_q] = k
+    free = [n for n in list(model.names)[1:] if n not in config.joints and model.joints[model.getJointId(n)].nq > 0]
+    if (order < 0).any():
+        raise RobotError(f"{path}: the joint {free[0]!r} is neither planned (joints) nor held (locked)")
+    return order
+
+
+def _limits(config: RobotConfig, model: pin.Model, path: Path) -> Limits:
+    rows = []
+    for name, joint in config.joints.items():
+        item = model.joints[model.getJointId(name)]
+        low = model.lowerPositionLimit[item.idx_q] if joint.lower is None else joint.lower
+        high = model.upperPositionLimit[item.idx_q] if joint.upper is None else joint.upper
+        speed = model.velocityLimit[item.idx_v] if joint.velocity is None else joint.velocity
+        if not (np.isfinite([low, high, speed]).all() and low < high and speed > 0):
+            expected = "expected finite limits with lower < upper and velocity > 0"
+            raise FileFormatError(str(path), f"joints.{name}", [low, high, speed], expected)
+        rows.append((low, high, speed, joint.acceleration, joint.jerk))
+    return Limits(*(np.array(column, float) for column in zip(*rows, strict=True)))
+
+
+def _pair_up(model: pin.Model, geometry: pin.GeometryModel, disabled: Sequence[tuple[str, str]]) -> None:
+    """Pair all geometry that can move against each other and is not disabled."""
+    skip = {frozenset(pair) for pair in disabled}
+    items = list(geometry.geometryObjects)
+    for i, j in combinations(range(len(items)), 2):
+        a, b = items[i], items[j]
+        if a.parentJoint == b.parentJoint:  # rigidly joined, or both fixed to the world
+            continue
+        if frozenset((link_of(model, a), link_of(model, b))) in skip:
+            continue
+        geometry.addCollisionPair(pin.CollisionPair(i, j))

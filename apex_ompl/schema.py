@@ -1,0 +1,178 @@
+"""YAML files checked by pydantic: reading, faults in one sentence, and writing without half files."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import tempfile
+from collections.abc import Hashable
+from pathlib import Path
+from typing import Any, TypeVar, get_args
+
+import yaml
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from apex_ompl.errors import FileFormatError, MissingFileError, nearest_name
+
+ModelT = TypeVar("ModelT", bound="StrictModel")
+
+
+class StrictModel(BaseModel):
+    """A frozen record that refuses unknown keys and numbers that are not finite."""
+
+    model_config = ConfigDict(
+        extra="forbid", frozen=True, allow_inf_nan=False, populate_by_name=True, validate_default=True
+    )
+
+
+class _Loader(yaml.SafeLoader):
+    """SafeLoader that refuses a key given twice."""
+
+
+def _mapping(loader: _Loader, node: yaml.MappingNode) -> dict[Hashable, Any]:
+    seen = set()
+    for key_node, _ in node.value:
+        key = loader.construct_object(key_node)
+        if key in seen:
+            raise yaml.constructor.ConstructorError(None, None, f"key {key!r} is given twice", key_node.start_mark)
+        seen.add(key)
+    return loader.construct_mapping(node, deep=True)
+
+
+_Loader.add_constructor(yaml.resolver.BaseResolver.DEFAULT_MAPPING_TAG, _mapping)
+
+
+def read_yaml(path: Path, role: str) -> dict[str, Any]:
+    """Read a YAML mapping.
+
+    Raises:
+        MissingFileError: The file cannot be read.
+        FileFormatError: It is not YAML, or not a mapping.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise MissingFileError(str(path), role, (error.strerror or "cannot be read").lower()) from error
+    except UnicodeDecodeError as error:
+        raise FileFormatError(str(path), "", str(error.reason), "expected UTF-8 text") from error
+    return parse_yaml(text, str(path))
+
+
+def parse_yaml(text: str, source: str) -> dict[str, Any]:
+    """Parse YAML text that holds one mapping; ``source`` names it in errors.
+
+    Raises:
+        FileFormatError: It does not parse, or is not a mapping.
+    """
+    try:
+        data = yaml.load(text, Loader=_Loader)
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark
+        place = f"line {mark.line + 1}, column {mark.column + 1}" if mark else ""
+        problem = str(error.problem or error.context).strip()
+        raise FileFormatError(source, place, problem, "expected valid YAML") from error
+    except (yaml.YAMLError, ValueError, TypeError) as error:
+        raise FileFormatError(source, "", str(error), "expected valid YAML") from error
+    if not isinstance(data, dict):
+        raise FileFormatError(source, "", data, "expected a mapping of keys to values")
+    return data
+
+
+def validate(model: type[ModelT], data: dict[str, Any], source: str) -> ModelT:
+    """Make a record from ``data``, or say in one sentence what is wrong with the first fault.
+
+    Raises:
+        FileFormatError: ``data`` does not fit ``model``.
+    """
+    try:
+        return model.model_validate(data)
+    except ValidationError as error:
+        first = error.errors()[0]
+        location = [str(part) for part in first["loc"]]
+        expected = first["msg"][0].lower() + first["msg"][1:]
+        value = first["input"]
+        if first["type"] == "extra_forbidden":
+            known = _known_keys(model, first["loc"][:-1])
+            near = nearest_name(location[-1], known)
+            hint = f"did you mean {near!r}?" if near else f"known: {', '.join(sorted(known))}"
+            expected, value = f"unknown key, {hint}", location[-1]
+        elif first["type"] == "missing":
+            expected, value = "required key is missing", sorted(map(str, value)) if value else value
+        elif first["type"] == "value_error":
+            expected = str(first["ctx"]["error"])
+        field = ".".join(location) if location else ""
+        raise FileFormatError(source, field, value, expected) from error
+
+
+def _known_keys(model: type[BaseModel], location: tuple[int | str, ...]) -> set[str]:
+    """Return the keys that the record at ``location`` inside ``model`` accepts."""
+    current: type[BaseModel] | None = model
+    for part in location:
+        if isinstance(part, int) or current is None:
+            continue
+        field = next(
+            (f for n, f in current.model_fields.items() if part in (n, f.alias)),
+            None,
+        )
+        current = _model_in(field.annotation) if field else None
+    if current is None:
+        return set()
+    return {field.alias or name for name, field in current.model_fields.items()}
+
+
+def _model_in(annotation: Any) -> type[BaseModel] | None:
+    """Return the record type inside an annotation such as ``tuple[Obstacle, ...] | None``."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation
+    for inner in get_args(annotation):
+        found = _model_in(inner)
+        if found is not None:
+            return found
+    return None
+
+
+def write_atomically(path: Path, content: bytes) -> None:
+    """Write a file under a temporary name beside it, then rename it.
+
+    Raises:
+        MissingFileError: The folder does not exist or cannot be written.
+    """
+    path = Path(path)
+    role = "output file"
+    if not path.parent.is_dir():
+        raise MissingFileError(str(path), role, f"folder {str(path.parent)!r} does not exist")
+    if path.is_dir():
+        raise MissingFileError(str(path), role, "is a folder")
+    temporary: str | None = None
+    try:
+        descriptor, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+        with os.fdopen(descriptor, "wb") as file:
+            file.write(content)
+        umask = os.umask(0)
+        os.umask(umask)
+        os.chmod(temporary, 0o666 & ~umask)
+        os.replace(temporary, path)
+    except OSError as error:
+        if temporary is not None:
+            with contextlib.suppress(OSError):
+                os.unlink(temporary)
+        why = (error.strerror or "cannot be written").lower()
+        raise MissingFileError(str(path), role, why) from error
+
+
+class _Dumper(yaml.SafeDumper):
+    """Block style for mappings, flow style for plain vectors of numbers."""
+
+
+def _represent_sequence(dumper: _Dumper, data: Any) -> yaml.SequenceNode:
+    flat = all(isinstance(v, (int, float)) for v in data)
+    return dumper.represent_sequence("tag:yaml.org,2002:seq", data, flow_style=flat)
+
+
+_Dumper.add_representer(list, _represent_sequence)
+_Dumper.add_representer(tuple, _represent_sequence)
+
+
+def dump_yaml(data: dict[str, Any]) -> str:
+    """Return YAML text with keys in the order given."""
+    return yaml.dump(data, Dumper=_Dumper, sort_keys=False, width=110, allow_unicode=True)

@@ -1,0 +1,128 @@
+"""Planner names, their parameter records and factories."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from typing import Any, ClassVar
+
+from ompl import base as ob
+
+from apex_ompl.errors import ParameterError, UnknownNameError
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """Parameters of one planner; a subclass per planner, whose defaults are the planner's.
+
+    Attributes:
+        optimizing: Whether the planner goes on improving until time is up.
+        repeatable: Whether the same seed gives the same path; not for planners that are stopped by the clock
+            or threaded.
+    """
+
+    optimizing: ClassVar[bool] = False
+    repeatable: ClassVar[bool] = True
+
+    def build(self, si: ob.SpaceInformation) -> ob.Planner:
+        """Return a planner for ``si`` with these parameters."""
+        raise TypeError(f"{type(self).__name__} does not say how to build its planner")
+
+    def changed(self, **values: Any) -> Parameters:
+        """Return a copy with some values changed; text is read as the field's type.
+
+        Raises:
+            UnknownNameError: No parameter of that name.
+            ParameterError: A value of the wrong type or out of range.
+        """
+        known = {f.name: f for f in fields(self)}
+        for name in values:
+            if name not in known:
+                raise UnknownNameError("parameter", name, known)
+        read = {name: _read(name, value, getattr(self, name), known[name]) for name, value in values.items()}
+        return dataclasses.replace(self, **read)
+
+
+def bounded(default: Any, low: float, high: float = float("inf"), unit: str = "") -> Any:
+    """Return a dataclass field with a range, ends included; the unit is for documentation."""
+    return dataclasses.field(default=default, metadata={"low": low, "high": high, "unit": unit})
+
+
+_REGISTRY: dict[str, type[Parameters]] = {}
+
+
+def register(name: str) -> Callable[[type[Parameters]], type[Parameters]]:
+    """Register a parameter class under a planner name."""
+
+    def enter(cls: type[Parameters]) -> type[Parameters]:
+        _REGISTRY[name] = cls
+        return cls
+
+    return enter
+
+
+def names() -> tuple[str, ...]:
+    """Names of all planners."""
+    _load()
+    return tuple(sorted(_REGISTRY))
+
+
+def parameters(name: str, **values: Any) -> Parameters:
+    """Return the parameters of a planner: its defaults, with some values changed.
+
+    Raises:
+        UnknownNameError: No such planner or parameter; the message lists the known ones.
+        ParameterError: A value of the wrong type or out of range.
+    """
+    _load()
+    if name not in _REGISTRY:
+        raise UnknownNameError("planner", name, _REGISTRY)
+    return _REGISTRY[name]().changed(**values)
+
+
+def make(name: str, si: ob.SpaceInformation, **values: Any) -> ob.Planner:
+    """Return a planner for a space information, for example ``make("rrtconnect", si, range=0.5)``.
+
+    Raises:
+        UnknownNameError: No such planner or parameter; the message lists the known ones.
+        ParameterError: A value of the wrong type or out of range.
+    """
+    return parameters(name, **values).build(si)
+
+
+def allocator(name: str, **values: Any) -> Callable[[ob.SpaceInformation], ob.Planner]:
+    """Return an allocator for ``SimpleSetup.setPlannerAllocator``.
+
+    Raises:
+        UnknownNameError: No such planner or parameter; the message lists the known ones.
+        ParameterError: A value of the wrong type or out of range.
+    """
+    return parameters(name, **values).build
+
+
+def _load() -> None:
+    """Import the modules that register planners."""
+    from apex_ompl.planners import sampling  # noqa: F401
+
+
+def _read(name: str, value: Any, default: Any, field: dataclasses.Field[Any]) -> Any:
+    """Return ``value`` as the type of ``default``, in range."""
+    kind = type(default)
+    expected = {bool: "true or false", int: "a whole number", float: "a number"}[kind]
+    low, high = field.metadata.get("low", -float("inf")), field.metadata.get("high", float("inf"))
+    if low > -float("inf") or high < float("inf"):
+        expected += f" in [{low:g}, {high:g}]"
+    read = value
+    if isinstance(value, str):
+        word = value.strip().lower()
+        words = {"true": True, "yes": True, "1": True, "false": False, "no": False, "0": False}
+        try:
+            read = words.get(word) if kind is bool else kind(word)
+        except ValueError:
+            read = None
+    elif kind is float and type(value) is int:
+        read = float(value)
+    if type(read) is not kind or not low <= read <= high:
+        raise ParameterError(f"parameter {name!r}", value, expected)
+    return read
