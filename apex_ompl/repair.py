@@ -23,7 +23,7 @@ def repair(ready: PlanningSetup, path: Array, fault: FullCheck, deadline: float)
 
     Args:
         ready: The problem.
-        path: States, shape (N, dof), each of them free.
+        path: States, shape (N, dof), the first and the last of them free.
         fault: What the full check said of ``path``.
         deadline: Value of ``time.perf_counter`` at which to give up [s].
 
@@ -34,15 +34,28 @@ def repair(ready: PlanningSetup, path: Array, fault: FullCheck, deadline: float)
         left = deadline - time.perf_counter()
         if left <= 0.0 or fault.segment is None:
             return None
-        k = fault.segment
-        bridge = _bridge(ready, path[k], path[k + 1], left)
+        first, last = _free_ends(ready, path, fault.segment)
+        bridge = _bridge(ready, path[first], path[last], left)
         if bridge is None:
             return None
-        path = np.concatenate([path[:k], bridge, path[k + 2 :]])
+        path = np.concatenate([path[:first], bridge, path[last + 1 :]])
         fault = full_check(ready.verdict, path, ready.start, ready.goals)
         if fault:
             return path
     return None
+
+
+def _free_ends(ready: PlanningSetup, path: Array, segment: int) -> tuple[int, int]:
+    """Return the states nearest to a segment, before and after it, that are free.
+
+    Shortcuts may put a state between those that were judged, so that a state of the path itself collides.
+    """
+    first, last = segment, segment + 1
+    while first > 0 and not ready.verdict.is_free(path[first]):
+        first -= 1
+    while last < len(path) - 1 and not ready.verdict.is_free(path[last]):
+        last += 1
+    return first, last
 
 
 def _bridge(ready: PlanningSetup, a: Array, b: Array, timeout: float) -> Array | None:

@@ -1,0 +1,86 @@
+"""What every committed measurement says besides its figures: command, versions, hardware, commit, date."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import subprocess
+import sys
+from datetime import UTC, datetime
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from apex_ompl.schema import write_atomically
+
+RESULTS = Path(__file__).parent / "results"
+LIBRARIES = ("apex-ompl", "ompl", "pin", "coal", "numpy")
+
+
+def hardware() -> str:
+    """Return the processor's name and the number of cores this process may use."""
+    name = platform.machine()
+    info = Path("/proc/cpuinfo")
+    if info.exists():
+        names = [line.split(":", 1)[1].strip() for line in info.read_text().splitlines() if "model name" in line]
+        name = names[0] if names else name
+    return f"{name}, {len(os.sched_getaffinity(0))} cores"
+
+
+def commit() -> str:
+    """Return the commit of the tree, with a mark when it has changes."""
+    root = Path(__file__).parent
+    try:
+        head = subprocess.run(
+            ["git", "rev-parse", "--short", "HEAD"], cwd=root, capture_output=True, text=True, check=True
+        )
+        dirty = subprocess.run(["git", "status", "--porcelain"], cwd=root, capture_output=True, text=True, check=True)
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+    return head.stdout.strip() + ("+changes" if dirty.stdout.strip() else "")
+
+
+def write(name: str, figures: dict[str, Any], table: str, **settings: Any) -> None:
+    """Write ``results/NAME.json`` and ``results/NAME.md``, and print the table.
+
+    Args:
+        name: Name of the measurement.
+        figures: The figures, ready for JSON.
+        table: A Markdown table of them.
+        **settings: Seed, N and other settings.
+    """
+    about = {
+        "command": " ".join(
+            [
+                "python",
+                *(str(a) for a in [Path(sys.argv[0]).name and f"benchmarks/{Path(sys.argv[0]).name}", *sys.argv[1:]]),
+            ]
+        ),
+        "date": datetime.now(UTC).strftime("%Y-%m-%d"),
+        "commit": commit(),
+        "hardware": hardware(),
+        "python": platform.python_version(),
+        "versions": {library: metadata.version(library) for library in LIBRARIES},
+        **settings,
+    }
+    RESULTS.mkdir(exist_ok=True)
+    write_atomically(RESULTS / f"{name}.json", (json.dumps({"about": about, **figures}, indent=1) + "\n").encode())
+    versions = ", ".join(f"{k} {v}" for k, v in about["versions"].items())
+    rest = ", ".join(f"{k} {v}" for k, v in settings.items())
+    head = f"`{about['command']}` on {about['hardware']}; {about['date']}, commit {about['commit']}, "
+    head += f"Python {about['python']}, {versions}; {rest}."
+    write_atomically(RESULTS / f"{name}.md", f"# {name}\n\n{head}\n\n{table}\n".encode())
+    print(table)
+
+
+def row(cells: list[Any]) -> str:
+    """Return one row of a Markdown table."""
+    return "| " + " | ".join(str(c) for c in cells) + " |"
+
+
+def percentiles(values: list[float] | np.ndarray, *which: float) -> list[float]:
+    """Return percentiles of ``values``, NaN when there are none."""
+    return [float(np.percentile(values, p)) if len(values) else float("nan") for p in which]
