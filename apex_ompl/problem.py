@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AfterValidator, Field, PositiveFloat, field_validator, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, PositiveFloat, field_validator, model_validator
 
 from apex_ompl.errors import FileFormatError, nearest_name
 from apex_ompl.schema import StrictModel, dump_yaml, read_yaml, validate, write_atomically
@@ -154,15 +154,18 @@ class AttachedObject(Body):
 JointValues = dict[str, float]
 
 
+def _one_or_many(value: Any) -> Any:
+    return [value] if isinstance(value, Mapping) else value
+
+
 class Goal(StrictModel):
     """What is to be reached: one of several complete joint configurations."""
 
-    joints: Annotated[tuple[JointValues, ...], Field(min_length=1)]
-
-    @field_validator("joints", mode="before")
-    @classmethod
-    def _one_or_many(cls, value: Any) -> Any:
-        return [value] if isinstance(value, Mapping) else value
+    joints: Annotated[
+        tuple[JointValues, ...],
+        Field(min_length=1),
+        BeforeValidator(_one_or_many, json_schema_input_type=JointValues | tuple[JointValues, ...]),
+    ]
 
 
 class Problem(StrictModel):

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import tempfile
 from collections.abc import Hashable
 from pathlib import Path
-from typing import Any, TypeVar, get_args
+from typing import Any, TypeVar, get_args, get_origin
 
 import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
@@ -39,6 +40,10 @@ def _mapping(loader: _Loader, node: yaml.MappingNode) -> dict[Hashable, Any]:
     return loader.construct_mapping(node, deep=True)
 
 
+# PyYAML reads 1e-3 as text, YAML 1.2 as a number.
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float", re.compile(r"^[-+]?(\d+(\.\d*)?|\.\d+)[eE][-+]?\d+$"), list("-+.0123456789")
+)
 _Loader.add_constructor(yaml.resolver.BaseResolver.DEFAULT_MAPPING_TAG, _mapping)
 
 
@@ -87,7 +92,9 @@ def validate(model: type[ModelT], data: dict[str, Any], source: str) -> ModelT:
     try:
         return model.model_validate(data)
     except ValidationError as error:
-        first = error.errors()[0]
+        faults = error.errors()
+        # A misspelt key shows up as a missing one too; the misspelling says more.
+        first = next((f for f in faults if f["type"] == "extra_forbidden"), faults[0])
         location = [str(part) for part in first["loc"]]
         expected = first["msg"][0].lower() + first["msg"][1:]
         value = first["input"]
@@ -107,14 +114,14 @@ def validate(model: type[ModelT], data: dict[str, Any], source: str) -> ModelT:
 def _known_keys(model: type[BaseModel], location: tuple[int | str, ...]) -> set[str]:
     """Return the keys that the record at ``location`` inside ``model`` accepts."""
     current: type[BaseModel] | None = model
+    free_key = False  # the next part is the key of a mapping, not a field
     for part in location:
-        if isinstance(part, int) or current is None:
+        if isinstance(part, int) or current is None or free_key:
+            free_key = False
             continue
-        field = next(
-            (f for n, f in current.model_fields.items() if part in (n, f.alias)),
-            None,
-        )
+        field = next((f for n, f in current.model_fields.items() if part in (n, f.alias)), None)
         current = _model_in(field.annotation) if field else None
+        free_key = field is not None and get_origin(field.annotation) is dict
     if current is None:
         return set()
     return {field.alias or name for name, field in current.model_fields.items()}

@@ -17,6 +17,7 @@ import pinocchio as pin
 import record
 
 from apex_ompl.collision import Verdict
+from apex_ompl.collision.broadphase import exact_requests
 from apex_ompl.problem import Obstacle
 from apex_ompl.robot import Robot, load_robot
 
@@ -52,7 +53,7 @@ class PlainLoop:
     def __init__(self, verdict: Verdict) -> None:
         """Take the compiled scene of ``verdict``."""
         self.robot, self.scene = verdict.robot, verdict._scene()
-        self.data, self.geometry_data = self.robot.model.createData(), self.scene.geometry.createData()
+        self.data, self.geometry_data = self.robot.model.createData(), exact_requests(self.scene.geometry.createData())
 
     def is_free(self, q: np.ndarray) -> bool:
         """Whether no pair collides at ``q``."""

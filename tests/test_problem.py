@@ -1,0 +1,195 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import jsonschema
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from apex_ompl import load_problem, problems
+from apex_ompl.errors import ApexError, FileFormatError, MissingFileError, UnknownNameError
+from apex_ompl.problem import AttachedObject, Goal, MeshFile, Obstacle, Problem, pose_matrix
+from apex_ompl.robot import Robot
+from apex_ompl.schema import parse_yaml
+
+FILE = """schema: apex-ompl/problem/1
+name: small
+robot: some_robot
+scene:
+  - {name: post, box: [0.1, 0.1, 0.4], position: [0.5, 0.0, 0.2], orientation: [0, 0, 0, 1]}
+  - {name: mover, sphere: {radius: 0.1}, position: [0.4, 0.6, 0.3], velocity: [0, -0.2, 0]}
+attached:
+  - {name: cup, link: left_hand_palm, cylinder: {radius: 0.035, length: 0.11}, position: [0, 0, 0.1],
+     contact: {point: [0, 0, 0.05], axis: [0, 0, 1]}}
+start: {a: 0.1, b: 1e-3}
+goal: {joints: {a: 1, b: 2}}
+"""
+
+
+def load_text(folder: Path, text: str) -> Problem:
+    path = folder / "p.yaml"
+    path.write_text(text)
+    return Problem.load(path)
+
+
+def test_reading_gives_states_in_the_order_asked_for(tmp_path: Path) -> None:
+    problem = load_text(tmp_path, FILE)
+    np.testing.assert_array_equal(problem.start_state(["b", "a"]), [0.001, 0.1])
+    np.testing.assert_array_equal(problem.goal_states(["a", "b"]), [[1.0, 2.0]])
+    assert problem.moving == ("mover",)
+    assert problem.scene[0].shape == "box" and problem.attached[0].contact is not None
+
+
+def test_several_goals(tmp_path: Path) -> None:
+    problem = load_text(tmp_path, FILE.replace("{a: 1, b: 2}", "[{a: 1, b: 2}, {b: 4, a: 3}]"))
+    np.testing.assert_array_equal(problem.goal_states(["a", "b"]), [[1.0, 2.0], [3.0, 4.0]])
+
+
+def test_saving_and_loading_round_trips(tmp_path: Path) -> None:
+    problem = load_text(tmp_path, FILE)
+    problem.save(tmp_path / "again.yaml")
+    assert Problem.load(tmp_path / "again.yaml") == problem
+    for name in problems.names():
+        load_problem(name).save(tmp_path / "again.yaml")
+        assert Problem.load(tmp_path / "again.yaml") == load_problem(name)
+
+
+numbers = st.floats(-10, 10, allow_nan=False)
+sizes = st.floats(1e-3, 5)
+vectors = st.tuples(numbers, numbers, numbers)
+shapes = st.one_of(
+    st.builds(lambda v: {"box": v}, st.tuples(sizes, sizes, sizes)),
+    st.builds(lambda r: {"sphere": {"radius": r}}, sizes),
+    st.builds(lambda r, n: {"cylinder": {"radius": r, "length": n}}, sizes, sizes),
+    st.builds(lambda r, n: {"capsule": {"radius": r, "length": n}}, sizes, sizes),
+    st.builds(lambda o: {"half_space": {"normal": (0.0, 1.0, 0.0), "offset": o}}, numbers),
+)
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.lists(st.tuples(shapes, vectors), max_size=4), st.lists(numbers, min_size=3, max_size=3))
+def test_any_problem_survives_its_file(tmp_path_factory: pytest.TempPathFactory, scene: list, start: list) -> None:
+    obstacles = tuple(Obstacle(name=f"o{k}", position=at, **shape) for k, (shape, at) in enumerate(scene))
+    values = dict(zip("abc", start, strict=True))
+    problem = Problem(name="any", robot="r", scene=obstacles, start=values, goal=Goal(joints=(values, values)))
+    path = tmp_path_factory.mktemp("p") / "any.yaml"
+    problem.save(path)
+    assert Problem.load(path) == problem
+
+
+def test_files_follow_the_exported_json_schema() -> None:
+    schema = json.loads(json.dumps(Problem.model_json_schema(by_alias=True)))
+    assert schema["properties"]["schema"]["const"] == "apex-ompl/problem/1"
+    jsonschema.validate(parse_yaml(FILE, "file"), schema)
+    broken = parse_yaml(FILE, "file")
+    broken["scene"][0]["bx"] = 1
+    with pytest.raises(jsonschema.ValidationError):
+        jsonschema.validate(broken, schema)
+    for name in problems.names():
+        jsonschema.validate(parse_yaml((problems.DATA / f"{name}.yaml").read_text(), name), schema)
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.lists(st.floats(-1, 1), min_size=4, max_size=4).filter(lambda q: np.linalg.norm(q) > 0.1))
+def test_pose_matrix_is_scipys(q: list[float]) -> None:
+    expected = Rotation.from_quat(q).as_matrix()
+    np.testing.assert_allclose(pose_matrix((1, 2, 3), q)[:3, :3], expected, atol=1e-12)
+    np.testing.assert_array_equal(pose_matrix((1, 2, 3), q)[:, 3], [1, 2, 3, 1])
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("problem/1", "problem/9", ["schema", "'apex-ompl/problem/9'", "expected 'apex-ompl/problem/1'"]),
+        ("schema: apex-ompl/problem/1\n", "", ["schema", "None", "expected 'apex-ompl/problem/1'"]),
+        ("start: {a: 0.1,", "start: {a: [,", ["line 10", "valid YAML"]),
+        ("box: [0.1, 0.1, 0.4]", "bx: [0.1, 0.1, 0.4]", ["scene.0.bx", "did you mean 'box'"]),
+        ("robot: some_robot\n", "", ["robot", "required key is missing"]),
+        ("robot: some_robot", "robots: some_robot", ["robot"]),
+        ("a: 0.1", "a: .nan", ["start.a", "finite", "nan"]),
+        ("a: 0.1", "a: .inf", ["start.a", "finite", "inf"]),
+        ("a: 0.1", "a: fast", ["start.a", "number", "'fast'"]),
+        ("a: 0.1", "a: 0.1, a: 0.2", ["line 10", "'a' is given twice"]),
+        ("[0.1, 0.1, 0.4]", "[0.1, 0.1]", ["scene.0.box"]),
+        ("[0.1, 0.1, 0.4]", "[0.1, 0.1, -0.4]", ["scene.0.box.2", "greater than 0", "-0.4"]),
+        ("orientation: [0, 0, 0, 1]", "orientation: [0, 0, 0, 2]", ["scene.0.orientation", "unit quaternion"]),
+        ("sphere: {radius: 0.1}, ", "", ["mover", "exactly one of box", "none"]),
+        ("sphere: {radius: 0.1}", "sphere: {radius: 0.1}, box: [1, 1, 1]", ["exactly one", "box and sphere"]),
+        ("name: mover", "name: post", ["'post'", "more than one object"]),
+        ("sphere: {radius: 0.1}", "mesh: {file: a.ply}", ["scene.1.mesh.file", ".stl or .obj", "a.ply"]),
+        ("cylinder: {radius: 0.035, length: 0.11}", "half_space: {normal: [0, 0, 1]}", ["half_space cannot be held"]),
+        ("axis: [0, 0, 1]", "axis: [0, 0, 0]", ["attached.0.contact.axis", "not zero"]),
+        ("goal: {joints: {a: 1, b: 2}}", "goal: {joints: []}", ["goal.joints", "at least 1 item"]),
+        ("goal: {joints: {a: 1, b: 2}}", "goal: {joint: {a: 1}}", ["goal.joint", "did you mean 'joints'"]),
+    ],
+)  # fmt: skip
+def test_each_fault_is_one_sentence_that_names_it(tmp_path: Path, old: str, new: str, words: list[str]) -> None:
+    assert old in FILE
+    with pytest.raises(FileFormatError) as caught:
+        load_text(tmp_path, FILE.replace(old, new, 1))
+    message = str(caught.value)
+    assert "\n" not in message and message.startswith(str(tmp_path / "p.yaml"))
+    for word in words:
+        assert word in message, message
+
+
+def test_unknown_and_missing_joints_are_named(robot: Robot) -> None:
+    joints = dict.fromkeys(robot.joint_names, 0.0)
+    problem = Problem(name="p", robot=robot.name, start=joints, goal=Goal(joints=(joints, joints)))
+    wrong = {"left_jiont3" if k == "left_joint3" else k: v for k, v in joints.items()}
+    with pytest.raises(FileFormatError, match=r"p: start: unknown joint, did you mean 'left_joint3'"):
+        problem.model_copy(update={"start": wrong}).start_state(robot.joint_names)
+    del joints["right_joint7"]
+    short = problem.model_copy(update={"goal": Goal(joints=(problem.start, joints))})
+    with pytest.raises(FileFormatError, match=r"goal\.joints\.1: joint 'right_joint7' is missing"):
+        short.goal_states(robot.joint_names)
+
+
+def test_missing_and_unreadable_files(tmp_path: Path) -> None:
+    with pytest.raises(MissingFileError, match=r"problem file '.*gone.yaml': no such file"):
+        Problem.load(tmp_path / "gone.yaml")
+    with pytest.raises(MissingFileError, match="directory"):
+        Problem.load(tmp_path)
+    (tmp_path / "binary.yaml").write_bytes(b"\xff\xfe\x00\x01")
+    with pytest.raises(FileFormatError, match="UTF-8"):
+        Problem.load(tmp_path / "binary.yaml")
+    (tmp_path / "list.yaml").write_text("- 1\n")
+    with pytest.raises(FileFormatError, match="mapping"):
+        Problem.load(tmp_path / "list.yaml")
+    with pytest.raises(UnknownNameError, match="did you mean 'shelf_swap'"):
+        load_problem("shelf_swpa")
+
+
+def test_saving_leaves_nothing_half_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    problem = load_text(tmp_path, FILE)
+    with pytest.raises(MissingFileError, match="folder .* does not exist"):
+        problem.save(tmp_path / "nowhere" / "p.yaml")
+    target = tmp_path / "kept.yaml"
+    target.write_text("before")
+
+    def fail(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.replace", fail)
+    with pytest.raises(ApexError, match="no space left"):
+        problem.save(target)
+    assert target.read_text() == "before"
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["kept.yaml", "p.yaml"]
+
+
+def test_paths_of_meshes_and_robots_start_at_the_file(tmp_path: Path) -> None:
+    folder = tmp_path / "deep"
+    folder.mkdir()
+    text = FILE.replace("sphere: {radius: 0.1}", "mesh: {file: ../bunny.stl}").replace("some_robot", "../r.yaml")
+    problem = load_text(folder, text)
+    assert problem.scene[1].mesh == MeshFile(file=str(tmp_path / "bunny.stl"))
+    assert problem.robot == str(tmp_path / "r.yaml")
+
+
+def test_a_held_half_space_is_refused_from_python_too() -> None:
+    with pytest.raises(ValueError, match="cannot be held"):
+        AttachedObject(name="floor", link="palm", half_space={"normal": (0.0, 0.0, 1.0)})

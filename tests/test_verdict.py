@@ -1,0 +1,363 @@
+from __future__ import annotations
+
+import coal
+import numpy as np
+import pinocchio as pin
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial import ConvexHull
+from support import states_around_home
+
+from apex_ompl.collision import Verdict
+from apex_ompl.collision.containment import may_contain
+from apex_ompl.collision.shapes import triangles, winding_number
+from apex_ompl.errors import FileFormatError, MissingFileError, SceneError, UnknownNameError
+from apex_ompl.problem import AttachedObject, Obstacle
+from apex_ompl.robot import Robot
+from apex_ompl.robot.model import link_of
+
+CUBE_OBJ = """v 0 0 0
+v 1 0 0
+v 1 1 0
+v 0 1 0
+v 0 0 1
+v 1 0 1
+v 1 1 1
+v 0 1 1
+f 1 3 2
+f 1 4 3
+f 5 6 7
+f 5 7 8
+f 1 2 6
+f 1 6 5
+f 2 3 7
+f 2 7 6
+f 3 4 8
+f 3 8 7
+f 4 1 5
+f 4 5 8
+"""
+
+
+def clutter(rng: np.random.Generator, count: int) -> list[Obstacle]:
+    """Every kind of primitive in turn."""
+    scene = []
+    for k in range(count):
+        position = tuple(rng.uniform([0.2, -0.8, 0.05], [0.9, 0.8, 0.9]))
+        turn = rng.normal(size=4)
+        turn = tuple(turn / np.linalg.norm(turn))
+        shape = [
+            {"box": tuple(rng.uniform(0.05, 0.3, 3))},
+            {"sphere": {"radius": 0.08}},
+            {"cylinder": {"radius": 0.05, "length": 0.3}},
+            {"capsule": {"radius": 0.04, "length": 0.2}},
+        ][k % 4]
+        scene.append(Obstacle(name=f"o{k}", position=position, orientation=turn, **shape))
+    scene.append(Obstacle(name="floor", half_space={"normal": (0.05, 0.0, 1.0), "offset": -0.03}))
+    return scene
+
+
+class Naive:
+    """An own loop over Coal: no broadphase, no Pinocchio collision code, solid and shell alike."""
+
+    def __init__(self, verdict: Verdict) -> None:
+        self.robot = verdict.robot
+        scene = verdict._scene()
+        self.geometry = scene.geometry
+        self.data = self.robot.model.createData()
+        self.pairs = [(p.first, p.second) for p in self.geometry.collisionPairs]
+
+    def is_free(self, q: np.ndarray) -> bool:
+        pin.forwardKinematics(self.robot.model, self.data, self.robot.to_pinocchio(q))
+        items = self.geometry.geometryObjects
+        poses = [self.data.oMi[g.parentJoint] * g.placement for g in items]
+        for a, b in self.pairs:
+            result = coal.CollisionResult()
+            transforms = [coal.Transform3s(poses[i].rotation, poses[i].translation) for i in (a, b)]
+            first, second = items[a].geometry, items[b].geometry
+            coal.collide(first, transforms[0], second, transforms[1], coal.CollisionRequest(), result)
+            if result.isCollision():
+                return False
+        return True
+
+
+def near_contact(verdict: Verdict, rng: np.random.Generator, count: int) -> np.ndarray:
+    """States on both sides of the border of collision, by bisection."""
+    found: list[np.ndarray] = []
+    while len(found) < count:
+        a, b = states_around_home(verdict.robot, rng, 2, 0.6)
+        if verdict.is_free(a) == verdict.is_free(b):
+            continue
+        free_a = verdict.is_free(a)
+        for _ in range(12):
+            middle = (a + b) / 2
+            a, b = (middle, b) if verdict.is_free(middle) == free_a else (a, middle)
+        found += [a, b]
+    return np.array(found[:count])
+
+
+def test_broadphase_agrees_with_a_plain_loop(robot: Robot) -> None:
+    rng = np.random.default_rng(3)
+    held = AttachedObject(
+        name="cup", link="left_hand_palm", cylinder={"radius": 0.035, "length": 0.11}, position=(0, 0.04, -0.05)
+    )
+    verdict = Verdict(robot, clutter(rng, 8), [held])
+    naive = Naive(verdict)
+    states = np.concatenate(
+        [states_around_home(robot, rng, 60), robot.random_state(rng, 40), near_contact(verdict, rng, 60)]
+    )
+    ours = [verdict.is_free(q) for q in states]
+    assert 0.2 < np.mean(ours) < 0.8
+    assert ours == [naive.is_free(q) for q in states]
+
+
+def test_home_is_free_and_nan_never(robot: Robot, baxter: Robot) -> None:
+    for some in (robot, baxter):
+        verdict = Verdict(some)
+        assert verdict.is_free(some.home)
+        for k in range(some.dof):
+            q = some.home.copy()
+            q[k] = np.nan
+            assert not verdict.is_free(q)
+        assert verdict.calls == some.dof + 1
+
+
+@pytest.mark.parametrize(
+    "shape",
+    [{"box": (0.02, 0.02, 0.02)}, {"sphere": {"radius": 0.02}}, {"cylinder": {"radius": 0.02, "length": 0.04}},
+     {"capsule": {"radius": 0.02, "length": 0.02}}],
+)  # fmt: skip
+def test_an_obstacle_wholly_inside_a_link_is_a_collision(robot: Robot, shape: dict) -> None:
+    for link in (f"{side}_link{k}" for side in ("left", "right") for k in range(1, 6)):
+        item = next(g for g in robot.geometry.geometryObjects if link_of(robot.model, g) == link)
+        vertices, _ = triangles(item.geometry)
+        centre = robot.link_pose(robot.home, link) @ item.placement.homogeneous @ [*vertices.mean(axis=0), 1.0]
+        verdict = Verdict(robot, [Obstacle(name="seed", position=tuple(centre[:3]), **shape)])
+        # Nothing touches the shell ...
+        assert shell_contacts(verdict, robot.home) == []
+        # ... and still the state is not free, also after the obstacle was moved away and back.
+        assert not verdict.is_free(robot.home)
+        assert "seed" in (c.second for c in verdict.contacts(robot.home))
+        verdict.move("seed", (0.0, 0.0, 3.0))
+        assert verdict.is_free(robot.home)
+        verdict.move("seed", tuple(centre[:3]))
+        assert not verdict.is_free(robot.home)
+
+
+def shell_contacts(verdict: Verdict, q: np.ndarray) -> list[tuple[str, str]]:
+    """The pairs that overlap by meshes and primitives alone, without the cases of containment."""
+    scene = verdict._scene()
+    model, geometry = verdict.robot.model, scene.geometry
+    data, geometry_data = model.createData(), geometry.createData()
+    pin.computeCollisions(model, data, geometry, geometry_data, verdict.robot.to_pinocchio(q), False)
+    pairs = [
+        (p.first, p.second)
+        for p, result in zip(geometry.collisionPairs, geometry_data.collisionResults, strict=True)
+        if result.isCollision() and all(scene.same[i] == i for i in (p.first, p.second))
+    ]
+    return [(scene.labels[a], scene.labels[b]) for a, b in pairs]
+
+
+def u_shape_obj(scale: float) -> str:
+    """A solid U of 3 x 3 x 3 units: legs and bottom 1 unit wide, the notch open towards +y."""
+    outline = [(0, 0), (3, 0), (3, 3), (2, 3), (2, 1), (1, 1), (1, 3), (0, 3)]
+    lines = [f"v {x * scale} {y * scale} {z * scale}" for z in (0, 3) for x, y in outline]
+    n = len(outline)
+    cap = [(0, 1, 4), (0, 4, 5), (1, 2, 3), (1, 3, 4), (0, 5, 6), (0, 6, 7)]
+    faces = [(c, b, a) for a, b, c in cap] + [(a + n, b + n, c + n) for a, b, c in cap]
+    for k in range(n):
+        j = (k + 1) % n
+        faces += [(k, j, j + n), (k, j + n, k + n)]
+    return "\n".join([*lines, *(f"f {a + 1} {b + 1} {c + 1}" for a, b, c in faces)]) + "\n"
+
+
+def test_a_link_inside_a_hollow_mesh_obstacle_is_a_collision_and_its_notch_is_not(robot: Robot, tmp_path) -> None:
+    file = tmp_path / "u.obj"
+    file.write_text(u_shape_obj(4.0))
+    u = Obstacle(name="u", mesh={"file": str(file)}, position=(-6.0, -2.0, -6.0))
+    verdict = Verdict(robot, [u])  # all of the robot in the solid bottom of the U
+    assert not shell_contacts(verdict, robot.home)
+    assert not verdict.is_free(robot.home)
+    assert {c.second for c in verdict.contacts(robot.home)} == {"u"}
+    verdict.move("u", (-6.0, -8.0, -6.0))  # all of it in the notch, inside the mesh's convex hull
+    assert not shell_contacts(verdict, robot.home)
+    assert verdict.is_free(robot.home)
+    assert verdict.contacts(robot.home) == []
+
+
+def test_a_held_object_inside_the_other_arm_is_a_collision(robot: Robot) -> None:
+    held = AttachedObject(name="pill", link="left_hand_palm", sphere={"radius": 0.01})
+    item = next(g for g in robot.geometry.geometryObjects if link_of(robot.model, g) == "right_link4")
+    vertices, _ = triangles(item.geometry)
+    inside = robot.link_pose(robot.home, "right_link4") @ item.placement.homogeneous @ [*vertices.mean(axis=0), 1.0]
+    local = np.linalg.inv(robot.link_pose(robot.home, "left_hand_palm")) @ inside
+    verdict = Verdict(robot, (), [held.model_copy(update={"position": tuple(local[:3])})])
+    assert not verdict.is_free(robot.home)
+    assert [(c.first, c.second) for c in verdict.contacts(robot.home)] == [("right_link4", "pill")]
+
+
+def test_links_never_hide_in_each_other(robot: Robot) -> None:
+    """The reason why links are no guests of each other: where one is inside another, the verdict knows."""
+    verdict = Verdict(robot)
+    items = list(robot.geometry.geometryObjects)
+    shells = {
+        i: np.array(triangles(g.geometry)[0])[triangles(g.geometry)[1]]
+        for i, g in enumerate(items)
+        if g.meshPath.endswith("stl")
+    }
+    data = robot.model.createData()
+    rng = np.random.default_rng(5)
+    for q in robot.random_state(rng, 25):
+        pin.forwardKinematics(robot.model, data, robot.to_pinocchio(q))
+        poses = [data.oMi[g.parentJoint] * g.placement for g in items]
+        inside = False
+        for pair in robot.geometry.collisionPairs:
+            for host, guest in ((pair.first, pair.second), (pair.second, pair.first)):
+                if host in shells and guest not in shells:
+                    point = poses[host].actInv(poses[guest].translation)
+                    inside |= abs(winding_number(point, shells[host])) > 0.5
+        assert not (inside and verdict.is_free(q))
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.floats(-1.5, 1.5), min_size=3, max_size=3))
+def test_winding_number_tells_inside_from_outside_of_a_convex_mesh(point: list[float]) -> None:
+    cloud = np.random.default_rng(1).normal(size=(40, 3))
+    hull = ConvexHull(cloud)
+    a, b, c = np.moveaxis(cloud[hull.simplices], 1, 0)
+    outward = np.einsum("ij,ij->i", np.cross(b - a, c - a), hull.equations[:, :3]) > 0
+    faces = np.where(outward[:, None], hull.simplices, hull.simplices[:, ::-1])
+    heights = hull.equations[:, :3] @ point + hull.equations[:, 3]
+    if np.abs(heights).min() < 1e-6:
+        return
+    winding = winding_number(np.array(point), cloud[faces])
+    assert winding == pytest.approx(1.0 if heights.max() < 0 else 0.0, abs=1e-6)
+
+
+def test_sizes_that_cannot_fit_are_not_looked_at(robot: Robot) -> None:
+    link = next(g.geometry for g in robot.geometry.geometryObjects if g.name.startswith("left_link5"))
+    assert may_contain(link, coal.Box(0.05, 0.05, 0.05))
+    assert not may_contain(link, coal.Box(0.4, 0.4, 0.4))
+    assert not may_contain(link, coal.Halfspace(np.array([0.0, 0.0, 1.0]), 0.0))
+
+
+def test_contacts_name_the_pair_and_the_depth(robot: Robot) -> None:
+    palm = robot.link_pose(robot.home, "left_hand_base")
+    flange_radius = 0.0355
+    # A box whose face cuts 4 mm into the flange cylinder, square to the cylinder's axis at home.
+    side = palm[:3, 3] + palm[:3, :3] @ [flange_radius - 0.004 + 0.05, 0.0, 0.025]
+    turn = pin.Quaternion(palm[:3, :3]).coeffs()
+    box = Obstacle(name="wall", box=(0.1, 0.02, 0.02), position=tuple(side), orientation=tuple(turn))
+    verdict = Verdict(robot, [box])
+    contacts = verdict.contacts(robot.home)
+    assert [(c.first, c.second) for c in contacts] == [("left_hand_base", "wall")]
+    assert contacts[0].depth == pytest.approx(0.004, abs=1e-5)
+    assert str(contacts[0]) == "left_hand_base <-> wall, 4 mm deep"
+
+
+def test_distance_is_that_of_closed_forms(robot: Robot) -> None:
+    tip = robot.link_pose(robot.home, "left_hand_middle_distal") @ np.array([-0.022, 0.0, 0.0, 1.0])
+    fingers = -robot.link_pose(robot.home, "left_hand_middle_distal")[:3, 0]  # the left hand is mirrored
+    ball = Obstacle(name="ball", sphere={"radius": 0.01}, position=tuple(tip[:3] + 0.06 * fingers))
+    verdict = Verdict(robot, [ball])
+    found = verdict.distance(robot.home)
+    assert (found.first, found.second) == ("left_hand_middle_distal", "ball")
+    assert found.value == pytest.approx(0.06 - 0.01 - 0.007, abs=1e-6)
+    assert np.linalg.norm(found.points[0] - found.points[1]) == pytest.approx(found.value, abs=1e-6)
+    assert verdict.clearance(robot.home) <= found.value
+    floor = Obstacle(name="floor", half_space={"normal": (0.0, 0.0, 2.0), "offset": -0.8})
+    alone = Verdict(robot, [floor]).distance(robot.home)
+    assert alone.second == "floor" and alone.value < 0.8
+    assert Verdict(robot).distance(robot.home).value == np.inf
+    assert Verdict(robot).distance(robot.home, fixtures=True).second in ("table_left", "table_right")
+
+
+def test_distance_is_positive_where_free_and_not_where_colliding(robot: Robot) -> None:
+    rng = np.random.default_rng(8)
+    verdict = Verdict(robot, clutter(rng, 6))
+    for q in states_around_home(robot, rng, 60):
+        clearance = verdict.clearance(q)
+        if verdict.is_free(q):
+            assert clearance > -1e-4  # hulls of the arms' convex meshes are the meshes
+        else:
+            assert clearance <= 1e-4
+
+
+def test_scene_changes_judge_like_a_scene_built_so(robot: Robot) -> None:
+    rng = np.random.default_rng(4)
+    scene = clutter(rng, 5)
+    changed = Verdict(robot, scene[:3])
+    changed.is_free(robot.home)
+    for obstacle in scene[3:]:
+        changed.add(obstacle)
+    changed.remove("o1")
+    changed.move("o0", (0.5, 0.2, 0.4))
+    cup = AttachedObject(name="cup", link="right_hand_palm", box=(0.06, 0.06, 0.12), position=(0.0, 0.04, -0.05))
+    changed.attach(cup)
+    moved = scene[0].model_copy(update={"position": (0.5, 0.2, 0.4)})
+    built = Verdict(robot, [moved, *scene[2:]], [cup])
+    states = states_around_home(robot, rng, 80)
+    assert [changed.is_free(q) for q in states] == [built.is_free(q) for q in states]
+    changed.detach("cup")
+    bare = Verdict(robot, [moved, *scene[2:]])
+    assert [changed.is_free(q) for q in states] == [bare.is_free(q) for q in states]
+    assert set(changed.obstacle_names) == {"o0", "o2", "o3", "o4", "floor"}
+
+
+def test_a_held_object_touches_its_hand_only(robot: Robot) -> None:
+    inside_hand = {"link": "left_hand_palm", "box": (0.05, 0.05, 0.05)}
+    assert Verdict(robot, (), [AttachedObject(name="cube", **inside_hand)]).is_free(robot.home)
+    across = {"link": "left_hand_middle_distal", "box": (0.2, 0.2, 0.2)}
+    assert not any(
+        "left_hand" in str(c) for c in Verdict(robot, (), [AttachedObject(name="c", **across)]).contacts(robot.home)
+    )
+    strict = AttachedObject(name="c", touch_links=("left_hand_middle_distal",), **across)
+    touched = {c.first for c in Verdict(robot, (), [strict]).contacts(robot.home)}
+    assert "left_hand_index_distal" in touched and "left_hand_middle_distal" not in touched
+    reach = AttachedObject(name="rod", link="left_hand_palm", box=(3.0, 0.02, 0.02))
+    hit = {c.first for c in Verdict(robot, (), [reach]).contacts(robot.home)}
+    assert any(name.startswith("left_link") for name in hit) and not any(n.startswith("left_hand") for n in hit)
+
+
+def test_meshes_in_stl_and_obj_collide_like_the_box_they_are(robot: Robot, tmp_path) -> None:
+    obj = tmp_path / "cube.obj"
+    obj.write_text(CUBE_OBJ)
+    stl = tmp_path / "cube.stl"
+    vertices, faces = triangles(coal.MeshLoader().load(str(obj), np.ones(3)))
+    facets = []
+    for a, b, c in vertices[faces]:
+        n = np.cross(b - a, c - a)
+        points = "\n".join(f"vertex {p[0]} {p[1]} {p[2]}" for p in (a, b, c))
+        facets.append(f"facet normal {n[0]} {n[1]} {n[2]}\nouter loop\n{points}\nendloop\nendfacet")
+    stl.write_text("solid cube\n" + "\n".join(facets) + "\nendsolid cube\n")
+    rng = np.random.default_rng(2)
+    size, corner = (0.3, 0.2, 0.5), np.array([0.35, -0.1, 0.1])
+    box = Verdict(robot, [Obstacle(name="b", box=size, position=tuple(corner + np.array(size) / 2))])
+    states = states_around_home(robot, rng, 150, 0.7)
+    expected = [box.is_free(q) for q in states]
+    assert 0.1 < np.mean(expected) < 0.9
+    for file in (obj, stl):
+        mesh = Verdict(robot, [Obstacle(name="m", mesh={"file": str(file), "scale": size}, position=tuple(corner))])
+        assert [mesh.is_free(q) for q in states] == expected
+
+
+def test_faulty_changes_say_what_is_wrong(robot: Robot, verdict: Verdict, post: Obstacle, tmp_path) -> None:
+    cup = AttachedObject(name="cup", link="left_hand_plam", sphere={"radius": 0.03})
+    with pytest.raises(SceneError, match="'post' is taken"):
+        verdict.add(post)
+    with pytest.raises(SceneError, match="'left_link3' is taken"):
+        verdict.add(post.model_copy(update={"name": "left_link3"}))
+    with pytest.raises(SceneError, match="no obstacle 'pst'; there are: .*post"):
+        verdict.remove("pst")
+    with pytest.raises(SceneError, match="no held object 'cup'"):
+        verdict.detach("cup")
+    with pytest.raises(UnknownNameError, match="did you mean 'left_hand_palm'"):
+        verdict.attach(cup)
+    gone = Obstacle(name="bunny", mesh={"file": str(tmp_path / "bunny.stl")})
+    with pytest.raises(MissingFileError, match="mesh of 'bunny'.*bunny.stl"):
+        verdict.add(gone)
+    (tmp_path / "bunny.stl").write_text("not a mesh")
+    with pytest.raises(FileFormatError, match=r"bunny.stl"):
+        verdict.add(gone)
+    assert verdict.is_free(robot.home)
