@@ -54,8 +54,8 @@ def load_problem(name_or_path: str | os.PathLike[str]) -> Problem:
 def setup(problem: Problem | str | os.PathLike[str]) -> og.SimpleSetup:
     """Return OMPL's SimpleSetup of a problem, for planners and tools of OMPL's own.
 
-    Space, verdict, motion validator, start, goals and a path length objective are set, and rrtconnect is
-    allocated unless another planner is set. Moving obstacles stand where they are at time 0.
+    Space, verdict, motion validator, start and goals are set, and rrtconnect is allocated unless another planner
+    is set. Moving obstacles stand where they are at time 0.
 
     Raises:
         ApexError: The problem is unknown or faulty.
@@ -133,7 +133,10 @@ class _Run:
         if all(ready.goal_faults):
             return self._failed(PlanStatus.INVALID_GOAL, "; ".join(ready.goal_faults))
         simple_setup = ready.simple_setup
-        simple_setup.setPlanner(parameters.build(simple_setup.getSpaceInformation()))
+        si = simple_setup.getSpaceInformation()
+        if parameters.optimizing:  # others would go on after their first solution, prm for one
+            simple_setup.setOptimizationObjective(ob.PathLengthOptimizationObjective(si))
+        simple_setup.setPlanner(parameters.build(si))
         deadline = time.perf_counter() + timeout
         # A condition made in C++: planners that run threads deadlock with one made in Python.
         ptc = ob.timedPlannerTerminationCondition(timeout)

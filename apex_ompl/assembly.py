@@ -76,7 +76,6 @@ def assemble(problem: Problem, robot: Robot | None = None) -> PlanningSetup:
     simple_setup.setStartState(to_state(space, start))
     given = [goal for goal, fault in zip(goals, goal_faults, strict=True) if not fault]
     set_goals(simple_setup, given or list(goals))
-    simple_setup.setOptimizationObjective(ob.PathLengthOptimizationObjective(si))
     return PlanningSetup(
         problem, robot, verdict, check, simple_setup, checker, motions, start, goals, start_fault, goal_faults
     )

@@ -16,8 +16,9 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any, NoReturn
 
-from apex_ompl.errors import ApexError, MissingFileError, ParameterError
+from apex_ompl.errors import ApexError, ParameterError
 from apex_ompl.result import PlanResult, PlanStatus, check_suffix
+from apex_ompl.schema import check_writable
 
 EXIT_CODES = {
     PlanStatus.EXACT_SOLUTION: 0,
@@ -87,9 +88,7 @@ def _plan(parsed: argparse.Namespace) -> int:
 
     if parsed.out is not None:
         check_suffix(parsed.out)
-        if not parsed.out.parent.is_dir():
-            why = f"folder {str(parsed.out.parent)!r} does not exist"
-            raise MissingFileError(str(parsed.out), "output file", why)
+        check_writable(parsed.out)
     result = plan(
         parsed.problem,
         planner=parsed.planner,

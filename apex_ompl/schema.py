@@ -15,6 +15,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from apex_ompl.errors import FileFormatError, MissingFileError, nearest_name
 
+OUTPUT = "output file"
 ModelT = TypeVar("ModelT", bound="StrictModel")
 
 
@@ -138,18 +139,27 @@ def _model_in(annotation: Any) -> type[BaseModel] | None:
     return None
 
 
+def check_writable(path: Path) -> None:
+    """Check that a file can be written, before the work that makes its content.
+
+    Raises:
+        MissingFileError: The folder does not exist or cannot be written, or the path is a folder.
+    """
+    if not path.parent.is_dir():
+        raise MissingFileError(str(path), OUTPUT, f"folder {str(path.parent)!r} does not exist")
+    if path.is_dir():
+        raise MissingFileError(str(path), OUTPUT, "is a folder")
+    if not os.access(path.parent, os.W_OK):
+        raise MissingFileError(str(path), OUTPUT, f"no permission to write in {str(path.parent)!r}")
+
+
 def write_atomically(path: Path, content: bytes) -> None:
     """Write a file under a temporary name beside it, then rename it.
 
     Raises:
         MissingFileError: The folder does not exist or cannot be written.
     """
-    path = Path(path)
-    role = "output file"
-    if not path.parent.is_dir():
-        raise MissingFileError(str(path), role, f"folder {str(path.parent)!r} does not exist")
-    if path.is_dir():
-        raise MissingFileError(str(path), role, "is a folder")
+    check_writable(path)
     temporary: str | None = None
     try:
         descriptor, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
@@ -164,7 +174,7 @@ def write_atomically(path: Path, content: bytes) -> None:
             with contextlib.suppress(OSError):
                 os.unlink(temporary)
         why = (error.strerror or "cannot be written").lower()
-        raise MissingFileError(str(path), role, why) from error
+        raise MissingFileError(str(path), OUTPUT, why) from error
 
 
 class _Dumper(yaml.SafeDumper):

@@ -35,9 +35,8 @@ def verdict(robot: Robot, post: Obstacle) -> Verdict:
 def problem(robot: Robot, post: Obstacle) -> Problem:
     """Both arms turn; easy for every planner, and the straight line collides."""
     start, goal = robot.home.copy(), robot.home.copy()
-    start[[1, 3]] = 0.3, -1.6
-    start[0], goal[0] = 0.1, -0.9
-    goal[[1, 3]] = 0.3, -1.6
+    start[[0, 1, 3]] = 0.1, 0.4, -1.6
+    goal[[0, 1, 3]] = -1.3, 0.4, -1.6
     as_dict = lambda q: dict(zip(robot.joint_names, q.tolist(), strict=True))  # noqa: E731
     return Problem(
         name="sweep", robot=robot.name, scene=(post,), start=as_dict(start), goal=Goal(joints=(as_dict(goal),))

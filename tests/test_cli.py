@@ -1,0 +1,191 @@
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from support import ROOT
+
+from apex_ompl.problem import Problem
+
+GOOD = (ROOT / "problems" / "data" / "shelf_swap.yaml").read_text()
+
+
+def one_sentence(text: str) -> bool:
+    return text.startswith("apex-ompl") and len(text.strip().splitlines()) == 1 and "Traceback" not in text
+
+
+@pytest.fixture
+def easy(problem: Problem, tmp_path: Path) -> Path:
+    problem.save(tmp_path / "easy.yaml")
+    return tmp_path / "easy.yaml"
+
+
+def test_plan_prints_status_time_and_length(apex_cli, easy: Path) -> None:
+    done = apex_cli("plan", easy, "--timeout", 30, "--seed", 3)
+    assert done.returncode == 0, done.stderr
+    lines = done.stdout.splitlines()
+    assert lines[0] == "sweep: EXACT_SOLUTION by rrtconnect" or lines[0].endswith("rrtconnect+repair")
+    assert "time" in lines[1] and "length" in lines[2] and "clearance" in lines[3] and "seed 3" in lines[4]
+
+
+def test_json_goes_to_standard_output_alone_and_out_writes_the_same(apex_cli, easy: Path, tmp_path: Path) -> None:
+    done = apex_cli("plan", easy, "--timeout", 30, "--json", "--set", "range=1.5", "--out", tmp_path / "r.json")
+    assert done.returncode == 0, done.stderr
+    printed = json.loads(done.stdout)
+    assert printed["status"] == "EXACT_SOLUTION"
+    assert printed == json.loads((tmp_path / "r.json").read_text())
+    names = ("status", "reason", "planner", "seed", "path", "times", "length", "clearance", "checks", "solved_by")
+    assert set(names) <= set(printed)
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".csv", ".yaml"])
+def test_out_writes_by_suffix(apex_cli, easy: Path, tmp_path: Path, suffix: str) -> None:
+    done = apex_cli("plan", easy, "--timeout", 30, "--out", tmp_path / f"r{suffix}")
+    assert done.returncode == 0 and (tmp_path / f"r{suffix}").stat().st_size > 100
+
+
+def test_listings(apex_cli) -> None:
+    problems, planners, info = (apex_cli(c) for c in ("problems", "planners", "info"))
+    assert problems.returncode == planners.returncode == info.returncode == 0
+    assert "shelf_swap" in problems.stdout and "reach_past_post" in problems.stdout
+    assert "rrtconnect" in planners.stdout and "range = 0.0 rad" in planners.stdout
+    assert "ompl" in info.stdout and "baxter" in info.stdout and "left_hand_synergy" in info.stdout
+    schema = json.loads(apex_cli("schema").stdout)
+    assert "start" in schema["required"]
+    assert apex_cli("--version").stdout.startswith("apex-ompl 0.")
+    assert "plan" in apex_cli("--help").stdout
+
+
+def test_check_says_what_is_free_and_what_touches(apex_cli, tmp_path: Path) -> None:
+    good = apex_cli("check", "shelf_swap")
+    assert good.returncode == 0 and good.stdout.count("free") == 2
+    data = yaml.safe_load(GOOD)
+    data["start"]["left_joint2"] = -0.187
+    (tmp_path / "bad.yaml").write_text(yaml.safe_dump(data))
+    bad = apex_cli("check", tmp_path / "bad.yaml")
+    assert bad.returncode == 3 and "mm deep" in bad.stdout and "left_hand_palm <-> board_3" in bad.stdout
+
+
+def edited(tmp_path: Path, **changes: object) -> Path:
+    data = yaml.safe_load(GOOD)
+    for key, value in changes.items():
+        part, _, rest = key.partition("__")
+        if rest:
+            data[part][rest] = value
+        else:
+            data[part] = value
+    path = tmp_path / "edited.yaml"
+    path.write_text(yaml.safe_dump(data))
+    return path
+
+
+CUBE = {"name": "b", "box": [0.1, 0.1, 0.1]}
+MESH = {"name": "b", "mesh": {"file": "b.stl"}}
+FAULTS = {
+    "missing file": (lambda t: ["plan", t / "gone.yaml"], 2, ["gone.yaml", "no such file"]),
+    "unknown problem": (lambda t: ["plan", "shelf_swp"], 2, ["'shelf_swp'", "did you mean 'shelf_swap'"]),
+    "not yaml": (lambda t: ["plan", edited_text(t, "start: {a: [")], 2, ["line", "valid YAML"]),
+    "wrong version": (lambda t: ["plan", edited(t, schema="apex-ompl/problem/7")], 2, ["schema", "problem/1"]),
+    "unknown key": (lambda t: ["plan", edited(t, scnee=[])], 2, ["scnee", "did you mean 'scene'"]),
+    "unknown joint": (lambda t: ["plan", edited(t, start__left_joint9=0.0)], 2, ["left_joint9", "did you mean"]),
+    "missing joint": (lambda t: ["plan", edited(t, start={"left_joint1": 0.0})], 2, ["'left_joint2' is missing"]),
+    "nan": (lambda t: ["plan", edited(t, start__left_joint3=float("nan"))], 2, ["start.left_joint3", "finite"]),
+    "wrong dimension": (lambda t: ["plan", edited(t, scene=[{"name": "b", "box": [1, 2]}])], 2, ["scene.0.box"]),
+    "unknown robot": (lambda t: ["plan", edited(t, robot="tripanda")], 2, ["robot 'tripanda'", "dual_panda_softhand"]),
+    "missing mesh": (lambda t: ["plan", edited(t, scene=[MESH])], 2, ["'b'", "b.stl"]),
+    "name of a link": (lambda t: ["plan", edited(t, scene=[{**CUBE, "name": "left_link1"}])], 2, ["left_link1"]),
+    "unknown link": (
+        lambda t: ["plan", edited(t, attached=[{**CUBE, "link": "left_plam"}])],
+        2,
+        ["link 'left_plam'"],
+    ),
+    "unknown planner": (lambda t: ["plan", "shelf_swap", "--planner", "rtr"], 2, ["planner 'rtr'", "rrtconnect"]),
+    "unknown parameter": (lambda t: ["plan", "shelf_swap", "--set", "rnge=1"], 2, ["'rnge'", "did you mean 'range'"]),
+    "bad parameter": (lambda t: ["plan", "shelf_swap", "--set", "range=far"], 2, ["'range'", "a number", "'far'"]),
+    "bad --set": (lambda t: ["plan", "shelf_swap", "--set", "range"], 2, ["--set", "NAME=VALUE"]),
+    "zero timeout": (lambda t: ["plan", "shelf_swap", "--timeout", "0"], 2, ["timeout", "positive"]),
+    "negative timeout": (lambda t: ["plan", "shelf_swap", "--timeout=-1"], 2, ["timeout", "positive"]),
+    "not a number": (lambda t: ["plan", "shelf_swap", "--timeout", "soon"], 2, ["--timeout", "'soon'"]),
+    "no output folder": (lambda t: ["plan", "shelf_swap", "--out", t / "no" / "r.npz"], 2, ["r.npz", "does not exist"]),
+    "output suffix": (lambda t: ["plan", "shelf_swap", "--out", t / "r.bag"], 2, ["r.bag", ".npz"]),
+    "output is a folder": (lambda t: ["plan", "shelf_swap", "--out", folder(t, "r.npz")], 2, ["r.npz", "is a folder"]),
+    "no command": (lambda t: [], 2, ["COMMAND"]),
+    "unknown option": (lambda t: ["plan", "shelf_swap", "--fast"], 2, ["--fast"]),
+    "limits broken": (
+        lambda t: ["plan", edited(t, start__left_joint2=3.0)],
+        3,
+        ["INVALID_START", "left_joint2 = 3", "[-1.7628, 1.7628]"],
+    ),
+    "start in collision": (
+        lambda t: ["plan", edited(t, start__left_joint2=-0.187)],
+        3,
+        ["INVALID_START", "<->", "mm deep"],
+    ),
+    "approximate": (lambda t: ["plan", "shelf_swap", "--planner", "rrt", "--timeout", ".2"], 4, ["APPROXIMATE_SOL"]),
+    "no plan": (lambda t: ["plan", "shelf_swap", "--timeout", "0.01"], 1, ["TIMEOUT"]),
+}  # fmt: skip
+
+
+def edited_text(tmp_path: Path, text: str) -> Path:
+    path = tmp_path / "edited.yaml"
+    path.write_text(text)
+    return path
+
+
+def folder(tmp_path: Path, name: str) -> Path:
+    (tmp_path / name).mkdir()
+    return tmp_path / name
+
+
+@pytest.mark.parametrize("case", FAULTS)
+def test_each_fault_is_one_sentence_and_an_exit_code(apex_cli, tmp_path: Path, case: str) -> None:
+    arguments, code, words = FAULTS[case]
+    done = apex_cli(*arguments(tmp_path))
+    assert done.returncode == code, done.stderr + done.stdout
+    assert "Traceback" not in done.stderr
+    if code == 2:
+        assert one_sentence(done.stderr) and done.stdout == "", done.stderr
+    said = done.stderr if code == 2 else done.stdout
+    for word in words:
+        assert word in said, said
+    leftovers = {p.name for p in tmp_path.iterdir()} - {"edited.yaml", "r.npz"}
+    assert not leftovers
+
+
+def test_an_output_that_cannot_be_written_is_named(apex_cli, easy: Path) -> None:
+    """/proc is read-only for everybody, root included."""
+    done = apex_cli("plan", easy, "--out", "/proc/r.npz")
+    assert done.returncode == 2 and one_sentence(done.stderr) and "/proc/r.npz" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("planner", "settings"),
+    [("rrtconnect", ["range=0.001"]), ("prm", ["max_nearest_neighbors=1"]), ("prmstar", []), ("rrtstar", [])],
+)
+def test_ctrl_c_ends_a_plan_in_good_order(planner: str, settings: list[str], tmp_path: Path) -> None:
+    """Planners that would go on for long: by their nature, or made slow by a parameter."""
+    command = [sys.executable, "-m", "apex_ompl.cli", "plan", "shelf_swap", "--planner", planner]
+    command += [word for setting in settings for word in ("--set", setting)]
+    command += ["--timeout", "60", "--out", str(tmp_path / "r.npz")]
+    running = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    time.sleep(2.5)
+    assert running.poll() is None, running.communicate()
+    begin = time.perf_counter()
+    running.send_signal(signal.SIGINT)
+    out, err = running.communicate(timeout=30)
+    assert time.perf_counter() - begin < 10.0
+    assert running.returncode == 130 and out == "" and "interrupted" in err and "Traceback" not in err
+    assert not (tmp_path / "r.npz").exists()
+
+
+def test_saved_npz_holds_the_proved_path(apex_cli, easy: Path, tmp_path: Path) -> None:
+    assert apex_cli("plan", easy, "--out", tmp_path / "r.npz", "--timeout", 30).returncode == 0
+    with np.load(tmp_path / "r.npz") as data:
+        assert data["path"].shape[1] == 16 and data["path"].dtype == np.float64

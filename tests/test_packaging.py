@@ -1,0 +1,78 @@
+"""Wheel and sdist, installed for real and used from a foreign folder."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tarfile
+import venv
+import zipfile
+from pathlib import Path
+
+import pydantic
+import pytest
+from support import ROOT
+
+USE = """
+import apex_ompl, apex_ompl.planners, apex_ompl.problems, sys
+assert 'site-packages' in apex_ompl.__file__, apex_ompl.__file__
+for foreign in ('planners', 'problems'):
+    try:
+        __import__(foreign)
+    except ImportError:
+        pass
+    else:
+        raise SystemExit(foreign + ' must not exist after an install')
+result = apex_ompl.plan('shelf_swap', timeout=30)
+print(result.status, apex_ompl.problems.names(), len(apex_ompl.planners.names()))
+"""
+
+
+def run(*command: object, cwd: Path) -> str:
+    done = subprocess.run([str(c) for c in command], check=False, capture_output=True, text=True, cwd=cwd, timeout=300)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An sdist, and a wheel built from the sdist, with the build tools of this environment."""
+    out = tmp_path_factory.mktemp("dist")
+    run(sys.executable, "-m", "build", "--no-isolation", "--outdir", out, ROOT, cwd=out)
+    return out
+
+
+def test_wheel_and_sdist_hold_what_is_needed(built: Path) -> None:
+    (wheel,), (sdist,) = built.glob("*.whl"), built.glob("*.tar.gz")
+    names = zipfile.ZipFile(wheel).namelist()
+    for wanted in (
+        "apex_ompl/py.typed", "apex_ompl/planners/registry.py", "apex_ompl/problems/data/shelf_swap.yaml",
+        "apex_ompl/robot/data/softhand2_left.urdf", "apex_ompl/robot/data/dual_panda_softhand.pairs.yaml",
+    ):  # fmt: skip
+        assert names.count(wanted) == 1, wanted
+    assert not any(n.startswith(("planners/", "problems/", "tests/")) for n in names)
+    packed = tarfile.open(sdist).getnames()
+    for wanted in ("constraints.txt", "README.md", "LICENSE", "planners/registry.py", "tests/test_packaging.py"):
+        assert any(n.endswith("/" + wanted) for n in packed), wanted
+
+
+def test_the_wheel_works_from_a_foreign_folder(built: Path, tmp_path: Path) -> None:
+    """A new environment that sees this one's libraries, with the wheel installed on its own."""
+    (wheel,) = built.glob("*.whl")
+    venv.create(tmp_path / "venv", with_pip=False, symlinks=True)
+    python = tmp_path / "venv" / "bin" / "python"
+    site = Path(run(python, "-c", "import sysconfig; print(sysconfig.get_path('purelib'))", cwd=tmp_path).strip())
+    run(sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--target", site, wheel, cwd=tmp_path)
+    libraries = Path(pydantic.__file__).parent.parent
+    (site / "libraries.pth").write_text(f"import site; site.addsitedir({str(libraries)!r})\n")
+    printed = run(python, "-c", USE, cwd=tmp_path)
+    assert printed.startswith("EXACT_SOLUTION") and "shelf_swap" in printed
+
+
+def test_this_tree_works_from_a_foreign_folder(tmp_path: Path) -> None:
+    code = "import apex_ompl.planners, apex_ompl.problems; print(apex_ompl.problems.names())"
+    assert "shelf_swap" in run(sys.executable, "-c", code, cwd=tmp_path)
+    done = subprocess.run(
+        [sys.executable, "-c", "import planners"], check=False, capture_output=True, text=True, cwd=ROOT, timeout=60
+    )
+    assert "import apex_ompl.planners, not planners" in done.stderr

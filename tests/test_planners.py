@@ -1,0 +1,100 @@
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+from ompl import base as ob
+from ompl import geometric as og
+
+from apex_ompl import planners
+from apex_ompl.assembly import assemble
+from apex_ompl.errors import ParameterError, UnknownNameError
+from apex_ompl.planners.sampling import OmplParameters, setter_stem
+from apex_ompl.problem import Problem
+
+
+def plain_space() -> ob.SpaceInformation:
+    space = ob.RealVectorStateSpace(3)
+    bounds = ob.RealVectorBounds(3)
+    bounds.setLow(-1)
+    bounds.setHigh(1)
+    space.setBounds(bounds)
+    return ob.SpaceInformation(space)
+
+
+def bound_planners() -> set[str]:
+    """Every geometric planner that the installed OMPL binds."""
+    classes = {n for n in dir(og) if isinstance(getattr(og, n), type) and issubclass(getattr(og, n), ob.Planner)}
+    return classes
+
+
+def test_every_planner_of_the_installed_ompl_has_a_name() -> None:
+    records = [planners.parameters(name) for name in planners.names()]
+    assert {r.planner for r in records if isinstance(r, OmplParameters)} == bound_planners()
+
+
+@pytest.mark.parametrize("name", planners.names())
+def test_defaults_are_ompls_and_values_arrive(name: str) -> None:
+    si = plain_space()
+    record = planners.parameters(name)
+    plain = getattr(og, record.planner)(si)
+    if name == "aorrtc":  # destroying one that was never set up ends the process
+        plain.setup()
+    changed = {}
+    for field in dataclasses.fields(record):
+        default = getattr(record, field.name)
+        if name not in ("aorrtc", "prm"):  # these two have no defaults to read before they are set up
+            assert getattr(plain, "get" + setter_stem(field.name))() == default, field.name
+        low, high = field.metadata.get("low", 0), field.metadata.get("high", 2)
+        changed[field.name] = (
+            (not default) if isinstance(default, bool) else type(default)(low + min(high - low, 2) / 2)
+        )
+    planner = planners.make(name, si, **changed)
+    for field, value in changed.items():
+        assert getattr(planner, "get" + setter_stem(field))() == value, field
+    assert type(planners.allocator(name, **changed)(si)) is type(plain)
+
+
+def test_records_are_frozen_and_read_text() -> None:
+    record = planners.parameters("rrt", range="0.5", goal_bias="1e-1", intermediate_states="true")
+    assert (record.range, record.goal_bias, record.intermediate_states) == (0.5, 0.1, True)
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        record.range = 1.0  # type: ignore[misc]
+    assert planners.parameters("prm", max_nearest_neighbors="7").max_nearest_neighbors == 7
+    assert planners.parameters("rrt", range=1).range == 1.0
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "error", "words"),
+    [
+        ("rrtconect", {}, UnknownNameError, ["planner 'rrtconect'", "did you mean 'rrtconnect'", "kpiece1"]),
+        ("rrtconnect", {"rnage": 1.0}, UnknownNameError, ["parameter 'rnage'", "did you mean 'range'"]),
+        ("rrtconnect", {"range": "wide"}, ParameterError, ["'range'", "a number in [0, inf]", "'wide'"]),
+        ("rrtconnect", {"range": -1.0}, ParameterError, ["'range'", "-1.0"]),
+        ("rrtconnect", {"range": float("nan")}, ParameterError, ["'range'", "nan"]),
+        ("rrt", {"goal_bias": 1.5}, ParameterError, ["'goal_bias'", "[0, 1]", "1.5"]),
+        ("rrt", {"intermediate_states": 1}, ParameterError, ["true or false"]),
+        ("prm", {"max_nearest_neighbors": 2.5}, ParameterError, ["a whole number"]),
+        ("prm", {"max_nearest_neighbors": True}, ParameterError, ["a whole number"]),
+    ],
+)
+def test_faults_name_the_thing(name: str, values: dict, error: type[Exception], words: list[str]) -> None:
+    with pytest.raises(error) as caught:
+        planners.make(name, plain_space(), **values)
+    for word in words:
+        assert word in str(caught.value)
+
+
+@pytest.mark.parametrize("name", planners.names())
+def test_every_planner_solves_the_robots_problem(name: str, problem: Problem) -> None:
+    """Selected the OMPL way, through an allocator, each finds an exact path or says why it did not."""
+    ready = assemble(problem)
+    simple_setup = ready.simple_setup
+    simple_setup.setPlannerAllocator(planners.allocator(name))
+    optimizing = planners.parameters(name).optimizing
+    status = simple_setup.solve(ob.timedPlannerTerminationCondition(1.5 if optimizing else 8.0))
+    assert ready.checker.fault is None and ready.motions.fault is None
+    if name in ("rrtconnect", "aorrtc", "prm", "bkpiece1", "lbkpiece1", "bitstar"):
+        assert status.getStatus() == ob.PlannerStatus.EXACT_SOLUTION
+    if status.getStatus() == ob.PlannerStatus.EXACT_SOLUTION:
+        assert simple_setup.getSolutionPath().check()
