@@ -105,7 +105,7 @@ def plan(
         raise ParameterError("snapshot", snapshot, expected)
     with _quiet_ompl():
         _seed_ompl(seed)
-        ready = assemble(loaded)
+        ready = assemble(loaded, seed=seed)
         run = _Run(ready, planner, seed, time.perf_counter() - started, loaded.moving)
         return run.finish(started, run.solve(parameters, timeout, simplify))
 

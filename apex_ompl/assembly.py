@@ -9,13 +9,17 @@ from numpy.typing import NDArray
 from ompl import base as ob
 from ompl import geometric as og
 
-from apex_ompl.collision.verdict import Verdict
+from apex_ompl.collision import Verdict
+from apex_ompl.goals import AlignmentGoal, alignment_goal
 from apex_ompl.problem import Problem
 from apex_ompl.robot import Robot, load_robot
 from apex_ompl.space import SEARCH_RESOLUTION, state_space, to_state
 from apex_ompl.validity import MotionCheck, VerdictChecker, VerdictMotionValidator
 
 Array = NDArray[np.float64]
+
+GOAL_STATES = 8  # how many states an alignment goal is sampled into
+GOAL_ATTEMPTS = 200
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,9 +35,11 @@ class PlanningSetup:
         checker: OMPL's state validity checker.
         motions: OMPL's motion validator.
         start: Start state, shape (dof,).
-        goals: Goal states, shape (goals, dof).
+        goals: Goal states, shape (goals, dof); for an alignment those that were sampled.
         start_fault: Why the start is invalid, or empty.
-        goal_faults: Why each goal is invalid, or empty; invalid ones are not given to OMPL unless all are.
+        goal_faults: Why each goal is invalid, or empty; invalid ones are not given to OMPL unless all are. For an
+            alignment that was not reached, why.
+        alignment: The alignment goal, or None.
     """
 
     problem: Problem
@@ -47,14 +53,16 @@ class PlanningSetup:
     goals: Array
     start_fault: str
     goal_faults: tuple[str, ...]
+    alignment: AlignmentGoal | None
 
 
-def assemble(problem: Problem, robot: Robot | None = None) -> PlanningSetup:
+def assemble(problem: Problem, robot: Robot | None = None, seed: int = 0) -> PlanningSetup:
     """Make a problem ready for OMPL.
 
     Args:
         problem: The problem; moving obstacles stand where they are at time 0.
         robot: Its robot, when it is loaded already.
+        seed: Seed of the sampling of an alignment goal.
 
     Raises:
         ApexError: The robot, a mesh or a joint of the problem is unknown or faulty.
@@ -62,9 +70,14 @@ def assemble(problem: Problem, robot: Robot | None = None) -> PlanningSetup:
     robot = robot or load_robot(problem.robot)
     start = problem.start_state(robot.joint_names)
     goals = problem.goal_states(robot.joint_names)
+    alignment = alignment_goal(robot, problem)
     verdict = Verdict(robot, problem.scene, problem.attached)
     start_fault = state_fault(verdict, start)
     goal_faults = tuple(state_fault(verdict, goal) for goal in goals)
+    if alignment is not None and not start_fault:
+        sampling = alignment.sample(verdict, np.random.default_rng(seed), GOAL_STATES, GOAL_ATTEMPTS)
+        goals = sampling.states
+        goal_faults = ("",) * len(goals) or (sampling.fault,)
     space = state_space(robot)
     simple_setup = og.SimpleSetup(space)
     si = simple_setup.getSpaceInformation()
@@ -77,7 +90,18 @@ def assemble(problem: Problem, robot: Robot | None = None) -> PlanningSetup:
     given = [goal for goal, fault in zip(goals, goal_faults, strict=True) if not fault]
     set_goals(simple_setup, given or list(goals))
     return PlanningSetup(
-        problem, robot, verdict, check, simple_setup, checker, motions, start, goals, start_fault, goal_faults
+        problem,
+        robot,
+        verdict,
+        check,
+        simple_setup,
+        checker,
+        motions,
+        start,
+        goals,
+        start_fault,
+        goal_faults,
+        alignment,
     )
 
 

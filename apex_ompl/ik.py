@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -111,7 +111,7 @@ def solve(
     tolerance: float = 1e-4,
     max_iterations: int = 100,
     damping: float = 1e-2,
-    accept: Callable[[Array], bool] | None = None,
+    fixed: Sequence[int] | NDArray[np.intp] = (),
 ) -> IKResult:
     """Descend from a state by damped least squares (Levenberg-Marquardt steps), clipped to the limits.
 
@@ -122,20 +122,23 @@ def solve(
         tolerance: Norm of the residual at which to stop.
         max_iterations: Most steps to take.
         damping: First damping factor; it shrinks with success and grows with failure.
-        accept: Stops at a state for which it is true, before the residual is small.
+        fixed: Indices of joints that stay as they are in ``q0``.
     """
     limits = kinematics.robot.limits
+    held = np.asarray(fixed, dtype=np.intp)
 
     def evaluate(q: Array) -> tuple[Array, Array]:
         kinematics.update(q)
         parts = [task.residual(kinematics) for task in tasks]
-        return np.concatenate([r for r, _ in parts]), np.concatenate([j for _, j in parts])
+        jacobian = np.concatenate([j for _, j in parts])
+        jacobian[:, held] = 0.0
+        return np.concatenate([r for r, _ in parts]), jacobian
 
     q = np.clip(np.asarray(q0, float), limits.lower, limits.upper)
     residual, jacobian = evaluate(q)
     error = float(np.linalg.norm(residual))
     count = 0
-    while count < max_iterations and error > tolerance and not (accept is not None and accept(q)):
+    while count < max_iterations and error > tolerance:
         count += 1
         gram = jacobian.T @ jacobian + damping * np.eye(len(q))
         trial = np.clip(q - np.linalg.solve(gram, jacobian.T @ residual), limits.lower, limits.upper)

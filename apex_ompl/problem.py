@@ -137,7 +137,7 @@ class ContactFace(StrictModel):
 class AttachedObject(Body):
     """A held solid, posed in the frame of the link that holds it.
 
-    ``touch_links`` are links it may touch; None means all links of the part (the hand) that holds it.
+    ``touch_links`` are links it may touch; None means all links of the hand that holds it.
     """
 
     link: Name
@@ -158,14 +158,90 @@ def _one_or_many(value: Any) -> Any:
     return [value] if isinstance(value, Mapping) else value
 
 
-class Goal(StrictModel):
-    """What is to be reached: one of several complete joint configurations."""
+class WorldVector(StrictModel):
+    """A vector seen in the world at the start state, fixed to the link that holds what it was drawn along.
 
-    joints: Annotated[
-        tuple[JointValues, ...],
-        Field(min_length=1),
-        BeforeValidator(_one_or_many, json_schema_input_type=JointValues | tuple[JointValues, ...]),
-    ]
+    This is how the paper states a task (its section III-A): ``tip`` is the point of contact [m], and the direction
+    from ``tail`` to ``tip`` the outward axis.
+    """
+
+    link: Name
+    tail: Vector
+    tip: Vector
+
+    @model_validator(mode="after")
+    def _not_a_point(self) -> Self:
+        if float(np.linalg.norm(np.subtract(self.tip, self.tail))) < 1e-6:
+            raise ValueError("expected a tail and a tip that differ")
+        return self
+
+
+class Tolerance(StrictModel):
+    """How far an alignment may be off: across and along the axis [m], and in angle [rad]."""
+
+    lateral: PositiveFloat
+    axial: PositiveFloat
+    angle: PositiveFloat
+
+
+ALIGNMENT_DEFAULTS: dict[str, tuple[float, Tolerance]] = {
+    "vertical": (0.01, Tolerance(lateral=0.01, axial=0.01, angle=float(np.radians(5)))),
+    "horizontal": (0.03, Tolerance(lateral=0.01, axial=0.01, angle=float(np.radians(8)))),
+    "pour": (0.05, Tolerance(lateral=0.015, axial=0.02, angle=float(np.radians(10)))),
+    "handover": (0.01, Tolerance(lateral=0.015, axial=0.01, angle=float(np.radians(12)))),
+}
+"""Kind -> distance [m] and tolerance where an alignment does not say."""
+
+
+class Alignment(StrictModel):
+    """Two contact faces brought together (section III-A of the paper), as ``apex_ompl.goals`` defines it.
+
+    Attributes:
+        kind: ``vertical`` (stacking), ``horizontal`` (insertion), ``pour`` or ``handover``.
+        first: Name of a held object that has a contact face, or a vector in the world.
+        second: The same; for a handover the name of the hand that receives.
+        distance: Gap between the faces along the axis; for ``pour`` the height of the lip above the opening [m].
+        tolerance: How far off is still good; the kind's own by default.
+        tilt: Least and largest angle between the axis of ``first`` and up, for ``pour`` [rad].
+    """
+
+    kind: Literal["vertical", "horizontal", "pour", "handover"]
+    first: Name | WorldVector
+    second: Name | WorldVector
+    distance: float | None = None
+    tolerance: Tolerance | None = None
+    tilt: tuple[float, float] | None = None
+
+    @model_validator(mode="after")
+    def _tilt_of_pouring(self) -> Self:
+        if self.tilt is not None and self.kind != "pour":
+            raise ValueError(f"tilt is for pour only, not for {self.kind}")
+        if self.tilt is not None and not 0.0 <= self.tilt[0] < self.tilt[1] <= float(np.pi):
+            raise ValueError("expected a tilt range [least, largest] inside [0, 3.1416]")
+        if self.first == self.second:
+            raise ValueError("first and second are the same")
+        return self
+
+
+class Goal(StrictModel):
+    """What is to be reached: one of several complete joint configurations, or an alignment of held objects."""
+
+    joints: (
+        Annotated[
+            tuple[JointValues, ...],
+            Field(min_length=1),
+            BeforeValidator(_one_or_many, json_schema_input_type=JointValues | tuple[JointValues, ...]),
+        ]
+        | None
+    ) = None
+    alignment: Alignment | None = None
+
+    @model_validator(mode="after")
+    def _one_kind(self) -> Self:
+        if (self.joints is None) == (self.alignment is None):
+            found = "none" if self.joints is None else "both"
+            raise ValueError(f"expected exactly one of joints, alignment; found {found}")
+        return self
 
 
 class Problem(StrictModel):
@@ -215,17 +291,17 @@ class Problem(StrictModel):
         return _in_order(self.start, joint_names, self.name, "start")
 
     def goal_states(self, joint_names: Sequence[str]) -> NDArray[np.float64]:
-        """Return the goals in the order of ``joint_names``, shape (goals, dof).
+        """Return the goals in the order of ``joint_names``, shape (goals, dof); none for an alignment.
 
         Raises:
             FileFormatError: A joint is missing or unknown.
         """
-        several = len(self.goal.joints) > 1
+        several = len(self.goal.joints or ()) > 1
         rows = []
-        for k, values in enumerate(self.goal.joints):
+        for k, values in enumerate(self.goal.joints or ()):
             field = f"goal.joints.{k}" if several else "goal.joints"
             rows.append(_in_order(values, joint_names, self.name, field))
-        return np.array(rows)
+        return np.array(rows).reshape(-1, len(joint_names))
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Problem:
@@ -254,8 +330,9 @@ class Problem(StrictModel):
         """Return the YAML text of the problem."""
         data = self.model_dump(by_alias=True, exclude_none=True, exclude_defaults=True)
         head = {"schema": SCHEMA, "name": data.pop("name"), "robot": data.pop("robot")}
-        goals = data["goal"]["joints"]
-        data["goal"]["joints"] = goals[0] if len(goals) == 1 else list(goals)
+        goals = data["goal"].get("joints", ())
+        if goals:
+            data["goal"]["joints"] = goals[0] if len(goals) == 1 else list(goals)
         return dump_yaml(head | data)
 
     def _located(self, folder: Path) -> Problem:

@@ -14,6 +14,7 @@ LAYERS = [
     {"robot"},
     {"collision"},
     {"ik", "space"},
+    {"goals", "grasp"},
     {"validity"},
     {"assembly", "simplify", "result"},
     {"repair"},

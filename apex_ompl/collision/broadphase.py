@@ -89,7 +89,7 @@ class CompiledScene:
             self.held[name] = self._add(name, frame.parentJoint, parent, placement, shapes[name])
         self.touch: dict[str, frozenset[str]] = {}
         for name, held in attached.items():
-            default = robot.part_links[robot.part_of(held.link)]
+            default = robot.hand_of(held.link)
             self.touch[name] = frozenset(default if held.touch_links is None else held.touch_links)
         self._pair_up()
         self.pairs = [(p.first, p.second) for p in self.geometry.collisionPairs]

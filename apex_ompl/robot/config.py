@@ -19,7 +19,7 @@ class Part(StrictModel):
     """A URDF that is mounted on the world or on a link of an earlier part.
 
     Attributes:
-        name: Name of the part; its links touch what the part holds.
+        name: Name of the part.
         urdf: URDF file, as a ``package://`` URI or a path relative to the robot file.
         srdf: SRDF file whose ``disable_collisions`` are taken over.
         prefix: Put before the names of all links and joints.
@@ -52,6 +52,24 @@ class Joint(StrictModel):
     jerk: PositiveFloat
 
 
+class Hand(StrictModel):
+    """A hand that can hold things.
+
+    Attributes:
+        synergy: The planned joint that closes it from 0 to 1, or None for a hand that stays as it is.
+        palm: The link that held objects are fixed to.
+        point: Where an object is held, in the palm's frame [m].
+        axis: Outward normal of the palm on its closing side, unit, in the palm's frame.
+        fingers: Where the open fingers point, unit, in the palm's frame.
+    """
+
+    synergy: str | None = None
+    palm: str
+    point: Vector
+    axis: Vector
+    fingers: Vector
+
+
 class RobotConfig(StrictModel):
     """A whole robot file.
 
@@ -63,6 +81,7 @@ class RobotConfig(StrictModel):
         joints: The planned joints in state order.
         locked: Joints held at a value; they become fixed joints.
         groups: Named groups of planned joints.
+        hands: Hands by name.
         disabled_pairs: File of further link pairs that are never checked.
     """
 
@@ -74,6 +93,7 @@ class RobotConfig(StrictModel):
     joints: Annotated[dict[str, Joint], Field(min_length=1)]
     locked: dict[str, float] = {}
     groups: dict[str, tuple[str, ...]] = {}
+    hands: dict[str, Hand] = {}
     disabled_pairs: str | None = None
 
     @model_validator(mode="after")
@@ -82,6 +102,9 @@ class RobotConfig(StrictModel):
             for name in names:
                 if name not in self.joints:
                     raise ValueError(f"group {group!r} names the unknown joint {name!r}")
+        for hand, record in self.hands.items():
+            if record.synergy is not None and record.synergy not in self.joints:
+                raise ValueError(f"hand {hand!r} names the unknown joint {record.synergy!r}")
         return self
 
 

@@ -15,7 +15,7 @@ from apex_ompl.errors import FileFormatError, RobotError, UnknownNameError
 from apex_ompl.problem import Body
 from apex_ompl.robot.assets import DATA, resolve
 from apex_ompl.robot.compose import compose
-from apex_ompl.robot.config import RobotConfig, read_config, read_disabled_pairs
+from apex_ompl.robot.config import Hand, RobotConfig, read_config, read_disabled_pairs
 
 Array = NDArray[np.float64]
 
@@ -49,10 +49,11 @@ class Robot:
         limits: Limits in state order.
         home: A comfortable free state, shape (dof,).
         groups: Group name -> indices into a state.
+        hands: Hand name -> where and how it holds.
         model: Pinocchio model; its q has its own order, see :meth:`to_pinocchio`.
         geometry: Collision geometry of the links with the pairs to check, without any scene.
         fixtures: Solids of the robot's place, such as its tables.
-        part_links: Part name -> links; a held object may touch the links of the part that holds it.
+        part_links: Part name -> names of its links.
         urdf: The composed URDF with absolute mesh paths.
     """
 
@@ -61,6 +62,7 @@ class Robot:
     limits: Limits
     home: Array
     groups: Mapping[str, NDArray[np.intp]]
+    hands: Mapping[str, Hand]
     model: pin.Model
     geometry: pin.GeometryModel
     fixtures: tuple[Body, ...]
@@ -109,6 +111,26 @@ class Robot:
             if link in links:
                 return part
         raise UnknownNameError("link", link, self.link_names)
+
+    def hand_of(self, link: str) -> tuple[str, ...]:
+        """Return the links that hang together with a link beyond the last planned joint: its hand.
+
+        They are the links below the nearest joint above ``link`` that does not mimic another one; for a palm or a
+        finger those of the wrist and of the whole hand.
+
+        Raises:
+            UnknownNameError: No such link.
+        """
+        model = self.model
+        joint = model.frames[self.link_frame(link)].parentJoint
+        while joint > 0 and model.joints[joint].nq == 0:
+            joint = model.parents[joint]
+        below = {joint}
+        for k in range(1, model.njoints):  # parents come before their children
+            if model.parents[k] in below:
+                below.add(k)
+        bodies = (f for f in model.frames if f.type == pin.FrameType.BODY)
+        return tuple(f.name for f in bodies if f.parentJoint in below)
 
     def limit_fault(self, q: Array) -> str | None:
         """Return a sentence about the first joint of ``q`` outside its limits, or None when all hold."""
@@ -175,6 +197,9 @@ def build_robot(config: RobotConfig, path: Path) -> Robot:
         disabled += read_disabled_pairs(resolve(config.disabled_pairs, path.parent, "file of disabled pairs"))
     _pair_up(model, geometry, disabled)
     names = tuple(config.joints)
+    for hand in config.hands.values():
+        if not model.existBodyName(hand.palm):
+            raise FileFormatError(str(path), "hands", hand.palm, "expected a link of the robot as palm")
     groups = {g: np.array([names.index(n) for n in members]) for g, members in config.groups.items()}
     limits = _limits(config, model, path)
     home = np.array([joint.home for joint in config.joints.values()])
@@ -186,7 +211,7 @@ def build_robot(config: RobotConfig, path: Path) -> Robot:
     for array in (home, *vars(limits).values(), *groups.values(), order):
         array.flags.writeable = False
     return Robot(
-        name=config.name, joint_names=names, limits=limits, home=home, groups=groups, model=model,
+        name=config.name, joint_names=names, limits=limits, home=home, groups=groups, hands=config.hands, model=model,
         geometry=geometry, fixtures=config.fixtures, part_links=composition.part_links,
         urdf=composition.urdf, _order=order,
     )  # fmt: skip
