@@ -25,7 +25,7 @@ from apex_ompl.problem import Problem
 from apex_ompl.repair import repair
 from apex_ompl.result import PlanResult, PlanStatus
 from apex_ompl.simplify import simplify as shorten
-from apex_ompl.space import path_length, path_to_array
+from apex_ompl.space import path_length, path_to_array, resample
 from apex_ompl.validity import full_check
 
 if TYPE_CHECKING:
@@ -121,7 +121,7 @@ class _Run:
         self.times = {"setup": setup_time}
         notes = (f"snapshot: {', '.join(moving)} taken to stand still",) if moving else ()
         self.blank = PlanResult(
-            status=PlanStatus.UNKNOWN, reason="", problem=ready.problem.name, robot=ready.robot.name,
+            status=PlanStatus.UNKNOWN, reason="", problem=ready.problem, robot=ready.robot.name,
             joint_names=ready.robot.joint_names, planner=planner, seed=seed, notes=notes,
         )  # fmt: skip
 
@@ -220,14 +220,6 @@ class _Run:
             yield
         finally:
             self.times[stage] = self.times.get(stage, 0.0) + time.perf_counter() - begin
-
-
-def resample(path: Array, count: int) -> Array:
-    """Return ``count`` states evenly spread by length over a path, shape (count, dof), its ends among them."""
-    steps = np.linalg.norm(np.diff(path, axis=0), axis=1)
-    along = np.concatenate([[0.0], np.cumsum(steps)])
-    wanted = np.linspace(0.0, along[-1], count)
-    return np.stack([np.interp(wanted, along, column) for column in path.T], axis=1)
 
 
 def _check_arguments(timeout: float, seed: int) -> None:

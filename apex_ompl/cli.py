@@ -14,11 +14,12 @@ from collections.abc import Sequence
 from dataclasses import fields
 from importlib import metadata
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import NoReturn
 
 from apex_ompl.errors import ApexError, ParameterError
+from apex_ompl.result import SCHEMA as RESULT
 from apex_ompl.result import PlanResult, PlanStatus, check_suffix
-from apex_ompl.schema import check_writable
+from apex_ompl.schema import check_writable, read_yaml
 
 EXIT_CODES = {
     PlanStatus.EXACT_SOLUTION: 0,
@@ -69,6 +70,21 @@ def _parser() -> _Parser:
     plan.add_argument("--json", action="store_true", help="print the whole result as JSON")
     plan.set_defaults(run=_plan)
 
+    render = commands.add_parser("render", help="draw a problem or a saved result, without a display")
+    render.add_argument("source", help="name of a problem, a problem file, or a saved result (.npz, .json, .yaml)")
+    render.add_argument("-o", "--out", type=Path, required=True, metavar="FILE", help=".png, .gif or .mp4")
+    render.add_argument("--azimuth", type=float, default=26.0, help="degrees from the front (default: %(default)s)")
+    render.set_defaults(run=_render)
+
+    convert = commands.add_parser("convert", help="make a problem of a MoveIt or MotionBenchMaker scene and request")
+    convert.add_argument("scene", type=Path, help="YAML of a moveit_msgs/PlanningScene")
+    convert.add_argument("request", type=Path, help="YAML of a moveit_msgs/MotionPlanRequest")
+    convert.add_argument("-o", "--out", type=Path, required=True, metavar="FILE", help="problem file to write (.yaml)")
+    convert.add_argument("--robot", default="dual_panda_softhand", help="robot name or file (default: %(default)s)")
+    convert.add_argument("--joint", action="append", default=[], metavar="THEIRS=OURS", help="a joint by another name")
+    convert.add_argument("--frame", action="append", default=[], metavar="THEIRS=OURS", help="a frame by another name")
+    convert.set_defaults(run=_convert)
+
     check = commands.add_parser("check", help="validate a problem, and say whether start and goal are free")
     check.add_argument("problem", help="name of a ready-made problem, or a YAML file")
     check.set_defaults(run=_check)
@@ -95,7 +111,7 @@ def _plan(parsed: argparse.Namespace) -> int:
         timeout=parsed.timeout,
         seed=parsed.seed,
         simplify=not parsed.no_simplify,
-        params=_settings(parsed.set),
+        params={name.replace("-", "_"): value for name, value in _pairs("--set", parsed.set).items()},
         snapshot=parsed.snapshot,
     )
     if parsed.out is not None:
@@ -104,19 +120,20 @@ def _plan(parsed: argparse.Namespace) -> int:
     return EXIT_CODES.get(result.status, 1)
 
 
-def _settings(pairs: Sequence[str]) -> dict[str, Any]:
-    settings = {}
+def _pairs(option: str, pairs: Sequence[str]) -> dict[str, str]:
+    """Read repeated NAME=VALUE options."""
+    found = {}
     for pair in pairs:
         name, equals, value = pair.partition("=")
-        if not equals or not name:
-            raise ParameterError("--set", pair, "NAME=VALUE")
-        settings[name.strip().replace("-", "_")] = value
-    return settings
+        if not equals or not name or not value:
+            raise ParameterError(option, pair, "NAME=VALUE")
+        found[name.strip()] = value.strip()
+    return found
 
 
 def _summary(result: PlanResult) -> str:
     stages = ", ".join(f"{k} {v:.3f}" for k, v in result.times.items() if k != "total")
-    lines = [f"{result.problem}: {result.status}" + (f" by {result.solved_by}" if result.solved_by else "")]
+    lines = [f"{result.problem.name}: {result.status}" + (f" by {result.solved_by}" if result.solved_by else "")]
     if result.reason:
         lines.append(f"  reason     {result.reason}")
     lines.append(f"  time       {result.times['total']:.3f} s ({stages})")
@@ -126,6 +143,39 @@ def _summary(result: PlanResult) -> str:
     lines.append(f"  checks     {result.checks} states judged, planner {result.planner}, seed {result.seed}")
     lines += [f"  note       {note}" for note in result.notes]
     return "\n".join(lines)
+
+
+def _convert(parsed: argparse.Namespace) -> int:
+    from apex_ompl.moveit import convert
+    from apex_ompl.robot import load_robot
+
+    if parsed.out.suffix not in (".yaml", ".yml"):
+        raise ParameterError("output", str(parsed.out), "a file name ending in .yaml")
+    joints, frames = _pairs("--joint", parsed.joint), _pairs("--frame", parsed.frame)
+    done = convert(parsed.scene, parsed.request, load_robot(parsed.robot), joints, frames)
+    done.problem.save(parsed.out)
+    for note in done.notes:
+        print(f"apex-ompl: note: {note}", file=sys.stderr)
+    print(parsed.out)
+    return 0
+
+
+def _render(parsed: argparse.Namespace) -> int:
+    from apex_ompl.api import load_problem
+    from apex_ompl.render import render
+
+    source = PlanResult.load(parsed.source) if _is_result(parsed.source) else load_problem(parsed.source)
+    render(source, parsed.out, azimuth=parsed.azimuth)
+    print(parsed.out)
+    return 0
+
+
+def _is_result(source: str) -> bool:
+    """Whether a file is a saved result rather than a problem."""
+    path = Path(source)
+    if path.suffix in (".npz", ".json"):
+        return True
+    return path.suffix in (".yaml", ".yml") and path.is_file() and read_yaml(path, "file").get("schema") == RESULT
 
 
 def _check(parsed: argparse.Namespace) -> int:

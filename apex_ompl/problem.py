@@ -328,12 +328,16 @@ class Problem(StrictModel):
 
     def to_yaml(self) -> str:
         """Return the YAML text of the problem."""
+        return dump_yaml(self.as_dict())
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the problem as plain data in the form of its file."""
         data = self.model_dump(by_alias=True, exclude_none=True, exclude_defaults=True)
         head = {"schema": SCHEMA, "name": data.pop("name"), "robot": data.pop("robot")}
         goals = data["goal"].get("joints", ())
         if goals:
             data["goal"]["joints"] = goals[0] if len(goals) == 1 else list(goals)
-        return dump_yaml(head | data)
+        return head | data
 
     def _located(self, folder: Path) -> Problem:
         def mesh_located(body: Any) -> Any:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import os
+import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
@@ -15,8 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 from ompl import base as ob
 
-from apex_ompl.errors import ParameterError
-from apex_ompl.schema import dump_yaml, write_atomically
+from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError
+from apex_ompl.problem import Problem
+from apex_ompl.schema import dump_yaml, read_yaml, validate, write_atomically
 
 SCHEMA = "apex-ompl/result/1"
 SUFFIXES = (".npz", ".csv", ".json", ".yaml")
@@ -49,7 +51,7 @@ class PlanResult:
     Attributes:
         status: OMPL's name; EXACT_SOLUTION only for a path that passed the full check.
         reason: One sentence that explains a status other than EXACT_SOLUTION.
-        problem: Name of the problem.
+        problem: The problem.
         robot: Name of the robot.
         joint_names: Order of the columns of ``path``.
         planner: Name of the planner.
@@ -66,7 +68,7 @@ class PlanResult:
 
     status: PlanStatus
     reason: str
-    problem: str
+    problem: Problem
     robot: str
     joint_names: tuple[str, ...]
     planner: str
@@ -89,7 +91,7 @@ class PlanResult:
             "schema": SCHEMA,
             "status": str(self.status),
             "reason": self.reason,
-            "problem": self.problem,
+            "problem": self.problem.name,
             "robot": self.robot,
             "planner": self.planner,
             "seed": self.seed,
@@ -101,6 +103,7 @@ class PlanResult:
             "notes": list(self.notes),
             "joint_names": list(self.joint_names),
             "path": None if self.path is None else self.path.tolist(),
+            "problem_file": self.problem.as_dict(),
         }
 
     def save(self, path: str | os.PathLike[str]) -> None:
@@ -112,6 +115,34 @@ class PlanResult:
         """
         path = Path(path)
         write_atomically(path, self._encoded(check_suffix(path)))
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> PlanResult:
+        """Read a result that was saved as .npz, .json or .yaml.
+
+        Raises:
+            MissingFileError: The file cannot be read.
+            FileFormatError: It is not a saved result.
+            ParameterError: It has another suffix; a .csv holds no problem.
+        """
+        path = Path(path)
+        suffixes = tuple(s for s in SUFFIXES if s != ".csv")
+        if path.suffix not in suffixes:
+            raise ParameterError("result file", str(path), f"a file name ending in {', '.join(suffixes)}")
+        data = read_yaml(path, "result file") if path.suffix != ".npz" else _read_npz(path)
+        if data.get("schema") != SCHEMA:
+            raise FileFormatError(str(path), "schema", data.get("schema"), f"expected {SCHEMA!r}")
+        try:
+            states = None if data["path"] is None else np.array(data["path"], dtype=float)
+            number = {k: float("nan") if data[k] is None else float(data[k]) for k in ("length", "clearance")}
+            return cls(
+                status=PlanStatus(data["status"]), reason=data["reason"], robot=data["robot"], path=states,
+                problem=validate(Problem, data["problem_file"], str(path)), planner=data["planner"],
+                joint_names=tuple(data["joint_names"]), seed=int(data["seed"]), times=data["times"],
+                checks=int(data["checks"]), solved_by=data["solved_by"], notes=tuple(data["notes"]), **number,
+            )  # fmt: skip
+        except (KeyError, TypeError, ValueError) as error:
+            raise FileFormatError(str(path), "", str(error), "expected a complete saved result") from error
 
     def _encoded(self, suffix: str) -> bytes:
         data = self.as_dict()
@@ -130,6 +161,19 @@ class PlanResult:
         del data["path"]
         np.savez(buffer, path=states, joint_names=np.array(self.joint_names), result=np.array(json.dumps(data)))
         return buffer.getvalue()
+
+
+def _read_npz(path: Path) -> dict[str, Any]:
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            data = json.loads(str(archive["result"]))
+            if not isinstance(data, dict):
+                raise ValueError("no mapping")
+            return data | {"path": archive["path"] if len(archive["path"]) else None}
+    except FileNotFoundError as error:
+        raise MissingFileError(str(path), "result file") from error
+    except (OSError, KeyError, ValueError, zipfile.BadZipFile) as error:
+        raise FileFormatError(str(path), "", str(error), "expected a saved result") from error
 
 
 def check_suffix(path: Path) -> str:

@@ -13,14 +13,13 @@ from support import ROOT
 
 import apex_ompl
 from apex_ompl import PlanStatus, load_problem, plan
-from apex_ompl.api import resample
 from apex_ompl.assembly import assemble
 from apex_ompl.collision import Verdict
 from apex_ompl.errors import FileFormatError, ParameterError, UnknownNameError
 from apex_ompl.problem import Goal, Obstacle, Problem
 from apex_ompl.repair import repair
 from apex_ompl.robot import Robot, load_robot
-from apex_ompl.space import path_length
+from apex_ompl.space import path_length, resample
 from apex_ompl.validity import full_check
 
 BAXTER = ROOT / "examples" / "baxter_table.yaml"
