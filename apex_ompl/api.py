@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import signal
 import threading
 import time
 from collections.abc import Mapping
@@ -19,8 +18,9 @@ from ompl import geometric as og
 from ompl import util as ou
 
 from apex_ompl import planners, problems
-from apex_ompl.assembly import PlanningSetup, assemble
+from apex_ompl.assembly import PlanningSetup, assemble, set_goals
 from apex_ompl.errors import ParameterError
+from apex_ompl.interrupt import Interrupt
 from apex_ompl.problem import Problem
 from apex_ompl.repair import repair
 from apex_ompl.result import PlanResult, PlanStatus
@@ -35,6 +35,12 @@ Array = NDArray[np.float64]
 
 DEFAULT_PLANNER = "rrtconnect"
 CLEARANCE_SAMPLES = 32
+STRAIGHT_LINE = "straight line"
+PROOF_SHARE, LONGEST_PROOF = 0.1, 0.5  # time kept from planners that stop at the timeout only, for repair [1, s]
+LONGEST_TIMEOUT = 1e8  # OMPL counts nanoseconds in 64 bits [s]
+
+_quiet_lock = threading.Lock()
+_quiet_levels: list[ou.LogLevel] = []
 
 
 def load_problem(name_or_path: str | os.PathLike[str]) -> Problem:
@@ -107,7 +113,9 @@ def plan(
         _seed_ompl(seed)
         ready = assemble(loaded, seed=seed)
         run = _Run(ready, planner, seed, time.perf_counter() - started, loaded.moving)
-        return run.finish(started, run.solve(parameters, timeout, simplify))
+        with Interrupt() as run.interrupt:
+            result = run.solve(parameters, timeout, simplify)
+        return run.finish(started, result)
 
 
 class _Run:
@@ -118,6 +126,7 @@ class _Run:
     ) -> None:
         self.ready = ready
         self.planner = planner
+        self.interrupt = Interrupt()
         self.times = {"setup": setup_time}
         notes = (f"snapshot: {', '.join(moving)} taken to stand still",) if moving else ()
         self.blank = PlanResult(
@@ -132,26 +141,60 @@ class _Run:
             return self._failed(PlanStatus.INVALID_START, ready.start_fault)
         if all(ready.goal_faults):
             return self._failed(PlanStatus.INVALID_GOAL, "; ".join(ready.goal_faults))
-        simple_setup = ready.simple_setup
+        deadline = time.perf_counter() + timeout
+        with self._timed("line"):
+            line = self._straight_line()
+        if line is not None:
+            return self._exact(line, STRAIGHT_LINE)
+        try:
+            status = self._run_ompl(parameters, timeout)
+            if status is PlanStatus.APPROXIMATE_SOLUTION:
+                return self._approximate()
+            if status is not PlanStatus.EXACT_SOLUTION:
+                said = "" if status is PlanStatus.TIMEOUT else f" (OMPL says {status})"
+                ours = PlanStatus.TIMEOUT if status in (PlanStatus.INVALID_START, PlanStatus.INVALID_GOAL) else status
+                return self._failed(ours, f"{self.planner} found no path in {timeout:g} s{said}")
+            states = path_to_array(ready.simple_setup.getSolutionPath(), ready.robot.dof)
+            return self._proved(states, deadline, simplify)
+        except Exception as error:
+            return self._failed(PlanStatus.CRASH, f"{self.planner} failed, {error!r}")
+
+    def _straight_line(self) -> Array | None:
+        """Return the straight line to the nearest goal for which it is a solution, or None.
+
+        Some of OMPL's planners hang, give up or raise where there is nothing to search for.
+        """
+        ready = self.ready
+        goals = sorted(ready.valid_goals, key=lambda goal: float(np.linalg.norm(goal - ready.start)))
+        lines = (np.stack([ready.start, goal]) for goal in goals)
+        return next((line for line in lines if full_check(ready.verdict, line, ready.start, goals)), None)
+
+    def _run_ompl(self, parameters: planners.Parameters, timeout: float) -> PlanStatus:
+        """Run the planner and return its status; faults of the checkers are raised."""
+        simple_setup = self.ready.simple_setup
         si = simple_setup.getSpaceInformation()
+        goals = self.ready.valid_goals
+        if parameters.threaded and len(goals) > 1:
+            nearest = goals[int(np.argmin(np.linalg.norm(goals - self.ready.start, axis=1)))]
+            set_goals(simple_setup, [nearest])
+            note = f"{self.planner} runs threads and takes one goal: the nearest of {len(goals)}"
+            self.blank = replace(self.blank, notes=(*self.blank.notes, note))
         if parameters.optimizing:  # others would go on after their first solution, prm for one
             simple_setup.setOptimizationObjective(ob.PathLengthOptimizationObjective(si))
         simple_setup.setPlanner(parameters.build(si))
-        deadline = time.perf_counter() + timeout
         # A condition made in C++: planners that run threads deadlock with one made in Python.
-        ptc = ob.timedPlannerTerminationCondition(timeout)
-        with _interruptible(ptc) as interrupted, self._timed("solve"):
+        if parameters.optimizing:  # it takes all the time there is, and what it finds must still be proved
+            timeout -= min(PROOF_SHARE * timeout, LONGEST_PROOF)
+        condition = ob.timedPlannerTerminationCondition(min(timeout, LONGEST_TIMEOUT))
+        with self.interrupt.ends(condition) as ptc, self._timed("solve"):
             status = PlanStatus.of(simple_setup.solve(ptc))
-        if interrupted.is_set():
-            raise KeyboardInterrupt
-        fault = ready.checker.fault or ready.motions.fault
+        self._raise_faults()
+        return status
+
+    def _raise_faults(self) -> None:
+        fault = self.ready.checker.fault or self.ready.motions.fault
         if fault is not None:
-            return self._failed(PlanStatus.CRASH, f"the validity checker failed: {fault!r}")
-        if status is PlanStatus.APPROXIMATE_SOLUTION:
-            return self._approximate()
-        if status is not PlanStatus.EXACT_SOLUTION:
-            return self._failed(status, f"{self.planner} found no path in {timeout:g} s")
-        return self._proved(path_to_array(simple_setup.getSolutionPath(), ready.robot.dof), deadline, simplify)
+            raise fault
 
     def finish(self, started: float, result: PlanResult) -> PlanResult:
         """Add clearance, length, counts and times."""
@@ -173,7 +216,8 @@ class _Run:
         candidates = [self._with_exact_ends(path)]
         if simplify:
             with self._timed("simplify"):
-                candidates.insert(0, shorten(self.ready.simple_setup, candidates[0]))
+                candidates.insert(0, shorten(self.ready.simple_setup, candidates[0], self.interrupt))
+            self._raise_faults()
         ready, reason = self.ready, ""
         for candidate in candidates:
             with self._timed("verify"):
@@ -182,7 +226,7 @@ class _Run:
                 return self._exact(candidate, self.planner)
             reason = reason or check.reason
             with self._timed("repair"):
-                mended = repair(ready, candidate, check, deadline)
+                mended = repair(ready, candidate, check, deadline, self.interrupt)
             if mended is not None:
                 return self._exact(mended, f"{self.planner}+repair")
         return self._failed(PlanStatus.TIMEOUT, f"the path found failed the full check and repair, {reason}")
@@ -205,10 +249,9 @@ class _Run:
         )
 
     def _with_exact_ends(self, path: Array) -> Array:
-        path = path.copy()
-        path[0] = self.ready.start
-        path[-1] = self.ready.goals[int(np.argmin(np.linalg.norm(self.ready.goals - path[-1], axis=1)))]
-        return path
+        goals = self.ready.valid_goals
+        goal = goals[int(np.argmin(np.linalg.norm(goals - path[-1], axis=1)))]
+        return np.concatenate([self.ready.start[None], path[1:-1], goal[None]])
 
     def _failed(self, status: PlanStatus, reason: str) -> PlanResult:
         return replace(self.blank, status=status, reason=reason)
@@ -231,37 +274,26 @@ def _check_arguments(timeout: float, seed: int) -> None:
 
 
 def _seed_ompl(seed: int) -> None:
-    level = ou.getLogLevel()
-    ou.setLogLevel(ou.LogLevel.LOG_NONE)  # it complains when generators were in use, and reseeds all the same
-    ou.RNG.setSeed(int(seed) + 1)  # OMPL takes no seed 0
-    ou.setLogLevel(level)
+    with _quiet_lock:
+        level = ou.getLogLevel()
+        ou.setLogLevel(ou.LogLevel.LOG_NONE)  # it complains when generators were in use, and reseeds all the same
+        ou.RNG.setSeed(int(seed) + 1)  # OMPL takes no seed 0
+        ou.setLogLevel(level)
 
 
 @contextmanager
 def _quiet_ompl() -> Iterator[None]:
     """Keep OMPL's information messages off standard output; warnings still go to standard error."""
-    level = ou.getLogLevel()
-    ou.setLogLevel(ou.LogLevel.LOG_WARN)
+    with _quiet_lock:
+        if not _quiet_levels:
+            _quiet_levels.append(ou.getLogLevel())
+            ou.setLogLevel(ou.LogLevel.LOG_WARN)
+        else:
+            _quiet_levels.append(_quiet_levels[0])
     try:
         yield
     finally:
-        ou.setLogLevel(level)
-
-
-@contextmanager
-def _interruptible(ptc: ob.PlannerTerminationCondition) -> Iterator[threading.Event]:
-    """Make Ctrl-C end the planner in good order: an exception inside its callbacks would end the process."""
-    pressed = threading.Event()
-
-    def handle(*_: object) -> None:
-        pressed.set()
-        ptc.terminate()
-
-    if threading.current_thread() is not threading.main_thread():
-        yield pressed
-        return
-    before = signal.signal(signal.SIGINT, handle)
-    try:
-        yield pressed
-    finally:
-        signal.signal(signal.SIGINT, before)
+        with _quiet_lock:
+            level = _quiet_levels.pop()
+            if not _quiet_levels:  # the last plan of several in as many threads
+                ou.setLogLevel(level)

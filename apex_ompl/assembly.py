@@ -55,6 +55,11 @@ class PlanningSetup:
     goal_faults: tuple[str, ...]
     alignment: AlignmentGoal | None
 
+    @property
+    def valid_goals(self) -> Array:
+        """The goals that are inside the limits and free, shape (valid, dof)."""
+        return self.goals[[not fault for fault in self.goal_faults[: len(self.goals)]]]
+
 
 def assemble(problem: Problem, robot: Robot | None = None, seed: int = 0) -> PlanningSetup:
     """Make a problem ready for OMPL.
@@ -87,7 +92,7 @@ def assemble(problem: Problem, robot: Robot | None = None, seed: int = 0) -> Pla
     si.setMotionValidator(motions)
     si.setStateValidityCheckingResolution(SEARCH_RESOLUTION / space.getMaximumExtent())
     simple_setup.setStartState(to_state(space, start))
-    given = [goal for goal, fault in zip(goals, goal_faults, strict=True) if not fault]
+    given = [goal for goal, fault in zip(goals, goal_faults, strict=False) if not fault]
     set_goals(simple_setup, given or list(goals))
     return PlanningSetup(
         problem,

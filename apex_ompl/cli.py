@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import platform
 import sys
 from collections.abc import Sequence
@@ -41,7 +42,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code; ``arguments`` default to ``sys.argv[1:]``."""
     parsed = _parser().parse_args(arguments)
     try:
-        return int(parsed.run(parsed))
+        code = int(parsed.run(parsed))
+        sys.stdout.flush()
+        return code
     except ApexError as error:
         print(f"apex-ompl: error: {error}", file=sys.stderr)
         return 2
@@ -49,8 +52,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print("apex-ompl: interrupted", file=sys.stderr)
         return 130
     except BrokenPipeError:
-        sys.stderr.close()
+        sys.stdout = open(os.devnull, "w")  # whoever read has enough; nothing is left to be flushed at exit
         return 1
+    except OSError as error:
+        sys.stdout = open(os.devnull, "w")
+        print(f"apex-ompl: error: output: {error.strerror or error}", file=sys.stderr)
+        return 2
 
 
 def _parser() -> _Parser:
@@ -114,8 +121,10 @@ def _plan(parsed: argparse.Namespace) -> int:
         params={name.replace("-", "_"): value for name, value in _pairs("--set", parsed.set).items()},
         snapshot=parsed.snapshot,
     )
-    if parsed.out is not None:
+    if parsed.out is not None and (result.path is not None or parsed.out.suffix != ".csv"):
         result.save(parsed.out)
+    elif parsed.out is not None:
+        print(f"apex-ompl: note: no path, so {parsed.out} is not written", file=sys.stderr)
     print(json.dumps(result.as_dict()) if parsed.json else _summary(result))
     return EXIT_CODES.get(result.status, 1)
 

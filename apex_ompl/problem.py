@@ -9,11 +9,11 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
-from pydantic import AfterValidator, BeforeValidator, Field, PositiveFloat, field_validator, model_validator
+from numpy.typing import ArrayLike, NDArray
+from pydantic import AfterValidator, BeforeValidator, Field, PositiveFloat, Strict, field_validator, model_validator
 
 from apex_ompl.errors import FileFormatError, nearest_name
 from apex_ompl.schema import StrictModel, dump_yaml, read_yaml, validate, write_atomically
@@ -34,7 +34,11 @@ def _non_zero(v: tuple[float, float, float]) -> tuple[float, float, float]:
     return v
 
 
-Vector = tuple[float, float, float]
+LARGEST = 1e4  # lengths beyond are taken for a fault [m]
+
+Coordinate = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
+Size = Annotated[float, Field(gt=0.0, le=LARGEST)]
+Vector = tuple[Coordinate, Coordinate, Coordinate]
 Direction = Annotated[Vector, AfterValidator(_non_zero)]
 Quaternion = Annotated[tuple[float, float, float, float], AfterValidator(_unit_quaternion)]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_./-]*$")]
@@ -43,14 +47,14 @@ Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_./-]*$")]
 class Sphere(StrictModel):
     """A ball centred on the object's origin; radius [m]."""
 
-    radius: PositiveFloat
+    radius: Size
 
 
 class RoundBar(StrictModel):
     """A cylinder along z centred on the origin, or a capsule whose ``length`` excludes its end caps [m]."""
 
-    radius: PositiveFloat
-    length: PositiveFloat
+    radius: Size
+    length: Size
 
 
 class MeshFile(StrictModel):
@@ -78,14 +82,14 @@ class HalfSpace(StrictModel):
     """All points x of the object's frame with normal . x <= offset [m]; the normal points out of the solid."""
 
     normal: Direction
-    offset: float = 0.0
+    offset: Coordinate = 0.0
 
 
 class Body(StrictModel):
     """A named solid: exactly one shape, and its pose."""
 
     name: Name
-    box: tuple[PositiveFloat, PositiveFloat, PositiveFloat] | None = None
+    box: tuple[Size, Size, Size] | None = None
     sphere: Sphere | None = None
     cylinder: RoundBar | None = None
     capsule: RoundBar | None = None
@@ -113,6 +117,7 @@ class Body(StrictModel):
         return pose_matrix(self.position, self.orientation)
 
 
+BodyT = TypeVar("BodyT", bound=Body)
 SHAPES = ("box", "sphere", "cylinder", "capsule", "mesh", "half_space")
 
 
@@ -151,7 +156,7 @@ class AttachedObject(Body):
         return self
 
 
-JointValues = dict[str, float]
+JointValues = dict[str, Annotated[float, Strict()]]
 
 
 def _one_or_many(value: Any) -> Any:
@@ -340,22 +345,24 @@ class Problem(StrictModel):
         return head | data
 
     def _located(self, folder: Path) -> Problem:
-        def mesh_located(body: Any) -> Any:
-            if body.mesh is None:
-                return body
-            file = str((folder / body.mesh.file).resolve())  # an absolute path stays as it is
-            return body.model_copy(update={"mesh": body.mesh.model_copy(update={"file": file})})
-
         update: dict[str, Any] = {
-            "scene": tuple(mesh_located(o) for o in self.scene),
-            "attached": tuple(mesh_located(o) for o in self.attached),
+            "scene": tuple(located(o, folder) for o in self.scene),
+            "attached": tuple(located(o, folder) for o in self.attached),
         }
         if self.robot.endswith((".yaml", ".yml")):
-            update["robot"] = str((folder / self.robot).resolve())
+            update["robot"] = os.path.normpath(folder / self.robot)
         return self.model_copy(update=update)
 
 
-def pose_matrix(position: Sequence[float], orientation: Sequence[float]) -> NDArray[np.float64]:
+def located(body: BodyT, folder: Path) -> BodyT:
+    """Return a body whose mesh, if it has one, is named by its absolute path; a relative one starts at ``folder``."""
+    if body.mesh is None:
+        return body
+    file = os.path.abspath(folder / body.mesh.file)
+    return body.model_copy(update={"mesh": body.mesh.model_copy(update={"file": file})})
+
+
+def pose_matrix(position: ArrayLike, orientation: ArrayLike) -> NDArray[np.float64]:
     """Return the homogeneous transform of a position [m] and a quaternion xyzw, shape (4, 4)."""
     x, y, z, w = np.asarray(orientation, float) / np.linalg.norm(orientation)
     pose = np.eye(4)

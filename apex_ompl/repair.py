@@ -10,6 +10,7 @@ from ompl import base as ob
 from ompl import geometric as og
 
 from apex_ompl.assembly import PlanningSetup
+from apex_ompl.interrupt import Interrupt
 from apex_ompl.space import FULL_RESOLUTION, path_to_array, state_space, to_state
 from apex_ompl.validity import FullCheck, MotionCheck, VerdictChecker, VerdictMotionValidator, full_check
 
@@ -18,7 +19,9 @@ Array = NDArray[np.float64]
 MAX_BRIDGES = 20
 
 
-def repair(ready: PlanningSetup, path: Array, fault: FullCheck, deadline: float) -> Array | None:
+def repair(
+    ready: PlanningSetup, path: Array, fault: FullCheck, deadline: float, interrupt: Interrupt | None = None
+) -> Array | None:
     """Plan stretches that fail the full check anew, at the resolution of the full check.
 
     Args:
@@ -26,16 +29,18 @@ def repair(ready: PlanningSetup, path: Array, fault: FullCheck, deadline: float)
         path: States, shape (N, dof), the first and the last of them free.
         fault: What the full check said of ``path``.
         deadline: Value of ``time.perf_counter`` at which to give up [s].
+        interrupt: Ends the work in good order when it was pressed.
 
     Returns:
         A path that passes the full check, or None.
     """
+    interrupt = interrupt or Interrupt()
     for _ in range(MAX_BRIDGES):
         left = deadline - time.perf_counter()
-        if left <= 0.0 or fault.segment is None:
+        if left <= 0.0 or fault.segment is None or interrupt.pressed:
             return None
         first, last = _free_ends(ready, path, fault.segment)
-        bridge = _bridge(ready, path[first], path[last], left)
+        bridge = _bridge(ready, path[first], path[last], left, interrupt)
         if bridge is None:
             return None
         path = np.concatenate([path[:first], bridge, path[last + 1 :]])
@@ -58,18 +63,23 @@ def _free_ends(ready: PlanningSetup, path: Array, segment: int) -> tuple[int, in
     return first, last
 
 
-def _bridge(ready: PlanningSetup, a: Array, b: Array, timeout: float) -> Array | None:
+def _bridge(ready: PlanningSetup, a: Array, b: Array, timeout: float, interrupt: Interrupt) -> Array | None:
     """Return a path between two free states, judged at the resolution of the full check, or None."""
     space = state_space(ready.robot)
     setup = og.SimpleSetup(space)
     si = setup.getSpaceInformation()
-    setup.setStateValidityChecker(VerdictChecker(si, ready.verdict))
-    si.setMotionValidator(VerdictMotionValidator(si, MotionCheck(ready.verdict, FULL_RESOLUTION)))
+    checker = VerdictChecker(si, ready.verdict)
+    motions = VerdictMotionValidator(si, MotionCheck(ready.verdict, FULL_RESOLUTION))
+    setup.setStateValidityChecker(checker)
+    si.setMotionValidator(motions)
     setup.setStartAndGoalStates(to_state(space, a), to_state(space, b))
     setup.setPlanner(og.RRTConnect(si))
-    status = setup.solve(ob.timedPlannerTerminationCondition(timeout))
+    with interrupt.ends(ob.timedPlannerTerminationCondition(timeout)) as ptc:
+        status = setup.solve(ptc)
+    fault = checker.fault or motions.fault
+    if fault is not None:
+        raise fault
     if status.getStatus() != ob.PlannerStatus.EXACT_SOLUTION:
         return None
     bridge = path_to_array(setup.getSolutionPath(), ready.robot.dof)
-    bridge[0], bridge[-1] = a, b
-    return bridge
+    return np.stack([a, b]) if len(bridge) < 2 else np.concatenate([a[None], bridge[1:-1], b[None]])

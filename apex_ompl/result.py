@@ -44,7 +44,7 @@ class PlanStatus(StrEnum):
         return cls(status.getStatus().name)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PlanResult:
     """Outcome of one call of ``plan``; true only when ``status`` is EXACT_SOLUTION.
 
@@ -62,7 +62,8 @@ class PlanResult:
         clearance: Least distance of any checked pair at 32 states spread over the path [m], NaN without a path.
         checks: How many states were judged.
         solved_by: What found the path: the planner's name, with ``+repair`` when a stretch of it failed the
-            full check and was planned anew; empty without a path.
+            full check and was planned anew; ``straight line`` when that was a solution, so that no planner ran;
+            empty without a path.
         notes: What a user should know about this run, such as a snapshot of moving obstacles.
     """
 

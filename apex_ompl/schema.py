@@ -34,11 +34,13 @@ class _Loader(yaml.SafeLoader):
 def _mapping(loader: _Loader, node: yaml.MappingNode) -> dict[Hashable, Any]:
     seen = set()
     for key_node, _ in node.value:
+        if key_node.tag == "tag:yaml.org,2002:merge":
+            continue
         key = loader.construct_object(key_node)
         if key in seen:
             raise yaml.constructor.ConstructorError(None, None, f"key {key!r} is given twice", key_node.start_mark)
         seen.add(key)
-    return loader.construct_mapping(node, deep=True)
+    return loader.construct_mapping(node, deep=True)  # which takes merge keys in
 
 
 # PyYAML reads 1e-3 as text, YAML 1.2 as a number.
@@ -61,6 +63,8 @@ def read_yaml(path: Path, role: str) -> dict[str, Any]:
         raise MissingFileError(str(path), role, (error.strerror or "cannot be read").lower()) from error
     except UnicodeDecodeError as error:
         raise FileFormatError(str(path), "", str(error.reason), "expected UTF-8 text") from error
+    except ValueError as error:
+        raise MissingFileError(str(path), role, str(error)) from error
     return parse_yaml(text, str(path))
 
 
@@ -77,8 +81,9 @@ def parse_yaml(text: str, source: str) -> dict[str, Any]:
         place = f"line {mark.line + 1}, column {mark.column + 1}" if mark else ""
         problem = str(error.problem or error.context).strip()
         raise FileFormatError(source, place, problem, "expected valid YAML") from error
-    except (yaml.YAMLError, ValueError, TypeError) as error:
-        raise FileFormatError(source, "", str(error), "expected valid YAML") from error
+    except Exception as error:  # PyYAML lets many kinds through, and deep nesting ends the recursion
+        what = str(error) or type(error).__name__
+        raise FileFormatError(source, "", what, "expected valid YAML") from error
     if not isinstance(data, dict):
         raise FileFormatError(source, "", data, "expected a mapping of keys to values")
     return data
@@ -139,16 +144,29 @@ def _model_in(annotation: Any) -> type[BaseModel] | None:
     return None
 
 
+def is_file(path: Path) -> bool:
+    """Whether a path is that of a file; False also for names that no file can have."""
+    try:
+        return path.is_file()
+    except (OSError, ValueError):
+        return False
+
+
 def check_writable(path: Path) -> None:
     """Check that a file can be written, before the work that makes its content.
 
     Raises:
         MissingFileError: The folder does not exist or cannot be written, or the path is a folder.
     """
-    if not path.parent.is_dir():
-        raise MissingFileError(str(path), OUTPUT, f"folder {str(path.parent)!r} does not exist")
-    if path.is_dir():
-        raise MissingFileError(str(path), OUTPUT, "is a folder")
+    try:
+        if not path.parent.is_dir():
+            raise MissingFileError(str(path), OUTPUT, f"folder {str(path.parent)!r} does not exist")
+        if path.is_dir():
+            raise MissingFileError(str(path), OUTPUT, "is a folder")
+    except (OSError, ValueError) as error:
+        raise MissingFileError(str(path), OUTPUT, "no file can have this name") from error
+    if "\0" in str(path) or len(os.fsencode(path.name)) > 200:
+        raise MissingFileError(str(path), OUTPUT, "no file can have this name")
     if not os.access(path.parent, os.W_OK):
         raise MissingFileError(str(path), OUTPUT, f"no permission to write in {str(path.parent)!r}")
 

@@ -6,13 +6,16 @@ import numpy as np
 from numpy.typing import NDArray
 from ompl import geometric as og
 
+from apex_ompl.interrupt import Interrupt
 from apex_ompl.space import array_to_path, path_length, path_to_array
 
 ROUNDS = 6
 LEAST_GAIN = 0.01  # a round that shortens by less than this share is the last
 
 
-def simplify(setup: og.SimpleSetup, path: NDArray[np.float64]) -> NDArray[np.float64]:
+def simplify(
+    setup: og.SimpleSetup, path: NDArray[np.float64], interrupt: Interrupt | None = None
+) -> NDArray[np.float64]:
     """Return a shorter path with the same ends, by OMPL's vertex reduction and partial shortcuts.
 
     Motions are judged by the setup's motion validator.
@@ -20,6 +23,7 @@ def simplify(setup: og.SimpleSetup, path: NDArray[np.float64]) -> NDArray[np.flo
     Args:
         setup: OMPL's setup of the problem.
         path: States, shape (N, dof).
+        interrupt: No further round is begun when it was pressed.
     """
     if len(path) < 3:
         return path
@@ -27,6 +31,8 @@ def simplify(setup: og.SimpleSetup, path: NDArray[np.float64]) -> NDArray[np.flo
     work = array_to_path(setup.getSpaceInformation(), path)
     best = path
     for _ in range(ROUNDS):
+        if interrupt is not None and interrupt.pressed:
+            break
         simplifier.reduceVertices(work)
         simplifier.partialShortcutPath(work)
         states = path_to_array(work, path.shape[1])
@@ -35,5 +41,4 @@ def simplify(setup: og.SimpleSetup, path: NDArray[np.float64]) -> NDArray[np.flo
             best = states
         if gain < LEAST_GAIN:
             break
-    best[0], best[-1] = path[0], path[-1]
-    return best
+    return np.concatenate([path[:1], best[1:-1], path[-1:]])

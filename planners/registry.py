@@ -20,16 +20,18 @@ class Parameters:
         optimizing: Whether the planner goes on improving until time is up.
         repeatable: Whether the same seed gives the same path; not for planners that are stopped by the clock
             or threaded.
+        threaded: Whether the planner runs threads of its own; OMPL 2.0.1's then deadlock over several goals.
     """
 
     optimizing: ClassVar[bool] = False
     repeatable: ClassVar[bool] = True
+    threaded: ClassVar[bool] = False
 
     def build(self, si: ob.SpaceInformation) -> ob.Planner:
         """Return a planner for ``si`` with these parameters."""
         raise TypeError(f"{type(self).__name__} does not say how to build its planner")
 
-    def changed(self, **values: Any) -> Parameters:
+    def changed(self, /, **values: Any) -> Parameters:
         """Return a copy with some values changed; text is read as the field's type.
 
         Raises:
@@ -48,6 +50,8 @@ def bounded(default: Any, low: float, high: float = float("inf"), unit: str = ""
     """Return a dataclass field with a range, ends included; the unit is for documentation."""
     return dataclasses.field(default=default, metadata={"low": low, "high": high, "unit": unit})
 
+
+LARGEST_INT = 2**31 - 1
 
 _REGISTRY: dict[str, type[Parameters]] = {}
 
@@ -68,7 +72,7 @@ def names() -> tuple[str, ...]:
     return tuple(sorted(_REGISTRY))
 
 
-def parameters(name: str, **values: Any) -> Parameters:
+def parameters(name: str, /, **values: Any) -> Parameters:
     """Return the parameters of a planner: its defaults, with some values changed.
 
     Raises:
@@ -81,7 +85,7 @@ def parameters(name: str, **values: Any) -> Parameters:
     return _REGISTRY[name]().changed(**values)
 
 
-def make(name: str, si: ob.SpaceInformation, **values: Any) -> ob.Planner:
+def make(name: str, si: ob.SpaceInformation, /, **values: Any) -> ob.Planner:
     """Return a planner for a space information, for example ``make("rrtconnect", si, range=0.5)``.
 
     Raises:
@@ -91,7 +95,7 @@ def make(name: str, si: ob.SpaceInformation, **values: Any) -> ob.Planner:
     return parameters(name, **values).build(si)
 
 
-def allocator(name: str, **values: Any) -> Callable[[ob.SpaceInformation], ob.Planner]:
+def allocator(name: str, /, **values: Any) -> Callable[[ob.SpaceInformation], ob.Planner]:
     """Return an allocator for ``SimpleSetup.setPlannerAllocator``.
 
     Raises:
@@ -111,6 +115,7 @@ def _read(name: str, value: Any, default: Any, field: dataclasses.Field[Any]) ->
     kind = type(default)
     expected = {bool: "true or false", int: "a whole number", float: "a number"}[kind]
     low, high = field.metadata.get("low", -float("inf")), field.metadata.get("high", float("inf"))
+    high = min(high, LARGEST_INT) if kind is int else high
     if low > -float("inf") or high < float("inf"):
         expected += f" in [{low:g}, {high:g}]"
     read = value

@@ -165,6 +165,7 @@ class PRM(OmplParameters):
     """Probabilistic roadmap, grown in one thread and searched in another (Kavraki et al., 1996)."""
 
     planner: ClassVar[str] = "PRM"
+    threaded: ClassVar[bool] = True
     repeatable: ClassVar[bool] = False
     max_nearest_neighbors: int = bounded(10, 1)
 
@@ -175,6 +176,7 @@ class PRMstar(OmplParameters):
     """PRM with the neighbourhood that makes it asymptotically optimal (Karaman and Frazzoli, 2011)."""
 
     planner: ClassVar[str] = "PRMstar"
+    threaded: ClassVar[bool] = True
     optimizing: ClassVar[bool] = True
     repeatable: ClassVar[bool] = False
 

@@ -14,6 +14,8 @@ from support import ROOT
 
 from apex_ompl.problem import Problem
 
+# Around the left shoulder, where the arm is in every state.
+BLOB = {"name": "blob", "sphere": {"radius": 0.1}, "position": [0.0, 0.5, 0.45]}
 GOOD = (ROOT / "problems" / "data" / "shelf_swap.yaml").read_text()
 
 
@@ -67,10 +69,10 @@ def test_check_says_what_is_free_and_what_touches(apex_cli, tmp_path: Path) -> N
     good = apex_cli("check", "shelf_swap")
     assert good.returncode == 0 and good.stdout.count("free") == 2
     data = yaml.safe_load(GOOD)
-    data["start"]["left_joint2"] = -0.187
+    data["scene"] = [BLOB]
     (tmp_path / "bad.yaml").write_text(yaml.safe_dump(data))
     bad = apex_cli("check", tmp_path / "bad.yaml")
-    assert bad.returncode == 3 and "mm deep" in bad.stdout and "left_hand_palm <-> board_3" in bad.stdout
+    assert bad.returncode == 3 and "mm deep" in bad.stdout and "<-> blob" in bad.stdout
 
 
 def edited(tmp_path: Path, **changes: object) -> Path:
@@ -110,6 +112,13 @@ FAULTS = {
     "unknown parameter": (lambda t: ["plan", "shelf_swap", "--set", "rnge=1"], 2, ["'rnge'", "did you mean 'range'"]),
     "bad parameter": (lambda t: ["plan", "shelf_swap", "--set", "range=far"], 2, ["'range'", "a number", "'far'"]),
     "bad --set": (lambda t: ["plan", "shelf_swap", "--set", "range"], 2, ["--set", "NAME=VALUE"]),
+    "own name as parameter": (lambda t: ["plan", "shelf_swap", "--set", "name=1"], 2, ["unknown parameter 'name'"]),
+    "huge whole number": (
+        lambda t: ["plan", "shelf_swap", "--planner", "prm", "--set", "max_nearest_neighbors=99999999999"],
+        2,
+        ["'max_nearest_neighbors'", "99999999999"],
+    ),
+    "impossible name": (lambda t: ["plan", "shelf_swap", "--out", t / ("n" * 300 + ".npz")], 2, ["this name"]),
     "zero timeout": (lambda t: ["plan", "shelf_swap", "--timeout", "0"], 2, ["timeout", "positive"]),
     "negative timeout": (lambda t: ["plan", "shelf_swap", "--timeout=-1"], 2, ["timeout", "positive"]),
     "not a number": (lambda t: ["plan", "shelf_swap", "--timeout", "soon"], 2, ["--timeout", "'soon'"]),
@@ -124,9 +133,9 @@ FAULTS = {
         ["INVALID_START", "left_joint2 = 3", "[-1.7628, 1.7628]"],
     ),
     "start in collision": (
-        lambda t: ["plan", edited(t, start__left_joint2=-0.187)],
+        lambda t: ["plan", edited(t, scene=[BLOB])],
         3,
-        ["INVALID_START", "<->", "mm deep"],
+        ["INVALID_START", "left_link", "<-> blob", "mm deep"],
     ),
     "approximate": (lambda t: ["plan", "shelf_swap", "--planner", "rrt", "--timeout", ".2"], 4, ["APPROXIMATE_SOL"]),
     "no plan": (lambda t: ["plan", "shelf_swap", "--timeout", "0.01"], 1, ["TIMEOUT"]),
@@ -183,6 +192,19 @@ def test_ctrl_c_ends_a_plan_in_good_order(planner: str, settings: list[str], tmp
     assert time.perf_counter() - begin < 10.0
     assert running.returncode == 130 and out == "" and "interrupted" in err and "Traceback" not in err
     assert not (tmp_path / "r.npz").exists()
+
+
+def test_a_csv_needs_a_path_but_the_status_is_told(apex_cli, tmp_path: Path) -> None:
+    done = apex_cli("plan", edited(tmp_path, start__left_joint2=3.0), "--out", tmp_path / "r.csv")
+    assert done.returncode == 3 and "INVALID_START" in done.stdout and "is not written" in done.stderr
+    assert not (tmp_path / "r.csv").exists()
+
+
+def test_a_full_or_closed_output_is_no_traceback() -> None:
+    for shell in ("{} schema > /dev/full", "{} problems | true"):
+        command = shell.format(f"{sys.executable} -m apex_ompl.cli")
+        done = subprocess.run(command, check=False, shell=True, capture_output=True, text=True, timeout=60)
+        assert "Traceback" not in done.stderr and "Exception ignored" not in done.stderr
 
 
 def test_saved_npz_holds_the_proved_path(apex_cli, easy: Path, tmp_path: Path) -> None:

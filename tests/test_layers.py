@@ -9,11 +9,11 @@ import pytest
 from support import ROOT
 
 LAYERS = [
-    {"errors", "schema"},
+    {"errors", "meshes", "schema"},
     {"problem"},
     {"robot"},
     {"collision"},
-    {"ik", "space"},
+    {"ik", "interrupt", "space"},
     {"goals", "grasp"},
     {"validity"},
     {"assembly", "simplify", "result", "moveit"},

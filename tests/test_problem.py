@@ -44,6 +44,13 @@ def test_reading_gives_states_in_the_order_asked_for(tmp_path: Path) -> None:
     assert problem.scene[0].shape == "box" and problem.attached[0].contact is not None
 
 
+def test_merge_keys_are_taken_in(tmp_path: Path) -> None:
+    text = FILE.replace("start: {a: 0.1, b: 1e-3}", "start: &s {a: 0.1, b: 1e-3}").replace(
+        "{a: 1, b: 2}", "{<<: *s, b: 2}"
+    )
+    assert load_text(tmp_path, text).goal_states(["a", "b"]).tolist() == [[0.1, 2.0]]
+
+
 def test_several_goals(tmp_path: Path) -> None:
     problem = load_text(tmp_path, FILE.replace("{a: 1, b: 2}", "[{a: 1, b: 2}, {b: 4, a: 3}]"))
     np.testing.assert_array_equal(problem.goal_states(["a", "b"]), [[1.0, 2.0], [3.0, 4.0]])
@@ -113,6 +120,13 @@ def test_pose_matrix_is_scipys(q: list[float]) -> None:
         ("a: 0.1", "a: .nan", ["start.a", "finite", "nan"]),
         ("a: 0.1", "a: .inf", ["start.a", "finite", "inf"]),
         ("a: 0.1", "a: fast", ["start.a", "number", "'fast'"]),
+        ("a: 0.1", "a: yes", ["start.a", "number", "True"]),
+        ("a: 0.1", "a: !!bool foo", ["valid YAML"]),
+        ("a: 0.1", "a: " + "[" * 3000, ["valid YAML"]),
+        ("position: [0.5, 0.0, 0.2]", "position: [1e300, 0.0, 0.2]", ["scene.0.position.0", "10000"]),
+        ("{joints: {a: 1, b: 2}}", "{alignment: {kind: diagonal, first: cup, second: b}}", ["alignment.kind"]),
+        ("goal: {joints: {a: 1, b: 2}}", "goal: {}", ["exactly one of joints, alignment"]),
+        ("{joints: {a: 1, b: 2}}", "{alignment: {kind: vertical, first: cup, second: cup}}", ["the same"]),
         ("a: 0.1", "a: 0.1, a: 0.2", ["line 10", "'a' is given twice"]),
         ("[0.1, 0.1, 0.4]", "[0.1, 0.1]", ["scene.0.box"]),
         ("[0.1, 0.1, 0.4]", "[0.1, 0.1, -0.4]", ["scene.0.box.2", "greater than 0", "-0.4"]),
@@ -154,6 +168,9 @@ def test_missing_and_unreadable_files(tmp_path: Path) -> None:
         Problem.load(tmp_path / "gone.yaml")
     with pytest.raises(MissingFileError, match="directory"):
         Problem.load(tmp_path)
+    for name in ("x\0y.yaml", "n" * 300 + ".yaml"):
+        with pytest.raises(MissingFileError):
+            Problem.load(tmp_path / name)
     (tmp_path / "binary.yaml").write_bytes(b"\xff\xfe\x00\x01")
     with pytest.raises(FileFormatError, match="UTF-8"):
         Problem.load(tmp_path / "binary.yaml")

@@ -195,3 +195,24 @@ def test_faulty_robot_files_say_what_is_wrong(tmp_path: Path) -> None:
     path.write_text(path.read_text() + "locked: {elbow: 0}\n")
     with pytest.raises(RobotError, match="no joint 'elbow'"):
         load_robot(path)
+    for lost in ('<box size="0.3,0.05,0.05"/>', '<box size="0.3 0.05"/>', "<ellipsoid/>"):
+        with pytest.raises(RobotError, match="'tip'|cannot read"):
+            load_robot(write_small(tmp_path, geometry=lost))
+
+
+def test_meshes_of_fixtures_lie_beside_the_robot_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = tmp_path / "deep"
+    folder.mkdir()
+    path = write_small(folder)
+    path.write_text(path.read_text() + "fixtures: [{name: f, mesh: {file: t.obj}}]\n")
+    monkeypatch.chdir(tmp_path)
+    (fixture,) = load_robot("deep/small.robot.yaml").fixtures
+    assert fixture.mesh is not None and fixture.mesh.file == str(folder / "t.obj")
+
+
+def test_the_hand_of_a_link_is_what_hangs_together_with_it(robot: Robot, baxter: Robot) -> None:
+    hand = robot.hand_of("left_hand_index_distal")
+    assert hand == robot.hand_of("left_hand_palm") and set(robot.part_links["left_hand"]) <= set(hand)
+    assert not any("right" in link for link in hand) and "left_link6" not in hand
+    assert "left_wrist" in baxter.hand_of("left_gripper") and "left_lower_forearm" not in baxter.hand_of("left_gripper")
+    assert not any("elbow" in link for link in baxter.hand_of("torso"))

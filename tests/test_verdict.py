@@ -11,8 +11,8 @@ from support import states_around_home
 
 from apex_ompl.collision import Verdict
 from apex_ompl.collision.containment import may_contain
-from apex_ompl.collision.shapes import triangles, winding_number
-from apex_ompl.errors import FileFormatError, MissingFileError, SceneError, UnknownNameError
+from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError, SceneError, UnknownNameError
+from apex_ompl.meshes import triangles, winding_number
 from apex_ompl.problem import AttachedObject, Obstacle
 from apex_ompl.robot import Robot
 from apex_ompl.robot.model import link_of
@@ -360,4 +360,121 @@ def test_faulty_changes_say_what_is_wrong(robot: Robot, verdict: Verdict, post: 
     (tmp_path / "bunny.stl").write_text("not a mesh")
     with pytest.raises(FileFormatError, match=r"bunny.stl"):
         verdict.add(gone)
+    assert verdict.is_free(robot.home)
+
+
+def rotated_half_spaces(rng: np.random.Generator, count: int) -> list[Obstacle]:
+    scene = []
+    for k in range(count):
+        turn = rng.normal(size=4)
+        turn = tuple(turn / np.linalg.norm(turn))
+        offset = -float(rng.uniform(0.5, 1.0))
+        scene.append(Obstacle(name=f"h{k}", half_space={"normal": (0, 0, 1), "offset": offset}, orientation=turn))
+    return scene
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 5])
+def test_several_turned_half_spaces_are_judged_by_their_definition(robot: Robot, count: int) -> None:
+    """Coal's boxes around turned half-spaces overflow; here the vertices of the arms' meshes decide."""
+    rng = np.random.default_rng(count)
+    items = [g for g in robot.geometry.geometryObjects if g.meshPath.endswith("stl") and g.parentJoint > 0]
+    clouds = [triangles(g.geometry)[0] for g in items]
+    data = robot.model.createData()
+    wrong = judged = 0
+    for _ in range(12):
+        scene = rotated_half_spaces(rng, count)
+        verdict = Verdict(robot, scene)
+        planes = [(s.pose[:3, :3] @ s.half_space.normal, s.half_space.offset) for s in scene]
+        for q in states_around_home(robot, rng, 8):
+            pin.forwardKinematics(robot.model, data, robot.to_pinocchio(q))
+            poses = [data.oMi[g.parentJoint] * g.placement for g in items]
+            low = min(
+                float((cloud @ pose.rotation.T + pose.translation).dot(n).min() - d)
+                for cloud, pose in zip(clouds, poses, strict=True)
+                for n, d in planes
+            )
+            if low < -1e-3:
+                judged += 1
+                wrong += verdict.is_free(q)
+    assert judged > 10 and wrong == 0
+
+
+def test_a_half_space_can_be_moved(robot: Robot) -> None:
+    floor = Obstacle(name="floor", half_space={"normal": (0, 0, 1)}, position=(0, 0, -1))
+    verdict = Verdict(robot, [floor])
+    assert verdict.is_free(robot.home)
+    verdict.move("floor", (0, 0, 0.2))
+    assert not verdict.is_free(robot.home)
+    verdict.move("floor", (0, 0, -0.5))
+    assert verdict.is_free(robot.home) and verdict.distance(robot.home).second == "floor"
+
+
+def cube(at: tuple[float, float, float], edge: float, first: int) -> tuple[list[str], list[str]]:
+    """Vertices and faces of a cube as OBJ lines; ``first`` is the number of its first vertex."""
+    lines = CUBE_OBJ.splitlines()
+    points = [[float(v) * edge + c for v, c in zip(x.split()[1:], at, strict=True)] for x in lines if x[0] == "v"]
+    faces = [[int(v) + first - 1 for v in x.split()[1:]] for x in lines if x[0] == "f"]
+    return [f"v {x} {y} {z}" for x, y, z in points], [f"f {a} {b} {c}" for a, b, c in faces]
+
+
+@pytest.mark.parametrize("swapped", [False, True])
+def test_each_piece_of_a_mesh_is_looked_for_inside_links(robot: Robot, tmp_path, swapped: bool) -> None:
+    item = next(g for g in robot.geometry.geometryObjects if link_of(robot.model, g) == "left_link4")
+    vertices, _ = triangles(item.geometry)
+    inside = robot.link_pose(robot.home, "left_link4") @ item.placement.homogeneous @ [*vertices.mean(axis=0), 1.0]
+    places = [tuple(inside[:3] - 0.01), (3.0, 3.0, 3.0)]
+    pieces = [cube(at, 0.02, 1 + 8 * k) for k, at in enumerate(places[::-1] if swapped else places)]
+    file = tmp_path / "two.obj"
+    file.write_text("\n".join([*(x for p in pieces for x in p[0]), *(x for p in pieces for x in p[1])]) + "\n")
+    verdict = Verdict(robot, [Obstacle(name="two", mesh={"file": str(file)})])
+    assert shell_contacts(verdict, robot.home) == []
+    assert not verdict.is_free(robot.home)
+
+
+FLAT = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\nf 1 2 3\nf 2 4 3\n"
+FLIPPED = CUBE_OBJ.replace("f 1 3 2", "f 1 2 3")
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (FLAT, "one plane"),
+        ("v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "one plane"),
+        (CUBE_OBJ.replace("v 1 1 1", "v nan 1 1"), "not finite"),
+        (CUBE_OBJ.replace("v 1 1 1", "v 1e300 1 1"), "too far"),
+        (FLIPPED, "oriented against each other"),
+        ("", "expected an STL or OBJ mesh"),
+    ],
+)
+def test_meshes_that_bound_no_solid_are_refused(robot: Robot, tmp_path, text: str, words: str) -> None:
+    """In Coal, flat and infinite ones end the process."""
+    file = tmp_path / "m.obj"
+    file.write_text(text)
+    with pytest.raises(FileFormatError, match=words):
+        Verdict(robot, [Obstacle(name="m", mesh={"file": str(file)})])
+
+
+def test_a_mesh_with_a_hole_is_judged_by_the_winding_number(robot: Robot, tmp_path) -> None:
+    file = tmp_path / "open.obj"
+    file.write_text(CUBE_OBJ.replace("f 5 6 7\n", ""))
+    for position, free in (((-3.0, -3.0, -3.0), False), ((20.0, 0.0, 0.0), True)):
+        room = Obstacle(name="room", mesh={"file": str(file), "scale": (6, 6, 6)}, position=position)
+        assert Verdict(robot, [room]).is_free(robot.home) == free
+
+
+def test_what_a_fixed_link_holds_collides_with_the_arms(baxter: Robot) -> None:
+    ball = AttachedObject(name="ball", link="torso", sphere={"radius": 0.9})
+    assert not Verdict(baxter, (), [ball]).is_free(baxter.home)
+    held = AttachedObject(name="ball", link="left_gripper", sphere={"radius": 0.5})
+    names = {c.first for c in Verdict(baxter, (), [held]).contacts(baxter.home)}
+    assert names and "left_wrist" not in names
+
+
+def test_wrong_numbers_of_joints_and_places_are_named(robot: Robot, verdict: Verdict) -> None:
+    for q in (np.zeros(5), np.zeros(20), np.float64(1.0)):
+        with pytest.raises(ParameterError, match="state: expected 16 joint values"):
+            verdict.is_free(q)
+    for position in ((np.nan, 0.0, 0.0), (1.0, 2.0), (1e300, 0.0, 0.0)):
+        with pytest.raises(FileFormatError, match="obstacle 'post': position"):
+            verdict.move("post", position)
     assert verdict.is_free(robot.home)

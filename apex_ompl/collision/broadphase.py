@@ -13,7 +13,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from apex_ompl.collision.containment import ANCHOR_RADIUS, Host, anchor_placement, may_contain
+from apex_ompl.collision.containment import ANCHOR_RADIUS, Host, anchor_points, may_contain
 from apex_ompl.collision.distance import HullDistances
 from apex_ompl.collision.shapes import is_shell
 from apex_ompl.problem import AttachedObject, Body
@@ -69,9 +69,12 @@ class CompiledScene:
         robot: Robot,
         obstacles: Mapping[str, Body],
         attached: Mapping[str, AttachedObject],
-        shapes: Mapping[str, coal.CollisionGeometry],
+        placed: Mapping[str, tuple[coal.CollisionGeometry, Array]],
     ) -> None:
-        """Compile ``obstacles`` (fixtures among them) and ``attached``, whose geometry is in ``shapes``."""
+        """Compile ``obstacles`` (fixtures among them) and ``attached``.
+
+        Their geometry and pose, in the world or in the link that holds them, are in ``placed``.
+        """
         self.model = robot.model
         self.data = robot.model.createData()
         self.geometry = robot.geometry.copy()
@@ -79,14 +82,15 @@ class CompiledScene:
         self.links = len(self.labels)
         self.scene: dict[str, int] = {}
         self.fixtures = frozenset(body.name for body in robot.fixtures)
-        for name, body in obstacles.items():
-            self.scene[name] = self._add(name, 0, 0, pin.SE3(body.pose), shapes[name])
+        for name in obstacles:
+            shape, pose = placed[name]
+            self.scene[name] = self._add(name, 0, 0, pin.SE3(pose), shape)
         self.held: dict[str, int] = {}
         for name, held in attached.items():
             frame = robot.model.frames[robot.link_frame(held.link)]
-            placement = frame.placement * pin.SE3(held.pose)
+            shape, pose = placed[name]
             parent = robot.link_frame(held.link)
-            self.held[name] = self._add(name, frame.parentJoint, parent, placement, shapes[name])
+            self.held[name] = self._add(name, frame.parentJoint, parent, frame.placement * pin.SE3(pose), shape)
         self.touch: dict[str, frozenset[str]] = {}
         for name, held in attached.items():
             default = robot.hand_of(held.link)
@@ -94,7 +98,8 @@ class CompiledScene:
         self._pair_up()
         self.pairs = [(p.first, p.second) for p in self.geometry.collisionPairs]
         self.same = list(range(self.geometry.ngeoms))  # geometry -> the geometry it stands for
-        self.hollow: list[tuple[int, int, Host]] = []
+        self.offsets: dict[int, pin.SE3] = {}  # geometry that stands for another -> where in the other's frame
+        self.hollow: list[tuple[int, int, Host, pin.SE3]] = []
         self._add_containment()
         self.geometry_data, self.manager = self._broadphase(self.geometry)
         self.second = self._second_stage()
@@ -121,11 +126,11 @@ class CompiledScene:
             self.geometry.addCollisionPair(pin.CollisionPair(i, j))
 
     def _add_containment(self) -> None:
-        """For every pair in which one may be wholly inside the mesh of the other, pair hull and point."""
+        """For every pair in which one may be wholly inside the mesh of the other, pair hull and points."""
         items = self.geometry.geometryObjects
         hosts: dict[int, Host] = {}
         hulls: dict[int, int] = {}
-        anchors: dict[int, int] = {}
+        anchors: dict[int, list[int]] = {}
         for a, b in self.pairs:
             if a < self.links and b < self.links:
                 continue
@@ -134,20 +139,25 @@ class CompiledScene:
                     continue
                 if h not in hosts:
                     hosts[h] = Host.of(items[h].geometry)
+                points = [pin.SE3(np.eye(3), point) for point in anchor_points(items[g].geometry)]
                 if not hosts[h].convex:
-                    self.hollow.append((h, g, hosts[h]))
+                    self.hollow += [(h, g, hosts[h], point) for point in points]
                     continue
                 if h not in hulls:
-                    hulls[h] = self._stand_in(h, "#hull", items[h].placement, hosts[h].hull)
+                    hulls[h] = self._stand_in(h, pin.SE3.Identity(), hosts[h].hull)
                 if g not in anchors:
-                    point = anchor_placement(items[g])
-                    anchors[g] = self._stand_in(g, "#point", point, coal.Sphere(ANCHOR_RADIUS))
-                self.geometry.addCollisionPair(pin.CollisionPair(hulls[h], anchors[g]))
+                    anchors[g] = [self._stand_in(g, point, coal.Sphere(ANCHOR_RADIUS)) for point in points]
+                for anchor in anchors[g]:
+                    self.geometry.addCollisionPair(pin.CollisionPair(hulls[h], anchor))
 
-    def _stand_in(self, index: int, suffix: str, placement: pin.SE3, shape: coal.CollisionGeometry) -> int:
+    def _stand_in(self, index: int, offset: pin.SE3, shape: coal.CollisionGeometry) -> int:
         item = self.geometry.geometryObjects[index]
+        number = self._add(
+            f"{item.name}#{len(self.same)}", item.parentJoint, item.parentFrame, item.placement * offset, shape
+        )
         self.same.append(index)
-        return self._add(item.name + suffix, item.parentJoint, item.parentFrame, placement, shape)
+        self.offsets[number] = offset
+        return number
 
     def _broadphase(self, geometry: pin.GeometryModel) -> tuple[pin.GeometryData, Any]:
         # The manager does not keep its arguments alive; this object does.
@@ -160,11 +170,11 @@ class CompiledScene:
             return None
         geometry = pin.GeometryModel()
         items = self.geometry.geometryObjects
-        for k, (h, g, host) in enumerate(self.hollow):
+        for k, (h, g, host, offset) in enumerate(self.hollow):
             a, b = items[h], items[g]
             point = coal.Sphere(ANCHOR_RADIUS)
             hull = pin.GeometryObject(f"hull{k}", a.parentJoint, a.parentFrame, a.placement, host.hull)
-            guest = pin.GeometryObject(f"point{k}", b.parentJoint, b.parentFrame, anchor_placement(b), point)
+            guest = pin.GeometryObject(f"point{k}", b.parentJoint, b.parentFrame, b.placement * offset, point)
             pair = [geometry.addGeometryObject(item) for item in (hull, guest)]
             geometry.addCollisionPair(pin.CollisionPair(*pair))
         return geometry, *self._broadphase(geometry)
@@ -174,15 +184,14 @@ class CompiledScene:
         index = self.scene[name]
         items = self.geometry.geometryObjects
         items[index].placement = placement
-        for k, original in enumerate(self.same):
-            if original == index and k != index:
-                hull = items[k].name.endswith("#hull")
-                items[k].placement = placement if hull else anchor_placement(items[index])
-        for k, (h, g, _) in enumerate(self.hollow):
+        for number, offset in self.offsets.items():
+            if self.same[number] == index:
+                items[number].placement = placement * offset
+        for k, (h, g, _, offset) in enumerate(self.hollow):
             if h == index:
                 self.second[0].geometryObjects[2 * k].placement = placement
             if g == index:
-                self.second[0].geometryObjects[2 * k + 1].placement = anchor_placement(items[index])
+                self.second[0].geometryObjects[2 * k + 1].placement = placement * offset
         self._distances.clear()
 
     def collides(self, q: Array) -> bool:
@@ -198,7 +207,7 @@ class CompiledScene:
             if not pin.computeCollisions(self.model, self.data, manager, q, True):
                 return []
             found = []
-            for k, (h, g, host) in enumerate(self.hollow):
+            for k, (h, g, host, _) in enumerate(self.hollow):
                 if pin.computeCollision(geometry, data, k):
                     point = data.oMg[2 * k].actInv(data.oMg[2 * k + 1].translation)
                     if host.contains(point):

@@ -1,9 +1,9 @@
 """The case that a shell misses: one solid wholly inside another whose surface is a triangle mesh.
 
 Meshes collide by their triangles alone, so a small obstacle wholly inside a link, or a link wholly inside a
-mesh obstacle, touches nothing. If nothing touches, a guest is either wholly inside its host or wholly outside,
-so one point of the guest decides. Links of the robot are no guests of each other: they hang together, and a
-chain cannot enter a shell without crossing it.
+mesh obstacle, touches nothing. If nothing touches, each connected piece of a guest is either wholly inside its
+host or wholly outside, so one point of each piece decides. Links of the robot are no guests of each other: they
+hang together, and a chain cannot enter a shell without crossing it.
 """
 
 from __future__ import annotations
@@ -12,10 +12,10 @@ from dataclasses import dataclass
 
 import coal
 import numpy as np
-import pinocchio as pin
 from numpy.typing import NDArray
 
-from apex_ompl.collision.shapes import convex_hull, is_shell, triangles, winding_number
+from apex_ompl.collision.shapes import convex_hull, is_shell
+from apex_ompl.meshes import is_closed, piece_points, triangles, winding_number
 
 ANCHOR_RADIUS = 1e-6  # [m]
 CONVEX_TOLERANCE = 1e-3  # a mesh is convex when its hull has no more than this share of extra volume
@@ -35,7 +35,7 @@ class Host:
         hull = convex_hull(mesh)
         vertices, faces = triangles(mesh)
         full = float(hull.computeVolume())
-        convex = abs(full - abs(float(mesh.computeVolume()))) <= CONVEX_TOLERANCE * full
+        convex = is_closed(vertices, faces) and abs(full - abs(float(mesh.computeVolume()))) <= CONVEX_TOLERANCE * full
         return cls(hull, convex, vertices[faces])
 
     def contains(self, point: NDArray[np.float64]) -> bool:
@@ -55,11 +55,9 @@ def may_contain(host: coal.BVHModelBase, guest: coal.CollisionGeometry) -> bool:
     return _inscribed_radius(guest) <= widest_ball and (is_shell(guest) or volume <= hull.computeVolume())
 
 
-def anchor_placement(item: pin.GeometryObject) -> pin.SE3:
-    """Return the placement, in the parent joint, of a point that belongs to the solid of ``item``."""
-    if is_shell(item.geometry):
-        return item.placement * pin.SE3(np.eye(3), np.array(item.geometry.vertex(0)))
-    return item.placement
+def anchor_points(geometry: coal.CollisionGeometry) -> NDArray[np.float64]:
+    """Return one point of each connected piece of a solid, in its own frame, shape (pieces, 3) [m]."""
+    return piece_points(*triangles(geometry)) if is_shell(geometry) else np.zeros((1, 3))
 
 
 def _inscribed_radius(guest: coal.CollisionGeometry) -> float:

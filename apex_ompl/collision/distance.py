@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -61,9 +62,14 @@ class HullDistances:
         for a, b in self._pairs:
             self._hulls.addCollisionPair(pin.CollisionPair(a, b))
         self._hull_data = self._hulls.createData()
+        self._lock = threading.Lock()
 
     def values(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the signed distance of every pair at a state in Pinocchio's order, shape (pairs,) [m]."""
+        with self._lock:
+            return self._values(q)
+
+    def _values(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
         pin.computeDistances(self._model, self._data, self._hulls, self._hull_data, q)
         return np.array([result.min_distance for result in self._hull_data.distanceResults])
 
@@ -71,9 +77,10 @@ class HullDistances:
         """Return the closest pair at a state in Pinocchio's order."""
         if not self._pairs:
             return NO_PAIR
-        values = self.values(q)
-        k = int(np.argmin(values))
-        result = self._hull_data.distanceResults[k]
-        points = np.array([result.getNearestPoint1(), result.getNearestPoint2()])
+        with self._lock:
+            values = self._values(q)
+            k = int(np.argmin(values))
+            result = self._hull_data.distanceResults[k]
+            points = np.array([result.getNearestPoint1(), result.getNearestPoint2()])
         first, second = (self._labels[i] for i in self._pairs[k])
         return Distance(float(values[k]), first, second, points)

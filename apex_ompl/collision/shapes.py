@@ -9,7 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apex_ompl.errors import FileFormatError, MissingFileError
+from apex_ompl.meshes import extent_fault, orientation_fault, triangles
 from apex_ompl.problem import Body
+from apex_ompl.schema import is_file
 
 
 def coal_geometry(body: Body) -> coal.CollisionGeometry:
@@ -20,7 +22,7 @@ def coal_geometry(body: Body) -> coal.CollisionGeometry:
 
     Raises:
         MissingFileError: The mesh file cannot be read.
-        FileFormatError: The mesh file holds no triangles.
+        FileFormatError: The mesh file holds no solid; see ``apex_ompl.meshes``.
     """
     if body.box is not None:
         return coal.Box(*body.box)
@@ -31,11 +33,32 @@ def coal_geometry(body: Body) -> coal.CollisionGeometry:
     if body.capsule is not None:
         return coal.Capsule(body.capsule.radius, body.capsule.length)
     if body.half_space is not None:
-        normal = np.asarray(body.half_space.normal, float)
-        length = float(np.linalg.norm(normal))
-        return coal.Halfspace(normal / length, body.half_space.offset / length)
+        return _half_space(np.asarray(body.half_space.normal, float), body.half_space.offset)
     assert body.mesh is not None
     return _load_mesh(body.name, body.mesh.file, np.asarray(body.mesh.scale, float))
+
+
+def world_geometry(body: Body) -> tuple[coal.CollisionGeometry, NDArray[np.float64]]:
+    """Return the Coal geometry of a body and its placement in the world, shape (4, 4).
+
+    A half-space is given in world coordinates with the identity as placement: Coal's bounding box of a rotated
+    one overflows, and the broadphase then misses collisions.
+
+    Raises:
+        MissingFileError: The mesh file cannot be read.
+        FileFormatError: The mesh file holds no solid.
+    """
+    if body.half_space is None:
+        return coal_geometry(body), body.pose
+    normal = body.pose[:3, :3] @ np.asarray(body.half_space.normal, float)
+    length = float(np.linalg.norm(normal))
+    offset = body.half_space.offset / length + float(normal @ body.pose[:3, 3]) / length
+    return _half_space(normal / length, offset), np.eye(4)
+
+
+def _half_space(normal: NDArray[np.float64], offset: float) -> coal.Halfspace:
+    length = float(np.linalg.norm(normal))
+    return coal.Halfspace(normal / length, offset / length)
 
 
 def is_shell(geometry: coal.CollisionGeometry) -> bool:
@@ -52,37 +75,19 @@ def convex_hull(geometry: coal.CollisionGeometry) -> coal.CollisionGeometry:
     return geometry.convex
 
 
-def triangles(mesh: coal.BVHModelBase) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Return the vertices, shape (V, 3) [m], and the vertex indices of the triangles, shape (T, 3)."""
-    faces = [mesh.tri_indices(k) for k in range(mesh.num_tris)]
-    return np.array(mesh.vertices()), np.array([[t[0], t[1], t[2]] for t in faces])
-
-
 def _load_mesh(name: str, file: str, scale: NDArray[np.float64]) -> coal.CollisionGeometry:
     role = f"mesh of {name!r}"
-    if not Path(file).is_file():
+    if not is_file(Path(file)):
         raise MissingFileError(file, role)
     try:
         mesh = coal.MeshLoader().load(file, scale)
     except Exception as error:
-        raise FileFormatError(file, "", str(error), f"expected a readable mesh ({role})") from error
+        raise FileFormatError(file, "", "something else", f"expected an STL or OBJ mesh ({role})") from error
     if mesh is None or mesh.num_tris == 0:
-        raise FileFormatError(file, "", "no triangles", f"expected a triangle mesh ({role})")
+        fault = "no triangles"
+    else:
+        vertices, faces = triangles(mesh)
+        fault = extent_fault(vertices) or orientation_fault(vertices, faces)
+    if fault:
+        raise FileFormatError(file, "", fault, f"expected a closed mesh of consistently oriented triangles ({role})")
     return mesh
-
-
-def winding_number(point: NDArray[np.float64], corners: NDArray[np.float64]) -> float:
-    """Return how often a closed triangle mesh winds around a point: about 1 inside, 0 outside.
-
-    Args:
-        point: Shape (3,), not on the surface.
-        corners: Corners of the triangles, shape (T, 3, 3), counter-clockwise from outside.
-
-    The solid angle of each triangle is taken by the formula of van Oosterom and Strackee (1983).
-    """
-    a, b, c = np.moveaxis(corners - point, 1, 0)
-    la, lb, lc = (np.linalg.norm(v, axis=1) for v in (a, b, c))
-    numerator = np.einsum("ij,ij->i", a, np.cross(b, c))
-    dots = [np.einsum("ij,ij->i", u, v) for u, v in ((a, b), (b, c), (c, a))]
-    denominator = la * lb * lc + dots[0] * lc + dots[1] * la + dots[2] * lb
-    return float(np.arctan2(numerator, denominator).sum() / (2.0 * np.pi))

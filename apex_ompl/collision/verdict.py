@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 
 from apex_ompl.collision.broadphase import CompiledScene, Contact
 from apex_ompl.collision.distance import Distance
-from apex_ompl.collision.shapes import coal_geometry
+from apex_ompl.collision.shapes import coal_geometry, world_geometry
 from apex_ompl.errors import SceneError
-from apex_ompl.problem import AttachedObject, Body, Obstacle, pose_matrix
+from apex_ompl.problem import AttachedObject, Body, Obstacle
 from apex_ompl.robot import Robot
+from apex_ompl.schema import validate
 
 Array = NDArray[np.float64]
 
@@ -24,8 +25,9 @@ class Verdict:
     """Judges states of a robot in a scene by Coal's meshes under Pinocchio's AABB-tree broadphase.
 
     Meshes collide by their triangles, primitives as solids, and one solid wholly inside a mesh counts as a
-    collision. A state with a number that is not finite is never free. Limits are not judged here. A verdict
-    may be used from several threads; each thread that plans on its own should have its own.
+    collision. What never moves, such as a robot's base, is not judged against what never moves. A state with a number
+    that is not finite is never free. Limits are not judged here. Queries may come from several threads, as they do
+    from planners that run threads; scene changes may not, and each plan should have a verdict of its own.
     """
 
     def __init__(
@@ -46,7 +48,7 @@ class Verdict:
         self.calls = 0
         self._obstacles: dict[str, Body] = {}
         self._attached: dict[str, AttachedObject] = {}
-        self._shapes: dict[str, coal.CollisionGeometry] = {}
+        self._placed: dict[str, tuple[coal.CollisionGeometry, Array]] = {}
         self._compiled: CompiledScene | None = None
         self._fixtures = frozenset(body.name for body in robot.fixtures)
         for body in (*robot.fixtures, *scene):
@@ -68,7 +70,7 @@ class Verdict:
             FileFormatError: Its mesh file holds no triangles.
         """
         self._claim(obstacle.name)
-        self._shapes[obstacle.name] = coal_geometry(obstacle)
+        self._placed[obstacle.name] = world_geometry(obstacle)
         self._obstacles[obstacle.name] = obstacle
         self._compiled = None
 
@@ -77,12 +79,20 @@ class Verdict:
 
         Raises:
             SceneError: There is no such obstacle.
+            FileFormatError: The position or the orientation is none.
         """
         old = self._find(self._obstacles, name, "obstacle")
         turn = old.orientation if orientation is None else orientation
-        self._obstacles[name] = old.model_validate({**old.model_dump(), "position": position, "orientation": turn})
+        fields = {**old.model_dump(), "position": tuple(position), "orientation": tuple(turn)}
+        new = validate(type(old), fields, f"obstacle {name!r}")
+        self._obstacles[name] = new
+        if new.half_space is not None:  # its pose is part of its geometry
+            self._placed[name] = world_geometry(new)
+            self._compiled = None
+            return
+        self._placed[name] = (self._placed[name][0], new.pose)
         if self._compiled is not None:
-            self._compiled.place(name, pin.SE3(pose_matrix(position, turn)))
+            self._compiled.place(name, pin.SE3(new.pose))
 
     def remove(self, name: str) -> None:
         """Remove an obstacle.
@@ -91,7 +101,7 @@ class Verdict:
             SceneError: There is no such obstacle.
         """
         self._find(self._obstacles, name, "obstacle")
-        del self._obstacles[name], self._shapes[name]
+        del self._obstacles[name], self._placed[name]
         self._compiled = None
 
     def attach(self, held: AttachedObject) -> None:
@@ -106,7 +116,7 @@ class Verdict:
         self._claim(held.name)
         for link in (held.link, *(held.touch_links or ())):
             self.robot.link_frame(link)
-        self._shapes[held.name] = coal_geometry(held)
+        self._placed[held.name] = (coal_geometry(held), held.pose)
         self._attached[held.name] = held
         self._compiled = None
 
@@ -117,7 +127,7 @@ class Verdict:
             SceneError: There is no such held object.
         """
         self._find(self._attached, name, "held object")
-        del self._attached[name], self._shapes[name]
+        del self._attached[name], self._placed[name]
         self._compiled = None
 
     def is_free(self, q: Array) -> bool:
@@ -162,6 +172,6 @@ class Verdict:
     def _scene(self) -> CompiledScene:
         compiled = self._compiled
         if compiled is None:
-            compiled = CompiledScene(self.robot, self._obstacles, self._attached, self._shapes)
+            compiled = CompiledScene(self.robot, self._obstacles, self._attached, self._placed)
             self._compiled = compiled
         return compiled

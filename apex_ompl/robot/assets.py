@@ -7,6 +7,7 @@ from functools import cache
 from pathlib import Path
 
 from apex_ompl.errors import MissingFileError
+from apex_ompl.schema import is_file
 
 DATA = Path(__file__).parent / "data"
 
@@ -40,12 +41,12 @@ def resolve(uri: str, relative_to: Path, role: str) -> Path:
     if uri.startswith("package://"):
         rest = uri.removeprefix("package://")
         for root in package_roots():
-            if (root / rest).is_file():
+            if is_file(root / rest):
                 return root / rest
         package = rest.split("/", 1)[0]
         raise MissingFileError(uri, role, f"not under any package folder; is the package {package!r} installed?")
-    path = Path(uri.removeprefix("file://")).expanduser()
+    path = Path(uri.removeprefix("file://"))
     path = path if path.is_absolute() else relative_to / path
-    if not path.is_file():
+    if not is_file(path):
         raise MissingFileError(str(path), role)
     return path

@@ -65,7 +65,10 @@ def compose(config: RobotConfig, folder: Path) -> Composition:
         children = {c.get("link") for c in root.iterfind("joint/child")}
         if part.parent not in links:
             raise RobotError(f"part {part.name!r}: no link {part.parent!r} to mount it on")
-        _mount(root, part, next(n for n in names if n not in children))
+        roots = [n for n in names if n not in children]
+        if len(roots) != 1:
+            raise RobotError(f"part {part.name!r}: expected one root link, found {', '.join(roots) or 'none'}")
+        _mount(root, part, roots[0])
         links.update(names)
         part_links[part.name] = tuple(names)
         if part.srdf:
@@ -156,7 +159,7 @@ def _lock(root: ET.Element, name: str, value: float) -> None:
         raise RobotError(f"locked: the joint {name!r} is {kind}, expected revolute, continuous or prismatic")
     axis_element = joint.find("axis")
     text = "1 0 0" if axis_element is None else axis_element.get("xyz", "1 0 0")
-    axis = np.array([float(v) for v in text.split()])
+    axis = _floats(text, name)
     axis /= np.linalg.norm(axis)
     motion = np.eye(4)
     if kind == "prismatic":
@@ -166,13 +169,23 @@ def _lock(root: ET.Element, name: str, value: float) -> None:
     origin = joint.find("origin")
     placement = np.eye(4)
     if origin is not None:
-        placement[:3, 3] = [float(v) for v in origin.get("xyz", "0 0 0").split()]
-        placement[:3, :3] = pin.rpy.rpyToMatrix(*[float(v) for v in origin.get("rpy", "0 0 0").split()])
+        placement[:3, 3] = _floats(origin.get("xyz", "0 0 0"), name)
+        placement[:3, :3] = pin.rpy.rpyToMatrix(*_floats(origin.get("rpy", "0 0 0"), name))
     for tag in ("origin", "axis", "limit", "mimic", "dynamics", "safety_controller"):
         for element in joint.findall(tag):
             joint.remove(element)
     joint.set("type", "fixed")
     _set_origin(joint, placement @ motion)
+
+
+def _floats(text: str, joint: str) -> np.ndarray:
+    try:
+        values = np.array([float(v) for v in text.split()])
+    except ValueError:
+        values = np.empty(0)
+    if values.shape != (3,) or not np.isfinite(values).all():
+        raise RobotError(f"joint {joint!r}: expected three numbers, got {text!r}")
+    return values
 
 
 def _set_origin(joint: ET.Element, pose: np.ndarray) -> None:

@@ -8,7 +8,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, PositiveFloat, model_validator
 
 from apex_ompl.errors import FileFormatError
-from apex_ompl.problem import Body, Name, Quaternion, Vector
+from apex_ompl.problem import Body, Name, Quaternion, Vector, located
 from apex_ompl.schema import StrictModel, read_yaml, validate
 
 SCHEMA = "apex-ompl/robot/1"
@@ -132,7 +132,8 @@ def read_config(path: Path) -> RobotConfig:
     data = read_yaml(path, "robot file")
     if data.get("schema") != SCHEMA:
         raise FileFormatError(str(path), "schema", data.get("schema"), f"expected {SCHEMA!r}")
-    return validate(RobotConfig, data, str(path))
+    config = validate(RobotConfig, data, str(path))
+    return config.model_copy(update={"fixtures": tuple(located(f, path.parent) for f in config.fixtures)})
 
 
 def read_disabled_pairs(path: Path) -> list[tuple[str, str]]:

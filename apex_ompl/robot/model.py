@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
 from pathlib import Path
+from xml.etree import ElementTree as ET
 
+import coal
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from apex_ompl.errors import FileFormatError, RobotError, UnknownNameError
+from apex_ompl.errors import FileFormatError, ParameterError, RobotError, UnknownNameError
+from apex_ompl.meshes import extent_fault
 from apex_ompl.problem import Body
 from apex_ompl.robot.assets import DATA, resolve
 from apex_ompl.robot.compose import compose
@@ -81,8 +85,15 @@ class Robot:
         return tuple(f.name for f in self.model.frames if f.type == pin.FrameType.BODY)
 
     def to_pinocchio(self, q: Array) -> Array:
-        """Return a state, shape (dof,), or states, shape (N, dof), in Pinocchio's order, as a new array."""
-        return np.asarray(q, dtype=float)[..., self._order]
+        """Return a state, shape (dof,), or states, shape (N, dof), in Pinocchio's order, as a new array.
+
+        Raises:
+            ParameterError: Another number of joint values.
+        """
+        q = np.asarray(q, dtype=float)
+        if q.ndim == 0 or q.shape[-1] != len(self._order):
+            raise ParameterError("state", q.shape, f"{len(self._order)} joint values")
+        return q[..., self._order]
 
     def link_frame(self, link: str) -> int:
         """Return the Pinocchio frame of a link.
@@ -125,6 +136,8 @@ class Robot:
         joint = model.frames[self.link_frame(link)].parentJoint
         while joint > 0 and model.joints[joint].nq == 0:
             joint = model.parents[joint]
+        if joint == 0:  # fixed to the world: nothing moves it, and nothing else hangs on it
+            return tuple(f.name for f in model.frames if f.type == pin.FrameType.BODY and f.parentJoint == 0)
         below = {joint}
         for k in range(1, model.njoints):  # parents come before their children
             if model.parents[k] in below:
@@ -191,6 +204,7 @@ def build_robot(config: RobotConfig, path: Path) -> Robot:
         geometry = pin.buildGeomFromUrdfString(model, composition.urdf, pin.GeometryType.COLLISION)
     except Exception as error:  # Pinocchio's parser raises several kinds
         raise RobotError(f"{path}: Pinocchio cannot read the composed URDF ({error})") from error
+    _check_geometry(model, geometry, composition.urdf, path)
     order = _state_order(config, model, path)
     disabled = list(composition.disabled_pairs)
     if config.disabled_pairs:
@@ -220,6 +234,20 @@ def build_robot(config: RobotConfig, path: Path) -> Robot:
 def link_of(model: pin.Model, item: pin.GeometryObject) -> str:
     """Return the name of the link that a geometry belongs to."""
     return str(model.frames[item.parentFrame].name)
+
+
+def _check_geometry(model: pin.Model, geometry: pin.GeometryModel, urdf: str, path: Path) -> None:
+    """Refuse links whose collision geometry Pinocchio dropped, or that is no solid."""
+    found = Counter(link_of(model, item) for item in geometry.geometryObjects)
+    for link in ET.fromstring(urdf).findall("link"):
+        name, wanted = str(link.get("name")), len(link.findall("collision"))
+        if found[name] != wanted:
+            raise RobotError(f"{path}: link {name!r} has {wanted} collision geometries, {found[name]} can be read")
+    for item in geometry.geometryObjects:
+        mesh = item.geometry
+        fault = extent_fault(np.array(mesh.vertices())) if mesh.getObjectType() == coal.OT_BVH else ""
+        if fault:
+            raise RobotError(f"{path}: the collision mesh of link {link_of(model, item)!r} has {fault}")
 
 
 def _state_order(config: RobotConfig, model: pin.Model, path: Path) -> NDArray[np.intp]:

@@ -1,0 +1,63 @@
+"""Ctrl-C during a plan: an exception inside OMPL's callbacks would end the process, so it waits its turn."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import TracebackType
+from typing import Self
+
+from ompl import base as ob
+
+
+class Interrupt:
+    """Holds SIGINT back while planning: it ends the planner at work, and is raised when planning has ended.
+
+    Outside the main thread, where Python allows no signal handlers, it does nothing.
+
+    Attributes:
+        pressed: Whether SIGINT came.
+    """
+
+    def __init__(self) -> None:
+        """Start without a handler; the ``with`` statement sets it."""
+        self.pressed = False
+        self._conditions: list[ob.PlannerTerminationCondition] = []
+        self._before: object = None
+
+    def __enter__(self) -> Self:
+        """Take SIGINT over."""
+        if threading.current_thread() is threading.main_thread():
+            self._before = signal.signal(signal.SIGINT, self._handle)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Give SIGINT back, and raise KeyboardInterrupt when it came.
+
+        Raises:
+            KeyboardInterrupt: SIGINT came in the meantime.
+        """
+        if self._before is not None:
+            signal.signal(signal.SIGINT, self._before)  # type: ignore[arg-type]
+        if self.pressed:
+            raise KeyboardInterrupt
+
+    @contextmanager
+    def ends(self, condition: ob.PlannerTerminationCondition) -> Iterator[ob.PlannerTerminationCondition]:
+        """While the block runs, let SIGINT end the planner that watches ``condition``."""
+        self._conditions.append(condition)
+        if self.pressed:
+            condition.terminate()
+        try:
+            yield condition
+        finally:
+            self._conditions.remove(condition)
+
+    def _handle(self, *_: object) -> None:
+        self.pressed = True
+        for condition in self._conditions:
+            condition.terminate()
