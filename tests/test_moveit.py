@@ -1,0 +1,111 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from moveit_files import REQUEST, SCENE
+from scipy.spatial.transform import Rotation
+from test_verdict import CUBE_OBJ
+
+from apex_ompl.errors import ApexError, FileFormatError
+from apex_ompl.moveit import Conversion, convert
+from apex_ompl.robot import Robot
+
+JOINTS = {f"panda_joint{k}": f"left_joint{k}" for k in range(1, 8)}
+FRAMES = {"base_link": "world", "palm": "left_hand_palm"}
+
+
+def converted(folder: Path, robot: Robot, scene: str = SCENE, request: str = REQUEST) -> Conversion:
+    (folder / "scene0001.yaml").write_text(scene)
+    (folder / "request0001.yaml").write_text(request)
+    (folder / "rock.obj").write_text(CUBE_OBJ)
+    return convert(folder / "scene0001.yaml", folder / "request0001.yaml", robot, JOINTS, FRAMES)
+
+
+def test_every_shape_lands_where_the_messages_put_it(robot: Robot, tmp_path: Path) -> None:
+    done = converted(tmp_path, robot)
+    bodies = {b.name: b for b in done.problem.scene}
+    assert set(bodies) == {"base/0", "base/1", "pillar", "rock"}
+    turn = Rotation.from_euler("z", 90, degrees=True)
+    assert bodies["base/0"].box == (0.4, 0.1, 0.2)
+    np.testing.assert_allclose(bodies["base/0"].pose[:3, :3], turn.as_matrix(), atol=1e-6)
+    expected = np.array([0.5, 0.0, 0.1]) + turn.apply([0.1, 0.0, 0.2])  # object pose, then primitive pose
+    np.testing.assert_allclose(bodies["base/1"].position, expected, atol=1e-6)
+    assert bodies["base/1"].sphere.radius == 0.05
+    assert (bodies["pillar"].cylinder.radius, bodies["pillar"].cylinder.length) == (0.04, 0.6)
+    np.testing.assert_allclose(bodies["pillar"].position, [0.45, 0.1, 0.3])
+    assert bodies["rock"].mesh.file == str(tmp_path / "rock.obj") and bodies["rock"].mesh.scale == (0.1, 0.1, 0.1)
+    (cup,) = done.problem.attached
+    assert cup.link == "left_hand_palm" and cup.cylinder.radius == 0.03
+    np.testing.assert_allclose(cup.position, [0.0, 0.02, -0.04])
+
+
+def test_joints_come_by_the_map_and_the_rest_stays_home(robot: Robot, tmp_path: Path) -> None:
+    problem = converted(tmp_path, robot).problem
+    start = problem.start_state(robot.joint_names)
+    expected = robot.home.copy()
+    expected[[0, 1, 3, 14]] = 0.6, 0.3, -1.6, 0.2
+    np.testing.assert_array_equal(start, expected)
+    expected[0] = -1.35
+    np.testing.assert_array_equal(problem.goal_states(robot.joint_names), [expected])
+
+
+def test_what_is_left_out_is_named(robot: Robot, tmp_path: Path) -> None:
+    notes = "\n".join(converted(tmp_path, robot).notes)
+    for word in ("'finger'", "unheard_of", "planner_id: not used", "taken at home"):
+        assert word in notes
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("type: box", "type: cone", ["collision_objects.0.primitives.0.type", "'cone'", "cannot be read"]),
+        ("[0.4, 0.1, 0.2]", "[0.4, 0.1]", ["primitives.0.dimensions", "3 numbers"]),
+        ("frame_id: base_link", "frame_id: moon", ["'moon'", "--frame moon=LINK"]),
+        ("resource: rock.obj", "resource: gone.obj", ["gone.obj", "no such file"]),
+        ("{resource: rock.obj, dimensions: [0.1, 0.1, 0.1]}", "{vertices: []}", ["meshes.0", "mesh by path"]),
+        ("position: [0.1, 0, 0.2]", "position: [0.1, 0]", ["primitive_poses.1.position", "3 finite numbers"]),
+        ("position: [0.2]", "position: []", ["robot_state.joint_state", "expected 1 positions"]),
+    ],
+)
+def test_what_matters_and_cannot_be_read_is_an_error(
+    robot: Robot, tmp_path: Path, old: str, new: str, words: list[str]
+) -> None:
+    assert old in SCENE
+    with pytest.raises(ApexError) as caught:
+        converted(tmp_path, robot, scene=SCENE.replace(old, new))
+    for word in words:
+        assert word in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("addition", "word"),
+    [
+        ("path_constraints: {joint_constraints: [{joint_name: x}]}", "path_constraints"),
+        ("trajectory_constraints: {constraints: [{name: x}]}", "trajectory_constraints"),
+    ],
+)
+def test_constraints_that_would_change_the_problem_are_errors(
+    robot: Robot, tmp_path: Path, addition: str, word: str
+) -> None:
+    with pytest.raises(FileFormatError, match=word):
+        converted(tmp_path, robot, request=REQUEST + addition)
+    pose_goal = REQUEST.split("goal_constraints")[0] + "goal_constraints: [{position_constraints: [{link_name: x}]}]"
+    with pytest.raises(FileFormatError, match="position_constraints"):
+        converted(tmp_path, robot, request=pose_goal)
+    with pytest.raises(FileFormatError, match="goal_constraints"):
+        converted(tmp_path, robot, request=REQUEST.split("goal_constraints")[0])
+
+
+def test_the_command_converts_and_what_it_writes_plans(apex_cli, robot: Robot, tmp_path: Path) -> None:
+    converted(tmp_path, robot)
+    arguments = ["convert", tmp_path / "scene0001.yaml", tmp_path / "request0001.yaml", "-o", tmp_path / "p.yaml"]
+    arguments += [word for pair in JOINTS.items() for word in ("--joint", "=".join(pair))]
+    arguments += [word for pair in FRAMES.items() for word in ("--frame", "=".join(pair))]
+    done = apex_cli(*arguments)
+    assert done.returncode == 0 and done.stderr.count("note:") >= 3, done.stderr
+    planned = apex_cli("plan", tmp_path / "p.yaml", "--timeout", 30)
+    assert planned.returncode == 0, planned.stdout + planned.stderr
+    wrong = apex_cli(*arguments[:3], "-o", tmp_path / "q.txt")
+    assert wrong.returncode == 2 and "ending in .yaml" in wrong.stderr
