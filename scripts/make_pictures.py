@@ -1,0 +1,32 @@
+"""Draw every ready-made problem, and the axes of a vertical and a horizontal goal, into docs/pictures.
+
+Usage: python scripts/make_pictures.py
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from apex_ompl import load_problem, plan, problems
+from apex_ompl.render import render
+
+OUT = Path(__file__).resolve().parent.parent / "docs" / "pictures"
+SIZE = (960, 720)
+FROM_BEHIND = {"shelf_swap": 150.0}
+
+
+def main() -> None:
+    """Draw the problems, and the motion of the first one in README."""
+    argparse.ArgumentParser(description=__doc__.splitlines()[0]).parse_args()
+    OUT.mkdir(parents=True, exist_ok=True)
+    for name in problems.names():
+        render(load_problem(name), OUT / f"{name}.png", SIZE, FROM_BEHIND.get(name, 26.0))
+        print(OUT / f"{name}.png")
+    result = plan("ball_in_cup", timeout=20.0)
+    render(result, OUT / "ball_in_cup_motion.png", (1280, 960))
+    print(OUT / "ball_in_cup_motion.png")
+
+
+if __name__ == "__main__":
+    main()
