@@ -84,10 +84,14 @@ def plan(
 ) -> PlanResult:
     """Plan a path and prove it by the full check.
 
+    The straight line to each goal is tried before the planner runs. What the planner finds is shortened, proved, and
+    planned anew where the proof fails.
+
     Args:
         problem: A problem, its name, or its file.
         planner: Name of a planner, see ``apex_ompl.planners.names()``.
-        timeout: Seconds for finding and repairing a path; shortening comes after.
+        timeout: Seconds for finding and repairing a path; shortening, which is capped by counts, comes on top. Of
+            planners that stop at the timeout only, a tenth, at most 0.5 s, is kept for repair.
         seed: Seed of all random numbers, 0 or more. The same seed gives the same path for planners that are
             neither stopped by the clock nor threaded, as long as no other thread plans at the same time (OMPL
             seeds one generator per process).

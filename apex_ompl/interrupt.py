@@ -7,7 +7,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 from ompl import base as ob
 
@@ -25,7 +25,7 @@ class Interrupt:
         """Start without a handler; the ``with`` statement sets it."""
         self.pressed = False
         self._conditions: list[ob.PlannerTerminationCondition] = []
-        self._before: object = None
+        self._before: Any = None
 
     def __enter__(self) -> Self:
         """Take SIGINT over."""
@@ -42,7 +42,7 @@ class Interrupt:
             KeyboardInterrupt: SIGINT came in the meantime.
         """
         if self._before is not None:
-            signal.signal(signal.SIGINT, self._before)  # type: ignore[arg-type]
+            signal.signal(signal.SIGINT, self._before)
         if self.pressed:
             raise KeyboardInterrupt
 

@@ -37,9 +37,7 @@ def orientation_fault(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -
         vertices: Shape (V, 3) [m].
         faces: Indices of the corners, shape (T, 3).
     """
-    corners = weld(vertices)[faces]
-    corners = corners[(corners != np.roll(corners, 1, axis=1)).all(axis=1)]  # without slivers
-    edges = np.concatenate([corners[:, [k, (k + 1) % 3]] for k in range(3)])
+    edges = _edges(vertices, faces)
     turned = edges[:, 0] > edges[:, 1]
     _, place, uses = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
     balance = np.bincount(place.ravel(), weights=np.where(turned, -1.0, 1.0))
@@ -50,10 +48,15 @@ def orientation_fault(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -
 
 def is_closed(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> bool:
     """Whether every edge of a mesh belongs to more than one triangle."""
+    edges = np.sort(_edges(vertices, faces), axis=1)
+    return bool((np.unique(edges, axis=0, return_counts=True)[1] > 1).all())
+
+
+def _edges(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the directed edges of all triangles as numbers of places, shape (E, 2), without those of slivers."""
     corners = weld(vertices)[faces]
     corners = corners[(corners != np.roll(corners, 1, axis=1)).all(axis=1)]
-    edges = np.sort(np.concatenate([corners[:, [k, (k + 1) % 3]] for k in range(3)]), axis=1)
-    return bool((np.unique(edges, axis=0, return_counts=True)[1] > 1).all())
+    return np.concatenate([corners[:, [k, (k + 1) % 3]] for k in range(3)])
 
 
 def weld(vertices: NDArray[np.float64]) -> NDArray[np.int64]:

@@ -44,7 +44,7 @@ class HandPose:
 
 @dataclass(frozen=True)
 class Reach:
-    """A problem between (left, right) hand poses; ``hands`` are what they hold, or their synergies."""
+    """A problem between (left, right) hand poses, with what the hands hold, or with their synergies."""
 
     file: str
     robot: str

@@ -1,4 +1,4 @@
-"""Draw every ready-made problem, and the axes of a vertical and a horizontal goal, into docs/pictures.
+"""Draw every ready-made problem, and the motion at the head of README, into docs/pictures.
 
 Usage: python scripts/make_pictures.py
 """

@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 
 from apex_ompl.collision import Verdict
@@ -37,7 +38,10 @@ def problem(robot: Robot, post: Obstacle) -> Problem:
     start, goal = robot.home.copy(), robot.home.copy()
     start[[0, 1, 3]] = 0.1, 0.4, -1.6
     goal[[0, 1, 3]] = -1.3, 0.4, -1.6
-    as_dict = lambda q: dict(zip(robot.joint_names, q.tolist(), strict=True))  # noqa: E731
+
+    def as_dict(q: np.ndarray) -> dict[str, float]:
+        return dict(zip(robot.joint_names, q.tolist(), strict=True))
+
     return Problem(
         name="sweep", robot=robot.name, scene=(post,), start=as_dict(start), goal=Goal(joints=(as_dict(goal),))
     )
