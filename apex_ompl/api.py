@@ -203,7 +203,7 @@ class _Run:
     def finish(self, started: float, result: PlanResult) -> PlanResult:
         """Add clearance, length, counts and times."""
         path = result.path
-        checks = self.ready.verdict.calls
+        checks = self.ready.verdict.tally.states
         if path is not None:
             with self._timed("clearance"):
                 states = resample(path, CLEARANCE_SAMPLES)

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -19,37 +17,6 @@ from apex_ompl.space import FULL_RESOLUTION, SEARCH_RESOLUTION
 Array = NDArray[np.float64]
 
 
-@lru_cache(maxsize=256)
-def bit_reversed(n: int) -> NDArray[np.intp]:
-    """Return 0..n-1 in bit-reversed order, shape (n,): each prefix is spread evenly over the range.
-
-    A path that collides somewhere is so rejected after few states (van der Corput's sequence).
-    """
-    bits = max(n - 1, 1).bit_length()
-    numbers = np.arange(1 << bits)
-    turned = np.zeros_like(numbers)
-    for k in range(bits):
-        turned |= ((numbers >> k) & 1) << (bits - 1 - k)
-    order = turned[turned < n].astype(np.intp)
-    order.flags.writeable = False
-    return order
-
-
-def states_between(a: Array, b: Array, resolution: float) -> Array:
-    """Return evenly spaced states strictly between two, at most ``resolution`` apart [rad, max-norm].
-
-    Args:
-        a: First state, shape (dof,).
-        b: Last state, shape (dof,).
-        resolution: Largest spacing, from ``a`` and to ``b`` too.
-
-    Returns:
-        States, shape (M, dof); M is 0 when ``a`` and ``b`` are close enough.
-    """
-    n = max(1, math.ceil(float(np.abs(b - a).max()) / resolution))
-    return a + (np.arange(1, n) / n)[:, None] * (b - a)
-
-
 class MotionCheck:
     """Judges straight motions between states at a spacing; a plain callable, without OMPL."""
 
@@ -60,11 +27,7 @@ class MotionCheck:
 
     def __call__(self, a: Array, b: Array) -> bool:
         """Whether the motion from ``a`` to ``b`` is free, its end first; ``a`` is taken to be free."""
-        is_free = self.verdict.is_free
-        if not is_free(b):
-            return False
-        inner = states_between(a, b, self.resolution)
-        return all(is_free(inner[k]) for k in bit_reversed(len(inner)))
+        return self.verdict.first_collision(np.stack([a, b]), self.resolution, start=False) is None
 
 
 class VerdictChecker(ob.StateValidityChecker):
@@ -125,7 +88,7 @@ class FullCheck:
         ok: Whether the path is a solution.
         reason: One sentence about the first fault found, empty when there is none.
         segment: Index of the segment (states k and k + 1) with the fault, or None.
-        states: How many states were judged.
+        states: How many states were judged one by one.
     """
 
     ok: bool
@@ -138,24 +101,6 @@ class FullCheck:
         return self.ok
 
 
-def sample_path(path: Array, resolution: float) -> tuple[Array, NDArray[np.intp]]:
-    """Return states along a polyline at a spacing, and the segment of each.
-
-    Args:
-        path: States, shape (N, dof).
-        resolution: Largest spacing [rad, max-norm].
-
-    Returns:
-        States, shape (M, dof), the given ones among them bit for bit, and segment indices, shape (M,).
-    """
-    pieces, segments = [path[:1]], [np.zeros(1, np.intp)]
-    for k in range(len(path) - 1):
-        inner = states_between(path[k], path[k + 1], resolution)
-        pieces += [inner, path[k + 1 : k + 2]]
-        segments.append(np.full(len(inner) + 1, k, np.intp))
-    return np.concatenate(pieces), np.concatenate(segments)
-
-
 def full_check(
     verdict: Verdict,
     path: Array,
@@ -166,7 +111,8 @@ def full_check(
     """Decide whether a path is a solution.
 
     It is when every state along it is inside the limits and free at a spacing of ``resolution``, the first
-    state is ``start`` bit for bit, and the last is one of ``goals``.
+    state is ``start`` bit for bit, and the last is one of ``goals``. Stretches that the spheres prove free count as
+    sampled.
 
     Args:
         verdict: Judges the states.
@@ -191,11 +137,11 @@ def full_check(
     ends = list(goals)
     if ends and not any(np.array_equal(path[-1], goal) for goal in ends):
         return FullCheck(False, "the path does not end at a goal", len(path) - 2, 0)
-    states, segments = sample_path(path, resolution)
-    for count, k in enumerate(bit_reversed(len(states)), start=1):
-        if not verdict.is_free(states[k]):
-            contacts = verdict.contacts(states[k])
-            what = str(contacts[0]) if contacts else "in collision"
-            segment = int(segments[k])
-            return FullCheck(False, f"between states {segment} and {segment + 1}: {what}", segment, count)
-    return FullCheck(True, "", None, len(states))
+    before = verdict.tally.states
+    hit = verdict.first_collision(path, resolution)
+    judged = verdict.tally.states - before
+    if hit is None:
+        return FullCheck(True, "", None, judged)
+    contacts = verdict.contacts(hit.state)
+    what = str(contacts[0]) if contacts else "in collision"
+    return FullCheck(False, f"between states {hit.segment} and {hit.segment + 1}: {what}", hit.segment, judged)

@@ -138,7 +138,7 @@ FAULTS = {
         ["INVALID_START", "left_link", "<-> blob", "mm deep"],
     ),
     "approximate": (lambda t: ["plan", "shelf_swap", "--planner", "rrt", "--timeout", ".2"], 4, ["APPROXIMATE_SOL"]),
-    "no plan": (lambda t: ["plan", "shelf_swap", "--timeout", "0.01"], 1, ["TIMEOUT"]),
+    "no plan": (lambda t: ["plan", "shelf_swap", "--timeout", "0.00001"], 1, ["TIMEOUT"]),
 }  # fmt: skip
 
 

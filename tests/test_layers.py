@@ -10,6 +10,7 @@ from support import ROOT
 
 LAYERS = [
     {"errors", "meshes", "schema"},
+    {"kernel"},
     {"problem"},
     {"robot"},
     {"collision"},

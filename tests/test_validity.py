@@ -12,11 +12,12 @@ from support import states_around_home
 
 from apex_ompl.assembly import assemble
 from apex_ompl.collision import Verdict
+from apex_ompl.collision.sweep import bit_reversed, sample_path, states_between
 from apex_ompl.errors import ParameterError
 from apex_ompl.problem import Problem
 from apex_ompl.robot import Robot
 from apex_ompl.space import array_to_path, path_length, path_to_array, state_space, to_array, to_state
-from apex_ompl.validity import MotionCheck, VerdictChecker, bit_reversed, full_check, sample_path, states_between
+from apex_ompl.validity import MotionCheck, VerdictChecker, full_check
 
 
 @pytest.mark.parametrize("n", [0, 1, 2, 3, 5, 8, 13, 100, 257])
@@ -109,10 +110,11 @@ def test_a_faulty_verdict_never_raises_inside_ompl(problem: Problem, monkeypatch
     si = ready.simple_setup.getSpaceInformation()
     state = to_state(si.getStateSpace(), ready.start)
 
-    def broken(_: np.ndarray) -> bool:
+    def broken(*_: object, **__: object) -> bool:
         raise RuntimeError("broken on purpose")
 
     monkeypatch.setattr(ready.verdict, "is_free", broken)
+    monkeypatch.setattr(ready.verdict, "first_collision", broken)
     assert not si.isValid(state)
     assert not si.checkMotion(state, state)
     assert "broken on purpose" in str(ready.checker.fault) and "broken on purpose" in str(ready.motions.fault)

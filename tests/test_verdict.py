@@ -120,7 +120,7 @@ def test_home_is_free_and_nan_never(robot: Robot, baxter: Robot) -> None:
             q = some.home.copy()
             q[k] = np.nan
             assert not verdict.is_free(q)
-        assert verdict.calls == some.dof + 1
+        assert verdict.tally.states == some.dof + 1
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -105,6 +105,14 @@ class CompiledScene:
         self.second = self._second_stage()
         self.lock = threading.Lock()
         self._distances: dict[str, HullDistances] = {}
+        self._checks: dict[tuple[int, int], list[int]] = {}
+        for k, pair in enumerate(self.geometry.collisionPairs):
+            self._checks.setdefault(self._key(self.same[pair.first], self.same[pair.second]), []).append(k)
+        self._hollow_pairs = {self._key(h, g) for h, g, _, _ in self.hollow}
+
+    @staticmethod
+    def _key(a: int, b: int) -> tuple[int, int]:
+        return (a, b) if a < b else (b, a)
 
     def _add(self, name: str, joint: int, frame: int, placement: pin.SE3, shape: coal.CollisionGeometry) -> int:
         self.labels.append(name)
@@ -199,6 +207,19 @@ class CompiledScene:
         if pin.computeCollisions(self.model, self.data, self.manager, q, True):
             return True
         return self.second is not None and bool(self._contained(q))
+
+    def any_collides(self, q: Array, pairs: Iterable[tuple[int, int]]) -> bool:
+        """Whether any of the given pairs of geometries overlaps at a state in Pinocchio's order."""
+        hollow = False
+        with self.lock:
+            pin.updateGeometryPlacements(self.model, self.data, self.geometry, self.geometry_data, q)
+            for a, b in pairs:
+                key = self._key(a, b)
+                hollow = hollow or key in self._hollow_pairs
+                for k in self._checks[key]:
+                    if pin.computeCollision(self.geometry, self.geometry_data, k):
+                        return True
+        return hollow and bool(self._contained(q))
 
     def _contained(self, q: Array) -> list[tuple[int, int]]:
         """Return the pairs (host, guest) of hollow meshes with something wholly inside."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import coal
@@ -12,7 +13,9 @@ from numpy.typing import NDArray
 
 from apex_ompl.collision.broadphase import CompiledScene, Contact
 from apex_ompl.collision.distance import Distance
+from apex_ompl.collision.proofs import Pairs, Proofs, Tally
 from apex_ompl.collision.shapes import coal_geometry, world_geometry
+from apex_ompl.collision.sweep import bit_reversed, grid, sample_path
 from apex_ompl.errors import SceneError
 from apex_ompl.problem import AttachedObject, Body, Obstacle
 from apex_ompl.robot import Robot
@@ -21,8 +24,24 @@ from apex_ompl.schema import validate
 Array = NDArray[np.float64]
 
 
+@dataclass(frozen=True)
+class Collision:
+    """Where a path collides.
+
+    Attributes:
+        state: A colliding state, shape (dof,).
+        segment: It lies between states ``segment`` and ``segment + 1`` of the path.
+    """
+
+    state: Array
+    segment: int
+
+
 class Verdict:
-    """Judges states of a robot in a scene by Coal's meshes under Pinocchio's AABB-tree broadphase.
+    """Judges states of a robot in a scene, in two stages that agree with the second alone.
+
+    First covers of spheres that contain the solids prove most free states free, and whole stretches of motions. What
+    they cannot prove goes to Coal's meshes under Pinocchio's AABB-tree broadphase, which alone say "colliding".
 
     Meshes collide by their triangles, primitives as solids, and one solid wholly inside a mesh counts as a
     collision. What never moves, such as a robot's base, is not judged against what never moves. A state with a number
@@ -35,8 +54,16 @@ class Verdict:
         robot: Robot,
         scene: Iterable[Obstacle] = (),
         attached: Iterable[AttachedObject] = (),
+        *,
+        proofs: bool = True,
     ) -> None:
         """Judge ``robot`` with its fixtures, the obstacles of ``scene`` and what it holds.
+
+        Args:
+            robot: The robot.
+            scene: Obstacles.
+            attached: Held objects.
+            proofs: Whether the spheres come first; without them every state goes to the meshes.
 
         Raises:
             SceneError: A name is taken already.
@@ -45,7 +72,9 @@ class Verdict:
             FileFormatError: A mesh file holds no triangles.
         """
         self.robot = robot
-        self.calls = 0
+        self.tally = Tally()
+        self._prove = proofs
+        self._proofs: Proofs | None = None
         self._obstacles: dict[str, Body] = {}
         self._attached: dict[str, AttachedObject] = {}
         self._placed: dict[str, tuple[coal.CollisionGeometry, Array]] = {}
@@ -93,6 +122,8 @@ class Verdict:
         self._placed[name] = (self._placed[name][0], new.pose)
         if self._compiled is not None:
             self._compiled.place(name, pin.SE3(new.pose))
+            if self._proofs is not None:
+                self._proofs.obstacles_moved()
 
     def remove(self, name: str) -> None:
         """Remove an obstacle.
@@ -132,11 +163,65 @@ class Verdict:
 
     def is_free(self, q: Array) -> bool:
         """Whether the state ``q``, shape (dof,), collides with nothing."""
-        self.calls += 1
+        return bool(self.are_free(np.asarray(q, float)[None])[0])
+
+    def are_free(self, states: Array) -> NDArray[np.bool_]:
+        """Whether each of the states, shape (N, dof), collides with nothing; shape (N,)."""
+        self.robot.to_pinocchio(states[:0])
+        free = np.ones(len(states), bool)
+        for k, pairs in self._open(states):
+            free[k] = self._free_by_meshes(states[k], pairs)
+        return free
+
+    def first_collision(self, path: Array, resolution: float, start: bool = True) -> Collision | None:
+        """Return a colliding state along a path, or None when it is free.
+
+        States at most ``resolution`` apart are judged, the same as ``apex_ompl.collision.sweep.sample_path`` returns,
+        in bit-reversed order; those inside a stretch that the spheres prove to be free count as judged.
+
+        Args:
+            path: States, shape (N, dof).
+            resolution: Largest spacing [rad, max-norm].
+            start: Whether the first state is judged too.
+        """
+        path = np.ascontiguousarray(path, float)
+        self.robot.to_pinocchio(path)
+        if len(path) == 1:
+            free = not start or self.is_free(path[0])
+            return None if free else Collision(path[0].copy(), 0)
+        if not (self._prove and np.isfinite(path).all()):
+            return self._first_sampled(path, resolution, start)
+        starts = grid(path, resolution)
+        last = int(starts[-1])
+        self.tally.steps += last
+        queue = [(0, 0), (last, last), (0, last)][0 if start else 1 :]
+        for number, state, pairs in self._proved().open_states(path, starts, queue, self.tally):
+            if not self._free_by_meshes(state, pairs):
+                segment = int(np.searchsorted(starts, number, side="left")) - 1
+                return Collision(state.copy(), max(segment, 0))
+        return None
+
+    def _first_sampled(self, path: Array, resolution: float, start: bool) -> Collision | None:
+        states, segments = sample_path(path, resolution)
+        skip = 0 if start else 1
+        last = len(states) - 1 - skip
+        for k in (last, *bit_reversed(last)):
+            if not self.is_free(states[k + skip]):
+                return Collision(states[k + skip], int(segments[k + skip]))
+        return None
+
+    def _open(self, states: Array) -> Iterable[tuple[int, Pairs]]:
+        if not self._prove:
+            return [(k, None) for k in range(len(states))]
+        return self._proved().open_pairs(states, self.tally)
+
+    def _free_by_meshes(self, q: Array, pairs: Pairs) -> bool:
+        self.tally.meshes += 1
         order = self.robot.to_pinocchio(q)
         if not np.isfinite(order).all():
             return False
-        return not self._scene().collides(order)
+        scene = self._scene()
+        return not (scene.collides(order) if pairs is None else scene.any_collides(order, pairs))
 
     def contacts(self, q: Array) -> list[Contact]:
         """Return all overlapping pairs at ``q``, shape (dof,), the deepest first."""
@@ -169,9 +254,17 @@ class Verdict:
             raise SceneError(f"no {kind} {name!r}; there are: {listing}")
         return where[name]
 
+    def _proved(self) -> Proofs:
+        scene = self._scene()
+        proofs = self._proofs
+        if proofs is None:
+            proofs = self._proofs = Proofs(self.robot, scene)
+        return proofs
+
     def _scene(self) -> CompiledScene:
         compiled = self._compiled
         if compiled is None:
+            self._proofs = None
             compiled = CompiledScene(self.robot, self._obstacles, self._attached, self._placed)
             self._compiled = compiled
         return compiled

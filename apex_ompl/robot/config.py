@@ -83,6 +83,7 @@ class RobotConfig(StrictModel):
         groups: Named groups of planned joints.
         hands: Hands by name.
         disabled_pairs: File of further link pairs that are never checked.
+        covers: File of sphere covers of the links; without it coarser ones are made at run time.
     """
 
     schema_id: Literal["apex-ompl/robot/1"] = Field(alias="schema")
@@ -95,6 +96,7 @@ class RobotConfig(StrictModel):
     groups: dict[str, tuple[str, ...]] = {}
     hands: dict[str, Hand] = {}
     disabled_pairs: str | None = None
+    covers: str | None = None
 
     @model_validator(mode="after")
     def _known_joints(self) -> Self:

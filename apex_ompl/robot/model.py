@@ -59,6 +59,7 @@ class Robot:
         fixtures: Solids of the robot's place, such as its tables.
         part_links: Part name -> names of its links.
         urdf: The composed URDF with absolute mesh paths.
+        covers: File of the links' sphere covers, or None.
     """
 
     name: str
@@ -72,6 +73,7 @@ class Robot:
     fixtures: tuple[Body, ...]
     part_links: Mapping[str, tuple[str, ...]]
     urdf: str = field(repr=False)
+    covers: Path | None = field(repr=False)
     _order: NDArray[np.intp] = field(repr=False)
 
     @property
@@ -210,6 +212,7 @@ def build_robot(config: RobotConfig, path: Path) -> Robot:
     if config.disabled_pairs:
         disabled += read_disabled_pairs(resolve(config.disabled_pairs, path.parent, "file of disabled pairs"))
     _pair_up(model, geometry, disabled)
+    covers = resolve(config.covers, path.parent, "file of sphere covers") if config.covers else None
     names = tuple(config.joints)
     for hand in config.hands.values():
         if not model.existBodyName(hand.palm):
@@ -227,7 +230,7 @@ def build_robot(config: RobotConfig, path: Path) -> Robot:
     return Robot(
         name=config.name, joint_names=names, limits=limits, home=home, groups=groups, hands=config.hands, model=model,
         geometry=geometry, fixtures=config.fixtures, part_links=composition.part_links,
-        urdf=composition.urdf, _order=order,
+        urdf=composition.urdf, covers=covers, _order=order,
     )  # fmt: skip
 
 

@@ -1,0 +1,133 @@
+"""Compilation of the kernel by numba, cached on disk where there is a writable place.
+
+numba keeps compiled code beside the source and renews it when that one file changes; the kernel is spread over several
+files that are compiled into each other, so the cache is a folder of our own, named after a digest of all of them and
+of the versions of Python, numba and the kernel's processor. It is ``$NUMBA_CACHE_DIR`` when that is set, or the
+user's cache folder; where neither can be written, the code is compiled anew in every process, and a warning says so.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+import platform
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numba
+from llvmlite import binding as llvm
+from numba.core import config
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+LOG = logging.getLogger("apex_ompl")
+NOT_COMPILED = ("__init__.py", "build.py", "face.py")
+TYPICAL_SECONDS = 30  # first compilation on two cores of 2025; benchmarks/verdict.py measures it
+
+# Without numba's runtime no array is counted, which costs most of the time otherwise; nothing may be allocated.
+OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "_nrt": False}
+
+_lock = threading.RLock()
+
+
+@cache
+def _digest() -> str:
+    digest = hashlib.sha256()
+    for path in sorted(Path(__file__).parent.glob("*.py")):
+        if path.name not in NOT_COMPILED:
+            digest.update(path.read_bytes())
+    processor = f"{platform.machine()} {llvm.get_host_cpu_name()}"
+    digest.update(f"{sys.version_info[:3]} {numba.__version__} {processor}".encode())
+    return digest.hexdigest()[:16]
+
+
+@cache
+def cache_folder() -> Path | None:
+    """Return the folder that compiled code is kept in, or None when no place for it can be written."""
+    given = os.environ.get("NUMBA_CACHE_DIR")
+    homes = [Path(given)] if given else []
+    user = os.environ.get("XDG_CACHE_HOME")
+    homes.append(Path(user) if user else Path("~/.cache").expanduser())
+    for home in homes:
+        folder = home / "apex_ompl" / f"kernel-{_digest()}"
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            tempfile.TemporaryFile(dir=folder).close()
+        except OSError:
+            continue
+        return folder
+    return None
+
+
+def inlined(function: F) -> F:
+    """Compile a function that is only called by other compiled ones."""
+    compiled: F = numba.njit(**OPTIONS, forceinline=True)(function)
+    return compiled
+
+
+def pasted(function: F) -> F:
+    """Paste a function into those that call it, as what returns arrays must be without numba's runtime."""
+    compiled: F = numba.njit(**OPTIONS, inline="always")(function)
+    return compiled
+
+
+def entry(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Compile a function that Python calls; its code is kept on disk, and its first compilation is announced.
+
+    Calls release Python's lock, and run on the calling thread alone.
+    """
+    folder = cache_folder()
+    with _lock:
+        kept, config.CACHE_DIR = config.CACHE_DIR, str(folder or "")
+        try:
+            dispatcher = numba.njit(**OPTIONS, cache=folder is not None)(function)
+        finally:
+            config.CACHE_DIR = kept
+    return _Announced(dispatcher, function.__name__)
+
+
+class _Announced:
+    """A compiled function whose first call, when nothing was kept from an earlier process, says that it compiles."""
+
+    _compiling = 0.0  # seconds spent in all
+    _said = False
+
+    def __init__(self, dispatcher: Any, name: str) -> None:
+        self.dispatcher = dispatcher
+        self.name = name
+        self.__wrapped__ = dispatcher.py_func
+        self.__doc__ = dispatcher.py_func.__doc__
+        self._ready = False
+
+    def __call__(self, *arguments: Any) -> Any:
+        if self._ready:
+            return self.dispatcher(*arguments)
+        with _lock:
+            folder = cache_folder()
+            if folder is None or not any(folder.rglob(f"*.{self.name}-*.nbi")):
+                self._announce(folder)
+            begin = time.perf_counter()
+            result = self.dispatcher(*arguments)
+            _Announced._compiling += time.perf_counter() - begin
+            self._ready = True
+        return result
+
+    @staticmethod
+    def _announce(folder: Path | None) -> None:
+        if _Announced._said:
+            return
+        _Announced._said = True
+        where = f"kept in {folder}" if folder else "in every process anew, since no cache folder can be written"
+        LOG.warning("apex_ompl compiles its collision kernel (about %d s, %s)", TYPICAL_SECONDS, where)
+
+
+def seconds_spent() -> float:
+    """Return how long this process waited for compiled code, made or loaded [s]."""
+    return _Announced._compiling

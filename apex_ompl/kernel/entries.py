@@ -1,0 +1,165 @@
+"""The compiled functions that Python calls. Robots and scenes come packed, see ``apex_ompl.kernel.tables.pack``."""
+
+from __future__ import annotations
+
+from apex_ompl.kernel.compiled import entry, inlined
+from apex_ompl.kernel.kinematics import bound_motion, place_joint, place_robot
+from apex_ompl.kernel.nearest import gradient_of_two, gradient_to_obstacle, nearest_bodies, nearest_obstacle
+from apex_ompl.kernel.proof import judged, known, proved
+from apex_ompl.kernel.tables import Floats, Integers
+from apex_ompl.kernel.views import Work, robot_view, scene_view, work_view
+
+PROVED_STATES, OPEN_STATES, PROVED_BOXES, TRIED_BOXES, PROVED_STEPS = range(5)
+DONE = -1
+
+
+@entry
+def judge_states(
+    ri: Integers, rf: Floats, si: Integers, sf: Floats, wi: Integers, wf: Floats,
+    states: Floats, found: Integers, counts: Integers,
+) -> None:  # fmt: skip  # fmt: skip
+    """List for each state, shape (N, dof), the pairs that are not proved to be apart.
+
+    ``found`` (N, K, 2) gets the pairs, ``counts`` (N,) their number, or -1 when nothing can be said of the state.
+    """
+    t, s = robot_view(ri, rf), scene_view(si, sf)
+    w = work_view(t, wi, wf)
+    for k in range(len(states)):
+        counts[k] = judged(t, s, w, states[k], found[k])
+
+
+@entry
+def clearances(
+    ri: Integers, rf: Floats, si: Integers, sf: Floats, wi: Integers, wf: Floats,
+    states: Floats, limit: float, values: Floats, slopes: Floats,
+) -> None:  # fmt: skip  # fmt: skip
+    """Put the signed clearance of each state, shape (N, dof), to obstacles and between links into ``values`` (N, 2).
+
+    Clearances over ``limit`` are not looked for; ``limit`` stands for them, with gradient 0. ``slopes``, shape
+    (N, 2, dof), gets the gradients; shape (0, 2, dof) asks for none.
+    """
+    t, s = robot_view(ri, rf), scene_view(si, sf)
+    w = work_view(t, wi, wf)
+    for k in range(len(states)):
+        q = states[k]
+        place_robot(t, w, q)
+        near = nearest_obstacle(t, s, w, q, limit)
+        own = nearest_bodies(t, w, q, limit)
+        values[k, 0], values[k, 1] = near[0], own[0]
+        if len(slopes):
+            for i in range(len(q)):
+                slopes[k, 0, i] = slopes[k, 1, i] = 0.0
+            if near[1] >= 0:
+                gradient_to_obstacle(t, s, w, near, slopes[k, 0])
+            if own[1] >= 0:
+                gradient_of_two(t, w, own, slopes[k, 1])
+
+
+@entry
+def joint_frames(
+    ri: Integers, rf: Floats, wi: Integers, wf: Floats, states: Floats, turn: Floats, origin: Floats
+) -> None:
+    """Put the frames of all joints, axes along z, into ``turn`` (N, J, 3, 3) and ``origin`` (N, J, 3)."""
+    t = robot_view(ri, rf)
+    w = work_view(t, wi, wf)
+    for k in range(len(states)):
+        place_robot(t, w, states[k])
+        for j in t.lazy:
+            place_joint(t, w, states[k], j)
+        for j in range(len(t.joint_parent)):
+            for i in range(3):
+                origin[k, j, i] = w.origin[j, i]
+                for m in range(3):
+                    turn[k, j, i, m] = w.turn[j, i, m]
+
+
+@inlined
+def _segment(starts: Integers, g: int) -> int:
+    """Return the segment that state ``g`` of the grid lies on, the last one for the end."""
+    low, high = 0, len(starts) - 1
+    while high - low > 1:
+        middle = (low + high) // 2
+        if starts[middle] <= g:
+            low = middle
+        else:
+            high = middle
+    return low
+
+
+@inlined
+def _state(path: Floats, starts: Integers, g: int, out: Floats) -> None:
+    """Put state ``g`` of the grid over a path into ``out``."""
+    k = _segment(starts, g)
+    if g == starts[k + 1]:
+        k += 1
+    if g == starts[k]:
+        for i in range(len(out)):
+            out[i] = path[k, i]
+        return
+    step = (g - starts[k]) / (starts[k + 1] - starts[k])
+    for i in range(len(out)):
+        out[i] = path[k, i] + step * (path[k + 1, i] - path[k, i])
+
+
+@inlined
+def _reach(path: Floats, starts: Integers, a: int, b: int, middle: Floats, w: Work) -> None:
+    """Put into ``w.reach`` how far each joint gets from a state, on the path between two states of the grid."""
+    for i in range(len(middle)):
+        w.reach[i] = 0.0
+    for g in (a, b):
+        _state(path, starts, g, w.end)
+        for i in range(len(middle)):
+            w.reach[i] = max(w.reach[i], abs(w.end[i] - middle[i]))
+    for k in range(_segment(starts, a) + 1, _segment(starts, b) + 1):
+        for i in range(len(middle)):
+            w.reach[i] = max(w.reach[i], abs(path[k, i] - middle[i]))
+    for i in range(len(middle)):
+        w.reach[i] += 1e-12  # rounding
+
+
+@entry
+def advance(
+    ri: Integers, rf: Floats, si: Integers, sf: Floats, wi: Integers, wf: Floats, path: Floats, starts: Integers,
+    queue: Integers, ends: Integers, state: Floats, found: Integers, tally: Integers,
+) -> int:  # fmt: skip
+    """Prove a path until a state is met that only the meshes can judge.
+
+    The path, shape (N, dof), carries a grid: vertex k is state ``starts[k]`` of it, shape (N,), with evenly spaced
+    ones between. ``queue`` holds intervals of the grid that are not settled, from ``ends[0]`` to ``ends[1]``; an
+    interval of one state asks for that state. The ends of every other interval have their own entries. Of an interval
+    the middle is judged, then a box around it that holds all of the interval, and if that is not proved its halves
+    wait their turn, so that states are met in bit-reversed order.
+
+    Returns:
+        DONE, or the number of the state that is not proved: it is in ``state``, its pairs in ``found`` (K, 2) and
+        their number in ``ends[2]``, as in :func:`judge_states`. Calling again goes on behind it.
+    """
+    t, s = robot_view(ri, rf), scene_view(si, sf)
+    w = work_view(t, wi, wf)
+    while ends[0] < ends[1]:
+        a, b = queue[ends[0], 0], queue[ends[0], 1]
+        ends[0] += 1
+        middle = (a + b) // 2
+        if b - a == 1:
+            continue
+        _state(path, starts, middle, state)
+        ends[2] = judged(t, s, w, state, found)
+        if ends[2] == 0:
+            tally[PROVED_STATES] += 1
+            if b - a >= 3:
+                tally[TRIED_BOXES] += 1
+                _reach(path, starts, a, b, state, w)
+                if known(t, state, w.reach):
+                    bound_motion(t, w, w.reach)
+                    if proved(t, s, w, state, w.pair):
+                        tally[PROVED_BOXES] += 1
+                        tally[PROVED_STEPS] += b - a
+                        continue
+        if b - a >= 2:
+            queue[ends[1], 0], queue[ends[1], 1] = a, middle
+            queue[ends[1] + 1, 0], queue[ends[1] + 1, 1] = middle, b
+            ends[1] += 2
+        if ends[2] != 0:
+            tally[OPEN_STATES] += 1
+            return int(middle)
+    return DONE

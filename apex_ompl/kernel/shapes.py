@@ -1,0 +1,85 @@
+"""Inside the kernel: signed distances of points to boxes, spheres, cylinders, capsules and half-spaces."""
+
+from __future__ import annotations
+
+import math
+
+from apex_ompl.kernel.compiled import inlined
+from apex_ompl.kernel.tables import BOX, CAPSULE, CYLINDER, HALF_SPACE, SPHERE, SceneArrays
+
+
+@inlined
+def local_point(s: SceneArrays, o: int, x: float, y: float, z: float) -> tuple[float, float, float]:
+    """Return a point of the world in an obstacle's frame."""
+    r, p = s.rotation[o], s.offset[o]
+    dx, dy, dz = x - p[0], y - p[1], z - p[2]
+    return (
+        r[0, 0] * dx + r[1, 0] * dy + r[2, 0] * dz,
+        r[0, 1] * dx + r[1, 1] * dy + r[2, 1] * dz,
+        r[0, 2] * dx + r[1, 2] * dy + r[2, 2] * dz,
+    )
+
+
+@inlined
+def distance(s: SceneArrays, o: int, x: float, y: float, z: float) -> float:
+    """Return the signed distance of a point of the world to an obstacle [m], negative inside."""
+    kind, size = s.kind[o], s.size[o]
+    if kind == HALF_SPACE:
+        n = s.offset[o]
+        return float(n[0] * x + n[1] * y + n[2] * z - size[0])
+    if kind == SPHERE:
+        p = s.offset[o]
+        return float(math.sqrt((x - p[0]) ** 2 + (y - p[1]) ** 2 + (z - p[2]) ** 2) - size[0])
+    a, b, c = local_point(s, o, x, y, z)
+    if kind == BOX:
+        a, b, c = abs(a) - size[0], abs(b) - size[1], abs(c) - size[2]
+        inside = min(max(a, b, c), 0.0)
+        a, b, c = max(a, 0.0), max(b, 0.0), max(c, 0.0)
+        return float(math.sqrt(a * a + b * b + c * c) + inside)
+    if kind == CYLINDER:
+        across, along = math.sqrt(a * a + b * b) - size[0], abs(c) - size[1]
+        inside = min(max(across, along), 0.0)
+        across, along = max(across, 0.0), max(along, 0.0)
+        return float(math.sqrt(across * across + along * along) + inside)
+    c -= min(max(c, -size[1]), size[1])  # CAPSULE
+    return float(math.sqrt(a * a + b * b + c * c) - size[0])
+
+
+@inlined
+def direction(s: SceneArrays, o: int, x: float, y: float, z: float) -> tuple[float, float, float]:
+    """Return the gradient of :func:`distance`: a unit vector, one of several where the distance has an edge."""
+    kind, size, p = s.kind[o], s.size[o], s.offset[o]
+    if kind == HALF_SPACE:
+        return p[0], p[1], p[2]
+    a, b, c = local_point(s, o, x, y, z)
+    if kind == BOX:
+        u, v, w = abs(a) - size[0], abs(b) - size[1], abs(c) - size[2]
+        if max(u, v, w) > 0.0:
+            u, v, w = max(u, 0.0), max(v, 0.0), max(w, 0.0)
+        else:
+            first, second = u >= v and u >= w, v > u and v >= w
+            u, v, w = (1.0, 0.0, 0.0) if first else (0.0, 1.0, 0.0) if second else (0.0, 0.0, 1.0)
+        a, b, c = math.copysign(u, a), math.copysign(v, b), math.copysign(w, c)
+    elif kind == CYLINDER:
+        radial = math.sqrt(a * a + b * b)
+        across, along = radial - size[0], abs(c) - size[1]
+        if max(across, along) > 0.0:
+            across, along = max(across, 0.0), max(along, 0.0)
+        else:
+            across, along = (1.0, 0.0) if across >= along else (0.0, 1.0)
+        if radial > 0.0:
+            a, b, c = a / radial * across, b / radial * across, math.copysign(along, c)
+        else:
+            a, b, c = across, 0.0, math.copysign(along, c)
+    elif kind == CAPSULE:
+        c -= min(max(c, -size[1]), size[1])
+    long = math.sqrt(a * a + b * b + c * c)
+    if not long > 0.0:
+        return s.rotation[o, 0, 0], s.rotation[o, 1, 0], s.rotation[o, 2, 0]
+    a, b, c = a / long, b / long, c / long
+    r = s.rotation[o]
+    return (
+        r[0, 0] * a + r[0, 1] * b + r[0, 2] * c,
+        r[1, 0] * a + r[1, 1] * b + r[1, 2] * c,
+        r[2, 0] * a + r[2, 1] * b + r[2, 2] * c,
+    )

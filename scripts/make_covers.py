@@ -1,0 +1,74 @@
+"""Make the sphere covers of all link shapes of a robot, prove them, and write them to a file.
+
+Prints per shape the balls of each level (the root first, leaves last), the volume of the leaves relative to the
+solid, and how far the surface of the leaves is from the solid. With ``--tolerances`` it writes nothing, and prints
+how many leaves each gap takes instead.
+
+Usage: python scripts/make_covers.py dual_panda_softhand [--gaps 0.02 0.005] [-o FILE]
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+
+import coal
+import numpy as np
+
+from apex_ompl.collision.spheres import GAPS, Cover, make_cover, quality, shape_key, unproved, write_covers
+from apex_ompl.robot import load_robot
+from apex_ompl.robot.assets import DATA
+
+
+def shapes_of(robot: str) -> dict[str, tuple[list[str], coal.CollisionGeometry]]:
+    """Return shape key -> names of the links' geometry objects with that shape, and the shape."""
+    shapes: dict[str, tuple[list[str], coal.CollisionGeometry]] = {}
+    for item in load_robot(robot).geometry.geometryObjects:
+        shapes.setdefault(shape_key(item.geometry), ([], item.geometry))[0].append(item.name)
+    return shapes
+
+
+def row(name: str, geometry: coal.CollisionGeometry, cover: Cover, seconds: float) -> str:
+    """Return one row of the table."""
+    left = len(unproved(geometry, cover))
+    ratio, mean, largest = quality(geometry, cover, np.random.default_rng(0))
+    levels = " ".join(str(n) for n in np.bincount(cover.levels))
+    proved = "" if left == 0 else f"  NOT PROVED: {left} boxes"
+    numbers = f"{len(cover.leaves):6d}  {ratio:7.2f}  {mean * 1e3:7.1f}  {largest * 1e3:7.1f}  {seconds:7.2f}"
+    return f"{name:44s} {levels:12s} {numbers}{proved}"
+
+
+def main() -> None:
+    """Make and write the covers of one robot."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("robot")
+    parser.add_argument("--gaps", type=float, nargs="+", default=list(GAPS), help="metres, descending")
+    parser.add_argument("--tolerances", type=float, nargs="+", help="metres: only compare these gaps")
+    parser.add_argument("--only", default="", help="only shapes of links whose names contain this, with --tolerances")
+    parser.add_argument("--effort", type=int, default=3, choices=(1, 2, 3), help="how thorough the search is")
+    parser.add_argument("-o", "--output", type=Path)
+    args = parser.parse_args()
+    covers = {}
+    print(
+        f"{'shape':44s} {'levels':12s} {'leaves':>6s}  {'volume':>6s}  {'mean mm':>7s}  {'max mm':>7s}  {'seconds':>7s}"
+    )
+    for key, (names, geometry) in shapes_of(args.robot).items():
+        label = names[0] + (f" and {len(names) - 1} more" if len(names) > 1 else "")
+        if args.tolerances:
+            for gap in args.tolerances if any(args.only in name for name in names) else ():
+                start = time.perf_counter()
+                cover = make_cover(geometry, (gap,), most=400, effort=args.effort)
+                print(row(f"{gap * 1e3:4.0f} mm: {label}", geometry, cover, time.perf_counter() - start), flush=True)
+            continue
+        start = time.perf_counter()
+        covers[key] = make_cover(geometry, args.gaps, effort=args.effort)
+        print(row(label, geometry, covers[key], time.perf_counter() - start), flush=True)
+    if covers:
+        target = args.output or DATA / f"{args.robot}.spheres.json"
+        write_covers(target, covers)
+        print(f"{len(covers)} covers, {sum(len(c.radii) for c in covers.values())} balls -> {target}")
+
+
+if __name__ == "__main__":
+    main()
