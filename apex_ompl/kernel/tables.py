@@ -109,6 +109,8 @@ ROWS = {
 }  # fmt: skip
 """Shape of one row of the arrays whose rows are not single numbers."""
 
+WHOLE = RobotArrays._fields[: RobotArrays._fields.index("joint_rotation")]  # integers come first
+
 
 def pack(arrays: RobotArrays | SceneArrays) -> tuple[Integers, Floats]:
     """Return all arrays behind each other in two, which the kernel takes apart again.
@@ -195,7 +197,7 @@ class RobotTables:
             found = head.get("schema") if isinstance(head, dict) else head
             raise FileFormatError(str(path), "schema", found, f"expected {SCHEMA!r}")
         for name, array in arrays.items():
-            wanted = np.int64 if RobotArrays.__annotations__[name] == "Integers" else np.float64
+            wanted = np.int64 if name in WHOLE else np.float64
             if array.dtype != wanted or array.shape[1:] != ROWS.get(name, ()):
                 expected = f"expected {np.dtype(wanted)} in rows of shape {ROWS.get(name, ())}"
                 raise FileFormatError(str(path), name, f"{array.dtype} {array.shape}", expected)

@@ -1,0 +1,347 @@
+"""The kernel against Pinocchio, Coal, finite differences and brute force."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import coal
+import numpy as np
+import pinocchio as pin
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support import ROOT, states_around_home
+
+from apex_ompl.collision import Verdict
+from apex_ompl.collision.tabulate import primitives
+from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError
+from apex_ompl.kernel import build
+from apex_ompl.kernel.face import Kernel
+from apex_ompl.kernel.tables import FIXED, PRISMATIC, REVOLUTE, RobotTables, scene_tables
+from apex_ompl.problem import Obstacle
+from apex_ompl.robot import Robot
+
+SHAPES = {
+    "box": lambda r: coal.Box(*r.uniform(0.05, 0.5, 3)),
+    "sphere": lambda r: coal.Sphere(r.uniform(0.03, 0.3)),
+    "cylinder": lambda r: coal.Cylinder(r.uniform(0.03, 0.3), r.uniform(0.05, 0.6)),
+    "capsule": lambda r: coal.Capsule(r.uniform(0.03, 0.2), r.uniform(0.05, 0.6)),
+    "half-space": lambda r: coal.Halfspace(unit(r), r.uniform(-0.3, 0.3)),
+}
+
+
+def unit(rng: np.random.Generator) -> np.ndarray:
+    v = rng.normal(size=3)
+    return v / np.linalg.norm(v)
+
+
+def pose(rng: np.random.Generator, spread: float = 0.5) -> np.ndarray:
+    at = np.eye(4)
+    at[:3, :3] = pin.exp3(unit(rng) * rng.uniform(0.0, np.pi))
+    at[:3, 3] = rng.normal(0.0, spread, 3)
+    return at
+
+
+def balls(rng: np.random.Generator, leaves: int) -> dict[str, np.ndarray]:
+    """A root around some leaves, as a cover has them."""
+    centres, radii = rng.normal(0.0, 0.05, (leaves, 3)), rng.uniform(0.01, 0.06, leaves)
+    root = float((np.linalg.norm(centres, axis=1) + radii).max())
+    return {
+        "centres": np.concatenate([np.zeros((1, 3)), centres]), "radii": np.array([root, *radii]),
+        "first": np.array([1] + [0] * leaves), "count": np.array([leaves] + [0] * leaves),
+    }  # fmt: skip
+
+
+def random_robot(seed: int, joints: int = 9, dof: int = 4) -> tuple[RobotTables, list, list, list]:
+    """A random tree of revolute, prismatic, fixed and mimic joints with a body on each, and the parts it is of."""
+    rng = np.random.default_rng(seed)
+    specs = [build.JointSpec(0)]
+    for k in range(1, joints):
+        kind = int(rng.choice([REVOLUTE, REVOLUTE, PRISMATIC, FIXED]))
+        specs.append(
+            build.JointSpec(
+                int(rng.integers(0, k)), kind, pose(rng, 0.2), unit(rng), -1 if kind == FIXED else k % dof,
+                float(rng.uniform(-1.5, 1.5)), float(rng.normal(0.0, 0.3)),
+            )
+        )  # fmt: skip
+    bodies = [build.BodySpec(f"b{k}", k, pose(rng, 0.05), **balls(rng, 3)) for k in range(joints)]
+    pairs = [(a, b) for a in range(joints) for b in range(a) if rng.random() < 0.5]
+    names = [f"q{k}" for k in range(dof)]
+    box = np.ones(dof)
+    tables = build.robot_tables("tree", names, lower=-box, upper=box, joints=specs, bodies=bodies, pairs=pairs)
+    return tables, specs, bodies, pairs
+
+
+def frames(specs: list, q: np.ndarray) -> list[np.ndarray]:
+    """Forward kinematics from the book: placement, then rotation about or translation along the axis."""
+    found = [np.eye(4)]
+    for joint in specs[1:]:
+        motion = np.eye(4)
+        value = joint.ratio * q[joint.source] + joint.shift
+        if joint.kind == REVOLUTE:
+            motion[:3, :3] = pin.exp3(joint.axis * value)
+        elif joint.kind == PRISMATIC:
+            motion[:3, 3] = joint.axis * value
+        found.append(found[joint.parent] @ joint.placement @ motion)
+    return found
+
+
+def leaves_at(specs: list, bodies: list, q: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    """World centres and radii of the leaves of each body."""
+    poses, found = frames(specs, q), []
+    for body in bodies:
+        at = poses[body.joint] @ body.placement
+        leaf = body.count == 0
+        found.append((body.centres[leaf] @ at[:3, :3].T + at[:3, 3], body.radii[leaf]))
+    return found
+
+
+def coal_distance(shape: coal.CollisionGeometry, at: np.ndarray, point: np.ndarray, radius: float) -> float:
+    return float(
+        coal.distance(
+            shape, coal.Transform3s(at[:3, :3], at[:3, 3]), coal.Sphere(radius), coal.Transform3s(np.eye(3), point),
+            coal.DistanceRequest(True), coal.DistanceResult(),
+        )
+    )  # fmt: skip
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 10**6))
+def test_clearance_of_random_trees_is_that_of_all_spheres(seed: int) -> None:
+    tables, specs, bodies, pairs = random_robot(seed)
+    rng = np.random.default_rng(seed)
+    shapes = [(make(rng), pose(rng)) for make in SHAPES.values() for _ in range(2)]
+    scene = scene_tables([(n, p) for n, (shape, at) in enumerate(shapes) for p in primitives(shape, at)])
+    kernel = Kernel(tables, scene)
+    states = rng.uniform(-1.0, 1.0, (3, tables.dof))
+    values = kernel.clearance(states)
+    for q, (near, own) in zip(states, values, strict=True):
+        leaves = leaves_at(specs, bodies, q)
+        alone = Kernel(single_ball(), scene)
+        to_scene = min(
+            alone.clearance(c[None])[0, 0] - r + 0.01 for cs, rs in leaves for c, r in zip(cs, rs, strict=True)
+        )
+        between = np.inf
+        for a, b in pairs:
+            (ca, ra), (cb, rb) = leaves[a], leaves[b]
+            away = np.linalg.norm(ca[:, None] - cb[None], axis=2) - ra[:, None] - rb[None]
+            between = min(between, float(away.min()))
+        assert near == pytest.approx(to_scene, abs=1e-9)
+        assert own == pytest.approx(between, abs=1e-9)
+    capped = kernel.clearance(states, limit=0.02)
+    assert capped == pytest.approx(np.minimum(values, 0.02), abs=1e-12)
+
+
+def single_ball() -> RobotTables:
+    """A ball of 1 cm on three sliders: its state is where it is."""
+    specs = [build.JointSpec(0)]
+    specs += [build.JointSpec(k, PRISMATIC, np.eye(4), np.eye(3)[k], k) for k in range(3)]
+    cover = {
+        "centres": np.zeros((1, 3)),
+        "radii": np.array([0.01]),
+        "first": np.zeros(1, int),
+        "count": np.zeros(1, int),
+    }
+    body = build.BodySpec("ball", 3, np.eye(4), **cover)
+    box = 10.0 * np.ones(3)
+    return build.robot_tables("ball", "xyz", lower=-box, upper=box, joints=specs, bodies=[body], pairs=[])
+
+
+def cylinder_surface(shape: coal.Cylinder, at: np.ndarray) -> np.ndarray:
+    """Points all over the surface, in the world."""
+    turns, share = (grid.ravel() for grid in np.meshgrid(np.linspace(0.0, 2 * np.pi, 200), np.linspace(-1.0, 1.0, 161)))
+    ring = np.stack([np.cos(turns), np.sin(turns)], axis=1) * shape.radius
+    side = np.column_stack([ring, share * shape.halfLength])
+    caps = [
+        np.column_stack([ring * share[:, None], np.full(len(share), z)]) for z in (-shape.halfLength, shape.halfLength)
+    ]
+    return np.concatenate([side, *caps]) @ at[:3, :3].T + at[:3, 3]
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_distances_are_those_of_coal(name: str) -> None:
+    rng = np.random.default_rng(3)
+    tables, inside = single_ball(), 0
+    for _ in range(40):
+        shape, at = SHAPES[name](rng), pose(rng)
+        if name == "half-space":
+            at = np.eye(4)
+        kernel = Kernel(tables, scene_tables([(0, p) for p in primitives(shape, at)]))
+        for point in at[:3, 3] + rng.normal(0.0, 0.2, (20, 3)):
+            expected = coal_distance(shape, at, point, 0.01)
+            found, slope = (v[0, 0] for v in kernel.clearance_gradient(point))
+            inside += expected < -0.02
+            if expected > 0.0 or name != "cylinder":
+                assert found == pytest.approx(expected, abs=1e-5 if expected > 0.0 else 1e-3)
+            else:  # EPA stops early inside a cylinder, with too large a depth
+                away = np.linalg.norm(cylinder_surface(shape, at) - point, axis=1).min()
+                local = at[:3, :3].T @ (point - at[:3, 3])
+                within = np.hypot(*local[:2]) < shape.radius and abs(local[2]) < shape.halfLength
+                assert found == pytest.approx((-away if within else away) - 0.01, abs=3e-3)
+            assert np.linalg.norm(slope) == pytest.approx(1.0)
+            back = kernel.clearance(point - slope * 1e-6)[0, 0]
+            assert back == pytest.approx(found - 1e-6, abs=1e-10)
+    assert inside > 20
+
+
+@settings(max_examples=15, deadline=None)
+@given(seed=st.integers(0, 10**6))
+def test_gradients_are_finite_differences_on_random_trees(seed: int) -> None:
+    tables, *_ = random_robot(seed)
+    rng = np.random.default_rng(seed)
+    shapes = [(make(rng), pose(rng)) for make in SHAPES.values()]
+    kernel = Kernel(tables, scene_tables([(n, p) for n, (s, at) in enumerate(shapes) for p in primitives(s, at)]))
+    check_gradients(kernel, rng.uniform(-0.9, 0.9, (6, tables.dof)))
+
+
+def check_gradients(kernel: Kernel, states: np.ndarray) -> None:
+    step, smooth = 1e-6, 0
+    values, slopes = kernel.clearance_gradient(states)
+    for q, value, slope in zip(states, values, slopes, strict=True):
+        shifts = step * np.eye(len(q))
+        ahead, behind = kernel.clearance(q + shifts), kernel.clearance(q - shifts)
+        numeric = (ahead - behind) / (2 * step)
+        bent = np.abs(ahead + behind - 2 * value) > 1e-8  # another sphere takes over between the two
+        where = np.isfinite(value) & ~bent.any(axis=0)
+        smooth += int(where.sum())
+        assert np.abs(numeric - slope.T)[:, where] == pytest.approx(0.0, abs=1e-5)
+    assert smooth >= len(states)
+
+
+@pytest.mark.parametrize("which", ["robot", "baxter"])
+def test_frames_and_gradients_of_real_robots(which: str, request: pytest.FixtureRequest, post: Obstacle) -> None:
+    robot: Robot = request.getfixturevalue(which)
+    kernel = Verdict(robot, [post])._proved().kernel
+    states = states_around_home(robot, np.random.default_rng(0), 20)
+    turn, origin = kernel.joint_frames(states)
+    data = robot.model.createData()
+    for k, q in enumerate(states):
+        pin.forwardKinematics(robot.model, data, robot.to_pinocchio(q))
+        assert origin[k] == pytest.approx(np.array([at.translation for at in data.oMi]), abs=1e-12)
+        for j in range(1, robot.model.njoints):  # the axis, which turning about z leaves alone
+            name = robot.model.joints[j].shortname()
+            if name.endswith("RZ"):
+                assert turn[k, j, :, 2] == pytest.approx(data.oMi[j].rotation[:, 2], abs=1e-12)
+    check_gradients(kernel, states)
+
+
+def test_tables_are_saved_and_loaded_without_pinocchio(robot: Robot, post: Obstacle, tmp_path: Path) -> None:
+    kernel = Verdict(robot, [post])._proved().kernel
+    states = states_around_home(robot, np.random.default_rng(1), 5)
+    kernel.robot.save(tmp_path / "robot.npz")
+    np.save(tmp_path / "states.npy", states)
+    code = f"""
+import sys, numpy as np
+for name in ("pinocchio", "coal", "ompl"):
+    sys.modules[name] = None
+from apex_ompl.kernel.face import Kernel
+from apex_ompl.kernel.tables import BOX, Primitive, RobotTables, scene_tables
+at = np.eye(4)
+at[:3, 3] = {list(post.position)}
+box = Primitive(BOX, at, {tuple(e / 2 for e in post.box)})
+kernel = Kernel(RobotTables.load({str(tmp_path / "robot.npz")!r}), scene_tables([(0, box)]))
+np.save({str(tmp_path / "values.npy")!r}, kernel.clearance(np.load({str(tmp_path / "states.npy")!r})))
+"""
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT, timeout=120)
+    alone = Kernel(kernel.robot, scene_tables([(0, p) for p in primitives(coal.Box(*post.box), post.pose)]))
+    assert np.array_equal(np.load(tmp_path / "values.npy"), alone.clearance(states))
+
+
+def test_faulty_tables_are_refused(tmp_path: Path) -> None:
+    tables, *_ = random_robot(0)
+    tables.save(tmp_path / "good.npz")
+    assert RobotTables.load(tmp_path / "good.npz").body_names == tables.body_names
+    with pytest.raises(MissingFileError, match="no.npz"):
+        RobotTables.load(tmp_path / "no.npz")
+    (tmp_path / "text.npz").write_text("hello")
+    with pytest.raises(FileFormatError, match=r"text.npz.*kernel tables"):
+        RobotTables.load(tmp_path / "text.npz")
+    (tmp_path / "short.npz").write_bytes((tmp_path / "good.npz").read_bytes()[:-400])
+    with pytest.raises(FileFormatError, match="short.npz"):
+        RobotTables.load(tmp_path / "short.npz")
+    for name, wrong in {
+        "joint_parent": tables.arrays.joint_parent + 7, "bodies": tables.arrays.bodies + 90,
+        "node_radius": tables.arrays.node_radius * np.nan, "node_first": tables.arrays.node_first * 0,
+        "pair_bodies": tables.arrays.pair_bodies + 50, "lower": tables.arrays.lower[:-1],
+    }.items():  # fmt: skip
+        bad = RobotTables("bad", tables.joint_names, tables.body_names, tables.numbers,
+                          tables.arrays._replace(**{name: wrong}))  # fmt: skip
+        bad.save(tmp_path / "bad.npz")
+        with pytest.raises(FileFormatError, match=name):
+            RobotTables.load(tmp_path / "bad.npz")
+
+
+def test_states_of_another_shape_are_refused(robot: Robot) -> None:
+    kernel = Verdict(robot)._proved().kernel
+    with pytest.raises(ParameterError, match=r"\(N, 16\)"):
+        kernel.clearance(np.zeros(7))
+
+
+def test_what_is_no_number_is_never_proved(robot: Robot) -> None:
+    kernel = Verdict(robot)._proved().kernel
+    assert kernel.unproved(robot.home)[1][0] == 0
+    for k in range(robot.dof):
+        for value in (np.nan, np.inf, -np.inf):
+            q = robot.home.copy()
+            q[k] = value
+            assert kernel.unproved(q)[1][0] == -1
+    q = robot.home.copy()
+    q[-1] = 1.001  # beyond the limits the ball around the fingers does not hold
+    assert kernel.unproved(q)[1][0] == -1
+
+
+def test_threads_do_not_disturb_each_other(robot: Robot, post: Obstacle) -> None:
+    kernel = Verdict(robot, [post])._proved().kernel
+    rng = np.random.default_rng(2)
+    batches = [states_around_home(robot, rng, 4000) for _ in range(4)]
+    expected = [kernel.clearance(batch) for batch in batches]
+    found: list[np.ndarray | None] = [None] * 4
+
+    def work(k: int) -> None:
+        for _ in range(3):
+            found[k] = kernel.clearance(batches[k])
+
+    threads = [threading.Thread(target=work, args=(k,)) for k in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert all(np.array_equal(a, b) for a, b in zip(expected, found, strict=True))
+
+
+CALL = """
+import numpy as np
+from apex_ompl.kernel import compiled
+
+def plus(a):
+    return a[0] + 1.0
+
+f = compiled.entry(plus)
+assert f(np.ones(1)) == f(np.ones(1)) == 2.0
+print(compiled.cache_folder())
+"""
+
+
+@pytest.mark.parametrize("writable", [True, False])
+def test_code_is_kept_where_it_can_be(tmp_path: Path, writable: bool) -> None:
+    (tmp_path / "file").write_text("not a folder")
+    home = tmp_path / "cache" if writable else tmp_path / "file"
+    script = tmp_path / "call.py"
+    script.write_text(CALL)
+    env = {"PATH": "", "NUMBA_CACHE_DIR": str(home), "XDG_CACHE_HOME": str(home), "PYTHONPATH": str(ROOT)}
+
+    def run() -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            [sys.executable, script], check=False, env=env, capture_output=True, text=True, timeout=120
+        )
+
+    first, second = run(), run()
+    assert first.returncode == second.returncode == 0, first.stderr + second.stderr
+    assert "compiles" in first.stderr
+    if writable:
+        assert str(home) in first.stdout and "compiles" not in second.stderr
+    else:
+        assert first.stdout.strip() == "None" and "no cache folder" in first.stderr and "compiles" in second.stderr
