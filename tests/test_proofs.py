@@ -1,0 +1,226 @@
+"""The two stages of the verdict against the meshes alone, and proofs of motions against dense samples."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+
+import coal
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support import states_around_home
+from test_kernel import SHAPES, pose, random_robot
+
+from apex_ompl.collision import Verdict
+from apex_ompl.collision.sweep import grid, sample_path
+from apex_ompl.collision.tabulate import primitives
+from apex_ompl.kernel import entries
+from apex_ompl.kernel.face import MOST_PAIRS, Kernel
+from apex_ompl.kernel.tables import scene_tables
+from apex_ompl.problem import AttachedObject, MeshFile, Obstacle
+from apex_ompl.robot import Robot
+from apex_ompl.validity import full_check
+
+STEP = """\
+v 0 0 0\nv 0.3 0 0\nv 0.3 0.1 0\nv 0.1 0.1 0\nv 0.1 0.3 0\nv 0 0.3 0
+v 0 0 0.2\nv 0.3 0 0.2\nv 0.3 0.1 0.2\nv 0.1 0.1 0.2\nv 0.1 0.3 0.2\nv 0 0.3 0.2
+f 4 3 2\nf 4 2 1\nf 6 5 4\nf 6 4 1\nf 10 8 9\nf 10 7 8\nf 12 10 11\nf 12 7 10
+f 1 2 8\nf 1 8 7\nf 2 3 9\nf 2 9 8\nf 3 4 10\nf 3 10 9\nf 4 5 11\nf 4 11 10\nf 5 6 12\nf 5 12 11\nf 6 1 7\nf 6 7 12
+"""
+
+
+def clutter(rng: np.random.Generator, mesh: Path) -> list[Obstacle]:
+    """One obstacle of each kind and a few boxes, in front of the arms."""
+
+    def place() -> dict[str, tuple[float, ...]]:
+        turn = rng.normal(size=4)
+        where = rng.uniform([0.25, -0.8, 0.1], [0.9, 0.8, 0.9])
+        return {"position": tuple(where), "orientation": tuple(turn / np.linalg.norm(turn))}
+
+    mesh.write_text(STEP)
+    return [
+        Obstacle(name="ball", sphere={"radius": 0.06}, **place()),
+        Obstacle(name="bar", cylinder={"radius": 0.04, "length": 0.5}, **place()),
+        Obstacle(name="pill", capsule={"radius": 0.05, "length": 0.3}, **place()),
+        Obstacle(name="step", mesh=MeshFile(file=str(mesh)), **place()),
+        Obstacle(name="ceiling", half_space={"normal": (0.1, 0.0, -1.0), "offset": -1.2}),
+        *(Obstacle(name=f"box{k}", box=tuple(rng.uniform(0.04, 0.25, 3)), **place()) for k in range(3)),
+    ]
+
+
+def held(robot: Robot) -> list[AttachedObject]:
+    palms = [hand.palm for hand in robot.hands.values()]
+    return [
+        AttachedObject(name="cup", link=palms[0], cylinder={"radius": 0.035, "length": 0.12}, position=(0, 0, 0.1)),
+        AttachedObject(name="block", link=palms[1], box=(0.05, 0.08, 0.2), position=(0, 0, 0.12)),
+    ]
+
+
+def verdicts(robot: Robot, scene: list[Obstacle], hands: list[AttachedObject]) -> tuple[Verdict, Verdict]:
+    return Verdict(robot, scene, hands), Verdict(robot, scene, hands, proofs=False)
+
+
+def towards_contact(meshes: Verdict, states: np.ndarray, steps: int = 9) -> np.ndarray:
+    """States on both sides of the border of collision."""
+    free = meshes.are_free(states)
+    found = []
+    for a, b in zip(states[free], states[~free], strict=False):
+        low, high = a, b
+        for _ in range(steps):
+            middle = (low + high) / 2
+            low, high = (middle, high) if meshes.is_free(middle) else (low, middle)
+        found += [low, high]
+    return np.array(found)
+
+
+@pytest.mark.parametrize("holding", [False, True])
+@pytest.mark.parametrize("which", ["robot", "baxter"])
+def test_both_stages_say_what_the_meshes_say(
+    which: str, holding: bool, request: pytest.FixtureRequest, tmp_path: Path
+) -> None:
+    robot: Robot = request.getfixturevalue(which)
+    rng = np.random.default_rng(5)
+    both, meshes = verdicts(robot, clutter(rng, tmp_path / "step.obj"), held(robot) if holding else [])
+    wide = states_around_home(robot, rng, 900, 0.6)
+    states = np.concatenate([wide, robot.random_state(rng, 300), towards_contact(meshes, wide[:500])])
+    expected = meshes.are_free(states)
+    assert np.array_equal(both.are_free(states), expected)
+    proved = both._proved().kernel.unproved(states)[1] == 0
+    assert not (proved & ~expected).any()
+    assert 0.3 < expected.mean() < 0.9 and proved.sum() > 0.5 * expected.sum()
+    assert both.tally.proved == proved.sum() and both.tally.states == len(states)
+
+
+def test_what_is_wholly_inside_a_link_is_never_proved_free(robot: Robot) -> None:
+    rng = np.random.default_rng(8)
+    inside = 0
+    for k, item in enumerate(robot.geometry.geometryObjects):
+        if item.parentJoint == 0 or item.geometry.getObjectType() != coal.OT_BVH:
+            continue
+        q = states_around_home(robot, rng, 1)[0]
+        link = robot.model.frames[item.parentFrame].name
+        at = robot.link_pose(q, link)
+        middle = at[:3, :3] @ np.array(item.geometry.vertices()).mean(axis=0) + at[:3, 3]
+        seed = Obstacle(name="seed", box=(0.02, 0.02, 0.02), position=tuple(middle))
+        both, meshes = verdicts(robot, [seed], [])
+        assert both._proved().kernel.unproved(q)[1][0] != 0, k
+        assert both.is_free(q) == meshes.is_free(q)
+        inside += not meshes.is_free(q)
+    assert inside >= 14
+
+
+def test_moved_added_and_removed_obstacles_are_followed(robot: Robot) -> None:
+    rng = np.random.default_rng(3)
+    states = states_around_home(robot, rng, 60)
+    scene = [Obstacle(name="a", box=(0.3, 0.3, 0.3), position=(0.5, 0.3, 0.4))]
+    both, meshes = verdicts(robot, scene, [])
+    seen = []
+    for change in (
+        lambda v: None,
+        lambda v: v.move("a", (0.5, -0.3, 0.5)),
+        lambda v: v.add(Obstacle(name="b", sphere={"radius": 0.15}, position=(0.45, 0.4, 0.5))),
+        lambda v: v.remove("a"),
+        lambda v: v.attach(AttachedObject(name="c", link="left_hand_palm", box=(0.3, 0.1, 0.1), position=(0, 0, 0.2))),
+        lambda v: v.detach("c"),
+    ):
+        change(both)
+        change(meshes)
+        seen.append(meshes.are_free(states))
+        assert np.array_equal(both.are_free(states), seen[-1])
+    assert len({tuple(s) for s in seen}) >= 4
+
+
+@pytest.mark.parametrize("which", ["robot", "baxter"])
+def test_motions_and_paths_are_judged_alike(which: str, request: pytest.FixtureRequest, tmp_path: Path) -> None:
+    robot: Robot = request.getfixturevalue(which)
+    rng = np.random.default_rng(11)
+    both, meshes = verdicts(robot, clutter(rng, tmp_path / "step.obj"), held(robot))
+    states = states_around_home(robot, rng, 150, 0.5)
+    states = states[meshes.are_free(states)]
+    outcomes = []
+    for a, b, c in zip(states, states[1:], states[2:], strict=False):
+        path = np.stack([a, (a + b) / 2, b, b, (b + c) / 2])
+        hit, expected = (v.first_collision(path, 0.031) for v in (both, meshes))
+        assert (hit is None) == (expected is None)
+        outcomes.append(hit is None)
+        if hit is not None:
+            assert not meshes.is_free(hit.state)
+            dense, segments = sample_path(path, 0.031)
+            at = np.flatnonzero((dense == hit.state).all(axis=1))
+            assert len(at) and hit.segment in segments[at]
+    assert 10 < sum(outcomes) < len(outcomes) - 10
+    assert both.tally.proved_steps > 0.3 * both.tally.steps
+
+
+def test_proved_motions_hold_at_a_hundred_times_the_density(robot: Robot, tmp_path: Path) -> None:
+    rng = np.random.default_rng(21)
+    both, meshes = verdicts(robot, clutter(rng, tmp_path / "step.obj"), held(robot))
+    wide = states_around_home(robot, rng, 400, 0.5)
+    edge = towards_contact(meshes, wide, steps=5)[::2]  # free, and near to a contact
+    judged = 0
+    for a in edge[:40]:
+        b = np.clip(a + rng.normal(0.0, 0.02, robot.dof), robot.limits.lower, robot.limits.upper)
+        path = np.stack([a, b])
+        before = both.tally.meshes
+        if both.first_collision(path, 0.031) is None and both.tally.meshes == before:
+            dense = sample_path(path, 0.031 / 100)[0]
+            judged += len(dense)
+            assert meshes.are_free(dense).all()
+    assert judged > 1000
+
+
+@settings(max_examples=60, deadline=None)
+@given(seed=st.integers(0, 10**6), size=st.floats(0.001, 0.3))
+def test_proved_boxes_hold_for_random_trees(seed: int, size: float) -> None:
+    """A motion that is proved as a whole keeps every sphere off every other and off the scene."""
+    tables, *_ = random_robot(seed)
+    rng = np.random.default_rng(seed)
+    shapes = [(make(rng), pose(rng, 1.0)) for make in SHAPES.values()]
+    kernel = Kernel(tables, scene_tables([(n, p) for n, (s, at) in enumerate(shapes) for p in primitives(s, at)]))
+    a = rng.uniform(-0.6, 0.6, tables.dof)
+    path = np.stack([a, np.clip(a + rng.normal(0.0, size, tables.dof), -1.0, 1.0)])
+    starts = grid(path, 0.0031)
+    last = int(starts[-1])
+    work = np.empty((2 * last + 4, 2), np.int64)
+    work[0] = 0, last
+    ends, counts = np.array([0, 1, 0]), np.zeros(5, np.int64)
+    state, found = np.empty(tables.dof), np.empty((MOST_PAIRS, 2), np.int64)
+    done = entries.advance(*kernel.packed, *kernel.room(), path, starts, work, ends, state, found, counts)
+    if done == entries.DONE and counts[entries.PROVED_BOXES] > 0:
+        dense = path[0] + np.linspace(0.0, 1.0, 300)[:, None] * (path[1] - path[0])
+        if counts[entries.PROVED_STEPS] == last:
+            assert (kernel.clearance(dense) > 0.0).all()
+
+
+def test_the_full_check_agrees_with_the_meshes_alone(robot: Robot, tmp_path: Path) -> None:
+    rng = np.random.default_rng(2)
+    both, meshes = verdicts(robot, clutter(rng, tmp_path / "step.obj")[:4], [])
+    states = states_around_home(robot, rng, 40, 0.3)
+    states = states[meshes.are_free(states)]
+    verdict_of = []
+    for a, b in zip(states, states[1:], strict=False):
+        path = a + np.linspace(0.0, 1.0, 40)[:, None] * (b - a)
+        one, other = full_check(both, path), full_check(meshes, path)
+        assert one.ok == other.ok and bool(one.reason) == bool(other.reason)
+        verdict_of.append(one.ok)
+    assert {True, False} == set(verdict_of)
+
+
+def test_two_threads_judge_as_one_does(robot: Robot, tmp_path: Path) -> None:
+    rng = np.random.default_rng(4)
+    both, meshes = verdicts(robot, clutter(rng, tmp_path / "step.obj"), held(robot))
+    states = states_around_home(robot, rng, 400)
+    expected = meshes.are_free(states)
+    found: list[np.ndarray | None] = [None] * 3
+
+    def work(k: int) -> None:
+        found[k] = np.array([both.is_free(q) for q in states])
+
+    threads = [threading.Thread(target=work, args=(k,)) for k in range(3)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert all(np.array_equal(expected, one) for one in found)
