@@ -25,7 +25,7 @@ from apex_ompl.problem import Problem
 from apex_ompl.repair import repair
 from apex_ompl.result import PlanResult, PlanStatus
 from apex_ompl.simplify import simplify as shorten
-from apex_ompl.space import path_length, path_to_array, resample
+from apex_ompl.space import FULL_RESOLUTION, path_length, path_to_array, resample
 from apex_ompl.validity import full_check
 
 if TYPE_CHECKING:
@@ -171,7 +171,8 @@ class _Run:
         ready = self.ready
         goals = sorted(ready.valid_goals, key=lambda goal: float(np.linalg.norm(goal - ready.start)))
         lines = (np.stack([ready.start, goal]) for goal in goals)
-        return next((line for line in lines if full_check(ready.verdict, line, ready.start, goals)), None)
+        free = (line for line in lines if ready.verdict.first_collision(line, FULL_RESOLUTION) is None)
+        return next((line for line in free if full_check(ready.verdict, line, ready.start, goals)), None)
 
     def _run_ompl(self, parameters: planners.Parameters, timeout: float) -> PlanStatus:
         """Run the planner and return its status; faults of the checkers are raised."""

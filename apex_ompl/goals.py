@@ -100,7 +100,7 @@ class Sampling:
         attempts: Descents made.
         converged: Descents that satisfied it, free or not.
         best: The errors of the best attempt.
-        blocked: Why the last state that satisfied it was not free, or empty.
+        blocked: Why the last state that satisfied it was not free; empty when one was free, or none satisfied it.
     """
 
     states: Array
@@ -294,7 +294,7 @@ class AlignmentGoal:
         states: list[Array] = []
         best: dict[str, float] = {}
         converged = attempts = 0
-        blocked = ""
+        colliding: Array | None = None
         while attempts < max_attempts and len(states) < count:
             attempts += 1
             q = self.attempt(rng)
@@ -307,8 +307,11 @@ class AlignmentGoal:
             if verdict.is_free(q):
                 states.append(q)
             else:
-                blocked = str(next(iter(verdict.contacts(q)), "in collision"))
+                colliding = q
         found = np.array(states).reshape(-1, self.robot.dof)
+        blocked = ""
+        if colliding is not None and not states:
+            blocked = str(next(iter(verdict.contacts(colliding)), "in collision"))
         return Sampling(found, attempts, converged, best, blocked)
 
     def _hand_joints(self) -> NDArray[np.intp]:

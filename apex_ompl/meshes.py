@@ -6,6 +6,7 @@ import coal
 import numpy as np
 from numpy.typing import NDArray
 
+MOST_TRIANGLES = 200_000  # after which large ones are taken as they are
 LARGEST = 1e4  # coordinates beyond are taken for a fault [m]
 
 
@@ -80,6 +81,62 @@ def piece_points(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDA
     _, first = np.unique(label[corners[:, 0]], return_index=True)
     points: NDArray[np.float64] = vertices[faces[first, 0]]
     return points
+
+
+def bounding_boxes(vertices: NDArray[np.float64], faces: NDArray[np.int64], columns: int = 8) -> NDArray[np.float64]:
+    """Return boxes that together contain the solid of a closed mesh, cavities left open, shape (boxes, 2, 3) [m].
+
+    The mesh is cut into columns along one axis. A line along that axis through a point of the solid leaves the solid
+    at both ends through the surface, inside the same column; so the box around what the column has of the surface
+    contains what it has of the solid. The axis is the one with the least volume of boxes.
+
+    Args:
+        vertices: Shape (V, 3) [m].
+        faces: Indices of the corners, shape (T, 3).
+        columns: How many along each of the two other axes.
+    """
+    corners = _halved(vertices[faces], 0.5 * float(np.ptp(vertices, axis=0).min()) / columns)
+    found = [_columns(corners, np.delete(np.arange(3), axis), columns) for axis in range(3)]
+    return min(found, key=lambda boxes: float(np.prod(boxes[:, 1] - boxes[:, 0], axis=1).sum()))
+
+
+def _halved(corners: NDArray[np.float64], longest: float) -> NDArray[np.float64]:
+    """Halve triangles, shape (T, 3, 3), along their longest edges until all edges are short, or there are many."""
+    while len(corners) < MOST_TRIANGLES:
+        edges = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2)
+        large = edges.max(axis=1) > longest
+        if not large.any():
+            break
+        turn = (edges[large].argmax(axis=1)[:, None] + np.arange(3)) % 3
+        a, b, c = np.moveaxis(np.take_along_axis(corners[large], turn[:, :, None], axis=1), 1, 0)
+        middle = (a + b) / 2.0
+        corners = np.concatenate([corners[~large], np.stack([a, middle, c], 1), np.stack([middle, b, c], 1)])
+    return corners
+
+
+def _columns(corners: NDArray[np.float64], cut: NDArray[np.intp], columns: int) -> NDArray[np.float64]:
+    """Return the boxes around triangles, shape (T, 3, 3), column by column; ``cut`` are the axes that are cut."""
+    low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
+    width = np.maximum((high - low)[cut] / columns, 1e-12)
+    least, most = corners.min(axis=1), corners.max(axis=1)
+    first, last = (
+        np.clip((v[:, cut] - low[cut]) / width, 0, columns - 1).astype(int) for v in (least - 1e-9, most + 1e-9)
+    )
+    boxes = np.full((columns, columns, 2, 3), np.inf)
+    boxes[:, :, 1] = -np.inf
+    span = (last - first).max(axis=0) + 1
+    for shift in np.ndindex(*span):
+        cell = first + shift
+        here = (cell <= last).all(axis=1)
+        x, y = cell[here].T
+        floor, roof = least[here].copy(), most[here].copy()
+        floor[:, cut] = np.maximum(floor[:, cut], low[cut] + cell[here] * width)
+        roof[:, cut] = np.minimum(roof[:, cut], low[cut] + (cell[here] + 1) * width)
+        np.minimum.at(boxes[:, :, 0], (x, y), floor)
+        np.maximum.at(boxes[:, :, 1], (x, y), roof)
+    found = boxes[np.isfinite(boxes).all(axis=(2, 3))]
+    wide: NDArray[np.float64] = found + np.array([-1e-9, 1e-9])[:, None]
+    return wide
 
 
 def winding_number(point: NDArray[np.float64], corners: NDArray[np.float64]) -> float:

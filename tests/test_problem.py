@@ -210,3 +210,10 @@ def test_paths_of_meshes_and_robots_start_at_the_file(tmp_path: Path) -> None:
 def test_a_held_half_space_is_refused_from_python_too() -> None:
     with pytest.raises(ValueError, match="cannot be held"):
         AttachedObject(name="floor", link="palm", half_space={"normal": (0.0, 0.0, 1.0)})
+
+
+@pytest.mark.parametrize("levels", [50, 500, 50_000])
+@pytest.mark.parametrize("opening", ["[", "{b: ", "- ", "- [\n", "? ", "[']', "])
+def test_deep_nesting_is_a_fault_and_no_crash(levels: int, opening: str) -> None:
+    with pytest.raises(FileFormatError):
+        parse_yaml("a: " + opening * levels, "deep.yaml")

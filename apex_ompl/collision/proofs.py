@@ -12,6 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apex_ompl.collision.broadphase import CompiledScene
+from apex_ompl.collision.rough_cover import rough_cover
+from apex_ompl.collision.shapes import is_shell
 from apex_ompl.collision.sphere_proof import Cover
 from apex_ompl.collision.spheres import make_cover, read_covers, shape_key
 from apex_ompl.collision.tabulate import tabulate, tabulate_scene
@@ -67,7 +69,7 @@ def covers_of(robot: Robot, shapes: Sequence[coal.CollisionGeometry]) -> list[Co
     for shape in shapes:
         key = shape_key(shape)
         if key not in _covers:
-            _covers[key] = make_cover(shape, effort=1)
+            _covers[key] = rough_cover(shape) if is_shell(shape) else make_cover(shape, effort=1)
         found.append(_covers[key])
     return found
 

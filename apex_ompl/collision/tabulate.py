@@ -25,6 +25,7 @@ from apex_ompl.kernel.tables import (
     SceneTables,
     scene_tables,
 )  # fmt: skip
+from apex_ompl.meshes import bounding_boxes, triangles
 from apex_ompl.robot import Robot
 
 Array = NDArray[np.float64]
@@ -106,7 +107,7 @@ def tabulate_scene(obstacles: Mapping[int, tuple[coal.CollisionGeometry, Array]]
 
 
 def primitives(shape: coal.CollisionGeometry, pose: Array) -> list[Primitive]:
-    """Return solids that the kernel knows and that contain a geometry: itself, or the box around a mesh."""
+    """Return solids that the kernel knows and that contain a geometry: itself, or boxes around a mesh."""
     kind = shape.getNodeType()
     if kind == coal.GEOM_BOX:
         return [Primitive(BOX, pose, tuple(shape.halfSide))]
@@ -119,8 +120,9 @@ def primitives(shape: coal.CollisionGeometry, pose: Array) -> list[Primitive]:
     if kind == coal.GEOM_HALFSPACE:
         normal = pose[:3, :3] @ shape.n
         return [Primitive(HALF_SPACE, pose, (*normal, shape.d + float(normal @ pose[:3, 3])))]
-    corners = np.array(shape.vertices())
-    low, high = corners.min(axis=0), corners.max(axis=0)
-    centre = np.eye(4)
-    centre[:3, 3] = (low + high) / 2.0
-    return [Primitive(BOX, pose @ centre, tuple((high - low) / 2.0 + 1e-9))]
+    found = []
+    for low, high in bounding_boxes(*triangles(shape)):
+        centre = np.eye(4)
+        centre[:3, 3] = (low + high) / 2.0
+        found.append(Primitive(BOX, pose @ centre, tuple((high - low) / 2.0)))
+    return found
