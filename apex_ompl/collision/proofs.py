@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 from weakref import WeakKeyDictionary
 
 import coal
@@ -23,8 +25,19 @@ from apex_ompl.kernel.tables import RobotTables, SceneTables
 from apex_ompl.robot import Robot
 
 Array = NDArray[np.float64]
-Pairs = list[tuple[int, int]] | None
-"""Pairs of geometries to look at, or None for all."""
+
+
+class Open(NamedTuple):
+    """What the meshes must judge at a state.
+
+    Attributes:
+        pairs: Pairs of geometries that are not proved to be apart.
+        complete: Whether all others are proved to be apart.
+    """
+
+    pairs: list[tuple[int, int]]
+    complete: bool
+
 
 _robots: WeakKeyDictionary[Robot, RobotTables] = WeakKeyDictionary()
 _covers: dict[str, Cover] = {}
@@ -91,6 +104,7 @@ class Proofs:
             RobotError: A joint moves in a way that the kernel does not know.
         """
         self.scene = scene
+        self._local = threading.local()
         self.kernel = Kernel(self._robot(robot), self._obstacles())
 
     def _robot(self, robot: Robot) -> RobotTables:
@@ -118,23 +132,37 @@ class Proofs:
         """Take over the poses of the scene's obstacles."""
         self.kernel = Kernel(self.kernel.robot, self._obstacles())
 
-    def open_pairs(self, states: Array, tally: Tally) -> list[tuple[int, Pairs]]:
-        """Return the states, shape (N, dof), that are not proved free: their numbers and the pairs in question."""
+    def open_at(self, q: Array, tally: Tally) -> Open | None:
+        """Return what is left to be judged at a state, shape (dof,); None where it is proved free."""
+        mine = self._local
+        if not hasattr(mine, "state"):
+            mine.state = np.empty((1, self.kernel.robot.dof))
+            mine.found, mine.counts = np.empty((1, MOST_PAIRS, 2), np.int64), np.empty(1, np.int64)
+            mine.room = self.kernel.room()
+        mine.state[0] = q
+        entries.judge_states(*self.kernel.packed, *mine.room, mine.state, mine.found, mine.counts)
+        count = int(mine.counts[0])
+        if count == 0:
+            tally.proved += 1
+            return None
+        return self._left(mine.found[0], count)
+
+    def open_among(self, states: Array, tally: Tally) -> list[tuple[int, Open]]:
+        """Return the states, shape (N, dof), that are not proved free: their numbers and what is left to be judged."""
         found, counts = self.kernel.unproved(states)
         opened = np.flatnonzero(counts)
         tally.proved += len(states) - len(opened)
-        return [(int(k), self._pairs(found[k], int(counts[k]))) for k in opened]
+        return [(int(k), self._left(found[k], int(counts[k]))) for k in opened]
 
-    def _pairs(self, found: NDArray[np.int64], count: int) -> Pairs:
-        if not 0 <= count < MOST_PAIRS:
-            return None
+    def _left(self, found: NDArray[np.int64], count: int) -> Open:
         numbers = self.kernel.robot.numbers
-        return [(numbers[a], numbers[b] if b >= 0 else -1 - b) for a, b in found[:count].tolist()]
+        pairs = [(numbers[a], numbers[b] if b >= 0 else -1 - b) for a, b in found[: max(count, 0)].tolist()]
+        return Open(pairs, 0 < count < MOST_PAIRS)
 
     def open_states(
         self, path: Array, starts: NDArray[np.int64], queue: Sequence[tuple[int, int]], tally: Tally
-    ) -> Iterator[tuple[int, Array, Pairs]]:
-        """Prove a path, and yield what the meshes must judge: number in the grid, state, pairs in question.
+    ) -> Iterator[tuple[int, Array, Open]]:
+        """Prove a path, and yield what the meshes must judge: number in the grid, state, what is left to be judged.
 
         Args:
             path: States, shape (N, dof).
@@ -161,4 +189,4 @@ class Proofs:
             tally.proved_steps += int(fresh[entries.PROVED_STEPS])
             if number == entries.DONE:
                 return
-            yield number, state, self._pairs(found, int(ends[2]))
+            yield number, state, self._left(found, int(ends[2]))

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from apex_ompl.collision.broadphase import CompiledScene, Contact
 from apex_ompl.collision.distance import Distance
-from apex_ompl.collision.proofs import Pairs, Proofs, Tally
+from apex_ompl.collision.proofs import Open, Proofs, Tally
 from apex_ompl.collision.shapes import coal_geometry, world_geometry
 from apex_ompl.collision.sweep import bit_reversed, grid, sample_path
-from apex_ompl.errors import SceneError
+from apex_ompl.errors import ParameterError, SceneError
 from apex_ompl.problem import AttachedObject, Body, Obstacle
 from apex_ompl.robot import Robot
 from apex_ompl.schema import validate
@@ -163,14 +163,23 @@ class Verdict:
 
     def is_free(self, q: Array) -> bool:
         """Whether the state ``q``, shape (dof,), collides with nothing."""
-        return bool(self.are_free(np.asarray(q, float)[None])[0])
+        q = np.asarray(q, float)
+        if q.shape != (self.robot.dof,):
+            self.robot.to_pinocchio(q)  # says what is wrong
+            raise ParameterError("state", q.shape, f"an array of shape ({self.robot.dof},)")
+        if not self._prove:
+            return self._free_by_meshes(q)
+        left = self._proved().open_at(q, self.tally)
+        return left is None or self._free_by_meshes(q, left)
 
     def are_free(self, states: Array) -> NDArray[np.bool_]:
         """Whether each of the states, shape (N, dof), collides with nothing; shape (N,)."""
         self.robot.to_pinocchio(states[:0])
+        if not self._prove:
+            return np.array([self._free_by_meshes(q) for q in states], bool)
         free = np.ones(len(states), bool)
-        for k, pairs in self._open(states):
-            free[k] = self._free_by_meshes(states[k], pairs)
+        for k, left in self._proved().open_among(states, self.tally):
+            free[k] = self._free_by_meshes(states[k], left)
         return free
 
     def first_collision(self, path: Array, resolution: float, start: bool = True) -> Collision | None:
@@ -195,8 +204,8 @@ class Verdict:
         last = int(starts[-1])
         self.tally.steps += last
         queue = [(0, 0), (last, last), (0, last)][0 if start else 1 :]
-        for number, state, pairs in self._proved().open_states(path, starts, queue, self.tally):
-            if not self._free_by_meshes(state, pairs):
+        for number, state, left in self._proved().open_states(path, starts, queue, self.tally):
+            if not self._free_by_meshes(state, left):
                 segment = int(np.searchsorted(starts, number, side="left")) - 1
                 return Collision(state.copy(), max(segment, 0))
         return None
@@ -209,19 +218,6 @@ class Verdict:
             if not self.is_free(states[k + skip]):
                 return Collision(states[k + skip], int(segments[k + skip]))
         return None
-
-    def _open(self, states: Array) -> Iterable[tuple[int, Pairs]]:
-        if not self._prove:
-            return [(k, None) for k in range(len(states))]
-        return self._proved().open_pairs(states, self.tally)
-
-    def _free_by_meshes(self, q: Array, pairs: Pairs) -> bool:
-        self.tally.meshes += 1
-        order = self.robot.to_pinocchio(q)
-        if not np.isfinite(order).all():
-            return False
-        scene = self._scene()
-        return not (scene.collides(order) if pairs is None else scene.any_collides(order, pairs))
 
     def contacts(self, q: Array) -> list[Contact]:
         """Return all overlapping pairs at ``q``, shape (dof,), the deepest first."""
@@ -241,6 +237,20 @@ class Verdict:
     def clearance(self, q: Array) -> float:
         """Return the least distance of all pairs that are checked, links against each other included [m]."""
         return self._scene().distances("pairs").closest(self.robot.to_pinocchio(q)).value
+
+    def _free_by_meshes(self, q: Array, left: Open | None = None) -> bool:
+        """Judge a state by its meshes: those that are left to be judged first, and all unless these are all."""
+        self.tally.meshes += 1
+        order = self.robot.to_pinocchio(q)
+        if not np.isfinite(order).all():
+            return False
+        scene = self._scene()
+        if left is not None:
+            if left.pairs and scene.any_collides(order, left.pairs):
+                return False
+            if left.complete:
+                return True
+        return not scene.collides(order)
 
     def _claim(self, name: str) -> None:
         taken = name in self._obstacles or name in self._attached or self.robot.model.existBodyName(name)
