@@ -39,6 +39,8 @@ class Open(NamedTuple):
     complete: bool
 
 
+LEAVES = 32  # of a cover made at run time
+
 _robots: WeakKeyDictionary[Robot, RobotTables] = WeakKeyDictionary()
 _covers: dict[str, Cover] = {}
 
@@ -82,7 +84,8 @@ def covers_of(robot: Robot, shapes: Sequence[coal.CollisionGeometry]) -> list[Co
     for shape in shapes:
         key = shape_key(shape)
         if key not in _covers:
-            _covers[key] = rough_cover(shape) if is_shell(shape) else make_cover(shape, effort=1)
+            boxy = is_shell(shape) or shape.getNodeType() == coal.GEOM_BOX
+            _covers[key] = rough_cover(shape) if boxy else make_cover(shape, effort=1, most=LEAVES)
         found.append(_covers[key])
     return found
 

@@ -1,4 +1,4 @@
-"""A cover of any closed mesh in milliseconds, for meshes that nobody made a better one of."""
+"""A cover of a box or of any closed mesh in milliseconds, for shapes that nobody made a better one of."""
 
 from __future__ import annotations
 
@@ -10,45 +10,51 @@ from apex_ompl.collision.sphere_proof import PAD, Cover
 from apex_ompl.meshes import bounding_boxes, triangles
 
 COLUMNS = 6
+LEAVES = 64  # at most, of a box
+LEAVES_IN_MESH = 200
+
+Array = NDArray[np.float64]
 
 
-def rough_cover(mesh: coal.BVHModelBase) -> Cover:
-    """Return a cover of the solid of a mesh: balls around boxes that contain it, and around pieces of each.
+def rough_cover(geometry: coal.CollisionGeometry) -> Cover:
+    """Return a cover of a box or of the solid of a mesh: balls around boxes that contain it, halved again and again.
 
-    The boxes are those of ``apex_ompl.meshes.bounding_boxes``, so that nothing is left to be proved: a ball around
+    The boxes of a mesh are those of ``apex_ompl.meshes.bounding_boxes``. Nothing is left to be proved: a ball around
     all corners of a box contains the box.
     """
-    boxes = bounding_boxes(*triangles(mesh), COLUMNS)
-    pieces = [_cut(low, high) for low, high in boxes]
-    roots = [_ball(low, high) for low, high in boxes]
-    leaves = [_ball(low, high) for rows in pieces for low, high in rows]
-    whole = _ball(boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0))
-    lone = [len(rows) == 1 for rows in pieces]
-    first, count, kept = [1], [len(roots)], []
-    at, row = 1 + len(roots), 0
-    for rows, single in zip(pieces, lone, strict=True):
-        first.append(0 if single else at)
-        count.append(0 if single else len(rows))
-        if not single:
-            kept += leaves[row : row + len(rows)]
-            at += len(rows)
-        row += len(rows)
-    balls = np.array([whole, *roots, *kept])
-    first += [0] * len(kept)
-    count += [0] * len(kept)
-    return Cover(balls[:, :3].copy(), balls[:, 3] + PAD, np.array(first, np.int64), np.array(count, np.int64))
+    if geometry.getNodeType() == coal.GEOM_BOX:
+        boxes, most = np.array([[-geometry.halfSide, geometry.halfSide]]), LEAVES
+    else:
+        boxes, most = bounding_boxes(*triangles(geometry), COLUMNS), LEAVES_IN_MESH
+    sides = boxes[:, 1] - boxes[:, 0]
+    longest = float(sides.max())
+    while len(boxes) < most and _leaves(sides, longest / 1.1) <= most:
+        longest /= 1.1
+    queue = [np.stack([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)])]
+    first, count, at = [], [], 0
+    while at < len(queue):
+        parts = list(boxes) if at == 0 and len(boxes) > 1 else _halves(queue[at], longest)
+        first.append(len(queue) if parts else 0)
+        count.append(len(parts))
+        queue += parts
+        at += 1
+    nodes = np.array(queue)
+    radii = np.linalg.norm(nodes[:, 1] - nodes[:, 0], axis=1) / 2.0 + PAD
+    return Cover(nodes.mean(axis=1), radii, np.array(first, np.int64), np.array(count, np.int64))
 
 
-def _ball(low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.array([*(low + high) / 2.0, float(np.linalg.norm(high - low)) / 2.0])
+def _leaves(sides: Array, longest: float) -> float:
+    """Return how many parts boxes, shape (boxes, 3), fall into when sides are halved until none is too long."""
+    return float(np.prod(2.0 ** np.ceil(np.log2(np.maximum(sides / longest, 1.0))), axis=1).sum())
 
 
-def _cut(low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return pieces of a box, cut along its longest side, about as long as it is wide, shape (pieces, 2, 3)."""
-    sides = high - low
+def _halves(box: Array, longest: float) -> list[Array]:
+    """Return the halves of a box along its longest side, shape (2, 3) each, or nothing when that is short enough."""
+    sides = box[1] - box[0]
     axis = int(np.argmax(sides))
-    across = max(float(np.delete(sides, axis).max()), 1e-9)
-    ends = np.linspace(low[axis], high[axis], max(1, round(float(sides[axis]) / across)) + 1)
-    pieces = np.tile(np.stack([low, high]), (len(ends) - 1, 1, 1))
-    pieces[:, 0, axis], pieces[:, 1, axis] = ends[:-1], ends[1:]
-    return pieces
+    if sides[axis] <= longest:
+        return []
+    middle = (box[0, axis] + box[1, axis]) / 2.0
+    lower, upper = box.copy(), box.copy()
+    lower[1, axis] = upper[0, axis] = middle
+    return [lower, upper]

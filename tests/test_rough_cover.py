@@ -1,0 +1,92 @@
+"""Boxes around meshes and covers made of boxes, against the winding number and random points."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import coal
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support import ROOT
+
+from apex_ompl.collision.rough_cover import rough_cover
+from apex_ompl.collision.sphere_proof import Cover
+from apex_ompl.collision.tabulate import primitives
+from apex_ompl.meshes import bounding_boxes, triangles, winding_number
+
+MESHES = sorted((ROOT / "problems" / "data").glob("*.obj"))
+
+
+def load(path: Path, scale: np.ndarray) -> coal.BVHModelBase:
+    return coal.MeshLoader().load(str(path), scale)
+
+
+def points_inside(mesh: coal.BVHModelBase, rng: np.random.Generator, count: int) -> np.ndarray:
+    vertices, faces = triangles(mesh)
+    corners = vertices[faces]
+    drawn = rng.uniform(vertices.min(axis=0), vertices.max(axis=0), (count, 3))
+    surface = (corners * rng.dirichlet(np.ones(3), len(corners))[:, :, None]).sum(axis=1)
+    return np.concatenate([drawn[[abs(winding_number(p, corners)) > 0.5 for p in drawn]], vertices, surface])
+
+
+def in_boxes(boxes: np.ndarray, points: np.ndarray) -> np.ndarray:
+    return ((points[:, None] >= boxes[:, 0]) & (points[:, None] <= boxes[:, 1])).all(axis=2).any(axis=1)
+
+
+def answered_for(cover: Cover, points: np.ndarray) -> np.ndarray:
+    """Whether each point is in a leaf and in all balls above it: what a walk down the tree relies on."""
+    inside = np.linalg.norm(points[:, None] - cover.centres, axis=2) <= cover.radii
+    for k, parent in enumerate(cover.parents):
+        if parent >= 0:
+            inside[:, k] &= inside[:, parent]
+    return inside[:, cover.leaves].any(axis=1)
+
+
+@pytest.mark.parametrize("columns", [1, 5, 8])
+@pytest.mark.parametrize("path", MESHES, ids=lambda p: p.stem)
+def test_boxes_and_covers_contain_a_mesh(path: Path, columns: int) -> None:
+    rng = np.random.default_rng(columns)
+    mesh = load(path, rng.uniform(0.3, 3.0, 3))
+    inside = points_inside(mesh, rng, 1500)
+    boxes = bounding_boxes(*triangles(mesh), columns)
+    assert len(inside) > 200 and in_boxes(boxes, inside).all()
+    assert not in_boxes(boxes[1:], inside).all() or columns > 1  # one box less is seen
+    assert answered_for(rough_cover(mesh), inside).all()
+
+
+def test_cavities_are_left_open() -> None:
+    mesh = load(ROOT / "problems" / "data" / "cup.obj", np.ones(3))
+    vertices, faces = triangles(mesh)
+    boxes = bounding_boxes(vertices, faces)
+    middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2.0
+    assert abs(winding_number(middle, vertices[faces])) < 0.5 and not in_boxes(boxes, middle[None]).any()
+    assert np.prod(boxes[:, 1] - boxes[:, 0], axis=1).sum() < 0.6 * np.prod(np.ptp(vertices, axis=0))
+
+
+def test_obstacles_of_meshes_contain_them() -> None:
+    rng = np.random.default_rng(1)
+    mesh = load(MESHES[0], np.ones(3))
+    at = np.eye(4)
+    at[:3, :3] = np.linalg.qr(rng.normal(size=(3, 3)))[0] * (1, 1, 1)
+    at[:3, 3] = rng.normal(size=3)
+    world = points_inside(mesh, rng, 500) @ at[:3, :3].T + at[:3, 3]
+    held = np.zeros(len(world), bool)
+    for solid in primitives(mesh, at):
+        local = (world - solid.pose[:3, 3]) @ solid.pose[:3, :3]
+        held |= (np.abs(local) <= np.array(solid.size) + 1e-9).all(axis=1)
+    assert held.all()
+
+
+@settings(max_examples=40, deadline=None)
+@given(sides=st.tuples(*[st.floats(0.002, 0.8)] * 3), seed=st.integers(0, 1000))
+def test_covers_of_boxes_contain_them(sides: tuple[float, float, float], seed: int) -> None:
+    half = np.array(sides) / 2.0
+    cover = rough_cover(coal.Box(*sides))
+    signs = np.array(list(np.ndindex(2, 2, 2))) * 2.0 - 1.0
+    drawn = np.random.default_rng(seed).uniform(-half, half, (500, 3))
+    assert answered_for(cover, np.concatenate([signs * half, drawn])).all()
+    assert len(cover.leaves) <= 64
+    smaller = Cover(cover.centres, cover.radii - 1e-3, cover.first, cover.count)
+    assert not answered_for(smaller, signs * half).all()
