@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from ompl import base as ob
 
 from apex_ompl.collision.verdict import Verdict
@@ -25,9 +25,9 @@ class MotionCheck:
         self.verdict = verdict
         self.resolution = resolution
 
-    def __call__(self, a: Array, b: Array) -> bool:
+    def __call__(self, a: ArrayLike, b: ArrayLike) -> bool:
         """Whether the motion from ``a`` to ``b`` is free, its end first; ``a`` is taken to be free."""
-        return self.verdict.first_collision(np.stack([a, b]), self.resolution, start=False) is None
+        return self.verdict.first_collision(np.array([a, b]), self.resolution, start=False) is None
 
 
 class VerdictChecker(ob.StateValidityChecker):
@@ -74,7 +74,7 @@ class VerdictMotionValidator(ob.MotionValidator):
     def checkMotion(self, first: Any, second: Any) -> bool:  # noqa: N802 - OMPL's name
         """Whether the straight motion between two states is free."""
         try:
-            return self.check(np.array(first[0 : self.dof]), np.array(second[0 : self.dof]))
+            return self.check(first[0 : self.dof], second[0 : self.dof])
         except BaseException as error:
             self.fault = self.fault or error
             return False

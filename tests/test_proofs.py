@@ -14,8 +14,9 @@ from support import states_around_home
 from test_kernel import SHAPES, pose, random_robot
 
 from apex_ompl.collision import Verdict
-from apex_ompl.collision.sweep import grid, sample_path
+from apex_ompl.collision.sweep import sample_path
 from apex_ompl.collision.tabulate import primitives
+from apex_ompl.errors import ParameterError
 from apex_ompl.kernel import entries
 from apex_ompl.kernel.face import MOST_PAIRS, Kernel
 from apex_ompl.kernel.tables import scene_tables
@@ -181,8 +182,8 @@ def test_proved_boxes_hold_for_random_trees(seed: int, size: float) -> None:
     kernel = Kernel(tables, scene_tables([(n, p) for n, (s, at) in enumerate(shapes) for p in primitives(s, at)]))
     a = rng.uniform(-0.6, 0.6, tables.dof)
     path = np.stack([a, np.clip(a + rng.normal(0.0, size, tables.dof), -1.0, 1.0)])
-    starts = grid(path, 0.0031)
-    last = int(starts[-1])
+    starts = np.empty(2, np.int64)
+    last = entries.lay_grid(path, 0.0031, starts)
     work = np.empty((2 * last + 4, 2), np.int64)
     work[0] = 0, last
     ends, counts = np.array([0, 1, 0]), np.zeros(5, np.int64)
@@ -224,3 +225,16 @@ def test_two_threads_judge_as_one_does(robot: Robot, tmp_path: Path) -> None:
     for thread in threads:
         thread.join()
     assert all(np.array_equal(expected, one) for one in found)
+
+
+@pytest.mark.parametrize("proofs", [True, False])
+def test_paths_with_numbers_that_are_none_collide(robot: Robot, proofs: bool) -> None:
+    verdict = Verdict(robot, proofs=proofs)
+    path = np.tile(robot.home, (4, 1))
+    assert verdict.first_collision(path, 0.031) is None
+    for value in (np.nan, np.inf):
+        path[2, 3] = value
+        hit = verdict.first_collision(path, 0.031)
+        assert hit is not None and hit.segment == 1
+    with pytest.raises(ParameterError, match=r"\(N, 16\)"):
+        verdict.first_collision(path[:, :5], 0.031)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple
@@ -39,7 +39,7 @@ class Open(NamedTuple):
     complete: bool
 
 
-LEAVES = 32  # of a cover made at run time
+QUICK_GAPS, LEAVES = (0.02, 0.005), 32  # of covers made at run time
 
 _robots: WeakKeyDictionary[Robot, RobotTables] = WeakKeyDictionary()
 _covers: dict[str, Cover] = {}
@@ -85,7 +85,7 @@ def covers_of(robot: Robot, shapes: Sequence[coal.CollisionGeometry]) -> list[Co
         key = shape_key(shape)
         if key not in _covers:
             boxy = is_shell(shape) or shape.getNodeType() == coal.GEOM_BOX
-            _covers[key] = rough_cover(shape) if boxy else make_cover(shape, effort=1, most=LEAVES)
+            _covers[key] = rough_cover(shape) if boxy else make_cover(shape, QUICK_GAPS, effort=1, most=LEAVES)
         found.append(_covers[key])
     return found
 
@@ -137,18 +137,14 @@ class Proofs:
 
     def open_at(self, q: Array, tally: Tally) -> Open | None:
         """Return what is left to be judged at a state, shape (dof,); None where it is proved free."""
-        mine = self._local
-        if not hasattr(mine, "state"):
-            mine.state = np.empty((1, self.kernel.robot.dof))
-            mine.found, mine.counts = np.empty((1, MOST_PAIRS, 2), np.int64), np.empty(1, np.int64)
-            mine.room = self.kernel.room()
+        mine = self._mine()
         mine.state[0] = q
-        entries.judge_states(*self.kernel.packed, *mine.room, mine.state, mine.found, mine.counts)
-        count = int(mine.counts[0])
+        entries.judge_states(*self.kernel.packed, *mine.room, mine.state, mine.found[None], mine.ends[:1])
+        count = int(mine.ends[0])
         if count == 0:
             tally.proved += 1
             return None
-        return self._left(mine.found[0], count)
+        return self._left(mine.found, count)
 
     def open_among(self, states: Array, tally: Tally) -> list[tuple[int, Open]]:
         """Return the states, shape (N, dof), that are not proved free: their numbers and what is left to be judged."""
@@ -162,34 +158,73 @@ class Proofs:
         pairs = [(numbers[a], numbers[b] if b >= 0 else -1 - b) for a, b in found[: max(count, 0)].tolist()]
         return Open(pairs, 0 < count < MOST_PAIRS)
 
-    def open_states(
-        self, path: Array, starts: NDArray[np.int64], queue: Sequence[tuple[int, int]], tally: Tally
-    ) -> Iterator[tuple[int, Array, Open]]:
-        """Prove a path, and yield what the meshes must judge: number in the grid, state, what is left to be judged.
+    def first_collision(
+        self, path: Array, resolution: float, start: bool, tally: Tally, is_free: Callable[[Array, Open], bool]
+    ) -> tuple[Array, int] | None:
+        """Prove a path, state by state where it must be.
 
         Args:
-            path: States, shape (N, dof).
-            starts: Where they stand in the grid, see ``apex_ompl.collision.sweep.grid``.
-            queue: Intervals of the grid to prove; one of a single state asks for that state, others for what is
-                between their ends.
+            path: States, shape (N, dof), N > 1, in a row of memory.
+            resolution: Largest spacing of states [rad, max-norm].
+            start: Whether the first state is judged too.
             tally: Is kept up to date.
+            is_free: Judges a state that is not proved, given what is left to be judged of it.
+
+        Returns:
+            A state that is not free and the segment that it lies on, or None.
+
+        Raises:
+            NoGridError: The path has numbers that are not finite, or is too long for its resolution.
         """
-        kernel = self.kernel
-        work = np.empty((2 * int(starts[-1]) + len(queue) + 2, 2), np.int64)
-        work[: len(queue)] = queue
-        ends = np.array([0, len(queue), 0], np.int64)
-        state, counts = np.empty(path.shape[1]), np.zeros(5, np.int64)
-        found = np.empty((MOST_PAIRS, 2), np.int64)
-        packed, room = kernel.packed, kernel.room()
-        seen = counts.copy()
-        while True:
-            number = entries.advance(*packed, *room, path, starts, work, ends, state, found, counts)
-            fresh = counts - seen
-            seen = counts.copy()
-            tally.proved += int(fresh[entries.PROVED_STATES])
-            tally.boxes += int(fresh[entries.TRIED_BOXES])
-            tally.proved_boxes += int(fresh[entries.PROVED_BOXES])
-            tally.proved_steps += int(fresh[entries.PROVED_STEPS])
+        mine = self._mine()
+        starts = mine.starts if len(path) == 2 else np.empty(len(path), np.int64)
+        last = entries.lay_grid(path, resolution, starts)
+        if last < 0:
+            raise NoGridError
+        if len(mine.queue) < 2 * last + 4:
+            mine.queue = np.empty((4 * last + 4, 2), np.int64)
+        queue, ends, state = mine.queue, mine.ends, mine.state[0]
+        entered = [(0, 0), (last, last), (0, last)][0 if start else 1 :]
+        queue[: len(entered)] = entered
+        ends[:2] = 0, len(entered)
+        mine.counts[:] = 0
+        hit = None
+        while hit is None:
+            number = entries.advance(
+                *self.kernel.packed, *mine.room, path, starts, queue, ends, state, mine.found, mine.counts
+            )
             if number == entries.DONE:
-                return
-            yield number, state, self._left(found, int(ends[2]))
+                break
+            if not is_free(state, self._left(mine.found, int(ends[2]))):
+                hit = state.copy(), max(int(np.searchsorted(starts, number)) - 1, 0)
+        proved, _, proved_boxes, boxes, proved_steps = mine.counts.tolist()
+        tally.proved += proved
+        tally.boxes += boxes
+        tally.proved_boxes += proved_boxes
+        tally.proved_steps += proved_steps
+        tally.steps += last
+        return hit
+
+    def _mine(self) -> _Room:
+        """Return this thread's room to work in."""
+        room: _Room | None = getattr(self._local, "room", None)
+        if room is None:
+            room = self._local.room = _Room(self.kernel)
+        return room
+
+
+class NoGridError(Exception):
+    """A path that no grid can be laid over."""
+
+
+class _Room:
+    """Arrays that calls of one thread work in."""
+
+    def __init__(self, kernel: Kernel) -> None:
+        self.room = kernel.room()
+        self.state = np.empty((1, kernel.robot.dof))
+        self.found = np.empty((MOST_PAIRS, 2), np.int64)
+        self.starts = np.empty(2, np.int64)
+        self.queue = np.empty((256, 2), np.int64)
+        self.ends = np.zeros(3, np.int64)
+        self.counts = np.zeros(5, np.int64)

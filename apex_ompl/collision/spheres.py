@@ -26,7 +26,7 @@ __all__ = ["GAPS", "Cover", "make_cover", "quality", "read_covers", "shape_key",
 
 SCHEMA = "apex-ompl/spheres/1"
 COLUMNS = ["x", "y", "z", "radius", "first child", "children"]
-GAPS = (0.02, 0.005)  # [m]
+GAPS = (0.02, 0.007, 0.0025)  # [m]
 MOST = (64, 96, 256)  # leaves of a cover: of a quick one, of others, of a mesh that is not convex; the gap gives way
 QUICK = 4.0  # a quick cover grows by boxes so much larger, which takes less time and leaves more to spare
 

@@ -58,9 +58,3 @@ def sample_path(path: Array, resolution: float) -> tuple[Array, NDArray[np.intp]
         pieces += [inner, path[k + 1 : k + 2]]
         segments.append(np.full(len(inner) + 1, k, np.intp))
     return np.concatenate(pieces), np.concatenate(segments)
-
-
-def grid(path: Array, resolution: float) -> NDArray[np.int64]:
-    """Return where the states of a path, shape (N, dof), stand in what :func:`sample_path` returns, shape (N,)."""
-    steps = np.ceil(np.abs(np.diff(path, axis=0)).max(axis=1) / resolution)
-    return np.concatenate([[0], np.cumsum(np.maximum(steps, 1.0))]).astype(np.int64)

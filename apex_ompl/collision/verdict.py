@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from apex_ompl.collision.broadphase import CompiledScene, Contact
 from apex_ompl.collision.distance import Distance
-from apex_ompl.collision.proofs import Open, Proofs, Tally
+from apex_ompl.collision.proofs import NoGridError, Open, Proofs, Tally
 from apex_ompl.collision.shapes import coal_geometry, world_geometry
-from apex_ompl.collision.sweep import bit_reversed, grid, sample_path
+from apex_ompl.collision.sweep import bit_reversed, sample_path
 from apex_ompl.errors import ParameterError, SceneError
 from apex_ompl.problem import AttachedObject, Body, Obstacle
 from apex_ompl.robot import Robot
@@ -192,23 +192,27 @@ class Verdict:
             path: States, shape (N, dof).
             resolution: Largest spacing [rad, max-norm].
             start: Whether the first state is judged too.
+
+        Raises:
+            ParameterError: ``path`` has not the shape (N, dof).
         """
         path = np.ascontiguousarray(path, float)
-        self.robot.to_pinocchio(path)
+        if path.ndim != 2 or path.shape[1] != self.robot.dof or len(path) == 0:
+            raise ParameterError("path", path.shape, f"an array of shape (N, {self.robot.dof})")
         if len(path) == 1:
             free = not start or self.is_free(path[0])
             return None if free else Collision(path[0].copy(), 0)
-        if not (self._prove and np.isfinite(path).all()):
-            return self._first_sampled(path, resolution, start)
-        starts = grid(path, resolution)
-        last = int(starts[-1])
-        self.tally.steps += last
-        queue = [(0, 0), (last, last), (0, last)][0 if start else 1 :]
-        for number, state, left in self._proved().open_states(path, starts, queue, self.tally):
-            if not self._free_by_meshes(state, left):
-                segment = int(np.searchsorted(starts, number, side="left")) - 1
-                return Collision(state.copy(), max(segment, 0))
-        return None
+        if self._prove:
+            try:
+                hit = self._proved().first_collision(path, resolution, start, self.tally, self._free_by_meshes)
+                return None if hit is None else Collision(*hit)
+            except NoGridError:
+                pass
+        broken = ~np.isfinite(path).all(axis=1)
+        if broken.any():
+            k = int(np.argmax(broken))
+            return Collision(path[k].copy(), max(k - 1, 0))
+        return self._first_sampled(path, resolution, start)
 
     def _first_sampled(self, path: Array, resolution: float, start: bool) -> Collision | None:
         states, segments = sample_path(path, resolution)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from apex_ompl.kernel.compiled import entry, inlined
 from apex_ompl.kernel.kinematics import bound_motion, place_joint, place_robot
 from apex_ompl.kernel.nearest import gradient_of_two, gradient_to_obstacle, nearest_bodies, nearest_obstacle
@@ -11,6 +13,7 @@ from apex_ompl.kernel.views import Work, robot_view, scene_view, work_view
 
 PROVED_STATES, OPEN_STATES, PROVED_BOXES, TRIED_BOXES, PROVED_STEPS = range(5)
 DONE = -1
+MOST_STEPS = 50_000_000
 
 
 @entry
@@ -71,6 +74,31 @@ def joint_frames(
                 origin[k, j, i] = w.origin[j, i]
                 for m in range(3):
                     turn[k, j, i, m] = w.turn[j, i, m]
+
+
+@entry
+def lay_grid(path: Floats, resolution: float, starts: Integers) -> int:
+    """Lay a grid of states over a path, shape (N, dof), at most ``resolution`` apart [max-norm].
+
+    ``starts`` (N,) gets the numbers of the given states in the grid; from each to the next there are as many steps as
+    are needed, at least one.
+
+    Returns:
+        The number of the last state, or -1 for a path with numbers that are not finite, or with too many steps.
+    """
+    starts[0] = 0
+    for k in range(len(path) - 1):
+        largest = 0.0
+        for i in range(path.shape[1]):
+            step = abs(path[k + 1, i] - path[k, i])
+            if not math.isfinite(step):
+                return -1
+            largest = max(largest, step)
+        steps = max(1.0, math.ceil(largest / resolution))
+        if starts[k] + steps > MOST_STEPS:
+            return -1
+        starts[k + 1] = starts[k] + int(steps)
+    return int(starts[len(path) - 1])
 
 
 @inlined
