@@ -130,19 +130,29 @@ def _state(path: Floats, starts: Integers, g: int, out: Floats) -> None:
 
 
 @inlined
-def _reach(path: Floats, starts: Integers, a: int, b: int, middle: Floats, w: Work) -> None:
-    """Put into ``w.reach`` how far each joint gets from a state, on the path between two states of the grid."""
-    for i in range(len(middle)):
-        w.reach[i] = 0.0
-    for g in (a, b):
-        _state(path, starts, g, w.end)
-        for i in range(len(middle)):
-            w.reach[i] = max(w.reach[i], abs(w.end[i] - middle[i]))
-    for k in range(_segment(starts, a) + 1, _segment(starts, b) + 1):
-        for i in range(len(middle)):
-            w.reach[i] = max(w.reach[i], abs(path[k, i] - middle[i]))
-    for i in range(len(middle)):
-        w.reach[i] += 1e-12  # rounding
+def _describe(path: Floats, starts: Integers, a: int, b: int, middle: Floats, w: Work) -> None:
+    """Describe the path between two states of the grid for :func:`bound_motion`, as seen from a state between them."""
+    centre, dof = (a + b) // 2, len(middle)
+    _state(path, starts, b, w.end)
+    for i in range(dof):
+        w.step[i] = 0.5 * w.end[i]
+        w.reach[i] = w.stray[i] = 0.0
+    _state(path, starts, a, w.end)
+    for i in range(dof):
+        w.step[i] -= 0.5 * w.end[i]
+    first, last = _segment(starts, a) + 1, _segment(starts, b)
+    for k in range(first - 1, last + 2):  # the ends, and the given states between them
+        g = a if k < first else b if k > last else starts[k]
+        if k < first or k > last:
+            _state(path, starts, g, w.end)
+        along = min(max(2.0 * (g - centre) / (b - a), -1.0), 1.0)
+        for i in range(dof):
+            shift = (w.end[i] if k < first or k > last else path[k, i]) - middle[i]
+            w.reach[i] = max(w.reach[i], abs(shift))
+            w.stray[i] = max(w.stray[i], abs(shift - along * w.step[i]))
+    for i in range(dof):
+        w.reach[i] = max(w.reach[i], abs(w.step[i]) + w.stray[i]) + 1e-12  # and rounding
+        w.stray[i] += 1e-12
 
 
 @entry
@@ -176,9 +186,9 @@ def advance(
             tally[PROVED_STATES] += 1
             if b - a >= 3:
                 tally[TRIED_BOXES] += 1
-                _reach(path, starts, a, b, state, w)
+                _describe(path, starts, a, b, state, w)
                 if known(t, state, w.reach):
-                    bound_motion(t, w, w.reach)
+                    bound_motion(t, w)
                     if proved(t, s, w, state, w.pair):
                         tally[PROVED_BOXES] += 1
                         tally[PROVED_STEPS] += b - a

@@ -71,36 +71,76 @@ def open_cluster(t: RobotArrays, w: Work, q: Floats, c: int) -> None:
 
 
 @inlined
-def bound_motion(t: RobotArrays, w: Work, reach: Floats) -> None:
-    """Bound how far the spheres of each cluster move, relative to each joint frame above, and to the world.
+def bound_motion(t: RobotArrays, w: Work) -> None:
+    """Bound how far the spheres of each cluster move, relative to the frame of each joint above, and to the world.
 
-    ``reach`` (dof,) is how far each planned joint may be from the state that ``w`` holds. From the tips to the root:
-    what moved by at most m relative to a joint's frame stays within (distance from the axis + m) of that axis, so
-    that turning the joint by at most a moves it by at most a (distance + m), an arc being longer than its chord.
-    This is the bound of adaptive collision checking (Schwarzer, Saha and Latombe 2005), with the lever arms of the
-    state itself.
+    States are within ``w.reach`` of the one that ``w`` holds, and within ``w.stray`` of the straight motion through it
+    that goes by ``w.step`` to both sides, (dof,) each. From the tips to the root, with the joints beyond the frame of
+    a joint; two bounds are kept, of which the smaller one holds.
+
+    ``sway``: what moved by at most m relative to a joint's frame stays within (distance from the axis + m) of that
+    axis, so that turning the joint by at most a moves it by at most a (distance + m), an arc being longer than its
+    chord. This is the bound of adaptive collision checking (Schwarzer, Saha and Latombe 2005), with the lever arms of
+    the state itself.
+
+    ``drift`` and ``rest``: by Taylor's theorem a point p moves by at most the length of its velocity, the sum of
+    step_i a_i x (p - o_i), and half of its largest acceleration. With the Jacobi identity the acceleration is at most
+    the sum of 2 step_i arm_i (the steps of the turning joints below i, and half of step_i), where arm_i bounds the
+    distance of p from the axis a_i all along. The stray adds to it as in ``sway``, and so does what moves inside a
+    cluster.
     """
+    w.flags[0] = 1
     for c in range(len(t.cluster_joint)):
-        j, dof, moved = t.cluster_joint[c], t.cluster_dof[c], 0.0
+        j, dof, inner, spread = t.cluster_joint[c], t.cluster_dof[c], 0.0, t.cluster_spread[c]
         if dof >= 0:
-            moved = t.cluster_speed[c] * reach[dof]
-        while j > 0:
+            inner = t.cluster_speed[c] * w.reach[dof]
+        moved, strayed, levers, bend = inner, 0.0, 0.0, 0.0
+        vx = vy = vz = ox = oy = oz = 0.0
+        while True:
             w.sway[c, j] = moved
+            w.drift[c, j, 0], w.drift[c, j, 1], w.drift[c, j, 2] = vx, vy, vz
+            w.rest[c, j] = inner + strayed + bend + spread * math.sqrt(ox * ox + oy * oy + oz * oz)
+            if j == 0:
+                break
             kind = t.joint_kind[j]
             if kind != FIXED:
-                turn = abs(t.joint_ratio[j]) * reach[t.joint_source[j]]
+                k, ratio = t.joint_source[j], t.joint_ratio[j]
+                reach, stray, step = abs(ratio) * w.reach[k], abs(ratio) * w.stray[k], ratio * w.step[k]
+                r, o, p = w.turn[j], w.origin[j], w.ball[c]
+                ax, ay, az = r[0, 2], r[1, 2], r[2, 2]
                 if kind == REVOLUTE:
-                    moved += turn * (_lever(w, c, j) + t.cluster_spread[c] + moved)
+                    x, y, z = p[0] - o[0], p[1] - o[1], p[2] - o[2]
+                    x, y, z = ay * z - az * y, az * x - ax * z, ax * y - ay * x
+                    arm = math.sqrt(x * x + y * y + z * z) + spread + moved
+                    vx, vy, vz = vx + step * x, vy + step * y, vz + step * z
+                    ox, oy, oz = ox + step * ax, oy + step * ay, oz + step * az
+                    bend += abs(step) * (levers + 0.5 * abs(step) * arm)
+                    levers += abs(step) * arm
+                    strayed += stray * (arm + strayed)
+                    moved += reach * arm
                 else:
-                    moved += turn
+                    vx, vy, vz = vx + step * ax, vy + step * ay, vz + step * az
+                    levers += abs(step)
+                    strayed += stray
+                    moved += reach
             j = t.joint_parent[j]
-        w.sway[c, 0] = moved
 
 
 @inlined
-def _lever(w: Work, c: int, j: int) -> float:
-    """Return the distance of the centre of a cluster's ball from the axis of a joint."""
-    r, o, p = w.turn[j], w.origin[j], w.ball[c]
-    x, y, z = p[0] - o[0], p[1] - o[1], p[2] - o[2]
-    along = r[0, 2] * x + r[1, 2] * y + r[2, 2] * z
-    return math.sqrt(max(0.0, x * x + y * y + z * z - along * along))
+def cluster_sway(w: Work, c: int) -> float:
+    """Return how far the spheres of a cluster move at most in the world."""
+    if w.flags[0] == 0:
+        return 0.0
+    x, y, z = w.drift[c, 0, 0], w.drift[c, 0, 1], w.drift[c, 0, 2]
+    return float(min(w.sway[c, 0], math.sqrt(x * x + y * y + z * z) + w.rest[c, 0]))
+
+
+@inlined
+def pair_sway(w: Work, a: int, b: int, common: int) -> float:
+    """Return how far the spheres of two clusters move at most relative to each other."""
+    if w.flags[0] == 0:
+        return 0.0
+    u, v = w.drift[a, common], w.drift[b, common]
+    x, y, z = u[0] - v[0], u[1] - v[1], u[2] - v[2]
+    straight = math.sqrt(x * x + y * y + z * z) + w.rest[a, common] + w.rest[b, common]
+    return float(min(w.sway[a, common] + w.sway[b, common], straight))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from apex_ompl.kernel.compiled import inlined
-from apex_ompl.kernel.kinematics import node_x, open_cluster, place_robot
+from apex_ompl.kernel.kinematics import cluster_sway, node_x, open_cluster, pair_sway, place_robot
 from apex_ompl.kernel.shapes import distance
 from apex_ompl.kernel.tables import Floats, Integers, RobotArrays, SceneArrays
 from apex_ompl.kernel.views import Work
@@ -64,7 +64,7 @@ def cluster_against(
     t: RobotArrays, s: SceneArrays, w: Work, q: Floats, c: int, o: int, found: Integers, count: int
 ) -> int:
     """Add the bodies of a cluster that are not proved to be off an obstacle; return how many pairs there are now."""
-    sway = w.sway[c, 0]
+    sway = cluster_sway(w, c)
     if distance(s, o, w.ball[c, 0], w.ball[c, 1], w.ball[c, 2]) > t.cluster_ball[c, 3] + sway:
         return count
     open_cluster(t, w, q, c)
@@ -87,7 +87,7 @@ def unproved_with_scene(t: RobotArrays, s: SceneArrays, w: Work, q: Floats, foun
     for c in range(len(t.cluster_joint)):
         if not t.cluster_meets_scene[c]:
             continue
-        radius = t.cluster_ball[c, 3] + w.sway[c, 0]
+        radius = t.cluster_ball[c, 3] + cluster_sway(w, c)
         x, y, z = w.ball[c, 0], w.ball[c, 1], w.ball[c, 2]
         k = 0
         while k < len(s.tree_skip):
@@ -117,7 +117,7 @@ def unproved_with_itself(t: RobotArrays, w: Work, q: Floats, found: Integers, co
     for p in range(len(t.pair_common)):
         a, b = t.pair_clusters[p, 0], t.pair_clusters[p, 1]
         common = t.pair_common[p]
-        sway = w.sway[a, common] + w.sway[b, common]
+        sway = pair_sway(w, a, b, common)
         if a != b:
             apart = t.cluster_ball[a, 3] + t.cluster_ball[b, 3] + sway
             u, v = w.ball[a], w.ball[b]
@@ -183,7 +183,5 @@ def judged(t: RobotArrays, s: SceneArrays, w: Work, q: Floats, found: Integers) 
     if not known(t, q, w.reach):
         return -1
     place_robot(t, w, q)
-    for c in range(len(t.cluster_joint)):
-        for j in range(len(t.joint_parent)):
-            w.sway[c, j] = 0.0
+    w.flags[0] = 0
     return unproved(t, s, w, q, found)

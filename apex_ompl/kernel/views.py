@@ -47,8 +47,10 @@ class Work(NamedTuple):
 
     ``turn`` (J, 3, 3) and ``origin`` (J, 3) are the joints in the world; ``ball`` (C, 3) the centres of the clusters'
     balls, ``opened`` (C,) whether inner joints and ``root`` (B, 3), the centres of the bodies' outermost spheres, are
-    known. ``sway`` (C, J) bounds how far the centre of any sphere of a cluster moves relative to a joint's frame.
-    ``stack`` holds nodes that wait; ``reach`` and ``end`` (dof,) and ``pair`` (1, 2) are for those who need them.
+    known. ``stack`` holds nodes that wait, ``flags`` (1,) whether clusters move. Then, relative to the frames of joints
+    above a cluster, (C, J): ``sway`` bounds how far the centre of any of its spheres moves; so does the length of
+    ``drift`` (C, J, 3) with ``rest`` added to it. ``step``, ``stray``, ``reach`` and ``end`` (dof,) describe motions,
+    see :func:`apex_ompl.kernel.kinematics.bound_motion`; ``pair`` (1, 2) is for who needs it.
     """
 
     turn: Floats
@@ -58,6 +60,11 @@ class Work(NamedTuple):
     root: Floats
     sway: Floats
     stack: Integers
+    flags: Integers
+    drift: Floats
+    rest: Floats
+    step: Floats
+    stray: Floats
     reach: Floats
     end: Floats
     pair: Integers
@@ -66,8 +73,8 @@ class Work(NamedTuple):
 def room(arrays: RobotArrays) -> tuple[int, int]:
     """Return how many integers and floats one call of the kernel needs to work in."""
     joints, clusters = len(arrays.joint_parent), len(arrays.cluster_joint)
-    floats = 12 * joints + 3 * clusters + 3 * len(arrays.body_joint) + clusters * joints + 2 * len(arrays.lower)
-    return clusters + 2 * len(arrays.node_first) + 4, floats
+    floats = 12 * joints + 3 * clusters + 3 * len(arrays.body_joint) + 5 * clusters * joints + 4 * len(arrays.lower)
+    return clusters + 3 + 2 * len(arrays.node_first) + 2, floats
 
 
 @pasted
@@ -78,11 +85,14 @@ def work_view(t: RobotArrays, i: Integers, f: Floats) -> Work:
     b = a + 3 * joints
     c = b + 3 * clusters
     d = c + 3 * bodies
-    e = d + clusters * joints
+    chains = clusters * joints
+    e = d + 5 * chains
     work = Work(
         f[:a].reshape(joints, 3, 3), f[a:b].reshape(joints, 3), f[b:c].reshape(clusters, 3), i[:clusters],
-        f[c:d].reshape(bodies, 3), f[d:e].reshape(clusters, joints), i[clusters + 2 :],
-        f[e : e + dof], f[e + dof : e + 2 * dof], i[clusters : clusters + 2].reshape(1, 2),
+        f[c:d].reshape(bodies, 3), f[d : d + chains].reshape(clusters, joints), i[clusters + 3 :],
+        i[clusters + 2 : clusters + 3], f[d + chains : d + 4 * chains].reshape(clusters, joints, 3),
+        f[d + 4 * chains : e].reshape(clusters, joints), f[e : e + dof], f[e + dof : e + 2 * dof],
+        f[e + 2 * dof : e + 3 * dof], f[e + 3 * dof : e + 4 * dof], i[clusters : clusters + 2].reshape(1, 2),
     )  # fmt: skip
     for k in range(3):
         work.origin[0, k] = 0.0
@@ -90,4 +100,5 @@ def work_view(t: RobotArrays, i: Integers, f: Floats) -> Work:
             work.turn[0, k, m] = 1.0 if k == m else 0.0
     for k in range(dof):
         work.reach[k] = 0.0
+    work.flags[0] = 0
     return work

@@ -1,0 +1,104 @@
+"""How far spheres move along motions: the kernel's bounds against samples."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support import states_around_home
+from test_kernel import random_robot
+
+from apex_ompl.collision import Verdict
+from apex_ompl.kernel.kinematics import bound_motion, cluster_sway, pair_sway, place_joint, place_robot
+from apex_ompl.kernel.tables import RobotTables
+from apex_ompl.kernel.views import Work
+from apex_ompl.robot import Robot
+
+
+def room(tables: RobotTables) -> Work:
+    t = tables.arrays
+    joints, clusters, dof = len(t.joint_parent), len(t.cluster_joint), tables.dof
+    work = Work(
+        turn=np.zeros((joints, 3, 3)), origin=np.zeros((joints, 3)), ball=np.zeros((clusters, 3)),
+        opened=np.zeros(clusters, np.int64), root=np.zeros((len(t.body_joint), 3)), sway=np.zeros((clusters, joints)),
+        stack=np.zeros(100, np.int64), flags=np.zeros(1, np.int64), drift=np.zeros((clusters, joints, 3)),
+        rest=np.zeros((clusters, joints)), step=np.zeros(dof), stray=np.zeros(dof), reach=np.zeros(dof),
+        end=np.zeros(dof), pair=np.zeros((1, 2), np.int64),
+    )  # fmt: skip
+    work.turn[0] = np.eye(3)
+    return work
+
+
+def placed(tables: RobotTables, q: np.ndarray) -> tuple[Work, list[np.ndarray]]:
+    """The joints at a state, and the world centres of all spheres, cluster by cluster."""
+    t, w = tables.arrays, room(tables)
+    place_robot.py_func(t, w, q)
+    for j in t.lazy:
+        place_joint.py_func(t, w, q, int(j))
+    ends = [*t.body_root[1:], len(t.node_first)]
+    found = []
+    for first, count in t.cluster_bodies:
+        rows = []
+        for b in range(first, first + count):
+            j, nodes = t.body_joint[b], slice(int(t.body_root[b]), int(ends[b]))
+            rows.append(t.node_centre[nodes] @ w.turn[j].T + w.origin[j])
+        found.append(np.concatenate(rows))
+    return w, found
+
+
+def check(tables: RobotTables, middle: np.ndarray, step: np.ndarray, stray: np.ndarray, seed: int) -> float:
+    """Compare bounds with samples; return the largest ratio of what moves to its bound."""
+    t, rng = tables.arrays, np.random.default_rng(seed)
+    w, here = placed(tables, middle)
+    w.step[:], w.stray[:], w.reach[:] = step, stray, np.abs(step) + stray
+    bound_motion.py_func(t, w)
+    tightest = 0.0
+    for along in [-1.0, 1.0, *rng.uniform(-1.0, 1.0, 6)]:
+        q = middle + along * step + rng.choice([-1.0, 0.0, 1.0], len(step)) * stray
+        there_frames, there = placed(tables, q)
+
+        def in_frame(points: np.ndarray, frames: Work, j: int) -> np.ndarray:
+            return (points - frames.origin[j]) @ frames.turn[j]
+
+        for c in range(len(here)):
+            moved = np.linalg.norm(there[c] - here[c], axis=1).max()
+            assert moved <= cluster_sway.py_func(w, c) + 1e-9
+            tightest = max(tightest, moved / (cluster_sway.py_func(w, c) + 1e-9))
+        for (a, b), common in zip(t.pair_clusters, t.pair_common, strict=True):
+            bound = pair_sway.py_func(w, int(a), int(b), int(common))
+            before, after = (
+                in_frame(cloud[a], frames, common)[:, None] - in_frame(cloud[b], frames, common)[None]
+                for cloud, frames in ((here, w), (there, there_frames))
+            )
+            assert np.linalg.norm(after - before, axis=2).max() <= bound + 1e-9
+    return tightest
+
+
+@settings(max_examples=40, deadline=None)
+@given(seed=st.integers(0, 10**6), size=st.floats(1e-3, 1.0), bent=st.floats(0.0, 0.3))
+def test_spheres_of_random_trees_stay_within_their_bounds(seed: int, size: float, bent: float) -> None:
+    tables, *_ = random_robot(seed)
+    rng = np.random.default_rng(seed)
+    step, stray = rng.normal(0.0, size, tables.dof), np.abs(rng.normal(0.0, size * bent, tables.dof))
+    over = (np.abs(step) + stray).max() / 0.9  # the balls of clusters hold inside the limits, which are 1
+    step, stray = step / max(1.0, over), stray / max(1.0, over)
+    room_left = 1.0 - np.abs(step) - stray
+    check(tables, rng.uniform(-room_left, room_left), step, stray, seed)
+
+
+@pytest.mark.parametrize("size", [0.01, 0.1, 0.4])
+@pytest.mark.parametrize("which", ["robot", "baxter"])
+def test_spheres_of_real_robots_stay_within_their_bounds(
+    which: str, size: float, request: pytest.FixtureRequest
+) -> None:
+    robot: Robot = request.getfixturevalue(which)
+    tables = Verdict(robot)._proved().kernel.robot
+    rng = np.random.default_rng(6)
+    tightest = 0.0
+    for q in states_around_home(robot, rng, 6):
+        step = rng.normal(0.0, size, robot.dof)
+        step[robot.groups.get("hands", [])] *= 0.1
+        inner = np.clip(q, robot.limits.lower + np.abs(step), robot.limits.upper - np.abs(step))
+        tightest = max(tightest, check(tables, inner, step, np.abs(rng.normal(0.0, 0.01 * size, robot.dof)), 1))
+    assert tightest > 0.35  # a bound that is far off would be useless
