@@ -28,7 +28,7 @@ EXIT_CODES = {
     PlanStatus.INVALID_GOAL: 3,
     PlanStatus.APPROXIMATE_SOLUTION: 4,
 }
-LIBRARIES = ("ompl", "pin", "coal", "numpy", "scipy", "pydantic", "example-robot-data", "torch", "ruckig")
+LIBRARIES = ("ompl", "pin", "coal", "numba", "numpy", "scipy", "pydantic", "example-robot-data", "torch", "ruckig")
 
 
 class _Parser(argparse.ArgumentParser):

@@ -17,7 +17,7 @@ import numpy as np
 from apex_ompl.schema import write_atomically
 
 RESULTS = Path(__file__).parent / "results"
-LIBRARIES = ("apex-ompl", "ompl", "pin", "coal", "numpy")
+LIBRARIES = ("apex-ompl", "ompl", "pin", "coal", "numba", "numpy")
 
 
 def hardware() -> str:

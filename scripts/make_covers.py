@@ -4,7 +4,7 @@ Prints per shape the balls of each level (the root first, leaves last), the volu
 solid, and how far the surface of the leaves is from the solid. With ``--tolerances`` it writes nothing, and prints
 how many leaves each gap takes instead.
 
-Usage: python scripts/make_covers.py dual_panda_softhand [--gaps 0.02 0.005] [-o FILE]
+Usage: python scripts/make_covers.py dual_panda_softhand [--gaps 0.02 0.007 0.0025] [-o FILE]
 """
 
 from __future__ import annotations
