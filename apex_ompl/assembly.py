@@ -77,6 +77,7 @@ def assemble(problem: Problem, robot: Robot | None = None, seed: int = 0) -> Pla
     goals = problem.goal_states(robot.joint_names)
     alignment = alignment_goal(robot, problem)
     verdict = Verdict(robot, problem.scene, problem.attached)
+    verdict.prepare()
     start_fault = state_fault(verdict, start)
     goal_faults = tuple(state_fault(verdict, goal) for goal in goals)
     if alignment is not None and not start_fault:

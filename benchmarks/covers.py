@@ -48,7 +48,7 @@ def measure(path: Path, states: int, seeds: int) -> dict[str, float]:
         verdict = Verdict(robot, boxes(count, rng))
         drawn = around_home(robot, rng, states)
         free = drawn[verdict.are_free(drawn)]
-        kernel = verdict._proved().kernel
+        kernel = verdict.kernel
         proved.append(float((kernel.unproved(free)[1] == 0).mean()))
         kernel_us.append(of_batch(kernel.unproved, free))
         free_us.append(microseconds(verdict.is_free, free))

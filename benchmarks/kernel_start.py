@@ -27,7 +27,7 @@ from apex_ompl.collision import Verdict
 robot = apex_ompl.load_robot("dual_panda_softhand")
 marks.append(time.perf_counter())
 verdict = Verdict(robot)
-verdict._proved()
+verdict.prepare()
 marks.append(time.perf_counter())
 assert verdict.is_free(robot.home)
 marks.append(time.perf_counter())

@@ -68,7 +68,7 @@ class Count:
 
     def add(self, both: Verdict, meshes: Verdict, states: np.ndarray) -> None:
         """Judge states by both verdicts."""
-        proved = both._proved().kernel.unproved(states)[1] == 0
+        proved = both.kernel.unproved(states)[1] == 0
         truth = meshes.are_free(states)
         self.states += len(states)
         self.free += int(truth.sum())

@@ -121,7 +121,7 @@ def judge_states(robot: Robot, count: int, share: int, rng: np.random.Generator)
     states = np.concatenate([spread, tight])
     answers = [both.are_free(states), meshes.are_free(states), np.array([loop.is_free(q) for q in states])]
     free_states, hit_states = spread[free][:1000], spread[~free][:1000]
-    kernel = both._proved().kernel
+    kernel = both.kernel
     proved = kernel.unproved(free_states)[1] == 0
     return {
         "obstacles": count, "pairs": len(meshes._scene().geometry.collisionPairs), "free_share": float(free.mean()),

@@ -214,7 +214,7 @@ def check_gradients(kernel: Kernel, states: np.ndarray) -> None:
 @pytest.mark.parametrize("which", ["robot", "baxter"])
 def test_frames_and_gradients_of_real_robots(which: str, request: pytest.FixtureRequest, post: Obstacle) -> None:
     robot: Robot = request.getfixturevalue(which)
-    kernel = Verdict(robot, [post])._proved().kernel
+    kernel = Verdict(robot, [post]).kernel
     states = states_around_home(robot, np.random.default_rng(0), 20)
     turn, origin = kernel.joint_frames(states)
     data = robot.model.createData()
@@ -229,7 +229,7 @@ def test_frames_and_gradients_of_real_robots(which: str, request: pytest.Fixture
 
 
 def test_tables_are_saved_and_loaded_without_pinocchio(robot: Robot, post: Obstacle, tmp_path: Path) -> None:
-    kernel = Verdict(robot, [post])._proved().kernel
+    kernel = Verdict(robot, [post]).kernel
     states = states_around_home(robot, np.random.default_rng(1), 5)
     kernel.robot.save(tmp_path / "robot.npz")
     np.save(tmp_path / "states.npy", states)
@@ -275,13 +275,13 @@ def test_faulty_tables_are_refused(tmp_path: Path) -> None:
 
 
 def test_states_of_another_shape_are_refused(robot: Robot) -> None:
-    kernel = Verdict(robot)._proved().kernel
+    kernel = Verdict(robot).kernel
     with pytest.raises(ParameterError, match=r"\(N, 16\)"):
         kernel.clearance(np.zeros(7))
 
 
 def test_what_is_no_number_is_never_proved(robot: Robot) -> None:
-    kernel = Verdict(robot)._proved().kernel
+    kernel = Verdict(robot).kernel
     assert kernel.unproved(robot.home)[1][0] == 0
     for k in range(robot.dof):
         for value in (np.nan, np.inf, -np.inf):
@@ -294,7 +294,7 @@ def test_what_is_no_number_is_never_proved(robot: Robot) -> None:
 
 
 def test_threads_do_not_disturb_each_other(robot: Robot, post: Obstacle) -> None:
-    kernel = Verdict(robot, [post])._proved().kernel
+    kernel = Verdict(robot, [post]).kernel
     rng = np.random.default_rng(2)
     batches = [states_around_home(robot, rng, 4000) for _ in range(4)]
     expected = [kernel.clearance(batch) for batch in batches]

@@ -93,7 +93,7 @@ def test_spheres_of_real_robots_stay_within_their_bounds(
     which: str, size: float, request: pytest.FixtureRequest
 ) -> None:
     robot: Robot = request.getfixturevalue(which)
-    tables = Verdict(robot)._proved().kernel.robot
+    tables = Verdict(robot).kernel.robot
     rng = np.random.default_rng(6)
     tightest = 0.0
     for q in states_around_home(robot, rng, 6):

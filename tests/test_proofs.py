@@ -88,7 +88,7 @@ def test_both_stages_say_what_the_meshes_say(
     states = np.concatenate([wide, robot.random_state(rng, 300), towards_contact(meshes, wide[:500])])
     expected = meshes.are_free(states)
     assert np.array_equal(both.are_free(states), expected)
-    proved = both._proved().kernel.unproved(states)[1] == 0
+    proved = both.kernel.unproved(states)[1] == 0
     assert not (proved & ~expected).any()
     assert 0.3 < expected.mean() < 0.9 and proved.sum() > 0.5 * expected.sum()
     assert both.tally.proved == proved.sum() and both.tally.states == len(states)
@@ -106,7 +106,7 @@ def test_what_is_wholly_inside_a_link_is_never_proved_free(robot: Robot) -> None
         middle = at[:3, :3] @ np.array(item.geometry.vertices()).mean(axis=0) + at[:3, 3]
         seed = Obstacle(name="seed", box=(0.02, 0.02, 0.02), position=tuple(middle))
         both, meshes = verdicts(robot, [seed], [])
-        assert both._proved().kernel.unproved(q)[1][0] != 0, k
+        assert both.kernel.unproved(q)[1][0] != 0, k
         assert both.is_free(q) == meshes.is_free(q)
         inside += not meshes.is_free(q)
     assert inside >= 14

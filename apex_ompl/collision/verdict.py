@@ -17,6 +17,7 @@ from apex_ompl.collision.proofs import NoGridError, Open, Proofs, Tally
 from apex_ompl.collision.shapes import coal_geometry, world_geometry
 from apex_ompl.collision.sweep import bit_reversed, sample_path
 from apex_ompl.errors import ParameterError, SceneError
+from apex_ompl.kernel import Kernel
 from apex_ompl.problem import AttachedObject, Body, Obstacle
 from apex_ompl.robot import Robot
 from apex_ompl.schema import validate
@@ -160,6 +161,19 @@ class Verdict:
         self._find(self._attached, name, "held object")
         del self._attached[name], self._placed[name]
         self._compiled = None
+
+    @property
+    def kernel(self) -> Kernel:
+        """The compiled kernel for the robot and scene of now: clearances, their gradients, and the tables."""
+        return self._proved().kernel
+
+    def prepare(self) -> None:
+        """Do now what the first queries would do: compile the scene, make tables, and load or compile the kernel."""
+        still = np.zeros((2, self.robot.dof))
+        self._scene()
+        if self._prove:
+            self._proved().first_collision(still, 1.0, True, Tally(), lambda *_: True)
+            self._proved().open_at(still[0], Tally())
 
     def is_free(self, q: Array) -> bool:
         """Whether the state ``q``, shape (dof,), collides with nothing."""

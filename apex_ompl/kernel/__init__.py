@@ -1,1 +1,6 @@
 """The compiled kernel: clearance, its gradient and proofs of freedom over flat arrays, without Pinocchio or Coal."""
+
+from apex_ompl.kernel.face import Kernel
+from apex_ompl.kernel.tables import Primitive, RobotTables, SceneTables, scene_tables
+
+__all__ = ["Kernel", "Primitive", "RobotTables", "SceneTables", "scene_tables"]
