@@ -6,6 +6,7 @@ import coal
 import numpy as np
 from numpy.typing import NDArray
 
+BOX_PAD = 1e-6  # boxes are larger than what they must hold by this, to stand above rounding [m]
 MOST_TRIANGLES = 200_000  # after which large ones are taken as they are
 LARGEST = 1e4  # coordinates beyond are taken for a fault [m]
 
@@ -83,21 +84,32 @@ def piece_points(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDA
     return points
 
 
-def bounding_boxes(vertices: NDArray[np.float64], faces: NDArray[np.int64], columns: int = 8) -> NDArray[np.float64]:
-    """Return boxes that together contain the solid of a closed mesh, cavities left open, shape (boxes, 2, 3) [m].
+def bounding_boxes(corners: NDArray[np.float64], columns: int = 8) -> NDArray[np.float64]:
+    """Return boxes that together contain the solid of a mesh, cavities left open, shape (boxes, 2, 3) [m].
 
     The mesh is cut into columns along one axis. A line along that axis through a point of the solid leaves the solid
     at both ends through the surface, inside the same column; so the box around what the column has of the surface
-    contains what it has of the solid. The axis is the one with the least volume of boxes.
+    contains what it has of the solid. The axis is the one with the least volume of boxes. A surface that is not
+    closed gets one box around all of it, as points with a winding number over a half lie in its convex hull.
 
     Args:
-        vertices: Shape (V, 3) [m].
-        faces: Indices of the corners, shape (T, 3).
+        corners: Corners of the triangles, holes capped (see :func:`capped`), shape (T, 3, 3) [m].
         columns: How many along each of the two other axes.
     """
-    corners = _halved(vertices[faces], 0.5 * float(np.ptp(vertices, axis=0).min()) / columns)
-    found = [_columns(corners, np.delete(np.arange(3), axis), columns) for axis in range(3)]
+    if not _is_cycle(corners):
+        columns = 1
+    size = float(np.ptp(corners.reshape(-1, 3), axis=0).min())
+    small = _halved(corners, 0.5 * size / columns)
+    found = [_columns(small, np.delete(np.arange(3), axis), columns) for axis in range(3)]
     return min(found, key=lambda boxes: float(np.prod(boxes[:, 1] - boxes[:, 0], axis=1).sum()))
+
+
+def _is_cycle(corners: NDArray[np.float64]) -> bool:
+    """Whether every edge is run through as often one way as the other, so that winding numbers are whole."""
+    edges = _edges(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3))
+    turned = np.where(edges[:, 0] > edges[:, 1], -1.0, 1.0)
+    place = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True)[1].ravel()
+    return not np.bincount(place, weights=turned).any()
 
 
 def _halved(corners: NDArray[np.float64], longest: float) -> NDArray[np.float64]:
@@ -135,8 +147,46 @@ def _columns(corners: NDArray[np.float64], cut: NDArray[np.intp], columns: int) 
         np.minimum.at(boxes[:, :, 0], (x, y), floor)
         np.maximum.at(boxes[:, :, 1], (x, y), roof)
     found = boxes[np.isfinite(boxes).all(axis=(2, 3))]
-    wide: NDArray[np.float64] = found + np.array([-1e-9, 1e-9])[:, None]
+    wide: NDArray[np.float64] = found + np.array([-BOX_PAD, BOX_PAD])[:, None]
     return wide
+
+
+def capped(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return the corners of the triangles of a mesh, shape (T, 3, 3), with a fan of triangles over every hole.
+
+    Args:
+        vertices: Shape (V, 3) [m].
+        faces: Indices of the corners, shape (T, 3), oriented alike.
+    """
+    corners = vertices[faces]
+    if is_closed(vertices, faces):
+        return corners
+    place = weld(vertices)
+    where = np.zeros((int(place.max()) + 1, 3))
+    where[place] = vertices
+    rows = place[faces]
+    edges = np.concatenate([rows[:, [k, (k + 1) % 3]] for k in range(3)])
+    edges = edges[edges[:, 0] != edges[:, 1]]
+    _, index, inverse = np.unique(np.sort(edges, axis=1), axis=0, return_index=True, return_inverse=True)
+    turned = np.where(edges[:, 0] > edges[:, 1], -1.0, 1.0)
+    balance = np.bincount(inverse.ravel(), weights=turned)
+    uses = np.bincount(inverse.ravel())
+    rim = edges[index[(uses == 1) & (balance != 0)]]
+    label = np.arange(len(where))
+    while True:
+        new = label.copy()
+        least = label[rim].min(axis=1)
+        for column in rim.T:
+            np.minimum.at(new, column, least)
+        if np.array_equal(new, label):
+            break
+        label = new
+    fans = []
+    for loop in np.unique(label[rim[:, 0]]):
+        own = where[rim[label[rim[:, 0]] == loop]]
+        hub = np.broadcast_to(own.mean(axis=(0, 1)), (len(own), 3))
+        fans.append(np.stack([own[:, 1], own[:, 0], hub], axis=1))  # against the edge of the neighbour
+    return np.concatenate([corners, *fans])
 
 
 def winding_number(point: NDArray[np.float64], corners: NDArray[np.float64]) -> float:

@@ -20,7 +20,8 @@ from apex_ompl.collision.tabulate import primitives
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError
 from apex_ompl.kernel import build
 from apex_ompl.kernel.face import Kernel
-from apex_ompl.kernel.tables import FIXED, PRISMATIC, REVOLUTE, RobotTables, scene_tables
+from apex_ompl.kernel.scene import scene_tables
+from apex_ompl.kernel.tables import FIXED, PRISMATIC, REVOLUTE, RobotTables
 from apex_ompl.problem import Obstacle
 from apex_ompl.robot import Robot
 
@@ -238,7 +239,8 @@ import sys, numpy as np
 for name in ("pinocchio", "coal", "ompl"):
     sys.modules[name] = None
 from apex_ompl.kernel.face import Kernel
-from apex_ompl.kernel.tables import BOX, Primitive, RobotTables, scene_tables
+from apex_ompl.kernel.scene import Primitive, scene_tables
+from apex_ompl.kernel.tables import BOX, RobotTables
 at = np.eye(4)
 at[:3, 3] = {list(post.position)}
 box = Primitive(BOX, at, {tuple(e / 2 for e in post.box)})

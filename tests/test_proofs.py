@@ -19,7 +19,7 @@ from apex_ompl.collision.tabulate import primitives
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel import entries
 from apex_ompl.kernel.face import MOST_PAIRS, Kernel
-from apex_ompl.kernel.tables import scene_tables
+from apex_ompl.kernel.scene import scene_tables
 from apex_ompl.problem import AttachedObject, MeshFile, Obstacle
 from apex_ompl.robot import Robot
 from apex_ompl.validity import full_check

@@ -204,8 +204,9 @@ class CompiledScene:
 
     def collides(self, q: Array) -> bool:
         """Whether anything overlaps at a state in Pinocchio's order."""
-        if pin.computeCollisions(self.model, self.data, self.manager, q, True):
-            return True
+        with self.lock:
+            if pin.computeCollisions(self.model, self.data, self.manager, q, True):
+                return True
         return self.second is not None and bool(self._contained(q))
 
     def any_collides(self, q: Array, pairs: Iterable[tuple[int, int]]) -> bool:

@@ -15,15 +15,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apex_ompl.collision.shapes import convex_hull, is_shell
-from apex_ompl.meshes import is_closed, piece_points, triangles, winding_number
+from apex_ompl.meshes import capped, is_closed, piece_points, triangles, winding_number
 
 ANCHOR_RADIUS = 1e-6  # [m]
-CONVEX_TOLERANCE = 1e-3  # a mesh is convex when its hull has no more than this share of extra volume
+CONVEX_TOLERANCE = 5e-4  # a mesh is convex when its triangles' centres are no deeper than this below its hull [m]
 
 
 @dataclass(frozen=True)
 class Host:
-    """A mesh that may contain others: its hull, and whether the hull is the solid itself."""
+    """A mesh that may contain others: its hull, whether the hull stands for the solid, and its triangles.
+
+    Holes are closed by fans of triangles (see ``apex_ompl.meshes.capped``). The hull stands for the solid where no
+    triangle is deeper than three times ``CONVEX_TOLERANCE`` below it: the depth is a concave function, so that it is
+    at most three times its value at the centre of a triangle.
+    """
 
     hull: coal.CollisionGeometry
     convex: bool
@@ -34,13 +39,35 @@ class Host:
         """Analyse a mesh."""
         hull = convex_hull(mesh)
         vertices, faces = triangles(mesh)
-        full = float(hull.computeVolume())
-        convex = is_closed(vertices, faces) and abs(full - abs(float(mesh.computeVolume()))) <= CONVEX_TOLERANCE * full
-        return cls(hull, convex, vertices[faces])
+        outside = hull_corners(hull)
+        normals = np.cross(outside[:, 1] - outside[:, 0], outside[:, 2] - outside[:, 0])
+        long = np.linalg.norm(normals, axis=1)
+        sound = long > 1e-14
+        normals = normals[sound] / long[sound, None]
+        offsets = np.einsum("ij,ij->i", normals, outside[sound, 0])
+        middle = outside.mean(axis=(0, 1))
+        normals, offsets = (
+            v * np.sign(offsets - normals @ middle)[(...,) + (None,) * (v.ndim - 1)] for v in (normals, offsets)
+        )
+        depth = (offsets - vertices[faces].mean(axis=1) @ normals.T).min(axis=1)
+        return cls(hull, is_closed(vertices, faces) and float(depth.max()) <= CONVEX_TOLERANCE, capped(vertices, faces))
+
+    @property
+    def outline(self) -> NDArray[np.float64]:
+        """Corners of the triangles of what stands for the solid, shape (T, 3, 3) [m]."""
+        return hull_corners(self.hull) if self.convex else self.corners
 
     def contains(self, point: NDArray[np.float64]) -> bool:
         """Whether a point, in the mesh's frame and off its surface, lies in the solid."""
         return abs(winding_number(point, self.corners)) > 0.5
+
+
+def hull_corners(hull: coal.ConvexBase32) -> NDArray[np.float64]:
+    """Return the corners of the triangles of a convex hull, shape (T, 3, 3) [m]."""
+    points = np.array(hull.points())
+    rows = [hull.polygons(k) for k in range(hull.num_polygons)]
+    corners: NDArray[np.float64] = points[np.array([[row[0], row[1], row[2]] for row in rows])]
+    return corners
 
 
 def may_contain(host: coal.BVHModelBase, guest: coal.CollisionGeometry) -> bool:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import NamedTuple
 from weakref import WeakKeyDictionary
 
@@ -18,7 +17,7 @@ from apex_ompl.collision.rough_cover import rough_cover
 from apex_ompl.collision.shapes import is_shell
 from apex_ompl.collision.sphere_proof import Cover
 from apex_ompl.collision.spheres import make_cover, read_covers, shape_key
-from apex_ompl.collision.tabulate import tabulate, tabulate_scene
+from apex_ompl.collision.tabulate import mesh_boxes, primitives, tabulate, tabulate_scene
 from apex_ompl.kernel import entries
 from apex_ompl.kernel.face import MOST_PAIRS, Kernel
 from apex_ompl.kernel.tables import RobotTables, SceneTables
@@ -40,9 +39,10 @@ class Open(NamedTuple):
 
 
 QUICK_GAPS, LEAVES = (0.02, 0.005), 32  # of covers made at run time
+SLENDER = 0.05  # cylinders thinner or flatter than this are covered like boxes
 
 _robots: WeakKeyDictionary[Robot, RobotTables] = WeakKeyDictionary()
-_covers: dict[str, Cover] = {}
+_quick: dict[str, Cover] = {}  # by shape key
 
 
 @dataclass
@@ -74,25 +74,32 @@ class Tally:
 def covers_of(robot: Robot, shapes: Sequence[coal.CollisionGeometry]) -> list[Cover]:
     """Return a cover of each shape: one that the robot's file brings, or a quick one made now.
 
+    What a file brings is taken on trust; ``scripts/make_covers.py`` writes only covers that are proved, and for those
+    that ship the tests prove it again.
+
     Raises:
         MissingFileError: The robot names a file of covers that cannot be read.
         FileFormatError: That file does not follow its schema.
     """
-    if robot.covers is not None:
-        _covers.update(_read(str(robot.covers)))
+    given = read_covers(robot.covers) if robot.covers is not None else {}
     found = []
     for shape in shapes:
         key = shape_key(shape)
-        if key not in _covers:
-            boxy = is_shell(shape) or shape.getNodeType() == coal.GEOM_BOX
-            _covers[key] = rough_cover(shape) if boxy else make_cover(shape, QUICK_GAPS, effort=1, most=LEAVES)
-        found.append(_covers[key])
+        if key not in given and key not in _quick:
+            _quick[key] = _quick_cover(shape)
+        found.append(given[key] if key in given else _quick[key])
     return found
 
 
-@lru_cache(maxsize=8)
-def _read(path: str) -> dict[str, Cover]:
-    return read_covers(path)
+def _quick_cover(shape: coal.CollisionGeometry) -> Cover:
+    kind = shape.getNodeType()
+    if is_shell(shape) or kind == coal.GEOM_BOX:
+        return rough_cover(shape)
+    if kind == coal.GEOM_CYLINDER:
+        sizes = sorted((float(shape.radius), float(shape.halfLength)))
+        if sizes[0] < SLENDER * sizes[1]:
+            return rough_cover(coal.Box(2.0 * shape.radius, 2.0 * shape.radius, 2.0 * shape.halfLength))
+    return make_cover(shape, QUICK_GAPS, effort=1, most=LEAVES)
 
 
 class Proofs:
@@ -108,6 +115,7 @@ class Proofs:
         """
         self.scene = scene
         self._local = threading.local()
+        self._boxes: dict[int, Array] = {}
         self.kernel = Kernel(self._robot(robot), self._obstacles())
 
     def _robot(self, robot: Robot) -> RobotTables:
@@ -126,10 +134,13 @@ class Proofs:
         return tables
 
     def _obstacles(self) -> SceneTables:
-        items = self.scene.geometry.geometryObjects
-        return tabulate_scene(
-            {n: (items[n].geometry, items[n].placement.homogeneous) for n in self.scene.scene.values()}
-        )
+        solids = {}
+        for number in self.scene.scene.values():
+            item = self.scene.geometry.geometryObjects[number]
+            if is_shell(item.geometry) and number not in self._boxes:
+                self._boxes[number] = mesh_boxes(item.geometry)
+            solids[number] = primitives(item.geometry, item.placement.homogeneous, self._boxes.get(number))
+        return tabulate_scene(solids)
 
     def obstacles_moved(self) -> None:
         """Take over the poses of the scene's obstacles."""
@@ -181,9 +192,9 @@ class Proofs:
         last = entries.lay_grid(path, resolution, starts)
         if last < 0:
             raise NoGridError
-        if len(mine.queue) < 2 * last + 4:
-            mine.queue = np.empty((4 * last + 4, 2), np.int64)
         queue, ends, state = mine.queue, mine.ends, mine.state[0]
+        if len(queue) < 2 * last + 4:
+            queue = np.empty((2 * last + 4, 2), np.int64)
         entered = [(0, 0), (last, last), (0, last)][0 if start else 1 :]
         queue[: len(entered)] = entered
         ends[:2] = 0, len(entered)
@@ -225,6 +236,6 @@ class _Room:
         self.state = np.empty((1, kernel.robot.dof))
         self.found = np.empty((MOST_PAIRS, 2), np.int64)
         self.starts = np.empty(2, np.int64)
-        self.queue = np.empty((256, 2), np.int64)
+        self.queue = np.empty((4096, 2), np.int64)
         self.ends = np.zeros(3, np.int64)
         self.counts = np.zeros(5, np.int64)

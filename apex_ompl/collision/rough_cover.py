@@ -6,8 +6,9 @@ import coal
 import numpy as np
 from numpy.typing import NDArray
 
+from apex_ompl.collision.containment import Host
 from apex_ompl.collision.sphere_proof import PAD, Cover
-from apex_ompl.meshes import bounding_boxes, triangles
+from apex_ompl.meshes import bounding_boxes
 
 COLUMNS = 6
 LEAVES = 64  # at most, of a box
@@ -25,7 +26,7 @@ def rough_cover(geometry: coal.CollisionGeometry) -> Cover:
     if geometry.getNodeType() == coal.GEOM_BOX:
         boxes, most = np.array([[-geometry.halfSide, geometry.halfSide]]), LEAVES
     else:
-        boxes, most = bounding_boxes(*triangles(geometry), COLUMNS), LEAVES_IN_MESH
+        boxes, most = bounding_boxes(Host.of(geometry).outline, COLUMNS), LEAVES_IN_MESH
     sides = boxes[:, 1] - boxes[:, 0]
     longest = float(sides.max())
     while len(boxes) < most and _leaves(sides, longest / 1.1) <= most:

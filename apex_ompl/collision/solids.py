@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from apex_ompl.collision.containment import Host
 from apex_ompl.collision.shapes import convex_hull, is_shell
 from apex_ompl.errors import ParameterError
-from apex_ompl.meshes import is_closed, triangles, weld, winding_number
+from apex_ompl.meshes import triangles, winding_number
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -286,8 +286,7 @@ def solid_of(geometry: coal.CollisionGeometry) -> Solid:
         raise ParameterError("geometry", kind, "a box, sphere, cylinder, capsule, convex body or mesh")
     if Host.of(geometry).convex:
         return Solid((Polytope.around(np.array(convex_hull(geometry).points())),))
-    vertices, faces = triangles(geometry)
-    return _cells(_capped(vertices, faces))
+    return _cells(capped(*triangles(geometry)))
 
 
 def triangle_points(corners: Array, spacing: float) -> Array:
@@ -302,39 +301,6 @@ def triangle_points(corners: Array, spacing: float) -> Array:
     # One of those that fall together, on the edges and in the fans of slivers.
     _, first = np.unique(np.round(stacked / (0.5 * spacing)), axis=0, return_index=True)
     return np.concatenate([corners.reshape(-1, 3), stacked[np.sort(first)]])
-
-
-def _capped(vertices: Array, faces: Indices) -> Array:
-    """Return the corners of the triangles, shape (T, 3, 3), with a fan of triangles over every hole."""
-    corners = vertices[faces]
-    if is_closed(vertices, faces):
-        return corners
-    place = weld(vertices)
-    where = np.zeros((int(place.max()) + 1, 3))
-    where[place] = vertices
-    rows = place[faces]
-    edges = np.concatenate([rows[:, [k, (k + 1) % 3]] for k in range(3)])
-    edges = edges[edges[:, 0] != edges[:, 1]]
-    _, index, inverse = np.unique(np.sort(edges, axis=1), axis=0, return_index=True, return_inverse=True)
-    turned = np.where(edges[:, 0] > edges[:, 1], -1.0, 1.0)
-    balance = np.bincount(inverse.ravel(), weights=turned)
-    uses = np.bincount(inverse.ravel())
-    rim = edges[index[(uses == 1) & (balance != 0)]]
-    label = np.arange(len(where))
-    while True:
-        new = label.copy()
-        least = label[rim].min(axis=1)
-        for column in rim.T:
-            np.minimum.at(new, column, least)
-        if np.array_equal(new, label):
-            break
-        label = new
-    fans = []
-    for loop in np.unique(label[rim[:, 0]]):
-        own = where[rim[label[rim[:, 0]] == loop]]
-        hub = np.broadcast_to(own.mean(axis=(0, 1)), (len(own), 3))
-        fans.append(np.stack([own[:, 1], own[:, 0], hub], axis=1))  # against the edge of the neighbour
-    return np.concatenate([corners, *fans])
 
 
 def _cells(corners: Array) -> Solid:

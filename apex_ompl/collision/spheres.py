@@ -26,6 +26,7 @@ __all__ = ["GAPS", "Cover", "make_cover", "quality", "read_covers", "shape_key",
 
 SCHEMA = "apex-ompl/spheres/1"
 COLUMNS = ["x", "y", "z", "radius", "first child", "children"]
+LARGEST = 1e6  # numbers of a file beyond are a fault [m]
 GAPS = (0.02, 0.007, 0.0025)  # [m]
 MOST = (64, 96, 256)  # leaves of a cover: of a quick one, of others, of a mesh that is not convex; the gap gives way
 QUICK = 4.0  # a quick cover grows by boxes so much larger, which takes less time and leaves more to spare
@@ -173,6 +174,10 @@ def read_covers(path: Path | str) -> dict[str, Cover]:
     return {key: _cover_of(rows, name, f"covers.{key}") for key, rows in data["covers"].items()}
 
 
+def _is_number(value: Any) -> bool:
+    return type(value) in (int, float) and abs(value) < LARGEST
+
+
 def _cover_of(rows: Any, file: str, field: str) -> Cover:
     """Return the cover that rows of a file describe, or say what is wrong with them."""
     if not isinstance(rows, list) or not rows:
@@ -180,8 +185,8 @@ def _cover_of(rows: Any, file: str, field: str) -> Cover:
     following = 1
     for k, row in enumerate(rows):
         where = f"{field}.{k}"
-        numbers = isinstance(row, list) and len(row) == len(COLUMNS) and all(type(x) in (int, float) for x in row)
-        if not numbers or not np.isfinite(row).all():
+        numbers = isinstance(row, list) and len(row) == len(COLUMNS) and all(_is_number(x) for x in row)
+        if not numbers:
             raise FileFormatError(file, where, row, f"expected the numbers {', '.join(COLUMNS)}")
         if row[3] <= 0.0:
             raise FileFormatError(file, where, row[3], "expected a positive radius")

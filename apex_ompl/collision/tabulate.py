@@ -9,9 +9,11 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from apex_ompl.collision.containment import Host
 from apex_ompl.collision.sphere_proof import Cover
 from apex_ompl.errors import RobotError
 from apex_ompl.kernel.build import BodySpec, JointSpec, robot_tables
+from apex_ompl.kernel.scene import Primitive, scene_tables
 from apex_ompl.kernel.tables import (
     BOX,
     CAPSULE,
@@ -20,17 +22,16 @@ from apex_ompl.kernel.tables import (
     PRISMATIC,
     REVOLUTE,
     SPHERE,
-    Primitive,
     RobotTables,
     SceneTables,
-    scene_tables,
 )  # fmt: skip
-from apex_ompl.meshes import bounding_boxes, triangles
+from apex_ompl.meshes import bounding_boxes
 from apex_ompl.robot import Robot
 
 Array = NDArray[np.float64]
 
-PROBE = 0.5  # value of a planned joint at which the motion of the others is read off [rad]
+PROBE = 1e-3  # value of a planned joint at which the motion of the others is read off: less than half a turn of any
+CHECKS = (0.37, -1.13, 2.71)  # where it is looked at again, besides the limits
 
 
 def joint_specs(robot: Robot) -> list[JointSpec]:
@@ -43,29 +44,34 @@ def joint_specs(robot: Robot) -> list[JointSpec]:
         RobotError: A joint moves in another way.
     """
     model, data = robot.model, robot.model.createData()
-    specs = [JointSpec(0)]
-    zero = np.zeros(model.nq)
-    pin.forwardKinematics(model, data, zero)
-    rest = [data.liMi[k].copy() for k in range(model.njoints)]
     source = [int(k) for k in robot.to_pinocchio(np.arange(float(robot.dof)))]  # by place in Pinocchio's order
-    moved: dict[int, list[pin.SE3]] = {}
+
+    def placements(p: int, value: float) -> list[pin.SE3]:
+        q = np.zeros(model.nq)
+        q[p] = value
+        pin.forwardKinematics(model, data, q)
+        return [placement.copy() for placement in data.liMi]
+
+    rest = placements(0, 0.0)
+    specs = {0: JointSpec(0)}
     for p in range(model.nq):
-        for scale in (1.0, -2.0):
-            pin.forwardKinematics(model, data, zero + scale * PROBE * np.eye(model.nq)[p])
-            moved.setdefault(p, []).extend(data.liMi[k].copy() for k in range(model.njoints))
-    for k in range(1, model.njoints):
-        parent, place = int(model.parents[k]), rest[k].homogeneous
-        p = int(model.joints[k].idx_q)
-        motion = pin.log6(rest[k].actInv(moved[p][k])).vector / PROBE
-        again = pin.exp6(pin.Motion(-2.0 * PROBE * motion))
-        speed, turn = np.linalg.norm(motion[:3]), np.linalg.norm(motion[3:])
-        if not rest[k].actInv(moved[p][model.njoints + k]).isApprox(again, 1e-9) or min(speed, turn) > 1e-12:
-            raise RobotError(f"joint {model.names[k]!r} is neither revolute nor prismatic, which the kernel needs")
-        kind, along = (REVOLUTE, motion[3:]) if turn > 0.0 else (PRISMATIC, motion[:3])
-        ratio = float(np.linalg.norm(along))
-        axis = along / ratio if ratio > 0.0 else np.array([0.0, 0.0, 1.0])
-        specs.append(JointSpec(parent, kind, place, axis, source[p], ratio))
-    return specs
+        probe = placements(p, PROBE)
+        limits = float(robot.limits.lower[source[p]]), float(robot.limits.upper[source[p]])
+        checks = [(value, placements(p, value)) for value in (*CHECKS, *limits)]
+        for k in (k for k in range(1, model.njoints) if model.joints[k].idx_q == p):
+            motion = pin.log6(rest[k].actInv(probe[k])).vector / PROBE
+            speed, turn = np.linalg.norm(motion[:3]), np.linalg.norm(motion[3:])
+            same = (
+                rest[k].actInv(there[k]).isApprox(pin.exp6(pin.Motion(value * motion)), 1e-6) for value, there in checks
+            )
+            if min(speed, turn) > 1e-9 or not all(same):
+                raise RobotError(f"joint {model.names[k]!r} is neither revolute nor prismatic, which the kernel needs")
+            kind, along = (REVOLUTE, motion[3:]) if turn > speed else (PRISMATIC, motion[:3])
+            ratio = float(np.linalg.norm(along))
+            axis = along / ratio if ratio > 1e-9 else np.array([0.0, 0.0, 1.0])
+            place = rest[k].homogeneous
+            specs[k] = JointSpec(int(model.parents[k]), kind, place, axis, source[p], ratio)
+    return [specs[k] for k in range(model.njoints)]
 
 
 def tabulate(
@@ -101,13 +107,19 @@ def tabulate(
     )  # fmt: skip
 
 
-def tabulate_scene(obstacles: Mapping[int, tuple[coal.CollisionGeometry, Array]]) -> SceneTables:
-    """Return the tables of obstacles by number, each a geometry and its pose in the world, shape (4, 4)."""
-    return scene_tables([(n, p) for n, (shape, pose) in obstacles.items() for p in primitives(shape, pose)])
+def tabulate_scene(solids: Mapping[int, Sequence[Primitive]]) -> SceneTables:
+    """Return the tables of obstacles by number, each the solids that :func:`primitives` returns."""
+    return scene_tables([(number, solid) for number, parts in solids.items() for solid in parts])
 
 
-def primitives(shape: coal.CollisionGeometry, pose: Array) -> list[Primitive]:
-    """Return solids that the kernel knows and that contain a geometry: itself, or boxes around a mesh."""
+def primitives(shape: coal.CollisionGeometry, pose: Array, boxes: Array | None = None) -> list[Primitive]:
+    """Return solids that the kernel knows and that contain a geometry: itself, or boxes around a mesh.
+
+    Args:
+        shape: The geometry.
+        pose: Its pose in the world, shape (4, 4) [m].
+        boxes: What :func:`mesh_boxes` returned for it before.
+    """
     kind = shape.getNodeType()
     if kind == coal.GEOM_BOX:
         return [Primitive(BOX, pose, tuple(shape.halfSide))]
@@ -121,8 +133,13 @@ def primitives(shape: coal.CollisionGeometry, pose: Array) -> list[Primitive]:
         normal = pose[:3, :3] @ shape.n
         return [Primitive(HALF_SPACE, pose, (*normal, shape.d + float(normal @ pose[:3, 3])))]
     found = []
-    for low, high in bounding_boxes(*triangles(shape)):
+    for low, high in mesh_boxes(shape) if boxes is None else boxes:
         centre = np.eye(4)
         centre[:3, 3] = (low + high) / 2.0
         found.append(Primitive(BOX, pose @ centre, tuple((high - low) / 2.0)))
     return found
+
+
+def mesh_boxes(mesh: coal.BVHModelBase) -> Array:
+    """Return boxes in the mesh's frame that together contain its solid, shape (boxes, 2, 3) [m]."""
+    return bounding_boxes(Host.of(mesh).outline)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import threading
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -18,6 +20,7 @@ from apex_ompl.collision.shapes import coal_geometry, world_geometry
 from apex_ompl.collision.sweep import bit_reversed, sample_path
 from apex_ompl.errors import ParameterError, SceneError
 from apex_ompl.kernel import Kernel
+from apex_ompl.kernel.entries import MOST_STEPS
 from apex_ompl.problem import AttachedObject, Body, Obstacle
 from apex_ompl.robot import Robot
 from apex_ompl.schema import validate
@@ -76,6 +79,7 @@ class Verdict:
         self.tally = Tally()
         self._prove = proofs
         self._proofs: Proofs | None = None
+        self._lock = threading.RLock()  # several threads may ask first
         self._obstacles: dict[str, Body] = {}
         self._attached: dict[str, AttachedObject] = {}
         self._placed: dict[str, tuple[coal.CollisionGeometry, Array]] = {}
@@ -102,7 +106,7 @@ class Verdict:
         self._claim(obstacle.name)
         self._placed[obstacle.name] = world_geometry(obstacle)
         self._obstacles[obstacle.name] = obstacle
-        self._compiled = None
+        self._forget()
 
     def move(self, name: str, position: Sequence[float], orientation: Sequence[float] | None = None) -> None:
         """Place an obstacle anew, in the world [m, quaternion xyzw]; without orientation it keeps its own.
@@ -118,7 +122,7 @@ class Verdict:
         self._obstacles[name] = new
         if new.half_space is not None:  # its pose is part of its geometry
             self._placed[name] = world_geometry(new)
-            self._compiled = None
+            self._forget()
             return
         self._placed[name] = (self._placed[name][0], new.pose)
         if self._compiled is not None:
@@ -134,7 +138,7 @@ class Verdict:
         """
         self._find(self._obstacles, name, "obstacle")
         del self._obstacles[name], self._placed[name]
-        self._compiled = None
+        self._forget()
 
     def attach(self, held: AttachedObject) -> None:
         """Fix an object to the link that holds it; from now on it collides like a part of the robot.
@@ -150,7 +154,7 @@ class Verdict:
             self.robot.link_frame(link)
         self._placed[held.name] = (coal_geometry(held), held.pose)
         self._attached[held.name] = held
-        self._compiled = None
+        self._forget()
 
     def detach(self, name: str) -> None:
         """Take a held object away.
@@ -160,7 +164,7 @@ class Verdict:
         """
         self._find(self._attached, name, "held object")
         del self._attached[name], self._placed[name]
-        self._compiled = None
+        self._forget()
 
     @property
     def kernel(self) -> Kernel:
@@ -187,8 +191,14 @@ class Verdict:
         return left is None or self._free_by_meshes(q, left)
 
     def are_free(self, states: Array) -> NDArray[np.bool_]:
-        """Whether each of the states, shape (N, dof), collides with nothing; shape (N,)."""
-        self.robot.to_pinocchio(states[:0])
+        """Whether each of the states, shape (N, dof), collides with nothing; shape (N,).
+
+        Raises:
+            ParameterError: Another shape.
+        """
+        states = np.asarray(states, float)
+        if states.ndim != 2 or states.shape[1] != self.robot.dof:
+            raise ParameterError("states", states.shape, f"an array of shape (N, {self.robot.dof})")
         if not self._prove:
             return np.array([self._free_by_meshes(q) for q in states], bool)
         free = np.ones(len(states), bool)
@@ -208,9 +218,11 @@ class Verdict:
             start: Whether the first state is judged too.
 
         Raises:
-            ParameterError: ``path`` has not the shape (N, dof).
+            ParameterError: ``path`` has not the shape (N, dof), or too many steps; ``resolution`` is not positive.
         """
-        path = np.ascontiguousarray(path, float)
+        path = np.require(path, float, ["C", "W"])  # the kernel is compiled for arrays like this
+        if not (math.isfinite(resolution) and resolution > 0.0):
+            raise ParameterError("resolution", resolution, "a positive number of radians")
         if path.ndim != 2 or path.shape[1] != self.robot.dof or len(path) == 0:
             raise ParameterError("path", path.shape, f"an array of shape (N, {self.robot.dof})")
         if len(path) == 1:
@@ -226,6 +238,8 @@ class Verdict:
         if broken.any():
             k = int(np.argmax(broken))
             return Collision(path[k].copy(), max(k - 1, 0))
+        if float(np.abs(np.diff(path, axis=0)).max(axis=1).sum()) / resolution > MOST_STEPS:
+            raise ParameterError("path", f"longer than {MOST_STEPS} steps of {resolution:g}", "a shorter one")
         return self._first_sampled(path, resolution, start)
 
     def _first_sampled(self, path: Array, resolution: float, start: bool) -> Collision | None:
@@ -283,16 +297,20 @@ class Verdict:
         return where[name]
 
     def _proved(self) -> Proofs:
-        scene = self._scene()
         proofs = self._proofs
         if proofs is None:
-            proofs = self._proofs = Proofs(self.robot, scene)
+            with self._lock:
+                proofs = self._proofs = self._proofs or Proofs(self.robot, self._scene())
         return proofs
 
     def _scene(self) -> CompiledScene:
         compiled = self._compiled
         if compiled is None:
-            self._proofs = None
-            compiled = CompiledScene(self.robot, self._obstacles, self._attached, self._placed)
-            self._compiled = compiled
+            with self._lock:
+                compiled = self._compiled or CompiledScene(self.robot, self._obstacles, self._attached, self._placed)
+                self._compiled = compiled
         return compiled
+
+    def _forget(self) -> None:
+        """Drop what was made of the objects of before."""
+        self._compiled = self._proofs = None

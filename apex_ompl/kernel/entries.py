@@ -20,7 +20,7 @@ MOST_STEPS = 50_000_000
 def judge_states(
     ri: Integers, rf: Floats, si: Integers, sf: Floats, wi: Integers, wf: Floats,
     states: Floats, found: Integers, counts: Integers,
-) -> None:  # fmt: skip  # fmt: skip
+) -> None:  # fmt: skip
     """List for each state, shape (N, dof), the pairs that are not proved to be apart.
 
     ``found`` (N, K, 2) gets the pairs, ``counts`` (N,) their number, or -1 when nothing can be said of the state.
@@ -35,16 +35,22 @@ def judge_states(
 def clearances(
     ri: Integers, rf: Floats, si: Integers, sf: Floats, wi: Integers, wf: Floats,
     states: Floats, limit: float, values: Floats, slopes: Floats,
-) -> None:  # fmt: skip  # fmt: skip
+) -> None:  # fmt: skip
     """Put the signed clearance of each state, shape (N, dof), to obstacles and between links into ``values`` (N, 2).
 
     Clearances over ``limit`` are not looked for; ``limit`` stands for them, with gradient 0. ``slopes``, shape
-    (N, 2, dof), gets the gradients; shape (0, 2, dof) asks for none.
+    (N, 2, dof), gets the gradients; shape (0, 2, dof) asks for none. States that the tables do not hold for get NaN.
     """
     t, s = robot_view(ri, rf), scene_view(si, sf)
     w = work_view(t, wi, wf)
     for k in range(len(states)):
         q = states[k]
+        if not known(t, q, w.reach):
+            values[k, 0] = values[k, 1] = math.nan
+            if len(slopes):
+                for i in range(len(q)):
+                    slopes[k, 0, i] = slopes[k, 1, i] = math.nan
+            continue
         place_robot(t, w, q)
         near = nearest_obstacle(t, s, w, q, limit)
         own = nearest_bodies(t, w, q, limit)
@@ -94,10 +100,10 @@ def lay_grid(path: Floats, resolution: float, starts: Integers) -> int:
             if not math.isfinite(step):
                 return -1
             largest = max(largest, step)
-        steps = max(1.0, math.ceil(largest / resolution))
-        if starts[k] + steps > MOST_STEPS:
+        steps = largest / resolution
+        if not steps <= MOST_STEPS - starts[k]:  # before it is rounded: whole numbers overflow
             return -1
-        starts[k + 1] = starts[k] + int(steps)
+        starts[k + 1] = starts[k] + max(1, int(math.ceil(steps)))
     return int(starts[len(path) - 1])
 
 
@@ -130,6 +136,16 @@ def _state(path: Floats, starts: Integers, g: int, out: Floats) -> None:
 
 
 @inlined
+def _take_in(w: Work, state: Floats, middle: Floats, along: float) -> None:
+    """Widen reach and stray to a state that is about ``along`` of a step from the middle."""
+    along = min(max(along, -1.0), 1.0)
+    for i in range(len(middle)):
+        shift = state[i] - middle[i]
+        w.reach[i] = max(w.reach[i], abs(shift))
+        w.stray[i] = max(w.stray[i], abs(shift - along * w.step[i]))
+
+
+@inlined
 def _describe(path: Floats, starts: Integers, a: int, b: int, middle: Floats, w: Work) -> None:
     """Describe the path between two states of the grid for :func:`bound_motion`, as seen from a state between them."""
     centre, dof = (a + b) // 2, len(middle)
@@ -140,16 +156,11 @@ def _describe(path: Floats, starts: Integers, a: int, b: int, middle: Floats, w:
     _state(path, starts, a, w.end)
     for i in range(dof):
         w.step[i] -= 0.5 * w.end[i]
-    first, last = _segment(starts, a) + 1, _segment(starts, b)
-    for k in range(first - 1, last + 2):  # the ends, and the given states between them
-        g = a if k < first else b if k > last else starts[k]
-        if k < first or k > last:
-            _state(path, starts, g, w.end)
-        along = min(max(2.0 * (g - centre) / (b - a), -1.0), 1.0)
-        for i in range(dof):
-            shift = (w.end[i] if k < first or k > last else path[k, i]) - middle[i]
-            w.reach[i] = max(w.reach[i], abs(shift))
-            w.stray[i] = max(w.stray[i], abs(shift - along * w.step[i]))
+    _take_in(w, w.end, middle, 2.0 * (a - centre) / (b - a))
+    _state(path, starts, b, w.end)
+    _take_in(w, w.end, middle, 2.0 * (b - centre) / (b - a))
+    for k in range(_segment(starts, a) + 1, _segment(starts, b) + 1):
+        _take_in(w, path[k], middle, 2.0 * (starts[k] - centre) / (b - a))
     for i in range(dof):
         w.reach[i] = max(w.reach[i], abs(w.step[i]) + w.stray[i]) + 1e-12  # and rounding
         w.stray[i] += 1e-12

@@ -37,7 +37,7 @@ class Kernel:
         Raises:
             ParameterError: Another shape.
         """
-        states = np.ascontiguousarray(np.atleast_2d(np.asarray(q, dtype=float)))
+        states = np.require(np.atleast_2d(np.asarray(q, dtype=float)), requirements=["C", "W"])
         if states.ndim != 2 or states.shape[1] != self.robot.dof:
             raise ParameterError("states", states.shape, f"an array of shape (N, {self.robot.dof})")
         return states
@@ -64,7 +64,7 @@ class Kernel:
 
         Returns:
             Shape (N, 2) [m]: to the obstacles, and between bodies that may touch. The true clearances are at least as
-            large where these are positive.
+            large where these are positive. NaN where a state is not finite, or a hand is outside its limits.
         """
         states = self.states(q)
         values = np.empty((len(states), 2))

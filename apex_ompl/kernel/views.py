@@ -38,7 +38,7 @@ def scene_view(i: Integers, f: Floats) -> SceneArrays:
     return SceneArrays(
         _ints(i, 0), _ints(i, 1), _ints(i, 2), _ints(i, 3).reshape(-1, 2), _ints(i, 4),
         _floats(i, f, 5).reshape(-1, 3, 3), _floats(i, f, 6).reshape(-1, 3), _floats(i, f, 7).reshape(-1, 3),
-        _floats(i, f, 8), _floats(i, f, 9).reshape(-1, 3), _floats(i, f, 10).reshape(-1, 3),
+        _floats(i, f, 8).reshape(-1, 3), _floats(i, f, 9).reshape(-1, 3),
     )  # fmt: skip
 
 
