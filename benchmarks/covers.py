@@ -20,7 +20,7 @@ import record
 from verdict import around_home, boxes, microseconds, of_batch
 
 from apex_ompl import assembly, plan
-from apex_ompl.collision import Verdict, proofs
+from apex_ompl.collision import Verdict
 from apex_ompl.collision.spheres import quality, read_covers, shape_key
 from apex_ompl.robot import load_robot
 from apex_ompl.space import FULL_RESOLUTION, SEARCH_RESOLUTION
@@ -32,7 +32,6 @@ def measure(path: Path, states: int, seeds: int) -> dict[str, float]:
     """Return the figures of one file of covers."""
     rng = np.random.default_rng(0)
     robot = replace(load_robot("dual_panda_softhand"), covers=path)
-    proofs._covers.clear()
     covers = read_covers(path)
     ratios, gaps, total = [], [], 0
     for item in robot.geometry.geometryObjects:

@@ -157,6 +157,8 @@ def judge_paths(verdicts: tuple[Verdict, Verdict], paths: list[np.ndarray]) -> d
     ``batched`` is Pinocchio's own call for a batch of states, on one thread.
     """
     both, meshes = verdicts
+    both.prepare()
+    meshes.prepare()
     scene = meshes._scene()
     pool = pin.BroadPhaseManagerPool_DynamicAABBTreeCollisionManager(scene.model, scene.geometry, 1)
     exact_requests(pool.getGeometryData(0))

@@ -6,6 +6,8 @@ import subprocess
 import sys
 import threading
 from pathlib import Path
+from types import SimpleNamespace
+from unittest import mock
 
 import coal
 import numpy as np
@@ -16,12 +18,13 @@ from hypothesis import strategies as st
 from support import ROOT, states_around_home
 
 from apex_ompl.collision import Verdict
-from apex_ompl.collision.tabulate import primitives
+from apex_ompl.collision.tabulate import joint_specs, primitives
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError
-from apex_ompl.kernel import build
+from apex_ompl.kernel import build, entries, views
 from apex_ompl.kernel.face import Kernel
 from apex_ompl.kernel.scene import scene_tables
 from apex_ompl.kernel.tables import FIXED, PRISMATIC, REVOLUTE, RobotTables
+from apex_ompl.kernel.views import robot_view, scene_view
 from apex_ompl.problem import Obstacle
 from apex_ompl.robot import Robot
 
@@ -268,12 +271,97 @@ def test_faulty_tables_are_refused(tmp_path: Path) -> None:
         "joint_parent": tables.arrays.joint_parent + 7, "bodies": tables.arrays.bodies + 90,
         "node_radius": tables.arrays.node_radius * np.nan, "node_first": tables.arrays.node_first * 0,
         "pair_bodies": tables.arrays.pair_bodies + 50, "lower": tables.arrays.lower[:-1],
+        "node_count": -tables.arrays.node_count, "node_outer": -tables.arrays.node_outer,
+        "joint_source": np.full_like(tables.arrays.joint_source, -1), "eager": tables.arrays.eager[::-1].copy(),
+        "pair_common": np.full_like(tables.arrays.pair_common, len(tables.arrays.joint_parent) - 1),
     }.items():  # fmt: skip
         bad = RobotTables("bad", tables.joint_names, tables.body_names, tables.numbers,
                           tables.arrays._replace(**{name: wrong}))  # fmt: skip
         bad.save(tmp_path / "bad.npz")
         with pytest.raises(FileFormatError, match=name):
             RobotTables.load(tmp_path / "bad.npz")
+
+
+def test_damaged_tables_are_faults_and_no_crash(tmp_path: Path) -> None:
+    tables, *_ = random_robot(1)
+    tables.save(tmp_path / "good.npz")
+    good, rng = (tmp_path / "good.npz").read_bytes(), np.random.default_rng(0)
+    kernel = Kernel(tables, scene_tables([]))
+    expected = kernel.clearance(np.zeros(tables.dof))
+    for _ in range(200):
+        bad = bytearray(good)
+        for place in rng.integers(0, len(bad), 3):
+            bad[place] = rng.integers(0, 256)
+        (tmp_path / "bad.npz").write_bytes(bad)
+        try:
+            loaded = RobotTables.load(tmp_path / "bad.npz")
+        except FileFormatError:
+            continue
+        assert np.array_equal(Kernel(loaded, scene_tables([])).clearance(np.zeros(tables.dof)), expected)
+    np.save(tmp_path / "plain.npy", np.zeros(3))
+    with pytest.raises(FileFormatError, match="kernel tables"):
+        RobotTables.load(tmp_path / "plain.npy")
+
+
+def test_arrays_come_out_of_a_pack_as_they_went_in(robot: Robot, post: Obstacle) -> None:
+    kernel = Verdict(robot, [post]).kernel
+    for tables, view in ((kernel.robot, robot_view), (kernel.scene, scene_view)):
+        with mock.patch.multiple(views, _ints=views._ints.py_func, _floats=views._floats.py_func):
+            seen = view.py_func(*tables.packed)
+        for name, array in tables.arrays._asdict().items():
+            assert np.array_equal(getattr(seen, name), array), name
+
+
+def test_read_only_arrays_are_not_compiled_for_anew(robot: Robot) -> None:
+    verdict = Verdict(robot)
+    verdict.prepare()
+    before = [len(f.dispatcher.signatures) for f in (entries.judge_states, entries.advance, entries.lay_grid)]
+    path = np.tile(robot.home, (3, 1))
+    path.flags.writeable = False
+    assert verdict.first_collision(path, 0.031) is None and verdict.is_free(robot.home)
+    verdict.kernel.unproved(robot.home)
+    after = [len(f.dispatcher.signatures) for f in (entries.judge_states, entries.advance, entries.lay_grid)]
+    assert before == after == [1, 1, 1]
+
+
+@pytest.mark.parametrize("step", [0.0, 1e-320, 1e18, 1e300])
+def test_grids_hold_no_more_steps_than_they_can_count(step: float) -> None:
+    starts = np.empty(2, np.int64)
+    path = np.array([[0.0], [step]])
+    assert entries.lay_grid(path, 0.03, starts) == (1 if step < 0.03 else -1)
+    for resolution in (0.0, 1e-320, np.nan):
+        assert entries.lay_grid(np.array([[0.0], [1.0]]), resolution, starts) == -1
+    assert entries.lay_grid(np.array([[0.0], [1.0]]), 0.03, starts) == 34
+
+
+def test_clearance_of_what_is_no_number_is_none(robot: Robot) -> None:
+    kernel = Verdict(robot).kernel
+    for k in range(robot.dof):
+        q = robot.home.copy()
+        q[k] = np.nan
+        assert np.isnan(kernel.clearance(q)).all()
+    values, slopes = kernel.clearance_gradient(np.stack([robot.home, robot.home + 2.0]))
+    assert np.isfinite(values[0]).all() and np.isfinite(slopes[0]).all() and np.isnan(slopes[1]).all()
+
+
+@pytest.mark.parametrize("ratio", [0.3, -1.57, 6.3, 10.0, -25.0, 40.0])
+@pytest.mark.parametrize("driver", ["revolute", "prismatic"])
+def test_mimic_ratios_are_read_as_they_are(ratio: float, driver: str) -> None:
+    limit = '<limit lower="-2" upper="2" velocity="1" effort="1"/>'
+    urdf = f"""<robot name="g">
+      <link name="a"/><link name="b"/><link name="c"/>
+      <joint name="slide" type="{driver}"><parent link="a"/><child link="b"/><axis xyz="0 0 1"/>{limit}</joint>
+      <joint name="turn" type="revolute"><parent link="b"/><child link="c"/><origin xyz="0.1 0 0" rpy="0.3 0.2 0.1"/>
+        <axis xyz="0 0.6 0.8"/>{limit}<mimic joint="slide" multiplier="{ratio}" offset="0.2"/></joint></robot>"""
+    model = pin.buildModelFromXML(urdf, mimic=True)
+    limits = SimpleNamespace(lower=np.array([-2.0]), upper=np.array([2.0]))
+    robot = SimpleNamespace(model=model, dof=1, limits=limits, to_pinocchio=lambda q: np.asarray(q, float))
+    specs = joint_specs(robot)  # type: ignore[arg-type]
+    assert specs[2].ratio == pytest.approx(abs(ratio), rel=1e-9)
+    data = model.createData()
+    for value in (-2.0, -0.7, 0.0, 0.3, 1.9):
+        pin.forwardKinematics(model, data, np.array([value]))
+        assert frames(specs, np.array([value]))[2] == pytest.approx(data.oMi[2].homogeneous, abs=1e-8)
 
 
 def test_states_of_another_shape_are_refused(robot: Robot) -> None:

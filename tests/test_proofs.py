@@ -2,24 +2,18 @@
 
 from __future__ import annotations
 
+import sys
 import threading
 from pathlib import Path
 
 import coal
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from support import states_around_home
-from test_kernel import SHAPES, pose, random_robot
 
 from apex_ompl.collision import Verdict
 from apex_ompl.collision.sweep import sample_path
-from apex_ompl.collision.tabulate import primitives
 from apex_ompl.errors import ParameterError
-from apex_ompl.kernel import entries
-from apex_ompl.kernel.face import MOST_PAIRS, Kernel
-from apex_ompl.kernel.scene import scene_tables
 from apex_ompl.problem import AttachedObject, MeshFile, Obstacle
 from apex_ompl.robot import Robot
 from apex_ompl.validity import full_check
@@ -172,29 +166,6 @@ def test_proved_motions_hold_at_a_hundred_times_the_density(robot: Robot, tmp_pa
     assert judged > 1000
 
 
-@settings(max_examples=60, deadline=None)
-@given(seed=st.integers(0, 10**6), size=st.floats(0.001, 0.3))
-def test_proved_boxes_hold_for_random_trees(seed: int, size: float) -> None:
-    """A motion that is proved as a whole keeps every sphere off every other and off the scene."""
-    tables, *_ = random_robot(seed)
-    rng = np.random.default_rng(seed)
-    shapes = [(make(rng), pose(rng, 1.0)) for make in SHAPES.values()]
-    kernel = Kernel(tables, scene_tables([(n, p) for n, (s, at) in enumerate(shapes) for p in primitives(s, at)]))
-    a = rng.uniform(-0.6, 0.6, tables.dof)
-    path = np.stack([a, np.clip(a + rng.normal(0.0, size, tables.dof), -1.0, 1.0)])
-    starts = np.empty(2, np.int64)
-    last = entries.lay_grid(path, 0.0031, starts)
-    work = np.empty((2 * last + 4, 2), np.int64)
-    work[0] = 0, last
-    ends, counts = np.array([0, 1, 0]), np.zeros(5, np.int64)
-    state, found = np.empty(tables.dof), np.empty((MOST_PAIRS, 2), np.int64)
-    done = entries.advance(*kernel.packed, *kernel.room(), path, starts, work, ends, state, found, counts)
-    if done == entries.DONE and counts[entries.PROVED_BOXES] > 0:
-        dense = path[0] + np.linspace(0.0, 1.0, 300)[:, None] * (path[1] - path[0])
-        if counts[entries.PROVED_STEPS] == last:
-            assert (kernel.clearance(dense) > 0.0).all()
-
-
 def test_the_full_check_agrees_with_the_meshes_alone(robot: Robot, tmp_path: Path) -> None:
     rng = np.random.default_rng(2)
     both, meshes = verdicts(robot, clutter(rng, tmp_path / "step.obj")[:4], [])
@@ -238,3 +209,92 @@ def test_paths_with_numbers_that_are_none_collide(robot: Robot, proofs: bool) ->
         assert hit is not None and hit.segment == 1
     with pytest.raises(ParameterError, match=r"\(N, 16\)"):
         verdict.first_collision(path[:, :5], 0.031)
+
+
+CUBE = "".join(f"v {x} {y} {z}\n" for x in (0, 0.3) for y in (0, 0.3) for z in (0, 0.3))
+SIDES = "f 1 2 4\nf 1 4 3\nf 5 7 8\nf 5 8 6\nf 1 5 6\nf 1 6 2\nf 3 4 8\nf 3 8 7\nf 1 3 7\nf 1 7 5\n"
+LID = "f 2 6 8\nf 2 8 4\n"
+
+
+@pytest.mark.parametrize("lid", [True, False])
+def test_the_inside_of_a_mesh_with_a_hole_is_inside(robot: Robot, tmp_path: Path, lid: bool) -> None:
+    (tmp_path / "cube.obj").write_text(CUBE + SIDES + (LID if lid else ""))
+    q = robot.home
+    palm = robot.link_pose(q, "left_hand_palm")
+    ball = AttachedObject(name="ball", link="left_hand_palm", sphere={"radius": 0.01}, position=(0, 0.9, 0.0))
+    middle = palm[:3, :3] @ (0.0, 0.9, 0.0) + palm[:3, 3]
+    for shift in ((0.0, 0.0, 0.0), (0.05, -0.05, 0.0), (0.0, 0.0, 0.08), (0.0, 0.0, -0.08)):
+        corner = middle - 0.15 + shift
+        cube = Obstacle(name="cube", mesh=MeshFile(file=str(tmp_path / "cube.obj")), position=tuple(corner))
+        both, meshes = verdicts(robot, [cube], [ball])
+        assert not meshes.is_free(q) and not both.is_free(q)
+
+
+def test_a_notch_in_a_mesh_is_outside(robot: Robot, tmp_path: Path) -> None:
+    step = STEP.replace("0.3", "1.0").replace("0.1", "0.985")  # a cube with 15 mm cut from an edge
+    (tmp_path / "notched.obj").write_text(step)
+    palm = robot.link_pose(robot.home, "left_hand_palm")
+    ball = AttachedObject(name="ball", link="left_hand_palm", sphere={"radius": 0.003}, position=(0, 3.0, 0.0))
+    middle = palm[:3, :3] @ (0.0, 3.0, 0.0) + palm[:3, 3]
+    corner = middle - (0.9925, 0.9925, 0.1)
+    notched = Obstacle(name="n", mesh=MeshFile(file=str(tmp_path / "notched.obj")), position=tuple(corner))
+    both, meshes = verdicts(robot, [notched], [ball])
+    assert meshes.is_free(robot.home) and both.is_free(robot.home)
+    for verdict in (both, meshes):
+        verdict.move("n", tuple(corner + (0.05, 0.05, 0.0)))
+        assert not verdict.is_free(robot.home)
+
+
+@pytest.mark.parametrize("proofs", [True, False])
+def test_bad_resolutions_and_endless_paths_are_refused(robot: Robot, proofs: bool) -> None:
+    verdict = Verdict(robot, proofs=proofs)
+    path = np.stack([robot.home, robot.home + 0.1])
+    for resolution in (0.0, -1.0, np.nan, np.inf):
+        with pytest.raises(ParameterError, match="resolution"):
+            verdict.first_collision(path, resolution)
+    with pytest.raises(ParameterError, match="path"):
+        verdict.first_collision(np.stack([robot.home, robot.home + 1e12]), 0.0031)
+
+
+def test_first_questions_from_several_threads_leave_one_scene(robot: Robot) -> None:
+    palm = robot.link_pose(robot.home, "left_hand_palm")[:3, 3]
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        for _ in range(5):
+            verdict = Verdict(robot, [Obstacle(name="box", box=(0.1, 0.1, 0.1), position=(2.0, 0.0, 0.5))])
+            threads = [threading.Thread(target=verdict.is_free, args=(robot.home,)) for _ in range(3)]
+            for thread in threads:
+                thread.start()
+            for thread in threads:
+                thread.join()
+            verdict.move("box", tuple(palm))
+            assert not verdict.is_free(robot.home)
+    finally:
+        sys.setswitchinterval(interval)
+
+
+def test_threads_that_ask_for_all_pairs_and_for_some_do_not_mix(robot: Robot) -> None:
+    palm = robot.link_pose(robot.home, "left_hand_palm")[:3, 3]
+    verdict = Verdict(robot, [Obstacle(name="box", box=(0.05, 0.05, 0.05), position=tuple(palm))])
+    away = robot.home.copy()
+    away[0], away[-1] = 1.5, 1.0 + 1e-7  # the hand is beyond its limits, so that all pairs are looked at
+    assert verdict.is_free(away) and not verdict.is_free(robot.home)
+    wrong: list[int] = []
+    stop = threading.Event()
+
+    def disturb() -> None:
+        while not stop.is_set():
+            verdict.is_free(away)
+
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    thread = threading.Thread(target=disturb)
+    thread.start()
+    try:
+        wrong += [k for k in range(8000) if verdict.is_free(robot.home)]
+    finally:
+        stop.set()
+        thread.join()
+        sys.setswitchinterval(interval)
+    assert not wrong
