@@ -1,6 +1,6 @@
 """How long the compiled kernel takes to be ready: compiled for the first time, and loaded from the cache.
 
-Runs fresh processes, the first with an empty cache folder, and times the import, the robot, its tables, and the first
+Runs fresh processes, the first with an empty cache folder, and times the import, the robot, ``Verdict.prepare``, and the first
 state and motion judged.
 
 Usage: python benchmarks/kernel_start.py [--runs 5]
@@ -37,7 +37,7 @@ assert verdict.first_collision([robot.home, other], 0.031) is None
 marks.append(time.perf_counter())
 print(json.dumps([b - a for a, b in zip(marks, marks[1:])]))
 """
-STAGES = ("import", "robot", "tables", "first state", "first motion")
+STAGES = ("import", "robot", "prepare", "first state", "first motion")
 
 
 def main() -> None:
