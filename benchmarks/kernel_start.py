@@ -1,7 +1,7 @@
 """How long the compiled kernel takes to be ready: compiled for the first time, and loaded from the cache.
 
-Runs fresh processes, the first with an empty cache folder, and times the import, the robot, ``Verdict.prepare``, and the first
-state and motion judged.
+Runs fresh processes, the first with an empty cache folder, and times the import, the robot, ``Verdict.prepare``, and
+the first state and motion judged.
 
 Usage: python benchmarks/kernel_start.py [--runs 5]
 """
