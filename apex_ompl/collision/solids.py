@@ -278,8 +278,8 @@ def solid_of(geometry: coal.CollisionGeometry) -> Solid:
     if kind == coal.GEOM_SPHERE:
         return Solid((Round(float(geometry.radius), 0.0, capped=True),))
     if kind in (coal.GEOM_CYLINDER, coal.GEOM_CAPSULE):
-        capped = kind == coal.GEOM_CAPSULE
-        return Solid((Round(float(geometry.radius), float(geometry.halfLength), capped=capped),))
+        capsule = bool(kind == coal.GEOM_CAPSULE)
+        return Solid((Round(float(geometry.radius), float(geometry.halfLength), capped=capsule),))
     if kind == coal.GEOM_CONVEX:
         return Solid((Polytope.around(np.array(geometry.points())),))
     if not is_shell(geometry):
