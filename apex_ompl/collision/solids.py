@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from apex_ompl.collision.containment import Host
 from apex_ompl.collision.shapes import convex_hull, is_shell
 from apex_ompl.errors import ParameterError
-from apex_ompl.meshes import triangles, winding_number
+from apex_ompl.meshes import capped, triangles, winding_number
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
