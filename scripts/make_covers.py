@@ -10,6 +10,7 @@ Usage: python scripts/make_covers.py dual_panda_softhand [--gaps 0.02 0.007 0.00
 from __future__ import annotations
 
 import argparse
+import sys
 import time
 from pathlib import Path
 
@@ -17,8 +18,10 @@ import coal
 import numpy as np
 
 from apex_ompl.collision.spheres import GAPS, Cover, make_cover, quality, shape_key, unproved, write_covers
+from apex_ompl.errors import ApexError
 from apex_ompl.robot import load_robot
 from apex_ompl.robot.assets import DATA
+from apex_ompl.schema import check_writable
 
 
 def shapes_of(robot: str) -> dict[str, tuple[list[str], coal.CollisionGeometry]]:
@@ -49,6 +52,9 @@ def main() -> None:
     parser.add_argument("--effort", type=int, default=3, choices=(1, 2, 3), help="how thorough the search is")
     parser.add_argument("-o", "--output", type=Path)
     args = parser.parse_args()
+    output = args.output or DATA / f"{args.robot}.spheres.json"
+    if not args.tolerances:
+        check_writable(output)
     covers = {}
     print(
         f"{'shape':44s} {'levels':12s} {'leaves':>6s}  {'volume':>6s}  {'mean mm':>7s}  {'max mm':>7s}  {'seconds':>7s}"
@@ -65,10 +71,13 @@ def main() -> None:
         covers[key] = make_cover(geometry, args.gaps, effort=args.effort)
         print(row(label, geometry, covers[key], time.perf_counter() - start), flush=True)
     if covers:
-        target = args.output or DATA / f"{args.robot}.spheres.json"
-        write_covers(target, covers)
-        print(f"{len(covers)} covers, {sum(len(c.radii) for c in covers.values())} balls -> {target}")
+        write_covers(output, covers)
+        print(f"{len(covers)} covers, {sum(len(c.radii) for c in covers.values())} balls -> {output}")
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except ApexError as error:
+        print(f"make_covers: error: {error}", file=sys.stderr)
+        sys.exit(2)

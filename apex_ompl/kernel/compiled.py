@@ -95,7 +95,6 @@ def entry(function: Callable[..., Any]) -> Callable[..., Any]:
 class _Announced:
     """A compiled function whose first call, when nothing was kept from an earlier process, says that it compiles."""
 
-    _compiling = 0.0  # seconds spent in all
     _said = False
 
     def __init__(self, dispatcher: Any, name: str) -> None:
@@ -112,9 +111,11 @@ class _Announced:
             folder = cache_folder()
             if folder is None or not any(folder.rglob(f"*.{self.name}-*.nbi")):
                 self._announce(folder)
-            begin = time.perf_counter()
-            result = self.dispatcher(*arguments)
-            _Announced._compiling += time.perf_counter() - begin
+                begin = time.perf_counter()
+                result = self.dispatcher(*arguments)
+                LOG.warning("apex_ompl compiled %s in %.1f s", self.name, time.perf_counter() - begin)
+            else:
+                result = self.dispatcher(*arguments)
             self._ready = True
         return result
 
@@ -125,8 +126,3 @@ class _Announced:
         _Announced._said = True
         where = f"kept in {folder}" if folder else "in every process anew, since no cache folder can be written"
         LOG.warning("apex_ompl compiles its collision kernel (about %d s, %s)", TYPICAL_SECONDS, where)
-
-
-def seconds_spent() -> float:
-    """Return how long this process waited for compiled code, made or loaded [s]."""
-    return _Announced._compiling
