@@ -60,7 +60,7 @@ class PlanResult:
         times: Seconds per stage, and ``total``.
         length: Sum of Euclidean joint-space steps [rad], NaN without a path.
         clearance: Least distance of any checked pair at 32 states spread over the path [m], NaN without a path.
-        checks: How many states were judged.
+        checks: How many states were judged one by one; those inside proved stretches of motions do not count.
         solved_by: What found the path: the planner's name, with ``+repair`` when a stretch of it failed the
             full check and was planned anew; ``straight line`` when that was a solution, so that no planner ran;
             empty without a path.
