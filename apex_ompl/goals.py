@@ -31,7 +31,8 @@ from numpy.typing import NDArray
 
 from apex_ompl.collision import Verdict
 from apex_ompl.errors import FileFormatError, UnknownNameError
-from apex_ompl.ik import Kinematics, solve
+from apex_ompl.ik import Links, in_world
+from apex_ompl.kernel import Target, facing, gap, slope
 from apex_ompl.problem import ALIGNMENT_DEFAULTS, Alignment, AttachedObject, Problem, WorldVector
 from apex_ompl.robot import Robot
 
@@ -153,7 +154,8 @@ class AlignmentGoal:
                 "goal.alignment", "second", self.second.link, "expected two faces that move against each other"
             )
         self._radial = self._lip_direction(held)
-        self._kinematics = Kinematics(robot)
+        self._data = robot.model.createData()
+        self._inverse = Links.of(robot).inverse(self.targets(), self._hand_joints())
 
     def _face(self, field: str, named: str | WorldVector, held: Mapping[str, AttachedObject]) -> Face:
         if isinstance(named, WorldVector):
@@ -182,10 +184,10 @@ class AlignmentGoal:
 
     def faces(self, q: Array) -> tuple[Array, Array, Array, Array]:
         """Return p1, a1, p2, a2 in the world at a state, each of shape (3,)."""
-        self._kinematics.update(np.asarray(q, float))
+        pin.framesForwardKinematics(self.robot.model, self._data, self.robot.to_pinocchio(np.asarray(q, float)))
         found: list[Array] = []
         for face, frame in zip((self.first, self.second), self._frames, strict=True):
-            pose = self._kinematics.pose(frame)
+            pose = self._pose(frame)
             found += [pose[:3, :3] @ face.point + pose[:3, 3], pose[:3, :3] @ face.axis]
         return found[0], found[1], found[2], found[3]
 
@@ -205,7 +207,7 @@ class AlignmentGoal:
             }
             if self._radial is not None:
                 frame = self._frames[0]
-                out = self._kinematics.pose(frame)[:3, :3] @ self._radial
+                out = self._pose(frame)[:3, :3] @ self._radial
                 errors["roll"] = angle(out, _lowest_direction(a1))
             return errors
         errors = {
@@ -236,51 +238,36 @@ class AlignmentGoal:
             "roll": t.angle,
         }
 
-    def residual(self, kinematics: Kinematics) -> tuple[Array, Array]:
-        """Return what inverse kinematics brings to zero, shape (m,), and its Jacobian, shape (m, dof)."""
-        (p1, a1, jp1, ja1), (p2, a2, jp2, ja2) = (
-            self._moving(kinematics, face, frame)
-            for face, frame in zip((self.first, self.second), self._frames, strict=True)
-        )
-        w, d = POSITION_WEIGHT, self.distance
+    def targets(self) -> list[Target]:
+        """Return what inverse kinematics brings to zero; lengths count ``POSITION_WEIGHT`` times against angles."""
+        links, up, w, d = Links.of(self.robot), in_world(UP), POSITION_WEIGHT, self.distance
+        p1, p2 = (links.point(face.link, face.point) for face in (self.first, self.second))
+        a1, a2 = (links.direction(face.link, face.axis) for face in (self.first, self.second))
         if self.alignment.kind == "pour":
-            middle = np.cos((self.tilt[0] + self.tilt[1]) / 2)
-            rows = [(w * (p1 - p2 - d * UP), w * (jp1 - jp2)), (a2 - UP, ja2), (a1[2:] - middle, ja1[2:])]
+            middle = float(np.cos((self.tilt[0] + self.tilt[1]) / 2))
+            targets = [gap(p2, p1, up, d, w), facing(a2, up, -1.0), slope(a1, up, middle)]
             if self._radial is not None:
-                out, jout = self._turned(kinematics, self._radial)
-                deepest = -np.sqrt(1.0 - middle**2)  # height of the lowest direction square to the axis
-                rows.append((out[2:] - deepest, jout[2:]))
-        else:
-            rows = [(w * (p2 - p1 - d * a1), w * (jp2 - jp1 - d * ja1)), (a1 + a2, ja1 + ja2)]
-            if self.alignment.kind == "vertical":
-                rows.append((a1 - UP, ja1))
-            elif self.alignment.kind == "horizontal":
-                rows.append((a1[2:], ja1[2:]))
-        return np.concatenate([r for r, _ in rows]), np.concatenate([j for _, j in rows])
-
-    def _moving(self, kinematics: Kinematics, face: Face, frame: int) -> tuple[Array, Array, Array, Array]:
-        """Return a face in the world with the Jacobians of its point and axis."""
-        pose, jacobian = kinematics.pose(frame), kinematics.jacobian(frame)
-        arm, axis = pose[:3, :3] @ face.point, pose[:3, :3] @ face.axis
-        return (
-            pose[:3, 3] + arm,
-            axis,
-            jacobian[:3] - pin.skew(arm) @ jacobian[3:],
-            -pin.skew(axis) @ jacobian[3:],
-        )
-
-    def _turned(self, kinematics: Kinematics, direction: Array) -> tuple[Array, Array]:
-        """Return a direction fixed to the first link in the world, with its Jacobian."""
-        frame = self._frames[0]
-        turned = kinematics.pose(frame)[:3, :3] @ direction
-        return turned, -pin.skew(turned) @ kinematics.jacobian(frame)[3:]
+                deepest = -float(np.sqrt(1.0 - middle**2))  # height of the lowest direction square to the axis
+                targets.append(slope(links.direction(self.first.link, self._radial), up, deepest))
+            return targets
+        targets = [gap(p1, p2, a1, d, w), facing(a1, a2)]
+        if self.alignment.kind == "vertical":
+            targets.append(facing(a1, up, -1.0))
+        elif self.alignment.kind == "horizontal":
+            targets.append(slope(a1, up))
+        return targets
 
     def attempt(self, rng: np.random.Generator) -> Array:
         """Return the end of one descent from a random state around home, hands as at the start, shape (dof,)."""
         q0 = self.robot.home + rng.normal(0.0, RESTART_SPREAD, self.robot.dof)
         hands = self._hand_joints()
         q0[hands] = self.start[hands]
-        return solve(self._kinematics, [self], q0, fixed=hands).q
+        limits = self.robot.limits
+        ends: Array = self._inverse.descend(np.clip(q0, limits.lower, limits.upper)).states[0]
+        return ends
+
+    def _pose(self, frame: int) -> Array:
+        return np.array(self._data.oMf[frame].homogeneous)
 
     def sample(self, verdict: Verdict, rng: np.random.Generator, count: int = 8, max_attempts: int = 200) -> Sampling:
         """Sample free states that satisfy the alignment, by descents from random restarts.

@@ -21,7 +21,8 @@ from apex_ompl.api import plan
 from apex_ompl.assembly import assemble
 from apex_ompl.collision import Verdict
 from apex_ompl.grasp import grasp
-from apex_ompl.ik import AxisTask, Kinematics, PointTask, Task, solve
+from apex_ompl.ik import Links, in_world
+from apex_ompl.kernel import facing, gap
 from apex_ompl.problem import Alignment, AttachedObject, Goal, Obstacle, Problem
 from apex_ompl.robot import Robot, load_robot
 from apex_ompl.validity import full_check
@@ -301,20 +302,21 @@ def hand_states(
     robot: Robot, verdict: Verdict, home: np.ndarray, poses: tuple[HandPose, HandPose], *, seed: int, count: int
 ) -> list[np.ndarray]:
     """Return free states with both hands at their poses."""
-    rng, kinematics = np.random.default_rng(seed), Kinematics(robot)
-    tasks: list[Task] = []
+    rng, links = np.random.default_rng(seed), Links.of(robot)
+    targets = []
     fixed = [robot.joint_names.index(h.synergy) for h in robot.hands.values() if h.synergy]
     for hand, pose in zip(robot.hands.values(), poses, strict=True):
-        frame = robot.link_frame(hand.palm)
-        tasks.append(PointTask(frame, np.asarray(hand.point), np.asarray(pose.point)))
-        tasks.append(AxisTask(frame, np.asarray(hand.fingers), np.asarray(pose.fingers)))
+        targets.append(gap(in_world(pose.point), links.point(hand.palm, hand.point)))
+        targets.append(facing(links.direction(hand.palm, hand.fingers), in_world(pose.fingers), -1.0))
+    inverse = links.inverse(targets, fixed)
     found: list[np.ndarray] = []
     for _ in range(4000):
         q0 = home + rng.normal(0.0, 0.6, robot.dof)
         q0[fixed] = home[fixed]
-        result = solve(kinematics, tasks, q0, fixed=fixed)
-        if result.error < 1e-3 and verdict.is_free(result.q) and verdict.clearance(result.q) > MARGIN:
-            found.append(np.round(result.q, 4))
+        end = inverse.descend(q0)
+        q = end.states[0]
+        if end.errors[0] < 1e-3 and verdict.is_free(q) and verdict.clearance(q) > MARGIN:
+            found.append(np.round(q, 4))
             if len(found) == count:
                 break
     return found

@@ -1,7 +1,20 @@
-"""The compiled kernel: clearance, its gradient and proofs of freedom over flat arrays, without Pinocchio or Coal."""
+"""The compiled kernel over flat arrays, without Pinocchio or Coal: clearance, gradients, proofs, inverse kinematics."""
 
 from apex_ompl.kernel.face import Kernel
+from apex_ompl.kernel.inverse import Fixed, Inverse, Target, facing, gap, slope
 from apex_ompl.kernel.scene import Primitive, scene_tables
 from apex_ompl.kernel.tables import RobotTables, SceneTables
 
-__all__ = ["Kernel", "Primitive", "RobotTables", "SceneTables", "scene_tables"]
+__all__ = [
+    "Fixed",
+    "Inverse",
+    "Kernel",
+    "Primitive",
+    "RobotTables",
+    "SceneTables",
+    "Target",
+    "facing",
+    "gap",
+    "scene_tables",
+    "slope",
+]

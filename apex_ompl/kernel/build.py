@@ -90,8 +90,8 @@ def robot_tables(
     return _Builder(joints, bodies, lower, upper).tables(name, tuple(joint_names), pairs, given)
 
 
-def _turn_to(axis: Array | None) -> Array:
-    """Return a rotation whose third column is ``axis``, shape (4, 4)."""
+def turn_to(axis: Array | None) -> Array:
+    """Return the rotation by which the kernel turns a joint's frame, so that ``axis`` is its z; shape (4, 4)."""
     turn = np.eye(4)
     if axis is not None:
         z = np.asarray(axis, float) / np.linalg.norm(axis)
@@ -107,7 +107,7 @@ class _Builder:
 
     def __init__(self, joints: Sequence[JointSpec], bodies: Sequence[BodySpec], lower: Array, upper: Array) -> None:
         self.joints, self.lower, self.upper = joints, lower, upper
-        turns = [_turn_to(j.axis if j.kind != FIXED else None) for j in joints]
+        turns = [turn_to(j.axis if j.kind != FIXED else None) for j in joints]
         self.placements = [np.eye(4)]
         for k, joint in enumerate(joints[1:], start=1):
             placement = np.eye(4) if joint.placement is None else joint.placement

@@ -28,7 +28,7 @@ from numba.core import config
 F = TypeVar("F", bound=Callable[..., Any])
 
 LOG = logging.getLogger("apex_ompl")
-NOT_COMPILED = ("__init__.py", "build.py", "face.py", "faults.py", "scene.py")
+NOT_COMPILED = ("__init__.py", "build.py", "face.py", "faults.py", "inverse.py", "scene.py")
 TYPICAL_SECONDS = 20  # benchmarks/kernel_start.py measures it
 
 # Without numba's runtime no array is counted, which costs most of the time otherwise; nothing may be allocated.
