@@ -44,15 +44,18 @@ _quiet_levels: list[ou.LogLevel] = []
 
 
 def load_problem(name_or_path: str | os.PathLike[str]) -> Problem:
-    """Return a ready-made problem by name, or one from a YAML file.
+    """Return a problem by its name, one of a suite by its id (``shelf/hard/900012``), or one from a YAML file.
 
     Raises:
-        UnknownNameError: No ready-made problem of that name; the message lists the known ones.
+        UnknownNameError: No problem of that name, or no such suite or level; the message lists the known ones.
+        ParameterError: No such seed.
         MissingFileError: The file, or one that it names, cannot be read.
         FileFormatError: The file does not follow the schema.
     """
     text = os.fspath(name_or_path)
-    if text.endswith((".yaml", ".yml")) or os.sep in text or Path(text).is_file():
+    if Path(text).is_file() or text.endswith((".yaml", ".yml")):
+        return Problem.load(text)
+    if os.sep in text and not problems.is_id(text):
         return Problem.load(text)
     return problems.load(text)
 

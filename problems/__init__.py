@@ -1,14 +1,23 @@
-"""Ready-made problems, by name."""
+"""Ready-made problems by name, and the suites that planners are judged on.
+
+A problem of a suite goes by ``suite/level/seed``, for example ``shelf/hard/900012``. Seeds 0 to 799 999 are for
+training, 800 000 to 899 999 for validation, 900 000 to 999 999 for tests.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 if not __name__.startswith("apex_ompl."):  # the folder also lies at the top of the source tree
     raise ImportError("import apex_ompl.problems, not problems")
 
-from apex_ompl.errors import UnknownNameError
+from apex_ompl.errors import ParameterError, UnknownNameError
 from apex_ompl.problem import Problem
+
+if TYPE_CHECKING:
+    from apex_ompl.problems.frozen import Witness
 
 DATA = Path(__file__).parent / "data"
 
@@ -18,15 +27,90 @@ def names() -> tuple[str, ...]:
     return tuple(sorted(path.stem for path in DATA.glob("*.yaml")))
 
 
+def suites() -> Mapping[str, tuple[str, ...]]:
+    """Return the suites, each with its levels."""
+    from apex_ompl.problems.suites import LEVELS
+
+    return dict(LEVELS)
+
+
 def load(name: str) -> Problem:
-    """Return a ready-made problem.
+    """Return a ready-made problem, or one of a suite by its id, for example ``shelf/hard/900012``.
 
     Raises:
         UnknownNameError: No such problem; the message lists the known ones.
+        ParameterError: No such seed.
+        SuiteError: No problem can be drawn for that seed.
     """
+    from apex_ompl.problems.suites import ProblemId
+
+    which = ProblemId.parse(name)
+    if which is not None:
+        return sample(which.suite, level=which.level, seed=which.seed)
     if name not in names():
         raise UnknownNameError("problem", name, names())
     return Problem.load(DATA / f"{name}.yaml")
 
 
-__all__ = ["load", "names"]
+def is_id(text: str) -> bool:
+    """Whether a text has the form of an id of a problem of a suite."""
+    from apex_ompl.problems.suites import ID
+
+    return ID.fullmatch(text) is not None
+
+
+def sample(suite: str, *, level: str, seed: int) -> Problem:
+    """Return a problem of a suite; the same seed gives the same problem.
+
+    Start and goal are free by a margin of 1 cm. Frozen problems, the first ones of validation and test, are read and
+    have a witness; others are drawn now, and may be impossible to solve.
+
+    Args:
+        suite: See :func:`suites`.
+        level: One of its levels.
+        seed: 0 to 999 999.
+
+    Raises:
+        UnknownNameError: No such suite or level.
+        ParameterError: No such seed.
+        SuiteError: No problem can be drawn for that seed.
+        FileFormatError: The file of a frozen problem is not the one that was frozen.
+    """
+    from apex_ompl.problems import frozen
+    from apex_ompl.problems.suites import ProblemId, first_draw
+
+    which = ProblemId(suite, level, seed)
+    return frozen.load(which).problem if frozen.is_frozen(which) else first_draw(which)[1]
+
+
+def frozen_names(suite: str, level: str, split: str = "test") -> tuple[str, ...]:
+    """Return the ids of the frozen problems of a suite and level, of the split ``validation`` or ``test``.
+
+    Raises:
+        UnknownNameError: No such suite, level or split.
+    """
+    from apex_ompl.problems import frozen
+    from apex_ompl.problems.suites import ProblemId
+
+    ProblemId(suite, level, 0)
+    if split not in frozen.COUNTS:
+        raise UnknownNameError("split with frozen problems", split, frozen.COUNTS)
+    return tuple(f"{suite}/{level}/{seed}" for seed in frozen.frozen_seeds(level, split))
+
+
+def witness(name: str) -> Witness:
+    """Return the witness of a frozen problem: a path that passed the full check.
+
+    Raises:
+        ParameterError: The problem is not a frozen one.
+    """
+    from apex_ompl.problems import frozen
+    from apex_ompl.problems.suites import ProblemId
+
+    which = ProblemId.parse(name)
+    if which is None or not frozen.is_frozen(which):
+        raise ParameterError("problem", name, "a frozen problem of a suite")
+    return frozen.load(which).witness
+
+
+__all__ = ["frozen_names", "is_id", "load", "names", "sample", "suites", "witness"]

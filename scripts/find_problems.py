@@ -20,18 +20,25 @@ import numpy as np
 from apex_ompl.api import plan
 from apex_ompl.assembly import assemble
 from apex_ompl.collision import Verdict
-from apex_ompl.grasp import grasp
 from apex_ompl.ik import Links, in_world
 from apex_ompl.kernel import facing, gap
 from apex_ompl.problem import Alignment, AttachedObject, Goal, Obstacle, Problem
+from apex_ompl.problems.objects import (
+    DATA,
+    Held,
+    bar,
+    block_and_peg,
+    boxes,
+    cup_and_ball,
+    parcels,
+    put_in_hands,
+    two_cups,
+)
 from apex_ompl.robot import Robot, load_robot
 from apex_ompl.validity import full_check
 
 ROOT = Path(__file__).resolve().parent.parent
-DATA = ROOT / "problems" / "data"
 MARGIN = 0.01  # [m]
-PALM = -0.009  # height of an object's surface over the palm, in the palm's frame [m]
-ALONG_X = (0.0, float(np.sqrt(0.5)), 0.0, float(np.sqrt(0.5)))  # turns z to the palm's x
 FORWARD, DOWN = (1.0, 0.0, 0.0), (0.0, 0.0, -1.0)
 
 
@@ -52,7 +59,7 @@ class Reach:
     scene: Callable[[], Sequence[Obstacle]]
     start: tuple[HandPose, HandPose]
     goal: tuple[HandPose, HandPose]
-    held: Callable[[], Sequence[tuple[str, AttachedObject]]] = tuple
+    held: Callable[[], Held] = tuple
     synergies: tuple[float, ...] = ()
 
 
@@ -62,7 +69,7 @@ class Align:
 
     file: str
     scene: Callable[[], Sequence[Obstacle]]
-    held: Callable[[], Sequence[tuple[str, AttachedObject]]]
+    held: Callable[[], Held]
     alignment: Alignment
     seed: int = 0
 
@@ -132,68 +139,6 @@ def two_walls() -> list[Obstacle]:
     return [
         Obstacle(name=f"{side}_wall", box=size, position=(0.5, y, 0.25)) for side, y in (("left", 0.2), ("right", -0.2))
     ]
-
-
-def boxes() -> list[tuple[str, AttachedObject]]:
-    """A box in each hand, faces to be stacked on the side of the little finger."""
-    size, height = (0.07, 0.07, 0.14), PALM - 0.035
-    base = {"link": "palm", "box": size, "position": (0.0, 0.02, height), "orientation": ALONG_X}
-    return [
-        ("left_hand", AttachedObject(name="lower", contact={"point": (0, 0, -0.07), "axis": (0, 0, -1)}, **base)),
-        ("right_hand", AttachedObject(name="upper", contact={"point": (0, 0, 0.07), "axis": (0, 0, 1)}, **base)),
-    ]
-
-
-def cup(name: str, side: int, **contact: object) -> AttachedObject:
-    """The cup, its opening (the mesh's +z) on the little finger's side: -x for the left palm, +x for the right."""
-    turn = ALONG_X if side > 0 else (0.0, -ALONG_X[1], 0.0, ALONG_X[3])
-    return AttachedObject(
-        name=name, link="palm", mesh={"file": str(DATA / "cup.obj")}, position=(0.0, 0.02, PALM - 0.04),
-        orientation=turn, contact={"point": (0, 0, 0.065), "axis": (0, 0, 1), **contact},
-    )  # fmt: skip
-
-
-def cup_and_ball() -> list[tuple[str, AttachedObject]]:
-    """A cup in the left hand, a ball between the outer fingers of the right one."""
-    ball = AttachedObject(
-        name="ball", link="palm", sphere={"radius": 0.032}, position=(0.035, 0.03, PALM - 0.032),
-        contact={"point": (0.032, 0, 0), "axis": (1, 0, 0)},
-    )  # fmt: skip
-    return [("left_hand", cup("cup", -1)), ("right_hand", ball)]
-
-
-def block_and_peg() -> list[tuple[str, AttachedObject]]:
-    """A block with a square hole in the left hand, a round peg in the right one."""
-    block = AttachedObject(
-        name="block", link="palm", mesh={"file": str(DATA / "block.obj")}, position=(-0.03, 0.03, PALM - 0.04),
-        orientation=(0.0, -ALONG_X[1], 0.0, ALONG_X[3]), contact={"point": (0, 0, 0.035), "axis": (0, 0, 1)},
-    )  # fmt: skip
-    peg = AttachedObject(
-        name="peg", link="palm", cylinder={"radius": 0.016, "length": 0.18}, position=(0.02, 0.03, PALM - 0.016),
-        orientation=ALONG_X, contact={"point": (0, 0, 0.09), "axis": (0, 0, 1)},
-    )  # fmt: skip
-    return [("left_hand", block), ("right_hand", peg)]
-
-
-def two_cups() -> list[tuple[str, AttachedObject]]:
-    """A full cup in the right hand, its lip away from the palm, and an empty one in the left hand."""
-    # Of the turned cup, -x of the mesh looks along +z of the palm, so +x is the side away from the palm.
-    return [("left_hand", cup("empty", -1)), ("right_hand", cup("full", 1, point=(0.04, 0, 0.065)))]
-
-
-def bar() -> list[tuple[str, AttachedObject]]:
-    """A bar in the left hand that sticks out beyond the little finger, where the right hand is to take it."""
-    held = AttachedObject(
-        name="bar", link="palm", cylinder={"radius": 0.015, "length": 0.36}, position=(-0.1, 0.03, PALM - 0.015),
-        orientation=ALONG_X, contact={"point": (0.015, 0, -0.13), "axis": (1, 0, 0)},
-    )  # fmt: skip
-    return [("left_hand", held)]
-
-
-def parcels() -> list[tuple[str, AttachedObject]]:
-    """A parcel in each hand, along the fingers."""
-    base = {"link": "palm", "box": (0.07, 0.12, 0.06), "position": (0.0, 0.06, PALM - 0.03)}
-    return [(f"{side}_hand", AttachedObject(name=f"{side}_parcel", **base)) for side in ("left", "right")]
 
 
 RECIPES: tuple[Reach | Align, ...] = (
@@ -285,16 +230,11 @@ def block_obj(edge: float = 0.08, hole: float = 0.042, depth: float = 0.07, floo
     return "\n".join(lines) + "\n"
 
 
-def put_in_hands(robot: Robot, held: Sequence[tuple[str, AttachedObject]]) -> tuple[list[AttachedObject], np.ndarray]:
-    """Close the hands on what they hold; return the objects and a home state with these synergies."""
-    home, objects = robot.home.copy(), []
-    for hand, item in held:
-        closed = grasp(robot, hand, item)
-        print(f"  {item.name}: synergy {closed.synergy:.3f}, first touch {closed.touched or 'none'}")
-        # The default touch links, those of the hand, are the same and keep the file short.
-        objects.append(closed.held.model_copy(update={"touch_links": None}))
-        if closed.synergy_joint:
-            home[robot.joint_names.index(closed.synergy_joint)] = np.floor(closed.synergy * 1e3) / 1e3
+def hold(robot: Robot, held: Held) -> tuple[tuple[AttachedObject, ...], np.ndarray]:
+    """Return what the hands hold and a home state that holds it, and say how it is held."""
+    objects, home, grasps = put_in_hands(robot, held)
+    for closed in grasps:
+        print(f"  {closed.held.name}: synergy {closed.synergy:.3f}, first touch {closed.touched or 'none'}")
     return objects, home
 
 
@@ -342,7 +282,7 @@ def find_reach(recipe: Reach) -> Problem:
     """Return the problem of a reaching recipe."""
     robot = load_robot(recipe.robot)
     scene = tuple(recipe.scene())
-    attached, home = put_in_hands(robot, recipe.held())
+    attached, home = hold(robot, recipe.held())
     for joint, value in zip((h.synergy for h in robot.hands.values()), recipe.synergies, strict=False):
         home[robot.joint_names.index(str(joint))] = value
     verdict = Verdict(robot, scene, attached)
@@ -352,7 +292,7 @@ def find_reach(recipe: Reach) -> Problem:
     pairs = sorted((float(np.linalg.norm(a - b)), i, j) for i, a in enumerate(starts) for j, b in enumerate(goals))
     for _, i, j in pairs:
         problem = Problem(
-            name=Path(recipe.file).stem, robot=robot.name, scene=scene, attached=tuple(attached),
+            name=Path(recipe.file).stem, robot=robot.name, scene=scene, attached=attached,
             start=named(robot, starts[i]), goal=Goal(joints=(named(robot, goals[j]),)),
         )  # fmt: skip
         if is_hard_enough(problem, robot):
@@ -364,7 +304,7 @@ def find_align(recipe: Align) -> Problem:
     """Return the problem of an alignment recipe: from a random free start with the hands well apart."""
     robot = load_robot("dual_panda_softhand")
     scene = tuple(recipe.scene())
-    attached, home = put_in_hands(robot, recipe.held())
+    attached, home = hold(robot, recipe.held())
     verdict = Verdict(robot, scene, attached)
     rng = np.random.default_rng(recipe.seed)
     fixed = [robot.joint_names.index(str(h.synergy)) for h in robot.hands.values()]
@@ -378,7 +318,7 @@ def find_align(recipe: Align) -> Problem:
         if not apart or not verdict.is_free(start) or verdict.clearance(start) < MARGIN:
             continue
         problem = Problem(
-            name=Path(recipe.file).stem, robot=robot.name, scene=scene, attached=tuple(attached),
+            name=Path(recipe.file).stem, robot=robot.name, scene=scene, attached=attached,
             start=named(robot, start), goal=Goal(alignment=recipe.alignment),
         )  # fmt: skip
         if is_hard_enough(problem, robot):

@@ -17,7 +17,7 @@ LAYERS = [
     {"ik", "interrupt", "space"},
     {"goals", "grasp"},
     {"validity"},
-    {"assembly", "simplify", "result", "moveit"},
+    {"assembly", "simplify", "result", "moveit", "moving"},
     {"repair", "render"},
     {"planners", "problems"},
     {"api"},

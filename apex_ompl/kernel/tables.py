@@ -10,6 +10,7 @@ from __future__ import annotations
 import io
 import json
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -155,6 +156,42 @@ class RobotTables:
     def dof(self) -> int:
         """Number of planned joints."""
         return len(self.joint_names)
+
+    def judging(self, joints: Sequence[int]) -> RobotTables:
+        """Return tables that judge only what some of these planned joints move and no other ones do.
+
+        So the arms can be placed one after the other, each against the scene, itself and what does not move.
+
+        Args:
+            joints: Numbers of planned joints.
+        """
+        a, mine = self.arrays, {int(k) for k in joints}
+        movers: list[set[int]] = []  # of each joint; parents come first
+        for parent, source in zip(a.joint_parent, a.joint_source, strict=True):
+            above = movers[parent] if movers else set()
+            movers.append(above | ({int(source)} - {-1}))
+        inner = (set() if dof < 0 else {int(dof)} for dof in a.cluster_dof)
+        clusters = [movers[j] | own for j, own in zip(a.cluster_joint, inner, strict=True)]
+        meets = [bool(m) and bool(c) and c <= mine for m, c in zip(a.cluster_meets_scene, clusters, strict=True)]
+        pairs = [bool(both) and both <= mine for both in (clusters[c] | clusters[d] for c, d in a.pair_clusters)]
+        arrays = a._replace(
+            cluster_meets_scene=np.array(meets, np.int64),
+            pair_clusters=a.pair_clusters[pairs],
+            pair_common=a.pair_common[pairs],
+            pair_bodies=a.pair_bodies[pairs],
+        )
+        return RobotTables(self.name, self.joint_names, self.body_names, self.numbers, arrays)
+
+    def without_pair(self, first: str, second: str) -> RobotTables:
+        """Return tables that do not judge two bodies, by their names, against each other."""
+        a = self.arrays
+        both = {self.body_names.index(first), self.body_names.index(second)}
+        kept = np.array([set(row) != both for row in a.bodies.tolist()], bool)
+        counts = [int(kept[k : k + n].sum()) for k, n in a.pair_bodies]
+        firsts = np.cumsum([0, *counts])[:-1]
+        spans = np.stack([firsts, np.array(counts, int)], axis=1).astype(np.int64).reshape(-1, 2)
+        arrays = a._replace(pair_bodies=spans, bodies=a.bodies[kept])
+        return RobotTables(self.name, self.joint_names, self.body_names, self.numbers, arrays)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the tables as a NumPy ``.npz`` file, under a temporary name first.

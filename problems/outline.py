@@ -1,0 +1,38 @@
+"""What a suite draws: a problem in arrays, and the problem made of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apex_ompl.problem import AttachedObject, Goal, Obstacle, Problem
+from apex_ompl.robot import Robot
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Outline:
+    """A scene, held objects, and the states to go between.
+
+    Attributes:
+        scene: Obstacles.
+        start: Shape (dof,).
+        goal: Shape (dof,).
+        attached: Held objects.
+    """
+
+    scene: tuple[Obstacle, ...]
+    start: Array
+    goal: Array
+    attached: tuple[AttachedObject, ...] = ()
+
+    def problem(self, name: str, robot: Robot) -> Problem:
+        """Return the problem by a name, for the robot that it was drawn for."""
+        start, goal = (dict(zip(robot.joint_names, q.tolist(), strict=True)) for q in (self.start, self.goal))
+        return Problem(
+            name=name, robot=robot.name, scene=self.scene, attached=self.attached, start=start,
+            goal=Goal(joints=(goal,)),
+        )  # fmt: skip
