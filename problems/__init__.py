@@ -29,7 +29,7 @@ def names() -> tuple[str, ...]:
 
 def suites() -> Mapping[str, tuple[str, ...]]:
     """Return the suites, each with its levels."""
-    from apex_ompl.problems.suites import LEVELS
+    from apex_ompl.problems.catalogue import LEVELS
 
     return dict(LEVELS)
 
@@ -42,7 +42,7 @@ def load(name: str) -> Problem:
         ParameterError: No such seed.
         SuiteError: No problem can be drawn for that seed.
     """
-    from apex_ompl.problems.suites import ProblemId
+    from apex_ompl.problems.catalogue import ProblemId
 
     which = ProblemId.parse(name)
     if which is not None:
@@ -54,7 +54,7 @@ def load(name: str) -> Problem:
 
 def is_id(text: str) -> bool:
     """Whether a text has the form of an id of a problem of a suite."""
-    from apex_ompl.problems.suites import ID
+    from apex_ompl.problems.catalogue import ID
 
     return ID.fullmatch(text) is not None
 
@@ -77,7 +77,7 @@ def sample(suite: str, *, level: str, seed: int) -> Problem:
         FileFormatError: The file of a frozen problem is not the one that was frozen.
     """
     from apex_ompl.problems import frozen
-    from apex_ompl.problems.suites import ProblemId, first_draw
+    from apex_ompl.problems.catalogue import ProblemId, first_draw
 
     which = ProblemId(suite, level, seed)
     return frozen.load(which).problem if frozen.is_frozen(which) else first_draw(which)[1]
@@ -90,7 +90,7 @@ def frozen_names(suite: str, level: str, split: str = "test") -> tuple[str, ...]
         UnknownNameError: No such suite, level or split.
     """
     from apex_ompl.problems import frozen
-    from apex_ompl.problems.suites import ProblemId
+    from apex_ompl.problems.catalogue import ProblemId
 
     ProblemId(suite, level, 0)
     if split not in frozen.COUNTS:
@@ -105,7 +105,7 @@ def witness(name: str) -> Witness:
         ParameterError: The problem is not a frozen one.
     """
     from apex_ompl.problems import frozen
-    from apex_ompl.problems.suites import ProblemId
+    from apex_ompl.problems.catalogue import ProblemId
 
     which = ProblemId.parse(name)
     if which is None or not frozen.is_frozen(which):
