@@ -88,7 +88,7 @@ def shelf(rng: np.random.Generator, level: str) -> Draft:
 
 def bins(rng: np.random.Generator, level: str) -> Draft:
     """Four open bins on the tables; each hand goes from the depth of one to the depth of another."""
-    high, wide, deep = {"easy": (0.16, 0.34, 0.02), "medium": (0.26, 0.28, 0.12), "hard": (0.34, 0.255, 0.165)}[level]
+    high, wide, deep = {"easy": (0.16, 0.34, 0.02), "medium": (0.3, 0.27, 0.14), "hard": (0.34, 0.255, 0.165)}[level]
     scene, spots = [], []
     for k, middle in enumerate((-0.62, -0.22, 0.22, 0.62)):
         x, y = rng.uniform(0.44, 0.54), middle + rng.uniform(-0.03, 0.03)
@@ -104,7 +104,7 @@ def bins(rng: np.random.Generator, level: str) -> Draft:
 
 def cage(rng: np.random.Generator, level: str) -> Draft:
     """A roofed cage of bars in front of each arm; the hands reach in between the bars, from one side to another."""
-    gap, bars, tall = {"easy": (0.38, 2, 0.6), "medium": (0.35, 2, 0.6), "hard": (0.28, 2, 0.6)}[level]
+    gap, bars, tall = {"easy": (0.44, 2, 0.6), "medium": (0.39, 2, 0.6), "hard": (0.27, 2, 0.6)}[level]
     scene, ends = [], []
     flip = bool(rng.integers(2))
     for side, middle in (("left", 0.3), ("right", -0.3)):
@@ -148,7 +148,7 @@ def posts(rng: np.random.Generator, level: str) -> Draft:
 
 def wall(rng: np.random.Generator, level: str) -> Draft:
     """A wall between the arms with two windows, through which hands reach over to the other side."""
-    size = {"easy": 0.34, "medium": 0.28, "hard": 0.23}[level]
+    size = {"easy": 0.34, "medium": 0.29, "hard": 0.23}[level]
     thick, near, far, tall = 0.03, 0.1, 1.0, 1.1
     x, z = rng.uniform(0.48, 0.54), np.sort(rng.uniform([0.2, 0.58], [0.26, 0.64]))
     windows = [(x, float(z[0])), (x, float(z[1]))]
@@ -171,20 +171,16 @@ def wall(rng: np.random.Generator, level: str) -> Draft:
         return Region((0.4, 0.65), (y[0], y[1]), (0.15, 0.6), (DOWN, FORWARD))
 
     first = int(rng.integers(2))
-    if level == "hard":  # both hands reach through, and change windows
-        start, goal = (through(1, first), through(-1, 1 - first)), (through(1, 1 - first), through(-1, first))
-    elif level == "medium":  # one hand changes windows
-        start, goal = (through(1, first), beside(-1)), (through(1, 1 - first), beside(-1))
-        if rng.integers(2):
-            start, goal = (beside(1), through(-1, first)), (beside(1), through(-1, 1 - first))
-    else:
-        start, goal = (beside(1), beside(-1)), (through(1, first), beside(-1))
-    return Draft(tuple(scene), start, goal)
+    start, goal = [through(1, first), through(-1, 1 - first)], [through(1, 1 - first), through(-1, first)]
+    if level == "easy":  # one hand changes windows, the other one stays on its side
+        other = int(rng.integers(2))
+        start[other] = goal[other] = beside((1, -1)[other])
+    return Draft(tuple(scene), (start[0], start[1]), (goal[0], goal[1]))
 
 
 def swap(rng: np.random.Generator, level: str) -> Draft:
     """Two holes in front of the arms, one above the other: each hand goes from the one near it into the other one."""
-    size, depth = {"easy": (0.4, 0.1), "medium": (0.34, 0.16), "hard": (0.28, 0.22)}[level]
+    size, depth = {"easy": (0.4, 0.1), "medium": (0.315, 0.19), "hard": (0.28, 0.22)}[level]
     front = rng.uniform(0.55, 0.6)
     side, low = float(rng.choice([-1.0, 1.0])), rng.uniform(0.16, 0.22) + size / 2 - 0.15
     spots, scene = [], []
