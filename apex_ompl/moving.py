@@ -18,6 +18,7 @@ from apex_ompl.space import FULL_RESOLUTION
 
 Array = NDArray[np.float64]
 
+SHORTEST = 0.01  # time of a step of a path [s]
 STEP = 0.005  # that obstacles move on while one place, grown by half of it, stands for them [m]
 
 
@@ -135,5 +136,5 @@ def even_times(robot: Robot, path: Array, pace: float) -> Array:
         pace: Share of the velocity limits, in (0, 1].
     """
     steps = (np.abs(np.diff(path, axis=0)) / robot.limits.velocity).max(axis=1) / pace
-    times: Array = np.concatenate([[0.0], np.cumsum(np.maximum(steps, 1e-6))])
+    times: Array = np.concatenate([[0.0], np.cumsum(np.maximum(steps, SHORTEST))])
     return times

@@ -112,8 +112,23 @@ def load(which: ProblemId) -> Frozen:
     return Frozen(problem, Witness(path, times), row["draw"])
 
 
-def save(suite: str, level: str, frozen: Mapping[int, Frozen]) -> None:
-    """Write the frozen problems of a suite and level, by seed, and their hash."""
+def exists(suite: str, level: str) -> bool:
+    """Whether the problems of a suite and level have been frozen."""
+    return (FOLDER / _name(suite, level)).is_file()
+
+
+def save(suite: str, level: str, frozen: Mapping[int, Frozen], dropped: int) -> int:
+    """Write the frozen problems of a suite and level, by seed, and the hash of their file.
+
+    Args:
+        suite: The suite.
+        level: Its level.
+        frozen: The problems.
+        dropped: How many draws were left out because no witness was found.
+
+    Returns:
+        The size of the file in bytes.
+    """
     some = robot()
     held: list[Any] = []
     rows = []
@@ -131,7 +146,7 @@ def save(suite: str, level: str, frozen: Mapping[int, Frozen]) -> None:
             row["times"] = _counts(item.witness.times, TICK).tolist()
         rows.append(row)
     head = {"schema": SCHEMA, "suite": suite, "level": level, "robot": ROBOT, "joints": list(some.joint_names)}
-    text = json.dumps({**head, "held": held, "problems": rows}, separators=(",", ":"))
+    text = json.dumps({**head, "dropped": dropped, "held": held, "problems": rows}, separators=(",", ":"))
     content = lzma.compress(text.encode(), preset=9 | lzma.PRESET_EXTREME)
     FOLDER.mkdir(exist_ok=True)
     write_atomically(FOLDER / _name(suite, level), content)
@@ -139,6 +154,7 @@ def save(suite: str, level: str, frozen: Mapping[int, Frozen]) -> None:
     lines = [f"{sums[name]}  {name}\n" for name in sorted(sums)]
     write_atomically(FOLDER / SUMS, "".join(lines).encode())
     _file.cache_clear()
+    return len(content)
 
 
 def digest(problem: Problem) -> str:

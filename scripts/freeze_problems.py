@@ -1,0 +1,150 @@
+"""Draw the frozen validation and test problems of the suites, find a witness for each, and write their files.
+
+Draws for which no witness is found are dropped and drawn anew. Files that exist are left alone, since results refer
+to them; --replace draws them again.
+
+Usage: python scripts/freeze_problems.py [--replace] [--jobs 2] [SUITE/LEVEL ...]
+"""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing
+import time
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apex_ompl.api import plan
+from apex_ompl.assembly import assemble
+from apex_ompl.collision import Verdict
+from apex_ompl.moving import at_time, even_times, timed_check
+from apex_ompl.problem import Problem
+from apex_ompl.problems import frozen
+from apex_ompl.problems.alignment import PACE, duration
+from apex_ompl.problems.catalogue import ProblemId, first_draw
+from apex_ompl.problems.frozen import Frozen, Witness
+from apex_ompl.problems.reach import robot
+from apex_ompl.space import SEARCH_RESOLUTION
+from apex_ompl.validity import full_check
+
+Array = NDArray[np.float64]
+
+LIMITS = ((0, 10.0), (1, 20.0))  # seeds and time limits of rrtconnect [s]
+QUICK = 1.0  # time limit among obstacles that were stopped [s]
+PACES = (PACE, 2.0 * PACE, PACE / 2.0)  # shares of the velocity limits
+WAITS = (1.0, 2.0, 4.0, 8.0)  # [s]
+ASIDE, HURRY = 60, 0.8  # random states to wait at, and the pace to get there
+
+
+def witness(problem: Problem) -> Witness | None:
+    """Return a witness for a problem, or None when none was found."""
+    return _timed_witness(problem) if problem.moving else _static_witness(problem)
+
+
+def _static_witness(problem: Problem) -> Witness | None:
+    ready = assemble(problem)
+    for seed, timeout in LIMITS:
+        for shorter in (True, False):
+            result = plan(problem, "rrtconnect", timeout=timeout, seed=seed, simplify=shorter)
+            if not result or result.path is None:
+                break
+            found = Witness(result.path).rounded()
+            if full_check(ready.verdict, found.path, ready.start, ready.goals):
+                return found
+    return None
+
+
+def _timed_witness(problem: Problem) -> Witness | None:
+    for path, times in _timed_paths(problem):
+        found = Witness(path, times).rounded()
+        assert found.times is not None
+        if timed_check(robot(), problem, found.path, found.times):
+            return found
+    return None
+
+
+def _timed_paths(problem: Problem) -> Iterator[tuple[Array, Array]]:
+    """Yield timed paths that may do: straight lines, ways around places of the obstacles, waits, and ways aside."""
+    names = robot().joint_names
+    line = np.stack([problem.start_state(names), problem.goal_states(names)[0]])
+    for pace in PACES:
+        yield line, even_times(robot(), line, pace)
+    lasts = duration(line[0], line[1])
+    for shares in ((0.5,), (0.25, 0.5, 0.75), (0.0, 0.25, 0.5, 0.75, 1.0), (0.0,), (1.0,), ()):
+        stopped = [
+            at_time(obstacle, share * lasts).model_copy(update={"name": f"{obstacle.name}_{k}", "velocity": None})
+            for obstacle in problem.scene
+            for k, share in enumerate(shares)
+        ]
+        for seed in range(2):
+            result = plan(problem.model_copy(update={"scene": tuple(stopped)}), "rrtconnect", timeout=QUICK, seed=seed)
+            if not result or result.path is None:
+                break
+            for pace in PACES:
+                yield result.path, even_times(robot(), result.path, pace)
+            for wait in WAITS:
+                times = even_times(robot(), result.path, PACE)
+                yield np.concatenate([line[:1], result.path]), np.concatenate([[0.0], wait + times])
+    yield from _ways_aside(problem, line)
+
+
+def _ways_aside(problem: Problem, line: Array) -> Iterator[tuple[Array, Array]]:
+    """Yield timed paths by way of random states, where they wait for the obstacles to pass."""
+    some, rng = robot(), np.random.default_rng(0)
+    verdict = Verdict(some, (), problem.attached)
+    hands = some.groups["hands"]
+    for k in range(ASIDE):
+        via = (line[0] if k % 2 else some.home) + rng.normal(0.0, 0.5, some.dof)
+        via[hands] = line[0, hands]
+        via = np.clip(via, some.limits.lower, some.limits.upper)
+        if verdict.first_collision(np.stack([line[0], via, line[1]]), SEARCH_RESOLUTION) is not None:
+            continue
+        away, on = np.stack([line[0], via]), np.stack([via, line[1]])
+        for wait in (0.01, *WAITS):
+            first = even_times(some, away, HURRY)
+            second = first[-1] + wait + even_times(some, on, 2.0 * PACE)
+            yield np.concatenate([away, on]), np.concatenate([first, second])
+
+
+def freeze(level: tuple[str, str]) -> tuple[dict[int, Frozen], int, float]:
+    """Return the frozen problems of a suite and level by seed, how many draws had no witness, and the time taken."""
+    found: dict[int, Frozen] = {}
+    dropped, begin = 0, time.perf_counter()
+    for split in frozen.COUNTS:
+        for seed in frozen.frozen_seeds(level[1], split):
+            number = -1
+            while seed not in found:
+                number, problem = first_draw(ProblemId(*level, seed), number)
+                proof = witness(problem)
+                if proof is None:
+                    dropped += 1
+                else:
+                    found[seed] = Frozen(problem, proof, number)
+    return found, dropped, time.perf_counter() - begin
+
+
+def main() -> None:
+    """Freeze the levels named, or all that are missing."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("levels", nargs="*", metavar="SUITE/LEVEL")
+    parser.add_argument("--replace", action="store_true", help="draw levels again whose files exist")
+    parser.add_argument("--jobs", type=int, default=2)
+    args = parser.parse_args()
+    wanted = [tuple(name.split("/")) for name in args.levels] or list(frozen.files())
+    todo = [pair for pair in wanted if args.replace or not frozen.exists(*pair)]
+    todo.sort(key=lambda pair: pair[1] not in ("hard", "medium"))  # what takes longest first
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(args.jobs, mp_context=context) as pool:
+        jobs = {pool.submit(freeze, pair): pair for pair in todo}
+        for job in as_completed(jobs):
+            found, dropped, spent = job.result()
+            size = frozen.save(*jobs[job], found, dropped)
+            said = f"{len(found)} problems, {dropped} draws without a witness, {size} bytes, {spent:.0f} s"
+            print(f"{'/'.join(jobs[job])}: {said}", flush=True)
+
+
+if __name__ == "__main__":
+    main()

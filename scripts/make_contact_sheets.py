@@ -1,0 +1,64 @@
+"""Draw a few problems of every suite and level into docs/pictures/suites, a sheet a suite: start, and goal as a ghost.
+
+Usage: python scripts/make_contact_sheets.py [--first 900000] [--columns 3] [SUITE ...]
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from pathlib import Path
+
+import imageio.v3 as iio
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from apex_ompl import problems
+from apex_ompl.render import render
+from apex_ompl.schema import write_atomically
+
+OUT = Path(__file__).resolve().parent.parent / "docs" / "pictures" / "suites"
+SIZE, DRAWN = (400, 300), (1200, 900)  # of a picture on the sheet, and as it is drawn [pixels]
+FROM_BEHIND = {"shelf": 150.0, "swap": 150.0}
+FROM_ABOVE_LEFT = 40.0
+SOME_MOVING = ("moving-small-0.1", "moving-large-0.2", "moving-huge-0.4")
+
+
+def picture(name: str, azimuth: float) -> Image.Image:
+    """Return the picture of a problem with its name on it."""
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "problem.png"
+        render(problems.load(name), file, DRAWN, azimuth)
+        drawn = Image.fromarray(np.asarray(iio.imread(file))[..., :3]).resize(SIZE, Image.Resampling.LANCZOS)
+    ImageDraw.Draw(drawn).text((8, 6), name, fill="#222222", font=ImageFont.load_default(14))
+    return drawn
+
+
+def sheet(suite: str, first: int, columns: int) -> Image.Image:
+    """Return the sheet of a suite: a row a level."""
+    levels = [v for v in problems.suites()[suite] if not v.startswith("moving") or v in SOME_MOVING]
+    whole = Image.new("RGB", (SIZE[0] * columns, SIZE[1] * len(levels)))
+    for row, level in enumerate(levels):
+        for column in range(columns):
+            drawn = picture(f"{suite}/{level}/{first + column}", FROM_BEHIND.get(suite, FROM_ABOVE_LEFT))
+            whole.paste(drawn, (column * SIZE[0], row * SIZE[1]))
+    return whole
+
+
+def main() -> None:
+    """Draw the sheets of the suites named, or of all."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("suites", nargs="*")
+    parser.add_argument("--first", type=int, default=900_000, help="seed of the first problem (default: %(default)s)")
+    parser.add_argument("--columns", type=int, default=3)
+    args = parser.parse_args()
+    OUT.mkdir(parents=True, exist_ok=True)
+    for suite in args.suites or problems.suites():
+        drawn = sheet(suite, args.first, args.columns)
+        file = OUT / f"{suite}.jpg"
+        write_atomically(file, iio.imwrite("<bytes>", np.asarray(drawn), extension=".jpg", quality=85))
+        print(file)
+
+
+if __name__ == "__main__":
+    main()
