@@ -1,0 +1,45 @@
+"""How many problems of each suite and level are drawn in a second on one core, start and goal included.
+
+Usage: python benchmarks/sampling.py [-n 200] [SUITE[/LEVEL] ...]
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+
+import numpy as np
+import record
+
+from apex_ompl import problems
+
+FIRST = 100_000  # seed of the first problem, of the training split
+
+
+def main() -> None:
+    """Measure and write."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("levels", nargs="*", metavar="SUITE[/LEVEL]")
+    parser.add_argument("-n", type=int, default=200, help="problems a level (default: %(default)s)")
+    args = parser.parse_args()
+    every = [f"{suite}/{level}" for suite, levels in problems.suites().items() for level in levels]
+    figures, rows = [], [["suite/level", "problems/s", "ms p50", "p95"], ["---", *["---:"] * 3]]
+    for level in (v for v in every if not args.levels or v in args.levels or v.split("/")[0] in args.levels):
+        suite, name = level.split("/")
+        problems.sample(suite, level=name, seed=0)  # loads the robot, the kernel and what the hands hold
+        for seed in range(20):
+            problems.sample(suite, level=name, seed=seed)
+        spent = []
+        for seed in range(FIRST, FIRST + args.n):
+            begin = time.perf_counter()
+            problems.sample(suite, level=name, seed=seed)
+            spent.append(time.perf_counter() - begin)
+        rate, (middle, slow) = 1.0 / float(np.mean(spent)), record.percentiles(spent, 50, 95)
+        figures.append({"level": level, "problems_per_s": rate, "s_p50": middle, "s_p95": slow})
+        rows.append([level, f"{rate:.0f}", f"{middle * 1e3:.1f}", f"{slow * 1e3:.1f}"])
+    seeds = f"{FIRST} to {FIRST + args.n - 1}"
+    record.write("sampling", {"levels": figures}, "\n".join(map(record.row, rows)), N=args.n, seeds=seeds)
+
+
+if __name__ == "__main__":
+    main()
