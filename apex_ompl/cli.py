@@ -66,7 +66,7 @@ def _parser() -> _Parser:
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
     plan = commands.add_parser("plan", help="plan a path for a problem")
-    plan.add_argument("problem", help="name of a ready-made problem, or a YAML file")
+    plan.add_argument("problem", help="name of a problem, an id as shelf/hard/900012, or a YAML file")
     plan.add_argument("--planner", default="rrtconnect", help="see 'apex-ompl planners' (default: %(default)s)")
     plan.add_argument("--timeout", type=float, default=5.0, metavar="SECONDS", help="default: %(default)s")
     plan.add_argument("--seed", type=int, default=0, help="default: %(default)s")
@@ -78,7 +78,7 @@ def _parser() -> _Parser:
     plan.set_defaults(run=_plan)
 
     render = commands.add_parser("render", help="draw a problem or a saved result, without a display")
-    render.add_argument("source", help="name of a problem, a problem file, or a saved result (.npz, .json, .yaml)")
+    render.add_argument("source", help="a problem as for plan, or a saved result (.npz, .json, .yaml)")
     render.add_argument("-o", "--out", type=Path, required=True, metavar="FILE", help=".png, .gif or .mp4")
     render.add_argument("--azimuth", type=float, default=26.0, help="degrees from the front (default: %(default)s)")
     render.set_defaults(run=_render)
@@ -93,11 +93,11 @@ def _parser() -> _Parser:
     convert.set_defaults(run=_convert)
 
     check = commands.add_parser("check", help="validate a problem, and say whether start and goal are free")
-    check.add_argument("problem", help="name of a ready-made problem, or a YAML file")
+    check.add_argument("problem", help="name of a problem, an id as shelf/hard/900012, or a YAML file")
     check.set_defaults(run=_check)
 
     for name, run, text in (
-        ("problems", _problems, "list the ready-made problems"),
+        ("problems", _problems, "list the ready-made problems and the suites"),
         ("planners", _planners, "list the planners and their parameters"),
         ("info", _info, "print versions and robots"),
         ("schema", _schema, "print the JSON schema of problem files"),
@@ -211,6 +211,9 @@ def _problems(_: argparse.Namespace) -> int:
     for name in problems.names():
         problem = problems.load(name)
         print(f"{name:<20} {problem.robot}, {len(problem.scene)} obstacles")
+    print("suites, as SUITE/LEVEL/SEED; seeds 0 to 799999 train, from 800000 validate, from 900000 test")
+    for suite, levels in problems.suites().items():
+        print(f"{suite:<20} {', '.join(levels)}")
     return 0
 
 

@@ -153,7 +153,7 @@ def save(suite: str, level: str, frozen: Mapping[int, Frozen], dropped: int) -> 
     sums = {**_sums(), _name(suite, level): hashlib.sha256(content).hexdigest()}
     lines = [f"{sums[name]}  {name}\n" for name in sorted(sums)]
     write_atomically(FOLDER / SUMS, "".join(lines).encode())
-    _file.cache_clear()
+    forget()
     return len(content)
 
 
@@ -203,6 +203,11 @@ def _file(suite: str, level: str) -> tuple[dict[str, Any], dict[int, dict[str, A
     data = json.loads(lzma.decompress(content))
     rows = {row["seed"]: row for row in data.pop("problems")}
     return data, rows
+
+
+def forget() -> None:
+    """Forget the files that were read."""
+    _file.cache_clear()
 
 
 def files() -> Sequence[tuple[str, str]]:

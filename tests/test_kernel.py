@@ -435,3 +435,45 @@ def test_code_is_kept_where_it_can_be(tmp_path: Path, writable: bool) -> None:
         assert str(home) in first.stdout and "compiles" not in second.stderr
     else:
         assert first.stdout.strip() == "None" and "no cache folder" in first.stderr and "compiles" in second.stderr
+
+
+@settings(max_examples=60, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_tables_for_one_side_judge_that_side_alone(robot: Robot, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    ball = Obstacle(name="ball", sphere={"radius": 0.1}, position=tuple(rng.uniform([0.2, -0.6, 0.1], [0.7, 0.6, 0.8])))
+    whole = Verdict(robot, [ball]).kernel
+    sides = [[k for k, name in enumerate(robot.joint_names) if name.startswith(side)] for side in ("left", "right")]
+    kernels = [Kernel(whole.robot.judging(joints), whole.scene) for joints in sides]
+    q, other = states_around_home(robot, rng, 2)
+    everything, parts = whole.clearance(q)[0], [kernel.clearance(q)[0] for kernel in kernels]
+    assert everything[0] == min(parts[0][0], parts[1][0])  # all that moves is moved by one side or the other
+    assert everything[1] <= min(parts[0][1], parts[1][1])
+    for joints, kernel, part in zip(reversed(sides), kernels, parts, strict=True):
+        mixed = q.copy()
+        mixed[joints] = other[joints]  # the other side does not count
+        assert np.array_equal(kernel.clearance(mixed)[0], part)
+
+
+def test_pairs_between_the_sides_are_left_to_the_whole(robot: Robot) -> None:
+    whole = Verdict(robot).kernel
+    sides = [[k for k, name in enumerate(robot.joint_names) if name.startswith(side)] for side in ("left", "right")]
+    kernels = [Kernel(whole.robot.judging(joints), whole.scene) for joints in sides]
+    q = robot.home.copy()
+    q[[0, 1, 7, 8]] = -1.2, 0.3, 1.2, 0.3  # the hands meet in the middle
+    assert whole.clearance(q)[0, 1] < 0.0 < min(kernel.clearance(q)[0, 1] for kernel in kernels)
+
+
+def test_a_pair_can_be_left_out(robot: Robot) -> None:
+    whole = Verdict(robot).kernel
+    q = robot.home.copy()
+    q[[0, 1, 7, 8]] = -1.5, 0.3, 1.5, 0.3
+    tables, left_out = whole.robot, 0
+    while Kernel(tables, whole.scene).clearance(q)[0, 1] < 0.0:
+        found, counts = Kernel(tables, whole.scene).unproved(q)
+        assert counts[0] > 0
+        a, b = (tables.body_names[k] for k in found[0, 0])
+        smaller = tables.without_pair(a, b)
+        assert len(smaller.arrays.bodies) == len(tables.arrays.bodies) - 1
+        tables, left_out = smaller, left_out + 1
+    assert left_out > 2

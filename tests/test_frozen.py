@@ -1,0 +1,116 @@
+"""The frozen problems: all there, unchanged, and each with a witness that solves it."""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support import ROOT
+
+from apex_ompl import problems
+from apex_ompl.collision import Verdict
+from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError, UnknownNameError
+from apex_ompl.moving import timed_check
+from apex_ompl.problems import frozen
+from apex_ompl.problems.catalogue import ProblemId
+from apex_ompl.robot import Robot
+from apex_ompl.validity import full_check
+
+FOLDER = ROOT / "problems" / "frozen"
+EVERY = [(suite, level) for suite, levels in problems.suites().items() for level in levels]
+MOVING = [pair for pair in EVERY if pair[1].startswith("moving-")]
+STATIC = [pair for pair in EVERY if pair not in MOVING]
+
+
+def test_the_files_match_their_hashes_and_are_small() -> None:
+    lines = [line.split() for line in (FOLDER / "SHA256SUMS").read_text().splitlines()]
+    assert {name for _, name in lines} == {f"{suite}-{level}.json.xz" for suite, level in EVERY}
+    for wanted, name in lines:
+        assert hashlib.sha256((FOLDER / name).read_bytes()).hexdigest() == wanted
+    assert sum(path.stat().st_size for path in FOLDER.iterdir()) < 10 * 2**20
+
+
+@pytest.mark.parametrize(("suite", "level"), EVERY)
+def test_the_first_problems_of_validation_and_test_are_frozen(robot: Robot, suite: str, level: str) -> None:
+    counts = (20, 10) if level.startswith("moving-") else (100, 30)
+    names = [problems.frozen_names(suite, level, split) for split in ("test", "validation")]
+    for first, count, some in zip((900_000, 800_000), counts, names, strict=True):
+        assert some == tuple(f"{suite}/{level}/{first + k}" for k in range(count))
+    digests = set()
+    for name in (*names[0], *names[1]):
+        problem, witness = problems.load(name), problems.witness(name)
+        digests.add(frozen.digest(problem))
+        assert problem.name == name and bool(problem.moving) == level.startswith("moving-")
+        assert np.array_equal(witness.path[0], problem.start_state(robot.joint_names))
+        assert np.array_equal(witness.path[-1], problem.goal_states(robot.joint_names)[0])
+        assert (witness.times is not None) == bool(problem.moving)
+    assert len(digests) == sum(counts)
+
+
+@pytest.mark.parametrize(("suite", "level"), STATIC)
+def test_witnesses_pass_the_full_check(robot: Robot, suite: str, level: str) -> None:
+    """Some of each level; scripts/check_frozen.py looks at all."""
+    for name in problems.frozen_names(suite, level)[::20]:
+        problem, witness = problems.load(name), problems.witness(name)
+        verdict = Verdict(robot, problem.scene, problem.attached)
+        check = full_check(verdict, witness.path, witness.path[0], problem.goal_states(robot.joint_names))
+        assert check, check.reason
+        broken = witness.path.copy()
+        broken[len(broken) // 2, 1] += 3.0
+        assert not full_check(verdict, broken, witness.path[0], [witness.path[-1]])
+
+
+@pytest.mark.parametrize(("suite", "level"), MOVING)
+def test_timed_witnesses_pass_their_check(robot: Robot, suite: str, level: str) -> None:
+    for name in problems.frozen_names(suite, level)[3::16]:
+        witness = problems.witness(name)
+        check = timed_check(robot, problems.load(name), witness.path, witness.times)
+        assert check, check.reason
+
+
+@pytest.fixture
+def copied(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Two files of frozen problems in another folder."""
+    for name in ("swap-easy.json.xz", "vertical-small.json.xz", "SHA256SUMS"):
+        shutil.copy(FOLDER / name, tmp_path / name)
+    monkeypatch.setattr(frozen, "FOLDER", tmp_path)
+    frozen.forget()
+    yield tmp_path
+    frozen.forget()
+
+
+def test_what_is_saved_is_what_is_loaded(copied: Path) -> None:
+    seeds = (900_000, 900_007, 800_003)
+    some = {seed: frozen.load(ProblemId("vertical", "small", seed)) for seed in seeds}
+    (copied / "vertical-small.json.xz").unlink()
+    frozen.save("vertical", "small", some, 3)
+    for seed, item in some.items():
+        again = frozen.load(ProblemId("vertical", "small", seed))
+        assert again.problem == item.problem and again.number == item.number
+        assert np.array_equal(again.witness.path, item.witness.path)
+
+
+def test_a_changed_or_missing_file_is_named_and_nothing_is_drawn_instead(copied: Path) -> None:
+    file = copied / "swap-easy.json.xz"
+    assert problems.load("swap/easy/900003").name == "swap/easy/900003"
+    frozen.forget()
+    content = bytearray(file.read_bytes())
+    content[len(content) // 2] ^= 1
+    file.write_bytes(content)
+    with pytest.raises(FileFormatError, match="swap-easy.json.xz: SHA-256"):
+        problems.load("swap/easy/900003")
+    file.unlink()
+    with pytest.raises(MissingFileError, match="swap-easy.json.xz"):
+        problems.sample("swap", level="easy", seed=900_003)
+    assert problems.load("swap/easy/900100").name == "swap/easy/900100"  # behind the frozen ones it is drawn
+
+
+def test_only_frozen_problems_have_witnesses() -> None:
+    for name in ("swap/easy/12", "swap/easy/900100", "ball_in_cup"):
+        with pytest.raises(ParameterError, match="frozen"):
+            problems.witness(name)
+    with pytest.raises(UnknownNameError, match="train"):
+        problems.frozen_names("swap", "easy", "train")

@@ -1,0 +1,171 @@
+"""The suites: drawn by seed alone, with starts and goals that are what they are said to be."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from apex_ompl import problems
+from apex_ompl.api import load_problem
+from apex_ompl.collision import Verdict
+from apex_ompl.errors import ApexError, ParameterError, UnknownNameError
+from apex_ompl.goals import AlignmentGoal
+from apex_ompl.moving import at_time
+from apex_ompl.problem import Alignment, Problem
+from apex_ompl.problems import alignment
+from apex_ompl.problems.catalogue import SPLITS, ProblemId
+from apex_ompl.problems.frozen import digest
+from apex_ompl.robot import Robot
+
+EVERY = [(suite, level) for suite, levels in problems.suites().items() for level in levels]
+HARD = ("shelf", "bins", "cage", "posts", "wall", "swap", "clutter")
+LEVELS = ["free", "small", "large", "moving-medium-0.2", "moving-huge-0.4"]
+FACES = {"vertical": [("lower", "upper")], "horizontal": [("cup", "ball"), ("block", "peg")]}
+
+
+def ends(problem: Problem, robot: Robot) -> np.ndarray:
+    names = robot.joint_names
+    return np.stack([problem.start_state(names), problem.goal_states(names)[0]])
+
+
+def box_corners(robot: Robot, problem: Problem, q: np.ndarray) -> list[np.ndarray]:
+    """Corners of the held boxes at a state, by Pinocchio, each of shape (8, 3)."""
+    signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T / 2.0
+    found = []
+    for body in problem.attached:
+        pose = robot.link_pose(q, body.link) @ body.pose
+        found.append(signs * body.box @ pose[:3, :3].T + pose[:3, 3])
+    return found
+
+
+def test_the_suites_and_levels_are_those_of_the_contract() -> None:
+    suites = problems.suites()
+    assert set(suites) == {"vertical", "horizontal", *HARD}
+    assert all(suites[suite] == ("easy", "medium", "hard") for suite in HARD)
+    moving = {f"moving-{size}-{speed}" for size in alignment.SIZES for speed in ("0.1", "0.2", "0.4")}
+    for suite in ("vertical", "horizontal"):
+        assert set(suites[suite]) == {"free", "small", "medium", "large"} | moving and len(moving) == 15
+
+
+@settings(max_examples=40, deadline=None)
+@given(which=st.sampled_from(EVERY), seed=st.integers(0, 799_999), other=st.integers(0, 799_999))
+def test_the_same_seed_gives_the_same_problem(which: tuple[str, str], seed: int, other: int) -> None:
+    suite, level = which
+    first = problems.sample(suite, level=level, seed=seed)
+    problems.sample(suite, level=level, seed=other)  # nothing is carried over
+    again = problems.load(f"{suite}/{level}/{seed}")
+    assert again == first and digest(again) == digest(first) and first.name == f"{suite}/{level}/{seed}"
+    if other != seed:
+        assert digest(problems.sample(suite, level=level, seed=other)) != digest(first)
+
+
+def test_another_process_draws_the_same() -> None:
+    name = "horizontal/moving-large-0.2/4321"
+    code = "from apex_ompl import problems; from apex_ompl.problems.frozen import digest; "
+    code += f"print(digest(problems.load({name!r})))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == digest(problems.load(name))
+
+
+@pytest.mark.parametrize("level", ["easy", "medium", "hard"])
+@pytest.mark.parametrize("suite", HARD)
+def test_starts_and_goals_of_the_hard_suites_keep_a_centimetre(robot: Robot, suite: str, level: str) -> None:
+    """By Coal's distances, the links against each other included; the hands hold nothing."""
+    for seed in range(3):
+        problem = problems.sample(suite, level=level, seed=seed)
+        verdict = Verdict(robot, problem.scene, proofs=False)
+        for q in ends(problem, robot):
+            assert robot.limit_fault(q) is None and verdict.is_free(q) and verdict.clearance(q) >= 0.01
+            assert (q[robot.groups["hands"]] <= 0.4).all()
+        if suite == "clutter":
+            assert len(problem.scene) == {"easy": 10, "medium": 20, "hard": 30}[level]
+
+
+@pytest.mark.parametrize("level", LEVELS)
+@pytest.mark.parametrize("suite", ["vertical", "horizontal"])
+def test_alignment_problems_are_as_the_paper_has_them(robot: Robot, suite: str, level: str) -> None:
+    held = set()
+    for seed in range(8):
+        problem = problems.sample(suite, level=level, seed=seed)
+        start, goal = ends(problem, robot)
+        names = tuple(body.name for body in problem.attached)
+        held.add(names)
+        assert names in FACES[suite]
+        task = AlignmentGoal(robot, Alignment(kind=suite, first=names[0], second=names[1]), problem.attached, start)
+        assert task.is_satisfied(goal) and not task.is_satisfied(start)
+        assert np.array_equal(start[robot.groups["hands"]], goal[robot.groups["hands"]])
+        bare = Verdict(robot, (), problem.attached, proofs=False)
+        assert bare.is_free(start) and bare.is_free(goal)
+        assert min(bare.distance(q, fixtures=True).value for q in (start, goal)) >= 0.01
+        if suite == "vertical":
+            corners = box_corners(robot, problem, start)
+            assert min(c[:, 2].min() for c in corners) >= 0.08
+            assert np.linalg.norm(corners[0].mean(axis=0) - corners[1].mean(axis=0)) >= 0.4
+    assert held == set(FACES[suite])
+
+
+@pytest.mark.parametrize("level", LEVELS[1:])
+def test_cubes_have_their_size_and_speed_and_keep_off_start_and_goal(robot: Robot, level: str) -> None:
+    moving, _, rest = level.rpartition("moving-")
+    size, _, speed = rest.partition("-")
+    counts = set()
+    for seed in range(12):
+        problem = problems.sample("vertical", level=level, seed=seed)
+        start, goal = ends(problem, robot)
+        lasts = float(np.max(np.abs(goal - start) / robot.limits.velocity)) / 0.25
+        counts.add(len(problem.scene))
+        for cube in problem.scene:
+            edge = {"small": 0.06, "medium": 0.10, "large": 0.15, "xlarge": 0.20, "huge": 0.30}[size or level]
+            assert cube.box == (edge, edge, edge) and cube.moving == bool(speed)
+            if speed:
+                assert np.linalg.norm(cube.velocity) == pytest.approx(float(speed), abs=1e-4)
+        for q, time in ((start, 0.0), (goal, lasts)):
+            scene = [at_time(cube, time) for cube in problem.scene]
+            assert Verdict(robot, scene, problem.attached).distance(q).value >= 0.03
+    assert counts == {1} if speed else 1 < len(counts) and counts <= {1, 2, 3}
+
+
+def test_splits_are_by_seed() -> None:
+    bounds = {"train": (0, 799_999), "validation": (800_000, 899_999), "test": (900_000, 999_999)}
+    assert {name: (seeds[0], seeds[-1]) for name, seeds in SPLITS.items()} == bounds
+    for name, (first, last) in bounds.items():
+        assert ProblemId("shelf", "hard", first).split == ProblemId("shelf", "hard", last).split == name
+
+
+@pytest.mark.parametrize(
+    ("name", "error", "said"),
+    [
+        ("shelv/hard/12", UnknownNameError, "did you mean 'shelf'"),
+        ("shelf/hart/12", UnknownNameError, "did you mean 'hard'"),
+        ("vertical/moving-huge-0.3/12", UnknownNameError, "moving-huge-0.4"),
+        ("shelf/hard/1000000", ParameterError, "from 0 to 999999, got 1000000"),
+        ("shelf/hard", ApexError, "no such file"),
+    ],
+)
+def test_wrong_ids_are_named(name: str, error: type[ApexError], said: str) -> None:
+    with pytest.raises(error, match=said):
+        load_problem(name)
+
+
+@pytest.mark.parametrize("seed", [-1, 1_000_000, 1.5, True, "7"])
+def test_wrong_seeds_are_named(seed: object) -> None:
+    with pytest.raises(ParameterError, match="seed"):
+        problems.sample("shelf", level="hard", seed=seed)  # type: ignore[arg-type]
+
+
+def test_ids_work_at_the_command_line(apex_cli) -> None:
+    done = apex_cli("check", "posts/easy/7")
+    assert done.returncode == 0 and "posts/easy/7" in done.stdout and done.stdout.count("free") == 2
+    done = apex_cli("plan", "vertical/small/11", "--json")
+    assert done.returncode == 0 and '"EXACT_SOLUTION"' in done.stdout
+    done = apex_cli("plan", "vertical/moving-huge-0.4/11")
+    assert done.returncode == 2 and "snapshot" in done.stderr
+    done = apex_cli("plan", "shelf/hard/x12")
+    assert done.returncode == 2 and len(done.stderr.strip().splitlines()) == 1
+    listing = apex_cli("problems").stdout
+    assert all(suite in listing for suite in problems.suites())
