@@ -1,0 +1,55 @@
+"""Check all frozen problems: hashes, start and goal, and every witness by the full check; count redrawn ones.
+
+Usage: python scripts/check_frozen.py [--redraw 0] [SUITE[/LEVEL] ...]
+"""
+
+from __future__ import annotations
+
+import argparse
+
+from apex_ompl import problems
+from apex_ompl.assembly import assemble
+from apex_ompl.moving import timed_check
+from apex_ompl.problems import frozen
+from apex_ompl.problems.catalogue import ProblemId, first_draw
+from apex_ompl.problems.reach import robot
+from apex_ompl.validity import full_check
+
+
+def fault(name: str) -> str:
+    """Return what is wrong with a frozen problem or its witness, or an empty text."""
+    problem, witness = problems.load(name), problems.witness(name)
+    if witness.times is not None:
+        return timed_check(robot(), problem, witness.path, witness.times).reason
+    ready = assemble(problem)
+    faults = (ready.start_fault, *ready.goal_faults)
+    return "".join(faults) or full_check(ready.verdict, witness.path, ready.start, ready.goals).reason
+
+
+def main() -> None:
+    """Check the levels named, or all."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("levels", nargs="*", metavar="SUITE[/LEVEL]")
+    parser.add_argument("--redraw", type=int, default=0, metavar="N", help="draw N of each level anew, and compare")
+    args = parser.parse_args()
+    faults = count = same = redrawn = 0
+    for suite, level in frozen.files():
+        if args.levels and suite not in args.levels and f"{suite}/{level}" not in args.levels:
+            continue
+        names = [name for split in frozen.COUNTS for name in problems.frozen_names(suite, level, split)]
+        found = [(name, said) for name in names if (said := fault(name))]
+        for name, said in found:
+            print(f"{name}: {said}", flush=True)
+        for name in names[: args.redraw]:
+            which = ProblemId(suite, level, int(name.rsplit("/", 1)[1]))
+            kept = frozen.load(which)
+            redrawn += 1
+            same += frozen.digest(first_draw(which, kept.number - 1)[1]) == kept.digest
+        faults, count = faults + len(found), count + len(names)
+        print(f"{suite}/{level}: {len(names) - len(found)} of {len(names)} sound", flush=True)
+    print(f"{count - faults} of {count} frozen problems sound; {same} of {redrawn} redrawn the same")
+    raise SystemExit(1 if faults else 0)
+
+
+if __name__ == "__main__":
+    main()
