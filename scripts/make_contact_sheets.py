@@ -1,6 +1,6 @@
 """Draw a few problems of every suite and level into docs/pictures/suites, a sheet a suite: start, and goal as a ghost.
 
-Usage: python scripts/make_contact_sheets.py [--first 900000] [--columns 3] [SUITE ...]
+Usage: python scripts/make_contact_sheets.py [--first 0] [--columns 3] [SUITE ...]
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def main() -> None:
     """Draw the sheets of the suites named, or of all."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("suites", nargs="*")
-    parser.add_argument("--first", type=int, default=900_000, help="seed of the first problem (default: %(default)s)")
+    parser.add_argument("--first", type=int, default=0, help="seed of the first problem (default: %(default)s)")
     parser.add_argument("--columns", type=int, default=3)
     args = parser.parse_args()
     OUT.mkdir(parents=True, exist_ok=True)

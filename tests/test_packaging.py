@@ -24,6 +24,7 @@ for foreign in ('planners', 'problems'):
     else:
         raise SystemExit(foreign + ' must not exist after an install')
 result = apex_ompl.plan('shelf_swap', timeout=30)
+assert len(apex_ompl.problems.witness('shelf/hard/900012').path) > 2
 print(result.status, apex_ompl.problems.names(), len(apex_ompl.planners.names()))
 """
 
@@ -47,6 +48,7 @@ def test_wheel_and_sdist_hold_what_is_needed(built: Path) -> None:
     names = zipfile.ZipFile(wheel).namelist()
     for wanted in (
         "apex_ompl/py.typed", "apex_ompl/planners/registry.py", "apex_ompl/problems/data/shelf_swap.yaml",
+        "apex_ompl/problems/frozen/SHA256SUMS",
         "apex_ompl/robot/data/softhand2_left.urdf", "apex_ompl/robot/data/dual_panda_softhand.pairs.yaml",
     ):  # fmt: skip
         assert names.count(wanted) == 1, wanted
