@@ -79,8 +79,8 @@ def timed_check(
     """Decide whether a path that passes its states at given times is free of obstacles, moving ones among them.
 
     Between states the path goes straight at an even pace. It is cut into pieces during which no obstacle moves more
-    than ``STEP``; each piece is judged among obstacles grown by half of that, at the places of the middle of its time:
-    what is found free is free at all times.
+    than ``STEP``; each piece is judged among obstacles grown by half of that, at the places of the middle of its time,
+    so that obstacles miss nothing between samples. Along the path states are judged as in the full check.
 
     Args:
         robot: The robot.
