@@ -24,6 +24,7 @@ from apex_ompl.interrupt import Interrupt
 from apex_ompl.problem import Problem
 from apex_ompl.repair import repair
 from apex_ompl.result import PlanResult, PlanStatus
+from apex_ompl.schema import is_file
 from apex_ompl.simplify import simplify as shorten
 from apex_ompl.space import FULL_RESOLUTION, path_length, path_to_array, resample
 from apex_ompl.validity import full_check
@@ -48,16 +49,19 @@ def load_problem(name_or_path: str | os.PathLike[str]) -> Problem:
 
     Raises:
         UnknownNameError: No problem of that name, or no such suite or level; the message lists the known ones.
-        ParameterError: No such seed.
+        ParameterError: No such seed, or the rest of an id is no level and seed.
         MissingFileError: The file, or one that it names, cannot be read.
         FileFormatError: The file does not follow the schema.
     """
     text = os.fspath(name_or_path)
-    if Path(text).is_file() or text.endswith((".yaml", ".yml")):
+    if problems.is_id(text):
+        return problems.load(text)
+    if is_file(Path(text)) or text.endswith((".yaml", ".yml")):
         return Problem.load(text)
-    if os.sep in text and not problems.is_id(text):
-        return Problem.load(text)
-    return problems.load(text)
+    suite, *levels = text.split("/")
+    if levels and suite in problems.suites():
+        raise ParameterError("problem", text, f"an id such as {suite}/{problems.suites()[suite][0]}/12, or a file")
+    return Problem.load(text) if os.sep in text else problems.load(text)
 
 
 def setup(problem: Problem | str | os.PathLike[str]) -> og.SimpleSetup:

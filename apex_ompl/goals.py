@@ -22,6 +22,7 @@ Angles are in radians, lengths in metres.
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -155,6 +156,7 @@ class AlignmentGoal:
             )
         self._radial = self._lip_direction(held)
         self._data = robot.model.createData()
+        self._lock = threading.Lock()  # of the data
         self._inverse = Links.of(robot).inverse(self.targets(), self._hand_joints())
 
     def _face(self, field: str, named: str | WorldVector, held: Mapping[str, AttachedObject]) -> Face:
@@ -184,16 +186,24 @@ class AlignmentGoal:
 
     def faces(self, q: Array) -> tuple[Array, Array, Array, Array]:
         """Return p1, a1, p2, a2 in the world at a state, each of shape (3,)."""
-        pin.framesForwardKinematics(self.robot.model, self._data, self.robot.to_pinocchio(np.asarray(q, float)))
+        return self._faces(self._poses(q))
+
+    def _poses(self, q: Array) -> list[Array]:
+        """Return the poses of the two links in the world, shape (4, 4) each."""
+        with self._lock:
+            pin.framesForwardKinematics(self.robot.model, self._data, self.robot.to_pinocchio(np.asarray(q, float)))
+            return [np.array(self._data.oMf[frame].homogeneous) for frame in self._frames]
+
+    def _faces(self, poses: Sequence[Array]) -> tuple[Array, Array, Array, Array]:
         found: list[Array] = []
-        for face, frame in zip((self.first, self.second), self._frames, strict=True):
-            pose = self._pose(frame)
+        for face, pose in zip((self.first, self.second), poses, strict=True):
             found += [pose[:3, :3] @ face.point + pose[:3, 3], pose[:3, :3] @ face.axis]
         return found[0], found[1], found[2], found[3]
 
     def errors(self, q: Array) -> dict[str, float]:
         """Return the error terms at a state, shape (dof,): lengths [m] and angles [rad], none negative."""
-        p1, a1, p2, a2 = self.faces(q)
+        poses = self._poses(q)
+        p1, a1, p2, a2 = self._faces(poses)
         e = p2 - p1
         if self.alignment.kind == "pour":
             e = -e  # from the opening up to the lip
@@ -206,8 +216,7 @@ class AlignmentGoal:
                 "tilt": max(low - tilt, tilt - high, 0.0),
             }
             if self._radial is not None:
-                frame = self._frames[0]
-                out = self._pose(frame)[:3, :3] @ self._radial
+                out = poses[0][:3, :3] @ self._radial
                 errors["roll"] = angle(out, _lowest_direction(a1))
             return errors
         errors = {
@@ -265,9 +274,6 @@ class AlignmentGoal:
         limits = self.robot.limits
         ends: Array = self._inverse.descend(np.clip(q0, limits.lower, limits.upper)).states[0]
         return ends
-
-    def _pose(self, frame: int) -> Array:
-        return np.array(self._data.oMf[frame].homogeneous)
 
     def sample(self, verdict: Verdict, rng: np.random.Generator, count: int = 8, max_attempts: int = 200) -> Sampling:
         """Sample free states that satisfy the alignment, by descents from random restarts.

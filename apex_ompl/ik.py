@@ -11,6 +11,7 @@ import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
 from apex_ompl.collision.tabulate import joint_specs
+from apex_ompl.errors import UnknownNameError
 from apex_ompl.kernel import Fixed, Inverse, RobotTables, Target
 from apex_ompl.kernel.build import robot_tables, turn_to
 from apex_ompl.kernel.tables import FIXED
@@ -33,8 +34,10 @@ class Links:
         Raises:
             RobotError: A joint moves in a way that the kernel does not know.
         """
-        self.robot = robot
+        # The robot itself is not kept: `of` would keep it alive for good.
         specs = joint_specs(robot)
+        frames = (f for f in robot.model.frames if f.type == pin.FrameType.BODY)
+        self._placements = {f.name: (int(f.parentJoint), f.placement.copy()) for f in frames}
         self._turns = [turn_to(spec.axis if spec.kind != FIXED else None)[:3, :3] for spec in specs]
         limits = robot.limits
         self.tables: RobotTables = robot_tables(
@@ -72,8 +75,9 @@ class Links:
         return Inverse(self.tables, targets, fixed)
 
     def _placement(self, link: str) -> tuple[int, pin.SE3]:
-        frame = self.robot.model.frames[self.robot.link_frame(link)]
-        return int(frame.parentJoint), frame.placement
+        if link not in self._placements:
+            raise UnknownNameError("link", link, self._placements)
+        return self._placements[link]
 
 
 _known: WeakKeyDictionary[Robot, Links] = WeakKeyDictionary()

@@ -19,6 +19,7 @@ from apex_ompl.space import FULL_RESOLUTION
 Array = NDArray[np.float64]
 
 SHORTEST = 0.01  # time of a step of a path [s]
+MOST_PIECES = 1_000_000
 STEP = 0.005  # that obstacles move on while one place, grown by half of it, stands for them [m]
 
 
@@ -27,9 +28,9 @@ class TimedCheck:
     """Outcome of the check of a timed path.
 
     Attributes:
-        ok: Whether the path is a solution.
-        reason: One sentence about the first fault in time, empty when there is none.
-        time: When it is met at the latest [s], or None.
+        ok: Whether the path is inside the limits of positions and velocities, and free.
+        reason: One sentence about the first fault found, empty when there is none: limits are looked at first.
+        time: By when it is met [s], or None.
     """
 
     ok: bool
@@ -37,7 +38,7 @@ class TimedCheck:
     time: float | None = None
 
     def __bool__(self) -> bool:
-        """Whether the path is a solution."""
+        """Whether the path is inside the limits and free."""
         return self.ok
 
 
@@ -110,6 +111,8 @@ def timed_check(
         )
     movers = [o for o in problem.scene if o.moving]
     fastest = max((float(np.linalg.norm(o.velocity or (0, 0, 0))) for o in movers), default=0.0)
+    if fastest * times[-1] / STEP > MOST_PIECES:
+        raise ParameterError("times", float(times[-1]), f"an end at which no obstacle moved {MOST_PIECES * STEP:g} m")
     pieces = max(1, int(np.ceil(fastest * times[-1] / STEP)))
     cuts = np.linspace(0.0, times[-1], pieces + 1)
     scene = [grown(o, STEP / 2.0) if o.moving else o for o in problem.scene]
@@ -134,7 +137,12 @@ def even_times(robot: Robot, path: Array, pace: float) -> Array:
         robot: The robot.
         path: States, shape (N, dof).
         pace: Share of the velocity limits, in (0, 1].
+
+    Raises:
+        ParameterError: ``pace`` is not.
     """
+    if not 0.0 < pace <= 1.0:
+        raise ParameterError("pace", pace, "a share of the velocity limits, above 0 and at most 1")
     steps = (np.abs(np.diff(path, axis=0)) / robot.limits.velocity).max(axis=1) / pace
     times: Array = np.concatenate([[0.0], np.cumsum(np.maximum(steps, SHORTEST))])
     return times

@@ -3,7 +3,8 @@
 Runs are kept in a store as they end (JSON lines), so that the command goes on where it was stopped; the results are
 made of all runs in the store. On levels with moving obstacles planners see the scene of time 0, and what they find is
 followed at a quarter of the velocity limits among the moving obstacles: a run counts when nothing is hit. Of those
-levels 20 test problems are frozen; more are drawn, and may have no solution.
+levels 20 test problems are frozen; more are drawn, and may have no solution. A cube may be where the goal is at time
+0; such runs fail, and are counted as ``goal_blocked``.
 
 Usage: python benchmarks/calibration.py [-n 50] [--rrt 20] [--jobs 2] [--store FILE] [SUITE[/LEVEL] ...]
 """
@@ -68,7 +69,12 @@ def read(store: Path) -> dict[tuple[str, str], dict[str, Any]]:
     """Return the runs in a store by problem and planner."""
     if not store.is_file():
         return {}
-    runs = (json.loads(line) for line in store.read_text().splitlines())
+    runs = []
+    for line in store.read_text().splitlines():
+        try:
+            runs.append(json.loads(line))
+        except json.JSONDecodeError:  # the process ended while it wrote
+            continue
     return {(r["problem"], r["planner"]): r for r in runs}
 
 
@@ -80,10 +86,11 @@ def summary(runs: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
     lengths = [r["length"] for r in runs if r["solved"]]
     return {
         "n": len(runs),
+        "goal_blocked": sum(r["status"] == "INVALID_GOAL" for r in runs),
         "success": {str(limit): float((found <= limit).mean()) for limit in LIMITS},
         "found_s": [_percentile(found, p) for p in (50, 95)],
         "simplified_s": [_percentile(simplified, p) for p in (50, 95)],
-        "length_rad": record.percentiles(lengths, 50, 95),
+        "length_rad": record.percentiles(lengths, 50, 95) if lengths else [None, None],
     }
 
 
@@ -112,7 +119,7 @@ def table(figures: list[dict[str, Any]]) -> str:
             rows.append(
                 [*((figure["level"], f"{figure['line']:.2f}") if planner == "rrtconnect" else ("", "")), planner,
                  s["n"], *(f"{v:.2f}" for v in s["success"].values()), *map(_cell, s["found_s"]),
-                 *map(_cell, s["simplified_s"]), *(f"{v:.1f}" for v in s["length_rad"])]
+                 *map(_cell, s["simplified_s"]), *("-" if v is None else f"{v:.1f}" for v in s["length_rad"])]
             )  # fmt: skip
     return "\n".join(record.row(row) for row in rows)
 
@@ -127,6 +134,9 @@ def main() -> None:
     parser.add_argument("--store", type=Path, default=STORE)
     args = parser.parse_args()
     every = [f"{suite}/{level}" for suite, levels in problems.suites().items() for level in levels]
+    for name in args.levels:
+        if name not in every and name not in problems.suites():
+            raise SystemExit(f"unknown suite or level {name!r}; known: {', '.join(every)}")
     levels = [v for v in every if not args.levels or v in args.levels or v.split("/")[0] in args.levels]
     done = read(args.store)
     todo: list[tuple[str, str]] = []
@@ -138,12 +148,16 @@ def main() -> None:
     args.store.parent.mkdir(parents=True, exist_ok=True)
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(args.jobs, mp_context=context, initializer=warm_up) as pool, args.store.open("a") as out:
-        for k, future in enumerate(as_completed([pool.submit(run, job) for job in todo])):
+        jobs = {pool.submit(run, job): job for job in todo}
+        for k, future in enumerate(as_completed(jobs)):
+            if future.exception() is not None:
+                print(f"{jobs[future]}: {future.exception()}", flush=True)
+                continue
             out.write(json.dumps(future.result()) + "\n")
             out.flush()
             if (k + 1) % 100 == 0:
                 print(f"{k + 1} of {len(todo)} runs", flush=True)
-    figures = []
+    figures: list[dict[str, Any]] = []
     by_level: dict[str, list[dict[str, Any]]] = {}
     for (name, _), one in read(args.store).items():
         by_level.setdefault(name.rsplit("/", 1)[0], []).append(one)

@@ -41,6 +41,8 @@ def load(name: str) -> Problem:
         UnknownNameError: No such problem; the message lists the known ones.
         ParameterError: No such seed.
         SuiteError: No problem can be drawn for that seed.
+        MissingFileError: The file of a frozen problem cannot be read.
+        FileFormatError: The file of a frozen problem is not the one that was frozen.
     """
     from apex_ompl.problems.catalogue import ProblemId
 
@@ -62,8 +64,10 @@ def is_id(text: str) -> bool:
 def sample(suite: str, *, level: str, seed: int) -> Problem:
     """Return a problem of a suite; the same seed gives the same problem.
 
-    Start and goal are free by a margin of 1 cm. Frozen problems, the first ones of validation and test, are read and
-    have a witness; others are drawn now, and may be impossible to solve.
+    Start and goal are free by a margin of 1 cm; held objects may be closer to each other at the goal, where they meet.
+    A moving obstacle leaves the start free at time 0, and the goal when the straight line gets there at a quarter of
+    the velocity limits; earlier it may be in the place of the goal. Frozen problems, the first ones of validation and
+    test, are read and have a witness; others are drawn now, and may be impossible to solve.
 
     Args:
         suite: See :func:`suites`.
@@ -74,6 +78,7 @@ def sample(suite: str, *, level: str, seed: int) -> Problem:
         UnknownNameError: No such suite or level.
         ParameterError: No such seed.
         SuiteError: No problem can be drawn for that seed.
+        MissingFileError: The file of a frozen problem cannot be read.
         FileFormatError: The file of a frozen problem is not the one that was frozen.
     """
     from apex_ompl.problems import frozen
@@ -103,6 +108,8 @@ def witness(name: str) -> Witness:
 
     Raises:
         ParameterError: The problem is not a frozen one.
+        MissingFileError: Its file cannot be read.
+        FileFormatError: Its file is not the one that was frozen.
     """
     from apex_ompl.problems import frozen
     from apex_ompl.problems.catalogue import ProblemId

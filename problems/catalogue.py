@@ -25,7 +25,7 @@ LEVELS: dict[str, tuple[str, ...]] = {
 }
 """Suite -> its levels."""
 
-ID = re.compile(r"([A-Za-z_]+)/([a-z]+(?:-[a-z]+-[0-9.]+)?)/(\d+)")
+ID = re.compile(r"([A-Za-z_]+)/([A-Za-z0-9_.-]+)/(0|[1-9][0-9]{0,19})")
 
 
 class SuiteError(ApexError):
@@ -53,10 +53,10 @@ class ProblemId:
             UnknownNameError: No such suite or level.
             ParameterError: The seed is none.
         """
-        if self.suite not in LEVELS:
-            raise UnknownNameError("suite", self.suite, LEVELS)
-        if self.level not in LEVELS[self.suite]:
-            raise UnknownNameError(f"level of {self.suite}", self.level, LEVELS[self.suite])
+        if not isinstance(self.suite, str) or self.suite not in LEVELS:
+            raise UnknownNameError("suite", str(self.suite), LEVELS)
+        if not isinstance(self.level, str) or self.level not in LEVELS[self.suite]:
+            raise UnknownNameError(f"level of {self.suite}", str(self.level), LEVELS[self.suite])
         whole = isinstance(self.seed, (int, np.integer)) and not isinstance(self.seed, bool)
         if not whole or not 0 <= self.seed < SPLITS["test"].stop:
             raise ParameterError("seed", self.seed, f"a whole number from 0 to {SPLITS['test'].stop - 1}")
@@ -73,6 +73,8 @@ class ProblemId:
     @classmethod
     def parse(cls, text: str) -> ProblemId | None:
         """Return what a name of the form ``suite/level/seed`` stands for, or None for names of another form.
+
+        The seed has no leading zeros: a problem has one name.
 
         Raises:
             UnknownNameError: No such suite or level.

@@ -11,6 +11,7 @@ from __future__ import annotations
 import hashlib
 import json
 import lzma
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -20,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apex_ompl.errors import FileFormatError, MissingFileError
+from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError
 from apex_ompl.problem import Problem, located
 from apex_ompl.problems.catalogue import LEVELS, SPLITS, ProblemId
 from apex_ompl.problems.objects import DATA
@@ -91,25 +92,30 @@ def load(which: ProblemId) -> Frozen:
     """Return a frozen problem.
 
     Raises:
-        MissingFileError: Its file is missing.
-        FileFormatError: Its file is not the one that was frozen.
+        MissingFileError: Its file cannot be read.
+        FileFormatError: Its file is not the one that was frozen, or holds something else.
     """
-    head, rows = _file(which.suite, which.level)
+    path = FOLDER / _name(which.suite, which.level)
+    head, rows = _file(path, which.suite, which.level)
     if which.seed not in rows:
-        raise FileFormatError(_name(which.suite, which.level), "problems", which.seed, "expected the frozen seeds")
+        raise FileFormatError(str(path), "problems", f"none with seed {which.seed}", "expected the frozen seeds")
     row, joints = rows[which.seed], head["joints"]
-    held = [{**body} for body in head["held"][row["held"]]]
-    start, goal = (dict(zip(joints, row[key], strict=True)) for key in ("start", "goal"))
-    fields = {
-        "schema": "apex-ompl/problem/1", "name": str(which), "robot": head["robot"], "scene": row["scene"],
-        "attached": held, "start": start, "goal": {"joints": goal},
-    }  # fmt: skip
-    problem = validate(Problem, fields, str(which))
+    try:
+        start, goal = (dict(zip(joints, row[key], strict=True)) for key in ("start", "goal"))
+        fields = {
+            "schema": "apex-ompl/problem/1", "name": str(which), "robot": head["robot"], "scene": row["scene"],
+            "attached": head["held"][row["held"]], "start": start, "goal": {"joints": goal},
+        }  # fmt: skip
+        inner = np.array(row["path"], float).reshape(-1, len(joints)) * GRAIN
+        states = np.concatenate([[row["start"]], inner, [row["goal"]]])
+        times = np.array(row["times"], float) * TICK if "times" in row else None
+        number = int(row["draw"])
+    except (KeyError, IndexError, TypeError, ValueError) as error:
+        seed = f"problems, seed {which.seed}"
+        raise FileFormatError(str(path), seed, repr(error), "expected a problem and its witness") from error
+    problem = validate(Problem, fields, f"{path}, {which}")
     problem = problem.model_copy(update={"attached": tuple(located(body, DATA) for body in problem.attached)})
-    inner = np.array(row["path"], float).reshape(-1, len(joints)) * GRAIN
-    path = np.concatenate([[row["start"]], inner, [row["goal"]]])
-    times = np.array(row["times"], float) * TICK if "times" in row else None
-    return Frozen(problem, Witness(path, times), row["draw"])
+    return Frozen(problem, Witness(states, times), number)
 
 
 def exists(suite: str, level: str) -> bool:
@@ -117,7 +123,7 @@ def exists(suite: str, level: str) -> bool:
     return (FOLDER / _name(suite, level)).is_file()
 
 
-def save(suite: str, level: str, frozen: Mapping[int, Frozen], dropped: int) -> int:
+def save(suite: str, level: str, frozen: Mapping[int, Frozen], dropped: int, *, replace: bool = False) -> int:
     """Write the frozen problems of a suite and level, by seed, and the hash of their file.
 
     Args:
@@ -125,10 +131,16 @@ def save(suite: str, level: str, frozen: Mapping[int, Frozen], dropped: int) -> 
         level: Its level.
         frozen: The problems.
         dropped: How many draws were left out because no witness was found.
+        replace: Whether a file that exists may be replaced; results refer to what it holds.
 
     Returns:
         The size of the file in bytes.
+
+    Raises:
+        ParameterError: The file exists, and is not to be replaced.
     """
+    if exists(suite, level) and not replace:
+        raise ParameterError("replace", replace, f"True, since {_name(suite, level)} exists")
     some = robot()
     held: list[Any] = []
     rows = []
@@ -184,24 +196,47 @@ def _name(suite: str, level: str) -> str:
 
 
 def _sums() -> dict[str, str]:
+    """Return the hashes by name of file; the form is that of ``sha256sum``.
+
+    Raises:
+        MissingFileError: The file of hashes is there and cannot be read.
+        FileFormatError: It holds something else.
+    """
     path = FOLDER / SUMS
-    if not path.is_file():
-        return {}
-    pairs = (line.split() for line in path.read_text().splitlines())
-    return {name: value for value, name in pairs}
+    found: dict[str, str] = {}
+    for line in _content(path).decode(errors="replace").splitlines() if path.exists() else ():
+        match = re.fullmatch(r"([0-9a-f]{64})  (\S+)", line)
+        if match is None or match[2] in found:
+            raise FileFormatError(str(path), "", line, "expected a hash, two blanks and a name, each name once")
+        found[match[2]] = match[1]
+    return found
+
+
+def _content(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise MissingFileError(str(path), "file of frozen problems", error.strerror or str(error)) from error
 
 
 @lru_cache(maxsize=8)
-def _file(suite: str, level: str) -> tuple[dict[str, Any], dict[int, dict[str, Any]]]:
-    path = FOLDER / _name(suite, level)
-    if not path.is_file():
-        raise MissingFileError(str(path), "file of frozen problems")
-    content = path.read_bytes()
+def _file(path: Path, suite: str, level: str) -> tuple[dict[str, Any], dict[int, dict[str, Any]]]:
+    content = _content(path)
     found, wanted = hashlib.sha256(content).hexdigest(), _sums().get(path.name, "")
     if found != wanted:
         raise FileFormatError(str(path), "SHA-256", found[:16], f"expected {wanted[:16] or 'an entry in ' + SUMS}")
-    data = json.loads(lzma.decompress(content))
-    rows = {row["seed"]: row for row in data.pop("problems")}
+    try:
+        data = json.loads(lzma.decompress(content))
+        listed = data.pop("problems")
+        rows = {row["seed"]: row for row in listed}
+    except (lzma.LZMAError, ValueError, TypeError, KeyError, AttributeError) as error:
+        raise FileFormatError(str(path), "", repr(error), "expected frozen problems (JSON, LZMA)") from error
+    head = {"schema": SCHEMA, "suite": suite, "level": level, "robot": ROBOT, "joints": list(robot().joint_names)}
+    for field, expected in head.items():
+        if data.get(field) != expected:
+            raise FileFormatError(str(path), field, data.get(field), f"expected {expected!r}")
+    if len(rows) != len(listed) or not isinstance(data.get("held"), list):
+        raise FileFormatError(str(path), "problems", len(listed), "expected each seed once, and a list of held objects")
     return data, rows
 
 

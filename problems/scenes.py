@@ -201,7 +201,7 @@ def swap(rng: np.random.Generator, level: str) -> Draft:
 
 
 def clutter(rng: np.random.Generator, level: str) -> Draft:
-    """Ten to thirty boxes, balls, cylinders and capsules of 4 to 20 cm; the hands go across."""
+    """Ten to thirty boxes, balls, cylinders and capsules, 4 cm to half a metre long; the hands go across."""
     count, longest, scene = *{"easy": (10, 0.2), "medium": (20, 0.3), "hard": (30, 0.4)}[level], []
     for k in range(count):
         turn = rng.normal(size=4)

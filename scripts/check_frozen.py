@@ -1,4 +1,4 @@
-"""Check all frozen problems: hashes, start and goal, and every witness by the full check; count redrawn ones.
+"""Check all frozen problems: hashes, start, goal and witness; and whether they are drawn the same again.
 
 Usage: python scripts/check_frozen.py [--redraw 0] [SUITE[/LEVEL] ...]
 """
@@ -7,8 +7,11 @@ from __future__ import annotations
 
 import argparse
 
+import numpy as np
+
 from apex_ompl import problems
 from apex_ompl.assembly import assemble
+from apex_ompl.errors import ApexError
 from apex_ompl.moving import timed_check
 from apex_ompl.problems import frozen
 from apex_ompl.problems.catalogue import ProblemId, first_draw
@@ -18,8 +21,15 @@ from apex_ompl.validity import full_check
 
 def fault(name: str) -> str:
     """Return what is wrong with a frozen problem or its witness, or an empty text."""
-    problem, witness = problems.load(name), problems.witness(name)
+    try:
+        problem, witness = problems.load(name), problems.witness(name)
+    except ApexError as error:
+        return str(error)
     if witness.times is not None:
+        names = robot().joint_names
+        ends = [problem.start_state(names), problem.goal_states(names)[0]]
+        if not np.array_equal(witness.path[[0, -1]], ends):
+            return "the witness does not go from start to goal"
         return timed_check(robot(), problem, witness.path, witness.times).reason
     ready = assemble(problem)
     faults = (ready.start_fault, *ready.goal_faults)
@@ -32,6 +42,10 @@ def main() -> None:
     parser.add_argument("levels", nargs="*", metavar="SUITE[/LEVEL]")
     parser.add_argument("--redraw", type=int, default=0, metavar="N", help="draw N of each level anew, and compare")
     args = parser.parse_args()
+    every = [f"{suite}/{level}" for suite, level in frozen.files()]
+    for name in args.levels:
+        if name not in every and name not in problems.suites():
+            raise SystemExit(f"unknown suite or level {name!r}; known: {', '.join(every)}")
     faults = count = same = redrawn = 0
     for suite, level in frozen.files():
         if args.levels and suite not in args.levels and f"{suite}/{level}" not in args.levels:
@@ -48,7 +62,7 @@ def main() -> None:
         faults, count = faults + len(found), count + len(names)
         print(f"{suite}/{level}: {len(names) - len(found)} of {len(names)} sound", flush=True)
     print(f"{count - faults} of {count} frozen problems sound; {same} of {redrawn} redrawn the same")
-    raise SystemExit(1 if faults else 0)
+    raise SystemExit(1 if faults or same < redrawn else 0)
 
 
 if __name__ == "__main__":

@@ -133,17 +133,29 @@ def main() -> None:
     parser.add_argument("--replace", action="store_true", help="draw levels again whose files exist")
     parser.add_argument("--jobs", type=int, default=2)
     args = parser.parse_args()
-    wanted = [tuple(name.split("/")) for name in args.levels] or list(frozen.files())
+    every = {f"{suite}/{level}": (suite, level) for suite, level in frozen.files()}
+    for name in args.levels:
+        if name not in every:
+            raise SystemExit(f"unknown level {name!r}; known: {', '.join(every)}")
+    wanted = [every[name] for name in args.levels or every]
     todo = [pair for pair in wanted if args.replace or not frozen.exists(*pair)]
     todo.sort(key=lambda pair: pair[1] not in ("hard", "medium"))  # what takes longest first
+    failed = 0
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(args.jobs, mp_context=context) as pool:
         jobs = {pool.submit(freeze, pair): pair for pair in todo}
         for job in as_completed(jobs):
-            found, dropped, spent = job.result()
-            size = frozen.save(*jobs[job], found, dropped)
+            name = "/".join(jobs[job])
+            try:
+                found, dropped, spent = job.result()
+                size = frozen.save(*jobs[job], found, dropped, replace=args.replace)
+            except Exception as error:  # the other levels go on
+                failed += 1
+                print(f"{name}: {error!r}", flush=True)
+                continue
             said = f"{len(found)} problems, {dropped} draws without a witness, {size} bytes, {spent:.0f} s"
-            print(f"{'/'.join(jobs[job])}: {said}", flush=True)
+            print(f"{name}: {said}", flush=True)
+    raise SystemExit(1 if failed else 0)
 
 
 if __name__ == "__main__":

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import hashlib
+import json
+import lzma
 import shutil
 from pathlib import Path
 
@@ -14,9 +16,11 @@ from apex_ompl import problems
 from apex_ompl.collision import Verdict
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError, UnknownNameError
 from apex_ompl.moving import timed_check
+from apex_ompl.problem import Obstacle
 from apex_ompl.problems import frozen
 from apex_ompl.problems.catalogue import ProblemId
 from apex_ompl.robot import Robot
+from apex_ompl.space import resample
 from apex_ompl.validity import full_check
 
 FOLDER = ROOT / "problems" / "frozen"
@@ -42,7 +46,7 @@ def test_the_first_problems_of_validation_and_test_are_frozen(robot: Robot, suit
     digests = set()
     for name in (*names[0], *names[1]):
         problem, witness = problems.load(name), problems.witness(name)
-        digests.add(frozen.digest(problem))
+        digests.add(frozen.digest(problem.model_copy(update={"name": "any"})))
         assert problem.name == name and bool(problem.moving) == level.startswith("moving-")
         assert np.array_equal(witness.path[0], problem.start_state(robot.joint_names))
         assert np.array_equal(witness.path[-1], problem.goal_states(robot.joint_names)[0])
@@ -58,9 +62,10 @@ def test_witnesses_pass_the_full_check(robot: Robot, suite: str, level: str) -> 
         verdict = Verdict(robot, problem.scene, problem.attached)
         check = full_check(verdict, witness.path, witness.path[0], problem.goal_states(robot.joint_names))
         assert check, check.reason
-        broken = witness.path.copy()
-        broken[len(broken) // 2, 1] += 3.0
-        assert not full_check(verdict, broken, witness.path[0], [witness.path[-1]])
+        # An obstacle in the way of the right palm, in the middle of the path, is met.
+        at = robot.link_pose(resample(witness.path, 3)[1], "right_hand_palm")[:3, 3]
+        verdict.add(Obstacle(name="in_the_way", sphere={"radius": 0.03}, position=tuple(at)))
+        assert "in_the_way" in full_check(verdict, witness.path, witness.path[0], [witness.path[-1]]).reason
 
 
 @pytest.mark.parametrize(("suite", "level"), MOVING)
@@ -87,6 +92,8 @@ def test_what_is_saved_is_what_is_loaded(copied: Path) -> None:
     some = {seed: frozen.load(ProblemId("vertical", "small", seed)) for seed in seeds}
     (copied / "vertical-small.json.xz").unlink()
     frozen.save("vertical", "small", some, 3)
+    with pytest.raises(ParameterError, match="vertical-small.json.xz exists"):
+        frozen.save("vertical", "small", some, 3)
     for seed, item in some.items():
         again = frozen.load(ProblemId("vertical", "small", seed))
         assert again.problem == item.problem and again.number == item.number
@@ -106,6 +113,61 @@ def test_a_changed_or_missing_file_is_named_and_nothing_is_drawn_instead(copied:
     with pytest.raises(MissingFileError, match="swap-easy.json.xz"):
         problems.sample("swap", level="easy", seed=900_003)
     assert problems.load("swap/easy/900100").name == "swap/easy/900100"  # behind the frozen ones it is drawn
+
+
+def changed_file(copied: Path, change) -> None:
+    """Put something else into a file of frozen problems, and its hash among the others."""
+    file = copied / "swap-easy.json.xz"
+    data = json.loads(lzma.decompress(file.read_bytes()))
+    content = change(data)
+    content = content if isinstance(content, bytes) else lzma.compress(json.dumps(content).encode())
+    file.write_bytes(content)
+    (copied / "SHA256SUMS").write_text(f"{hashlib.sha256(content).hexdigest()}  swap-easy.json.xz\n")
+    frozen.forget()
+
+
+def first_row(change) -> object:
+    def apply(data: dict) -> dict:
+        change(next(row for row in data["problems"] if row["seed"] == 900_000))
+        return data
+
+    return apply
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda data: b"not xz", "LZMA"),
+        (lambda data: lzma.compress(b"{"), "JSON"),
+        (lambda data: [], "JSON"),
+        (lambda data: {**data, "schema": "apex-ompl/frozen/9"}, "schema"),
+        (lambda data: {**data, "level": "hard"}, "level"),
+        (lambda data: {**data, "robot": "baxter"}, "robot"),
+        (lambda data: {**data, "joints": ["a"]}, "joints"),
+        (lambda data: {**data, "problems": data["problems"] * 2}, "once"),
+        (lambda data: {**data, "held": None}, "held"),
+        (lambda data: {**data, "problems": data["problems"][1:2]}, "none with seed 900000"),
+        (first_row(lambda row: row.pop("draw")), "seed 900000"),
+        (first_row(lambda row: row.update(held=7)), "seed 900000"),
+        (first_row(lambda row: row["start"].pop()), "seed 900000"),
+        (first_row(lambda row: row["path"].append([1])), "900000"),
+        (first_row(lambda row: row.update(scene=[{"name": "x"}])), "scene"),
+    ],
+)
+def test_a_damaged_file_with_a_right_hash_is_one_sentence(copied: Path, change, said: str) -> None:
+    changed_file(copied, change)
+    with pytest.raises(FileFormatError, match=said) as caught:
+        problems.load("swap/easy/900000")
+    assert "swap-easy.json.xz" in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("line", ["one", "a b c", f"{'0' * 64}  swap-easy.json.xz"])
+def test_a_damaged_file_of_hashes_is_named(copied: Path, line: str) -> None:
+    with (copied / "SHA256SUMS").open("a") as file:
+        file.write(line + "\n")
+    frozen.forget()
+    with pytest.raises(FileFormatError, match="SHA256SUMS"):
+        problems.load("swap/easy/900000")
 
 
 def test_only_frozen_problems_have_witnesses() -> None:

@@ -1,5 +1,8 @@
 from __future__ import annotations
 
+import gc
+import weakref
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -8,7 +11,7 @@ from hypothesis import strategies as st
 from apex_ompl.errors import ParameterError, UnknownNameError
 from apex_ompl.ik import Links, in_world
 from apex_ompl.kernel import Target, facing, gap, slope
-from apex_ompl.robot import Robot
+from apex_ompl.robot import Robot, load_robot
 
 LINKS = {
     "dual_panda_softhand": ("right_hand_index_distal", "left_link5"),  # a finger that follows a synergy, and an arm
@@ -124,7 +127,24 @@ def test_bad_input_is_named(robot: Robot) -> None:
         links.inverse([])
     with pytest.raises(ParameterError, match="states"):
         links.inverse([targets_and_residual(robot, "gap")[0]]).descend(np.zeros(3))
+    inverse = links.inverse([targets_and_residual(robot, "gap")[0]])
+    for wrong in (np.zeros(3), np.zeros(17), np.zeros((1, 16)), np.zeros(0)):
+        with pytest.raises(ParameterError, match="state"):
+            inverse.residual(wrong)
+    with pytest.raises(ParameterError, match="fixed"):
+        links.inverse([targets_and_residual(robot, "gap")[0]], fixed=[16])
+    for whole, parts in (((0, 0, 1), (0.0,) * 11), ((3, 0, 1, 0), (0.0,) * 11), ((0, 0, 1, 0), (0.0,) * 3)):
+        with pytest.raises(ParameterError, match="target"):
+            Target(whole, parts)
     bad = robot.home.copy()
     bad[0] = np.nan
     target = pose_targets(robot, "left_hand_palm", robot.link_pose(robot.home, "left_hand_palm"))
     assert not links.inverse(target).descend(bad).errors[0] <= 1.0
+
+
+def test_links_do_not_keep_their_robot_alive() -> None:
+    some = load_robot("baxter")
+    kept, _ = weakref.ref(some), Links.of(some)
+    del some
+    gc.collect()
+    assert kept() is None

@@ -19,7 +19,7 @@ from support import ROOT, states_around_home
 
 from apex_ompl.collision import Verdict
 from apex_ompl.collision.tabulate import joint_specs, primitives
-from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError
+from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError, UnknownNameError
 from apex_ompl.kernel import build, entries, views
 from apex_ompl.kernel.face import Kernel
 from apex_ompl.kernel.scene import scene_tables
@@ -475,3 +475,16 @@ def test_a_pair_can_be_left_out(robot: Robot) -> None:
     assert smaller.unproved(q)[1][0] == 0 and smaller.clearance(q)[0, 1] > 0.0
     for other in states_around_home(robot, np.random.default_rng(5), 50):  # elsewhere nothing changes
         assert np.array_equal(smaller.clearance(other), whole.clearance(other))
+    right = [k for k, name in enumerate(robot.joint_names) if name.startswith("right")]
+    one, other_order = whole.robot.judging(right).without_pair(a, b), whole.robot.without_pair(a, b).judging(right)
+    for state in states_around_home(robot, np.random.default_rng(6), 50, 1.0):
+        values = [
+            Kernel(tables, whole.scene).clearance(state) for tables in (one, other_order, whole.robot.judging(right))
+        ]
+        assert np.array_equal(values[0], values[1]) and np.array_equal(
+            values[0], values[2]
+        )  # the pair is not of one side
+    with pytest.raises(UnknownNameError, match="body"):
+        whole.robot.without_pair("no_such_body", a)
+    with pytest.raises(ParameterError, match="joints"):
+        whole.robot.judging([99])

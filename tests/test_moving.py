@@ -121,6 +121,15 @@ def test_wrong_arguments_are_named(robot: Robot, path: np.ndarray, times: list[f
         timed_check(robot, problem_with(robot), path, times)
 
 
+def test_what_takes_too_long_and_paces_that_are_none_are_named(robot: Robot) -> None:
+    ball = Obstacle(name="ball", sphere={"radius": 0.1}, position=(2.0, 0.0, 0.5), velocity=(0.1, 0.0, 0.0))
+    with pytest.raises(ParameterError, match="times"):
+        timed_check(robot, problem_with(robot, ball), np.stack([robot.home, robot.home]), [0.0, 1e10])
+    for pace in (0.0, -1.0, np.nan, 1.5):
+        with pytest.raises(ParameterError, match="pace"):
+            even_times(robot, np.stack([robot.home, robot.home]), pace)
+
+
 def test_limits_and_shapes_that_cannot_be_grown_are_named(robot: Robot) -> None:
     path = np.stack([robot.home, robot.home])
     path[1, 3] = 0.5

@@ -18,7 +18,7 @@ from apex_ompl.kernel.tables import FIXED, REVOLUTE, Floats, Integers, RobotArra
 from apex_ompl.kernel.views import Work, robot_view, work_view
 
 GAP, FACING, SLOPE = range(3)
-A, B, C, NUMBER, WEIGHT = 0, 3, 6, 9, 10  # where the parts of a target are
+A, B, C, NUMBER, WEIGHT, PARTS = 0, 3, 6, 9, 10, 11  # where the parts of a target are, and how many
 MOST_DAMPING = 1e6
 
 

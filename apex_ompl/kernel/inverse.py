@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from apex_ompl.errors import ParameterError
-from apex_ompl.kernel.descent import FACING, GAP, SLOPE, descend, residual
+from apex_ompl.kernel.descent import FACING, GAP, PARTS, SLOPE, descend, residual
 from apex_ompl.kernel.tables import RobotTables
 from apex_ompl.kernel.views import room
 
@@ -35,6 +35,19 @@ class Target:
 
     whole: tuple[int, int, int, int]
     parts: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        """Check what the compiled code trusts.
+
+        Raises:
+            ParameterError: Not four whole numbers, the kind first, or not eleven parts.
+        """
+        if len(self.whole) != 4 or self.whole[0] not in (GAP, FACING, SLOPE):
+            raise ParameterError("target", self.whole, "a kind and three joints")
+        if any(isinstance(j, bool) or not isinstance(j, (int, np.integer)) for j in self.whole):
+            raise ParameterError("target", self.whole, "whole numbers of joints")
+        if len(self.parts) != PARTS:
+            raise ParameterError("target", self.parts, f"{PARTS} parts")
 
     @property
     def rows(self) -> int:
@@ -92,6 +105,8 @@ class Inverse:
         joints = sorted({j for target in targets for j in target.whole[1:]})
         if not joints or joints[0] < 0 or joints[-1] >= len(arrays.joint_parent):
             raise ParameterError("targets", joints, f"targets on joints 0 to {len(arrays.joint_parent) - 1}")
+        if any(k not in range(robot.dof) for k in fixed):
+            raise ParameterError("fixed", list(fixed), f"numbers of planned joints, 0 to {robot.dof - 1}")
         self.robot = robot
         self.targets = tuple(targets)
         self.rows = sum(target.rows for target in targets)
@@ -112,8 +127,14 @@ class Inverse:
         return np.empty(self._room[0], np.int64), np.empty(self._room[1])
 
     def residual(self, q: Array) -> tuple[Array, Array]:
-        """Return the residual at a state, shape (m,), and its Jacobian, shape (m, dof), of all planned joints."""
+        """Return the residual at a state, shape (m,), and its Jacobian, shape (m, dof), of all planned joints.
+
+        Raises:
+            ParameterError: Another shape.
+        """
         q = np.require(q, float, ["C", "W"])
+        if q.shape != (self.robot.dof,):
+            raise ParameterError("state", q.shape, f"an array of shape ({self.robot.dof},)")
         values, rows = np.empty(self.rows), np.empty((self.rows, len(q)))
         work = np.empty((4, max(len(q), 3)))
         residual(
@@ -133,6 +154,9 @@ class Inverse:
         self, states: ArrayLike, *, tolerance: float = 1e-4, max_steps: int = 100, damping: float = 1e-2
     ) -> Descents:
         """Descend from states by damped least squares (Levenberg-Marquardt), clipped to the limits.
+
+        A state that is not finite in a joint that the targets depend on gets an error that is not finite; other joints
+        stay as they are.
 
         Args:
             states: First states, shape (N, dof).

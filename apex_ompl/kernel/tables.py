@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from apex_ompl.errors import FileFormatError, MissingFileError
+from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError, UnknownNameError
 from apex_ompl.schema import is_file, write_atomically
 
 Floats = NDArray[np.float64]
@@ -164,7 +164,12 @@ class RobotTables:
 
         Args:
             joints: Numbers of planned joints.
+
+        Raises:
+            ParameterError: There is no such joint.
         """
+        if any(k not in range(self.dof) for k in joints):
+            raise ParameterError("joints", list(joints), f"numbers of planned joints, 0 to {self.dof - 1}")
         a, mine = self.arrays, {int(k) for k in joints}
         movers: list[set[int]] = []  # of each joint; parents come first
         for parent, source in zip(a.joint_parent, a.joint_source, strict=True):
@@ -183,13 +188,19 @@ class RobotTables:
         return RobotTables(self.name, self.joint_names, self.body_names, self.numbers, arrays)
 
     def without_pair(self, first: str, second: str) -> RobotTables:
-        """Return tables that do not judge two bodies, by their names, against each other."""
+        """Return tables that do not judge two bodies, by their names, against each other.
+
+        Raises:
+            UnknownNameError: No such body.
+        """
         a = self.arrays
+        for name in (first, second):
+            if name not in self.body_names:
+                raise UnknownNameError("body", name, self.body_names)
         both = {self.body_names.index(first), self.body_names.index(second)}
         kept = np.array([set(row) != both for row in a.bodies.tolist()], bool)
-        counts = [int(kept[k : k + n].sum()) for k, n in a.pair_bodies]
-        firsts = np.cumsum([0, *counts])[:-1]
-        spans = np.stack([firsts, np.array(counts, int)], axis=1).astype(np.int64).reshape(-1, 2)
+        before = np.concatenate([[0], np.cumsum(kept)])
+        spans = np.array([(before[k], before[k + n] - before[k]) for k, n in a.pair_bodies], np.int64).reshape(-1, 2)
         arrays = a._replace(pair_bodies=spans, bodies=a.bodies[kept])
         return RobotTables(self.name, self.joint_names, self.body_names, self.numbers, arrays)
 
