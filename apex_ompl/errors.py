@@ -9,10 +9,21 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable
+from typing import Any
 
 
 class ApexError(Exception):
-    """Root of all errors raised on purpose by this package."""
+    """Root of all errors raised on purpose by this package; it can be sent between processes."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Return what pickling needs: the sentence and the attributes, as the constructors take other arguments."""
+        return _rebuilt, (type(self), self.args, self.__dict__)
+
+
+def _rebuilt(kind: type[ApexError], args: tuple[Any, ...], attributes: dict[str, Any]) -> ApexError:
+    error = kind.__new__(kind, *args)
+    error.__dict__.update(attributes)
+    return error
 
 
 def nearest_name(name: str, known: Iterable[str]) -> str | None:

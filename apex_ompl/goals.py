@@ -186,7 +186,10 @@ class AlignmentGoal:
 
     def faces(self, q: Array) -> tuple[Array, Array, Array, Array]:
         """Return p1, a1, p2, a2 in the world at a state, each of shape (3,)."""
-        return self._faces(self._poses(q))
+        found: list[Array] = []
+        for face, pose in zip((self.first, self.second), self._poses(q), strict=True):
+            found += [pose[:3, :3] @ face.point + pose[:3, 3], pose[:3, :3] @ face.axis]
+        return found[0], found[1], found[2], found[3]
 
     def _poses(self, q: Array) -> list[Array]:
         """Return the poses of the two links in the world, shape (4, 4) each."""
@@ -194,16 +197,9 @@ class AlignmentGoal:
             pin.framesForwardKinematics(self.robot.model, self._data, self.robot.to_pinocchio(np.asarray(q, float)))
             return [np.array(self._data.oMf[frame].homogeneous) for frame in self._frames]
 
-    def _faces(self, poses: Sequence[Array]) -> tuple[Array, Array, Array, Array]:
-        found: list[Array] = []
-        for face, pose in zip((self.first, self.second), poses, strict=True):
-            found += [pose[:3, :3] @ face.point + pose[:3, 3], pose[:3, :3] @ face.axis]
-        return found[0], found[1], found[2], found[3]
-
     def errors(self, q: Array) -> dict[str, float]:
         """Return the error terms at a state, shape (dof,): lengths [m] and angles [rad], none negative."""
-        poses = self._poses(q)
-        p1, a1, p2, a2 = self._faces(poses)
+        p1, a1, p2, a2 = self.faces(q)
         e = p2 - p1
         if self.alignment.kind == "pour":
             e = -e  # from the opening up to the lip
@@ -216,7 +212,7 @@ class AlignmentGoal:
                 "tilt": max(low - tilt, tilt - high, 0.0),
             }
             if self._radial is not None:
-                out = poses[0][:3, :3] @ self._radial
+                out = self._poses(q)[0][:3, :3] @ self._radial
                 errors["roll"] = angle(out, _lowest_direction(a1))
             return errors
         errors = {

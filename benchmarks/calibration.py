@@ -6,7 +6,7 @@ followed at a quarter of the velocity limits among the moving obstacles: a run c
 levels 20 test problems are frozen; more are drawn, and may have no solution. A cube may be where the goal is at time
 0; such runs fail, and are counted as ``goal_blocked``.
 
-Usage: python benchmarks/calibration.py [-n 50] [--rrt 20] [--jobs 2] [--store FILE] [SUITE[/LEVEL] ...]
+Usage: python benchmarks/calibration.py [-n 50] [--rrt 20] [--jobs 2] [--store FILE] [--report] [SUITE[/LEVEL] ...]
 """
 
 from __future__ import annotations
@@ -114,8 +114,7 @@ def table(figures: list[dict[str, Any]]) -> str:
     head += ["found s p50", "p95", "simplified s p50", "p95", "length rad p50", "p95"]
     rows = [head, ["---", "---:", "---", *["---:"] * (len(head) - 3)]]
     for figure in figures:
-        for planner in ("rrtconnect", "rrt"):
-            s = figure[planner]
+        for planner, s in figure["planners"].items():
             rows.append(
                 [*((figure["level"], f"{figure['line']:.2f}") if planner == "rrtconnect" else ("", "")), planner,
                  s["n"], *(f"{v:.2f}" for v in s["success"].values()), *map(_cell, s["found_s"]),
@@ -132,6 +131,7 @@ def main() -> None:
     parser.add_argument("--rrt", type=int, default=20, help="problems for rrt (default: %(default)s)")
     parser.add_argument("--jobs", type=int, default=2, help="processes (default: %(default)s)")
     parser.add_argument("--store", type=Path, default=STORE)
+    parser.add_argument("--report", action="store_true", help="run nothing; write the results of what the store holds")
     args = parser.parse_args()
     every = [f"{suite}/{level}" for suite, levels in problems.suites().items() for level in levels]
     for name in args.levels:
@@ -145,6 +145,8 @@ def main() -> None:
         for planner, count in ((LINE, max(frozen, args.n)), ("rrtconnect", args.n), ("rrt", args.rrt)):
             names = [f"{level}/{FIRST + k}" for k in range(count)]
             todo += [(name, planner) for name in names if (name, planner) not in done]
+    todo.sort(key=lambda job: (job[1] == "rrt", "moving" in job[0]))  # rrt, which takes most of the time, last
+    todo = [] if args.report else todo
     args.store.parent.mkdir(parents=True, exist_ok=True)
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(args.jobs, mp_context=context, initializer=warm_up) as pool, args.store.open("a") as out:
@@ -164,16 +166,10 @@ def main() -> None:
     for level in every:
         mine = by_level.get(level, [])
         of = {p: [r for r in mine if r["planner"] == p] for p in (LINE, "rrtconnect", "rrt")}
-        if all(of.values()):
+        if of[LINE]:
             line = float(np.mean([r["solved"] for r in of[LINE]]))
-            figures.append(
-                {
-                    "level": level,
-                    "line": line,
-                    "line_n": len(of[LINE]),
-                    **{p: summary(of[p]) for p in ("rrtconnect", "rrt")},
-                }
-            )
+            planners = {p: summary(of[p]) for p in ("rrtconnect", "rrt") if of[p]}
+            figures.append({"level": level, "line": line, "line_n": len(of[LINE]), "planners": planners})
     record.write(
         "calibration", {"levels": figures}, table(figures), split="test", timeout=TIMEOUT, jobs=args.jobs,
         seeds="number of the problem modulo 1000",

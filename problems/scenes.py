@@ -148,7 +148,7 @@ def posts(rng: np.random.Generator, level: str) -> Draft:
 
 def wall(rng: np.random.Generator, level: str) -> Draft:
     """A wall between the arms with two windows, through which hands reach over to the other side."""
-    size = {"easy": 0.34, "medium": 0.29, "hard": 0.23}[level]
+    size = {"easy": 0.31, "medium": 0.29, "hard": 0.23}[level]
     thick, near, far, tall = 0.03, 0.1, 1.0, 1.1
     x, z = rng.uniform(0.48, 0.54), np.sort(rng.uniform([0.2, 0.58], [0.26, 0.64]))
     windows = [(x, float(z[0])), (x, float(z[1]))]

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import pickle
 from pathlib import Path
 
 import jsonschema
@@ -10,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from apex_ompl import load_problem, problems
+from apex_ompl import errors, load_problem, problems
 from apex_ompl.errors import ApexError, FileFormatError, MissingFileError, UnknownNameError
 from apex_ompl.problem import AttachedObject, Goal, MeshFile, Obstacle, Problem, pose_matrix
 from apex_ompl.robot import Robot
@@ -217,3 +218,18 @@ def test_a_held_half_space_is_refused_from_python_too() -> None:
 def test_deep_nesting_is_a_fault_and_no_crash(levels: int, opening: str) -> None:
     with pytest.raises(FileFormatError):
         parse_yaml("a: " + opening * levels, "deep.yaml")
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        errors.UnknownNameError("planner", "rrt", ["a"]),
+        errors.FileFormatError("file", "field", 1, "expected 2"),
+        errors.MissingFileError("file", "role"),
+        errors.ParameterError("seed", -1, "more"),
+        errors.SceneError("said"),
+    ],
+)
+def test_errors_pass_between_processes(error: errors.ApexError) -> None:
+    again = pickle.loads(pickle.dumps(error))
+    assert type(again) is type(error) and str(again) == str(error) and vars(again) == vars(error)

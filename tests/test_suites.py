@@ -17,7 +17,7 @@ from apex_ompl.errors import ApexError, ParameterError, UnknownNameError
 from apex_ompl.goals import AlignmentGoal
 from apex_ompl.moving import at_time
 from apex_ompl.problem import Alignment, Problem
-from apex_ompl.problems import alignment
+from apex_ompl.problems import alignment, scenes
 from apex_ompl.problems.catalogue import SPLITS, ProblemId
 from apex_ompl.problems.frozen import digest
 from apex_ompl.robot import Robot
@@ -70,6 +70,17 @@ def test_another_process_draws_the_same() -> None:
     code += f"print(digest(problems.load({name!r})))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == digest(problems.load(name))
+
+
+@pytest.mark.parametrize("level", ["easy", "medium", "hard"])
+@pytest.mark.parametrize("suite", HARD)
+def test_every_scene_can_be_built(suite: str, level: str) -> None:
+    """Whatever the numbers drawn: no board without thickness, no name twice."""
+    for seed in range(150):
+        draft = scenes.SUITES[suite](np.random.default_rng([9, seed]), level)
+        assert len({body.name for body in draft.scene}) == len(draft.scene)
+        for region in (*draft.start, *draft.goal):
+            assert all(low <= high for low, high in (region.x, region.y, region.z)) and region.fingers
 
 
 @pytest.mark.parametrize("level", ["easy", "medium", "hard"])
