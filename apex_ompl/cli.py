@@ -199,10 +199,15 @@ def _check(parsed: argparse.Namespace) -> int:
     if problem.attached:
         print("  held       " + ", ".join(f"{held.name} by {held.link}" for held in problem.attached))
     print(f"  start      {ready.start_fault or 'free'}")
-    for k, fault in enumerate(ready.goal_faults):
-        label = "goal" if len(ready.goal_faults) == 1 else f"goal {k}"
-        print(f"  {label:<10} {fault or 'free'}")
-    return 3 if ready.start_fault or all(ready.goal_faults) else 0
+    goal_faults, note = ready.goal_faults, ""
+    if problem.moving:  # what moves may have left a goal when the robot gets there
+        still = tuple(obstacle for obstacle in problem.scene if not obstacle.moving)
+        goal_faults = assemble(problem.model_copy(update={"scene": still}), ready.robot).goal_faults
+        note = f" (without {', '.join(problem.moving)})"
+    for k, fault in enumerate(goal_faults):
+        label = "goal" if len(goal_faults) == 1 else f"goal {k}"
+        print(f"  {label:<10} {fault or 'free'}{note}")
+    return 3 if ready.start_fault or all(goal_faults) else 0
 
 
 def _problems(_: argparse.Namespace) -> int:

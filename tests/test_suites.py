@@ -186,6 +186,10 @@ def test_wrong_seeds_are_named(seed: object) -> None:
 def test_ids_work_at_the_command_line(apex_cli) -> None:
     done = apex_cli("check", "posts/easy/7")
     assert done.returncode == 0 and "posts/easy/7" in done.stdout and done.stdout.count("free") == 2
+    done = apex_cli("check", "vertical/moving-huge-0.1/0")  # the cube begins where the goal is
+    assert done.returncode == 0 and "goal       free (without cube_0)" in done.stdout
+    done = apex_cli("plan", "vertical/moving-huge-0.1/0", "--snapshot")
+    assert done.returncode == 3 and "cube_0" in done.stdout
     done = apex_cli("plan", "vertical/small/11", "--json")
     assert done.returncode == 0 and '"EXACT_SOLUTION"' in done.stdout
     done = apex_cli("plan", "vertical/moving-huge-0.4/11")
