@@ -166,7 +166,7 @@ class _Run:
                 ours = PlanStatus.TIMEOUT if status in (PlanStatus.INVALID_START, PlanStatus.INVALID_GOAL) else status
                 return self._failed(ours, f"{self.planner} found no path in {timeout:g} s{said}")
             states = path_to_array(ready.simple_setup.getSolutionPath(), ready.robot.dof)
-            return self._proved(states, deadline, simplify)
+            return self._proved(states, deadline, simplify and not parameters.smooth)
         except Exception as error:
             return self._failed(PlanStatus.CRASH, f"{self.planner} failed, {error!r}")
 
@@ -228,7 +228,7 @@ class _Run:
         candidates = [self._with_exact_ends(path)]
         if simplify:
             with self._timed("simplify"):
-                candidates.insert(0, shorten(self.ready.simple_setup, candidates[0], self.interrupt))
+                candidates.insert(0, self._shortened(candidates[0]))
             self._raise_faults()
         ready, reason = self.ready, ""
         for candidate in candidates:
@@ -242,6 +242,11 @@ class _Run:
             if mended is not None:
                 return self._exact(mended, f"{self.planner}+repair")
         return self._failed(PlanStatus.TIMEOUT, f"the path found failed the full check and repair, {reason}")
+
+    def _shortened(self, path: Array) -> Array:
+        simple_setup = self.ready.simple_setup
+        si = simple_setup.getSpaceInformation()
+        return shorten(simple_setup.getPathSimplifier(), si, path, lambda: self.interrupt.pressed)
 
     def _exact(self, path: Array, solved_by: str) -> PlanResult:
         return replace(self.blank, status=PlanStatus.EXACT_SOLUTION, path=path, solved_by=solved_by)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
+from ompl import base as ob
 from ompl import geometric as og
 
-from apex_ompl.interrupt import Interrupt
 from apex_ompl.space import array_to_path, path_length, path_to_array
 
 ROUNDS = 6
@@ -14,24 +16,27 @@ LEAST_GAIN = 0.01  # a round that shortens by less than this share is the last
 
 
 def simplify(
-    setup: og.SimpleSetup, path: NDArray[np.float64], interrupt: Interrupt | None = None
+    simplifier: og.PathSimplifier,
+    si: ob.SpaceInformation,
+    path: NDArray[np.float64],
+    stop: Callable[[], bool] = lambda: False,
 ) -> NDArray[np.float64]:
     """Return a shorter path with the same ends, by OMPL's vertex reduction and partial shortcuts.
 
-    Motions are judged by the setup's motion validator.
+    Motions are judged by the motion validator of ``si``.
 
     Args:
-        setup: OMPL's setup of the problem.
+        simplifier: OMPL's simplifier for ``si``.
+        si: OMPL's space information of the problem.
         path: States, shape (N, dof).
-        interrupt: No further round is begun when it was pressed.
+        stop: Asked before every round whether to end.
     """
     if len(path) < 3:
         return path
-    simplifier = setup.getPathSimplifier()
-    work = array_to_path(setup.getSpaceInformation(), path)
+    work = array_to_path(si, path)
     best = path
     for _ in range(ROUNDS):
-        if interrupt is not None and interrupt.pressed:
+        if stop():
             break
         simplifier.reduceVertices(work)
         simplifier.partialShortcutPath(work)

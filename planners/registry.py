@@ -20,11 +20,13 @@ class Parameters:
         optimizing: Whether the planner goes on improving until time is up.
         repeatable: Whether the same seed gives the same path; not for planners that are stopped by the clock
             or threaded.
+        smooth: Whether its paths are short and smooth already, and shortcuts would only break them.
         threaded: Whether the planner runs threads of its own; OMPL 2.0.1's then deadlock over several goals.
     """
 
     optimizing: ClassVar[bool] = False
     repeatable: ClassVar[bool] = True
+    smooth: ClassVar[bool] = False
     threaded: ClassVar[bool] = False
 
     def build(self, si: ob.SpaceInformation) -> ob.Planner:
@@ -107,7 +109,7 @@ def allocator(name: str, /, **values: Any) -> Callable[[ob.SpaceInformation], ob
 
 def _load() -> None:
     """Import the modules that register planners."""
-    from apex_ompl.planners import sampling  # noqa: F401
+    from apex_ompl.planners import polish, sampling  # noqa: F401
 
 
 def _read(name: str, value: Any, default: Any, field: dataclasses.Field[Any]) -> Any:

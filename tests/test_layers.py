@@ -11,7 +11,8 @@ from support import ROOT
 LAYERS = [
     {"errors", "meshes", "schema"},
     {"kernel"},
-    {"problem"},
+    {"problem", "spline"},
+    {"optimize"},
     {"robot"},
     {"collision"},
     {"ik", "interrupt", "space"},

@@ -1,0 +1,137 @@
+"""RRTConnect whose path is shortened, put on a spline and optimised."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from ompl import base as ob
+from ompl import geometric as og
+
+from apex_ompl.collision import Verdict
+from apex_ompl.errors import ParameterError
+from apex_ompl.optimize import Optimizer, Settings
+from apex_ompl.planners.registry import Parameters, bounded, register
+from apex_ompl.simplify import simplify
+from apex_ompl.space import FULL_RESOLUTION, array_to_path, path_to_array
+from apex_ompl.spline import Spline
+from apex_ompl.validity import VerdictChecker
+
+Array = NDArray[np.float64]
+
+NAME = "rrtconnect+polish"
+LOG = logging.getLogger("apex_ompl")
+
+
+def polished(optimizer: Optimizer, verdict: Verdict, path: Array, stop: Any = lambda: False) -> Array | None:
+    """Return a short path of ``optimizer.spline.states`` states near a given one, proved by the full check, or None.
+
+    The path, shape (N, dof), is fitted by a spline, whose control points are optimised.
+    """
+    limits = verdict.robot.limits
+    control = optimizer.spline.fit(path, limits.lower, limits.upper).control
+
+    def is_valid(states: Array) -> bool:
+        return verdict.first_collision(states, FULL_RESOLUTION) is None
+
+    best = optimizer.shorten(verdict.kernel, control, is_valid, stop)
+    return None if best is None else optimizer.spline.path(best)
+
+
+class PolishedRRTConnect(ob.Planner):
+    """OMPL planner: RRTConnect, OMPL's simplification by counts, and trajectory optimisation, until ``ptc`` ends it.
+
+    What RRTConnect found is a solution as soon as it is found; the simplified and the optimised path are added to it,
+    and OMPL gives the shortest. Where optimisation finds nothing valid, the simplified path stands.
+    """
+
+    def __init__(self, si: ob.SpaceInformation, verdict: Verdict, optimizer: Optimizer, inner: og.RRTConnect) -> None:
+        """Optimise by ``verdict`` what ``inner`` finds."""
+        super().__init__(si, NAME)
+        inner.setup()
+        self._verdict = verdict
+        self._optimizer = optimizer
+        self._inner = inner
+
+    def clear(self) -> None:
+        """Forget what was found."""
+        super().clear()
+        self._inner.clear()
+
+    def solve(self, ptc: ob.PlannerTerminationCondition) -> ob.PlannerStatus:
+        """Solve the problem; no exception leaves it, since one would end the process inside OMPL."""
+        try:
+            return self._solve(ptc)
+        except Exception:
+            LOG.exception("%s failed", NAME)
+            return ob.PlannerStatus(ob.PlannerStatus.CRASH)
+
+    def _solve(self, ptc: ob.PlannerTerminationCondition) -> ob.PlannerStatus:
+        si, pdef, dof = self.getSpaceInformation(), self.getProblemDefinition(), self._verdict.robot.dof
+        self._inner.setProblemDefinition(pdef)
+        status = self._inner.solve(ptc)
+        if status.getStatus() != ob.PlannerStatus.EXACT_SOLUTION or ptc():
+            return status
+        path = path_to_array(pdef.getSolutionPath(), dof)
+        path = simplify(og.PathSimplifier(si), si, path, lambda: bool(ptc()))
+        self._add(path)
+        if not ptc():
+            better = polished(self._optimizer, self._verdict, path, lambda: bool(ptc()))
+            if better is not None:
+                self._add(better)
+        return status
+
+    def _add(self, path: Array) -> None:
+        si, pdef = self.getSpaceInformation(), self.getProblemDefinition()
+        pdef.addSolutionPath(array_to_path(si, path), False, 0.0, NAME)
+
+
+@register(NAME)
+@dataclass(frozen=True)
+class RRTConnectPolish(Parameters):
+    """RRTConnect, simplified, fitted by a B-spline and optimised on its control points.
+
+    Attributes:
+        range: Longest step of RRTConnect's trees; 0 lets OMPL choose.
+        control_points: Number of control points of the spline.
+        pinned: How many of them coincide with each end.
+        scene_margin: Clearance to obstacles that the optimiser asks for.
+        own_margin: Clearance between the robot's links that it asks for.
+        stiffness: Weight of the path's speed squared at first; it grows as long as paths stay valid.
+    """
+
+    smooth: ClassVar[bool] = True
+    range: float = bounded(0.0, 0.0, unit="rad")
+    control_points: int = bounded(14, 6, 200)
+    pinned: int = bounded(1, 1, 90)
+    scene_margin: float = bounded(0.04, 1e-4, 1.0, unit="m")
+    own_margin: float = bounded(0.02, 1e-4, 1.0, unit="m")
+    stiffness: float = bounded(1e-3, 1e-9, 1e3, unit="1/rad^2")
+
+    def __post_init__(self) -> None:
+        """Check that control points are left free.
+
+        Raises:
+            ParameterError: All are pinned.
+        """
+        Spline(self.control_points, self.pinned)
+
+    def build(self, si: ob.SpaceInformation) -> ob.Planner:
+        """Return the planner.
+
+        Raises:
+            ParameterError: ``si`` has no verdict to judge by.
+        """
+        checker = si.getStateValidityChecker()
+        if not isinstance(checker, VerdictChecker):
+            expected = "apex_ompl's VerdictChecker, as apex_ompl.setup sets it"
+            raise ParameterError(f"state validity checker for {NAME}", type(checker).__name__, expected)
+        settings = Settings(scene_margin=self.scene_margin, own_margin=self.own_margin, stiffness=self.stiffness)
+        optimizer = Optimizer(Spline(self.control_points, self.pinned), settings)
+        optimizer.prepare(checker.verdict.kernel)
+        inner = og.RRTConnect(si)
+        inner.setRange(self.range)
+        return PolishedRRTConnect(si, checker.verdict, optimizer, inner)
