@@ -10,7 +10,7 @@ import numpy as np
 
 from apex_ompl.errors import ApexError, ParameterError, UnknownNameError
 from apex_ompl.problem import Problem
-from apex_ompl.problems import alignment, scenes
+from apex_ompl.problems import alignment, broad, scenes
 from apex_ompl.problems.outline import Outline
 from apex_ompl.problems.reach import HandPoses, robot
 
@@ -24,6 +24,11 @@ LEVELS: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(scenes.SUITES, scenes.LEVELS),
 }
 """Suite -> its levels."""
+
+TRAINING = {broad.SUITE: broad.LEVELS}
+"""Problems of no suite that training draws on -> their levels; none of them is frozen."""
+
+KNOWN = {**LEVELS, **TRAINING}
 
 ID = re.compile(r"([A-Za-z_]+)/([A-Za-z0-9_.-]+)/(0|[1-9][0-9]{0,19})")
 
@@ -53,10 +58,10 @@ class ProblemId:
             UnknownNameError: No such suite or level.
             ParameterError: The seed is none.
         """
-        if not isinstance(self.suite, str) or self.suite not in LEVELS:
-            raise UnknownNameError("suite", str(self.suite), LEVELS)
-        if not isinstance(self.level, str) or self.level not in LEVELS[self.suite]:
-            raise UnknownNameError(f"level of {self.suite}", str(self.level), LEVELS[self.suite])
+        if not isinstance(self.suite, str) or self.suite not in KNOWN:
+            raise UnknownNameError("suite", str(self.suite), KNOWN)
+        if not isinstance(self.level, str) or self.level not in KNOWN[self.suite]:
+            raise UnknownNameError(f"level of {self.suite}", str(self.level), KNOWN[self.suite])
         whole = isinstance(self.seed, (int, np.integer)) and not isinstance(self.seed, bool)
         if not whole or not 0 <= self.seed < SPLITS["test"].stop:
             raise ParameterError("seed", self.seed, f"a whole number from 0 to {SPLITS['test'].stop - 1}")
@@ -90,6 +95,8 @@ def draw(which: ProblemId, number: int) -> Outline | None:
     rng = np.random.default_rng([group, which.seed, number])
     if which.suite in alignment.HOLDINGS:
         return alignment.draw(rng, which.suite, which.level)
+    if which.suite == broad.SUITE:
+        return broad.draw(rng, which.level, SYNERGIES)
     draft = scenes.SUITES[which.suite](rng, which.level)
     poses = HandPoses(draft.scene)
     start = poses.draw(rng, draft.start, SYNERGIES)

@@ -79,7 +79,7 @@ class Frozen:
 
 def is_frozen(which: ProblemId) -> bool:
     """Whether a problem is among the frozen ones."""
-    return any(which.seed in frozen_seeds(which.level, split) for split in COUNTS)
+    return which.suite in LEVELS and any(which.seed in frozen_seeds(which.level, split) for split in COUNTS)
 
 
 def frozen_seeds(level: str, split: str) -> range:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from apex_ompl.problem import Obstacle
 from apex_ompl.problems.reach import Direction, Region
@@ -18,6 +19,7 @@ from apex_ompl.problems.reach import Direction, Region
 FORWARD: Direction = (1.0, 0.0, 0.0)
 DOWN: Direction = (0.0, 0.0, -1.0)
 BOARD = 0.02
+Array = NDArray[np.float64]
 Pair = tuple[Region, Region]
 Point = tuple[float, float, float]
 
@@ -47,6 +49,17 @@ def _made(**fields: Any) -> Obstacle:
 
 def _short(numbers: Iterable[float]) -> tuple[float, ...]:
     return tuple(round(float(v), 4) for v in numbers)
+
+
+def primitive(name: str, kind: int, size: Array, position: Array, turn: Array) -> Obstacle:
+    """Return a box, a ball, a cylinder or a capsule (kind 0 to 3) of a size, turned by a quaternion of any length."""
+    wide, _, long = _short(size)
+    shapes: tuple[dict[str, Any], ...] = (
+        {"box": _short(size)}, {"sphere": {"radius": wide / 2}},
+        {"cylinder": {"radius": wide / 2, "length": long}}, {"capsule": {"radius": wide / 2, "length": long}},
+    )  # fmt: skip
+    unit = np.round(turn / np.linalg.norm(turn), 6)
+    return _made(name=name, **shapes[kind], position=_short(position), orientation=tuple(float(v) for v in unit))
 
 
 def around(point: Point, slack: float, *fingers: Direction) -> Region:
@@ -205,16 +218,9 @@ def clutter(rng: np.random.Generator, level: str) -> Draft:
     count, longest, scene = *{"easy": (10, 0.2), "medium": (20, 0.3), "hard": (30, 0.4)}[level], []
     for k in range(count):
         turn = rng.normal(size=4)
-        turn = turn / np.linalg.norm(turn)
-        place = _short(rng.uniform([0.05, -0.8, 0.1], [0.8, 0.8, 1.0]))
-        pose = {"position": place, "orientation": tuple(float(v) for v in np.round(turn, 6))}
-        size, kind = _short(rng.uniform(0.04, (0.14, 0.14, longest))), int(rng.integers(4))
-        shapes = (
-            {"box": size}, {"sphere": {"radius": size[0] / 2}},
-            {"cylinder": {"radius": size[0] / 2, "length": size[2]}},
-            {"capsule": {"radius": size[0] / 2, "length": size[2]}},
-        )  # fmt: skip
-        scene.append(_made(name=f"thing_{k}", **shapes[kind], **pose))
+        place = rng.uniform([0.05, -0.8, 0.1], [0.8, 0.8, 1.0])
+        size, kind = rng.uniform(0.04, (0.14, 0.14, longest)), int(rng.integers(4))
+        scene.append(primitive(f"thing_{k}", kind, size, place, turn))
 
     def side(y: float) -> Region:
         return Region((0.4, 0.75), (y - 0.15, y + 0.15), (0.12, 0.7), (DOWN, FORWARD))
