@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import threading
 import time
 from collections.abc import Mapping
 from contextlib import contextmanager
@@ -15,12 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 from ompl import base as ob
 from ompl import geometric as og
-from ompl import util as ou
 
 from apex_ompl import planners, problems
 from apex_ompl.assembly import PlanningSetup, assemble, set_goals
 from apex_ompl.errors import ParameterError
 from apex_ompl.interrupt import Interrupt
+from apex_ompl.ompl_globals import quiet_ompl, seed_ompl
 from apex_ompl.problem import Problem
 from apex_ompl.repair import repair
 from apex_ompl.result import PlanResult, PlanStatus
@@ -39,9 +38,6 @@ CLEARANCE_SAMPLES = 32
 STRAIGHT_LINE = "straight line"
 PROOF_SHARE, LONGEST_PROOF = 0.1, 0.5  # time kept from planners that stop at the timeout only, for repair [1, s]
 LONGEST_TIMEOUT = 1e8  # OMPL counts nanoseconds in 64 bits [s]
-
-_quiet_lock = threading.Lock()
-_quiet_levels: list[ou.LogLevel] = []
 
 
 def load_problem(name_or_path: str | os.PathLike[str]) -> Problem:
@@ -120,8 +116,8 @@ def plan(
     if loaded.moving and not snapshot:
         expected = f"True, since the obstacle {loaded.moving[0]!r} moves and plans hold for one moment only"
         raise ParameterError("snapshot", snapshot, expected)
-    with _quiet_ompl():
-        _seed_ompl(seed)
+    with quiet_ompl():
+        seed_ompl(seed)
         ready = assemble(loaded, seed=seed)
         run = _Run(ready, planner, seed, time.perf_counter() - started, loaded.moving)
         with Interrupt() as run.interrupt:
@@ -288,29 +284,3 @@ def _check_arguments(timeout: float, seed: int) -> None:
         raise ParameterError("timeout", timeout, "a positive number of seconds")
     if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or not 0 <= seed < 2**31:
         raise ParameterError("seed", seed, "a whole number from 0 to 2147483647")
-
-
-def _seed_ompl(seed: int) -> None:
-    with _quiet_lock:
-        level = ou.getLogLevel()
-        ou.setLogLevel(ou.LogLevel.LOG_NONE)  # it complains when generators were in use, and reseeds all the same
-        ou.RNG.setSeed(int(seed) + 1)  # OMPL takes no seed 0
-        ou.setLogLevel(level)
-
-
-@contextmanager
-def _quiet_ompl() -> Iterator[None]:
-    """Keep OMPL's information messages off standard output; warnings still go to standard error."""
-    with _quiet_lock:
-        if not _quiet_levels:
-            _quiet_levels.append(ou.getLogLevel())
-            ou.setLogLevel(ou.LogLevel.LOG_WARN)
-        else:
-            _quiet_levels.append(_quiet_levels[0])
-    try:
-        yield
-    finally:
-        with _quiet_lock:
-            level = _quiet_levels.pop()
-            if not _quiet_levels:  # the last plan of several in as many threads
-                ou.setLogLevel(level)

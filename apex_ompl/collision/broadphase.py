@@ -7,6 +7,7 @@ import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import coal
 import numpy as np
@@ -58,6 +59,9 @@ def exact_requests(data: pin.GeometryData) -> pin.GeometryData:
     return data
 
 
+_links_as_hosts: WeakKeyDictionary[Robot, dict[int, Host]] = WeakKeyDictionary()  # what was analysed before
+
+
 class CompiledScene:
     """The robot, the obstacles and the held objects of one moment as one Pinocchio geometry model.
 
@@ -75,6 +79,7 @@ class CompiledScene:
 
         Their geometry and pose, in the world or in the link that holds them, are in ``placed``.
         """
+        self._robot = robot
         self.model = robot.model
         self.data = robot.model.createData()
         self.geometry = robot.geometry.copy()
@@ -136,7 +141,8 @@ class CompiledScene:
     def _add_containment(self) -> None:
         """For every pair in which one may be wholly inside the mesh of the other, pair hull and points."""
         items = self.geometry.geometryObjects
-        hosts: dict[int, Host] = {}
+        links = _links_as_hosts.setdefault(self._robot, {})
+        hosts = dict(links)
         hulls: dict[int, int] = {}
         anchors: dict[int, list[int]] = {}
         for a, b in self.pairs:
@@ -147,6 +153,8 @@ class CompiledScene:
                     continue
                 if h not in hosts:
                     hosts[h] = Host.of(items[h].geometry)
+                    if h < self.links:
+                        links[h] = hosts[h]
                 points = [pin.SE3(np.eye(3), point) for point in anchor_points(items[g].geometry)]
                 if not hosts[h].convex:
                     self.hollow += [(h, g, hosts[h], point) for point in points]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 from weakref import WeakKeyDictionary
@@ -41,7 +41,9 @@ class Open(NamedTuple):
 QUICK_GAPS, LEAVES = (0.02, 0.005), 32  # of covers made at run time
 SLENDER = 0.05  # cylinders thinner or flatter than this are covered like boxes
 
-_robots: WeakKeyDictionary[Robot, RobotTables] = WeakKeyDictionary()
+MOST_TABLES = 64  # that are kept of a robot with different things in its hands
+
+_robots: WeakKeyDictionary[Robot, dict[Hashable, RobotTables]] = WeakKeyDictionary()
 _quick: dict[str, Cover] = {}  # by shape key
 
 
@@ -120,17 +122,22 @@ class Proofs:
 
     def _robot(self, robot: Robot) -> RobotTables:
         scene = self.scene
-        if not scene.held and robot in _robots:
-            return _robots[robot]
         numbers = [*range(scene.links), *scene.held.values()]
         rows = {number: row for row, number in enumerate(numbers)}
         items = [scene.geometry.geometryObjects[number] for number in numbers]
+        held = items[scene.links :]
+        poses = tuple((i.parentJoint, i.placement.homogeneous.tobytes(), shape_key(i.geometry)) for i in held)
+        key = (tuple(scene.held.items()), poses, tuple(sorted((k, tuple(sorted(v))) for k, v in scene.touch.items())))
+        known = _robots.setdefault(robot, {})
+        if key in known:
+            return known[key]
         covers = covers_of(robot, [item.geometry for item in items])
         meets = [item.parentJoint > 0 or number >= scene.links for item, number in zip(items, numbers, strict=True)]
         pairs = [(rows[a], rows[b]) for a, b in scene.pairs if a in rows and b in rows]
         tables = tabulate(robot, items=items, numbers=numbers, covers=covers, meets_scene=meets, pairs=pairs)
-        if not scene.held:
-            _robots[robot] = tables
+        while len(known) >= MOST_TABLES:
+            known.pop(next(iter(known)), None)
+        known[key] = tables
         return tables
 
     def _obstacles(self) -> SceneTables:
