@@ -9,7 +9,6 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cache
 from typing import Any
 
 import numpy as np
@@ -24,8 +23,9 @@ from apex_ompl.errors import UnknownNameError
 from apex_ompl.ompl_globals import quiet_ompl, seed_ompl
 from apex_ompl.optimize import Optimizer
 from apex_ompl.problem import Obstacle, Problem
+from apex_ompl.problems import scenes
 from apex_ompl.problems.catalogue import KNOWN, SPLITS, SuiteError
-from apex_ompl.robot import Robot, load_robot
+from apex_ompl.problems.reach import robot
 from apex_ompl.simplify import simplify
 from apex_ompl.space import SEARCH_RESOLUTION, path_length, path_to_array
 from apex_ompl.spline import Spline
@@ -38,13 +38,20 @@ STRAIGHT_SHARE = 0.2  # of the problems that are kept, those that the straight l
 NO_POINT = (0.0, 0.0, -1.0)
 """The obstacle point where there is no obstacle: a metre under the tables' surface, further than any obstacle [m]."""
 
-BUMPS, BUMP_SIZE = (1, 8), (0.4, 1.2)  # paths at once, first few and then many, and how far they stray [rad]
+FEW, MANY, BUMP_SIZE = 1, 8, (0.4, 1.2)  # paths from bumps at once, and how far they stray [rad]
 MOST_ITERATIONS = 30_000  # of rrtconnect
 PART = (0.1, 0.6)  # where parts begin, as a share of a path's states
 PART_STEPS = 12
 SAME = 0.1  # paths nearer to each other than this are one [rad, max-norm]
 BETWEEN = 12  # states at which two paths are compared
-SEARCHED = ("shelf", "bins", "cage", "posts", "wall", "swap", "clutter")  # by rrtconnect; the others from bumps
+RECIPES = {
+    "open": (("bumps", "bumps"), ("rrtconnect", "many bumps")),
+    "easy": (("rrtconnect", "rrtconnect"), ("many bumps", "rrtconnect")),
+    "medium": (("rrtconnect", "rrtconnect"), ("many bumps", "rrtconnect")),
+    "hard": (("rrtconnect", "bumps"), ("many bumps", "rrtconnect")),
+}
+"""How paths are sought, by what yields most, on the levels of the hard suites and in open scenes: by these ways in turn,
+and where none of them worked by those behind, until one does."""
 
 
 @dataclass(frozen=True)
@@ -86,7 +93,7 @@ class Options:
 
     seed: int = 0
     copies: int = 2
-    parts: int = 1
+    parts: int = 2
 
 
 SHARES = {"easy": 1.0, "medium": 0.8, "hard": 0.5, "free": 1.0}
@@ -136,11 +143,6 @@ def work(unit: Unit, options: Options, spline: Spline) -> tuple[Paths, dict[str,
     return engine.paths(), engine.times
 
 
-@cache
-def _robot(name: str) -> Robot:
-    return load_robot(name)
-
-
 class _Engine:
     """Solves the problems of a unit one by one."""
 
@@ -163,7 +165,7 @@ class _Engine:
             except SuiteError:
                 self.counts["not drawn"] += 1
                 return
-            task = _Task(assemble(problem, _robot(problem.robot)), self.optimizer)
+            task = _Task(assemble(problem, robot()), self.optimizer)
         self.counts["drawn"] += 1
         ends = task.ready.start, task.ready.goals[0]
         with self._timed("check"):
@@ -190,25 +192,27 @@ class _Engine:
         self._keep(task, number, kept)
 
     def _sought(self, task: _Task, seed: int) -> Iterator[tuple[str, Array]]:
-        """Find paths by what yields most for the suite first, and by the other where that finds none."""
+        """Find paths, see :data:`RECIPES`."""
         rng = np.random.default_rng([zlib.crc32(self.unit.name.encode()), self.options.seed, seed])
-        order = ("rrtconnect", "bumps") if self.unit.suite in SEARCHED else ("bumps", "rrtconnect")
+        first, second = RECIPES.get(self.unit.level if self.unit.suite in scenes.SUITES else "", RECIPES["open"])
+        rounds = self.options.copies // len(first) + 1
         found = 0
-        for source in order:
-            for k in range(self.options.copies):
-                if found == self.options.copies:
-                    return
-                with self._timed(source):
-                    control = task.bumped(rng, k) if source == "bumps" else task.searched(int(rng.integers(2**31 - 1)))
-                if control is None:
-                    continue
-                with self._timed("shorten"):
-                    control = task.shortened(control)
-                if control is not None:
-                    found += 1
-                    yield source, control
-            if found:
+        for k, way in enumerate((*(first * rounds)[: self.options.copies], *second)):
+            if k >= self.options.copies and found:
                 return
+            source = "rrtconnect" if way == "rrtconnect" else "bumps"
+            with self._timed(source):
+                if source == "bumps":
+                    control = task.bumped(rng, line=k == 0, many=way == "many bumps")
+                else:
+                    control = task.searched(int(rng.integers(2**31 - 1)))
+            if control is None:
+                continue
+            with self._timed("shorten"):
+                control = task.shortened(control)
+            if control is not None:
+                found += 1
+                yield source, control
 
     def _keep(self, task: _Task, number: int, kept: list[tuple[str, Array]]) -> None:
         """Keep paths, their reversals, and parts of both."""
@@ -258,7 +262,7 @@ class _Engine:
 
     def paths(self) -> Paths:
         """Return what was kept."""
-        dof, free = len(problems_joints()), self.optimizer.spline.free
+        dof, free = robot().dof, self.optimizer.spline.free
         shapes = {"start": (dof,), "goal": (dof,), "control": (free, dof)}
         arrays = {
             name: np.array(self.rows[name], kind).reshape(-1, *shapes.get(name, shape))
@@ -276,13 +280,6 @@ class _Engine:
             self.times[stage] = self.times.get(stage, 0.0) + time.perf_counter() - begin
 
 
-def problems_joints() -> tuple[str, ...]:
-    """Return the joints of the suites' robot, in state order."""
-    from apex_ompl.problems.reach import robot
-
-    return robot().joint_names
-
-
 class _Task:
     """One problem, made ready."""
 
@@ -295,13 +292,16 @@ class _Task:
     def is_valid(self, states: Array) -> bool:
         return bool(full_check(self.verdict, states))
 
-    def bumped(self, rng: np.random.Generator, k: int) -> Array | None:
-        """Return a clear path from bumps; the straight line is among them for the first one, k = 0."""
-        size = float(rng.uniform(*BUMP_SIZE))
-        starts = self.optimizer.starts(self.ready.start, self.ready.goals[0], sum(BUMPS) + 1, rng, size)
-        few, many = starts[int(k > 0) : int(k > 0) + BUMPS[0]], starts[-BUMPS[1] :]
-        found = self.optimizer.first_valid(self.kernel, few, self.is_valid)
-        return self.optimizer.first_valid(self.kernel, many, self.is_valid) if found is None else found
+    def bumped(self, rng: np.random.Generator, line: bool, many: bool) -> Array | None:
+        """Return a clear path from the straight line, or else from bumps; from more of them where ``many``."""
+        start, goal, size = self.ready.start, self.ready.goals[0], float(rng.uniform(*BUMP_SIZE))
+        counts = (4 * MANY,) if many else (FEW, MANY)
+        for count in counts:
+            starts = self.optimizer.starts(start, goal, count + 1, rng, size)
+            found = self.optimizer.first_valid(self.kernel, starts[:count] if line else starts[1:], self.is_valid)
+            if found is not None:
+                return found
+        return None
 
     def searched(self, seed: int) -> Array | None:
         """Return the fit to a path that rrtconnect found, and that OMPL simplified."""

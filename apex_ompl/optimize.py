@@ -23,8 +23,8 @@ Check = Callable[[Array], bool]
 """Whether a path, shape (states, dof), is valid."""
 
 ROUND = 8  # steps between two checks
-ROUNDS = 6
-STIFFER = 3.0  # factor from one round of shortening to the next
+ROUNDS = 6  # of them for the first valid path
+STIFFER, SHORTENINGS = 5.0, 4  # factor from one round of shortening to the next, and how many rounds
 LAST_RESORT = 0.1  # factor on the stiffness where nothing came out valid
 
 
@@ -49,8 +49,8 @@ class Settings:
     own_margin: float = 0.02
     stiffness: float = 1e-3
     damping: float = 1e-2
-    steps: int = 40
-    tolerance: float = 1e-3
+    steps: int = 30
+    tolerance: float = 2e-3
 
     def __post_init__(self) -> None:
         """Check the numbers.
@@ -247,7 +247,7 @@ class Optimizer:
         """
         now, stiffness = self._control(kernel, control)[:1], self.settings.stiffness
         best: Array | None = None
-        for k in range(ROUNDS):
+        for k in range(SHORTENINGS):
             if stop():
                 break
             bent = self.improve(kernel, now, stiffness=stiffness)

@@ -1,0 +1,172 @@
+"""Make a data set of proven paths: problems of the training split are drawn, solved, and what was proved is kept.
+
+The same options give the same paths. What was stopped goes on when the command is given again; at most the units under
+way are lost. With one worker everything runs in this process; more are run by Ray, on this machine or on a cluster.
+
+Usage: python scripts/generate_data.py FOLDER [--problems 10000] [--workers 2] [--address HOST:PORT] [SUITE[/LEVEL] ...]
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import platform
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterator
+from importlib import metadata
+from typing import Any
+
+from apex_ompl.dataset import DatasetError, Paths, Store
+from apex_ompl.errors import ApexError
+from apex_ompl.generation import Options, Unit, plan_units, work
+from apex_ompl.problems.reach import robot
+from apex_ompl.spline import Spline
+
+LIBRARIES = ("apex-ompl", "ompl", "pin", "coal", "numba", "numpy", "zarr")
+OBJECT_STORE = 256 << 20  # of Ray [bytes]
+Done = tuple[Unit, Paths, dict[str, float]]
+
+
+def here(units: list[Unit], options: Options, spline: Spline) -> Iterator[Done]:
+    """Work in this process."""
+    for unit in units:
+        yield unit, *work(unit, options, spline)
+
+
+def spread(units: list[Unit], options: Options, spline: Spline, workers: int, address: str | None) -> Iterator[Done]:
+    """Work by Ray, twice as many units under way as there are workers.
+
+    Raises:
+        DatasetError: Ray is not there, or a worker died more than once over a unit.
+    """
+    try:
+        import ray
+    except ImportError as error:
+        raise DatasetError(
+            "several workers need Ray, expected: pip install 'apex-ompl[train]'; or --workers 1"
+        ) from error
+    local: dict[str, Any] = {} if address else {"num_cpus": workers, "object_store_memory": OBJECT_STORE}
+    try:
+        ray.init(address=address, include_dashboard=False, log_to_driver=False, logging_level="error", **local)
+    except Exception as error:  # ConnectionError, ValueError, RuntimeError
+        raise DatasetError(
+            f"Ray: {str(error).splitlines()[0]}, expected a cluster at {address or 'this machine'}"
+        ) from error
+    try:
+        task = ray.remote(num_cpus=1, max_retries=1)(work)
+        waiting, under_way = iter(units), {}
+        for unit in itertools.islice(waiting, 2 * workers):
+            under_way[task.remote(unit, options, spline)] = unit
+        while under_way:
+            done, _ = ray.wait(list(under_way), num_returns=1)
+            unit = under_way.pop(done[0])
+            try:
+                paths, times = ray.get(done[0])
+            except ray.exceptions.RayTaskError as error:
+                raise DatasetError(f"unit {unit.name}: {str(error.cause).splitlines()[0]}") from error
+            except ray.exceptions.RayError as error:
+                raise DatasetError(
+                    f"unit {unit.name}: its worker died twice ({type(error).__name__}); what is written is whole, and "
+                    "the same command goes on from there"
+                ) from error
+            following = next(waiting, None)
+            if following is not None:
+                under_way[task.remote(following, options, spline)] = following
+            yield unit, paths, times
+    finally:
+        ray.shutdown()
+
+
+def generate(args: argparse.Namespace) -> None:
+    """Make what is missing of the data set."""
+    from tqdm import tqdm
+
+    options, spline = Options(args.seed, args.copies, args.parts), Spline(args.control_points, args.pinned)
+    units = plan_units(args.problems, args.levels)
+    manifest = {
+        "robot": robot().name, "joints": list(robot().joint_names), "seed": args.seed, "copies": args.copies,
+        "parts": args.parts, "control_points": args.control_points, "pinned": args.pinned, "degree": spline.degree,
+        "split": "train", "problems_per_unit": units[0].size, "python": platform.python_version(),
+        "versions": {library: metadata.version(library) for library in LIBRARIES},
+    }  # fmt: skip
+    same = ("robot", "joints", "seed", "copies", "parts", "control_points", "pinned", "degree", "problems_per_unit")
+    store = Store.create(args.folder, manifest, same)
+    there = set(store.units())
+    left = [unit for unit in units if unit.name not in there]
+    started, paths, times = time.perf_counter(), 0, Counter[str]()
+    alone = args.workers == 1 and args.address is None
+    source = here(left, options, spline) if alone else spread(left, options, spline, args.workers, args.address)
+    try:
+        with tqdm(total=len(units), initial=len(units) - len(left), unit="unit", disable=args.quiet) as bar:
+            for unit, found, spent in source:
+                store.write(unit.name, found)
+                paths += len(found)
+                times.update(spent)
+                bar.set_postfix_str(f"{paths / (time.perf_counter() - started):.1f} paths/s, {unit.suite}/{unit.level}")
+                bar.update()
+    finally:
+        source.close()
+        seconds = time.perf_counter() - started
+        if paths:
+            run = {"workers": args.workers, "seconds": round(seconds, 1), "paths": paths}
+            run["worker_seconds"] = {stage: round(value, 1) for stage, value in sorted(times.items())}
+            store.note(runs=[*store.manifest.get("runs", []), run])
+    total = summary(store)
+    store.note(counts=total)
+    print(f"{args.folder}: {total['paths']} paths of {total['solved']} problems in {total['units']} units", end="")
+    print(f"; {paths} of them now, {paths / seconds:.1f} a second" if paths else "; nothing was left to do")
+
+
+def summary(store: Store) -> dict[str, Any]:
+    """Return what a data set holds, by counting."""
+    total: Counter[str] = Counter()
+    for paths in store:
+        total.update({"units": 1, "paths": len(paths)})
+        total.update({key: n for key, n in paths.counts.items() if isinstance(n, int)})
+        total["unsolved"] += len(paths.counts.get("unsolved", ()))
+    return dict(total)
+
+
+def main() -> None:
+    """Read the command line."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("folder", metavar="FOLDER")
+    parser.add_argument("levels", nargs="*", metavar="SUITE[/LEVEL]", help="by default all static ones, and broad")
+    parser.add_argument(
+        "--problems", type=_count, default=10_000, help="how many to draw, about (default: %(default)s)"
+    )
+    parser.add_argument("--seed", type=_whole, default=0, help="of the random choices (default: %(default)s)")
+    parser.add_argument("--copies", type=_count, default=Options.copies, help="paths sought (default: %(default)s)")
+    parser.add_argument("--parts", type=_whole, default=Options.parts, help="parts of each path (default: %(default)s)")
+    parser.add_argument("--control-points", type=_count, default=Spline.points, help="(default: %(default)s)")
+    parser.add_argument("--pinned", type=_count, default=Spline.pinned, help="at each end (default: %(default)s)")
+    parser.add_argument("--workers", type=_count, default=1, help="more than one are run by Ray (default: %(default)s)")
+    parser.add_argument("--address", help="of a Ray cluster, for example 10.0.0.1:6379, or auto")
+    parser.add_argument("--quiet", action="store_true", help="show no progress")
+    args = parser.parse_args()
+    try:
+        generate(args)
+    except KeyboardInterrupt:
+        sys.exit(130)
+    except ApexError as error:
+        print(f"generate_data: error: {error}", file=sys.stderr)
+        sys.exit(2)
+
+
+def _whole(text: str) -> int:
+    if not text.isdecimal() or not int(text) < 2**31:
+        raise argparse.ArgumentTypeError(f"{text!r}, expected a whole number from 0 to 2147483647")
+    return int(text)
+
+
+def _count(text: str) -> int:
+    value = _whole(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"{text!r}, expected a whole number, 1 or more")
+    return value
+
+
+if __name__ == "__main__":
+    main()
