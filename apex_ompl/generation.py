@@ -50,7 +50,7 @@ RECIPES = {
     "medium": (("rrtconnect", "rrtconnect"), ("many bumps", "rrtconnect")),
     "hard": (("rrtconnect", "bumps"), ("many bumps", "rrtconnect")),
 }
-"""How paths are sought, by what yields most, on the levels of the hard suites and in open scenes: by these ways in turn,
+"""How paths are sought, by what yields most, on levels of the hard suites and in open scenes: by these ways in turn,
 and where none of them worked by those behind, until one does."""
 
 
