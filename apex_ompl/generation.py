@@ -96,8 +96,9 @@ class Options:
     parts: int = 2
 
 
-SHARES = {"easy": 1.0, "medium": 0.8, "hard": 0.5, "free": 1.0}
-"""How many problems of a level are drawn, relative to others."""
+SHARES = {"broad": 6.0, "vertical": 1.2, "horizontal": 1.2, "easy": 1.0, "medium": 0.8, "hard": 0.4}
+"""How many problems are drawn of each level of a suite, or of a level of the hard suites, relative to others: fewer where
+one takes longer."""
 
 
 def static_levels() -> list[tuple[str, str]]:
@@ -110,7 +111,7 @@ def plan_units(count: int, only: Sequence[str] = ()) -> list[Unit]:
 
     Args:
         count: How many problems to draw.
-        only: Suites, or ``suite/level``; none means all. The broad generator counts five times.
+        only: Suites, or ``suite/level``; none means all.
 
     Raises:
         UnknownNameError: No such suite or level.
@@ -120,7 +121,7 @@ def plan_units(count: int, only: Sequence[str] = ()) -> list[Unit]:
         if name not in {s for s, _ in known} | {f"{s}/{level}" for s, level in known}:
             raise UnknownNameError("static suite or level", name, [f"{s}/{level}" for s, level in known])
     chosen = [(s, v) for s, v in known if not only or s in only or f"{s}/{v}" in only]
-    weights = [5.0 if s == "broad" else SHARES.get(v, 1.0) for s, v in chosen]
+    weights = [SHARES[s if s in SHARES else v] for s, v in chosen]
     found = [
         (k / weight, place, Unit(s, v, k))
         for place, ((s, v), weight) in enumerate(zip(chosen, weights, strict=True))

@@ -1,0 +1,144 @@
+"""Print and plot what a data set holds: a folder that generate_data made, or a file of paths.
+
+Writes description.md, figures.png and motions.jpg (ten random motions) into a folder.
+
+Usage: python scripts/describe_data.py DATA [--out FOLDER] [--check 200] [--seed 0]
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from apex_ompl import description, problems
+from apex_ompl.assembly import assemble
+from apex_ompl.dataset import SOURCES, Paths, Store, load
+from apex_ompl.errors import ApexError
+from apex_ompl.problems.reach import robot
+from apex_ompl.schema import check_writable, write_atomically
+from apex_ompl.spline import Spline
+from apex_ompl.validity import full_check
+
+SHOTS, MOTIONS, SIZE = 5, 10, (320, 240)
+
+
+def table(figures: list[description.Figures]) -> str:
+    """Return the table of the levels in Markdown."""
+    head = ["level", "problems", "paths", *SOURCES, "straight", "homotopies", "several", "duplicates"]
+    head += ["length rad p5", "p50", "p95", "clearance mm p5", "p50", "p95"]
+    rows = [head, ["---", *["---:"] * (len(head) - 1)]]
+    for f in figures:
+        numbers = [f"{f.straight:.2f}", f"{f.homotopies:.2f}", f"{f.several:.2f}", f.duplicates]
+        spread = [f"{v:.1f}" for v in f.length] + [f"{1e3 * v:.0f}" for v in f.clearance]
+        rows.append([f.name, f.problems, f.paths, *f.sources.values(), *numbers, *spread])
+    return "\n".join("| " + " | ".join(str(c) for c in row) + " |" for row in rows)
+
+
+def checked(paths: Paths, spline: Spline, which: np.ndarray) -> str:
+    """Return what the full check says of some paths as they are stored."""
+    control, good = paths.control(spline, which), 0
+    for k, points in zip(which, control, strict=True):
+        ready = assemble(problems.load(paths.problem_name(int(paths.arrays["problem"][k]))), robot())
+        good += bool(full_check(ready.verdict, spline.path(points), paths.start[k], [paths.goal[k]]))
+    return f"{good} of {len(which)} random paths pass the full check as they are stored."
+
+
+def plot(paths: Paths, spline: Spline, figures: list[description.Figures], file: Path) -> None:
+    """Draw lengths, clearances, sources and the coverage of joints."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from io import BytesIO
+
+    import matplotlib.pyplot as plt
+
+    limits = robot().limits
+    fig, axes = plt.subplots(2, 2, figsize=(13, 9), layout="constrained")
+    suites = np.array([paths.names["suite"][k] for k in paths.arrays["suite"]])[paths.arrays["problem"]]
+    for axis, key, scale, unit in ((axes[0, 0], "length", 1.0, "rad"), (axes[0, 1], "clearance", 1e3, "mm")):
+        names = sorted(set(suites.tolist()))
+        axis.boxplot([scale * paths.arrays[key][suites == s] for s in names], tick_labels=names, showfliers=False)
+        axis.set_title(f"{key} [{unit}], by suite")
+        axis.tick_params(axis="x", rotation=30)
+    rows, bottom = figures[:-1], np.zeros(len(figures) - 1)
+    for source in SOURCES:
+        counts = np.array([f.sources[source] for f in rows], float)
+        axes[1, 0].barh([f.name for f in rows], counts, left=bottom, label=source)
+        bottom += counts
+    axes[1, 0].set_title("paths, by level and source")
+    axes[1, 0].tick_params(axis="y", labelsize=7)
+    axes[1, 0].legend(fontsize=8)
+    low, middle, high = description.coverage(paths, spline, limits.lower, limits.upper)
+    joints = np.arange(len(low))
+    axes[1, 1].bar(joints, high - low, bottom=low, color="#9db8d2", label="1st to 99th percentile")
+    axes[1, 1].plot(joints, middle, "k_", markersize=14, label="median")
+    axes[1, 1].set_xticks(joints, robot().joint_names, rotation=90, fontsize=7)
+    axes[1, 1].set_ylim(0.0, 1.0)
+    axes[1, 1].set_title("joints, share of their range")
+    axes[1, 1].legend(fontsize=8)
+    stream = BytesIO()
+    fig.savefig(stream, format="png", dpi=90)
+    plt.close(fig)
+    write_atomically(file, stream.getvalue())
+
+
+def draw(paths: Paths, spline: Spline, which: np.ndarray, file: Path) -> list[str]:
+    """Draw some motions, a row each, and return what they are."""
+    import imageio.v3 as iio
+
+    from apex_ompl.render import Stage
+
+    rows, captions = [], []
+    for k, points in zip(which, paths.control(spline, which), strict=True):
+        name = paths.problem_name(int(paths.arrays["problem"][k]))
+        stage = Stage(assemble(problems.load(name), robot()), SIZE)
+        at = np.linspace(0, spline.states - 1, SHOTS).astype(int)
+        rows.append(np.concatenate([stage.shoot(q) for q in spline.path(points)[at]], axis=1))
+        length = f"{float(paths.arrays['length'][k]):.1f} rad"
+        captions.append(f"{name}, {SOURCES[paths.arrays['source'][k]]}, {length}")
+    write_atomically(file, iio.imwrite("<bytes>", np.concatenate(rows), extension=".jpg", quality=80))
+    return captions
+
+
+def describe(args: argparse.Namespace) -> None:
+    """Describe the data set."""
+    for name in ("description.md", "figures.png", "motions.jpg"):
+        check_writable(args.out / name)
+    paths = load(args.data) if args.data.is_file() else Paths.joined(Store(args.data))
+    spline = Spline(paths.arrays["control"].shape[1] + 2 * args.pinned, args.pinned)
+    figures = description.levels(paths)
+    rng = np.random.default_rng(args.seed)
+    text = [f"# {args.data.name}", "", f"{len(paths)} paths of {paths.problems} problems.", "", table(figures), ""]
+    if args.check:
+        which = np.sort(rng.choice(len(paths), min(args.check, len(paths)), replace=False))
+        text += [checked(paths, spline, which), ""]
+    plot(paths, spline, figures, args.out / "figures.png")
+    chosen = np.sort(rng.choice(len(paths), min(MOTIONS, len(paths)), replace=False))
+    captions = draw(paths, spline, chosen, args.out / "motions.jpg")
+    text += ["![figures](figures.png)", "", "Ten random motions, from left to right:", ""]
+    text += [*(f"{k}. {c}" for k, c in enumerate(captions, 1)), "", "![motions](motions.jpg)", ""]
+    print("\n".join(text))
+    write_atomically(args.out / "description.md", "\n".join(text).encode())
+
+
+def main() -> None:
+    """Read the command line."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("data", type=Path, metavar="DATA")
+    parser.add_argument("--out", type=Path, default=Path(), help="folder (default: this one)")
+    parser.add_argument("--check", type=int, default=200, help="paths that are proved again (default: %(default)s)")
+    parser.add_argument("--pinned", type=int, default=Spline.pinned, help="control points (default: %(default)s)")
+    parser.add_argument("--seed", type=int, default=0, help="of the random choices (default: %(default)s)")
+    args = parser.parse_args()
+    try:
+        describe(args)
+    except ApexError as error:
+        print(f"describe_data: error: {error}", file=sys.stderr)
+        sys.exit(2)
+
+
+if __name__ == "__main__":
+    main()
