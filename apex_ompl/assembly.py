@@ -12,8 +12,9 @@ from ompl import geometric as og
 from apex_ompl.collision import Verdict
 from apex_ompl.goals import AlignmentGoal, alignment_goal
 from apex_ompl.problem import Problem
+from apex_ompl.resolution import SEARCH_RESOLUTION
 from apex_ompl.robot import Robot, load_robot
-from apex_ompl.space import SEARCH_RESOLUTION, state_space, to_state
+from apex_ompl.space import state_space, to_state
 from apex_ompl.validity import MotionCheck, VerdictChecker, VerdictMotionValidator
 
 Array = NDArray[np.float64]

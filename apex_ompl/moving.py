@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 from apex_ompl.collision import Verdict
 from apex_ompl.errors import ParameterError
 from apex_ompl.problem import Obstacle, Problem
+from apex_ompl.resolution import FULL_RESOLUTION
 from apex_ompl.robot import Robot
-from apex_ompl.space import FULL_RESOLUTION
 
 Array = NDArray[np.float64]
 

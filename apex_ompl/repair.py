@@ -11,7 +11,8 @@ from ompl import geometric as og
 
 from apex_ompl.assembly import PlanningSetup
 from apex_ompl.interrupt import Interrupt
-from apex_ompl.space import FULL_RESOLUTION, path_to_array, state_space, to_state
+from apex_ompl.resolution import FULL_RESOLUTION
+from apex_ompl.space import path_to_array, state_space, to_state
 from apex_ompl.validity import FullCheck, MotionCheck, VerdictChecker, VerdictMotionValidator, full_check
 
 Array = NDArray[np.float64]

@@ -13,15 +13,10 @@ from numpy.typing import NDArray
 from ompl import base as ob
 from ompl import geometric as og
 
+from apex_ompl.resolution import SEARCH_RESOLUTION
 from apex_ompl.robot import Robot
 
 Array = NDArray[np.float64]
-
-SEARCH_RESOLUTION = 0.031
-"""Spacing of states that planners check along a motion [rad, max-norm]."""
-
-FULL_RESOLUTION = 0.0031
-"""Spacing of states of the full check, which decides whether a path is a solution [rad, max-norm]."""
 
 
 def state_space(robot: Robot, resolution: float = SEARCH_RESOLUTION) -> ob.RealVectorStateSpace:

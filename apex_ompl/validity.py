@@ -12,7 +12,7 @@ from ompl import base as ob
 
 from apex_ompl.collision.verdict import Verdict
 from apex_ompl.errors import ParameterError
-from apex_ompl.space import FULL_RESOLUTION, SEARCH_RESOLUTION
+from apex_ompl.resolution import FULL_RESOLUTION, SEARCH_RESOLUTION
 
 Array = NDArray[np.float64]
 

@@ -22,8 +22,8 @@ from verdict import around_home, boxes, microseconds, of_batch
 from apex_ompl import assembly, plan
 from apex_ompl.collision import Verdict
 from apex_ompl.collision.spheres import quality, read_covers, shape_key
+from apex_ompl.resolution import FULL_RESOLUTION, SEARCH_RESOLUTION
 from apex_ompl.robot import load_robot
-from apex_ompl.space import FULL_RESOLUTION, SEARCH_RESOLUTION
 
 PROBLEMS = ("shelf_swap", "reach_past_post")
 

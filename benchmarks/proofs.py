@@ -23,8 +23,8 @@ from apex_ompl.collision import Verdict
 from apex_ompl.collision.proofs import Tally
 from apex_ompl.collision.sweep import sample_path
 from apex_ompl.problem import AttachedObject, MeshFile, Obstacle
+from apex_ompl.resolution import FULL_RESOLUTION, SEARCH_RESOLUTION
 from apex_ompl.robot import Robot, load_robot
-from apex_ompl.space import FULL_RESOLUTION, SEARCH_RESOLUTION
 
 SCENES = 20
 INSIDE_SCENES = 100

@@ -22,8 +22,9 @@ from apex_ompl import plan, problems
 from apex_ompl.collision import Verdict
 from apex_ompl.collision.broadphase import exact_requests
 from apex_ompl.problem import Obstacle
+from apex_ompl.resolution import FULL_RESOLUTION
 from apex_ompl.robot import Robot, load_robot
-from apex_ompl.space import FULL_RESOLUTION, resample
+from apex_ompl.space import resample
 from apex_ompl.validity import full_check
 
 SCENES = (3, 10, 30, 100, 300)

@@ -15,8 +15,9 @@ from apex_ompl.collision import Verdict
 from apex_ompl.errors import ParameterError
 from apex_ompl.optimize import Optimizer, Settings
 from apex_ompl.planners.registry import Parameters, bounded, register
+from apex_ompl.resolution import FULL_RESOLUTION
 from apex_ompl.simplify import simplify
-from apex_ompl.space import FULL_RESOLUTION, array_to_path, path_to_array
+from apex_ompl.space import array_to_path, path_to_array
 from apex_ompl.spline import Spline
 from apex_ompl.validity import VerdictChecker
 

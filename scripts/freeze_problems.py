@@ -27,7 +27,7 @@ from apex_ompl.problems.alignment import PACE, duration
 from apex_ompl.problems.catalogue import ProblemId, first_draw
 from apex_ompl.problems.frozen import Frozen, Witness
 from apex_ompl.problems.reach import robot
-from apex_ompl.space import SEARCH_RESOLUTION
+from apex_ompl.resolution import SEARCH_RESOLUTION
 from apex_ompl.validity import full_check
 
 Array = NDArray[np.float64]

@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import itertools
 import platform
+import socket
 import sys
 import time
 from collections import Counter
@@ -19,8 +20,9 @@ from importlib import metadata
 from typing import Any
 
 from apex_ompl.dataset import DatasetError, Paths, Store
+from apex_ompl.engine import Options
 from apex_ompl.errors import ApexError
-from apex_ompl.generation import Options, Unit, plan_units, work
+from apex_ompl.generation import Unit, plan_units, work
 from apex_ompl.problems.reach import robot
 from apex_ompl.spline import Spline
 
@@ -47,6 +49,8 @@ def spread(units: list[Unit], options: Options, spline: Spline, workers: int, ad
         raise DatasetError(
             "several workers need Ray, expected: pip install 'apex-ompl[train]'; or --workers 1"
         ) from error
+    if address and ":" in address.removeprefix("ray://"):
+        _reach(address.removeprefix("ray://"))
     local: dict[str, Any] = {} if address else {"num_cpus": workers, "object_store_memory": OBJECT_STORE}
     try:
         ray.init(address=address, include_dashboard=False, log_to_driver=False, logging_level="error", **local)
@@ -77,6 +81,19 @@ def spread(units: list[Unit], options: Options, spline: Spline, workers: int, ad
             yield unit, paths, times
     finally:
         ray.shutdown()
+
+
+def _reach(address: str) -> None:
+    """Look whether somebody listens at HOST:PORT: Ray itself tries for minutes.
+
+    Raises:
+        DatasetError: Nobody does.
+    """
+    host, _, port = address.rpartition(":")
+    try:
+        socket.create_connection((host.strip("[]"), int(port)), timeout=5.0).close()
+    except (OSError, ValueError, OverflowError) as error:
+        raise DatasetError(f"--address {address}: {error}, expected HOST:PORT of a Ray cluster") from error
 
 
 def generate(args: argparse.Namespace) -> None:

@@ -9,11 +9,11 @@ import pytest
 from support import ROOT
 
 LAYERS = [
-    {"errors", "meshes", "schema"},
+    {"errors", "meshes", "resolution", "schema"},
     {"kernel"},
     {"problem", "spline"},
     {"dataset", "optimize"},
-    {"description"},
+    {"description", "engine"},
     {"robot"},
     {"collision"},
     {"ik", "interrupt", "ompl_globals", "space"},

@@ -91,3 +91,29 @@ class Kernel:
         turn, origin = np.empty((len(states), joints, 3, 3)), np.empty((len(states), joints, 3))
         entries.joint_frames(*self.robot.packed, *self.room(), states, turn, origin)
         return turn, origin
+
+    def proves(self, path: ArrayLike, resolution: float) -> bool:
+        """Whether the spheres alone prove all of a path free, its states at most ``resolution`` apart [rad, max-norm].
+
+        Args:
+            path: States, shape (N, dof), N > 1.
+            resolution: Spacing; whole stretches are proved at once where that works.
+
+        Raises:
+            ParameterError: Another shape, or a spacing that is not positive.
+        """
+        states = self.states(path)
+        if len(states) < 2 or not resolution > 0.0:
+            raise ParameterError("path", (states.shape, resolution), "two states or more, and a positive resolution")
+        found, counts = self.unproved(states[[0, -1]])
+        if counts.any():
+            return False
+        starts = np.empty(len(states), np.int64)
+        last = entries.lay_grid(states, float(resolution), starts)
+        if last < 0:
+            return False
+        queue, ends, tally = np.empty((2 * last + 4, 2), np.int64), np.array([0, 1, 0]), np.zeros(5, np.int64)
+        queue[0] = 0, last
+        state = np.empty(self.robot.dof)
+        arrays = (states, starts, queue, ends, state, found[0], tally)
+        return bool(entries.advance(*self.packed, *self.room(), *arrays) == entries.DONE)

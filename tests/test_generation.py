@@ -1,0 +1,159 @@
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support import ROOT
+
+from apex_ompl import problems
+from apex_ompl.assembly import assemble
+from apex_ompl.dataset import FIELDS, SHAPES, SOURCES, Paths, Store
+from apex_ompl.engine import STRAIGHT_SHARE, Options, rounded
+from apex_ompl.errors import UnknownNameError
+from apex_ompl.generation import NO_POINT, Unit, plan_units, static_levels, work
+from apex_ompl.problems.reach import robot
+from apex_ompl.space import path_length
+from apex_ompl.spline import Spline
+from apex_ompl.validity import full_check
+
+SCRIPT = ROOT / "scripts" / "generate_data.py"
+UNITS = [Unit("vertical", "medium", 3, 4), Unit("wall", "easy", 3, 3), Unit("broad", "free", 3, 4)]
+
+
+@pytest.fixture(scope="module")
+def made() -> list[Paths]:
+    return [work(unit, Options(), Spline())[0] for unit in UNITS]
+
+
+def same(a: Paths, b: Paths) -> bool:
+    return all(np.array_equal(a.arrays[k], b.arrays[k]) for k in FIELDS) and a.counts == b.counts
+
+
+def test_every_path_is_proven_and_described_truly(made: list[Paths]) -> None:
+    spline, sources = Spline(), set()
+    for paths in made:
+        assert len(paths) > 10
+        control, a = paths.control(spline), paths.arrays
+        things = np.concatenate([[0], np.cumsum(a["things"])]).astype(int)
+        for k in range(len(paths)):
+            owner = int(a["problem"][k])
+            problem = problems.load(paths.problem_name(owner))
+            ready = assemble(problem, robot())
+            path = spline.path(control[k])
+            assert full_check(ready.verdict, path, paths.start[k], [paths.goal[k]])
+            assert a["length"][k] == pytest.approx(path_length(path), rel=1e-5)
+            # No sphere of the cover is nearer than it says, at the states that were looked at.
+            assert ready.verdict.kernel.clearance(path[::2], 0.2).min() == pytest.approx(a["clearance"][k], abs=1e-6)
+            source = SOURCES[a["source"][k]]
+            sources.add(source)
+            ends = ready.start, ready.goals[0]
+            ends = ends[::-1] if source == "reversed" else ends
+            if source != "part":
+                assert np.array_equal(path[0], ends[0])
+                assert np.array_equal(path[-1], ends[1])
+            else:
+                assert any(np.array_equal(path[-1], end) for end in ends)
+            straight = bool(full_check(ready.verdict, path[[0, -1]]))
+            assert not straight or source in ("line", "reversed")
+            nearest = ready.verdict.distance(path[0])
+            point = nearest.points[1] if problem.scene else NO_POINT
+            np.testing.assert_allclose(a["point"][k], point, atol=1e-3)
+            mine = slice(things[owner], things[owner + 1])
+            np.testing.assert_allclose(
+                a["position"][mine], [o.position for o in problem.scene] or np.zeros((0, 3)), atol=1e-6
+            )
+            for number, thing in zip(a["shape"][mine], problem.scene, strict=True):
+                assert getattr(thing, SHAPES[number]) is not None
+    assert {"bumps", "rrtconnect", "reversed", "part"} <= sources
+
+
+def test_the_same_seed_gives_the_same_paths_and_another_one_others(made: list[Paths]) -> None:
+    assert same(work(UNITS[1], Options(), Spline())[0], made[1])
+    assert not same(work(UNITS[1], Options(seed=1), Spline())[0], made[1])
+
+
+def test_problems_that_a_line_solves_are_few() -> None:
+    paths, _ = work(Unit("vertical", "free", 1, 10), Options(copies=1, parts=0), Spline())
+    lines = int((paths.arrays["source"] == SOURCES.index("line")).sum())
+    assert paths.counts["straight, left out"] > 0
+    assert lines <= STRAIGHT_SHARE * paths.problems
+
+
+def test_units_cover_all_static_levels_with_training_seeds() -> None:
+    units = plan_units(3000)
+    assert {(u.suite, u.level) for u in units} == set(static_levels())
+    assert len({u.name for u in units}) == len(units)
+    assert 0.8 * 3000 < sum(u.size for u in units) < 1.2 * 3000
+    assert max(u.seeds.stop for u in units) <= 800_000
+    more = {u.name for u in plan_units(4000)}
+    assert {u.name for u in units} <= more, "a larger set goes on with a smaller one"
+    assert {u.suite for u in plan_units(10, ["shelf"])} == {"shelf"}
+    assert {(u.suite, u.level) for u in plan_units(10, ["cage/hard"])} == {("cage", "hard")}
+    with pytest.raises(UnknownNameError, match="shelv"):
+        plan_units(10, ["shelv"])
+    with pytest.raises(UnknownNameError, match="moving"):
+        plan_units(10, ["vertical/moving-large-0.2"])
+
+
+def test_half_precision_stays_inside_the_limits() -> None:
+    lower, upper = robot().limits.lower, robot().limits.upper
+    control = np.stack([lower, upper, np.nextafter(upper, -np.inf)])
+    half = rounded(control, lower, upper)
+    assert (half >= lower).all() and (half <= upper).all()
+    assert np.array_equal(half, half.astype(np.float16)) and np.abs(half - control).max() < 4e-3
+
+
+def script(*arguments: object, **options: object) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, str(SCRIPT), *map(str, arguments)]
+    return subprocess.run(command, check=False, capture_output=True, text=True, timeout=240, **options)
+
+
+SMALL = ("vertical/small", "wall/easy", "broad", "--problems", 60, "--parts", 1, "--quiet")
+
+
+def test_a_killed_run_goes_on_and_ends_as_one_that_was_not(tmp_path: Path) -> None:
+    whole = script(tmp_path / "whole", *SMALL)
+    assert whole.returncode == 0, whole.stderr
+    wanted = Store(tmp_path / "whole")
+    command = [sys.executable, str(SCRIPT), str(tmp_path / "killed"), *map(str, SMALL)]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    units = tmp_path / "killed" / "units"
+    until = time.monotonic() + 120
+    while time.monotonic() < until and not (units.is_dir() and list(units.glob("[!.]*.zip"))):
+        time.sleep(0.02)
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    before = {p.name: p.stat().st_mtime_ns for p in units.glob("[!.]*.zip")}
+    assert 0 < len(before) < len(wanted.units())
+    assert script(tmp_path / "killed", *SMALL).returncode == 0
+    killed = Store(tmp_path / "killed")
+    assert killed.units() == wanted.units()
+    assert all(same(killed.read(name), wanted.read(name)) for name in wanted.units())
+    assert all((units / name).stat().st_mtime_ns == stamp for name, stamp in before.items()), "made once"
+    assert killed.manifest["counts"] == wanted.manifest["counts"]
+    again = script(tmp_path / "killed", *SMALL)
+    assert again.returncode == 0 and "nothing was left to do" in again.stdout
+
+
+def test_faults_of_the_command_are_sentences(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    (tmp_path / "old").mkdir()
+    (tmp_path / "old" / "manifest.json").write_text('{"schema": "apex-ompl/dataset/0"}')
+    cases = [
+        ((tmp_path / "file", "wall/easy"), "file"),
+        ((tmp_path / "old", "wall/easy"), "expected 'apex-ompl/dataset/1'"),
+        ((tmp_path / "new", "wal/easy"), "did you mean 'wall/easy'"),
+        ((tmp_path / "new", "--problems", "-3"), "expected a whole number"),
+        ((tmp_path / "new", "--control-points", "5"), "points: expected a whole number, 6 or more"),
+        ((tmp_path / "new", "wall/easy", "--address", "127.0.0.1:1"), "Ray"),
+    ]
+    for arguments, words in cases:
+        result = script(*arguments)
+        assert result.returncode == 2 and words in result.stderr and "Traceback" not in result.stderr, result.stderr
+    assert not (tmp_path / "new" / "units").exists() or not list((tmp_path / "new" / "units").iterdir())
