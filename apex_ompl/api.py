@@ -18,13 +18,13 @@ from ompl import geometric as og
 from apex_ompl import planners, problems
 from apex_ompl.assembly import PlanningSetup, assemble, set_goals
 from apex_ompl.errors import ParameterError
+from apex_ompl.files import is_file
 from apex_ompl.interrupt import Interrupt
 from apex_ompl.ompl_globals import quiet_ompl, seed_ompl
 from apex_ompl.problem import Problem
 from apex_ompl.repair import repair
 from apex_ompl.resolution import FULL_RESOLUTION
 from apex_ompl.result import PlanResult, PlanStatus
-from apex_ompl.schema import is_file
 from apex_ompl.simplify import simplify as shorten
 from apex_ompl.space import path_length, path_to_array, resample
 from apex_ompl.validity import full_check

@@ -18,9 +18,10 @@ from pathlib import Path
 from typing import NoReturn
 
 from apex_ompl.errors import ApexError, ParameterError
+from apex_ompl.files import check_writable
 from apex_ompl.result import SCHEMA as RESULT
 from apex_ompl.result import PlanResult, PlanStatus, check_suffix
-from apex_ompl.schema import check_writable, read_yaml
+from apex_ompl.schema import read_yaml
 
 EXIT_CODES = {
     PlanStatus.EXACT_SOLUTION: 0,

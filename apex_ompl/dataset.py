@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from apex_ompl.errors import ApexError, FileFormatError, MissingFileError
-from apex_ompl.schema import is_file, write_atomically
+from apex_ompl.files import is_file, write_atomically
 from apex_ompl.spline import Spline
 
 Array = NDArray[np.float64]
@@ -262,15 +262,13 @@ def save(path: Path, paths: Paths) -> None:
     Raises:
         DatasetError: It cannot be written.
     """
-    import zarr
-    from zarr.storage import ZipStore
-
+    zarr, zip_store = _zarr()
     temporary: str | None = None
     try:
         handle, temporary = tempfile.mkstemp(prefix=f".{path.stem}.", suffix=".part", dir=path.parent)
         os.close(handle)
         os.unlink(temporary)  # the store wants to make it
-        with ZipStore(temporary, mode="w") as store:
+        with zip_store(temporary, mode="w") as store:
             about = {"schema": SCHEMA, "names": {k: list(v) for k, v in paths.names.items()}, "counts": paths.counts}
             group = zarr.create_group(store, attributes=about)
             for name in FIELDS:
@@ -293,13 +291,11 @@ def load(path: Path) -> Paths:
         MissingFileError: There is no such file.
         FileFormatError: It holds something else.
     """
-    import zarr
-    from zarr.storage import ZipStore
-
+    zarr, zip_store = _zarr()
     if not is_file(path):
         raise MissingFileError(str(path), "file of paths")
     try:
-        with ZipStore(path, mode="r") as store:
+        with zip_store(path, mode="r") as store:
             group = zarr.open_group(store, mode="r")
             about: dict[str, Any] = dict(group.attrs)
             arrays = {name: np.asarray(group[name]) for name in FIELDS}
@@ -313,6 +309,16 @@ def load(path: Path) -> Paths:
     if fault:
         raise FileFormatError(str(path), fault, "values that do not fit", "expected arrays that fit each other")
     return Paths(arrays, names, counts)
+
+
+def _zarr() -> tuple[Any, Any]:
+    try:
+        import zarr
+        from zarr.storage import ZipStore
+    except ImportError as error:
+        expected = "expected: pip install -c constraints.txt '.[data]'"
+        raise DatasetError(f"data sets need {error.name}, {expected}") from error
+    return zarr, ZipStore
 
 
 def _renumbered(numbers: NDArray[Any], names: Iterable[str], known: list[str]) -> NDArray[Any]:

@@ -13,6 +13,7 @@ from ompl import geometric as og
 
 from apex_ompl import problems
 from apex_ompl.assembly import PlanningSetup, assemble
+from apex_ompl.cases import WrittenCase
 from apex_ompl.dataset import SHAPES, Paths
 from apex_ompl.engine import Case, Engine, Options, Row
 from apex_ompl.errors import UnknownNameError
@@ -161,6 +162,23 @@ class Task(Case):
             nearest = self.ready.verdict.distance(q)
             self.points[key] = nearest.points[1] if nearest.first else np.array(NO_POINT)
         return self.points[key]
+
+
+def written(unit: Unit) -> list[WrittenCase]:
+    """Return the problems of a unit for machines without Pinocchio."""
+    found = []
+    with quiet_ompl():
+        for seed in unit.seeds:
+            try:
+                problem = problems.load(f"{unit.suite}/{unit.level}/{seed}")
+            except SuiteError:
+                continue
+            task = Task(assemble(problem, robot()), Optimizer())
+            points = np.stack([task.point(task.start), task.point(task.goal)])
+            kernel, row = task.kernel, row_of(problem, seed)
+            names = (unit.name, unit.suite, unit.level, unit.recipe)
+            found.append(WrittenCase(*names, row, kernel.robot, kernel.scene, task.start, task.goal, points))
+    return found
 
 
 def row_of(problem: Problem, seed: int) -> Row:

@@ -16,7 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import AfterValidator, BeforeValidator, Field, PositiveFloat, Strict, field_validator, model_validator
 
 from apex_ompl.errors import FileFormatError, nearest_name
-from apex_ompl.schema import StrictModel, dump_yaml, read_yaml, validate, write_atomically
+from apex_ompl.files import write_atomically
+from apex_ompl.schema import StrictModel, dump_yaml, read_yaml, validate
 
 SCHEMA = "apex-ompl/problem/1"
 MESH_SUFFIXES = (".stl", ".obj")

@@ -20,12 +20,12 @@ from numpy.typing import NDArray
 from apex_ompl.assembly import PlanningSetup, assemble
 from apex_ompl.collision.shapes import coal_geometry, is_shell
 from apex_ompl.errors import MissingFileError, ParameterError
+from apex_ompl.files import check_writable, write_atomically
 from apex_ompl.goals import Face
 from apex_ompl.meshes import triangles
 from apex_ompl.problem import Body, Problem
 from apex_ompl.result import PlanResult
 from apex_ompl.robot import Robot
-from apex_ompl.schema import check_writable, write_atomically
 from apex_ompl.space import resample
 
 Array = NDArray[np.float64]

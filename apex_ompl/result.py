@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 from ompl import base as ob
 
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError
+from apex_ompl.files import write_atomically
 from apex_ompl.problem import Problem
-from apex_ompl.schema import dump_yaml, read_yaml, validate, write_atomically
+from apex_ompl.schema import dump_yaml, read_yaml, validate
 
 SCHEMA = "apex-ompl/result/1"
 SUFFIXES = (".npz", ".csv", ".json", ".yaml")

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
-import os
 import re
-import tempfile
 from collections.abc import Hashable
 from pathlib import Path
 from typing import Any, TypeVar, get_args, get_origin
@@ -15,7 +12,6 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from apex_ompl.errors import FileFormatError, MissingFileError, nearest_name
 
-OUTPUT = "output file"
 ModelT = TypeVar("ModelT", bound="StrictModel")
 
 
@@ -160,57 +156,6 @@ def _model_in(annotation: Any) -> type[BaseModel] | None:
         if found is not None:
             return found
     return None
-
-
-def is_file(path: Path) -> bool:
-    """Whether a path is that of a file; False also for names that no file can have."""
-    try:
-        return path.is_file()
-    except (OSError, ValueError):
-        return False
-
-
-def check_writable(path: Path) -> None:
-    """Check that a file can be written, before the work that makes its content.
-
-    Raises:
-        MissingFileError: The folder does not exist or cannot be written, or the path is a folder.
-    """
-    try:
-        if not path.parent.is_dir():
-            raise MissingFileError(str(path), OUTPUT, f"folder {str(path.parent)!r} does not exist")
-        if path.is_dir():
-            raise MissingFileError(str(path), OUTPUT, "is a folder")
-    except (OSError, ValueError) as error:
-        raise MissingFileError(str(path), OUTPUT, "no file can have this name") from error
-    if "\0" in str(path) or len(os.fsencode(path.name)) > 200:
-        raise MissingFileError(str(path), OUTPUT, "no file can have this name")
-    if not os.access(path.parent, os.W_OK):
-        raise MissingFileError(str(path), OUTPUT, f"no permission to write in {str(path.parent)!r}")
-
-
-def write_atomically(path: Path, content: bytes) -> None:
-    """Write a file under a temporary name beside it, then rename it.
-
-    Raises:
-        MissingFileError: The folder does not exist or cannot be written.
-    """
-    check_writable(path)
-    temporary: str | None = None
-    try:
-        descriptor, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
-        with os.fdopen(descriptor, "wb") as file:
-            file.write(content)
-        umask = os.umask(0)
-        os.umask(umask)
-        os.chmod(temporary, 0o666 & ~umask)
-        os.replace(temporary, path)
-    except OSError as error:
-        if temporary is not None:
-            with contextlib.suppress(OSError):
-                os.unlink(temporary)
-        why = (error.strerror or "cannot be written").lower()
-        raise MissingFileError(str(path), OUTPUT, why) from error
 
 
 class _Dumper(yaml.SafeDumper):

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from apex_ompl.schema import write_atomically
+from apex_ompl.files import write_atomically
 
 RESULTS = Path(__file__).parent / "results"
 LIBRARIES = ("apex-ompl", "ompl", "pin", "coal", "numba", "numpy")

@@ -16,7 +16,7 @@ import numpy as np
 
 from apex_ompl.dataset import PATH_FIELDS, SOURCES, DatasetError, Paths, Store, save
 from apex_ompl.errors import ApexError
-from apex_ompl.schema import check_writable
+from apex_ompl.files import check_writable
 
 TRIES = 6
 SLACK = 0.98

@@ -22,11 +22,11 @@ import pinocchio as pin
 from scipy.optimize import minimize
 
 from apex_ompl.collision.shapes import convex_hull
+from apex_ompl.files import write_atomically
 from apex_ompl.robot import Robot
 from apex_ompl.robot.assets import DATA
 from apex_ompl.robot.config import PAIRS_SCHEMA, RobotConfig, read_config
 from apex_ompl.robot.model import build_robot, link_of
-from apex_ompl.schema import write_atomically
 
 
 def root_part(robot: Robot, config: RobotConfig, link: str) -> str:

@@ -17,8 +17,8 @@ from apex_ompl import description, problems
 from apex_ompl.assembly import assemble
 from apex_ompl.dataset import SOURCES, Paths, Store, load
 from apex_ompl.errors import ApexError
+from apex_ompl.files import check_writable, write_atomically
 from apex_ompl.problems.reach import robot
-from apex_ompl.schema import check_writable, write_atomically
 from apex_ompl.spline import Spline
 from apex_ompl.validity import full_check
 
@@ -135,6 +135,12 @@ def main() -> None:
     args = parser.parse_args()
     try:
         describe(args)
+    except ImportError as error:
+        print(
+            f"describe_data: error: no {error.name}, expected: pip install -c constraints.txt '.[data]'",
+            file=sys.stderr,
+        )
+        sys.exit(2)
     except ApexError as error:
         print(f"describe_data: error: {error}", file=sys.stderr)
         sys.exit(2)

@@ -3,6 +3,9 @@
 The same options give the same paths. What was stopped goes on when the command is given again; at most the units under
 way are lost. With one worker everything runs in this process; more are run by Ray, on this machine or on a cluster.
 
+With --write-cases problems are drawn only, and written for machines without Pinocchio, Coal and OMPL; there --cases
+solves them from the straight line and from bumps, and keeps what the spheres prove.
+
 Usage: python scripts/generate_data.py FOLDER [--problems 10000] [--workers 2] [--address HOST:PORT] [SUITE[/LEVEL] ...]
 """
 
@@ -15,29 +18,33 @@ import socket
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from importlib import metadata
 from typing import Any
 
+from apex_ompl.cases import load_cases, save_cases, work_cases
 from apex_ompl.dataset import DatasetError, Paths, Store
 from apex_ompl.engine import Options
-from apex_ompl.errors import ApexError
-from apex_ompl.generation import Unit, plan_units, work
-from apex_ompl.problems.reach import robot
+from apex_ompl.errors import ApexError, ParameterError
 from apex_ompl.spline import Spline
+
+# Pinocchio, Coal and OMPL are imported where problems are drawn: --cases needs none of them.
 
 LIBRARIES = ("apex-ompl", "ompl", "pin", "coal", "numba", "numpy", "zarr")
 OBJECT_STORE = 256 << 20  # of Ray [bytes]
-Done = tuple[Unit, Paths, dict[str, float]]
+Work = Callable[[Any, Options, Spline], tuple[Paths, dict[str, float]]]
+Done = tuple[str, Paths, dict[str, float]]
 
 
-def here(units: list[Unit], options: Options, spline: Spline) -> Iterator[Done]:
-    """Work in this process."""
-    for unit in units:
-        yield unit, *work(unit, options, spline)
+def here(work: Work, units: dict[str, Any], options: Options, spline: Spline) -> Iterator[Done]:
+    """Work in this process, on units by their names."""
+    for name, unit in units.items():
+        yield name, *work(unit, options, spline)
 
 
-def spread(units: list[Unit], options: Options, spline: Spline, workers: int, address: str | None) -> Iterator[Done]:
+def spread(
+    work: Work, units: dict[str, Any], options: Options, spline: Spline, *, workers: int, address: str | None
+) -> Iterator[Done]:
     """Work by Ray, twice as many units under way as there are workers.
 
     Raises:
@@ -47,7 +54,7 @@ def spread(units: list[Unit], options: Options, spline: Spline, workers: int, ad
         import ray
     except ImportError as error:
         raise DatasetError(
-            "several workers need Ray, expected: pip install 'apex-ompl[train]'; or --workers 1"
+            "several workers need Ray, expected: pip install 'apex-ompl[data]'; or --workers 1"
         ) from error
     if address and ":" in address.removeprefix("ray://"):
         _reach(address.removeprefix("ray://"))
@@ -60,25 +67,25 @@ def spread(units: list[Unit], options: Options, spline: Spline, workers: int, ad
         ) from error
     try:
         task = ray.remote(num_cpus=1, max_retries=1)(work)
-        waiting, under_way = iter(units), {}
-        for unit in itertools.islice(waiting, 2 * workers):
-            under_way[task.remote(unit, options, spline)] = unit
+        waiting, under_way = iter(units.items()), {}
+        for name, unit in itertools.islice(waiting, 2 * workers):
+            under_way[task.remote(unit, options, spline)] = name
         while under_way:
             done, _ = ray.wait(list(under_way), num_returns=1)
-            unit = under_way.pop(done[0])
+            name = under_way.pop(done[0])
             try:
                 paths, times = ray.get(done[0])
             except ray.exceptions.RayTaskError as error:
-                raise DatasetError(f"unit {unit.name}: {str(error.cause).splitlines()[0]}") from error
+                raise DatasetError(f"unit {name}: {str(error.cause).splitlines()[0]}") from error
             except ray.exceptions.RayError as error:
                 raise DatasetError(
-                    f"unit {unit.name}: its worker died twice ({type(error).__name__}); what is written is whole, and "
+                    f"unit {name}: its worker died twice ({type(error).__name__}); what is written is whole, and "
                     "the same command goes on from there"
                 ) from error
             following = next(waiting, None)
             if following is not None:
-                under_way[task.remote(following, options, spline)] = following
-            yield unit, paths, times
+                under_way[task.remote(following[1], options, spline)] = following[0]
+            yield name, paths, times
     finally:
         ray.shutdown()
 
@@ -100,28 +107,31 @@ def generate(args: argparse.Namespace) -> None:
     """Make what is missing of the data set."""
     from tqdm import tqdm
 
-    options, spline = Options(args.seed, args.copies, args.parts), Spline(args.control_points, args.pinned)
-    units = plan_units(args.problems, args.levels)
+    spline = Spline(args.control_points, args.pinned)
+    work, units, about = _given(args) if args.cases else _drawn(args)
+    options = Options(args.seed, args.copies, 0 if args.cases else args.parts)
     manifest = {
-        "robot": robot().name, "joints": list(robot().joint_names), "seed": args.seed, "copies": args.copies,
-        "parts": args.parts, "control_points": args.control_points, "pinned": args.pinned, "degree": spline.degree,
-        "split": "train", "problems_per_unit": units[0].size, "python": platform.python_version(),
-        "versions": {library: metadata.version(library) for library in LIBRARIES},
+        **about, "seed": args.seed, "copies": args.copies,
+        "parts": options.parts, "control_points": args.control_points, "pinned": args.pinned, "degree": spline.degree,
+        "split": "train", "python": platform.python_version(),
+        "versions": _versions(),
     }  # fmt: skip
     same = ("robot", "joints", "seed", "copies", "parts", "control_points", "pinned", "degree", "problems_per_unit")
     store = Store.create(args.folder, manifest, same)
     there = set(store.units())
-    left = [unit for unit in units if unit.name not in there]
+    left = {name: unit for name, unit in units.items() if name not in there}
     started, paths, times = time.perf_counter(), 0, Counter[str]()
     alone = args.workers == 1 and args.address is None
-    source = here(left, options, spline) if alone else spread(left, options, spline, args.workers, args.address)
+    source = here(work, left, options, spline)
+    if not alone:
+        source = spread(work, left, options, spline, workers=args.workers, address=args.address)
     try:
         with tqdm(total=len(units), initial=len(units) - len(left), unit="unit", disable=args.quiet) as bar:
-            for unit, found, spent in source:
-                store.write(unit.name, found)
+            for name, found, spent in source:
+                store.write(name, found)
                 paths += len(found)
                 times.update(spent)
-                bar.set_postfix_str(f"{paths / (time.perf_counter() - started):.1f} paths/s, {unit.suite}/{unit.level}")
+                bar.set_postfix_str(f"{paths / (time.perf_counter() - started):.1f} paths/s, {name}")
                 bar.update()
     finally:
         source.close()
@@ -134,6 +144,48 @@ def generate(args: argparse.Namespace) -> None:
     store.note(counts=total)
     print(f"{args.folder}: {total['paths']} paths of {total['solved']} problems in {total['units']} units", end="")
     print(f"; {paths} of them now, {paths / seconds:.1f} a second" if paths else "; nothing was left to do")
+
+
+def _drawn(args: argparse.Namespace) -> tuple[Work, dict[str, Any], dict[str, Any]]:
+    """Return what works, units to draw, and what the manifest says of the robot."""
+    from apex_ompl.generation import plan_units, work
+    from apex_ompl.problems.reach import robot
+
+    units = {unit.name: unit for unit in plan_units(args.problems, args.levels)}
+    sizes = {unit.size for unit in units.values()}
+    about = {"robot": robot().name, "joints": list(robot().joint_names), "problems_per_unit": max(sizes)}
+    return work, units, about
+
+
+def _given(args: argparse.Namespace) -> tuple[Work, dict[str, Any], dict[str, Any]]:
+    """Return what works, units that were written, and what the manifest says of the robot.
+
+    Raises:
+        ParameterError: Suites are named beside.
+    """
+    if args.levels:
+        raise ParameterError("SUITE[/LEVEL]", " ".join(args.levels), "none beside --cases")
+    units: dict[str, Any] = {}
+    for case in load_cases(args.cases):
+        units.setdefault(case.unit, []).append(case)
+    first = next(iter(units.values()))[0]
+    sizes = {len(unit) for unit in units.values()}
+    about = {"robot": first.robot.name, "joints": list(first.robot.joint_names), "problems_per_unit": max(sizes)}
+    return work_cases, units, about
+
+
+def write_cases(args: argparse.Namespace) -> None:
+    """Draw problems and write them for machines without Pinocchio."""
+    from apex_ompl.generation import plan_units, written
+
+    cases = [case for unit in plan_units(args.problems, args.levels) for case in written(unit)]
+    save_cases(args.folder, cases)
+    print(f"{args.folder}: {len(cases)} problems in {len({case.unit for case in cases})} units")
+
+
+def _versions() -> dict[str, str]:
+    installed = {dist.metadata["Name"].lower().replace("_", "-"): dist.version for dist in metadata.distributions()}
+    return {library: installed[library] for library in LIBRARIES if library in installed}
 
 
 def summary(store: Store) -> dict[str, Any]:
@@ -161,12 +213,20 @@ def main() -> None:
     parser.add_argument("--pinned", type=_count, default=Spline.pinned, help="at each end (default: %(default)s)")
     parser.add_argument("--workers", type=_count, default=1, help="more than one are run by Ray (default: %(default)s)")
     parser.add_argument("--address", help="of a Ray cluster, for example 10.0.0.1:6379, or auto")
+    parser.add_argument("--write-cases", action="store_true", help="draw problems only, and write them to FOLDER")
+    parser.add_argument("--cases", metavar="FOLDER", help="solve the problems that --write-cases wrote there")
     parser.add_argument("--quiet", action="store_true", help="show no progress")
     args = parser.parse_args()
     try:
-        generate(args)
+        write_cases(args) if args.write_cases else generate(args)
     except KeyboardInterrupt:
         sys.exit(130)
+    except ImportError as error:
+        print(
+            f"generate_data: error: no {error.name}, expected: pip install -c constraints.txt '.[data]'",
+            file=sys.stderr,
+        )
+        sys.exit(2)
     except ApexError as error:
         print(f"generate_data: error: {error}", file=sys.stderr)
         sys.exit(2)

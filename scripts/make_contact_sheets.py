@@ -14,8 +14,8 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from apex_ompl import problems
+from apex_ompl.files import write_atomically
 from apex_ompl.render import render
-from apex_ompl.schema import write_atomically
 
 OUT = Path(__file__).resolve().parent.parent / "docs" / "pictures" / "suites"
 SIZE, DRAWN = (400, 300), (1200, 900)  # of a picture on the sheet, and as it is drawn [pixels]

@@ -19,9 +19,9 @@ import numpy as np
 
 from apex_ompl.collision.spheres import GAPS, Cover, make_cover, quality, shape_key, unproved, write_covers
 from apex_ompl.errors import ApexError
+from apex_ompl.files import check_writable
 from apex_ompl.robot import load_robot
 from apex_ompl.robot.assets import DATA
-from apex_ompl.schema import check_writable
 
 
 def shapes_of(robot: str) -> dict[str, tuple[list[str], coal.CollisionGeometry]]:

@@ -9,11 +9,14 @@ import pytest
 from support import ROOT
 
 LAYERS = [
-    {"errors", "meshes", "resolution", "schema"},
+    {"errors"},
+    {"files", "meshes", "resolution"},
+    {"schema"},
     {"kernel"},
     {"problem", "spline"},
     {"dataset", "optimize"},
     {"description", "engine"},
+    {"cases"},
     {"robot"},
     {"collision"},
     {"ik", "interrupt", "ompl_globals", "space"},

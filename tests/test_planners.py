@@ -2,11 +2,12 @@ from __future__ import annotations
 
 import dataclasses
 
+import numpy as np
 import pytest
 from ompl import base as ob
 from ompl import geometric as og
 
-from apex_ompl import planners
+from apex_ompl import plan, planners
 from apex_ompl.assembly import assemble
 from apex_ompl.errors import ParameterError, UnknownNameError
 from apex_ompl.planners.sampling import OmplParameters, setter_stem
@@ -33,7 +34,7 @@ def test_every_planner_of_the_installed_ompl_has_a_name() -> None:
     assert {r.planner for r in records if isinstance(r, OmplParameters)} == bound_planners()
 
 
-@pytest.mark.parametrize("name", planners.names())
+@pytest.mark.parametrize("name", [n for n in planners.names() if isinstance(planners.parameters(n), OmplParameters)])
 def test_defaults_are_ompls_and_values_arrive(name: str) -> None:
     si = plain_space()
     record = planners.parameters(name)
@@ -76,6 +77,9 @@ def test_records_are_frozen_and_read_text() -> None:
         ("rrt", {"intermediate_states": 1}, ParameterError, ["true or false"]),
         ("prm", {"max_nearest_neighbors": 2.5}, ParameterError, ["a whole number"]),
         ("prm", {"max_nearest_neighbors": True}, ParameterError, ["a whole number"]),
+        ("rrtconnect+polish", {"pinned": 7}, ParameterError, ["pinned", "less than half of the 14 points"]),
+        ("rrtconnect+polish", {"control_points": 5}, ParameterError, ["control_points", "[6, 200]"]),
+        ("rrtconnect+polish", {}, ParameterError, ["state validity checker", "VerdictChecker"]),
     ],
 )
 def test_faults_name_the_thing(name: str, values: dict, error: type[Exception], words: list[str]) -> None:
@@ -94,7 +98,40 @@ def test_every_planner_solves_the_robots_problem(name: str, problem: Problem) ->
     optimizing = planners.parameters(name).optimizing
     status = simple_setup.solve(ob.timedPlannerTerminationCondition(1.5 if optimizing else 8.0))
     assert ready.checker.fault is None and ready.motions.fault is None
-    if name in ("rrtconnect", "aorrtc", "prm", "bkpiece1", "lbkpiece1", "bitstar"):
+    if name in ("rrtconnect", "rrtconnect+polish", "aorrtc", "prm", "bkpiece1", "lbkpiece1", "bitstar"):
         assert status.getStatus() == ob.PlannerStatus.EXACT_SOLUTION
     if status.getStatus() == ob.PlannerStatus.EXACT_SOLUTION:
         assert simple_setup.getSolutionPath().check()
+
+
+@pytest.mark.parametrize("name", ["shelf/medium/800005", "swap/medium/800002"])
+def test_polish_shortens_what_rrtconnect_finds(name: str) -> None:
+    """The same trees, a shorter path that passes the full check, and smooth: it turns by little at each state."""
+    plain = plan(name, "rrtconnect", timeout=30.0, seed=3)
+    polished = plan(name, "rrtconnect+polish", timeout=30.0, seed=3)
+    again = plan(name, "rrtconnect+polish", timeout=30.0, seed=3)
+    assert plain and polished and polished.solved_by == "rrtconnect+polish"
+    assert polished.length < plain.length and polished.clearance > plain.clearance
+    assert np.array_equal(polished.path, again.path)
+    assert "simplify" not in polished.times
+    steps = np.diff(polished.path, axis=0)
+    turns = np.linalg.norm(np.diff(steps, axis=0), axis=1) / np.linalg.norm(steps, axis=1).mean()
+    assert len(polished.path) == 256 and turns.max() < 0.5
+    few = plan(name, "rrtconnect+polish", timeout=30.0, seed=3, params={"control_points": 20, "pinned": 3})
+    assert few and np.abs(np.diff(few.path, axis=0)[[0, -1]]).max() < 0.01 * np.abs(np.diff(few.path, axis=0)).max()
+
+
+def test_polish_stops_with_its_condition(problem: Problem) -> None:
+    """When time is up behind the search, what was found by then is the solution."""
+    ready = assemble(problem)
+    planner = planners.make("rrtconnect+polish", ready.simple_setup.getSpaceInformation())
+    ready.simple_setup.setPlanner(planner)
+    asked = iter([False] * 40)
+    status = ready.simple_setup.solve(ob.PlannerTerminationCondition(lambda: next(asked, True)))
+    assert status.getStatus() == ob.PlannerStatus.EXACT_SOLUTION
+    short = ready.simple_setup.getSolutionPath()
+    ready.simple_setup.clear()
+    assert ready.simple_setup.solve(ob.timedPlannerTerminationCondition(20.0)).getStatus() == status.getStatus()
+    assert ready.simple_setup.getSolutionPath().length() < short.length()
+    ready.simple_setup.clear()
+    assert ready.simple_setup.solve(ob.plannerAlwaysTerminatingCondition()).getStatus() != status.getStatus()

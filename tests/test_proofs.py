@@ -15,6 +15,7 @@ from apex_ompl.collision import Verdict
 from apex_ompl.collision.sweep import sample_path
 from apex_ompl.errors import ParameterError
 from apex_ompl.problem import AttachedObject, MeshFile, Obstacle
+from apex_ompl.resolution import FULL_RESOLUTION
 from apex_ompl.robot import Robot
 from apex_ompl.validity import full_check
 
@@ -298,3 +299,19 @@ def test_threads_that_ask_for_all_pairs_and_for_some_do_not_mix(robot: Robot) ->
         thread.join()
         sys.setswitchinterval(interval)
     assert not wrong
+
+
+def test_the_kernel_alone_proves_what_the_spheres_prove(verdict: Verdict, robot: Robot) -> None:
+    """What it proves no mesh denies; it proves most free motions, and none that collides."""
+    rng, proved, free = np.random.default_rng(11), 0, 0
+    for a, b in zip(states_around_home(robot, rng, 60), states_around_home(robot, rng, 60), strict=True):
+        line = np.stack([a, 0.7 * a + 0.3 * b, b])
+        by_kernel = verdict.kernel.proves(line, FULL_RESOLUTION)
+        by_all = verdict.first_collision(line, FULL_RESOLUTION) is None
+        assert by_all or not by_kernel
+        proved, free = proved + by_kernel, free + by_all
+    assert 0.5 * free <= proved < 60
+    assert not verdict.kernel.proves(np.full((2, robot.dof), np.nan), FULL_RESOLUTION)
+    for path, resolution in ((robot.home[None], 0.01), (np.stack([robot.home] * 2), 0.0)):
+        with pytest.raises(ParameterError, match="path"):
+            verdict.kernel.proves(path, resolution)

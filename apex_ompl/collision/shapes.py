@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apex_ompl.errors import FileFormatError, MissingFileError
+from apex_ompl.files import is_file
 from apex_ompl.meshes import extent_fault, orientation_fault, triangles
 from apex_ompl.problem import Body
-from apex_ompl.schema import is_file
 
 
 def coal_geometry(body: Body) -> coal.CollisionGeometry:

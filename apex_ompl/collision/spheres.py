@@ -19,8 +19,8 @@ from apex_ompl.collision.solids import Array, Round, solid_of
 from apex_ompl.collision.sphere_proof import PAD, Cover, boxes_left, distances, grown
 from apex_ompl.collision.sphere_search import search
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError
+from apex_ompl.files import write_atomically
 from apex_ompl.meshes import triangles
-from apex_ompl.schema import write_atomically
 
 __all__ = ["GAPS", "Cover", "make_cover", "quality", "read_covers", "shape_key", "unproved", "write_covers"]
 

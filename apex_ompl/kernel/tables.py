@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError, UnknownNameError
-from apex_ompl.schema import is_file, write_atomically
+from apex_ompl.files import is_file, write_atomically
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

@@ -1,0 +1,95 @@
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support import ROOT
+
+from apex_ompl import problems
+from apex_ompl.assembly import assemble
+from apex_ompl.cases import WrittenCase, load_cases, save_cases
+from apex_ompl.dataset import SOURCES, Store
+from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError
+from apex_ompl.generation import Unit, written
+from apex_ompl.problems.reach import robot
+from apex_ompl.spline import Spline
+from apex_ompl.validity import full_check
+
+WITHOUT = """
+import runpy, sys
+class Nothing:
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] in ("pinocchio", "coal", "hppfcl", "ompl", "pydantic"):
+            raise ImportError(name)
+sys.meta_path.insert(0, Nothing())
+sys.argv = sys.argv[1:]
+runpy.run_path(sys.argv[0], run_name="__main__")
+"""
+
+
+@pytest.fixture(scope="module")
+def cases() -> list[WrittenCase]:
+    return [*written(Unit("broad", "free", 5, 4)), *written(Unit("horizontal", "small", 5, 3))]
+
+
+def test_what_is_written_is_read(cases: list[WrittenCase], tmp_path: Path) -> None:
+    save_cases(tmp_path, cases)
+    again = load_cases(tmp_path)
+    assert len(again) == len(cases) == 7
+    for old, new in zip(cases, again, strict=True):
+        assert (new.unit, new.suite, new.level, new.recipe) == (old.unit, old.suite, old.level, old.recipe)
+        assert new.row.seed == old.row.seed and new.row.held == old.row.held
+        assert len(new.row.things) == len(old.row.things)
+        for mine, theirs in ((new.start, old.start), (new.goal, old.goal), (new.points, old.points)):
+            assert np.array_equal(mine, theirs)
+        packed = [(*case.scene.packed, *case.robot.packed) for case in (new, old)]
+        for mine, theirs in zip(*packed, strict=True):
+            assert np.array_equal(mine, theirs)
+
+
+def test_they_are_solved_without_pinocchio_coal_and_ompl(cases: list[WrittenCase], tmp_path: Path) -> None:
+    """What the spheres proved there passes the full check here, meshes and all."""
+    save_cases(tmp_path / "cases", cases)
+    command = [sys.executable, "-c", WITHOUT, str(ROOT / "scripts" / "generate_data.py"), str(tmp_path / "data")]
+    command += ["--cases", str(tmp_path / "cases"), "--quiet"]
+    result = subprocess.run(command, check=False, capture_output=True, text=True, timeout=300)
+    assert result.returncode == 0, result.stderr
+    store, spline = Store(tmp_path / "data"), Spline()
+    assert store.units() == ["broad-free-00005", "horizontal-small-00005"]
+    seen = 0
+    for paths in store:
+        for k, control in enumerate(paths.control(spline)):
+            ready = assemble(problems.load(paths.problem_name(int(paths.arrays["problem"][k]))), robot())
+            assert full_check(ready.verdict, spline.path(control), paths.start[k], [paths.goal[k]])
+            assert SOURCES[paths.arrays["source"][k]] in ("line", "bumps", "reversed")
+            seen += 1
+    assert seen >= 8
+
+
+def test_damaged_files_are_named(cases: list[WrittenCase], tmp_path: Path) -> None:
+    with pytest.raises(ParameterError, match="cases"):
+        save_cases(tmp_path, [])
+    with pytest.raises(MissingFileError, match=r"cases\.npz"):
+        load_cases(tmp_path / "nowhere")
+    save_cases(tmp_path, cases[:2])
+    file = tmp_path / "cases.npz"
+    whole = file.read_bytes()
+    for content in (b"", whole[: len(whole) // 2], b"PK" + whole[2:300]):
+        file.write_bytes(content)
+        with pytest.raises(FileFormatError, match=r"cases\.npz"):
+            load_cases(tmp_path)
+    file.write_bytes(whole)
+    with np.load(file) as data:
+        arrays = dict(data)
+    wrong = {"start": arrays["start"][:, :5], "kind_count": arrays["kind_count"] + 1, "goal": arrays["goal"][:1]}
+    for name, value in wrong.items():
+        np.savez(file, **{**arrays, name: value})
+        with pytest.raises(FileFormatError, match=r"cases\.npz"):
+            load_cases(tmp_path)
+    file.write_bytes(whole)
+    (tmp_path / "tables-0.npz").unlink()
+    with pytest.raises(MissingFileError, match="tables-0"):
+        load_cases(tmp_path)
