@@ -1,8 +1,8 @@
 """Print and plot what a data set holds: a folder that generate_data made, or a file of paths.
 
-Writes description.md, figures.png and motions.jpg (ten random motions) into a folder.
+Writes description.md, figures.png and motions.jpg (some random ones) into a folder.
 
-Usage: python scripts/describe_data.py DATA [--out FOLDER] [--check 200] [--seed 0]
+Usage: python scripts/describe_data.py DATA [--out FOLDER] [--check 200] [--motions 10] [--seed 0]
 """
 
 from __future__ import annotations
@@ -116,9 +116,9 @@ def describe(args: argparse.Namespace) -> None:
         which = np.sort(rng.choice(len(paths), min(args.check, len(paths)), replace=False))
         text += [checked(paths, spline, which), ""]
     plot(paths, spline, figures, args.out / "figures.png")
-    chosen = np.sort(rng.choice(len(paths), min(MOTIONS, len(paths)), replace=False))
+    chosen = np.sort(rng.choice(len(paths), min(args.motions, len(paths)), replace=False))
     captions = draw(paths, spline, chosen, args.out / "motions.jpg")
-    text += ["![figures](figures.png)", "", "Ten random motions, from left to right:", ""]
+    text += ["![figures](figures.png)", "", f"{len(chosen)} random motions, from left to right:", ""]
     text += [*(f"{k}. {c}" for k, c in enumerate(captions, 1)), "", "![motions](motions.jpg)", ""]
     print("\n".join(text))
     write_atomically(args.out / "description.md", "\n".join(text).encode())
@@ -130,6 +130,7 @@ def main() -> None:
     parser.add_argument("data", type=Path, metavar="DATA")
     parser.add_argument("--out", type=Path, default=Path(), help="folder (default: this one)")
     parser.add_argument("--check", type=int, default=200, help="paths that are proved again (default: %(default)s)")
+    parser.add_argument("--motions", type=int, default=MOTIONS, help="that are drawn (default: %(default)s)")
     parser.add_argument("--pinned", type=int, default=Spline.pinned, help="control points (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=0, help="of the random choices (default: %(default)s)")
     args = parser.parse_args()

@@ -13,7 +13,7 @@ from support import ROOT
 
 from apex_ompl import problems
 from apex_ompl.assembly import assemble
-from apex_ompl.dataset import FIELDS, SHAPES, SOURCES, Paths, Store
+from apex_ompl.dataset import FIELDS, SHAPES, SOURCES, Paths, Store, load
 from apex_ompl.engine import STRAIGHT_SHARE, Options, rounded
 from apex_ompl.errors import UnknownNameError
 from apex_ompl.generation import NO_POINT, Unit, plan_units, static_levels, work
@@ -139,6 +139,40 @@ def test_a_killed_run_goes_on_and_ends_as_one_that_was_not(tmp_path: Path) -> No
     assert killed.manifest["counts"] == wanted.manifest["counts"]
     again = script(tmp_path / "killed", *SMALL)
     assert again.returncode == 0 and "nothing was left to do" in again.stdout
+
+
+def test_a_set_is_described_and_made_compact(made: list[Paths], tmp_path: Path) -> None:
+    store = Store.create(tmp_path / "data", {}, {})
+    for unit, paths in zip(UNITS, made, strict=True):
+        store.write(unit.name, paths)
+    command = [sys.executable, str(SCRIPT.parent / "compact_data.py"), str(tmp_path / "data"), str(tmp_path / "c.zip")]
+    assert subprocess.run(command, check=False, capture_output=True).returncode == 0
+    size = 0.8 * (tmp_path / "c.zip").stat().st_size
+    assert len(load(tmp_path / "c.zip")) == sum(map(len, made))
+    done = subprocess.run([*command, "--mib", str(size / 2**20)], check=False, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    few, all_of_them = load(tmp_path / "c.zip"), Paths.joined(store)
+    assert (tmp_path / "c.zip").stat().st_size <= size
+    assert few.problems == all_of_them.problems and 10 < len(few) < len(all_of_them)
+    parts = SOURCES.index("part")
+    assert (few.arrays["source"] != parts).sum() == (all_of_them.arrays["source"] != parts).sum(), "parts go first"
+    done = subprocess.run([*command, "--mib", "0.001"], check=False, capture_output=True, text=True)
+    assert done.returncode == 2 and "expected a higher limit" in done.stderr
+    command = [sys.executable, str(SCRIPT.parent / "describe_data.py"), str(tmp_path / "c.zip")]
+    done = subprocess.run(
+        [*command, "--out", str(tmp_path), "--check", "5", "--motions", "2"],
+        check=False,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    text = (tmp_path / "description.md").read_text()
+    assert f"{len(few)} paths of {few.problems} problems" in text
+    assert "5 of 5 random paths pass the full check" in text
+    for name in ("figures.png", "motions.jpg"):
+        assert (tmp_path / name).stat().st_size > 10_000
+    done = subprocess.run([*command, "--out", "/nowhere"], check=False, capture_output=True, text=True)
+    assert done.returncode == 2 and "does not exist" in done.stderr and "Traceback" not in done.stderr
 
 
 def test_faults_of_the_command_are_sentences(tmp_path: Path) -> None:
