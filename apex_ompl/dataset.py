@@ -8,10 +8,13 @@ compact set is one such file with paths of many units.
 from __future__ import annotations
 
 import contextlib
+import fcntl
+import hashlib
 import json
 import os
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -48,6 +51,7 @@ PATH_FIELDS: dict[str, tuple[Any, tuple[int, ...]]] = {
     "length": (np.float32, ()), "source": (np.uint8, ()), "homotopy": (np.uint8, ()),
 }  # fmt: skip
 FIELDS = {**PROBLEM_FIELDS, **THING_FIELDS, **PATH_FIELDS}
+SPLINE = ("points", "pinned", "states", "degree")
 
 
 class DatasetError(ApexError):
@@ -67,11 +71,13 @@ class Paths:
             [rad], ``source`` (a number in :data:`SOURCES`), and ``homotopy``, which tells paths of a problem apart that
             could not be deformed into each other along straight lines.
         names: What numbers stand for: ``suite``, ``level``, ``held``.
+        about: Whose paths these are: ``robot``, ``joints``, and the fields of their :class:`Spline`.
         counts: What was tried, and what came of it.
     """
 
     arrays: Mapping[str, NDArray[Any]]
     names: Mapping[str, tuple[str, ...]]
+    about: Mapping[str, Any]
     counts: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -80,7 +86,7 @@ class Paths:
         Raises:
             DatasetError: They do not.
         """
-        fault = _fault(self.arrays)
+        fault = _fault(self.arrays) or _about_fault(self.about, self.arrays)
         if fault:
             raise DatasetError(f"data set: {fault}")
 
@@ -103,8 +109,14 @@ class Paths:
         """Goal of each path, shape (N, dof) [rad]."""
         return from_micro(self.arrays["goal"])
 
-    def control(self, spline: Spline, which: Any = slice(None)) -> Array:
+    @property
+    def spline(self) -> Spline:
+        """What the control points belong to."""
+        return Spline(**{key: self.about[key] for key in SPLINE})
+
+    def control(self, which: Any = slice(None)) -> Array:
         """Return all control points of paths, shape (n, points, dof) [rad]."""
+        spline = self.spline
         free = np.asarray(self.arrays["control"][which], float)
         points = np.zeros((len(free), spline.points, free.shape[2]))
         points[:, spline.inner] = free
@@ -128,7 +140,7 @@ class Paths:
         arrays |= {name: a[name][things] for name in THING_FIELDS}
         arrays |= {name: a[name][kept] for name in PATH_FIELDS}
         arrays["problem"] = place[a["problem"][kept]].astype(np.int32)
-        return Paths(arrays, self.names)
+        return Paths(arrays, self.names, self.about)
 
     @classmethod
     def joined(cls, several: Iterable[Paths]) -> Paths:
@@ -142,6 +154,8 @@ class Paths:
             raise DatasetError("data set: no paths to join")
         names: dict[str, list[str]] = {key: [] for key in ("suite", "level", "held")}
         columns: dict[str, list[NDArray[Any]]] = {name: [] for name in FIELDS}
+        if any(dict(part.about) != dict(parts[0].about) for part in parts):
+            raise DatasetError("data set: its units have states of different robots or splines")
         before = 0
         for part in parts:
             for name in FIELDS:
@@ -150,11 +164,8 @@ class Paths:
                     column = _renumbered(column, part.names[name], names[name])
                 columns[name].append(column + np.int32(before) if name == "problem" else column)
             before += part.problems
-        try:
-            arrays = {name: np.concatenate(column) for name, column in columns.items()}
-        except ValueError as error:
-            raise DatasetError("data set: its units have states of different robots or splines") from error
-        return cls(arrays, {key: tuple(values) for key, values in names.items()})
+        arrays = {name: np.concatenate(column) for name, column in columns.items()}
+        return cls(arrays, {key: tuple(values) for key, values in names.items()}, parts[0].about)
 
 
 def to_micro(states: ArrayLike) -> NDArray[np.int32]:
@@ -204,11 +215,13 @@ class Store:
             DatasetError: What is there was made otherwise.
         """
         path = Path(folder) / "manifest.json"
-        if not path.exists():
-            try:
-                (path.parent / "units").mkdir(parents=True, exist_ok=True)
-            except OSError as error:
-                raise MissingFileError(str(folder), "folder for a data set", str(error.strerror).lower()) from error
+        try:
+            (path.parent / "units").mkdir(parents=True, exist_ok=True)
+            new = not path.exists()
+        except (OSError, ValueError) as error:
+            why = (getattr(error, "strerror", None) or str(error)).lower()
+            raise MissingFileError(str(folder), "folder for a data set", why) from error
+        if new:
             write_atomically(path, (json.dumps({"schema": SCHEMA, **manifest}, indent=1) + "\n").encode())
         store = cls(folder)
         for key in same:
@@ -217,9 +230,23 @@ class Store:
                     f"{folder}: {key} is {store.manifest.get(key)!r} there, expected {manifest[key]!r}; "
                     "take another folder, or the same options"
                 )
-        for left in (store.folder / "units").glob(".*.part"):  # of a process that was ended
-            left.unlink(missing_ok=True)
         return store
+
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Keep other processes from writing, and clear away what an ended one left half-written.
+
+        Raises:
+            DatasetError: Another process writes here.
+        """
+        with open(self.folder / ".lock", "w") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError as error:
+                raise DatasetError(f"{self.folder}: another process writes here, expected one at a time") from error
+            for left in (self.folder / "units").glob(".*.part"):
+                left.unlink(missing_ok=True)
+            yield
 
     def note(self, **entries: Any) -> None:
         """Add entries to the manifest.
@@ -269,8 +296,14 @@ def save(path: Path, paths: Paths) -> None:
         os.close(handle)
         os.unlink(temporary)  # the store wants to make it
         with zip_store(temporary, mode="w") as store:
-            about = {"schema": SCHEMA, "names": {k: list(v) for k, v in paths.names.items()}, "counts": paths.counts}
-            group = zarr.create_group(store, attributes=about)
+            head = {
+                "schema": SCHEMA,
+                "names": {k: list(v) for k, v in paths.names.items()},
+                "about": dict(paths.about),
+                "counts": dict(paths.counts),
+                "digest": _digest(paths.arrays),
+            }
+            group = zarr.create_group(store, attributes=head)
             for name in FIELDS:
                 array = np.ascontiguousarray(paths.arrays[name])
                 group.create_array(name, data=array, chunks=tuple(max(1, n) for n in array.shape))
@@ -297,18 +330,29 @@ def load(path: Path) -> Paths:
     try:
         with zip_store(path, mode="r") as store:
             group = zarr.open_group(store, mode="r")
-            about: dict[str, Any] = dict(group.attrs)
-            arrays = {name: np.asarray(group[name]) for name in FIELDS}
-        names = {key: tuple(str(v) for v in about["names"][key]) for key in ("suite", "level", "held")}
-        counts, found = about["counts"], about["schema"]
+            head: dict[str, Any] = dict(group.attrs)
+            found = head["schema"]
+            arrays = {name: np.asarray(group[name]) for name in FIELDS} if found == SCHEMA else {}
+        if found == SCHEMA:
+            names = {key: tuple(str(v) for v in head["names"][key]) for key in ("suite", "level", "held")}
+            about, counts, digest = head["about"], head["counts"], head["digest"]
     except Exception as error:  # zipfile, zarr and the codecs let many kinds through
         raise FileFormatError(str(path), "", type(error).__name__, "expected paths of a data set") from error
     if found != SCHEMA:
         raise FileFormatError(str(path), "schema", found, f"expected {SCHEMA!r}")
-    fault = _fault(arrays) or _names_fault(arrays, names)
+    fault = _fault(arrays) or _names_fault(arrays, names) or _about_fault(about, arrays)
+    if not fault and digest != _digest(arrays):  # a chunk that is missed reads as zeros
+        fault = "digest"
     if fault:
         raise FileFormatError(str(path), fault, "values that do not fit", "expected arrays that fit each other")
-    return Paths(arrays, names, counts)
+    return Paths(arrays, names, about, counts)
+
+
+def _digest(arrays: Mapping[str, NDArray[Any]]) -> str:
+    digest = hashlib.sha256()
+    for name in FIELDS:
+        digest.update(np.ascontiguousarray(arrays[name]).tobytes())
+    return digest.hexdigest()
 
 
 def _zarr() -> tuple[Any, Any]:
@@ -353,6 +397,15 @@ def _fault(arrays: Mapping[str, NDArray[Any]]) -> str:
         if arrays["source"].max() >= len(SOURCES) or not np.isfinite(arrays["control"]).all():
             return "source or control"
     return ""
+
+
+def _about_fault(about: Any, arrays: Mapping[str, NDArray[Any]]) -> str:
+    try:
+        spline, joints = Spline(**{key: about[key] for key in SPLINE}), about["joints"]
+        fits = isinstance(about["robot"], str) and all(isinstance(name, str) for name in joints)
+        return "" if fits and arrays["control"].shape[1:] == (spline.free, len(joints)) else "about"
+    except (ApexError, KeyError, TypeError):
+        return "about"
 
 
 def _names_fault(arrays: Mapping[str, NDArray[Any]], names: Mapping[str, tuple[str, ...]]) -> str:

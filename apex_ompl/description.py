@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apex_ompl.dataset import SOURCES, Paths
-from apex_ompl.spline import Spline
 
 Array = NDArray[np.float64]
 
@@ -26,7 +25,7 @@ class Figures:
         problems: Number of problems.
         paths: Number of paths.
         sources: How many paths come from where.
-        straight: Share of the problems that the straight line solves.
+        straight: Share of the problems kept that the straight line solves; the engine keeps few of those.
         homotopies: Mean number of homotopies found of a problem that the straight line does not solve.
         several: Share of those problems with more than one.
         duplicates: Paths that are nearly the same as an earlier one with the same ends.
@@ -86,13 +85,13 @@ def duplicates(paths: Paths) -> NDArray[np.bool_]:
     return twins
 
 
-def coverage(paths: Paths, spline: Spline, lower: Array, upper: Array, most: int = 2000) -> Array:
+def coverage(paths: Paths, lower: Array, upper: Array, most: int = 2000) -> Array:
     """Return how much of each joint's range paths use: 1st, 50th and 99th percentile of their states, (3, dof) in 0..1.
 
     Of at most ``most`` paths, evenly spread over the set.
     """
     which = np.unique(np.linspace(0, len(paths) - 1, most).astype(int))
-    states = spline.path(paths.control(spline, which)).reshape(-1, len(lower))
+    states = paths.spline.path(paths.control(which)).reshape(-1, len(lower))
     return np.asarray((np.percentile(states, (1, 50, 99), axis=0) - lower) / (upper - lower))
 
 

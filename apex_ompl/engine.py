@@ -10,7 +10,7 @@ import zlib
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -159,7 +159,7 @@ class Case:
         return found
 
     def clearance(self, states: Array) -> float:
-        """Return the clearance of the sphere cover along a path, at every other state [m]."""
+        """Return the clearance of the sphere cover along a path, at every other of its states from the first [m]."""
         return float(self.kernel.clearance(states[::2], 0.2).min())
 
 
@@ -295,16 +295,17 @@ class Engine:
         for key, value in values.items():
             self._rows[key].append(value)
 
-    def paths(self, dof: int) -> Paths:
-        """Return what was kept, of a robot with ``dof`` joints."""
-        free = self.optimizer.spline.free
+    def paths(self, robot: str, joints: Sequence[str]) -> Paths:
+        """Return what was kept, of a robot by its name and planned joints."""
+        dof, free = len(joints), self.optimizer.spline.free
         shapes = {"start": (dof,), "goal": (dof,), "control": (free, dof)}
         arrays = {
             name: np.array(self._rows[name], kind).reshape(-1, *shapes.get(name, shape))
             for name, (kind, shape) in FIELDS.items()
         }
         names = {"suite": self._names[:1], "level": self._names[1:], "held": tuple(self._held)}
-        return Paths(arrays, names, {**self.counts, "unsolved": self._unsolved})
+        about = {"robot": robot, "joints": list(joints), **asdict(self.optimizer.spline)}
+        return Paths(arrays, names, about, {**self.counts, "unsolved": self._unsolved})
 
     @contextmanager
     def timed(self, stage: str) -> Iterator[None]:

@@ -121,7 +121,7 @@ def work(unit: Unit, options: Options, spline: Spline) -> tuple[Paths, dict[str,
                     engine.counts["not drawn"] += 1
                     continue
             engine.solve(task, row_of(task.ready.problem, seed))
-    return engine.paths(robot().dof), engine.times
+    return engine.paths(robot().name, robot().joint_names), engine.times
 
 
 class Task(Case):
@@ -148,12 +148,20 @@ class Task(Case):
         setup.setPlanner(og.RRTConnect(si))
         left = iter(range(MOST_ITERATIONS))
         status = setup.solve(ob.PlannerTerminationCondition(lambda: next(left, None) is None))
+        self._raise_faults()
         if status.getStatus() != ob.PlannerStatus.EXACT_SOLUTION:
             return None
         path = path_to_array(setup.getSolutionPath(), self.ready.robot.dof)
         path = simplify(og.PathSimplifier(si), si, path)
+        self._raise_faults()
         path = np.concatenate([self.start[None], path[1:-1], self.goal[None]])
         return self.optimizer.spline.fit(path, self.lower, self.upper).control
+
+    def _raise_faults(self) -> None:
+        """Raise what OMPL's callbacks kept, Ctrl-C among it."""
+        fault = self.ready.checker.fault or self.ready.motions.fault
+        if fault is not None:
+            raise fault
 
     def point(self, q: Array) -> Array:
         """Return the obstacle point that is nearest to the robot, tables excluded, shape (3,) [m]; by GJK."""

@@ -33,8 +33,8 @@ class Settings:
     """What a path costs, and how long it is worked on.
 
     Attributes:
-        samples: How many states of a path are judged, evenly spaced in the parameter: every fourth state of a path
-            of 256, and the middle between two.
+        samples: How many states are judged: the middles of as many even stretches of the parameter, twice as dense as
+            every fourth state of a path of 256.
         scene_margin: Clearance to obstacles below which a state costs [m].
         own_margin: Clearance between the robot's own links, its arms among them, below which a state costs [m].
         stiffness: Weight of half the integral of the speed squared, [1/rad^2]; for an even speed this is half the
@@ -64,8 +64,8 @@ class Settings:
             low = 1 if field.name == "samples" else 0
             good = isinstance(value, kinds) and not isinstance(value, bool) and low <= value < np.inf
             if not good or (value == 0 and field.name in ("scene_margin", "own_margin", "stiffness")):
-                expected = "a whole number" if whole else "a positive number"
-                raise ParameterError(field.name, value, f"{expected}, at least {low}" if whole else expected)
+                least = f"{low} or more" if whole or field.name in ("damping", "tolerance") else "more than 0"
+                raise ParameterError(field.name, value, f"{'a whole' if whole else 'a'} number, {least}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,6 +180,9 @@ class Optimizer:
         about = np.empty((len(control), 6))
         if not len(control):
             return self._bent(control, about)
+        for name, number in (("steps", steps), ("stiffness", stiffness), ("damping", damping)):
+            if number is not None and not (np.asarray(number) >= 0.0).all():
+                raise ParameterError(name, number, "a number, 0 or more")
         grid = _grid(self.spline, self.settings.samples)
         numbers = self._numbers()
         numbers[bending.STEPS] = self.settings.steps if steps is None else steps
@@ -231,10 +234,10 @@ class Optimizer:
     def shorten(
         self, kernel: Kernel, control: ArrayLike, is_valid: Check, stop: Callable[[], bool] = lambda: False
     ) -> Array | None:
-        """Return the shortest valid path that comes out of one, as control points, shape (points, dof), or None.
+        """Return the last valid path of stiffer and stiffer ones, control points of shape (points, dof), or None.
 
-        The stiffness grows from round to round, until a path fails the check; where the first one fails already, a
-        softer one has its turn.
+        Stiffer paths are shorter. The stiffness grows from round to round, until a path fails the check; where the
+        first one fails already, a softer one has its turn.
 
         Args:
             kernel: The robot among its obstacles.

@@ -42,9 +42,11 @@ class Spline:
         Raises:
             ParameterError: There are too few points, states or pinned points, or nothing is left free.
         """
-        for name, low in (("degree", 1), ("points", self.degree + 1), ("pinned", 1), ("states", 2)):
+        for name in ("degree", "points", "pinned", "states"):
             value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int) or value < low:
+            whole = isinstance(value, int) and not isinstance(value, bool)
+            low = {"points": self.degree + 1, "states": 2}.get(name, 1) if name != "degree" else 1
+            if not whole or value < low:
                 raise ParameterError(name, value, f"a whole number, {low} or more")
         if self.free < 1:
             raise ParameterError("pinned", self.pinned, f"less than half of the {self.points} points")

@@ -58,20 +58,25 @@ def warm_up() -> None:
 
 
 def scaled(workers: int) -> dict[str, float]:
-    """Return the rate of the script with some workers, start of the workers left out."""
+    """Return the rate of the script with some workers, their start included."""
     with tempfile.TemporaryDirectory() as folder:
         command = [sys.executable, str(SCRIPT), folder, *SCALED, "--problems", str(PROBLEMS), "--quiet"]
-        begin = time.perf_counter()
         subprocess.run([*command, "--workers", str(workers)], check=True, stdout=subprocess.DEVNULL)
-        whole = time.perf_counter() - begin
         made = json.loads((Path(folder) / "manifest.json").read_text())["runs"][0]
-    return {"workers": workers, "paths": made["paths"], "seconds": made["seconds"], "with_start_s": whole}
+    return {"workers": workers, "paths": made["paths"], "seconds": made["seconds"]}
 
 
 def main() -> None:
     """Measure, and write the results."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--units", type=int, default=2, help=f"of {UNIT} problems, a level (default: %(default)s)")
+    parser.add_argument(
+        "--units",
+        type=int,
+        choices=range(1, 100),
+        metavar="N",
+        default=2,
+        help=f"of {UNIT} problems, a level (default: %(default)s)",
+    )
     parser.add_argument("--workers", type=int, default=2, help="processes at once (default: %(default)s)")
     parser.add_argument("--first", type=int, default=40_000, help="number of the first unit (default: %(default)s)")
     args = parser.parse_args()
@@ -98,7 +103,7 @@ def main() -> None:
     text += [f"A worker took {memory:.0f} MiB at most.", ""]
     text += [f"generate_data {' '.join(SCALED)} --problems {PROBLEMS}: " + "; ".join(
         f"{s['workers']} worker{'s' if s['workers'] > 1 else ''} {s['paths'] / s['seconds']:.1f} paths/s "
-        f"({s['with_start_s']:.0f} s with the start)" for s in scaling) + "."]  # fmt: skip
+        f"({s['seconds']:.0f} s)" for s in scaling) + "."]  # fmt: skip
     record.write(
         "data_engine", {"levels": levels, "totals": totals, "mixed_rate": mix, "hours": hours, "scaling": scaling,
                         "memory_mb": memory}, "\n".join(text), units=args.units, problems_per_unit=UNIT,
@@ -117,7 +122,7 @@ def _totals(name: str, rows: list[dict[str, Any]], workers: int) -> dict[str, An
     rates = {s: workers * n / seconds for s, n in sources.items()}
     shares = {stage: value / seconds for stage, value in times.most_common()}
     return {"level": name, "rate": sum(rates.values()), "rates": rates, "tried": tried, "solved": solved,
-            "seconds_per_problem": seconds / max(1, tried), "time": shares}  # fmt: skip
+            "seconds_per_problem": seconds / max(1, UNIT * len(rows)), "time": shares}  # fmt: skip
 
 
 def _summary(level: str, made: list[dict[str, Any]], workers: int) -> dict[str, Any]:
@@ -136,7 +141,7 @@ def _mixed(levels: list[dict[str, Any]]) -> float:
 
 
 def _table(rows: list[dict[str, Any]]) -> str:
-    head = ["level", "paths/s", *SOURCES[1:], "problems tried", "solved", "s a problem", "where the time goes"]
+    head = ["level", "paths/s", *SOURCES[1:], "problems tried", "solved", "s a problem drawn", "where the time goes"]
     lines = [head, ["---", *["---:"] * (len(head) - 2), "---"]]
     for f in rows:
         where = ", ".join(f"{stage} {share:.0%}" for stage, share in list(f["time"].items())[:MOST_DEEP])

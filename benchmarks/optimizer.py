@@ -137,7 +137,8 @@ def main() -> None:
     args = parser.parse_args()
     static = [(s, v) for s, levels in problems.suites().items() for v in levels if not v.startswith("moving-")]
     chosen = [f"{s}/{v}" for s, v in static if not args.levels or s in args.levels or f"{s}/{v}" in args.levels]
-    if not chosen:
+    known = {s for s, _ in static} | {f"{s}/{v}" for s, v in static}
+    if not chosen or not set(args.levels) <= known:
         raise SystemExit(f"unknown suite or level; known: {', '.join(f'{s}/{v}' for s, v in static)}")
     done, todo = read(args.store), []
     for level in chosen:
@@ -147,6 +148,8 @@ def main() -> None:
         todo += [(name, m) for m in methods for name in names if (name, m) not in done]
     todo.sort(key=lambda job: job[1] in ON_HARD_ALONE)
     args.store.parent.mkdir(parents=True, exist_ok=True)
+    if args.store.is_file() and not args.store.read_bytes().endswith(b"\n"):  # the process ended while it wrote
+        args.store.write_text(args.store.read_text() + "\n")
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(args.jobs, mp_context=context, initializer=warm_up) as pool, args.store.open("a") as out:
         jobs = {pool.submit(run, job): job for job in ([] if args.report else todo)}

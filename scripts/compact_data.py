@@ -18,37 +18,62 @@ from apex_ompl.dataset import PATH_FIELDS, SOURCES, DatasetError, Paths, Store, 
 from apex_ompl.errors import ApexError
 from apex_ompl.files import check_writable
 
-TRIES = 6
-SLACK = 0.98
+CLOSE = 200  # how closely the limit is met: to one part in this
 
 
-def some(paths: Paths, count: int, rng: np.random.Generator) -> Paths:
+def some(paths: Paths, count: int, seed: int) -> Paths:
     """Return a set with all problems and ``count`` of the paths."""
     rank = np.array([{"reversed": 1, "part": 2}.get(s, 0) for s in SOURCES])[paths.arrays["source"]]
-    order = np.lexsort((rng.random(len(paths)), rank))
+    order = np.lexsort((np.random.default_rng(seed).random(len(paths)), rank))
     kept = np.sort(order[:count])
     arrays = {name: a[kept] if name in PATH_FIELDS else a for name, a in paths.arrays.items()}
-    return Paths(arrays, paths.names, {})
+    return Paths(arrays, paths.names, paths.about)
 
 
 def compact(args: argparse.Namespace) -> None:
     """Write as many paths as fit."""
     check_writable(args.file)
-    whole, limit = Paths.joined(Store(args.folder)), args.mib * 2**20
-    count = len(whole)
+    every, limit = Paths.joined(Store(args.folder)), args.mib * 2**20
     with tempfile.TemporaryDirectory() as folder:
-        for _ in range(TRIES):
-            trial = Path(folder) / "trial.zip"
-            chosen = some(whole, count, np.random.default_rng(args.seed))
-            save(trial, chosen)
+        trial = Path(folder) / "trial.zip"
+        fits, too_many, count = -1, len(every) + 1, len(every)
+        while count > fits and too_many - fits > max(1, len(every) // CLOSE):
+            save(trial, some(every, count, args.seed))
             size = trial.stat().st_size
-            if size <= limit:
-                break
-            count = int(count * limit / size * SLACK)
-        else:
-            raise DatasetError(f"{args.mib} MiB: even {len(chosen)} paths take more, expected a higher limit")
+            fits, too_many = (count, too_many) if size <= limit else (fits, count)
+            count = (fits + too_many) // 2
+        if fits < 0:
+            raise DatasetError(f"{args.mib} MiB: the problems alone take more, expected a higher limit")
+    chosen = some(every, fits, args.seed)
     save(args.file, chosen)
-    print(f"{args.file}: {len(chosen)} of {len(whole)} paths, {chosen.problems} problems, {size / 2**20:.1f} MiB")
+    size = args.file.stat().st_size
+    print(f"{args.file}: {len(chosen)} of {len(every)} paths, {chosen.problems} problems, {size / 2**20:.1f} MiB")
+
+
+def mebibytes(text: str) -> float:
+    """Read a size.
+
+    Raises:
+        ArgumentTypeError: It is none.
+    """
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0.0 < value < 1e6:
+        raise argparse.ArgumentTypeError(f"{text!r}, expected a positive number of MiB")
+    return value
+
+
+def whole(text: str) -> int:
+    """Read a whole number.
+
+    Raises:
+        ArgumentTypeError: It is none.
+    """
+    if not text.isdecimal() or not int(text) < 2**31:
+        raise argparse.ArgumentTypeError(f"{text!r}, expected a whole number from 0 to 2147483647")
+    return int(text)
 
 
 def main() -> None:
@@ -56,8 +81,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path, metavar="FOLDER")
     parser.add_argument("file", type=Path, metavar="FILE.zip")
-    parser.add_argument("--mib", type=float, default=24.0, help="largest size (default: %(default)s)")
-    parser.add_argument("--seed", type=int, default=0, help="of the random choice (default: %(default)s)")
+    parser.add_argument("--mib", type=mebibytes, default=24.0, help="largest size (default: %(default)s)")
+    parser.add_argument("--seed", type=whole, default=0, help="of the random choice (default: %(default)s)")
     args = parser.parse_args()
     try:
         compact(args)

@@ -15,11 +15,10 @@ import numpy as np
 
 from apex_ompl import description, problems
 from apex_ompl.assembly import assemble
-from apex_ompl.dataset import SOURCES, Paths, Store, load
+from apex_ompl.dataset import SOURCES, DatasetError, Paths, Store, load
 from apex_ompl.errors import ApexError
-from apex_ompl.files import check_writable, write_atomically
+from apex_ompl.files import check_writable, is_file, write_atomically
 from apex_ompl.problems.reach import robot
-from apex_ompl.spline import Spline
 from apex_ompl.validity import full_check
 
 SHOTS, MOTIONS, SIZE = 5, 10, (320, 240)
@@ -37,16 +36,16 @@ def table(figures: list[description.Figures]) -> str:
     return "\n".join("| " + " | ".join(str(c) for c in row) + " |" for row in rows)
 
 
-def checked(paths: Paths, spline: Spline, which: np.ndarray) -> str:
+def checked(paths: Paths, which: np.ndarray) -> str:
     """Return what the full check says of some paths as they are stored."""
-    control, good = paths.control(spline, which), 0
+    control, spline, good = paths.control(which), paths.spline, 0
     for k, points in zip(which, control, strict=True):
         ready = assemble(problems.load(paths.problem_name(int(paths.arrays["problem"][k]))), robot())
         good += bool(full_check(ready.verdict, spline.path(points), paths.start[k], [paths.goal[k]]))
     return f"{good} of {len(which)} random paths pass the full check as they are stored."
 
 
-def plot(paths: Paths, spline: Spline, figures: list[description.Figures], file: Path) -> None:
+def plot(paths: Paths, figures: list[description.Figures], file: Path) -> None:
     """Draw lengths, clearances, sources and the coverage of joints."""
     import matplotlib
 
@@ -71,7 +70,7 @@ def plot(paths: Paths, spline: Spline, figures: list[description.Figures], file:
     axes[1, 0].set_title("paths, by level and source")
     axes[1, 0].tick_params(axis="y", labelsize=7)
     axes[1, 0].legend(fontsize=8)
-    low, middle, high = description.coverage(paths, spline, limits.lower, limits.upper)
+    low, middle, high = description.coverage(paths, limits.lower, limits.upper)
     joints = np.arange(len(low))
     axes[1, 1].bar(joints, high - low, bottom=low, color="#9db8d2", label="1st to 99th percentile")
     axes[1, 1].plot(joints, middle, "k_", markersize=14, label="median")
@@ -85,14 +84,14 @@ def plot(paths: Paths, spline: Spline, figures: list[description.Figures], file:
     write_atomically(file, stream.getvalue())
 
 
-def draw(paths: Paths, spline: Spline, which: np.ndarray, file: Path) -> list[str]:
+def draw(paths: Paths, which: np.ndarray, file: Path) -> list[str]:
     """Draw some motions, a row each, and return what they are."""
     import imageio.v3 as iio
 
     from apex_ompl.render import Stage
 
-    rows, captions = [], []
-    for k, points in zip(which, paths.control(spline, which), strict=True):
+    rows, captions, spline = [], [], paths.spline
+    for k, points in zip(which, paths.control(which), strict=True):
         name = paths.problem_name(int(paths.arrays["problem"][k]))
         stage = Stage(assemble(problems.load(name), robot()), SIZE)
         at = np.linspace(0, spline.states - 1, SHOTS).astype(int)
@@ -107,21 +106,44 @@ def describe(args: argparse.Namespace) -> None:
     """Describe the data set."""
     for name in ("description.md", "figures.png", "motions.jpg"):
         check_writable(args.out / name)
-    paths = load(args.data) if args.data.is_file() else Paths.joined(Store(args.data))
-    spline = Spline(paths.arrays["control"].shape[1] + 2 * args.pinned, args.pinned)
+    paths = load(args.data) if is_file(args.data) else Paths.joined(Store(args.data))
+    if not len(paths):
+        raise DatasetError(f"{args.data}: there are no paths, expected some")
     figures = description.levels(paths)
     rng = np.random.default_rng(args.seed)
     text = [f"# {args.data.name}", "", f"{len(paths)} paths of {paths.problems} problems.", "", table(figures), ""]
     if args.check:
         which = np.sort(rng.choice(len(paths), min(args.check, len(paths)), replace=False))
-        text += [checked(paths, spline, which), ""]
-    plot(paths, spline, figures, args.out / "figures.png")
+        text += [checked(paths, which), ""]
+    plot(paths, figures, args.out / "figures.png")
     chosen = np.sort(rng.choice(len(paths), min(args.motions, len(paths)), replace=False))
-    captions = draw(paths, spline, chosen, args.out / "motions.jpg")
+    captions = draw(paths, chosen, args.out / "motions.jpg")
     text += ["![figures](figures.png)", "", f"{len(chosen)} random motions, from left to right:", ""]
     text += [*(f"{k}. {c}" for k, c in enumerate(captions, 1)), "", "![motions](motions.jpg)", ""]
     print("\n".join(text))
     write_atomically(args.out / "description.md", "\n".join(text).encode())
+
+
+def whole(text: str) -> int:
+    """Read a whole number.
+
+    Raises:
+        ArgumentTypeError: It is none.
+    """
+    if not text.isdecimal() or not int(text) < 2**31:
+        raise argparse.ArgumentTypeError(f"{text!r}, expected a whole number from 0 to 2147483647")
+    return int(text)
+
+
+def some(text: str) -> int:
+    """Read a whole number, 1 or more.
+
+    Raises:
+        ArgumentTypeError: It is none.
+    """
+    if whole(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text!r}, expected a whole number, 1 or more")
+    return int(text)
 
 
 def main() -> None:
@@ -129,10 +151,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("data", type=Path, metavar="DATA")
     parser.add_argument("--out", type=Path, default=Path(), help="folder (default: this one)")
-    parser.add_argument("--check", type=int, default=200, help="paths that are proved again (default: %(default)s)")
-    parser.add_argument("--motions", type=int, default=MOTIONS, help="that are drawn (default: %(default)s)")
-    parser.add_argument("--pinned", type=int, default=Spline.pinned, help="control points (default: %(default)s)")
-    parser.add_argument("--seed", type=int, default=0, help="of the random choices (default: %(default)s)")
+    parser.add_argument("--check", type=whole, default=200, help="paths that are proved again (default: %(default)s)")
+    parser.add_argument("--motions", type=some, default=MOTIONS, help="that are drawn (default: %(default)s)")
+    parser.add_argument("--seed", type=whole, default=0, help="of the random choices (default: %(default)s)")
     args = parser.parse_args()
     try:
         describe(args)

@@ -20,12 +20,14 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from importlib import metadata
+from pathlib import Path
 from typing import Any
 
 from apex_ompl.cases import load_cases, save_cases, work_cases
 from apex_ompl.dataset import DatasetError, Paths, Store
 from apex_ompl.engine import Options
 from apex_ompl.errors import ApexError, ParameterError
+from apex_ompl.files import check_writable
 from apex_ompl.spline import Spline
 
 # Pinocchio, Coal and OMPL are imported where problems are drawn: --cases needs none of them.
@@ -62,9 +64,7 @@ def spread(
     try:
         ray.init(address=address, include_dashboard=False, log_to_driver=False, logging_level="error", **local)
     except Exception as error:  # ConnectionError, ValueError, RuntimeError
-        raise DatasetError(
-            f"Ray: {str(error).splitlines()[0]}, expected a cluster at {address or 'this machine'}"
-        ) from error
+        raise DatasetError(f"Ray: {_first_line(error)}, expected a cluster at {address or 'this machine'}") from error
     try:
         task = ray.remote(num_cpus=1, max_retries=1)(work)
         waiting, under_way = iter(units.items()), {}
@@ -76,7 +76,7 @@ def spread(
             try:
                 paths, times = ray.get(done[0])
             except ray.exceptions.RayTaskError as error:
-                raise DatasetError(f"unit {name}: {str(error.cause).splitlines()[0]}") from error
+                raise DatasetError(f"unit {name}: {_first_line(error.cause)}") from error
             except ray.exceptions.RayError as error:
                 raise DatasetError(
                     f"unit {name}: its worker died twice ({type(error).__name__}); what is written is whole, and "
@@ -88,6 +88,10 @@ def spread(
             yield name, paths, times
     finally:
         ray.shutdown()
+
+
+def _first_line(error: BaseException) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0]
 
 
 def _reach(address: str) -> None:
@@ -105,7 +109,8 @@ def _reach(address: str) -> None:
 
 def generate(args: argparse.Namespace) -> None:
     """Make what is missing of the data set."""
-    from tqdm import tqdm
+    import tqdm  # noqa: F401 - said now if it is missing, and not behind the first unit
+    import zarr  # noqa: F401
 
     spline = Spline(args.control_points, args.pinned)
     work, units, about = _given(args) if args.cases else _drawn(args)
@@ -118,32 +123,42 @@ def generate(args: argparse.Namespace) -> None:
     }  # fmt: skip
     same = ("robot", "joints", "seed", "copies", "parts", "control_points", "pinned", "degree", "problems_per_unit")
     store = Store.create(args.folder, manifest, same)
-    there = set(store.units())
-    left = {name: unit for name, unit in units.items() if name not in there}
-    started, paths, times = time.perf_counter(), 0, Counter[str]()
-    alone = args.workers == 1 and args.address is None
-    source = here(work, left, options, spline)
-    if not alone:
-        source = spread(work, left, options, spline, workers=args.workers, address=args.address)
+    with store.locked():
+        there = set(store.units())
+        left = {name: unit for name, unit in units.items() if name not in there}
+        source = here(work, left, options, spline)
+        if left and (args.workers > 1 or args.address is not None):
+            source = spread(work, left, options, spline, workers=args.workers, address=args.address)
+        paths, seconds = _make(store, source, len(units), len(left), args)
+        total = summary(store)
+        store.note(counts=total)
+    print(f"{args.folder}: {total['paths']} paths of {total['solved']} problems in {total['units']} units", end="")
+    print(f"; {paths} of them now, {paths / seconds:.1f} a second" if left else "; nothing was left to do")
+
+
+def _make(store: Store, source: Iterator[Done], units: int, left: int, args: argparse.Namespace) -> tuple[int, float]:
+    """Write what is made, and note the run; return how many paths it made, and in how many seconds."""
+    from tqdm import tqdm
+
+    begin, done, paths, times = time.perf_counter(), 0, 0, Counter[str]()
+    seconds = 0.0
     try:
-        with tqdm(total=len(units), initial=len(units) - len(left), unit="unit", disable=args.quiet) as bar:
+        with tqdm(total=units, initial=units - left, unit="unit", disable=args.quiet) as bar:
             for name, found, spent in source:
                 store.write(name, found)
-                paths += len(found)
+                done, paths = done + 1, paths + len(found)
                 times.update(spent)
-                bar.set_postfix_str(f"{paths / (time.perf_counter() - started):.1f} paths/s, {name}")
+                rate = paths / (time.perf_counter() - begin)
+                bar.set_postfix_str(f"{rate:.1f} paths/s, {name}")
                 bar.update()
     finally:
         source.close()
-        seconds = time.perf_counter() - started
-        if paths:
-            run = {"workers": args.workers, "seconds": round(seconds, 1), "paths": paths}
+        seconds = time.perf_counter() - begin
+        if done:
+            run = {"workers": args.workers, "seconds": round(seconds, 1), "units": done, "paths": paths}
             run["worker_seconds"] = {stage: round(value, 1) for stage, value in sorted(times.items())}
             store.note(runs=[*store.manifest.get("runs", []), run])
-    total = summary(store)
-    store.note(counts=total)
-    print(f"{args.folder}: {total['paths']} paths of {total['solved']} problems in {total['units']} units", end="")
-    print(f"; {paths} of them now, {paths / seconds:.1f} a second" if paths else "; nothing was left to do")
+    return paths, max(seconds, 1e-9)
 
 
 def _drawn(args: argparse.Namespace) -> tuple[Work, dict[str, Any], dict[str, Any]]:
@@ -175,9 +190,19 @@ def _given(args: argparse.Namespace) -> tuple[Work, dict[str, Any], dict[str, An
 
 
 def write_cases(args: argparse.Namespace) -> None:
-    """Draw problems and write them for machines without Pinocchio."""
+    """Draw problems and write them for machines without Pinocchio.
+
+    Raises:
+        DatasetError: The folder cannot be made.
+    """
     from apex_ompl.generation import plan_units, written
 
+    folder = Path(args.folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except (OSError, ValueError) as error:
+        raise DatasetError(f"{folder}: {getattr(error, 'strerror', None) or error}, expected a folder") from error
+    check_writable(folder / "cases.npz")
     cases = [case for unit in plan_units(args.problems, args.levels) for case in written(unit)]
     save_cases(args.folder, cases)
     print(f"{args.folder}: {len(cases)} problems in {len({case.unit for case in cases})} units")
@@ -190,7 +215,7 @@ def _versions() -> dict[str, str]:
 
 def summary(store: Store) -> dict[str, Any]:
     """Return what a data set holds, by counting."""
-    total: Counter[str] = Counter()
+    total: Counter[str] = Counter(units=0, paths=0, solved=0)
     for paths in store:
         total.update({"units": 1, "paths": len(paths)})
         total.update({key: n for key, n in paths.counts.items() if isinstance(n, int)})

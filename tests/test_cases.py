@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -14,6 +15,7 @@ from apex_ompl.cases import WrittenCase, load_cases, save_cases
 from apex_ompl.dataset import SOURCES, Store
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError
 from apex_ompl.generation import Unit, written
+from apex_ompl.kernel import RobotTables
 from apex_ompl.problems.reach import robot
 from apex_ompl.spline import Spline
 from apex_ompl.validity import full_check
@@ -61,7 +63,7 @@ def test_they_are_solved_without_pinocchio_coal_and_ompl(cases: list[WrittenCase
     assert store.units() == ["broad-free-00005", "horizontal-small-00005"]
     seen = 0
     for paths in store:
-        for k, control in enumerate(paths.control(spline)):
+        for k, control in enumerate(paths.control()):
             ready = assemble(problems.load(paths.problem_name(int(paths.arrays["problem"][k]))), robot())
             assert full_check(ready.verdict, spline.path(control), paths.start[k], [paths.goal[k]])
             assert SOURCES[paths.arrays["source"][k]] in ("line", "bumps", "reversed")
@@ -84,12 +86,40 @@ def test_damaged_files_are_named(cases: list[WrittenCase], tmp_path: Path) -> No
     file.write_bytes(whole)
     with np.load(file) as data:
         arrays = dict(data)
-    wrong = {"start": arrays["start"][:, :5], "kind_count": arrays["kind_count"] + 1, "goal": arrays["goal"][:1]}
+    wrong = {
+        "start": arrays["start"][:, :5], "goal": arrays["goal"][:1], "points": arrays["points"][:, :1],
+        "kind_count": arrays["kind_count"] + 1, "tree_skip": 0 * arrays["tree_skip"],
+        "tree_range": arrays["tree_range"] + 10**6, "open": arrays["open"] + 99, "kind": arrays["kind"] + 7,
+        "owner": arrays["owner"].astype(np.int32), "size": arrays["size"][:, :1], "offset": np.nan * arrays["offset"],
+    }  # fmt: skip
     for name, value in wrong.items():
         np.savez(file, **{**arrays, name: value})
         with pytest.raises(FileFormatError, match=r"cases\.npz"):
             load_cases(tmp_path)
+    about = json.loads(str(arrays["about"]))
+    for key, value in (
+        ("unit", "../../evil"),
+        ("recipe", "none"),
+        ("tables", -1),
+        ("things", [[9, [], [], []]]),
+        ("seed", "x"),
+    ):
+        first = {**about["cases"][0], key: value}
+        np.savez(file, **{**arrays, "about": json.dumps({**about, "cases": [first, *about["cases"][1:]]})})
+        with pytest.raises(FileFormatError, match=r"cases\.npz"):
+            load_cases(tmp_path)
+    for other, words in (({**about, "schema": "apex-ompl/cases/0"}, "cases/0"), ({**about, "cases": []}, "cases")):
+        np.savez(file, **{**arrays, "about": json.dumps(other)})
+        with pytest.raises(FileFormatError, match=words):
+            load_cases(tmp_path)
     file.write_bytes(whole)
+    other = RobotTables.load(tmp_path / "tables-0.npz").judging(range(4))
+    kept = (tmp_path / "tables-0.npz").read_bytes()
+    other.save(tmp_path / "tables-0.npz")
+    with pytest.raises(FileFormatError, match="another file"):
+        load_cases(tmp_path)
+    (tmp_path / "tables-0.npz").write_bytes(kept)
+    assert len(load_cases(tmp_path)) == 2
     (tmp_path / "tables-0.npz").unlink()
     with pytest.raises(MissingFileError, match="tables-0"):
         load_cases(tmp_path)

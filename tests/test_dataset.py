@@ -2,7 +2,10 @@ from __future__ import annotations
 
 import errno
 import json
+import subprocess
+import sys
 import zipfile
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +18,7 @@ from apex_ompl.errors import ApexError, FileFormatError, MissingFileError
 from apex_ompl.spline import Spline
 
 DOF, FREE = 5, 12
+ABOUT = {"robot": "some", "joints": ["a", "b", "c", "d", "e"], **asdict(Spline())}
 MANIFEST = {"robot": "some", "seed": 0}
 
 
@@ -33,7 +37,7 @@ def random_paths(seed: int, problems: int = 3, paths: int = 7, suite: str = "she
         "homotopy": rng.integers(0, 2, paths),
     }  # fmt: skip
     names = {"suite": (suite,), "level": ("easy",), "held": ("", "cup")}
-    return Paths({k: np.asarray(v).astype(FIELDS[k][0]) for k, v in arrays.items()}, names, {"solved": problems})
+    return Paths({k: np.asarray(v).astype(FIELDS[k][0]) for k, v in arrays.items()}, names, ABOUT, {"solved": problems})
 
 
 def same(a: Paths, b: Paths) -> bool:
@@ -80,8 +84,11 @@ def test_joined_sets_keep_what_belongs_together(tmp_path: Path) -> None:
     first = int(joined.arrays["things"][:4].sum())
     count = int(joined.arrays["things"][4])
     assert np.array_equal(chosen.arrays["size"][:count], joined.arrays["size"][first : first + count])
-    spline = Spline()
-    control = joined.control(spline)
+    other = Paths(parts[0].arrays, parts[0].names, {**ABOUT, "robot": "another"})
+    with pytest.raises(DatasetError, match="different robots"):
+        Paths.joined([parts[0], other])
+    assert joined.spline == Spline()
+    control = joined.control()
     assert np.array_equal(control[:, 0], joined.start) and np.array_equal(control[:, -1], joined.goal)
     with pytest.raises(DatasetError, match="no paths"):
         Paths.joined([])
@@ -108,6 +115,8 @@ def test_leftovers_of_an_ended_process_are_cleared(tmp_path: Path) -> None:
     (tmp_path / "units" / ".unit-1.abc.part").write_bytes(b"half")
     again = Store.create(tmp_path, MANIFEST, MANIFEST)
     assert again.units() == ["unit-0"]
+    with again.locked(), pytest.raises(DatasetError, match="another process"), Store(tmp_path).locked():
+        pass
     assert [p.name for p in (tmp_path / "units").iterdir()] == ["unit-0.zip"]
 
 
@@ -120,6 +129,27 @@ def test_a_full_disk_leaves_nothing_behind(tmp_path: Path, monkeypatch: pytest.M
     monkeypatch.setattr(dataset.os, "fsync", full)
     with pytest.raises(DatasetError, match="unit-0.zip: cannot be written, no space left on device"):
         store.write("unit-0", random_paths(0))
+    assert not list((tmp_path / "units").iterdir())
+
+
+def test_a_disk_that_is_really_full_leaves_nothing_behind(tmp_path: Path) -> None:
+    """The system itself refuses to write on."""
+    Store.create(tmp_path, MANIFEST, MANIFEST)
+    save(tmp_path / "large.zip", random_paths(0, 50, 400))
+    code = f"""
+import resource, signal
+from pathlib import Path
+from apex_ompl.dataset import DatasetError, Store, load
+paths = load(Path({str(tmp_path / "large.zip")!r}))
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
+try:
+    Store({str(tmp_path)!r}).write("unit-0", paths)
+except DatasetError as error:
+    print("said:", error)
+"""
+    done = subprocess.run([sys.executable, "-c", code], check=False, capture_output=True, text=True)
+    assert "said:" in done.stdout and "unit-0.zip: cannot be written" in done.stdout, done.stderr
     assert not list((tmp_path / "units").iterdir())
 
 
@@ -142,7 +172,12 @@ def test_damaged_units_are_named(tmp_path: Path) -> None:
             paths = load(file)
         except ApexError:
             continue
-        assert len(paths) == 7
+        assert same(paths, random_paths(0))
+    for name in (b"control/c/0/0/0", b"start/c/0/0"):  # a chunk by another name would read as zeros
+        assert whole.count(name) == 2
+        file.write_bytes(whole.replace(name, name[:-1] + b"7"))
+        with pytest.raises(FileFormatError, match="unit.zip"):
+            load(file)
     with zipfile.ZipFile(file, "w") as archive:
         archive.writestr("zarr.json", "{}")
     with pytest.raises(FileFormatError, match="unit.zip"):
@@ -159,12 +194,13 @@ def test_damaged_units_are_named(tmp_path: Path) -> None:
         ("length", np.zeros(6, np.float32), "lengths"),
         ("things", np.zeros(3, np.uint16), "things"),
         ("start", np.zeros((7, DOF)), "start"),
+        ("control", np.zeros((7, 1, DOF), np.float16), "about"),
     ],
 )
 def test_arrays_that_do_not_fit_are_named(name: str, value: np.ndarray, word: str) -> None:
     paths = random_paths(0)
     with pytest.raises(DatasetError, match=word):
-        Paths({**paths.arrays, name: value}, paths.names)
+        Paths({**paths.arrays, name: value}, paths.names, ABOUT)
 
 
 def test_duplicates_and_figures_are_counted() -> None:
@@ -176,7 +212,7 @@ def test_duplicates_and_figures_are_counted() -> None:
     arrays["source"][:] = [1, 2, 3, 2, 4, 0]
     arrays["problem"][:] = [0, 0, 0, 0, 0, 1]
     arrays["homotopy"][:] = [0, 1, 0, 1, 0, 0]
-    twins = Paths(arrays, paths.names)
+    twins = Paths(arrays, paths.names, ABOUT)
     assert duplicates(twins).tolist() == [False, False, False, True, False, False]
     first, all_of_them = levels(twins)
     assert (first.name, all_of_them.name) == ("shelf/easy", "all")

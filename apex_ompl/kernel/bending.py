@@ -267,7 +267,7 @@ def bend(
             )  # fmt: skip
             better = tables[1 - now, COST] < tables[now, COST]
         if not better:
-            damping *= 4.0
+            damping = max(4.0 * damping, LEAST_DAMPING)
             if damping > MOST_DAMPING:
                 break
             continue

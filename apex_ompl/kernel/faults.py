@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from apex_ompl.kernel.tables import FIXED, PRISMATIC, RobotArrays, RobotTables
+from apex_ompl.kernel.tables import BOX, FIXED, HALF_SPACE, PRISMATIC, ROWS, RobotArrays, RobotTables, SceneArrays
 
 
 def head_fault(head: dict[str, Any]) -> str:
@@ -16,6 +16,29 @@ def head_fault(head: dict[str, Any]) -> str:
         if not isinstance(values, list) or not all(type(v) is kind for v in values):
             return key
     return "" if isinstance(head.get("name"), str) else "name"
+
+
+def scene_fault(s: SceneArrays) -> str:
+    """Return the name of a scene's array that does not fit, or whose numbers point out of the scene; else nothing."""
+    things, boxes = len(s.kind), len(s.tree_skip)
+    for name, array in s._asdict().items():
+        whole = name in SceneArrays._fields[: SceneArrays._fields.index("rotation")]
+        if array.dtype != (np.int64 if whole else np.float64) or array.shape[1:] != ROWS.get(name, ()):
+            return name
+        size = 1 if name == "open" else boxes if name.startswith("tree") else things
+        if len(array) != size or not np.isfinite(array).all():
+            return name
+    if things and not BOX <= s.kind.min() <= s.kind.max() <= HALF_SPACE:
+        return "kind"
+    closed = things - int(s.open[0])
+    if not 0 <= closed <= things or (s.kind[:closed] == HALF_SPACE).any() or (s.kind[closed:] != HALF_SPACE).any():
+        return "open"
+    if ((s.tree_skip <= np.arange(boxes)) | (s.tree_skip > boxes)).any():
+        return "tree_skip"
+    first, count = s.tree_range.T
+    if boxes and not ((first >= 0) & (count >= 0) & (first <= closed) & (count <= closed - first)).all():
+        return "tree_range"
+    return ""
 
 
 def table_fault(tables: RobotTables) -> str:
