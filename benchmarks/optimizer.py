@@ -146,7 +146,7 @@ def main() -> None:
         names = problems.frozen_names(*level.split("/"), "validation")[: args.hard if hard else args.n]
         methods = [m for m in METHODS if hard or m not in ON_HARD_ALONE]
         todo += [(name, m) for m in methods for name in names if (name, m) not in done]
-    todo.sort(key=lambda job: job[1] in ON_HARD_ALONE)
+    todo.sort(key=lambda job: (job[1] in ON_HARD_ALONE, job[0].rsplit("/", 1)[1]))  # all levels in turn
     args.store.parent.mkdir(parents=True, exist_ok=True)
     if args.store.is_file() and not args.store.read_bytes().endswith(b"\n"):  # the process ended while it wrote
         args.store.write_text(args.store.read_text() + "\n")
