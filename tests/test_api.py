@@ -19,6 +19,7 @@ from apex_ompl import PlanResult, PlanStatus, api, load_problem, plan, planners
 from apex_ompl.assembly import assemble
 from apex_ompl.collision import Verdict
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError, UnknownNameError
+from apex_ompl.ompl_globals import seed_ompl
 from apex_ompl.problem import Goal, Obstacle, Problem
 from apex_ompl.repair import repair
 from apex_ompl.robot import Robot, load_robot
@@ -69,7 +70,7 @@ def test_the_same_seed_gives_the_same_tree_for_rrt(problem: Problem) -> None:
     problem = problem.model_copy(update={"goal": Goal(joints=(near,))})
     paths = []
     for seed in (6, 6, 7):
-        api._seed_ompl(seed)
+        seed_ompl(seed)
         simple_setup = assemble(problem).simple_setup
         simple_setup.setPlanner(planners.make("rrt", simple_setup.getSpaceInformation(), range=0.2, goal_bias=0.2))
         status = simple_setup.solve(ob.timedPlannerTerminationCondition(30.0))

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import os
+import runpy
 import signal
 import subprocess
 import sys
@@ -13,7 +14,7 @@ from support import ROOT
 
 from apex_ompl import problems
 from apex_ompl.assembly import assemble
-from apex_ompl.dataset import FIELDS, SHAPES, SOURCES, Paths, Store, load
+from apex_ompl.dataset import FIELDS, SHAPES, SOURCES, DatasetError, Paths, Store, load
 from apex_ompl.engine import STRAIGHT_SHARE, Options, rounded
 from apex_ompl.errors import UnknownNameError
 from apex_ompl.generation import NO_POINT, Unit, plan_units, static_levels, work
@@ -191,3 +192,30 @@ def test_faults_of_the_command_are_sentences(tmp_path: Path) -> None:
         result = script(*arguments)
         assert result.returncode == 2 and words in result.stderr and "Traceback" not in result.stderr, result.stderr
     assert not (tmp_path / "new" / "units").exists() or not list((tmp_path / "new" / "units").iterdir())
+
+
+def test_workers_of_ray_make_the_same_paths_and_may_die(tmp_path: Path) -> None:
+    """Two workers give what one gives; one that dies over a unit twice is a sentence, and what is written stays."""
+    few = ("wall/easy", "broad/free", "--problems", 40, "--parts", 0, "--copies", 1, "--quiet")
+    alone, two = script(tmp_path / "one", *few), script(tmp_path / "two", *few, "--workers", 2)
+    assert alone.returncode == 0 and two.returncode == 0, two.stderr
+    stores = Store(tmp_path / "one"), Store(tmp_path / "two")
+    assert stores[0].units() == stores[1].units() and len(stores[0].units()) > 1
+    assert all(same(stores[0].read(name), stores[1].read(name)) for name in stores[0].units())
+    scope = runpy.run_path(str(SCRIPT))
+
+    def dies(unit: int, *_: object) -> tuple[int, dict[str, float]]:
+        if unit == 1:
+            os._exit(1)
+        return unit, {}
+
+    def fails(unit: int, *_: object) -> tuple[int, dict[str, float]]:
+        raise ValueError(f"no unit {unit}")
+
+    done = []
+    with pytest.raises(DatasetError, match=r"unit b: its worker died twice .*the same command goes on"):
+        for name, *_ in scope["spread"](dies, {"a": 0, "b": 1}, Options(), Spline(), workers=1, address=None):
+            done.append(name)
+    assert done == ["a"]
+    with pytest.raises(DatasetError, match="unit a: no unit 5"):
+        list(scope["spread"](fails, {"a": 5}, Options(), Spline(), workers=1, address=None))
