@@ -58,13 +58,9 @@ def spread(
         raise DatasetError(
             "several workers need Ray, expected: pip install 'apex-ompl[data]'; or --workers 1"
         ) from error
-    if address and ":" in address.removeprefix("ray://"):
-        _reach(address.removeprefix("ray://"))
-    local: dict[str, Any] = {} if address else {"num_cpus": workers, "object_store_memory": OBJECT_STORE}
-    try:
-        ray.init(address=address, include_dashboard=False, log_to_driver=False, logging_level="error", **local)
-    except Exception as error:  # ConnectionError, ValueError, RuntimeError
-        raise DatasetError(f"Ray: {_first_line(error)}, expected a cluster at {address or 'this machine'}") from error
+    mine = not ray.is_initialized()  # who has started Ray goes on with it
+    if mine:
+        _start(ray, workers, address)
     try:
         task = ray.remote(num_cpus=1, max_retries=1)(work)
         waiting, under_way = iter(units.items()), {}
@@ -87,7 +83,24 @@ def spread(
                 under_way[task.remote(following[1], options, spline)] = following[0]
             yield name, paths, times
     finally:
-        ray.shutdown()
+        if mine:
+            ray.shutdown()
+
+
+def _start(ray: Any, workers: int, address: str | None) -> None:
+    """Start Ray on this machine, or join a cluster.
+
+    Raises:
+        DatasetError: There is none.
+    """
+    if address and ":" in address.removeprefix("ray://"):
+        _reach(address.removeprefix("ray://"))
+    local: dict[str, Any] = {} if address else {"num_cpus": workers, "object_store_memory": OBJECT_STORE}
+    try:
+        ray.init(address=address, include_dashboard=False, log_to_driver=False, logging_level="error", **local)
+    except Exception as error:  # ConnectionError, ValueError, RuntimeError
+        said = _first_line(error)
+        raise DatasetError(f"Ray: {said}, expected a cluster at {address or 'this machine'}") from error
 
 
 def _first_line(error: BaseException) -> str:

@@ -194,28 +194,30 @@ def test_faults_of_the_command_are_sentences(tmp_path: Path) -> None:
     assert not (tmp_path / "new" / "units").exists() or not list((tmp_path / "new" / "units").iterdir())
 
 
-def test_workers_of_ray_make_the_same_paths_and_may_die(tmp_path: Path) -> None:
-    """Two workers give what one gives; one that dies over a unit twice is a sentence, and what is written stays."""
-    few = ("wall/easy", "broad/free", "--problems", 40, "--parts", 0, "--copies", 1, "--quiet")
-    alone, two = script(tmp_path / "one", *few), script(tmp_path / "two", *few, "--workers", 2)
-    assert alone.returncode == 0 and two.returncode == 0, two.stderr
-    stores = Store(tmp_path / "one"), Store(tmp_path / "two")
-    assert stores[0].units() == stores[1].units() and len(stores[0].units()) > 1
-    assert all(same(stores[0].read(name), stores[1].read(name)) for name in stores[0].units())
-    scope = runpy.run_path(str(SCRIPT))
+def test_workers_of_ray_make_the_same_paths_and_may_die(made: list[Paths]) -> None:
+    """Two workers give what one gives; one that dies over a unit twice is a sentence, and so is one that fails."""
+    ray = pytest.importorskip("ray")
+    spread = runpy.run_path(str(SCRIPT))["spread"]
+    options: dict = {"workers": 2, "address": None}
+    ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False, logging_level="error")
+    try:
+        units = {unit.name: unit for unit in UNITS}
+        found = {name: paths for name, paths, _ in spread(work, units, Options(), Spline(), **options)}
+        assert all(same(found[unit.name], paths) for unit, paths in zip(UNITS, made, strict=True))
 
-    def dies(unit: int, *_: object) -> tuple[int, dict[str, float]]:
-        if unit == 1:
-            os._exit(1)
-        return unit, {}
+        def fails(unit: int, *_: object) -> tuple[int, dict[str, float]]:
+            if unit == 1:
+                os._exit(1)
+            if unit == 2:
+                raise ValueError("no unit 2")
+            return unit, {}
 
-    def fails(unit: int, *_: object) -> tuple[int, dict[str, float]]:
-        raise ValueError(f"no unit {unit}")
-
-    done = []
-    with pytest.raises(DatasetError, match=r"unit b: its worker died twice .*the same command goes on"):
-        for name, *_ in scope["spread"](dies, {"a": 0, "b": 1}, Options(), Spline(), workers=1, address=None):
-            done.append(name)
-    assert done == ["a"]
-    with pytest.raises(DatasetError, match="unit a: no unit 5"):
-        list(scope["spread"](fails, {"a": 5}, Options(), Spline(), workers=1, address=None))
+        done = []
+        with pytest.raises(DatasetError, match=r"unit b: its worker died twice .*the same command goes on"):
+            for name, *_ in spread(fails, {"a": 0, "b": 1}, Options(), Spline(), **options):
+                done.append(name)
+        assert done == ["a"]
+        with pytest.raises(DatasetError, match="unit c: no unit 2"):
+            list(spread(fails, {"c": 2}, Options(), Spline(), **options))
+    finally:
+        ray.shutdown()
