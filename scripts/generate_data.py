@@ -100,7 +100,8 @@ def _start(ray: Any, workers: int, address: str | None) -> None:
         ray.init(address=address, include_dashboard=False, log_to_driver=False, logging_level="error", **local)
     except Exception as error:  # ConnectionError, ValueError, RuntimeError
         said = _first_line(error)
-        raise DatasetError(f"Ray: {said}, expected a cluster at {address or 'this machine'}") from error
+        expected = f"expected a cluster at {address or 'this machine'}, and RAY_AUTH_MODE=token if it asks for tokens"
+        raise DatasetError(f"Ray: {said}, {expected}") from error
 
 
 def _first_line(error: BaseException) -> str:
