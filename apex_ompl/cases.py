@@ -19,13 +19,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apex_ompl.dataset import SHAPES, Paths
 from apex_ompl.engine import RECIPES, Case, Engine, Options, Row
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError
 from apex_ompl.files import is_file, write_atomically
 from apex_ompl.kernel import Kernel, RobotTables
 from apex_ompl.kernel.faults import scene_fault
 from apex_ompl.kernel.tables import SceneArrays, SceneTables
+from apex_ompl.records import SHAPES, Paths
 from apex_ompl.spline import Spline
 
 Array = NDArray[np.float64]

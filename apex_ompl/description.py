@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from apex_ompl.dataset import SOURCES, Paths
+from apex_ompl.records import SOURCES, Paths
 
 Array = NDArray[np.float64]
 

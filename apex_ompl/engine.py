@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apex_ompl.dataset import FIELDS, SOURCES, Paths, to_micro
 from apex_ompl.kernel import Kernel
 from apex_ompl.optimize import Optimizer
+from apex_ompl.records import FIELDS, SOURCES, Paths, to_micro
 from apex_ompl.resolution import FULL_RESOLUTION, SEARCH_RESOLUTION
 from apex_ompl.spline import Spline
 

@@ -14,7 +14,6 @@ from ompl import geometric as og
 from apex_ompl import problems
 from apex_ompl.assembly import PlanningSetup, assemble
 from apex_ompl.cases import WrittenCase
-from apex_ompl.dataset import SHAPES, Paths
 from apex_ompl.engine import Case, Engine, Options, Row
 from apex_ompl.errors import UnknownNameError
 from apex_ompl.ompl_globals import quiet_ompl, seed_ompl
@@ -23,6 +22,7 @@ from apex_ompl.problem import Obstacle, Problem
 from apex_ompl.problems import scenes
 from apex_ompl.problems.catalogue import KNOWN, SPLITS, SuiteError
 from apex_ompl.problems.reach import robot
+from apex_ompl.records import SHAPES, Paths
 from apex_ompl.resolution import SEARCH_RESOLUTION
 from apex_ompl.simplify import simplify
 from apex_ompl.space import path_to_array

@@ -23,10 +23,10 @@ from typing import Any
 import numpy as np
 import record
 
-from apex_ompl.dataset import SOURCES
 from apex_ompl.engine import Options
 from apex_ompl.generation import SHARES, UNIT, Unit, static_levels, work
 from apex_ompl.problems import scenes
+from apex_ompl.records import SOURCES
 from apex_ompl.spline import Spline
 
 SCRIPT = Path(__file__).resolve().parent.parent / "scripts" / "generate_data.py"

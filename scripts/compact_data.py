@@ -14,9 +14,10 @@ from pathlib import Path
 
 import numpy as np
 
-from apex_ompl.dataset import PATH_FIELDS, SOURCES, DatasetError, Paths, Store, save
+from apex_ompl.dataset import Store, save
 from apex_ompl.errors import ApexError
 from apex_ompl.files import check_writable
+from apex_ompl.records import PATH_FIELDS, SOURCES, DatasetError, Paths
 
 CLOSE = 200  # how closely the limit is met: to one part in this
 

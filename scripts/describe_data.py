@@ -15,10 +15,11 @@ import numpy as np
 
 from apex_ompl import description, problems
 from apex_ompl.assembly import assemble
-from apex_ompl.dataset import SOURCES, DatasetError, Paths, Store, load
+from apex_ompl.dataset import Store, load
 from apex_ompl.errors import ApexError
 from apex_ompl.files import check_writable, is_file, write_atomically
 from apex_ompl.problems.reach import robot
+from apex_ompl.records import SOURCES, DatasetError, Paths
 from apex_ompl.validity import full_check
 
 SHOTS, MOTIONS, SIZE = 5, 10, (320, 240)

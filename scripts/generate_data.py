@@ -24,10 +24,11 @@ from pathlib import Path
 from typing import Any
 
 from apex_ompl.cases import load_cases, save_cases, work_cases
-from apex_ompl.dataset import DatasetError, Paths, Store
+from apex_ompl.dataset import Store
 from apex_ompl.engine import Options
 from apex_ompl.errors import ApexError, ParameterError
 from apex_ompl.files import check_writable
+from apex_ompl.records import DatasetError, Paths
 from apex_ompl.spline import Spline
 
 # Pinocchio, Coal and OMPL are imported where problems are drawn: --cases needs none of them.

@@ -12,11 +12,12 @@ from support import ROOT
 from apex_ompl import problems
 from apex_ompl.assembly import assemble
 from apex_ompl.cases import WrittenCase, load_cases, save_cases
-from apex_ompl.dataset import SOURCES, Store
+from apex_ompl.dataset import Store
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError
 from apex_ompl.generation import Unit, written
 from apex_ompl.kernel import RobotTables
 from apex_ompl.problems.reach import robot
+from apex_ompl.records import SOURCES
 from apex_ompl.spline import Spline
 from apex_ompl.validity import full_check
 

@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 
 from apex_ompl import dataset
-from apex_ompl.dataset import FIELDS, DatasetError, Paths, Store, from_micro, load, save, to_micro
+from apex_ompl.dataset import Store, load, save
 from apex_ompl.description import duplicates, levels
 from apex_ompl.errors import ApexError, FileFormatError, MissingFileError
+from apex_ompl.records import FIELDS, DatasetError, Paths, from_micro, to_micro
 from apex_ompl.spline import Spline
 
 DOF, FREE = 5, 12
@@ -139,7 +140,8 @@ def test_a_disk_that_is_really_full_leaves_nothing_behind(tmp_path: Path) -> Non
     code = f"""
 import resource, signal
 from pathlib import Path
-from apex_ompl.dataset import DatasetError, Store, load
+from apex_ompl.dataset import Store, load
+from apex_ompl.records import DatasetError
 paths = load(Path({str(tmp_path / "large.zip")!r}))
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
