@@ -1,6 +1,7 @@
 """APEX for OMPL: dual-arm planning with latent diffusion, real meshes and proven paths.
 
-``plan`` solves a problem, ``load_problem`` reads one, ``setup`` gives OMPL's SimpleSetup of one. Planners are in
+``plan`` solves a problem, ``load_problem`` reads one, ``setup`` gives OMPL's SimpleSetup of one, ``load_model`` reads
+a trained model. Planners are in
 ``apex_ompl.planners``, ready-made problems in ``apex_ompl.problems``.
 """
 
@@ -11,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from apex_ompl.api import load_problem, plan, setup
+    from apex_ompl.diffusion.checkpoint import load_model
     from apex_ompl.errors import ApexError
     from apex_ompl.problem import Problem
     from apex_ompl.result import PlanResult, PlanStatus
@@ -24,6 +26,7 @@ _HOMES = {
     "PlanStatus": "result",
     "Problem": "problem",
     "Robot": "robot",
+    "load_model": "diffusion.checkpoint",
     "load_problem": "api",
     "load_robot": "robot",
     "plan": "api",
@@ -36,6 +39,7 @@ __all__ = [
     "PlanStatus",
     "Problem",
     "Robot",
+    "load_model",
     "load_problem",
     "load_robot",
     "plan",

@@ -47,12 +47,14 @@ class Unit:
         level: One of its levels.
         number: Counts the units of a level from 0.
         size: Number of problems that are drawn.
+        split: The split that their seeds are of.
     """
 
     suite: str
     level: str
     number: int
     size: int = UNIT
+    split: str = "train"
 
     @property
     def name(self) -> str:
@@ -66,8 +68,8 @@ class Unit:
 
     @property
     def seeds(self) -> range:
-        """Seeds of its problems, of the training split."""
-        return range(self.number * self.size, (self.number + 1) * self.size)
+        """Seeds of its problems."""
+        return SPLITS[self.split][self.number * self.size :][: self.size]
 
 
 SHARES = {"broad": 6.0, "vertical": 1.2, "horizontal": 1.2, "easy": 1.0, "medium": 0.8, "hard": 0.4}
@@ -80,12 +82,13 @@ def static_levels() -> list[tuple[str, str]]:
     return [(s, level) for s, levels in KNOWN.items() for level in levels if not level.startswith("moving-")]
 
 
-def plan_units(count: int, only: Sequence[str] = ()) -> list[Unit]:
+def plan_units(count: int, only: Sequence[str] = (), split: str = "train") -> list[Unit]:
     """Return units of about ``count`` problems over all static suites and levels, the levels in turn.
 
     Args:
         count: How many problems to draw.
         only: Suites, or ``suite/level``; none means all.
+        split: The split that they are of.
 
     Raises:
         UnknownNameError: No such suite or level.
@@ -97,10 +100,10 @@ def plan_units(count: int, only: Sequence[str] = ()) -> list[Unit]:
     chosen = [(s, v) for s, v in known if not only or s in only or f"{s}/{v}" in only]
     weights = [SHARES[s if s in SHARES else v] for s, v in chosen]
     found = [
-        (k / weight, place, Unit(s, v, k))
+        (k / weight, place, Unit(s, v, k, split=split))
         for place, ((s, v), weight) in enumerate(zip(chosen, weights, strict=True))
         for k in range(max(1, round(count * weight / sum(weights) / UNIT)))
-        if (k + 1) * UNIT <= SPLITS["train"].stop
+        if (k + 1) * UNIT <= len(SPLITS[split])
     ]
     return [unit for *_, unit in sorted(found, key=lambda row: row[:2])]
 

@@ -218,7 +218,8 @@ def write_cases(args: argparse.Namespace) -> None:
     except (OSError, ValueError) as error:
         raise DatasetError(f"{folder}: {getattr(error, 'strerror', None) or error}, expected a folder") from error
     check_writable(folder / "cases.npz")
-    cases = [case for unit in plan_units(args.problems, args.levels) for case in written(unit)]
+    units = plan_units(args.problems, args.levels, args.split)
+    cases = [case for unit in units for case in written(unit)]
     save_cases(args.folder, cases)
     print(f"{args.folder}: {len(cases)} problems in {len({case.unit for case in cases})} units")
 
@@ -254,9 +255,14 @@ def main() -> None:
     parser.add_argument("--workers", type=_count, default=1, help="more than one are run by Ray (default: %(default)s)")
     parser.add_argument("--address", help="of a Ray cluster, for example 10.0.0.1:6379, or auto")
     parser.add_argument("--write-cases", action="store_true", help="draw problems only, and write them to FOLDER")
+    parser.add_argument(
+        "--split", choices=("train", "validation"), default="train", help="of --write-cases (default: %(default)s)"
+    )
     parser.add_argument("--cases", metavar="FOLDER", help="solve the problems that --write-cases wrote there")
     parser.add_argument("--quiet", action="store_true", help="show no progress")
     args = parser.parse_args()
+    if args.split != "train" and not args.write_cases:
+        parser.error("--split validation goes with --write-cases: data are of the training split")
     try:
         write_cases(args) if args.write_cases else generate(args)
     except KeyboardInterrupt:

@@ -18,6 +18,7 @@ LAYERS = [
     {"dataset"},
     {"description", "engine"},
     {"cases"},
+    {"diffusion"},
     {"robot"},
     {"collision"},
     {"ik", "interrupt", "ompl_globals", "space"},

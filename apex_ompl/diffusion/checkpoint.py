@@ -1,0 +1,190 @@
+"""Checkpoints: a folder of ``config.json``, ``model.safetensors`` and a model card; nothing in it is executed."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from pydantic import Field
+from safetensors import SafetensorError
+from safetensors.torch import load as load_tensors
+from safetensors.torch import save as save_tensors
+
+from apex_ompl.diffusion.model import LatentDiffusion, ModelConfig
+from apex_ompl.diffusion.proposals import TrajectoryModel
+from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError, UnknownNameError
+from apex_ompl.files import is_file
+from apex_ompl.schema import StrictModel, validate
+
+SCHEMA = "apex-ompl/model/1"
+SHIPPED = Path(__file__).parent / "checkpoints"
+CONFIG, WEIGHTS, CARD = "config.json", "model.safetensors", "README.md"
+PICKLES = (".pt", ".pth", ".ckpt", ".bin", ".pkl", ".pickle")
+
+
+class CheckpointConfig(StrictModel):
+    """What ``config.json`` holds.
+
+    Attributes:
+        schema_: Version of the format.
+        model: What the model is made of.
+        digest: SHA-256 of the file of weights.
+        trained: What is known of the training.
+    """
+
+    schema_: Literal["apex-ompl/model/1"] = Field(alias="schema")
+    model: ModelConfig
+    digest: str
+    trained: dict[str, Any] = {}
+
+
+def save_model(
+    folder: str | os.PathLike[str],
+    network: LatentDiffusion,
+    trained: Mapping[str, Any],
+    card: str,
+    *,
+    half: bool = True,
+) -> None:
+    """Write a checkpoint, whole or not at all; one that is there is replaced.
+
+    Args:
+        folder: Where.
+        network: The model.
+        trained: What is known of its training, ready for JSON.
+        card: The model card, Markdown.
+        half: Whether weights are stored in half precision.
+
+    Raises:
+        MissingFileError: The folder cannot be written.
+    """
+    folder = Path(folder)
+    kept = {
+        name: (tensor.half() if half and tensor.is_floating_point() else tensor).cpu().contiguous()
+        for name, tensor in network.state_dict().items()
+    }
+    weights = save_tensors(kept)
+    config = {
+        "schema": SCHEMA, "model": network.config.model_dump(mode="json"),
+        "digest": hashlib.sha256(weights).hexdigest(), "trained": dict(trained),
+    }  # fmt: skip
+    content = {CONFIG: (json.dumps(config, indent=1) + "\n").encode(), WEIGHTS: weights, CARD: card.encode()}
+    temporary: Path | None = None
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+        for name, data in content.items():
+            (temporary / name).write_bytes(data)
+        temporary.chmod(0o755)
+        if folder.exists():
+            old = Path(tempfile.mkdtemp(prefix=f".{folder.name}.old.", dir=folder.parent))
+            os.replace(folder, old / folder.name)
+            os.replace(temporary, folder)
+            shutil.rmtree(old)
+        else:
+            os.replace(temporary, folder)
+    except (OSError, ValueError) as error:
+        if temporary is not None:
+            shutil.rmtree(temporary, ignore_errors=True)
+        why = (getattr(error, "strerror", None) or str(error)).lower()
+        raise MissingFileError(str(folder), "folder for a checkpoint", why) from error
+
+
+def load_model(
+    name: str | os.PathLike[str] = "apex", *, device: str | torch.device = "cpu", robot: str | None = None
+) -> TrajectoryModel:
+    """Return a trained model.
+
+    Args:
+        name: One that ships, ``apex`` or ``apex-paper``, or a folder.
+        device: Where it runs.
+        robot: Name of the robot it must be for; by default any.
+
+    Raises:
+        UnknownNameError: Nothing of that name ships, and there is no such folder.
+        MissingFileError: A file of the checkpoint is missing.
+        FileFormatError: It is damaged, a pickle, of another version, or for another robot.
+        ParameterError: There is no such device.
+    """
+    folder = _folder(name)
+    for file in (CONFIG, WEIGHTS):
+        if not is_file(folder / file):
+            raise MissingFileError(str(folder / file), "file of a checkpoint")
+    config, weights = read_config(folder), (folder / WEIGHTS).read_bytes()
+    source = str(folder / WEIGHTS)
+    if robot is not None and config.model.robot != robot:
+        raise FileFormatError(str(folder / CONFIG), "model.robot", config.model.robot, f"expected {robot!r}")
+    found = hashlib.sha256(weights).hexdigest()
+    if found != config.digest:
+        raise FileFormatError(source, "", f"SHA-256 {found[:12]}...", f"expected {config.digest[:12]}...: damaged")
+    try:
+        tensors = load_tensors(weights)
+    except (SafetensorError, ValueError) as error:
+        raise FileFormatError(source, "", str(error), "expected safetensors") from error
+    network = LatentDiffusion(config.model)
+    state = network.state_dict()
+    wanted = {key: tuple(value.shape) for key, value in state.items()}
+    shapes = {key: tuple(value.shape) for key, value in tensors.items()}
+    wrong = sorted(set(wanted.items()) ^ set(shapes.items()))
+    if wrong:
+        expected = f"expected weights that fit {CONFIG}"
+        raise FileFormatError(source, wrong[0][0], shapes.get(wrong[0][0], "nothing"), expected)
+    for key, tensor in tensors.items():
+        if not torch.isfinite(tensor).all():
+            raise FileFormatError(source, key, "numbers that are not finite", "expected finite weights")
+    network.load_state_dict({key: tensor.to(state[key].dtype) for key, tensor in tensors.items()})
+    try:
+        network.to(device)
+    except (RuntimeError, AssertionError) as error:
+        raise ParameterError("device", str(device), "a device of torch's that is there") from error
+    return TrajectoryModel(network, config.trained)
+
+
+def read_config(folder: Path) -> CheckpointConfig:
+    """Read the configuration of a checkpoint.
+
+    Raises:
+        FileFormatError: It is not one.
+    """
+    path = folder / CONFIG
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+        if not isinstance(data, dict):
+            raise ValueError
+    except (OSError, ValueError) as error:
+        raise FileFormatError(
+            str(path), "", type(error).__name__, "expected the configuration of a checkpoint"
+        ) from error
+    if data.get("schema") != SCHEMA:
+        raise FileFormatError(str(path), "schema", data.get("schema"), f"expected {SCHEMA!r}")
+    return validate(CheckpointConfig, data, str(path))
+
+
+def shipped() -> tuple[str, ...]:
+    """Names of the checkpoints that ship."""
+    return tuple(sorted(path.parent.name for path in SHIPPED.glob(f"*/{CONFIG}")))
+
+
+def _folder(name: str | os.PathLike[str]) -> Path:
+    text = os.fspath(name)
+    if text in shipped():
+        return SHIPPED / text
+    folder = Path(text)
+    try:
+        if folder.is_dir():
+            return folder
+        if folder.suffix in PICKLES:
+            expected = f"expected a checkpoint's folder ({CONFIG}, {WEIGHTS}); pickles are not read"
+            raise FileFormatError(text, "", folder.suffix, expected)
+    except (OSError, ValueError) as error:
+        raise MissingFileError(text, "checkpoint", "no folder can have this name") from error
+    if os.sep in text or folder.exists():
+        raise MissingFileError(text, "checkpoint", "no such folder")
+    raise UnknownNameError("checkpoint", text, shipped())

@@ -1,0 +1,158 @@
+"""Training data: paths of a store as tensors, mirrored where the robot allows it, and drawn by weight."""
+
+from __future__ import annotations
+
+import fnmatch
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from apex_ompl.dataset import Store, load
+from apex_ompl.diffusion.conditions import Conditions, Probes, Table
+from apex_ompl.engine import rounded
+from apex_ompl.errors import ParameterError
+from apex_ompl.files import is_file
+from apex_ompl.kernel import Kernel
+from apex_ompl.records import Paths, to_micro
+
+Array = NDArray[np.float64]
+
+NOTHING_HELD = "[]"
+
+
+@dataclass(frozen=True)
+class Mirror:
+    """A symmetry of a robot: its image in the plane y = 0.
+
+    State q becomes ``sign * q[order] + shift``.
+
+    Attributes:
+        order: Which joint takes the place of each.
+        sign: 1 or -1 for each.
+        shift: What is added [rad].
+    """
+
+    order: Sequence[int]
+    sign: Sequence[float]
+    shift: Sequence[float]
+
+    def states(self, q: Array) -> Array:
+        """Return the images of states, shape (..., dof)."""
+        return np.asarray(q[..., list(self.order)] * np.array(self.sign) + np.array(self.shift))
+
+    def paths(self, paths: Paths, lower: Array, upper: Array) -> Paths:
+        """Return the images of all paths whose problem has nothing held, and which stay inside the limits."""
+        a = dict(paths.arrays)
+        spline = paths.spline
+        control = self.states(paths.control())
+        inside = ((control >= lower) & (control <= upper)).all(axis=(1, 2))
+        held = np.array(paths.names["held"], object)[a["held"][a["problem"]]] if len(control) else np.zeros(0, object)
+        kept = inside & (held == NOTHING_HELD)
+        flip = np.array([1.0, -1.0, 1.0])
+        a["position"] = (a["position"] * flip).astype(np.float32)
+        a["orientation"] = (a["orientation"] * np.array([-1.0, 1.0, -1.0, 1.0])).astype(np.float32)
+        for name in ("problem", "clearance", "length", "source", "homotopy"):
+            a[name] = a[name][kept]
+        a["point"] = (a["point"][kept] * flip).astype(np.float32)
+        a["start"], a["goal"] = to_micro(control[kept, 0]), to_micro(control[kept, -1])
+        a["control"] = rounded(control[kept][:, spline.inner], lower, upper).astype(np.float16)
+        return Paths(a, paths.names, paths.about)
+
+
+def held_out(name: str, share: float) -> bool:
+    """Whether a problem, by its name, is kept from training; the same in every run."""
+    number = int.from_bytes(hashlib.sha256(name.encode()).digest()[:8], "big")
+    return number < share * 2**64
+
+
+class Window:
+    """Paths in memory, to draw batches from."""
+
+    def __init__(self, parts: Sequence[Paths], probes: Probes, kernel: Kernel, weights: Mapping[str, float]) -> None:
+        """Take in paths, drawn in proportion to the weight that the first fitting pattern gives their level.
+
+        Raises:
+            ParameterError: There are no paths, or all weigh nothing.
+        """
+        self._tables = [Table(part, probes, kernel) for part in parts if len(part)]
+        parts = [part for part in parts if len(part)]
+        self.control = torch.cat([torch.tensor(part.control(), dtype=torch.float32) for part in parts] or [_NONE])
+        found = [_weights(part, weights) for part in parts]
+        self._ends = np.cumsum([len(part) for part in parts])
+        self.cumulated = np.cumsum(np.concatenate(found or [np.zeros(0)]))
+        if not len(self.cumulated) or not self.cumulated[-1] > 0.0:
+            raise ParameterError("training data", len(self.cumulated), "paths, some of them with a positive weight")
+
+    def __len__(self) -> int:
+        """Return the number of paths."""
+        return len(self.control)
+
+    def drawn(self, count: int, generator: torch.Generator) -> NDArray[np.int64]:
+        """Return the numbers of paths drawn with replacement, sorted."""
+        uniform = torch.rand(count, generator=generator, dtype=torch.float64).numpy()
+        found = np.searchsorted(self.cumulated, uniform * self.cumulated[-1], side="right")
+        return np.sort(np.minimum(found, len(self) - 1))
+
+    def batch(self, which: NDArray[np.int64]) -> tuple[Tensor, Conditions]:
+        """Return control points (B, points, dof) and conditions of paths by their numbers, which are sorted."""
+        places = np.searchsorted(which, np.concatenate([[0], self._ends]))
+        pieces = [
+            table.batch(torch.from_numpy(which[a:b] - (end - len(table.start))))
+            for table, a, b, end in zip(self._tables, places[:-1], places[1:], self._ends, strict=True)
+            if b > a
+        ]
+        return self.control[torch.from_numpy(which)], Conditions.joined(pieces)
+
+
+_NONE = torch.zeros(0, 1, 1)
+
+
+def _weights(paths: Paths, weights: Mapping[str, float]) -> Array:
+    levels = [
+        f"{paths.names['suite'][s]}/{paths.names['level'][v]}"
+        for s, v in zip(paths.arrays["suite"], paths.arrays["level"], strict=True)
+    ]
+    known: dict[str, float] = {}
+    for level in set(levels):
+        known[level] = next((w for pattern, w in weights.items() if fnmatch.fnmatch(level, pattern)), 1.0)
+    return np.asarray(np.array([known[level] for level in levels])[paths.arrays["problem"]])
+
+
+def window_paths(data: Path, seed: int, units: int, number: int) -> tuple[Paths, int]:
+    """Return the paths of one window of a data set, and how many windows there are.
+
+    Windows are some units each, in another order at every pass; a single file is one window.
+
+    Args:
+        data: Folder of a data set, or a file of paths.
+        seed: Of the order.
+        units: Units in a window.
+        number: Counts the windows from 0, on over all passes.
+
+    Raises:
+        MissingFileError: There is no such data set.
+        FileFormatError: It is damaged.
+        ParameterError: It is empty.
+    """
+    if is_file(data):
+        return load(data), 1
+    store = Store(data)
+    names = store.units()
+    if not names:
+        raise ParameterError("data", str(data), "a data set with at least one unit")
+    windows = -(-len(names) // units)
+    turn, k = divmod(number, windows)
+    order = np.random.default_rng([seed, turn]).permutation(len(names))[k * units : (k + 1) * units]
+    return Paths.joined(store.read(names[j]) for j in sorted(order)), windows
+
+
+def split(paths: Paths, share: float) -> tuple[Paths, Paths]:
+    """Return the paths of problems to train on, and of those that are held out."""
+    out = np.array([held_out(paths.problem_name(k), share) for k in range(paths.problems)], bool)
+    return paths.chosen(np.flatnonzero(~out)), paths.chosen(np.flatnonzero(out))

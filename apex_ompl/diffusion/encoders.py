@@ -1,0 +1,103 @@
+"""Encoders of conditions: the MLP phi of the paper, and one that sees the obstacles."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from apex_ompl.diffusion.conditions import Conditions, distances
+from apex_ompl.records import SHAPES
+
+MIDDLE = (0.4, 0.0, 0.6)  # about where the robot works, from which points are counted [m]
+NEAR = 0.4  # distances are told apart up to here [m]
+SCENES = ("none", "set", "distances")
+
+
+class ConditionEncoder(nn.Module):
+    """Turns conditions into one vector.
+
+    With ``scene="none"`` it is the paper's phi: an MLP over the vector g of start, goal and obstacle point. ``set``
+    adds the obstacles, each through an MLP and then pooled by mean and maximum, so that their order does not matter
+    (Zaheer et al. 2017). ``distances`` adds what the obstacles mean to the robot: where its probes are along the
+    straight line, and how far they are from each obstacle, and from the nearest one.
+
+    Attributes:
+        out: Size of the vector.
+    """
+
+    lower: Tensor
+    upper: Tensor
+    middle: Tensor
+
+    def __init__(self, dof: int, *, out: int, width: int, scene: str, point: bool, probes: int, along: int) -> None:
+        """Make an encoder.
+
+        Args:
+            dof: Number of joints.
+            out: Size of the vector.
+            width: Width inside.
+            scene: ``none``, ``set`` or ``distances``.
+            point: Whether it sees the obstacle point.
+            probes: Number of probes.
+            along: Number of states of the straight line at which they are.
+        """
+        super().__init__()
+        self.out, self.scene, self.point, self.along = out, scene, point, along
+        self.register_buffer("lower", torch.full((dof,), -1.0))
+        self.register_buffer("upper", torch.full((dof,), 1.0))
+        self.register_buffer("middle", torch.tensor(MIDDLE), persistent=False)
+        size = 2 * dof + 3 * point
+        if scene != "none":
+            seen = len(SHAPES) + 15 + (3 * probes if scene == "distances" else 0)
+            self.thing = nn.Sequential(
+                nn.Linear(seen, width), nn.SiLU(), nn.Linear(width, width), nn.SiLU(), nn.Linear(width, width)
+            )
+            size += 2 * width
+        if scene == "distances":
+            size += 4 * along * probes
+        self.phi = nn.Sequential(nn.Linear(size, 2 * width), nn.SiLU(), nn.Linear(2 * width, out))
+
+    def set_limits(self, lower: Tensor, upper: Tensor) -> None:
+        """Scale states by the robot's limits, shape (dof,) [rad]."""
+        self.lower.copy_(lower)
+        self.upper.copy_(upper)
+
+    def forward(self, given: Conditions) -> Tensor:
+        """Return vectors, shape (B, out)."""
+        span = self.upper - self.lower
+        parts = [2.0 * (q - self.lower) / span - 1.0 for q in (given.start, given.goal)]
+        if self.point:
+            parts.append(given.point - self.middle)
+        if self.scene != "none":
+            parts += self._seen(given)
+        encoded: Tensor = self.phi(torch.cat(parts, dim=1))
+        return encoded
+
+    def _seen(self, given: Conditions) -> list[Tensor]:
+        """Return what is seen of the obstacles, tensors of shape (B, ...)."""
+        there, count = given.there, len(given.there)
+        owner = there.nonzero()[:, 0]
+        shape, position, turn, size = (v[there] for v in (given.shape, given.position, given.turn, given.size))
+        kinds = nn.functional.one_hot(shape, len(SHAPES)).to(position)
+        things = [kinds, position - self.middle, turn.flatten(1), size]
+        parts: list[Tensor] = []
+        if self.scene == "distances":
+            along, probes = given.probes.shape[1:3]
+            points = given.probes.flatten(1, 2)
+            apart = distances(shape, position, turn, size, points[owner]).clamp(-NEAR, NEAR) / NEAR
+            parts += [(points - self.middle).flatten(1), _pooled(apart, there, 1.0).amin(dim=1)]
+            things.append(apart.reshape(-1, along, probes)[:, [0, along // 2, -1]].flatten(1))
+        tokens = self.thing(torch.cat(things, dim=1))
+        mean = _pooled(tokens, there, 0.0).sum(dim=1) / there.sum(dim=1, keepdim=True).clamp(min=1)
+        return [*parts, mean, _pooled(tokens, there, -LARGE).amax(dim=1).clamp(min=0.0).reshape(count, -1)]
+
+
+LARGE = 1e4
+
+
+def _pooled(values: Tensor, there: Tensor, rest: float) -> Tensor:
+    """Return values (T, K) of obstacles that are there at their places, shape (B, M + 1, K), and ``rest`` besides."""
+    count, most = there.shape
+    table = values.new_full((count, most + 1, values.shape[1]), rest)
+    table[:, :most][there] = values
+    return table

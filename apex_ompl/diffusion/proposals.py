@@ -1,0 +1,217 @@
+"""A trained model as planners use it: paths proposed for a query."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from apex_ompl.diffusion.conditions import Conditions, Probes, Query, batched
+from apex_ompl.diffusion.guidance import Guidance, guided, log_likelihood
+from apex_ompl.diffusion.model import LatentDiffusion
+from apex_ompl.diffusion.sampler import SAMPLERS, Callback, ddpm, noise_like
+from apex_ompl.errors import ParameterError, UnknownNameError
+from apex_ompl.kernel import Kernel
+from apex_ompl.spline import Spline
+
+Array = NDArray[np.float64]
+
+PLAIN = Guidance(gamma=0.0)
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """How a path is denoised.
+
+    Attributes:
+        sampler: ``ddim``, ``dpm_solver`` or ``ddpm``.
+        steps: Number of denoising steps; the paper takes all 256 by ``ddpm``.
+        temperature: Standard deviation of the noise to begin with; less gives likelier and less diverse paths.
+        guidance: How paths are drawn away from obstacles; not at all by default.
+    """
+
+    sampler: str = "ddim"
+    steps: int = 2
+    temperature: float = 1.0
+    guidance: Guidance = PLAIN
+
+    def __post_init__(self) -> None:
+        """Check the numbers.
+
+        Raises:
+            UnknownNameError: No such sampler.
+            ParameterError: A number out of range.
+        """
+        if self.sampler not in SAMPLERS:
+            raise UnknownNameError("sampler", self.sampler, SAMPLERS)
+        if self.steps < 1:
+            raise ParameterError("number of denoising steps", self.steps, "1 or more")
+        if not 0.0 <= self.temperature < np.inf:
+            raise ParameterError("temperature", self.temperature, "a number, 0 or more")
+
+
+@dataclass(frozen=True, eq=False)
+class Proposals:
+    """Paths that were proposed; they need not be valid.
+
+    Attributes:
+        control: Control points, shape (B, points, dof) [rad], inside the limits, their ends exact.
+        latent: Latent vectors, shape (B, *latent).
+        seconds: Where the time went: ``condition``, ``network``, ``guidance``, ``decode`` [s].
+    """
+
+    control: Array
+    latent: Tensor
+    seconds: Mapping[str, float]
+
+
+class TrajectoryModel:
+    """Proposes paths; safe to use from several threads.
+
+    Attributes:
+        network: The model.
+        about: What is known of its training.
+        spline: The spline of the control points.
+    """
+
+    def __init__(self, network: LatentDiffusion, about: Mapping[str, Any]) -> None:
+        """Use a model as it is now."""
+        self.network = network.eval().requires_grad_(False)
+        self.about = dict(about)
+        self.spline: Spline = network.autoencoder.spline
+        joint, offset = network.probe_joint.cpu().numpy(), network.probe_offset.cpu().double().numpy()
+        self.probes = Probes(joint, offset, network.config.condition.along)
+
+    @property
+    def device(self) -> torch.device:
+        """Where it runs."""
+        return self.network.probe_offset.device
+
+    def propose(
+        self, query: Query, kernel: Kernel, count: int, *, sampling: Sampling | None = None,
+        generator: torch.Generator | None = None, callback: Callback | None = None,
+    ) -> Proposals:  # fmt: skip
+        """Return paths from noise (Algorithm 1 of the paper, generate_traj).
+
+        Args:
+            query: The problem.
+            kernel: The robot among its obstacles, which guidance asks.
+            count: How many paths.
+            sampling: How they are denoised; by default in two deterministic steps.
+            generator: Source of all noise; the same state gives the same paths.
+            callback: Called at every step.
+
+        Raises:
+            ParameterError: The query has states of another robot, or there are no paths to propose.
+        """
+        sampling = sampling or Sampling()
+        if count < 1:
+            raise ParameterError("count", count, "a positive number of paths")
+        shape = torch.zeros(count, *self.network.latent, device=self.device)
+        first = sampling.temperature * noise_like(shape, generator)
+        top = self.network.schedule.steps - 1
+        return self._denoised(query, kernel, first, top, sampling=sampling, generator=generator, callback=callback)
+
+    def renoise(
+        self, query: Query, kernel: Kernel, control: Array, step: int, *, sampling: Sampling | None = None,
+        generator: torch.Generator | None = None, callback: Callback | None = None,
+    ) -> Proposals:  # fmt: skip
+        """Return paths near given ones: noised up to a step, and denoised again.
+
+        Args:
+            query: The problem.
+            kernel: The robot among its obstacles.
+            control: Control points, shape (B, points, dof).
+            step: How noisy they become, 0 to T - 1.
+            sampling: How they are denoised; its number of steps is cut to those there are.
+            generator: Source of all noise.
+            callback: Called at every step.
+
+        Raises:
+            ParameterError: Control points of another shape, or no such step.
+        """
+        sampling = sampling or Sampling()
+        if control.ndim != 3 or control.shape[1:] != (self.spline.points, len(self.network.config.joints)):
+            wanted = f"(B, {self.spline.points}, {len(self.network.config.joints)})"
+            raise ParameterError("control points", control.shape, f"an array of shape {wanted}")
+        if not 0 <= step < self.network.schedule.steps:
+            raise ParameterError("step", step, f"0 to {self.network.schedule.steps - 1}")
+        with torch.inference_mode():
+            clean = self.network.autoencoder.encode(torch.tensor(control, dtype=torch.float32, device=self.device))
+            first = self.network.schedule.noisy(clean, noise_like(clean, generator), step)
+        sampling = replace(sampling, steps=min(sampling.steps, step + 1))
+        return self._denoised(query, kernel, first, step, sampling=sampling, generator=generator, callback=callback)
+
+    def conditions(self, query: Query, kernel: Kernel) -> Conditions:
+        """Return a query as a batch of one.
+
+        Raises:
+            ParameterError: It has states of another robot.
+        """
+        dof = len(self.network.config.joints)
+        if query.start.shape != (dof,) or query.goal.shape != (dof,) or kernel.robot.dof != dof:
+            raise ParameterError("start and goal", (query.start.shape, query.goal.shape), f"states of shape ({dof},)")
+        return batched([query], self.probes, kernel).to(self.device)
+
+    def _denoised(
+        self, query: Query, kernel: Kernel, first: Tensor, top: int, *, sampling: Sampling,
+        generator: torch.Generator | None, callback: Callback | None,
+    ) -> Proposals:  # fmt: skip
+        network, clock = self.network, _Clock()
+        with torch.no_grad():
+            given = self.conditions(query, kernel)
+            encoded = network.encoder(given).expand(len(first), -1)
+            start, goal = given.start.expand(len(first), -1), given.goal.expand(len(first), -1)
+            clock.lap("condition")
+            if network.regresses:
+                zero = torch.zeros_like(first)
+                latent = network.said(zero, torch.zeros(len(zero), dtype=torch.int64, device=zero.device), encoded)
+            else:
+
+                def likelihood(clean: Tensor) -> Tensor:
+                    with clock.within("guidance"):
+                        return log_likelihood(network.autoencoder, kernel, clean, (start, goal), sampling.guidance)
+
+                predict = guided(network.predict(encoded), likelihood, network.schedule, sampling.guidance)
+                times = network.schedule.times(sampling.steps, top)
+                extra: dict[str, Any] = {} if callback is None else {"callback": callback}
+                if sampling.sampler == "ddpm":
+                    latent = ddpm(predict, first, network.schedule, times, generator=generator, **extra)
+                else:
+                    latent = SAMPLERS[sampling.sampler](predict, first, network.schedule, times, **extra)
+            clock.lap("network")
+            found = network.autoencoder.control(latent, start, goal).cpu().double().numpy()
+            limits = kernel.robot.arrays
+            found = self.spline.with_ends(np.clip(found, limits.lower, limits.upper), query.start, query.goal)
+            clock.lap("decode")
+        return Proposals(found, latent, clock.seconds)
+
+
+class _Clock:
+    """Counts the seconds of stages."""
+
+    def __init__(self) -> None:
+        self.seconds = {"condition": 0.0, "network": 0.0, "guidance": 0.0, "decode": 0.0}
+        self._last, self._inside = time.perf_counter(), 0.0
+
+    def lap(self, stage: str) -> None:
+        """Count what has passed since the last lap to a stage, but for what was counted within."""
+        now = time.perf_counter()
+        self.seconds[stage] += now - self._last - self._inside
+        self._last, self._inside = now, 0.0
+
+    @contextmanager
+    def within(self, stage: str) -> Iterator[None]:
+        """Count the time of a block to a stage inside of the one that the next lap ends."""
+        begin = time.perf_counter()
+        yield
+        passed = time.perf_counter() - begin
+        self.seconds[stage] += passed
+        self._inside += passed

@@ -1,0 +1,97 @@
+"""Train a latent diffusion model; the same command goes on where it was interrupted.
+
+The run's folder gets ``checkpoint`` (read it by ``apex_ompl.load_model``), ``log.csv``, TensorBoard's files, and
+``state.pt``, from which it goes on. Several GPUs, or processes, train together by
+``torchrun --nproc-per-node N scripts/train.py CONFIG.yaml``. Neither Pinocchio nor OMPL is needed.
+
+Usage: python scripts/train.py CONFIG.yaml [--out FOLDER] [--set KEY=VALUE ...] [--minutes M]
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from apex_ompl.errors import ApexError, MissingFileError
+
+
+def train(args: argparse.Namespace) -> None:
+    """Train until the end, or until the time is up."""
+    from tqdm import tqdm
+
+    from apex_ompl.cases import load_cases
+    from apex_ompl.diffusion.config import TrainingConfig
+    from apex_ompl.diffusion.training import Place, Trainer
+
+    config = TrainingConfig.read(args.config, dict(args.set))
+    folder = Path(args.out or Path("runs") / Path(args.config).stem)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise MissingFileError(str(folder), "folder of a training run", str(error.strerror).lower()) from error
+    cases = load_cases(config.cases) if config.cases is not None else []
+    place = Place.here()
+    trainer = Trainer(config, folder, place, cases, tqdm.write)
+    with tqdm(disable=args.quiet or place.rank != 0, unit="step") as bar:
+
+        def watch(at: Trainer, loss: float) -> None:
+            bar.total, bar.n = at.steps, at.step
+            bar.set_postfix_str(f"{at.phase} loss {loss:.4f}")
+            bar.update(0)
+
+        bar.initial = trainer.step
+        trainer.run(60.0 * args.minutes, watch)
+    if place.rank == 0:
+        print(f"{folder / 'checkpoint'}: {trainer.phase}, step {trainer.step} of {trainer.steps}")
+
+
+def main() -> None:
+    """Read the command line."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("config", metavar="CONFIG.yaml")
+    parser.add_argument("--out", help="folder of the run (default: runs/CONFIG)")
+    parser.add_argument(
+        "--set", type=_setting, action="append", default=[], metavar="KEY=VALUE", help="for example latent.dim=96"
+    )
+    parser.add_argument("--minutes", type=_minutes, default=float("inf"), help="end after these, to go on another time")
+    parser.add_argument("--quiet", action="store_true", help="show no progress")
+    args = parser.parse_args()
+    try:
+        train(args)
+    except KeyboardInterrupt:
+        sys.exit(130)
+    except ImportError as error:
+        expected = "expected: pip install -c constraints.txt '.[train]'"
+        print(f"train: error: no {error.name}, {expected}", file=sys.stderr)
+        sys.exit(2)
+    except ApexError as error:
+        print(f"train: error: {error}", file=sys.stderr)
+        sys.exit(2)
+
+
+def _setting(text: str) -> tuple[str, Any]:
+    key, equals, value = text.partition("=")
+    if not key or not equals:
+        raise argparse.ArgumentTypeError(f"{text!r}, expected KEY=VALUE")
+    try:
+        return key, yaml.safe_load(value)
+    except yaml.YAMLError as error:
+        raise argparse.ArgumentTypeError(f"{text!r}, expected a value in YAML") from error
+
+
+def _minutes(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not value > 0.0:
+        raise argparse.ArgumentTypeError(f"{text!r}, expected minutes, more than 0")
+    return value
+
+
+if __name__ == "__main__":
+    main()

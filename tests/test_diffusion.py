@@ -1,0 +1,561 @@
+"""Noise, samplers, latent spaces, encoders and guidance, against other implementations, and against what they claim."""
+
+from __future__ import annotations
+
+from functools import cache, partial
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support import ROOT
+
+from apex_ompl.dataset import load
+from apex_ompl.diffusion.autoencoder import LinearLatent, VariationalLatent
+from apex_ompl.diffusion.conditions import Probes, Query, Table, Things, batched, distances, rotations
+from apex_ompl.diffusion.denoisers import UNetDenoiser
+from apex_ompl.diffusion.encoders import ConditionEncoder
+from apex_ompl.diffusion.guidance import Guidance, collision_cost, gradient, log_likelihood
+from apex_ompl.diffusion.model import (
+    ConditionConfig,
+    DenoiserConfig,
+    LatentConfig,
+    LatentDiffusion,
+    ModelConfig,
+    NoiseConfig,
+)
+from apex_ompl.diffusion.proposals import Sampling, TrajectoryModel
+from apex_ompl.diffusion.sampler import SAMPLERS, ddim, ddpm, dpm_solver
+from apex_ompl.diffusion.schedule import PREDICTIONS, SCHEDULES, Estimate, NoiseSchedule
+from apex_ompl.errors import ParameterError, UnknownNameError
+from apex_ompl.kernel import Kernel, RobotTables
+from apex_ompl.kernel.scene import Primitive, scene_tables
+from apex_ompl.kernel.tables import BOX, CAPSULE, CYLINDER, SPHERE
+from apex_ompl.records import SHAPES, Paths
+from apex_ompl.spline import Spline
+
+DATA = ROOT / "data" / "dual_panda_softhand"
+DOF = 16
+KINDS = {"box": BOX, "sphere": SPHERE, "cylinder": CYLINDER, "capsule": CAPSULE}
+
+
+@cache
+def some_paths() -> Paths:
+    """Paths of a few problems of every level."""
+    paths = load(DATA / "paths.zip")
+    return paths.chosen(np.arange(0, paths.problems, 100))
+
+
+@cache
+def kernel(*things: tuple[str, tuple[float, ...], tuple[float, ...]]) -> Kernel:
+    """The robot among obstacles that are given by shape, position and size; kernels keep radii and half lengths."""
+    solids = []
+    for k, (shape, position, size) in enumerate(things):
+        pose = np.eye(4)
+        pose[:3, 3] = position
+        solids.append((k, Primitive(KINDS[shape], pose, size)))
+    return Kernel(RobotTables.load(DATA / "robot.npz"), scene_tables(solids))
+
+
+def config(**parts: object) -> ModelConfig:
+    robot = kernel().robot
+    count = len(Probes.of(robot, 3).joint)
+    small = {
+        "latent": LatentConfig(dim=24, width=16), "condition": ConditionConfig(width=16, out=32, along=3),
+        "denoiser": DenoiserConfig(width=32, blocks=2), "noise": NoiseConfig(),
+    }  # fmt: skip
+    return ModelConfig(robot=robot.name, joints=robot.joint_names, probes=count, **(small | parts))
+
+
+def network(seed: int = 0, **parts: object) -> LatentDiffusion:
+    """A small model, its last layer not zero as at the beginning of a training."""
+    torch.manual_seed(seed)
+    model = LatentDiffusion(config(**parts))
+    probes = Probes.of(kernel().robot, 3)
+    model.probe_joint.copy_(torch.from_numpy(probes.joint))
+    model.probe_offset.copy_(torch.from_numpy(probes.offset))
+    if isinstance(model.autoencoder, LinearLatent):
+        model.autoencoder.fit(torch.tensor(some_paths().control(), dtype=torch.float32))
+    for parameter in model.denoiser.parameters():
+        if not parameter.detach().any():
+            torch.nn.init.normal_(parameter, std=0.05)
+    return model
+
+
+VARIATIONAL = {
+    "latent": LatentConfig(kind="variational", width=16, channels=4),
+    "denoiser": DenoiserConfig(kind="unet", width=8, multipliers=(1, 2)),
+    "condition": ConditionConfig(scene="none", point=True, width=16, out=32, along=2),
+}
+REGRESSION = {"denoiser": DenoiserConfig(kind="regression", width=32, blocks=2)}
+WALL = ("box", (0.45, 0.0, 0.6), (0.05, 0.4, 0.3))
+POST = ("cylinder", (0.4, 0.3, 0.5), (0.05, 0.3))
+
+
+def query(seed: int = 0) -> Query:
+    rng = np.random.default_rng(seed)
+    limits = kernel().robot.arrays
+    middle, span = (limits.lower + limits.upper) / 2, limits.upper - limits.lower
+    ends = middle + 0.3 * span * rng.uniform(-0.5, 0.5, (2, DOF))
+    rows = [(0, WALL[1], (0, 0, 0, 1), (0.1, 0.8, 0.6)), (2, POST[1], (0, 0, 0, 1), (0.05, 0.6, 0.0))]
+    return Query(ends[0], ends[1], np.array([0.4, 0.0, 0.5]), Things.of(rows))
+
+
+# Noise
+
+
+@pytest.mark.parametrize("kind", SCHEDULES)
+@pytest.mark.parametrize("steps", [64, 256, 1000])
+def test_noise_grows_from_almost_none_to_almost_all(kind: str, steps: int) -> None:
+    left = NoiseSchedule(steps, kind).alpha_bar
+    assert all(a > b for a, b in pairwise(left.tolist()))
+    assert left[0] > 0.97 and left[-1] < 1e-3
+
+
+@settings(deadline=None)
+@given(st.sampled_from(PREDICTIONS), st.sampled_from(SCHEDULES), st.integers(1, 254), st.integers(0, 2**31))
+def test_what_a_perfect_network_says_gives_sample_and_noise_back(kind: str, name: str, t: int, seed: int) -> None:
+    schedule, g = NoiseSchedule(256, name), torch.Generator().manual_seed(seed)
+    clean, noise = (torch.randn(3, 5, generator=g, dtype=torch.float64) for _ in range(2))
+    sample = schedule.noisy(clean, noise, t)
+    found = schedule.estimate(kind, sample, schedule.target(kind, clean, noise, torch.full((3,), t)), t)
+    torch.testing.assert_close(found.clean, clean, atol=1e-4, rtol=1e-4)
+    torch.testing.assert_close(found.noise, noise, atol=1e-4, rtol=1e-4)
+
+
+@settings(deadline=None)
+@given(st.integers(0, 255), st.data())
+def test_steps_fall_from_the_first(first: int, data: st.DataObject) -> None:
+    count = data.draw(st.integers(1, first + 1))
+    times = NoiseSchedule(256).times(count, first)
+    assert len(times) == count and times[0] == first and times[-1] >= 0
+    assert all(a > b for a, b in pairwise(times))
+    if count == first + 1:
+        assert times == list(range(first, -1, -1))
+
+
+def test_bad_schedules_are_named() -> None:
+    with pytest.raises(UnknownNameError, match="noise schedule 'cosin', did you mean 'cosine'"):
+        NoiseSchedule(256, "cosin")
+    with pytest.raises(ParameterError, match="number of denoising steps: expected 1 to 256, got 257"):
+        NoiseSchedule(256).times(257)
+    with pytest.raises(ParameterError, match="times"):
+        ddim(lambda z, t: Estimate(z, z), torch.zeros(1, 2), NoiseSchedule(8), [1, 3])
+
+
+# Samplers, against the schedulers of diffusers
+
+
+def blurred(schedule: NoiseSchedule) -> partial[Estimate]:
+    """A denoiser that is not linear, and the same for both implementations."""
+
+    def predict(sample: torch.Tensor, t: int) -> Estimate:
+        noise = torch.tanh(sample * (0.5 + t / 512)) + 0.1 * torch.sin(3.0 * sample)
+        return schedule.estimate("noise", sample, noise, t)
+
+    return partial(predict)
+
+
+@pytest.mark.parametrize("kind", SCHEDULES)
+@pytest.mark.parametrize(
+    ("name", "steps"), [*[("ddim", n) for n in (1, 2, 8, 32)], *[("dpm_solver", n) for n in (1, 2, 5, 8, 40)]]
+)
+def test_deterministic_samplers_are_those_of_diffusers(name: str, steps: int, kind: str) -> None:
+    """Where DDIM's steps do not divide 256, diffusers takes other ones than those it lists."""
+    diffusers = pytest.importorskip("diffusers")
+    schedule = NoiseSchedule(256, kind)
+    betas = schedule.betas.float().numpy()
+    rest = {"num_train_timesteps": 256, "trained_betas": betas, "timestep_spacing": "trailing"}
+    if name == "ddim":
+        theirs = diffusers.DDIMScheduler(**rest, clip_sample=False, set_alpha_to_one=True)
+    else:
+        theirs = diffusers.DPMSolverMultistepScheduler(
+            **rest, algorithm_type="dpmsolver++", solver_order=2, final_sigmas_type="zero", lower_order_final=True
+        )
+    theirs.set_timesteps(steps)
+    predict = blurred(schedule)
+    start = torch.randn(4, 7, generator=torch.Generator().manual_seed(steps))
+    times = schedule.times(steps)
+    assert times == theirs.timesteps.tolist()
+    mine = SAMPLERS[name](predict, start, schedule, times)
+    sample = start
+    for t in theirs.timesteps:
+        sample = theirs.step(predict(sample, int(t)).noise, t, sample).prev_sample
+    torch.testing.assert_close(mine, sample, atol=2e-3 * float(sample.abs().max()), rtol=2e-3)
+
+
+@pytest.mark.parametrize("kind", SCHEDULES)
+def test_ancestral_sampling_is_that_of_diffusers(kind: str) -> None:
+    diffusers = pytest.importorskip("diffusers")
+    schedule = NoiseSchedule(64, kind)
+    theirs = diffusers.DDPMScheduler(64, trained_betas=schedule.betas.float().numpy(), clip_sample=False)
+    theirs.set_timesteps(64)
+    predict = blurred(schedule)
+    start = torch.randn(4, 7, generator=torch.Generator().manual_seed(1))
+    mine = ddpm(predict, start, schedule, schedule.times(64), generator=torch.Generator().manual_seed(2))
+    sample, g = start, torch.Generator().manual_seed(2)
+    for t in theirs.timesteps:
+        sample = theirs.step(predict(sample, int(t)).noise, t, sample, generator=g).prev_sample
+    torch.testing.assert_close(mine, sample, atol=2e-3 * float(sample.abs().max()), rtol=2e-3)
+
+
+@pytest.mark.parametrize("name", SAMPLERS)
+def test_samplers_find_the_only_point_there_is(name: str) -> None:
+    """Where all data are one point, the perfect denoiser is known, and every sampler ends there."""
+    schedule, point = NoiseSchedule(256), torch.tensor([0.3, -1.2, 2.0])
+
+    def predict(sample: torch.Tensor, t: int) -> Estimate:
+        signal, sigma = schedule.scales(t, sample)
+        return Estimate((sample - signal * point) / sigma, point.expand_as(sample))
+
+    g = torch.Generator().manual_seed(0)
+    seen: list[int] = []
+    found = SAMPLERS[name](
+        predict, torch.randn(5, 3, generator=g), schedule, schedule.times(6), callback=lambda t, z, e: seen.append(t),
+        **({"generator": g} if name == "ddpm" else {}),
+    )  # fmt: skip
+    torch.testing.assert_close(found, point.expand(5, 3))
+    assert seen == schedule.times(6)
+
+
+def test_samples_of_a_normal_distribution_are_normal() -> None:
+    """Of data from N(m, s^2) the perfect denoiser is linear; samples must have that mean and spread."""
+    schedule, mean, spread = NoiseSchedule(256), 1.5, 0.4
+
+    def predict(sample: torch.Tensor, t: int) -> Estimate:
+        signal, sigma = schedule.scales(t, sample)
+        clean = mean + signal * spread**2 / (signal**2 * spread**2 + sigma**2) * (sample - signal * mean)
+        return Estimate((sample - signal * clean) / sigma, clean)
+
+    g = torch.Generator().manual_seed(0)
+    first = torch.randn(20_000, 1, generator=g, dtype=torch.float64)
+    for found in (
+        ddpm(predict, first, schedule, schedule.times(256), generator=g),
+        ddim(predict, first, schedule, schedule.times(128)),
+        dpm_solver(predict, first, schedule, schedule.times(32)),
+    ):
+        assert float(found.mean()) == pytest.approx(mean, abs=0.02)
+        assert float(found.std()) == pytest.approx(spread, abs=0.02)
+
+
+def test_two_orders_are_better_than_one() -> None:
+    """The second-order solver is nearer to many steps of DDIM than as few steps of DDIM itself."""
+    schedule = NoiseSchedule(256)
+
+    def predict(sample: torch.Tensor, t: int) -> Estimate:
+        clean = torch.tanh(2.0 * sample * schedule.scales(t, sample)[0])
+        return schedule.estimate("clean", sample, clean, t)
+
+    first = torch.randn(50, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    wanted = ddim(predict, first, schedule, schedule.times(256))
+    one = ddim(predict, first, schedule, schedule.times(32))
+    two = dpm_solver(predict, first, schedule, schedule.times(32))
+    assert (two - wanted).norm() < 0.8 * (one - wanted).norm()
+
+
+# Latent spaces
+
+
+@pytest.mark.parametrize("parts", [{}, VARIATIONAL], ids=["linear", "variational"])
+def test_ends_are_exact_whatever_the_weights_are(parts: dict[str, object]) -> None:
+    model = network(3, **parts)
+    ends = torch.randn(2, 5, DOF, generator=torch.Generator().manual_seed(0))
+    latent = 10.0 * torch.randn(5, *model.latent, generator=torch.Generator().manual_seed(1))
+    path = model.autoencoder.decode(latent, *ends)
+    assert path.shape == (5, 256, DOF)
+    assert (path[:, 0] == ends[0]).all() and (path[:, -1] == ends[1]).all()
+    control = model.autoencoder.control(latent, *ends)
+    assert (control[:, 0] == ends[0]).all() and (control[:, -1] == ends[1]).all()
+    assert torch.isfinite(path).all()
+
+
+def test_all_components_give_paths_back_and_few_give_the_nearest() -> None:
+    control = torch.tensor(some_paths().control(), dtype=torch.float64)
+    full = LinearLatent(Spline(), DOF, 192).double()
+    full.fit(control)
+    latent = full.encode(control)
+    torch.testing.assert_close(full.control(latent, control[:, 0], control[:, -1]), control, atol=1e-5, rtol=0)
+    torch.testing.assert_close(latent.mean(dim=0), torch.zeros(192).double(), atol=1e-4, rtol=0)
+    large = full.deviations > 1e-4  # the others are rounding alone
+    torch.testing.assert_close(latent.T @ latent / len(latent) * large, torch.diag(large).double(), atol=2e-3, rtol=0)
+    few = LinearLatent(Spline(), DOF, 20).double()
+    few.fit(control)
+    rows = few.residual(control).flatten(1)
+    rows = rows - rows.mean(dim=0)
+    values = torch.linalg.svdvals(rows)  # no 20 directions leave less (Eckart and Young)
+    rest = few.control(few.encode(control), control[:, 0], control[:, -1]) - control
+    assert float(rest.square().sum()) == pytest.approx(float(values[20:].square().sum()), rel=1e-3)
+
+
+def test_paths_of_control_points_are_those_of_the_spline() -> None:
+    paths = some_paths()
+    model = LinearLatent(Spline(), DOF, 10).double()
+    control = torch.tensor(paths.control(slice(0, 20)))
+    np.testing.assert_allclose(model.path(control).numpy(), Spline().path(control.numpy()), atol=2e-6)
+    line = model.line(control[:, 0], control[:, -1]).numpy()
+    np.testing.assert_allclose(line, Spline().line(control[:, 0].numpy(), control[:, -1].numpy()), atol=1e-6)
+
+
+def test_the_variational_network_learns_to_give_paths_back() -> None:
+    torch.manual_seed(0)
+    control = torch.tensor(some_paths().control(slice(0, 64)), dtype=torch.float32)
+    model = VariationalLatent(Spline(), DOF, 8, 32)
+    model.measure(control)
+    optimizer = torch.optim.Adam(model.parameters(), 2e-3)
+    errors = []
+    for k in range(120):
+        noise = torch.randn(64, *model.latent, generator=torch.Generator().manual_seed(k))
+        loss, error = model.loss(control, noise, 1e-6)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        errors.append(float(error.detach()))
+    assert errors[-1] < 0.1 * errors[0]
+    model.measure(control)
+    with torch.no_grad():
+        latent = model.encode(control)
+        assert latent.std(dim=(0, 2)) == pytest.approx(np.ones(8), abs=0.05)
+        found = model.control(latent, control[:, 0], control[:, -1])
+        path = model.path(control)
+        apart = (model.path(found) - path).square().mean()
+        assert apart < 0.2 * (model.path(model.line(control[:, 0], control[:, -1])) - path).square().mean()
+
+
+def test_states_that_cannot_be_halved_are_refused() -> None:
+    with pytest.raises(ParameterError, match="states, width: expected 16 times a whole number of states"):
+        VariationalLatent(Spline(states=250), DOF)
+    with pytest.raises(ParameterError, match="dimension of the latent space: expected 1 to 192, got 193"):
+        LinearLatent(Spline(), DOF, 193)
+
+
+# Conditions
+
+
+@given(st.integers(0, 2**31))
+@settings(max_examples=20, deadline=None)
+def test_quaternions_become_the_rotations_of_scipy(seed: int) -> None:
+    from scipy.spatial.transform import Rotation
+
+    quaternions = np.random.default_rng(seed).normal(size=(7, 4))
+    np.testing.assert_allclose(rotations(quaternions), Rotation.from_quat(quaternions).as_matrix(), atol=1e-6)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_distances_are_those_of_the_meshes_library(shape: str) -> None:
+    import coal
+
+    rng = np.random.default_rng(3)
+    size = {"box": (0.1, 0.2, 0.3), "sphere": (0.2, 0.0, 0.0)}.get(shape, (0.15, 0.4, 0.0))
+    theirs = {
+        "box": coal.Box(0.1, 0.2, 0.3), "sphere": coal.Sphere(0.2), "cylinder": coal.Cylinder(0.15, 0.4),
+        "capsule": coal.Capsule(0.15, 0.4),
+    }[shape]  # fmt: skip
+    quaternion = rng.normal(size=4)
+    things = Things.of([(SHAPES.index(shape), (0.1, -0.2, 0.3), quaternion, size)])
+    ends = np.zeros(DOF)
+    given_ = batched([Query(ends, ends, np.zeros(3), things)], Probes.of(kernel().robot, 2), kernel())
+    points = rng.uniform(-0.8, 0.8, (60, 3))
+    mine = distances(
+        given_.shape[0], given_.position[0], given_.turn[0], given_.size[0], torch.tensor(points[None]).float()
+    )[0].numpy()  # fmt: skip
+    pose = coal.Transform3s(rotations(quaternion).astype(float), np.array([0.1, -0.2, 0.3]))
+    for point, value in zip(points, mine, strict=True):
+        result = coal.DistanceResult()
+        dot = coal.Transform3s(np.eye(3), point)
+        coal.distance(coal.Sphere(1e-9), dot, theirs, pose, coal.DistanceRequest(), result)
+        if result.min_distance > 1e-3:
+            assert value == pytest.approx(result.min_distance, abs=1e-4)
+        else:
+            assert value < 2e-3
+
+
+def test_probes_are_where_the_joints_take_them() -> None:
+    probes, q = Probes.of(kernel().robot, 5), query()
+    places = probes.places(kernel(), q.start[None], q.goal[None])
+    assert places.shape == (1, 5, len(probes.joint), 3)
+    turn, origin = kernel().joint_frames(np.stack([q.start, (q.start + q.goal) / 2, q.goal]))
+    for k, along in enumerate((0, 2, 4)):
+        wanted = [turn[k, j] @ p + origin[k, j] for j, p in zip(probes.joint, probes.offset, strict=True)]
+        np.testing.assert_allclose(places[0, along], wanted, atol=1e-6)
+
+
+@pytest.mark.parametrize("scene", ["none", "set", "distances"])
+def test_the_order_of_obstacles_does_not_matter(scene: str) -> None:
+    torch.manual_seed(0)
+    probes, rng = Probes.of(kernel().robot, 3), np.random.default_rng(5)
+    sizes = {"probes": len(probes.joint), "along": 3, "out": 20, "width": 16}
+    encoder = ConditionEncoder(DOF, scene=scene, point=True, **sizes)
+    rows = [
+        (int(rng.integers(4)), rng.uniform(-1, 1, 3), rng.normal(size=4), rng.uniform(0.05, 0.4, 3)) for _ in range(9)
+    ]
+    q = query()
+
+    def encoded(chosen: list[int], beside: int = 0) -> torch.Tensor:
+        """The code of a query, in a batch with another one of ``beside`` obstacles."""
+        mine = Query(q.start, q.goal, q.point, Things.of([rows[k] for k in chosen]))
+        other = Query(q.goal, q.start, q.point, Things.of(rows[:beside]))
+        return encoder(batched([mine, other], probes, kernel()))[0]
+
+    first = encoded(list(range(9)))
+    for _ in range(5):
+        torch.testing.assert_close(encoded(list(rng.permutation(9)), 4), first, atol=1e-5, rtol=1e-5)
+    torch.testing.assert_close(encoded([0, 1]), encoded([1, 0], 9), atol=1e-5, rtol=1e-5)
+    other = encoded(list(range(8)))
+    assert (scene == "none") == torch.allclose(other, first, atol=1e-5)
+    assert torch.isfinite(encoded([])).all()
+
+
+def test_conditions_of_stored_paths_are_those_of_their_problems() -> None:
+    paths = some_paths()
+    probes = Probes.of(kernel().robot, 3)
+    which = np.arange(0, len(paths), 37)
+    found = Table(paths, probes, kernel()).batch(torch.from_numpy(which))
+    a = paths.arrays
+    first = np.concatenate([[0], np.cumsum(a["things"])])
+    queries = []
+    for k in which:
+        p = a["problem"][k]
+        span = slice(int(first[p]), int(first[p + 1]))
+        things = Things(a["shape"][span].astype(int), a["position"][span], a["orientation"][span], a["size"][span])
+        queries.append(Query(paths.start[k], paths.goal[k], a["point"][k], things))
+    wanted = batched(queries, probes, kernel())
+    torch.manual_seed(0)
+    sizes = {"probes": len(probes.joint), "along": 3, "out": 20, "width": 16}
+    encoder = ConditionEncoder(DOF, scene="distances", point=True, **sizes)
+    torch.testing.assert_close(encoder(found), encoder(wanted), atol=1e-4, rtol=1e-4)
+
+
+# Networks
+
+
+def test_the_unet_takes_its_condition_and_its_step() -> None:
+    torch.manual_seed(0)
+    net = UNetDenoiser(4, 12, 8, (1, 2, 4))
+    latent, condition, t = torch.randn(3, 4, 16), torch.randn(3, 12), torch.tensor([3, 100, 255])
+    out = net(latent, t, condition)
+    assert out.shape == latent.shape
+    assert not torch.allclose(out, net(latent, t, condition + 1.0), atol=1e-3)
+    assert not torch.allclose(out, net(latent, t - 3, condition), atol=1e-3)
+    torch.testing.assert_close(out[1:2], net(latent[1:2], t[1:2], condition[1:2]), atol=1e-5, rtol=1e-4)
+
+
+@pytest.mark.parametrize(
+    "parts", [{}, VARIATIONAL, {"denoiser": DenoiserConfig(kind="regression", width=32, blocks=2)}]
+)
+def test_the_same_seed_gives_the_same_paths(parts: dict[str, object]) -> None:
+    model = TrajectoryModel(network(**parts), {})
+
+    def proposed(seed: int) -> np.ndarray:
+        generator = torch.Generator().manual_seed(seed)
+        sampling = Sampling("ddpm", 4)
+        return model.propose(query(), kernel(WALL), 3, sampling=sampling, generator=generator).control
+
+    first, limits = proposed(1), kernel().robot.arrays
+    np.testing.assert_array_equal(first, proposed(1))
+    assert np.array_equal(first, proposed(2)) == model.network.regresses
+    assert (first[:, 0] == query().start).all() and (first[:, -1] == query().goal).all()
+    assert ((first >= limits.lower) & (first <= limits.upper)).all()
+
+
+def test_noise_up_to_a_step_leaves_paths_near() -> None:
+    """A denoiser that knows the path gives it back; one step of noise strays less than all of it."""
+    model = TrajectoryModel(network(), {})
+    control = some_paths().control(slice(0, 1)).repeat(6, axis=0)
+    ends = Query(control[0, 0], control[0, -1], np.zeros(3), Things.of([]))
+
+    def strayed(step: int) -> float:
+        generator = torch.Generator().manual_seed(0)
+        found = model.renoise(ends, kernel(), control, step, sampling=Sampling(steps=3), generator=generator)
+        return float(np.abs(found.control - control).mean())
+
+    assert strayed(0) < 0.2 * strayed(255)
+    with pytest.raises(ParameterError, match="step: expected 0 to 255, got 256"):
+        strayed(256)
+    with pytest.raises(ParameterError, match=r"control points: expected an array of shape \(B, 14, 16\)"):
+        model.renoise(ends, kernel(), control[:, :5], 3)
+
+
+def test_a_query_of_another_robot_is_refused() -> None:
+    model = TrajectoryModel(network(), {})
+    with pytest.raises(ParameterError, match=r"start and goal: expected states of shape \(16,\)"):
+        model.propose(Query(np.zeros(7), np.zeros(7), np.zeros(3), Things.of([])), kernel(), 1)
+    with pytest.raises(ParameterError, match="count: expected a positive number of paths, got 0"):
+        model.propose(query(), kernel(), 0)
+
+
+# Guidance
+
+
+@pytest.mark.parametrize("parts", [{}, VARIATIONAL], ids=["linear", "variational"])
+@pytest.mark.parametrize("scaling", ["noise", "clean"])
+def test_guidance_of_nothing_is_the_plain_model_bit_for_bit(parts: dict[str, object], scaling: str) -> None:
+    model = TrajectoryModel(network(**parts), {})
+    for name in SAMPLERS:
+        found = [
+            model.propose(
+                query(), kernel(WALL, POST), 4, sampling=Sampling(name, 5, 1.0, guidance),
+                generator=torch.Generator().manual_seed(4),
+            ).control
+            for guidance in (Guidance(gamma=0.0, scaling=scaling), Guidance(gamma=0.0), Guidance(1.0, begin=0.0))
+        ]  # fmt: skip
+        np.testing.assert_array_equal(found[0], found[1])
+        np.testing.assert_array_equal(found[0], found[2])
+
+
+def test_the_cost_has_the_gradient_that_it_says() -> None:
+    rng, among = np.random.default_rng(0), kernel(WALL, POST)
+    paths = Spline(states=16).path(some_paths().control(slice(0, 6)))
+    cost, slope = collision_cost(among, paths, 0.1)
+    assert (cost > 0).any() and slope.shape == paths.shape
+    for _ in range(10):
+        way = rng.normal(size=paths.shape)
+        step = 1e-6
+        up, down = (collision_cost(among, paths + s * way, 0.1)[0] for s in (step, -step))
+        np.testing.assert_allclose((up - down) / (2 * step), (slope * way).sum(axis=(1, 2)), rtol=2e-3, atol=2e-4)
+
+
+@pytest.mark.parametrize("parts", [{}, VARIATIONAL], ids=["linear", "variational"])
+def test_the_gradient_goes_through_decoder_and_kernel(parts: dict[str, object]) -> None:
+    model, among, guidance = network(**parts), kernel(WALL, POST), Guidance(margin=0.1, samples=32)
+    ends = tuple(torch.tensor(e, dtype=torch.float64)[None].repeat(3, 1) for e in (query().start, query().goal))
+    latent = 0.5 * torch.randn(3, *model.latent, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    function = partial(_likely, model.double(), among, ends, guidance)
+    slope = gradient(function, latent)
+    way = torch.randn(latent.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    difference = (function(latent + 1e-6 * way) - function(latent - 1e-6 * way)) / 2e-6
+    torch.testing.assert_close((slope * way).flatten(1).sum(dim=1), difference, rtol=5e-3, atol=5e-4)
+
+
+def _likely(model: LatentDiffusion, among: Kernel, ends: tuple, guidance: Guidance, z: torch.Tensor) -> torch.Tensor:
+    return log_likelihood(model.autoencoder, among, z, ends, guidance)
+
+
+@pytest.mark.parametrize("scaling", ["noise", "clean"])
+@pytest.mark.parametrize("name", SAMPLERS)
+def test_guidance_lowers_the_collision_cost_on_average(name: str, scaling: str) -> None:
+    model, among = TrajectoryModel(network(), {}), kernel(WALL, POST)
+    costs = []
+    for gamma in (0.0, 3.0):
+        guidance, total = Guidance(gamma, scaling, clip=1.0, begin=0.6), 0.0
+        for seed in range(3):
+            found = model.propose(
+                query(seed), among, 8, sampling=Sampling(name, 8, 1.0, guidance),
+                generator=torch.Generator().manual_seed(seed),
+            )  # fmt: skip
+            total += collision_cost(among, model.spline.path(found.control)[:, ::4], 0.03)[0].mean()
+        costs.append(total)
+    assert costs[1] < 0.9 * costs[0]
+
+
+def test_faulty_guidance_is_refused() -> None:
+    for name, value in (("gamma", -1.0), ("clip", np.nan), ("margin", 0.0), ("samples", 1)):
+        with pytest.raises(ParameterError, match=name):
+            Guidance(**{name: value})
+    with pytest.raises(UnknownNameError, match="scaling of guidance 'none', did you mean 'noise'"):
+        Guidance(scaling="none")
+    with pytest.raises(UnknownNameError, match="sampler 'ddmp', did you mean 'ddpm'"):
+        Sampling("ddmp")
+    with pytest.raises(ParameterError, match="temperature"):
+        Sampling(temperature=-1.0)

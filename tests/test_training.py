@@ -1,0 +1,502 @@
+"""Training: it learns, goes on after any interruption, and its checkpoints say what they are."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from safetensors.torch import load_file, save_file
+from support import ROOT
+
+import apex_ompl
+from apex_ompl.cases import load_cases
+from apex_ompl.dataset import Store, load, save
+from apex_ompl.diffusion.checkpoint import load_model, save_model
+from apex_ompl.diffusion.conditions import Query, Things
+from apex_ompl.diffusion.config import TrainingConfig
+from apex_ompl.diffusion.data import Mirror, held_out, split, window_paths
+from apex_ompl.diffusion.proposals import Sampling, TrajectoryModel
+from apex_ompl.diffusion.training import Place, Trainer
+from apex_ompl.diffusion.validation import judged, query_of_case
+from apex_ompl.errors import ApexError, FileFormatError, MissingFileError, ParameterError, UnknownNameError
+from apex_ompl.kernel import Kernel, RobotTables
+from apex_ompl.kernel.scene import Primitive, scene_tables
+from apex_ompl.kernel.tables import BOX
+from apex_ompl.optimize import Optimizer
+from apex_ompl.records import Paths
+from apex_ompl.resolution import FULL_RESOLUTION
+
+DATA = ROOT / "data" / "dual_panda_softhand"
+SCRIPT = ROOT / "scripts" / "train.py"
+HERE = Place(0, 1, torch.device("cpu"))
+SMALL = {
+    "schema": "apex-ompl/training/1", "robot": str(DATA / "robot.npz"), "latent": {"dim": 32},
+    "condition": {"width": 32, "out": 64, "along": 3}, "denoiser": {"width": 64, "blocks": 2}, "steps": 12, "batch": 32,
+    "warmup": 2, "held_out": 0.0, "log_every": 5,
+}  # fmt: skip
+VARIATIONAL = {
+    "latent": {"kind": "variational", "width": 16, "channels": 4}, "autoencoder": {"steps": 5},
+    "denoiser": {"kind": "unet", "width": 8, "multipliers": [1, 2]}, "condition": {"scene": "none", "point": True},
+    "noise": {"prediction": "noise", "schedule": "linear"},
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def paths() -> Paths:
+    """Paths of a few problems of every level."""
+    whole = load(DATA / "paths.zip")
+    return whole.chosen(np.arange(0, whole.problems, 60))
+
+
+@pytest.fixture(scope="module")
+def few(paths: Paths, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A file of 32 paths of different problems."""
+    first = np.unique(paths.arrays["problem"], return_index=True)[1][:32]
+    arrays = dict(paths.arrays)
+    for name in ("problem", "start", "goal", "control", "point", "clearance", "length", "source", "homotopy"):
+        arrays[name] = arrays[name][first]
+    file = tmp_path_factory.mktemp("data") / "few.zip"
+    save(file, Paths(arrays, paths.names, paths.about))
+    return file
+
+
+@pytest.fixture(autouse=True)
+def _one_thread() -> Iterator[None]:
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+def config(data: Path, **changes: Any) -> TrainingConfig:
+    return TrainingConfig.model_validate({**SMALL, "data": str(data), **changes})
+
+
+def weights(trainer: Trainer) -> dict[str, torch.Tensor]:
+    return {**trainer.network.state_dict(), **{f"averaged.{k}": v for k, v in trainer.averaged.items()}}
+
+
+def assert_same(first: dict[str, torch.Tensor], second: dict[str, torch.Tensor]) -> None:
+    assert first.keys() == second.keys()
+    for name, tensor in first.items():
+        assert torch.equal(tensor, second[name]), name
+
+
+def query_of_path(paths: Paths, k: int) -> Query:
+    a, p = paths.arrays, paths.arrays["problem"][k]
+    first = int(a["things"][:p].sum())
+    span = slice(first, first + int(a["things"][p]))
+    things = Things(a["shape"][span].astype(int), a["position"][span], a["orientation"][span], a["size"][span])
+    return Query(paths.start[k], paths.goal[k], a["point"][k], things)
+
+
+def test_32_trajectories_are_learnt_by_heart(few: Path, tmp_path: Path) -> None:
+    sizes = {"denoiser": {"width": 192, "blocks": 2}, "condition": {"width": 64, "out": 128, "along": 3}}
+    trainer = Trainer(config(few, steps=1500, rate=3e-3, ema=0.99, log_every=10_000, **sizes), tmp_path, HERE)
+    trainer.run()
+    model, paths = TrajectoryModel(trainer.averaged_network(), {}), load(few)
+    kernel = Kernel(RobotTables.load(DATA / "robot.npz"), scene_tables([]))
+    control, apart, from_line = paths.control(), [], []
+    for k in range(len(paths)):
+        generator = torch.Generator().manual_seed(k)
+        query = query_of_path(paths, k)
+        found = model.propose(query, kernel, 4, sampling=Sampling("ddim", 8), generator=generator).control
+        apart.append(np.abs(found - control[k]).mean())
+        from_line.append(np.abs(model.spline.line(query.start, query.goal) - control[k]).mean())
+    assert np.mean(apart) < 0.25 * np.mean(from_line)
+
+
+@pytest.mark.parametrize("kind", ["linear", "variational", "several windows"])
+def test_a_run_that_is_interrupted_comes_to_the_same_weights(
+    kind: str, few: Path, paths: Paths, tmp_path: Path
+) -> None:
+    data, changes = few, VARIATIONAL if kind == "variational" else {}
+    if kind == "several windows":
+        data, changes = tmp_path / "store", {"units": 2, "batch": 64}
+        store = Store.create(data, {"robot": "x"}, [])
+        for k in range(5):
+            store.write(f"unit-{k}", paths.chosen(np.arange(20 * k, 20 * k + 7)))
+    cut = {"linear": [5], "variational": [3, 7], "several windows": [6, 9]}[kind]
+    whole = Trainer(config(data, **changes), tmp_path / "whole", HERE)
+    (tmp_path / "whole").mkdir()
+    whole.run()
+    part_folder = tmp_path / "part"
+    part_folder.mkdir()
+    for last in [*cut, 10_000]:
+        part = Trainer(config(data, **changes), part_folder, HERE)
+        steps = 0
+        while not part.done and steps < last:
+            part.advance()
+            steps += 1
+        if not part.done:
+            part.save()
+            part.advance()  # what is not saved is lost
+    assert part.phase == whole.phase and part.step == whole.step == 12
+    assert_same(weights(part), weights(whole))
+
+
+def test_what_was_logged_behind_the_last_save_is_forgotten(few: Path, tmp_path: Path) -> None:
+    def trainer() -> Trainer:
+        return Trainer(config(few, log_every=1, held_out=0.2), tmp_path, HERE)
+
+    first = trainer()
+    for step in range(1, 6):
+        first.advance()
+        first._log(1.0, False)  # noqa: SLF001
+        if step == 4:
+            first.save()
+    assert [row["step"] for row in first._runlog.rows()] == ["1", "2", "3", "4", "5"]  # noqa: SLF001
+    second = trainer()
+    assert second.step == 4
+    second.run()
+    rows = second._runlog.rows()  # noqa: SLF001
+    assert [int(row["step"]) for row in rows] == list(range(1, 13))
+    assert all(float(row["held_out"]) > 0 for row in rows)
+    assert list((tmp_path / "tensorboard").iterdir())
+
+
+def test_a_killed_command_goes_on(few: Path, tmp_path: Path) -> None:
+    file = tmp_path / "small.yaml"
+    file.write_text(yaml.safe_dump({**SMALL, "data": str(few), "steps": 3000, "save_every": 0.05, "log_every": 500}))
+    command = [sys.executable, str(SCRIPT), str(file), "--out", str(tmp_path / "run"), "--quiet"]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    process = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+    state = tmp_path / "run" / "state.pt"
+    begin = time.monotonic()
+    while not state.exists():
+        assert process.poll() is None and time.monotonic() - begin < 120
+        time.sleep(0.02)
+    time.sleep(0.1)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    step = torch.load(state, weights_only=True)["step"]
+    assert 0 < step < 3000
+    load_model(tmp_path / "run" / "checkpoint")
+    how: dict[str, Any] = {"env": environment, "capture_output": True, "text": True}
+    changed = subprocess.run([*command, "--set", "steps=7"], check=False, **how)
+    assert changed.returncode == 2 and "expected the state of a run with this configuration" in changed.stderr
+    done = subprocess.run([*command, "--minutes", "0.01"], check=False, **how)
+    assert done.returncode == 0, done.stderr
+    assert torch.load(state, weights_only=True)["step"] > step
+    assert not list((tmp_path / "run").glob(".*"))
+
+
+def test_two_processes_train_one_model(few: Path, tmp_path: Path) -> None:
+    file = tmp_path / "small.yaml"
+    file.write_text(yaml.safe_dump({**SMALL, "data": str(few), "steps": 4}))
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", str(SCRIPT)]
+    command += [str(file), "--out", str(tmp_path / "run"), "--quiet"]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "denoiser, step 4 of 4" in done.stdout
+    both = load_model(tmp_path / "run" / "checkpoint").network.state_dict()
+    # The same steps by hand: the gradients of both processes' batches, averaged.
+    single = Trainer(config(few, steps=4), tmp_path / "single", HERE)
+    for _ in range(4):
+        gradients = []
+        for rank in range(2):
+            single.place = Place(rank, 2, torch.device("cpu"))
+            loss = single._loss()  # noqa: SLF001
+            gradients.append(torch.autograd.grad(loss, single._parameters, allow_unused=True))  # noqa: SLF001
+        single.place = HERE
+        mean = [None if a is None else (a + b) / 2 for a, b in zip(*gradients, strict=True)]
+        single._loss = lambda mean=mean: _Given(single, mean)  # type: ignore[assignment,method-assign]  # noqa: SLF001
+        single.advance()
+        del single._loss
+    for name, tensor in single.averaged_network().state_dict().items():
+        torch.testing.assert_close(both[name], tensor, atol=2e-3, rtol=2e-3)
+
+
+class _Given:
+    """Stands for a loss whose gradient is known."""
+
+    def __init__(self, trainer: Trainer, gradients: list[torch.Tensor | None]) -> None:
+        self.trainer, self.gradients = trainer, gradients
+
+    def backward(self) -> None:
+        for parameter, gradient in zip(self.trainer._parameters, self.gradients, strict=True):  # noqa: SLF001
+            parameter.grad = gradient
+
+    def detach(self) -> float:
+        return 0.0
+
+
+# Data
+
+
+def test_mirror_images_are_valid_where_paths_are(paths: Paths) -> None:
+    """But for a few: the Panda's fifth link is not quite symmetric."""
+    mirror = Mirror(**yaml.safe_load((ROOT / "scripts" / "configs" / "apex.yaml").read_text())["mirror"])
+    robot = RobotTables.load(DATA / "robot.npz")
+    image = mirror.paths(paths, robot.arrays.lower, robot.arrays.upper)
+    assert 0.2 * len(paths) < len(image) < len(paths)
+    twice = mirror.paths(image, robot.arrays.lower, robot.arrays.upper)
+    assert len(twice) > 0.9 * len(image)
+    np.testing.assert_allclose(mirror.states(mirror.states(paths.control())), paths.control(), atol=1e-12)
+    proven, near = [], []
+    for k in range(0, len(image), 7):
+        query = query_of_path(image, k)
+        things = query.things
+        solids = []
+        for shape, place, turn, size in zip(
+            things.shape, things.position, things.orientation, things.size, strict=True
+        ):
+            if shape != 0:
+                break
+            x, y, z, w = (float(v) for v in turn)
+            pose = np.eye(4)
+            pose[:3, 3] = place
+            pose[:3, :3] = [
+                [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+                [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+                [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+            ]
+            solids.append((len(solids), Primitive(BOX, pose, tuple(np.asarray(size, float) / 2))))
+        else:
+            states = image.spline.path(image.control(slice(k, k + 1))[0])
+            clearance = Kernel(robot, scene_tables(solids)).clearance(states[::5])
+            proven.append(clearance.min() > -0.01)
+            near.append(abs(clearance.min() - image.arrays["clearance"][k]) < 0.01)
+    assert len(proven) > 20 and np.mean(proven) > 0.95 and np.mean(near) > 0.85
+
+
+def test_problems_are_held_out_whole(paths: Paths) -> None:
+    train, out = split(paths, 0.3)
+    names = [{part.problem_name(k) for k in range(part.problems)} for part in (train, out)]
+    assert not names[0] & names[1] and len(train) + len(out) == len(paths)
+    assert 0.15 < len(names[1]) / paths.problems < 0.45
+    assert all(held_out(name, 0.3) for name in names[1]) and not any(held_out(name, 0.3) for name in names[0])
+
+
+def test_every_pass_goes_through_all_units_once(paths: Paths, tmp_path: Path) -> None:
+    store = Store.create(tmp_path, {"robot": "x"}, [])
+    for k in range(5):
+        store.write(f"unit-{k}", paths.chosen([k]))
+    found = [window_paths(tmp_path, 3, 2, number) for number in range(9)]
+    assert all(windows == 3 for _, windows in found)
+    names = [[p.problem_name(k) for k in range(p.problems)] for p, _ in found]
+    passes = [sum(names[k : k + 3], []) for k in (0, 3, 6)]
+    assert all(sorted(one) == sorted(passes[0]) and len(set(one)) == 5 for one in passes)
+    assert len({tuple(one) for one in passes}) > 1
+
+
+def test_weights_say_how_often_paths_are_drawn(paths: Paths, few: Path, tmp_path: Path) -> None:
+    file = tmp_path / "data.zip"
+    save(file, paths)
+    trainer = Trainer(config(file, weights={"shelf/*": 0.0, "*/hard": 5.0}), tmp_path, HERE)
+    window = trainer._window  # noqa: SLF001
+    drawn = window.drawn(100_000, torch.Generator().manual_seed(0))
+    assert (np.diff(drawn) >= 0).all()
+    a = paths.arrays
+    levels = [
+        f"{paths.names['suite'][a['suite'][p]]}/{paths.names['level'][a['level'][p]]}" for p in a["problem"].tolist()
+    ]
+    weight = np.array([0.0 if v.startswith("shelf") else 5.0 if v.endswith("hard") else 1.0 for v in levels])
+    shares = np.bincount(drawn, minlength=len(paths)) / len(drawn)
+    np.testing.assert_allclose(shares, weight / weight.sum(), atol=5e-3)
+    with pytest.raises(ParameterError, match="training data: expected paths, some of them with a positive weight"):
+        Trainer(config(few, weights={"*": 0.0}), tmp_path, HERE)
+
+
+# Validation
+
+
+def test_proposals_are_judged_by_repair_and_proof(few: Path, tmp_path: Path) -> None:
+    cases = load_cases(DATA / "validation")[::30]
+    model = TrajectoryModel(Trainer(config(few), tmp_path, HERE).averaged_network(), {})
+    said = judged(model, cases, 3)
+    wanted = []
+    for case in cases:
+        kernel = Kernel(case.robot, case.scene)
+        control = model.propose(query_of_case(case), kernel, 3, generator=torch.Generator().manual_seed(0)).control
+        found = Optimizer(model.spline).first_valid(kernel, control, lambda p, k=kernel: k.proves(p, FULL_RESOLUTION))
+        wanted.append(found is not None)
+    assert said["repaired"] == pytest.approx(np.mean(wanted))
+    assert 0.0 <= said["sampled"] <= said["repaired"]
+    levels = {f"{case.suite}/{case.level}" for case in cases}
+    assert levels <= said.keys()
+
+
+# Configurations
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"schema": "apex-ompl/training/2"}, "schema: expected 'apex-ompl/training/1', got 'apex-ompl/training/2'"),
+        ({"stepz": 3}, "stepz: unknown key, did you mean 'steps'?"),
+        ({"steps": 0}, "steps: input should be greater than or equal to 1, got 0"),
+        ({"latent": {"kind": "quadratic"}}, "latent.kind: input should be 'linear' or 'variational'"),
+        ({"rate": float("nan")}, "rate: input should be a finite number"),
+        ({"mirror": {"order": [0, 0], "sign": [1, 1], "shift": [0, 0]}}, "mirror: expected every joint's number once"),
+    ],
+)
+def test_faulty_configurations_are_named(change: dict[str, Any], said: str, few: Path, tmp_path: Path) -> None:
+    file = tmp_path / "faulty.yaml"
+    file.write_text(yaml.safe_dump({**SMALL, "data": str(few), **change}))
+    with pytest.raises(FileFormatError, match="faulty.yaml") as caught:
+        TrainingConfig.read(file)
+    assert said in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"data": "/no/such"}, "manifest of a data set '/no/such/manifest.json': no such file"),
+        ({"robot": "/no/such.npz"}, "file of kernel tables '/no/such.npz': no such file"),
+        ({"latent": {"dim": 500}}, "dimension of the latent space: expected 1 to 192, got 500"),
+        ({"mirror": {"order": [0], "sign": [1], "shift": [0]}}, "mirror: expected 16 joints, got 1"),
+    ],
+)
+def test_what_does_not_fit_is_named(change: dict[str, Any], said: str, few: Path, tmp_path: Path) -> None:
+    with pytest.raises(ApexError) as caught:
+        Trainer(config(**{"data": few, **change}), tmp_path, HERE)
+    assert str(caught.value) == said
+
+
+def test_dotted_keys_change_a_configuration() -> None:
+    read = TrainingConfig.read(ROOT / "scripts" / "configs" / "apex.yaml", {"latent.dim": 7, "steps": 3})
+    assert read.latent.dim == 7 and read.steps == 3
+    for name in ("apex", "apex-paper"):
+        TrainingConfig.read(ROOT / "scripts" / "configs" / f"{name}.yaml")
+    with pytest.raises(FileFormatError, match="expected 'steps' to hold keys"):
+        TrainingConfig.read(ROOT / "scripts" / "configs" / "apex.yaml", {"steps.more": 3})
+
+
+def test_a_damaged_state_is_named(few: Path, tmp_path: Path) -> None:
+    (tmp_path / "state.pt").write_bytes(b"not a state")
+    with pytest.raises(FileFormatError, match=r"state.pt: expected the state of a training run"):
+        Trainer(config(few), tmp_path, HERE)
+
+
+# Checkpoints
+
+
+@pytest.fixture(scope="module")
+def saved(few: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("run")
+    trainer = Trainer(config(few), folder, HERE)
+    trainer.run()
+    return folder / "checkpoint"
+
+
+def test_a_checkpoint_gives_the_model_back(saved: Path, few: Path, tmp_path: Path) -> None:
+    trainer = Trainer(config(few), saved.parent, HERE)
+    assert trainer.done
+    model, original = apex_ompl.load_model(saved), trainer.averaged_network()
+    assert model.network.config == original.config
+    for name, tensor in original.state_dict().items():
+        found = model.network.state_dict()[name]
+        torch.testing.assert_close(found, tensor.half().to(tensor) if tensor.is_floating_point() else tensor)
+    save_model(tmp_path / "again", model.network, model.about, "again")
+    assert (tmp_path / "again" / "model.safetensors").read_bytes() == (saved / "model.safetensors").read_bytes()
+    assert "Trained for 12 steps of 32 paths" in (saved / "README.md").read_text()
+    assert model.about["config"]["steps"] == 12
+    kernel = Kernel(RobotTables.load(DATA / "robot.npz"), scene_tables([]))
+    query = query_of_path(load(few), 0)
+    first, second = (
+        m.propose(query, kernel, 3, generator=torch.Generator().manual_seed(1)).control
+        for m in (model, load_model(str(tmp_path / "again")))
+    )
+    np.testing.assert_array_equal(first, second)
+
+
+def _changed(saved: Path, folder: Path, **changes: Any) -> Path:
+    shutil.copytree(saved, folder)
+    data = json.loads((folder / "config.json").read_text())
+    data.update(changes)
+    (folder / "config.json").write_text(json.dumps(data))
+    return folder
+
+
+def test_faulty_checkpoints_are_named(saved: Path, tmp_path: Path) -> None:
+    with pytest.raises(UnknownNameError, match="unknown checkpoint 'apexx'"):
+        load_model("apexx")
+    with pytest.raises(MissingFileError, match="checkpoint '/no/such/folder': no such folder"):
+        load_model("/no/such/folder")
+    with pytest.raises(FileFormatError, match="pickles are not read, got '.pt'"):
+        load_model(saved.parent / "state.pt")
+    with pytest.raises(FileFormatError, match="model.robot: expected 'baxter', got 'dual_panda_softhand'"):
+        load_model(saved, robot="baxter")
+    with pytest.raises(ParameterError, match="device: expected a device of torch's"):
+        load_model(saved, device="cuda:7")
+    with pytest.raises(MissingFileError, match="config.json': no such file"):
+        load_model(tmp_path)
+    other = _changed(saved, tmp_path / "version", schema="apex-ompl/model/9")
+    with pytest.raises(FileFormatError, match="schema: expected 'apex-ompl/model/1', got 'apex-ompl/model/9'"):
+        load_model(other)
+    other = _changed(saved, tmp_path / "key", modle={})
+    with pytest.raises(FileFormatError, match="modle: unknown key, did you mean 'model'"):
+        load_model(other)
+    (tmp_path / "key" / "config.json").write_text("[]")
+    with pytest.raises(FileFormatError, match="expected the configuration of a checkpoint"):
+        load_model(tmp_path / "key")
+    damaged = _changed(saved, tmp_path / "damaged")
+    content = bytearray((damaged / "model.safetensors").read_bytes())
+    content[-100] ^= 1
+    (damaged / "model.safetensors").write_bytes(content)
+    with pytest.raises(FileFormatError, match=r"model.safetensors: expected .*: damaged, got 'SHA-256"):
+        load_model(damaged)
+
+
+@pytest.mark.parametrize(
+    ("what", "said"),
+    [
+        ("missing", "denoiser.leave.bias: expected weights that fit config.json"),
+        ("shape", "denoiser.leave.bias: expected weights that fit config.json"),
+        ("nan", "denoiser.leave.bias: expected finite weights"),
+        ("text", "model.safetensors: expected safetensors"),
+    ],
+)
+def test_weights_that_do_not_fit_are_named(what: str, said: str, saved: Path, tmp_path: Path) -> None:
+    import hashlib
+
+    folder = _changed(saved, tmp_path / what)
+    file = folder / "model.safetensors"
+    tensors = load_file(file)
+    bias = tensors.pop("denoiser.leave.bias")
+    if what == "shape":
+        tensors["denoiser.leave.bias"] = bias[:-1].clone()
+    elif what == "nan":
+        tensors["denoiser.leave.bias"] = torch.full_like(bias, torch.nan)
+    save_file(tensors, file)
+    if what == "text":
+        file.write_text("weights")
+    digest = hashlib.sha256(file.read_bytes()).hexdigest()
+    shutil.rmtree(tmp_path / "fitting", ignore_errors=True)
+    fitting = _changed(folder, tmp_path / "fitting", digest=digest)
+    with pytest.raises(FileFormatError) as caught:
+        load_model(fitting)
+    assert said in str(caught.value)
+
+
+def test_a_checkpoint_is_written_whole_or_not_at_all(saved: Path, tmp_path: Path, monkeypatch: Any) -> None:
+    network = load_model(saved).network
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(MissingFileError, match="folder for a checkpoint"):
+        save_model(tmp_path / "file" / "inside", network, {}, "")
+    folder = tmp_path / "there"
+    save_model(folder, network, {"step": 1}, "first")
+
+    def full(*_: object) -> int:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(MissingFileError, match="no space left on device"):
+        save_model(folder, network, {"step": 2}, "second")
+    monkeypatch.undo()
+    assert load_model(folder).about == {"step": 1}
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["file", "there"]
