@@ -32,9 +32,6 @@ from apex_ompl.validity import full_check
 Array = NDArray[np.float64]
 
 UNIT = 16  # problems in a unit of work
-NO_POINT = (0.0, 0.0, -1.0)
-"""The obstacle point where there is no obstacle: a metre under the tables' surface, further than any obstacle [m]."""
-
 MOST_ITERATIONS = 30_000  # of rrtconnect
 
 
@@ -170,8 +167,7 @@ class Task(Case):
         """Return the obstacle point that is nearest to the robot, tables excluded, shape (3,) [m]; by GJK."""
         key = q.tobytes()
         if key not in self.points:
-            nearest = self.ready.verdict.distance(q)
-            self.points[key] = nearest.points[1] if nearest.first else np.array(NO_POINT)
+            self.points[key] = self.ready.verdict.obstacle_point(q)
         return self.points[key]
 
 

@@ -418,7 +418,8 @@ def test_conditions_of_stored_paths_are_those_of_their_problems() -> None:
     for k in which:
         p = a["problem"][k]
         span = slice(int(first[p]), int(first[p + 1]))
-        things = Things(a["shape"][span].astype(int), a["position"][span], a["orientation"][span], a["size"][span])
+        columns = (a[name][span] for name in ("shape", "position", "orientation", "size"))
+        things = Things.of(list(zip(*columns, strict=True)))
         queries.append(Query(paths.start[k], paths.goal[k], a["point"][k], things))
     wanted = batched(queries, probes, kernel())
     torch.manual_seed(0)

@@ -14,10 +14,11 @@ from support import ROOT
 
 from apex_ompl import problems
 from apex_ompl.assembly import assemble
+from apex_ompl.collision.verdict import NO_POINT
 from apex_ompl.dataset import Store, load
 from apex_ompl.engine import STRAIGHT_SHARE, Options, rounded
 from apex_ompl.errors import UnknownNameError
-from apex_ompl.generation import NO_POINT, Unit, plan_units, static_levels, work
+from apex_ompl.generation import Unit, plan_units, static_levels, work
 from apex_ompl.problems.reach import robot
 from apex_ompl.records import FIELDS, SHAPES, SOURCES, DatasetError, Paths
 from apex_ompl.space import path_length

@@ -25,7 +25,7 @@ LAYERS = [
     {"goals", "grasp"},
     {"validity"},
     {"assembly", "simplify", "result", "moveit", "moving"},
-    {"repair", "render"},
+    {"queries", "repair", "render"},
     {"planners", "problems"},
     {"generation"},
     {"api"},

@@ -98,7 +98,8 @@ def query_of_path(paths: Paths, k: int) -> Query:
     a, p = paths.arrays, paths.arrays["problem"][k]
     first = int(a["things"][:p].sum())
     span = slice(first, first + int(a["things"][p]))
-    things = Things(a["shape"][span].astype(int), a["position"][span], a["orientation"][span], a["size"][span])
+    columns = (a[name][span] for name in ("shape", "position", "orientation", "size"))
+    things = Things.of(list(zip(*columns, strict=True)))
     return Query(paths.start[k], paths.goal[k], a["point"][k], things)
 
 
@@ -241,9 +242,9 @@ def test_mirror_images_are_valid_where_paths_are(paths: Paths) -> None:
     """But for a few: the Panda's fifth link is not quite symmetric."""
     mirror = Mirror(**yaml.safe_load((ROOT / "scripts" / "configs" / "apex.yaml").read_text())["mirror"])
     robot = RobotTables.load(DATA / "robot.npz")
-    image = mirror.paths(paths, robot.arrays.lower, robot.arrays.upper)
+    image = mirror.paths(paths, Kernel(robot, scene_tables([])))
     assert 0.2 * len(paths) < len(image) < len(paths)
-    twice = mirror.paths(image, robot.arrays.lower, robot.arrays.upper)
+    twice = mirror.paths(image, Kernel(robot, scene_tables([])))
     assert len(twice) > 0.9 * len(image)
     np.testing.assert_allclose(mirror.states(mirror.states(paths.control())), paths.control(), atol=1e-12)
     proven, near = [], []
@@ -251,20 +252,12 @@ def test_mirror_images_are_valid_where_paths_are(paths: Paths) -> None:
         query = query_of_path(image, k)
         things = query.things
         solids = []
-        for shape, place, turn, size in zip(
-            things.shape, things.position, things.orientation, things.size, strict=True
-        ):
+        for shape, place, turn, size in zip(things.shape, things.position, things.turn, things.size, strict=True):
             if shape != 0:
                 break
-            x, y, z, w = (float(v) for v in turn)
             pose = np.eye(4)
-            pose[:3, 3] = place
-            pose[:3, :3] = [
-                [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-                [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-                [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-            ]
-            solids.append((len(solids), Primitive(BOX, pose, tuple(np.asarray(size, float) / 2))))
+            pose[:3, :3], pose[:3, 3] = turn, place
+            solids.append((len(solids), Primitive(BOX, pose, tuple(size))))
         else:
             states = image.spline.path(image.control(slice(k, k + 1))[0])
             clearance = Kernel(robot, scene_tables(solids)).clearance(states[::5])

@@ -41,6 +41,10 @@ class Collision:
     segment: int
 
 
+NO_POINT = (0.0, 0.0, -1.0)
+"""The obstacle point where there is no obstacle: a metre under the tables' surface, further than any obstacle [m]."""
+
+
 class Verdict:
     """Judges states of a robot in a scene, in two stages that agree with the second alone.
 
@@ -167,6 +171,13 @@ class Verdict:
         self._forget()
 
     @property
+    def movable(self) -> NDArray[np.bool_]:
+        """Which of the kernel's obstacles do not belong to the robot's fixtures, shape (obstacles,)."""
+        numbers = self._scene().scene
+        owners = [numbers[name] for name in self.obstacle_names]
+        return np.isin(self.kernel.scene.arrays.owner, owners)
+
+    @property
     def kernel(self) -> Kernel:
         """The compiled kernel for the robot and scene of now: clearances, their gradients, and the tables."""
         return self._proved().kernel
@@ -265,6 +276,14 @@ class Verdict:
             fixtures: Whether the robot's fixtures count as obstacles.
         """
         return self._scene().distances("all" if fixtures else "scene").closest(self.robot.to_pinocchio(q))
+
+    def obstacle_point(self, q: Array) -> Array:
+        """Return the obstacle point nearest to the robot by GJK, fixtures excluded, shape (3,) [m].
+
+        This is the obstacle point in the paper's condition g; NO_POINT where there is no obstacle.
+        """
+        nearest = self.distance(q)
+        return np.asarray(nearest.points[1] if nearest.first else NO_POINT, float)
 
     def clearance(self, q: Array) -> float:
         """Return the least distance of all pairs that are checked, links against each other included [m]."""

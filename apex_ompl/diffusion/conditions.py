@@ -11,9 +11,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from apex_ompl.kernel import Kernel, RobotTables
+from apex_ompl.kernel.tables import BOX, HALF_SPACE, SceneArrays
 from apex_ompl.records import SHAPES, Paths
 
 Array = NDArray[np.float64]
+
+
+HALVES = np.array([[0.5, 0.5, 0.5], [1.0, 0.5, 0.5], [1.0, 0.5, 0.5], [1.0, 0.5, 0.5]], np.float32)
+"""From sizes as they are stored to those of the networks: half edges, radii, half lengths."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,25 +28,48 @@ class Things:
     Attributes:
         shape: Number of each one's shape in ``apex_ompl.records.SHAPES``, shape (M,).
         position: Shape (M, 3) [m].
-        orientation: Quaternions xyzw, shape (M, 4).
-        size: Edges; radius; or radius and length along z, shape (M, 3) [m].
+        turn: Rotations, shape (M, 3, 3).
+        size: Half edges; radius; or radius and half length along z, shape (M, 3) [m].
     """
 
     shape: NDArray[np.int64]
     position: Array
-    orientation: Array
+    turn: Array
     size: Array
 
     @classmethod
     def of(cls, rows: Sequence[tuple[int, Sequence[float], Sequence[float], Sequence[float]]]) -> Things:
-        """Return obstacles from rows of shape, position, orientation and size."""
+        """Return obstacles from rows of shape, position, orientation and size, as data sets hold them."""
         columns = list(zip(*rows, strict=True)) or [(), (), (), ()]
-        numbers = [np.array(c, float).reshape(-1, n) for c, n in zip(columns[1:], (3, 4, 3), strict=True)]
-        return cls(np.array(columns[0], np.int64), *numbers)
+        shape = np.array(columns[0], np.int64)
+        place, turn, size = (np.array(c, float).reshape(-1, n) for c, n in zip(columns[1:], (3, 4, 3), strict=True))
+        return cls(shape, place, rotations(turn).astype(float), size * HALVES[shape])
+
+    @classmethod
+    def among(cls, scene: SceneArrays, chosen: NDArray[np.bool_]) -> Things:
+        """Return some of the kernel's obstacles; a half-space is a large box, as far as a robot can tell."""
+        shape, position = scene.kind[chosen].copy(), scene.offset[chosen].copy()
+        turn, size = scene.rotation[chosen].copy(), scene.size[chosen].copy()
+        for k in np.flatnonzero(shape == HALF_SPACE):
+            normal, distance = position[k].copy(), size[k, 0]
+            turn[k] = _upright(normal)
+            shape[k], position[k], size[k] = BOX, (distance - LARGE[2]) * normal, LARGE
+        return cls(shape, position, turn, size)
 
     def __len__(self) -> int:
         """Return their number."""
         return len(self.shape)
+
+
+LARGE = np.array([3.0, 3.0, 0.5])
+"""Half edges of the box that stands for a half-space [m]."""
+
+
+def _upright(normal: Array) -> Array:
+    """Return a rotation whose z axis is ``normal``, shape (3, 3)."""
+    across = np.cross(normal, np.eye(3)[int(np.argmin(np.abs(normal)))])
+    across /= np.linalg.norm(across)
+    return np.stack([across, np.cross(normal, across), normal], axis=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,10 +188,6 @@ def rotations(orientation: NDArray[np.floating]) -> NDArray[np.float32]:
     return np.asarray(np.moveaxis(np.array(rows), (0, 1), (-2, -1)), np.float32)
 
 
-HALVES = np.array([[0.5, 0.5, 0.5], [1.0, 0.5, 0.5], [1.0, 0.5, 0.5], [1.0, 0.5, 0.5]], np.float32)
-"""From sizes as they are stored to those of the networks: half edges, radii, half lengths."""
-
-
 def batched(queries: Sequence[Query], probes: Probes, kernel: Kernel) -> Conditions:
     """Return queries as a batch; the kernel's obstacles are not looked at."""
     most = max((len(q.things) for q in queries), default=0)
@@ -174,8 +198,7 @@ def batched(queries: Sequence[Query], probes: Probes, kernel: Kernel) -> Conditi
     for k, query in enumerate(queries):
         n, things = len(query.things), query.things
         shape[k, :n], there[k, :n], position[k, :n] = things.shape, True, things.position
-        turn[k, :n] = rotations(things.orientation)
-        size[k, :n] = things.size * HALVES[things.shape]
+        turn[k, :n], size[k, :n] = things.turn, things.size
     start, goal = np.stack([q.start for q in queries]), np.stack([q.goal for q in queries])
     numbers = (start, goal, np.stack([q.point for q in queries]), probes.places(kernel, start, goal))
     rest = (shape, position, turn, size, there)

@@ -24,6 +24,7 @@ from apex_ompl.records import Paths, to_micro
 Array = NDArray[np.float64]
 
 NOTHING_HELD = "[]"
+EVERY, CLOSE = 8, 0.01  # states of an image that are looked at, and clearances that are told apart [m]
 
 
 @dataclass(frozen=True)
@@ -46,14 +47,20 @@ class Mirror:
         """Return the images of states, shape (..., dof)."""
         return np.asarray(q[..., list(self.order)] * np.array(self.sign) + np.array(self.shift))
 
-    def paths(self, paths: Paths, lower: Array, upper: Array) -> Paths:
-        """Return the images of all paths whose problem has nothing held, and which stay inside the limits."""
+    def paths(self, paths: Paths, kernel: Kernel) -> Paths:
+        """Return the images of all paths whose problem has nothing held.
+
+        Those are left out that leave the limits, or whose links touch each other by the kernel: no robot is quite
+        symmetric.
+        """
         a = dict(paths.arrays)
-        spline = paths.spline
+        spline, lower, upper = paths.spline, kernel.robot.arrays.lower, kernel.robot.arrays.upper
         control = self.states(paths.control())
         inside = ((control >= lower) & (control <= upper)).all(axis=(1, 2))
         held = np.array(paths.names["held"], object)[a["held"][a["problem"]]] if len(control) else np.zeros(0, object)
         kept = inside & (held == NOTHING_HELD)
+        for k in np.flatnonzero(kept):
+            kept[k] = kernel.clearance(spline.path(control[k])[::EVERY], CLOSE)[:, 1].min() >= 0.0
         flip = np.array([1.0, -1.0, 1.0])
         a["position"] = (a["position"] * flip).astype(np.float32)
         a["orientation"] = (a["orientation"] * np.array([-1.0, 1.0, -1.0, 1.0])).astype(np.float32)

@@ -327,7 +327,7 @@ class Trainer:
         self._left = PASSES * max(1, len(self._window) // self.config.batch) if self._windows > 1 else 2**31
 
     def _load_window(self, number: int) -> tuple[Window, Window | None, SplineConfig]:
-        config, arrays = self.config, self._kernel.robot.arrays
+        config = self.config
         paths, self._windows = window_paths(Path(config.data), config.seed, config.units, number)
         robot = self._kernel.robot
         if (paths.about["robot"], tuple(paths.about["joints"])) != (robot.name, robot.joint_names):
@@ -338,7 +338,7 @@ class Trainer:
             if len(config.mirror.order) != robot.dof:
                 raise ParameterError("mirror", len(config.mirror.order), f"{robot.dof} joints")
             mirror = Mirror(**config.mirror.model_dump())
-            parts.append(mirror.paths(train, arrays.lower, arrays.upper))
+            parts.append(mirror.paths(train, self._kernel))
         window = Window(parts, self._probes, self._kernel, config.weights)
         watched = Window([out], self._probes, self._kernel, {}) if len(out) else None
         return window, watched, SplineConfig(**{k: paths.about[k] for k in SplineConfig.model_fields})

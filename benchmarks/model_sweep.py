@@ -1,0 +1,110 @@
+"""What matters in the model: short trainings that differ in one thing each, judged on validation problems.
+
+Every variant is trained by scripts/train.py for as many steps, on one thread, two at a time; what is trained already
+is not trained again. Then B = 1 and 8 proposals in two deterministic steps are repaired by the optimiser and judged
+by the kernel.
+
+Usage: python benchmarks/model_sweep.py [--steps 3000] [--data FOLDER] [--runs FOLDER] [--only NAME ...]
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import record
+import torch
+
+from apex_ompl.cases import load_cases
+from apex_ompl.diffusion.checkpoint import load_model
+from apex_ompl.diffusion.runlog import RunLog
+from apex_ompl.diffusion.validation import judged
+
+ROOT = record.RESULTS.parent.parent
+VARIANTS: dict[str, dict[str, Any]] = {
+    "apex": {},
+    "scene: set": {"condition.scene": "set"},
+    "scene: none": {"condition.scene": "none"},
+    "components: 32": {"latent.dim": 32},
+    "components: 128": {"latent.dim": 128},
+    "width: 384": {"denoiser.width": 384},
+    "prediction: noise": {"noise.prediction": "noise"},
+    "regression": {"denoiser.kind": "regression"},
+    "data: 1/2": {"held_out": 0.5},
+    "data: 1/4": {"held_out": 0.75},
+    "no mirror images": {"mirror": "null"},
+    "no weights": {"weights": "{}"},
+}
+
+
+def trained(name: str, args: argparse.Namespace) -> Path:
+    """Train a variant unless it is there; return its folder."""
+    folder: Path = args.runs / name.replace(":", "").replace(" ", "-").replace("/", "-of-")
+    settings = {"steps": args.steps, "validate_every": 10**9, "log_every": 500, "cases": "null", **VARIANTS[name]}
+    if args.data is not None:
+        settings["data"] = args.data
+    command = [sys.executable, str(ROOT / "scripts" / "train.py"), str(ROOT / "scripts" / "configs" / "apex.yaml")]
+    command += ["--out", str(folder), "--quiet"]
+    for key, value in settings.items():
+        command += ["--set", f"{key}={value}"]
+    environment = {**os.environ, "OMP_NUM_THREADS": str(args.threads)}
+    subprocess.run(command, check=True, env=environment, cwd=ROOT, stdout=subprocess.DEVNULL)
+    return folder
+
+
+def figures(folder: Path, cases: list[Any]) -> dict[str, Any]:
+    """Return what a variant came to."""
+    last = RunLog(folder).rows()[-1]
+    model = load_model(folder / "checkpoint")
+    found: dict[str, Any] = {
+        "minutes": float(last["seconds"]) / 60.0, "loss": float(last["loss"]), "held_out": float(last["held_out"]),
+        "paths": model.about["paths"], "weights": sum(p.numel() for p in model.network.parameters()),
+    }  # fmt: skip
+    for count in (1, 8):
+        said = judged(model, cases, count)
+        hard = [value for name, value in said.items() if name.endswith("/hard")]
+        found[f"B{count}"] = {**said, "hard": sum(hard) / len(hard)}
+    return found
+
+
+def table(rows: dict[str, dict[str, Any]]) -> str:
+    """Return the Markdown table."""
+    head = ["variant", "weights M", "paths", "min", "loss", "held out", "B = 1: valid", "repaired", "hard levels"]
+    head += ["B = 8: valid", "repaired", "hard levels"]
+    lines = [record.row(head), record.row(["---", *["---:"] * (len(head) - 1)])]
+    for name, f in rows.items():
+        cells = [name, f"{f['weights'] / 1e6:.1f}", f["paths"], f"{f['minutes']:.0f}", f"{f['loss']:.3f}"]
+        cells.append(f"{f['held_out']:.3f}")
+        for count in (1, 8):
+            cells += [f"{f[f'B{count}'][key]:.2f}" for key in ("sampled", "repaired", "hard")]
+        lines.append(record.row(cells))
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Train, judge, and write the results."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--steps", type=int, default=3000, help="of each (default: %(default)s)")
+    parser.add_argument("--threads", type=int, default=1, help="of each (default: %(default)s)")
+    parser.add_argument("--data", help="data set (default: the one that ships)")
+    parser.add_argument("--runs", type=Path, default=record.RESULTS.parent / "runs" / "sweep")
+    parser.add_argument("--only", nargs="*", default=list(VARIANTS), choices=list(VARIANTS), metavar="NAME")
+    args = parser.parse_args()
+    with ThreadPoolExecutor(2) as pool:
+        folders = dict(zip(args.only, pool.map(lambda name: trained(name, args), args.only), strict=True))
+    cases = load_cases(ROOT / "data" / "dual_panda_softhand" / "validation")
+    torch.set_num_threads(1)
+    rows = {name: figures(folder, cases) for name, folder in folders.items()}
+    record.write(
+        "model_sweep", {"variants": rows}, table(rows), steps=args.steps, threads=args.threads,
+        data=Path(args.data).name if args.data else "that ships", n=len(cases), torch=torch.__version__, seed=0,
+    )  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()

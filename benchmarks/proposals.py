@@ -1,0 +1,288 @@
+"""What proposals are worth: B = 1, 8 and 32 of them judged, repaired, judged again and shortened, on test problems.
+
+The models, unguided and guided, stand beside the straight line, random bumps, the nearest training paths, a regression
+network of the same size and conditions, the same network with random weights, and with the conditions of another
+problem of the level. All are repaired by the same steps of the same optimiser (6 rounds of 8, the better half goes on),
+shortened, and judged by the same full check; beside them rrtconnect+polish. Times leave out the setup of the problem.
+Runs are kept in a store as they end (JSON lines), so that the command goes on where it was stopped.
+
+Usage: python benchmarks/proposals.py [-n 10] [--hard 30] [--jobs 2] [--split test] [--report] [SUITE[/LEVEL] ...]
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import multiprocessing
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import record
+import torch
+
+from apex_ompl import load_model, plan, problems
+from apex_ompl.assembly import PlanningSetup, assemble
+from apex_ompl.dataset import load
+from apex_ompl.diffusion.conditions import Query
+from apex_ompl.diffusion.guidance import Guidance
+from apex_ompl.diffusion.model import LatentDiffusion
+from apex_ompl.diffusion.neighbours import Neighbours
+from apex_ompl.diffusion.proposals import Sampling, TrajectoryModel
+from apex_ompl.kernel import RobotTables
+from apex_ompl.optimize import Optimizer
+from apex_ompl.problems.reach import robot
+from apex_ompl.queries import query_of
+from apex_ompl.space import path_length
+from apex_ompl.validity import full_check
+
+ROOT = record.RESULTS.parent.parent
+STORE = record.RESULTS.parent / "runs" / "proposals.jsonl"
+COUNTS = (1, 8, 32)
+GUIDED = Guidance(gamma=1.0)
+PAPER = Sampling("ddpm", 256)
+GUIDED_PAPER = Sampling("ddpm", 256, guidance=Guidance(1.0, "noise", begin=0.25))
+METHODS: dict[str, tuple[int, ...]] = {
+    "line": (1,),
+    "bumps": (8, 32),
+    "nearest paths": COUNTS,
+    "regression": (1,),
+    "random weights": COUNTS,
+    "shuffled conditions": COUNTS,
+    "apex": COUNTS,
+    "apex, guided": COUNTS,
+    "apex-paper": (1, 8),
+    "apex-paper, guided": (1, 8),
+    "rrtconnect+polish": (1,),
+}
+"""And with how many proposals."""
+
+TIME_LIMIT = 10.0  # of rrtconnect+polish [s]
+
+
+@cache
+def model(name: str) -> TrajectoryModel:
+    """Return a model by its name, folder or kind."""
+    torch.set_num_threads(1)
+    if name == "random weights":
+        torch.manual_seed(0)
+        trained = load_model("apex").network
+        drawn = LatentDiffusion(trained.config)
+        torch.nn.init.kaiming_uniform_(drawn.denoiser.leave.weight)  # it would begin at zero
+        kept = {k: v for k, v in trained.state_dict().items() if k.startswith(("autoencoder", "probe"))}
+        kept |= {k: v for k, v in trained.state_dict().items() if k in ("encoder.lower", "encoder.upper")}
+        drawn.load_state_dict({**drawn.state_dict(), **kept})
+        return TrajectoryModel(drawn, {})
+    return load_model(name)
+
+
+@cache
+def neighbours() -> Neighbours:
+    """Return the training paths to look for neighbours in."""
+    folder = ROOT / "data" / "dual_panda_softhand"
+    return Neighbours(load(folder / "paths.zip"), RobotTables.load(folder / "robot.npz"))
+
+
+def run(job: tuple[str, str, int, str]) -> dict[str, Any]:
+    """Return one run of a method on a problem with so many proposals; the last entry is the regression's folder."""
+    name, method, count, folder = job
+    seed = int(name.rsplit("/", 1)[1]) % 1000
+    about = {"problem": name, "method": method, "count": count}
+    if method == "rrtconnect+polish":
+        result = plan(problems.load(name), method, timeout=TIME_LIMIT, seed=seed)
+        took = sum(result.times.get(k, 0.0) for k in ("line", "solve", "simplify", "verify", "repair"))
+        length = result.length if result else None
+        return {**about, "sampled": False, "solved": bool(result), "found_s": took, "total_s": took, "length": length}
+    ready, optimizer = assemble(problems.load(name), robot()), Optimizer()
+    make = proposer(ready, optimizer, name, (method, folder), seed)
+
+    def is_valid(path: np.ndarray) -> bool:
+        return bool(full_check(ready.verdict, path, ready.start, [ready.goals[0]]))
+
+    begin = time.perf_counter()
+    control = make(count)
+    proposed = time.perf_counter()
+    valid = next((c for c in control if is_valid(optimizer.spline.path(c))), None)
+    judged = time.perf_counter()
+    found = valid if valid is not None else optimizer.first_valid(ready.verdict.kernel, control, is_valid)
+    found_s = time.perf_counter() - begin
+    best = None if found is None else optimizer.shorten(ready.verdict.kernel, found, is_valid)
+    best = found if best is None else best
+    took = time.perf_counter() - begin
+    length = None if best is None else path_length(optimizer.spline.path(best))
+    return {
+        **about, "sampled": valid is not None, "solved": best is not None, "propose_s": proposed - begin,
+        "judge_s": judged - proposed, "found_s": found_s, "total_s": took, "length": length,
+    }  # fmt: skip
+
+
+def proposer(
+    ready: PlanningSetup, optimizer: Optimizer, name: str, how: tuple[str, str], seed: int
+) -> Callable[[int], np.ndarray]:
+    """Return what makes proposals; what needs no problem is made ready."""
+    method, folder = how
+    kernel, start, goal = ready.verdict.kernel, ready.start, ready.goals[0]
+    if method in ("line", "bumps"):
+        return lambda count: optimizer.starts(start, goal, count, np.random.default_rng(seed))
+    if method == "nearest paths":
+        near = neighbours()
+        return lambda count: near.refitted(query_of(ready.verdict, start, goal), kernel, count)
+    kinds = {"regression": folder, "random weights": "random weights"}
+    network = model(kinds.get(method, "apex-paper" if method.startswith("apex-paper") else "apex"))
+    sampling = {"apex, guided": Sampling(guidance=GUIDED), "apex-paper": PAPER, "apex-paper, guided": GUIDED_PAPER}
+    other = _other(name, ready) if method == "shuffled conditions" else None
+
+    def made(count: int) -> np.ndarray:
+        query = query_of(ready.verdict, start, goal)
+        generator = torch.Generator().manual_seed(seed)
+        if other is None:
+            return network.propose(query, kernel, count, sampling=sampling.get(method), generator=generator).control
+        found = network.propose(other, kernel, count, generator=generator).control
+        line = optimizer.spline.line
+        moved = found - line(other.start, other.goal) + line(start, goal)
+        limits = kernel.robot.arrays
+        return optimizer.spline.with_ends(np.clip(moved, limits.lower, limits.upper), start, goal)
+
+    return made
+
+
+def _other(name: str, ready: PlanningSetup) -> Query:
+    """Return the query of the next problem of a level."""
+    level, number = name.rsplit("/", 1)
+    split = "test" if int(number) >= 900_000 else "validation"
+    names = problems.frozen_names(*level.split("/"), split)
+    there = names[(names.index(name) + 1) % len(names)]
+    setup = assemble(problems.load(there), ready.robot)
+    return query_of(setup.verdict, setup.start, setup.goals[0])
+
+
+def warm_up() -> None:
+    """Load kernel, robot and models, so that no run pays for it."""
+    run(("wall/easy/800000", "line", 1, ""))
+    plan("wall/easy/800000", "rrtconnect+polish", timeout=5.0)
+    for name in ("apex", "apex-paper", "random weights"):
+        model(name)
+
+
+def read(store: Path) -> dict[tuple[str, str, int], dict[str, Any]]:
+    """Return the runs in a store by problem, method and count."""
+    runs = []
+    for line in store.read_text().splitlines() if store.is_file() else []:
+        try:
+            runs.append(json.loads(line))
+        except json.JSONDecodeError:  # the process ended while it wrote
+            continue
+    return {(r["problem"], r["method"], r["count"]): r for r in runs}
+
+
+def figures(runs: dict[tuple[str, str, int], dict[str, Any]], level: str) -> dict[str, Any]:
+    """Return what came of every method and count on a level."""
+    mine = {key: r for key, r in runs.items() if key[0].rsplit("/", 1)[0] == level}
+    polished = {n: r for (n, m, _), r in mine.items() if m == "rrtconnect+polish" and r["solved"]}
+    found: dict[str, Any] = {}
+    for method, counts in METHODS.items():
+        for count in counts:
+            some = [r for (_, m, c), r in mine.items() if (m, c) == (method, count)]
+            if some:
+                found[f"{method}, {count}" if len(counts) > 1 else method] = _of_runs(some, polished)
+    return found
+
+
+def _of_runs(some: Sequence[dict[str, Any]], polished: dict[str, dict[str, Any]]) -> dict[str, Any]:
+    took = np.sort([r["total_s"] if r["solved"] else math.inf for r in some])
+    found = [r["found_s"] for r in some if r["solved"]]
+    both = [(r, polished[r["problem"]]) for r in some if r["solved"] and r["problem"] in polished]
+    middle = float(took[(len(took) - 1) // 2])
+    return {
+        "n": len(some), "sampled": float(np.mean([r["sampled"] for r in some])),
+        "solved": float(np.mean([r["solved"] for r in some])),
+        "propose_s_p50": float(np.median([r.get("propose_s", math.nan) for r in some])),
+        "found_s_p50": float(np.median(found)) if found else None,
+        "total_s_p50": middle if math.isfinite(middle) else None,
+        "length_p50": float(np.median([r["length"] for r in some if r["solved"]] or [math.nan])),
+        "length_over_polished": float(np.exp(np.mean([math.log(a["length"] / b["length"]) for a, b in both])))
+        if both else None,
+        "time_over_polished": float(np.exp(np.mean([math.log(a["total_s"] / b["total_s"]) for a, b in both])))
+        if both else None,
+    }  # fmt: skip
+
+
+def table(levels: Sequence[dict[str, Any]]) -> str:
+    """Return the Markdown table."""
+    head = ["suite/level", "proposals", "N", "valid", "repaired", "propose ms", "found ms", "total ms", "length rad"]
+    head += ["length / rrtconnect+polish", "time / rrtconnect+polish"]
+    rows = [head, ["---", "---", *["---:"] * (len(head) - 2)]]
+    for level in levels:
+        for k, (method, f) in enumerate(level["methods"].items()):
+            cells = [level["level"] if k == 0 else "", method, f["n"], f"{f['sampled']:.2f}", f"{f['solved']:.2f}"]
+            cells += list(_cells(f))
+            rows.append(cells)
+    return "\n".join(record.row(row) for row in rows)
+
+
+def _cells(f: dict[str, Any]) -> Iterator[str]:
+    def ms(value: float | None, otherwise: str) -> str:
+        return otherwise if value is None or math.isnan(value) else f"{1e3 * value:.0f}"
+
+    yield ms(f["propose_s_p50"], "-")
+    yield ms(f["found_s_p50"], "-")
+    yield ms(f["total_s_p50"], "not solved")
+    yield "-" if math.isnan(f["length_p50"]) else f"{f['length_p50']:.1f}"
+    for name in ("length_over_polished", "time_over_polished"):
+        yield "-" if f[name] is None else f"{f[name]:.2f}"
+
+
+def main() -> None:
+    """Run what is missing, and write the results of all."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("levels", nargs="*", metavar="SUITE[/LEVEL]")
+    parser.add_argument("-n", type=int, default=10, help="problems of a level (default: %(default)s)")
+    parser.add_argument("--hard", type=int, default=30, help="of a hard level (default: %(default)s)")
+    parser.add_argument("--jobs", type=int, default=2, help="processes (default: %(default)s)")
+    parser.add_argument("--split", choices=("validation", "test"), default="test")
+    parser.add_argument("--methods", nargs="*", choices=list(METHODS), default=list(METHODS), metavar="NAME")
+    parser.add_argument("--regression", default=str(ROOT / "benchmarks" / "runs" / "regression" / "checkpoint"))
+    parser.add_argument("--store", type=Path, default=STORE)
+    parser.add_argument("--report", action="store_true", help="run nothing; write the results of what the store holds")
+    args = parser.parse_args()
+    static = [(s, v) for s, levels in problems.suites().items() for v in levels if not v.startswith("moving-")]
+    known = {s for s, _ in static} | {f"{s}/{v}" for s, v in static}
+    if not set(args.levels) <= known:
+        raise SystemExit(f"unknown suite or level; known: {', '.join(f'{s}/{v}' for s, v in static)}")
+    chosen = [f"{s}/{v}" for s, v in static if not args.levels or s in args.levels or f"{s}/{v}" in args.levels]
+    done, todo = read(args.store), []
+    for level in chosen:
+        names = problems.frozen_names(*level.split("/"), args.split)[: args.hard if level.endswith("/hard") else args.n]
+        todo += [(n, m, c, args.regression) for m in args.methods for c in METHODS[m] for n in names]
+    todo = [job for job in todo if job[:3] not in done]
+    todo.sort(key=lambda job: (job[1].startswith("apex-paper"), int(job[0].rsplit("/", 1)[1]) % 1000))
+    args.store.parent.mkdir(parents=True, exist_ok=True)
+    if args.store.is_file() and not args.store.read_bytes().endswith(b"\n"):  # the process ended while it wrote
+        args.store.write_text(args.store.read_text() + "\n")
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(args.jobs, mp_context=context, initializer=warm_up) as pool, args.store.open("a") as out:
+        jobs = {pool.submit(run, job): job for job in ([] if args.report else todo)}
+        for k, future in enumerate(as_completed(jobs)):
+            if future.exception() is not None:
+                print(f"{jobs[future]}: {future.exception()}", flush=True)
+                continue
+            out.write(json.dumps(future.result()) + "\n")
+            out.flush()
+            if (k + 1) % 500 == 0:
+                print(f"{k + 1} of {len(jobs)} runs", flush=True)
+    runs = read(args.store)
+    levels = [{"level": f"{s}/{v}", "methods": figures(runs, f"{s}/{v}")} for s, v in static]
+    levels = [level for level in levels if level["methods"]]
+    record.write(
+        "proposals", {"levels": levels}, table(levels), split=args.split, jobs=args.jobs, torch=torch.__version__,
+        time_limit=TIME_LIMIT, seeds="number of the problem modulo 1000",
+    )  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,148 @@
+"""Draw how a model denoises a trajectory, and how diverse its trajectories are, as the paper's figures do.
+
+``denoising.png`` shows the paths of both hands at t = 0, 64, 128 and 256 of the reverse process (section IV-A), from
+above and from the side, the obstacles as grey outlines. ``diversity.png`` shows valid trajectories of one problem: x
+and y of both hands over the path, from start to goal (section IV-D).
+
+Usage: python scripts/draw_model.py [--model apex-paper] [--problem NAME] [--folder docs/pictures]
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from apex_ompl import load_model, load_problem
+from apex_ompl.assembly import PlanningSetup, assemble
+from apex_ompl.diffusion.guidance import Guidance
+from apex_ompl.diffusion.proposals import Sampling
+from apex_ompl.errors import ApexError
+from apex_ompl.kernel import Kernel
+from apex_ompl.optimize import Optimizer
+from apex_ompl.problems.reach import robot
+from apex_ompl.queries import query_of
+from apex_ompl.validity import full_check
+
+MOMENTS = (0, 64, 128, 256)
+HANDS = {"left_hand_palm_0": "tab:blue", "right_hand_palm_0": "tab:orange"}
+GUIDED = Guidance(1.0, "noise", begin=0.25)
+
+
+def places(kernel: Kernel, path: np.ndarray) -> dict[str, np.ndarray]:
+    """Return where the palms are along a path, shape (N, 3) [m], by body."""
+    tables = kernel.robot
+    _, origin = kernel.joint_frames(path)
+    return {name: origin[:, tables.arrays.body_joint[tables.body_names.index(name)]] for name in HANDS}
+
+
+def outlines(axes: Any, ready: PlanningSetup, first: int, second: int) -> None:
+    """Draw the obstacles' boxes onto two of the world's axes."""
+    from matplotlib.patches import Rectangle
+
+    scene = ready.verdict.kernel.scene.arrays
+    for rotation, offset, size in zip(scene.rotation, scene.offset, scene.size, strict=True):
+        half = np.abs(rotation) @ size
+        corner = offset[[first, second]] - half[[first, second]]
+        sides = 2.0 * half[[first, second]]
+        axes.add_patch(Rectangle(tuple(corner), *sides, facecolor="0.92", edgecolor="0.6", lw=0.6, zorder=0))
+
+
+def denoising(name: str, ready: PlanningSetup, seed: int, file: Path) -> None:
+    """Draw what the reverse process is at some moments."""
+    import matplotlib.pyplot as plt
+
+    model, kernel = load_model(name), ready.verdict.kernel
+    network, snapshots = model.network, {}
+    ends = [torch.tensor(q, dtype=torch.float32)[None] for q in (ready.start, ready.goals[0])]
+    steps = network.schedule.steps
+
+    def keep(t: int, sample: torch.Tensor, estimate: Any) -> None:
+        del estimate
+        if steps - 1 - t in MOMENTS:
+            snapshots[steps - 1 - t] = network.autoencoder.decode(sample, *ends)[0].double().numpy()
+
+    query, generator = query_of(ready.verdict, ready.start, ready.goals[0]), torch.Generator().manual_seed(seed)
+    sampling = Sampling("ddpm", steps, guidance=GUIDED)
+    made = model.propose(query, kernel, 1, sampling=sampling, generator=generator, callback=keep)
+    snapshots[steps] = network.autoencoder.decode(made.latent, *ends)[0].double().numpy()
+    figure, axes = plt.subplots(2, len(MOMENTS), figsize=(12, 6.2), sharex=True, sharey="row", layout="constrained")
+    for column, moment in enumerate(MOMENTS):
+        for row, (first, second) in enumerate(((0, 1), (0, 2))):
+            at = axes[row, column]
+            outlines(at, ready, first, second)
+            for body, line in places(kernel, snapshots[moment]).items():
+                at.plot(line[:, first], line[:, second], color=HANDS[body], lw=1.2)
+                at.plot(*line[0, [first, second]], "P", color=HANDS[body], ms=7)
+                at.plot(*line[-1, [first, second]], "v", color=HANDS[body], ms=7)
+            at.set_aspect("equal")
+            at.set(xlim=(-0.3, 1.3), ylim=(-1.1, 1.1) if second == 1 else (-0.1, 1.5))
+        axes[0, column].set_title(f"t = {moment}")
+        axes[1, column].set_xlabel("x m")
+    axes[0, 0].set_ylabel("y m")
+    axes[1, 0].set_ylabel("z m")
+    figure.savefig(file, dpi=110)
+    plt.close(figure)
+
+
+def diversity(name: str, ready: PlanningSetup, seed: int, file: Path, wanted: int = 12) -> int:
+    """Draw valid trajectories of one problem; return how many there are."""
+    import matplotlib.pyplot as plt
+
+    model, kernel, optimizer = load_model(name), ready.verdict.kernel, Optimizer()
+    query, found = query_of(ready.verdict, ready.start, ready.goals[0]), []
+
+    def is_valid(path: np.ndarray) -> bool:
+        return bool(full_check(ready.verdict, path, ready.start, [ready.goals[0]]))
+
+    generator = torch.Generator().manual_seed(seed)
+    sampling = Sampling("ddim", 8, guidance=Guidance(1.0))
+    for control in model.propose(query, kernel, 4 * wanted, sampling=sampling, generator=generator).control:
+        repaired = optimizer.first_valid(kernel, control[None], is_valid)
+        if repaired is not None and len(found) < wanted:
+            found.append(optimizer.spline.path(repaired))
+    figure, axes = plt.subplots(2, 2, figsize=(9, 5.5), sharex=True, layout="constrained")
+    share = np.linspace(0.0, 1.0, optimizer.spline.states)
+    for path in found:
+        for column, line in enumerate(places(kernel, path).values()):
+            for row in range(2):
+                axes[row, column].plot(share, line[:, row], lw=1.0, alpha=0.8)
+                axes[row, column].plot(0.0, line[0, row], "kP", ms=8)
+                axes[row, column].plot(1.0, line[-1, row], "kv", ms=8)
+    for column, title in enumerate(("left hand", "right hand")):
+        axes[0, column].set_title(title)
+        axes[1, column].set_xlabel("share of the path")
+    axes[0, 0].set_ylabel("x m")
+    axes[1, 0].set_ylabel("y m")
+    figure.savefig(file, dpi=110)
+    plt.close(figure)
+    return len(found)
+
+
+def main() -> None:
+    """Draw both."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--model", default="apex-paper", help="for the denoising (default: %(default)s)")
+    parser.add_argument("--diverse", default="apex", help="for the diversity (default: %(default)s)")
+    parser.add_argument("--problem", default="horizontal/large/900003")
+    parser.add_argument("--many", default="posts/hard/900004", help="problem of the diversity (default: %(default)s)")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--folder", type=Path, default=Path("docs/pictures"))
+    args = parser.parse_args()
+    try:
+        args.folder.mkdir(parents=True, exist_ok=True)
+        one, many = (assemble(load_problem(name), robot()) for name in (args.problem, args.many))
+        denoising(args.model, one, args.seed, args.folder / "denoising.png")
+        count = diversity(args.diverse, many, args.seed, args.folder / "diversity.png")
+    except ApexError as error:
+        print(f"draw_model: error: {error}", file=sys.stderr)
+        sys.exit(2)
+    print(f"{args.folder}: denoising.png, diversity.png with {count} valid trajectories of {args.many}")
+
+
+if __name__ == "__main__":
+    main()
