@@ -91,11 +91,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--steps", type=int, default=3000, help="of each (default: %(default)s)")
     parser.add_argument("--threads", type=int, default=1, help="of each (default: %(default)s)")
+    parser.add_argument("--jobs", type=int, default=2, help="trained at a time (default: %(default)s)")
     parser.add_argument("--data", help="data set (default: the one that ships)")
     parser.add_argument("--runs", type=Path, default=record.RESULTS.parent / "runs" / "sweep")
     parser.add_argument("--only", nargs="*", default=list(VARIANTS), choices=list(VARIANTS), metavar="NAME")
     args = parser.parse_args()
-    with ThreadPoolExecutor(2) as pool:
+    with ThreadPoolExecutor(args.jobs) as pool:
         folders = dict(zip(args.only, pool.map(lambda name: trained(name, args), args.only), strict=True))
     cases = load_cases(ROOT / "data" / "dual_panda_softhand" / "validation")
     torch.set_num_threads(1)

@@ -1,6 +1,6 @@
 """Make the compact set of a data set: one file of all problems with as many of their paths as fit.
 
-Whole paths come first, then reversals, then random parts.
+Whole paths come first, then reversals, then random parts. The robot's tables go beside it.
 
 Usage: python scripts/compact_data.py FOLDER FILE.zip [--mib 24] [--seed 0]
 """
@@ -16,7 +16,7 @@ import numpy as np
 
 from apex_ompl.dataset import Store, save
 from apex_ompl.errors import ApexError
-from apex_ompl.files import check_writable
+from apex_ompl.files import check_writable, write_atomically
 from apex_ompl.records import PATH_FIELDS, SOURCES, DatasetError, Paths
 
 CLOSE = 200  # how closely the limit is met: to one part in this
@@ -47,6 +47,8 @@ def compact(args: argparse.Namespace) -> None:
             raise DatasetError(f"{args.mib} MiB: the problems alone take more, expected a higher limit")
     chosen = some(every, fits, args.seed)
     save(args.file, chosen)
+    if (args.folder / "robot.npz").is_file():
+        write_atomically(args.file.parent / "robot.npz", (args.folder / "robot.npz").read_bytes())
     size = args.file.stat().st_size
     print(f"{args.file}: {len(chosen)} of {len(every)} paths, {chosen.problems} problems, {size / 2**20:.1f} MiB")
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import itertools
+import json
 import platform
 import socket
 import sys
@@ -28,6 +29,7 @@ from apex_ompl.dataset import Store
 from apex_ompl.engine import Options
 from apex_ompl.errors import ApexError, ParameterError
 from apex_ompl.files import check_writable
+from apex_ompl.kernel import RobotTables
 from apex_ompl.records import DatasetError, Paths
 from apex_ompl.spline import Spline
 
@@ -128,7 +130,7 @@ def generate(args: argparse.Namespace) -> None:
     import zarr  # noqa: F401
 
     spline = Spline(args.control_points, args.pinned)
-    work, units, about = _given(args) if args.cases else _drawn(args)
+    work, units, about, tables = _given(args) if args.cases else _drawn(args)
     options = Options(args.seed, args.copies, 0 if args.cases else args.parts)
     manifest = {
         **about, "seed": args.seed, "copies": args.copies,
@@ -139,6 +141,8 @@ def generate(args: argparse.Namespace) -> None:
     same = ("robot", "joints", "seed", "copies", "parts", "control_points", "pinned", "degree", "problems_per_unit")
     store = Store.create(args.folder, manifest, same)
     with store.locked():
+        if tables is not None:
+            tables.save(store.folder / "robot.npz")
         there = set(store.units())
         left = {name: unit for name, unit in units.items() if name not in there}
         source = here(work, left, options, spline)
@@ -176,19 +180,20 @@ def _make(store: Store, source: Iterator[Done], units: int, left: int, args: arg
     return paths, max(seconds, 1e-9)
 
 
-def _drawn(args: argparse.Namespace) -> tuple[Work, dict[str, Any], dict[str, Any]]:
-    """Return what works, units to draw, and what the manifest says of the robot."""
+def _drawn(args: argparse.Namespace) -> tuple[Work, dict[str, Any], dict[str, Any], RobotTables]:
+    """Return what works, units to draw, what the manifest says of the robot, and its tables with empty hands."""
+    from apex_ompl.collision import Verdict
     from apex_ompl.generation import plan_units, work
     from apex_ompl.problems.reach import robot
 
     units = {unit.name: unit for unit in plan_units(args.problems, args.levels)}
     sizes = {unit.size for unit in units.values()}
     about = {"robot": robot().name, "joints": list(robot().joint_names), "problems_per_unit": max(sizes)}
-    return work, units, about
+    return work, units, about, Verdict(robot()).kernel.robot
 
 
-def _given(args: argparse.Namespace) -> tuple[Work, dict[str, Any], dict[str, Any]]:
-    """Return what works, units that were written, and what the manifest says of the robot.
+def _given(args: argparse.Namespace) -> tuple[Work, dict[str, Any], dict[str, Any], RobotTables | None]:
+    """Return what works, units that were written, what the manifest says of the robot, and its tables if known.
 
     Raises:
         ParameterError: Suites are named beside.
@@ -196,12 +201,13 @@ def _given(args: argparse.Namespace) -> tuple[Work, dict[str, Any], dict[str, An
     if args.levels:
         raise ParameterError("SUITE[/LEVEL]", " ".join(args.levels), "none beside --cases")
     units: dict[str, Any] = {}
-    for case in load_cases(args.cases):
+    cases = load_cases(args.cases)
+    for case in cases:
         units.setdefault(case.unit, []).append(case)
-    first = next(iter(units.values()))[0]
+    first, tables = cases[0], next((case.robot for case in cases if json.loads(case.row.held) == []), None)
     sizes = {len(unit) for unit in units.values()}
     about = {"robot": first.robot.name, "joints": list(first.robot.joint_names), "problems_per_unit": max(sizes)}
-    return work_cases, units, about
+    return work_cases, units, about, tables
 
 
 def write_cases(args: argparse.Namespace) -> None:
