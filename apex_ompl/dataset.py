@@ -8,7 +8,6 @@ compact set is one such file with paths of many units.
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import hashlib
 import json
 import os
@@ -22,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apex_ompl.errors import FileFormatError, MissingFileError
-from apex_ompl.files import is_file, write_atomically
+from apex_ompl.files import is_file, locked, write_atomically
 from apex_ompl.records import FIELDS, DatasetError, Paths, about_fault, arrays_fault, names_fault
 
 SCHEMA = "apex-ompl/dataset/1"
@@ -87,13 +86,9 @@ class Store:
         """Keep other processes from writing, and clear away what an ended one left half-written.
 
         Raises:
-            DatasetError: Another process writes here.
+            FolderInUseError: Another process writes here.
         """
-        with open(self.folder / ".lock", "w") as file:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError as error:
-                raise DatasetError(f"{self.folder}: another process writes here, expected one at a time") from error
+        with locked(self.folder):
             for left in (self.folder / "units").glob(".*.part"):
                 left.unlink(missing_ok=True)
             yield

@@ -105,6 +105,19 @@ class ParameterError(ApexError):
         super().__init__(f"{name}: expected {expected}, got {_short(value)}")
 
 
+class FolderInUseError(ApexError):
+    """A folder that another process writes into.
+
+    Attributes:
+        folder: The folder.
+    """
+
+    def __init__(self, folder: str) -> None:
+        """Compose the sentence."""
+        self.folder = folder
+        super().__init__(f"{folder}: another process writes here, expected one at a time")
+
+
 class RobotError(ApexError):
     """A robot description that cannot be made into a robot."""
 

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import os
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
-from apex_ompl.errors import MissingFileError
+from apex_ompl.errors import FolderInUseError, MissingFileError
 
 OUTPUT = "output file"
 
@@ -37,6 +40,21 @@ def check_writable(path: Path) -> None:
         raise MissingFileError(str(path), OUTPUT, "no file can have this name")
     if not os.access(path.parent, os.W_OK):
         raise MissingFileError(str(path), OUTPUT, f"no permission to write in {str(path.parent)!r}")
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Keep other processes from writing into a folder.
+
+    Raises:
+        FolderInUseError: Another process writes there.
+    """
+    with open(folder / ".lock", "w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise FolderInUseError(str(folder)) from error
+        yield
 
 
 def write_atomically(path: Path, content: bytes) -> None:

@@ -23,12 +23,13 @@ from apex_ompl.diffusion.guidance import Guidance
 from apex_ompl.diffusion.proposals import Sampling
 from apex_ompl.errors import ApexError
 from apex_ompl.kernel import Kernel
+from apex_ompl.kernel.tables import BOX, HALF_SPACE, SPHERE
 from apex_ompl.optimize import Optimizer
 from apex_ompl.problems.reach import robot
 from apex_ompl.queries import query_of
 from apex_ompl.validity import full_check
 
-MOMENTS = (0, 64, 128, 256)
+MOMENTS = (0.0, 0.25, 0.5, 1.0)  # as shares of the reverse process
 HANDS = {"left_hand_palm_0": "tab:blue", "right_hand_palm_0": "tab:orange"}
 GUIDED = Guidance(1.0, "noise", begin=0.25)
 
@@ -45,8 +46,11 @@ def outlines(axes: Any, ready: PlanningSetup, first: int, second: int) -> None:
     from matplotlib.patches import Rectangle
 
     scene = ready.verdict.kernel.scene.arrays
-    for rotation, offset, size in zip(scene.rotation, scene.offset, scene.size, strict=True):
-        half = np.abs(rotation) @ size
+    for kind, rotation, offset, size in zip(scene.kind, scene.rotation, scene.offset, scene.size, strict=True):
+        if kind == HALF_SPACE:
+            continue
+        around = size if kind == BOX else np.array([size[0], size[0], size[0] if kind == SPHERE else size[1]])
+        half = np.abs(rotation) @ around
         corner = offset[[first, second]] - half[[first, second]]
         sides = 2.0 * half[[first, second]]
         axes.add_patch(Rectangle(tuple(corner), *sides, facecolor="0.92", edgecolor="0.6", lw=0.6, zorder=0))
@@ -60,10 +64,11 @@ def denoising(name: str, ready: PlanningSetup, seed: int, file: Path) -> None:
     network, snapshots = model.network, {}
     ends = [torch.tensor(q, dtype=torch.float32)[None] for q in (ready.start, ready.goals[0])]
     steps = network.schedule.steps
+    moments = [round(share * steps) for share in MOMENTS]
 
     def keep(t: int, sample: torch.Tensor, estimate: Any) -> None:
         del estimate
-        if steps - 1 - t in MOMENTS:
+        if steps - 1 - t in moments:
             snapshots[steps - 1 - t] = network.autoencoder.decode(sample, *ends)[0].double().numpy()
 
     query, generator = query_of(ready.verdict, ready.start, ready.goals[0]), torch.Generator().manual_seed(seed)
@@ -71,7 +76,7 @@ def denoising(name: str, ready: PlanningSetup, seed: int, file: Path) -> None:
     made = model.propose(query, kernel, 1, sampling=sampling, generator=generator, callback=keep)
     snapshots[steps] = network.autoencoder.decode(made.latent, *ends)[0].double().numpy()
     figure, axes = plt.subplots(2, len(MOMENTS), figsize=(12, 6.2), sharex=True, sharey="row", layout="constrained")
-    for column, moment in enumerate(MOMENTS):
+    for column, moment in enumerate(moments):
         for row, (first, second) in enumerate(((0, 1), (0, 2))):
             at = axes[row, column]
             outlines(at, ready, first, second)
@@ -93,7 +98,8 @@ def diversity(name: str, ready: PlanningSetup, seed: int, file: Path, wanted: in
     """Draw valid trajectories of one problem; return how many there are."""
     import matplotlib.pyplot as plt
 
-    model, kernel, optimizer = load_model(name), ready.verdict.kernel, Optimizer()
+    model, kernel = load_model(name), ready.verdict.kernel
+    optimizer = Optimizer(model.spline)
     query, found = query_of(ready.verdict, ready.start, ready.goals[0]), []
 
     def is_valid(path: np.ndarray) -> bool:
@@ -102,8 +108,10 @@ def diversity(name: str, ready: PlanningSetup, seed: int, file: Path, wanted: in
     generator = torch.Generator().manual_seed(seed)
     sampling = Sampling("ddim", 8, guidance=Guidance(1.0))
     for control in model.propose(query, kernel, 4 * wanted, sampling=sampling, generator=generator).control:
+        if len(found) == wanted:
+            break
         repaired = optimizer.first_valid(kernel, control[None], is_valid)
-        if repaired is not None and len(found) < wanted:
+        if repaired is not None:
             found.append(optimizer.spline.path(repaired))
     figure, axes = plt.subplots(2, 2, figsize=(9, 5.5), sharex=True, layout="constrained")
     share = np.linspace(0.0, 1.0, optimizer.spline.states)
@@ -138,7 +146,7 @@ def main() -> None:
         one, many = (assemble(load_problem(name), robot()) for name in (args.problem, args.many))
         denoising(args.model, one, args.seed, args.folder / "denoising.png")
         count = diversity(args.diverse, many, args.seed, args.folder / "diversity.png")
-    except ApexError as error:
+    except (ApexError, ImportError, OSError) as error:
         print(f"draw_model: error: {error}", file=sys.stderr)
         sys.exit(2)
     print(f"{args.folder}: denoising.png, diversity.png with {count} valid trajectories of {args.many}")

@@ -11,12 +11,14 @@ from __future__ import annotations
 
 import argparse
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
 import yaml
 
 from apex_ompl.errors import ApexError, MissingFileError
+from apex_ompl.files import locked
 
 
 def train(args: argparse.Namespace) -> None:
@@ -36,15 +38,24 @@ def train(args: argparse.Namespace) -> None:
     cases = load_cases(config.cases) if config.cases is not None else []
     place = Place.here()
     trainer = Trainer(config, folder, place, cases, tqdm.write)
-    with tqdm(disable=args.quiet or place.rank != 0, unit="step") as bar:
+    bars: dict[str, Any] = {}
 
-        def watch(at: Trainer, loss: float) -> None:
-            bar.total, bar.n = at.steps, at.step
-            bar.set_postfix_str(f"{at.phase} loss {loss:.4f}")
-            bar.update(0)
+    def watch(at: Trainer, loss: float) -> None:
+        if at.phase not in bars:  # a phase has a speed of its own
+            for bar in bars.values():
+                bar.close()
+            quiet = args.quiet or place.rank != 0
+            bars[at.phase] = tqdm(total=at.steps, initial=at.step - 1, unit="step", desc=at.phase, disable=quiet)
+        bars[at.phase].set_postfix_str(f"loss {loss:.4f}", refresh=False)
+        bars[at.phase].update()
 
-        bar.initial = trainer.step
-        trainer.run(60.0 * args.minutes, watch)
+    try:
+        with locked(folder) if place.rank == 0 else nullcontext():
+            trainer.run(60.0 * args.minutes, watch)
+    finally:
+        for bar in bars.values():
+            bar.close()
+        place.leave()
     if place.rank == 0:
         print(f"{folder / 'checkpoint'}: {trainer.phase}, step {trainer.step} of {trainer.steps}")
 

@@ -14,7 +14,7 @@ import pytest
 from apex_ompl import dataset
 from apex_ompl.dataset import Store, load, save
 from apex_ompl.description import duplicates, levels
-from apex_ompl.errors import ApexError, FileFormatError, MissingFileError
+from apex_ompl.errors import ApexError, FileFormatError, FolderInUseError, MissingFileError
 from apex_ompl.records import FIELDS, DatasetError, Paths, from_micro, to_micro
 from apex_ompl.spline import Spline
 
@@ -116,7 +116,7 @@ def test_leftovers_of_an_ended_process_are_cleared(tmp_path: Path) -> None:
     (tmp_path / "units" / ".unit-1.abc.part").write_bytes(b"half")
     again = Store.create(tmp_path, MANIFEST, MANIFEST)
     assert again.units() == ["unit-0"]
-    with again.locked(), pytest.raises(DatasetError, match="another process"), Store(tmp_path).locked():
+    with again.locked(), pytest.raises(FolderInUseError, match="another process"), Store(tmp_path).locked():
         pass
     assert [p.name for p in (tmp_path / "units").iterdir()] == ["unit-0.zip"]
 

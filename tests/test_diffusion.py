@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+from concurrent.futures import ThreadPoolExecutor
 from functools import cache, partial
 from itertools import pairwise
 
@@ -207,7 +209,7 @@ def test_samplers_find_the_only_point_there_is(name: str) -> None:
     schedule, point = NoiseSchedule(256), torch.tensor([0.3, -1.2, 2.0])
 
     def predict(sample: torch.Tensor, t: int) -> Estimate:
-        signal, sigma = schedule.scales(t, sample)
+        signal, sigma = schedule.scale(t)
         return Estimate((sample - signal * point) / sigma, point.expand_as(sample))
 
     g = torch.Generator().manual_seed(0)
@@ -225,7 +227,7 @@ def test_samples_of_a_normal_distribution_are_normal() -> None:
     schedule, mean, spread = NoiseSchedule(256), 1.5, 0.4
 
     def predict(sample: torch.Tensor, t: int) -> Estimate:
-        signal, sigma = schedule.scales(t, sample)
+        signal, sigma = schedule.scale(t)
         clean = mean + signal * spread**2 / (signal**2 * spread**2 + sigma**2) * (sample - signal * mean)
         return Estimate((sample - signal * clean) / sigma, clean)
 
@@ -245,7 +247,7 @@ def test_two_orders_are_better_than_one() -> None:
     schedule = NoiseSchedule(256)
 
     def predict(sample: torch.Tensor, t: int) -> Estimate:
-        clean = torch.tanh(2.0 * sample * schedule.scales(t, sample)[0])
+        clean = torch.tanh(2.0 * sample * schedule.scale(t)[0])
         return schedule.estimate("clean", sample, clean, t)
 
     first = torch.randn(50, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
@@ -461,7 +463,7 @@ def test_the_same_seed_gives_the_same_paths(parts: dict[str, object]) -> None:
 
 
 def test_noise_up_to_a_step_leaves_paths_near() -> None:
-    """A denoiser that knows the path gives it back; one step of noise strays less than all of it."""
+    """One step of noise, and of denoising by whatever network, strays less than all of it."""
     model = TrajectoryModel(network(), {})
     control = some_paths().control(slice(0, 1)).repeat(6, axis=0)
     ends = Query(control[0, 0], control[0, -1], np.zeros(3), Things.of([]))
@@ -474,14 +476,28 @@ def test_noise_up_to_a_step_leaves_paths_near() -> None:
     assert strayed(0) < 0.2 * strayed(255)
     with pytest.raises(ParameterError, match="step: expected 0 to 255, got 256"):
         strayed(256)
-    with pytest.raises(ParameterError, match=r"control points: expected an array of shape \(B, 14, 16\)"):
+    with pytest.raises(ParameterError, match=r"control points: expected finite numbers of shape \(B, 14, 16\)"):
         model.renoise(ends, kernel(), control[:, :5], 3)
+    with pytest.raises(ParameterError, match="control points: expected finite numbers"):
+        model.renoise(ends, kernel(), control * np.nan, 3)
 
 
 def test_a_query_of_another_robot_is_refused() -> None:
     model = TrajectoryModel(network(), {})
-    with pytest.raises(ParameterError, match=r"start and goal: expected states of shape \(16,\)"):
+    with pytest.raises(ParameterError, match=r"start: expected a finite state of shape \(16,\)"):
         model.propose(Query(np.zeros(7), np.zeros(7), np.zeros(3), Things.of([])), kernel(), 1)
+    tables = kernel().robot
+    other = Kernel(dataclasses.replace(tables, name="baxter"), kernel().scene)
+    with pytest.raises(ParameterError, match="robot: expected dual_panda_softhand, which .* got 'baxter'"):
+        model.propose(query(), other, 1)
+    nan = query()
+    nan.goal[3] = np.nan
+    with pytest.raises(ParameterError, match="goal: expected a finite state"):
+        model.propose(nan, kernel(), 1)
+    lost = query()
+    lost.things.position[0, 1] = np.nan
+    with pytest.raises(ParameterError, match="obstacles: expected finite positions"):
+        model.propose(lost, kernel(), 1)
     with pytest.raises(ParameterError, match="count: expected a positive number of paths, got 0"):
         model.propose(query(), kernel(), 0)
 
@@ -531,6 +547,39 @@ def test_the_gradient_goes_through_decoder_and_kernel(parts: dict[str, object]) 
 
 def _likely(model: LatentDiffusion, among: Kernel, ends: tuple, guidance: Guidance, z: torch.Tensor) -> torch.Tensor:
     return log_likelihood(model.autoencoder, among, z, ends, guidance)
+
+
+def test_guided_paths_stay_near_where_little_is_left_of_the_sample() -> None:
+    """At the first steps almost all is noise, and whatever is divided by what is left of the sample grows large."""
+    model, sizes = TrajectoryModel(network(noise=NoiseConfig(most=4.0)), {}), []
+    for gamma in (0.0, 1.0):
+        guidance = Guidance(gamma, "noise", begin=1.0)
+        for steps in (1, 2, 8):
+            found = model.propose(query(), kernel(WALL, POST), 4, sampling=Sampling("ddim", steps, 1.0, guidance))
+            sizes.append(float(found.latent.abs().max()))
+    assert max(sizes) <= 4.0
+    control = some_paths().control(slice(0, 4))
+    ends = Query(control[0, 0], control[0, -1], np.zeros(3), Things.of([]))
+    sampling = Sampling("ddim", 4, 1.0, Guidance(1.0, "noise"))
+    again = model.renoise(ends, kernel(WALL, POST), control, 100, sampling=sampling)
+    assert np.isfinite(again.control).all() and float(again.latent.abs().max()) <= 4.0
+
+
+def test_threads_propose_what_one_does() -> None:
+    model = TrajectoryModel(network(), {})
+
+    def proposed(seed: int) -> np.ndarray:
+        return model.propose(query(), kernel(WALL), 3, generator=torch.Generator().manual_seed(seed)).control
+
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(proposed, range(12)))
+    for seed, control in enumerate(found):
+        np.testing.assert_array_equal(control, proposed(seed))
+
+
+def test_a_latent_space_that_the_unet_cannot_halve_is_named() -> None:
+    with pytest.raises(ParameterError, match="length of the latent space: expected 4 times a whole number, got 10"):
+        UNetDenoiser(4, 12, 8, (1, 2, 4))(torch.zeros(1, 4, 10), torch.zeros(1), torch.zeros(1, 12))
 
 
 @pytest.mark.parametrize("scaling", ["noise", "clean"])

@@ -21,14 +21,16 @@ from safetensors.torch import load_file, save_file
 from support import ROOT
 
 import apex_ompl
-from apex_ompl.cases import load_cases
+from apex_ompl.cases import load_cases, save_cases
 from apex_ompl.dataset import Store, load, save
 from apex_ompl.diffusion.checkpoint import load_model, save_model
 from apex_ompl.diffusion.conditions import Query, Things
 from apex_ompl.diffusion.config import TrainingConfig
 from apex_ompl.diffusion.data import Mirror, held_out, split, window_paths
+from apex_ompl.diffusion.objective import Place
 from apex_ompl.diffusion.proposals import Sampling, TrajectoryModel
-from apex_ompl.diffusion.training import Place, Trainer
+from apex_ompl.diffusion.runlog import read_log
+from apex_ompl.diffusion.training import Trainer, TrainingError
 from apex_ompl.diffusion.validation import judged, query_of_case
 from apex_ompl.errors import ApexError, FileFormatError, MissingFileError, ParameterError, UnknownNameError
 from apex_ompl.kernel import Kernel, RobotTables
@@ -130,8 +132,8 @@ def test_a_run_that_is_interrupted_comes_to_the_same_weights(
         for k in range(5):
             store.write(f"unit-{k}", paths.chosen(np.arange(20 * k, 20 * k + 7)))
     cut = {"linear": [5], "variational": [3, 7], "several windows": [6, 9]}[kind]
-    whole = Trainer(config(data, **changes), tmp_path / "whole", HERE)
     (tmp_path / "whole").mkdir()
+    whole = Trainer(config(data, **changes), tmp_path / "whole", HERE)
     whole.run()
     part_folder = tmp_path / "part"
     part_folder.mkdir()
@@ -148,24 +150,29 @@ def test_a_run_that_is_interrupted_comes_to_the_same_weights(
     assert_same(weights(part), weights(whole))
 
 
-def test_what_was_logged_behind_the_last_save_is_forgotten(few: Path, tmp_path: Path) -> None:
+def test_what_was_logged_behind_the_last_save_is_forgotten(paths: Paths, tmp_path: Path) -> None:
     def trainer() -> Trainer:
-        return Trainer(config(few, log_every=1, held_out=0.2), tmp_path, HERE)
+        return Trainer(config(data, log_every=1, held_out=0.2), tmp_path, HERE)
 
+    data = tmp_path / "some.zip"
+    save(data, paths)
     first = trainer()
     for step in range(1, 6):
         first.advance()
         first._log(1.0, False)  # noqa: SLF001
         if step == 4:
             first.save()
-    assert [row["step"] for row in first._runlog.rows()] == ["1", "2", "3", "4", "5"]  # noqa: SLF001
+    assert [row["step"] for row in read_log(tmp_path)] == ["1", "2", "3", "4", "5"]
     second = trainer()
     assert second.step == 4
     second.run()
-    rows = second._runlog.rows()  # noqa: SLF001
+    rows = read_log(tmp_path)
     assert [int(row["step"]) for row in rows] == list(range(1, 13))
     assert all(float(row["held_out"]) > 0 for row in rows)
-    assert list((tmp_path / "tensorboard").iterdir())
+    assert len(list((tmp_path / "tensorboard").iterdir())) == 2
+    (tmp_path / "log.csv").write_text("phase,step\ndenoiser,three\n")
+    with pytest.raises(FileFormatError, match="log.csv: step: expected the log of a training run"):
+        trainer()
 
 
 def test_a_killed_command_goes_on(few: Path, tmp_path: Path) -> None:
@@ -179,7 +186,8 @@ def test_a_killed_command_goes_on(few: Path, tmp_path: Path) -> None:
     while not state.exists():
         assert process.poll() is None and time.monotonic() - begin < 120
         time.sleep(0.02)
-    time.sleep(0.1)
+    while not (tmp_path / "run" / "checkpoint" / "README.md").exists():
+        time.sleep(0.02)
     process.send_signal(signal.SIGKILL)
     process.wait()
     step = torch.load(state, weights_only=True)["step"]
@@ -191,12 +199,15 @@ def test_a_killed_command_goes_on(few: Path, tmp_path: Path) -> None:
     done = subprocess.run([*command, "--minutes", "0.01"], check=False, **how)
     assert done.returncode == 0, done.stderr
     assert torch.load(state, weights_only=True)["step"] > step
-    assert not list((tmp_path / "run").glob(".*"))
+    assert [path.name for path in (tmp_path / "run").glob(".*")] == [".lock"]
+    same = subprocess.run([*command, "--set", "log_every=7", "--minutes", "0.001"], check=False, **how)
+    assert same.returncode == 0, same.stderr  # it decides nothing
 
 
 def test_two_processes_train_one_model(few: Path, tmp_path: Path) -> None:
     file = tmp_path / "small.yaml"
-    file.write_text(yaml.safe_dump({**SMALL, "data": str(few), "steps": 4}))
+    changes = {"steps": 4, "warmup": 1, "rate": 0.05}
+    file.write_text(yaml.safe_dump({**SMALL, "data": str(few), **changes}))
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", str(SCRIPT)]
     command += [str(file), "--out", str(tmp_path / "run"), "--quiet"]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
@@ -205,7 +216,9 @@ def test_two_processes_train_one_model(few: Path, tmp_path: Path) -> None:
     assert "denoiser, step 4 of 4" in done.stdout
     both = load_model(tmp_path / "run" / "checkpoint").network.state_dict()
     # The same steps by hand: the gradients of both processes' batches, averaged.
-    single = Trainer(config(few, steps=4), tmp_path / "single", HERE)
+    (tmp_path / "single").mkdir()
+    single = Trainer(config(few, **changes), tmp_path / "single", HERE)
+    before = {name: tensor.clone() for name, tensor in single.averaged_network().state_dict().items()}
     for _ in range(4):
         gradients = []
         for rank in range(2):
@@ -217,8 +230,11 @@ def test_two_processes_train_one_model(few: Path, tmp_path: Path) -> None:
         single._loss = lambda mean=mean: _Given(single, mean)  # type: ignore[assignment,method-assign]  # noqa: SLF001
         single.advance()
         del single._loss
-    for name, tensor in single.averaged_network().state_dict().items():
-        torch.testing.assert_close(both[name], tensor, atol=2e-3, rtol=2e-3)
+    after = single.averaged_network().state_dict()
+    moved = {name: float((after[name] - before[name]).abs().max()) for name in single.averaged}
+    assert max(moved.values()) > 0.02
+    for name in single.averaged:
+        torch.testing.assert_close(both[name], after[name], atol=2e-3, rtol=2e-3)
 
 
 class _Given:
@@ -290,7 +306,7 @@ def test_weights_say_how_often_paths_are_drawn(paths: Paths, few: Path, tmp_path
     file = tmp_path / "data.zip"
     save(file, paths)
     trainer = Trainer(config(file, weights={"shelf/*": 0.0, "*/hard": 5.0}), tmp_path, HERE)
-    window = trainer._window  # noqa: SLF001
+    window = trainer.supply.window
     drawn = window.drawn(100_000, torch.Generator().manual_seed(0))
     assert (np.diff(drawn) >= 0).all()
     a = paths.arrays
@@ -308,7 +324,7 @@ def test_weights_say_how_often_paths_are_drawn(paths: Paths, few: Path, tmp_path
 
 
 def test_proposals_are_judged_by_repair_and_proof(few: Path, tmp_path: Path) -> None:
-    cases = load_cases(DATA / "validation")[::30]
+    cases = load_cases(DATA / "validation")[::60]
     model = TrajectoryModel(Trainer(config(few), tmp_path, HERE).averaged_network(), {})
     said = judged(model, cases, 3)
     wanted = []
@@ -373,6 +389,41 @@ def test_a_damaged_state_is_named(few: Path, tmp_path: Path) -> None:
     (tmp_path / "state.pt").write_bytes(b"not a state")
     with pytest.raises(FileFormatError, match=r"state.pt: expected the state of a training run"):
         Trainer(config(few), tmp_path, HERE)
+    (tmp_path / "state.pt").unlink()
+    trainer = Trainer(config(few), tmp_path, HERE)
+    trainer.save()
+    state = torch.load(tmp_path / "state.pt", weights_only=True)
+    del state["optimizer"]
+    torch.save(state, tmp_path / "state.pt")
+    with pytest.raises(FileFormatError, match="expected the state of a training run, got 'KeyError'"):
+        Trainer(config(few), tmp_path, HERE)
+    with pytest.raises(MissingFileError, match="does not exist"):
+        Trainer(config(few), tmp_path / "no" / "folder", HERE)
+
+
+def test_steps_without_a_finite_gradient_change_nothing(few: Path, tmp_path: Path) -> None:
+    trainer = Trainer(config(few, steps=100), tmp_path, HERE)
+    trainer.advance()
+    before = {name: tensor.clone() for name, tensor in weights(trainer).items()}
+    trainer.supply.window.control.fill_(torch.nan)
+    trainer.advance()
+    assert_same(before, weights(trainer))
+    with pytest.raises(TrainingError, match="20 gradients in a row are not finite"):
+        for _ in range(20):
+            trainer.advance()
+    assert_same(before, weights(trainer))
+
+
+def test_training_needs_no_ompl_and_no_pinocchio(few: Path, tmp_path: Path) -> None:
+    file = tmp_path / "small.yaml"
+    save_cases(tmp_path / "cases", load_cases(DATA / "validation")[::120])
+    file.write_text(yaml.safe_dump({**SMALL, "data": str(few), "steps": 2, "cases": str(tmp_path / "cases")}))
+    code = "import sys\nfor name in ('ompl', 'pinocchio', 'coal', 'ruckig'):\n    sys.modules[name] = None\n"
+    code += f"sys.argv = ['train.py', {str(file)!r}, '--out', {str(tmp_path / 'run')!r}, '--quiet']\n"
+    code += f"exec(compile(open({str(SCRIPT)!r}).read(), 'train.py', 'exec'))\n"
+    done = subprocess.run([sys.executable, "-c", code], check=False, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "step 2 of 2" in done.stdout and "repaired" in done.stdout
 
 
 # Checkpoints
@@ -394,9 +445,9 @@ def test_a_checkpoint_gives_the_model_back(saved: Path, few: Path, tmp_path: Pat
     for name, tensor in original.state_dict().items():
         found = model.network.state_dict()[name]
         torch.testing.assert_close(found, tensor.half().to(tensor) if tensor.is_floating_point() else tensor)
-    save_model(tmp_path / "again", model.network, model.about, "again")
+    save_model(tmp_path / "again", model.network, model.about)
     assert (tmp_path / "again" / "model.safetensors").read_bytes() == (saved / "model.safetensors").read_bytes()
-    assert "Trained for 12 steps of 32 paths" in (saved / "README.md").read_text()
+    assert "denoiser, step 12, 0 min, 32 paths in memory" in (saved / "README.md").read_text()
     assert model.about["config"]["steps"] == 12
     kernel = Kernel(RobotTables.load(DATA / "robot.npz"), scene_tables([]))
     query = query_of_path(load(few), 0)
@@ -480,16 +531,33 @@ def test_a_checkpoint_is_written_whole_or_not_at_all(saved: Path, tmp_path: Path
     network = load_model(saved).network
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(MissingFileError, match="folder for a checkpoint"):
-        save_model(tmp_path / "file" / "inside", network, {}, "")
+        save_model(tmp_path / "file" / "inside", network, {})
+    (tmp_path / "precious").mkdir()
+    (tmp_path / "precious" / "thesis.txt").write_text("years of work")
+    with pytest.raises(MissingFileError, match="something else is there"):
+        save_model(tmp_path / "precious", network, {})
     folder = tmp_path / "there"
-    save_model(folder, network, {"step": 1}, "first")
+    save_model(folder, network, {"step": 1})
+    left = tmp_path / ".there.killed.part"
+    left.mkdir()
 
     def full(*_: object) -> int:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(Path, "write_bytes", full)
-    with pytest.raises(MissingFileError, match="no space left on device"):
-        save_model(folder, network, {"step": 2}, "second")
-    monkeypatch.undo()
-    assert load_model(folder).about == {"step": 1}
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["file", "there"]
+    replace, calls = os.replace, []
+
+    def refused(source: Any, target: Any) -> None:
+        calls.append(target)
+        if len(calls) == 2:
+            full()
+        replace(source, target)
+
+    for owner, name, fault in ((Path, "write_bytes", full), (os, "replace", refused)):
+        monkeypatch.setattr(owner, name, fault)
+        with pytest.raises(MissingFileError, match="no space left on device"):
+            save_model(folder, network, {"step": 2})
+        monkeypatch.undo()
+        assert load_model(folder).about == {"step": 1}
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["file", "precious", "there"]
+    save_model(folder, network, {"step": 3})
+    assert load_model(folder).about == {"step": 3}

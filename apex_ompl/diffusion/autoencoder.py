@@ -174,8 +174,13 @@ class VariationalLatent(Autoencoder):
 
     def moments(self, control: Tensor) -> Moments:
         """Return the distribution of the encoder, before it is scaled; control points (B, points, dof)."""
+        return self._moments(self._rest(control))
+
+    def _rest(self, control: Tensor) -> Tensor:
         path = self.path(control)
-        rest = path - self._even_line(path[:, 0], path[:, -1])
+        return path - self._even_line(path[:, 0], path[:, -1])
+
+    def _moments(self, rest: Tensor) -> Moments:
         mean, log_variance = self.encoder(rest.transpose(1, 2)).chunk(2, dim=1)
         return Moments(mean, log_variance.clamp(-20.0, 10.0))
 
@@ -188,18 +193,18 @@ class VariationalLatent(Autoencoder):
         """Return the loss, and the error of reconstruction in it.
 
         The loss is the negative evidence lower bound (Kingma and Welling 2014): the mean square error of the states
-        [rad^2], and ``weight`` times the divergence from the standard normal distribution per state.
+        [rad^2], and ``weight`` times the divergence from the standard normal distribution, per number of the latent.
 
         Args:
             control: Control points, shape (B, points, dof).
             noise: Standard normal, shape (B, *latent).
             weight: Weight of the divergence.
         """
-        path = self.path(control)
-        rest = path - self._even_line(path[:, 0], path[:, -1])
-        mean, log_variance = self.moments(control)
+        with torch.autocast(control.device.type, enabled=False):  # half precision would blur the path
+            rest = self._rest(control)
+        mean, log_variance = self._moments(rest)
         found = self.residuals(mean + (0.5 * log_variance).exp() * noise)
-        error = functional.mse_loss(found, rest)
+        error = functional.mse_loss(found.float(), rest)
         apart = 0.5 * (mean**2 + log_variance.exp() - 1.0 - log_variance)
         return error + weight * apart.mean(), error
 

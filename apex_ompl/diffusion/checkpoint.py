@@ -26,6 +26,7 @@ from apex_ompl.schema import StrictModel, validate
 SCHEMA = "apex-ompl/model/1"
 SHIPPED = Path(__file__).parent / "checkpoints"
 CONFIG, WEIGHTS, CARD = "config.json", "model.safetensors", "README.md"
+PART = ".part"
 PICKLES = (".pt", ".pth", ".ckpt", ".bin", ".pkl", ".pickle")
 
 
@@ -46,26 +47,22 @@ class CheckpointConfig(StrictModel):
 
 
 def save_model(
-    folder: str | os.PathLike[str],
-    network: LatentDiffusion,
-    trained: Mapping[str, Any],
-    card: str,
-    *,
-    half: bool = True,
+    folder: str | os.PathLike[str], network: LatentDiffusion, trained: Mapping[str, Any], *, half: bool = True
 ) -> None:
-    """Write a checkpoint, whole or not at all; one that is there is replaced.
+    """Write a checkpoint with its model card, whole or not at all; one that is there is replaced.
 
     Args:
         folder: Where.
         network: The model.
         trained: What is known of its training, ready for JSON.
-        card: The model card, Markdown.
         half: Whether weights are stored in half precision.
 
     Raises:
-        MissingFileError: The folder cannot be written.
+        MissingFileError: The folder cannot be written, or something else is there.
     """
     folder = Path(folder)
+    if folder.exists() and not is_file(folder / CONFIG):
+        raise MissingFileError(str(folder), "folder for a checkpoint", "something else is there")
     kept = {
         name: (tensor.half() if half and tensor.is_floating_point() else tensor).cpu().contiguous()
         for name, tensor in network.state_dict().items()
@@ -75,26 +72,56 @@ def save_model(
         "schema": SCHEMA, "model": network.config.model_dump(mode="json"),
         "digest": hashlib.sha256(weights).hexdigest(), "trained": dict(trained),
     }  # fmt: skip
-    content = {CONFIG: (json.dumps(config, indent=1) + "\n").encode(), WEIGHTS: weights, CARD: card.encode()}
-    temporary: Path | None = None
+    card = model_card(network.config, trained, sum(p.numel() for p in network.parameters()))
+    content = {WEIGHTS: weights, CARD: card.encode(), CONFIG: (json.dumps(config, indent=1) + "\n").encode()}
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
-        temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
-        for name, data in content.items():
-            (temporary / name).write_bytes(data)
-        temporary.chmod(0o755)
-        if folder.exists():
-            old = Path(tempfile.mkdtemp(prefix=f".{folder.name}.old.", dir=folder.parent))
-            os.replace(folder, old / folder.name)
-            os.replace(temporary, folder)
-            shutil.rmtree(old)
-        else:
-            os.replace(temporary, folder)
+        for left in folder.parent.glob(f".{folder.name}.*{PART}"):  # of a process that was killed
+            shutil.rmtree(left, ignore_errors=True)
+        temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", suffix=PART, dir=folder.parent))
     except (OSError, ValueError) as error:
-        if temporary is not None:
-            shutil.rmtree(temporary, ignore_errors=True)
         why = (getattr(error, "strerror", None) or str(error)).lower()
         raise MissingFileError(str(folder), "folder for a checkpoint", why) from error
+    new, old = temporary / "new", temporary / "old"
+    try:
+        new.mkdir()
+        for name, data in content.items():
+            (new / name).write_bytes(data)
+        if folder.exists():
+            os.replace(folder, old)
+        os.replace(new, folder)
+    except OSError as error:
+        if old.exists() and not folder.exists():
+            os.replace(old, folder)
+        raise MissingFileError(str(folder), "folder for a checkpoint", str(error.strerror).lower()) from error
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def model_card(config: ModelConfig, trained: Mapping[str, Any], weights: int) -> str:
+    """Return a model card, Markdown.
+
+    Args:
+        config: What the model is made of.
+        trained: What is known of its training.
+        weights: Their number.
+    """
+    latent, condition, noise = config.latent, config.condition, config.noise
+    size = f"{latent.dim} components" if latent.kind == "linear" else f"{latent.channels} channels"
+    lines = [
+        f"# A latent diffusion model of paths for {config.robot}",
+        "",
+        f"{weights / 1e6:.2f} million weights: a {latent.kind} latent space of {size}, a denoiser of kind "
+        f"{config.denoiser.kind}, scene {condition.scene!r}, {noise.prediction} prediction over {noise.steps} steps.",
+    ]
+    if {"phase", "step", "seconds", "paths"} <= trained.keys():
+        lines += [
+            "",
+            f"Trained by `scripts/train.py`: {trained['phase']}, step {trained['step']}, {trained['seconds'] / 60:.0f} "
+            f"min, {trained['paths']} paths in memory (mirror images counted). The configuration is in `config.json`.",
+        ]
+    lines += ["", "It proposes paths; they are not valid until they are checked. `apex_ompl.load_model` reads it.", ""]
+    return "\n".join(lines)
 
 
 def load_model(
@@ -128,7 +155,8 @@ def load_model(
         tensors = load_tensors(weights)
     except (SafetensorError, ValueError) as error:
         raise FileFormatError(source, "", str(error), "expected safetensors") from error
-    network = LatentDiffusion(config.model)
+    with torch.random.fork_rng(devices=[]):
+        network = LatentDiffusion(config.model)
     state = network.state_dict()
     wanted = {key: tuple(value.shape) for key, value in state.items()}
     shapes = {key: tuple(value.shape) for key, value in tensors.items()}

@@ -61,6 +61,9 @@ class Things:
         return len(self.shape)
 
 
+AT_ONCE = 1024
+"""Paths whose joint frames are in memory at once."""
+
 LARGE = np.array([3.0, 3.0, 0.5])
 """Half edges of the box that stands for a half-space [m]."""
 
@@ -170,11 +173,14 @@ class Probes:
 
     def places(self, kernel: Kernel, start: Array, goal: Array) -> NDArray[np.float32]:
         """Return where the points are along straight lines between states of shape (B, dof): (B, L, P, 3) [m]."""
-        states = start[:, None] + self.shares[:, None] * (goal - start)[:, None]
-        turn, origin = kernel.joint_frames(states.reshape(-1, start.shape[1]))
-        places = np.einsum("npij,pj->npi", turn[:, self.joint], self.offset) + origin[:, self.joint]
-        shape = len(start), len(self.shares), len(self.joint), 3
-        return np.asarray(places.reshape(shape), np.float32)
+        found = np.empty((len(start), len(self.shares), len(self.joint), 3), np.float32)
+        for k in range(0, len(start), AT_ONCE):
+            ends = start[k : k + AT_ONCE, None], goal[k : k + AT_ONCE, None]
+            states = ends[0] + self.shares[:, None] * (ends[1] - ends[0])
+            turn, origin = kernel.joint_frames(states.reshape(-1, start.shape[1]))
+            places = np.einsum("npij,pj->npi", turn[:, self.joint], self.offset) + origin[:, self.joint]
+            found[k : k + AT_ONCE] = places.reshape(states.shape[0], *found.shape[1:])
+        return found
 
 
 def rotations(orientation: NDArray[np.floating]) -> NDArray[np.float32]:

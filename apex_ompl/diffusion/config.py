@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from apex_ompl.diffusion.model import ConditionConfig, Count, DenoiserConfig, LatentConfig, NoiseConfig
+from apex_ompl.diffusion.model import ConditionConfig, Count, DenoiserConfig, LatentConfig, NoiseConfig, SamplingConfig
 from apex_ompl.errors import FileFormatError
 from apex_ompl.schema import StrictModel, read_yaml, validate
 
@@ -77,6 +77,8 @@ class TrainingConfig(StrictModel):
         save_every: Seconds between two saves.
         validate_every: Steps between two validations by proposals.
         proposals: Proposals for each problem of a validation.
+        judged: How they are denoised.
+        sampling: How the trained model denoises unless something else is said.
     """
 
     schema_: Literal["apex-ompl/training/1"] = Field(alias="schema")
@@ -105,6 +107,18 @@ class TrainingConfig(StrictModel):
     save_every: Positive = 120.0
     validate_every: Count = 2000
     proposals: Count = 8
+    judged: SamplingConfig = SamplingConfig()
+    sampling: SamplingConfig = SamplingConfig()
+
+    @property
+    def essence(self) -> str:
+        """What decides the weights, as text: all but how often things are logged, saved and judged, and from where."""
+        return self.model_dump_json(
+            exclude={
+                "data", "robot", "cases", "log_every", "save_every", "validate_every", "proposals", "judged",
+                "sampling",
+            }
+        )  # fmt: skip
 
     @classmethod
     def read(cls, path: str | os.PathLike[str], changes: Mapping[str, Any] | None = None) -> TrainingConfig:

@@ -15,15 +15,20 @@ from torch import Tensor
 
 from apex_ompl.dataset import Store, load
 from apex_ompl.diffusion.conditions import Conditions, Probes, Table
+from apex_ompl.diffusion.config import TrainingConfig
 from apex_ompl.engine import rounded
 from apex_ompl.errors import ParameterError
 from apex_ompl.files import is_file
-from apex_ompl.kernel import Kernel
-from apex_ompl.records import Paths, to_micro
+from apex_ompl.kernel import Kernel, RobotTables
+from apex_ompl.kernel.scene import scene_tables
+from apex_ompl.records import SPLINE, Paths, to_micro
 
 Array = NDArray[np.float64]
 
 NOTHING_HELD = "[]"
+MEASURED = 100_000  # paths that the latent space is measured on
+WATCHED_SHARE = 0.02  # of all problems, at most, that the validation loss is taken on
+PASSES, FOREVER = 4, 2**40  # over a window before the next, and steps where there is only one window
 EVERY, CLOSE = 8, 0.01  # states of an image that are looked at, and clearances that are told apart [m]
 
 
@@ -121,6 +126,7 @@ _NONE = torch.zeros(0, 1, 1)
 
 
 def _weights(paths: Paths, weights: Mapping[str, float]) -> Array:
+    """Return the weight of each path, by the first pattern that fits its level."""
     levels = [
         f"{paths.names['suite'][s]}/{paths.names['level'][v]}"
         for s, v in zip(paths.arrays["suite"], paths.arrays["level"], strict=True)
@@ -163,3 +169,72 @@ def split(paths: Paths, share: float) -> tuple[Paths, Paths]:
     """Return the paths of problems to train on, and of those that are held out."""
     out = np.array([held_out(paths.problem_name(k), share) for k in range(paths.problems)], bool)
     return paths.chosen(np.flatnonzero(~out)), paths.chosen(np.flatnonzero(out))
+
+
+class Supply:
+    """What a training run draws its batches from: one window of its data at a time.
+
+    Attributes:
+        window: Paths to train on.
+        watched: Paths of problems that are held out, the same ones all along, or None.
+        spline: Fields of the paths' spline.
+        number: Number of the window.
+        left: Steps before the next one.
+    """
+
+    def __init__(self, config: TrainingConfig, robot: RobotTables) -> None:
+        """Read the first window.
+
+        Raises:
+            ApexError: The data cannot be read, or are those of another robot.
+        """
+        self._config, self._kernel = config, Kernel(robot, scene_tables([]))
+        self.probes = Probes.of(robot, config.condition.along)
+        self._mirror: Mirror | None = None
+        if config.mirror is not None:
+            if len(config.mirror.order) != robot.dof:
+                raise ParameterError("mirror", len(config.mirror.order), f"{robot.dof} joints")
+            self._mirror = Mirror(**config.mirror.model_dump())
+        self.watched: Window | None = None
+        self.number = self.left = 0
+        self.window = self._read(0)
+        self._count()
+
+    def measured(self) -> Tensor:
+        """Return control points to measure a latent space on, drawn as training draws."""
+        generator = torch.Generator().manual_seed(self._config.seed)
+        return self.window.control[torch.from_numpy(self.window.drawn(MEASURED, generator))]
+
+    def digest(self) -> str:
+        """Return a digest of the data of the first window."""
+        return hashlib.sha256(self.window.control.numpy().tobytes()).hexdigest()
+
+    def spend(self) -> None:
+        """Count a step, and read the next window when this one has had its turn."""
+        if self.left == 0:
+            self.go_to(self.number + 1)
+        self.left -= 1
+
+    def go_to(self, number: int, left: int | None = None) -> None:
+        """Read another window, with so many steps left."""
+        if number != self.number:
+            del self.window  # two need not be in memory at once
+            self.window, self.number = self._read(number), number
+        self._count()
+        self.left = self.left if left is None else left
+
+    def _count(self) -> None:
+        self.left = PASSES * max(1, len(self.window) // self._config.batch) if self._windows > 1 else FOREVER
+
+    def _read(self, number: int) -> Window:
+        config, robot = self._config, self._kernel.robot
+        paths, self._windows = window_paths(Path(config.data), config.seed, config.units, number)
+        if (paths.about["robot"], tuple(paths.about["joints"])) != (robot.name, robot.joint_names):
+            raise ParameterError("data", paths.about["robot"], f"paths of {robot.name}, whose tables are given")
+        self.spline = {k: paths.about[k] for k in SPLINE}
+        train, out = split(paths, config.held_out)
+        if self.watched is None:
+            few = split(paths, min(config.held_out, WATCHED_SHARE))[1]  # the same problems for every share
+            self.watched = Window([few], self.probes, self._kernel, {}) if len(few) else None
+        parts = [train] if self._mirror is None else [train, self._mirror.paths(train, self._kernel)]
+        return Window(parts, self.probes, self._kernel, config.weights)

@@ -9,6 +9,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from apex_ompl.errors import ParameterError
+
 GROUPS = 8
 
 
@@ -54,7 +56,7 @@ class MLPDenoiser(nn.Module):
         nn.init.zeros_(self.leave.bias)
 
     def forward(self, latent: Tensor, t: Tensor, condition: Tensor) -> Tensor:
-        """Map latent vectors (B, dim), steps (B,) and conditions (B, condition) to (B, dim)."""
+        """Map latent vectors (B, dim) to (B, dim); steps (B,) and conditions (B, condition), or one for all."""
         mood = functional.silu(self.step(t) + condition)
         x = self.enter(latent)
         for block in self.blocks:
@@ -107,6 +109,7 @@ class UNetDenoiser(nn.Module):
         mood = 4 * width
         self.mood = nn.Sequential(nn.Linear(step_size + condition, mood), nn.SiLU(), nn.Linear(mood, mood), nn.SiLU())
         sizes = [width * m for m in multipliers]
+        self.divisor = 2 ** (len(sizes) - 1)
         self.enter = nn.Conv1d(channels, width, 3, padding=1)
         self.down, self.up = nn.ModuleList(), nn.ModuleList()
         now, skips = width, [width]
@@ -126,7 +129,13 @@ class UNetDenoiser(nn.Module):
         self.leave = nn.Sequential(nn.GroupNorm(GROUPS, now), nn.SiLU(), nn.Conv1d(now, channels, 3, padding=1))
 
     def forward(self, latent: Tensor, t: Tensor, condition: Tensor) -> Tensor:
-        """Map latent vectors (B, channels, length), steps (B,) and conditions (B, condition) to noise."""
+        """Map latent vectors (B, channels, length) to noise; steps (B,) and conditions (B, condition), or one for all.
+
+        Raises:
+            ParameterError: The length cannot be halved as often as there are resolutions.
+        """
+        if latent.shape[-1] % self.divisor:
+            raise ParameterError("length of the latent space", latent.shape[-1], f"{self.divisor} times a whole number")
         mood = self.mood(torch.cat([self.step(t), condition], dim=1))
         x = self.enter(latent)
         kept = [x]

@@ -84,7 +84,8 @@ class ConditionEncoder(nn.Module):
         if self.scene == "distances":
             along, probes = given.probes.shape[1:3]
             points = given.probes.flatten(1, 2)
-            apart = distances(shape, position, turn, size, points[owner]).clamp(-NEAR, NEAR) / NEAR
+            with torch.autocast(points.device.type, enabled=False):  # half precision is some millimetres off
+                apart = distances(shape, position, turn, size, points[owner]).clamp(-NEAR, NEAR) / NEAR
             parts += [(points - self.middle).flatten(1), _pooled(apart, there, 1.0).amin(dim=1)]
             things.append(apart.reshape(-1, along, probes)[:, [0, along // 2, -1]].flatten(1))
         tokens = self.thing(torch.cat(things, dim=1))

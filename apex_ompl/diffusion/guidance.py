@@ -30,7 +30,8 @@ class Guidance:
         scaling: ``noise`` adds to the noise as in equation 7, in proportion to the noise that is left; ``clean`` adds
             the gradient to the clean sample, not scaled with the noise.
         clip: Longest gradient, in standard deviations of the latent space.
-        begin: It acts at steps below this share of the schedule; 1 means all.
+        begin: It acts at steps below this share of the schedule; 1 means all. Two deterministic steps over 256 are
+            those at 255 and 127.
         margin: Clearance below which a state costs [m].
         samples: How many states of a path are looked at.
     """
@@ -38,7 +39,7 @@ class Guidance:
     gamma: float = 1.0
     scaling: str = "clean"
     clip: float = 1.0
-    begin: float = 1.0
+    begin: float = 0.6
     margin: float = 0.03
     samples: int = 64
 
@@ -112,8 +113,9 @@ def log_likelihood(
 
 
 def guided(
-    predict: Predict, likelihood: Callable[[Tensor], Tensor], schedule: NoiseSchedule, guidance: Guidance
-) -> Predict:
+    predict: Predict, slope: Callable[[Tensor], Tensor], schedule: NoiseSchedule, guidance: Guidance,
+    most: float | None = None,
+) -> Predict:  # fmt: skip
     """Return a denoiser that is drawn to what is likely.
 
     With ``scaling="noise"`` this is equation 7 of the paper with alpha_bar under the root, as Dhariwal and Nichol
@@ -123,9 +125,10 @@ def guided(
 
     Args:
         predict: The plain denoiser.
-        likelihood: Gives log p(g given x) of clean samples, shape (B,).
+        slope: Gives the gradient of log p(g given x) at clean samples, of their shape.
         schedule: The noise schedule.
         guidance: How strongly, and when.
+        most: Clean samples are clipped at this, as those of the plain denoiser are.
     """
     if guidance.gamma == 0.0:
         return predict
@@ -134,14 +137,18 @@ def guided(
         found = predict(sample, t)
         if t >= guidance.begin * schedule.steps:
             return found
-        slope = gradient(likelihood, found.clean)
-        signal, sigma = schedule.scales(t, sample)
+        signal, sigma = schedule.scale(t)
+        way = slope(found.clean)
         if guidance.scaling == "noise":
-            slope = shortened(slope / signal, guidance.clip)
-            noise = found.noise - guidance.gamma * sigma * slope
-            return Estimate(noise, (sample - sigma * noise) / signal)
-        clean = found.clean + guidance.gamma * shortened(slope, guidance.clip)
-        return Estimate((sample - signal * clean) / sigma, clean)
+            noise = found.noise - guidance.gamma * sigma * shortened(way / signal, guidance.clip)
+            clean = (sample - sigma * noise) / signal
+        else:
+            clean = found.clean + guidance.gamma * shortened(way, guidance.clip)
+            noise = (sample - signal * clean) / sigma
+        if most is None:
+            return Estimate(noise, clean)
+        inside = clean.clamp(-most, most)
+        return Estimate(torch.where(inside == clean, noise, (sample - signal * inside) / sigma), inside)
 
     return bent
 

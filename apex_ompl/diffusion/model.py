@@ -90,13 +90,21 @@ class NoiseConfig(StrictModel):
         steps: Number of steps T.
         schedule: ``cosine`` or ``linear``.
         prediction: What the network says: ``noise``, ``velocity`` or ``clean``.
-        most: Clean samples are clipped at this many standard deviations; none when it is null.
+        most: Clean samples are clipped at this many standard deviations; not at all by default, as paths among many
+            obstacles have components far out.
     """
 
     steps: Count = 256
     schedule: Literal["cosine", "linear"] = "cosine"
     prediction: Literal["noise", "velocity", "clean"] = "velocity"
-    most: Annotated[float, Field(gt=0)] | None = 5.0
+    most: Annotated[float, Field(gt=0)] | None = None
+
+
+class SamplingConfig(StrictModel):
+    """How paths are denoised unless something else is said, see ``apex_ompl.diffusion.proposals.Sampling``."""
+
+    sampler: Literal["ddpm", "ddim", "dpm_solver"] = "ddim"
+    steps: Count = 2
 
 
 class ModelConfig(StrictModel):
@@ -111,6 +119,7 @@ class ModelConfig(StrictModel):
         condition: Encoder of conditions.
         denoiser: Network.
         noise: Diffusion.
+        sampling: How paths are denoised unless something else is said.
     """
 
     robot: str
@@ -121,6 +130,7 @@ class ModelConfig(StrictModel):
     condition: ConditionConfig = ConditionConfig()
     denoiser: DenoiserConfig = DenoiserConfig()
     noise: NoiseConfig = NoiseConfig()
+    sampling: SamplingConfig = SamplingConfig()
 
 
 class LatentDiffusion(nn.Module):
@@ -175,7 +185,7 @@ class LatentDiffusion(nn.Module):
         return self.config.denoiser.kind == "regression"
 
     def said(self, latent: Tensor, t: Tensor, encoded: Tensor) -> Tensor:
-        """Return what the network says of noisy latent vectors (B, *latent) at steps (B,)."""
+        """Return what the network says of noisy latent vectors (B, *latent) at steps (B,) or, all alike, (1,)."""
         if isinstance(self.denoiser, MLPDenoiser):
             out: Tensor = self.denoiser(latent.flatten(1), t, encoded)
             return out.reshape(latent.shape)
@@ -202,20 +212,16 @@ class LatentDiffusion(nn.Module):
         return nn.functional.mse_loss(said.float(), wanted)
 
     def predict(self, encoded: Tensor) -> Predict:
-        """Return the function that samplers ask, for encoded conditions of shape (B, out)."""
+        """Return the function that samplers ask, for one encoded condition of shape (1, out), or (B, out)."""
         noise = self.config.noise
 
         def predict(sample: Tensor, t: int) -> Estimate:
-            steps = torch.full((len(sample),), t, device=sample.device)
+            steps = torch.full((1,), t, device=sample.device)
             found = self.schedule.estimate(noise.prediction, sample, self.said(sample, steps, encoded), t)
-            return found if noise.most is None else clipped(found, sample, t, self.schedule, noise.most)
+            if noise.most is None:
+                return found
+            signal, sigma = self.schedule.scale(t)
+            clean = found.clean.clamp(-noise.most, noise.most)
+            return Estimate(torch.where(clean == found.clean, found.noise, (sample - signal * clean) / sigma), clean)
 
         return predict
-
-
-def clipped(found: Estimate, sample: Tensor, t: int, schedule: NoiseSchedule, most: float) -> Estimate:
-    """Return an estimate whose clean sample is at most ``most`` in size, and the noise that goes with it."""
-    clean = found.clean.clamp(-most, most)
-    signal, sigma = schedule.scales(t, sample)
-    noise = torch.where(clean == found.clean, found.noise, (sample - signal * clean) / sigma)
-    return Estimate(noise, clean)

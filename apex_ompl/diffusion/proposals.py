@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from apex_ompl.diffusion.conditions import Conditions, Probes, Query, batched
-from apex_ompl.diffusion.guidance import Guidance, guided, log_likelihood
+from apex_ompl.diffusion.guidance import Guidance, gradient, guided, log_likelihood
 from apex_ompl.diffusion.model import LatentDiffusion
 from apex_ompl.diffusion.sampler import SAMPLERS, Callback, ddpm, noise_like
 from apex_ompl.errors import ParameterError, UnknownNameError
@@ -79,6 +79,7 @@ class TrajectoryModel:
         network: The model.
         about: What is known of its training.
         spline: The spline of the control points.
+        sampling: How paths are denoised unless something else is said.
     """
 
     def __init__(self, network: LatentDiffusion, about: Mapping[str, Any]) -> None:
@@ -88,6 +89,12 @@ class TrajectoryModel:
         self.spline: Spline = network.autoencoder.spline
         joint, offset = network.probe_joint.cpu().numpy(), network.probe_offset.cpu().double().numpy()
         self.probes = Probes(joint, offset, network.config.condition.along)
+        self.sampling = Sampling(**network.config.sampling.model_dump())
+
+    @property
+    def sees_point(self) -> bool:
+        """Whether it looks at the obstacle point of a query."""
+        return self.network.config.condition.point
 
     @property
     def device(self) -> torch.device:
@@ -104,17 +111,18 @@ class TrajectoryModel:
             query: The problem.
             kernel: The robot among its obstacles, which guidance asks.
             count: How many paths.
-            sampling: How they are denoised; by default in two deterministic steps.
-            generator: Source of all noise; the same state gives the same paths.
+            sampling: How they are denoised; by default as the model's configuration says.
+            generator: Source of all noise; the same state gives the same paths. By default one with seed 0.
             callback: Called at every step.
 
         Raises:
             ParameterError: The query has states of another robot, or there are no paths to propose.
         """
-        sampling = sampling or Sampling()
-        if count < 1:
+        sampling = sampling or self.sampling
+        if not isinstance(count, int) or count < 1:
             raise ParameterError("count", count, "a positive number of paths")
         shape = torch.zeros(count, *self.network.latent, device=self.device)
+        generator = generator or torch.Generator().manual_seed(0)
         first = sampling.temperature * noise_like(shape, generator)
         top = self.network.schedule.steps - 1
         return self._denoised(query, kernel, first, top, sampling=sampling, generator=generator, callback=callback)
@@ -131,19 +139,22 @@ class TrajectoryModel:
             control: Control points, shape (B, points, dof).
             step: How noisy they become, 0 to T - 1.
             sampling: How they are denoised; its number of steps is cut to those there are.
-            generator: Source of all noise.
+            generator: Source of all noise; by default one with seed 0.
             callback: Called at every step.
 
         Raises:
             ParameterError: Control points of another shape, or no such step.
         """
-        sampling = sampling or Sampling()
-        if control.ndim != 3 or control.shape[1:] != (self.spline.points, len(self.network.config.joints)):
-            wanted = f"(B, {self.spline.points}, {len(self.network.config.joints)})"
-            raise ParameterError("control points", control.shape, f"an array of shape {wanted}")
-        if not 0 <= step < self.network.schedule.steps:
+        sampling, control = sampling or self.sampling, np.asarray(control, float)
+        shape = (self.spline.points, len(self.network.config.joints))
+        if control.ndim != 3 or control.shape[1:] != shape or not np.isfinite(control).all():
+            raise ParameterError(
+                "control points", control.shape, f"finite numbers of shape (B, {shape[0]}, {shape[1]})"
+            )
+        if not isinstance(step, int) or not 0 <= step < self.network.schedule.steps:
             raise ParameterError("step", step, f"0 to {self.network.schedule.steps - 1}")
-        with torch.inference_mode():
+        generator = generator or torch.Generator().manual_seed(0)
+        with torch.no_grad():
             clean = self.network.autoencoder.encode(torch.tensor(control, dtype=torch.float32, device=self.device))
             first = self.network.schedule.noisy(clean, noise_like(clean, generator), step)
         sampling = replace(sampling, steps=min(sampling.steps, step + 1))
@@ -153,33 +164,44 @@ class TrajectoryModel:
         """Return a query as a batch of one.
 
         Raises:
-            ParameterError: It has states of another robot.
+            ParameterError: The robot is another one, or numbers are not finite.
         """
-        dof = len(self.network.config.joints)
-        if query.start.shape != (dof,) or query.goal.shape != (dof,) or kernel.robot.dof != dof:
-            raise ParameterError("start and goal", (query.start.shape, query.goal.shape), f"states of shape ({dof},)")
+        config = self.network.config
+        if (kernel.robot.name, kernel.robot.joint_names) != (config.robot, config.joints):
+            raise ParameterError("robot", kernel.robot.name, f"{config.robot}, which the model was trained for")
+        for name, state in (("start", query.start), ("goal", query.goal)):
+            if np.shape(state) != (len(config.joints),) or not np.isfinite(state).all():
+                raise ParameterError(name, state, f"a finite state of shape ({len(config.joints)},)")
+        things = query.things
+        numbers = (query.point, things.position, things.turn, things.size)
+        if not all(np.isfinite(values).all() for values in numbers):
+            raise ParameterError("obstacles", "NaN or infinity", "finite positions, rotations and sizes")
         return batched([query], self.probes, kernel).to(self.device)
 
     def _denoised(
         self, query: Query, kernel: Kernel, first: Tensor, top: int, *, sampling: Sampling,
-        generator: torch.Generator | None, callback: Callback | None,
+        generator: torch.Generator, callback: Callback | None,
     ) -> Proposals:  # fmt: skip
         network, clock = self.network, _Clock()
         with torch.no_grad():
             given = self.conditions(query, kernel)
-            encoded = network.encoder(given).expand(len(first), -1)
+            encoded = network.encoder(given)
             start, goal = given.start.expand(len(first), -1), given.goal.expand(len(first), -1)
             clock.lap("condition")
             if network.regresses:
                 zero = torch.zeros_like(first)
-                latent = network.said(zero, torch.zeros(len(zero), dtype=torch.int64, device=zero.device), encoded)
+                latent = network.said(zero, torch.zeros(1, dtype=torch.int64, device=zero.device), encoded)
             else:
 
-                def likelihood(clean: Tensor) -> Tensor:
-                    with clock.within("guidance"):
-                        return log_likelihood(network.autoencoder, kernel, clean, (start, goal), sampling.guidance)
+                def likely(clean: Tensor) -> Tensor:
+                    return log_likelihood(network.autoencoder, kernel, clean, (start, goal), sampling.guidance)
 
-                predict = guided(network.predict(encoded), likelihood, network.schedule, sampling.guidance)
+                def slope(clean: Tensor) -> Tensor:
+                    with clock.within("guidance"):
+                        return gradient(likely, clean)
+
+                most = network.config.noise.most
+                predict = guided(network.predict(encoded), slope, network.schedule, sampling.guidance, most)
                 times = network.schedule.times(sampling.steps, top)
                 extra: dict[str, Any] = {} if callback is None else {"callback": callback}
                 if sampling.sampler == "ddpm":

@@ -6,51 +6,70 @@ import csv
 import io
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
+from apex_ompl.errors import FileFormatError, MissingFileError
 from apex_ompl.files import is_file, write_atomically
 
 FIELDS = ("phase", "step", "loss", "held_out", "rate", "seconds", "sampled", "repaired", "levels")
 PLOTTED = ("loss", "held_out", "rate", "sampled", "repaired")
+FILE = "log.csv"
+
+
+def read_log(folder: Path) -> list[dict[str, str]]:
+    """Return the rows of a run's log.
+
+    Raises:
+        FileFormatError: It is none.
+    """
+    path = folder / FILE
+    if not is_file(path):
+        return []
+    with path.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    if any(not (row.get("step") or "").isdecimal() or not row.get("phase") for row in rows):
+        raise FileFormatError(str(path), "step", "no number", "expected the log of a training run")
+    return rows
 
 
 class RunLog:
     """Rows of numbers by phase and step."""
 
-    def __init__(self, folder: Path) -> None:
-        """Write into a folder."""
-        self.path, self.board = folder / "log.csv", folder / "tensorboard"
+    def __init__(self, folder: Path, progress: Mapping[str, int]) -> None:
+        """Go on with the log in a folder, behind the last step of each phase; later rows are forgotten.
 
-    def rows(self) -> list[dict[str, str]]:
-        """Return what was logged."""
-        if not is_file(self.path):
-            return []
-        with self.path.open(newline="") as file:
-            return list(csv.DictReader(file))
-
-    def cut(self, phases: Mapping[str, int]) -> None:
-        """Forget rows behind the last step of each phase; phases that are not named have not begun."""
-        rows = self.rows()
-        kept = [row for row in rows if int(row["step"] or 0) <= phases.get(row["phase"], -1)]
-        if len(kept) < len(rows):
-            text = io.StringIO(newline="")
-            writer = csv.DictWriter(text, FIELDS)
-            writer.writeheader()
-            writer.writerows(kept)
-            write_atomically(self.path, text.getvalue().encode())
-
-    def add(self, row: Mapping[str, str | int]) -> None:
-        """Add a row."""
-        new = not is_file(self.path)
-        with self.path.open("a", newline="") as file:
-            writer = csv.DictWriter(file, FIELDS)
-            if new:
-                writer.writeheader()
-            writer.writerow(row)
+        Raises:
+            FileFormatError: What is there is no log.
+            MissingFileError: It cannot be written.
+        """
+        self._path = folder / FILE
+        rows = read_log(folder)
+        kept = [row for row in rows if int(row["step"]) <= progress.get(row["phase"], -1)]
+        text = io.StringIO(newline="")
+        writer = csv.DictWriter(text, FIELDS, extrasaction="ignore")
+        writer.writeheader()
+        writer.writerows(kept)
+        write_atomically(self._path, text.getvalue().encode())
+        self._board: Any = None
         try:
             from torch.utils.tensorboard import SummaryWriter
         except ImportError:
             return
-        with SummaryWriter(str(self.board)) as board:
+        self._board = SummaryWriter(str(folder / "tensorboard"), purge_step=max(progress.values(), default=0) + 1)
+
+    def add(self, row: Mapping[str, str | int]) -> None:
+        """Add a row.
+
+        Raises:
+            MissingFileError: It cannot be written.
+        """
+        try:
+            with self._path.open("a", newline="") as file:
+                csv.DictWriter(file, FIELDS).writerow(row)
+        except OSError as error:
+            raise MissingFileError(str(self._path), "log of a training run", str(error.strerror).lower()) from error
+        if self._board is not None:
             for name in PLOTTED:
                 if name in row:
-                    board.add_scalar(f"{row['phase']}/{name}", float(row[name]), int(row["step"]))
+                    self._board.add_scalar(f"{row['phase']}/{name}", float(row[name]), int(row["step"]))
+            self._board.flush()

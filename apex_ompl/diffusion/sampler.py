@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 
 import torch
@@ -59,7 +60,7 @@ def ddim(
         callback(t, sample, estimate)
         if following < 0:
             return estimate.clean
-        signal, sigma = schedule.scales(following, sample)
+        signal, sigma = schedule.scale(following)
         sample = signal * estimate.clean + sigma * estimate.noise
     return sample
 
@@ -84,9 +85,8 @@ def dpm_solver(
         if last is not None:
             clean = clean + step / (2.0 * last[0]) * (clean - last[1])
         last = step, estimate.clean
-        signal, sigma = schedule.scales(following, sample)
-        sigma_now = schedule.scales(t, sample)[1]
-        sample = sigma / sigma_now * sample - signal * torch.expm1(torch.tensor(-step)).to(sample) * clean
+        signal, sigma = schedule.scale(following)
+        sample = sigma / schedule.scale(t)[1] * sample - signal * math.expm1(-step) * clean
     return sample
 
 

@@ -71,15 +71,23 @@ class NoiseSchedule:
         """Share of the sample's variance that is left at each step, shape (steps,), float64."""
         return torch.cumprod(1.0 - self.betas, dim=0)
 
-    def scales(self, t: Tensor | int, like: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the factors of sample and noise at steps, to be multiplied with tensors like ``like``."""
-        left = self.alpha_bar[torch.as_tensor(t, device=self.alpha_bar.device)]
-        left = left.reshape(*left.shape, *[1] * (like.ndim - left.ndim)) if left.ndim else left
+    def scales(self, t: Tensor, like: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the factors of sample and noise at steps (B,), to be multiplied with tensors like ``like``."""
+        left = self.alpha_bar[t.to(self.alpha_bar.device)]
+        left = left.reshape(*left.shape, *[1] * (like.ndim - left.ndim))
         return left.sqrt().to(like), (1.0 - left).sqrt().to(like)
+
+    def scale(self, t: int) -> tuple[float, float]:
+        """Return the factors of sample and noise at one step."""
+        return self._scales[t]
+
+    @cached_property
+    def _scales(self) -> list[tuple[float, float]]:
+        return list(zip(self.alpha_bar.sqrt().tolist(), (1.0 - self.alpha_bar).sqrt().tolist(), strict=True))
 
     def noisy(self, clean: Tensor, noise: Tensor, t: Tensor | int) -> Tensor:
         """Return samples with noise in them (equation 2): one step for all, or shape (B,) for one each."""
-        signal, sigma = self.scales(t, clean)
+        signal, sigma = self.scale(t) if isinstance(t, int) else self.scales(t, clean)
         return signal * clean + sigma * noise
 
     def target(self, prediction: str, clean: Tensor, noise: Tensor, t: Tensor) -> Tensor:
@@ -94,9 +102,9 @@ class NoiseSchedule:
         signal, sigma = self.scales(t, clean)
         return signal * noise - sigma * clean
 
-    def estimate(self, prediction: str, sample: Tensor, said: Tensor, t: Tensor | int) -> Estimate:
+    def estimate(self, prediction: str, sample: Tensor, said: Tensor, t: int) -> Estimate:
         """Return noise and clean sample from what a network says of a noisy one."""
-        signal, sigma = self.scales(t, sample)
+        signal, sigma = self.scale(t)
         if prediction == "noise":
             return Estimate(said, (sample - sigma * said) / signal)
         if prediction == "clean":

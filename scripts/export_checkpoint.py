@@ -1,0 +1,44 @@
+"""Take a training run's checkpoint into the package, where ``apex_ompl.load_model(NAME)`` finds it.
+
+Usage: python scripts/export_checkpoint.py RUN NAME
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from apex_ompl.errors import ApexError
+
+LARGEST = 24.0  # of all that ship together [MiB]
+
+
+def export(run: Path, name: str) -> None:
+    """Read the checkpoint of a run, which proves it, and write it in half precision."""
+    from apex_ompl.diffusion.checkpoint import SHIPPED, load_model, save_model
+
+    folder = run / "checkpoint" if (run / "checkpoint").is_dir() else run
+    model = load_model(folder)
+    save_model(SHIPPED / name, model.network, model.about)
+    size = sum(file.stat().st_size for file in SHIPPED.glob("*/*")) / 2**20
+    print(f"{name}: {model.about.get('phase')}, step {model.about.get('step')}; {size:.1f} MiB ship together")
+    if size > LARGEST:
+        print(f"export_checkpoint: note: expected at most {LARGEST:g} MiB together", file=sys.stderr)
+
+
+def main() -> None:
+    """Read the command line."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("run", type=Path, metavar="RUN", help="folder of a training run, or a checkpoint")
+    parser.add_argument("name", metavar="NAME", help="for example apex")
+    args = parser.parse_args()
+    try:
+        export(args.run, args.name)
+    except ApexError as error:
+        print(f"export_checkpoint: error: {error}", file=sys.stderr)
+        sys.exit(2)
+
+
+if __name__ == "__main__":
+    main()
