@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from apex_ompl.kernel import Kernel
 from apex_ompl.optimize import Optimizer
+from apex_ompl.pool import first_valid
 from apex_ompl.records import FIELDS, SOURCES, Paths, to_micro
 from apex_ompl.resolution import FULL_RESOLUTION, SEARCH_RESOLUTION
 from apex_ompl.spline import Spline
@@ -107,7 +108,7 @@ class Case:
         counts = (4 * MANY,) if many else (FEW, MANY)
         for count in counts:
             starts = self.optimizer.starts(start, goal, count + 1, rng, size)
-            found = self.optimizer.first_valid(self.kernel, starts[:count] if line else starts[1:], self.is_valid)
+            found = first_valid(self.optimizer, self.kernel, starts[:count] if line else starts[1:], self.is_valid)
             if found is not None:
                 return found
         return None

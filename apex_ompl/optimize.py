@@ -22,8 +22,6 @@ Array = NDArray[np.float64]
 Check = Callable[[Array], bool]
 """Whether a path, shape (states, dof), is valid."""
 
-ROUND = 8  # steps between two checks
-ROUNDS = 6  # of them for the first valid path
 STIFFER, SHORTENINGS = 5.0, 4  # factor from one round of shortening to the next, and how many rounds
 LAST_RESORT = 0.1  # factor on the stiffness where nothing came out valid
 
@@ -194,42 +192,6 @@ class Optimizer:
             numbers[bending.DAMPING] = first
             bending.bend(*kernel.packed, *kernel.room(), *grid, self.spline.pinned, points, numbers, scratch, held, row)
         return self._bent(control, about)
-
-    def first_valid(
-        self, kernel: Kernel, control: ArrayLike, is_valid: Check, stop: Callable[[], bool] = lambda: False
-    ) -> Array | None:
-        """Return control points, shape (points, dof), of the first path that comes out valid, or None.
-
-        All paths are improved in rounds. Those that are clear at the samples are checked, the best first; the better
-        half goes on to the next round. In the last round the stiffness is softer.
-
-        Args:
-            kernel: The robot among its obstacles.
-            control: Where to start from, shape (B, points, dof).
-            is_valid: Decides; called with the states of a path.
-            stop: Asked between rounds whether to give up.
-
-        Raises:
-            ParameterError: Control points of another shape.
-        """
-        paths = self._control(kernel, control)
-        damping: Array | None = None
-        soft = LAST_RESORT * self.settings.stiffness
-        for k in range(ROUNDS):
-            if stop() or not len(paths):
-                break
-            last = k == ROUNDS - 1
-            bent = self.improve(
-                kernel, paths, steps=ROUND, damping=damping, stiffness=soft if last else self.settings.stiffness
-            )
-            order = np.argsort(bent.shortfall, kind="stable")
-            for j in order:
-                found: Array = bent.control[j]
-                if bent.clearance[j].min() >= NEARLY and is_valid(self.spline.path(found)):
-                    return found
-            keep = np.sort(order[: max(1, len(order) // 2)])
-            paths, damping = bent.control[keep], bent.damping[keep]
-        return None
 
     def shorten(
         self, kernel: Kernel, control: ArrayLike, is_valid: Check, stop: Callable[[], bool] = lambda: False

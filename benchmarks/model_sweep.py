@@ -22,7 +22,7 @@ import torch
 
 from apex_ompl.cases import load_cases
 from apex_ompl.diffusion.checkpoint import load_model
-from apex_ompl.diffusion.runlog import RunLog
+from apex_ompl.diffusion.runlog import read_log
 from apex_ompl.diffusion.validation import judged
 
 ROOT = record.RESULTS.parent.parent
@@ -33,7 +33,6 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "components: 32": {"latent.dim": 32},
     "components: 128": {"latent.dim": 128},
     "width: 384": {"denoiser.width": 384},
-    "prediction: noise": {"noise.prediction": "noise"},
     "regression": {"denoiser.kind": "regression"},
     "data: 1/2": {"held_out": 0.5},
     "data: 1/4": {"held_out": 0.75},
@@ -59,7 +58,7 @@ def trained(name: str, args: argparse.Namespace) -> Path:
 
 def figures(folder: Path, cases: list[Any]) -> dict[str, Any]:
     """Return what a variant came to."""
-    last = RunLog(folder).rows()[-1]
+    last = read_log(folder)[-1]
     model = load_model(folder / "checkpoint")
     found: dict[str, Any] = {
         "minutes": float(last["seconds"]) / 60.0, "loss": float(last["loss"]), "held_out": float(last["held_out"]),

@@ -26,6 +26,7 @@ import record
 from apex_ompl import plan, problems
 from apex_ompl.assembly import assemble
 from apex_ompl.optimize import Optimizer
+from apex_ompl.pool import first_valid
 from apex_ompl.problems.reach import robot
 from apex_ompl.space import path_length
 from apex_ompl.validity import full_check
@@ -58,7 +59,7 @@ def _optimised(name: str, count: int, seed: int) -> dict[str, Any]:
 
     begin = time.perf_counter()
     starts = optimizer.starts(start, goal, count, np.random.default_rng(seed))
-    found = optimizer.first_valid(kernel, starts, is_valid)
+    found = first_valid(optimizer, kernel, starts, is_valid)
     found_s = time.perf_counter() - begin
     best = None if found is None else optimizer.shorten(kernel, found, is_valid)
     best = found if best is None else best

@@ -1,12 +1,15 @@
 """What proposals are worth: B = 1, 8 and 32 of them judged, repaired, judged again and shortened, on test problems.
 
 The models, unguided and guided, stand beside the straight line, random bumps, the nearest training paths, a regression
-network of the same size and conditions, the same network with random weights, and with the conditions of another
-problem of the level. All are repaired by the same steps of the same optimiser (6 rounds of 8, the better half goes on),
-shortened, and judged by the same full check; beside them rrtconnect+polish. Times leave out the setup of the problem.
-Runs are kept in a store as they end (JSON lines), so that the command goes on where it was stopped.
+network of the same size, conditions and training, the same network with random weights, and with the conditions of
+another problem of the level. All are repaired by the same steps of the same optimiser, shortened, and judged by the
+same full check; beside them rrtconnect+polish. Times leave out the setup of the problem. Runs are kept in a store as
+they end (JSON lines), so that the command goes on where it was stopped.
 
-Usage: python benchmarks/proposals.py [-n 10] [--hard 30] [--jobs 2] [--split test] [--report] [SUITE[/LEVEL] ...]
+The regression network is trained by ``python scripts/train.py scripts/configs/apex.yaml --set
+denoiser.kind=regression --out benchmarks/runs/regression``, with the same --set as the model.
+
+Usage: python benchmarks/proposals.py [SUITE[/LEVEL] ...] [-n 10] [--hard 30] [--jobs 2] [--split test] [--report]
 """
 
 from __future__ import annotations
@@ -20,7 +23,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import record
@@ -28,14 +31,17 @@ import torch
 
 from apex_ompl import load_model, plan, problems
 from apex_ompl.assembly import PlanningSetup, assemble
-from apex_ompl.dataset import load
+from apex_ompl.diffusion.checkpoint import SHIPPED, read_config
 from apex_ompl.diffusion.conditions import Query
+from apex_ompl.diffusion.data import Mirror, window_paths
 from apex_ompl.diffusion.guidance import Guidance
 from apex_ompl.diffusion.model import LatentDiffusion
 from apex_ompl.diffusion.neighbours import Neighbours
 from apex_ompl.diffusion.proposals import Sampling, TrajectoryModel
-from apex_ompl.kernel import RobotTables
+from apex_ompl.kernel import Kernel, RobotTables
+from apex_ompl.kernel.scene import scene_tables
 from apex_ompl.optimize import Optimizer
+from apex_ompl.pool import first_valid
 from apex_ompl.problems.reach import robot
 from apex_ompl.queries import query_of
 from apex_ompl.space import path_length
@@ -56,8 +62,8 @@ METHODS: dict[str, tuple[int, ...]] = {
     "shuffled conditions": COUNTS,
     "apex": COUNTS,
     "apex, guided": COUNTS,
-    "apex-paper": (1, 8),
-    "apex-paper, guided": (1, 8),
+    "apex-paper": COUNTS,
+    "apex-paper, guided": COUNTS,
     "rrtconnect+polish": (1,),
 }
 """And with how many proposals."""
@@ -82,24 +88,67 @@ def model(name: str) -> TrajectoryModel:
 
 
 @cache
-def neighbours() -> Neighbours:
-    """Return the training paths to look for neighbours in."""
-    folder = ROOT / "data" / "dual_panda_softhand"
-    return Neighbours(load(folder / "paths.zip"), RobotTables.load(folder / "robot.npz"))
+def neighbours(data: str) -> Neighbours:
+    """Return the training paths to look for neighbours in, with the mirror images that the model saw."""
+    tables = RobotTables.load(ROOT / "data" / "dual_panda_softhand" / "robot.npz")
+    paths, _ = window_paths(Path(data), 0, 10**9, 0)
+    mirror = load_model("apex").about["config"]["mirror"]
+    images = [] if mirror is None else [Mirror(**mirror).paths(paths, Kernel(tables, scene_tables([])))]
+    return Neighbours([paths, *images], tables)
 
 
-def run(job: tuple[str, str, int, str]) -> dict[str, Any]:
-    """Return one run of a method on a problem with so many proposals; the last entry is the regression's folder."""
-    name, method, count, folder = job
+class Job(NamedTuple):
+    """A run: a problem, a method with so many proposals, and what the method is made of."""
+
+    problem: str
+    method: str
+    count: int
+    made_of: str
+    data: str
+    regression: str
+
+    @property
+    def key(self) -> tuple[str, str, int, str]:
+        """What tells runs apart."""
+        return self.problem, self.method, self.count, self.made_of
+
+
+def made_of(method: str, args: argparse.Namespace) -> str:
+    """Return a digest of the models that a method uses, so that runs of others are not taken for its own.
+
+    Raises:
+        SystemExit: The regression network was not trained as the model was.
+    """
+    if method in ("line", "bumps", "rrtconnect+polish"):
+        return ""
+    if method == "nearest paths":
+        return Path(args.data).name
+    folder = (
+        Path(args.regression) if method == "regression" else SHIPPED / ("apex-paper" if "paper" in method else "apex")
+    )
+    if method == "regression":
+        mine, apex = (read_config(f).trained["config"] for f in (folder, SHIPPED / "apex"))
+        mine["denoiser"]["kind"] = apex["denoiser"]["kind"]
+        if any(mine[key] != apex[key] for key in ALIKE):
+            raise SystemExit(f"{folder}: expected a regression that was trained as apex was")
+    return read_config(folder).digest[:12]
+
+
+ALIKE = ("latent", "condition", "denoiser", "steps", "batch", "rate", "weights", "mirror")
+
+
+def run(job: Job) -> dict[str, Any]:
+    """Return one run of a method on a problem with so many proposals."""
+    name, method, count = job.problem, job.method, job.count
     seed = int(name.rsplit("/", 1)[1]) % 1000
-    about = {"problem": name, "method": method, "count": count}
+    about = {"problem": name, "method": method, "count": count, "made_of": job.made_of}
     if method == "rrtconnect+polish":
         result = plan(problems.load(name), method, timeout=TIME_LIMIT, seed=seed)
         took = sum(result.times.get(k, 0.0) for k in ("line", "solve", "simplify", "verify", "repair"))
         length = result.length if result else None
         return {**about, "sampled": False, "solved": bool(result), "found_s": took, "total_s": took, "length": length}
     ready, optimizer = assemble(problems.load(name), robot()), Optimizer()
-    make = proposer(ready, optimizer, name, (method, folder), seed)
+    make = proposer(ready, optimizer, job, seed)
 
     def is_valid(path: np.ndarray) -> bool:
         return bool(full_check(ready.verdict, path, ready.start, [ready.goals[0]]))
@@ -109,7 +158,7 @@ def run(job: tuple[str, str, int, str]) -> dict[str, Any]:
     proposed = time.perf_counter()
     valid = next((c for c in control if is_valid(optimizer.spline.path(c))), None)
     judged = time.perf_counter()
-    found = valid if valid is not None else optimizer.first_valid(ready.verdict.kernel, control, is_valid)
+    found = valid if valid is not None else first_valid(optimizer, ready.verdict.kernel, control, is_valid)
     found_s = time.perf_counter() - begin
     best = None if found is None else optimizer.shorten(ready.verdict.kernel, found, is_valid)
     best = found if best is None else best
@@ -121,24 +170,23 @@ def run(job: tuple[str, str, int, str]) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def proposer(
-    ready: PlanningSetup, optimizer: Optimizer, name: str, how: tuple[str, str], seed: int
-) -> Callable[[int], np.ndarray]:
+def proposer(ready: PlanningSetup, optimizer: Optimizer, job: Job, seed: int) -> Callable[[int], np.ndarray]:
     """Return what makes proposals; what needs no problem is made ready."""
-    method, folder = how
+    method = job.method
     kernel, start, goal = ready.verdict.kernel, ready.start, ready.goals[0]
     if method in ("line", "bumps"):
         return lambda count: optimizer.starts(start, goal, count, np.random.default_rng(seed))
     if method == "nearest paths":
-        near = neighbours()
-        return lambda count: near.refitted(query_of(ready.verdict, start, goal), kernel, count)
-    kinds = {"regression": folder, "random weights": "random weights"}
+        near = neighbours(job.data)
+        return lambda count: near.refitted(query_of(ready.verdict, start, goal, point=False), kernel, count)
+    kinds = {"regression": job.regression, "random weights": "random weights"}
     network = model(kinds.get(method, "apex-paper" if method.startswith("apex-paper") else "apex"))
     sampling = {"apex, guided": Sampling(guidance=GUIDED), "apex-paper": PAPER, "apex-paper, guided": GUIDED_PAPER}
-    other = _other(name, ready) if method == "shuffled conditions" else None
+    other = _other(job.problem, ready) if method == "shuffled conditions" else None
+    ready.verdict.obstacle_point(start)  # GJK's pairs are made ready once for a scene
 
     def made(count: int) -> np.ndarray:
-        query = query_of(ready.verdict, start, goal)
+        query = query_of(ready.verdict, start, goal, point=network.sees_point)
         generator = torch.Generator().manual_seed(seed)
         if other is None:
             return network.propose(query, kernel, count, sampling=sampling.get(method), generator=generator).control
@@ -161,33 +209,39 @@ def _other(name: str, ready: PlanningSetup) -> Query:
     return query_of(setup.verdict, setup.start, setup.goals[0])
 
 
-def warm_up() -> None:
-    """Load kernel, robot and models, so that no run pays for it."""
-    run(("wall/easy/800000", "line", 1, ""))
-    plan("wall/easy/800000", "rrtconnect+polish", timeout=5.0)
-    for name in ("apex", "apex-paper", "random weights"):
-        model(name)
+def warm_up(jobs: Sequence[Job]) -> None:
+    """Load kernel, robot and models, so that no run pays for it: one run of each method on an easy problem."""
+    for job in jobs:
+        run(job._replace(problem="wall/easy/800000"))
 
 
-def read(store: Path) -> dict[tuple[str, str, int], dict[str, Any]]:
-    """Return the runs in a store by problem, method and count."""
+def attempted(job: Job) -> dict[str, Any]:
+    """Return a run; one that raises counts as not solved, and says why."""
+    try:
+        return run(job)
+    except Exception as error:
+        about = {"problem": job.problem, "method": job.method, "count": job.count, "made_of": job.made_of}
+        return {**about, "sampled": False, "solved": False, "error": repr(error)}
+
+
+def read(store: Path) -> dict[tuple[str, str, int, str], dict[str, Any]]:
+    """Return the runs in a store by problem, method, count, and what the method was made of."""
     runs = []
     for line in store.read_text().splitlines() if store.is_file() else []:
         try:
             runs.append(json.loads(line))
         except json.JSONDecodeError:  # the process ended while it wrote
             continue
-    return {(r["problem"], r["method"], r["count"]): r for r in runs}
+    return {(r["problem"], r["method"], r["count"], r["made_of"]): r for r in runs}
 
 
-def figures(runs: dict[tuple[str, str, int], dict[str, Any]], level: str) -> dict[str, Any]:
+def figures(runs: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Return what came of every method and count on a level."""
-    mine = {key: r for key, r in runs.items() if key[0].rsplit("/", 1)[0] == level}
-    polished = {n: r for (n, m, _), r in mine.items() if m == "rrtconnect+polish" and r["solved"]}
+    polished = {r["problem"]: r for r in runs if r["method"] == "rrtconnect+polish" and r["solved"]}
     found: dict[str, Any] = {}
     for method, counts in METHODS.items():
         for count in counts:
-            some = [r for (_, m, c), r in mine.items() if (m, c) == (method, count)]
+            some = [r for r in runs if (r["method"], r["count"]) == (method, count)]
             if some:
                 found[f"{method}, {count}" if len(counts) > 1 else method] = _of_runs(some, polished)
     return found
@@ -195,15 +249,16 @@ def figures(runs: dict[tuple[str, str, int], dict[str, Any]], level: str) -> dic
 
 def _of_runs(some: Sequence[dict[str, Any]], polished: dict[str, dict[str, Any]]) -> dict[str, Any]:
     took = np.sort([r["total_s"] if r["solved"] else math.inf for r in some])
-    found = [r["found_s"] for r in some if r["solved"]]
+    found = np.sort([r["found_s"] if r["solved"] else math.inf for r in some])
     both = [(r, polished[r["problem"]]) for r in some if r["solved"] and r["problem"] in polished]
-    middle = float(took[(len(took) - 1) // 2])
+    total, first = (float(times[(len(times) - 1) // 2]) for times in (took, found))
     return {
         "n": len(some), "sampled": float(np.mean([r["sampled"] for r in some])),
         "solved": float(np.mean([r["solved"] for r in some])),
         "propose_s_p50": float(np.median([r.get("propose_s", math.nan) for r in some])),
-        "found_s_p50": float(np.median(found)) if found else None,
-        "total_s_p50": middle if math.isfinite(middle) else None,
+        "found_s_p50": first if math.isfinite(first) else None,
+        "total_s_p50": total if math.isfinite(total) else None,
+        "both": len(both),
         "length_p50": float(np.median([r["length"] for r in some if r["solved"]] or [math.nan])),
         "length_over_polished": float(np.exp(np.mean([math.log(a["length"] / b["length"]) for a, b in both])))
         if both else None,
@@ -214,8 +269,8 @@ def _of_runs(some: Sequence[dict[str, Any]], polished: dict[str, dict[str, Any]]
 
 def table(levels: Sequence[dict[str, Any]]) -> str:
     """Return the Markdown table."""
-    head = ["suite/level", "proposals", "N", "valid", "repaired", "propose ms", "found ms", "total ms", "length rad"]
-    head += ["length / rrtconnect+polish", "time / rrtconnect+polish"]
+    head = ["suite/level", "proposals", "N", "valid", "repaired", "propose ms", "found ms p50", "shortened ms p50"]
+    head += ["length rad", "length / rrtconnect+polish", "time / rrtconnect+polish", "on"]
     rows = [head, ["---", "---", *["---:"] * (len(head) - 2)]]
     for level in levels:
         for k, (method, f) in enumerate(level["methods"].items()):
@@ -230,11 +285,12 @@ def _cells(f: dict[str, Any]) -> Iterator[str]:
         return otherwise if value is None or math.isnan(value) else f"{1e3 * value:.0f}"
 
     yield ms(f["propose_s_p50"], "-")
-    yield ms(f["found_s_p50"], "-")
-    yield ms(f["total_s_p50"], "not solved")
+    yield ms(f["found_s_p50"], "not found")
+    yield ms(f["total_s_p50"], "not found")
     yield "-" if math.isnan(f["length_p50"]) else f"{f['length_p50']:.1f}"
     for name in ("length_over_polished", "time_over_polished"):
         yield "-" if f[name] is None else f"{f[name]:.2f}"
+    yield str(f["both"])
 
 
 def main() -> None:
@@ -243,6 +299,10 @@ def main() -> None:
     parser.add_argument("levels", nargs="*", metavar="SUITE[/LEVEL]")
     parser.add_argument("-n", type=int, default=10, help="problems of a level (default: %(default)s)")
     parser.add_argument("--hard", type=int, default=30, help="of a hard level (default: %(default)s)")
+    parser.add_argument("--paper", type=int, default=5, help="of a level for apex-paper (default: %(default)s)")
+    parser.add_argument(
+        "--data", default=str(ROOT / "data" / "dual_panda_softhand" / "paths.zip"), help="for neighbours"
+    )
     parser.add_argument("--jobs", type=int, default=2, help="processes (default: %(default)s)")
     parser.add_argument("--split", choices=("validation", "test"), default="test")
     parser.add_argument("--methods", nargs="*", choices=list(METHODS), default=list(METHODS), metavar="NAME")
@@ -255,32 +315,41 @@ def main() -> None:
     if not set(args.levels) <= known:
         raise SystemExit(f"unknown suite or level; known: {', '.join(f'{s}/{v}' for s, v in static)}")
     chosen = [f"{s}/{v}" for s, v in static if not args.levels or s in args.levels or f"{s}/{v}" in args.levels]
-    done, todo = read(args.store), []
+    kinds = {method: made_of(method, args) for method in args.methods}
+    jobs: list[Job] = []
     for level in chosen:
-        names = problems.frozen_names(*level.split("/"), args.split)[: args.hard if level.endswith("/hard") else args.n]
-        todo += [(n, m, c, args.regression) for m in args.methods for c in METHODS[m] for n in names]
-    todo = [job for job in todo if job[:3] not in done]
-    todo.sort(key=lambda job: (job[1].startswith("apex-paper"), int(job[0].rsplit("/", 1)[1]) % 1000))
+        most = args.hard if level.endswith("/hard") else args.n
+        names = problems.frozen_names(*level.split("/"), args.split)[:most]
+        for method in args.methods:
+            few = names[: args.paper] if method.startswith("apex-paper") else names
+            rest = kinds[method], args.data, args.regression
+            jobs += [Job(name, method, count, *rest) for count in METHODS[method] for name in few]
+    done = read(args.store)
+    todo = [] if args.report else [job for job in jobs if job.key not in done]
+    todo.sort(key=lambda job: (job.method.startswith("apex-paper"), int(job.problem.rsplit("/", 1)[1]) % 1000))
+    first = {job.method: job for job in reversed(todo)}
     args.store.parent.mkdir(parents=True, exist_ok=True)
     if args.store.is_file() and not args.store.read_bytes().endswith(b"\n"):  # the process ended while it wrote
         args.store.write_text(args.store.read_text() + "\n")
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(args.jobs, mp_context=context, initializer=warm_up) as pool, args.store.open("a") as out:
-        jobs = {pool.submit(run, job): job for job in ([] if args.report else todo)}
-        for k, future in enumerate(as_completed(jobs)):
-            if future.exception() is not None:
-                print(f"{jobs[future]}: {future.exception()}", flush=True)
-                continue
-            out.write(json.dumps(future.result()) + "\n")
+    pool = ProcessPoolExecutor(
+        args.jobs, multiprocessing.get_context("spawn"), initializer=warm_up, initargs=(list(first.values()),)
+    )
+    with pool, args.store.open("a") as out:
+        for k, future in enumerate(as_completed([pool.submit(attempted, job) for job in todo])):
+            result = future.result()
+            if "error" in result:
+                print(result, flush=True)
+            out.write(json.dumps(result) + "\n")
             out.flush()
             if (k + 1) % 500 == 0:
-                print(f"{k + 1} of {len(jobs)} runs", flush=True)
-    runs = read(args.store)
-    levels = [{"level": f"{s}/{v}", "methods": figures(runs, f"{s}/{v}")} for s, v in static]
+                print(f"{k + 1} of {len(todo)} runs", flush=True)
+    done = read(args.store)
+    runs = [done[job.key] for job in jobs if job.key in done]
+    levels = [{"level": v, "methods": figures([r for r in runs if r["problem"].startswith(f"{v}/")])} for v in chosen]
     levels = [level for level in levels if level["methods"]]
     record.write(
-        "proposals", {"levels": levels}, table(levels), split=args.split, jobs=args.jobs, torch=torch.__version__,
-        time_limit=TIME_LIMIT, seeds="number of the problem modulo 1000",
+        "proposals", {"levels": levels, "made_of": kinds}, table(levels), split=args.split, jobs=args.jobs,
+        torch=torch.__version__, time_limit=TIME_LIMIT, seeds="number of the problem modulo 1000",
     )  # fmt: skip
 
 

@@ -25,6 +25,7 @@ from apex_ompl.errors import ApexError
 from apex_ompl.kernel import Kernel
 from apex_ompl.kernel.tables import BOX, HALF_SPACE, SPHERE
 from apex_ompl.optimize import Optimizer
+from apex_ompl.pool import first_valid
 from apex_ompl.problems.reach import robot
 from apex_ompl.queries import query_of
 from apex_ompl.validity import full_check
@@ -110,7 +111,7 @@ def diversity(name: str, ready: PlanningSetup, seed: int, file: Path, wanted: in
     for control in model.propose(query, kernel, 4 * wanted, sampling=sampling, generator=generator).control:
         if len(found) == wanted:
             break
-        repaired = optimizer.first_valid(kernel, control[None], is_valid)
+        repaired = first_valid(optimizer, kernel, control[None], is_valid)
         if repaired is not None:
             found.append(optimizer.spline.path(repaired))
     figure, axes = plt.subplots(2, 2, figsize=(9, 5.5), sharex=True, layout="constrained")

@@ -15,7 +15,7 @@ LAYERS = [
     {"kernel"},
     {"problem", "spline"},
     {"optimize", "records"},
-    {"dataset"},
+    {"dataset", "pool"},
     {"description", "engine"},
     {"cases"},
     {"diffusion"},

@@ -8,6 +8,7 @@ from apex_ompl.assembly import PlanningSetup, assemble
 from apex_ompl.collision import Verdict
 from apex_ompl.errors import ParameterError
 from apex_ompl.optimize import Optimizer, Settings
+from apex_ompl.pool import first_valid
 from apex_ompl.resolution import FULL_RESOLUTION
 from apex_ompl.robot import Robot
 from apex_ompl.space import path_length
@@ -112,7 +113,7 @@ def test_valid_paths_are_found_where_the_line_is_not_one(robot: Robot) -> None:
             return bool(full_check(ready.verdict, path, ready.start, ready.goals))
 
         starts = optimizer.starts(ready.start, ready.goals[0], 8, np.random.default_rng(1))
-        found = optimizer.first_valid(ready.verdict.kernel, starts, is_valid)
+        found = first_valid(optimizer, ready.verdict.kernel, starts, is_valid)
         if found is None:
             continue
         solved += 1
@@ -127,9 +128,9 @@ def test_valid_paths_are_found_where_the_line_is_not_one(robot: Robot) -> None:
 def test_it_gives_up_when_told(ready: PlanningSetup) -> None:
     optimizer = Optimizer()
     starts = optimizer.starts(ready.start, ready.goals[0], 4, np.random.default_rng(1))
-    left = iter([False, False])
+    left = iter([False] * 7)
     told = lambda: next(left, True)  # noqa: E731
-    assert optimizer.first_valid(ready.verdict.kernel, starts, lambda _: False, told) is None
+    assert first_valid(optimizer, ready.verdict.kernel, starts, lambda _: False, told) is None
     assert next(left, "none") == "none"
     assert optimizer.shorten(ready.verdict.kernel, starts[0], lambda _: True, lambda: True) is None
     assert optimizer.shorten(ready.verdict.kernel, starts[0], lambda _: False) is None

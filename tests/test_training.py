@@ -37,6 +37,7 @@ from apex_ompl.kernel import Kernel, RobotTables
 from apex_ompl.kernel.scene import Primitive, scene_tables
 from apex_ompl.kernel.tables import BOX
 from apex_ompl.optimize import Optimizer
+from apex_ompl.pool import first_valid
 from apex_ompl.records import Paths
 from apex_ompl.resolution import FULL_RESOLUTION
 
@@ -331,7 +332,7 @@ def test_proposals_are_judged_by_repair_and_proof(few: Path, tmp_path: Path) -> 
     for case in cases:
         kernel = Kernel(case.robot, case.scene)
         control = model.propose(query_of_case(case), kernel, 3, generator=torch.Generator().manual_seed(0)).control
-        found = Optimizer(model.spline).first_valid(kernel, control, lambda p, k=kernel: k.proves(p, FULL_RESOLUTION))
+        found = first_valid(Optimizer(model.spline), kernel, control, lambda p, k=kernel: k.proves(p, FULL_RESOLUTION))
         wanted.append(found is not None)
     assert said["repaired"] == pytest.approx(np.mean(wanted))
     assert 0.0 <= said["sampled"] <= said["repaired"]

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from apex_ompl.diffusion.conditions import Conditions, Probes, Query, Table, batched, distances
+from apex_ompl.errors import ParameterError
 from apex_ompl.kernel import Kernel, RobotTables
 from apex_ompl.kernel.scene import scene_tables
 from apex_ompl.records import Paths
@@ -21,16 +24,17 @@ PER_METRE = 3.0  # rad that a metre of clearance counts as much as
 class Neighbours:
     """Training paths by start, goal, and the clearances of the robot's probes along the straight line between them."""
 
-    def __init__(self, paths: Paths, robot: RobotTables) -> None:
-        """Look for neighbours among ``paths`` of ``robot``."""
-        self._probes = Probes.of(robot, ALONG)
-        kernel = Kernel(robot, scene_tables([]))
-        table = Table(paths, self._probes, kernel)
-        parts = (torch.arange(k, min(k + 2048, len(paths))) for k in range(0, len(paths), 2048))
-        self._features = np.concatenate([features(table.batch(part)) for part in parts])
-        self.spline = paths.spline
-        control = paths.control()
-        self._residual = (control - self.spline.line(control[:, 0], control[:, -1])).astype(np.float32)
+    def __init__(self, several: Sequence[Paths], robot: RobotTables) -> None:
+        """Look for neighbours among paths of ``robot``, all of the same spline."""
+        self._probes, self.spline = Probes.of(robot, ALONG), several[0].spline
+        kernel, rows, rests = Kernel(robot, scene_tables([])), [], []
+        for paths in several:
+            table = Table(paths, self._probes, kernel)
+            parts = (torch.arange(k, min(k + 2048, len(paths))) for k in range(0, len(paths), 2048))
+            rows += [features(table.batch(part)) for part in parts]
+            control = paths.control()
+            rests.append((control - self.spline.line(control[:, 0], control[:, -1])).astype(np.float32))
+        self._features, self._residual = np.concatenate(rows), np.concatenate(rests)
 
     def refitted(self, query: Query, kernel: Kernel, count: int) -> Array:
         """Return what the nearest paths differ in from their straight lines, put on that of a query.
@@ -42,10 +46,15 @@ class Neighbours:
 
         Returns:
             Control points, shape (count, points, dof) [rad], inside the limits.
+
+        Raises:
+            ParameterError: There are not as many paths.
         """
+        if not 1 <= count <= len(self._residual):
+            raise ParameterError("count", count, f"1 to {len(self._residual)}, as many as there are paths")
         mine = features(batched([query], self._probes, kernel))
         apart = ((self._features - mine) ** 2).sum(axis=1)
-        nearest = np.argpartition(apart, count)[:count]
+        nearest = np.argpartition(apart, count - 1)[:count]
         nearest = nearest[np.argsort(apart[nearest], kind="stable")]
         limits = kernel.robot.arrays
         control = self.spline.line(query.start, query.goal) + self._residual[nearest]

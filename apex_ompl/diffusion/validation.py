@@ -14,6 +14,7 @@ from apex_ompl.diffusion.conditions import Query, Things
 from apex_ompl.diffusion.proposals import Sampling, TrajectoryModel
 from apex_ompl.kernel import Kernel
 from apex_ompl.optimize import Optimizer
+from apex_ompl.pool import first_valid
 from apex_ompl.resolution import FULL_RESOLUTION
 
 
@@ -51,7 +52,7 @@ def judged(
         generator = torch.Generator().manual_seed(seed)
         control = model.propose(query_of_case(case), kernel, count, sampling=sampling, generator=generator).control
         direct = any(is_valid(model.spline.path(points)) for points in control)
-        found = direct or optimizer.first_valid(kernel, control, is_valid) is not None
+        found = direct or first_valid(optimizer, kernel, control, is_valid) is not None
         seconds.append(time.perf_counter() - begin)
         sampled.append(direct)
         repaired.append(found)

@@ -1,0 +1,136 @@
+"""Paths on the way to be valid: always the most promising one is improved next."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from numpy.typing import ArrayLike
+
+from apex_ompl.kernel.face import Kernel
+from apex_ompl.optimize import LAST_RESORT, NEARLY, Array, Check, Optimizer
+
+ROUND, ROUNDS = 4, 12  # steps between two checks of a path, and how often
+SOFT_ROUNDS = 2  # the last of them are softer
+IMPATIENCE = 2.0  # factor on the shortfall of a path for every round that was spent on it
+PER_PATH = 16  # steps, in the mean
+CLEAR = 0.01  # clearance at the samples at which a path is checked at once [m]
+
+
+@dataclass
+class Candidate:
+    """A path that is worked on.
+
+    Attributes:
+        control: Control points, shape (points, dof).
+        origin: Where it comes from.
+        shortfall: Its cost that is due to clearance.
+        clearance: Smallest clearance at the samples [m].
+        damping: Of the next step.
+        rounds: How often it was worked on.
+    """
+
+    control: Array
+    origin: str
+    shortfall: float
+    clearance: float
+    damping: float
+    rounds: int = 0
+
+    @property
+    def hope(self) -> float:
+        """What is least for the candidate to be improved next."""
+        return self.shortfall * IMPATIENCE**self.rounds
+
+
+class Pool:
+    """Candidates for a valid path among the obstacles of a kernel.
+
+    Always the candidate with the least shortfall is improved by a few steps, one that was worked on before a little
+    later than a fresh one; as soon as it is clear at the samples it is checked. The last steps for a candidate are
+    softer.
+
+    Attributes:
+        candidates: All that there are.
+        steps: Steps that were taken.
+    """
+
+    def __init__(self, optimizer: Optimizer, kernel: Kernel, is_valid: Check) -> None:
+        """Let ``is_valid`` decide about the states of paths."""
+        self._optimizer, self._kernel, self._is_valid = optimizer, kernel, is_valid
+        self.candidates: list[Candidate] = []
+        self.steps = 0
+
+    def add(self, control: ArrayLike, origin: str = "", stop: Callable[[], bool] = lambda: False) -> Candidate | None:
+        """Take in paths, control points of shape (B, points, dof), and return the first that is valid as it is.
+
+        Raises:
+            ParameterError: Control points of another shape.
+        """
+        bent = self._optimizer.improve(self._kernel, control, steps=0)
+        numbers = zip(bent.control, bent.shortfall, bent.clearance.min(axis=1), bent.damping, strict=True)
+        fresh = [Candidate(c.copy(), origin, float(s), float(d), float(m)) for c, s, d, m in numbers]
+        self.candidates += fresh
+        for candidate in sorted(fresh, key=lambda one: one.shortfall):
+            if stop():
+                break
+            if self._passes(candidate):
+                return candidate
+        return None
+
+    def work(self, steps: int, stop: Callable[[], bool] = lambda: False) -> Candidate | None:
+        """Improve candidates until one is valid, by at most so many steps in all.
+
+        Args:
+            steps: Most steps.
+            stop: Asked between rounds whether to give up.
+
+        Returns:
+            The valid one, or None.
+        """
+        left, settings = steps, self._optimizer.settings
+        while left > 0 and not stop():
+            chosen = min(
+                (one for one in self.candidates if one.rounds < ROUNDS), key=lambda one: one.hope, default=None
+            )
+            if chosen is None:
+                break
+            soft = chosen.rounds >= ROUNDS - SOFT_ROUNDS
+            bent = self._optimizer.improve(
+                self._kernel, chosen.control[None], steps=ROUND, damping=chosen.damping, enough=CLEAR,
+                stiffness=(LAST_RESORT if soft else 1.0) * settings.stiffness,
+            )  # fmt: skip
+            chosen.control, chosen.shortfall = bent.control[0], float(bent.shortfall[0])
+            chosen.clearance, chosen.damping = float(bent.clearance[0].min()), float(bent.damping[0])
+            chosen.rounds += 1
+            left -= ROUND
+            self.steps += int(bent.steps[0])
+            if self._passes(chosen):
+                return chosen
+        return None
+
+    def _passes(self, candidate: Candidate) -> bool:
+        if candidate.clearance < NEARLY:
+            return False
+        return self._is_valid(self._optimizer.spline.path(candidate.control))
+
+
+def first_valid(
+    optimizer: Optimizer, kernel: Kernel, control: ArrayLike, is_valid: Check,
+    stop: Callable[[], bool] = lambda: False,
+) -> Array | None:  # fmt: skip
+    """Return control points, shape (points, dof), of the first of some paths that comes out valid, or None.
+
+    Args:
+        optimizer: Improves them, by ``PER_PATH`` steps for each and some more.
+        kernel: The robot among its obstacles.
+        control: Where to start from, shape (B, points, dof).
+        is_valid: Decides; called with the states of a path.
+        stop: Asked between rounds whether to give up.
+
+    Raises:
+        ParameterError: Control points of another shape.
+    """
+    pool = Pool(optimizer, kernel, is_valid)
+    found = pool.add(control, stop=stop) or pool.work(PER_PATH * (len(pool.candidates) + 2), stop)
+    return None if found is None else found.control
