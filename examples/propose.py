@@ -1,0 +1,53 @@
+"""Ask the model for paths, repair them, and see which are solutions.
+
+Usage: python examples/propose.py [PROBLEM] [--count 8]
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+
+import apex_ompl
+from apex_ompl.assembly import assemble
+from apex_ompl.errors import ApexError
+from apex_ompl.optimize import Optimizer
+from apex_ompl.pool import first_valid
+from apex_ompl.queries import query_of
+from apex_ompl.space import path_length
+from apex_ompl.validity import full_check
+
+
+def main() -> None:
+    """Propose, judge, repair, and judge again."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("problem", nargs="?", default="shelf/hard/900012")
+    parser.add_argument("--count", type=int, default=8, help="paths to propose (default: %(default)s)")
+    args = parser.parse_args()
+    try:
+        model = apex_ompl.load_model("apex")
+        ready = assemble(apex_ompl.load_problem(args.problem))
+        start, goal, kernel = ready.start, ready.goals[0], ready.verdict.kernel
+        query = query_of(ready.verdict, start, goal)
+        begin = time.perf_counter()
+        proposed = model.propose(query, kernel, args.count).control
+    except ApexError as error:
+        print(f"propose: error: {error}", file=sys.stderr)
+        sys.exit(2)
+    took = time.perf_counter() - begin
+    valid = [bool(full_check(ready.verdict, model.spline.path(c), start, [goal])) for c in proposed]
+    print(f"{args.count} paths in {1e3 * took:.0f} ms, {sum(valid)} of them valid as they are")
+    begin = time.perf_counter()
+    found = first_valid(
+        Optimizer(model.spline), kernel, proposed, lambda path: bool(full_check(ready.verdict, path, start, [goal]))
+    )
+    took = time.perf_counter() - begin
+    if found is None:
+        print(f"none valid after {1e3 * took:.0f} ms of repair")
+        return
+    print(f"a valid one after {1e3 * took:.0f} ms of repair, {path_length(model.spline.path(found)):.1f} rad long")
+
+
+if __name__ == "__main__":
+    main()
