@@ -106,6 +106,10 @@ class Store:
         """Return the names of the units that are complete, sorted."""
         return sorted(path.stem for path in (self.folder / "units").glob("[!.]*.zip"))
 
+    def files(self) -> list[Path]:
+        """Return the files of the units that are complete, sorted."""
+        return [self.folder / "units" / f"{name}.zip" for name in self.units()]
+
     def write(self, name: str, paths: Paths) -> None:
         """Write a unit.
 

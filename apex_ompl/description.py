@@ -58,7 +58,7 @@ def _figures(paths: Paths, name: str, problems: NDArray[np.intp], twins: NDArray
     mine = np.isin(a["problem"], problems)
     source, owner = a["source"][mine], a["problem"][mine]
     straight = set(owner[source == SOURCES.index("line")].tolist())
-    whole = np.isin(source, [SOURCES.index(s) for s in ("bumps", "rrtconnect")])
+    whole = np.isin(source, [SOURCES.index(s) for s in ("bumps", "rrtconnect", "model")])
     classes = Counter(k for k, _ in set(zip(owner[whole].tolist(), a["homotopy"][mine][whole].tolist(), strict=True)))
     return Figures(
         name=name, problems=len(problems), paths=int(mine.sum()),

@@ -8,7 +8,7 @@ from __future__ import annotations
 import time
 import zlib
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from apex_ompl.kernel import Kernel
 from apex_ompl.optimize import Optimizer
 from apex_ompl.pool import first_valid
-from apex_ompl.records import FIELDS, SOURCES, Paths, to_micro
+from apex_ompl.records import FIELDS, SOURCES, Paths, rounded, to_micro
 from apex_ompl.resolution import FULL_RESOLUTION, SEARCH_RESOLUTION
 from apex_ompl.spline import Spline
 
@@ -49,11 +49,13 @@ class Options:
         seed: Seed of all random choices but the problems themselves.
         copies: How many paths of different origin are sought for each problem.
         parts: How many parts of each of them, from a state on the way to the goal.
+        model: Name or folder of a model whose proposals are tried before all else; none by default.
     """
 
     seed: int = 0
     copies: int = 2
     parts: int = 2
+    model: str = ""
 
 
 @dataclass(frozen=True)
@@ -76,7 +78,10 @@ class Case:
 
     Attributes:
         points: Obstacle points nearest to the robot, shape (3,) [m], by the bytes of the state.
+        proposer: Gives a number of proposals, control points of shape (B, points, dof), by a seed; where there is one.
     """
+
+    proposer: Callable[[int, int], Array] | None = None
 
     def __init__(self, kernel: Kernel, start: Array, goal: Array, optimizer: Optimizer) -> None:
         """Go from ``start`` to ``goal``, shape (dof,)."""
@@ -97,6 +102,12 @@ class Case:
         """Return control points near a path that a planner found, or None; here there is no planner."""
         del seed
         return None
+
+    def proposed(self, seed: int) -> Array | None:
+        """Return a clear path from proposals of a model, or None."""
+        if self.proposer is None:
+            return None
+        return first_valid(self.optimizer, self.kernel, self.proposer(MANY, seed), self.is_valid)
 
     def point(self, q: Array) -> Array | None:
         """Return the obstacle point nearest to the robot at a state, shape (3,) [m], where it is known."""
@@ -164,14 +175,6 @@ class Case:
         return float(self.kernel.clearance(states[::2], 0.2).min())
 
 
-def rounded(control: Array, lower: Array, upper: Array) -> Array:
-    """Return control points as half-precision numbers inside the limits, shape (..., dof)."""
-    half = control.astype(np.float16)
-    half = np.where(half.astype(float) > upper, np.nextafter(half, np.float16(-np.inf)), half)
-    half = np.where(half.astype(float) < lower, np.nextafter(half, np.float16(np.inf)), half)
-    return half.astype(float)
-
-
 def _apart(spline: Spline, a: Array, b: Array) -> float:
     """Return how far two paths are apart at the same parameter [rad, max-norm]."""
     return float(np.abs(spline.path(a) - spline.path(b)).max())
@@ -187,7 +190,9 @@ class Engine:
 
     def __init__(self, unit: str, names: tuple[str, str], recipe: str, options: Options, spline: Spline) -> None:
         """Solve problems of a suite and level, ``names``, by a recipe; the unit's name goes into the seeds."""
-        self._unit, self._names, self._recipe, self._options = unit, names, RECIPES[recipe], options
+        first, second = RECIPES[recipe]
+        self._recipe = (("model",), (*first, *second)) if options.model else (first, second)
+        self._unit, self._names, self._options = unit, names, options
         self.optimizer = Optimizer(spline)
         self.counts: Counter[str] = Counter()
         self.times: dict[str, float] = {}
@@ -232,12 +237,13 @@ class Engine:
         for k, way in enumerate((*(first * rounds)[: self._options.copies], *second)):
             if k >= self._options.copies and found:
                 return
-            source = "rrtconnect" if way == "rrtconnect" else "bumps"
+            source = "bumps" if way == "many bumps" else way
             with self.timed(source):
                 if source == "bumps":
                     control = task.bumped(rng, line=k == 0, many=way == "many bumps")
                 else:
-                    control = task.searched(int(rng.integers(2**31 - 1)))
+                    seek = task.proposed if source == "model" else task.searched
+                    control = seek(int(rng.integers(2**31 - 1)))
             if control is None:
                 continue
             with self.timed("shorten"):

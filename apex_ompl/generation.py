@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +17,7 @@ from apex_ompl import problems
 from apex_ompl.assembly import PlanningSetup, assemble
 from apex_ompl.cases import WrittenCase
 from apex_ompl.engine import Case, Engine, Options, Row
-from apex_ompl.errors import UnknownNameError
+from apex_ompl.errors import ParameterError, UnknownNameError
 from apex_ompl.ompl_globals import quiet_ompl, seed_ompl
 from apex_ompl.optimize import Optimizer
 from apex_ompl.problem import Obstacle, Problem
@@ -28,6 +30,9 @@ from apex_ompl.simplify import simplify
 from apex_ompl.space import path_to_array
 from apex_ompl.spline import Spline
 from apex_ompl.validity import full_check
+
+if TYPE_CHECKING:
+    from apex_ompl.diffusion.proposals import TrajectoryModel
 
 Array = NDArray[np.float64]
 
@@ -112,6 +117,7 @@ def work(unit: Unit, options: Options, spline: Spline) -> tuple[Paths, dict[str,
         The paths, and where the time went [s].
     """
     engine = Engine(unit.name, (unit.suite, unit.level), unit.recipe, options, spline)
+    model = _model(options.model, spline) if options.model else None
     with quiet_ompl():
         for seed in unit.seeds:
             with engine.timed("draw"):
@@ -120,8 +126,40 @@ def work(unit: Unit, options: Options, spline: Spline) -> tuple[Paths, dict[str,
                 except SuiteError:
                     engine.counts["not drawn"] += 1
                     continue
+            if model is not None:
+                task.proposer = _proposer(model, task)
             engine.solve(task, row_of(task.ready.problem, seed))
     return engine.paths(robot().name, robot().joint_names), engine.times
+
+
+@cache
+def _model(name: str, spline: Spline) -> TrajectoryModel:
+    """Return a model whose paths fit.
+
+    Raises:
+        ApexError: There is none, or it is for another robot or spline.
+    """
+    from apex_ompl.diffusion.checkpoint import load_model  # torch, which data without a model need not
+
+    model = load_model(name, robot=robot().name)
+    if model.spline != spline:
+        raise ParameterError("model", name, f"one of paths by {spline}")
+    return model
+
+
+def _proposer(model: TrajectoryModel, task: Task) -> Callable[[int, int], Array]:
+    """Return what proposes paths for a problem, by a seed."""
+    import torch
+
+    from apex_ompl.queries import query_of
+    from apex_ompl.torch_threads import one_torch_thread
+
+    def propose(count: int, seed: int) -> Array:
+        query = query_of(task.ready.verdict, task.start, task.goal, point=model.sees_point)
+        with one_torch_thread():
+            return model.propose(query, task.kernel, count, generator=torch.Generator().manual_seed(seed)).control
+
+    return propose
 
 
 class Task(Case):

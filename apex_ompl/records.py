@@ -15,9 +15,9 @@ from apex_ompl.spline import Spline
 Array = NDArray[np.float64]
 
 MICRO = 1e-6  # states are kept in millionths of a radian, in which the suites draw them
-SOURCES = ("line", "bumps", "rrtconnect", "reversed", "part")
+SOURCES = ("line", "bumps", "rrtconnect", "reversed", "part", "model")
 """Where a path comes from: the straight line, optimisation from bumps, rrtconnect and optimisation, another path
-backwards, or the rest of another path from a state on it."""
+backwards, the rest of another path from a state on it, or optimisation from what a model proposed."""
 
 SHAPES = ("box", "sphere", "cylinder", "capsule")
 """Kinds of obstacles. Sizes are edges; radius; or radius and length along z [m]."""
@@ -151,6 +151,14 @@ class Paths:
             before += part.problems
         arrays = {name: np.concatenate(column) for name, column in columns.items()}
         return cls(arrays, {key: tuple(values) for key, values in names.items()}, parts[0].about)
+
+
+def rounded(control: Array, lower: Array, upper: Array) -> Array:
+    """Return control points as half-precision numbers inside the limits, shape (..., dof)."""
+    half = control.astype(np.float16)
+    half = np.where(half.astype(float) > upper, np.nextafter(half, np.float16(-np.inf)), half)
+    half = np.where(half.astype(float) < lower, np.nextafter(half, np.float16(np.inf)), half)
+    return half.astype(float)
 
 
 def to_micro(states: ArrayLike) -> NDArray[np.int32]:

@@ -91,7 +91,7 @@ def model(name: str) -> TrajectoryModel:
 def neighbours(data: str) -> Neighbours:
     """Return the training paths to look for neighbours in, with the mirror images that the model saw."""
     tables = RobotTables.load(ROOT / "data" / "dual_panda_softhand" / "robot.npz")
-    paths, _ = window_paths(Path(data), 0, 10**9, 0)
+    paths, _ = window_paths(data.split(","), 0, 10**9, 0)
     mirror = load_model("apex").about["config"]["mirror"]
     images = [] if mirror is None else [Mirror(**mirror).paths(paths, Kernel(tables, scene_tables([])))]
     return Neighbours([paths, *images], tables)

@@ -131,15 +131,27 @@ def generate(args: argparse.Namespace) -> None:
 
     spline = Spline(args.control_points, args.pinned)
     work, units, about, tables = _given(args) if args.cases else _drawn(args)
-    options = Options(args.seed, args.copies, 0 if args.cases else args.parts)
+    options = Options(args.seed, args.copies, 0 if args.cases else args.parts, args.model)
     manifest = {
         **about, "seed": args.seed, "copies": args.copies,
-        "parts": options.parts, "control_points": args.control_points, "pinned": args.pinned, "degree": spline.degree,
+        "parts": options.parts, "model": args.model, "control_points": args.control_points, "pinned": args.pinned,
+        "degree": spline.degree,
         "split": "train", "python": platform.python_version(),
         "versions": _versions(),
     }  # fmt: skip
-    same = ("robot", "joints", "seed", "copies", "parts", "control_points", "pinned", "degree", "problems_per_unit")
-    store = Store.create(args.folder, manifest, same)
+    same = (
+        "robot",
+        "joints",
+        "seed",
+        "copies",
+        "parts",
+        "model",
+        "control_points",
+        "pinned",
+        "degree",
+        "problems_per_unit",
+    )
+    store = Store.create(args.folder, manifest, (*same, "problems_per_unit"))
     with store.locked():
         if tables is not None:
             tables.save(store.folder / "robot.npz")
@@ -256,6 +268,7 @@ def main() -> None:
     parser.add_argument("--seed", type=_whole, default=0, help="of the random choices (default: %(default)s)")
     parser.add_argument("--copies", type=_count, default=Options.copies, help="paths sought (default: %(default)s)")
     parser.add_argument("--parts", type=_whole, default=Options.parts, help="parts of each path (default: %(default)s)")
+    parser.add_argument("--model", default="", help="whose proposals are tried first, for example apex (default: none)")
     parser.add_argument("--control-points", type=_count, default=Spline.points, help="(default: %(default)s)")
     parser.add_argument("--pinned", type=_count, default=Spline.pinned, help="at each end (default: %(default)s)")
     parser.add_argument("--workers", type=_count, default=1, help="more than one are run by Ray (default: %(default)s)")
@@ -267,6 +280,8 @@ def main() -> None:
     parser.add_argument("--cases", metavar="FOLDER", help="solve the problems that --write-cases wrote there")
     parser.add_argument("--quiet", action="store_true", help="show no progress")
     args = parser.parse_args()
+    if args.model and (args.cases or args.write_cases):
+        parser.error("--model goes with problems that are drawn here")
     if args.split != "train" and not args.write_cases:
         parser.error("--split validation goes with --write-cases: data are of the training split")
     try:

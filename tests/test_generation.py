@@ -16,11 +16,11 @@ from apex_ompl import problems
 from apex_ompl.assembly import assemble
 from apex_ompl.collision.verdict import NO_POINT
 from apex_ompl.dataset import Store, load
-from apex_ompl.engine import STRAIGHT_SHARE, Options, rounded
-from apex_ompl.errors import UnknownNameError
+from apex_ompl.engine import STRAIGHT_SHARE, Options
+from apex_ompl.errors import ParameterError, UnknownNameError
 from apex_ompl.generation import Unit, plan_units, static_levels, work
 from apex_ompl.problems.reach import robot
-from apex_ompl.records import FIELDS, SHAPES, SOURCES, DatasetError, Paths
+from apex_ompl.records import FIELDS, SHAPES, SOURCES, DatasetError, Paths, rounded
 from apex_ompl.space import path_length
 from apex_ompl.spline import Spline
 from apex_ompl.validity import full_check
@@ -226,3 +226,15 @@ def test_workers_of_ray_make_the_same_paths_and_may_die(made: list[Paths]) -> No
             list(spread(fails, {"c": 2}, Options(), Spline(), **options))
     finally:
         ray.shutdown()
+
+
+def test_proposals_of_a_model_are_proven_like_all_else() -> None:
+    unit, options = Unit("posts", "hard", 3, 3), Options(copies=2, parts=0, model="apex")
+    paths, times = work(unit, options, Spline())
+    assert "model" in {SOURCES[k] for k in paths.arrays["source"]} and times["model"] > 0.0
+    assert same(paths, work(unit, options, Spline())[0])
+    for k in range(len(paths)):
+        ready = assemble(problems.load(paths.problem_name(paths.arrays["problem"][k])), robot())
+        assert full_check(ready.verdict, paths.spline.path(paths.control(slice(k, k + 1))[0]))
+    with pytest.raises(ParameterError, match="model: expected one of paths by"):
+        work(unit, options, Spline(16))

@@ -16,7 +16,7 @@ LAYERS = [
     {"problem", "spline"},
     {"optimize", "records"},
     {"dataset", "pool"},
-    {"description", "engine"},
+    {"description", "engine", "torch_threads"},
     {"cases"},
     {"diffusion"},
     {"robot"},

@@ -295,8 +295,10 @@ def test_every_pass_goes_through_all_units_once(paths: Paths, tmp_path: Path) ->
     store = Store.create(tmp_path, {"robot": "x"}, [])
     for k in range(5):
         store.write(f"unit-{k}", paths.chosen([k]))
-    found = [window_paths(tmp_path, 3, 2, number) for number in range(9)]
+    found = [window_paths([str(tmp_path)], 3, 2, number) for number in range(9)]
     assert all(windows == 3 for _, windows in found)
+    both, _ = window_paths([str(tmp_path), str(tmp_path)], 0, 100, 0)
+    assert both.problems == 10
     names = [[p.problem_name(k) for k in range(p.problems)] for p, _ in found]
     passes = [sum(names[k : k + 3], []) for k in (0, 3, 6)]
     assert all(sorted(one) == sorted(passes[0]) and len(set(one)) == 5 for one in passes)

@@ -52,7 +52,7 @@ class TrainingConfig(StrictModel):
 
     Attributes:
         schema_: Version of the format.
-        data: Folder of a data set, or a file of paths.
+        data: Folder of a data set, or a file of paths; or several.
         robot: File of the robot's kernel tables.
         cases: Folder of validation problems, as ``generate_data.py --write-cases`` writes them; none by default.
         latent: Latent space.
@@ -82,7 +82,7 @@ class TrainingConfig(StrictModel):
     """
 
     schema_: Literal["apex-ompl/training/1"] = Field(alias="schema")
-    data: str
+    data: str | Annotated[tuple[str, ...], Field(min_length=1)]
     robot: str
     cases: str | None = None
     latent: LatentConfig = LatentConfig()
@@ -109,6 +109,11 @@ class TrainingConfig(StrictModel):
     proposals: Count = 8
     judged: SamplingConfig = SamplingConfig()
     sampling: SamplingConfig = SamplingConfig()
+
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """All data sets."""
+        return (self.data,) if isinstance(self.data, str) else self.data
 
     @property
     def essence(self) -> str:

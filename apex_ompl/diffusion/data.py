@@ -16,12 +16,11 @@ from torch import Tensor
 from apex_ompl.dataset import Store, load
 from apex_ompl.diffusion.conditions import Conditions, Probes, Table
 from apex_ompl.diffusion.config import TrainingConfig
-from apex_ompl.engine import rounded
 from apex_ompl.errors import ParameterError
 from apex_ompl.files import is_file
 from apex_ompl.kernel import Kernel, RobotTables
 from apex_ompl.kernel.scene import scene_tables
-from apex_ompl.records import SPLINE, Paths, to_micro
+from apex_ompl.records import SPLINE, Paths, rounded, to_micro
 
 Array = NDArray[np.float64]
 
@@ -137,13 +136,13 @@ def _weights(paths: Paths, weights: Mapping[str, float]) -> Array:
     return np.asarray(np.array([known[level] for level in levels])[paths.arrays["problem"]])
 
 
-def window_paths(data: Path, seed: int, units: int, number: int) -> tuple[Paths, int]:
-    """Return the paths of one window of a data set, and how many windows there are.
+def window_paths(data: Sequence[str], seed: int, units: int, number: int) -> tuple[Paths, int]:
+    """Return the paths of one window of some data sets, and how many windows there are.
 
-    Windows are some units each, in another order at every pass; a single file is one window.
+    Windows are some units each, in another order at every pass; a single file counts as one unit.
 
     Args:
-        data: Folder of a data set, or a file of paths.
+        data: Folders of data sets, and files of paths.
         seed: Of the order.
         units: Units in a window.
         number: Counts the windows from 0, on over all passes.
@@ -151,18 +150,19 @@ def window_paths(data: Path, seed: int, units: int, number: int) -> tuple[Paths,
     Raises:
         MissingFileError: There is no such data set.
         FileFormatError: It is damaged.
-        ParameterError: It is empty.
+        DatasetError: The data sets are of different robots or splines.
+        ParameterError: They are empty.
     """
-    if is_file(data):
-        return load(data), 1
-    store = Store(data)
-    names = store.units()
-    if not names:
-        raise ParameterError("data", str(data), "a data set with at least one unit")
-    windows = -(-len(names) // units)
+    files: list[Path] = []
+    for name in data:
+        path = Path(name)
+        files += [path] if is_file(path) else Store(path).files()
+    if not files:
+        raise ParameterError("data", ", ".join(data), "data sets with at least one unit")
+    windows = -(-len(files) // units)
     turn, k = divmod(number, windows)
-    order = np.random.default_rng([seed, turn]).permutation(len(names))[k * units : (k + 1) * units]
-    return Paths.joined(store.read(names[j]) for j in sorted(order)), windows
+    order = np.random.default_rng([seed, turn]).permutation(len(files))[k * units : (k + 1) * units]
+    return Paths.joined(load(files[j]) for j in sorted(order)), windows
 
 
 def split(paths: Paths, share: float) -> tuple[Paths, Paths]:
@@ -228,7 +228,7 @@ class Supply:
 
     def _read(self, number: int) -> Window:
         config, robot = self._config, self._kernel.robot
-        paths, self._windows = window_paths(Path(config.data), config.seed, config.units, number)
+        paths, self._windows = window_paths(config.sources, config.seed, config.units, number)
         if (paths.about["robot"], tuple(paths.about["joints"])) != (robot.name, robot.joint_names):
             raise ParameterError("data", paths.about["robot"], f"paths of {robot.name}, whose tables are given")
         self.spline = {k: paths.about[k] for k in SPLINE}
