@@ -48,7 +48,7 @@ def test_wheel_and_sdist_hold_what_is_needed(built: Path) -> None:
     names = zipfile.ZipFile(wheel).namelist()
     for wanted in (
         "apex_ompl/py.typed", "apex_ompl/planners/registry.py", "apex_ompl/problems/data/shelf_swap.yaml",
-        "apex_ompl/problems/frozen/SHA256SUMS",
+        "apex_ompl/problems/frozen/SHA256SUMS", "apex_ompl/diffusion/checkpoints/apex/model.safetensors",
         "apex_ompl/robot/data/softhand2_left.urdf", "apex_ompl/robot/data/dual_panda_softhand.pairs.yaml",
     ):  # fmt: skip
         assert names.count(wanted) == 1, wanted

@@ -182,6 +182,11 @@ class Trainer:
     def about(self) -> dict[str, Any]:
         """Return what a checkpoint says of its training."""
         config = self.config.model_dump(mode="json", by_alias=True)
+        config["data"] = [Path(source).name for source in self.config.sources]  # where they lay is nobody's business
+        config["robot"], config["cases"] = (
+            Path(self.config.robot).name,
+            self.config.cases and Path(self.config.cases).name,
+        )
         return {
             "phase": self.phase, "step": self.step, "seconds": round(self.seconds), "torch": torch.__version__,
             "paths": len(self.supply.window), "config": config,
