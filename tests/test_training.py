@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import os
 import shutil
@@ -108,7 +109,7 @@ def query_of_path(paths: Paths, k: int) -> Query:
 
 def test_32_trajectories_are_learnt_by_heart(few: Path, tmp_path: Path) -> None:
     sizes = {"denoiser": {"width": 192, "blocks": 2}, "condition": {"width": 64, "out": 128, "along": 3}}
-    trainer = Trainer(config(few, steps=1500, rate=3e-3, ema=0.99, log_every=10_000, **sizes), tmp_path, HERE)
+    trainer = Trainer(config(few, steps=1200, rate=3e-3, ema=0.99, log_every=10_000, **sizes), tmp_path, HERE)
     trainer.run()
     model, paths = TrajectoryModel(trainer.averaged_network(), {}), load(few)
     kernel = Kernel(RobotTables.load(DATA / "robot.npz"), scene_tables([]))
@@ -170,7 +171,8 @@ def test_what_was_logged_behind_the_last_save_is_forgotten(paths: Paths, tmp_pat
     rows = read_log(tmp_path)
     assert [int(row["step"]) for row in rows] == list(range(1, 13))
     assert all(float(row["held_out"]) > 0 for row in rows)
-    assert len(list((tmp_path / "tensorboard").iterdir())) == 2
+    if importlib.util.find_spec("tensorboard"):
+        assert len(list((tmp_path / "tensorboard").iterdir())) == 2
     (tmp_path / "log.csv").write_text("phase,step\ndenoiser,three\n")
     with pytest.raises(FileFormatError, match="log.csv: step: expected the log of a training run"):
         trainer()
@@ -195,8 +197,6 @@ def test_a_killed_command_goes_on(few: Path, tmp_path: Path) -> None:
     assert 0 < step < 3000
     load_model(tmp_path / "run" / "checkpoint")
     how: dict[str, Any] = {"env": environment, "capture_output": True, "text": True}
-    changed = subprocess.run([*command, "--set", "steps=7"], check=False, **how)
-    assert changed.returncode == 2 and "expected the state of a run with this configuration" in changed.stderr
     done = subprocess.run([*command, "--minutes", "0.01"], check=False, **how)
     assert done.returncode == 0, done.stderr
     assert torch.load(state, weights_only=True)["step"] > step
@@ -395,6 +395,8 @@ def test_a_damaged_state_is_named(few: Path, tmp_path: Path) -> None:
     (tmp_path / "state.pt").unlink()
     trainer = Trainer(config(few), tmp_path, HERE)
     trainer.save()
+    with pytest.raises(FileFormatError, match="expected the state of a run with this configuration and these data"):
+        Trainer(config(few, steps=7), tmp_path, HERE)
     state = torch.load(tmp_path / "state.pt", weights_only=True)
     del state["optimizer"]
     torch.save(state, tmp_path / "state.pt")

@@ -25,7 +25,7 @@ from apex_ompl.records import SPLINE, Paths, rounded, to_micro
 Array = NDArray[np.float64]
 
 NOTHING_HELD = "[]"
-MEASURED = 100_000  # paths that the latent space is measured on
+MEASURED = 100_000  # paths that the latent space is measured on, at most
 WATCHED_SHARE = 0.02  # of all problems, at most, that the validation loss is taken on
 PASSES, FOREVER = 4, 2**40  # over a window before the next, and steps where there is only one window
 EVERY, CLOSE = 8, 0.01  # states of an image that are looked at, and clearances that are told apart [m]
@@ -203,7 +203,8 @@ class Supply:
     def measured(self) -> Tensor:
         """Return control points to measure a latent space on, drawn as training draws."""
         generator = torch.Generator().manual_seed(self._config.seed)
-        return self.window.control[torch.from_numpy(self.window.drawn(MEASURED, generator))]
+        count = min(MEASURED, 8 * len(self.window))  # so that few are left out
+        return self.window.control[torch.from_numpy(self.window.drawn(count, generator))]
 
     def digest(self) -> str:
         """Return a digest of the data of the first window."""
