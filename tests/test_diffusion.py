@@ -280,7 +280,7 @@ def test_all_components_give_paths_back_and_few_give_the_nearest() -> None:
     latent = full.encode(control)
     torch.testing.assert_close(full.control(latent, control[:, 0], control[:, -1]), control, atol=1e-5, rtol=0)
     torch.testing.assert_close(latent.mean(dim=0), torch.zeros(192).double(), atol=1e-4, rtol=0)
-    large = full.deviations > 1e-4  # the others are rounding alone
+    large = full.deviations > 1.01e-3 * full.deviations.max()  # the others are nearly nothing
     torch.testing.assert_close(latent.T @ latent / len(latent) * large, torch.diag(large).double(), atol=2e-3, rtol=0)
     few = LinearLatent(Spline(), DOF, 20).double()
     few.fit(control)

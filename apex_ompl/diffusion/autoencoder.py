@@ -17,6 +17,7 @@ from apex_ompl.errors import ParameterError
 from apex_ompl.spline import Spline
 
 MOST_GROUPS = 8  # of channels that are normalised together
+FLAT = 1e-3  # deviations below this share of the largest are not blown up to one
 
 
 class Autoencoder(nn.Module):
@@ -110,7 +111,7 @@ class LinearLatent(Autoencoder):
         signs = torch.sign(vectors[vectors.abs().argmax(dim=0), torch.arange(len(order))])  # the same everywhere
         self.mean.copy_(mean)
         self.components.copy_(vectors * signs)
-        self.deviations.copy_(values[order].clamp(min=1e-12).sqrt())
+        self.deviations.copy_(values[order].clamp(min=float(FLAT**2 * values.max().clamp(min=1e-12))).sqrt())
 
     def encode(self, control: Tensor) -> Tensor:
         """Return latent vectors (B, dim) of control points (B, points, dof)."""
