@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -227,8 +228,12 @@ def written(unit: Unit) -> list[WrittenCase]:
 
 
 def row_of(problem: Problem, seed: int) -> Row:
-    """Return what is written of a problem."""
-    held = json.dumps([h.model_dump(mode="json", exclude_defaults=True) for h in problem.attached])
+    """Return what is written of a problem; meshes by the names of their files, without the folders."""
+    bodies = [h.model_dump(mode="json", exclude_defaults=True) for h in problem.attached]
+    for body in bodies:
+        if "mesh" in body:
+            body["mesh"]["file"] = Path(body["mesh"]["file"]).name
+    held = json.dumps(bodies)
     return Row(seed, held, [_thing(thing) for thing in problem.scene])
 
 

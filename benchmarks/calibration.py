@@ -12,16 +12,14 @@ Usage: python benchmarks/calibration.py [-n 50] [--rrt 20] [--jobs 2] [--store F
 from __future__ import annotations
 
 import argparse
-import json
 import math
-import multiprocessing
 from collections.abc import Iterable, Mapping
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import record
+from store import RunStore
 
 from apex_ompl import plan, problems
 from apex_ompl.moving import even_times, timed_check
@@ -63,19 +61,6 @@ def _line(name: str) -> bool:
 def warm_up() -> None:
     """Load the kernel and the robot, so that no run pays for it."""
     plan(problems.frozen_names("shelf", "hard")[0], timeout=0.1, simplify=False)
-
-
-def read(store: Path) -> dict[tuple[str, str], dict[str, Any]]:
-    """Return the runs in a store by problem and planner."""
-    if not store.is_file():
-        return {}
-    runs = []
-    for line in store.read_text().splitlines():
-        try:
-            runs.append(json.loads(line))
-        except json.JSONDecodeError:  # the process ended while it wrote
-            continue
-    return {(r["problem"], r["planner"]): r for r in runs}
 
 
 def summary(runs: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
@@ -138,7 +123,8 @@ def main() -> None:
         if name not in every and name not in problems.suites():
             raise SystemExit(f"unknown suite or level {name!r}; known: {', '.join(every)}")
     levels = [v for v in every if not args.levels or v in args.levels or v.split("/")[0] in args.levels]
-    done = read(args.store)
+    store = RunStore(args.store, ("problem", "planner"))
+    done = store.read()
     todo: list[tuple[str, str]] = []
     for level in levels:
         frozen = len(problems.frozen_names(*level.split("/")))
@@ -147,21 +133,10 @@ def main() -> None:
             todo += [(name, planner) for name in names if (name, planner) not in done]
     todo.sort(key=lambda job: (job[1] == "rrt", "moving" in job[0]))  # rrt, which takes most of the time, last
     todo = [] if args.report else todo
-    args.store.parent.mkdir(parents=True, exist_ok=True)
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(args.jobs, mp_context=context, initializer=warm_up) as pool, args.store.open("a") as out:
-        jobs = {pool.submit(run, job): job for job in todo}
-        for k, future in enumerate(as_completed(jobs)):
-            if future.exception() is not None:
-                print(f"{jobs[future]}: {future.exception()}", flush=True)
-                continue
-            out.write(json.dumps(future.result()) + "\n")
-            out.flush()
-            if (k + 1) % 100 == 0:
-                print(f"{k + 1} of {len(todo)} runs", flush=True)
+    store.complete(run, todo, args.jobs, warm_up)
     figures: list[dict[str, Any]] = []
     by_level: dict[str, list[dict[str, Any]]] = {}
-    for (name, _), one in read(args.store).items():
+    for (name, _), one in store.read().items():
         by_level.setdefault(name.rsplit("/", 1)[0], []).append(one)
     for level in every:
         mine = by_level.get(level, [])

@@ -11,17 +11,15 @@ Usage: python benchmarks/optimizer.py [-n 10] [--hard 20] [--jobs 2] [--store FI
 from __future__ import annotations
 
 import argparse
-import json
 import math
-import multiprocessing
 import time
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import record
+from store import RunStore
 
 from apex_ompl import plan, problems
 from apex_ompl.assembly import assemble
@@ -74,18 +72,7 @@ def warm_up() -> None:
     plan("wall/easy/800000", "rrtconnect+polish", timeout=5.0)
 
 
-def read(store: Path) -> dict[tuple[str, str], dict[str, Any]]:
-    """Return the runs in a store by problem and method."""
-    runs = []
-    for line in store.read_text().splitlines() if store.is_file() else []:
-        try:
-            runs.append(json.loads(line))
-        except json.JSONDecodeError:  # the process ended while it wrote
-            continue
-    return {(r["problem"], r["method"]): r for r in runs}
-
-
-def figures(runs: dict[tuple[str, str], dict[str, Any]], level: str) -> dict[str, Any]:
+def figures(runs: dict[tuple[Any, ...], dict[str, Any]], level: str) -> dict[str, Any]:
     """Return success, time and length of every method on a level, and lengths on what all of two solve."""
     mine = {key: r for key, r in runs.items() if key[0].rsplit("/", 1)[0] == level}
     found: dict[str, Any] = {}
@@ -141,28 +128,16 @@ def main() -> None:
     known = {s for s, _ in static} | {f"{s}/{v}" for s, v in static}
     if not chosen or not set(args.levels) <= known:
         raise SystemExit(f"unknown suite or level; known: {', '.join(f'{s}/{v}' for s, v in static)}")
-    done, todo = read(args.store), []
+    store = RunStore(args.store, ("problem", "method"))
+    done, todo = store.read(), []
     for level in chosen:
         hard = level.endswith("/hard")
         names = problems.frozen_names(*level.split("/"), "validation")[: args.hard if hard else args.n]
         methods = [m for m in METHODS if hard or m not in ON_HARD_ALONE]
         todo += [(name, m) for m in methods for name in names if (name, m) not in done]
     todo.sort(key=lambda job: (job[1] in ON_HARD_ALONE, job[0].rsplit("/", 1)[1]))  # all levels in turn
-    args.store.parent.mkdir(parents=True, exist_ok=True)
-    if args.store.is_file() and not args.store.read_bytes().endswith(b"\n"):  # the process ended while it wrote
-        args.store.write_text(args.store.read_text() + "\n")
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(args.jobs, mp_context=context, initializer=warm_up) as pool, args.store.open("a") as out:
-        jobs = {pool.submit(run, job): job for job in ([] if args.report else todo)}
-        for k, future in enumerate(as_completed(jobs)):
-            if future.exception() is not None:
-                print(f"{jobs[future]}: {future.exception()}", flush=True)
-                continue
-            out.write(json.dumps(future.result()) + "\n")
-            out.flush()
-            if (k + 1) % 100 == 0:
-                print(f"{k + 1} of {len(jobs)} runs", flush=True)
-    runs = read(args.store)
+    store.complete(run, [] if args.report else todo, args.jobs, warm_up)
+    runs = store.read()
     levels = [{"level": f"{s}/{v}", "methods": figures(runs, f"{s}/{v}")} for s, v in static]
     levels = [level for level in levels if level["methods"]]
     record.write(

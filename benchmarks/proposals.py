@@ -15,12 +15,9 @@ Usage: python benchmarks/proposals.py [SUITE[/LEVEL] ...] [-n 10] [--hard 30] [-
 from __future__ import annotations
 
 import argparse
-import json
 import math
-import multiprocessing
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -28,6 +25,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import record
 import torch
+from neighbours import Neighbours
+from store import RunStore
 
 from apex_ompl import load_model, plan, problems
 from apex_ompl.assembly import PlanningSetup, assemble
@@ -36,7 +35,6 @@ from apex_ompl.diffusion.conditions import Query
 from apex_ompl.diffusion.data import Mirror, window_paths
 from apex_ompl.diffusion.guidance import Guidance
 from apex_ompl.diffusion.model import LatentDiffusion
-from apex_ompl.diffusion.neighbours import Neighbours
 from apex_ompl.diffusion.proposals import Sampling, TrajectoryModel
 from apex_ompl.kernel import Kernel, RobotTables
 from apex_ompl.kernel.scene import scene_tables
@@ -109,8 +107,12 @@ class Job(NamedTuple):
 
     @property
     def key(self) -> tuple[str, str, int, str]:
-        """What tells runs apart."""
+        """The job's entries of ``KEYS``."""
         return self.problem, self.method, self.count, self.made_of
+
+
+KEYS = ("problem", "method", "count", "made_of")
+"""What tells runs apart."""
 
 
 def made_of(method: str, args: argparse.Namespace) -> str:
@@ -224,17 +226,6 @@ def attempted(job: Job) -> dict[str, Any]:
         return {**about, "sampled": False, "solved": False, "error": repr(error)}
 
 
-def read(store: Path) -> dict[tuple[str, str, int, str], dict[str, Any]]:
-    """Return the runs in a store by problem, method, count, and what the method was made of."""
-    runs = []
-    for line in store.read_text().splitlines() if store.is_file() else []:
-        try:
-            runs.append(json.loads(line))
-        except json.JSONDecodeError:  # the process ended while it wrote
-            continue
-    return {(r["problem"], r["method"], r["count"], r["made_of"]): r for r in runs}
-
-
 def figures(runs: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Return what came of every method and count on a level."""
     polished = {r["problem"]: r for r in runs if r["method"] == "rrtconnect+polish" and r["solved"]}
@@ -324,26 +315,13 @@ def main() -> None:
             few = names[: args.paper] if method.startswith("apex-paper") else names
             rest = kinds[method], args.data, args.regression
             jobs += [Job(name, method, count, *rest) for count in METHODS[method] for name in few]
-    done = read(args.store)
+    store = RunStore(args.store, KEYS)
+    done = store.read()
     todo = [] if args.report else [job for job in jobs if job.key not in done]
     todo.sort(key=lambda job: (job.method.startswith("apex-paper"), int(job.problem.rsplit("/", 1)[1]) % 1000))
     first = {job.method: job for job in reversed(todo)}
-    args.store.parent.mkdir(parents=True, exist_ok=True)
-    if args.store.is_file() and not args.store.read_bytes().endswith(b"\n"):  # the process ended while it wrote
-        args.store.write_text(args.store.read_text() + "\n")
-    pool = ProcessPoolExecutor(
-        args.jobs, multiprocessing.get_context("spawn"), initializer=warm_up, initargs=(list(first.values()),)
-    )
-    with pool, args.store.open("a") as out:
-        for k, future in enumerate(as_completed([pool.submit(attempted, job) for job in todo])):
-            result = future.result()
-            if "error" in result:
-                print(result, flush=True)
-            out.write(json.dumps(result) + "\n")
-            out.flush()
-            if (k + 1) % 500 == 0:
-                print(f"{k + 1} of {len(todo)} runs", flush=True)
-    done = read(args.store)
+    store.complete(attempted, todo, args.jobs, warm_up, list(first.values()))
+    done = store.read()
     runs = [done[job.key] for job in jobs if job.key in done]
     levels = [{"level": v, "methods": figures([r for r in runs if r["problem"].startswith(f"{v}/")])} for v in chosen]
     levels = [level for level in levels if level["methods"]]

@@ -151,7 +151,7 @@ def generate(args: argparse.Namespace) -> None:
         "degree",
         "problems_per_unit",
     )
-    store = Store.create(args.folder, manifest, (*same, "problems_per_unit"))
+    store = Store.create(args.folder, manifest, same)
     with store.locked():
         if tables is not None:
             tables.save(store.folder / "robot.npz")

@@ -27,7 +27,8 @@ def train(args: argparse.Namespace) -> None:
 
     from apex_ompl.cases import load_cases
     from apex_ompl.diffusion.config import TrainingConfig
-    from apex_ompl.diffusion.training import Place, Trainer
+    from apex_ompl.diffusion.objective import Place
+    from apex_ompl.diffusion.training import Trainer
 
     config = TrainingConfig.read(args.config, dict(args.set))
     folder = Path(args.out or Path("runs") / Path(args.config).stem)
@@ -37,7 +38,6 @@ def train(args: argparse.Namespace) -> None:
         raise MissingFileError(str(folder), "folder of a training run", str(error.strerror).lower()) from error
     cases = load_cases(config.cases) if config.cases is not None else []
     place = Place.here()
-    trainer = Trainer(config, folder, place, cases, tqdm.write)
     bars: dict[str, Any] = {}
 
     def watch(at: Trainer, loss: float) -> None:
@@ -51,6 +51,7 @@ def train(args: argparse.Namespace) -> None:
 
     try:
         with locked(folder) if place.rank == 0 else nullcontext():
+            trainer = Trainer(config, folder, place, cases, tqdm.write)
             trainer.run(60.0 * args.minutes, watch)
     finally:
         for bar in bars.values():

@@ -3,12 +3,16 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
+from support import ROOT
 
 from apex_ompl.collision import Verdict
+from apex_ompl.dataset import load, save
 from apex_ompl.problem import Goal, Obstacle, Problem
+from apex_ompl.records import Paths
 from apex_ompl.robot import Robot, load_robot
 
 
@@ -57,3 +61,22 @@ def apex_cli():
         return subprocess.run(command, check=False, **settings)
 
     return run
+
+
+@pytest.fixture(scope="session")
+def paths() -> Paths:
+    """Paths of a few problems of every level."""
+    whole = load(ROOT / "data" / "dual_panda_softhand" / "paths.zip")
+    return whole.chosen(np.arange(0, whole.problems, 60))
+
+
+@pytest.fixture(scope="session")
+def few(paths: Paths, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A file of 32 paths of different problems."""
+    first = np.unique(paths.arrays["problem"], return_index=True)[1][:32]
+    arrays = dict(paths.arrays)
+    for name in ("problem", "start", "goal", "control", "point", "clearance", "length", "source", "homotopy"):
+        arrays[name] = arrays[name][first]
+    file = tmp_path_factory.mktemp("data") / "few.zip"
+    save(file, Paths(arrays, paths.names, paths.about))
+    return file

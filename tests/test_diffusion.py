@@ -1,261 +1,34 @@
-"""Noise, samplers, latent spaces, encoders and guidance, against other implementations, and against what they claim."""
+"""Latent spaces, encoders, networks and guidance, against other implementations, and against what they claim."""
 
 from __future__ import annotations
 
 import dataclasses
 from concurrent.futures import ThreadPoolExecutor
-from functools import cache, partial
-from itertools import pairwise
+from functools import partial
 
 import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support import ROOT
+from models import DOF, POST, VARIATIONAL, WALL, kernel, network, query, some_paths
 
-from apex_ompl.dataset import load
 from apex_ompl.diffusion.autoencoder import LinearLatent, VariationalLatent
 from apex_ompl.diffusion.conditions import Probes, Query, Table, Things, batched, distances, rotations
 from apex_ompl.diffusion.denoisers import UNetDenoiser
 from apex_ompl.diffusion.encoders import ConditionEncoder
 from apex_ompl.diffusion.guidance import Guidance, collision_cost, gradient, log_likelihood
 from apex_ompl.diffusion.model import (
-    ConditionConfig,
     DenoiserConfig,
-    LatentConfig,
     LatentDiffusion,
-    ModelConfig,
     NoiseConfig,
 )
 from apex_ompl.diffusion.proposals import Sampling, TrajectoryModel
-from apex_ompl.diffusion.sampler import SAMPLERS, ddim, ddpm, dpm_solver
-from apex_ompl.diffusion.schedule import PREDICTIONS, SCHEDULES, Estimate, NoiseSchedule
+from apex_ompl.diffusion.sampler import SAMPLERS
 from apex_ompl.errors import ParameterError, UnknownNameError
-from apex_ompl.kernel import Kernel, RobotTables
-from apex_ompl.kernel.scene import Primitive, scene_tables
-from apex_ompl.kernel.tables import BOX, CAPSULE, CYLINDER, SPHERE
-from apex_ompl.records import SHAPES, Paths
+from apex_ompl.kernel import Kernel
+from apex_ompl.records import SHAPES
 from apex_ompl.spline import Spline
-
-DATA = ROOT / "data" / "dual_panda_softhand"
-DOF = 16
-KINDS = {"box": BOX, "sphere": SPHERE, "cylinder": CYLINDER, "capsule": CAPSULE}
-
-
-@cache
-def some_paths() -> Paths:
-    """Paths of a few problems of every level."""
-    paths = load(DATA / "paths.zip")
-    return paths.chosen(np.arange(0, paths.problems, 100))
-
-
-@cache
-def kernel(*things: tuple[str, tuple[float, ...], tuple[float, ...]]) -> Kernel:
-    """The robot among obstacles that are given by shape, position and size; kernels keep radii and half lengths."""
-    solids = []
-    for k, (shape, position, size) in enumerate(things):
-        pose = np.eye(4)
-        pose[:3, 3] = position
-        solids.append((k, Primitive(KINDS[shape], pose, size)))
-    return Kernel(RobotTables.load(DATA / "robot.npz"), scene_tables(solids))
-
-
-def config(**parts: object) -> ModelConfig:
-    robot = kernel().robot
-    count = len(Probes.of(robot, 3).joint)
-    small = {
-        "latent": LatentConfig(dim=24, width=16), "condition": ConditionConfig(width=16, out=32, along=3),
-        "denoiser": DenoiserConfig(width=32, blocks=2), "noise": NoiseConfig(),
-    }  # fmt: skip
-    return ModelConfig(robot=robot.name, joints=robot.joint_names, probes=count, **(small | parts))
-
-
-def network(seed: int = 0, **parts: object) -> LatentDiffusion:
-    """A small model, its last layer not zero as at the beginning of a training."""
-    torch.manual_seed(seed)
-    model = LatentDiffusion(config(**parts))
-    probes = Probes.of(kernel().robot, 3)
-    model.probe_joint.copy_(torch.from_numpy(probes.joint))
-    model.probe_offset.copy_(torch.from_numpy(probes.offset))
-    if isinstance(model.autoencoder, LinearLatent):
-        model.autoencoder.fit(torch.tensor(some_paths().control(), dtype=torch.float32))
-    for parameter in model.denoiser.parameters():
-        if not parameter.detach().any():
-            torch.nn.init.normal_(parameter, std=0.05)
-    return model
-
-
-VARIATIONAL = {
-    "latent": LatentConfig(kind="variational", width=16, channels=4),
-    "denoiser": DenoiserConfig(kind="unet", width=8, multipliers=(1, 2)),
-    "condition": ConditionConfig(scene="none", point=True, width=16, out=32, along=2),
-}
-REGRESSION = {"denoiser": DenoiserConfig(kind="regression", width=32, blocks=2)}
-WALL = ("box", (0.45, 0.0, 0.6), (0.05, 0.4, 0.3))
-POST = ("cylinder", (0.4, 0.3, 0.5), (0.05, 0.3))
-
-
-def query(seed: int = 0) -> Query:
-    rng = np.random.default_rng(seed)
-    limits = kernel().robot.arrays
-    middle, span = (limits.lower + limits.upper) / 2, limits.upper - limits.lower
-    ends = middle + 0.3 * span * rng.uniform(-0.5, 0.5, (2, DOF))
-    rows = [(0, WALL[1], (0, 0, 0, 1), (0.1, 0.8, 0.6)), (2, POST[1], (0, 0, 0, 1), (0.05, 0.6, 0.0))]
-    return Query(ends[0], ends[1], np.array([0.4, 0.0, 0.5]), Things.of(rows))
-
-
-# Noise
-
-
-@pytest.mark.parametrize("kind", SCHEDULES)
-@pytest.mark.parametrize("steps", [64, 256, 1000])
-def test_noise_grows_from_almost_none_to_almost_all(kind: str, steps: int) -> None:
-    left = NoiseSchedule(steps, kind).alpha_bar
-    assert all(a > b for a, b in pairwise(left.tolist()))
-    assert left[0] > 0.97 and left[-1] < 1e-3
-
-
-@settings(deadline=None)
-@given(st.sampled_from(PREDICTIONS), st.sampled_from(SCHEDULES), st.integers(1, 254), st.integers(0, 2**31))
-def test_what_a_perfect_network_says_gives_sample_and_noise_back(kind: str, name: str, t: int, seed: int) -> None:
-    schedule, g = NoiseSchedule(256, name), torch.Generator().manual_seed(seed)
-    clean, noise = (torch.randn(3, 5, generator=g, dtype=torch.float64) for _ in range(2))
-    sample = schedule.noisy(clean, noise, t)
-    found = schedule.estimate(kind, sample, schedule.target(kind, clean, noise, torch.full((3,), t)), t)
-    torch.testing.assert_close(found.clean, clean, atol=1e-4, rtol=1e-4)
-    torch.testing.assert_close(found.noise, noise, atol=1e-4, rtol=1e-4)
-
-
-@settings(deadline=None)
-@given(st.integers(0, 255), st.data())
-def test_steps_fall_from_the_first(first: int, data: st.DataObject) -> None:
-    count = data.draw(st.integers(1, first + 1))
-    times = NoiseSchedule(256).times(count, first)
-    assert len(times) == count and times[0] == first and times[-1] >= 0
-    assert all(a > b for a, b in pairwise(times))
-    if count == first + 1:
-        assert times == list(range(first, -1, -1))
-
-
-def test_bad_schedules_are_named() -> None:
-    with pytest.raises(UnknownNameError, match="noise schedule 'cosin', did you mean 'cosine'"):
-        NoiseSchedule(256, "cosin")
-    with pytest.raises(ParameterError, match="number of denoising steps: expected 1 to 256, got 257"):
-        NoiseSchedule(256).times(257)
-    with pytest.raises(ParameterError, match="times"):
-        ddim(lambda z, t: Estimate(z, z), torch.zeros(1, 2), NoiseSchedule(8), [1, 3])
-
-
-# Samplers, against the schedulers of diffusers
-
-
-def blurred(schedule: NoiseSchedule) -> partial[Estimate]:
-    """A denoiser that is not linear, and the same for both implementations."""
-
-    def predict(sample: torch.Tensor, t: int) -> Estimate:
-        noise = torch.tanh(sample * (0.5 + t / 512)) + 0.1 * torch.sin(3.0 * sample)
-        return schedule.estimate("noise", sample, noise, t)
-
-    return partial(predict)
-
-
-@pytest.mark.parametrize("kind", SCHEDULES)
-@pytest.mark.parametrize(
-    ("name", "steps"), [*[("ddim", n) for n in (1, 2, 8, 32)], *[("dpm_solver", n) for n in (1, 2, 5, 8, 40)]]
-)
-def test_deterministic_samplers_are_those_of_diffusers(name: str, steps: int, kind: str) -> None:
-    """Where DDIM's steps do not divide 256, diffusers takes other ones than those it lists."""
-    diffusers = pytest.importorskip("diffusers")
-    schedule = NoiseSchedule(256, kind)
-    betas = schedule.betas.float().numpy()
-    rest = {"num_train_timesteps": 256, "trained_betas": betas, "timestep_spacing": "trailing"}
-    if name == "ddim":
-        theirs = diffusers.DDIMScheduler(**rest, clip_sample=False, set_alpha_to_one=True)
-    else:
-        theirs = diffusers.DPMSolverMultistepScheduler(
-            **rest, algorithm_type="dpmsolver++", solver_order=2, final_sigmas_type="zero", lower_order_final=True
-        )
-    theirs.set_timesteps(steps)
-    predict = blurred(schedule)
-    start = torch.randn(4, 7, generator=torch.Generator().manual_seed(steps))
-    times = schedule.times(steps)
-    assert times == theirs.timesteps.tolist()
-    mine = SAMPLERS[name](predict, start, schedule, times)
-    sample = start
-    for t in theirs.timesteps:
-        sample = theirs.step(predict(sample, int(t)).noise, t, sample).prev_sample
-    torch.testing.assert_close(mine, sample, atol=2e-3 * float(sample.abs().max()), rtol=2e-3)
-
-
-@pytest.mark.parametrize("kind", SCHEDULES)
-def test_ancestral_sampling_is_that_of_diffusers(kind: str) -> None:
-    diffusers = pytest.importorskip("diffusers")
-    schedule = NoiseSchedule(64, kind)
-    theirs = diffusers.DDPMScheduler(64, trained_betas=schedule.betas.float().numpy(), clip_sample=False)
-    theirs.set_timesteps(64)
-    predict = blurred(schedule)
-    start = torch.randn(4, 7, generator=torch.Generator().manual_seed(1))
-    mine = ddpm(predict, start, schedule, schedule.times(64), generator=torch.Generator().manual_seed(2))
-    sample, g = start, torch.Generator().manual_seed(2)
-    for t in theirs.timesteps:
-        sample = theirs.step(predict(sample, int(t)).noise, t, sample, generator=g).prev_sample
-    torch.testing.assert_close(mine, sample, atol=2e-3 * float(sample.abs().max()), rtol=2e-3)
-
-
-@pytest.mark.parametrize("name", SAMPLERS)
-def test_samplers_find_the_only_point_there_is(name: str) -> None:
-    """Where all data are one point, the perfect denoiser is known, and every sampler ends there."""
-    schedule, point = NoiseSchedule(256), torch.tensor([0.3, -1.2, 2.0])
-
-    def predict(sample: torch.Tensor, t: int) -> Estimate:
-        signal, sigma = schedule.scale(t)
-        return Estimate((sample - signal * point) / sigma, point.expand_as(sample))
-
-    g = torch.Generator().manual_seed(0)
-    seen: list[int] = []
-    found = SAMPLERS[name](
-        predict, torch.randn(5, 3, generator=g), schedule, schedule.times(6), callback=lambda t, z, e: seen.append(t),
-        **({"generator": g} if name == "ddpm" else {}),
-    )  # fmt: skip
-    torch.testing.assert_close(found, point.expand(5, 3))
-    assert seen == schedule.times(6)
-
-
-def test_samples_of_a_normal_distribution_are_normal() -> None:
-    """Of data from N(m, s^2) the perfect denoiser is linear; samples must have that mean and spread."""
-    schedule, mean, spread = NoiseSchedule(256), 1.5, 0.4
-
-    def predict(sample: torch.Tensor, t: int) -> Estimate:
-        signal, sigma = schedule.scale(t)
-        clean = mean + signal * spread**2 / (signal**2 * spread**2 + sigma**2) * (sample - signal * mean)
-        return Estimate((sample - signal * clean) / sigma, clean)
-
-    g = torch.Generator().manual_seed(0)
-    first = torch.randn(20_000, 1, generator=g, dtype=torch.float64)
-    for found in (
-        ddpm(predict, first, schedule, schedule.times(256), generator=g),
-        ddim(predict, first, schedule, schedule.times(128)),
-        dpm_solver(predict, first, schedule, schedule.times(32)),
-    ):
-        assert float(found.mean()) == pytest.approx(mean, abs=0.02)
-        assert float(found.std()) == pytest.approx(spread, abs=0.02)
-
-
-def test_two_orders_are_better_than_one() -> None:
-    """The second-order solver is nearer to many steps of DDIM than as few steps of DDIM itself."""
-    schedule = NoiseSchedule(256)
-
-    def predict(sample: torch.Tensor, t: int) -> Estimate:
-        clean = torch.tanh(2.0 * sample * schedule.scale(t)[0])
-        return schedule.estimate("clean", sample, clean, t)
-
-    first = torch.randn(50, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    wanted = ddim(predict, first, schedule, schedule.times(256))
-    one = ddim(predict, first, schedule, schedule.times(32))
-    two = dpm_solver(predict, first, schedule, schedule.times(32))
-    assert (two - wanted).norm() < 0.8 * (one - wanted).norm()
-
 
 # Latent spaces
 

@@ -16,6 +16,7 @@ from apex_ompl.optimize import Optimizer
 from apex_ompl.pool import first_valid
 from apex_ompl.problems.reach import robot
 from apex_ompl.resolution import FULL_RESOLUTION
+from apex_ompl.torch_threads import one_torch_thread
 
 CASES = load_cases(ROOT / "data" / "dual_panda_softhand" / "validation")
 
@@ -34,13 +35,14 @@ def test_what_ships_is_small_and_named() -> None:
 def test_a_sample_of_the_model_is_shorter_to_repair_than_the_line(name: str) -> None:
     """One proposal for each of some problems that no training saw, against the straight line, both repaired alike."""
     model, solved = load_model(name), {"model": 0, "line": 0}
-    torch.set_num_threads(1)
     hard = [case for case in CASES if case.level == "hard" and case.suite != "bins"][::4]
     for case in hard:
         kernel = Kernel(case.robot, case.scene)
         generator = torch.Generator().manual_seed(1)
+        with one_torch_thread():
+            proposed = model.propose(query_of_case(case), kernel, 1, generator=generator)
         starts = {
-            "model": model.propose(query_of_case(case), kernel, 1, generator=generator).control,
+            "model": proposed.control,
             "line": model.spline.line(case.start, case.goal)[None],
         }
         for kind, control in starts.items():

@@ -134,9 +134,23 @@ class Conditions:
             columns.append(torch.cat(tensors))
         return cls(*columns)
 
-    def repeated(self, count: int) -> Conditions:
-        """Return every query ``count`` times, one behind the other."""
-        return Conditions(*(getattr(self, f.name).repeat_interleave(count, dim=0) for f in fields(self)))
+    def things(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Return shape (T,), position (T, 3), turn (T, 3, 3) and size (T, 3) of the obstacles that there are."""
+        there = self.there
+        return self.shape[there], self.position[there], self.turn[there], self.size[there]
+
+    def apart(self) -> Tensor:
+        """Return the distances of the obstacles that there are from the probes, shape (T, L * P) [m]."""
+        owner = self.there.nonzero()[:, 0]
+        return distances(*self.things(), self.probes.flatten(1, 2)[owner])
+
+
+def pooled(values: Tensor, there: Tensor, rest: float) -> Tensor:
+    """Return values (T, K) of obstacles that are there at their places, shape (B, M + 1, K), and ``rest`` besides."""
+    count, most = there.shape
+    table = values.new_full((count, most + 1, values.shape[1]), rest)
+    table[:, :most][there] = values
+    return table
 
 
 def _padded(tensor: Tensor, most: int) -> Tensor:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from apex_ompl.diffusion.conditions import Conditions, distances
+from apex_ompl.diffusion.conditions import Conditions, pooled
 from apex_ompl.records import SHAPES
 
 MIDDLE = (0.4, 0.0, 0.6)  # about where the robot works, from which points are counted [m]
 NEAR = 0.4  # distances are told apart up to here [m]
-SCENES = ("none", "set", "distances")
+LARGE = 1e4
 
 
 class ConditionEncoder(nn.Module):
@@ -20,9 +20,6 @@ class ConditionEncoder(nn.Module):
     adds the obstacles, each through an MLP and then pooled by mean and maximum, so that their order does not matter
     (Zaheer et al. 2017). ``distances`` adds what the obstacles mean to the robot: where its probes are along the
     straight line, and how far they are from each obstacle, and from the nearest one.
-
-    Attributes:
-        out: Size of the vector.
     """
 
     lower: Tensor
@@ -42,7 +39,7 @@ class ConditionEncoder(nn.Module):
             along: Number of states of the straight line at which they are.
         """
         super().__init__()
-        self.out, self.scene, self.point, self.along = out, scene, point, along
+        self.scene, self.point, self.along = scene, point, along
         self.register_buffer("lower", torch.full((dof,), -1.0))
         self.register_buffer("upper", torch.full((dof,), 1.0))
         self.register_buffer("middle", torch.tensor(MIDDLE), persistent=False)
@@ -75,30 +72,17 @@ class ConditionEncoder(nn.Module):
 
     def _seen(self, given: Conditions) -> list[Tensor]:
         """Return what is seen of the obstacles, tensors of shape (B, ...)."""
-        there, count = given.there, len(given.there)
-        owner = there.nonzero()[:, 0]
-        shape, position, turn, size = (v[there] for v in (given.shape, given.position, given.turn, given.size))
+        there = given.there
+        shape, position, turn, size = given.things()
         kinds = nn.functional.one_hot(shape, len(SHAPES)).to(position)
         things = [kinds, position - self.middle, turn.flatten(1), size]
         parts: list[Tensor] = []
         if self.scene == "distances":
             along, probes = given.probes.shape[1:3]
-            points = given.probes.flatten(1, 2)
-            with torch.autocast(points.device.type, enabled=False):  # half precision is some millimetres off
-                apart = distances(shape, position, turn, size, points[owner]).clamp(-NEAR, NEAR) / NEAR
-            parts += [(points - self.middle).flatten(1), _pooled(apart, there, 1.0).amin(dim=1)]
+            with torch.autocast(there.device.type, enabled=False):  # half precision is some millimetres off
+                apart = given.apart().clamp(-NEAR, NEAR) / NEAR
+            parts += [(given.probes - self.middle).flatten(1), pooled(apart, there, 1.0).amin(dim=1)]
             things.append(apart.reshape(-1, along, probes)[:, [0, along // 2, -1]].flatten(1))
         tokens = self.thing(torch.cat(things, dim=1))
-        mean = _pooled(tokens, there, 0.0).sum(dim=1) / there.sum(dim=1, keepdim=True).clamp(min=1)
-        return [*parts, mean, _pooled(tokens, there, -LARGE).amax(dim=1).clamp(min=0.0).reshape(count, -1)]
-
-
-LARGE = 1e4
-
-
-def _pooled(values: Tensor, there: Tensor, rest: float) -> Tensor:
-    """Return values (T, K) of obstacles that are there at their places, shape (B, M + 1, K), and ``rest`` besides."""
-    count, most = there.shape
-    table = values.new_full((count, most + 1, values.shape[1]), rest)
-    table[:, :most][there] = values
-    return table
+        mean = pooled(tokens, there, 0.0).sum(dim=1) / there.sum(dim=1, keepdim=True).clamp(min=1)
+        return [*parts, mean, pooled(tokens, there, -LARGE).amax(dim=1).clamp(min=0.0)]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -52,10 +52,9 @@ class Guidance:
         """
         if self.scaling not in SCALINGS:
             raise UnknownNameError("scaling of guidance", self.scaling, SCALINGS)
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if field.name in ("gamma", "clip", "begin") and not 0.0 <= value < np.inf:
-                raise ParameterError(field.name, value, "a number, 0 or more")
+        for name, value in (("gamma", self.gamma), ("clip", self.clip), ("begin", self.begin)):
+            if not 0.0 <= value < np.inf:
+                raise ParameterError(name, value, "a number, 0 or more")
         if not 0.0 < self.margin < np.inf:
             raise ParameterError("margin", self.margin, "a number, more than 0")
         if self.samples < 2:
@@ -145,10 +144,7 @@ def guided(
         else:
             clean = found.clean + guidance.gamma * shortened(way, guidance.clip)
             noise = (sample - signal * clean) / sigma
-        if most is None:
-            return Estimate(noise, clean)
-        inside = clean.clamp(-most, most)
-        return Estimate(torch.where(inside == clean, noise, (sample - signal * inside) / sigma), inside)
+        return schedule.clipped(Estimate(noise, clean), sample, t, most)
 
     return bent
 

@@ -218,10 +218,6 @@ class LatentDiffusion(nn.Module):
         def predict(sample: Tensor, t: int) -> Estimate:
             steps = torch.full((1,), t, device=sample.device)
             found = self.schedule.estimate(noise.prediction, sample, self.said(sample, steps, encoded), t)
-            if noise.most is None:
-                return found
-            signal, sigma = self.schedule.scale(t)
-            clean = found.clean.clamp(-noise.most, noise.most)
-            return Estimate(torch.where(clean == found.clean, found.noise, (sample - signal * clean) / sigma), clean)
+            return self.schedule.clipped(found, sample, t, noise.most)
 
         return predict

@@ -111,6 +111,14 @@ class NoiseSchedule:
             return Estimate((sample - signal * said) / sigma, said)
         return Estimate(sigma * sample + signal * said, signal * sample - sigma * said)
 
+    def clipped(self, found: Estimate, sample: Tensor, t: int, most: float | None) -> Estimate:
+        """Return an estimate whose clean sample is at most ``most``, and whose noise fits it where that changed it."""
+        if most is None:
+            return found
+        signal, sigma = self.scale(t)
+        clean = found.clean.clamp(-most, most)
+        return Estimate(torch.where(clean == found.clean, found.noise, (sample - signal * clean) / sigma), clean)
+
     def times(self, count: int, first: int | None = None) -> list[int]:
         """Return ``count`` steps at which to denoise, evenly from ``first`` down ("trailing", Lin et al. 2024).
 

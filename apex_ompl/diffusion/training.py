@@ -183,10 +183,8 @@ class Trainer:
         """Return what a checkpoint says of its training."""
         config = self.config.model_dump(mode="json", by_alias=True)
         config["data"] = [Path(source).name for source in self.config.sources]  # where they lay is nobody's business
-        config["robot"], config["cases"] = (
-            Path(self.config.robot).name,
-            self.config.cases and Path(self.config.cases).name,
-        )
+        config["robot"] = Path(self.config.robot).name
+        config["cases"] = None if self.config.cases is None else Path(self.config.cases).name
         return {
             "phase": self.phase, "step": self.step, "seconds": round(self.seconds), "torch": torch.__version__,
             "paths": len(self.supply.window), "config": config,
@@ -227,13 +225,8 @@ class Trainer:
 
     def _loss(self) -> Tensor:
         config, place = self.config, self.place
-        generator = torch.Generator().manual_seed(
-            int(
-                np.random.SeedSequence([config.seed, PHASES.index(self.phase), self.step, place.rank]).generate_state(
-                    1
-                )[0]
-            )
-        )
+        numbers = [config.seed, PHASES.index(self.phase), self.step, place.rank]
+        generator = torch.Generator().manual_seed(int(np.random.SeedSequence(numbers).generate_state(1)[0]))
         window = self.supply.window
         control, given = window.batch(window.drawn(max(1, config.batch // place.world), generator))
         arguments = self._noise(len(control), generator)

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from apex_ompl.diffusion.conditions import Conditions, Probes, Query, Table, batched, distances
+from apex_ompl.diffusion.conditions import Conditions, Probes, Query, Table, batched, pooled
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel import Kernel, RobotTables
 from apex_ompl.kernel.scene import scene_tables
@@ -63,12 +63,6 @@ class Neighbours:
 
 def features(given: Conditions) -> NDArray[np.float32]:
     """Return what neighbours are compared by, shape (B, features) [rad]."""
-    there = given.there
-    points = given.probes.flatten(1, 2)
-    owner = there.nonzero()[:, 0]
-    apart = distances(given.shape[there], given.position[there], given.turn[there], given.size[there], points[owner])
-    nearest = torch.full((*there.shape, points.shape[1]), NEAR)
-    nearest[there] = apart.clamp(-NEAR, NEAR)
-    least = torch.cat([nearest, torch.full((len(there), 1, points.shape[1]), NEAR)], dim=1).amin(dim=1)
+    least = pooled(given.apart().clamp(-NEAR, NEAR), given.there, NEAR).amin(dim=1)
     rows = torch.cat([given.start, given.goal, PER_METRE * least / least.shape[1] ** 0.5], dim=1)
     return np.asarray(rows.numpy(), np.float32)

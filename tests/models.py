@@ -1,0 +1,91 @@
+"""Small models, robots among obstacles, and queries, for the tests of the model."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import torch
+from support import ROOT
+
+from apex_ompl.dataset import load
+from apex_ompl.diffusion.autoencoder import LinearLatent
+from apex_ompl.diffusion.conditions import Probes, Query, Things
+from apex_ompl.diffusion.model import (
+    ConditionConfig,
+    DenoiserConfig,
+    LatentConfig,
+    LatentDiffusion,
+    ModelConfig,
+    NoiseConfig,
+)
+from apex_ompl.kernel import Kernel, RobotTables
+from apex_ompl.kernel.scene import Primitive, scene_tables
+from apex_ompl.kernel.tables import BOX, CAPSULE, CYLINDER, SPHERE
+from apex_ompl.records import Paths
+
+DATA = ROOT / "data" / "dual_panda_softhand"
+DOF = 16
+KINDS = {"box": BOX, "sphere": SPHERE, "cylinder": CYLINDER, "capsule": CAPSULE}
+
+
+@cache
+def some_paths() -> Paths:
+    """Paths of a few problems of every level."""
+    paths = load(DATA / "paths.zip")
+    return paths.chosen(np.arange(0, paths.problems, 100))
+
+
+@cache
+def kernel(*things: tuple[str, tuple[float, ...], tuple[float, ...]]) -> Kernel:
+    """The robot among obstacles that are given by shape, position and size; kernels keep radii and half lengths."""
+    solids = []
+    for k, (shape, position, size) in enumerate(things):
+        pose = np.eye(4)
+        pose[:3, 3] = position
+        solids.append((k, Primitive(KINDS[shape], pose, size)))
+    return Kernel(RobotTables.load(DATA / "robot.npz"), scene_tables(solids))
+
+
+def config(**parts: object) -> ModelConfig:
+    robot = kernel().robot
+    count = len(Probes.of(robot, 3).joint)
+    small = {
+        "latent": LatentConfig(dim=24, width=16), "condition": ConditionConfig(width=16, out=32, along=3),
+        "denoiser": DenoiserConfig(width=32, blocks=2), "noise": NoiseConfig(),
+    }  # fmt: skip
+    return ModelConfig(robot=robot.name, joints=robot.joint_names, probes=count, **(small | parts))
+
+
+def network(seed: int = 0, **parts: object) -> LatentDiffusion:
+    """A small model, its last layer not zero as at the beginning of a training."""
+    torch.manual_seed(seed)
+    model = LatentDiffusion(config(**parts))
+    probes = Probes.of(kernel().robot, 3)
+    model.probe_joint.copy_(torch.from_numpy(probes.joint))
+    model.probe_offset.copy_(torch.from_numpy(probes.offset))
+    if isinstance(model.autoencoder, LinearLatent):
+        model.autoencoder.fit(torch.tensor(some_paths().control(), dtype=torch.float32))
+    for parameter in model.denoiser.parameters():
+        if not parameter.detach().any():
+            torch.nn.init.normal_(parameter, std=0.05)
+    return model
+
+
+VARIATIONAL = {
+    "latent": LatentConfig(kind="variational", width=16, channels=4),
+    "denoiser": DenoiserConfig(kind="unet", width=8, multipliers=(1, 2)),
+    "condition": ConditionConfig(scene="none", point=True, width=16, out=32, along=2),
+}
+REGRESSION = {"denoiser": DenoiserConfig(kind="regression", width=32, blocks=2)}
+WALL = ("box", (0.45, 0.0, 0.6), (0.05, 0.4, 0.3))
+POST = ("cylinder", (0.4, 0.3, 0.5), (0.05, 0.3))
+
+
+def query(seed: int = 0) -> Query:
+    rng = np.random.default_rng(seed)
+    limits = kernel().robot.arrays
+    middle, span = (limits.lower + limits.upper) / 2, limits.upper - limits.lower
+    ends = middle + 0.3 * span * rng.uniform(-0.5, 0.5, (2, DOF))
+    rows = [(0, WALL[1], (0, 0, 0, 1), (0.1, 0.8, 0.6)), (2, POST[1], (0, 0, 0, 1), (0.05, 0.6, 0.0))]
+    return Query(ends[0], ends[1], np.array([0.4, 0.0, 0.5]), Things.of(rows))
