@@ -17,14 +17,15 @@ from ompl import geometric as og
 
 from apex_ompl import planners, problems
 from apex_ompl.assembly import PlanningSetup, assemble, set_goals
-from apex_ompl.errors import ParameterError
+from apex_ompl.errors import ApexError, ParameterError
 from apex_ompl.files import is_file
 from apex_ompl.interrupt import Interrupt
 from apex_ompl.ompl_globals import quiet_ompl, seed_ompl
+from apex_ompl.planners.apex_parameters import WITHOUT_MODEL, default_planner
 from apex_ompl.problem import Problem
 from apex_ompl.repair import repair
 from apex_ompl.resolution import FULL_RESOLUTION
-from apex_ompl.result import PlanResult, PlanStatus
+from apex_ompl.result import INSIDE, PlanResult, PlanStatus
 from apex_ompl.simplify import simplify as shorten
 from apex_ompl.space import path_length, path_to_array, resample
 from apex_ompl.validity import full_check
@@ -34,7 +35,6 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-DEFAULT_PLANNER = "rrtconnect"
 CLEARANCE_SAMPLES = 32
 STRAIGHT_LINE = "straight line"
 PROOF_SHARE, LONGEST_PROOF = 0.1, 0.5  # time kept from planners that stop at the timeout only, for repair [1, s]
@@ -64,21 +64,22 @@ def load_problem(name_or_path: str | os.PathLike[str]) -> Problem:
 def setup(problem: Problem | str | os.PathLike[str]) -> og.SimpleSetup:
     """Return OMPL's SimpleSetup of a problem, for planners and tools of OMPL's own.
 
-    Space, verdict, motion validator, start and goals are set, and rrtconnect is allocated unless another planner
+    Space, verdict, motion validator, start and goals are set, and the default planner is allocated unless another one
     is set. Moving obstacles stand where they are at time 0.
 
     Raises:
         ApexError: The problem is unknown or faulty.
     """
     loaded = problem if isinstance(problem, Problem) else load_problem(problem)
-    simple_setup = assemble(loaded).simple_setup
-    simple_setup.setPlannerAllocator(planners.allocator(DEFAULT_PLANNER))
+    ready = assemble(loaded)
+    simple_setup = ready.simple_setup
+    simple_setup.setPlannerAllocator(planners.allocator(default_planner(ready.robot.name)))
     return simple_setup
 
 
 def plan(
     problem: Problem | str | os.PathLike[str],
-    planner: str = DEFAULT_PLANNER,
+    planner: str | None = None,
     *,
     timeout: float = 5.0,
     seed: int = 0,
@@ -88,12 +89,13 @@ def plan(
 ) -> PlanResult:
     """Plan a path and prove it by the full check.
 
-    The straight line to each goal is tried before the planner runs. What the planner finds is shortened, proved, and
-    planned anew where the proof fails.
+    The straight line to each goal is tried before the planner runs. What the planner finds is shortened unless it is
+    smooth, proved, and planned anew where the proof fails.
 
     Args:
         problem: A problem, its name, or its file.
-        planner: Name of a planner, see ``apex_ompl.planners.names()``.
+        planner: Name of a planner, see ``apex_ompl.planners.names()``; by default apex, or rrtconnect+polish for a
+            robot that no model ships for.
         timeout: Seconds for finding and repairing a path; shortening, which is capped by counts, comes on top. Of
             planners that stop at the timeout only, a tenth, at most 0.5 s, is kept for repair.
         seed: Seed of all random numbers, 0 or more. The same seed gives the same path for planners that are
@@ -112,7 +114,8 @@ def plan(
     """
     started = time.perf_counter()
     _check_arguments(timeout, seed)
-    parameters = planners.parameters(planner, **dict(params or {}))
+    if planner is not None:
+        planners.parameters(planner, **dict(params or {}))  # before the problem is read
     loaded = problem if isinstance(problem, Problem) else load_problem(problem)
     if loaded.moving and not snapshot:
         expected = f"True, since the obstacle {loaded.moving[0]!r} moves and plans hold for one moment only"
@@ -120,7 +123,13 @@ def plan(
     with quiet_ompl():
         seed_ompl(seed)
         ready = assemble(loaded, seed=seed)
-        run = _Run(ready, planner, seed, time.perf_counter() - started, loaded.moving)
+        notes = [f"snapshot: {', '.join(loaded.moving)} taken to stand still"] if loaded.moving else []
+        if planner is None:
+            planner = default_planner(ready.robot.name)
+            if planner == WITHOUT_MODEL:
+                notes.append(f"no model of {ready.robot.name} ships, so {planner} plans")
+        parameters = planners.parameters(planner, **dict(params or {}))
+        run = _Run(ready, planner, seed, time.perf_counter() - started, tuple(notes))
         with Interrupt() as run.interrupt:
             result = run.solve(parameters, timeout, simplify)
         return run.finish(started, result)
@@ -130,13 +139,12 @@ class _Run:
     """One call of ``plan`` on an assembled problem."""
 
     def __init__(
-        self, ready: PlanningSetup, planner: str, seed: int, setup_time: float, moving: tuple[str, ...]
+        self, ready: PlanningSetup, planner: str, seed: int, setup_time: float, notes: tuple[str, ...]
     ) -> None:
         self.ready = ready
         self.planner = planner
         self.interrupt = Interrupt()
         self.times = {"setup": setup_time}
-        notes = (f"snapshot: {', '.join(moving)} taken to stand still",) if moving else ()
         self.blank = PlanResult(
             status=PlanStatus.UNKNOWN, reason="", problem=ready.problem, robot=ready.robot.name,
             joint_names=ready.robot.joint_names, planner=planner, seed=seed, notes=notes,
@@ -149,21 +157,30 @@ class _Run:
             return self._failed(PlanStatus.INVALID_START, ready.start_fault)
         if all(ready.goal_faults):
             return self._failed(PlanStatus.INVALID_GOAL, "; ".join(ready.goal_faults))
-        deadline = time.perf_counter() + timeout
         with self._timed("line"):
             line = self._straight_line()
         if line is not None:
             return self._exact(line, STRAIGHT_LINE)
         try:
+            with self._timed("setup"):
+                planner = self._set_up(parameters)
+            deadline = time.perf_counter() + timeout
             status = self._run_ompl(parameters, timeout)
+            report = getattr(planner, "report", None)
+            if report is not None:
+                self.times |= {INSIDE + stage: seconds for stage, seconds in report.times.items()}
             if status is PlanStatus.APPROXIMATE_SOLUTION:
                 return self._approximate()
             if status is not PlanStatus.EXACT_SOLUTION:
                 said = "" if status is PlanStatus.TIMEOUT else f" (OMPL says {status})"
+                said += f", {report.reason}" if report is not None and report.reason else ""
                 ours = PlanStatus.TIMEOUT if status in (PlanStatus.INVALID_START, PlanStatus.INVALID_GOAL) else status
                 return self._failed(ours, f"{self.planner} found no path in {timeout:g} s{said}")
             states = path_to_array(ready.simple_setup.getSolutionPath(), ready.robot.dof)
-            return self._proved(states, deadline, simplify and not parameters.smooth)
+            solved_by = self.planner if report is None else report.solved_by
+            return self._proved(states, deadline, simplify and not parameters.smooth, solved_by)
+        except ApexError:  # a checkpoint that is missing, for one
+            raise
         except Exception as error:
             return self._failed(PlanStatus.CRASH, f"{self.planner} failed, {error!r}")
 
@@ -178,8 +195,8 @@ class _Run:
         free = (line for line in lines if ready.verdict.first_collision(line, FULL_RESOLUTION) is None)
         return next((line for line in free if full_check(ready.verdict, line, ready.start, goals)), None)
 
-    def _run_ompl(self, parameters: planners.Parameters, timeout: float) -> PlanStatus:
-        """Run the planner and return its status; faults of the checkers are raised."""
+    def _set_up(self, parameters: planners.Parameters) -> ob.Planner:
+        """Make the planner, warm."""
         simple_setup = self.ready.simple_setup
         si = simple_setup.getSpaceInformation()
         goals = self.ready.valid_goals
@@ -190,7 +207,14 @@ class _Run:
             self.blank = replace(self.blank, notes=(*self.blank.notes, note))
         if parameters.optimizing:  # others would go on after their first solution, prm for one
             simple_setup.setOptimizationObjective(ob.PathLengthOptimizationObjective(si))
-        simple_setup.setPlanner(parameters.build(si))
+        planner = parameters.build(si)
+        simple_setup.setPlanner(planner)
+        simple_setup.setup()
+        return planner
+
+    def _run_ompl(self, parameters: planners.Parameters, timeout: float) -> PlanStatus:
+        """Run the planner and return its status; faults of the checkers are raised."""
+        simple_setup = self.ready.simple_setup
         # A condition made in C++: planners that run threads deadlock with one made in Python.
         if parameters.optimizing:  # it takes all the time there is, and what it finds must still be proved
             timeout -= min(PROOF_SHARE * timeout, LONGEST_PROOF)
@@ -217,7 +241,7 @@ class _Run:
         self.times["total"] = time.perf_counter() - started
         return replace(result, checks=checks, times=dict(self.times))
 
-    def _proved(self, path: Array, deadline: float, simplify: bool) -> PlanResult:
+    def _proved(self, path: Array, deadline: float, simplify: bool, solved_by: str) -> PlanResult:
         """Put the exact start and goal in, shorten the path, prove it, and repair it where it fails.
 
         When a shortened path can neither be proved nor repaired, the path as it was found has its turn.
@@ -232,12 +256,12 @@ class _Run:
             with self._timed("verify"):
                 check = full_check(ready.verdict, candidate, ready.start, ready.goals)
             if check:
-                return self._exact(candidate, self.planner)
+                return self._exact(candidate, solved_by)
             reason = reason or check.reason
             with self._timed("repair"):
                 mended = repair(ready, candidate, check, deadline, self.interrupt)
             if mended is not None:
-                return self._exact(mended, f"{self.planner}+repair")
+                return self._exact(mended, f"{solved_by}+repair")
         return self._failed(PlanStatus.TIMEOUT, f"the path found failed the full check and repair, {reason}")
 
     def _shortened(self, path: Array) -> Array:

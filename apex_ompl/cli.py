@@ -19,8 +19,8 @@ from typing import NoReturn
 
 from apex_ompl.errors import ApexError, ParameterError
 from apex_ompl.files import check_writable
+from apex_ompl.result import INSIDE, PlanResult, PlanStatus, check_suffix
 from apex_ompl.result import SCHEMA as RESULT
-from apex_ompl.result import PlanResult, PlanStatus, check_suffix
 from apex_ompl.schema import read_yaml
 
 EXIT_CODES = {
@@ -68,10 +68,11 @@ def _parser() -> _Parser:
 
     plan = commands.add_parser("plan", help="plan a path for a problem")
     plan.add_argument("problem", help="name of a problem, an id as shelf/hard/900012, or a YAML file")
-    plan.add_argument("--planner", default="rrtconnect", help="see 'apex-ompl planners' (default: %(default)s)")
+    plan.add_argument("--planner", help="see 'apex-ompl planners' (default: apex)")
     plan.add_argument("--timeout", type=float, default=5.0, metavar="SECONDS", help="default: %(default)s")
     plan.add_argument("--seed", type=int, default=0, help="default: %(default)s")
     plan.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="a planner parameter")
+    plan.add_argument("--params", type=Path, metavar="FILE", help="planner parameters in YAML; --set goes before them")
     plan.add_argument("--no-simplify", action="store_true", help="keep the path as the planner found it")
     plan.add_argument("--snapshot", action="store_true", help="take moving obstacles to stand still")
     plan.add_argument("--out", type=Path, metavar="FILE", help="write the result: .npz, .csv, .json or .yaml")
@@ -113,13 +114,15 @@ def _plan(parsed: argparse.Namespace) -> int:
     if parsed.out is not None:
         check_suffix(parsed.out)
         check_writable(parsed.out)
+    params = {} if parsed.params is None else read_yaml(parsed.params, "file of planner parameters")
+    params |= {name.replace("-", "_"): value for name, value in _pairs("--set", parsed.set).items()}
     result = plan(
         parsed.problem,
         planner=parsed.planner,
         timeout=parsed.timeout,
         seed=parsed.seed,
         simplify=not parsed.no_simplify,
-        params={name.replace("-", "_"): value for name, value in _pairs("--set", parsed.set).items()},
+        params=params,
         snapshot=parsed.snapshot,
     )
     if parsed.out is not None and (result.path is not None or parsed.out.suffix != ".csv"):
@@ -142,11 +145,15 @@ def _pairs(option: str, pairs: Sequence[str]) -> dict[str, str]:
 
 
 def _summary(result: PlanResult) -> str:
-    stages = ", ".join(f"{k} {v:.3f}" for k, v in result.times.items() if k != "total")
+    times = [(name, f"{seconds:.3f}") for name, seconds in result.times.items() if name != "total"]
+    stages = ", ".join(f"{name} {text}" for name, text in times if not name.startswith(INSIDE))
+    inside = ", ".join(f"{name.removeprefix(INSIDE)} {text}" for name, text in times if name.startswith(INSIDE))
     lines = [f"{result.problem.name}: {result.status}" + (f" by {result.solved_by}" if result.solved_by else "")]
     if result.reason:
         lines.append(f"  reason     {result.reason}")
     lines.append(f"  time       {result.times['total']:.3f} s ({stages})")
+    if inside:
+        lines.append(f"  solve      {inside}")
     if result.path is not None:
         lines.append(f"  length     {result.length:.3f} rad over {len(result.path)} states")
         lines.append(f"  clearance  {result.clearance * 1e3:.1f} mm")

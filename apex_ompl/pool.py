@@ -28,6 +28,7 @@ class Candidate:
         clearance: Smallest clearance at the samples [m].
         damping: Of the next step.
         rounds: How often it was worked on.
+        given_up: Whether nothing more comes of it.
     """
 
     control: Array
@@ -36,6 +37,7 @@ class Candidate:
     clearance: float
     damping: float
     rounds: int = 0
+    given_up: bool = False
 
     @property
     def hope(self) -> float:
@@ -90,9 +92,8 @@ class Pool:
         """
         left, settings = steps, self._optimizer.settings
         while left > 0 and not stop():
-            chosen = min(
-                (one for one in self.candidates if one.rounds < ROUNDS), key=lambda one: one.hope, default=None
-            )
+            hopeful = (one for one in self.candidates if one.rounds < ROUNDS and not one.given_up)
+            chosen = min(hopeful, key=lambda one: one.hope, default=None)
             if chosen is None:
                 break
             soft = chosen.rounds >= ROUNDS - SOFT_ROUNDS
@@ -107,6 +108,8 @@ class Pool:
             self.steps += int(bent.steps[0])
             if self._passes(chosen):
                 return chosen
+            if not bent.steps[0]:  # nothing is short of clearance, and yet it is not valid
+                chosen.given_up = True
         return None
 
     def _passes(self, candidate: Candidate) -> bool:

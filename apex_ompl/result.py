@@ -25,6 +25,10 @@ SCHEMA = "apex-ompl/result/1"
 SUFFIXES = (".npz", ".csv", ".json", ".yaml")
 
 
+INSIDE = "solve: "
+"""Stands before the names of a planner's own stages in ``PlanResult.times``."""
+
+
 class PlanStatus(StrEnum):
     """OMPL's planner status names."""
 
@@ -58,13 +62,14 @@ class PlanResult:
         planner: Name of the planner.
         seed: The seed used.
         path: States to be joined by straight lines, shape (N, dof) [rad; synergies 0..1], or None.
-        times: Seconds per stage, and ``total``.
+        times: Seconds per stage, and ``total``; those of a planner's own stages, as ``solve: repair``, are part of
+            ``solve``.
         length: Sum of Euclidean joint-space steps [rad], NaN without a path.
         clearance: Least distance of any checked pair at 32 states spread over the path [m], NaN without a path.
         checks: How many states were judged one by one; those inside proved stretches of motions do not count.
-        solved_by: What found the path: the planner's name, with ``+repair`` when a stretch of it failed the
-            full check and was planned anew; ``straight line`` when that was a solution, so that no planner ran;
-            empty without a path.
+        solved_by: What found the path: the planner's name, or the stage of apex that did (see
+            ``apex_ompl.search.Report``), with ``+repair`` when a stretch of it failed the full check and was planned
+            anew; ``straight line`` when that was a solution, so that no planner ran; empty without a path.
         notes: What a user should know about this run, such as a snapshot of moving obstacles.
     """
 

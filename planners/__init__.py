@@ -3,6 +3,16 @@
 if not __name__.startswith("apex_ompl."):  # the folder also lies at the top of the source tree
     raise ImportError("import apex_ompl.planners, not planners")
 
+from typing import Any
+
 from apex_ompl.planners.registry import Parameters, allocator, make, names, parameters
 
-__all__ = ["Parameters", "allocator", "make", "names", "parameters"]
+__all__ = ["APEX", "Parameters", "allocator", "make", "names", "parameters"]
+
+
+def __getattr__(name: str) -> Any:
+    if name == "APEX":  # torch comes with it
+        from apex_ompl.planners.apex import APEX
+
+        return APEX
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -116,8 +116,9 @@ class RRTConnectPolish(Parameters):
         """Check that control points are left free.
 
         Raises:
-            ParameterError: All are pinned.
+            ParameterError: One is of the wrong type or out of range, or all are pinned.
         """
+        super().__post_init__()
         Spline(self.control_points, self.pinned)
 
     def build(self, si: ob.SpaceInformation) -> ob.Planner:

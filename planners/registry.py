@@ -29,6 +29,15 @@ class Parameters:
     smooth: ClassVar[bool] = False
     threaded: ClassVar[bool] = False
 
+    def __post_init__(self) -> None:
+        """Check the values.
+
+        Raises:
+            ParameterError: One is of the wrong type or out of range.
+        """
+        for field in fields(self):
+            _read(field.name, getattr(self, field.name), field.default, field)
+
     def build(self, si: ob.SpaceInformation) -> ob.Planner:
         """Return a planner for ``si`` with these parameters."""
         raise TypeError(f"{type(self).__name__} does not say how to build its planner")
@@ -51,6 +60,11 @@ class Parameters:
 def bounded(default: Any, low: float, high: float = float("inf"), unit: str = "") -> Any:
     """Return a dataclass field with a range, ends included; the unit is for documentation."""
     return dataclasses.field(default=default, metadata={"low": low, "high": high, "unit": unit})
+
+
+def one_of(default: str, *others: str) -> Any:
+    """Return a dataclass field that is one of some words."""
+    return dataclasses.field(default=default, metadata={"words": (default, *others)})
 
 
 LARGEST_INT = 2**31 - 1
@@ -109,12 +123,17 @@ def allocator(name: str, /, **values: Any) -> Callable[[ob.SpaceInformation], ob
 
 def _load() -> None:
     """Import the modules that register planners."""
-    from apex_ompl.planners import polish, sampling  # noqa: F401
+    from apex_ompl.planners import apex_parameters, polish, sampling  # noqa: F401
 
 
 def _read(name: str, value: Any, default: Any, field: dataclasses.Field[Any]) -> Any:
     """Return ``value`` as the type of ``default``, in range."""
     kind = type(default)
+    if kind is str:
+        words = field.metadata.get("words", ())
+        if not isinstance(value, str) or not value or (words and value not in words):
+            raise ParameterError(f"parameter {name!r}", value, f"one of {', '.join(words)}" if words else "a name")
+        return value
     expected = {bool: "true or false", int: "a whole number", float: "a number"}[kind]
     low, high = field.metadata.get("low", -float("inf")), field.metadata.get("high", float("inf"))
     high = min(high, LARGEST_INT) if kind is int else high

@@ -33,8 +33,9 @@ def test_plan_prints_status_time_and_length(apex_cli, easy: Path) -> None:
     done = apex_cli("plan", easy, "--timeout", 30, "--seed", 3)
     assert done.returncode == 0, done.stderr
     lines = done.stdout.splitlines()
-    assert lines[0] == "sweep: EXACT_SOLUTION by rrtconnect" or lines[0].endswith("rrtconnect+repair")
-    assert "time" in lines[1] and "length" in lines[2] and "clearance" in lines[3] and "seed 3" in lines[4]
+    assert lines[0].startswith("sweep: EXACT_SOLUTION by ")
+    assert lines[2].startswith("  solve      query 0.") and lines[5].endswith("planner apex, seed 3")
+    assert "time" in lines[1] and "length" in lines[3] and "clearance" in lines[4]
 
 
 def test_json_goes_to_standard_output_alone_and_out_writes_the_same(apex_cli, easy: Path, tmp_path: Path) -> None:

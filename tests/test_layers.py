@@ -19,6 +19,7 @@ LAYERS = [
     {"description", "engine", "torch_threads"},
     {"cases"},
     {"diffusion"},
+    {"search"},
     {"robot"},
     {"collision"},
     {"ik", "interrupt", "ompl_globals", "space"},

@@ -7,7 +7,9 @@ import json
 import os
 import shutil
 import tempfile
+import threading
 from collections.abc import Mapping
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -173,6 +175,30 @@ def load_model(
     except (RuntimeError, AssertionError) as error:
         raise ParameterError("device", str(device), "a device of torch's that is there") from error
     return TrajectoryModel(network, config.trained)
+
+
+def shared_model(name: str | os.PathLike[str], *, device: str = "cpu", robot: str | None = None) -> TrajectoryModel:
+    """Return a trained model, the same object as before as long as its file has not changed.
+
+    Raises:
+        ApexError: As :func:`load_model` does.
+    """
+    folder = _folder(name)
+    try:
+        stamp = (folder / WEIGHTS).stat().st_mtime_ns
+    except OSError:
+        stamp = 0
+    with _loading:
+        return _shared(str(folder.absolute()), stamp, device, robot)
+
+
+_loading = threading.Lock()
+
+
+@lru_cache(maxsize=4)
+def _shared(folder: str, stamp: int, device: str, robot: str | None) -> TrajectoryModel:
+    del stamp
+    return load_model(folder, device=device, robot=robot)
 
 
 def read_config(folder: Path) -> CheckpointConfig:

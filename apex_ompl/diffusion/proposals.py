@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
@@ -102,30 +102,30 @@ class TrajectoryModel:
         return self.network.probe_offset.device
 
     def propose(
-        self, query: Query, kernel: Kernel, count: int, *, sampling: Sampling | None = None,
+        self, query: Query | Sequence[Query], kernel: Kernel, count: int, *, sampling: Sampling | None = None,
         generator: torch.Generator | None = None, callback: Callback | None = None,
     ) -> Proposals:  # fmt: skip
         """Return paths from noise (Algorithm 1 of the paper, generate_traj).
 
         Args:
-            query: The problem.
+            query: The problem, or several of one scene.
             kernel: The robot among its obstacles, which guidance asks.
-            count: How many paths.
+            count: How many paths for each query; those of the first query come first.
             sampling: How they are denoised; by default as the model's configuration says.
             generator: Source of all noise; the same state gives the same paths. By default one with seed 0.
             callback: Called at every step.
 
         Raises:
-            ParameterError: The query has states of another robot, or there are no paths to propose.
+            ParameterError: A query has states of another robot, or there are no paths to propose.
         """
-        sampling = sampling or self.sampling
+        sampling, queries = sampling or self.sampling, [query] if isinstance(query, Query) else list(query)
         if not isinstance(count, int) or count < 1:
             raise ParameterError("count", count, "a positive number of paths")
-        shape = torch.zeros(count, *self.network.latent, device=self.device)
+        shape = torch.zeros(len(queries) * count, *self.network.latent, device=self.device)
         generator = generator or torch.Generator().manual_seed(0)
         first = sampling.temperature * noise_like(shape, generator)
         top = self.network.schedule.steps - 1
-        return self._denoised(query, kernel, first, top, sampling=sampling, generator=generator, callback=callback)
+        return self._denoised(queries, kernel, first, top, sampling=sampling, generator=generator, callback=callback)
 
     def renoise(
         self, query: Query, kernel: Kernel, control: Array, step: int, *, sampling: Sampling | None = None,
@@ -158,10 +158,10 @@ class TrajectoryModel:
             clean = self.network.autoencoder.encode(torch.tensor(control, dtype=torch.float32, device=self.device))
             first = self.network.schedule.noisy(clean, noise_like(clean, generator), step)
         sampling = replace(sampling, steps=min(sampling.steps, step + 1))
-        return self._denoised(query, kernel, first, step, sampling=sampling, generator=generator, callback=callback)
+        return self._denoised([query], kernel, first, step, sampling=sampling, generator=generator, callback=callback)
 
-    def conditions(self, query: Query, kernel: Kernel) -> Conditions:
-        """Return a query as a batch of one.
+    def conditions(self, queries: Sequence[Query], kernel: Kernel) -> Conditions:
+        """Return queries as a batch.
 
         Raises:
             ParameterError: The robot is another one, or numbers are not finite.
@@ -169,24 +169,27 @@ class TrajectoryModel:
         config = self.network.config
         if (kernel.robot.name, kernel.robot.joint_names) != (config.robot, config.joints):
             raise ParameterError("robot", kernel.robot.name, f"{config.robot}, which the model was trained for")
-        for name, state in (("start", query.start), ("goal", query.goal)):
-            if np.shape(state) != (len(config.joints),) or not np.isfinite(state).all():
-                raise ParameterError(name, state, f"a finite state of shape ({len(config.joints)},)")
-        things = query.things
-        numbers = (query.point, things.position, things.turn, things.size)
-        if not all(np.isfinite(values).all() for values in numbers):
-            raise ParameterError("obstacles", "NaN or infinity", "finite positions, rotations and sizes")
-        return batched([query], self.probes, kernel).to(self.device)
+        for query in queries:
+            for name, state in (("start", query.start), ("goal", query.goal)):
+                if np.shape(state) != (len(config.joints),) or not np.isfinite(state).all():
+                    raise ParameterError(name, state, f"a finite state of shape ({len(config.joints)},)")
+            things = query.things
+            numbers = (query.point, things.position, things.turn, things.size)
+            if not all(np.isfinite(values).all() for values in numbers):
+                raise ParameterError("obstacles", "NaN or infinity", "finite positions, rotations and sizes")
+        return batched(queries, self.probes, kernel).to(self.device)
 
     def _denoised(
-        self, query: Query, kernel: Kernel, first: Tensor, top: int, *, sampling: Sampling,
+        self, queries: Sequence[Query], kernel: Kernel, first: Tensor, top: int, *, sampling: Sampling,
         generator: torch.Generator, callback: Callback | None,
     ) -> Proposals:  # fmt: skip
         network, clock = self.network, _Clock()
         with torch.no_grad():
-            given = self.conditions(query, kernel)
+            given, each = self.conditions(queries, kernel), len(first) // len(queries)
             encoded = network.encoder(given)
-            start, goal = given.start.expand(len(first), -1), given.goal.expand(len(first), -1)
+            if len(queries) > 1:
+                encoded = encoded.repeat_interleave(each, dim=0)
+            start, goal = (ends.repeat_interleave(each, dim=0) for ends in (given.start, given.goal))
             clock.lap("condition")
             if network.regresses:
                 zero = torch.zeros_like(first)
@@ -211,7 +214,8 @@ class TrajectoryModel:
             clock.lap("network")
             found = network.autoencoder.control(latent, start, goal).cpu().double().numpy()
             limits = kernel.robot.arrays
-            found = self.spline.with_ends(np.clip(found, limits.lower, limits.upper), query.start, query.goal)
+            ends = (np.repeat([getattr(q, name) for q in queries], each, axis=0) for name in ("start", "goal"))
+            found = self.spline.with_ends(np.clip(found, limits.lower, limits.upper), *ends)
             clock.lap("decode")
         return Proposals(found, latent, clock.seconds)
 

@@ -1,0 +1,264 @@
+"""The stages of APEX that need no tree: propose, judge, repair, resample (Algorithm 1 of the paper, execute)."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from apex_ompl.diffusion.conditions import Query
+from apex_ompl.diffusion.proposals import Sampling, TrajectoryModel
+from apex_ompl.diffusion.schedule import Estimate
+from apex_ompl.kernel import Kernel
+from apex_ompl.optimize import Check, Optimizer
+from apex_ompl.pool import PER_PATH, Candidate, Pool
+
+Array = NDArray[np.float64]
+Stop = Callable[[], bool]
+
+LINE, EXPERIENCE, PROPOSED, RESAMPLED = "line", "experience", "apex", "apex+resample"
+"""Where candidates come from, as ``solved_by`` names them."""
+
+AT_ONCE = 8  # proposals between two looks at the clock
+LEAST_STEPS = 48  # of repair in a round
+WORTH_RESAMPLING = 4  # candidates in a round
+VARIED = 4  # variations of a path at a time
+
+
+class OutOfTimeError(Exception):
+    """Raised inside of a sampler to leave it; never leaves this module."""
+
+
+@dataclass
+class Report:
+    """What a call of ``solve`` did.
+
+    Attributes:
+        solved_by: The stage that found the first valid path: ``line``, ``experience``, ``apex`` or ``apex+resample``,
+            with ``+repair`` where the optimiser had to help; ``apex+bridge`` or ``rrtconnect``; empty without one.
+        reason: One sentence where there is no exact solution.
+        times: Seconds by stage.
+        first: Seconds until the first valid path, NaN without one.
+        candidates: Paths that were proposed.
+        steps: Steps of the optimiser.
+        improved: How often a shorter path was found behind the first one.
+    """
+
+    solved_by: str = ""
+    reason: str = ""
+    times: dict[str, float] = field(default_factory=dict)
+    first: float = float("nan")
+    candidates: int = 0
+    steps: int = 0
+    improved: int = 0
+
+    @contextmanager
+    def timed(self, stage: str) -> Iterator[None]:
+        """Count the time of a block to a stage."""
+        begin = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.times[stage] = self.times.get(stage, 0.0) + time.perf_counter() - begin
+
+
+@dataclass(frozen=True)
+class SearchSettings:
+    """How APEX searches before it grows trees.
+
+    Attributes:
+        line: Whether the straight line is a candidate.
+        batches: Numbers of proposals for each pair of start and goal, one round behind the other.
+        sampling: How they are denoised, guidance included.
+        resample: How often colliding candidates are resampled in each round.
+        noise: How far they are noised for that, as a share of the schedule.
+        repair: Whether candidates are improved by the optimiser.
+        lambda_obs: Valid paths that come nearer to an obstacle than this are resampled too [m].
+    """
+
+    line: bool = True
+    batches: tuple[int, ...] = (1, 7, 24)
+    sampling: Sampling = Sampling()
+    resample: int = 1
+    noise: float = 0.4
+    repair: bool = True
+    lambda_obs: float = 0.0
+
+
+class Search:
+    """A search for a valid path between some starts and goals in one scene.
+
+    Attributes:
+        pool: All candidates.
+    """
+
+    def __init__(
+        self, model: TrajectoryModel, optimizer: Optimizer, kernel: Kernel, is_valid: Check,
+        gap: Callable[[Array], float], *, settings: SearchSettings, generator: torch.Generator, report: Report,
+    ) -> None:  # fmt: skip
+        """Search with a model's proposals.
+
+        Args:
+            model: Proposes.
+            optimizer: Repairs.
+            kernel: The robot among its obstacles.
+            is_valid: Decides; called with the states of a path.
+            gap: Gives the distance of a path's states from the obstacles [m]; asked where ``lambda_obs`` is not 0.
+            settings: How.
+            generator: Source of all noise.
+            report: Is told about times and numbers.
+        """
+        self._model, self._optimizer, self._kernel, self._is_valid = model, optimizer, kernel, is_valid
+        self._gap, self._settings, self._generator, self._report = gap, settings, generator, report
+        self.pool = Pool(optimizer, kernel, is_valid)
+        self._close: list[tuple[float, Candidate]] = []  # valid, but nearer to an obstacle than lambda_obs
+
+    def run(self, queries: Sequence[Query], experience: Sequence[Array], stop: Stop) -> Candidate | None:
+        """Return a valid path for one of several queries, or None.
+
+        Args:
+            queries: The problems, which differ in their starts and goals.
+            experience: What earlier paths differed in from their straight lines, each of shape (points, dof).
+            stop: Asked often whether to give up.
+        """
+        for stage in self._stages(queries, experience, stop):
+            if stop():
+                break
+            found = stage()
+            if found is not None and self._keeps_distance(found):
+                return found
+        return max(self._close, key=lambda pair: pair[0])[1] if self._close else None
+
+    def vary(self, control: Array, query: Query, noise: float, stop: Stop) -> Candidate | None:
+        """Return a valid path that a given one becomes when it is noised and denoised again, or None.
+
+        Args:
+            control: Control points of the given path, shape (points, dof).
+            query: Its start and goal.
+            noise: How far it is noised, as a share of the schedule.
+            stop: Asked often whether to give up.
+        """
+        pool = Pool(self._optimizer, self._kernel, self._is_valid)
+        found = self._renoised(np.repeat(control[None], VARIED, axis=0), query, noise, stop)
+        if found is None:
+            return None
+        return pool.add(found, RESAMPLED, stop) or pool.work(PER_PATH * VARIED, stop)
+
+    def fresh(self, query: Query, stop: Stop) -> Candidate | None:
+        """Return a valid path that new proposals become, or None."""
+        pool = Pool(self._optimizer, self._kernel, self._is_valid)
+        found = self._proposed([query], AT_ONCE, stop)
+        if found is None:
+            return None
+        return pool.add(found, PROPOSED, stop) or pool.work(PER_PATH * AT_ONCE, stop)
+
+    def _stages(
+        self, queries: Sequence[Query], experience: Sequence[Array], stop: Stop
+    ) -> Iterator[Callable[[], Candidate | None]]:
+        settings = self._settings
+        if settings.line or experience:
+            yield lambda: self._known(queries, experience, stop)
+        for batch in settings.batches or (0,):
+            each = max(1, AT_ONCE // len(queries))
+            for k in range(0, batch, each):
+                count = min(each, batch - k)
+                yield lambda count=count: self._propose(queries, count, stop)  # type: ignore[misc]
+            if settings.repair:
+                steps = max(LEAST_STEPS, PER_PATH * batch * len(queries))
+                yield lambda steps=steps: self._repair(steps, stop)  # type: ignore[misc]
+            for _ in range(settings.resample):
+                yield lambda: self._resample(queries, stop)
+                if settings.repair:
+                    yield lambda: self._repair(PER_PATH * WORTH_RESAMPLING, stop)
+
+    def _known(self, queries: Sequence[Query], experience: Sequence[Array], stop: Stop) -> Candidate | None:
+        """Take in what costs nothing: straight lines, and earlier paths put on other ends."""
+        with self._report.timed("known"):
+            spline, limits = self._model.spline, self._kernel.robot.arrays
+            lines = np.stack([spline.line(q.start, q.goal) for q in queries])
+            found = self._add(lines, LINE, stop) if self._settings.line else None
+            for residual in experience if found is None else ():
+                moved = np.clip(lines + residual, limits.lower, limits.upper)
+                found = self._add(spline.with_ends(moved, lines[:, 0], lines[:, -1]), EXPERIENCE, stop)
+                if found is not None or stop():
+                    break
+        return found
+
+    def _propose(self, queries: Sequence[Query], count: int, stop: Stop) -> Candidate | None:
+        with self._report.timed("propose"):
+            control = self._proposed(queries, count, stop)
+        with self._report.timed("judge"):
+            return None if control is None else self._add(control, PROPOSED, stop)
+
+    def _repair(self, steps: int, stop: Stop) -> Candidate | None:
+        before = self.pool.steps
+        with self._report.timed("repair"):
+            found = self.pool.work(steps, stop)
+        self._report.steps += self.pool.steps - before
+        return found
+
+    def _resample(self, queries: Sequence[Query], stop: Stop) -> Candidate | None:
+        """Noise the candidates that come nearest to being valid, and denoise them again under guidance."""
+        with self._report.timed("resample"):
+            best = sorted(self.pool.candidates, key=lambda one: one.shortfall)[:WORTH_RESAMPLING]
+            for query in queries:
+                mine = [one.control for one in best if _joins(one.control, query)]
+                control = self._renoised(np.stack(mine), query, self._settings.noise, stop) if mine else None
+                found = None if control is None else self._add(control, RESAMPLED, stop)
+                if found is not None or stop():
+                    return found
+        return None
+
+    def _add(self, control: Array, origin: str, stop: Stop) -> Candidate | None:
+        self._report.candidates += len(control)
+        return self.pool.add(control, origin, stop)
+
+    def _keeps_distance(self, found: Candidate) -> bool:
+        """Whether a valid path is as far from obstacles as is wanted; one that is not is set aside."""
+        wanted = self._settings.lambda_obs
+        if wanted <= 0.0:
+            return True
+        gap = self._gap(self._model.spline.path(found.control))
+        if gap < wanted:
+            found.given_up = True
+            self._close.append((gap, found))
+        return gap >= wanted
+
+    def _proposed(self, queries: Sequence[Query], count: int, stop: Stop) -> Array | None:
+        try:
+            return self._model.propose(
+                queries, self._kernel, count, sampling=self._settings.sampling, generator=self._generator,
+                callback=_leaving(stop),
+            ).control  # fmt: skip
+        except OutOfTimeError:
+            return None
+
+    def _renoised(self, control: Array, query: Query, noise: float, stop: Stop) -> Array | None:
+        step = max(0, round(noise * self._model.network.schedule.steps) - 1)
+        try:
+            return self._model.renoise(
+                query, self._kernel, control, step, sampling=self._settings.sampling, generator=self._generator,
+                callback=_leaving(stop),
+            ).control  # fmt: skip
+        except OutOfTimeError:
+            return None
+
+
+def _joins(control: Array, query: Query) -> bool:
+    return np.array_equal(control[0], query.start) and np.array_equal(control[-1], query.goal)
+
+
+def _leaving(stop: Stop) -> Callable[[int, Tensor, Estimate], None]:
+    """Return a callback that leaves a sampler when time is up."""
+
+    def callback(*_: object) -> None:
+        if stop():
+            raise OutOfTimeError
+
+    return callback

@@ -1,0 +1,103 @@
+"""APEX: paths proposed by latent diffusion, bent away from obstacles, repaired, and completed by RRTConnect."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+from ompl import base as ob
+from ompl import util as ou
+
+from apex_ompl.diffusion.checkpoint import shared_model
+from apex_ompl.diffusion.proposals import Sampling
+from apex_ompl.optimize import Optimizer
+from apex_ompl.planners.apex_parameters import NAME, ApexParameters
+from apex_ompl.planners.judge import Judge
+from apex_ompl.planners.solve_loop import LOG, SolveLoop
+from apex_ompl.queries import query_of
+from apex_ompl.search import Report
+from apex_ompl.torch_threads import one_torch_thread
+
+Array = NDArray[np.float64]
+Stop = Callable[[], bool]
+Status = ob.PlannerStatus
+
+
+class APEX(ob.Planner):
+    """OMPL planner: section III of the paper inside ``solve``, and complete in the limit by RRTConnect.
+
+    It works with any validity checker. With this project's, proposals are guided and repaired among the obstacles; with
+    another one they are judged by it. A first path is shortened; with a path length objective it is improved until the
+    termination condition holds.
+
+    Attributes:
+        parameters: How it plans.
+        judge: Decides what is valid.
+        model: Proposes.
+        optimizer: Repairs and shortens.
+        experience: What earlier paths differed in from their straight lines, each of shape (points, dof).
+        report: What the last call of ``solve`` did.
+    """
+
+    def __init__(self, si: ob.SpaceInformation, parameters: ApexParameters | None = None) -> None:
+        """Plan in the space of ``si``, whose validity checker is set.
+
+        Raises:
+            ApexError: The model or the robot cannot be loaded, or do not fit the space.
+        """
+        super().__init__(si, NAME)
+        self.parameters = parameters or ApexParameters()
+        self.judge = Judge(si, self.parameters.robot)
+        robot = self.judge.verdict.robot.name
+        self.model = shared_model(self.parameters.model, device=self.parameters.device, robot=robot)
+        self.optimizer = Optimizer(self.model.spline)
+        self.experience: list[Array] = []
+        self._solves = 0
+        self._warm = False
+        self.report = Report()
+
+    def setup(self) -> None:
+        """Make all ready that the first call of ``solve`` would have to: kernel, network, optimiser."""
+        super().setup()
+        if self._warm:
+            return
+        verdict = self.judge.verdict
+        self.optimizer.prepare(verdict.kernel)
+        query = query_of(verdict, verdict.robot.home, verdict.robot.home, point=self.model.sees_point)
+        with one_torch_thread():
+            self.model.propose(query, verdict.kernel, 1, sampling=Sampling())
+        self._warm = True
+
+    def clear(self) -> None:
+        """Forget all that was found."""
+        super().clear()
+        self.clearQuery()
+        self.experience = []
+
+    def clearQuery(self) -> None:  # noqa: N802 - OMPL's name
+        """Forget the query; earlier paths stay candidates for the next one."""
+        self._solves, self.report = 0, Report()
+
+    def next_seed(self) -> int:
+        """Return the seed of the next call of ``solve``: another one each time, and the same ones after ``clear``."""
+        first = self.parameters.seed if self.parameters.seed >= 0 else int(ou.RNG().uniformInt(0, 2**31 - 2))
+        self._solves += 1
+        return first + self._solves - 1
+
+    def solve(self, ptc: ob.PlannerTerminationCondition) -> ob.PlannerStatus:
+        """Solve the problem; no exception leaves it, since one would end the process inside OMPL.
+
+        Starts and goals are read anew by every call. ``report`` says what was done, and why where nothing was found.
+        """
+        self.report = Report()
+        try:
+            if not self._warm:
+                self.setup()
+            with one_torch_thread():
+                status = SolveLoop(self, ptc).run()
+        except Exception as error:
+            LOG.exception("%s failed", NAME)
+            self.report.reason = f"{NAME} failed, {error!r}"
+            status = Status.CRASH
+        return Status(status)

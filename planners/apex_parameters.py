@@ -1,0 +1,112 @@
+"""Parameters of APEX; torch is imported when a planner is built."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, ClassVar
+
+from ompl import base as ob
+
+from apex_ompl import diffusion
+from apex_ompl.planners.registry import Parameters, bounded, one_of, register
+
+if TYPE_CHECKING:
+    from apex_ompl.search import SearchSettings
+
+NAME = "apex"
+WITHOUT_MODEL = "rrtconnect+polish"
+CHECKPOINTS = Path(diffusion.__path__[0]) / "checkpoints"
+
+
+def default_planner(robot: str) -> str:
+    """Return the planner that is taken for a robot where none is named: apex where its model is there for it.
+
+    Otherwise it is rrtconnect+polish, which needs no model.
+    """
+    try:
+        config = json.loads((CHECKPOINTS / ApexParameters.model / "config.json").read_text(encoding="utf-8"))
+        there = config["model"]["robot"] == robot
+    except (OSError, ValueError, KeyError):
+        there = False
+    return NAME if there else WITHOUT_MODEL
+
+
+@register(NAME)
+@dataclass(frozen=True)
+class ApexParameters(Parameters):
+    """Proposals of a latent diffusion model, repaired, bridged, and completed by RRTConnect.
+
+    Attributes:
+        model: Name or folder of a checkpoint.
+        robot: The robot, where the validity checker is not this project's.
+        device: Where the network runs.
+        line: Whether the straight line is a candidate.
+        sampler: ``ddim``, ``dpm_solver`` or ``ddpm``.
+        denoising_steps: Number of denoising steps; the paper takes all 256 by ``ddpm``.
+        temperature: Standard deviation of the noise to begin with.
+        first: Proposals for each pair of start and goal in the first round.
+        second: In the second.
+        third: In the third.
+        guidance: Whether paths are drawn away from obstacles while they are denoised.
+        gamma: Scale of the guidance.
+        resample: How often colliding candidates are resampled in each round.
+        noise: How far they are noised for that, as a share of the schedule.
+        lambda_obs: Valid paths that come nearer to an obstacle than this are resampled too; the one that keeps most
+            distance stands when none comes out better.
+        repair: Whether candidates are improved by the optimiser.
+        bridge: Whether blocked stretches of the best candidates are bridged by short trees.
+        fallback: Whether RRTConnect gets the time that is left.
+        polish: Whether valid paths are shortened.
+        approximate: Whether, without an exact solution, a path that ends near a goal is given as an approximate one.
+        anytime: Whether paths are improved until the time is up, as they are with a path length objective.
+        range: Longest step of RRTConnect's trees, in bridges and as fallback; 0 lets OMPL choose.
+        seed: Of the proposals' noise; -1 takes one that follows from OMPL's.
+    """
+
+    smooth: ClassVar[bool] = True
+    model: str = "apex"
+    robot: str = "dual_panda_softhand"
+    device: str = "cpu"
+    line: bool = True
+    sampler: str = one_of("ddim", "dpm_solver", "ddpm")
+    denoising_steps: int = bounded(2, 1, 1000)
+    temperature: float = bounded(1.0, 0.0, 10.0)
+    first: int = bounded(1, 0, 1024)
+    second: int = bounded(7, 0, 1024)
+    third: int = bounded(24, 0, 1024)
+    guidance: bool = False
+    gamma: float = bounded(1.0, 0.0, 1e3)
+    resample: int = bounded(1, 0, 100)
+    noise: float = bounded(0.4, 0.0, 1.0)
+    lambda_obs: float = bounded(0.0, 0.0, 1.0, unit="m")
+    repair: bool = True
+    bridge: bool = True
+    fallback: bool = True
+    polish: bool = True
+    approximate: bool = False
+    anytime: bool = False
+    range: float = bounded(0.0, 0.0, unit="rad")
+    seed: int = bounded(-1, -1)
+
+    def search(self) -> SearchSettings:
+        """Return what of it concerns the search before trees."""
+        from apex_ompl.diffusion.guidance import Guidance
+        from apex_ompl.diffusion.proposals import Sampling
+        from apex_ompl.search import SearchSettings
+
+        guidance = Guidance(gamma=self.gamma if self.guidance else 0.0)
+        sampling = Sampling(self.sampler, self.denoising_steps, self.temperature, guidance)
+        batches = tuple(count for count in (self.first, self.second, self.third) if count)
+        return SearchSettings(self.line, batches, sampling, self.resample, self.noise, self.repair, self.lambda_obs)
+
+    def build(self, si: ob.SpaceInformation) -> ob.Planner:
+        """Return the planner.
+
+        Raises:
+            ApexError: The model or the robot cannot be loaded, or do not fit the space.
+        """
+        from apex_ompl.planners.apex import APEX
+
+        return APEX(si, self)

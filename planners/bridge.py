@@ -1,0 +1,92 @@
+"""Blocked stretches of a path bridged by short trees: what resampling does not solve, trees may."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+from ompl import base as ob
+from ompl import geometric as og
+
+from apex_ompl.planners.judge import Judge
+from apex_ompl.space import path_to_array, to_state
+
+Array = NDArray[np.float64]
+Stop = Callable[[], bool]
+
+CALLS = 20_000  # of the termination condition of one bridge
+EVERY = 2  # states of a path that are judged to find its blocked stretches
+
+
+def grown(tree: ob.Planner, pdef: ob.ProblemDefinition, ptc: ob.PlannerTerminationCondition) -> ob.PlannerStatus:
+    """Let a planner solve a problem, and return its status."""
+    tree.setProblemDefinition(pdef)
+    tree.setup()
+    return tree.solve(ptc)
+
+
+def connect(si: ob.SpaceInformation, longest: float) -> og.RRTConnect:
+    """Return an RRTConnect whose longest step is given; 0 lets OMPL choose [rad]."""
+    tree = og.RRTConnect(si)
+    if longest > 0.0:
+        tree.setRange(longest)
+    return tree
+
+
+def joined(si: ob.SpaceInformation, judge: Judge, path: Array, stop: Stop, longest: float = 0.0) -> Array | None:
+    """Return a valid path whose blocked stretches are planned anew by RRTConnect between their free ends, or None.
+
+    Args:
+        si: OMPL's space information.
+        judge: Decides what is blocked.
+        path: States, shape (N, dof), its ends free.
+        stop: Asked often whether to give up.
+        longest: Longest step of the trees; 0 lets OMPL choose [rad].
+    """
+    states = _thinned(path)
+    free = _free(judge, states, stop)
+    if stop() or not (free[0] and free[-1]):
+        return None
+    pieces, k = [states[:1]], 0
+    while k < len(states) - 1:
+        following = next(j for j in range(k + 1, len(states)) if free[j])
+        if following == k + 1 and judge.is_valid(states[[k, following]], stop):
+            pieces.append(states[following : following + 1])
+        else:
+            bridge = _bridge(si, states[k], states[following], stop, longest)
+            if bridge is None:
+                return None
+            pieces.append(bridge[1:])
+        k = following
+    found = np.concatenate(pieces)
+    return found if judge.is_valid(found, stop) else None
+
+
+def beginning(judge: Judge, path: Array, stop: Stop) -> Array:
+    """Return the valid beginning of a path, states of shape (M, dof), M >= 1; its start is taken to be valid."""
+    states = _thinned(path)
+    for k in range(1, len(states)):
+        if stop() or not judge.is_valid(states[k - 1 : k + 1], stop):
+            return states[:k]
+    return states
+
+
+def _thinned(path: Array) -> Array:
+    return np.concatenate([path[:-1:EVERY], path[-1:]])
+
+
+def _free(judge: Judge, states: Array, stop: Stop) -> NDArray[np.bool_]:
+    return np.array([not stop() and judge.is_free(q) for q in states])
+
+
+def _bridge(si: ob.SpaceInformation, a: Array, b: Array, stop: Stop, longest: float) -> Array | None:
+    """Return a path of RRTConnect's between two free states, or None."""
+    space, pdef = si.getStateSpace(), ob.ProblemDefinition(si)
+    pdef.setStartAndGoalStates(to_state(space, a), to_state(space, b))
+    left = iter(range(CALLS))
+    ptc = ob.PlannerTerminationCondition(lambda: stop() or next(left, None) is None)
+    if grown(connect(si, longest), pdef, ptc).getStatus() != ob.PlannerStatus.EXACT_SOLUTION:
+        return None
+    inner = path_to_array(pdef.getSolutionPath(), len(a))
+    return np.concatenate([a[None], inner[1:-1], b[None]])

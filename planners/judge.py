@@ -1,0 +1,89 @@
+"""What decides for a planner whether paths are valid: this project's verdict, or whatever checkers OMPL was given."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+from ompl import base as ob
+
+from apex_ompl.collision import Verdict
+from apex_ompl.errors import ParameterError
+from apex_ompl.resolution import FULL_RESOLUTION
+from apex_ompl.robot import load_robot
+from apex_ompl.space import to_state
+from apex_ompl.validity import VerdictChecker
+
+Array = NDArray[np.float64]
+Stop = Callable[[], bool]
+
+LOG = logging.getLogger("apex_ompl")
+EVERY = 4  # states of a path whose distance from the obstacles is measured
+
+
+class Judge:
+    """Judges states and paths of a space information.
+
+    With a ``VerdictChecker`` a path is valid by the full check; with another checker when all of its states are valid
+    and all motions between them, by ``isValid`` and ``checkMotion``. In the second case the robot is known by name, and
+    its obstacles are not known.
+
+    Attributes:
+        verdict: The robot, among its obstacles where they are known.
+        knows_obstacles: Whether they are.
+    """
+
+    def __init__(self, si: ob.SpaceInformation, robot: str) -> None:
+        """Judge by what ``si`` brings.
+
+        Raises:
+            ApexError: There is no such robot.
+            ParameterError: The space has another dimension than the robot.
+        """
+        self._si = si
+        checker = si.getStateValidityChecker()
+        self.knows_obstacles = isinstance(checker, VerdictChecker)
+        self.verdict = checker.verdict if isinstance(checker, VerdictChecker) else Verdict(load_robot(robot))
+        dof, dimension = self.verdict.robot.dof, int(si.getStateSpace().getDimension())
+        if dof != dimension:
+            raise ParameterError("state space", dimension, f"{dof} dimensions, those of {self.verdict.robot.name}")
+        if not self.knows_obstacles:
+            LOG.warning(
+                "the validity checker is not apex_ompl's: it judges, and proposals are kept clear of %s itself alone",
+                self.verdict.robot.name,
+            )
+
+    def is_free(self, q: Array) -> bool:
+        """Whether a state, shape (dof,), is valid."""
+        if self.knows_obstacles:
+            return self.verdict.is_free(q)
+        return bool(self._si.isValid(to_state(self._si.getStateSpace(), q)))
+
+    def is_valid(self, path: Array, stop: Stop = lambda: False) -> bool:
+        """Whether a path, shape (N, dof), is valid; not when it is told to stop meanwhile."""
+        if self.knows_obstacles:
+            return self.verdict.first_collision(path, FULL_RESOLUTION) is None
+        space = self._si.getStateSpace()
+        states = [to_state(space, q) for q in path]
+        order = sorted(range(len(states)), key=lambda k: (-(k & -k), k))  # coarse before fine
+        for k in order:
+            if stop() or not self._si.isValid(states[k]):
+                return False
+        return all(not stop() and self._si.checkMotion(a, b) for a, b in zip(states, states[1:], strict=False))
+
+    def gap(self, path: Array) -> float:
+        """Return the distance of states, shape (N, dof), from the obstacles by GJK, fixtures left out [m].
+
+        Every fourth state is measured; infinite where the obstacles are not known.
+        """
+        if not self.knows_obstacles:
+            return np.inf
+        states = np.concatenate([path[::EVERY], path[-1:]])
+        bound, least = self.verdict.kernel.clearance(states)[:, 0], np.inf
+        for k in np.argsort(bound):  # the spheres' clearance is at most that of the meshes
+            if bound[k] >= least:
+                break
+            least = min(least, self.verdict.distance(states[k]).value)
+        return float(least)

@@ -1,0 +1,243 @@
+"""The stages of APEX inside ``solve``: starts and goals, proposals, bridges, trees, shorter paths."""
+
+from __future__ import annotations
+
+import logging
+import time
+from itertools import cycle, product
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from ompl import base as ob
+from ompl import geometric as og
+
+from apex_ompl.diffusion.conditions import Query
+from apex_ompl.planners import bridge
+from apex_ompl.planners.apex_parameters import NAME
+from apex_ompl.queries import query_of
+from apex_ompl.search import Search
+from apex_ompl.simplify import simplify
+from apex_ompl.space import array_to_path, path_length, path_to_array, to_array, to_state
+
+if TYPE_CHECKING:
+    from apex_ompl.planners.apex import APEX
+
+Array = NDArray[np.float64]
+Status = ob.PlannerStatus
+
+LOG = logging.getLogger("apex_ompl")
+MOST_GOALS = 8  # that are read
+MOST_QUERIES = 8  # pairs of start and goal that proposals are made for, the nearest ones
+BRIDGED = 2  # candidates whose blocked stretches are bridged
+KEPT = 4  # earlier paths that are candidates for the next query
+VARIATIONS = (0.3, 0.6, None, 0.15)  # noise on the best path, or new proposals, in turn while there is time
+GAIN = 1e-3  # least gain in length that counts as one [rad]
+
+
+class SolveLoop:
+    """One call of ``APEX.solve``: its stages, one behind the other."""
+
+    def __init__(self, planner: APEX, ptc: ob.PlannerTerminationCondition) -> None:
+        """Solve the planner's problem until ``ptc`` holds."""
+        self.ptc = ptc
+        self.begin = time.perf_counter()
+        self.report, self.parameters, self.judge = planner.report, planner.parameters, planner.judge
+        self.model, self.optimizer, self.experience = planner.model, planner.optimizer, planner.experience
+        self.si, self.pdef = planner.getSpaceInformation(), planner.getProblemDefinition()
+        self.inputs = planner.getPlannerInputStates()
+        self.kernel = self.judge.verdict.kernel
+        self.generator = torch.Generator().manual_seed(planner.next_seed())
+        self.best: Array | None = None
+
+    def stop(self) -> bool:
+        """Whether time is up."""
+        return bool(self.ptc())
+
+    def is_valid(self, path: Array) -> bool:
+        """Whether a path, shape (N, dof), is valid; not when time is up meanwhile."""
+        return self.judge.is_valid(path, self.stop)
+
+    def run(self) -> Any:
+        """Go through the stages, and return OMPL's status."""
+        with self.report.timed("query"):
+            starts, goals = self._starts(), self._goals()
+            if isinstance(goals, str):
+                return self._without(Status.UNRECOGNIZED_GOAL_TYPE, goals)
+            if not starts:
+                return self._without(Status.INVALID_START, "no start state is valid")
+            if not goals:
+                out = Status.TIMEOUT if self.stop() else Status.INVALID_GOAL
+                return self._without(out, "no valid goal state was sampled")
+            queries = self._queries(starts, goals)
+        search = Search(
+            self.model, self.optimizer, self.kernel, self.is_valid, self.judge.gap,
+            settings=self.parameters.search(), generator=self.generator, report=self.report,
+        )  # fmt: skip
+        found = search.run(queries, self.experience, self.stop)
+        if found is not None:
+            self.report.solved_by = found.origin + ("+repair" if found.rounds else "")
+            self._accept(self.model.spline.path(found.control), found.control)
+            self._shorten(found.control)
+        if self.best is None and self.parameters.bridge:
+            self._bridge(search)
+        status = Status.TIMEOUT
+        if self.best is None and self.parameters.fallback:
+            status = self._grow_trees(starts)
+        if self.best is None:
+            if status != Status.APPROXIMATE_SOLUTION and self.parameters.approximate:
+                status = self._approximate(search, goals)
+            return self._without(status, f"no path among {self.report.candidates} candidates in the time given")
+        self._improve(search, queries)
+        return Status.EXACT_SOLUTION
+
+    def _without(self, status: Any, reason: str) -> Any:
+        self.report.reason = reason
+        LOG.info("%s: %s", NAME, reason)
+        return status
+
+    def _starts(self) -> list[Array]:
+        """Return the valid starts."""
+        inputs, found = self.inputs, []
+        inputs.restart()
+        while inputs.haveMoreStartStates():
+            state = inputs.nextStart()
+            if state is None:
+                break
+            found.append(to_array(state, self.kernel.robot.dof))
+        return _sound(found)
+
+    def _goals(self) -> list[Array] | str:
+        """Return valid goals, some where there are many; or why the goal is of no use."""
+        if not self.pdef.getGoal().hasType(ob.GOAL_SAMPLEABLE_REGION):
+            return "the goal cannot be sampled, expected a goal state, goal states or a sampleable region"
+        inputs, found = self.inputs, []
+        state = inputs.nextGoal(self.ptc)  # waits for one
+        while state is not None:
+            found.append(to_array(state, self.kernel.robot.dof))
+            more = len(found) < MOST_GOALS and not self.stop() and inputs.haveMoreGoalStates()
+            state = inputs.nextGoal() if more else None
+        return _sound(found)
+
+    def _queries(self, starts: list[Array], goals: list[Array]) -> list[Query]:
+        """Return the pairs that are nearest to each other."""
+        pairs = sorted(product(starts, goals), key=lambda pair: float(np.linalg.norm(pair[1] - pair[0])))
+        verdict, point = self.judge.verdict, self.model.sees_point
+        return [query_of(verdict, start, goal, point=point) for start, goal in pairs[:MOST_QUERIES]]
+
+    def _accept(self, path: Array, control: Array | None = None) -> None:
+        """Take a valid path as a solution."""
+        if self.best is None:
+            self.report.first = time.perf_counter() - self.begin
+        self.best = path
+        self.pdef.addSolutionPath(array_to_path(self.si, path), False, 0.0, NAME)
+        if control is not None:
+            self.experience.insert(0, control - self.model.spline.line(control[0], control[-1]))
+            del self.experience[KEPT:]
+
+    def _shorten(self, control: Array) -> None:
+        """Take the shorter path that the optimiser makes of a valid one."""
+        if not self.parameters.polish or self.stop():
+            return
+        with self.report.timed("polish"):
+            better = self.optimizer.shorten(self.kernel, control, self.is_valid, self.stop)
+        if better is not None:
+            self._accept_shorter(better)
+
+    def _accept_shorter(self, control: Array) -> bool:
+        path = self.model.spline.path(control)
+        if self.best is not None and path_length(path) > path_length(self.best) - GAIN:
+            return False
+        self._accept(path, control)
+        return True
+
+    def _bridge(self, search: Search) -> None:
+        """Join the free stretches of the best candidates by short trees."""
+        for candidate in sorted(search.pool.candidates, key=lambda one: one.shortfall)[:BRIDGED]:
+            if self.stop():
+                return
+            with self.report.timed("bridge"):
+                path = bridge.joined(
+                    self.si, self.judge, self.model.spline.path(candidate.control), self.stop, self.parameters.range
+                )
+            if path is not None:
+                self.report.solved_by = "apex+bridge"
+                self._polish(path)
+                return
+
+    def _grow_trees(self, starts: list[Array]) -> Any:
+        """Let RRTConnect plan with the time that is left, and polish what it finds."""
+        pdef, tree = ob.ProblemDefinition(self.si), bridge.connect(self.si, self.parameters.range)
+        for start in starts:
+            pdef.addStartState(to_state(self.si.getStateSpace(), start))
+        pdef.setGoal(self.pdef.getGoal())
+        with self.report.timed("rrtconnect"):
+            status = bridge.grown(tree, pdef, self.ptc).getStatus()
+        if status == Status.EXACT_SOLUTION:
+            self.report.solved_by = "rrtconnect"
+            self._polish(path_to_array(pdef.getSolutionPath(), self.kernel.robot.dof))
+        elif status == Status.APPROXIMATE_SOLUTION and self.parameters.approximate:
+            self.pdef.addSolutionPath(pdef.getSolutionPath(), True, pdef.getSolutionDifference(), NAME)
+        else:
+            status = Status.TIMEOUT
+        return status
+
+    def _polish(self, path: Array) -> None:
+        """Take a polyline as a solution; shorten it, put it on a spline, and optimise it."""
+        self._accept(path)
+        if self.stop() or not self.parameters.polish:
+            return
+        with self.report.timed("simplify"):
+            short = simplify(og.PathSimplifier(self.si), self.si, path, self.stop)
+        if path_length(short) < path_length(path):
+            self._accept(short)
+        limits = self.kernel.robot.arrays
+        self._shorten(self.model.spline.fit(short, limits.lower, limits.upper).control)
+
+    def _approximate(self, search: Search, goals: list[Array]) -> Any:
+        """Take the valid beginning of the candidate that comes nearest to a goal as an approximate solution."""
+        best, least = None, np.inf
+        for candidate in sorted(search.pool.candidates, key=lambda one: one.shortfall)[:BRIDGED]:
+            path = bridge.beginning(self.judge, self.model.spline.path(candidate.control), self.stop)
+            gap = min(float(np.linalg.norm(goal - path[-1])) for goal in goals)
+            if len(path) > 1 and gap < least:
+                best, least = path, gap
+        if best is None:
+            return Status.TIMEOUT
+        self.pdef.addSolutionPath(array_to_path(self.si, best), True, least, NAME)
+        return Status.APPROXIMATE_SOLUTION
+
+    def _improve(self, search: Search, queries: list[Query]) -> None:
+        """With a path length objective, or by parameter, look for shorter paths until time is up."""
+        objective = self.pdef.getOptimizationObjective() if self.pdef.hasOptimizationObjective() else None
+        if not self.parameters.anytime and not isinstance(objective, ob.PathLengthOptimizationObjective):
+            return
+        limits = self.kernel.robot.arrays
+        with self.report.timed("improve"):
+            for noise in cycle(VARIATIONS):
+                assert self.best is not None
+                if self.stop() or (objective is not None and objective.isSatisfied(ob.Cost(path_length(self.best)))):
+                    return
+                start, goal = self.best[0], self.best[-1]
+                query = next(
+                    (q for q in queries if np.array_equal(q.start, start) and np.array_equal(q.goal, goal)), queries[0]
+                )
+                if noise is None:
+                    found = search.fresh(query, self.stop)
+                else:
+                    control = self.model.spline.fit(self.best, limits.lower, limits.upper).control
+                    found = search.vary(control, query, noise, self.stop)
+                if found is None or self.stop():
+                    continue
+                better = self.optimizer.shorten(self.kernel, found.control, self.is_valid, self.stop)
+                self.report.improved += self._accept_shorter(found.control if better is None else better)
+
+
+def _sound(states: list[Array]) -> list[Array]:
+    """Return states that are finite, each once."""
+    found: list[Array] = []
+    for state in states:
+        if np.isfinite(state).all() and not any(np.array_equal(state, other) for other in found):
+            found.append(state)
+    return found
