@@ -135,6 +135,17 @@ class Search:
                 return found
         return max(self._close, key=lambda pair: pair[0])[1] if self._close else None
 
+    def again(self, queries: Sequence[Query], stop: Stop) -> Candidate | None:
+        """Return a valid path for one of several queries from more rounds of proposals, until it is told to stop."""
+        batch = max(self._settings.batches, default=0)
+        while batch and not stop():
+            self.pool = Pool(self._optimizer, self._kernel, self._is_valid)
+            for stage in self._round(queries, batch, stop):
+                found = None if stop() else stage()
+                if found is not None and self._keeps_distance(found):
+                    return found
+        return None
+
     def vary(self, control: Array, query: Query, noise: float, stop: Stop) -> Candidate | None:
         """Return a valid path that a given one becomes when it is noised and denoised again, or None.
 
@@ -165,17 +176,19 @@ class Search:
         if settings.line or experience:
             yield lambda: self._known(queries, experience, stop)
         for batch in settings.batches or (0,):
-            each = max(1, AT_ONCE // len(queries))
-            for k in range(0, batch, each):
-                count = min(each, batch - k)
-                yield lambda count=count: self._propose(queries, count, stop)  # type: ignore[misc]
+            yield from self._round(queries, batch, stop)
+
+    def _round(self, queries: Sequence[Query], batch: int, stop: Stop) -> Iterator[Callable[[], Candidate | None]]:
+        settings, each = self._settings, max(1, AT_ONCE // len(queries))
+        for k in range(0, batch, each):
+            count = min(each, batch - k)
+            yield lambda count=count: self._propose(queries, count, stop)  # type: ignore[misc]
+        if settings.repair:
+            yield lambda: self._repair(max(LEAST_STEPS, PER_PATH * batch * len(queries)), stop)
+        for _ in range(settings.resample):
+            yield lambda: self._resample(queries, stop)
             if settings.repair:
-                steps = max(LEAST_STEPS, PER_PATH * batch * len(queries))
-                yield lambda steps=steps: self._repair(steps, stop)  # type: ignore[misc]
-            for _ in range(settings.resample):
-                yield lambda: self._resample(queries, stop)
-                if settings.repair:
-                    yield lambda: self._repair(PER_PATH * WORTH_RESAMPLING, stop)
+                yield lambda: self._repair(PER_PATH * WORTH_RESAMPLING, stop)
 
     def _known(self, queries: Sequence[Query], experience: Sequence[Array], stop: Stop) -> Candidate | None:
         """Take in what costs nothing: straight lines, and earlier paths put on other ends."""

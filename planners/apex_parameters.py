@@ -57,7 +57,7 @@ class ApexParameters(Parameters):
             distance stands when none comes out better.
         repair: Whether candidates are improved by the optimiser.
         bridge: Whether blocked stretches of the best candidates are bridged by short trees.
-        fallback: Whether RRTConnect gets the time that is left.
+        fallback: Whether RRTConnect gets the time that is left; otherwise there are more rounds of proposals.
         polish: Whether valid paths are shortened.
         approximate: Whether, without an exact solution, a path that ends near a goal is given as an approximate one.
         anytime: Whether paths are improved until the time is up, as they are with a path length objective.

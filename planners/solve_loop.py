@@ -16,6 +16,7 @@ from ompl import geometric as og
 from apex_ompl.diffusion.conditions import Query
 from apex_ompl.planners import bridge
 from apex_ompl.planners.apex_parameters import NAME
+from apex_ompl.pool import Candidate
 from apex_ompl.queries import query_of
 from apex_ompl.search import Search
 from apex_ompl.simplify import simplify
@@ -75,22 +76,30 @@ class SolveLoop:
             self.model, self.optimizer, self.kernel, self.is_valid, self.judge.gap,
             settings=self.parameters.search(), generator=self.generator, report=self.report,
         )  # fmt: skip
-        found = search.run(queries, self.experience, self.stop)
+        self._take(search.run(queries, self.experience, self.stop))
+        if self.best is None and self.parameters.bridge:
+            self._bridge(search)
+        status, near = Status.TIMEOUT, None
+        if self.best is None and self.parameters.approximate:
+            near = self._nearest(search, goals)
+        if self.best is None and self.parameters.fallback:
+            status = self._grow_trees(starts)
+        elif self.best is None:
+            self._take(search.again(queries, self.stop))
+        if self.best is None:
+            if status == Status.TIMEOUT and near is not None:
+                status = Status.APPROXIMATE_SOLUTION
+                self.pdef.addSolutionPath(array_to_path(self.si, near[0]), True, near[1], NAME)
+            return self._without(status, f"no path among {self.report.candidates} candidates in the time given")
+        self._improve(search, queries)
+        return Status.EXACT_SOLUTION
+
+    def _take(self, found: Candidate | None) -> None:
+        """Take a candidate that is valid, and shorten it."""
         if found is not None:
             self.report.solved_by = found.origin + ("+repair" if found.rounds else "")
             self._accept(self.model.spline.path(found.control), found.control)
             self._shorten(found.control)
-        if self.best is None and self.parameters.bridge:
-            self._bridge(search)
-        status = Status.TIMEOUT
-        if self.best is None and self.parameters.fallback:
-            status = self._grow_trees(starts)
-        if self.best is None:
-            if status != Status.APPROXIMATE_SOLUTION and self.parameters.approximate:
-                status = self._approximate(search, goals)
-            return self._without(status, f"no path among {self.report.candidates} candidates in the time given")
-        self._improve(search, queries)
-        return Status.EXACT_SOLUTION
 
     def _without(self, status: Any, reason: str) -> Any:
         self.report.reason = reason
@@ -195,18 +204,15 @@ class SolveLoop:
         limits = self.kernel.robot.arrays
         self._shorten(self.model.spline.fit(short, limits.lower, limits.upper).control)
 
-    def _approximate(self, search: Search, goals: list[Array]) -> Any:
-        """Take the valid beginning of the candidate that comes nearest to a goal as an approximate solution."""
+    def _nearest(self, search: Search, goals: list[Array]) -> tuple[Array, float] | None:
+        """Return the valid beginning of the candidate that comes nearest to a goal, and how near, or None."""
         best, least = None, np.inf
         for candidate in sorted(search.pool.candidates, key=lambda one: one.shortfall)[:BRIDGED]:
             path = bridge.beginning(self.judge, self.model.spline.path(candidate.control), self.stop)
             gap = min(float(np.linalg.norm(goal - path[-1])) for goal in goals)
             if len(path) > 1 and gap < least:
                 best, least = path, gap
-        if best is None:
-            return Status.TIMEOUT
-        self.pdef.addSolutionPath(array_to_path(self.si, best), True, least, NAME)
-        return Status.APPROXIMATE_SOLUTION
+        return None if best is None else (best, least)
 
     def _improve(self, search: Search, queries: list[Query]) -> None:
         """With a path length objective, or by parameter, look for shorter paths until time is up."""

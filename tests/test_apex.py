@@ -257,7 +257,7 @@ ALONE = {"bridge": False, "fallback": False, "polish": False}
     ],
 )
 def test_stages_can_be_left_out(changes: dict[str, Any], by: tuple[str, ...]) -> None:
-    result = plan(at_hand("swap/hard/800000"), timeout=20.0, params={**ALONE, **changes})
+    result = plan(at_hand("swap/hard/800000"), timeout=4.0, params={**ALONE, **changes})
     assert result.solved_by in by and bool(result) == bool(result.solved_by), (result.solved_by, result.reason)
     names = {name.removeprefix(INSIDE) for name in result.times}
     assert "polish" not in names
@@ -269,12 +269,12 @@ def test_the_algorithm_of_the_paper_alone_runs(ready: PlanningSetup) -> None:
     """Guided ancestral sampling in all steps, resampling on collision or nearness, nothing else."""
     paper = {
         "sampler": "ddpm", "denoising_steps": 64, "guidance": True, "gamma": 1.0, "lambda_obs": 0.02, "line": False,
-        "repair": False, "first": 8, "second": 8, "third": 0, "resample": 2, **ALONE,
+        "repair": False, "first": 8, "second": 0, "third": 0, "resample": 2, **ALONE,
     }  # fmt: skip
     setup = ready.simple_setup
     planner = planners.make("apex", setup.getSpaceInformation(), **paper)
     setup.setPlanner(planner)
-    status = setup.solve(within(60.0)).getStatus()
+    status = setup.solve(within(6.0)).getStatus()
     assert status in (EXACT, TIMEOUT)
     assert planner.report.times.keys() >= {"propose", "judge"}
     assert planner.report.candidates >= 8
@@ -410,7 +410,7 @@ def test_approximate_solutions_come_with_their_difference(ready: PlanningSetup) 
     si = setup.getSpaceInformation()
     nothing = {"line": True, "first": 1, "second": 0, "third": 0, "repair": False, "resample": 0, **ALONE}
     setup.setPlanner(planners.make("apex", si, approximate=True, seed=0, **nothing))
-    status = setup.solve(within(10.0)).getStatus()
+    status = setup.solve(within(1.0)).getStatus()
     assert status == ob.PlannerStatus.APPROXIMATE_SOLUTION
     path = states(setup)
     gap = np.linalg.norm(path[-1] - ready.goals[0])
@@ -418,7 +418,7 @@ def test_approximate_solutions_come_with_their_difference(ready: PlanningSetup) 
     assert full_check(ready.verdict, path, ready.start)
     setup.clear()
     setup.setPlanner(planners.make("apex", si, seed=0, **nothing))
-    assert setup.solve(within(10.0)).getStatus() == TIMEOUT and not setup.haveSolutionPath()
+    assert setup.solve(within(1.0)).getStatus() == TIMEOUT and not setup.haveSolutionPath()
 
 
 def test_no_exception_leaves_solve(

@@ -1,0 +1,283 @@
+"""APEX head to head: with and without trees, against controls of its model, RRTConnect, and RRTConnect polished.
+
+Every run is a call of ``plan`` in the same space, by the same verdict, at the same resolution, with the same seed (the
+number of the problem modulo 1000). "Without trees" is APEX with ``fallback=false`` and ``bridge=false``; the controls
+are the same pipeline with random weights, with the conditions of another problem, with random bumps instead of
+proposals, and with the straight line and its repair alone. Paths are judged once more at a tenth of the resolution of
+the full check; one that fails there counts as false-valid. Runs are kept in a store as they end, so that the command
+goes on where it was stopped.
+
+Usage: python benchmarks/apex.py [SUITE[/LEVEL] ...] [-n 100] [--controls 50] [--split test] [--methods ...] [--report]
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import record
+import torch
+from ompl import base as ob
+from store import RunStore
+
+from apex_ompl import plan, problems
+from apex_ompl.assembly import assemble
+from apex_ompl.diffusion.conditions import Query
+from apex_ompl.diffusion.model import LatentDiffusion
+from apex_ompl.diffusion.proposals import Proposals, TrajectoryModel
+from apex_ompl.optimize import Optimizer
+from apex_ompl.planners.apex import APEX
+from apex_ompl.planners.apex_parameters import ApexParameters
+from apex_ompl.planners.registry import register
+from apex_ompl.problems.reach import robot
+from apex_ompl.queries import query_of
+from apex_ompl.resolution import FULL_RESOLUTION
+from apex_ompl.result import INSIDE
+from apex_ompl.validity import full_check
+
+STORE = record.RESULTS.parent / "runs" / "apex.jsonl"
+LIMIT, SHORT_LIMIT = 10.0, 2.0  # [s]; of controls
+MOMENTS = (0.05, 0.1, 0.5, 2.0)  # at which shares are given [s]
+TREELESS = {"fallback": False, "bridge": False}
+METHODS: dict[str, tuple[str, dict[str, Any], float]] = {
+    "apex": ("apex", {}, LIMIT),
+    "rrtconnect": ("rrtconnect", {}, LIMIT),
+    "rrtconnect+polish": ("rrtconnect+polish", {}, LIMIT),
+    "apex without trees": ("apex", TREELESS, SHORT_LIMIT),
+    "random weights": ("random weights", TREELESS, SHORT_LIMIT),
+    "shuffled conditions": ("shuffled conditions", TREELESS, SHORT_LIMIT),
+    "bumps": ("bumps", TREELESS, SHORT_LIMIT),
+    "line": ("apex", {**TREELESS, "first": 0, "second": 0, "third": 0, "resample": 0}, SHORT_LIMIT),
+}
+FULL = ("apex", "rrtconnect", "rrtconnect+polish")
+AFTER = ("polish", "simplify")  # stages behind the first valid path
+
+
+class Bumps(TrajectoryModel):
+    """Random bumps in the place of proposals."""
+
+    def propose(self, query: Any, kernel: Any, count: int, **options: Any) -> Proposals:
+        """Return bumps on the straight lines of queries."""
+        queries = [query] if isinstance(query, Query) else list(query)
+        rng = np.random.default_rng(int(torch.randint(2**31, (1,), generator=options.get("generator"))))
+        found = np.concatenate([Optimizer(self.spline).starts(q.start, q.goal, count + 1, rng)[1:] for q in queries])
+        return Proposals(found, torch.empty(0), {})
+
+    def renoise(self, query: Query, kernel: Any, control: Any, step: int, **options: Any) -> Proposals:
+        """Return other bumps: a path is not resampled."""
+        return self.propose(query, kernel, len(control), **options)
+
+
+class Shuffled(TrajectoryModel):
+    """Proposals for the problem next to the one at hand, put on its ends."""
+
+    other: Query
+
+    def propose(self, query: Any, kernel: Any, count: int, **options: Any) -> Proposals:
+        """Return proposals for another problem."""
+        queries = [query] if isinstance(query, Query) else list(query)
+        found = super().propose(self.other, kernel, count * len(queries), **options)
+        start, goal = (np.repeat([getattr(q, end) for q in queries], count, axis=0) for end in ("start", "goal"))
+        line, limits = self.spline.line, kernel.robot.arrays
+        moved = found.control - line(self.other.start, self.other.goal) + line(start, goal)
+        control = self.spline.with_ends(np.clip(moved, limits.lower, limits.upper), start, goal)
+        return Proposals(control, found.latent, found.seconds)
+
+    def renoise(self, query: Query, kernel: Any, control: Any, step: int, **options: Any) -> Proposals:
+        """Return paths near given ones, denoised for the other problem."""
+        line, limits = self.spline.line, kernel.robot.arrays
+        ends = line(query.start, query.goal) - line(self.other.start, self.other.goal)
+        there = np.clip(control - ends, limits.lower, limits.upper)
+        found = super().renoise(self.other, kernel, there, step, **options)
+        moved = np.clip(found.control + ends, limits.lower, limits.upper)
+        start, goal = (np.repeat(q[None], len(control), axis=0) for q in (query.start, query.goal))
+        return Proposals(self.spline.with_ends(moved, start, goal), found.latent, found.seconds)
+
+
+def drawn(trained: LatentDiffusion) -> LatentDiffusion:
+    """Return a network like a trained one with random weights; its latent space and its limits are those."""
+    torch.manual_seed(0)
+    network = LatentDiffusion(trained.config)
+    torch.nn.init.kaiming_uniform_(network.denoiser.leave.weight)  # it would begin at zero
+    kept = {k: v for k, v in trained.state_dict().items() if k.startswith(("autoencoder", "probe"))}
+    kept |= {k: v for k, v in trained.state_dict().items() if k in ("encoder.lower", "encoder.upper")}
+    network.load_state_dict({**network.state_dict(), **kept})
+    return network
+
+
+@cache
+def control(kind: str, trained: TrajectoryModel) -> TrajectoryModel:
+    """Return what takes the place of the model."""
+    if kind == "random weights":
+        return TrajectoryModel(drawn(trained.network), {})
+    return (Bumps if kind == "bumps" else Shuffled)(trained.network, {})
+
+
+OTHER: list[Query] = []  # of the problem at hand
+
+
+@dataclass(frozen=True)
+class Control(ApexParameters):
+    """APEX with another model."""
+
+    def build(self, si: ob.SpaceInformation) -> ob.Planner:
+        """Return the planner."""
+        planner = APEX(si, self)
+        planner.model = control(self.kind, planner.model)  # type: ignore[attr-defined]
+        if isinstance(planner.model, Shuffled):
+            planner.model.other = OTHER[0]
+        return planner
+
+
+for _kind in ("random weights", "shuffled conditions", "bumps"):
+    register(_kind)(type("Control", (Control,), {"kind": _kind}))
+
+
+def next_query(name: str) -> Query:
+    """Return the query of the next problem of a level."""
+    level, number = name.rsplit("/", 1)
+    there = f"{level}/{int(number) + 1}"
+    setup = assemble(problems.load(there), robot())
+    return query_of(setup.verdict, setup.start, setup.goals[0])
+
+
+def run(job: tuple[str, str]) -> dict[str, Any]:
+    """Return one run of a method on a problem."""
+    name, method = job
+    planner, params, limit = METHODS[method]
+    if planner == "shuffled conditions":
+        OTHER[:] = [next_query(name)]
+    result = plan(problems.load(name), planner, timeout=limit, seed=int(name.rsplit("/", 1)[1]) % 1000, params=params)
+    times = result.times
+    total = sum(times.get(k, 0.0) for k in ("line", "solve", "simplify", "verify", "repair"))
+    after = sum(times.get(INSIDE + k, 0.0) for k in AFTER) + times.get("simplify", 0.0)
+    found = {
+        "problem": name, "method": method, "solved": bool(result), "by": result.solved_by, "found_s": total - after,
+        "total_s": total, "length": result.length if result else None, "status": str(result.status),
+        "stages": {k: v for k, v in times.items() if k.startswith(INSIDE)}, "setup_s": times.get("setup", 0.0),
+    }  # fmt: skip
+    if result and method in ("apex", "apex without trees"):
+        ready = assemble(problems.load(name), robot())
+        found["false"] = not full_check(ready.verdict, result.path, resolution=FULL_RESOLUTION / 10)
+    return found
+
+
+def warm_up(methods: Sequence[str]) -> None:
+    """Load the kernel, the robot and the models, so that no run pays for it."""
+    torch.set_num_threads(1)
+    for method in methods:
+        run(("wall/easy/800000", method))
+
+
+def figures(runs: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Return what came of every method on a level, and of pairs with RRTConnect and RRTConnect polished."""
+    by = {method: {r["problem"]: r for r in runs if r["method"] == method} for method in METHODS}
+    found: dict[str, Any] = {}
+    for method, mine in by.items():
+        if not mine:
+            continue
+        some = list(mine.values())
+        first = np.sort([r["found_s"] if r["solved"] else math.inf for r in some])
+        total = np.sort([r["total_s"] if r["solved"] else math.inf for r in some])
+        found[method] = {
+            "n": len(some), "solved": float(np.mean([r["solved"] for r in some])),
+            "in": {str(t): float(np.mean(first <= t)) for t in MOMENTS},
+            "found_s": [_percentile(first, p) for p in (50, 95)], "total_s": [_percentile(total, p) for p in (50, 95)],
+            "length": float(np.median([r["length"] for r in some if r["solved"]] or [math.nan])),
+            "by": dict(Counter(r["by"] for r in some if r["solved"])),
+            "false": sum(r.get("false", False) for r in some),
+            "lost": sum(not r["solved"] and by["rrtconnect"].get(n, {}).get("solved", False) for n, r in mine.items()),
+        }  # fmt: skip
+        for other in ("rrtconnect", "rrtconnect+polish"):
+            pairs = [(r, by[other][n]) for n, r in mine.items() if r["solved"] and by[other].get(n, {}).get("solved")]
+            ratios = {key: [a[key] / max(b[key], 1e-9) for a, b in pairs] for key in ("length", "total_s")}
+            found[method][f"over {other}"] = {k: float(np.exp(np.mean(np.log(v)))) for k, v in ratios.items() if v}
+    return found
+
+
+def _percentile(values: np.ndarray, p: float) -> float | None:
+    value = float(values[min(len(values) - 1, math.ceil(p / 100 * len(values)) - 1)])
+    return value if math.isfinite(value) else None
+
+
+def table(levels: Sequence[dict[str, Any]]) -> str:
+    """Return the Markdown tables: who solved, then times and lengths."""
+    stages = sorted({by for level in levels for by in level["methods"].get("apex", {}).get("by", {})})
+    lines = [
+        record.row(["suite/level", "N", *stages, "not solved"]),
+        record.row(["---", *["---:"] * (len(stages) + 2)]),
+    ]
+    for level in levels:
+        f = level["methods"].get("apex")
+        if f:
+            shares = [f"{f['by'].get(stage, 0) / f['n']:.2f}" for stage in stages]
+            lines.append(record.row([level["level"], f["n"], *shares, f"{1.0 - f['solved']:.2f}"]))
+    head = ["suite/level", "method", "N", "solved", *(f"in {t:g} s" for t in MOMENTS), "lost", "first ms p50", "p95"]
+    head += ["total ms p50", "p95", "length rad", "length / rrtconnect", "length / polished", "time / polished"]
+    lines += ["", record.row(head), record.row(["---", "---", *["---:"] * (len(head) - 2)])]
+    for level in levels:
+        for k, (method, f) in enumerate(level["methods"].items()):
+            cells = [level["level"] if k == 0 else "", method, f["n"], f"{f['solved']:.2f}"]
+            cells += [f"{share:.2f}" for share in f["in"].values()] + [f["lost"]]
+            cells += ["-" if v is None else f"{1e3 * v:.0f}" for v in (*f["found_s"], *f["total_s"])]
+            cells.append("-" if math.isnan(f["length"]) else f"{f['length']:.1f}")
+            for other, key in (
+                ("rrtconnect", "length"),
+                ("rrtconnect+polish", "length"),
+                ("rrtconnect+polish", "total_s"),
+            ):
+                value = f[f"over {other}"].get(key)
+                cells.append("-" if value is None else f"{value:.2f}")
+            lines.append(record.row(cells))
+    false = sum(f["false"] for level in levels for f in level["methods"].values())
+    return "\n".join([*lines, "", f"False-valid paths: {false}."])
+
+
+def main() -> None:
+    """Run what is missing, and write the results of all."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("levels", nargs="*", metavar="SUITE[/LEVEL]")
+    parser.add_argument("-n", type=int, default=100, help="problems of a level (default: %(default)s)")
+    parser.add_argument("--controls", type=int, default=50, help="of a hard level, for controls (default: %(default)s)")
+    parser.add_argument("--split", choices=("validation", "test"), default="test")
+    parser.add_argument("--jobs", type=int, default=1, help="processes (default: one, as runs are timed)")
+    parser.add_argument("--methods", nargs="*", choices=list(METHODS), default=list(METHODS), metavar="NAME")
+    parser.add_argument("--store", type=Path, default=STORE)
+    parser.add_argument("--name", default="apex", help="of the results (default: %(default)s)")
+    parser.add_argument("--report", action="store_true", help="run nothing; write the results of what the store holds")
+    args = parser.parse_args()
+    static = [(s, v) for s, levels in problems.suites().items() for v in levels if not v.startswith("moving-")]
+    known = {s for s, _ in static} | {f"{s}/{v}" for s, v in static}
+    if not set(args.levels) <= known:
+        raise SystemExit(f"unknown suite or level; known: {', '.join(f'{s}/{v}' for s, v in static)}")
+    chosen = [f"{s}/{v}" for s, v in static if not args.levels or s in args.levels or f"{s}/{v}" in args.levels]
+    jobs: list[tuple[str, str]] = []
+    for level in chosen:
+        names = problems.frozen_names(*level.split("/"), args.split)
+        for method in args.methods:
+            most = args.n if method in FULL else args.controls if level.endswith("/hard") else 0
+            jobs += [(name, method) for name in names[:most]]
+    store = RunStore(args.store, ("problem", "method"))
+    done = store.read()
+    todo = [] if args.report else [job for job in jobs if job not in done]
+    todo.sort(key=lambda job: int(job[0].rsplit("/", 1)[1]))  # all methods and levels in turn
+    store.complete(run, todo, args.jobs, warm_up, args.methods)
+    done = store.read()
+    runs = [done[job] for job in jobs if job in done]
+    levels = [{"level": v, "methods": figures([r for r in runs if r["problem"].startswith(f"{v}/")])} for v in chosen]
+    levels = [level for level in levels if level["methods"]]
+    record.write(
+        args.name, {"levels": levels}, table(levels), split=args.split, jobs=args.jobs, torch=torch.__version__,
+        limits=f"{LIMIT:g} s, controls {SHORT_LIMIT:g} s", seeds="number of the problem modulo 1000",
+    )  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()
