@@ -24,20 +24,18 @@ from typing import Any
 import numpy as np
 import record
 import torch
+from controls import Bumps, Shuffled, drawn, next_query
 from ompl import base as ob
 from store import RunStore
 
 from apex_ompl import plan, problems
 from apex_ompl.assembly import assemble
 from apex_ompl.diffusion.conditions import Query
-from apex_ompl.diffusion.model import LatentDiffusion
-from apex_ompl.diffusion.proposals import Proposals, TrajectoryModel
-from apex_ompl.optimize import Optimizer
+from apex_ompl.diffusion.proposals import TrajectoryModel
 from apex_ompl.planners.apex import APEX
 from apex_ompl.planners.apex_parameters import ApexParameters
 from apex_ompl.planners.registry import register
 from apex_ompl.problems.reach import robot
-from apex_ompl.queries import query_of
 from apex_ompl.resolution import FULL_RESOLUTION
 from apex_ompl.result import INSIDE
 from apex_ompl.validity import full_check
@@ -58,58 +56,6 @@ METHODS: dict[str, tuple[str, dict[str, Any], float]] = {
 }
 FULL = ("apex", "rrtconnect", "rrtconnect+polish")
 AFTER = ("polish", "simplify")  # stages behind the first valid path
-
-
-class Bumps(TrajectoryModel):
-    """Random bumps in the place of proposals."""
-
-    def propose(self, query: Any, kernel: Any, count: int, **options: Any) -> Proposals:
-        """Return bumps on the straight lines of queries."""
-        queries = [query] if isinstance(query, Query) else list(query)
-        rng = np.random.default_rng(int(torch.randint(2**31, (1,), generator=options.get("generator"))))
-        found = np.concatenate([Optimizer(self.spline).starts(q.start, q.goal, count + 1, rng)[1:] for q in queries])
-        return Proposals(found, torch.empty(0), {})
-
-    def renoise(self, query: Query, kernel: Any, control: Any, step: int, **options: Any) -> Proposals:
-        """Return other bumps: a path is not resampled."""
-        return self.propose(query, kernel, len(control), **options)
-
-
-class Shuffled(TrajectoryModel):
-    """Proposals for the problem next to the one at hand, put on its ends."""
-
-    other: Query
-
-    def propose(self, query: Any, kernel: Any, count: int, **options: Any) -> Proposals:
-        """Return proposals for another problem."""
-        queries = [query] if isinstance(query, Query) else list(query)
-        found = super().propose(self.other, kernel, count * len(queries), **options)
-        start, goal = (np.repeat([getattr(q, end) for q in queries], count, axis=0) for end in ("start", "goal"))
-        line, limits = self.spline.line, kernel.robot.arrays
-        moved = found.control - line(self.other.start, self.other.goal) + line(start, goal)
-        control = self.spline.with_ends(np.clip(moved, limits.lower, limits.upper), start, goal)
-        return Proposals(control, found.latent, found.seconds)
-
-    def renoise(self, query: Query, kernel: Any, control: Any, step: int, **options: Any) -> Proposals:
-        """Return paths near given ones, denoised for the other problem."""
-        line, limits = self.spline.line, kernel.robot.arrays
-        ends = line(query.start, query.goal) - line(self.other.start, self.other.goal)
-        there = np.clip(control - ends, limits.lower, limits.upper)
-        found = super().renoise(self.other, kernel, there, step, **options)
-        moved = np.clip(found.control + ends, limits.lower, limits.upper)
-        start, goal = (np.repeat(q[None], len(control), axis=0) for q in (query.start, query.goal))
-        return Proposals(self.spline.with_ends(moved, start, goal), found.latent, found.seconds)
-
-
-def drawn(trained: LatentDiffusion) -> LatentDiffusion:
-    """Return a network like a trained one with random weights; its latent space and its limits are those."""
-    torch.manual_seed(0)
-    network = LatentDiffusion(trained.config)
-    torch.nn.init.kaiming_uniform_(network.denoiser.leave.weight)  # it would begin at zero
-    kept = {k: v for k, v in trained.state_dict().items() if k.startswith(("autoencoder", "probe"))}
-    kept |= {k: v for k, v in trained.state_dict().items() if k in ("encoder.lower", "encoder.upper")}
-    network.load_state_dict({**network.state_dict(), **kept})
-    return network
 
 
 @cache
@@ -138,14 +84,6 @@ class Control(ApexParameters):
 
 for _kind in ("random weights", "shuffled conditions", "bumps"):
     register(_kind)(type("Control", (Control,), {"kind": _kind}))
-
-
-def next_query(name: str) -> Query:
-    """Return the query of the next problem of a level."""
-    level, number = name.rsplit("/", 1)
-    there = f"{level}/{int(number) + 1}"
-    setup = assemble(problems.load(there), robot())
-    return query_of(setup.verdict, setup.start, setup.goals[0])
 
 
 def run(job: tuple[str, str]) -> dict[str, Any]:

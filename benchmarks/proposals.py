@@ -25,16 +25,15 @@ from typing import Any, NamedTuple
 import numpy as np
 import record
 import torch
+from controls import Shuffled, drawn, next_query
 from neighbours import Neighbours
 from store import RunStore
 
 from apex_ompl import load_model, plan, problems
 from apex_ompl.assembly import PlanningSetup, assemble
 from apex_ompl.diffusion.checkpoint import SHIPPED, read_config
-from apex_ompl.diffusion.conditions import Query
 from apex_ompl.diffusion.data import Mirror, window_paths
 from apex_ompl.diffusion.guidance import Guidance
-from apex_ompl.diffusion.model import LatentDiffusion
 from apex_ompl.diffusion.proposals import Sampling, TrajectoryModel
 from apex_ompl.kernel import Kernel, RobotTables
 from apex_ompl.kernel.scene import scene_tables
@@ -74,14 +73,9 @@ def model(name: str) -> TrajectoryModel:
     """Return a model by its name, folder or kind."""
     torch.set_num_threads(1)
     if name == "random weights":
-        torch.manual_seed(0)
-        trained = load_model("apex").network
-        drawn = LatentDiffusion(trained.config)
-        torch.nn.init.kaiming_uniform_(drawn.denoiser.leave.weight)  # it would begin at zero
-        kept = {k: v for k, v in trained.state_dict().items() if k.startswith(("autoencoder", "probe"))}
-        kept |= {k: v for k, v in trained.state_dict().items() if k in ("encoder.lower", "encoder.upper")}
-        drawn.load_state_dict({**drawn.state_dict(), **kept})
-        return TrajectoryModel(drawn, {})
+        return TrajectoryModel(drawn(load_model("apex").network), {})
+    if name == "shuffled conditions":
+        return Shuffled(load_model("apex").network, {})
     return load_model(name)
 
 
@@ -181,34 +175,19 @@ def proposer(ready: PlanningSetup, optimizer: Optimizer, job: Job, seed: int) ->
     if method == "nearest paths":
         near = neighbours(job.data)
         return lambda count: near.refitted(query_of(ready.verdict, start, goal, point=False), kernel, count)
-    kinds = {"regression": job.regression, "random weights": "random weights"}
+    kinds = {"regression": job.regression, "random weights": method, "shuffled conditions": method}
     network = model(kinds.get(method, "apex-paper" if method.startswith("apex-paper") else "apex"))
+    if isinstance(network, Shuffled):
+        network.other = next_query(job.problem)
     sampling = {"apex, guided": Sampling(guidance=GUIDED), "apex-paper": PAPER, "apex-paper, guided": GUIDED_PAPER}
-    other = _other(job.problem, ready) if method == "shuffled conditions" else None
     ready.verdict.obstacle_point(start)  # GJK's pairs are made ready once for a scene
 
     def made(count: int) -> np.ndarray:
         query = query_of(ready.verdict, start, goal, point=network.sees_point)
         generator = torch.Generator().manual_seed(seed)
-        if other is None:
-            return network.propose(query, kernel, count, sampling=sampling.get(method), generator=generator).control
-        found = network.propose(other, kernel, count, generator=generator).control
-        line = optimizer.spline.line
-        moved = found - line(other.start, other.goal) + line(start, goal)
-        limits = kernel.robot.arrays
-        return optimizer.spline.with_ends(np.clip(moved, limits.lower, limits.upper), start, goal)
+        return network.propose(query, kernel, count, sampling=sampling.get(method), generator=generator).control
 
     return made
-
-
-def _other(name: str, ready: PlanningSetup) -> Query:
-    """Return the query of the next problem of a level."""
-    level, number = name.rsplit("/", 1)
-    split = "test" if int(number) >= 900_000 else "validation"
-    names = problems.frozen_names(*level.split("/"), split)
-    there = names[(names.index(name) + 1) % len(names)]
-    setup = assemble(problems.load(there), ready.robot)
-    return query_of(setup.verdict, setup.start, setup.goals[0])
 
 
 def warm_up(jobs: Sequence[Job]) -> None:

@@ -229,7 +229,7 @@ def test_another_checker_judges_and_is_told_of_once(caplog: pytest.LogCaptureFix
     assert sum("is not apex_ompl's" in record.message for record in caplog.records) == 1
 
 
-def test_the_example_of_the_readme_for_other_checkers_runs(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_example_with_a_checker_of_its_own_runs(capsys: pytest.CaptureFixture[str]) -> None:
     text = (ROOT / "examples" / "own_checker.py").read_text()
     exec(compile(text, "own_checker.py", "exec"), {"__name__": "__main__"})  # noqa: S102
     assert "EXACT_SOLUTION" in capsys.readouterr().out

@@ -14,7 +14,8 @@ README = (ROOT / "README.md").read_text()
 
 
 def test_readme_example_runs_as_printed(tmp_path: Path) -> None:
-    (code,) = re.findall(r"```python\n(.*?)```", README, re.S)
+    code, script = re.findall(r"```python\n(.*?)```", README, re.S)
+    assert (ROOT / "examples" / "own_checker.py").read_text().endswith(script), "which another test runs"
     assert len(code.strip().splitlines()) <= 12
     done = subprocess.run(
         [sys.executable, "-c", code], check=False, capture_output=True, text=True, cwd=tmp_path, timeout=120
