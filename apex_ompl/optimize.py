@@ -23,6 +23,7 @@ Check = Callable[[Array], bool]
 """Whether a path, shape (states, dof), is valid."""
 
 STIFFER, SHORTENINGS = 5.0, 4  # factor from one round of shortening to the next, and how many rounds
+PART = 8  # steps between two looks at the clock
 LAST_RESORT = 0.1  # factor on the stiffness where nothing came out valid
 
 
@@ -205,7 +206,7 @@ class Optimizer:
             kernel: The robot among its obstacles.
             control: Where to start from, shape (points, dof); it need not be valid.
             is_valid: Decides; called with the states of a path.
-            stop: Asked between rounds whether to end.
+            stop: Asked between parts of rounds whether to end.
 
         Raises:
             ParameterError: Control points of another shape.
@@ -215,16 +216,29 @@ class Optimizer:
         for k in range(SHORTENINGS):
             if stop():
                 break
-            bent = self.improve(kernel, now, stiffness=stiffness)
-            good = is_valid(self.spline.path(bent.control[0]))
-            if good:
-                best, now = bent.control[0], bent.control
+            bent = self._in_parts(kernel, now, stiffness, stop)
+            if bent is None:
+                break
+            if is_valid(self.spline.path(bent[0])):
+                best, now = bent[0], bent
                 stiffness *= STIFFER
             elif best is None and k < 2:
-                now, stiffness = bent.control, LAST_RESORT * stiffness
+                now, stiffness = bent, LAST_RESORT * stiffness
             else:
                 break
         return best
+
+    def _in_parts(self, kernel: Kernel, control: Array, stiffness: float, stop: Callable[[], bool]) -> Array | None:
+        """Return a path, shape (1, points, dof), improved as far as it goes, or None when told to stop meanwhile."""
+        left, damping = self.settings.steps, None
+        while True:
+            steps = min(PART, left)
+            bent = self.improve(kernel, control, steps=steps, stiffness=stiffness, damping=damping)
+            control, damping, left = bent.control, bent.damping, left - steps
+            if bent.steps[0] < steps or left == 0:
+                return control
+            if stop():
+                return None
 
     def _control(self, kernel: Kernel, control: ArrayLike) -> Array:
         points = np.require(control, float, ["C", "W"])

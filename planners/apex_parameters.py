@@ -13,6 +13,7 @@ from apex_ompl import diffusion
 from apex_ompl.planners.registry import Parameters, bounded, one_of, register
 
 if TYPE_CHECKING:
+    from apex_ompl.diffusion.proposals import Sampling
     from apex_ompl.search import SearchSettings
 
 NAME = "apex"
@@ -43,8 +44,8 @@ class ApexParameters(Parameters):
         robot: The robot, where the validity checker is not this project's.
         device: Where the network runs.
         line: Whether the straight line is a candidate.
-        sampler: ``ddim``, ``dpm_solver`` or ``ddpm``.
-        denoising_steps: Number of denoising steps; the paper takes all 256 by ``ddpm``.
+        sampler: ``ddim``, ``dpm_solver`` or ``ddpm``; ``model`` takes that of the checkpoint.
+        denoising_steps: Number of denoising steps; 0 takes that of the checkpoint: 2 for apex, all 256 for apex-paper.
         temperature: Standard deviation of the noise to begin with.
         first: Proposals for each pair of start and goal in the first round.
         second: In the second.
@@ -70,8 +71,8 @@ class ApexParameters(Parameters):
     robot: str = "dual_panda_softhand"
     device: str = "cpu"
     line: bool = True
-    sampler: str = one_of("ddim", "dpm_solver", "ddpm")
-    denoising_steps: int = bounded(2, 1, 1000)
+    sampler: str = one_of("model", "ddim", "dpm_solver", "ddpm")
+    denoising_steps: int = bounded(0, 0, 1000)
     temperature: float = bounded(1.0, 0.0, 10.0)
     first: int = bounded(1, 0, 1024)
     second: int = bounded(7, 0, 1024)
@@ -90,14 +91,15 @@ class ApexParameters(Parameters):
     range: float = bounded(0.0, 0.0, unit="rad")
     seed: int = bounded(-1, -1)
 
-    def search(self) -> SearchSettings:
-        """Return what of it concerns the search before trees."""
+    def search(self, own: Sampling) -> SearchSettings:
+        """Return what of it concerns the search before trees; ``own`` is how the checkpoint samples by itself."""
+        from apex_ompl.diffusion import proposals
         from apex_ompl.diffusion.guidance import Guidance
-        from apex_ompl.diffusion.proposals import Sampling
         from apex_ompl.search import SearchSettings
 
         guidance = Guidance(gamma=self.gamma if self.guidance else 0.0)
-        sampling = Sampling(self.sampler, self.denoising_steps, self.temperature, guidance)
+        sampler = own.sampler if self.sampler == "model" else self.sampler
+        sampling = proposals.Sampling(sampler, self.denoising_steps or own.steps, self.temperature, guidance)
         batches = tuple(count for count in (self.first, self.second, self.third) if count)
         return SearchSettings(self.line, batches, sampling, self.resample, self.noise, self.repair, self.lambda_obs)
 

@@ -74,7 +74,7 @@ class SolveLoop:
             queries = self._queries(starts, goals)
         search = Search(
             self.model, self.optimizer, self.kernel, self.is_valid, self.judge.gap,
-            settings=self.parameters.search(), generator=self.generator, report=self.report,
+            settings=self.parameters.search(self.model.sampling), generator=self.generator, report=self.report,
         )  # fmt: skip
         self._take(search.run(queries, self.experience, self.stop))
         if self.best is None and self.parameters.bridge:

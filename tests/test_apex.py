@@ -335,7 +335,7 @@ def test_with_time_left_paths_only_get_shorter(ready: PlanningSetup) -> None:
 def test_faulty_parameters_are_named(tmp_path: Path) -> None:
     for values, error, said in (
         ({"gamma": float("nan")}, ParameterError, "'gamma'"),
-        ({"sampler": "euler"}, ParameterError, "one of ddim, dpm_solver, ddpm"),
+        ({"sampler": "euler"}, ParameterError, "one of model, ddim, dpm_solver, ddpm"),
         ({"model": ""}, ParameterError, "'model'"),
         ({"first": 1.5}, ParameterError, "a whole number"),
         ({"lambda_obs": -1.0}, ParameterError, "'lambda_obs'"),
