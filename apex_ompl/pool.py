@@ -57,9 +57,19 @@ class Pool:
         steps: Steps that were taken.
     """
 
-    def __init__(self, optimizer: Optimizer, kernel: Kernel, is_valid: Check) -> None:
-        """Let ``is_valid`` decide about the states of paths."""
-        self._optimizer, self._kernel, self._is_valid = optimizer, kernel, is_valid
+    def __init__(
+        self, optimizer: Optimizer, kernel: Kernel, is_valid: Check,
+        is_wanted: Callable[[Candidate, Array], bool] = lambda candidate, path: True,
+    ) -> None:  # fmt: skip
+        """Let ``is_valid`` decide about the states of paths.
+
+        Args:
+            optimizer: Improves them.
+            kernel: The robot among its obstacles.
+            is_valid: Decides; called with the states of a path.
+            is_wanted: Asked about valid ones, with the states; nothing more is done for those that are not.
+        """
+        self._optimizer, self._kernel, self._is_valid, self._is_wanted = optimizer, kernel, is_valid, is_wanted
         self.candidates: list[Candidate] = []
         self.steps = 0
 
@@ -115,7 +125,11 @@ class Pool:
     def _passes(self, candidate: Candidate) -> bool:
         if candidate.clearance < NEARLY:
             return False
-        return self._is_valid(self._optimizer.spline.path(candidate.control))
+        path = self._optimizer.spline.path(candidate.control)
+        if not self._is_valid(path):
+            return False
+        candidate.given_up = not self._is_wanted(candidate, path)
+        return not candidate.given_up
 
 
 def first_valid(

@@ -68,7 +68,7 @@ class PlanResult:
         clearance: Least distance of any checked pair at 32 states spread over the path [m], NaN without a path.
         checks: How many states were judged one by one; those inside proved stretches of motions do not count.
         solved_by: What found the path: the planner's name, or the stage of apex that did (see
-            ``apex_ompl.search.Report``), with ``+repair`` when a stretch of it failed the full check and was planned
+            ``apex_ompl.report.Report``), with ``+repair`` when a stretch of it failed the full check and was planned
             anew; ``straight line`` when that was a solution, so that no planner ran; empty without a path.
         notes: What a user should know about this run, such as a snapshot of moving obstacles.
     """

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -13,11 +11,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from apex_ompl.diffusion.conditions import Query
-from apex_ompl.diffusion.proposals import Sampling, TrajectoryModel
+from apex_ompl.diffusion.proposals import Proposals, Sampling, TrajectoryModel
 from apex_ompl.diffusion.schedule import Estimate
 from apex_ompl.kernel import Kernel
 from apex_ompl.optimize import Check, Optimizer
 from apex_ompl.pool import PER_PATH, Candidate, Pool
+from apex_ompl.report import Report
 
 Array = NDArray[np.float64]
 Stop = Callable[[], bool]
@@ -33,39 +32,6 @@ VARIED = 4  # variations of a path at a time
 
 class OutOfTimeError(Exception):
     """Raised inside of a sampler to leave it; never leaves this module."""
-
-
-@dataclass
-class Report:
-    """What a call of ``solve`` did.
-
-    Attributes:
-        solved_by: The stage that found the first valid path: ``line``, ``experience``, ``apex`` or ``apex+resample``,
-            with ``+repair`` where the optimiser had to help; ``apex+bridge`` or ``rrtconnect``; empty without one.
-        reason: One sentence where there is no exact solution.
-        times: Seconds by stage.
-        first: Seconds until the first valid path, NaN without one.
-        candidates: Paths that were proposed.
-        steps: Steps of the optimiser.
-        improved: How often a shorter path was found behind the first one.
-    """
-
-    solved_by: str = ""
-    reason: str = ""
-    times: dict[str, float] = field(default_factory=dict)
-    first: float = float("nan")
-    candidates: int = 0
-    steps: int = 0
-    improved: int = 0
-
-    @contextmanager
-    def timed(self, stage: str) -> Iterator[None]:
-        """Count the time of a block to a stage."""
-        begin = time.perf_counter()
-        try:
-            yield
-        finally:
-            self.times[stage] = self.times.get(stage, 0.0) + time.perf_counter() - begin
 
 
 @dataclass(frozen=True)
@@ -116,7 +82,7 @@ class Search:
         """
         self._model, self._optimizer, self._kernel, self._is_valid = model, optimizer, kernel, is_valid
         self._gap, self._settings, self._generator, self._report = gap, settings, generator, report
-        self.pool = Pool(optimizer, kernel, is_valid)
+        self.pool = self._pool()
         self._close: list[tuple[float, Candidate]] = []  # valid, but nearer to an obstacle than lambda_obs
 
     def run(self, queries: Sequence[Query], experience: Sequence[Array], stop: Stop) -> Candidate | None:
@@ -131,20 +97,20 @@ class Search:
             if stop():
                 break
             found = stage()
-            if found is not None and self._keeps_distance(found):
+            if found is not None:
                 return found
-        return max(self._close, key=lambda pair: pair[0])[1] if self._close else None
+        return self._farthest()
 
     def again(self, queries: Sequence[Query], stop: Stop) -> Candidate | None:
         """Return a valid path for one of several queries from more rounds of proposals, until it is told to stop."""
         batch = max(self._settings.batches, default=0)
         while batch and not stop():
-            self.pool = Pool(self._optimizer, self._kernel, self._is_valid)
+            self.pool = self._pool()
             for stage in self._round(queries, batch, stop):
                 found = None if stop() else stage()
-                if found is not None and self._keeps_distance(found):
+                if found is not None:
                     return found
-        return None
+        return self._farthest()
 
     def vary(self, control: Array, query: Query, noise: float, stop: Stop) -> Candidate | None:
         """Return a valid path that a given one becomes when it is noised and denoised again, or None.
@@ -155,7 +121,7 @@ class Search:
             noise: How far it is noised, as a share of the schedule.
             stop: Asked often whether to give up.
         """
-        pool = Pool(self._optimizer, self._kernel, self._is_valid)
+        pool = self._pool()
         found = self._renoised(np.repeat(control[None], VARIED, axis=0), query, noise, stop)
         if found is None:
             return None
@@ -163,7 +129,7 @@ class Search:
 
     def fresh(self, query: Query, stop: Stop) -> Candidate | None:
         """Return a valid path that new proposals become, or None."""
-        pool = Pool(self._optimizer, self._kernel, self._is_valid)
+        pool = self._pool()
         found = self._proposed([query], AT_ONCE, stop)
         if found is None:
             return None
@@ -232,35 +198,50 @@ class Search:
         self._report.candidates += len(control)
         return self.pool.add(control, origin, stop)
 
-    def _keeps_distance(self, found: Candidate) -> bool:
+    def _pool(self) -> Pool:
+        return Pool(self._optimizer, self._kernel, self._is_valid, self._keeps_distance)
+
+    def _keeps_distance(self, found: Candidate, path: Array) -> bool:
         """Whether a valid path is as far from obstacles as is wanted; one that is not is set aside."""
         wanted = self._settings.lambda_obs
         if wanted <= 0.0:
             return True
-        gap = self._gap(self._model.spline.path(found.control))
+        with self._report.timed("distance"):
+            gap = self._gap(path)
         if gap < wanted:
-            found.given_up = True
             self._close.append((gap, found))
         return gap >= wanted
 
+    def _farthest(self) -> Candidate | None:
+        """Return the one of the valid paths that were set aside that keeps most distance, or None."""
+        return max(self._close, key=lambda pair: pair[0])[1] if self._close else None
+
     def _proposed(self, queries: Sequence[Query], count: int, stop: Stop) -> Array | None:
-        try:
-            return self._model.propose(
+        return self._sampled(
+            lambda: self._model.propose(
                 queries, self._kernel, count, sampling=self._settings.sampling, generator=self._generator,
                 callback=_leaving(stop),
-            ).control  # fmt: skip
-        except OutOfTimeError:
-            return None
+            )
+        )  # fmt: skip
 
     def _renoised(self, control: Array, query: Query, noise: float, stop: Stop) -> Array | None:
         step = max(0, round(noise * self._model.network.schedule.steps) - 1)
-        try:
-            return self._model.renoise(
+        return self._sampled(
+            lambda: self._model.renoise(
                 query, self._kernel, control, step, sampling=self._settings.sampling, generator=self._generator,
                 callback=_leaving(stop),
-            ).control  # fmt: skip
+            )
+        )  # fmt: skip
+
+    def _sampled(self, sample: Callable[[], Proposals]) -> Array | None:
+        """Return the control points of proposals, or None where time ended meanwhile; count the time of guidance."""
+        try:
+            made = sample()
         except OutOfTimeError:
             return None
+        times = self._report.times
+        times["guidance"] = times.get("guidance", 0.0) + made.seconds.get("guidance", 0.0)
+        return made.control
 
 
 def _joins(control: Array, query: Query) -> bool:

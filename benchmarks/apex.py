@@ -3,7 +3,8 @@
 Every run is a call of ``plan`` in the same space, by the same verdict, at the same resolution, with the same seed (the
 number of the problem modulo 1000). "Without trees" is APEX with ``fallback=false`` and ``bridge=false``; the controls
 are the same pipeline with random weights, with the conditions of another problem, with random bumps instead of
-proposals, and with the straight line and its repair alone. Paths are judged once more at a tenth of the resolution of
+proposals, and with the straight line and its repair alone. Times leave out the setup of problem and planner, which is
+given by itself, and are those of a warm process. Paths are judged once more at a tenth of the resolution of
 the full check; one that fails there counts as false-valid. Runs are kept in a store as they end, so that the command
 goes on where it was stopped.
 
@@ -13,6 +14,7 @@ Usage: python benchmarks/apex.py [SUITE[/LEVEL] ...] [-n 100] [--controls 50] [-
 from __future__ import annotations
 
 import argparse
+import json
 import math
 from collections import Counter
 from collections.abc import Sequence
@@ -24,12 +26,13 @@ from typing import Any
 import numpy as np
 import record
 import torch
-from controls import Bumps, Shuffled, drawn, next_query
+from controls import Bumps, Shuffled, checkpoint_digest, drawn, next_query
 from ompl import base as ob
 from store import RunStore
 
 from apex_ompl import plan, problems
 from apex_ompl.assembly import assemble
+from apex_ompl.diffusion.checkpoint import SHIPPED
 from apex_ompl.diffusion.conditions import Query
 from apex_ompl.diffusion.proposals import TrajectoryModel
 from apex_ompl.planners.apex import APEX
@@ -86,9 +89,28 @@ for _kind in ("random weights", "shuffled conditions", "bumps"):
     register(_kind)(type("Control", (Control,), {"kind": _kind}))
 
 
-def run(job: tuple[str, str]) -> dict[str, Any]:
+def made_of(method: str) -> str:
+    """Return what tells runs of a method apart from those with another model or other parameters."""
+    planner, params, limit = METHODS[method]
+    model = "" if planner.startswith("rrtconnect") else checkpoint_digest(SHIPPED / "apex")
+    return f"{model} {json.dumps(params)} {limit:g} s"
+
+
+def attempted(job: tuple[str, str, str]) -> dict[str, Any]:
+    """Return a run; one that raises counts as not solved, and says why."""
+    try:
+        return run(job)
+    except Exception as error:
+        print(f"{job}: {error!r}", flush=True)
+        return {
+            "problem": job[0], "method": job[1], "made_of": job[2], "solved": False, "by": "", "found_s": math.inf,
+            "total_s": math.inf, "length": None, "status": repr(error), "stages": {}, "setup_s": 0.0,
+        }  # fmt: skip
+
+
+def run(job: tuple[str, str, str]) -> dict[str, Any]:
     """Return one run of a method on a problem."""
-    name, method = job
+    name, method, kind = job
     planner, params, limit = METHODS[method]
     if planner == "shuffled conditions":
         OTHER[:] = [next_query(name)]
@@ -97,11 +119,12 @@ def run(job: tuple[str, str]) -> dict[str, Any]:
     total = sum(times.get(k, 0.0) for k in ("line", "solve", "simplify", "verify", "repair"))
     after = sum(times.get(INSIDE + k, 0.0) for k in AFTER) + times.get("simplify", 0.0)
     found = {
-        "problem": name, "method": method, "solved": bool(result), "by": result.solved_by, "found_s": total - after,
+        "problem": name, "method": method, "made_of": kind, "solved": bool(result), "by": result.solved_by,
+        "found_s": total - after,
         "total_s": total, "length": result.length if result else None, "status": str(result.status),
         "stages": {k: v for k, v in times.items() if k.startswith(INSIDE)}, "setup_s": times.get("setup", 0.0),
     }  # fmt: skip
-    if result and method in ("apex", "apex without trees"):
+    if result:
         ready = assemble(problems.load(name), robot())
         found["false"] = not full_check(ready.verdict, result.path, resolution=FULL_RESOLUTION / 10)
     return found
@@ -111,7 +134,7 @@ def warm_up(methods: Sequence[str]) -> None:
     """Load the kernel, the robot and the models, so that no run pays for it."""
     torch.set_num_threads(1)
     for method in methods:
-        run(("wall/easy/800000", method))
+        run(("wall/easy/800000", method, ""))
 
 
 def figures(runs: Sequence[dict[str, Any]]) -> dict[str, Any]:
@@ -129,15 +152,22 @@ def figures(runs: Sequence[dict[str, Any]]) -> dict[str, Any]:
             "in": {str(t): float(np.mean(first <= t)) for t in MOMENTS},
             "found_s": [_percentile(first, p) for p in (50, 95)], "total_s": [_percentile(total, p) for p in (50, 95)],
             "length": float(np.median([r["length"] for r in some if r["solved"]] or [math.nan])),
+            "setup_s": float(np.median([r["setup_s"] for r in some])),
             "by": dict(Counter(r["by"] for r in some if r["solved"])),
             "false": sum(r.get("false", False) for r in some),
-            "lost": sum(not r["solved"] and by["rrtconnect"].get(n, {}).get("solved", False) for n, r in mine.items()),
+            "lost": sum(
+                not r["solved"] and _within(by["rrtconnect"].get(n), METHODS[method][2]) for n, r in mine.items()
+            ),
         }  # fmt: skip
         for other in ("rrtconnect", "rrtconnect+polish"):
             pairs = [(r, by[other][n]) for n, r in mine.items() if r["solved"] and by[other].get(n, {}).get("solved")]
             ratios = {key: [a[key] / max(b[key], 1e-9) for a, b in pairs] for key in ("length", "total_s")}
             found[method][f"over {other}"] = {k: float(np.exp(np.mean(np.log(v)))) for k, v in ratios.items() if v}
     return found
+
+
+def _within(run: dict[str, Any] | None, limit: float) -> bool:
+    return run is not None and run["solved"] and run["found_s"] <= limit
 
 
 def _percentile(values: np.ndarray, p: float) -> float | None:
@@ -158,13 +188,22 @@ def table(levels: Sequence[dict[str, Any]]) -> str:
             shares = [f"{f['by'].get(stage, 0) / f['n']:.2f}" for stage in stages]
             lines.append(record.row([level["level"], f["n"], *shares, f"{1.0 - f['solved']:.2f}"]))
     head = ["suite/level", "method", "N", "solved", *(f"in {t:g} s" for t in MOMENTS), "lost", "first ms p50", "p95"]
-    head += ["total ms p50", "p95", "length rad", "length / rrtconnect", "length / polished", "time / polished"]
+    head += [
+        "total ms p50",
+        "p95",
+        "setup ms",
+        "length rad",
+        "length / rrtconnect",
+        "length / polished",
+        "time / polished",
+    ]
     lines += ["", record.row(head), record.row(["---", "---", *["---:"] * (len(head) - 2)])]
     for level in levels:
         for k, (method, f) in enumerate(level["methods"].items()):
             cells = [level["level"] if k == 0 else "", method, f["n"], f"{f['solved']:.2f}"]
             cells += [f"{share:.2f}" for share in f["in"].values()] + [f["lost"]]
             cells += ["-" if v is None else f"{1e3 * v:.0f}" for v in (*f["found_s"], *f["total_s"])]
+            cells.append(f"{1e3 * f['setup_s']:.0f}")
             cells.append("-" if math.isnan(f["length"]) else f"{f['length']:.1f}")
             for other, key in (
                 ("rrtconnect", "length"),
@@ -196,17 +235,17 @@ def main() -> None:
     if not set(args.levels) <= known:
         raise SystemExit(f"unknown suite or level; known: {', '.join(f'{s}/{v}' for s, v in static)}")
     chosen = [f"{s}/{v}" for s, v in static if not args.levels or s in args.levels or f"{s}/{v}" in args.levels]
-    jobs: list[tuple[str, str]] = []
+    jobs: list[tuple[str, str, str]] = []
     for level in chosen:
         names = problems.frozen_names(*level.split("/"), args.split)
         for method in args.methods:
             most = args.n if method in FULL else args.controls if level.endswith("/hard") else 0
-            jobs += [(name, method) for name in names[:most]]
-    store = RunStore(args.store, ("problem", "method"))
+            jobs += [(name, method, made_of(method)) for name in names[:most]]
+    store = RunStore(args.store, ("problem", "method", "made_of"))
     done = store.read()
     todo = [] if args.report else [job for job in jobs if job not in done]
     todo.sort(key=lambda job: int(job[0].rsplit("/", 1)[1]))  # all methods and levels in turn
-    store.complete(run, todo, args.jobs, warm_up, args.methods)
+    store.complete(attempted, todo, args.jobs, warm_up, args.methods)
     done = store.read()
     runs = [done[job] for job in jobs if job in done]
     levels = [{"level": v, "methods": figures([r for r in runs if r["problem"].startswith(f"{v}/")])} for v in chosen]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -60,13 +62,24 @@ class Shuffled(TrajectoryModel):
 
 def drawn(trained: LatentDiffusion) -> LatentDiffusion:
     """Return a network like a trained one with random weights; its latent space and its limits are those."""
-    torch.manual_seed(0)
-    network = LatentDiffusion(trained.config)
-    torch.nn.init.kaiming_uniform_(network.denoiser.leave.weight)  # it would begin at zero
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        network = LatentDiffusion(trained.config)
+        torch.nn.init.kaiming_uniform_(network.denoiser.leave.weight)  # it would begin at zero
     kept = {k: v for k, v in trained.state_dict().items() if k.startswith(("autoencoder", "probe"))}
     kept |= {k: v for k, v in trained.state_dict().items() if k in ("encoder.lower", "encoder.upper")}
     network.load_state_dict({**network.state_dict(), **kept})
     return network
+
+
+def digest(*files: Path) -> str:
+    """Return what tells the contents of files apart from others."""
+    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:12]
+
+
+def checkpoint_digest(folder: Path) -> str:
+    """Return a digest of a checkpoint."""
+    return digest(folder / "config.json", folder / "model.safetensors")
 
 
 def next_query(name: str) -> Query:

@@ -25,7 +25,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import record
 import torch
-from controls import Shuffled, drawn, next_query
+from controls import Shuffled, checkpoint_digest, digest, drawn, next_query
 from neighbours import Neighbours
 from store import RunStore
 
@@ -41,6 +41,7 @@ from apex_ompl.optimize import Optimizer
 from apex_ompl.pool import first_valid
 from apex_ompl.problems.reach import robot
 from apex_ompl.queries import query_of
+from apex_ompl.result import INSIDE
 from apex_ompl.space import path_length
 from apex_ompl.validity import full_check
 
@@ -118,7 +119,7 @@ def made_of(method: str, args: argparse.Namespace) -> str:
     if method in ("line", "bumps", "rrtconnect+polish"):
         return ""
     if method == "nearest paths":
-        return Path(args.data).name
+        return digest(*map(Path, args.data.split(",")))
     folder = (
         Path(args.regression) if method == "regression" else SHIPPED / ("apex-paper" if "paper" in method else "apex")
     )
@@ -127,7 +128,7 @@ def made_of(method: str, args: argparse.Namespace) -> str:
         mine["denoiser"]["kind"] = apex["denoiser"]["kind"]
         if any(mine[key] != apex[key] for key in ALIKE):
             raise SystemExit(f"{folder}: expected a regression that was trained as apex was")
-    return read_config(folder).digest[:12]
+    return checkpoint_digest(folder)
 
 
 ALIKE = ("latent", "condition", "denoiser", "steps", "batch", "rate", "weights", "mirror")
@@ -141,8 +142,9 @@ def run(job: Job) -> dict[str, Any]:
     if method == "rrtconnect+polish":
         result = plan(problems.load(name), method, timeout=TIME_LIMIT, seed=seed)
         took = sum(result.times.get(k, 0.0) for k in ("line", "solve", "simplify", "verify", "repair"))
+        found = took - sum(result.times.get(f"{INSIDE}{k}", 0.0) for k in ("simplify", "polish"))
         length = result.length if result else None
-        return {**about, "sampled": False, "solved": bool(result), "found_s": took, "total_s": took, "length": length}
+        return {**about, "sampled": False, "solved": bool(result), "found_s": found, "total_s": took, "length": length}
     ready, optimizer = assemble(problems.load(name), robot()), Optimizer()
     make = proposer(ready, optimizer, job, seed)
 

@@ -100,36 +100,20 @@ def overruns() -> tuple[str, bool]:
                 assert planner_status.getStatus() != ob.PlannerStatus.CRASH
     found = np.array(late)
     said = f"N = {len(found)}, ms p50 {1e3 * np.median(found):.1f}, p95 {1e3 * np.percentile(found, 95):.1f}, "
-    return said + f"most {1e3 * found.max():.1f}", bool(np.percentile(found, 95) < OVERRUN)
+    return said + f"most {1e3 * found.max():.1f}", bool(found.max() < OVERRUN)
 
 
 def walled() -> Problem:
-    """Two walls under a low ceiling go out from the left arm's base, and leave it no room to pass to its goal."""
+    """A wall that begins 12 cm from the left arm's first axis: its first link cannot turn past it, and must."""
     panda = robot()
     start, goal = panda.home.copy(), panda.home.copy()
-    start[0], goal[0] = -0.5, 1.5
-    walls = [
-        Obstacle(
-            name=f"wall{k}", box=(2.0, 0.04, 3.0), orientation=(0.0, 0.0, float(np.sin(a / 2)), float(np.cos(a / 2))),
-            position=_out(1.13, a),
-        )
-        for k, a in enumerate((1.06, -2.54))
-    ]  # fmt: skip
-    walls.append(Obstacle(name="ceiling", box=(3.0, 3.0, 0.04), position=(0.0, 0.3, 0.8)))
+    start[0], goal[0] = 0.6, 2.12
+    wall = Obstacle(name="wall", box=(2.0, 0.04, 3.0), position=(1.12, 0.5, 1.5))
 
     def named(q: np.ndarray) -> dict[str, float]:
         return dict(zip(panda.joint_names, q.tolist(), strict=True))
 
-    return Problem(
-        name="walled", robot=panda.name, scene=tuple(walls), start=named(start), goal=Goal(joints=(named(goal),))
-    )
-
-
-def _out(radius: float, angle: float) -> tuple[float, float, float]:
-    kernel = assemble(problems.load(HARD), robot()).verdict.kernel
-    joint = kernel.robot.arrays.body_joint[kernel.robot.body_names.index("left_link1_0")]
-    axis = kernel.joint_frames(robot().home[None])[1][0, joint]
-    return float(axis[0] + radius * np.cos(angle)), float(axis[1] + radius * np.sin(angle)), 1.5
+    return Problem(name="walled", robot=panda.name, scene=(wall,), start=named(start), goal=Goal(joints=(named(goal),)))
 
 
 def hopeless() -> tuple[str, bool]:
@@ -167,7 +151,9 @@ def goal_in_collision() -> tuple[str, bool]:
 def in_a_millisecond() -> tuple[str, bool]:
     """Next to no time."""
     result = plan(HARD, timeout=0.001)
-    return f"{result.status} after {1e3 * result.times['solve']:.1f} ms", str(result.status) == "TIMEOUT"
+    late = result.times["solve"] - 0.001
+    said = f"{result.status} after {1e3 * result.times['solve']:.1f} ms"
+    return said, str(result.status) == "TIMEOUT" and late < OVERRUN
 
 
 def nan_in_a_state() -> tuple[str, bool]:

@@ -11,12 +11,13 @@ from ompl import util as ou
 
 from apex_ompl.diffusion.checkpoint import shared_model
 from apex_ompl.diffusion.proposals import Sampling
+from apex_ompl.errors import ParameterError
 from apex_ompl.optimize import Optimizer
 from apex_ompl.planners.apex_parameters import NAME, ApexParameters
 from apex_ompl.planners.judge import Judge
 from apex_ompl.planners.solve_loop import LOG, SolveLoop
 from apex_ompl.queries import query_of
-from apex_ompl.search import Report
+from apex_ompl.report import Report
 from apex_ompl.torch_threads import one_torch_thread
 
 Array = NDArray[np.float64]
@@ -27,9 +28,9 @@ Status = ob.PlannerStatus
 class APEX(ob.Planner):
     """OMPL planner: section III of the paper inside ``solve``, and complete in the limit by RRTConnect.
 
-    It works with any validity checker. With this project's, proposals are guided and repaired among the obstacles; with
-    another one they are judged by it. A first path is shortened; with a path length objective it is improved until the
-    termination condition holds.
+    It works with any validity checker, and takes the one that is set when ``solve`` begins. With this project's,
+    proposals are guided and repaired among the obstacles; with another one they are judged by it. A first path is
+    shortened; with a path length objective it is improved until the termination condition holds.
 
     Attributes:
         parameters: How it plans.
@@ -51,6 +52,9 @@ class APEX(ob.Planner):
         self.judge = Judge(si, self.parameters.robot)
         robot = self.judge.verdict.robot.name
         self.model = shared_model(self.parameters.model, device=self.parameters.device, robot=robot)
+        steps, most = self.parameters.denoising_steps, self.model.network.schedule.steps
+        if steps > most:
+            raise ParameterError("parameter 'denoising_steps'", steps, f"at most {most}, those of the checkpoint")
         self.optimizer = Optimizer(self.model.spline)
         self.experience: list[Array] = []
         self._solves = 0
@@ -60,6 +64,11 @@ class APEX(ob.Planner):
     def setup(self) -> None:
         """Make all ready that the first call of ``solve`` would have to: kernel, network, optimiser."""
         super().setup()
+        self._prepare()
+
+    def _prepare(self) -> None:
+        if self.judge.outdated:
+            self.judge, self._warm = Judge(self.getSpaceInformation(), self.parameters.robot), False
         if self._warm:
             return
         verdict = self.judge.verdict
@@ -80,7 +89,7 @@ class APEX(ob.Planner):
         self._solves, self.report = 0, Report()
 
     def next_seed(self) -> int:
-        """Return the seed of the next call of ``solve``: another one each time, and the same ones after ``clear``."""
+        """Return the seed of the next call of ``solve``: one that follows from the given one, or from OMPL's."""
         first = self.parameters.seed if self.parameters.seed >= 0 else int(ou.RNG().uniformInt(0, 2**31 - 2))
         self._solves += 1
         return first + self._solves - 1
@@ -92,8 +101,7 @@ class APEX(ob.Planner):
         """
         self.report = Report()
         try:
-            if not self._warm:
-                self.setup()
+            self._prepare()
             with one_torch_thread():
                 status = SolveLoop(self, ptc).run()
         except Exception as error:

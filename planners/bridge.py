@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,7 @@ Stop = Callable[[], bool]
 
 CALLS = 20_000  # of the termination condition of one bridge
 EVERY = 2  # states of a path that are judged to find its blocked stretches
+SPACING = 0.1  # of states on polylines [rad]
 
 
 def grown(tree: ob.Planner, pdef: ob.ProblemDefinition, ptc: ob.PlannerTerminationCondition) -> ob.PlannerStatus:
@@ -34,18 +36,17 @@ def connect(si: ob.SpaceInformation, longest: float) -> og.RRTConnect:
     return tree
 
 
-def joined(si: ob.SpaceInformation, judge: Judge, path: Array, stop: Stop, longest: float = 0.0) -> Array | None:
+def joined(si: ob.SpaceInformation, judge: Judge, states: Array, stop: Stop, longest: float = 0.0) -> Array | None:
     """Return a valid path whose blocked stretches are planned anew by RRTConnect between their free ends, or None.
 
     Args:
         si: OMPL's space information.
         judge: Decides what is blocked.
-        path: States, shape (N, dof), its ends free.
+        states: The path, shape (N, dof), its ends free.
         stop: Asked often whether to give up.
         longest: Longest step of the trees; 0 lets OMPL choose [rad].
     """
-    states = _thinned(path)
-    free = _free(judge, states, stop)
+    free = np.array([not stop() and judge.is_free(q) for q in states])
     if stop() or not (free[0] and free[-1]):
         return None
     pieces, k = [states[:1]], 0
@@ -64,20 +65,29 @@ def joined(si: ob.SpaceInformation, judge: Judge, path: Array, stop: Stop, longe
 
 
 def beginning(judge: Judge, path: Array, stop: Stop) -> Array:
-    """Return the valid beginning of a path, states of shape (M, dof), M >= 1; its start is taken to be valid."""
-    states = _thinned(path)
+    """Return the valid beginning of a path, states of shape (M, dof), M >= 1; its start is taken to be valid.
+
+    Checkers that may take their time are asked until ``stop`` holds.
+    """
+    states = thinned(path)
     for k in range(1, len(states)):
-        if stop() or not judge.is_valid(states[k - 1 : k + 1], stop):
+        if (stop() and not judge.alone) or not judge.is_valid(states[k - 1 : k + 1], stop):
             return states[:k]
     return states
 
 
-def _thinned(path: Array) -> Array:
+def filled(path: Array) -> Array:
+    """Return a polyline, shape (N, dof), with states in between, at most ``SPACING`` apart [rad, max-norm]."""
+    pieces = [path[:1]]
+    for a, b in pairwise(path):
+        count = max(1, int(np.ceil(np.abs(b - a).max() / SPACING)))
+        pieces.append(a + (b - a) * (np.arange(1, count + 1)[:, None] / count))
+    return np.concatenate(pieces)
+
+
+def thinned(path: Array) -> Array:
+    """Return every other state of a path, shape (N, dof), its ends among them."""
     return np.concatenate([path[:-1:EVERY], path[-1:]])
-
-
-def _free(judge: Judge, states: Array, stop: Stop) -> NDArray[np.bool_]:
-    return np.array([not stop() and judge.is_free(q) for q in states])
 
 
 def _bridge(si: ob.SpaceInformation, a: Array, b: Array, stop: Stop, longest: float) -> Array | None:

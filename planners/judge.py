@@ -14,25 +14,27 @@ from apex_ompl.errors import ParameterError
 from apex_ompl.resolution import FULL_RESOLUTION
 from apex_ompl.robot import load_robot
 from apex_ompl.space import to_state
-from apex_ompl.validity import VerdictChecker
+from apex_ompl.validity import VerdictChecker, VerdictMotionValidator
 
 Array = NDArray[np.float64]
 Stop = Callable[[], bool]
 
 LOG = logging.getLogger("apex_ompl")
+PLAIN = (ob.MotionValidator, VerdictMotionValidator)  # OMPL's own, as bound, and this project's
 EVERY = 4  # states of a path whose distance from the obstacles is measured
 
 
 class Judge:
     """Judges states and paths of a space information.
 
-    With a ``VerdictChecker`` a path is valid by the full check; with another checker when all of its states are valid
-    and all motions between them, by ``isValid`` and ``checkMotion``. In the second case the robot is known by name, and
-    its obstacles are not known.
+    With a ``VerdictChecker`` a path is valid by the full check. With another checker, or one that says more than the
+    verdict, a path is valid when all of its states are and all motions between them, by ``isValid`` and
+    ``checkMotion``. A checker without a verdict knows the robot by name, and its obstacles are not known.
 
     Attributes:
         verdict: The robot, among its obstacles where they are known.
         knows_obstacles: Whether they are.
+        alone: Whether the verdict decides alone.
     """
 
     def __init__(self, si: ob.SpaceInformation, robot: str) -> None:
@@ -43,8 +45,11 @@ class Judge:
             ParameterError: The space has another dimension than the robot.
         """
         self._si = si
-        checker = si.getStateValidityChecker()
+        self._checkers = _checkers(si)
+        checker, motions = self._checkers
         self.knows_obstacles = isinstance(checker, VerdictChecker)
+        plain = type(checker).isValid is VerdictChecker.isValid and type(motions) in PLAIN
+        self.alone = self.knows_obstacles and plain
         self.verdict = checker.verdict if isinstance(checker, VerdictChecker) else Verdict(load_robot(robot))
         dof, dimension = self.verdict.robot.dof, int(si.getStateSpace().getDimension())
         if dof != dimension:
@@ -55,16 +60,24 @@ class Judge:
                 self.verdict.robot.name,
             )
 
+    @property
+    def outdated(self) -> bool:
+        """Whether the space information has other checkers by now."""
+        return any(mine is not theirs for mine, theirs in zip(self._checkers, _checkers(self._si), strict=True))
+
     def is_free(self, q: Array) -> bool:
         """Whether a state, shape (dof,), is valid."""
-        if self.knows_obstacles:
+        if self.alone:
             return self.verdict.is_free(q)
         return bool(self._si.isValid(to_state(self._si.getStateSpace(), q)))
 
     def is_valid(self, path: Array, stop: Stop = lambda: False) -> bool:
-        """Whether a path, shape (N, dof), is valid; not when it is told to stop meanwhile."""
-        if self.knows_obstacles:
-            return self.verdict.first_collision(path, FULL_RESOLUTION) is None
+        """Whether a path, shape (N, dof), is valid; without a verdict, not when it is told to stop meanwhile."""
+        if self.knows_obstacles and self.verdict.first_collision(path, FULL_RESOLUTION) is not None:
+            return False
+        return self.alone or self._valid_by_ompl(path, stop)
+
+    def _valid_by_ompl(self, path: Array, stop: Stop) -> bool:
         space = self._si.getStateSpace()
         states = [to_state(space, q) for q in path]
         order = sorted(range(len(states)), key=lambda k: (-(k & -k), k))  # coarse before fine
@@ -87,3 +100,7 @@ class Judge:
                 break
             least = min(least, self.verdict.distance(states[k]).value)
         return float(least)
+
+
+def _checkers(si: ob.SpaceInformation) -> tuple[ob.StateValidityChecker, ob.MotionValidator]:
+    return si.getStateValidityChecker(), si.getMotionValidator()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import time
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -15,6 +16,7 @@ from apex_ompl.collision import Verdict
 from apex_ompl.errors import ParameterError
 from apex_ompl.optimize import Optimizer, Settings
 from apex_ompl.planners.registry import Parameters, bounded, register
+from apex_ompl.report import Report
 from apex_ompl.resolution import FULL_RESOLUTION
 from apex_ompl.simplify import simplify
 from apex_ompl.space import array_to_path, path_to_array
@@ -47,6 +49,9 @@ class PolishedRRTConnect(ob.Planner):
 
     What RRTConnect found is a solution as soon as it is found; the simplified and the optimised path are added to it,
     and OMPL gives the shortest. Where optimisation finds nothing valid, the simplified path stands.
+
+    Attributes:
+        report: What the last call of ``solve`` did.
     """
 
     def __init__(self, si: ob.SpaceInformation, verdict: Verdict, optimizer: Optimizer, inner: og.RRTConnect) -> None:
@@ -56,6 +61,7 @@ class PolishedRRTConnect(ob.Planner):
         self._verdict = verdict
         self._optimizer = optimizer
         self._inner = inner
+        self.report = Report()
 
     def clear(self) -> None:
         """Forget what was found."""
@@ -64,23 +70,31 @@ class PolishedRRTConnect(ob.Planner):
 
     def solve(self, ptc: ob.PlannerTerminationCondition) -> ob.PlannerStatus:
         """Solve the problem; no exception leaves it, since one would end the process inside OMPL."""
+        self.report = Report()
         try:
             return self._solve(ptc)
-        except Exception:
+        except Exception as error:
             LOG.exception("%s failed", NAME)
+            self.report.reason = f"{NAME} failed, {error!r}"
             return ob.PlannerStatus(ob.PlannerStatus.CRASH)
 
     def _solve(self, ptc: ob.PlannerTerminationCondition) -> ob.PlannerStatus:
         si, pdef, dof = self.getSpaceInformation(), self.getProblemDefinition(), self._verdict.robot.dof
         self._inner.setProblemDefinition(pdef)
-        status = self._inner.solve(ptc)
+        begin = time.perf_counter()
+        with self.report.timed("rrtconnect"):
+            status = self._inner.solve(ptc)
+        if status.getStatus() == ob.PlannerStatus.EXACT_SOLUTION:
+            self.report.solved_by, self.report.first = NAME, time.perf_counter() - begin
         if status.getStatus() != ob.PlannerStatus.EXACT_SOLUTION or ptc():
             return status
         path = path_to_array(pdef.getSolutionPath(), dof)
-        path = simplify(og.PathSimplifier(si), si, path, lambda: bool(ptc()))
+        with self.report.timed("simplify"):
+            path = simplify(og.PathSimplifier(si), si, path, lambda: bool(ptc()))
         self._add(path)
         if not ptc():
-            better = polished(self._optimizer, self._verdict, path, lambda: bool(ptc()))
+            with self.report.timed("polish"):
+                better = polished(self._optimizer, self._verdict, path, lambda: bool(ptc()))
             if better is not None:
                 self._add(better)
         return status

@@ -29,7 +29,7 @@ Array = NDArray[np.float64]
 Status = ob.PlannerStatus
 
 LOG = logging.getLogger("apex_ompl")
-MOST_GOALS = 8  # that are read
+MOST_GOALS, GOAL_ATTEMPTS = 8, 32  # that are read, and asked for
 MOST_QUERIES = 8  # pairs of start and goal that proposals are made for, the nearest ones
 BRIDGED = 2  # candidates whose blocked stretches are bridged
 KEPT = 4  # earlier paths that are candidates for the next query
@@ -51,13 +51,15 @@ class SolveLoop:
         self.kernel = self.judge.verdict.kernel
         self.generator = torch.Generator().manual_seed(planner.next_seed())
         self.best: Array | None = None
+        self.control: Array | None = None  # of the best path, where it is on a spline
+        self.nearest: tuple[Array, float] | None = None  # a path that ends near a goal, and how near
 
     def stop(self) -> bool:
         """Whether time is up."""
         return bool(self.ptc())
 
     def is_valid(self, path: Array) -> bool:
-        """Whether a path, shape (N, dof), is valid; not when time is up meanwhile."""
+        """Whether a path, shape (N, dof), is valid by the judge."""
         return self.judge.is_valid(path, self.stop)
 
     def run(self) -> Any:
@@ -79,20 +81,22 @@ class SolveLoop:
         self._take(search.run(queries, self.experience, self.stop))
         if self.best is None and self.parameters.bridge:
             self._bridge(search)
-        status, near = Status.TIMEOUT, None
         if self.best is None and self.parameters.approximate:
-            near = self._nearest(search, goals)
+            with self.report.timed("approximate"):
+                self._note_nearest(search, goals)
         if self.best is None and self.parameters.fallback:
-            status = self._grow_trees(starts)
+            self._grow_trees(starts)
         elif self.best is None:
             self._take(search.again(queries, self.stop))
-        if self.best is None:
-            if status == Status.TIMEOUT and near is not None:
-                status = Status.APPROXIMATE_SOLUTION
-                self.pdef.addSolutionPath(array_to_path(self.si, near[0]), True, near[1], NAME)
-            return self._without(status, f"no path among {self.report.candidates} candidates in the time given")
-        self._improve(search, queries)
-        return Status.EXACT_SOLUTION
+        if self.best is not None:
+            self._improve(search, queries)
+            self._remember()
+            return Status.EXACT_SOLUTION
+        self._without(Status.TIMEOUT, f"no path among {self.report.candidates} candidates in the time given")
+        if self.nearest is None:
+            return Status.TIMEOUT
+        self.pdef.addSolutionPath(array_to_path(self.si, self.nearest[0]), True, self.nearest[1], NAME)
+        return Status.APPROXIMATE_SOLUTION
 
     def _take(self, found: Candidate | None) -> None:
         """Take a candidate that is valid, and shorten it."""
@@ -119,14 +123,18 @@ class SolveLoop:
 
     def _goals(self) -> list[Array] | str:
         """Return valid goals, some where there are many; or why the goal is of no use."""
+        if self.pdef.getGoal() is None:
+            return []
         if not self.pdef.getGoal().hasType(ob.GOAL_SAMPLEABLE_REGION):
             return "the goal cannot be sampled, expected a goal state, goal states or a sampleable region"
         inputs, found = self.inputs, []
         state = inputs.nextGoal(self.ptc)  # waits for one
-        while state is not None:
-            found.append(to_array(state, self.kernel.robot.dof))
-            more = len(found) < MOST_GOALS and not self.stop() and inputs.haveMoreGoalStates()
-            state = inputs.nextGoal() if more else None
+        for _ in range(GOAL_ATTEMPTS):
+            if state is not None:
+                found.append(to_array(state, self.kernel.robot.dof))
+            if len(found) == MOST_GOALS or self.stop() or not inputs.haveMoreGoalStates():
+                break
+            state = inputs.nextGoal()  # none where the next one is not valid
         return _sound(found)
 
     def _queries(self, starts: list[Array], goals: list[Array]) -> list[Query]:
@@ -139,10 +147,13 @@ class SolveLoop:
         """Take a valid path as a solution."""
         if self.best is None:
             self.report.first = time.perf_counter() - self.begin
-        self.best = path
+        self.best, self.control = path, control
         self.pdef.addSolutionPath(array_to_path(self.si, path), False, 0.0, NAME)
-        if control is not None:
-            self.experience.insert(0, control - self.model.spline.line(control[0], control[-1]))
+
+    def _remember(self) -> None:
+        """Keep what the best path differs in from its straight line."""
+        if self.control is not None:
+            self.experience.insert(0, self.control - self.model.spline.line(self.control[0], self.control[-1]))
             del self.experience[KEPT:]
 
     def _shorten(self, control: Array) -> None:
@@ -155,9 +166,16 @@ class SolveLoop:
             self._accept_shorter(better)
 
     def _accept_shorter(self, control: Array) -> bool:
-        path = self.model.spline.path(control)
-        if self.best is not None and path_length(path) > path_length(self.best) - GAIN:
-            return False
+        """Take a valid path if it is shorter, and passes no nearer to obstacles than is wanted, or than the best."""
+        path, wanted = self.model.spline.path(control), self.parameters.lambda_obs
+        if self.best is not None:
+            if path_length(path) > path_length(self.best) - GAIN:
+                return False
+            if wanted > 0.0:
+                with self.report.timed("distance"):
+                    gap = self.judge.gap(path)
+                    if gap < wanted and gap < self.judge.gap(bridge.filled(self.best)):
+                        return False
         self._accept(path, control)
         return True
 
@@ -167,30 +185,41 @@ class SolveLoop:
             if self.stop():
                 return
             with self.report.timed("bridge"):
-                path = bridge.joined(
-                    self.si, self.judge, self.model.spline.path(candidate.control), self.stop, self.parameters.range
-                )
+                blocked = bridge.thinned(self.model.spline.path(candidate.control))
+                path = bridge.joined(self.si, self.judge, blocked, self.stop, self.parameters.range)
             if path is not None:
                 self.report.solved_by = "apex+bridge"
                 self._polish(path)
                 return
 
-    def _grow_trees(self, starts: list[Array]) -> Any:
+    def _grow_trees(self, starts: list[Array]) -> None:
         """Let RRTConnect plan with the time that is left, and polish what it finds."""
-        pdef, tree = ob.ProblemDefinition(self.si), bridge.connect(self.si, self.parameters.range)
-        for start in starts:
-            pdef.addStartState(to_state(self.si.getStateSpace(), start))
-        pdef.setGoal(self.pdef.getGoal())
-        with self.report.timed("rrtconnect"):
-            status = bridge.grown(tree, pdef, self.ptc).getStatus()
-        if status == Status.EXACT_SOLUTION:
+        while self.best is None and not self.stop():
+            pdef, tree = ob.ProblemDefinition(self.si), bridge.connect(self.si, self.parameters.range)
+            for start in starts:
+                pdef.addStartState(to_state(self.si.getStateSpace(), start))
+            pdef.setGoal(self.pdef.getGoal())
+            with self.report.timed("rrtconnect"):
+                status = bridge.grown(tree, pdef, self.ptc).getStatus()
+            if status not in (Status.EXACT_SOLUTION, Status.APPROXIMATE_SOLUTION):
+                return
+            path = path_to_array(pdef.getSolutionPath(), self.kernel.robot.dof)
+            if status == Status.EXACT_SOLUTION:
+                self._mend(path)
+            elif self.parameters.approximate and (
+                self.nearest is None or pdef.getSolutionDifference() < self.nearest[1]
+            ):
+                self.nearest = path, pdef.getSolutionDifference()
+
+    def _mend(self, path: Array) -> None:
+        """Take a path of a tree, whose states are less close than the full check's; plan anew what fails that."""
+        found: Array | None = path
+        if self.judge.alone and not self.is_valid(path):
+            with self.report.timed("bridge"):
+                found = bridge.joined(self.si, self.judge, bridge.filled(path), self.stop, self.parameters.range)
+        if found is not None:
             self.report.solved_by = "rrtconnect"
-            self._polish(path_to_array(pdef.getSolutionPath(), self.kernel.robot.dof))
-        elif status == Status.APPROXIMATE_SOLUTION and self.parameters.approximate:
-            self.pdef.addSolutionPath(pdef.getSolutionPath(), True, pdef.getSolutionDifference(), NAME)
-        else:
-            status = Status.TIMEOUT
-        return status
+            self._polish(found)
 
     def _polish(self, path: Array) -> None:
         """Take a polyline as a solution; shorten it, put it on a spline, and optimise it."""
@@ -198,27 +227,28 @@ class SolveLoop:
         if self.stop() or not self.parameters.polish:
             return
         with self.report.timed("simplify"):
-            short = simplify(og.PathSimplifier(self.si), self.si, path, self.stop)
-        if path_length(short) < path_length(path):
-            self._accept(short)
+            at_once = 0 if self.judge.alone else 1  # other checkers may take their time
+            short = simplify(og.PathSimplifier(self.si), self.si, path, self.stop, at_once)
+            if path_length(short) < path_length(path) and self.is_valid(short):
+                self._accept(short)
         limits = self.kernel.robot.arrays
         self._shorten(self.model.spline.fit(short, limits.lower, limits.upper).control)
 
-    def _nearest(self, search: Search, goals: list[Array]) -> tuple[Array, float] | None:
-        """Return the valid beginning of the candidate that comes nearest to a goal, and how near, or None."""
-        best, least = None, np.inf
+    def _note_nearest(self, search: Search, goals: list[Array]) -> None:
+        """Note the valid beginning of the candidate that comes nearest to a goal."""
         for candidate in sorted(search.pool.candidates, key=lambda one: one.shortfall)[:BRIDGED]:
             path = bridge.beginning(self.judge, self.model.spline.path(candidate.control), self.stop)
             gap = min(float(np.linalg.norm(goal - path[-1])) for goal in goals)
-            if len(path) > 1 and gap < least:
-                best, least = path, gap
-        return None if best is None else (best, least)
+            if len(path) > 1 and (self.nearest is None or gap < self.nearest[1]):
+                self.nearest = path, gap
 
     def _improve(self, search: Search, queries: list[Query]) -> None:
         """With a path length objective, or by parameter, look for shorter paths until time is up."""
         objective = self.pdef.getOptimizationObjective() if self.pdef.hasOptimizationObjective() else None
-        if not self.parameters.anytime and not isinstance(objective, ob.PathLengthOptimizationObjective):
-            return
+        if not isinstance(objective, ob.PathLengthOptimizationObjective):
+            objective = None
+            if not self.parameters.anytime:
+                return
         limits = self.kernel.robot.arrays
         with self.report.timed("improve"):
             for noise in cycle(VARIATIONS):

@@ -16,7 +16,7 @@ LAYERS = [
     {"problem", "spline"},
     {"optimize", "records"},
     {"dataset", "pool"},
-    {"description", "engine", "torch_threads"},
+    {"description", "engine", "report", "torch_threads"},
     {"cases"},
     {"diffusion"},
     {"search"},

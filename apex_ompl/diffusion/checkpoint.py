@@ -178,16 +178,14 @@ def load_model(
 
 
 def shared_model(name: str | os.PathLike[str], *, device: str = "cpu", robot: str | None = None) -> TrajectoryModel:
-    """Return a trained model, the same object as before as long as its file has not changed.
+    """Return a trained model, the same object as before as long as its files have not changed.
 
     Raises:
         ApexError: As :func:`load_model` does.
     """
     folder = _folder(name)
-    try:
-        stamp = (folder / WEIGHTS).stat().st_mtime_ns
-    except OSError:
-        stamp = 0
+    files = [folder / name for name in (CONFIG, WEIGHTS)]
+    stamp = tuple(file.stat().st_mtime_ns for file in files if is_file(file))
     with _loading:
         return _shared(str(folder.absolute()), stamp, device, robot)
 
@@ -196,7 +194,7 @@ _loading = threading.Lock()
 
 
 @lru_cache(maxsize=4)
-def _shared(folder: str, stamp: int, device: str, robot: str | None) -> TrajectoryModel:
+def _shared(folder: str, stamp: tuple[int, ...], device: str, robot: str | None) -> TrajectoryModel:
     del stamp
     return load_model(folder, device=device, robot=robot)
 

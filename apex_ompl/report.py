@@ -1,0 +1,41 @@
+"""What a planner of this project says of its last call of ``solve``."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+
+@dataclass
+class Report:
+    """What a call of ``solve`` did.
+
+    Attributes:
+        solved_by: The stage that found the first valid path: ``line``, ``experience``, ``apex`` or ``apex+resample``,
+            with ``+repair`` where the optimiser had to help; ``apex+bridge`` or ``rrtconnect``; empty without one.
+        reason: One sentence where there is no exact solution.
+        times: Seconds by stage; those of ``guidance`` and ``distance`` are part of other stages.
+        first: Seconds until the first valid path, NaN without one.
+        candidates: Paths that were proposed.
+        steps: Steps of the optimiser.
+        improved: How often a shorter path was found behind the first one.
+    """
+
+    solved_by: str = ""
+    reason: str = ""
+    times: dict[str, float] = field(default_factory=dict)
+    first: float = float("nan")
+    candidates: int = 0
+    steps: int = 0
+    improved: int = 0
+
+    @contextmanager
+    def timed(self, stage: str) -> Iterator[None]:
+        """Count the time of a block to a stage."""
+        begin = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.times[stage] = self.times.get(stage, 0.0) + time.perf_counter() - begin
