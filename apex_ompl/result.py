@@ -190,5 +190,5 @@ def check_suffix(path: Path) -> str:
         ParameterError: It is none of ``SUFFIXES``.
     """
     if path.suffix not in SUFFIXES:
-        raise ParameterError("output", str(path), f"a file name ending in {', '.join(SUFFIXES)}")
+        raise ParameterError("output", path.name, f"a file name ending in {', '.join(SUFFIXES)}")
     return path.suffix

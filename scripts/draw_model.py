@@ -147,7 +147,10 @@ def main() -> None:
         one, many = (assemble(load_problem(name), robot()) for name in (args.problem, args.many))
         denoising(args.model, one, args.seed, args.folder / "denoising.png")
         count = diversity(args.diverse, many, args.seed, args.folder / "diversity.png")
-    except (ApexError, ImportError, OSError) as error:
+    except ImportError as error:
+        print(f"draw_model: error: no {error.name}, expected: pip install -c constraints.txt '.[data]'", file=sys.stderr)
+        sys.exit(2)
+    except (ApexError, OSError) as error:
         print(f"draw_model: error: {error}", file=sys.stderr)
         sys.exit(2)
     print(f"{args.folder}: denoising.png, diversity.png with {count} valid trajectories of {args.many}")
