@@ -10,7 +10,6 @@ Usage: python benchmarks/model_sweep.py [--steps 3000] [--data FOLDER] [--runs F
 from __future__ import annotations
 
 import argparse
-import math
 import os
 import subprocess
 import sys
@@ -26,6 +25,7 @@ from apex_ompl.diffusion.checkpoint import load_model
 from apex_ompl.diffusion.runlog import read_log
 from apex_ompl.diffusion.validation import judged
 
+LOSSES = ("loss", "held_out")
 ROOT = record.RESULTS.parent.parent
 VARIANTS: dict[str, dict[str, Any]] = {
     "apex": {},
@@ -58,10 +58,10 @@ def trained(name: str, args: argparse.Namespace) -> Path:
 def figures(folder: Path | None, cases: list[Any]) -> dict[str, Any]:
     """Return what a variant came to; without a folder, the checkpoint that ships."""
     model = load_model("apex" if folder is None else folder / "checkpoint")
-    last = {"loss": math.nan, "held_out": math.nan} if folder is None else read_log(folder)[-1]
+    last = {} if folder is None else read_log(folder)[-1]
     found: dict[str, Any] = {
-        "steps": model.about["step"], "minutes": model.about["seconds"] / 60.0, "loss": float(last["loss"]),
-        "held_out": float(last["held_out"]), "paths": model.about["paths"],
+        "steps": model.about["step"], "minutes": model.about["seconds"] / 60.0,
+        **{key: float(last[key]) if last else None for key in LOSSES}, "paths": model.about["paths"],
         "weights": sum(p.numel() for p in model.network.parameters()),
     }  # fmt: skip
     for count in (1, 8):
@@ -88,8 +88,8 @@ def table(rows: dict[str, dict[str, Any]]) -> str:
     head += ["B = 8: valid", "repaired", "hard levels"]
     lines = [record.row(head), record.row(["---", *["---:"] * (len(head) - 1)])]
     for name, f in rows.items():
-        cells = [name, f"{f['weights'] / 1e6:.1f}", f["paths"], f["steps"], f"{f['minutes']:.0f}", f"{f['loss']:.3f}"]
-        cells.append(f"{f['held_out']:.3f}")
+        cells = [name, f"{f['weights'] / 1e6:.1f}", f["paths"], f["steps"], f"{f['minutes']:.0f}"]
+        cells += ["-" if f[key] is None else f"{f[key]:.3f}" for key in LOSSES]
         for count in (1, 8):
             cells += [f"{f[f'B{count}'][key]:.2f}" for key in ("sampled", "repaired", "hard")]
         lines.append(record.row(cells))

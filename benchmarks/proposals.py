@@ -306,6 +306,9 @@ def main() -> None:
     runs = [done[job.key] for job in jobs if job.key in done]
     levels = [{"level": v, "methods": figures([r for r in runs if r["problem"].startswith(f"{v}/")])} for v in chosen]
     levels = [level for level in levels if level["methods"]]
+    hard = [r for r in runs if "/hard/" in r["problem"]]
+    if hard:
+        levels.insert(0, {"level": "all hard levels", "methods": figures(hard)})
     record.write(
         "proposals", {"levels": levels, "made_of": kinds}, table(levels), split=args.split, jobs=args.jobs,
         torch=torch.__version__, time_limit=TIME_LIMIT, seeds="number of the problem modulo 1000",
