@@ -239,8 +239,9 @@ class Search:
             made = sample()
         except OutOfTimeError:
             return None
-        times = self._report.times
-        times["guidance"] = times.get("guidance", 0.0) + made.seconds.get("guidance", 0.0)
+        times, took = self._report.times, made.seconds.get("guidance", 0.0)
+        if took:
+            times["guidance"] = times.get("guidance", 0.0) + took
         return made.control
 
 

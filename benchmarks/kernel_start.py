@@ -1,7 +1,7 @@
 """How long the compiled kernel takes to be ready: compiled for the first time, and loaded from the cache.
 
-Runs fresh processes, the first with an empty cache folder, and times the import, the robot, ``Verdict.prepare``, and
-the first state and motion judged.
+Runs fresh processes, the first with an empty cache folder, and times the import, the robot, ``Verdict.prepare``, the
+first state and motion judged, and the first plan by the default planner.
 
 Usage: python benchmarks/kernel_start.py [--runs 5]
 """
@@ -35,9 +35,11 @@ other = robot.home.copy()
 other[:3] += 0.1
 assert verdict.first_collision([robot.home, other], 0.031) is None
 marks.append(time.perf_counter())
+assert apex_ompl.plan("ball_in_cup")
+marks.append(time.perf_counter())
 print(json.dumps([b - a for a, b in zip(marks, marks[1:])]))
 """
-STAGES = ("import", "robot", "prepare", "first state", "first motion")
+STAGES = ("import", "robot", "prepare", "first state", "first motion", "first plan")
 
 
 def main() -> None:
@@ -56,7 +58,7 @@ def main() -> None:
     rows = [["compiled, once", *cold, sum(cold)], ["from the cache, median", *np.median(warm, axis=0)]]
     rows[1].append(float(np.median(np.sum(warm, axis=1))))
     figures = {"stages": STAGES, "cold_s": cold, "warm_s": warm}
-    lines = [record.row(["seconds", *STAGES, "sum"]), record.row(["---"] + ["---:"] * 6)]
+    lines = [record.row(["seconds", *STAGES, "sum"]), record.row(["---"] + ["---:"] * (len(STAGES) + 1))]
     lines += [record.row([row[0], *(f"{v:.2f}" for v in row[1:])]) for row in rows]
     record.write("kernel_start", figures, "\n".join(lines), N=args.runs)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +11,6 @@ from ompl import base as ob
 from ompl import util as ou
 
 from apex_ompl.diffusion.checkpoint import shared_model
-from apex_ompl.diffusion.proposals import Sampling
 from apex_ompl.errors import ParameterError
 from apex_ompl.optimize import Optimizer
 from apex_ompl.planners.apex_parameters import NAME, ApexParameters
@@ -74,8 +74,12 @@ class APEX(ob.Planner):
         verdict = self.judge.verdict
         self.optimizer.prepare(verdict.kernel)
         query = query_of(verdict, verdict.robot.home, verdict.robot.home, point=self.model.sees_point)
+        sampling = self.parameters.search(self.model.sampling).sampling
+        quick = replace(sampling, sampler="ddim", steps=min(2, sampling.steps))
         with one_torch_thread():
-            self.model.propose(query, verdict.kernel, 1, sampling=Sampling())
+            proposed = self.model.propose(query, verdict.kernel, 1, sampling=quick)
+        if self.parameters.lambda_obs > 0.0:
+            self.judge.gap(self.model.spline.path(proposed.control[0]))
         self._warm = True
 
     def clear(self) -> None:
