@@ -93,7 +93,7 @@ def assemble(problem: Problem, robot: Robot | None = None, seed: int = 0) -> Pla
     simple_setup.setStateValidityChecker(checker)
     si.setMotionValidator(motions)
     si.setStateValidityCheckingResolution(SEARCH_RESOLUTION / space.getMaximumExtent())
-    simple_setup.setStartState(to_state(space, start))
+    simple_setup.setStartState(to_state(si, start))
     given = [goal for goal, fault in zip(goals, goal_faults, strict=False) if not fault]
     set_goals(simple_setup, given or list(goals))
     return PlanningSetup(
@@ -114,13 +114,13 @@ def assemble(problem: Problem, robot: Robot | None = None, seed: int = 0) -> Pla
 
 def set_goals(simple_setup: og.SimpleSetup, goals: list[Array]) -> None:
     """Give OMPL one goal state, or several of which any will do; each is a state of shape (dof,)."""
-    space = simple_setup.getStateSpace()
+    si = simple_setup.getSpaceInformation()
     if len(goals) == 1:
-        simple_setup.setGoalState(to_state(space, goals[0]))
+        simple_setup.setGoalState(to_state(si, goals[0]))
         return
-    region = ob.GoalStates(simple_setup.getSpaceInformation())
+    region = ob.GoalStates(si)
     for goal in goals:
-        region.addState(to_state(space, goal))
+        region.addState(to_state(si, goal))
     simple_setup.setGoal(region)
 
 

@@ -73,7 +73,7 @@ def _bridge(ready: PlanningSetup, a: Array, b: Array, timeout: float, interrupt:
     motions = VerdictMotionValidator(si, MotionCheck(ready.verdict, FULL_RESOLUTION))
     setup.setStateValidityChecker(checker)
     si.setMotionValidator(motions)
-    setup.setStartAndGoalStates(to_state(space, a), to_state(space, b))
+    setup.setStartAndGoalStates(to_state(si, a), to_state(si, b))
     setup.setPlanner(og.RRTConnect(si))
     with interrupt.ends(ob.timedPlannerTerminationCondition(timeout)) as ptc:
         status = setup.solve(ptc)

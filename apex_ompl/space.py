@@ -43,9 +43,13 @@ def to_array(state: Any, dof: int) -> Array:
     return np.array(state[0:dof])
 
 
-def to_state(space: ob.RealVectorStateSpace, q: Array) -> Any:
-    """Return a new OMPL state with the values of ``q``, shape (dof,)."""
-    state = space.allocState()
+def to_state(owner: ob.SpaceInformation | ob.RealVectorStateSpace, q: Array) -> Any:
+    """Return a new OMPL state with the values of ``q``, shape (dof,).
+
+    That of a space information is freed when Python drops it; that of a space alone lives as long as the process, as
+    OMPL's bindings have it.
+    """
+    state = owner.allocState()
     state[0 : len(q)] = [float(v) for v in q]
     return state
 
@@ -59,7 +63,7 @@ def array_to_path(si: ob.SpaceInformation, states: Array) -> og.PathGeometric:
     """Return an OMPL path through ``states``, shape (N, dof)."""
     path = og.PathGeometric(si)
     for q in states:
-        path.append(to_state(si.getStateSpace(), q))
+        path.append(to_state(si, q))  # a copy
     return path
 
 

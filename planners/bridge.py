@@ -81,7 +81,7 @@ def filled(path: Array) -> Array:
     pieces = [path[:1]]
     for a, b in pairwise(path):
         count = max(1, int(np.ceil(np.abs(b - a).max() / SPACING)))
-        pieces.append(a + (b - a) * (np.arange(1, count + 1)[:, None] / count))
+        pieces += [a + (b - a) * (np.arange(1, count)[:, None] / count), b[None]]
     return np.concatenate(pieces)
 
 
@@ -92,8 +92,8 @@ def thinned(path: Array) -> Array:
 
 def _bridge(si: ob.SpaceInformation, a: Array, b: Array, stop: Stop, longest: float) -> Array | None:
     """Return a path of RRTConnect's between two free states, or None."""
-    space, pdef = si.getStateSpace(), ob.ProblemDefinition(si)
-    pdef.setStartAndGoalStates(to_state(space, a), to_state(space, b))
+    pdef = ob.ProblemDefinition(si)
+    pdef.setStartAndGoalStates(to_state(si, a), to_state(si, b))
     left = iter(range(CALLS))
     ptc = ob.PlannerTerminationCondition(lambda: stop() or next(left, None) is None)
     if grown(connect(si, longest), pdef, ptc).getStatus() != ob.PlannerStatus.EXACT_SOLUTION:

@@ -69,7 +69,7 @@ class Judge:
         """Whether a state, shape (dof,), is valid."""
         if self.alone:
             return self.verdict.is_free(q)
-        return bool(self._si.isValid(to_state(self._si.getStateSpace(), q)))
+        return bool(self._si.isValid(to_state(self._si, q)))
 
     def is_valid(self, path: Array, stop: Stop = lambda: False) -> bool:
         """Whether a path, shape (N, dof), is valid; without a verdict, not when it is told to stop meanwhile."""
@@ -78,8 +78,7 @@ class Judge:
         return self.alone or self._valid_by_ompl(path, stop)
 
     def _valid_by_ompl(self, path: Array, stop: Stop) -> bool:
-        space = self._si.getStateSpace()
-        states = [to_state(space, q) for q in path]
+        states = [to_state(self._si, q) for q in path]
         order = sorted(range(len(states)), key=lambda k: (-(k & -k), k))  # coarse before fine
         for k in order:
             if stop() or not self._si.isValid(states[k]):

@@ -197,7 +197,7 @@ class SolveLoop:
         while self.best is None and not self.stop():
             pdef, tree = ob.ProblemDefinition(self.si), bridge.connect(self.si, self.parameters.range)
             for start in starts:
-                pdef.addStartState(to_state(self.si.getStateSpace(), start))
+                pdef.addStartState(to_state(self.si, start))
             pdef.setGoal(self.pdef.getGoal())
             with self.report.timed("rrtconnect"):
                 status = bridge.grown(tree, pdef, self.ptc).getStatus()

@@ -148,7 +148,8 @@ def main() -> None:
         denoising(args.model, one, args.seed, args.folder / "denoising.png")
         count = diversity(args.diverse, many, args.seed, args.folder / "diversity.png")
     except ImportError as error:
-        print(f"draw_model: error: no {error.name}, expected: pip install -c constraints.txt '.[data]'", file=sys.stderr)
+        expected = "expected: pip install -c constraints.txt '.[data]'"
+        print(f"draw_model: error: no {error.name}, {expected}", file=sys.stderr)
         sys.exit(2)
     except (ApexError, OSError) as error:
         print(f"draw_model: error: {error}", file=sys.stderr)

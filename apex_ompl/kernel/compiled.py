@@ -29,7 +29,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 LOG = logging.getLogger("apex_ompl")
 NOT_COMPILED = ("__init__.py", "build.py", "face.py", "faults.py", "inverse.py", "scene.py")
-TYPICAL_SECONDS = 20  # benchmarks/kernel_start.py measures it
+TYPICAL_SECONDS = 45
 
 # Without numba's runtime no array is counted, which costs most of the time otherwise; nothing may be allocated.
 OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "_nrt": False}
