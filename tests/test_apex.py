@@ -322,6 +322,7 @@ def test_the_algorithm_of_the_paper_alone_runs(ready: PlanningSetup) -> None:
     setup = ready.simple_setup
     planner = planners.make("apex", setup.getSpaceInformation(), **paper)
     setup.setPlanner(planner)
+    setup.setup()  # the kernel may have to be compiled
     status = setup.solve(within(6.0)).getStatus()
     assert status in (EXACT, TIMEOUT)
     assert planner.report.times.keys() >= {"propose", "judge"}
@@ -483,6 +484,7 @@ def test_approximate_solutions_come_with_their_difference(ready: PlanningSetup) 
     si = setup.getSpaceInformation()
     nothing = {"line": True, "first": 1, "second": 0, "third": 0, "repair": False, "resample": 0, **ALONE}
     setup.setPlanner(planners.make("apex", si, approximate=True, seed=0, **nothing))
+    setup.setup()
     status = setup.solve(within(1.0)).getStatus()
     assert status == ob.PlannerStatus.APPROXIMATE_SOLUTION
     path = states(setup)
