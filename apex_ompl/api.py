@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Mapping
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -28,10 +27,11 @@ from apex_ompl.resolution import FULL_RESOLUTION
 from apex_ompl.result import INSIDE, PlanResult, PlanStatus
 from apex_ompl.simplify import simplify as shorten
 from apex_ompl.space import path_length, path_to_array, resample
+from apex_ompl.stopwatch import timed
 from apex_ompl.validity import full_check
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    pass
 
 Array = NDArray[np.float64]
 
@@ -157,12 +157,12 @@ class _Run:
             return self._failed(PlanStatus.INVALID_START, ready.start_fault)
         if all(ready.goal_faults):
             return self._failed(PlanStatus.INVALID_GOAL, "; ".join(ready.goal_faults))
-        with self._timed("line"):
+        with timed(self.times, "line"):
             line = self._straight_line()
         if line is not None:
             return self._exact(line, STRAIGHT_LINE)
         try:
-            with self._timed("setup"):
+            with timed(self.times, "setup"):
                 planner = self._set_up(parameters)
             deadline = time.perf_counter() + timeout
             status = self._run_ompl(parameters, timeout)
@@ -219,7 +219,7 @@ class _Run:
         if parameters.optimizing:  # it takes all the time there is, and what it finds must still be proved
             timeout -= min(PROOF_SHARE * timeout, LONGEST_PROOF)
         condition = ob.timedPlannerTerminationCondition(min(timeout, LONGEST_TIMEOUT))
-        with self.interrupt.ends(condition) as ptc, self._timed("solve"):
+        with self.interrupt.ends(condition) as ptc, timed(self.times, "solve"):
             status = PlanStatus.of(simple_setup.solve(ptc))
         self._raise_faults()
         return status
@@ -234,7 +234,7 @@ class _Run:
         path = result.path
         checks = self.ready.verdict.tally.states
         if path is not None:
-            with self._timed("clearance"):
+            with timed(self.times, "clearance"):
                 states = resample(path, CLEARANCE_SAMPLES)
                 clearance = min(self.ready.verdict.clearance(q) for q in states)
             result = replace(result, length=path_length(path), clearance=clearance)
@@ -248,17 +248,17 @@ class _Run:
         """
         candidates = [self._with_exact_ends(path)]
         if simplify:
-            with self._timed("simplify"):
+            with timed(self.times, "simplify"):
                 candidates.insert(0, self._shortened(candidates[0]))
             self._raise_faults()
         ready, reason = self.ready, ""
         for candidate in candidates:
-            with self._timed("verify"):
+            with timed(self.times, "verify"):
                 check = full_check(ready.verdict, candidate, ready.start, ready.goals)
             if check:
                 return self._exact(candidate, solved_by)
             reason = reason or check.reason
-            with self._timed("repair"):
+            with timed(self.times, "repair"):
                 mended = repair(ready, candidate, check, deadline, self.interrupt)
             if mended is not None:
                 return self._exact(mended, f"{solved_by}+repair")
@@ -293,14 +293,6 @@ class _Run:
 
     def _failed(self, status: PlanStatus, reason: str) -> PlanResult:
         return replace(self.blank, status=status, reason=reason)
-
-    @contextmanager
-    def _timed(self, stage: str) -> Iterator[None]:
-        begin = time.perf_counter()
-        try:
-            yield
-        finally:
-            self.times[stage] = self.times.get(stage, 0.0) + time.perf_counter() - begin
 
 
 def _check_arguments(timeout: float, seed: int) -> None:

@@ -5,11 +5,10 @@ What draws problems, and what asks OMPL and the meshes, builds on it: :mod:`apex
 
 from __future__ import annotations
 
-import time
 import zlib
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -22,6 +21,7 @@ from apex_ompl.pool import first_valid
 from apex_ompl.records import FIELDS, SOURCES, Paths, rounded, to_micro
 from apex_ompl.resolution import FULL_RESOLUTION, SEARCH_RESOLUTION
 from apex_ompl.spline import Spline
+from apex_ompl.stopwatch import timed
 
 Array = NDArray[np.float64]
 
@@ -314,11 +314,6 @@ class Engine:
         about = {"robot": robot, "joints": list(joints), **asdict(self.optimizer.spline)}
         return Paths(arrays, names, about, {**self.counts, "unsolved": self._unsolved})
 
-    @contextmanager
-    def timed(self, stage: str) -> Iterator[None]:
+    def timed(self, stage: str) -> AbstractContextManager[None]:
         """Count the time of a block to a stage."""
-        begin = time.perf_counter()
-        try:
-            yield
-        finally:
-            self.times[stage] = self.times.get(stage, 0.0) + time.perf_counter() - begin
+        return timed(self.times, stage)

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
+
+from apex_ompl.stopwatch import timed
 
 
 @dataclass
@@ -18,8 +18,8 @@ class Report:
         reason: One sentence where there is no exact solution.
         times: Seconds by stage; those of ``guidance`` and ``distance`` are part of other stages.
         first: Seconds until the first valid path, NaN without one.
-        candidates: Paths that were proposed.
-        steps: Steps of the optimiser.
+        candidates: Paths that were looked at before trees: straight lines, earlier paths, proposals.
+        steps: Steps of the optimiser in repair.
         improved: How often a shorter path was found behind the first one.
     """
 
@@ -31,11 +31,6 @@ class Report:
     steps: int = 0
     improved: int = 0
 
-    @contextmanager
-    def timed(self, stage: str) -> Iterator[None]:
+    def timed(self, stage: str) -> AbstractContextManager[None]:
         """Count the time of a block to a stage."""
-        begin = time.perf_counter()
-        try:
-            yield
-        finally:
-            self.times[stage] = self.times.get(stage, 0.0) + time.perf_counter() - begin
+        return timed(self.times, stage)

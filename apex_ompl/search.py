@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
@@ -140,21 +141,20 @@ class Search:
     ) -> Iterator[Callable[[], Candidate | None]]:
         settings = self._settings
         if settings.line or experience:
-            yield lambda: self._known(queries, experience, stop)
+            yield partial(self._known, queries, experience, stop)
         for batch in settings.batches or (0,):
             yield from self._round(queries, batch, stop)
 
     def _round(self, queries: Sequence[Query], batch: int, stop: Stop) -> Iterator[Callable[[], Candidate | None]]:
         settings, each = self._settings, max(1, AT_ONCE // len(queries))
         for k in range(0, batch, each):
-            count = min(each, batch - k)
-            yield lambda count=count: self._propose(queries, count, stop)  # type: ignore[misc]
+            yield partial(self._propose, queries, min(each, batch - k), stop)
         if settings.repair:
-            yield lambda: self._repair(max(LEAST_STEPS, PER_PATH * batch * len(queries)), stop)
+            yield partial(self._repair, max(LEAST_STEPS, PER_PATH * batch * len(queries)), stop)
         for _ in range(settings.resample):
-            yield lambda: self._resample(queries, stop)
+            yield partial(self._resample, queries, stop)
             if settings.repair:
-                yield lambda: self._repair(PER_PATH * WORTH_RESAMPLING, stop)
+                yield partial(self._repair, PER_PATH * WORTH_RESAMPLING, stop)
 
     def _known(self, queries: Sequence[Query], experience: Sequence[Array], stop: Stop) -> Candidate | None:
         """Take in what costs nothing: straight lines, and earlier paths put on other ends."""
@@ -183,7 +183,7 @@ class Search:
         return found
 
     def _resample(self, queries: Sequence[Query], stop: Stop) -> Candidate | None:
-        """Noise the candidates that come nearest to being valid, and denoise them again under guidance."""
+        """Noise the candidates that come nearest to being valid, and denoise them again as proposals are."""
         with self._report.timed("resample"):
             best = sorted(self.pool.candidates, key=lambda one: one.shortfall)[:WORTH_RESAMPLING]
             for query in queries:

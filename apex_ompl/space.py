@@ -43,13 +43,12 @@ def to_array(state: Any, dof: int) -> Array:
     return np.array(state[0:dof])
 
 
-def to_state(owner: ob.SpaceInformation | ob.RealVectorStateSpace, q: Array) -> Any:
-    """Return a new OMPL state with the values of ``q``, shape (dof,).
+def to_state(si: ob.SpaceInformation, q: Array) -> Any:
+    """Return a new OMPL state with the values of ``q``, shape (dof,), which is freed when Python drops it.
 
-    That of a space information is freed when Python drops it; that of a space alone lives as long as the process, as
-    OMPL's bindings have it.
+    In OMPL's bindings states that a space allocates, and not a space information, are never freed.
     """
-    state = owner.allocState()
+    state = si.allocState()
     state[0 : len(q)] = [float(v) for v in q]
     return state
 

@@ -21,7 +21,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import record
@@ -76,10 +76,12 @@ OTHER: list[Query] = []  # of the problem at hand
 class Control(ApexParameters):
     """APEX with another model."""
 
+    kind: ClassVar[str]
+
     def build(self, si: ob.SpaceInformation) -> ob.Planner:
         """Return the planner."""
         planner = APEX(si, self)
-        planner.model = control(self.kind, planner.model)  # type: ignore[attr-defined]
+        planner.model = control(self.kind, planner.model)
         if isinstance(planner.model, Shuffled):
             planner.model.other = OTHER[0]
         return planner
@@ -145,12 +147,13 @@ def figures(runs: Sequence[dict[str, Any]]) -> dict[str, Any]:
         if not mine:
             continue
         some = list(mine.values())
-        first = np.sort([r["found_s"] if r["solved"] else math.inf for r in some])
-        total = np.sort([r["total_s"] if r["solved"] else math.inf for r in some])
+        first = np.array([r["found_s"] if r["solved"] else math.inf for r in some])
+        total = np.array([r["total_s"] if r["solved"] else math.inf for r in some])
         found[method] = {
             "n": len(some), "solved": float(np.mean([r["solved"] for r in some])),
             "in": {str(t): float(np.mean(first <= t)) for t in MOMENTS},
-            "found_s": [_percentile(first, p) for p in (50, 95)], "total_s": [_percentile(total, p) for p in (50, 95)],
+            "found_s": [record.reached(first, p) for p in (50, 95)],
+            "total_s": [record.reached(total, p) for p in (50, 95)],
             "length": float(np.median([r["length"] for r in some if r["solved"]] or [math.nan])),
             "setup_s": float(np.median([r["setup_s"] for r in some])),
             "by": dict(Counter(r["by"] for r in some if r["solved"])),
@@ -170,33 +173,19 @@ def _within(run: dict[str, Any] | None, limit: float) -> bool:
     return run is not None and run["solved"] and run["found_s"] <= limit
 
 
-def _percentile(values: np.ndarray, p: float) -> float | None:
-    value = float(values[min(len(values) - 1, math.ceil(p / 100 * len(values)) - 1)])
-    return value if math.isfinite(value) else None
-
-
 def table(levels: Sequence[dict[str, Any]]) -> str:
     """Return the Markdown tables: who solved, then times and lengths."""
     stages = sorted({by for level in levels for by in level["methods"].get("apex", {}).get("by", {})})
-    lines = [
-        record.row(["suite/level", "N", *stages, "not solved"]),
-        record.row(["---", *["---:"] * (len(stages) + 2)]),
-    ]
+    lines = [record.row(["suite/level", "N", *stages, "not solved"])]
+    lines.append(record.row(["---", *["---:"] * (len(stages) + 2)]))
     for level in levels:
         f = level["methods"].get("apex")
         if f:
             shares = [f"{f['by'].get(stage, 0) / f['n']:.2f}" for stage in stages]
             lines.append(record.row([level["level"], f["n"], *shares, f"{1.0 - f['solved']:.2f}"]))
     head = ["suite/level", "method", "N", "solved", *(f"in {t:g} s" for t in MOMENTS), "lost", "first ms p50", "p95"]
-    head += [
-        "total ms p50",
-        "p95",
-        "setup ms",
-        "length rad",
-        "length / rrtconnect",
-        "length / polished",
-        "time / polished",
-    ]
+    head += ["total ms p50", "p95", "setup ms", "length rad"]
+    head += ["length / rrtconnect", "length / polished", "time / polished"]
     lines += ["", record.row(head), record.row(["---", "---", *["---:"] * (len(head) - 2)])]
     for level in levels:
         for k, (method, f) in enumerate(level["methods"].items()):
@@ -205,13 +194,9 @@ def table(levels: Sequence[dict[str, Any]]) -> str:
             cells += ["-" if v is None else f"{1e3 * v:.0f}" for v in (*f["found_s"], *f["total_s"])]
             cells.append(f"{1e3 * f['setup_s']:.0f}")
             cells.append("-" if math.isnan(f["length"]) else f"{f['length']:.1f}")
-            for other, key in (
-                ("rrtconnect", "length"),
-                ("rrtconnect+polish", "length"),
-                ("rrtconnect+polish", "total_s"),
-            ):
-                value = f[f"over {other}"].get(key)
-                cells.append("-" if value is None else f"{value:.2f}")
+            tree, polished = f["over rrtconnect"], f["over rrtconnect+polish"]
+            ratios = tree.get("length"), polished.get("length"), polished.get("total_s")
+            cells += ["-" if value is None else f"{value:.2f}" for value in ratios]
             lines.append(record.row(cells))
     false = sum(f["false"] for level in levels for f in level["methods"].values())
     return "\n".join([*lines, "", f"False-valid paths: {false}."])
@@ -230,11 +215,7 @@ def main() -> None:
     parser.add_argument("--name", default="apex", help="of the results (default: %(default)s)")
     parser.add_argument("--report", action="store_true", help="run nothing; write the results of what the store holds")
     args = parser.parse_args()
-    static = [(s, v) for s, levels in problems.suites().items() for v in levels if not v.startswith("moving-")]
-    known = {s for s, _ in static} | {f"{s}/{v}" for s, v in static}
-    if not set(args.levels) <= known:
-        raise SystemExit(f"unknown suite or level; known: {', '.join(f'{s}/{v}' for s, v in static)}")
-    chosen = [f"{s}/{v}" for s, v in static if not args.levels or s in args.levels or f"{s}/{v}" in args.levels]
+    chosen = record.static_levels(args.levels)
     jobs: list[tuple[str, str, str]] = []
     for level in chosen:
         names = problems.frozen_names(*level.split("/"), args.split)

@@ -73,18 +73,10 @@ def summary(runs: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
         "n": len(runs),
         "goal_blocked": sum(r["status"] == "INVALID_GOAL" for r in runs),
         "success": {str(limit): float((found <= limit).mean()) for limit in LIMITS},
-        "found_s": [_percentile(found, p) for p in (50, 95)],
-        "simplified_s": [_percentile(simplified, p) for p in (50, 95)],
+        "found_s": [record.reached(found, p) for p in (50, 95)],
+        "simplified_s": [record.reached(simplified, p) for p in (50, 95)],
         "length_rad": record.percentiles(lengths, 50, 95) if lengths else [None, None],
     }
-
-
-def _percentile(values: np.ndarray, p: float) -> float | None:
-    """Return a percentile, the next larger value, or None where it is endless."""
-    if not len(values):
-        return None
-    value = float(np.sort(values)[min(len(values) - 1, math.ceil(p / 100 * len(values)) - 1)])
-    return value if math.isfinite(value) else None
 
 
 def _cell(value: float | None) -> str:

@@ -123,11 +123,7 @@ def main() -> None:
     parser.add_argument("--store", type=Path, default=STORE)
     parser.add_argument("--report", action="store_true", help="run nothing; write the results of what the store holds")
     args = parser.parse_args()
-    static = [(s, v) for s, levels in problems.suites().items() for v in levels if not v.startswith("moving-")]
-    chosen = [f"{s}/{v}" for s, v in static if not args.levels or s in args.levels or f"{s}/{v}" in args.levels]
-    known = {s for s, _ in static} | {f"{s}/{v}" for s, v in static}
-    if not chosen or not set(args.levels) <= known:
-        raise SystemExit(f"unknown suite or level; known: {', '.join(f'{s}/{v}' for s, v in static)}")
+    chosen = record.static_levels(args.levels)
     store = RunStore(args.store, ("problem", "method"))
     done, todo = store.read(), []
     for level in chosen:
@@ -138,7 +134,7 @@ def main() -> None:
     todo.sort(key=lambda job: (job[1] in ON_HARD_ALONE, job[0].rsplit("/", 1)[1]))  # all levels in turn
     store.complete(run, [] if args.report else todo, args.jobs, warm_up)
     runs = store.read()
-    levels = [{"level": f"{s}/{v}", "methods": figures(runs, f"{s}/{v}")} for s, v in static]
+    levels = [{"level": level, "methods": figures(runs, level)} for level in record.static_levels([])]
     levels = [level for level in levels if level["methods"]]
     record.write(
         "optimizer", {"levels": levels}, table(levels), split="validation", jobs=args.jobs,

@@ -282,11 +282,7 @@ def main() -> None:
     parser.add_argument("--store", type=Path, default=STORE)
     parser.add_argument("--report", action="store_true", help="run nothing; write the results of what the store holds")
     args = parser.parse_args()
-    static = [(s, v) for s, levels in problems.suites().items() for v in levels if not v.startswith("moving-")]
-    known = {s for s, _ in static} | {f"{s}/{v}" for s, v in static}
-    if not set(args.levels) <= known:
-        raise SystemExit(f"unknown suite or level; known: {', '.join(f'{s}/{v}' for s, v in static)}")
-    chosen = [f"{s}/{v}" for s, v in static if not args.levels or s in args.levels or f"{s}/{v}" in args.levels]
+    chosen = record.static_levels(args.levels)
     kinds = {method: made_of(method, args) for method in args.methods}
     jobs: list[Job] = []
     for level in chosen:

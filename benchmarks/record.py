@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import platform
 import subprocess
@@ -14,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from apex_ompl import problems
 from apex_ompl.files import write_atomically
 
 RESULTS = Path(__file__).parent / "results"
@@ -79,6 +81,27 @@ def write(name: str, figures: dict[str, Any], table: str, **settings: Any) -> No
 def row(cells: list[Any]) -> str:
     """Return one row of a Markdown table."""
     return "| " + " | ".join(str(c) for c in cells) + " |"
+
+
+def reached(values: list[float] | np.ndarray, p: float) -> float | None:
+    """Return a percentile of times, the next larger value; None without any, or where it is endless."""
+    if not len(values):
+        return None
+    value = float(np.sort(values)[min(len(values) - 1, math.ceil(p / 100 * len(values)) - 1)])
+    return value if math.isfinite(value) else None
+
+
+def static_levels(wanted: list[str]) -> list[str]:
+    """Return the suites' levels without moving obstacles, or those of them that are wanted: SUITE or SUITE/LEVEL.
+
+    Raises:
+        SystemExit: No such suite or level.
+    """
+    static = [f"{s}/{v}" for s, levels in problems.suites().items() for v in levels if not v.startswith("moving-")]
+    chosen = [level for level in static if not wanted or level in wanted or level.split("/")[0] in wanted]
+    if not set(wanted) <= {*static, *(level.split("/")[0] for level in static)}:
+        raise SystemExit(f"unknown suite or level; known: {', '.join(static)}")
+    return chosen
 
 
 def percentiles(values: list[float] | np.ndarray, *which: float) -> list[float]:

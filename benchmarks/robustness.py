@@ -162,7 +162,7 @@ def nan_in_a_state() -> tuple[str, bool]:
     si = ready.simple_setup.getSpaceInformation()
     start, pdef = ready.start.copy(), ob.ProblemDefinition(si)
     start[4] = np.nan
-    pdef.setStartAndGoalStates(*(to_state(si.getStateSpace(), q) for q in (start, ready.goals[0])))
+    pdef.setStartAndGoalStates(*(to_state(si, q) for q in (start, ready.goals[0])))
     planner = APEX(si)
     planner.setProblemDefinition(pdef)
     status = planner.solve(ob.timedPlannerTerminationCondition(1.0)).getStatus()

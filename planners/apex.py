@@ -1,8 +1,7 @@
-"""APEX: paths proposed by latent diffusion, bent away from obstacles, repaired, and completed by RRTConnect."""
+"""APEX: paths proposed by latent diffusion, judged, repaired, resampled, and completed by RRTConnect."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -21,7 +20,6 @@ from apex_ompl.report import Report
 from apex_ompl.torch_threads import one_torch_thread
 
 Array = NDArray[np.float64]
-Stop = Callable[[], bool]
 Status = ob.PlannerStatus
 
 
@@ -29,8 +27,8 @@ class APEX(ob.Planner):
     """OMPL planner: section III of the paper inside ``solve``, and complete in the limit by RRTConnect.
 
     It works with any validity checker, and takes the one that is set when ``solve`` begins. With this project's,
-    proposals are guided and repaired among the obstacles; with another one they are judged by it. A first path is
-    shortened; with a path length objective it is improved until the termination condition holds.
+    proposals are repaired, and guided where that is asked for, among the obstacles; with another one they are judged
+    by it. A first path is shortened; with a path length objective it is improved until the termination condition holds.
 
     Attributes:
         parameters: How it plans.

@@ -3,15 +3,20 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
+from planning import HARD, at_hand
 from support import ROOT
 
+from apex_ompl.assembly import PlanningSetup, assemble
 from apex_ompl.collision import Verdict
 from apex_ompl.dataset import load, save
+from apex_ompl.ompl_globals import quiet_ompl
 from apex_ompl.problem import Goal, Obstacle, Problem
+from apex_ompl.problems import reach
 from apex_ompl.records import Paths
 from apex_ompl.robot import Robot, load_robot
 
@@ -80,3 +85,16 @@ def few(paths: Paths, tmp_path_factory: pytest.TempPathFactory) -> Path:
     file = tmp_path_factory.mktemp("data") / "few.zip"
     save(file, Paths(arrays, paths.names, paths.about))
     return file
+
+
+@pytest.fixture
+def quiet() -> Iterator[None]:
+    """OMPL says nothing."""
+    with quiet_ompl():
+        yield
+
+
+@pytest.fixture
+def ready() -> PlanningSetup:
+    """A hard problem, set up."""
+    return assemble(at_hand(HARD), reach.robot())

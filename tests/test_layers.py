@@ -10,7 +10,7 @@ from support import ROOT
 
 LAYERS = [
     {"errors"},
-    {"files", "meshes", "resolution"},
+    {"files", "meshes", "resolution", "stopwatch"},
     {"schema"},
     {"kernel"},
     {"problem", "spline"},

@@ -63,14 +63,15 @@ def test_space_has_the_limits_names_and_euclidean_metric(robot: Robot, baxter: R
     rng = np.random.default_rng(1)
     for some in (robot, baxter):
         space = state_space(some)
+        si = ob.SpaceInformation(space)
         assert space.getDimension() == some.dof
         assert [space.getDimensionName(k) for k in range(some.dof)] == list(some.joint_names)
         a, b = some.random_state(rng, 2)
-        assert space.distance(to_state(space, a), to_state(space, b)) == pytest.approx(np.linalg.norm(a - b))
-        assert np.array_equal(to_array(to_state(space, a), some.dof), a)
+        assert space.distance(to_state(si, a), to_state(si, b)) == pytest.approx(np.linalg.norm(a - b))
+        assert np.array_equal(to_array(to_state(si, a), some.dof), a)
         space.setup()
         assert space.getLongestValidSegmentLength() == pytest.approx(0.031)
-        low = to_state(space, some.limits.lower - 1e-3)
+        low = to_state(si, some.limits.lower - 1e-3)
         assert not space.satisfiesBounds(low)
 
 
@@ -85,12 +86,11 @@ def test_paths_go_to_ompl_and_back_bit_for_bit(problem: Problem) -> None:
 def test_ompl_judges_as_the_verdict_does(problem: Problem) -> None:
     ready = assemble(problem)
     si = ready.simple_setup.getSpaceInformation()
-    space = si.getStateSpace()
     rng = np.random.default_rng(3)
     states = states_around_home(ready.robot, rng, 60, 0.6)
     states[1::2] = states[::2] + rng.normal(0.0, 0.1, states[::2].shape)
     states = np.clip(states, ready.robot.limits.lower, ready.robot.limits.upper)
-    ompl_states = [to_state(space, q) for q in states]
+    ompl_states = [to_state(si, q) for q in states]
     free = [ready.verdict.is_free(q) for q in states]
     assert [si.isValid(s) for s in ompl_states] == free and 0.1 < np.mean(free) < 0.95
     good = [k for k, f in enumerate(free) if f]
@@ -108,7 +108,7 @@ def test_ompl_judges_as_the_verdict_does(problem: Problem) -> None:
 def test_a_faulty_verdict_never_raises_inside_ompl(problem: Problem, monkeypatch: pytest.MonkeyPatch) -> None:
     ready = assemble(problem)
     si = ready.simple_setup.getSpaceInformation()
-    state = to_state(si.getStateSpace(), ready.start)
+    state = to_state(si, ready.start)
 
     def broken(*_: object, **__: object) -> bool:
         raise RuntimeError("broken on purpose")
@@ -173,6 +173,6 @@ def test_clearance_callback_survives_a_fault(problem: Problem, monkeypatch: pyte
     ready = assemble(problem)
     monkeypatch.setattr(Verdict, "clearance", lambda *_: 1 / 0)
     checker: VerdictChecker = ready.checker
-    space = ready.simple_setup.getStateSpace()
-    assert checker.clearance(to_state(space, ready.start)) == 0.0
+    si = ready.simple_setup.getSpaceInformation()
+    assert checker.clearance(to_state(si, ready.start)) == 0.0
     assert isinstance(checker.fault, ZeroDivisionError)

@@ -6,6 +6,7 @@ the latent vector is.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from typing import NamedTuple
 
 import numpy as np
@@ -20,7 +21,7 @@ MOST_GROUPS = 8  # of channels that are normalised together
 FLAT = 1e-3  # deviations below this share of the largest are not blown up to one
 
 
-class Autoencoder(nn.Module):
+class Autoencoder(nn.Module, ABC):
     """What encodes residuals from the straight line.
 
     Attributes:
@@ -45,13 +46,13 @@ class Autoencoder(nn.Module):
         self.register_buffer("basis", torch.tensor(basis, dtype=torch.float32), persistent=False)
         self.register_buffer("fit_matrix", torch.tensor(np.linalg.pinv(inner), dtype=torch.float32), persistent=False)
 
+    @abstractmethod
     def encode(self, control: Tensor) -> Tensor:
         """Return latent vectors (B, *latent) of control points (B, points, dof)."""
-        raise NotImplementedError
 
+    @abstractmethod
     def control(self, latent: Tensor, start: Tensor, goal: Tensor) -> Tensor:
         """Return control points (B, points, dof) of latent vectors, between ends of shape (B, dof)."""
-        raise NotImplementedError
 
     def decode(self, latent: Tensor, start: Tensor, goal: Tensor) -> Tensor:
         """Return paths (B, states, dof) of latent vectors, between ends of shape (B, dof), which are exact."""

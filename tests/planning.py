@@ -1,0 +1,47 @@
+"""Problems, checkers and paths, for the tests of planners inside OMPL."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from typing import Any
+
+import numpy as np
+from ompl import base as ob
+from ompl import geometric as og
+
+from apex_ompl import problems
+from apex_ompl.problem import Problem
+from apex_ompl.problems.reach import robot
+from apex_ompl.space import path_to_array
+
+EXACT, TIMEOUT = ob.PlannerStatus.EXACT_SOLUTION, ob.PlannerStatus.TIMEOUT
+HARD = "shelf/hard/800012"
+EASY = "posts/easy/800001"
+
+
+def within(seconds: float) -> ob.PlannerTerminationCondition:
+    return ob.timedPlannerTerminationCondition(seconds)
+
+
+@cache
+def at_hand(name: str) -> Problem:
+    return problems.load(name)
+
+
+def states(setup: og.SimpleSetup) -> np.ndarray:
+    return path_to_array(setup.getSolutionPath(), robot().dof)
+
+
+ALONE = {"bridge": False, "fallback": False, "polish": False}
+
+
+class Plain(ob.StateValidityChecker):
+    """A checker that knows nothing of this project but its verdict, as that of a user's might."""
+
+    def __init__(self, si: ob.SpaceInformation, free: Callable[[np.ndarray], bool]) -> None:
+        super().__init__(si)
+        self.free = free
+
+    def isValid(self, state: Any) -> bool:  # noqa: N802
+        return self.free(np.array(state[0:16]))

@@ -1,0 +1,114 @@
+"""The stages of APEX: alone, in the paper's order, by seed, and with time left."""
+
+from __future__ import annotations
+
+import time
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import pytest
+import torch
+from ompl import base as ob
+from planning import ALONE, EXACT, HARD, TIMEOUT, at_hand, states, within
+
+from apex_ompl import plan, planners
+from apex_ompl.assembly import PlanningSetup
+from apex_ompl.planners import APEX
+from apex_ompl.planners.apex_parameters import ApexParameters
+from apex_ompl.planners.judge import Judge
+from apex_ompl.result import INSIDE
+from apex_ompl.space import path_length
+from apex_ompl.validity import full_check
+
+pytestmark = pytest.mark.usefixtures("quiet")
+
+
+@pytest.mark.parametrize(
+    ("changes", "by"),
+    [
+        ({"line": False, "third": 0}, ("apex", "apex+repair", "apex+resample", "apex+resample+repair")),
+        ({"first": 0, "second": 0, "third": 0, "resample": 0}, ("line+repair",)),
+        ({"repair": False, "line": False, "first": 32}, ("apex", "apex+resample", "")),
+        (
+            {"repair": False, "line": False, "first": 8, "second": 0, "third": 0, "resample": 0, "bridge": True},
+            ("apex", "apex+bridge"),
+        ),
+        (
+            {"line": False, "first": 0, "second": 0, "third": 0, "bridge": False, "fallback": True},
+            ("rrtconnect",),
+        ),
+    ],
+)
+def test_stages_can_be_left_out(changes: dict[str, Any], by: tuple[str, ...]) -> None:
+    result = plan(at_hand("swap/hard/800000"), timeout=4.0, params={**ALONE, **changes})
+    assert result.solved_by in by and bool(result) == bool(result.solved_by), (result.solved_by, result.reason)
+    names = {name.removeprefix(INSIDE) for name in result.times if name.startswith(INSIDE)}
+    assert "polish" not in names
+    assert ("repair" in names) <= changes.get("repair", True)
+    assert ("rrtconnect" in names) <= changes.get("fallback", False)
+
+
+def test_the_algorithm_of_the_paper_alone_runs(ready: PlanningSetup) -> None:
+    """Guided ancestral sampling in all steps, resampling on collision or nearness, nothing else."""
+    paper = {
+        "sampler": "ddpm", "denoising_steps": 64, "guidance": True, "gamma": 1.0, "lambda_obs": 0.02, "line": False,
+        "repair": False, "first": 8, "second": 0, "third": 0, "resample": 2, **ALONE,
+    }  # fmt: skip
+    setup = ready.simple_setup
+    planner = planners.make("apex", setup.getSpaceInformation(), **paper)
+    setup.setPlanner(planner)
+    setup.setup()  # the kernel may have to be compiled
+    status = setup.solve(within(6.0)).getStatus()
+    assert status in (EXACT, TIMEOUT)
+    assert planner.report.times.keys() >= {"propose", "judge"}
+    assert planner.report.candidates >= 8
+    if status == EXACT:
+        assert full_check(ready.verdict, states(setup), ready.start, ready.goals)
+
+
+def test_valid_paths_that_pass_too_near_are_resampled(ready: PlanningSetup) -> None:
+    judge = Judge(ready.simple_setup.getSpaceInformation(), "")
+    plain = plan(at_hand(HARD), timeout=20.0, params={"polish": False})
+    wary = plan(at_hand(HARD), timeout=20.0, params={"polish": False, "lambda_obs": 0.5})
+    assert plain and wary
+    gaps = [judge.gap(result.path) for result in (plain, wary)]
+    assert gaps[1] >= gaps[0] - 1e-9, "nothing is half a metre off, so the one that keeps most distance stands"
+    assert wary.times[INSIDE + "resample"] > plain.times.get(INSIDE + "resample", 0.0)
+    by_hand = min(ready.verdict.distance(q).value for q in wary.path[::4])
+    assert gaps[1] == pytest.approx(min(by_hand, ready.verdict.distance(wary.path[-1]).value))
+
+
+def test_the_same_seed_gives_the_same_path_also_in_threads() -> None:
+    def length(_: int) -> list[float]:
+        result = plan(at_hand(HARD), timeout=60.0, params={"seed": 5})
+        return [result.length, *result.path[100]]
+
+    threads = torch.get_num_threads()
+    alone = length(0)
+    with ThreadPoolExecutor(2) as pool:
+        assert all(found == alone for found in pool.map(length, range(2)))
+    assert torch.get_num_threads() == threads
+    assert plan(at_hand(HARD), timeout=60.0, params={"seed": 6}).length != alone[0]
+
+
+def test_with_time_left_paths_only_get_shorter(ready: PlanningSetup) -> None:
+    setup = ready.simple_setup
+    si = setup.getSpaceInformation()
+    setup.setOptimizationObjective(ob.PathLengthOptimizationObjective(si))
+    planner = APEX(si, ApexParameters(seed=0))
+    setup.setPlanner(planner)
+    setup.setup()
+    assert setup.solve(within(3.0)).getStatus() == EXACT
+    found = setup.getProblemDefinition().getSolutionCount()
+    assert "improve" in planner.report.times
+    once = plan(at_hand(HARD), timeout=20.0, params={"seed": 0})
+    assert found >= 1 + planner.report.improved
+    assert path_length(states(setup)) <= once.length + 1e-9
+    assert full_check(ready.verdict, states(setup), ready.start, ready.goals)
+    objective = ob.PathLengthOptimizationObjective(si)
+    objective.setCostThreshold(ob.Cost(100.0))
+    setup.clear()
+    setup.setOptimizationObjective(objective)
+    begin = time.perf_counter()
+    assert setup.solve(within(30.0)).getStatus() == EXACT
+    assert time.perf_counter() - begin < 20.0, "a path under the threshold is enough"
