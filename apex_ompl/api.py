@@ -24,7 +24,7 @@ from apex_ompl.planners.apex_parameters import WITHOUT_MODEL, default_planner
 from apex_ompl.problem import Problem
 from apex_ompl.repair import repair
 from apex_ompl.resolution import FULL_RESOLUTION
-from apex_ompl.result import INSIDE, PlanResult, PlanStatus
+from apex_ompl.result import FIRST, INSIDE, PlanResult, PlanStatus
 from apex_ompl.simplify import simplify as shorten
 from apex_ompl.space import path_length, path_to_array, resample
 from apex_ompl.stopwatch import timed
@@ -169,6 +169,8 @@ class _Run:
             report = getattr(planner, "report", None)
             if report is not None:
                 self.times |= {INSIDE + stage: seconds for stage, seconds in report.times.items()}
+                if report.solved_by:
+                    self.times[FIRST] = report.first
             if status is PlanStatus.APPROXIMATE_SOLUTION:
                 return self._approximate()
             if status is not PlanStatus.EXACT_SOLUTION:

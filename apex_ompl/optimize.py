@@ -7,7 +7,7 @@ whether a path is valid is handed in.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 
 import numpy as np
@@ -24,6 +24,7 @@ Check = Callable[[Array], bool]
 
 STIFFER, SHORTENINGS = 5.0, 4  # factor from one round of shortening to the next, and how many rounds
 PART = 8  # steps between two looks at the clock
+FINER = 2  # factor on the number of samples for paths that are clear at them and yet not valid
 LAST_RESORT = 0.1  # factor on the stiffness where nothing came out valid
 
 
@@ -32,8 +33,8 @@ class Settings:
     """What a path costs, and how long it is worked on.
 
     Attributes:
-        samples: How many states are judged: the middles of as many even stretches of the parameter, twice as dense as
-            every fourth state of a path of 256.
+        samples: How many states are judged: the middles of as many even stretches of the parameter, as dense as every
+            fourth state of a path of 256.
         scene_margin: Clearance to obstacles below which a state costs [m].
         own_margin: Clearance between the robot's own links, its arms among them, below which a state costs [m].
         stiffness: Weight of half the integral of the speed squared, [1/rad^2]; for an even speed this is half the
@@ -43,7 +44,7 @@ class Settings:
         tolerance: A step that lowers the cost by less than this share is the last.
     """
 
-    samples: int = 128
+    samples: int = 64
     scene_margin: float = 0.04
     own_margin: float = 0.02
     stiffness: float = 1e-3
@@ -104,6 +105,10 @@ class Optimizer:
     def prepare(self, kernel: Kernel) -> None:
         """Load or compile now what the first steps need."""
         self.improve(kernel, np.zeros((1, self.spline.points, kernel.robot.dof)), steps=0)
+
+    def finer(self) -> Optimizer:
+        """Return an optimiser that judges more states."""
+        return Optimizer(self.spline, replace(self.settings, samples=FINER * self.settings.samples))
 
     def starts(self, start: Array, goal: Array, count: int, rng: np.random.Generator, size: float = 1.0) -> Array:
         """Return the straight line, and bumped ones: count paths from a state to another, shape (count, points, dof).
@@ -200,7 +205,7 @@ class Optimizer:
         """Return the last valid path of stiffer and stiffer ones, control points of shape (points, dof), or None.
 
         Stiffer paths are shorter. The stiffness grows from round to round, until a path fails the check; where the
-        first one fails already, a softer one has its turn.
+        first one fails already, a softer one has its turn, judged at more states.
 
         Args:
             kernel: The robot among its obstacles.
@@ -213,17 +218,18 @@ class Optimizer:
         """
         now, stiffness = self._control(kernel, control)[:1], self.settings.stiffness
         best: Array | None = None
+        optimizer = self
         for k in range(SHORTENINGS):
             if stop():
                 break
-            bent = self._in_parts(kernel, now, stiffness, stop)
+            bent = optimizer._in_parts(kernel, now, stiffness, stop)
             if bent is None:
                 break
             if is_valid(self.spline.path(bent[0])):
                 best, now = bent[0], bent
                 stiffness *= STIFFER
             elif best is None and k < 2:
-                now, stiffness = bent, LAST_RESORT * stiffness
+                now, stiffness, optimizer = bent, LAST_RESORT * stiffness, self.finer()
             else:
                 break
         return best

@@ -28,6 +28,7 @@ class Candidate:
         clearance: Smallest clearance at the samples [m].
         damping: Of the next step.
         rounds: How often it was worked on.
+        fine: Whether more samples are looked at.
         given_up: Whether nothing more comes of it.
     """
 
@@ -37,6 +38,7 @@ class Candidate:
     clearance: float
     damping: float
     rounds: int = 0
+    fine: bool = False
     given_up: bool = False
 
     @property
@@ -49,8 +51,8 @@ class Pool:
     """Candidates for a valid path among the obstacles of a kernel.
 
     Always the candidate with the least shortfall is improved by a few steps, one that was worked on before a little
-    later than a fresh one; as soon as it is clear at the samples it is checked. The last steps for a candidate are
-    softer.
+    later than a fresh one; as soon as it is clear at the samples it is checked. One that is clear at them and yet not
+    valid is looked at more closely. The last steps for a candidate are softer.
 
     Attributes:
         candidates: All that there are.
@@ -70,6 +72,7 @@ class Pool:
             is_wanted: Asked about valid ones, with the states; nothing more is done for those that are not.
         """
         self._optimizer, self._kernel, self._is_valid, self._is_wanted = optimizer, kernel, is_valid, is_wanted
+        self._fine = optimizer.finer()
         self.candidates: list[Candidate] = []
         self.steps = 0
 
@@ -107,7 +110,8 @@ class Pool:
             if chosen is None:
                 break
             soft = chosen.rounds >= ROUNDS - SOFT_ROUNDS
-            bent = self._optimizer.improve(
+            optimizer = self._fine if chosen.fine else self._optimizer
+            bent = optimizer.improve(
                 self._kernel, chosen.control[None], steps=ROUND, damping=chosen.damping, enough=CLEAR,
                 stiffness=(LAST_RESORT if soft else 1.0) * settings.stiffness,
             )  # fmt: skip
@@ -119,7 +123,7 @@ class Pool:
             if self._passes(chosen):
                 return chosen
             if not bent.steps[0]:  # nothing is short of clearance, and yet it is not valid
-                chosen.given_up = True
+                chosen.given_up, chosen.fine = chosen.fine, True
         return None
 
     def _passes(self, candidate: Candidate) -> bool:

@@ -14,7 +14,8 @@ class Report:
 
     Attributes:
         solved_by: The stage that found the first valid path: ``line``, ``experience``, ``apex`` or ``apex+resample``,
-            with ``+repair`` where the optimiser had to help; ``apex+bridge`` or ``rrtconnect``; empty without one.
+            with ``+repair`` where the optimiser had to help; ``sprint``, ``apex+bridge`` or ``rrtconnect``; empty
+            without one.
         reason: One sentence where there is no exact solution.
         times: Seconds by stage; those of ``guidance`` and ``distance`` are part of other stages.
         first: Seconds until the first valid path, NaN without one.

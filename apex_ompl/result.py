@@ -27,6 +27,8 @@ SUFFIXES = (".npz", ".csv", ".json", ".yaml")
 
 INSIDE = "solve: "
 """Stands before the names of a planner's own stages in ``PlanResult.times``."""
+FIRST = INSIDE + "first"
+"""Names the time from the beginning of ``solve`` to the first valid path there, of planners that tell it."""
 
 
 class PlanStatus(StrEnum):

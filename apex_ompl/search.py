@@ -50,7 +50,7 @@ class SearchSettings:
     """
 
     line: bool = True
-    batches: tuple[int, ...] = (1, 7, 24)
+    batches: tuple[int, ...] = (4, 8, 24)
     sampling: Sampling = Sampling()
     resample: int = 1
     noise: float = 0.4
@@ -84,22 +84,56 @@ class Search:
         self._model, self._optimizer, self._kernel, self._is_valid = model, optimizer, kernel, is_valid
         self._gap, self._settings, self._generator, self._report = gap, settings, generator, report
         self.pool = self._pool()
+        self._known: list[tuple[str, Array]] = []  # straight lines and earlier paths that are not valid
         self._close: list[tuple[float, Candidate]] = []  # valid, but nearer to an obstacle than lambda_obs
 
-    def run(self, queries: Sequence[Query], experience: Sequence[Array], stop: Stop) -> Candidate | None:
-        """Return a valid path for one of several queries, or None.
+    def known(
+        self, ends: Sequence[tuple[Array, Array]], experience: Sequence[Array], stop: Stop
+    ) -> Candidate | None:  # fmt: skip
+        """Return a valid path among those that cost nothing, straight lines and earlier paths put on other ends.
+
+        Those that are not valid are candidates for repair.
 
         Args:
-            queries: The problems, which differ in their starts and goals.
+            ends: Pairs of start and goal, each of shape (dof,).
             experience: What earlier paths differed in from their straight lines, each of shape (points, dof).
             stop: Asked often whether to give up.
         """
-        for stage in self._stages(queries, experience, stop):
-            if stop():
-                break
-            found = stage()
-            if found is not None:
-                return found
+        spline, limits = self._model.spline, self._kernel.robot.arrays
+        with self._report.timed("known"):
+            for start, goal in ends:
+                line = spline.line(start, goal)
+                mine = [(LINE, line)] if self._settings.line else []
+                for residual in experience:
+                    moved = np.clip(line + residual, limits.lower, limits.upper)
+                    mine.append((EXPERIENCE, spline.with_ends(moved, start, goal)))
+                for origin, control in mine:
+                    if stop():
+                        return None
+                    self._report.candidates += 1
+                    found = Candidate(control, origin, np.inf, np.inf, 0.0)
+                    path = spline.path(control)
+                    if self._is_valid(path) and self._keeps_distance(found, path):
+                        return found
+                    self._known.append((origin, control))
+        return None
+
+    def run(self, queries: Sequence[Query], stop: Stop) -> Candidate | None:
+        """Return a valid path for one of several queries from some rounds of proposals, or None.
+
+        Args:
+            queries: The problems, which differ in their starts and goals.
+            stop: Asked often whether to give up.
+        """
+        for origin in dict.fromkeys(origin for origin, _ in self._known):
+            if not stop():
+                with self._report.timed("judge"):
+                    self.pool.add([control for mine, control in self._known if mine == origin], origin, stop)
+        for batch in self._settings.batches or (0,):
+            for stage in self._round(queries, batch, stop):
+                found = None if stop() else stage()
+                if found is not None:
+                    return found
         return self._farthest()
 
     def again(self, queries: Sequence[Query], stop: Stop) -> Candidate | None:
@@ -136,15 +170,6 @@ class Search:
             return None
         return pool.add(found, PROPOSED, stop) or pool.work(PER_PATH * AT_ONCE, stop)
 
-    def _stages(
-        self, queries: Sequence[Query], experience: Sequence[Array], stop: Stop
-    ) -> Iterator[Callable[[], Candidate | None]]:
-        settings = self._settings
-        if settings.line or experience:
-            yield partial(self._known, queries, experience, stop)
-        for batch in settings.batches or (0,):
-            yield from self._round(queries, batch, stop)
-
     def _round(self, queries: Sequence[Query], batch: int, stop: Stop) -> Iterator[Callable[[], Candidate | None]]:
         settings, each = self._settings, max(1, AT_ONCE // len(queries))
         for k in range(0, batch, each):
@@ -155,19 +180,6 @@ class Search:
             yield partial(self._resample, queries, stop)
             if settings.repair:
                 yield partial(self._repair, PER_PATH * WORTH_RESAMPLING, stop)
-
-    def _known(self, queries: Sequence[Query], experience: Sequence[Array], stop: Stop) -> Candidate | None:
-        """Take in what costs nothing: straight lines, and earlier paths put on other ends."""
-        with self._report.timed("known"):
-            spline, limits = self._model.spline, self._kernel.robot.arrays
-            lines = np.stack([spline.line(q.start, q.goal) for q in queries])
-            found = self._add(lines, LINE, stop) if self._settings.line else None
-            for residual in experience if found is None else ():
-                moved = np.clip(lines + residual, limits.lower, limits.upper)
-                found = self._add(spline.with_ends(moved, lines[:, 0], lines[:, -1]), EXPERIENCE, stop)
-                if found is not None or stop():
-                    break
-        return found
 
     def _propose(self, queries: Sequence[Query], count: int, stop: Stop) -> Candidate | None:
         with self._report.timed("propose"):

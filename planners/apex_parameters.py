@@ -44,6 +44,7 @@ class ApexParameters(Parameters):
         robot: The robot, where the validity checker is not this project's.
         device: Where the network runs.
         line: Whether the straight line is a candidate.
+        sprint: Iterations that RRTConnect has before proposals, where it is the fallback and ``lambda_obs`` is 0.
         sampler: ``ddim``, ``dpm_solver`` or ``ddpm``; ``model`` takes that of the checkpoint.
         denoising_steps: Number of denoising steps; 0 takes that of the checkpoint: 2 for apex, all 256 for apex-paper.
         temperature: Standard deviation of the noise to begin with.
@@ -58,7 +59,8 @@ class ApexParameters(Parameters):
             distance stands when none comes out better.
         repair: Whether candidates are improved by the optimiser.
         bridge: Whether blocked stretches of the best candidates are bridged by short trees.
-        fallback: Whether RRTConnect gets the time that is left; otherwise there are more rounds of proposals.
+        fallback: Whether RRTConnect gets the time that is left, and a sprint before; otherwise there are more rounds of
+            proposals.
         polish: Whether valid paths are shortened.
         approximate: Whether, without an exact solution, a path that ends near a goal is given as an approximate one.
         anytime: Whether paths are improved until the time is up, as they are with a path length objective.
@@ -71,11 +73,12 @@ class ApexParameters(Parameters):
     robot: str = "dual_panda_softhand"
     device: str = "cpu"
     line: bool = True
+    sprint: int = bounded(40, 0)
     sampler: str = one_of("model", "ddim", "dpm_solver", "ddpm")
     denoising_steps: int = bounded(0, 0, 1000)
     temperature: float = bounded(1.0, 0.0, 10.0)
-    first: int = bounded(1, 0, 1024)
-    second: int = bounded(7, 0, 1024)
+    first: int = bounded(4, 0, 1024)
+    second: int = bounded(8, 0, 1024)
     third: int = bounded(24, 0, 1024)
     guidance: bool = False
     gamma: float = bounded(1.0, 0.0, 1e3)
@@ -90,6 +93,11 @@ class ApexParameters(Parameters):
     anytime: bool = False
     range: float = bounded(0.0, 0.0, unit="rad")
     seed: int = bounded(-1, -1)
+
+    @property
+    def sprints(self) -> bool:
+        """Whether RRTConnect has a short try before proposals are made."""
+        return self.fallback and self.sprint > 0 and self.lambda_obs == 0.0
 
     def search(self, own: Sampling) -> SearchSettings:
         """Return what of it concerns the search before trees; ``own`` is how the checkpoint samples by itself."""

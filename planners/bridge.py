@@ -21,18 +21,13 @@ EVERY = 2  # states of a path that are judged to find its blocked stretches
 SPACING = 0.1  # of states on polylines [rad]
 
 
-def grown(tree: ob.Planner, pdef: ob.ProblemDefinition, ptc: ob.PlannerTerminationCondition) -> ob.PlannerStatus:
-    """Let a planner solve a problem, and return its status."""
-    tree.setProblemDefinition(pdef)
-    tree.setup()
-    return tree.solve(ptc)
-
-
-def connect(si: ob.SpaceInformation, longest: float) -> og.RRTConnect:
-    """Return an RRTConnect whose longest step is given; 0 lets OMPL choose [rad]."""
+def rooted(si: ob.SpaceInformation, pdef: ob.ProblemDefinition, longest: float) -> og.RRTConnect:
+    """Return an RRTConnect for a problem, whose longest step is given; 0 lets OMPL choose [rad]."""
     tree = og.RRTConnect(si)
     if longest > 0.0:
         tree.setRange(longest)
+    tree.setProblemDefinition(pdef)
+    tree.setup()
     return tree
 
 
@@ -96,7 +91,7 @@ def _bridge(si: ob.SpaceInformation, a: Array, b: Array, stop: Stop, longest: fl
     pdef.setStartAndGoalStates(to_state(si, a), to_state(si, b))
     left = iter(range(CALLS))
     ptc = ob.PlannerTerminationCondition(lambda: stop() or next(left, None) is None)
-    if grown(connect(si, longest), pdef, ptc).getStatus() != ob.PlannerStatus.EXACT_SOLUTION:
+    if rooted(si, pdef, longest).solve(ptc).getStatus() != ob.PlannerStatus.EXACT_SOLUTION:
         return None
     inner = path_to_array(pdef.getSolutionPath(), len(a))
     return np.concatenate([a[None], inner[1:-1], b[None]])

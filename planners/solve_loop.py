@@ -53,6 +53,7 @@ class SolveLoop:
         self.best: Array | None = None
         self.control: Array | None = None  # of the best path, where it is on a spline
         self.nearest: tuple[Array, float] | None = None  # a path that ends near a goal, and how near
+        self.trees: tuple[og.RRTConnect, ob.ProblemDefinition] | None = None  # that were begun
 
     def stop(self) -> bool:
         """Whether time is up."""
@@ -73,12 +74,18 @@ class SolveLoop:
             if not goals:
                 out = Status.TIMEOUT if self.stop() else Status.INVALID_GOAL
                 return self._without(out, "no valid goal state was sampled")
-            queries = self._queries(starts, goals)
+            ends = self._ends(starts, goals)
         search = Search(
             self.model, self.optimizer, self.kernel, self.is_valid, self.judge.gap,
             settings=self.parameters.search(self.model.sampling), generator=self.generator, report=self.report,
         )  # fmt: skip
-        self._take(search.run(queries, self.experience, self.stop))
+        self._take(search.known(ends, self.experience, self.stop))
+        if self.best is None and self.parameters.sprints:
+            self._sprint(ends)
+        with self.report.timed("query"):
+            queries = self._queries(ends)
+        if self.best is None:
+            self._take(search.run(queries, self.stop))
         if self.best is None and self.parameters.bridge:
             self._bridge(search)
         if self.best is None and self.parameters.approximate:
@@ -137,11 +144,14 @@ class SolveLoop:
             state = inputs.nextGoal()  # none where the next one is not valid
         return _sound(found)
 
-    def _queries(self, starts: list[Array], goals: list[Array]) -> list[Query]:
-        """Return the pairs that are nearest to each other."""
-        pairs = sorted(product(starts, goals), key=lambda pair: float(np.linalg.norm(pair[1] - pair[0])))
+    @staticmethod
+    def _ends(starts: list[Array], goals: list[Array]) -> list[tuple[Array, Array]]:
+        """Return the pairs of start and goal that are nearest to each other."""
+        return sorted(product(starts, goals), key=lambda pair: float(np.linalg.norm(pair[1] - pair[0])))[:MOST_QUERIES]
+
+    def _queries(self, ends: list[tuple[Array, Array]]) -> list[Query]:
         verdict, point = self.judge.verdict, self.model.sees_point
-        return [query_of(verdict, start, goal, point=point) for start, goal in pairs[:MOST_QUERIES]]
+        return [query_of(verdict, start, goal, point=point) for start, goal in ends]
 
     def _accept(self, path: Array, control: Array | None = None) -> None:
         """Take a valid path as a solution."""
@@ -195,30 +205,53 @@ class SolveLoop:
     def _grow_trees(self, starts: list[Array]) -> None:
         """Let RRTConnect plan with the time that is left, and polish what it finds."""
         while self.best is None and not self.stop():
-            pdef, tree = ob.ProblemDefinition(self.si), bridge.connect(self.si, self.parameters.range)
-            for start in starts:
-                pdef.addStartState(to_state(self.si, start))
-            pdef.setGoal(self.pdef.getGoal())
+            tree, pdef = self.trees or self._planted(starts)
+            self.trees = None
             with self.report.timed("rrtconnect"):
-                status = bridge.grown(tree, pdef, self.ptc).getStatus()
+                status = tree.solve(self.ptc).getStatus()
             if status not in (Status.EXACT_SOLUTION, Status.APPROXIMATE_SOLUTION):
                 return
             path = path_to_array(pdef.getSolutionPath(), self.kernel.robot.dof)
             if status == Status.EXACT_SOLUTION:
-                self._mend(path)
+                self._mend(path, "rrtconnect")
             elif self.parameters.approximate and (
                 self.nearest is None or pdef.getSolutionDifference() < self.nearest[1]
             ):
                 self.nearest = path, pdef.getSolutionDifference()
 
-    def _mend(self, path: Array) -> None:
+    def _sprint(self, ends: list[tuple[Array, Array]]) -> None:
+        """Let RRTConnect try for a few iterations, from the start to the goal that are nearest to each other.
+
+        In open scenes that is sooner done than proposals are made.
+        """
+        with self.report.timed("sprint"):
+            pdef = ob.ProblemDefinition(self.si)
+            pdef.setStartAndGoalStates(*(to_state(self.si, q) for q in ends[0]))
+            tree = bridge.rooted(self.si, pdef, self.parameters.range)
+            left = iter(range(self.parameters.sprint))
+            ptc = ob.PlannerTerminationCondition(lambda: self.stop() or next(left, None) is None)
+            solved = tree.solve(ptc).getStatus() == Status.EXACT_SOLUTION
+        if solved:
+            self._mend(path_to_array(pdef.getSolutionPath(), self.kernel.robot.dof), "sprint")
+        elif len(ends) == 1:
+            self.trees = tree, pdef
+
+    def _planted(self, starts: list[Array]) -> tuple[og.RRTConnect, ob.ProblemDefinition]:
+        """Return an RRTConnect for all starts and goals, and its problem definition."""
+        pdef = ob.ProblemDefinition(self.si)
+        for start in starts:
+            pdef.addStartState(to_state(self.si, start))
+        pdef.setGoal(self.pdef.getGoal())
+        return bridge.rooted(self.si, pdef, self.parameters.range), pdef
+
+    def _mend(self, path: Array, origin: str) -> None:
         """Take a path of a tree, whose states are less close than the full check's; plan anew what fails that."""
         found: Array | None = path
         if self.judge.alone and not self.is_valid(path):
             with self.report.timed("bridge"):
                 found = bridge.joined(self.si, self.judge, bridge.filled(path), self.stop, self.parameters.range)
         if found is not None:
-            self.report.solved_by = "rrtconnect"
+            self.report.solved_by = origin
             self._polish(found)
 
     def _polish(self, path: Array) -> None:

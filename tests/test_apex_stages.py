@@ -48,6 +48,25 @@ def test_stages_can_be_left_out(changes: dict[str, Any], by: tuple[str, ...]) ->
     assert ("rrtconnect" in names) <= changes.get("fallback", False)
 
 
+def test_open_scenes_take_a_sprint_of_a_tree() -> None:
+    problem = at_hand("vertical/small/800000")
+    quick = plan(problem, timeout=10.0)
+    assert quick.solved_by == "sprint" and not {INSIDE + "propose", INSIDE + "rrtconnect"} & quick.times.keys()
+    for params in ({"sprint": 0}, {"fallback": False}, {"lambda_obs": 0.001}):
+        other = plan(problem, timeout=10.0, params=params)
+        assert other and other.solved_by != "sprint" and INSIDE + "sprint" not in other.times
+
+
+def test_a_sprint_that_is_not_enough_is_the_beginning_of_the_fallback() -> None:
+    unaided = {"line": False, "first": 0, "second": 0, "third": 0, "repair": False, "bridge": False, "polish": False}
+    lengths = []
+    for sprint in (0, 1):
+        result = plan(at_hand("swap/hard/800000"), timeout=20.0, seed=1, params={**unaided, "sprint": sprint})
+        assert result.solved_by == "rrtconnect" and (INSIDE + "sprint" in result.times) == bool(sprint)
+        lengths.append(result.length)
+    assert lengths[0] == lengths[1], "one iteration more or less in the sprint changes nothing about the tree"
+
+
 def test_the_algorithm_of_the_paper_alone_runs(ready: PlanningSetup) -> None:
     """Guided ancestral sampling in all steps, resampling on collision or nearness, nothing else."""
     paper = {
