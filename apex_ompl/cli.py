@@ -10,14 +10,16 @@ import argparse
 import json
 import os
 import platform
+import re
 import sys
 from collections.abc import Sequence
 from dataclasses import fields
 from importlib import metadata
 from pathlib import Path
+from types import ModuleType
 from typing import NoReturn
 
-from apex_ompl.errors import ApexError, ParameterError
+from apex_ompl.errors import ApexError, MissingFileError, ParameterError
 from apex_ompl.files import check_writable
 from apex_ompl.result import INSIDE, PlanResult, PlanStatus, check_suffix
 from apex_ompl.result import SCHEMA as RESULT
@@ -93,6 +95,28 @@ def _parser() -> _Parser:
     convert.add_argument("--joint", action="append", default=[], metavar="THEIRS=OURS", help="a joint by another name")
     convert.add_argument("--frame", action="append", default=[], metavar="THEIRS=OURS", help="a frame by another name")
     convert.set_defaults(run=_convert)
+
+    bench = commands.add_parser("bench", help="run planners on suites through OMPL's Benchmark")
+    bench.add_argument("suites", nargs="+", metavar="SUITE", help="a suite, a level as shelf/hard, a problem or a file")
+    bench.add_argument(
+        "--planners", default="apex,rrtconnect", metavar="A,B,...",
+        help="names, with parameters as apex[fallback=false;bridge=false] (default: %(default)s)",
+    )  # fmt: skip
+    bench.add_argument("--runs", type=int, default=100, metavar="N", help="on a level (default: %(default)s)")
+    bench.add_argument("--timeout", type=float, default=5.0, metavar="SECONDS", help="default: %(default)s")
+    bench.add_argument("--seed", type=int, default=0, help="of the first run (default: %(default)s)")
+    bench.add_argument("--split", default="test", help="train, validation or test (default: %(default)s)")
+    bench.add_argument("--no-simplify", action="store_true", help="keep paths as planners found them")
+    bench.add_argument("--jobs", type=int, default=1, metavar="N", help="at a time (default: one, as they are timed)")
+    bench.add_argument("--address", metavar="HOST:PORT", help="of a Ray cluster to run on")
+    bench.add_argument("-o", "--out", type=Path, required=True, metavar="DIR", help="goes on where it was stopped")
+    bench.add_argument("--quiet", action="store_true", help="show no progress")
+    bench.set_defaults(run=_bench)
+
+    report = commands.add_parser("report", help="write an HTML page and Markdown of results of bench")
+    report.add_argument("results", type=Path, metavar="RESULTS", help="folder that bench wrote")
+    report.add_argument("-o", "--out", type=Path, required=True, metavar="DIR", help="gets report.html and report.md")
+    report.set_defaults(run=_report)
 
     check = commands.add_parser("check", help="validate a problem, and say whether start and goal are free")
     check.add_argument("problem", help="name of a problem, an id as shelf/hard/900012, or a YAML file")
@@ -185,6 +209,40 @@ def _render(parsed: argparse.Namespace) -> int:
     render(source, parsed.out, azimuth=parsed.azimuth)
     print(parsed.out)
     return 0
+
+
+def _bench(parsed: argparse.Namespace) -> int:
+    benchmark = _benchmark()
+    results = benchmark.bench(
+        parsed.suites, _split(parsed.planners), parsed.out, runs=parsed.runs, timeout=parsed.timeout, seed=parsed.seed,
+        split=parsed.split, simplify=not parsed.no_simplify, quiet=parsed.quiet,
+        workers=benchmark.Workers(parsed.jobs, parsed.address),
+    )  # fmt: skip
+    logs = benchmark.write_logs(results)
+    database = benchmark.write_database(results, logs)
+    print(benchmark.markdown(results))
+    print(f"{database}: {len(results.runs)} runs, for Planner Arena; OMPL's logs are in {logs[0].parent}")
+    return 0
+
+
+def _split(planners: str) -> list[str]:
+    """Split a list at its commas, those inside of brackets left alone."""
+    return [name for name in re.split(r",(?![^\[]*\])", planners) if name.strip()]
+
+
+def _report(parsed: argparse.Namespace) -> int:
+    for file in _benchmark().report(parsed.results, parsed.out):
+        print(file)
+    return 0
+
+
+def _benchmark() -> ModuleType:
+    try:
+        from apex_ompl import benchmark
+    except ImportError as error:
+        name = error.name or "a package"
+        raise MissingFileError(name, "package for benchmarks", "install the extra: apex-ompl[bench]") from error
+    return benchmark
 
 
 def _is_result(source: str) -> bool:

@@ -5,6 +5,9 @@ from __future__ import annotations
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 
+import numpy as np
+from numpy.typing import NDArray
+
 from apex_ompl.stopwatch import timed
 
 
@@ -19,7 +22,12 @@ class Report:
         reason: One sentence where there is no exact solution.
         times: Seconds by stage; those of ``guidance`` and ``distance`` are part of other stages.
         first: Seconds until the first valid path, NaN without one.
+        judged: Whether that had passed the full check by then.
+        path: The first valid path, shape (N, dof), or None.
+        lengths: Seconds, and length [rad], of each path that was taken as a solution.
         candidates: Paths that were looked at before trees: straight lines, earlier paths, proposals.
+        proposed: Those of them that the model proposed.
+        resampled: Those that it proposed on resampling.
         steps: Steps of the optimiser in repair.
         improved: How often a shorter path was found behind the first one.
     """
@@ -28,7 +36,12 @@ class Report:
     reason: str = ""
     times: dict[str, float] = field(default_factory=dict)
     first: float = float("nan")
+    judged: bool = False
+    path: NDArray[np.float64] | None = None
+    lengths: list[tuple[float, float]] = field(default_factory=list)
     candidates: int = 0
+    proposed: int = 0
+    resampled: int = 0
     steps: int = 0
     improved: int = 0
 

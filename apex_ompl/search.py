@@ -208,6 +208,8 @@ class Search:
 
     def _add(self, control: Array, origin: str, stop: Stop) -> Candidate | None:
         self._report.candidates += len(control)
+        self._report.proposed += len(control) if origin == PROPOSED else 0
+        self._report.resampled += len(control) if origin == RESAMPLED else 0
         return self.pool.add(control, origin, stop)
 
     def _pool(self) -> Pool:

@@ -19,26 +19,19 @@ import json
 import math
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import record
 import torch
-from controls import Bumps, Shuffled, checkpoint_digest, drawn, next_query
-from ompl import base as ob
+from controls import OTHER, checkpoint_digest, next_query
 from store import RunStore
 
 from apex_ompl import plan, problems
 from apex_ompl.assembly import assemble
 from apex_ompl.diffusion.checkpoint import SHIPPED
-from apex_ompl.diffusion.conditions import Query
-from apex_ompl.diffusion.proposals import TrajectoryModel
-from apex_ompl.planners.apex import APEX
-from apex_ompl.planners.apex_parameters import ApexParameters
-from apex_ompl.planners.registry import register
 from apex_ompl.problems.reach import robot
 from apex_ompl.resolution import FULL_RESOLUTION
 from apex_ompl.result import FIRST, INSIDE, PlanResult
@@ -62,35 +55,6 @@ FULL = ("apex", "rrtconnect", "rrtconnect+polish")
 
 
 @cache
-def control(kind: str, trained: TrajectoryModel) -> TrajectoryModel:
-    """Return what takes the place of the model."""
-    if kind == "random weights":
-        return TrajectoryModel(drawn(trained.network), {})
-    return (Bumps if kind == "bumps" else Shuffled)(trained.network, {})
-
-
-OTHER: list[Query] = []  # of the problem at hand
-
-
-@dataclass(frozen=True)
-class Control(ApexParameters):
-    """APEX with another model."""
-
-    kind: ClassVar[str]
-
-    def build(self, si: ob.SpaceInformation) -> ob.Planner:
-        """Return the planner."""
-        planner = APEX(si, self)
-        planner.model = control(self.kind, planner.model)
-        if isinstance(planner.model, Shuffled):
-            planner.model.other = OTHER[0]
-        return planner
-
-
-for _kind in ("random weights", "shuffled conditions", "bumps"):
-    register(_kind)(type("Control", (Control,), {"kind": _kind}))
-
-
 def made_of(method: str) -> str:
     """Return what tells runs of a method apart from those with another model or other parameters."""
     planner, params, limit = METHODS[method]

@@ -1,13 +1,19 @@
-"""What stands in the place of the model in comparisons: random bumps, random weights, another problem's conditions."""
+"""What stands in the place of the model in comparisons: random bumps, random weights, another problem's conditions.
+
+Importing this module registers APEX with each of them as a planner.
+"""
 
 from __future__ import annotations
 
 import hashlib
+from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
+from ompl import base as ob
 
 from apex_ompl import problems
 from apex_ompl.assembly import assemble
@@ -15,6 +21,9 @@ from apex_ompl.diffusion.conditions import Query
 from apex_ompl.diffusion.model import LatentDiffusion
 from apex_ompl.diffusion.proposals import Proposals, TrajectoryModel
 from apex_ompl.optimize import Optimizer
+from apex_ompl.planners.apex import APEX
+from apex_ompl.planners.apex_parameters import ApexParameters
+from apex_ompl.planners.registry import register
 from apex_ompl.problems.reach import robot
 from apex_ompl.queries import query_of
 
@@ -87,3 +96,33 @@ def next_query(name: str) -> Query:
     level, number = name.rsplit("/", 1)
     setup = assemble(problems.load(f"{level}/{int(number) + 1}"), robot())
     return query_of(setup.verdict, setup.start, setup.goals[0])
+
+
+@cache
+def control(kind: str, trained: TrajectoryModel) -> TrajectoryModel:
+    """Return what takes the place of the model."""
+    if kind == "random weights":
+        return TrajectoryModel(drawn(trained.network), {})
+    return (Bumps if kind == "bumps" else Shuffled)(trained.network, {})
+
+
+OTHER: list[Query] = []  # of the problem at hand
+
+
+@dataclass(frozen=True)
+class Control(ApexParameters):
+    """APEX with another model."""
+
+    kind: ClassVar[str]
+
+    def build(self, si: ob.SpaceInformation) -> ob.Planner:
+        """Return the planner."""
+        planner = APEX(si, self)
+        planner.model = control(self.kind, planner.model)
+        if isinstance(planner.model, Shuffled):
+            planner.model.other = OTHER[0]
+        return planner
+
+
+for _kind in ("random weights", "shuffled conditions", "bumps"):
+    register(_kind)(type("Control", (Control,), {"kind": _kind}))

@@ -19,7 +19,7 @@ from apex_ompl.planners.registry import Parameters, bounded, register
 from apex_ompl.report import Report
 from apex_ompl.resolution import FULL_RESOLUTION
 from apex_ompl.simplify import simplify
-from apex_ompl.space import array_to_path, path_to_array
+from apex_ompl.space import array_to_path, path_length, path_to_array
 from apex_ompl.spline import Spline
 from apex_ompl.validity import VerdictChecker
 
@@ -61,7 +61,7 @@ class PolishedRRTConnect(ob.Planner):
         self._verdict = verdict
         self._optimizer = optimizer
         self._inner = inner
-        self.report = Report()
+        self.report, self._begin = Report(), 0.0
 
     def clear(self) -> None:
         """Forget what was found."""
@@ -81,14 +81,14 @@ class PolishedRRTConnect(ob.Planner):
     def _solve(self, ptc: ob.PlannerTerminationCondition) -> ob.PlannerStatus:
         si, pdef, dof = self.getSpaceInformation(), self.getProblemDefinition(), self._verdict.robot.dof
         self._inner.setProblemDefinition(pdef)
-        begin = time.perf_counter()
+        begin = self._begin = time.perf_counter()
         with self.report.timed("rrtconnect"):
             status = self._inner.solve(ptc)
         if status.getStatus() == ob.PlannerStatus.EXACT_SOLUTION:
             self.report.solved_by, self.report.first = NAME, time.perf_counter() - begin
         if status.getStatus() != ob.PlannerStatus.EXACT_SOLUTION or ptc():
             return status
-        path = path_to_array(pdef.getSolutionPath(), dof)
+        self.report.path = path = path_to_array(pdef.getSolutionPath(), dof)
         with self.report.timed("simplify"):
             path = simplify(og.PathSimplifier(si), si, path, lambda: bool(ptc()))
         self._add(path)
@@ -100,6 +100,7 @@ class PolishedRRTConnect(ob.Planner):
         return status
 
     def _add(self, path: Array) -> None:
+        self.report.lengths.append((time.perf_counter() - self._begin, path_length(path)))
         si, pdef = self.getSpaceInformation(), self.getProblemDefinition()
         pdef.addSolutionPath(array_to_path(si, path), False, 0.0, NAME)
 

@@ -156,7 +156,9 @@ class SolveLoop:
     def _accept(self, path: Array, control: Array | None = None) -> None:
         """Take a valid path as a solution."""
         if self.best is None:
-            self.report.first = time.perf_counter() - self.begin
+            self.report.first, self.report.path = time.perf_counter() - self.begin, path
+            self.report.judged = self.judge.knows_obstacles
+        self.report.lengths.append((time.perf_counter() - self.begin, path_length(path)))
         self.best, self.control = path, control
         self.pdef.addSolutionPath(array_to_path(self.si, path), False, 0.0, NAME)
 

@@ -12,10 +12,8 @@ Usage: python scripts/generate_data.py FOLDER [--problems 10000] [--workers 2] [
 from __future__ import annotations
 
 import argparse
-import itertools
 import json
 import platform
-import socket
 import sys
 import time
 from collections import Counter
@@ -25,6 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from apex_ompl.cases import load_cases, save_cases, work_cases
+from apex_ompl.cluster import spread
 from apex_ompl.dataset import Store
 from apex_ompl.engine import Options
 from apex_ompl.errors import ApexError, ParameterError
@@ -36,92 +35,25 @@ from apex_ompl.spline import Spline
 # Pinocchio, Coal and OMPL are imported where problems are drawn: --cases needs none of them.
 
 LIBRARIES = ("apex-ompl", "ompl", "pin", "coal", "numba", "numpy", "zarr")
-OBJECT_STORE = 256 << 20  # of Ray [bytes]
 Work = Callable[[Any, Options, Spline], tuple[Paths, dict[str, float]]]
 Done = tuple[str, Paths, dict[str, float]]
 
 
-def here(work: Work, units: dict[str, Any], options: Options, spline: Spline) -> Iterator[Done]:
-    """Work in this process, on units by their names."""
-    for name, unit in units.items():
-        yield name, *work(unit, options, spline)
-
-
-def spread(
+def worked(
     work: Work, units: dict[str, Any], options: Options, spline: Spline, *, workers: int, address: str | None
 ) -> Iterator[Done]:
-    """Work by Ray, twice as many units under way as there are workers.
+    """Work on units by their names: in this process, or where there are several workers or a cluster by Ray.
 
     Raises:
-        DatasetError: Ray is not there, or a worker died more than once over a unit.
+        ClusterError: Ray is not there, or a worker failed.
     """
-    try:
-        import ray
-    except ImportError as error:
-        raise DatasetError(
-            "several workers need Ray, expected: pip install 'apex-ompl[data]'; or --workers 1"
-        ) from error
-    mine = not ray.is_initialized()  # who has started Ray goes on with it
-    if mine:
-        _start(ray, workers, address)
-    try:
-        task = ray.remote(num_cpus=1, max_retries=1)(work)
-        waiting, under_way = iter(units.items()), {}
-        for name, unit in itertools.islice(waiting, 2 * workers):
-            under_way[task.remote(unit, options, spline)] = name
-        while under_way:
-            done, _ = ray.wait(list(under_way), num_returns=1)
-            name = under_way.pop(done[0])
-            try:
-                paths, times = ray.get(done[0])
-            except ray.exceptions.RayTaskError as error:
-                raise DatasetError(f"unit {name}: {_first_line(error.cause)}") from error
-            except ray.exceptions.RayError as error:
-                raise DatasetError(
-                    f"unit {name}: its worker died twice ({type(error).__name__}); what is written is whole, and "
-                    "the same command goes on from there"
-                ) from error
-            following = next(waiting, None)
-            if following is not None:
-                under_way[task.remote(following[1], options, spline)] = following[0]
-            yield name, paths, times
-    finally:
-        if mine:
-            ray.shutdown()
-
-
-def _start(ray: Any, workers: int, address: str | None) -> None:
-    """Start Ray on this machine, or join a cluster.
-
-    Raises:
-        DatasetError: There is none.
-    """
-    if address and ":" in address.removeprefix("ray://"):
-        _reach(address.removeprefix("ray://"))
-    local: dict[str, Any] = {} if address else {"num_cpus": workers, "object_store_memory": OBJECT_STORE}
-    try:
-        ray.init(address=address, include_dashboard=False, log_to_driver=False, logging_level="error", **local)
-    except Exception as error:  # ConnectionError, ValueError, RuntimeError
-        said = _first_line(error)
-        expected = f"expected a cluster at {address or 'this machine'}, and RAY_AUTH_MODE=token if it asks for tokens"
-        raise DatasetError(f"Ray: {said}, {expected}") from error
-
-
-def _first_line(error: BaseException) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0]
-
-
-def _reach(address: str) -> None:
-    """Look whether somebody listens at HOST:PORT: Ray itself tries for minutes.
-
-    Raises:
-        DatasetError: Nobody does.
-    """
-    host, _, port = address.rpartition(":")
-    try:
-        socket.create_connection((host.strip("[]"), int(port)), timeout=5.0).close()
-    except (OSError, ValueError, OverflowError) as error:
-        raise DatasetError(f"--address {address}: {error}, expected HOST:PORT of a Ray cluster") from error
+    if not units or (workers == 1 and address is None):
+        for name, unit in units.items():
+            yield name, *work(unit, options, spline)
+        return
+    jobs = {name: (unit, options, spline) for name, unit in units.items()}
+    for name, (paths, times) in spread(work, jobs, workers=workers, address=address):
+        yield name, paths, times
 
 
 def generate(args: argparse.Namespace) -> None:
@@ -157,9 +89,7 @@ def generate(args: argparse.Namespace) -> None:
             tables.save(store.folder / "robot.npz")
         there = set(store.units())
         left = {name: unit for name, unit in units.items() if name not in there}
-        source = here(work, left, options, spline)
-        if left and (args.workers > 1 or args.address is not None):
-            source = spread(work, left, options, spline, workers=args.workers, address=args.address)
+        source = worked(work, left, options, spline, workers=args.workers, address=args.address)
         paths, seconds = _make(store, source, len(units), len(left), args)
         total = summary(store)
         store.note(counts=total)

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import os
-import runpy
 import signal
 import subprocess
 import sys
@@ -14,13 +13,14 @@ from support import ROOT
 
 from apex_ompl import problems
 from apex_ompl.assembly import assemble
+from apex_ompl.cluster import ClusterError, spread
 from apex_ompl.collision.verdict import NO_POINT
 from apex_ompl.dataset import Store, load
 from apex_ompl.engine import STRAIGHT_SHARE, Options
 from apex_ompl.errors import ParameterError, UnknownNameError
 from apex_ompl.generation import Unit, plan_units, static_levels, work
 from apex_ompl.problems.reach import robot
-from apex_ompl.records import FIELDS, SHAPES, SOURCES, DatasetError, Paths, rounded
+from apex_ompl.records import FIELDS, SHAPES, SOURCES, Paths, rounded
 from apex_ompl.space import path_length
 from apex_ompl.spline import Spline
 from apex_ompl.validity import full_check
@@ -199,31 +199,30 @@ def test_faults_of_the_command_are_sentences(tmp_path: Path) -> None:
 def test_workers_of_ray_make_the_same_paths_and_may_die(made: list[Paths]) -> None:
     """Two workers give what one gives; one that dies over a unit twice is a sentence, and so is one that fails."""
     ray = pytest.importorskip("ray")
-    spread = runpy.run_path(str(SCRIPT))["spread"]
     options: dict = {"workers": 2, "address": None}
     try:
         ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False, logging_level="error")
     except Exception as error:  # sandboxes without sockets or shared memory
         pytest.skip(f"Ray does not start here: {error}")
     try:
-        units = {unit.name: unit for unit in UNITS}
-        found = {name: paths for name, paths, _ in spread(work, units, Options(), Spline(), **options)}
+        units = {unit.name: (unit, Options(), Spline()) for unit in UNITS}
+        found = {name: paths for name, (paths, _) in spread(work, units, **options)}
         assert all(same(found[unit.name], paths) for unit, paths in zip(UNITS, made, strict=True))
 
-        def fails(unit: int, *_: object) -> tuple[int, dict[str, float]]:
+        def fails(unit: int) -> int:
             if unit == 1:
                 os._exit(1)
             if unit == 2:
                 raise ValueError("no unit 2")
-            return unit, {}
+            return unit
 
         done = []
-        with pytest.raises(DatasetError, match=r"unit b: its worker died twice .*the same command goes on"):
-            for name, *_ in spread(fails, {"a": 0, "b": 1}, Options(), Spline(), **options):
+        with pytest.raises(ClusterError, match=r"b: its worker died twice .*the same command goes on"):
+            for name, _ in spread(fails, {"a": (0,), "b": (1,)}, **options):
                 done.append(name)
         assert done == ["a"]
-        with pytest.raises(DatasetError, match="unit c: no unit 2"):
-            list(spread(fails, {"c": 2}, Options(), Spline(), **options))
+        with pytest.raises(ClusterError, match="c: no unit 2"):
+            list(spread(fails, {"c": (2,)}, **options))
     finally:
         ray.shutdown()
 

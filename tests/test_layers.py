@@ -28,8 +28,9 @@ LAYERS = [
     {"assembly", "simplify", "result", "moveit", "moving"},
     {"queries", "repair", "render"},
     {"planners", "problems"},
-    {"generation"},
+    {"generation", "planning"},
     {"api"},
+    {"benchmark"},
     {"cli"},
 ]
 HEIGHT = {name: height for height, names in enumerate(LAYERS) for name in names}

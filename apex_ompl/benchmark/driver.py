@@ -1,0 +1,120 @@
+"""A benchmark: runs kept as they end, so that it goes on where it was stopped."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import os
+import platform
+import shlex
+import sys
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+from apex_ompl.api import check_arguments
+from apex_ompl.benchmark.results import ABOUT, RUNS, SCHEMA, Results, hardware
+from apex_ompl.benchmark.rows import Job, Row, jobs
+from apex_ompl.benchmark.workers import Workers
+from apex_ompl.errors import MissingFileError, ParameterError
+from apex_ompl.files import locked, write_atomically
+from apex_ompl.resolution import FULL_RESOLUTION, SEARCH_RESOLUTION
+
+LIBRARIES = ("apex-ompl", "ompl", "pin", "coal", "numba", "numpy", "torch")
+
+
+def bench(
+    suites: Sequence[str], rows: Sequence[Row | str], out: str | os.PathLike[str], *, runs: int = 100,
+    timeout: float = 5.0, seed: int = 0, split: str = "test", simplify: bool = True, workers: Workers | None = None,
+    quiet: bool = False,
+) -> Results:  # fmt: skip
+    """Run planners on problems through OMPL's Benchmark, in the same space, by the same verdict and resolution.
+
+    A run is solved when its path passed the full check. What was run before with the same settings is not run again.
+    Every process has run each row once before its first run.
+
+    Args:
+        suites: Suites, levels, problems or files.
+        rows: Planners.
+        out: Folder for the results; it is made, or goes on.
+        runs: Of each row on a level, each on another problem; or on a single problem.
+        timeout: Of a run [s].
+        seed: Of the first run; the next ones follow.
+        split: Whose problems.
+        simplify: Whether paths are shortened; those of smooth planners are not.
+        workers: Where runs are made; by default one at a time, in a process of this machine.
+        quiet: Whether to show no progress.
+
+    Returns:
+        The results in the folder.
+
+    Raises:
+        ApexError: An argument is unknown or out of range, the folder is of something else, or the cluster fails.
+        KeyboardInterrupt: Ctrl-C was pressed; what had ended is kept.
+    """
+    workers = workers or Workers()
+    check_arguments(timeout, seed)
+    if isinstance(runs, bool) or not isinstance(runs, int) or runs < 1:
+        raise ParameterError("runs", runs, "a whole number, 1 or more")
+    for module in workers.modules:
+        importlib.import_module(module)
+    given = [row if isinstance(row, Row) else Row.parse(row) for row in rows]
+    wanted = jobs(suites, given, runs=runs, timeout=timeout, seed=seed, split=split, simplify=simplify)
+    folder = Path(out)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except (OSError, ValueError) as error:
+        raise MissingFileError(str(folder), "output folder", getattr(error, "strerror", None) or str(error)) from error
+    with locked(folder):
+        before = Results.load(folder) if (folder / ABOUT).exists() else Results(folder, {})
+        there = {one["key"] for one in before.runs}
+        left = [job for job in wanted if job.key not in there]
+        session = _session(workers, split=split, seed=seed)
+        results = Results(folder, _about(before.about, given, session))
+        results.note()
+        try:
+            _complete(results, left, len(wanted), workers, quiet)
+        finally:
+            results.note()
+    return Results.load(folder)
+
+
+def _session(workers: Workers, **more: Any) -> dict[str, Any]:
+    """Return what is noted of one call."""
+    return {
+        "command": shlex.join([Path(sys.argv[0]).name or "python", *sys.argv[1:]]),
+        "date": datetime.now(UTC).isoformat(timespec="seconds"), "hardware": hardware(), "jobs": workers.at_once,
+        "address": workers.address or "", "python": platform.python_version(),
+        "versions": {name: metadata.version(name) for name in LIBRARIES}, **more,
+    }  # fmt: skip
+
+
+def _about(before: dict[str, Any], rows: Sequence[Row], session: dict[str, Any]) -> dict[str, Any]:
+    known = {**before.get("rows", {})}
+    known |= {row.label: {"planner": row.planner, "params": dict(row.params), "all": row.settings()} for row in rows}
+    return {
+        "schema": SCHEMA, "sessions": [*before.get("sessions", []), session], "rows": known,
+        "resolution": {"search": SEARCH_RESOLUTION, "full": FULL_RESOLUTION}, "warm_up": before.get("warm_up", {}),
+    }  # fmt: skip
+
+
+def _complete(results: Results, left: Sequence[Job], of: int, workers: Workers, quiet: bool) -> None:
+    """Make the runs that are left, and write each as it ends."""
+    if not left:
+        return
+    file = results.folder / RUNS
+    if file.is_file() and not file.read_bytes().endswith(b"\n"):  # the process ended while it wrote
+        whole, end, _ = file.read_bytes().rpartition(b"\n")
+        write_atomically(file, whole + end)
+    solved = 0
+    with file.open("a") as out, tqdm(total=of, initial=of - len(left), unit="run", disable=quiet) as bar:
+        for done, one in enumerate(workers.made(left, results.about["warm_up"]), 1):
+            out.write(json.dumps(one) + "\n")
+            out.flush()
+            solved += one["solved"]
+            bar.set_postfix_str(f"{solved} of {done} solved, {one['experiment']} {one['label']}")
+            bar.update()

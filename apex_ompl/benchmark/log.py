@@ -1,0 +1,122 @@
+"""OMPL's own log of a benchmark, and the database of it that Planner Arena reads."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+from collections.abc import Mapping
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from ompl import tools as ot
+
+from apex_ompl.api import load_problem
+from apex_ompl.assembly import assemble
+from apex_ompl.benchmark.results import Results
+from apex_ompl.benchmark.runs import MEMORY, NO_PROBLEM, Run
+from apex_ompl.files import check_writable
+from apex_ompl.ompl_globals import quiet_ompl
+from apex_ompl.result import INSIDE
+
+DATABASE, LOGS = "benchmark.db", "logs"
+OWN = {
+    "first solution time REAL": "first", "total time REAL": "total", "path length REAL": "length",
+    "raw path length REAL": "raw_length", "jerk REAL": "jerk", "raw jerk REAL": "raw_jerk",
+    "clearance REAL": "clearance", "verdict calls INTEGER": "checks",
+}  # fmt: skip
+"""Names of properties in the log, and in runs."""
+
+
+def write_logs(results: Results) -> list[Path]:
+    """Write OMPL's log of each experiment, and return the files: ``logs/SUITE_LEVEL.log`` in the results' folder.
+
+    The runs of a planner on a level are runs of one experiment there. ``solved`` says whether the path passed the full
+    check.
+
+    Raises:
+        ApexError: A problem cannot be read any more, or a file cannot be written.
+    """
+    folder = results.folder / LOGS
+    folder.mkdir(exist_ok=True)
+    by_experiment: dict[str, list[Run]] = {}
+    for one in results.runs:
+        if one["status"] != NO_PROBLEM:
+            by_experiment.setdefault(one["experiment"], []).append(one)
+    return [_write(results, name, runs, folder) for name, runs in sorted(by_experiment.items())]
+
+
+def _write(results: Results, experiment: str, runs: list[Run], folder: Path) -> Path:
+    name = Path(experiment).stem if experiment.endswith((".yaml", ".yml")) else experiment
+    name = "_".join(name.replace("/", " ").split())  # OMPL's reader takes the last word of a line for the name
+    with quiet_ompl():
+        setup = assemble(load_problem(min(one["problem"] for one in runs))).simple_setup
+        log = ot.Benchmark(setup, name)
+        session = results.about["sessions"][-1]
+        for key in ("command", "hardware", "jobs", "split"):
+            log.addExperimentParameter(key, "TEXT", str(session[key]).replace(" = ", "="))
+        data = log.getRecordedExperimentData()
+        data.maxTime, data.maxMem = max(one["timeout"] for one in runs), MEMORY
+        data.startTime = datetime.fromisoformat(session["date"])
+        data.seed = int(session["seed"])
+        data.totalDuration = sum(one["total"] or 0.0 for one in runs)
+        data.setupInfo = f"{experiment}\n{setup.getSpaceInformation().getStateSpace().getName()}\n"
+        data.cpuInfo = session["hardware"] + "\n"
+        labels = list(dict.fromkeys(one["label"] for one in runs))
+        data.runCount = max(sum(one["label"] == label for one in runs) for label in labels)
+        data.planners = [_planner(results, label, [one for one in runs if one["label"] == label]) for label in labels]
+        file = folder / f"{name}.log"
+        check_writable(file)
+        temporary = folder / f".{name}.log"
+        log.saveResultsToFile(str(temporary))
+        os.replace(temporary, file)
+    return file
+
+
+def _planner(results: Results, label: str, runs: list[Run]) -> ot.PlannerExperiment:
+    made = ot.PlannerExperiment()
+    made.name = label
+    own = results.about["rows"].get(label, {}).get("all", {})
+    made.common = _properties({**runs[0]["common"], **{name: str(value) for name, value in own.items()}})
+    made.runs = [_properties(properties(one)) for one in sorted(runs, key=lambda one: int(one["seed"]))]
+    return made
+
+
+def _properties(values: Mapping[str, str]) -> ot.RunProperties:
+    made = ot.RunProperties()
+    for name, value in values.items():
+        made[name] = value
+    return made
+
+
+def properties(run: Run) -> dict[str, str]:
+    """Return a run's properties as OMPL's log has them: OMPL's own, and ours beside them."""
+    found = dict(run["properties"])
+    found["solved BOOLEAN"] = found["passed full check BOOLEAN"] = str(int(run["solved"]))
+    found["problem TEXT"] = Path(run["problem"]).name if run["problem"].endswith(".yaml") else run["problem"]
+    found["seed INTEGER"] = str(run["seed"])
+    found["solved by TEXT"] = run["by"]
+    found |= {name: _text(run[key]) for name, key in OWN.items()}
+    found |= {f"{name} INTEGER": str(value) for name, value in run["counts"].items()}
+    for stage, seconds in run["times"].items():
+        words = stage.removeprefix(INSIDE) if stage.startswith(INSIDE) else f"plan {stage}"
+        found[f"stage {words} REAL"] = _text(seconds)
+    return found
+
+
+def _text(value: Any) -> str:
+    return "nan" if value is None else f"{value:.9g}"
+
+
+def write_database(results: Results, logs: list[Path]) -> Path:
+    """Write the SQLite database of some logs, as OMPL's ``ompl_benchmark_statistics`` does, and return its file."""
+    file = results.folder / DATABASE
+    check_writable(file)
+    temporary = results.folder / f".{DATABASE}"
+    temporary.unlink(missing_ok=True)
+    with contextlib.redirect_stdout(io.StringIO()):
+        ot.readBenchmarkLog(str(temporary), [str(log) for log in logs], False)
+        ot.computeViews(str(temporary), False)
+    os.replace(temporary, file)
+    return file

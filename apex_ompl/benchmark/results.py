@@ -1,0 +1,77 @@
+"""Results of a benchmark in a folder."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from apex_ompl.benchmark.runs import Run
+from apex_ompl.errors import FileFormatError, MissingFileError
+from apex_ompl.files import write_atomically
+
+SCHEMA = "apex-ompl/benchmark/1"
+RUNS, ABOUT = "runs.jsonl", "about.json"
+
+
+@dataclass(frozen=True)
+class Results:
+    """A folder of results.
+
+    Attributes:
+        folder: The folder.
+        about: How they were made: schema, commands, hardware, versions, rows, warm-up.
+        runs: The runs, in no order.
+    """
+
+    folder: Path
+    about: dict[str, Any]
+    runs: list[Run] = field(default_factory=list)
+
+    @classmethod
+    def load(cls, folder: str | os.PathLike[str]) -> Results:
+        """Read a folder.
+
+        Raises:
+            MissingFileError: There are no results there.
+            FileFormatError: They are not of this version, or damaged.
+        """
+        folder = Path(folder)
+        try:
+            about = json.loads((folder / ABOUT).read_text(encoding="utf-8"))
+            lines = (folder / RUNS).read_text(encoding="utf-8").splitlines() if (folder / RUNS).is_file() else []
+        except (OSError, ValueError) as error:
+            why = f"expected {ABOUT} and {RUNS} there, as apex-ompl bench writes them"
+            raise MissingFileError(str(folder), "folder of benchmark results", why) from error
+        if not isinstance(about, dict) or about.get("schema") != SCHEMA:
+            found = about.get("schema") if isinstance(about, dict) else about
+            raise FileFormatError(str(folder / ABOUT), "schema", found, f"expected {SCHEMA!r}")
+        runs: dict[str, Run] = {}
+        for number, line in enumerate(lines):
+            try:
+                made = json.loads(line)
+                runs[made["key"]] = made
+            except (ValueError, KeyError, TypeError) as error:
+                if number < len(lines) - 1:  # the process may have ended while it wrote the last one
+                    raise FileFormatError(str(folder / RUNS), f"line {number + 1}", line, "expected a run") from error
+        return cls(folder, about, list(runs.values()))
+
+    def note(self) -> None:
+        """Write down how the results were made.
+
+        Raises:
+            MissingFileError: The file cannot be written.
+        """
+        write_atomically(self.folder / ABOUT, (json.dumps(self.about, indent=1) + "\n").encode())
+
+
+def hardware() -> str:
+    """Return the name of the processor and the number of cores that this process may use."""
+    name, info = platform.processor() or platform.machine(), Path("/proc/cpuinfo")
+    if info.exists():
+        names = [line.split(":", 1)[1].strip() for line in info.read_text().splitlines() if "model name" in line]
+        name = names[0] if names else name
+    return f"{name}, {len(os.sched_getaffinity(0))} cores"

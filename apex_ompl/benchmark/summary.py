@@ -1,0 +1,199 @@
+"""What came of a benchmark: figures of each row on each level, and tables of them."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from apex_ompl.benchmark.results import Results
+from apex_ompl.benchmark.runs import NO_PROBLEM, Run
+from apex_ompl.metrics import percentile_interval, share_interval
+
+MOMENTS = (0.1, 0.5, 2.0, 10.0)  # at which shares of solved runs are given [s]
+TREES = ("rrtconnect", "sprint")  # what of apex is a tree's work alone
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table: a title, heads of the columns, and rows of text."""
+
+    title: str
+    head: Sequence[str]
+    rows: Sequence[Sequence[str]]
+
+    def markdown(self) -> str:
+        """Return it as Markdown."""
+        lines = [self.head, ["---", "---", *["---:"] * (len(self.head) - 2)], *self.rows]
+        return f"### {self.title}\n\n" + "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+@dataclass(frozen=True)
+class Figures:
+    """What came of a row on a level.
+
+    Attributes:
+        experiment: The level.
+        label: The row.
+        runs: Its runs.
+    """
+
+    experiment: str
+    label: str
+    runs: Sequence[Run]
+
+    @property
+    def solved(self) -> list[Run]:
+        """Those that found a path which passed the full check."""
+        return [run for run in self.runs if run["solved"]]
+
+    def times(self, which: str = "first") -> np.ndarray:
+        """Return times, ``first`` or ``total``, infinite where a run is not solved, shape (N,) [s]."""
+        return np.sort([run[which] if run["solved"] else math.inf for run in self.runs])
+
+    def share_within(self, seconds: float) -> float:
+        """Return the share of runs with a first path in some time."""
+        return float(np.mean(self.times() <= seconds))
+
+    def percentile(self, which: str, p: float) -> float:
+        """Return a percentile of times, the next larger one; infinite where fewer runs are solved [s]."""
+        times = self.times(which)
+        return float(times[min(len(times) - 1, math.ceil(p / 100 * len(times)) - 1)])
+
+    def median(self, key: str) -> float:
+        """Return the median of what solved runs have, NaN where none has it."""
+        values = [run[key] for run in self.solved if run[key] is not None]
+        return float(np.median(values)) if values else math.nan
+
+    @property
+    def by(self) -> Counter[str]:
+        """What solved how many runs."""
+        return Counter(run["by"] for run in self.solved)
+
+
+def figures(results: Results) -> list[Figures]:
+    """Return the figures of all rows on all levels, in the order of the runs."""
+    runs: dict[tuple[str, str], list[Run]] = {}
+    for run in sorted(results.runs, key=lambda run: int(run["seed"])):
+        if run["status"] != NO_PROBLEM:
+            runs.setdefault((run["experiment"], run["label"]), []).append(run)
+    labels = list(results.about["rows"])
+    order = sorted(runs, key=lambda key: (key[0], labels.index(key[1]) if key[1] in labels else len(labels)))
+    return [Figures(*key, runs[key]) for key in order]
+
+
+def tables(results: Results) -> list[Table]:
+    """Return the tables of a report."""
+    found = figures(results)
+    return [successes(found), times(found), paths(found), stages(found)]
+
+
+def successes(found: Iterable[Figures]) -> Table:
+    """Return how many runs were solved in how much time."""
+    rows, last = [], ""
+    for f in found:
+        low, high = share_interval(len(f.solved), len(f.runs))
+        within = [_share(f.share_within(t)) for t in MOMENTS]
+        share = f"{_share(len(f.solved) / len(f.runs))} ({_share(low)} to {_share(high)})"
+        trees = sum(f.by[name] for name in TREES if f.label != name) / len(f.runs)
+        rows.append([_once(f.experiment, last), f.label, str(len(f.runs)), share, *within, _share(trees)])
+        last = f.experiment
+    head = ["level", "planner", "N", "solved (95 %, Wilson)", *(f"in {t:g} s" for t in MOMENTS), "by its trees alone"]
+    return Table("Success", head, rows)
+
+
+def times(found: Iterable[Figures]) -> Table:
+    """Return times to a first path and to the end."""
+    rows, last = [], ""
+    for f in found:
+        low, high = percentile_interval(f.times(), 50.0)
+        first = [f"{_ms(f.percentile('first', 50))} ({_ms(low)} to {_ms(high)})"]
+        first += [_ms(f.percentile("first", p)) for p in (95, 99)]
+        total = [_ms(f.percentile("total", p)) for p in (50, 95, 99)]
+        setup = [run["setup"] for run in f.runs if run["setup"] is not None]
+        made = _ms(float(np.median(setup))) if setup else "-"
+        rows.append([_once(f.experiment, last), f.label, *first, *total, made])
+        last = f.experiment
+    head = ["level", "planner", "first path p50 ms (95 %, bootstrap)", "p95", "p99", "end p50 ms", "p95", "p99"]
+    return Table("Time", [*head, "setup ms"], rows)
+
+
+def paths(found: Iterable[Figures]) -> Table:
+    """Return lengths, jerks and clearances."""
+    rows, last = [], ""
+    for f in found:
+        numbers = [_number(f.median(key)) for key in ("raw_length", "length", "raw_jerk", "jerk")]
+        clearance = f.median("clearance")
+        numbers.append("-" if math.isnan(clearance) else f"{1e3 * clearance:.1f}")
+        rows.append([_once(f.experiment, last), f.label, *numbers])
+        last = f.experiment
+    head = ["level", "planner", "first length rad", "length rad", "first jerk rad/s^3", "jerk rad/s^3", "clearance mm"]
+    return Table("Paths (medians; jerk of a run in 1 s at even speed)", head, rows)
+
+
+def stages(found: Iterable[Figures]) -> Table:
+    """Return who solved what."""
+    chosen = [f for f in found if len(f.by) > 1 or set(f.by) - {f.label}]
+    names = sorted({name for f in chosen for name in f.by})
+    rows, last = [], ""
+    for f in chosen:
+        shares = [_share(f.by[name] / len(f.runs)) for name in names]
+        rows.append([_once(f.experiment, last), f.label, *shares, _share(1.0 - len(f.solved) / len(f.runs))])
+        last = f.experiment
+    return Table("Share solved by each stage", ["level", "planner", *names, "not solved"], rows)
+
+
+def warnings(results: Results) -> list[str]:
+    """Return what a reader of times must know."""
+    sessions, said = results.about["sessions"], []
+    if any(session["jobs"] > 1 or session["address"] for session in sessions):
+        said.append("Several runs went at the same time, so that times are longer than those of runs alone.")
+    if len({session["hardware"] for session in sessions}) > 1:
+        said.append("The runs were made on different machines.")
+    if len({str(session["versions"]) for session in sessions}) > 1:
+        said.append("The runs were made with different versions of libraries.")
+    crashed = [run for run in results.runs if run["status"] == "CRASH"]
+    if crashed:
+        reasons = Counter(f"{run['label']}: {run['reason']}" for run in crashed)
+        said.append("Crashed: " + "; ".join(f"{n} x {reason}" for reason, n in reasons.most_common(5)) + ".")
+    skipped = len({run["problem"] for run in results.runs if run["status"] == NO_PROBLEM})
+    if skipped:
+        said.append(f"{skipped} seeds gave no problem and do not count.")
+    return said
+
+
+def about(results: Results) -> list[tuple[str, Any]]:
+    """Return how the results were made, as pairs of a name and a text."""
+    last = results.about["sessions"][-1]
+    pairs = [("Command", session["command"]) for session in results.about["sessions"]]
+    versions = ", ".join(f"{name} {version}" for name, version in last["versions"].items())
+    resolution = results.about["resolution"]
+    warm = ", ".join(f"{label} {seconds:.2f} s" for label, seconds in results.about["warm_up"].items())
+    pairs += [
+        ("Hardware", f"{last['hardware']}, {last['jobs']} run(s) at a time"), ("Date", last["date"]),
+        ("Versions", f"Python {last['python']}, {versions}"),
+        ("Split and first seed", f"{last['split']}, {last['seed']}"),
+        ("Spacing of states", f"{resolution['search']} rad in searches, {resolution['full']} rad in the full check"),
+        ("First run of a process, not counted", warm),
+    ]  # fmt: skip
+    return pairs
+
+
+def _once(name: str, last: str) -> str:
+    return "" if name == last else name
+
+
+def _share(value: float) -> str:
+    return f"{value:.2f}"
+
+
+def _ms(seconds: float) -> str:
+    return f"{1e3 * seconds:.0f}" if math.isfinite(seconds) else "-"
+
+
+def _number(value: float) -> str:
+    return "-" if math.isnan(value) else f"{value:.3g}"

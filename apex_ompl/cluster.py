@@ -1,0 +1,99 @@
+"""Work spread by Ray, over the cores of this machine or over a cluster."""
+
+from __future__ import annotations
+
+import itertools
+import socket
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+from apex_ompl.errors import ApexError
+
+OBJECT_STORE = 256 << 20  # of Ray [bytes]
+
+
+class ClusterError(ApexError):
+    """Ray is missing, cannot be reached, or a worker failed."""
+
+
+def spread(
+    work: Callable[..., Any], jobs: Mapping[str, tuple[Any, ...]], *, workers: int, address: str | None
+) -> Iterator[tuple[str, Any]]:
+    """Call a function once for each job, and yield names and what came of them as they are done.
+
+    Twice as many jobs are under way as there are workers; a job whose worker died is tried once more.
+
+    Args:
+        work: The function; it can be imported or pickled.
+        jobs: Its arguments, by names.
+        workers: How many jobs run at once.
+        address: Of a running cluster; by default Ray is started on this machine, and stopped again.
+
+    Raises:
+        ClusterError: Ray is not there, a job raised, or a worker died twice over one.
+    """
+    try:
+        import ray
+    except ImportError as error:
+        raise ClusterError("no Ray, expected: pip install 'apex-ompl[data]'; or one worker and no address") from error
+    mine = not ray.is_initialized()  # who has started Ray goes on with it
+    if mine:
+        _start(ray, workers, address)
+    try:
+        task = ray.remote(num_cpus=1, max_retries=1)(work)
+        waiting, under_way = iter(jobs.items()), {}
+        for name, job in itertools.islice(waiting, 2 * workers):
+            under_way[task.remote(*job)] = name
+        while under_way:
+            done, _ = ray.wait(list(under_way), num_returns=1)
+            name = under_way.pop(done[0])
+            try:
+                found = ray.get(done[0])
+            except ray.exceptions.RayTaskError as error:
+                raise ClusterError(f"{name}: {_first_line(error.cause)}") from error
+            except ray.exceptions.RayError as error:
+                raise ClusterError(
+                    f"{name}: its worker died twice ({type(error).__name__}); what is written is whole, and "
+                    "the same command goes on from there"
+                ) from error
+            following = next(waiting, None)
+            if following is not None:
+                under_way[task.remote(*following[1])] = following[0]
+            yield name, found
+    finally:
+        if mine:
+            ray.shutdown()
+
+
+def _start(ray: Any, workers: int, address: str | None) -> None:
+    """Start Ray on this machine, or join a cluster.
+
+    Raises:
+        ClusterError: There is none.
+    """
+    if address and ":" in address.removeprefix("ray://"):
+        _reach(address.removeprefix("ray://"))
+    local: dict[str, Any] = {} if address else {"num_cpus": workers, "object_store_memory": OBJECT_STORE}
+    try:
+        ray.init(address=address, include_dashboard=False, log_to_driver=False, logging_level="error", **local)
+    except Exception as error:  # ConnectionError, ValueError, RuntimeError
+        said = _first_line(error)
+        expected = f"expected a cluster at {address or 'this machine'}, and RAY_AUTH_MODE=token if it asks for tokens"
+        raise ClusterError(f"Ray: {said}, {expected}") from error
+
+
+def _first_line(error: BaseException) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0]
+
+
+def _reach(address: str) -> None:
+    """Look whether somebody listens at HOST:PORT: Ray itself tries for minutes.
+
+    Raises:
+        ClusterError: Nobody does.
+    """
+    host, _, port = address.rpartition(":")
+    try:
+        socket.create_connection((host.strip("[]"), int(port)), timeout=5.0).close()
+    except (OSError, ValueError, OverflowError) as error:
+        raise ClusterError(f"--address {address}: {error}, expected HOST:PORT of a Ray cluster") from error

@@ -1,0 +1,217 @@
+"""What ``plan`` does with a problem that is made ready: line, planner, shortening, proof, repair."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from ompl import base as ob
+
+from apex_ompl.assembly import PlanningSetup, set_goals
+from apex_ompl.errors import ApexError
+from apex_ompl.interrupt import Interrupt
+from apex_ompl.repair import repair
+from apex_ompl.resolution import FULL_RESOLUTION
+from apex_ompl.result import FIRST, INSIDE, PlanResult, PlanStatus
+from apex_ompl.simplify import simplify as shorten
+from apex_ompl.space import path_length, path_to_array, resample
+from apex_ompl.stopwatch import timed
+from apex_ompl.validity import full_check
+
+if TYPE_CHECKING:
+    from apex_ompl.planners import Parameters
+    from apex_ompl.report import Report
+
+Array = NDArray[np.float64]
+
+CLEARANCE_SAMPLES = 32
+STRAIGHT_LINE = "straight line"
+PROOF_SHARE, LONGEST_PROOF = 0.1, 0.5  # time kept from planners that stop at the timeout only, for repair [1, s]
+LONGEST_TIMEOUT = 1e8  # OMPL counts nanoseconds in 64 bits [s]
+
+
+class Planning:
+    """One call of ``plan`` on an assembled problem.
+
+    Attributes:
+        ready: The problem.
+        interrupt: Holds Ctrl-C back.
+        times: Seconds per stage so far.
+        blank: The result before anything is known.
+        raw: The first path that the planner found, shape (N, dof), or None.
+        report: What the planner says of its call of ``solve``, of planners that say it.
+    """
+
+    def __init__(
+        self, ready: PlanningSetup, planner: str, seed: int, setup_time: float, notes: tuple[str, ...]
+    ) -> None:
+        """Plan for ``ready`` with a planner by its name; ``setup_time`` went by already [s]."""
+        self.ready = ready
+        self.planner = planner
+        self.interrupt = Interrupt()
+        self.times = {"setup": setup_time}
+        self.raw: Array | None = None
+        self.report: Report | None = None
+        self.blank = PlanResult(
+            status=PlanStatus.UNKNOWN, reason="", problem=ready.problem, robot=ready.robot.name,
+            joint_names=ready.robot.joint_names, planner=planner, seed=seed, notes=notes,
+        )  # fmt: skip
+
+    def solve(self, parameters: Parameters, timeout: float, simplify: bool) -> PlanResult:
+        """Return the result without what ``finish`` adds."""
+        ready = self.ready
+        if ready.start_fault:
+            return self._failed(PlanStatus.INVALID_START, ready.start_fault)
+        if all(ready.goal_faults):
+            return self._failed(PlanStatus.INVALID_GOAL, "; ".join(ready.goal_faults))
+        with timed(self.times, "line"):
+            line = self.straight_line()
+        if line is not None:
+            return self._exact(line, STRAIGHT_LINE)
+        try:
+            with timed(self.times, "setup"):
+                planner = self._set_up(parameters)
+            status = self.run_ompl(planner, parameters, timeout)
+            deadline = time.perf_counter() + timeout - self.times["solve"]
+            report = self.report = getattr(planner, "report", None)
+            if report is not None:
+                self.times |= {INSIDE + stage: seconds for stage, seconds in report.times.items()}
+                if report.solved_by:
+                    self.times[FIRST] = report.first
+            if status is PlanStatus.APPROXIMATE_SOLUTION:
+                return self._approximate()
+            if status is not PlanStatus.EXACT_SOLUTION:
+                said = "" if status is PlanStatus.TIMEOUT else f" (OMPL says {status})"
+                said += f", {report.reason}" if report is not None and report.reason else ""
+                ours = PlanStatus.TIMEOUT if status in (PlanStatus.INVALID_START, PlanStatus.INVALID_GOAL) else status
+                return self._failed(ours, f"{self.planner} found no path in {timeout:g} s{said}")
+            states = path_to_array(ready.simple_setup.getSolutionPath(), ready.robot.dof)
+            self.raw = states if report is None or report.path is None else report.path
+            solved_by = self.planner if report is None else report.solved_by
+            return self._proved(states, deadline, simplify and not parameters.smooth, solved_by)
+        except ApexError:  # a checkpoint that is missing, for one
+            raise
+        except Exception as error:
+            return self._failed(PlanStatus.CRASH, f"{self.planner} failed, {error!r}")
+
+    def straight_line(self) -> Array | None:
+        """Return the straight line to the nearest goal for which it is a solution, or None.
+
+        Some of OMPL's planners hang, give up or raise where there is nothing to search for.
+        """
+        ready = self.ready
+        goals = sorted(ready.valid_goals, key=lambda goal: float(np.linalg.norm(goal - ready.start)))
+        lines = (np.stack([ready.start, goal]) for goal in goals)
+        free = (line for line in lines if ready.verdict.first_collision(line, FULL_RESOLUTION) is None)
+        return next((line for line in free if full_check(ready.verdict, line, ready.start, goals)), None)
+
+    def _set_up(self, parameters: Parameters) -> ob.Planner:
+        """Make the planner, warm."""
+        simple_setup = self.ready.simple_setup
+        si = simple_setup.getSpaceInformation()
+        goals = self.ready.valid_goals
+        if parameters.threaded and len(goals) > 1:
+            nearest = goals[int(np.argmin(np.linalg.norm(goals - self.ready.start, axis=1)))]
+            set_goals(simple_setup, [nearest])
+            note = f"{self.planner} runs threads and takes one goal: the nearest of {len(goals)}"
+            self.blank = replace(self.blank, notes=(*self.blank.notes, note))
+        if parameters.optimizing:  # others would go on after their first solution, prm for one
+            simple_setup.setOptimizationObjective(ob.PathLengthOptimizationObjective(si))
+        planner = parameters.build(si)
+        simple_setup.setPlanner(planner)
+        simple_setup.setup()
+        return planner
+
+    def run_ompl(self, planner: ob.Planner, parameters: Parameters, timeout: float) -> PlanStatus:
+        """Run the planner, which is set, and return its status; faults of the checkers are raised."""
+        del planner
+        # A condition made in C++: planners that run threads deadlock with one made in Python.
+        condition = ob.timedPlannerTerminationCondition(solving_time(parameters, timeout))
+        with self.interrupt.ends(condition) as ptc, timed(self.times, "solve"):
+            status = PlanStatus.of(self.ready.simple_setup.solve(ptc))
+        self.raise_faults()
+        return status
+
+    def raise_faults(self) -> None:
+        """Raise what the checkers met inside of OMPL."""
+        fault = self.ready.checker.fault or self.ready.motions.fault
+        if fault is not None:
+            raise fault
+
+    def finish(self, started: float, result: PlanResult) -> PlanResult:
+        """Add clearance, length, counts and times."""
+        path = result.path
+        checks = self.ready.verdict.tally.states
+        if path is not None:
+            with timed(self.times, "clearance"):
+                states = resample(path, CLEARANCE_SAMPLES)
+                clearance = min(self.ready.verdict.clearance(q) for q in states)
+            result = replace(result, length=path_length(path), clearance=clearance)
+        self.times["total"] = time.perf_counter() - started
+        return replace(result, checks=checks, times=dict(self.times))
+
+    def _proved(self, path: Array, deadline: float, simplify: bool, solved_by: str) -> PlanResult:
+        """Put the exact start and goal in, shorten the path, prove it, and repair it where it fails.
+
+        When a shortened path can neither be proved nor repaired, the path as it was found has its turn.
+        """
+        candidates = [self._with_exact_ends(path)]
+        if simplify:
+            with timed(self.times, "simplify"):
+                candidates.insert(0, self._shortened(candidates[0]))
+            self.raise_faults()
+        ready, reason = self.ready, ""
+        for candidate in candidates:
+            with timed(self.times, "verify"):
+                check = full_check(ready.verdict, candidate, ready.start, ready.goals)
+            if check:
+                return self._exact(candidate, solved_by)
+            reason = reason or check.reason
+            with timed(self.times, "repair"):
+                mended = repair(ready, candidate, check, deadline, self.interrupt)
+            if mended is not None:
+                return self._exact(mended, f"{solved_by}+repair")
+        return self._failed(PlanStatus.TIMEOUT, f"the path found failed the full check and repair, {reason}")
+
+    def _shortened(self, path: Array) -> Array:
+        simple_setup = self.ready.simple_setup
+        si = simple_setup.getSpaceInformation()
+        return shorten(simple_setup.getPathSimplifier(), si, path, lambda: self.interrupt.pressed)
+
+    def _exact(self, path: Array, solved_by: str) -> PlanResult:
+        return replace(self.blank, status=PlanStatus.EXACT_SOLUTION, path=path, solved_by=solved_by)
+
+    def _approximate(self) -> PlanResult:
+        ready = self.ready
+        simple_setup = ready.simple_setup
+        path = path_to_array(simple_setup.getSolutionPath(), ready.robot.dof)
+        path[0] = ready.start
+        gap = float(np.linalg.norm(ready.goals - path[-1], axis=1).min())
+        reason = f"the nearest state found is {gap:.3g} rad from the goal"
+        check = full_check(ready.verdict, path, ready.start)
+        if not check:
+            reason += f", and the path fails the full check, {check.reason}"
+        return replace(
+            self.blank, status=PlanStatus.APPROXIMATE_SOLUTION, reason=reason, path=path, solved_by=self.planner
+        )
+
+    def _with_exact_ends(self, path: Array) -> Array:
+        goals = self.ready.valid_goals
+        goal = goals[int(np.argmin(np.linalg.norm(goals - path[-1], axis=1)))]
+        return np.concatenate([self.ready.start[None], path[1:-1], goal[None]])
+
+    def _failed(self, status: PlanStatus, reason: str) -> PlanResult:
+        return replace(self.blank, status=status, reason=reason)
+
+
+def solving_time(parameters: Parameters, timeout: float) -> float:
+    """Return how much of a timeout is for the planner [s]; what it finds must still be proved.
+
+    Planners that stop at the timeout only leave a tenth of it, at most half a second.
+    """
+    if parameters.optimizing:
+        timeout -= min(PROOF_SHARE * timeout, LONGEST_PROOF)
+    return min(timeout, LONGEST_TIMEOUT)

@@ -1,0 +1,266 @@
+"""Make a figure of the paper anew, for static scenes: its numbers, a table, and a picture.
+
+``failure``: failure ratio R_f, smoothness S_r and time of planning, vertical and horizontal tasks among cubes.
+``size``: failure ratio over the size of the cubes, guided and not.
+``fid``: FID and KID of guided and unguided paths against solutions of the same problems, in the features of the
+variational autoencoder of ``apex-paper`` and in principal components.
+
+The runs of ``failure`` and ``size`` are the same, and are kept as they end; so are the solutions of ``fid``. The
+command goes on where it was stopped.
+
+Usage: python scripts/reproduce.py failure|size|fid [-n 100] [--keep FOLDER] [-o FOLDER]
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+import torch
+from tqdm import tqdm
+
+from apex_ompl import metrics, problems
+from apex_ompl.assembly import assemble
+from apex_ompl.benchmark import Results, Row, bench
+from apex_ompl.benchmark.summary import Figures, Table, about, figures
+from apex_ompl.cluster import spread
+from apex_ompl.dataset import Store
+from apex_ompl.diffusion.checkpoint import load_model
+from apex_ompl.diffusion.guidance import Guidance
+from apex_ompl.diffusion.proposals import Sampling
+from apex_ompl.engine import Options
+from apex_ompl.errors import ApexError
+from apex_ompl.files import write_atomically
+from apex_ompl.generation import plan_units, work
+from apex_ompl.ompl_globals import quiet_ompl
+from apex_ompl.problems.reach import robot
+from apex_ompl.queries import query_of
+from apex_ompl.records import SOURCES, Paths
+from apex_ompl.spline import Spline
+
+matplotlib.use("Agg")
+from matplotlib.figure import Figure  # noqa: E402
+
+ROOT = Path(__file__).resolve().parents[1]
+TASKS, SIZES = ("vertical", "horizontal"), ("small", "medium", "large")
+EDGES = {"free": 0.0, "small": 0.06, "medium": 0.10, "large": 0.15}  # of the cubes [m]
+TIMEOUT = 10.0  # [s]
+PAPER = {
+    "model": "apex-paper", "line": False, "repair": False, "bridge": False, "fallback": False, "polish": False,
+    "first": 8, "second": 8, "third": 16, "resample": 2,
+}  # fmt: skip
+"""The paper's algorithm alone: guided ancestral sampling in all steps, and resampling of what collides."""
+ALONE = {**PAPER, "model": "apex"}
+ROWS = (
+    Row("apex", "apex"),
+    Row("apex-paper", "apex", {**PAPER, "guidance": True}),
+    Row("apex-paper, unguided", "apex", PAPER),
+    Row("apex's model alone", "apex", {**ALONE, "guidance": True}),
+    Row("apex's model alone, unguided", "apex", ALONE),
+    Row("rrt", "rrt", runs=20),
+    Row("rrtconnect", "rrtconnect"),
+)
+PAIRS = (("apex-paper", "apex-paper, unguided"), ("apex's model alone", "apex's model alone, unguided"))
+COLOURS = ("#0b6e4f", "#3d5a80", "#98b6d8", "#7a5195", "#c9a6d6", "#c8553d", "#e0a458")
+FID_LEVELS = [f"{task}/{size}" for task in TASKS for size in SIZES]
+STEPS = 8  # of DDIM, for apex-paper, whose own 256 would take hours
+
+
+def runs(args: argparse.Namespace) -> Results:
+    """Return the runs of the planners on the paper's tasks."""
+    levels = [f"{task}/{size}" for task in TASKS for size in EDGES]
+    return bench(levels, ROWS, args.keep / "paper", runs=args.n, timeout=TIMEOUT)
+
+
+def failure(args: argparse.Namespace) -> tuple[dict[str, Any], list[Table], Figure, list[tuple[str, Any]]]:
+    """Return R_f, S_r and time of each planner on each task, over all sizes of cubes."""
+    results = runs(args)
+    per_level = [f for f in figures(results) if f.experiment.split("/")[1] in SIZES]
+    found: dict[str, Any] = {}
+    rows = []
+    picture = Figure(figsize=(11, 4), layout="constrained")
+    axes = picture.subplots(1, 3)
+    for t, task in enumerate(TASKS):
+        for k, row in enumerate(ROWS):
+            mine = [f for f in per_level if f.experiment.startswith(f"{task}/") and f.label == row.label]
+            f = Figures(task, row.label, [run for one in mine for run in one.runs])
+            ratio = metrics.failure_ratio([run["solved"] for run in f.runs])
+            low, high = (100.0 * (1.0 - v) for v in metrics.share_interval(len(f.solved), len(f.runs)))
+            length, raw, took = f.median("length"), f.median("raw_length"), f.percentile("total", 50)
+            found[f"{task}, {row.label}"] = {
+                "N": len(f.runs), "R_f": ratio, "interval": [high, low], "S_r": length, "S_r as found": raw,
+                "time_s": took if np.isfinite(took) else None,
+            }  # fmt: skip
+            seconds = f"{took:.3f}" if np.isfinite(took) else "-"
+            lengths = ["-" if np.isnan(v) else f"{v:.2f}" for v in (length, raw)]
+            ends = f"{high:.1f} to {low:.1f}"
+            rows.append([task, row.label, str(len(f.runs)), f"{ratio:.1f}", ends, *lengths, seconds])
+            at, colour = t * (len(ROWS) + 1) + k, COLOURS[k]
+            for axis, value in zip(axes, (ratio, length, took), strict=True):
+                axis.bar(at, value if np.isfinite(value) else 0.0, color=colour, label=row.label if t == 0 else None)
+            axes[0].plot([at, at], [high, low], color="black", linewidth=1)
+    for axis, title in zip(axes, ("R_f %", "S_r rad", "median time s"), strict=True):
+        axis.set_title(title)
+        middle = (len(ROWS) - 1) / 2
+        axis.set_xticks([middle, middle + len(ROWS) + 1], TASKS)
+    axes[2].set_yscale("log")
+    picture.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=8)
+    head = ["task", "planner", "N", "R_f %", "95 %", "S_r rad (median)", "as found", "time s (median)"]
+    return found, [Table("Failure ratio, smoothness, time", head, rows)], picture, about(results)
+
+
+def size(args: argparse.Namespace) -> tuple[dict[str, Any], list[Table], Figure, list[tuple[str, Any]]]:
+    """Return the failure ratio over the size of the cubes, guided and not."""
+    results = runs(args)
+    by = {(f.experiment, f.label): f for f in figures(results)}
+    found: dict[str, Any] = {}
+    rows = []
+    picture = Figure(figsize=(9, 4), layout="constrained")
+    labels = [label for pair in PAIRS for label in pair]
+    for axis, task in zip(picture.subplots(1, 2, sharey=True), TASKS, strict=True):
+        for label in labels:
+            line = []
+            for level, edge in EDGES.items():
+                f = by[f"{task}/{level}", label]
+                ratio = metrics.failure_ratio([run["solved"] for run in f.runs])
+                low, high = (100.0 * (1.0 - v) for v in metrics.share_interval(len(f.solved), len(f.runs)))
+                found[f"{task}/{level}, {label}"] = {"N": len(f.runs), "R_f": ratio, "interval": [high, low]}
+                cells = [f"{edge:.2f}", str(len(f.runs)), f"{ratio:.1f}", f"{high:.1f} to {low:.1f}"]
+                rows.append([task, label, *cells])
+                line.append(ratio)
+            style = "--" if "unguided" in label else "-"
+            colour = COLOURS[1 if "paper" in label else 3]
+            axis.plot(list(EDGES.values()), line, style, color=colour, marker="o", label=label)
+        axis.set_title(task)
+        axis.set_xlabel("edge of the cubes m")
+        axis.grid(alpha=0.3)
+    picture.axes[0].set_ylabel("R_f %")
+    picture.axes[0].legend(fontsize=8)
+    head = ["task", "planner", "edge m", "N", "R_f %", "95 %"]
+    return found, [Table("Failure ratio over the size of obstacles", head, rows)], picture, about(results)
+
+
+def solutions(folder: Path, count: int, workers: int) -> list[Paths]:
+    """Return solutions of validation problems, at least ``count`` where as many can be had, kept in a folder."""
+    units = {unit.name: unit for unit in plan_units(int(1.2 * count), FID_LEVELS, "validation")}
+    options, spline = Options(copies=1, parts=0), Spline()
+    store = Store.create(folder, {"problems": count, "levels": FID_LEVELS, **asdict(spline)}, ("problems", "levels"))
+    with store.locked():
+        there = set(store.units())
+        jobs = {name: (unit, options, spline) for name, unit in units.items() if name not in there}
+        if jobs:
+            made = spread(work, jobs, workers=workers, address=None)
+            for name, (paths, _) in tqdm(made, total=len(jobs), unit="unit"):
+                store.write(name, paths)
+        return list(store)
+
+
+def fid(args: argparse.Namespace) -> tuple[dict[str, Any], list[Table], Figure, list[tuple[str, Any]]]:
+    """Return distances of guided and unguided paths from solutions of the same problems."""
+    models = {name: load_model(name) for name in ("apex", "apex-paper")}
+    own = {"apex": models["apex"].sampling, "apex-paper": Sampling("ddim", STEPS)}
+    variants = {
+        f"{name}{'' if guided else ', unguided'}": (name, replace(own[name], guidance=Guidance(gamma=float(guided))))
+        for name in models
+        for guided in (True, False)
+    }
+    units = solutions(args.keep / "solutions", args.n, args.workers)
+    real, made = list[np.ndarray](), {label: list[np.ndarray]() for label in variants}
+    seconds, generator = dict.fromkeys(variants, 0.0), torch.Generator().manual_seed(0)
+    torch.set_num_threads(1)
+    with quiet_ompl(), torch.no_grad(), tqdm(total=args.n, unit="problem") as bar:
+        for paths, k in ((unit, k) for unit in units for k in first_of_each(unit)):
+            if len(real) == args.n:
+                break
+            control = paths.control(slice(k, k + 1))[0]
+            verdict = assemble(problems.load(paths.problem_name(int(paths.arrays["problem"][k]))), robot()).verdict
+            query = query_of(verdict, control[0], control[-1])
+            for label, (name, sampling) in variants.items():
+                begin = time.perf_counter()
+                found = models[name].propose(query, verdict.kernel, 1, sampling=sampling, generator=generator)
+                seconds[label] += time.perf_counter() - begin
+                made[label].append(found.control[0])
+            real.append(control)
+            bar.update()
+    spaces = {"VAE": models["apex-paper"].network.autoencoder, "PCA": models["apex"].network.autoencoder}
+
+    def features(paths: Sequence[np.ndarray], space: Any) -> np.ndarray:
+        parts = np.array_split(np.stack(paths), max(1, len(paths) // 500))
+        with torch.no_grad():
+            return np.concatenate([space.encode(torch.tensor(p, dtype=torch.float32)).flatten(1) for p in parts])
+
+    found_all: dict[str, Any] = {}
+    rows = []
+    picture = Figure(figsize=(8, 4), layout="constrained")
+    for axis, (name, space) in zip(picture.subplots(1, 2), spaces.items(), strict=True):
+        truth = features(real, space)
+        for k, (label, paths) in enumerate(made.items()):
+            r = metrics.realism(truth, features(paths, space))
+            found_all[f"{name}, {label}"] = {**asdict(r), "seconds a path": seconds[label] / len(real)}
+            ends = f"{r.interval[0]:.2f} to {r.interval[1]:.2f}"
+            cells = [str(r.made), str(r.dimension), f"{r.fid:.2f}", ends, f"{r.floor:.2f}", f"{r.kid:.4f}"]
+            rows.append([name, label, *cells, f"{1e3 * seconds[label] / len(real):.1f}"])
+            axis.bar(k, r.fid, color=COLOURS[k + 1])
+            axis.plot([k, k], r.interval, color="black", linewidth=1)
+        axis.axhline(r.floor, color="grey", linestyle=":")
+        axis.set_title(f"FID, {name} features (dots: floor)")
+        axis.set_xticks(range(len(made)), list(made), rotation=15, fontsize=8)
+    head = ["features", "paths", "N", "d", "FID", "95 %", "floor", "KID", "ms a path"]
+    says = [
+        ("Real", f"solutions of {len(real)} validation problems, one each, of {', '.join(FID_LEVELS)}"),
+        ("Made", f"one path for each of them; apex by its own sampling, apex-paper by {STEPS} steps of DDIM"),
+        ("Floor", "FID between two halves of the real set"),
+    ]
+    return found_all, [Table("FID and KID", head, rows)], picture, says
+
+
+def first_of_each(paths: Paths) -> list[int]:
+    """Return the first path of each problem that is not a reversal."""
+    found: dict[int, int] = {}
+    for k, (problem, source) in enumerate(zip(paths.arrays["problem"], paths.arrays["source"], strict=True)):
+        if SOURCES[source] != "reversed":
+            found.setdefault(int(problem), k)
+    return list(found.values())
+
+
+FIGURES = {"failure": (failure, 100), "size": (size, 100), "fid": (fid, 10_000)}
+
+
+def main() -> None:
+    """Make a figure."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("figure", choices=FIGURES)
+    parser.add_argument("-n", type=int, help="problems of a level, or for fid in all (default: 100, 10000)")
+    parser.add_argument("--workers", type=int, default=2, help="for the solutions of fid (default: %(default)s)")
+    parser.add_argument("--keep", type=Path, default=ROOT / "benchmarks" / "runs", metavar="FOLDER", help="for runs")
+    parser.add_argument("-o", "--out", type=Path, default=ROOT / "benchmarks" / "results", metavar="FOLDER")
+    args = parser.parse_args()
+    make, usual = FIGURES[args.figure]
+    args.n = usual if args.n is None else args.n
+    try:
+        if args.n < 4 or args.workers < 1:
+            parser.error("-n is 4 or more, --workers 1 or more")
+        args.keep.mkdir(parents=True, exist_ok=True)
+        found, tables, picture, says = make(args)
+        name = f"paper_{args.figure}"
+        text = [f"# {name}", f"`python scripts/reproduce.py {args.figure} -n {args.n}`"]
+        text += [*(table.markdown() for table in tables), "\n".join(f"- {key}: {value}" for key, value in says)]
+        write_atomically(args.out / f"{name}.json", (json.dumps({"about": says, **found}, indent=1) + "\n").encode())
+        write_atomically(args.out / f"{name}.md", ("\n\n".join(text) + "\n").encode())
+        picture.savefig(args.out / f"{name}.png", dpi=120)
+    except ApexError as error:
+        print(f"reproduce: error: {error}", file=sys.stderr)
+        sys.exit(2)
+    print("\n\n".join(table.markdown() for table in tables))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,68 @@
+"""Planners that a benchmark has to bear."""
+
+from __future__ import annotations
+
+import os
+import time
+from dataclasses import dataclass
+from typing import Any
+
+from ompl import base as ob
+from ompl import geometric as og
+
+from apex_ompl.planners.registry import Parameters, register
+
+
+class Cheat(ob.Planner):
+    """Says at the last moment that the straight line is a solution, whatever is in its way."""
+
+    def __init__(self, si: ob.SpaceInformation) -> None:
+        super().__init__(si, "cheat")
+
+    def solve(self, ptc: Any) -> ob.PlannerStatus:
+        inputs = self.getPlannerInputStates()
+        start, goal = inputs.nextStart(), inputs.nextGoal()
+        path = og.PathGeometric(self.getSpaceInformation())
+        path.append(start)
+        path.append(goal)
+        while not ptc():
+            time.sleep(0.001)
+        self.getProblemDefinition().addSolutionPath(path, False, 0.0, "cheat")
+        return ob.PlannerStatus(ob.PlannerStatus.EXACT_SOLUTION)
+
+
+class Dies(ob.Planner):
+    """Ends the process, but not on the problem that processes are warmed up with."""
+
+    def __init__(self, si: ob.SpaceInformation, on: int) -> None:
+        super().__init__(si, "dies")
+        self.on, self.solves = on, 0
+
+    def solve(self, ptc: Any) -> ob.PlannerStatus:
+        counts.append(1)
+        if len(counts) > self.on:
+            os._exit(3)
+        return ob.PlannerStatus(ob.PlannerStatus.TIMEOUT)
+
+
+counts: list[int] = []
+
+
+@register("cheat")
+@dataclass(frozen=True)
+class CheatParameters(Parameters):
+    """Says that the straight line is a solution."""
+
+    def build(self, si: ob.SpaceInformation) -> ob.Planner:
+        return Cheat(si)
+
+
+@register("dies")
+@dataclass(frozen=True)
+class DiesParameters(Parameters):
+    """Ends the process at one of its calls of solve."""
+
+    on: int = 1
+
+    def build(self, si: ob.SpaceInformation) -> ob.Planner:
+        return Dies(si, self.on)

@@ -1,0 +1,246 @@
+from __future__ import annotations
+
+import json
+import re
+import signal
+import sqlite3
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from ompl import tools as ot
+
+from apex_ompl import benchmark, problems
+from apex_ompl.benchmark import Results, Row, Workers, bench
+from apex_ompl.benchmark.rows import experiments, jobs
+from apex_ompl.benchmark.summary import Figures, figures
+from apex_ompl.cli import main
+from apex_ompl.errors import ApexError, FileFormatError, MissingFileError, ParameterError, UnknownNameError
+
+LEVEL, RUNS = "swap/easy", 3
+ROWS = ("apex[seed=1]", "rrtconnect")
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> Results:
+    folder = tmp_path_factory.mktemp("bench") / "results"
+    return bench([LEVEL], ROWS, folder, runs=RUNS, timeout=10.0, split="validation", quiet=True)
+
+
+def test_rows_are_read_and_checked() -> None:
+    row = Row.parse(" apex[fallback=false; lambda-obs=0.1] ")
+    assert row.planner == "apex" and dict(row.params) == {"fallback": "false", "lambda_obs": "0.1"}
+    assert row.parameters().fallback is False and row.settings()["lambda_obs"] == 0.1
+    assert Row.parse("rrtconnect+polish").planner == "rrtconnect+polish"
+    for text in ("", "apex[", "apex[gamma]", "apex[=1]", "a[b=1]c"):
+        with pytest.raises(ParameterError, match="planner"):
+            Row.parse(text)
+    for arguments in ({"timeout": 0.0}, {"runs": -1}):
+        with pytest.raises(ParameterError):
+            Row("a", "apex", **arguments)
+    assert Row("a", "apex", levels=("/hard", "cage", "wall/easy")).levels
+
+
+def test_suites_stand_for_their_static_levels() -> None:
+    assert list(experiments(["vertical"])) == [f"vertical/{v}" for v in ("free", "small", "medium", "large")]
+    assert experiments(["shelf/hard", "shelf_swap", "cage/easy/800001"]) == {
+        "shelf/hard": True, "shelf_swap": False, "cage/easy/800001": False,
+    }  # fmt: skip
+    for names in ([], ["no_such"], ["shelf/none"], ["vertical/moving-small-0.1"], ["vertical/moving-small-0.1/800001"]):
+        with pytest.raises(ApexError):
+            experiments(names)
+
+
+def test_runs_take_problems_and_seeds_in_turn() -> None:
+    rows = [Row("a", "rrtconnect"), Row("b", "rrt", runs=2, timeout=1.0, levels=("/hard",))]
+    options: dict = {"runs": 3, "timeout": 5.0, "seed": 7, "split": "test", "simplify": True}
+    found = jobs(["wall/hard", "wall/easy"], rows, **options)
+    assert [(j.problem, j.label, j.seed, j.timeout) for j in found[:3]] == [
+        ("wall/hard/900000", "a", 7, 5.0), ("wall/hard/900000", "b", 7, 1.0), ("wall/easy/900000", "a", 7, 5.0),
+    ]  # fmt: skip
+    assert len(found) == 3 + 2 + 3 and len({j.key for j in found}) == len(found)
+    assert [(j.problem, j.seed) for j in jobs(["shelf_swap"], rows[:1], **options)] == [
+        ("shelf_swap", 7), ("shelf_swap", 8), ("shelf_swap", 9),
+    ]  # fmt: skip
+    with pytest.raises(ParameterError, match="each once"):
+        jobs(["wall/hard"], [rows[0], rows[0]], **options)
+    with pytest.raises(UnknownNameError, match="split"):
+        jobs(["wall/hard"], rows, **{**options, "split": "none"})
+    with pytest.raises(UnknownNameError, match="planner"):
+        jobs(["wall/hard"], [Row("c", "no_such")], **options)
+
+
+def test_runs_tell_what_came_of_them(results: Results) -> None:
+    assert len(results.runs) == len(ROWS) * RUNS and {run["label"] for run in results.runs} == set(ROWS)
+    for run in results.runs:
+        assert run["solved"] and run["status"] == "EXACT_SOLUTION" and run["problem"] in problems.frozen_names(
+            "swap", "easy", "validation"
+        )  # fmt: skip
+        assert 0.0 < run["first"] <= run["total"] and run["properties"]["solved BOOLEAN"] == "1"
+        assert run["length"] <= run["raw_length"] + 1e-6 and run["clearance"] > 0.0 and run["checks"] > 0
+        assert run["times"]["solve"] == pytest.approx(float(run["properties"]["time REAL"]))
+    apex = [run for run in results.runs if run["label"] == ROWS[0]]
+    assert all(run["by"] and run["by"] != "apex[seed=1]" and run["counts"] for run in apex)
+    assert any("solve: polish" in run["times"] for run in apex)
+    assert set(results.about["warm_up"]) == set(ROWS)
+    assert results.about["rows"][ROWS[0]]["all"]["seed"] == 1
+
+
+def test_the_log_is_ompls_own(results: Results) -> None:
+    logs = benchmark.write_logs(results)
+    file = benchmark.write_database(results, logs)
+    assert [log.name for log in logs] == ["swap_easy.log"]
+    database = sqlite3.connect(file)
+    names = dict(database.execute("SELECT id, name FROM plannerConfigs").fetchall())
+    assert set(names.values()) == set(ROWS)
+    settings = dict(database.execute("SELECT name, settings FROM plannerConfigs").fetchall())
+    assert re.search(r"^;?fallback = True$", settings[ROWS[0]], re.M) and "range = 0.0" in settings[ROWS[1]]
+    rows = database.execute(
+        "SELECT plannerid, problem, seed, solved, path_length, solved_by, time FROM runs"
+    ).fetchall()
+    stored = {(run["label"], run["problem"]): run for run in results.runs}
+    assert len(rows) == len(stored)
+    for planner, problem, seed, solved, length, by, took in rows:
+        run = stored[names[planner], problem]
+        assert (seed, bool(solved), by) == (run["seed"], run["solved"], run["by"])
+        assert length == pytest.approx(run["length"], rel=1e-6) and took == pytest.approx(run["times"]["solve"])
+    experiment = database.execute("SELECT name, timelimit, runcount, split FROM experiments").fetchall()
+    assert experiment == [("swap/easy".replace("/", "_"), 10.0, RUNS, "validation")]
+    assert database.execute("SELECT count(*) FROM bestPlannerConfigsPerExperiment").fetchone()[0] >= 1
+    again = results.folder / "again.db"
+    command = [str(Path(sys.executable).with_name("ompl_benchmark_statistics")), "-d", str(again), str(logs[0])]
+    subprocess.run(command, check=True, capture_output=True)
+    assert sqlite3.connect(again).execute("SELECT count(*) FROM runs").fetchone() == (len(rows),)
+    ot.readBenchmarkLog(str(results.folder / "third.db"), [str(logs[0])], False)
+
+
+def outcome(results: Results) -> list[tuple]:
+    """What a table says of runs, but for the times."""
+    found = [(r["problem"], r["label"], r["solved"], r["by"], r["length"], r["raw_length"]) for r in results.runs]
+    return sorted(found)
+
+
+def test_what_is_there_is_not_run_again_and_broken_lines_are(results: Results, tmp_path: Path) -> None:
+    folder = tmp_path / "copy"
+    folder.mkdir()
+    lines = (results.folder / "runs.jsonl").read_text().splitlines(keepends=True)
+    (folder / "runs.jsonl").write_text("".join(lines[:2]) + lines[2][:40])
+    (folder / "about.json").write_text((results.folder / "about.json").read_text())
+    options: dict = {"runs": RUNS, "timeout": 10.0, "split": "validation", "quiet": True}
+    again = bench([LEVEL], ROWS, folder, **options)
+    assert outcome(again) == outcome(results)
+    assert (folder / "runs.jsonl").read_text().startswith("".join(lines[:2]))
+    assert len(again.about["sessions"]) == 2
+    begin = time.perf_counter()
+    assert outcome(bench([LEVEL], ROWS, folder, **options)) == outcome(results)
+    assert time.perf_counter() - begin < 2.0, "nothing was left to run, and no process started"
+
+
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
+def test_a_stopped_command_goes_on(results: Results, tmp_path: Path, how: signal.Signals) -> None:
+    folder, runs = tmp_path / "stopped", tmp_path / "stopped" / "runs.jsonl"
+    command = [sys.executable, "-m", "apex_ompl.cli", "bench", LEVEL, "--planners", ",".join(ROWS), "--runs", str(RUNS)]
+    command += ["--timeout", "10", "--split", "validation", "-o", str(folder)]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
+    for _ in range(1200):
+        if runs.is_file() and runs.read_text().count("\n") >= 1:
+            break
+        time.sleep(0.05)
+    process.send_signal(how)
+    _, said = process.communicate(timeout=60)
+    assert process.returncode == (130 if how is signal.SIGINT else -9) and "Traceback" not in said, said
+    assert 1 <= len(Results.load(folder).runs) < len(ROWS) * RUNS
+    options: dict = {"runs": RUNS, "timeout": 10.0, "split": "validation", "quiet": True}
+    assert outcome(bench([LEVEL], ROWS, folder, **options)) == outcome(results)
+
+
+def test_success_is_the_full_check_and_a_dead_process_is_a_crash(tmp_path: Path) -> None:
+    workers = Workers(modules=("bad_planners",))
+    rows = [Row("cheat", "cheat"), Row("dies", "dies", {"on": 2}), Row("rrtconnect", "rrtconnect")]
+    found = bench(["wall/hard"], rows, tmp_path, runs=2, timeout=0.3, split="validation", workers=workers, quiet=True)
+    by = {label: [run for run in found.runs if run["label"] == label] for label in ("cheat", "dies", "rrtconnect")}
+    for run in by["cheat"]:
+        assert not run["solved"] and run["properties"]["solved BOOLEAN"] == "1" and "full check" in run["reason"]
+    assert [run["status"] for run in by["dies"]] == ["TIMEOUT", "CRASH"] and len(by["rrtconnect"]) == 2
+    assert by["dies"][1]["reason"] == "the process died"
+    database = sqlite3.connect(benchmark.write_database(found, benchmark.write_logs(found)))
+    solved = "SELECT sum(solved) FROM runs JOIN plannerConfigs p ON p.id = plannerid WHERE p.name = 'cheat'"
+    assert database.execute(solved).fetchone() == (0,)
+    assert "Crashed: 1 x dies: the process died." in benchmark.markdown(found)
+    with pytest.raises(ParameterError, match="planners that do not end the process"):
+        bench(["wall/hard"], [Row("dies", "dies", {"on": 0})], tmp_path / "x", workers=workers, quiet=True)
+
+
+def made_up(firsts: list[float | None], timeout: float = 2.0) -> Figures:
+    runs = [
+        {"solved": t is not None, "first": t, "total": None if t is None else t + 0.1, "by": "apex", "timeout": timeout,
+         "length": 3.0 if t is not None else None}
+        for t in firsts
+    ]  # fmt: skip
+    return Figures("a/b", "apex", runs)
+
+
+def test_figures_count_what_is_not_solved_as_endless() -> None:
+    f = made_up([0.3, None, 0.1, 0.2])
+    assert f.share_within(0.2) == 0.5 and f.percentile("first", 50) == 0.2 and f.percentile("total", 75) == 0.4
+    assert np.isinf(f.percentile("first", 95)) and f.median("length") == 3.0 and f.by == {"apex": 3}
+
+
+def test_the_report_opens_without_a_network(results: Results, tmp_path: Path) -> None:
+    page, text = benchmark.report(results.folder, tmp_path / "report")
+    html, found = page.read_text(), text.read_text()
+    assert not re.findall(r"""(?:src|href)=["'](?!data:)""", html) and html.count("data:image/png;base64") >= 3
+    for f in figures(results):
+        length = f"{f.median('length'):.3g}"
+        assert f.label in html and f"<td>{length}</td>" in html and f" {length} " in found
+    assert "EPYC" in html or "cores" in html
+    assert "at the same time" not in found
+
+
+def test_runs_at_the_same_time_are_said(results: Results, tmp_path: Path) -> None:
+    options: dict = {"runs": 2, "timeout": 10.0, "split": "validation", "quiet": True}
+    found = bench([LEVEL], ROWS[1:], tmp_path, workers=Workers(2), **options)
+    assert outcome(found) == [one for one in outcome(results) if one[1] == ROWS[1]][:2]
+    assert "went at the same time" in benchmark.markdown(found)
+
+
+def test_faulty_results_are_named(results: Results, tmp_path: Path) -> None:
+    with pytest.raises(MissingFileError, match=r"about\.json"):
+        Results.load(tmp_path)
+    (tmp_path / "about.json").write_text(json.dumps({**results.about, "schema": "other"}))
+    with pytest.raises(FileFormatError, match="schema"):
+        bench([LEVEL], ROWS, tmp_path, quiet=True)
+    (tmp_path / "about.json").write_text(json.dumps(results.about))
+    with pytest.raises(FileFormatError, match="one run or more"):
+        benchmark.report(tmp_path, tmp_path / "out")
+    (tmp_path / "runs.jsonl").write_text("nonsense\n{}\n")
+    with pytest.raises(FileFormatError, match="line 1: expected a run"):
+        Results.load(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["bench", "no_such", "-o", "x"], "no_such"),
+        (["bench", "shelf/hard", "-o", "x", "--planners", "apex,none"], "unknown planner 'none'"),
+        (["bench", "shelf/hard", "-o", "x", "--planners", "apex[gama=1]"], "did you mean 'gamma'"),
+        (["bench", "shelf/hard", "-o", "x", "--runs", "0"], "runs"),
+        (["bench", "shelf/hard", "-o", "x", "--jobs", "0"], "jobs"),
+        (["bench", "shelf/hard", "-o", "x", "--timeout", "nan"], "timeout"),
+        (["bench", "shelf/hard", "-o", "x", "--split", "none"], "split"),
+        (["bench", "shelf/hard", "-o", "x", "--planners", ","], "planners"),
+        (["bench", "vertical/moving-small-0.1", "-o", "x"], "moving"),
+        (["report", "nowhere", "-o", "x"], "nowhere"),
+    ],
+)
+def test_faulty_commands_get_a_sentence(
+    arguments: list[str], words: str, capsys: pytest.CaptureFixture[str], tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    monkeypatch.chdir(tmp_path)
+    assert main(arguments) == 2
+    said = capsys.readouterr().err
+    assert words in said and said.count("\n") == 1 and not list(tmp_path.iterdir())
