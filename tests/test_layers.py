@@ -10,7 +10,7 @@ from support import ROOT
 
 LAYERS = [
     {"errors"},
-    {"files", "meshes", "resolution", "stopwatch"},
+    {"cluster", "files", "meshes", "resolution", "stopwatch"},
     {"schema"},
     {"kernel"},
     {"problem", "spline"},
@@ -23,7 +23,7 @@ LAYERS = [
     {"robot"},
     {"collision"},
     {"ik", "interrupt", "ompl_globals", "space"},
-    {"goals", "grasp"},
+    {"goals", "grasp", "metrics"},
     {"validity"},
     {"assembly", "simplify", "result", "moveit", "moving"},
     {"queries", "repair", "render"},
