@@ -82,10 +82,8 @@ class SolveLoop:
         self._take(search.known(ends, self.experience, self.stop))
         if self.best is None and self.parameters.sprints:
             self._sprint(ends)
-        with self.report.timed("query"):
-            queries = self._queries(ends)
         if self.best is None:
-            self._take(search.run(queries, self.stop))
+            self._take(search.run(self._queries(ends), self.stop))
         if self.best is None and self.parameters.bridge:
             self._bridge(search)
         if self.best is None and self.parameters.approximate:
@@ -94,9 +92,9 @@ class SolveLoop:
         if self.best is None and self.parameters.fallback:
             self._grow_trees(starts)
         elif self.best is None:
-            self._take(search.again(queries, self.stop))
+            self._take(search.again(self._queries(ends), self.stop))
         if self.best is not None:
-            self._improve(search, queries)
+            self._improve(search, ends)
             self._remember()
             return Status.EXACT_SOLUTION
         self._without(Status.TIMEOUT, f"no path among {self.report.candidates} candidates in the time given")
@@ -150,8 +148,10 @@ class SolveLoop:
         return sorted(product(starts, goals), key=lambda pair: float(np.linalg.norm(pair[1] - pair[0])))[:MOST_QUERIES]
 
     def _queries(self, ends: list[tuple[Array, Array]]) -> list[Query]:
+        """Return what the model is asked."""
         verdict, point = self.judge.verdict, self.model.sees_point
-        return [query_of(verdict, start, goal, point=point) for start, goal in ends]
+        with self.report.timed("query"):
+            return [query_of(verdict, start, goal, point=point) for start, goal in ends]
 
     def _accept(self, path: Array, control: Array | None = None) -> None:
         """Take a valid path as a solution."""
@@ -277,7 +277,7 @@ class SolveLoop:
             if len(path) > 1 and (self.nearest is None or gap < self.nearest[1]):
                 self.nearest = path, gap
 
-    def _improve(self, search: Search, queries: list[Query]) -> None:
+    def _improve(self, search: Search, ends: list[tuple[Array, Array]]) -> None:
         """With a path length objective, or by parameter, look for shorter paths until time is up."""
         objective = self.pdef.getOptimizationObjective() if self.pdef.hasOptimizationObjective() else None
         if not isinstance(objective, ob.PathLengthOptimizationObjective):
@@ -286,6 +286,7 @@ class SolveLoop:
                 return
         limits = self.kernel.robot.arrays
         with self.report.timed("improve"):
+            queries = self._queries(ends)
             for noise in cycle(VARIATIONS):
                 assert self.best is not None
                 if self.stop() or (objective is not None and objective.isSatisfied(ob.Cost(path_length(self.best)))):
