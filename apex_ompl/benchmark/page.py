@@ -139,7 +139,7 @@ def _grid(
         axis.grid(alpha=0.25)
         if log:
             axis.set_xscale("log")
-            axis.set_xlim(1e-3, max(run["timeout"] for f in found for run in f.runs))
+            axis.set_xlim(1e-3, max(f.limit for f in found))
     for axis in axes[len(levels) :]:
         axis.set_visible(False)
     if legend:
@@ -151,9 +151,8 @@ def _grid(
 def _curve(axis: Any, mine: Sequence[Figures], colours: dict[str, str]) -> None:
     for f in mine:
         times = f.times()
-        end = max(run["timeout"] for run in f.runs)
         there = times[np.isfinite(times)]
-        at = np.concatenate([[1e-3], np.maximum(there, 1e-3), [max(end, *there, 1e-3)]])
+        at = np.concatenate([[1e-3], np.maximum(there, 1e-3), [max(f.limit, *there, 1e-3)]])
         share = np.concatenate([[0.0], np.arange(1, len(there) + 1), [len(there)]]) / len(times)
         axis.step(at, share, where="post", color=colours[f.label], linewidth=1.4)
     axis.set_ylim(-0.02, 1.02)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import threading
 import time
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -24,7 +25,7 @@ from apex_ompl.planning import Planning, solving_time
 from apex_ompl.problems.catalogue import SuiteError
 from apex_ompl.result import FIRST, PlanResult, PlanStatus
 from apex_ompl.robot import Robot, load_robot
-from apex_ompl.space import path_length
+from apex_ompl.space import path_length, path_to_array
 from apex_ompl.torch_threads import one_torch_thread
 
 if TYPE_CHECKING:
@@ -34,6 +35,7 @@ Run = dict[str, Any]
 """A run as it is stored, ready for JSON."""
 
 MEMORY = 16_384.0  # that OMPL grants a run [MB]
+LOOK = 0.005  # between two looks for a first path [s]
 UPDATES = 0.05  # between two looks at a planner's progress [s]
 NO_PROBLEM, CRASH = "NO_PROBLEM", str(PlanStatus.CRASH)
 WARM_UP = "wall/easy/800000"
@@ -42,17 +44,51 @@ PROOF = ("verify", "repair")
 _robots: dict[str, Robot] = {}
 
 
+class Watch(threading.Thread):
+    """Looks for a planner's first exact path while it runs, every few milliseconds.
+
+    Attributes:
+        path: The path, shape (N, dof), or None.
+        seconds: From the beginning until it was seen.
+        over: Set when there is nothing more to be seen.
+    """
+
+    def __init__(self, pdef: ob.ProblemDefinition, dof: int) -> None:
+        """Watch a problem definition; ``start`` begins."""
+        super().__init__(daemon=True)
+        self._pdef, self._dof = pdef, dof
+        self._begin = time.perf_counter()
+        self.path: NDArray[np.float64] | None = None
+        self.seconds = np.inf
+        self.over = threading.Event()
+
+    def start(self) -> None:
+        """Begin."""
+        self._begin = time.perf_counter()
+        super().start()
+
+    def run(self) -> None:
+        """Look."""
+        while not self.over.wait(LOOK):
+            if self._pdef.hasExactSolution():
+                self.seconds = time.perf_counter() - self._begin
+                self.path = path_to_array(self._pdef.getSolutionPath(), self._dof)
+                return
+
+
 class Benchmarked(Planning):
     """One call of ``plan`` whose planner runs in an experiment of ``ompl.tools.Benchmark``.
 
     The planner runs even where the straight line is a solution.
 
     Attributes:
+        first_path: Of planners that go on after their first path, that one, shape (N, dof), or None.
         properties: OMPL's properties of the run.
         common: OMPL's parameters of the planner.
         seed: Of OMPL's random numbers.
     """
 
+    first_path: NDArray[np.float64] | None = None
     properties: dict[str, str]
     common: dict[str, str]
     seed: int
@@ -66,18 +102,30 @@ class Benchmarked(Planning):
         said = []
         experiment = ot.Benchmark(self.ready.simple_setup, "run")
         experiment.addPlanner(planner)
-        experiment.setPreRunEvent(lambda _: seed_ompl(self.seed))  # the experiment itself has drawn states by then
+        watch = Watch(self.ready.simple_setup.getProblemDefinition(), self.ready.robot.dof)
+
+        def begin(_: ob.Planner) -> None:
+            seed_ompl(self.seed)  # the experiment itself has drawn states by then
+            if parameters.optimizing:
+                watch.start()
+
+        experiment.setPreRunEvent(begin)
         experiment.setPostRunEvent(
             lambda *_: said.append(getattr(planner, "report", None))
         )  # then it clears the planner
         request = ot.Request(solving_time(parameters, timeout), MEMORY, 1, UPDATES, False, False, False)
-        experiment.benchmark(request)
+        try:
+            experiment.benchmark(request)
+        finally:
+            watch.over.set()
         self.raise_faults()
         if said and said[0] is not None:
             planner.report = said[0]
         recorded = experiment.getRecordedExperimentData().planners[0]
         self.properties, self.common = recorded.runs[0].to_dict(), recorded.common.to_dict()
         self.times["solve"] = float(self.properties["time REAL"])
+        if watch.path is not None:
+            self.first_path, self.times[FIRST] = watch.path, min(watch.seconds, self.times["solve"])
         return PlanStatus(ob.PlannerStatus.PlannerStatusType(int(self.properties["status ENUM"])).name)
 
 
@@ -127,7 +175,8 @@ def _outcome(job: Job) -> Run:
 
 def told(planning: Benchmarked, result: PlanResult) -> Run:
     """Return what is stored of a run."""
-    times, raw, path, report = result.times, planning.raw, result.path if result else None, planning.report
+    times, path, report = result.times, result.path if result else None, planning.report
+    raw = planning.raw if planning.first_path is None else planning.first_path
     found = raw is not None and bool(result)
     total = sum(times.get(stage, 0.0) for stage in ("solve", "simplify", *PROOF))
     first = times.get(FIRST, times.get("solve", 0.0))

@@ -51,6 +51,11 @@ class Figures:
         """Those that found a path which passed the full check."""
         return [run for run in self.runs if run["solved"]]
 
+    @property
+    def limit(self) -> float:
+        """The longest time that a run was given [s]."""
+        return max(float(run["timeout"]) for run in self.runs)
+
     def times(self, which: str = "first") -> np.ndarray:
         """Return times, ``first`` or ``total``, infinite where a run is not solved, shape (N,) [s]."""
         return np.sort([run[which] if run["solved"] else math.inf for run in self.runs])
@@ -97,7 +102,7 @@ def successes(found: Iterable[Figures]) -> Table:
     rows, last = [], ""
     for f in found:
         low, high = share_interval(len(f.solved), len(f.runs))
-        within = [_share(f.share_within(t)) for t in MOMENTS]
+        within = [_share(f.share_within(t)) if t <= f.limit else "-" for t in MOMENTS]
         share = f"{_share(len(f.solved) / len(f.runs))} ({_share(low)} to {_share(high)})"
         trees = sum(f.by[name] for name in TREES if f.label != name) / len(f.runs)
         rows.append([_once(f.experiment, last), f.label, str(len(f.runs)), share, *within, _share(trees)])
