@@ -118,10 +118,16 @@ class Search:
                     self._known.append((origin, control))
         return None
 
-    def run(self, queries: Sequence[Query], stop: Stop) -> Candidate | None:
-        """Return a valid path for one of several queries from some rounds of proposals, or None.
+    @property
+    def rounds(self) -> int:
+        """How many rounds of proposals there are; one without any repairs what is known."""
+        return len(self._settings.batches or (0,))
+
+    def round(self, number: int, queries: Sequence[Query], stop: Stop) -> Candidate | None:
+        """Return a valid path for one of several queries from a round of proposals, or None.
 
         Args:
+            number: Of the round, from 0.
             queries: The problems, which differ in their starts and goals.
             stop: Asked often whether to give up.
         """
@@ -129,12 +135,10 @@ class Search:
             if not stop():
                 with self._report.timed("judge"):
                     self.pool.add([control for mine, control in self._known if mine == origin], origin, stop)
-        for batch in self._settings.batches or (0,):
-            for stage in self._round(queries, batch, stop):
-                found = None if stop() else stage()
-                if found is not None:
-                    return found
-        return self._farthest()
+        self._known = []
+        batch = (self._settings.batches or (0,))[number]
+        found = (stage() for stage in self._round(queries, batch, stop) if not stop())
+        return next((one for one in found if one is not None), None)
 
     def again(self, queries: Sequence[Query], stop: Stop) -> Candidate | None:
         """Return a valid path for one of several queries from more rounds of proposals, until it is told to stop."""
@@ -145,7 +149,7 @@ class Search:
                 found = None if stop() else stage()
                 if found is not None:
                     return found
-        return self._farthest()
+        return self.farthest()
 
     def vary(self, control: Array, query: Query, noise: float, stop: Stop) -> Candidate | None:
         """Return a valid path that a given one becomes when it is noised and denoised again, or None.
@@ -226,7 +230,7 @@ class Search:
             self._close.append((gap, found))
         return gap >= wanted
 
-    def _farthest(self) -> Candidate | None:
+    def farthest(self) -> Candidate | None:
         """Return the one of the valid paths that were set aside that keeps most distance, or None."""
         return max(self._close, key=lambda pair: pair[0])[1] if self._close else None
 

@@ -44,7 +44,8 @@ class ApexParameters(Parameters):
         robot: The robot, where the validity checker is not this project's.
         device: Where the network runs.
         line: Whether the straight line is a candidate.
-        sprint: Iterations that RRTConnect has before proposals, where it is the fallback and ``lambda_obs`` is 0.
+        sprint: Iterations that RRTConnect has before proposals, where it is the fallback and ``lambda_obs`` is 0;
+            before the second and third round it has 32 and 128 times as many.
         sampler: ``ddim``, ``dpm_solver`` or ``ddpm``; ``model`` takes that of the checkpoint.
         denoising_steps: Number of denoising steps; 0 takes that of the checkpoint: 2 for apex, all 256 for apex-paper.
         temperature: Standard deviation of the noise to begin with.
@@ -59,7 +60,7 @@ class ApexParameters(Parameters):
             distance stands when none comes out better.
         repair: Whether candidates are improved by the optimiser.
         bridge: Whether blocked stretches of the best candidates are bridged by short trees.
-        fallback: Whether RRTConnect gets the time that is left, and a sprint before; otherwise there are more rounds of
+        fallback: Whether RRTConnect gets the time that is left, and sprints before; otherwise there are more rounds of
             proposals.
         polish: Whether valid paths are shortened.
         approximate: Whether, without an exact solution, a path that ends near a goal is given as an approximate one.
@@ -96,7 +97,7 @@ class ApexParameters(Parameters):
 
     @property
     def sprints(self) -> bool:
-        """Whether RRTConnect has a short try before proposals are made."""
+        """Whether RRTConnect has short tries before proposals are made."""
         return self.fallback and self.sprint > 0 and self.lambda_obs == 0.0
 
     def search(self, own: Sampling) -> SearchSettings:

@@ -16,7 +16,7 @@ from apex_ompl.space import path_to_array, to_state
 Array = NDArray[np.float64]
 Stop = Callable[[], bool]
 
-CALLS = 20_000  # of the termination condition of one bridge
+CALLS = 4_000  # of the termination condition of one bridge
 EVERY = 2  # states of a path that are judged to find its blocked stretches
 SPACING = 0.1  # of states on polylines [rad]
 

@@ -32,6 +32,7 @@ LOG = logging.getLogger("apex_ompl")
 MOST_GOALS, GOAL_ATTEMPTS = 8, 32  # that are read, and asked for
 MOST_QUERIES = 8  # pairs of start and goal that proposals are made for, the nearest ones
 BRIDGED = 2  # candidates whose blocked stretches are bridged
+LONGER = (1, 32, 128)  # factors on the iterations of sprints, before each round of proposals
 KEPT = 4  # earlier paths that are candidates for the next query
 VARIATIONS = (0.3, 0.6, None, 0.15)  # noise on the best path, or new proposals, in turn while there is time
 GAIN = 1e-3  # least gain in length that counts as one [rad]
@@ -80,17 +81,15 @@ class SolveLoop:
             settings=self.parameters.search(self.model.sampling), generator=self.generator, report=self.report,
         )  # fmt: skip
         self._take(search.known(ends, self.experience, self.stop))
-        if self.best is None and self.parameters.sprints:
-            self._sprint(ends)
         if self.best is None:
-            self._take(search.run(self._queries(ends), self.stop))
+            self._go_round(search, ends)
         if self.best is None and self.parameters.bridge:
             self._bridge(search)
         if self.best is None and self.parameters.approximate:
             with self.report.timed("approximate"):
                 self._note_nearest(search, goals)
         if self.best is None and self.parameters.fallback:
-            self._grow_trees(starts)
+            self._grow_trees(starts, whole=len(ends) == 1)
         elif self.best is None:
             self._take(search.again(self._queries(ends), self.stop))
         if self.best is not None:
@@ -102,6 +101,19 @@ class SolveLoop:
             return Status.TIMEOUT
         self.pdef.addSolutionPath(array_to_path(self.si, self.nearest[0]), True, self.nearest[1], NAME)
         return Status.APPROXIMATE_SOLUTION
+
+    def _go_round(self, search: Search, ends: list[tuple[Array, Array]]) -> None:
+        """Let trees and proposals take turns, each longer than the one before."""
+        queries: list[Query] = []
+        for number in range(search.rounds):
+            if self.parameters.sprints and not self.stop():
+                self._sprint(ends, self.parameters.sprint * LONGER[min(number, len(LONGER) - 1)])
+            if self.best is None and not self.stop():
+                queries = queries or self._queries(ends)
+                self._take(search.round(number, queries, self.stop))
+            if self.best is not None:
+                return
+        self._take(search.farthest())
 
     def _take(self, found: Candidate | None) -> None:
         """Take a candidate that is valid, and shorten it."""
@@ -204,10 +216,13 @@ class SolveLoop:
                 self._polish(path)
                 return
 
-    def _grow_trees(self, starts: list[Array]) -> None:
-        """Let RRTConnect plan with the time that is left, and polish what it finds."""
+    def _grow_trees(self, starts: list[Array], whole: bool) -> None:
+        """Let RRTConnect plan with the time that is left, and polish what it finds.
+
+        The trees of sprints go on where they are of the ``whole`` problem.
+        """
         while self.best is None and not self.stop():
-            tree, pdef = self.trees or self._planted(starts)
+            tree, pdef = self.trees if self.trees is not None and whole else self._planted(starts)
             self.trees = None
             with self.report.timed("rrtconnect"):
                 status = tree.solve(self.ptc).getStatus()
@@ -221,22 +236,23 @@ class SolveLoop:
             ):
                 self.nearest = path, pdef.getSolutionDifference()
 
-    def _sprint(self, ends: list[tuple[Array, Array]]) -> None:
-        """Let RRTConnect try for a few iterations, from the start to the goal that are nearest to each other.
+    def _sprint(self, ends: list[tuple[Array, Array]], iterations: int) -> None:
+        """Let RRTConnect try for some iterations, from the start to the goal that are nearest to each other.
 
-        In open scenes that is sooner done than proposals are made.
+        In open scenes that is sooner done than proposals are made; later it goes on where it stopped.
         """
         with self.report.timed("sprint"):
-            pdef = ob.ProblemDefinition(self.si)
-            pdef.setStartAndGoalStates(*(to_state(self.si, q) for q in ends[0]))
-            tree = bridge.rooted(self.si, pdef, self.parameters.range)
-            left = iter(range(self.parameters.sprint))
+            if self.trees is None:
+                pdef = ob.ProblemDefinition(self.si)
+                pdef.setStartAndGoalStates(*(to_state(self.si, q) for q in ends[0]))
+                self.trees = bridge.rooted(self.si, pdef, self.parameters.range), pdef
+            tree, pdef = self.trees
+            left = iter(range(iterations))
             ptc = ob.PlannerTerminationCondition(lambda: self.stop() or next(left, None) is None)
             solved = tree.solve(ptc).getStatus() == Status.EXACT_SOLUTION
         if solved:
+            self.trees = None
             self._mend(path_to_array(pdef.getSolutionPath(), self.kernel.robot.dof), "sprint")
-        elif len(ends) == 1:
-            self.trees = tree, pdef
 
     def _planted(self, starts: list[Array]) -> tuple[og.RRTConnect, ob.ProblemDefinition]:
         """Return an RRTConnect for all starts and goals, and its problem definition."""
