@@ -207,6 +207,22 @@ def test_runs_at_the_same_time_are_said(results: Results, tmp_path: Path) -> Non
     assert "went at the same time" in benchmark.markdown(found)
 
 
+def test_a_cluster_of_ray_makes_the_same_runs(results: Results, tmp_path: Path) -> None:
+    ray = pytest.importorskip("ray")
+    try:
+        ray.init(num_cpus=1, include_dashboard=False, log_to_driver=False, logging_level="error")
+    except Exception as error:  # sandboxes without sockets or shared memory
+        pytest.skip(f"Ray does not start here: {error}")
+    try:
+        options: dict = {"runs": 1, "timeout": 10.0, "split": "validation", "quiet": True}
+        found = bench([LEVEL], ROWS, tmp_path, workers=Workers(1, "auto"), **options)
+    finally:
+        ray.shutdown()
+    first = problems.frozen_names("swap", "easy", "validation")[0]
+    assert outcome(found) == [one for one in outcome(results) if one[0] == first]
+    assert "made on a cluster" in benchmark.markdown(found)
+
+
 def test_faulty_results_are_named(results: Results, tmp_path: Path) -> None:
     with pytest.raises(MissingFileError, match=r"about\.json"):
         Results.load(tmp_path)

@@ -155,7 +155,9 @@ def stages(found: Iterable[Figures]) -> Table:
 def warnings(results: Results) -> list[str]:
     """Return what a reader of times must know."""
     sessions, said = results.about["sessions"], []
-    if any(session["jobs"] > 1 or session["address"] for session in sessions):
+    if any(session["address"] for session in sessions):
+        said.append("Runs were made on a cluster, whose machines are not said.")
+    if any(session["jobs"] > 1 for session in sessions):
         said.append("Several runs went at the same time, so that times are longer than those of runs alone.")
     if len({session["hardware"] for session in sessions}) > 1:
         said.append("The runs were made on different machines.")
