@@ -112,9 +112,11 @@ class Search:
                         return None
                     self._report.candidates += 1
                     found = Candidate(control, origin, np.inf, np.inf, 0.0)
-                    path = spline.path(control)
-                    if self._is_valid(path) and self._keeps_distance(found, path):
-                        return found
+                    # A line that is not free is soon seen by its ends.
+                    if origin == EXPERIENCE or self._is_valid(np.stack([start, goal])):
+                        path = spline.path(control)
+                        if self._is_valid(path) and self._keeps_distance(found, path):
+                            return found
                     self._known.append((origin, control))
         return None
 
