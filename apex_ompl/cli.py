@@ -221,7 +221,7 @@ def _bench(parsed: argparse.Namespace) -> int:
     logs = benchmark.write_logs(results)
     database = benchmark.write_database(results, logs)
     print(benchmark.markdown(results))
-    print(f"{database}: {len(results.runs)} runs, for Planner Arena; OMPL's logs are in {logs[0].parent}")
+    print(f"{database}: {len(results.runs)} runs, for Planner Arena; OMPL's logs are in {results.folder / 'logs'}")
     return 0
 
 

@@ -17,16 +17,17 @@ class ClusterError(ApexError):
 
 
 def spread(
-    work: Callable[..., Any], jobs: Mapping[str, tuple[Any, ...]], *, workers: int, address: str | None
+    work: Callable[..., Any], jobs: Mapping[str, tuple[Any, ...]], *, workers: int, address: str | None, ahead: int = 2
 ) -> Iterator[tuple[str, Any]]:
     """Call a function once for each job, and yield names and what came of them as they are done.
 
-    Twice as many jobs are under way as there are workers; a job whose worker died is tried once more.
+    A job whose worker died is tried once more.
 
     Args:
         work: The function; it can be imported or pickled.
         jobs: Its arguments, by names.
         workers: How many jobs run at once.
+        ahead: How many jobs for each worker are under way or wait at Ray.
         address: Of a running cluster; by default Ray is started on this machine, and stopped again.
 
     Raises:
@@ -42,7 +43,7 @@ def spread(
     try:
         task = ray.remote(num_cpus=1, max_retries=1)(work)
         waiting, under_way = iter(jobs.items()), {}
-        for name, job in itertools.islice(waiting, 2 * workers):
+        for name, job in itertools.islice(waiting, ahead * workers):
             under_way[task.remote(*job)] = name
         while under_way:
             done, _ = ray.wait(list(under_way), num_returns=1)

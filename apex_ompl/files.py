@@ -47,9 +47,14 @@ def locked(folder: Path) -> Iterator[None]:
     """Keep other processes from writing into a folder.
 
     Raises:
+        MissingFileError: The folder cannot be written.
         FolderInUseError: Another process writes there.
     """
-    with open(folder / ".lock", "w") as file:
+    try:
+        file = open(folder / ".lock", "w")
+    except OSError as error:
+        raise MissingFileError(str(folder), "output folder", (error.strerror or "cannot be written").lower()) from error
+    with file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:

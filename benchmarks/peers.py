@@ -3,8 +3,10 @@
 RoboPlan loads this project's URDF, with the same pairs of links, obstacles and held objects; how often it says of
 random states what the verdict says is part of the results. It plans with the same spacing of states, as a Euclidean
 distance, which is finer than the greatest step of a joint that OMPL's planners go by here. What differs: it has no
-proofs of stretches; its paths are shortened by its own shortcuts. They are judged by the same full check, and planned
-anew where they fail it, as those of rrtconnect are; both counts. Problems with shapes that it has not are left out.
+proofs of stretches; its paths are shortened by its own shortcuts; of several goals it takes the first. They are judged
+by the same full check, and planned anew where they fail it, as those of rrtconnect are, which has two turns more: the
+straight line at first, and its path as it was found where the shortened one cannot be mended. Problems with shapes that
+it has not are left out.
 
 Usage: python benchmarks/peers.py [SUITE[/LEVEL] ...] [-n 100]    (needs the extra "peers")
 """
@@ -230,7 +232,7 @@ def main() -> None:
             cells = [level if k == 0 else "", method, f["n"], f"{f['solved']:.2f}", f["failed_check"], *times, length]
             rows.append(record.row(cells))
     same = np.sum([f["agreement"] for f in found.values()], axis=0)
-    left = sum(not run["carried"] for run in done.values()) // len(METHODS)
+    left = sum(not done[job]["carried"] for job in jobs if job in done) // len(METHODS)
     words = "both free, both colliding, free to RoboPlan alone, free to the verdict alone"
     text = f"\n\nRandom states near starts and goals: {', '.join(str(n) for n in same)} ({words}). "
     text += f"{left} problems have shapes that RoboPlan has not, and are left out."

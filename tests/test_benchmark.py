@@ -67,6 +67,9 @@ def test_runs_take_problems_and_seeds_in_turn() -> None:
     ]  # fmt: skip
     with pytest.raises(ParameterError, match="each once"):
         jobs(["wall/hard"], [rows[0], rows[0]], **options)
+    for more in ({"runs": 100_001}, {"seed": 2**31 - 2}):
+        with pytest.raises(ParameterError, match="runs: expected at most"):
+            jobs(["wall/hard"], rows, **{**options, **more})
     with pytest.raises(UnknownNameError, match="split"):
         jobs(["wall/hard"], rows, **{**options, "split": "none"})
     with pytest.raises(UnknownNameError, match="planner"):
@@ -97,7 +100,8 @@ def test_the_log_is_ompls_own(results: Results) -> None:
     names = dict(database.execute("SELECT id, name FROM plannerConfigs").fetchall())
     assert set(names.values()) == set(ROWS)
     settings = dict(database.execute("SELECT name, settings FROM plannerConfigs").fetchall())
-    assert re.search(r"^;?fallback = True$", settings[ROWS[0]], re.M) and "range = 0.0" in settings[ROWS[1]]
+    assert re.search(r"^;?fallback = True$", settings[ROWS[0]], re.M)
+    assert "range = 3.69" in settings[ROWS[1]], "what OMPL took, not the 0 that lets it choose"
     rows = database.execute(
         "SELECT plannerid, problem, seed, solved, path_length, solved_by, time FROM runs"
     ).fetchall()
@@ -159,17 +163,22 @@ def test_a_stopped_command_goes_on(results: Results, tmp_path: Path, how: signal
 
 def test_success_is_the_full_check_and_a_dead_process_is_a_crash(tmp_path: Path) -> None:
     workers = Workers(modules=("bad_planners",))
-    rows = [Row("cheat", "cheat"), Row("dies", "dies", {"on": 2}), Row("rrtconnect", "rrtconnect")]
+    rows = [Row("cheat", "cheat"), Row("dies", "dies", {"on": 1}), Row("shaky", "dies", {"on": 2})]
+    rows.append(Row("rrtconnect", "rrtconnect"))
     found = bench(["wall/hard"], rows, tmp_path, runs=2, timeout=0.3, split="validation", workers=workers, quiet=True)
-    by = {label: [run for run in found.runs if run["label"] == label] for label in ("cheat", "dies", "rrtconnect")}
+    by = {
+        label: [run for run in found.runs if run["label"] == label]
+        for label in ("cheat", "dies", "shaky", "rrtconnect")
+    }
     for run in by["cheat"]:
         assert not run["solved"] and run["properties"]["solved BOOLEAN"] == "1" and "full check" in run["reason"]
-    assert [run["status"] for run in by["dies"]] == ["TIMEOUT", "CRASH"] and len(by["rrtconnect"]) == 2
-    assert by["dies"][1]["reason"] == "the process died"
+    assert [run["reason"] for run in by["dies"]] == ["the process died"] * 2 and len(by["rrtconnect"]) == 2
+    assert [run["status"] for run in by["dies"]] == ["CRASH"] * 2
+    assert [run["status"] for run in by["shaky"]] == ["TIMEOUT"] * 2, "it is tried again in a process of its own"
     database = sqlite3.connect(benchmark.write_database(found, benchmark.write_logs(found)))
     solved = "SELECT sum(solved) FROM runs JOIN plannerConfigs p ON p.id = plannerid WHERE p.name = 'cheat'"
     assert database.execute(solved).fetchone() == (0,)
-    assert "Crashed: 1 x dies: the process died." in benchmark.markdown(found)
+    assert "Crashed: 2 x dies: the process died." in benchmark.markdown(found)
     with pytest.raises(ParameterError, match="planners that do not end the process"):
         bench(["wall/hard"], [Row("dies", "dies", {"on": 0})], tmp_path / "x", workers=workers, quiet=True)
 
@@ -230,11 +239,35 @@ def test_faulty_results_are_named(results: Results, tmp_path: Path) -> None:
     with pytest.raises(FileFormatError, match="schema"):
         bench([LEVEL], ROWS, tmp_path, quiet=True)
     (tmp_path / "about.json").write_text(json.dumps(results.about))
+    with pytest.raises(ParameterError, match=r"timeout: expected 10.0, as in .*; or another folder"):
+        bench([LEVEL], ROWS, tmp_path, timeout=3.0, quiet=True)
+    options: dict = {"timeout": 10.0, "split": "validation", "quiet": True}
+    with pytest.raises(ParameterError, match="the parameters that it has in"):
+        bench([LEVEL], [Row("rrtconnect", "rrtconnect", {"range": 1.0})], tmp_path, **options)
     with pytest.raises(FileFormatError, match="one run or more"):
         benchmark.report(tmp_path, tmp_path / "out")
     (tmp_path / "runs.jsonl").write_text("nonsense\n{}\n")
     with pytest.raises(FileFormatError, match="line 1: expected a run"):
         Results.load(tmp_path)
+    (tmp_path / "about.json").unlink()
+    with pytest.raises(FileFormatError, match="expected results of bench"):
+        bench([LEVEL], ROWS, tmp_path, quiet=True)
+
+
+def test_a_faulty_checkpoint_ends_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = [
+        "bench",
+        LEVEL,
+        "--planners",
+        "apex[model=no_such]",
+        "--runs",
+        "1",
+        "-o",
+        str(tmp_path / "x"),
+        "--quiet",
+    ]
+    assert main(arguments) == 2
+    assert "no_such" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ from apex_ompl.api import check_arguments
 from apex_ompl.benchmark.results import ABOUT, RUNS, SCHEMA, Results, hardware
 from apex_ompl.benchmark.rows import Job, Row, jobs
 from apex_ompl.benchmark.workers import Workers
-from apex_ompl.errors import MissingFileError, ParameterError
+from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError
 from apex_ompl.files import locked, write_atomically
 from apex_ompl.resolution import FULL_RESOLUTION, SEARCH_RESOLUTION
 
@@ -70,11 +70,19 @@ def bench(
     except (OSError, ValueError) as error:
         raise MissingFileError(str(folder), "output folder", getattr(error, "strerror", None) or str(error)) from error
     with locked(folder):
+        if (folder / RUNS).exists() and not (folder / ABOUT).exists():
+            raise FileFormatError(
+                str(folder), "", f"{RUNS} without {ABOUT}", "expected results of bench, or no such file"
+            )
         before = Results.load(folder) if (folder / ABOUT).exists() else Results(folder, {})
+        settings = {"timeout": float(timeout), "seed": seed, "split": split, "simplify": simplify}
+        about = _about(before.about, given, settings, folder)
         there = {one["key"] for one in before.runs}
         left = [job for job in wanted if job.key not in there]
-        session = _session(workers, split=split, seed=seed)
-        results = Results(folder, _about(before.about, given, session))
+        if not left:
+            return before
+        about["sessions"] = [*about["sessions"], _session(workers, split=split, seed=seed)]
+        results = Results(folder, about)
         results.note()
         try:
             _complete(results, left, len(wanted), workers, quiet)
@@ -93,19 +101,31 @@ def _session(workers: Workers, **more: Any) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _about(before: dict[str, Any], rows: Sequence[Row], session: dict[str, Any]) -> dict[str, Any]:
+def _about(
+    before: dict[str, Any], rows: Sequence[Row], settings: dict[str, Any], folder: Path
+) -> dict[str, Any]:  # fmt: skip
+    """Return what is noted of all calls.
+
+    Raises:
+        ParameterError: What is there was made otherwise.
+    """
+    for name, value in settings.items():
+        there = before.get("settings", settings)[name]
+        if there != value:
+            raise ParameterError(name, value, f"{there!r}, as in {folder}; or another folder")
     known = {**before.get("rows", {})}
-    known |= {row.label: {"planner": row.planner, "params": dict(row.params), "all": row.settings()} for row in rows}
+    for row in rows:
+        now = {"planner": row.planner, "all": row.settings()}
+        if known.setdefault(row.label, now) != now:
+            raise ParameterError("planner", row.label, f"the parameters that it has in {folder}; or another folder")
     return {
-        "schema": SCHEMA, "sessions": [*before.get("sessions", []), session], "rows": known,
+        "schema": SCHEMA, "settings": settings, "sessions": before.get("sessions", []), "rows": known,
         "resolution": {"search": SEARCH_RESOLUTION, "full": FULL_RESOLUTION}, "warm_up": before.get("warm_up", {}),
     }  # fmt: skip
 
 
 def _complete(results: Results, left: Sequence[Job], of: int, workers: Workers, quiet: bool) -> None:
     """Make the runs that are left, and write each as it ends."""
-    if not left:
-        return
     file = results.folder / RUNS
     if file.is_file() and not file.read_bytes().endswith(b"\n"):  # the process ended while it wrote
         whole, end, _ = file.read_bytes().rpartition(b"\n")

@@ -27,6 +27,7 @@ OWN = {
     "clearance REAL": "clearance", "verdict calls INTEGER": "checks",
 }  # fmt: skip
 """Names of properties in the log, and in runs."""
+BEHIND = ("simplify", "verify", "repair")  # the planner, in a plan
 
 
 def write_logs(results: Results) -> list[Path]:
@@ -44,18 +45,27 @@ def write_logs(results: Results) -> list[Path]:
     for one in results.runs:
         if one["status"] != NO_PROBLEM:
             by_experiment.setdefault(one["experiment"], []).append(one)
-    return [_write(results, name, runs, folder) for name, runs in sorted(by_experiment.items())]
+    names: dict[str, str] = {}
+    for experiment in sorted(by_experiment):
+        name = "_".join(short(experiment).replace("/", " ").split())  # OMPL's reader takes a line's last word for it
+        again = sum(other == name or other.startswith(f"{name}-") for other in names.values())
+        names[experiment] = f"{name}-{again + 1}" if again else name
+    return [_write(results, name, by_experiment[experiment], folder) for experiment, name in names.items()]
 
 
-def _write(results: Results, experiment: str, runs: list[Run], folder: Path) -> Path:
-    name = Path(experiment).stem if experiment.endswith((".yaml", ".yml")) else experiment
-    name = "_".join(name.replace("/", " ").split())  # OMPL's reader takes the last word of a line for the name
+def short(name: str) -> str:
+    """Return the name of an experiment or a problem; of a file without its folder."""
+    return Path(name).stem if name.endswith((".yaml", ".yml")) else name
+
+
+def _write(results: Results, name: str, runs: list[Run], folder: Path) -> Path:
+    experiment = short(runs[0]["experiment"])
     with quiet_ompl():
         setup = assemble(load_problem(min(one["problem"] for one in runs))).simple_setup
         log = ot.Benchmark(setup, name)
         session = results.about["sessions"][-1]
         for key in ("command", "hardware", "jobs", "split"):
-            log.addExperimentParameter(key, "TEXT", str(session[key]).replace(" = ", "="))
+            log.addExperimentParameter(key, "TEXT", _line(str(session[key]).replace(" = ", "=")))
         data = log.getRecordedExperimentData()
         data.maxTime, data.maxMem = max(one["timeout"] for one in runs), MEMORY
         data.startTime = datetime.fromisoformat(session["date"])
@@ -78,7 +88,8 @@ def _planner(results: Results, label: str, runs: list[Run]) -> ot.PlannerExperim
     made = ot.PlannerExperiment()
     made.name = label
     own = results.about["rows"].get(label, {}).get("all", {})
-    made.common = _properties({**runs[0]["common"], **{name: str(value) for name, value in own.items()}})
+    theirs: dict[str, str] = next((one["common"] for one in runs if one["common"]), {})
+    made.common = _properties({**{name: _line(str(value)) for name, value in own.items()}, **theirs})
     made.runs = [_properties(properties(one)) for one in sorted(runs, key=lambda one: int(one["seed"]))]
     return made
 
@@ -94,15 +105,22 @@ def properties(run: Run) -> dict[str, str]:
     """Return a run's properties as OMPL's log has them: OMPL's own, and ours beside them."""
     found = dict(run["properties"])
     found["solved BOOLEAN"] = found["passed full check BOOLEAN"] = str(int(run["solved"]))
-    found["problem TEXT"] = Path(run["problem"]).name if run["problem"].endswith(".yaml") else run["problem"]
+    found["problem TEXT"] = _line(short(run["problem"]))
     found["seed INTEGER"] = str(run["seed"])
     found["solved by TEXT"] = run["by"]
     found |= {name: _text(run[key]) for name, key in OWN.items()}
     found |= {f"{name} INTEGER": str(value) for name, value in run["counts"].items()}
+    # What Planner Arena adds to the planner's time.
+    found["simplification time REAL"] = _text(sum(run["times"].get(stage, 0.0) for stage in BEHIND))
     for stage, seconds in run["times"].items():
         words = stage.removeprefix(INSIDE) if stage.startswith(INSIDE) else f"plan {stage}"
         found[f"stage {words} REAL"] = _text(seconds)
     return found
+
+
+def _line(text: str) -> str:
+    """Return a text that does not break OMPL's log."""
+    return " ".join(text.split()).replace("; ", ", ")
 
 
 def _text(value: Any) -> str:

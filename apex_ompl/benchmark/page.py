@@ -14,6 +14,7 @@ import jinja2
 import matplotlib
 import numpy as np
 
+from apex_ompl.benchmark.log import short
 from apex_ompl.benchmark.results import Results
 from apex_ompl.benchmark.summary import Figures, about, figures, tables, warnings
 from apex_ompl.errors import FileFormatError, MissingFileError
@@ -23,7 +24,24 @@ matplotlib.use("Agg")
 from matplotlib.figure import Figure  # noqa: E402
 
 COLUMNS = 4  # of small pictures
-COLOURS = ("#0b6e4f", "#c8553d", "#3d5a80", "#e0a458", "#7a5195", "#5f7470", "#b56576", "#1b998b", "#8d6a9f", "#444444")
+COLOURS = (
+    "#0b6e4f",
+    "#c8553d",
+    "#3d5a80",
+    "#e0a458",
+    "#7a5195",
+    "#5f7470",
+    "#b56576",
+    "#1b998b",
+    "#8d6a9f",
+    "#444444",
+    "#a9bcd0",
+    "#6b8e23",
+    "#d4a5a5",
+    "#2f4858",
+    "#f6ae2d",
+    "#86bbd8",
+)
 
 TITLES = {
     "success": "Share of problems with a first path that passed the full check, over time",
@@ -133,7 +151,7 @@ def _grid(
     for axis, level in zip(axes, levels, strict=False):
         mine = [f for f in found if f.experiment == level]
         draw(axis, mine, colours)
-        axis.set_title(Path(level).stem if level.endswith(".yaml") else level, fontsize=9)
+        axis.set_title(short(level), fontsize=9)
         axis.tick_params(labelsize=7)
         axis.set_xlabel(unit, fontsize=7)
         axis.grid(alpha=0.25)

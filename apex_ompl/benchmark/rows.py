@@ -46,7 +46,7 @@ class Row:
         Raises:
             ParameterError: There is no label, or a number is not positive.
         """
-        if not self.label.strip() or "\n" in self.label:
+        if not self.label.strip() or not self.label.isprintable():
             raise ParameterError("label of a planner", self.label, "one line of text")
         for name, value in (("timeout", self.timeout), ("runs", self.runs)):
             if value is not None and not 0 < value < math.inf:
@@ -113,8 +113,10 @@ class Job:
     @property
     def key(self) -> str:
         """What tells the run apart from all others."""
-        made_of = json.dumps([self.planner, dict(self.params), self.timeout, self.simplify], sort_keys=True)
-        return f"{self.problem} {self.seed} {self.label} {hashlib.sha256(made_of.encode()).hexdigest()[:12]}"
+        settings = asdict(planners.parameters(self.planner, **self.params))
+        made_of = json.dumps([self.planner, settings, float(self.timeout), self.simplify], sort_keys=True)
+        digest = hashlib.sha256(made_of.encode()).hexdigest()[:12]
+        return f"{self.experiment} {self.problem} {self.seed} {self.label} {digest}"
 
 
 def experiments(suites: Sequence[str]) -> dict[str, bool]:
@@ -160,6 +162,9 @@ def jobs(
     """
     if split not in SPLITS:
         raise UnknownNameError("split", split, SPLITS)
+    if runs > len(SPLITS[split]) or seed + runs > 2**31:
+        most = min(len(SPLITS[split]), 2**31 - seed)
+        raise ParameterError("runs", runs, f"at most {most}, for there are no more problems of the split, or seeds")
     labels = [row.label for row in rows]
     if len(set(labels)) < len(labels) or not labels:
         raise ParameterError("planners", ", ".join(labels) or "none", "one or more, each once")

@@ -52,6 +52,11 @@ class Figures:
         return [run for run in self.runs if run["solved"]]
 
     @property
+    def planner(self) -> str:
+        """The name of its planner."""
+        return str(self.runs[0]["planner"])
+
+    @property
     def limit(self) -> float:
         """The longest time that a run was given [s]."""
         return max(float(run["timeout"]) for run in self.runs)
@@ -104,10 +109,20 @@ def successes(found: Iterable[Figures]) -> Table:
         low, high = share_interval(len(f.solved), len(f.runs))
         within = [_share(f.share_within(t)) if t <= f.limit else "-" for t in MOMENTS]
         share = f"{_share(len(f.solved) / len(f.runs))} ({_share(low)} to {_share(high)})"
-        trees = sum(f.by[name] for name in TREES if f.label != name) / len(f.runs)
-        rows.append([_once(f.experiment, last), f.label, str(len(f.runs)), share, *within, _share(trees)])
+        trees = sum(f.by[name] for name in TREES if f.planner != name) / len(f.runs)
+        rows.append(
+            [_once(f.experiment, last), f.label, str(len(f.runs)), f"{f.limit:g}", share, *within, _share(trees)]
+        )
         last = f.experiment
-    head = ["level", "planner", "N", "solved (95 %, Wilson)", *(f"in {t:g} s" for t in MOMENTS), "by its trees alone"]
+    head = [
+        "level",
+        "planner",
+        "N",
+        "limit s",
+        "solved (95 %, Wilson)",
+        *(f"in {t:g} s" for t in MOMENTS),
+        "by its trees alone",
+    ]
     return Table("Success", head, rows)
 
 
@@ -137,12 +152,12 @@ def paths(found: Iterable[Figures]) -> Table:
         rows.append([_once(f.experiment, last), f.label, *numbers])
         last = f.experiment
     head = ["level", "planner", "first length rad", "length rad", "first jerk rad/s^3", "jerk rad/s^3", "clearance mm"]
-    return Table("Paths (medians; jerk of a run in 1 s at even speed)", head, rows)
+    return Table("Paths (medians of solved runs; jerk of a run in 1 s at even speed)", head, rows)
 
 
 def stages(found: Iterable[Figures]) -> Table:
     """Return who solved what."""
-    chosen = [f for f in found if len(f.by) > 1 or set(f.by) - {f.label}]
+    chosen = [f for f in found if len(f.by) > 1 or set(f.by) - {f.planner}]
     names = sorted({name for f in chosen for name in f.by})
     rows, last = [], ""
     for f in chosen:
@@ -167,9 +182,17 @@ def warnings(results: Results) -> list[str]:
     if crashed:
         reasons = Counter(f"{run['label']}: {run['reason']}" for run in crashed)
         said.append("Crashed: " + "; ".join(f"{n} x {reason}" for reason, n in reasons.most_common(5)) + ".")
+    faulty = Counter(
+        f"{run['problem']}: {run['reason']}" for run in results.runs if run["status"].startswith("INVALID")
+    )
+    if faulty:
+        said.append("Faulty problems: " + "; ".join(list(faulty)[:5]) + ".")
     skipped = len({run["problem"] for run in results.runs if run["status"] == NO_PROBLEM})
     if skipped:
         said.append(f"{skipped} seeds gave no problem and do not count.")
+    if any(not run["raw_length"] for run in results.runs if run["solved"]):
+        said.append("Of planners that use all their time the first path is not known, and their end stands for it.")
+    said.append("OMPL's Benchmark looks at the clock every 0.1 s: runs may take so much longer than their limit.")
     return said
 
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from apex_ompl.benchmark.rows import Job
 from apex_ompl.benchmark.runs import CRASH, Run, run, told_of, unsolved, warm_up
 from apex_ompl.cluster import spread
-from apex_ompl.errors import ParameterError
+from apex_ompl.errors import ApexError, ParameterError
 
 
 @dataclass(frozen=True)
@@ -48,15 +48,15 @@ class Workers:
             warm: Is told how many seconds the first run of each row took, on this machine.
 
         Raises:
-            ParameterError: A planner kills the process before the first run.
-            ClusterError: The cluster fails.
+            ApexError: A planner kills the process before the first run; a file, a parameter or a checkpoint is at
+                fault; the cluster fails, or a worker there dies twice over one run.
         """
         first = list({job.label: job for job in jobs}.values())
         if self.address is not None:
             named = {job.key: (job, first, self.modules) for job in jobs}
-            yield from (one for _, one in spread(_remote, named, workers=self.at_once, address=self.address))
+            yield from (one for _, one in spread(_remote, named, workers=self.at_once, address=self.address, ahead=1))
             return
-        waiting, suspects = list(jobs[::-1]), list[Job]()
+        waiting, suspects, blamed = list(jobs[::-1]), list[Job](), set[str]()
         while waiting or suspects:  # those under way when a process died are made again, one by one
             under_way: dict[Future[Run], Job] = {}
             pool = self._pool(first, 1 if suspects else self.at_once)
@@ -65,14 +65,16 @@ class Workers:
                 yield from self._pooled(pool, suspects or waiting, 1 if suspects else self.at_once, under_way)
             except BrokenProcessPool:
                 died = list(under_way.values())
-                if not died:
+                if not died and len(waiting) == len(jobs):
                     raise ParameterError(
                         "planners", ", ".join(job.label for job in first), "planners that do not end the process"
                     ) from None
-                if len(died) == 1:
-                    yield told_of(died[0]) | unsolved(CRASH, "the process died")
-                else:
-                    suspects += died
+                for job in died:  # the first time it may have been the doing of a run before
+                    if job.key in blamed:
+                        yield told_of(job) | unsolved(CRASH, "the process died")
+                    else:
+                        blamed.add(job.key)
+                        suspects.append(job)
             finally:
                 pool.shutdown(cancel_futures=True)
 
@@ -87,7 +89,7 @@ class Workers:
         """Make runs of a queue, its end first, and take off what is under way."""
         while queue or under_way:
             while queue and len(under_way) < at_once:
-                under_way[pool.submit(run, queue[-1])] = queue[-1]
+                under_way[pool.submit(_run, queue[-1])] = queue[-1]
                 queue.pop()
             done, _ = wait(under_way, return_when=FIRST_COMPLETED)
             for future in done:
@@ -97,12 +99,16 @@ class Workers:
 
 
 _warm_up: dict[str, float] = {}  # of this process
+_faults: list[ApexError] = []
 
 
 def _prepare(first: Sequence[Job], modules: Sequence[str]) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # between runs; the process that waits for them goes by it
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    _warm_up.update(warm_up(first, modules))
+    try:
+        _warm_up.update(warm_up(first, modules))
+    except ApexError as error:  # said when there is somebody to hear it
+        _faults.append(error)
 
 
 def _end_with_parent() -> None:
@@ -114,7 +120,15 @@ def _end_with_parent() -> None:
 
 
 def _warm_up_seconds() -> dict[str, float]:
+    if _faults:
+        raise _faults[0]
     return _warm_up
+
+
+def _run(job: Job) -> Run:
+    if _faults:
+        raise _faults[0]
+    return run(job)
 
 
 def _remote(job: Job, first: Sequence[Job], modules: Sequence[str]) -> Run:
