@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import signal
 import sqlite3
@@ -148,12 +149,17 @@ def test_a_stopped_command_goes_on(results: Results, tmp_path: Path, how: signal
     folder, runs = tmp_path / "stopped", tmp_path / "stopped" / "runs.jsonl"
     command = [sys.executable, "-m", "apex_ompl.cli", "bench", LEVEL, "--planners", ",".join(ROWS), "--runs", str(RUNS)]
     command += ["--timeout", "10", "--split", "validation", "-o", str(folder)]
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
+    process = subprocess.Popen(
+        command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True, start_new_session=True
+    )
     for _ in range(1200):
         if runs.is_file() and runs.read_text().count("\n") >= 1:
             break
         time.sleep(0.05)
-    process.send_signal(how)
+    if how is signal.SIGINT:  # a terminal sends it to all
+        os.killpg(process.pid, how)
+    else:
+        process.send_signal(how)
     _, said = process.communicate(timeout=60)
     assert process.returncode == (130 if how is signal.SIGINT else -9) and "Traceback" not in said, said
     assert 1 <= len(Results.load(folder).runs) < len(ROWS) * RUNS

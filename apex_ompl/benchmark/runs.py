@@ -18,7 +18,6 @@ from apex_ompl.api import load_problem
 from apex_ompl.assembly import assemble
 from apex_ompl.benchmark.rows import Job
 from apex_ompl.errors import ApexError
-from apex_ompl.interrupt import Interrupt
 from apex_ompl.metrics import jerk
 from apex_ompl.ompl_globals import quiet_ompl, seed_ompl
 from apex_ompl.planning import Planning, solving_time
@@ -102,7 +101,6 @@ def run(job: Job) -> Run:
 
     Raises:
         ApexError: A file, a parameter or a checkpoint is at fault.
-        KeyboardInterrupt: Ctrl-C was pressed; the run ended in good order first.
     """
     about = told_of(job)
     try:
@@ -138,9 +136,7 @@ def _outcome(job: Job) -> Run:
         ready = assemble(problem, _robots[problem.robot], seed=job.seed)
         planning = Benchmarked(ready, job.planner, job.seed, time.perf_counter() - started, ())
         planning.seed, planning.properties, planning.common = job.seed, {}, {}
-        with Interrupt() as planning.interrupt:
-            result = planning.solve(parameters, job.timeout, job.simplify)
-        result = planning.finish(started, result)
+        result = planning.finish(started, planning.solve(parameters, job.timeout, job.simplify))
     return told(planning, result)
 
 

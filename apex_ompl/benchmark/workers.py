@@ -103,7 +103,7 @@ _faults: list[ApexError] = []
 
 
 def _prepare(first: Sequence[Job], modules: Sequence[str]) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # between runs; the process that waits for them goes by it
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the process that waits for runs goes by it
     threading.Thread(target=_end_with_parent, daemon=True).start()
     try:
         _warm_up.update(warm_up(first, modules))
