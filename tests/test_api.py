@@ -15,7 +15,7 @@ from ompl import util as ou
 from support import ROOT
 
 import apex_ompl
-from apex_ompl import PlanResult, PlanStatus, api, load_problem, plan, planners
+from apex_ompl import PlanResult, PlanStatus, load_problem, plan, planners, planning
 from apex_ompl.assembly import assemble
 from apex_ompl.collision import Verdict
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError, UnknownNameError
@@ -147,15 +147,15 @@ def test_several_goals_never_hang(planner: str, problem: Problem, tmp_path: Path
 
 @pytest.mark.parametrize("stage", ["shorten", "repair"])
 def test_ctrl_c_after_the_search_is_not_lost(stage: str, problem: Problem, monkeypatch: pytest.MonkeyPatch) -> None:
-    honest = getattr(api, stage)
+    honest = getattr(planning, stage)
 
     def pressed(*args: object) -> object:
         signal.raise_signal(signal.SIGINT)
         return honest(*args)
 
-    monkeypatch.setattr(api, stage, pressed)
+    monkeypatch.setattr(planning, stage, pressed)
     if stage == "repair":
-        monkeypatch.setattr(api, "full_check", lambda *_: FullCheck(False, "on purpose", 0, 1))
+        monkeypatch.setattr(planning, "full_check", lambda *_: FullCheck(False, "on purpose", 0, 1))
     before = signal.getsignal(signal.SIGINT)
     with pytest.raises(KeyboardInterrupt):
         plan(problem, "rrtconnect", timeout=20.0)

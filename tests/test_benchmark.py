@@ -149,9 +149,13 @@ def test_a_stopped_command_goes_on(results: Results, tmp_path: Path, how: signal
     folder, runs = tmp_path / "stopped", tmp_path / "stopped" / "runs.jsonl"
     command = [sys.executable, "-m", "apex_ompl.cli", "bench", LEVEL, "--planners", ",".join(ROWS), "--runs", str(RUNS)]
     command += ["--timeout", "10", "--split", "validation", "-o", str(folder)]
-    process = subprocess.Popen(
-        command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True, start_new_session=True
-    )
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # what a shell starts behind it ignores Ctrl-C
+    try:
+        process = subprocess.Popen(
+            command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True, start_new_session=True
+        )
+    finally:
+        signal.signal(signal.SIGINT, before)
     for _ in range(1200):
         if runs.is_file() and runs.read_text().count("\n") >= 1:
             break
