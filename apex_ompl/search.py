@@ -133,11 +133,13 @@ class Search:
             queries: The problems, which differ in their starts and goals.
             stop: Asked often whether to give up.
         """
-        for origin in dict.fromkeys(origin for origin, _ in self._known):
+        known, self._known = self._known, []
+        for origin in dict.fromkeys(origin for origin, _ in known):
             if not stop():
                 with self._report.timed("judge"):
-                    self.pool.add([control for mine, control in self._known if mine == origin], origin, stop)
-        self._known = []
+                    there = self.pool.add([control for mine, control in known if mine == origin], origin, stop)
+                if there is not None:
+                    return there
         batch = (self._settings.batches or (0,))[number]
         found = (stage() for stage in self._round(queries, batch, stop) if not stop())
         return next((one for one in found if one is not None), None)
