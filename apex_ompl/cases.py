@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from apex_ompl.engine import RECIPES, Case, Engine, Options, Row
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError
-from apex_ompl.files import is_file, write_atomically
+from apex_ompl.files import is_file, make_folder, write_atomically
 from apex_ompl.kernel import Kernel, RobotTables
 from apex_ompl.kernel.faults import scene_fault
 from apex_ompl.kernel.tables import SceneArrays, SceneTables
@@ -72,10 +72,7 @@ def save_cases(folder: str | os.PathLike[str], cases: Sequence[WrittenCase]) -> 
     folder = Path(folder)
     if not cases:
         raise ParameterError("cases", 0, "one problem or more")
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise MissingFileError(str(folder), "folder for problems", str(error.strerror).lower()) from error
+    make_folder(folder, "folder for problems")
     tables: list[RobotTables] = []
     head: list[dict[str, object]] = []
     for case in cases:

@@ -14,13 +14,14 @@ import re
 import sys
 from collections.abc import Sequence
 from dataclasses import fields
-from importlib import metadata
 from pathlib import Path
 from types import ModuleType
 from typing import NoReturn
 
+from apex_ompl import __version__
 from apex_ompl.errors import ApexError, MissingFileError, ParameterError
 from apex_ompl.files import check_writable
+from apex_ompl.provenance import LIBRARIES, versions
 from apex_ompl.result import INSIDE, PlanResult, PlanStatus, check_suffix
 from apex_ompl.result import SCHEMA as RESULT
 from apex_ompl.schema import read_yaml
@@ -31,7 +32,6 @@ EXIT_CODES = {
     PlanStatus.INVALID_GOAL: 3,
     PlanStatus.APPROXIMATE_SOLUTION: 4,
 }
-LIBRARIES = ("ompl", "pin", "coal", "numba", "numpy", "scipy", "pydantic", "example-robot-data", "torch", "ruckig")
 
 
 class _Parser(argparse.ArgumentParser):
@@ -65,7 +65,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _parser() -> _Parser:
     parser = _Parser(prog="apex-ompl", description="Plan motions of two arms and hands through OMPL.")
-    parser.add_argument("--version", action="version", version=f"apex-ompl {metadata.version('apex-ompl')}")
+    parser.add_argument("--version", action="version", version=f"apex-ompl {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
     plan = commands.add_parser("plan", help="plan a path for a problem")
@@ -304,12 +304,10 @@ def _planners(_: argparse.Namespace) -> int:
 def _info(_: argparse.Namespace) -> int:
     from apex_ompl.robot import load_robot, robot_names
 
-    print(f"apex-ompl {metadata.version('apex-ompl')}, Python {platform.python_version()}, {platform.machine()}")
-    for library in LIBRARIES:
-        try:
-            print(f"  {library:<20} {metadata.version(library)}")
-        except metadata.PackageNotFoundError:
-            print(f"  {library:<20} not installed")
+    print(f"apex-ompl {__version__}, Python {platform.python_version()}, {platform.machine()}")
+    there = versions()
+    for library in LIBRARIES[1:]:
+        print(f"  {library:<20} {there.get(library, 'not installed')}")
     print("robots")
     for name in robot_names():
         robot = load_robot(name)

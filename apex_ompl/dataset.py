@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apex_ompl.errors import FileFormatError, MissingFileError
-from apex_ompl.files import is_file, locked, write_atomically
+from apex_ompl.files import is_file, locked, make_folder, write_atomically
 from apex_ompl.records import FIELDS, DatasetError, Paths, about_fault, arrays_fault, names_fault
 
 SCHEMA = "apex-ompl/dataset/1"
@@ -64,13 +64,8 @@ class Store:
             DatasetError: What is there was made otherwise.
         """
         path = Path(folder) / "manifest.json"
-        try:
-            (path.parent / "units").mkdir(parents=True, exist_ok=True)
-            new = not path.exists()
-        except (OSError, ValueError) as error:
-            why = (getattr(error, "strerror", None) or str(error)).lower()
-            raise MissingFileError(str(folder), "folder for a data set", why) from error
-        if new:
+        make_folder(path.parent / "units", "folder for a data set")
+        if not path.exists():
             write_atomically(path, (json.dumps({"schema": SCHEMA, **manifest}, indent=1) + "\n").encode())
         store = cls(folder)
         for key in same:

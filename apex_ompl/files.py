@@ -42,6 +42,25 @@ def check_writable(path: Path) -> None:
         raise MissingFileError(str(path), OUTPUT, f"no permission to write in {str(path.parent)!r}")
 
 
+def make_folder(folder: str | os.PathLike[str], role: str = "output folder") -> Path:
+    """Make a folder and those above it, if they are not there, and return its path.
+
+    Args:
+        folder: The folder.
+        role: What it is for, as errors name it.
+
+    Raises:
+        MissingFileError: It cannot be made.
+    """
+    path = Path(folder)
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except (OSError, ValueError) as error:
+        why = (getattr(error, "strerror", None) or str(error)).lower()
+        raise MissingFileError(str(path), role, why) from error
+    return path
+
+
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
     """Keep other processes from writing into a folder.

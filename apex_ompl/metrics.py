@@ -47,6 +47,22 @@ def share_interval(count: int, of: int, confidence: float = 0.95) -> tuple[float
     return float(interval.low), float(interval.high)
 
 
+def next_percentile(values: ArrayLike, percentile: float) -> float:
+    """Return a percentile without interpolation, the next larger value, so that values may be infinite.
+
+    Raises:
+        ParameterError: No value is given.
+    """
+    given = np.sort(np.asarray(values, dtype=float))
+    if not given.size:
+        raise ParameterError("values", 0, "one or more")
+    return float(given[_rank(len(given), percentile)])
+
+
+def _rank(count: int, percentile: float) -> int:
+    return max(min(count - 1, int(np.ceil(percentile / 100.0 * count)) - 1), 0)
+
+
 def percentile_interval(
     values: ArrayLike, percentile: float, seed: int = 0, confidence: float = 0.95
 ) -> tuple[float, float]:
@@ -60,8 +76,7 @@ def percentile_interval(
         raise ParameterError("values", 0, "one or more")
     rng = np.random.default_rng(seed)
     drawn = np.sort(rng.integers(len(given), size=(5 * RESAMPLINGS, len(given))), axis=1)  # ranks: inf - inf is nan
-    rank = min(len(given) - 1, int(np.ceil(percentile / 100.0 * len(given))) - 1)
-    found = np.sort(drawn[:, max(rank, 0)])
+    found = np.sort(drawn[:, _rank(len(given), percentile)])
     tail = (1.0 - confidence) / 2.0
     low, high = found[int(tail * len(found))], found[int((1.0 - tail) * len(found))]
     return float(given[low]), float(given[high])

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import platform
 import subprocess
 import sys
 from datetime import UTC, datetime
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -17,19 +15,11 @@ import numpy as np
 
 from apex_ompl import problems
 from apex_ompl.files import write_atomically
+from apex_ompl.metrics import next_percentile
+from apex_ompl.provenance import hardware, versions
 
 RESULTS = Path(__file__).parent / "results"
-LIBRARIES = ("apex-ompl", "ompl", "pin", "coal", "numba", "numpy")
-
-
-def hardware() -> str:
-    """Return the processor's name and the number of cores this process may use."""
-    name = platform.machine()
-    info = Path("/proc/cpuinfo")
-    if info.exists():
-        names = [line.split(":", 1)[1].strip() for line in info.read_text().splitlines() if "model name" in line]
-        name = names[0] if names else name
-    return f"{name}, {len(os.sched_getaffinity(0))} cores"
+LIBRARIES = ("apex-ompl", "ompl", "pin", "coal", "numba", "numpy", "torch")
 
 
 def commit() -> str:
@@ -65,15 +55,15 @@ def write(name: str, figures: dict[str, Any], table: str, **settings: Any) -> No
         "commit": commit(),
         "hardware": hardware(),
         "python": platform.python_version(),
-        "versions": {library: metadata.version(library) for library in LIBRARIES},
+        "versions": versions(LIBRARIES),
         **settings,
     }
     RESULTS.mkdir(exist_ok=True)
     write_atomically(RESULTS / f"{name}.json", (json.dumps({"about": about, **figures}, indent=1) + "\n").encode())
-    versions = ", ".join(f"{k} {v}" for k, v in about["versions"].items())
+    made_with = ", ".join(f"{k} {v}" for k, v in about["versions"].items())
     rest = ", ".join(f"{k} {v}" for k, v in settings.items())
     head = f"`{about['command']}` on {about['hardware']}; {about['date']}, commit {about['commit']}, "
-    head += f"Python {about['python']}, {versions}; {rest}."
+    head += f"Python {about['python']}, {made_with}; {rest}."
     write_atomically(RESULTS / f"{name}.md", f"# {name}\n\n{head}\n\n{table}\n".encode())
     print(table)
 
@@ -87,7 +77,7 @@ def reached(values: list[float] | np.ndarray, p: float) -> float | None:
     """Return a percentile of times, the next larger value; None without any, or where it is endless."""
     if not len(values):
         return None
-    value = float(np.sort(values)[min(len(values) - 1, math.ceil(p / 100 * len(values)) - 1)])
+    value = next_percentile(values, p)
     return value if math.isfinite(value) else None
 
 

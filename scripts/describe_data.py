@@ -48,15 +48,13 @@ def checked(paths: Paths, which: np.ndarray) -> str:
 
 def plot(paths: Paths, figures: list[description.Figures], file: Path) -> None:
     """Draw lengths, clearances, sources and the coverage of joints."""
-    import matplotlib
-
-    matplotlib.use("Agg")
     from io import BytesIO
 
-    import matplotlib.pyplot as plt
+    from matplotlib.figure import Figure
 
     limits = robot().limits
-    fig, axes = plt.subplots(2, 2, figsize=(13, 9), layout="constrained")
+    fig = Figure(figsize=(13, 9), layout="constrained")
+    axes = fig.subplots(2, 2)
     suites = np.array([paths.names["suite"][k] for k in paths.arrays["suite"]])[paths.arrays["problem"]]
     for axis, key, scale, unit in ((axes[0, 0], "length", 1.0, "rad"), (axes[0, 1], "clearance", 1e3, "mm")):
         names = sorted(set(suites.tolist()))
@@ -81,7 +79,6 @@ def plot(paths: Paths, figures: list[description.Figures], file: Path) -> None:
     axes[1, 1].legend(fontsize=8)
     stream = BytesIO()
     fig.savefig(stream, format="png", dpi=90)
-    plt.close(fig)
     write_atomically(file, stream.getvalue())
 
 

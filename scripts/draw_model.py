@@ -22,6 +22,7 @@ from apex_ompl.assembly import PlanningSetup, assemble
 from apex_ompl.diffusion.guidance import Guidance
 from apex_ompl.diffusion.proposals import Sampling
 from apex_ompl.errors import ApexError
+from apex_ompl.files import make_folder
 from apex_ompl.kernel import Kernel
 from apex_ompl.kernel.tables import BOX, HALF_SPACE, SPHERE
 from apex_ompl.optimize import Optimizer
@@ -143,7 +144,7 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, default=Path("docs/pictures"))
     args = parser.parse_args()
     try:
-        args.folder.mkdir(parents=True, exist_ok=True)
+        make_folder(args.folder)
         one, many = (assemble(load_problem(name), robot()) for name in (args.problem, args.many))
         denoising(args.model, one, args.seed, args.folder / "denoising.png")
         count = diversity(args.diverse, many, args.seed, args.folder / "diversity.png")

@@ -18,8 +18,6 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
-from importlib import metadata
-from pathlib import Path
 from typing import Any
 
 from apex_ompl.cases import load_cases, save_cases, work_cases
@@ -27,9 +25,10 @@ from apex_ompl.cluster import spread
 from apex_ompl.dataset import Store
 from apex_ompl.engine import Options
 from apex_ompl.errors import ApexError, ParameterError
-from apex_ompl.files import check_writable
+from apex_ompl.files import check_writable, make_folder
 from apex_ompl.kernel import RobotTables
-from apex_ompl.records import DatasetError, Paths
+from apex_ompl.provenance import versions
+from apex_ompl.records import Paths
 from apex_ompl.spline import Spline
 
 # Pinocchio, Coal and OMPL are imported where problems are drawn: --cases needs none of them.
@@ -69,7 +68,7 @@ def generate(args: argparse.Namespace) -> None:
         "parts": options.parts, "model": args.model, "control_points": args.control_points, "pinned": args.pinned,
         "degree": spline.degree,
         "split": "train", "python": platform.python_version(),
-        "versions": _versions(),
+        "versions": versions(LIBRARIES),
     }  # fmt: skip
     same = (
         "robot",
@@ -156,25 +155,15 @@ def write_cases(args: argparse.Namespace) -> None:
     """Draw problems and write them for machines without Pinocchio.
 
     Raises:
-        DatasetError: The folder cannot be made.
+        MissingFileError: The folder cannot be made.
     """
     from apex_ompl.generation import plan_units, written
 
-    folder = Path(args.folder)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except (OSError, ValueError) as error:
-        raise DatasetError(f"{folder}: {getattr(error, 'strerror', None) or error}, expected a folder") from error
-    check_writable(folder / "cases.npz")
+    check_writable(make_folder(args.folder, "folder for problems") / "cases.npz")
     units = plan_units(args.problems, args.levels, args.split)
     cases = [case for unit in units for case in written(unit)]
     save_cases(args.folder, cases)
     print(f"{args.folder}: {len(cases)} problems in {len({case.unit for case in cases})} units")
-
-
-def _versions() -> dict[str, str]:
-    installed = {dist.metadata["Name"].lower().replace("_", "-"): dist.version for dist in metadata.distributions()}
-    return {library: installed[library] for library in LIBRARIES if library in installed}
 
 
 def summary(store: Store) -> dict[str, Any]:

@@ -22,9 +22,9 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-import matplotlib
 import numpy as np
 import torch
+from matplotlib.figure import Figure
 from tqdm import tqdm
 
 from apex_ompl import metrics, problems
@@ -38,16 +38,13 @@ from apex_ompl.diffusion.guidance import Guidance
 from apex_ompl.diffusion.proposals import Sampling
 from apex_ompl.engine import Options
 from apex_ompl.errors import ApexError
-from apex_ompl.files import write_atomically
+from apex_ompl.files import make_folder, write_atomically
 from apex_ompl.generation import plan_units, work
 from apex_ompl.ompl_globals import quiet_ompl
 from apex_ompl.problems.reach import robot
 from apex_ompl.queries import query_of
 from apex_ompl.records import SOURCES, Paths
 from apex_ompl.spline import Spline
-
-matplotlib.use("Agg")
-from matplotlib.figure import Figure  # noqa: E402
 
 ROOT = Path(__file__).resolve().parents[1]
 TASKS, SIZES = ("vertical", "horizontal"), ("small", "medium", "large")
@@ -57,7 +54,7 @@ PAPER = {
     "model": "apex-paper", "line": False, "repair": False, "bridge": False, "fallback": False, "polish": False,
     "first": 8, "second": 8, "third": 16, "resample": 2,
 }  # fmt: skip
-"""The paper's algorithm alone: guided ancestral sampling in all steps, and resampling of what collides."""
+"""The paper's algorithm without guidance: ancestral sampling in all steps, and resampling of what collides."""
 ALONE = {**PAPER, "model": "apex"}
 ROWS = (
     Row("apex", "apex"),
@@ -248,7 +245,7 @@ def main() -> None:
     try:
         if args.n < 4 or args.workers < 1:
             parser.error("-n is 4 or more, --workers 1 or more")
-        args.keep.mkdir(parents=True, exist_ok=True)
+        make_folder(args.keep)
         found, tables, picture, says = make(args)
         name = f"paper_{args.figure}"
         text = [f"# {name}", f"`python scripts/reproduce.py {args.figure} -n {args.n}`"]

@@ -17,8 +17,8 @@ from typing import Any
 
 import yaml
 
-from apex_ompl.errors import ApexError, MissingFileError
-from apex_ompl.files import locked
+from apex_ompl.errors import ApexError
+from apex_ompl.files import locked, make_folder
 
 
 def train(args: argparse.Namespace) -> None:
@@ -31,11 +31,7 @@ def train(args: argparse.Namespace) -> None:
     from apex_ompl.diffusion.training import Trainer
 
     config = TrainingConfig.read(args.config, dict(args.set))
-    folder = Path(args.out or Path("runs") / Path(args.config).stem)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise MissingFileError(str(folder), "folder of a training run", str(error.strerror).lower()) from error
+    folder = make_folder(args.out or Path("runs") / Path(args.config).stem, "folder of a training run")
     cases = load_cases(config.cases) if config.cases is not None else []
     place = Place.here()
     bars: dict[str, Any] = {}

@@ -10,7 +10,7 @@ from support import ROOT
 
 LAYERS = [
     {"errors"},
-    {"cluster", "files", "meshes", "resolution", "stopwatch"},
+    {"cluster", "files", "meshes", "provenance", "resolution", "stopwatch"},
     {"schema"},
     {"kernel"},
     {"problem", "spline"},

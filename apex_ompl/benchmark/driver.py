@@ -10,18 +10,18 @@ import shlex
 import sys
 from collections.abc import Sequence
 from datetime import UTC, datetime
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
 
 from apex_ompl.api import check_arguments
-from apex_ompl.benchmark.results import ABOUT, RUNS, SCHEMA, Results, hardware
+from apex_ompl.benchmark.results import ABOUT, RUNS, SCHEMA, Results
 from apex_ompl.benchmark.rows import Job, Row, jobs
 from apex_ompl.benchmark.workers import Workers
-from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError
-from apex_ompl.files import locked, write_atomically
+from apex_ompl.errors import FileFormatError, ParameterError
+from apex_ompl.files import locked, make_folder, write_atomically
+from apex_ompl.provenance import hardware, versions
 from apex_ompl.resolution import FULL_RESOLUTION, SEARCH_RESOLUTION
 
 LIBRARIES = ("apex-ompl", "ompl", "pin", "coal", "numba", "numpy", "torch")
@@ -64,11 +64,7 @@ def bench(
         importlib.import_module(module)
     given = [row if isinstance(row, Row) else Row.parse(row) for row in rows]
     wanted = jobs(suites, given, runs=runs, timeout=timeout, seed=seed, split=split, simplify=simplify)
-    folder = Path(out)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except (OSError, ValueError) as error:
-        raise MissingFileError(str(folder), "output folder", getattr(error, "strerror", None) or str(error)) from error
+    folder = make_folder(out)
     with locked(folder):
         if (folder / RUNS).exists() and not (folder / ABOUT).exists():
             raise FileFormatError(
@@ -97,7 +93,7 @@ def _session(workers: Workers, **more: Any) -> dict[str, Any]:
         "command": shlex.join([Path(sys.argv[0]).name or "python", *sys.argv[1:]]),
         "date": datetime.now(UTC).isoformat(timespec="seconds"), "hardware": hardware(), "jobs": workers.at_once,
         "address": workers.address or "", "python": platform.python_version(),
-        "versions": {name: metadata.version(name) for name in LIBRARIES}, **more,
+        "versions": versions(LIBRARIES), **more,
     }  # fmt: skip
 
 

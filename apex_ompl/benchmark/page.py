@@ -11,17 +11,15 @@ from pathlib import Path
 from typing import Any
 
 import jinja2
-import matplotlib
 import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from apex_ompl.benchmark.log import short
 from apex_ompl.benchmark.results import Results
 from apex_ompl.benchmark.summary import Figures, about, figures, tables, warnings
-from apex_ompl.errors import FileFormatError, MissingFileError
-from apex_ompl.files import write_atomically
-
-matplotlib.use("Agg")
-from matplotlib.figure import Figure  # noqa: E402
+from apex_ompl.errors import FileFormatError
+from apex_ompl.files import make_folder, write_atomically
 
 COLUMNS = 4  # of small pictures
 COLOURS = (
@@ -93,11 +91,7 @@ def report(results: str | os.PathLike[str], out: str | os.PathLike[str]) -> tupl
     found = figures(read)
     if not found:
         raise FileFormatError(str(read.folder), "", "none", "expected results with one run or more")
-    folder = Path(out)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except (OSError, ValueError) as error:
-        raise MissingFileError(str(folder), "output folder", getattr(error, "strerror", None) or str(error)) from error
+    folder = make_folder(out)
     page, text = folder / "report.html", folder / "report.md"
     write_atomically(page, html(read, found).encode())
     write_atomically(text, markdown(read).encode())
@@ -161,7 +155,7 @@ def _grid(
     for axis in axes[len(levels) :]:
         axis.set_visible(False)
     if legend:
-        handles = [matplotlib.lines.Line2D([], [], color=colour, label=label) for label, colour in colours.items()]
+        handles = [Line2D([], [], color=colour, label=label) for label, colour in colours.items()]
         figure.legend(handles=handles, loc="outside upper center", ncols=min(4, len(handles)), fontsize=8)
     return _png(figure)
 

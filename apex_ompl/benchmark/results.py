@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import platform
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -66,12 +65,3 @@ class Results:
             MissingFileError: The file cannot be written.
         """
         write_atomically(self.folder / ABOUT, (json.dumps(self.about, indent=1) + "\n").encode())
-
-
-def hardware() -> str:
-    """Return the name of the processor and the number of cores that this process may use."""
-    name, info = platform.processor() or platform.machine(), Path("/proc/cpuinfo")
-    if info.exists():
-        names = [line.split(":", 1)[1].strip() for line in info.read_text().splitlines() if "model name" in line]
-        name = names[0] if names else name
-    return f"{name}, {len(os.sched_getaffinity(0))} cores"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import os
 import time
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -53,14 +54,14 @@ class Benchmarked(Planning):
         beside: States that the experiment judged for itself.
         properties: OMPL's properties of the run.
         common: OMPL's parameters of the planner.
-        seed: Of OMPL's random numbers.
     """
 
-    optimizing: bool = False
-    beside: int = 0
-    properties: dict[str, str]
-    common: dict[str, str]
-    seed: int
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        """Take what a call of ``plan`` takes."""
+        super().__init__(*args, **kwargs)
+        self.optimizing, self.beside = False, 0
+        self.properties: dict[str, str] = {}
+        self.common: dict[str, str] = {}
 
     def straight_line(self) -> NDArray[np.float64] | None:
         """Return None: the planner has to find it."""
@@ -72,7 +73,7 @@ class Benchmarked(Planning):
         judged = [tally.states]
 
         def begin(_: ob.Planner) -> None:
-            seed_ompl(self.seed)  # the experiment itself has drawn and judged states by then
+            seed_ompl(self.blank.seed)  # the experiment itself has drawn and judged states by then
             judged.append(tally.states)
 
         def end(*_: object) -> None:  # behind it the experiment judges the path, and clears the planner
@@ -122,7 +123,7 @@ def unsolved(status: str, reason: str) -> Run:
     """Return what is said of a run without a result."""
     return {"status": status, "reason": reason, "solved": False, "by": "", "first": None, "total": None, "setup": None,
             "times": {}, "length": None, "raw_length": None, "jerk": None, "raw_jerk": None, "clearance": None,
-            "checks": 0, "counts": {}, "properties": {}, "common": {}}  # fmt: skip
+            "checks": 0, "counts": {}, "properties": {}, "common": {}, "load": None}  # fmt: skip
 
 
 def _outcome(job: Job) -> Run:
@@ -135,7 +136,6 @@ def _outcome(job: Job) -> Run:
         seed_ompl(job.seed)
         ready = assemble(problem, _robots[problem.robot], seed=job.seed)
         planning = Benchmarked(ready, job.planner, job.seed, time.perf_counter() - started, ())
-        planning.seed, planning.properties, planning.common = job.seed, {}, {}
         result = planning.finish(started, planning.solve(parameters, job.timeout, job.simplify))
     return told(planning, result)
 
@@ -144,13 +144,13 @@ def told(planning: Benchmarked, result: PlanResult) -> Run:
     """Return what is stored of a run."""
     times, path, report = result.times, result.path if result else None, planning.report
     raw = None if planning.optimizing else planning.raw  # others go on behind their first path
-    found = bool(result)
+    found = path is not None
     total = sum(times.get(stage, 0.0) for stage in ("solve", "simplify", *PROOF))
     first = times.get(FIRST, times.get("solve", 0.0))
     if report is None or not report.judged:  # what the planner found had still to be proved
         first += sum(times.get(stage, 0.0) for stage in PROOF)
     return {
-        "status": str(result.status), "reason": result.reason, "solved": bool(result), "by": result.solved_by,
+        "status": str(result.status), "reason": result.reason, "solved": found, "by": result.solved_by,
         "first": first if found else None, "total": total, "setup": times.get("setup"), "times": dict(times),
         "length": result.length if path is not None else None,
         "raw_length": path_length(raw) if found and raw is not None else None,
@@ -158,6 +158,7 @@ def told(planning: Benchmarked, result: PlanResult) -> Run:
         "raw_jerk": jerk(raw) if found and raw is not None and path_length(raw) > 0.0 else None,
         "clearance": result.clearance if path is not None and np.isfinite(result.clearance) else None,
         "checks": result.checks - planning.beside, "properties": planning.properties, "common": planning.common,
+        "load": os.getloadavg()[0],
         "counts": {} if report is None else {
             "candidates": report.candidates, "proposals": report.proposed, "resamples": report.resampled,
             "repair steps": report.steps, "improvements": report.improved,

@@ -12,8 +12,9 @@ import numpy as np
 
 from apex_ompl.benchmark.results import Results
 from apex_ompl.benchmark.runs import NO_PROBLEM, Run
-from apex_ompl.metrics import percentile_interval, share_interval
+from apex_ompl.metrics import next_percentile, percentile_interval, share_interval
 
+OTHERS = 0.5  # load average of other processes that is let pass
 MOMENTS = (0.1, 0.5, 2.0, 10.0)  # at which shares of solved runs are given [s]
 TREES = ("rrtconnect", "sprint")  # what of apex is a tree's work alone
 
@@ -71,8 +72,7 @@ class Figures:
 
     def percentile(self, which: str, p: float) -> float:
         """Return a percentile of times, the next larger one; infinite where fewer runs are solved [s]."""
-        times = self.times(which)
-        return float(times[min(len(times) - 1, math.ceil(p / 100 * len(times)) - 1)])
+        return next_percentile(self.times(which), p)
 
     def median(self, key: str) -> float:
         """Return the median of what solved runs have, NaN where none has it."""
@@ -174,6 +174,10 @@ def warnings(results: Results) -> list[str]:
         said.append("Runs were made on a cluster, whose machines are not said.")
     if any(session["jobs"] > 1 for session in sessions):
         said.append("Several runs went at the same time, so that times are longer than those of runs alone.")
+    most = max(session["jobs"] for session in sessions) + OTHERS
+    beside = sum(run["load"] is not None and run["load"] > most for run in results.runs)
+    if beside:
+        said.append(f"Other processes were at work beside {beside} of {len(results.runs)} runs (load over {most:g}).")
     if len({session["hardware"] for session in sessions}) > 1:
         said.append("The runs were made on different machines.")
     if len({str(session["versions"]) for session in sessions}) > 1:
