@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -67,7 +67,7 @@ class VerdictMotionValidator(ob.MotionValidator):
     def __init__(self, si: ob.SpaceInformation, check: MotionCheck) -> None:
         """Judge motions of ``si`` by ``check``."""
         super().__init__(si)
-        self.check = check
+        self.check: Callable[[Array, Array], bool] = check
         self.dof = check.verdict.robot.dof
         self.fault: BaseException | None = None
 

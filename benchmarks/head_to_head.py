@@ -7,12 +7,15 @@ problems of a level); the straight line, and eight random bumps in the place of 
 Runs are kept in benchmarks/runs/head_to_head as they end, with OMPL's logs and the database for Planner Arena; the
 command goes on where it was stopped.
 
-Usage: python benchmarks/head_to_head.py [SUITE[/LEVEL] ...] [-n 100] [--jobs 1]
+scripts/reproduce.py takes its runs from there, and adds some.
+
+Usage: python benchmarks/head_to_head.py [SUITE[/LEVEL] ...] [-n 50] [--jobs 1]
 """
 
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 
 import record
@@ -49,12 +52,14 @@ def main() -> None:
     """Run what is missing, and write the results."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("levels", nargs="*", metavar="SUITE[/LEVEL]")
-    parser.add_argument("-n", type=int, default=100, help="problems of a level (default: %(default)s)")
+    parser.add_argument("-n", type=int, default=50, help="problems of a level (default: %(default)s)")
     parser.add_argument("--jobs", type=int, default=1, help="runs at a time (default: one, as they are timed)")
     args = parser.parse_args()
     folder = Path(__file__).parent / "runs" / "head_to_head"
     workers = Workers(args.jobs, modules=("controls",))
-    results = bench(record.static_levels(args.levels), ROWS, folder, runs=args.n, timeout=TIMEOUT, workers=workers)
+    levels, labels = record.static_levels(args.levels), {row.label for row in ROWS}
+    results = bench(levels, ROWS, folder, runs=args.n, timeout=TIMEOUT, workers=workers)
+    results = replace(results, runs=[run for run in results.runs if run["label"] in labels])
     write_database(results, write_logs(results))
     report(folder, folder)
     found = [table for table in tables(results) if table.rows]

@@ -5,10 +5,10 @@
 ``fid``: FID and KID of guided and unguided paths against solutions of the same problems, in the features of the
 variational autoencoder of ``apex-paper`` and in principal components.
 
-The runs of ``failure`` and ``size`` are the same, and are kept as they end; so are the solutions of ``fid``. The
-command goes on where it was stopped.
+The runs of ``failure`` and ``size`` are the same, and are kept as they end, beside those of benchmarks/head_to_head.py,
+some of which they are; so are the solutions of ``fid``. The command goes on where it was stopped.
 
-Usage: python scripts/reproduce.py failure|size|fid [-n 100] [--keep FOLDER] [-o FOLDER]
+Usage: python scripts/reproduce.py failure|size|fid [-n 50] [--keep FOLDER] [-o FOLDER]
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ STEPS = 8  # of DDIM, for apex-paper, whose own 256 would take hours
 def runs(args: argparse.Namespace) -> Results:
     """Return the runs of the planners on the paper's tasks."""
     levels = [f"{task}/{size}" for task in TASKS for size in EDGES]
-    return bench(levels, ROWS, args.keep / "paper", runs=args.n, timeout=TIMEOUT)
+    return bench(levels, ROWS, args.keep / "head_to_head", runs=args.n, timeout=TIMEOUT)
 
 
 def failure(args: argparse.Namespace) -> tuple[dict[str, Any], list[Table], Figure, list[tuple[str, Any]]]:
@@ -228,14 +228,14 @@ def first_of_each(paths: Paths) -> list[int]:
     return list(found.values())
 
 
-FIGURES = {"failure": (failure, 100), "size": (size, 100), "fid": (fid, 10_000)}
+FIGURES = {"failure": (failure, 50), "size": (size, 50), "fid": (fid, 10_000)}
 
 
 def main() -> None:
     """Make a figure."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("figure", choices=FIGURES)
-    parser.add_argument("-n", type=int, help="problems of a level, or for fid in all (default: 100, 10000)")
+    parser.add_argument("-n", type=int, help="problems of a level, or for fid in all (default: 50, 10000)")
     parser.add_argument("--workers", type=int, default=2, help="for the solutions of fid (default: %(default)s)")
     parser.add_argument("--keep", type=Path, default=ROOT / "benchmarks" / "runs", metavar="FOLDER", help="for runs")
     parser.add_argument("-o", "--out", type=Path, default=ROOT / "benchmarks" / "results", metavar="FOLDER")

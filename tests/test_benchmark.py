@@ -15,8 +15,8 @@ import pytest
 from ompl import tools as ot
 
 from apex_ompl import benchmark, problems
-from apex_ompl.benchmark import Results, Row, Workers, bench
-from apex_ompl.benchmark.rows import experiments, jobs
+from apex_ompl.benchmark import Results, Row, Workers, bench, runs
+from apex_ompl.benchmark.rows import Job, experiments, jobs
 from apex_ompl.benchmark.summary import Figures, figures
 from apex_ompl.cli import main
 from apex_ompl.errors import ApexError, FileFormatError, MissingFileError, ParameterError, UnknownNameError
@@ -146,7 +146,7 @@ def test_what_is_there_is_not_run_again_and_broken_lines_are(results: Results, t
 
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
 def test_a_stopped_command_goes_on(results: Results, tmp_path: Path, how: signal.Signals) -> None:
-    folder, runs = tmp_path / "stopped", tmp_path / "stopped" / "runs.jsonl"
+    folder, file = tmp_path / "stopped", tmp_path / "stopped" / "runs.jsonl"
     command = [sys.executable, "-m", "apex_ompl.cli", "bench", LEVEL, "--planners", ROWS[1], "--runs", str(RUNS)]
     command += ["--timeout", "10", "--split", "validation", "-o", str(folder)]
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # what a shell starts behind it ignores Ctrl-C
@@ -157,7 +157,7 @@ def test_a_stopped_command_goes_on(results: Results, tmp_path: Path, how: signal
     finally:
         signal.signal(signal.SIGINT, before)
     for _ in range(1200):
-        if runs.is_file() and runs.read_text().count("\n") >= 1:
+        if file.is_file() and file.read_text().count("\n") >= 1:
             break
         time.sleep(0.05)
     if how is signal.SIGINT:  # a terminal sends it to all
@@ -196,12 +196,19 @@ def test_success_is_the_full_check_and_a_dead_process_is_a_crash(tmp_path: Path)
 
 
 def made_up(firsts: list[float | None], timeout: float = 2.0) -> Figures:
-    runs = [
+    made = [
         {"solved": t is not None, "first": t, "total": None if t is None else t + 0.1, "by": "apex", "timeout": timeout,
          "length": 3.0 if t is not None else None}
         for t in firsts
     ]  # fmt: skip
-    return Figures("a/b", "apex", runs)
+    return Figures("a/b", "apex", made)
+
+
+def test_first_paths_of_planners_that_use_all_their_time_are_noticed() -> None:
+    for name in ("aorrtc", "informedrrtstar"):
+        found = runs.run(Job("x", "wall/easy/800000", name, name, {}, 0, 1.0, True))
+        assert found["solved"] and found["raw_length"] is None
+        assert 0.0 < found["first"] < 0.5 * found["total"], name
 
 
 def test_figures_count_what_is_not_solved_as_endless() -> None:

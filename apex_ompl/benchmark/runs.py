@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import importlib
+import math
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
@@ -50,7 +51,7 @@ class Benchmarked(Planning):
     The planner runs even where the straight line is a solution.
 
     Attributes:
-        optimizing: Whether the planner goes on until its time is up; its first path is not known then.
+        optimizing: Whether the planner goes on until its time is up; the length of its first path is not known then.
         beside: States that the experiment judged for itself.
         properties: OMPL's properties of the run.
         common: OMPL's parameters of the planner.
@@ -80,6 +81,7 @@ class Benchmarked(Planning):
             judged.append(tally.states)
             reports.append(getattr(planner, "report", None))
 
+        noticed = self._notice_first() if parameters.optimizing else list[float]()
         experiment = ot.Benchmark(self.ready.simple_setup, "run")
         experiment.addPlanner(planner)
         experiment.setPreRunEvent(begin)
@@ -94,7 +96,35 @@ class Benchmarked(Planning):
         self.optimizing = parameters.optimizing
         self.properties, self.common = recorded.runs[0].to_dict(), recorded.common.to_dict()
         self.times["solve"] = float(self.properties["time REAL"])
+        noticed += [moment for data in recorded.runsProgressData for moment in _solved_at(data)]
+        if noticed:
+            self.times[FIRST] = min(noticed)
         return PlanStatus(ob.PlannerStatus.PlannerStatusType(int(self.properties["status ENUM"])).name)
+
+    def _notice_first(self) -> list[float]:
+        """Let the first motion that is checked when there is a path note the time since the first motion [s]."""
+        noticed = list[float]()
+        check, definition = self.ready.motions.check, self.ready.simple_setup.getProblemDefinition()
+        begin = 0.0
+
+        def watched(first: NDArray[np.float64], second: NDArray[np.float64]) -> bool:
+            nonlocal begin
+            begin = begin or time.perf_counter()
+            if not noticed and definition.hasExactSolution():
+                noticed.append(time.perf_counter() - begin)
+            return check(first, second)
+
+        self.ready.motions.check = watched
+        return noticed
+
+
+def _solved_at(progress: Iterable[Any]) -> Iterator[float]:
+    """Yield the moments of a run at which the planner said that it had a path [s]."""
+    for moment in progress:
+        said = moment.to_dict()
+        costs = (float(value) for name, value in said.items() if name.startswith("best cost"))
+        if any(math.isfinite(cost) for cost in costs):
+            yield float(said["time REAL"])
 
 
 def run(job: Job) -> Run:

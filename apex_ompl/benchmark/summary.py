@@ -195,7 +195,9 @@ def warnings(results: Results) -> list[str]:
     if skipped:
         said.append(f"{skipped} seeds gave no problem and do not count.")
     if any(not run["raw_length"] for run in results.runs if run["solved"]):
-        said.append("Of planners that use all their time the first path is not known, and their end stands for it.")
+        said.append(
+            "First paths of planners that use all their time are noticed up to 0.05 s late, without their length."
+        )
     said.append("OMPL's Benchmark looks at the clock every 0.1 s: runs may take so much longer than their limit.")
     return said
 
