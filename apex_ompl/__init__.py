@@ -1,8 +1,8 @@
 """APEX for OMPL: dual-arm planning with latent diffusion, real meshes and proven paths.
 
 ``plan`` solves a problem, ``load_problem`` reads one, ``setup`` gives OMPL's SimpleSetup of one, ``load_model`` reads
-a trained model. Planners are in
-``apex_ompl.planners``, ready-made problems in ``apex_ompl.problems``.
+a trained model, ``time_path`` times any path. Planners are in ``apex_ompl.planners``, ready-made problems in
+``apex_ompl.problems``.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from apex_ompl.problem import Problem
     from apex_ompl.result import PlanResult, PlanStatus
     from apex_ompl.robot import Robot, load_robot
+    from apex_ompl.trajectory import Timing, Trajectory, time_path
 
 __version__ = "0.1.0"
 
@@ -26,11 +27,14 @@ _HOMES = {
     "PlanStatus": "result",
     "Problem": "problem",
     "Robot": "robot",
+    "Timing": "trajectory",
+    "Trajectory": "trajectory",
     "load_model": "diffusion.checkpoint",
     "load_problem": "api",
     "load_robot": "robot",
     "plan": "api",
     "setup": "api",
+    "time_path": "trajectory",
 }
 
 __all__ = [
@@ -39,11 +43,14 @@ __all__ = [
     "PlanStatus",
     "Problem",
     "Robot",
+    "Timing",
+    "Trajectory",
     "load_model",
     "load_problem",
     "load_robot",
     "plan",
     "setup",
+    "time_path",
 ]
 
 

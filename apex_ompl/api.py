@@ -21,6 +21,7 @@ from apex_ompl.planners.apex_parameters import WITHOUT_MODEL, default_planner
 from apex_ompl.planning import Planning
 from apex_ompl.problem import Problem
 from apex_ompl.result import PlanResult
+from apex_ompl.trajectory import Timing, warm_up
 
 
 def load_problem(name_or_path: str | os.PathLike[str]) -> Problem:
@@ -68,8 +69,9 @@ def plan(
     simplify: bool = True,
     params: Mapping[str, Any] | None = None,
     snapshot: bool = False,
+    timing: bool | Timing = True,
 ) -> PlanResult:
-    """Plan a path and prove it by the full check.
+    """Plan a path, prove it by the full check, and time it.
 
     The straight line to each goal is tried before the planner runs. What the planner finds is shortened unless it is
     smooth, proved, and planned anew where the proof fails.
@@ -86,9 +88,10 @@ def plan(
         simplify: Whether to shorten the path that was found.
         params: Parameters of the planner by name.
         snapshot: Plan among moving obstacles as they stand at time 0.
+        timing: How the path is timed, or whether; the timed motion is proved by the full check too.
 
     Returns:
-        The result; it is true only for an exact path that passed the full check.
+        The result; it is true only for an exact path that passed the full check and, unless timing is off, is timed.
 
     Raises:
         ApexError: The problem, the planner or a parameter is unknown or faulty.
@@ -96,6 +99,9 @@ def plan(
     """
     started = time.perf_counter()
     check_arguments(timeout, seed)
+    if not isinstance(timing, (bool, Timing)):
+        raise ParameterError("timing", timing, "True, False or a Timing")
+    how = (Timing() if timing else None) if isinstance(timing, bool) else timing
     if planner is not None:
         planners.parameters(planner, **dict(params or {}))  # before the problem is read
     loaded = problem if isinstance(problem, Problem) else load_problem(problem)
@@ -105,6 +111,9 @@ def plan(
     with quiet_ompl():
         seed_ompl(seed)
         ready = assemble(loaded, seed=seed)
+        if how is not None:
+            how.start(how.limits(ready.robot.limits))  # whether it fits the robot
+            warm_up()
         notes = [f"snapshot: {', '.join(loaded.moving)} taken to stand still"] if loaded.moving else []
         if planner is None:
             planner = default_planner(ready.robot.name)
@@ -114,6 +123,8 @@ def plan(
         run = Planning(ready, planner, seed, time.perf_counter() - started, tuple(notes))
         with Interrupt() as run.interrupt:
             result = run.solve(parameters, timeout, simplify)
+            if how is not None:
+                result = run.with_timing(result, how)
         return run.finish(started, result)
 
 

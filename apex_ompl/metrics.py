@@ -11,7 +11,6 @@ from itertools import combinations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import linalg, stats
 
 from apex_ompl.errors import ParameterError
 from apex_ompl.space import resample
@@ -43,6 +42,8 @@ def share_interval(count: int, of: int, confidence: float = 0.95) -> tuple[float
     """
     if not 0 <= count <= of or of == 0:
         raise ParameterError("count", count, f"0 to {of}, of one or more")
+    from scipy import stats
+
     interval = stats.binomtest(count, of).proportion_ci(confidence, method="wilson")
     return float(interval.low), float(interval.high)
 
@@ -172,7 +173,7 @@ def frechet_distance(real: ArrayLike, made: ArrayLike) -> float:
     first, second = (np.atleast_2d(np.cov(x, rowvar=False)) for x in (a, b))
     # The trace of the root of a product is the sum of the singular values of the product of the roots.
     roots = [_root(covariance) for covariance in (first, second)]
-    shared = linalg.svdvals(roots[0] @ roots[1]).sum()
+    shared = np.linalg.svd(roots[0] @ roots[1], compute_uv=False).sum()
     return max(0.0, mean + float(np.trace(first) + np.trace(second) - 2.0 * shared))
 
 
@@ -268,5 +269,5 @@ def _features(real: ArrayLike, made: ArrayLike) -> tuple[Array, Array]:
 
 def _root(covariance: Array) -> Array:
     """Return the root of a covariance."""
-    values, vectors = linalg.eigh(covariance)
+    values, vectors = np.linalg.eigh(covariance)
     return np.asarray((vectors * np.sqrt(np.clip(values, 0.0, None))) @ vectors.T)

@@ -20,10 +20,14 @@ from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError
 from apex_ompl.files import write_atomically
 from apex_ompl.problem import Problem
 from apex_ompl.schema import dump_yaml, read_yaml, validate
+from apex_ompl.trajectory import Trajectory
+from apex_ompl.trajectory.files import suffix_of
 
-SCHEMA = "apex-ompl/result/1"
-SUFFIXES = (".npz", ".csv", ".json", ".yaml")
-
+SCHEMA = "apex-ompl/result/2"
+MOTIONS = (".traj.yaml", ".traj.json")
+SUFFIXES = (*MOTIONS, ".npz", ".csv", ".json", ".yaml")
+KNOTS = ("times", "positions", "velocities", "accelerations")
+NUMBERS = ("length", "clearance", "deviation")
 
 INSIDE = "solve: "
 """Stands before the names of a planner's own stages in ``PlanResult.times``."""
@@ -32,7 +36,7 @@ FIRST = INSIDE + "first"
 
 
 class PlanStatus(StrEnum):
-    """OMPL's planner status names."""
+    """OMPL's planner status names, and TIMING_FAILED for a proven path that could not be timed."""
 
     UNKNOWN = "UNKNOWN"
     INVALID_START = "INVALID_START"
@@ -44,6 +48,7 @@ class PlanStatus(StrEnum):
     CRASH = "CRASH"
     ABORT = "ABORT"
     INFEASIBLE = "INFEASIBLE"
+    TIMING_FAILED = "TIMING_FAILED"
 
     @classmethod
     def of(cls, status: ob.PlannerStatus) -> PlanStatus:
@@ -56,7 +61,8 @@ class PlanResult:
     """Outcome of one call of ``plan``; true only when ``status`` is EXACT_SOLUTION.
 
     Attributes:
-        status: OMPL's name; EXACT_SOLUTION only for a path that passed the full check.
+        status: OMPL's name; EXACT_SOLUTION only for a path that passed the full check and, unless timing is off, is
+            timed; TIMING_FAILED for one that could not be timed.
         reason: One sentence that explains a status other than EXACT_SOLUTION.
         problem: The problem.
         robot: Name of the robot.
@@ -64,6 +70,10 @@ class PlanResult:
         planner: Name of the planner.
         seed: The seed used.
         path: States to be joined by straight lines, shape (N, dof) [rad; synergies 0..1], or None.
+        trajectory: The timed motion, which passed the full check along its own samples and keeps all limits, or None.
+        limit_use: Largest share of each limit that ``trajectory`` uses, by ``position``, ``velocity``,
+            ``acceleration`` and ``jerk``; empty without one.
+        deviation: Largest distance of ``trajectory`` from ``path`` at its knots [rad], NaN without one.
         times: Seconds per stage, and ``total``; those of a planner's own stages, as ``solve: repair``, are part of
             ``solve``.
         length: Sum of Euclidean joint-space steps [rad], NaN without a path.
@@ -83,6 +93,9 @@ class PlanResult:
     planner: str
     seed: int
     path: NDArray[np.float64] | None = None
+    trajectory: Trajectory | None = None
+    limit_use: Mapping[str, float] = field(default_factory=dict)
+    deviation: float = float("nan")
     times: Mapping[str, float] = field(default_factory=dict)
     length: float = float("nan")
     clearance: float = float("nan")
@@ -91,11 +104,12 @@ class PlanResult:
     notes: tuple[str, ...] = ()
 
     def __bool__(self) -> bool:
-        """Whether there is an exact path that passed the full check."""
+        """Whether there is an exact path that passed the full check and, unless timing is off, is timed."""
         return self.status is PlanStatus.EXACT_SOLUTION
 
     def as_dict(self) -> dict[str, Any]:
         """Return the fields as plain data, ready for JSON; numbers that do not exist are None."""
+        motion = self.trajectory
         return {
             "schema": SCHEMA,
             "status": str(self.status),
@@ -112,18 +126,32 @@ class PlanResult:
             "notes": list(self.notes),
             "joint_names": list(self.joint_names),
             "path": None if self.path is None else self.path.tolist(),
+            "duration": None if motion is None else motion.duration,
+            "limit_use": dict(self.limit_use),
+            "deviation": None if np.isnan(self.deviation) else self.deviation,
+            "jerk": None if motion is None else motion.jerk,
+            "spectral_arc_length": None if motion is None else motion.spectral_arc_length,
+            "trajectory": None if motion is None else {key: getattr(motion, key).tolist() for key in KNOTS},
             "problem_file": self.problem.as_dict(),
         }
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the result by the suffix of ``path``: .npz, .json, .yaml (all fields) or .csv (the path).
+        """Write the result by the suffix of ``path``.
+
+        ``.npz``, ``.json`` and ``.yaml`` hold all fields, for :meth:`load`. ``.traj.yaml``, ``.traj.json`` and ``.csv``
+        hold the timed motion, see :meth:`apex_ompl.trajectory.Trajectory.save`; a ``.csv`` of a result without one
+        holds the path.
 
         Raises:
-            ParameterError: Another suffix, or a CSV without a path.
+            ParameterError: Another suffix, or nothing of the kind in the result.
             MissingFileError: The folder is missing or cannot be written.
         """
         path = Path(path)
-        write_atomically(path, self._encoded(check_suffix(path)))
+        suffix = check_suffix(path)
+        if self.trajectory is not None and suffix in (*MOTIONS, ".csv"):
+            self.trajectory.save(path)
+        else:
+            write_atomically(path, self._encoded(suffix))
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> PlanResult:
@@ -135,22 +163,26 @@ class PlanResult:
             ParameterError: It has another suffix; a .csv holds no problem.
         """
         path = Path(path)
-        suffixes = tuple(s for s in SUFFIXES if s != ".csv")
-        if path.suffix not in suffixes:
+        suffixes = tuple(s for s in SUFFIXES if s not in (*MOTIONS, ".csv"))
+        if path.suffix not in suffixes or path.name.endswith(MOTIONS):
             raise ParameterError("result file", str(path), f"a file name ending in {', '.join(suffixes)}")
         data = read_yaml(path, "result file") if path.suffix != ".npz" else _read_npz(path)
         if data.get("schema") != SCHEMA:
             raise FileFormatError(str(path), "schema", data.get("schema"), f"expected {SCHEMA!r}")
         try:
             states = None if data["path"] is None else np.array(data["path"], dtype=float)
-            number = {k: float("nan") if data[k] is None else float(data[k]) for k in ("length", "clearance")}
+            number = {k: float("nan") if data[k] is None else float(data[k]) for k in NUMBERS}
+            knots, names = data["trajectory"], tuple(data["joint_names"])
+            arrays = {} if knots is None else {key: np.array(knots[key], dtype=float) for key in KNOTS}
+            motion = Trajectory(**arrays, joint_names=names) if arrays else None
             return cls(
                 status=PlanStatus(data["status"]), reason=data["reason"], robot=data["robot"], path=states,
                 problem=validate(Problem, data["problem_file"], str(path)), planner=data["planner"],
-                joint_names=tuple(data["joint_names"]), seed=int(data["seed"]), times=data["times"],
-                checks=int(data["checks"]), solved_by=data["solved_by"], notes=tuple(data["notes"]), **number,
+                joint_names=names, trajectory=motion, limit_use=data["limit_use"], seed=int(data["seed"]),
+                times=data["times"], checks=int(data["checks"]), solved_by=data["solved_by"],
+                notes=tuple(data["notes"]), **number,
             )  # fmt: skip
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, ParameterError) as error:
             raise FileFormatError(str(path), "", str(error), "expected a complete saved result") from error
 
     def _encoded(self, suffix: str) -> bytes:
@@ -159,6 +191,8 @@ class PlanResult:
             return (json.dumps(data, indent=1) + "\n").encode()
         if suffix == ".yaml":
             return dump_yaml(data).encode()
+        if suffix in MOTIONS:
+            raise ParameterError("output", suffix, "a result with a timed motion")
         if suffix == ".csv":
             if self.path is None:
                 raise ParameterError("output", suffix, "a result with a path")
@@ -167,8 +201,10 @@ class PlanResult:
             return ("\n".join(rows) + "\n").encode()
         buffer = io.BytesIO()
         states = np.empty((0, len(self.joint_names))) if self.path is None else self.path
-        del data["path"]
-        np.savez(buffer, path=states, joint_names=np.array(self.joint_names), result=np.array(json.dumps(data)))
+        del data["path"], data["trajectory"]
+        arrays = {} if self.trajectory is None else {key: getattr(self.trajectory, key) for key in KNOTS}
+        names = np.array(self.joint_names)
+        np.savez(buffer, path=states, joint_names=names, result=np.array(json.dumps(data)), **arrays)
         return buffer.getvalue()
 
 
@@ -178,7 +214,8 @@ def _read_npz(path: Path) -> dict[str, Any]:
             data = json.loads(str(archive["result"]))
             if not isinstance(data, dict):
                 raise ValueError("no mapping")
-            return data | {"path": archive["path"] if len(archive["path"]) else None}
+            knots = {key: archive[key] for key in KNOTS} if KNOTS[0] in archive else None
+            return data | {"path": archive["path"] if len(archive["path"]) else None, "trajectory": knots}
     except FileNotFoundError as error:
         raise MissingFileError(str(path), "result file") from error
     except (OSError, KeyError, ValueError, zipfile.BadZipFile) as error:
@@ -191,6 +228,4 @@ def check_suffix(path: Path) -> str:
     Raises:
         ParameterError: It is none of ``SUFFIXES``.
     """
-    if path.suffix not in SUFFIXES:
-        raise ParameterError("output", path.name, f"a file name ending in {', '.join(SUFFIXES)}")
-    return path.suffix
+    return suffix_of(path, SUFFIXES)

@@ -24,13 +24,14 @@ LAYERS = [
     {"collision"},
     {"ik", "interrupt", "ompl_globals", "space"},
     {"goals", "grasp", "metrics"},
-    {"validity"},
+    {"trajectory", "validity"},
     {"assembly", "simplify", "result", "moveit", "moving"},
     {"queries", "repair", "render"},
     {"planners", "problems"},
     {"generation", "planning"},
     {"api"},
-    {"benchmark"},
+    {"benchmark", "plots"},
+    {"commands"},
     {"cli"},
 ]
 HEIGHT = {name: height for height, names in enumerate(LAYERS) for name in names}

@@ -1,0 +1,148 @@
+"""Files of trajectories: NumPy archives, CSV, and messages of ROS 2."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import zipfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError
+from apex_ompl.schema import read_yaml
+
+Array = NDArray[np.float64]
+
+SUFFIXES = (".npz", ".csv", ".traj.yaml", ".traj.json")
+MESSAGES = (".traj.yaml", ".traj.json")
+ROLE = "trajectory"
+STATES = ("positions", "velocities", "accelerations")
+COLUMNS = ("", "_velocity", "_acceleration")  # behind the name of a joint
+BILLION = 1_000_000_000
+
+
+def suffix_of(path: Path, known: Sequence[str] = SUFFIXES) -> str:
+    """Return which suffix a file name ends in.
+
+    Raises:
+        ParameterError: None of them.
+    """
+    found = next((suffix for suffix in known if path.name.endswith(suffix)), None)
+    if found is None:
+        raise ParameterError("output", path.name, f"a file name ending in {', '.join(known)}")
+    return found
+
+
+def encoded(
+    suffix: str, times: Array, states: Mapping[str, Array], names: Sequence[str],
+    controllers: Mapping[str, Sequence[str]] | None,
+) -> bytes:  # fmt: skip
+    """Return the content of a file.
+
+    Args:
+        suffix: One of ``SUFFIXES``.
+        times: Of the knots, shape (K,) [s].
+        states: Positions, velocities and accelerations by name, each of shape (K, dof).
+        names: Of the joints.
+        controllers: Joints by the name of their controller, for messages; by default one message holds all.
+
+    Raises:
+        ParameterError: ``controllers`` where they make no sense, an unknown joint, or one that has none or two.
+    """
+    if controllers is not None:
+        _check_controllers(controllers, names, suffix)
+    if suffix == ".npz":
+        buffer = io.BytesIO()
+        held: dict[str, Any] = {"times": times, "joint_names": np.array(names), **states}
+        np.savez(buffer, **held)
+        return buffer.getvalue()
+    if suffix == ".csv":
+        head = ["time", *(f"{name}{more}" for more in COLUMNS for name in names)]
+        table = np.hstack([times[:, None], *(states[name] for name in STATES)])
+        lines = [",".join(head), *(",".join(map(repr, row)) for row in table.tolist())]
+        return ("\n".join(lines) + "\n").encode()
+    message: dict[str, Any]
+    if controllers is None:
+        message = _message(times, states, names, range(len(names)))
+    else:
+        where = {name: [list(names).index(joint) for joint in joints] for name, joints in controllers.items()}
+        message = {name: _message(times, states, names, columns) for name, columns in where.items()}
+    if suffix == ".traj.json":
+        return (json.dumps(message) + "\n").encode()
+    dumper = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
+    text: str = yaml.dump(message, Dumper=dumper, default_flow_style=None, sort_keys=False, width=1_000_000)
+    return text.encode()
+
+
+def decoded(path: Path) -> tuple[Array, list[Array], tuple[str, ...]]:
+    """Return times, states in the order of ``STATES``, and joint names of a file.
+
+    Raises:
+        MissingFileError: It cannot be read.
+        FileFormatError: It holds no trajectory.
+        ParameterError: It has another suffix.
+    """
+    suffix = suffix_of(path)
+    try:
+        if suffix == ".npz":
+            with np.load(path, allow_pickle=False) as archive:
+                states = [archive[name].astype(float) for name in STATES]
+                return archive["times"].astype(float), states, tuple(str(name) for name in archive["joint_names"])
+        if suffix == ".csv":
+            return _of_table(path.read_text(encoding="utf-8"))
+        return _of_messages(read_yaml(path, ROLE))  # JSON is YAML
+    except OSError as error:
+        raise MissingFileError(str(path), ROLE, (error.strerror or "cannot be read").lower()) from error
+    except (KeyError, TypeError, ValueError, AttributeError, IndexError, zipfile.BadZipFile) as error:
+        raise FileFormatError(str(path), "", str(error), "expected a saved trajectory") from error
+
+
+def _message(times: Array, states: Mapping[str, Array], names: Sequence[str], columns: Sequence[int]) -> dict[str, Any]:
+    """Return a ``trajectory_msgs/JointTrajectory``."""
+    stamps = [divmod(round(time * BILLION), BILLION) for time in times.tolist()]
+    chosen = {name: states[name][:, list(columns)].tolist() for name in STATES}
+    points = [
+        {**{name: chosen[name][k] for name in STATES}, "effort": [], "time_from_start": {"sec": sec, "nanosec": nano}}
+        for k, (sec, nano) in enumerate(stamps)
+    ]
+    head = {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""}
+    return {"header": head, "joint_names": [names[c] for c in columns], "points": points}
+
+
+def _of_messages(data: Mapping[str, Any]) -> tuple[Array, list[Array], tuple[str, ...]]:
+    messages = [data] if "points" in data else list(data.values())
+    read = []
+    for message in messages:
+        points = message["points"]
+        stamps = [point["time_from_start"]["sec"] * BILLION + point["time_from_start"]["nanosec"] for point in points]
+        states = [np.array([point[name] for point in points], dtype=float) for name in STATES]
+        read.append((np.array(stamps) / BILLION, states, [str(name) for name in message["joint_names"]]))
+    if not read or any(not np.array_equal(times, read[0][0]) for times, _, _ in read):
+        raise ValueError("messages of different times")
+    states = [np.hstack([parts[k] for _, parts, _ in read]) for k in range(len(STATES))]
+    return read[0][0], states, tuple(name for _, _, names in read for name in names)
+
+
+def _of_table(text: str) -> tuple[Array, list[Array], tuple[str, ...]]:
+    head, *rows = csv.reader(io.StringIO(text))
+    table = np.array(rows, dtype=float)
+    dof = (len(head) - 1) // len(COLUMNS)
+    names = tuple(head[1 : 1 + dof])
+    if head != ["time", *(f"{name}{more}" for more in COLUMNS for name in names)] or table.ndim != 2:
+        raise ValueError("columns " + ", ".join(head)[:60])
+    return table[:, 0], [table[:, 1 + k * dof : 1 + (k + 1) * dof] for k in range(len(STATES))], names
+
+
+def _check_controllers(controllers: Mapping[str, Sequence[str]], names: Sequence[str], suffix: str) -> None:
+    if suffix not in MESSAGES:
+        raise ParameterError("controllers", suffix, f"a file name ending in {' or '.join(MESSAGES)}")
+    given = [joint for joints in controllers.values() for joint in joints]
+    if sorted(given) != sorted(names):
+        wrong = sorted(set(given) ^ set(names)) or sorted({joint for joint in given if given.count(joint) > 1})
+        raise ParameterError("controllers", ", ".join(wrong), "each joint of the trajectory once")

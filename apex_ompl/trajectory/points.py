@@ -1,0 +1,120 @@
+"""Ruckig's part: from state to state, at the fastest within the limits."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import ruckig
+from numpy.typing import NDArray
+
+from apex_ompl.robot.model import Limits
+from apex_ompl.trajectory.motion import Trajectory, joined
+
+Array = NDArray[np.float64]
+
+WITHIN = 1.0 - 1e-6  # of the limits that Ruckig is given, for its rounding
+JOINTS = 24  # places at which a motion may be joined
+SHORTEST = 1e-9  # piece [s]
+
+
+def stops(corners: Array, limits: Limits, names: tuple[str, ...]) -> Trajectory:
+    """Return the fastest motion from corner to corner, at rest at each, shape (n, dof) with n of 2 or more.
+
+    Along each straight line one number moves, by Ruckig with the limits of the joint that has the least.
+    """
+    parts = []
+    solver, task, made = ruckig.Ruckig(1), ruckig.InputParameter(1), ruckig.Trajectory(1)
+    for start, end in zip(corners[:-1], corners[1:], strict=True):
+        length = float(np.linalg.norm(end - start))
+        direction = (end - start) / length
+        moves = np.abs(direction) > 1e-12
+        task.target_position = [length]
+        for name in ("velocity", "acceleration", "jerk"):
+            most = WITHIN * np.min(getattr(limits, name)[moves] / np.abs(direction[moves]))
+            setattr(task, f"max_{name}", [float(most)])
+        _calculate(solver, task, made)
+        times = _breaks(made)
+        place, speed, push = (np.array(v)[:, None] for v in zip(*(_one(made, t) for t in times), strict=True))
+        positions = start + place * direction
+        positions[0], positions[-1] = start, end
+        parts.append(Trajectory(times, positions, speed * direction, push * direction, names))
+    return joined(parts)
+
+
+def from_motion(
+    velocity: Array, acceleration: Array, rest: Trajectory, limits: Limits, minimum_duration: float
+) -> Iterator[Trajectory]:
+    """Yield motions that begin with a velocity and go over into another motion from the same state, fastest first.
+
+    Args:
+        velocity: At the start, shape (dof,) [rad/s].
+        acceleration: At the start [rad/s^2].
+        rest: The motion from rest.
+        limits: Of the joints.
+        minimum_duration: Of the whole [s].
+    """
+    found = []
+    solver, task = ruckig.Ruckig(rest.dof), ruckig.InputParameter(rest.dof)
+    task.current_position, task.current_velocity = rest.positions[0].tolist(), velocity.tolist()
+    task.current_acceleration = acceleration.tolist()
+    for name in ("velocity", "acceleration", "jerk"):
+        setattr(task, f"max_{name}", (WITHIN * getattr(limits, name)).tolist())
+    for moment in np.linspace(0.0, rest.duration, JOINTS + 1) if rest.duration else [0.0]:
+        left = rest.duration - moment
+        task.target_position, task.target_velocity, task.target_acceleration = (
+            rest(moment, order).tolist() for order in range(3)
+        )
+        task.minimum_duration = max(minimum_duration - left, 0.0) or None
+        made = ruckig.Trajectory(rest.dof)
+        try:
+            _calculate(solver, task, made)
+        except ruckig.RuckigError:  # from this velocity that state cannot be reached within the limits
+            continue
+        found.append((made.duration + left, moment, made))
+    for _, moment, made in sorted(found, key=lambda one: one[0]):
+        motion = _motion(made, rest, moment)
+        if motion.use(limits)["position"] <= 1.0:
+            yield motion
+
+
+def _motion(made: ruckig.Trajectory, rest: Trajectory, moment: float) -> Trajectory:
+    """Return Ruckig's motion, followed by what is left of another one."""
+    after = rest.after(moment)
+    times = _breaks(made)
+    if len(times) < 2:
+        return after
+    states = [np.array(v) for v in zip(*(made.at_time(float(t)) for t in times), strict=True)]
+    states[0][0] = rest.positions[0]
+    for part, wanted in zip(states, (after.positions, after.velocities, after.accelerations), strict=True):
+        part[-1] = wanted[0]
+    return joined([Trajectory(times, states[0], states[1], states[2], rest.joint_names), after])
+
+
+def _calculate(solver: ruckig.Ruckig, task: ruckig.InputParameter, made: ruckig.Trajectory) -> None:
+    """Solve a task.
+
+    Raises:
+        RuckigError: It has no solution.
+    """
+    result = solver.calculate(task, made)
+    if result not in (ruckig.Result.Working, ruckig.Result.Finished):
+        raise ruckig.RuckigError(str(result))
+
+
+def _breaks(made: ruckig.Trajectory) -> Array:
+    """Return the moments between which all joints have constant jerk, ends included, shape (K,) [s]."""
+    found = [0.0, made.duration]
+    for profile in made.profiles[0]:
+        brake = np.cumsum(profile.brake.t)
+        found += [*brake, *(profile.brake.duration + np.cumsum(profile.t))]
+    times = np.unique(np.clip(found, 0.0, made.duration))
+    kept: Array = times[np.append(True, np.diff(times) > SHORTEST)]
+    if len(kept) > 1:
+        kept[-1] = made.duration
+    return kept
+
+
+def _one(made: ruckig.Trajectory, time: float) -> tuple[float, float, float]:
+    place, speed, push = made.at_time(float(time))
+    return place[0], speed[0], push[0]

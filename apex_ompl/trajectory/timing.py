@@ -1,0 +1,253 @@
+"""Time parameterisation: from a path to a motion within limits of velocity, acceleration and jerk."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from apex_ompl.errors import ParameterError
+from apex_ompl.kernel.speed import farthest, fastest, moments
+from apex_ompl.robot.model import Limits
+from apex_ompl.trajectory.curve import Curve, Polyline
+from apex_ompl.trajectory.motion import Trajectory
+from apex_ompl.trajectory.points import from_motion, stops
+
+Array = NDArray[np.float64]
+
+PER_PIECE = 10  # points of the grid a piece of the curve
+SPACINGS = (0.004, 0.006, 0.008, 0.012, 0.016, 0.024, 0.032, 0.048, 0.064, 0.096, 0.128, 0.192, 0.256, 0.512)
+FIRST = 4  # of the spacings of knots, that is tried first [s]
+CLOSER = 6  # times that the blending of corners is halved before the motion stops at them
+NANOSECOND = 1e-9
+
+
+@dataclass(frozen=True)
+class Timing:
+    """How a path is timed.
+
+    Attributes:
+        velocity_scale: Share of the limits of velocity that is used, over 0 to 1.
+        acceleration_scale: The same of acceleration.
+        jerk_scale: The same of jerk.
+        deviation: Largest distance of the motion from the path, over 0 [rad, Euclidean; synergies 0..1].
+        minimum_duration: The motion takes at least so long [s].
+        start_velocity: Velocity at the start, one number a joint, or none for rest [rad/s].
+        start_acceleration: Acceleration there [rad/s^2].
+    """
+
+    velocity_scale: float = 1.0
+    acceleration_scale: float = 1.0
+    jerk_scale: float = 1.0
+    deviation: float = 0.05
+    minimum_duration: float = 0.0
+    start_velocity: Sequence[float] = ()
+    start_acceleration: Sequence[float] = ()
+
+    def __post_init__(self) -> None:
+        """Check the numbers.
+
+        Raises:
+            ParameterError: One is out of its range.
+        """
+        for name in ("velocity_scale", "acceleration_scale", "jerk_scale"):
+            if not _is_number(getattr(self, name)) or not 0.0 < getattr(self, name) <= 1.0:
+                raise ParameterError(name, getattr(self, name), "a number over 0, at most 1")
+        if not _is_number(self.deviation) or not 0.0 < self.deviation < math.inf:
+            raise ParameterError("deviation", self.deviation, "a positive number of radians")
+        if not _is_number(self.minimum_duration) or not 0.0 <= self.minimum_duration < math.inf:
+            raise ParameterError("minimum_duration", self.minimum_duration, "a number of seconds, 0 or more")
+
+    def limits(self, limits: Limits) -> Limits:
+        """Return the scaled limits."""
+        return replace(
+            limits, velocity=limits.velocity * self.velocity_scale,
+            acceleration=limits.acceleration * self.acceleration_scale, jerk=limits.jerk * self.jerk_scale,
+        )  # fmt: skip
+
+    def start(self, limits: Limits) -> tuple[Array, Array] | None:
+        """Return velocity and acceleration at the start, or None for rest.
+
+        Raises:
+            ParameterError: Not one number a joint, or over the limits, given scaled.
+        """
+        found = []
+        for name, limit in (("velocity", limits.velocity), ("acceleration", limits.acceleration)):
+            given = np.array(getattr(self, f"start_{name}"), dtype=float)
+            if not given.size:
+                given = np.zeros(len(limit))
+            if given.shape != limit.shape or not np.isfinite(given).all():
+                raise ParameterError(f"start_{name}", given.shape, f"{len(limit)} finite numbers, one a joint")
+            if np.any(np.abs(given) > limit):
+                k = int(np.argmax(np.abs(given) / limit))
+                raise ParameterError(f"start_{name}", given[k], f"at most {limit[k]:g} for joint {k + 1}, as scaled")
+            found.append(given)
+        return (found[0], found[1]) if any(v.any() for v in found) else None
+
+
+@dataclass(frozen=True, eq=False)
+class Timed:
+    """A path that is timed.
+
+    Attributes:
+        trajectory: The motion.
+        deviation: Its largest distance from the path at its knots [rad].
+        way: ``blended``: along a curve that cuts corners, as fast as the limits allow; ``line``: along a straight line
+            by Ruckig; ``stops``: by Ruckig from corner to corner; with ``moving start`` before it when it is one.
+    """
+
+    trajectory: Trajectory
+    deviation: float
+    way: str
+
+
+def time_path(
+    path: ArrayLike, limits: Limits, joint_names: Sequence[str], timing: Timing | None = None,
+    fault: Callable[[Trajectory], str] = lambda trajectory: "",
+) -> Timed | str:  # fmt: skip
+    """Time a path, or say why it cannot be.
+
+    A straight line is run along by a jerk-limited profile of Ruckig's (Berscheid and Kroeger 2021), which is the
+    fastest. Any other path is made a curve that blends corners; reachability analysis gives the fastest way along it
+    within the limits of velocity and acceleration (:mod:`apex_ompl.kernel.speed`). The states on this way at even times
+    are control points of a uniform cubic B-spline in time: averages of what is within the limits are, and its jerk, the
+    change of acceleration from one knot to the next, is bounded by the distance of the knots, which is chosen so that
+    the motion is shortest. What is left over a limit is taken away by stretching time. Where ``fault`` finds one, the
+    curve stays closer to the path, and at last the motion stops at every corner.
+
+    Args:
+        path: States to be joined by straight lines, shape (N, dof).
+        limits: Of the joints.
+        joint_names: Of the columns.
+        timing: How.
+        fault: Says what is wrong with a motion, nothing if it is good.
+
+    Returns:
+        The timed path, or the fault of the last motion that was tried.
+
+    Raises:
+        ParameterError: The path has another shape or a number that is none, or an option is out of its range.
+    """
+    timing = timing or Timing()
+    states = np.array(path, dtype=float)
+    if states.ndim != 2 or states.shape[1] != len(limits.velocity) or not len(states) or not np.isfinite(states).all():
+        raise ParameterError("path", states.shape, f"finite numbers of shape (N, {len(limits.velocity)})")
+    scaled = timing.limits(limits)
+    start = timing.start(scaled)
+    said = ""
+    for timed in _ways(Polyline.through(states), scaled, tuple(joint_names), timing):
+        rest = timed.trajectory
+        if rest.duration < timing.minimum_duration:
+            rest = _stretched(rest, timing.minimum_duration)
+        motions = [rest] if start is None else from_motion(*start, rest, scaled, timing.minimum_duration)
+        for motion in motions:
+            said = fault(motion)
+            if not said:
+                return replace(timed, trajectory=motion, way=("" if start is None else "moving start, ") + timed.way)
+    return said or "no motion from the velocity at the start stays within the limits"
+
+
+def _ways(line: Polyline, limits: Limits, names: tuple[str, ...], timing: Timing) -> Iterator[Timed]:
+    """Yield motions from rest to rest, each closer to the path than the one before."""
+    if len(line.states) == 1:
+        yield Timed(_standing(line.states[0], names), 0.0, "line")
+        return
+    corners = line.corners()
+    if len(corners.states) > 2:
+        spacing = 3.0 * timing.deviation
+        for _ in range(CLOSER):
+            timed = blended(line, limits, names, spacing)
+            if timed.deviation <= timing.deviation:
+                yield timed
+            spacing /= 2.0
+    deviation = float(np.linalg.norm(line.states - corners.at(line.arc), axis=1).max())
+    yield Timed(stops(corners.states, limits, names), deviation, "line" if len(corners.states) == 2 else "stops")
+
+
+def blended(line: Polyline, limits: Limits, names: tuple[str, ...], spacing: float) -> Timed:
+    """Return the fastest motion along the curve with control points so far apart on a polyline [rad]."""
+    curve = Curve.along(line, spacing)
+    first, second = curve.derivatives(PER_PIECE)
+    step = curve.spacing / PER_PIECE
+    x = np.empty(len(first))
+    tried: dict[int, tuple[float, Array, Array]] = {}  # the spacing that the limits let, control points, their places
+
+    def attempt(which: int) -> float:
+        """Return the duration with a spacing of knots; what it takes is kept."""
+        if which not in tried:
+            apart = SPACINGS[which]
+            fastest(first, second, limits.velocity, np.minimum(limits.acceleration, limits.jerk * apart), step, x)
+            took = moments(x, step, 0.0, np.empty(0))
+            count = max(1, int(took / apart))
+            place = np.empty(count + 1)
+            moments(x, step, took / count, place)
+            place[-1] = line.length
+            points = curve.points(place)
+            points[0], points[-1] = line.states[0], line.states[-1]
+            control = np.concatenate([points[:1], points[:1], points, points[-1:], points[-1:]])
+            tried[which] = (_least_spacing(control, limits), control, place)
+        least, knots, _ = tried[which]
+        return float(least * (len(knots) - 3))
+
+    best = FIRST
+    for direction in (1, -1):
+        while 0 <= best + direction < len(SPACINGS) and attempt(best + direction) < attempt(best):
+            best += direction
+    apart, control, place = tried[best]
+    motion = _spline(control, apart, names)
+    at = np.concatenate([[0.0], place, [line.length]])
+    deviation = farthest(motion.positions, at, line.states, line.arc, 2.0 * curve.spacing)
+    return Timed(motion, float(deviation), "blended")
+
+
+def _least_spacing(control: Array, limits: Limits) -> float:
+    """Return the least distance of knots at which a cubic B-spline in time keeps the limits [s].
+
+    Velocity is a weighted mean of first differences of the control points; accelerations at knots are the second
+    differences, and jerks between them the third.
+    """
+    needs = []
+    difference = control
+    for order, limit in enumerate((limits.velocity, limits.acceleration, limits.jerk), 1):
+        difference = np.diff(difference, axis=0)
+        needs.append(float(np.abs(difference / limit).max(initial=0.0)) ** (1.0 / order))
+    return NANOSECOND * float(math.ceil(max(needs) * (1.0 + 1e-9) / NANOSECOND))
+
+
+def _spline(control: Array, apart: float, names: tuple[str, ...]) -> Trajectory:
+    """Return the uniform cubic B-spline in time with control points ``apart`` [s]."""
+    before, at, after = control[:-2], control[1:-1], control[2:]
+    positions = (before + 4.0 * at + after) / 6.0
+    positions[0], positions[-1] = control[0], control[-1]
+    times = np.arange(len(positions), dtype=float) * apart
+    return Trajectory(times, positions, (after - before) / (2.0 * apart), (after - 2.0 * at + before) / apart**2, names)
+
+
+def _standing(state: Array, names: tuple[str, ...]) -> Trajectory:
+    still = np.zeros((1, len(state)))
+    return Trajectory(np.zeros(1), state[None].copy(), still, still.copy(), names)
+
+
+def _stretched(motion: Trajectory, duration: float) -> Trajectory:
+    """Return the motion in a longer time; one without any stands still so long."""
+    if motion.duration:
+        return motion.slower(duration / motion.duration)
+    twice = [np.repeat(part, 2, axis=0) for part in (motion.positions, motion.velocities, motion.accelerations)]
+    return Trajectory(np.array([0.0, duration]), twice[0], twice[1], twice[2], motion.joint_names)
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
+
+
+@cache
+def warm_up() -> None:
+    """Load the compiled code, which takes a hundredth of a second in each process, or a few seconds when it is new."""
+    x = np.empty(3)
+    fastest(np.ones((3, 1)), np.zeros((3, 1)), np.ones(1), np.ones(1), 1.0, x)
+    moments(x, 1.0, 1.0, np.empty(1))
+    farthest(np.zeros((1, 1)), np.zeros(1), np.array([[0.0], [1.0]]), np.array([0.0, 1.0]), 1.0)
