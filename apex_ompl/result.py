@@ -73,7 +73,7 @@ class PlanResult:
         trajectory: The timed motion, which passed the full check along its own samples and keeps all limits, or None.
         limit_use: Largest share of each limit that ``trajectory`` uses, by ``position``, ``velocity``,
             ``acceleration`` and ``jerk``; empty without one.
-        deviation: Largest distance of ``trajectory`` from ``path`` at its knots [rad], NaN without one.
+        deviation: Largest distance of ``trajectory`` from ``path`` [rad], NaN without one.
         times: Seconds per stage, and ``total``; those of a planner's own stages, as ``solve: repair``, are part of
             ``solve``.
         length: Sum of Euclidean joint-space steps [rad], NaN without a path.

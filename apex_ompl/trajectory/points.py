@@ -38,6 +38,7 @@ def stops(corners: Array, limits: Limits, names: tuple[str, ...]) -> Trajectory:
         place, speed, push = (np.array(v)[:, None] for v in zip(*(_one(made, t) for t in times), strict=True))
         positions = start + place * direction
         positions[0], positions[-1] = start, end
+        speed[[0, -1]], push[[0, -1]] = 0.0, 0.0  # of rounding
         parts.append(Trajectory(times, positions, speed * direction, push * direction, names))
     return joined(parts)
 

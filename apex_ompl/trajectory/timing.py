@@ -21,6 +21,8 @@ Array = NDArray[np.float64]
 
 PER_PIECE = 10  # points of the grid a piece of the curve
 SPACINGS = (0.004, 0.006, 0.008, 0.012, 0.016, 0.024, 0.032, 0.048, 0.064, 0.096, 0.128, 0.192, 0.256, 0.512)
+FINE = 0.008  # distance of moments at which the deviation is measured, at most [s]
+SPACING = 3.0  # of control points, as a multiple of the deviation; a corner is cut by a third
 FIRST = 4  # of the spacings of knots, that is tried first [s]
 CLOSER = 6  # times that the blending of corners is halved before the motion stops at them
 NANOSECOND = 1e-9
@@ -95,7 +97,7 @@ class Timed:
 
     Attributes:
         trajectory: The motion.
-        deviation: Its largest distance from the path at its knots [rad].
+        deviation: Its largest distance from the path [rad].
         way: ``blended``: along a curve that cuts corners, as fast as the limits allow; ``line``: along a straight line
             by Ruckig; ``stops``: by Ruckig from corner to corner; with ``moving start`` before it when it is one.
     """
@@ -158,21 +160,22 @@ def _ways(line: Polyline, limits: Limits, names: tuple[str, ...], timing: Timing
         return
     corners = line.corners()
     if len(corners.states) > 2:
-        spacing = 3.0 * timing.deviation
-        for _ in range(CLOSER):
-            timed = blended(line, limits, names, spacing)
-            if timed.deviation <= timing.deviation:
+        for k in range(CLOSER):
+            timed = blended(line, limits, names, timing.deviation / 2**k)
+            if timed is not None:
                 yield timed
-            spacing /= 2.0
     deviation = float(np.linalg.norm(line.states - corners.at(line.arc), axis=1).max())
     yield Timed(stops(corners.states, limits, names), deviation, "line" if len(corners.states) == 2 else "stops")
 
 
-def blended(line: Polyline, limits: Limits, names: tuple[str, ...], spacing: float) -> Timed:
-    """Return the fastest motion along the curve with control points so far apart on a polyline [rad]."""
-    curve = Curve.along(line, spacing)
+def blended(line: Polyline, limits: Limits, names: tuple[str, ...], within: float) -> Timed | None:
+    """Return the fastest motion along a curve that stays within a distance of a polyline, or None [rad]."""
+    curve = Curve.along(line, SPACING * within)
     first, second = curve.derivatives(PER_PIECE)
-    step = curve.spacing / PER_PIECE
+    step, window = curve.spacing / PER_PIECE, 2.0 * curve.spacing
+    grid = np.linspace(0.0, line.length, len(first))
+    if farthest(curve.points(grid), grid, line.states, line.arc, window) > within:
+        return None
     x = np.empty(len(first))
     tried: dict[int, tuple[float, Array, Array]] = {}  # the spacing that the limits let, control points, their places
 
@@ -197,11 +200,17 @@ def blended(line: Polyline, limits: Limits, names: tuple[str, ...], spacing: flo
     for direction in (1, -1):
         while 0 <= best + direction < len(SPACINGS) and attempt(best + direction) < attempt(best):
             best += direction
-    apart, control, place = tried[best]
-    motion = _spline(control, apart, names)
-    at = np.concatenate([[0.0], place, [line.length]])
-    deviation = farthest(motion.positions, at, line.states, line.arc, 2.0 * curve.spacing)
-    return Timed(motion, float(deviation), "blended")
+    while best >= 0:  # knots that are far apart in time smooth the motion too much
+        attempt(best)
+        apart, control, place = tried[best]
+        motion = _spline(control, apart, names)
+        times = np.linspace(0.0, motion.duration, (len(motion.times) - 1) * math.ceil(apart / FINE) + 1)
+        at = np.interp(times, motion.times, np.concatenate([[0.0], place, [line.length]]))
+        deviation = float(farthest(motion(times), at, line.states, line.arc, window))
+        if deviation <= within:
+            return Timed(motion, deviation, "blended")
+        best -= 1
+    return None
 
 
 def _least_spacing(control: Array, limits: Limits) -> float:

@@ -1,0 +1,357 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import linprog
+
+from apex_ompl import api, cli, plan, planning
+from apex_ompl.assembly import assemble
+from apex_ompl.errors import ParameterError
+from apex_ompl.kernel.speed import farthest, fastest, moments
+from apex_ompl.result import PlanResult, PlanStatus
+from apex_ompl.robot import Limits
+from apex_ompl.trajectory import Timed, Timing, Trajectory, time_path
+from apex_ompl.trajectory.curve import Curve, Polyline
+from apex_ompl.validity import full_check
+
+NAMES = ("one", "two", "three")
+LIMITS = Limits(
+    np.full(3, -3.0), np.full(3, 3.0), np.array([2.0, 2.5, 1.5]), np.array([10.0, 15.0, 8.0]),
+    np.array([5000.0, 7500.0, 160.0]),
+)  # fmt: skip
+RATE = 0.001
+
+
+def timed(path: np.ndarray, timing: Timing | None = None, limits: Limits = LIMITS, **more: object) -> Timed:
+    made = time_path(path, limits, NAMES, timing, **more)  # type: ignore[arg-type]
+    assert isinstance(made, Timed), made
+    return made
+
+
+def keeps_limits(motion: Trajectory, limits: Limits = LIMITS) -> bool:
+    """By differences of positions at 1 kHz, which are means of the derivatives."""
+    times = np.arange(-5, int(motion.duration / RATE) + 6) * RATE
+    change, good = motion(times), bool(np.all(np.abs(motion(times)) <= 3.0 + 1e-12))
+    for order, limit in enumerate((limits.velocity, limits.acceleration, limits.jerk), 1):
+        change = np.diff(change, axis=0)
+        good = good and bool(np.all(np.abs(change) / RATE**order <= limit * (1.0 + 1e-6) + 1e-4 * (order == 3)))
+    return good and max(motion.use(limits).values()) <= 1.0 + 1e-9
+
+
+def distance(points: np.ndarray, path: np.ndarray) -> float:
+    """The largest distance of points from a polyline, by all of its sides."""
+    sides = np.diff(path, axis=0)
+    squares = np.maximum(np.sum(sides**2, axis=1), 1e-300)
+    share = np.clip(np.einsum("nkd,kd->nk", points[:, None] - path[:-1], sides) / squares, 0.0, 1.0)
+    return float(np.linalg.norm(points[:, None] - path[:-1] - share[..., None] * sides, axis=2).min(axis=1).max())
+
+
+@st.composite
+def paths(draw: st.DrawFn) -> np.ndarray:
+    rng = np.random.default_rng(draw(st.integers(0, 10**6)))
+    kind = draw(st.sampled_from(["two", "straight", "zigzag", "near", "smooth", "corners", "there and back"]))
+    a, b = rng.uniform(-2.9, 2.9, (2, 3))
+    if kind == "two":
+        return np.stack([a, b])
+    if kind == "straight":
+        return a + np.sort(rng.uniform(0.0, 1.0, 30))[:, None] * (b - a)
+    if kind == "zigzag":
+        return np.concatenate([a + np.linspace(0, 1, 20)[:, None] * (b - a)]) + 0.1 * (-1.0) ** np.arange(20)[:, None]
+    if kind == "near":
+        corners = rng.uniform(-2.0, 2.0, (5, 3))
+        return np.repeat(corners, 4, axis=0) + rng.normal(0.0, 10.0 ** -rng.integers(3, 13), (20, 3))
+    if kind == "smooth":
+        t = np.linspace(0.0, 1.0, 256)[:, None]
+        return np.sin(2.0 * np.pi * t * rng.uniform(0.1, 1.5, 3) + rng.uniform(0.0, 6.0, 3)) * rng.uniform(0.1, 2.5, 3)
+    corners = rng.uniform(-2.9, 2.9, (int(rng.integers(3, 9)), 3))
+    return corners if kind == "corners" else np.concatenate([corners, corners[::-1]])
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(path=paths(), deviation=st.sampled_from([0.2, 0.05, 0.01]), scale=st.sampled_from([1.0, 0.3, 0.01]))
+def test_motions_keep_all_limits_and_stay_near_their_paths(path: np.ndarray, deviation: float, scale: float) -> None:
+    path = np.clip(path, -3.0, 3.0)
+    timing = Timing(deviation=deviation, jerk_scale=scale)
+    made = timed(path, timing)
+    motion = made.trajectory
+    assert keeps_limits(motion, timing.limits(LIMITS))
+    np.testing.assert_array_equal(motion.positions[[0, -1]], path[[0, -1]])
+    assert not motion.velocities[[0, -1]].any() and not motion.accelerations[[0, -1]].any()
+    assert made.deviation <= deviation
+    knots = distance(motion.positions, path)
+    assert knots <= made.deviation + 1e-6, "measured against all sides"
+    assert distance(motion.sample(0.002).position, path) <= 1.05 * deviation + 1e-6
+
+
+def test_ten_thousand_points_keep_the_limits() -> None:
+    t = np.linspace(0.0, 1.0, 10_000)[:, None]
+    path = np.cos(7.0 * t * np.array([1.0, 1.3, 0.7])) + np.random.default_rng(0).normal(0.0, 1e-4, (10_000, 3))
+    made = timed(path)
+    assert made.way == "blended" and keeps_limits(made.trajectory) and made.deviation < 0.05
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2, 5])
+def test_the_greatest_speeds_are_those_of_a_linear_program(seed: int) -> None:
+    """On a grid the greedy passes may be a little slower where all joints that turn stand still for a moment."""
+    rng = np.random.default_rng(seed)
+    path = np.cumsum(rng.normal(0.0, 0.3, (8, 3)), axis=0)
+    curve = Curve.along(Polyline.through(path), 0.5)
+    first, second = curve.derivatives(12)
+    n, step = len(first), curve.spacing / 12
+    x = np.empty(n)
+    fastest(first, second, LIMITS.velocity, LIMITS.acceleration, step, x)
+    rows, bounds = [], []
+    for i in range(n - 1):  # |q' u + q'' x| <= a with u = (x[i + 1] - x[i]) / (2 step)
+        for j in range(3):
+            row = np.zeros(n)
+            row[i], row[i + 1] = second[i, j] - first[i, j] / (2 * step), first[i, j] / (2 * step)
+            rows += [row, -row]
+            bounds += [LIMITS.acceleration[j]] * 2
+    most = np.min((LIMITS.velocity / np.maximum(np.abs(first), 1e-12)) ** 2, axis=1)
+    most[[0, -1]] = 0.0
+    assert np.all(np.array(rows) @ x <= np.array(bounds) + 1e-9) and np.all(x >= 0.0) and np.all(x <= most + 1e-9)
+    found = linprog(-np.ones(n), np.array(rows), np.array(bounds), bounds=np.stack([np.zeros(n), most], 1))
+    assert found.success
+    duration, least = (np.sum(2.0 * step / (np.sqrt(y[1:]) + np.sqrt(y[:-1]))) for y in (x, np.maximum(found.x, 0.0)))
+    assert moments(x, step, 0.0, np.empty(0)) == pytest.approx(duration) and duration < 1.01 * least
+    if seed == 2:  # without such a place
+        np.testing.assert_allclose(x, found.x, atol=1e-6)
+
+
+def test_places_at_even_times_follow_the_speeds() -> None:
+    x = np.append(np.linspace(0.0, 4.0, 50), np.linspace(4.0, 0.0, 50)[1:])  # even acceleration, then the opposite
+    step = 0.02
+    duration = moments(x, step, 0.0, np.empty(0))
+    place = np.empty(101)
+    assert moments(x, step, duration / 100, place) == duration
+    push, half = 4.0 / (2 * 49 * step), duration / 2
+    times = np.linspace(0.0, duration, 101)
+    rising = 0.5 * push * times**2
+    falling = 98 * step - 0.5 * push * (duration - times) ** 2
+    np.testing.assert_allclose(place, np.where(times < half, rising, falling), atol=1e-12)
+
+
+def test_curves_have_their_derivatives_and_keep_to_straight_lines() -> None:
+    path = np.array([[0.0, 0.0, 0.0], [1.0, 0.2, 0.0], [1.1, -0.9, 0.4], [0.0, 0.0, 2.0]])
+    line = Polyline.through(path)
+    curve = Curve.along(line, 0.2)
+    first, second = curve.derivatives(10)
+    places = np.linspace(0.0, line.length, len(first))
+    h = 1e-5
+    inside = places[1:-1]
+    np.testing.assert_allclose(first[1:-1], (curve.points(inside + h) - curve.points(inside - h)) / (2 * h), atol=1e-6)
+    bends = (curve.points(inside + h) - 2 * curve.points(inside) + curve.points(inside - h)) / h**2
+    np.testing.assert_allclose(second[1:-1], bends, atol=2e-3)
+    np.testing.assert_allclose(curve.points(places[[0, -1]]), path[[0, -1]], atol=1e-12)
+    straight = (places > 0.7) & (places < 0.8)
+    np.testing.assert_allclose(curve.points(places[straight]), line.at(places[straight]), atol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(first[straight], axis=1), 1.0)
+
+
+def test_distances_from_a_polyline_are_those_from_all_its_sides() -> None:
+    rng = np.random.default_rng(2)
+    path = np.cumsum(rng.normal(0.0, 0.2, (30, 3)), axis=0)
+    line = Polyline.through(path)
+    places = np.sort(rng.uniform(0.0, line.length, 50))
+    points = line.at(places) + rng.normal(0.0, 0.01, (50, 3))
+    assert farthest(points, places, line.states, line.arc, 99.0) == pytest.approx(distance(points, path), rel=1e-12)
+    assert farthest(points, places, line.states, line.arc, 0.1) >= distance(points, path) - 1e-12
+
+
+@pytest.mark.parametrize("length", [1e-4, 0.01, 0.6, 4.0])
+def test_a_straight_line_takes_the_least_time_there_is(length: float) -> None:
+    """Seven phases of constant jerk, each as long as its limit lets it be (Biagiotti and Melchiorri 2008, 3.4)."""
+    v, a, j = 2.0, 10.0, 5000.0
+    path = np.array([[-length / 2.0, 0.0, 0.0], [length / 2.0, 0.0, 0.0]])
+    ramp = v / a + a / j if v * j >= a**2 else 2.0 * np.sqrt(v / j)
+    if length >= v * ramp:
+        least = length / v + ramp
+    elif length >= 2.0 * a**3 / j**2:
+        least = a / j + np.sqrt((a / j) ** 2 + 4.0 * length / a)
+    else:
+        least = 4.0 * np.cbrt(length / (2.0 * j))
+    made = timed(path)
+    assert made.way == "line" and made.deviation == 0.0
+    assert made.trajectory.duration == pytest.approx(least, rel=1e-5)
+    assert keeps_limits(made.trajectory)
+
+
+def test_a_gentle_curve_takes_little_more_than_the_least_time() -> None:
+    angle = np.linspace(0.0, np.pi, 256)
+    path = np.stack([1.5 * np.cos(angle), 1.5 * np.sin(angle), np.zeros(256)], 1)
+    stiff = Limits(np.full(3, -3.0), np.full(3, 3.0), np.full(3, 2.0), np.full(3, 10.0), np.full(3, 1e6))
+    first, second = Curve.along(Polyline.through(path), 0.01).derivatives(10)
+    x = np.empty(len(first))
+    step = Polyline.through(path).length / (len(first) - 1)
+    fastest(first, second, stiff.velocity, stiff.acceleration, step, x)
+    least = moments(x, step, 0.0, np.empty(0))
+    made = timed(path, limits=stiff)
+    assert 0.995 * least < made.trajectory.duration < 1.05 * least
+
+
+def test_paths_without_length_stand_still() -> None:
+    for path in (np.ones((1, 3)), np.ones((7, 3)), np.ones((2, 3)) + np.array([[0.0], [1e-12]])):
+        motion = timed(path).trajectory
+        assert motion.duration == 0.0 and motion.positions.tolist() == [path[0].tolist()]
+    motion = timed(np.ones((1, 3)), Timing(minimum_duration=2.0)).trajectory
+    assert motion.duration == 2.0 and not motion(np.linspace(0, 2, 9), 1).any()
+
+
+def test_scales_and_a_minimum_duration_slow_the_motion() -> None:
+    path = np.array([[0.0, 0.0, 0.0], [1.0, 0.3, 0.0], [1.0, -0.5, 1.0]])
+    quick = timed(path).trajectory
+    for name in ("velocity_scale", "acceleration_scale"):
+        scales = Timing(**{name: 0.25})
+        slow = timed(path, scales).trajectory
+        assert slow.duration > 1.3 * quick.duration and keeps_limits(slow, scales.limits(LIMITS))
+    late = timed(path, Timing(minimum_duration=9.0)).trajectory
+    assert late.duration == pytest.approx(9.0, abs=1e-9) and keeps_limits(late)
+    assert timed(path, Timing(minimum_duration=0.01)).trajectory.duration == quick.duration
+
+
+@settings(max_examples=30, deadline=None, derandomize=True)
+@given(path=paths(), seed=st.integers(0, 999), share=st.sampled_from([0.1, 0.6, 0.95]))
+def test_motions_begin_with_a_velocity(path: np.ndarray, seed: int, share: float) -> None:
+    rng = np.random.default_rng(seed)
+    path = np.clip(path, -2.0, 2.0)
+    velocity = share * LIMITS.velocity * rng.uniform(-1.0, 1.0, 3)
+    acceleration = 0.3 * (1.0 - share) * LIMITS.acceleration * rng.uniform(-1.0, 1.0, 3)
+    made = time_path(path, LIMITS, NAMES, Timing(start_velocity=velocity, start_acceleration=acceleration))
+    if isinstance(made, str):  # it cannot even brake within the limits
+        assert "velocity at the start" in made
+        return
+    motion = made.trajectory
+    assert made.way.startswith("moving start")
+    np.testing.assert_allclose(motion(0.0, 1), velocity, atol=1e-9)
+    np.testing.assert_allclose(motion(0.0, 2), acceleration, atol=1e-9)
+    np.testing.assert_array_equal(motion.positions[[0, -1]], path[[0, -1]])
+    assert not motion.velocities[-1].any() and max(motion.use(LIMITS).values()) <= 1.0 + 1e-9
+    times = np.arange(0.0, motion.duration, RATE)
+    change = motion(times)
+    for order, limit in enumerate((LIMITS.velocity, LIMITS.acceleration, LIMITS.jerk), 1):
+        change = np.diff(change, axis=0)
+        assert np.all(np.abs(change) / RATE**order <= limit * (1.0 + 1e-6) + 1e-4)
+
+
+def test_a_moving_start_is_no_slower_than_rest_where_the_path_goes_its_way() -> None:
+    path = np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0]])
+    moving = timed(path, Timing(start_velocity=(1.5, 0.0, 0.0))).trajectory
+    assert moving.duration < timed(path).trajectory.duration - 0.05
+    late = timed(path, Timing(start_velocity=(1.5, 0.0, 0.0), minimum_duration=4.0)).trajectory
+    assert late.duration >= 4.0 - 1e-6 and late(0.0, 1)[0] == pytest.approx(1.5)
+
+
+def test_where_a_motion_is_at_fault_it_stays_closer_and_stops_at_last() -> None:
+    path = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [1.0, 1.0, 1.5]])
+    tried: list[float] = []
+
+    def leaves(motion: Trajectory) -> str:
+        tried.append(distance(motion.sample(0.001).position, path))
+        return "it leaves the path" if tried[-1] > 1e-4 else ""
+
+    made = timed(path, fault=leaves)
+    assert made.way == "stops" and tried[-1] < 1e-9 and keeps_limits(made.trajectory)
+    assert all(later < 0.8 * earlier for earlier, later in zip(tried[:-1], tried[1:], strict=True))
+    for corner in path[1:-1]:
+        near = int(np.argmin(np.linalg.norm(made.trajectory.positions - corner, axis=1)))
+        np.testing.assert_allclose(made.trajectory.velocities[near], 0.0, atol=1e-12)
+    assert time_path(path, LIMITS, NAMES, fault=lambda motion: "never good") == "never good"
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"velocity_scale": 0.0}, "velocity_scale"), ({"acceleration_scale": 1.1}, "acceleration_scale"),
+        ({"jerk_scale": np.nan}, "jerk_scale"), ({"deviation": 0.0}, "deviation"), ({"deviation": "x"}, "deviation"),
+        ({"minimum_duration": -1.0}, "minimum_duration"), ({"start_velocity": (1.0,)}, "start_velocity"),
+        ({"start_velocity": (9.0, 0.0, 0.0)}, "start_velocity"), ({"start_acceleration": (0, 0, 99)}, "start_acc"),
+        ({"start_velocity": (np.nan, 0.0, 0.0)}, "start_velocity"),
+    ],
+)  # fmt: skip
+def test_faulty_options_are_named(options: dict[str, object], words: str) -> None:
+    with pytest.raises(ParameterError, match=words):
+        time_path(np.zeros((2, 3)), LIMITS, NAMES, Timing(**options))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("path", [np.zeros((2, 4)), np.zeros(3), np.zeros((0, 3)), np.full((2, 3), np.nan)])
+def test_faulty_paths_are_named(path: np.ndarray) -> None:
+    with pytest.raises(ParameterError, match="path"):
+        time_path(path, LIMITS, NAMES)
+
+
+def test_plans_are_timed_and_proved(tmp_path: object) -> None:
+    result = plan("ball_in_cup", timeout=20.0)
+    motion = result.trajectory
+    assert result and motion is not None and motion.dof == 16 and 0.3 < motion.duration < 10.0
+    assert set(result.limit_use) == {"position", "velocity", "acceleration", "jerk"}
+    assert 0.9 < max(result.limit_use.values()) <= 1.0 + 1e-9 and result.deviation <= Timing().deviation
+    ready = assemble(result.problem)
+    states = motion.sample(0.001).position
+    assert full_check(ready.verdict, states, ready.start, ready.goals)
+    assert result.times["timing"] > 0.0 and result.times["timing proof"] > 0.0
+    assert result.as_dict()["duration"] == motion.duration
+
+
+def test_a_path_that_cannot_be_timed_is_no_success(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(planning, "time_path", lambda *args: "the motion collides")
+    result = plan("ball_in_cup", timeout=20.0)
+    assert result.status is PlanStatus.TIMING_FAILED and not result and result.path is not None
+    assert result.reason == "the path cannot be timed, the motion collides" and result.trajectory is None
+    assert plan("ball_in_cup", timeout=20.0, timing=False)
+
+
+def test_collisions_of_the_timed_motion_are_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Blending that cuts a corner by up to half a radian runs into what the path goes around."""
+    tight = plan("reach_past_post", "rrtconnect", timeout=20.0, seed=3)
+    wide = plan("reach_past_post", "rrtconnect", timeout=20.0, seed=3, timing=Timing(deviation=0.5))
+    ready = assemble(tight.problem)
+    for result in (tight, wide):
+        assert result and result.trajectory is not None
+        assert full_check(ready.verdict, result.trajectory.sample(0.002).position, ready.start, ready.goals)
+    blind = time_path(wide.path, ready.robot.limits, ready.robot.joint_names, Timing(deviation=0.5))  # type: ignore[arg-type]
+    assert isinstance(blind, Timed)
+    assert not full_check(ready.verdict, blind.trajectory.sample(0.002).position), "or the test shows nothing"
+
+
+def test_what_is_no_timing_is_refused() -> None:
+    with pytest.raises(ParameterError, match="timing"):
+        api.plan("ball_in_cup", timing=0.5)  # type: ignore[arg-type]
+    with pytest.raises(ParameterError, match="start_velocity"):
+        api.plan("ball_in_cup", timing=Timing(start_velocity=(1.0, 2.0)))
+
+
+def test_the_command_writes_motions_and_draws_them(tmp_path, capsys: pytest.CaptureFixture[str]) -> None:  # type: ignore[no-untyped-def]
+    out = tmp_path / "m.traj.yaml"
+    assert cli.main(["plan", "ball_in_cup", "--timeout", "20", "--velocity-scale", "0.5", "--out", str(out)]) == 0
+    said = capsys.readouterr().out
+    motion = Trajectory.load(out)
+    assert f"motion     {motion.duration:.3f} s" in said and "jerk" in said and "timing proof" in said
+    out = tmp_path / "c.traj.json"
+    assert cli.main(["plan", "ball_in_cup", "--timeout", "20", "--out", str(out), "--controllers"]) == 0
+    assert Trajectory.load(out).dof == 16 and "left_arm_controller" in out.read_text()
+    out = tmp_path / "r.npz"
+    assert cli.main(["plan", "ball_in_cup", "--timeout", "20", "--out", str(out)]) == 0
+    saved = PlanResult.load(out)
+    assert saved.trajectory is not None and saved.limit_use["jerk"] > 0.0
+    for name in ("p.png", "p.svg"):
+        assert cli.main(["plot", str(out), "-o", str(tmp_path / name)]) == 0
+    assert (tmp_path / "p.png").read_bytes()[:4] == b"\x89PNG" and "<svg" in (tmp_path / "p.svg").read_text()
+    capsys.readouterr()
+    untimed = tmp_path / "n.npz"
+    assert cli.main(["plan", "ball_in_cup", "--timeout", "20", "--no-timing", "--out", str(untimed)]) == 0
+    assert PlanResult.load(untimed).trajectory is None
+    for arguments, words in (
+        (["plot", str(untimed), "-o", str(tmp_path / "q.png")], "timed motion"),
+        (["plot", str(out), "-o", str(tmp_path / "q.txt")], "ending in"),
+        (["plot", str(tmp_path / "none.npz"), "-o", str(tmp_path / "q.png")], "none.npz"),
+        (["plan", "ball_in_cup", "--jerk-scale", "2"], "jerk_scale"),
+        (["plan", "ball_in_cup", "--controllers"], "--controllers"),
+        (["plan", "ball_in_cup", "--no-timing", "--out", str(tmp_path / "q.traj.yaml")], "--no-timing"),
+    ):
+        capsys.readouterr()
+        assert cli.main(arguments) == 2
+        said = capsys.readouterr().err
+        assert words in said and said.count("\n") == 1
+    assert not list(tmp_path.glob("q*"))

@@ -1,0 +1,182 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from scipy.interpolate import CubicSpline
+
+from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError
+from apex_ompl.robot import Limits
+from apex_ompl.trajectory import Trajectory
+from apex_ompl.trajectory.motion import joined
+
+NAMES = ("one", "two", "three")
+LIMITS = Limits(*(np.full(3, v) for v in (-2.0, 3.0, 1.5, 4.0, 30.0)))
+
+
+@pytest.fixture(scope="module")
+def spline() -> CubicSpline:
+    rng = np.random.default_rng(4)
+    times = np.append(0.0, np.cumsum(rng.uniform(0.05, 0.4, 20)))
+    return CubicSpline(times, rng.normal(0.0, 0.4, (21, 3)), bc_type="clamped")
+
+
+@pytest.fixture(scope="module")
+def motion(spline: CubicSpline) -> Trajectory:
+    return Trajectory(spline.x, spline(spline.x), spline(spline.x, 1), spline(spline.x, 2), NAMES)
+
+
+def test_a_motion_is_the_piecewise_cubic_through_its_knots(spline: CubicSpline, motion: Trajectory) -> None:
+    times = np.random.default_rng(1).uniform(0.0, motion.duration, 400)
+    for order in range(4):
+        np.testing.assert_allclose(motion(times, order), spline(times, order), rtol=1e-7, atol=1e-7)
+    assert motion(times[0]).shape == (3,) and motion.dof == 3 and motion.duration == spline.x[-1]
+    np.testing.assert_array_equal(motion(motion.duration), motion.positions[-1])
+
+
+def test_it_stands_still_before_and_after(motion: Trajectory) -> None:
+    np.testing.assert_array_equal(motion([-1.0, 99.0]), motion.positions[[0, -1]])
+    for order in (1, 2, 3):
+        assert not motion([-1.0, 99.0], order).any()
+    for order in (-1, 4, True, 1.5):
+        with pytest.raises(ParameterError, match="order"):
+            motion(0.0, order)
+
+
+def test_use_of_limits_is_that_of_dense_samples(motion: Trajectory) -> None:
+    times = np.sort(np.append(motion.times, np.linspace(0.0, motion.duration, 200_001)))
+    dense = {
+        "position": np.abs((motion(times) - 0.5) / 2.5).max(),
+        "velocity": np.abs(motion(times, 1) / 1.5).max(),
+        "acceleration": np.abs(motion(times, 2) / 4.0).max(),
+        "jerk": np.abs(motion(times, 3) / 30.0).max(),
+    }
+    use = motion.use(LIMITS)
+    for name, share in dense.items():
+        assert share <= use[name] * (1.0 + 1e-12) and use[name] == pytest.approx(share, rel=1e-6), name
+    with pytest.raises(ParameterError, match="limits"):
+        motion.use(Limits(*(np.ones(2),) * 5))
+
+
+def test_jerk_is_its_mean_square_and_smooth_motions_have_an_arc_nearer_to_zero(motion: Trajectory) -> None:
+    times = np.linspace(0.0, motion.duration, 400_001)[:-1]
+    assert motion.jerk == pytest.approx(np.sqrt(np.mean(np.sum(motion(times, 3) ** 2, axis=1))), rel=1e-3)
+    times = np.linspace(0.0, 1.0, 50)[:, None]
+    q, v, a = times**3 * (10 - 15 * times + 6 * times**2), 30 * times**2 * (1 - times) ** 2, 60 * times - 180 * times**2
+    a = a + 120 * times**3
+    smooth = Trajectory(times[:, 0], q, v, a, ("one",))
+    assert motion.spectral_arc_length < smooth.spectral_arc_length < 0.0
+    still = Trajectory(np.zeros(1), np.ones((1, 2)), np.zeros((1, 2)), np.zeros((1, 2)), ("a", "b"))
+    assert still.duration == still.jerk == still.spectral_arc_length == 0.0
+    np.testing.assert_array_equal(still([-1.0, 0.0, 5.0]), np.ones((3, 2)))
+    assert len(list(still.stream())) == 1 and not still(0.5, 1).any()
+
+
+def test_samples_and_streams_end_at_the_end(motion: Trajectory) -> None:
+    made = motion.sample(0.01)
+    assert made.time[0] == 0.0 and made.time[-1] == motion.duration and np.all(np.diff(made.time) > 0.0)
+    assert np.diff(made.time).max() <= 0.01 + 1e-12
+    stream = list(motion.stream(1000.0))
+    assert len(stream) == int(np.ceil(motion.duration * 1000.0)) + 1
+    np.testing.assert_array_equal(stream[123].velocity, motion(0.123, 1))
+    np.testing.assert_array_equal(stream[-1].position, motion.positions[-1])
+    for wrong in (0.0, -1.0, np.nan, np.inf):
+        with pytest.raises(ParameterError):
+            motion.sample(wrong)
+        with pytest.raises(ParameterError):
+            list(motion.stream(wrong))
+
+
+def test_motions_are_slowed_cut_and_joined(motion: Trajectory) -> None:
+    times, slow = np.linspace(0.0, motion.duration, 97), motion.slower(2.5)
+    for order in range(4):
+        np.testing.assert_allclose(slow(2.5 * times, order), motion(times, order) / 2.5**order, rtol=1e-6, atol=1e-9)
+    cut = motion.after(1.0)
+    np.testing.assert_allclose(cut(times), motion(times + 1.0), atol=1e-12)
+    np.testing.assert_allclose(cut(times[1:9], 2), motion(times[1:9] + 1.0, 2), atol=1e-9)
+    assert motion.after(99.0).duration == 0.0
+    states = motion.positions[::-1], -motion.velocities[::-1], motion.accelerations[::-1]
+    whole = joined([motion, Trajectory(motion.duration - motion.times[::-1], *states, NAMES)])
+    assert whole.duration == pytest.approx(2.0 * motion.duration)
+    np.testing.assert_allclose(whole(motion.duration + times), motion(motion.duration - times), atol=1e-9)
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".csv", ".traj.yaml", ".traj.json"])
+def test_files_give_the_same_motion_back(motion: Trajectory, tmp_path: Path, suffix: str) -> None:
+    file = tmp_path / f"motion{suffix}"
+    motion.save(file)
+    again = Trajectory.load(file)
+    assert again.joint_names == NAMES
+    assert np.abs(again.times - motion.times).max() <= (5.1e-10 if "traj" in suffix else 0.0)
+    for name in ("positions", "velocities", "accelerations"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(motion, name))
+    times = np.linspace(0.0, motion.duration, 333)
+    np.testing.assert_allclose(again(times), motion(times), atol=1e-8)
+
+
+def test_messages_are_those_of_ros(motion: Trajectory, tmp_path: Path) -> None:
+    motion.save(tmp_path / "m.traj.yaml")
+    message = yaml.safe_load((tmp_path / "m.traj.yaml").read_text())
+    assert set(message) == {"header", "joint_names", "points"} and message["joint_names"] == list(NAMES)
+    for k in (0, 7, -1):
+        point = message["points"][k]
+        assert set(point) == {"positions", "velocities", "accelerations", "effort", "time_from_start"}
+        stamp = point["time_from_start"]
+        assert isinstance(stamp["sec"], int) and 0 <= stamp["nanosec"] < 10**9
+        assert stamp["sec"] + 1e-9 * stamp["nanosec"] == pytest.approx(motion.times[k], abs=1e-9)
+    controllers = {"b_controller": ["three"], "a_controller": ["two", "one"]}
+    motion.save(tmp_path / "m.traj.json", controllers)
+    messages = json.loads((tmp_path / "m.traj.json").read_text())
+    assert list(messages) == ["b_controller", "a_controller"]
+    assert messages["a_controller"]["points"][3]["positions"] == motion.positions[3, [1, 0]].tolist()
+    again = Trajectory.load(tmp_path / "m.traj.json")
+    assert again.joint_names == ("three", "two", "one")
+    np.testing.assert_array_equal(again.velocities, motion.velocities[:, [2, 1, 0]])
+    for wrong in ({"a": ["one", "two"]}, {"a": [*NAMES, "four"]}, {"a": [*NAMES], "b": ["one"]}):
+        with pytest.raises(ParameterError, match="controllers: expected each joint"):
+            motion.save(tmp_path / "x.traj.yaml", wrong)
+    with pytest.raises(ParameterError, match="controllers"):
+        motion.save(tmp_path / "x.csv", {"a": list(NAMES)})
+    assert not list(tmp_path.glob("x*"))
+
+
+def test_columns_of_a_table_have_names(motion: Trajectory, tmp_path: Path) -> None:
+    motion.save(tmp_path / "m.csv")
+    head, first, *_ = (tmp_path / "m.csv").read_text().splitlines()
+    assert head.split(",")[:5] == ["time", "one", "two", "three", "one_velocity"]
+    assert [float(v) for v in first.split(",")[:4]] == [0.0, *motion.positions[0]]
+
+
+def test_faulty_files_are_named(motion: Trajectory, tmp_path: Path) -> None:
+    with pytest.raises(ParameterError, match="ending in"):
+        motion.save(tmp_path / "m.txt")
+    with pytest.raises(MissingFileError, match="does not exist"):
+        motion.save(tmp_path / "no" / "m.csv")
+    with pytest.raises(MissingFileError, match="no such file"):
+        Trajectory.load(tmp_path / "m.csv")
+    motion.save(tmp_path / "good.csv")
+    table = (tmp_path / "good.csv").read_text()
+    contents = {
+        "a.csv": b"time,one\n0,1\n", "b.npz": b"PK", "c.traj.json": b"{}",
+        "d.traj.yaml": b"points: [1]\njoint_names: []\n",
+        "e.csv": table.replace("0.0", "nan", 1).encode(), "f.csv": table.splitlines()[0].encode(),
+        "g.traj.yaml": b"[1]",
+        "h.csv": b"\xff\xfe", "i.traj.yaml": b"a: {points: [], joint_names: []}\nb: 3\n",
+    }  # fmt: skip
+    for name, content in contents.items():
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(FileFormatError, match=name):
+            Trajectory.load(tmp_path / name)
+
+
+def test_faulty_knots_are_refused(motion: Trajectory) -> None:
+    good = {name: getattr(motion, name) for name in ("times", "positions", "velocities", "accelerations")}
+    for change in (
+        {"times": good["times"][::-1]}, {"times": good["times"] + 1.0}, {"times": good["times"][:-1]},
+        {"positions": good["positions"][:, :2]}, {"velocities": good["velocities"] * np.nan},
+    ):  # fmt: skip
+        with pytest.raises(ParameterError):
+            Trajectory(**{**good, **change}, joint_names=NAMES)
