@@ -34,7 +34,7 @@ PICTURES, FILMS = (".png",), (".gif", ".mp4")
 SIZE = (1280, 960)
 AZIMUTH = 26.0
 STRIP = (3, 2)  # columns and rows of the frames of a result's picture
-FRAMES, FRAME_RATE = 72, 24
+FRAMES, MOST_FRAMES, FRAME_RATE = 72, 720, 24
 GHOST = 0.3  # opacity of the goal in a problem's picture
 HELD_COLOURS = ("#2a9d8f", "#e9a03b", "#8e6bbf", "#4c78a8")
 OBSTACLE, FIXTURE, BACKGROUND = "#c8553d", "#c9a77c", "#f4f4f1"
@@ -52,7 +52,7 @@ def render(
     """Draw a problem or a result.
 
     A problem's .png shows the start, and a goal as a ghost; a result's .png shows frames along its path in reading
-    order; .gif and .mp4 show the path of a result as a film.
+    order; .gif and .mp4 show the motion of a result as a film, in its own time when it is timed, at most 30 s long.
 
     Args:
         source: A problem, or a result that has a path.
@@ -82,7 +82,10 @@ def render(
     shot = (3 * size[0] // 4, 3 * size[1] // 4) if out.suffix in FILMS else (size[0] // 2, size[1] // 2)
     stage = Stage(assemble(source.problem), shot, azimuth)
     if out.suffix in FILMS:
-        frames = [stage.shoot(q) for q in resample(source.path, FRAMES)]
+        motion = source.trajectory
+        each = 0.0 if motion is None else max(1.0 / FRAME_RATE, motion.duration / MOST_FRAMES)
+        states = resample(source.path, FRAMES) if motion is None else motion.sample(each).position
+        frames = [stage.shoot(q) for q in states]
         pause = [frames[-1]] * (FRAME_RATE // 2)
         write_atomically(out, _encode([*frames, *pause], out.suffix))
         return

@@ -1,4 +1,4 @@
-"""Draw every ready-made problem, and the motion at the head of README, into docs/pictures.
+"""Draw every ready-made problem, and the motions that README shows, into docs/pictures.
 
 Usage: python scripts/make_pictures.py
 """
@@ -9,6 +9,7 @@ import argparse
 from pathlib import Path
 
 from apex_ompl import load_problem, plan, problems
+from apex_ompl.plots import plot_motion
 from apex_ompl.render import render
 
 OUT = Path(__file__).resolve().parent.parent / "docs" / "pictures"
@@ -17,7 +18,7 @@ FROM_BEHIND = {"shelf_swap": 150.0}
 
 
 def main() -> None:
-    """Draw the problems, and the motion of the first one in README."""
+    """Draw the problems and motions."""
     argparse.ArgumentParser(description=__doc__.splitlines()[0]).parse_args()
     OUT.mkdir(parents=True, exist_ok=True)
     for name in problems.names():
@@ -26,6 +27,8 @@ def main() -> None:
     result = plan("ball_in_cup", timeout=20.0)
     render(result, OUT / "ball_in_cup_motion.png", (1280, 960))
     print(OUT / "ball_in_cup_motion.png")
+    plot_motion(plan("shelf_swap", timeout=20.0), OUT / "shelf_swap_timing.png")
+    print(OUT / "shelf_swap_timing.png")
 
 
 if __name__ == "__main__":

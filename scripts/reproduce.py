@@ -6,7 +6,8 @@
 variational autoencoder of ``apex-paper`` and in principal components.
 
 The runs of ``failure`` and ``size`` are the same, and are kept as they end, beside those of benchmarks/head_to_head.py,
-some of which they are; so are the solutions of ``fid``. The command goes on where it was stopped.
+some of which they are; so are the solutions of ``fid``. The paper's algorithm and rrt have 20 runs on each level. The
+command goes on where it was stopped.
 
 Usage: python scripts/reproduce.py failure|size|fid [-n 50] [--keep FOLDER] [-o FOLDER]
 """
@@ -58,10 +59,10 @@ PAPER = {
 ALONE = {**PAPER, "model": "apex"}
 ROWS = (
     Row("apex", "apex"),
-    Row("apex-paper", "apex", {**PAPER, "guidance": True}),
-    Row("apex-paper, unguided", "apex", PAPER),
-    Row("apex's model alone", "apex", {**ALONE, "guidance": True}),
-    Row("apex's model alone, unguided", "apex", ALONE),
+    Row("apex-paper", "apex", {**PAPER, "guidance": True}, runs=20),
+    Row("apex-paper, unguided", "apex", PAPER, runs=20),
+    Row("apex's model alone", "apex", {**ALONE, "guidance": True}, runs=20),
+    Row("apex's model alone, unguided", "apex", ALONE, runs=20),
     Row("rrt", "rrt", runs=20),
     Row("rrtconnect", "rrtconnect"),
 )

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import settings as hypothesis_settings
 from planning import HARD, at_hand
 from support import ROOT
 
@@ -19,6 +20,9 @@ from apex_ompl.problem import Goal, Obstacle, Problem
 from apex_ompl.problems import reach
 from apex_ompl.records import Paths
 from apex_ompl.robot import Robot, load_robot
+
+hypothesis_settings.register_profile("here", derandomize=True, deadline=None)  # the same examples on every machine
+hypothesis_settings.load_profile("here")
 
 
 @pytest.fixture(scope="session")

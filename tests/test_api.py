@@ -265,7 +265,7 @@ def test_results_are_saved_in_every_format(problem: Problem, tmp_path: Path) -> 
         assert again.as_dict() == result.as_dict() and again.problem == problem
     with pytest.raises(ParameterError, match=r"\.npz, \.json, \.yaml"):
         PlanResult.load(tmp_path / "r.csv")
-    for name, content in (("broken.npz", b"PK"), ("other.json", b"{}"), ("half.yaml", b"schema: apex-ompl/result/1")):
+    for name, content in (("broken.npz", b"PK"), ("other.json", b"{}"), ("half.yaml", b"schema: apex-ompl/result/2")):
         (tmp_path / name).write_bytes(content)
         with pytest.raises(FileFormatError, match=name):
             PlanResult.load(tmp_path / name)
@@ -273,14 +273,17 @@ def test_results_are_saved_in_every_format(problem: Problem, tmp_path: Path) -> 
         PlanResult.load(tmp_path / "gone.npz")
     assert np.array_equal(np.array(json.loads((tmp_path / "r.json").read_text())["path"]), result.path)
     assert np.array_equal(np.array(yaml.safe_load((tmp_path / "r.yaml").read_text())["path"]), result.path)
+    replace(result, trajectory=None).save(tmp_path / "r.csv")
     lines = (tmp_path / "r.csv").read_text().splitlines()
     assert lines[0].split(",") == list(result.joint_names)
     assert np.array_equal(np.array([[float(v) for v in line.split(",")] for line in lines[1:]]), result.path)
     with pytest.raises(ParameterError, match=r"\.npz, \.csv, \.json, \.yaml"):
         result.save(tmp_path / "r.txt")
     with pytest.raises(ParameterError, match="a result with a path"):
-        replace(result, path=None).save(tmp_path / "none.csv")
-    assert not (tmp_path / "none.csv").exists()
+        replace(result, path=None, trajectory=None).save(tmp_path / "none.csv")
+    with pytest.raises(ParameterError, match="a result with a timed motion"):
+        replace(result, trajectory=None).save(tmp_path / "none.traj.yaml")
+    assert not list(tmp_path.glob("none*"))
 
 
 def test_two_plans_run_in_two_threads(problem: Problem) -> None:

@@ -103,7 +103,7 @@ def test_states_that_cannot_be_halved_are_refused() -> None:
 
 
 @given(st.integers(0, 2**31))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_quaternions_become_the_rotations_of_scipy(seed: int) -> None:
     from scipy.spatial.transform import Rotation
 

@@ -87,7 +87,7 @@ class Stub(AlignmentGoal):
 directions = st.lists(st.floats(-1, 1), min_size=3, max_size=3).map(np.array).filter(lambda v: np.linalg.norm(v) > 0.1)
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=80)
 @given(directions, st.floats(0, 0.3), st.floats(-0.05, 0.05), st.floats(0, 0.05), st.floats(0, 6.28))
 def test_errors_are_the_offsets_that_were_put_in(
     axis: np.ndarray, turn: float, axial: float, lateral: float, around: float

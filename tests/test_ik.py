@@ -93,7 +93,7 @@ def test_descents_reach_reachable_poses_inside_the_limits(robot: Robot) -> None:
     assert solved >= 18
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_a_descent_never_gets_worse_and_leaves_the_rest_alone(robot: Robot, seed: int) -> None:
     rng = np.random.default_rng(seed)

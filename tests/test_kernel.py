@@ -112,7 +112,7 @@ def coal_distance(shape: coal.CollisionGeometry, at: np.ndarray, point: np.ndarr
     )  # fmt: skip
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(seed=st.integers(0, 10**6))
 def test_clearance_of_random_trees_is_that_of_all_spheres(seed: int) -> None:
     tables, specs, bodies, pairs = random_robot(seed)
@@ -191,7 +191,7 @@ def test_distances_are_those_of_coal(name: str) -> None:
     assert inside > 20
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(seed=st.integers(0, 10**6))
 def test_gradients_are_finite_differences_on_random_trees(seed: int) -> None:
     tables, *_ = random_robot(seed)
@@ -437,7 +437,7 @@ def test_code_is_kept_where_it_can_be(tmp_path: Path, writable: bool) -> None:
         assert first.stdout.strip() == "None" and "no cache folder" in first.stderr and "compiles" in second.stderr
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_tables_for_one_side_judge_that_side_alone(robot: Robot, seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -102,7 +102,7 @@ def with_moments(rng: np.random.Generator, mean: np.ndarray, covariance: np.ndar
     return np.asarray(mean + rows @ np.linalg.cholesky(covariance).T)
 
 
-@settings(deadline=None, max_examples=25)
+@settings(max_examples=25)
 @given(st.integers(0, 10_000), st.integers(1, 6))
 def test_frechet_distance_is_that_of_the_formula(seed: int, size: int) -> None:
     rng = np.random.default_rng(seed)

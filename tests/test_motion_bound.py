@@ -75,7 +75,7 @@ def check(tables: RobotTables, middle: np.ndarray, step: np.ndarray, stray: np.n
     return tightest
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(seed=st.integers(0, 10**6), size=st.floats(1e-3, 1.0), bent=st.floats(0.0, 0.3))
 def test_spheres_of_random_trees_stay_within_their_bounds(seed: int, size: float, bent: float) -> None:
     tables, *_ = random_robot(seed)

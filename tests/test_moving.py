@@ -30,7 +30,7 @@ def path_from_home(robot: Robot, rng: np.random.Generator) -> tuple[np.ndarray, 
     return path, even_times(robot, path, 0.5)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_what_passes_is_free_at_all_times_and_what_fails_nearly_touches(robot: Robot, seed: int) -> None:
     rng = np.random.default_rng(seed)

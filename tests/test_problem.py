@@ -78,7 +78,7 @@ shapes = st.one_of(
 )
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(st.lists(st.tuples(shapes, vectors), max_size=4), st.lists(numbers, min_size=3, max_size=3))
 def test_any_problem_survives_its_file(tmp_path_factory: pytest.TempPathFactory, scene: list, start: list) -> None:
     obstacles = tuple(Obstacle(name=f"o{k}", position=at, **shape) for k, (shape, at) in enumerate(scene))
@@ -101,7 +101,7 @@ def test_files_follow_the_exported_json_schema() -> None:
         jsonschema.validate(parse_yaml((problems.DATA / f"{name}.yaml").read_text(), name), schema)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(st.lists(st.floats(-1, 1), min_size=4, max_size=4).filter(lambda q: np.linalg.norm(q) > 0.1))
 def test_pose_matrix_is_scipys(q: list[float]) -> None:
     expected = Rotation.from_quat(q).as_matrix()

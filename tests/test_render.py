@@ -34,13 +34,15 @@ def test_the_robot_is_drawn_where_it_is(problem: Problem) -> None:
     assert np.abs(first - stage.shoot(ready.start)).mean() < 1.0
 
 
-def test_a_result_becomes_a_strip_and_a_film(problem: Problem, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("apex_ompl.render.FRAMES", 6)
+def test_a_result_becomes_a_strip_and_a_film(problem: Problem, tmp_path: Path) -> None:
     result = plan(problem, timeout=20.0)
     for name in ("r.png", "r.gif", "r.mp4"):
         render(result, tmp_path / name, SMALL)
     assert iio.imread(tmp_path / "r.png").shape[:2] == (SMALL[1] // 2 * 2, SMALL[0] // 2 * 3)
-    assert len(iio.imread(tmp_path / "r.gif", index=None)) >= 6
+    frames = len(iio.imread(tmp_path / "r.gif", index=None))
+    assert result.trajectory is not None
+    shown = int(np.ceil(24 * result.trajectory.duration)) + 1
+    assert shown <= frames <= shown + 12, "and the last one for half a second, as one frame or as many"
     assert (tmp_path / "r.mp4").read_bytes()[4:8] == b"ftyp"
     with pytest.raises(ParameterError, match="result with a path"):
         render(replace(result, path=None), tmp_path / "none.png", SMALL)

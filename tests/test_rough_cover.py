@@ -79,7 +79,7 @@ def test_obstacles_of_meshes_contain_them() -> None:
     assert held.all()
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(sides=st.tuples(*[st.floats(0.002, 0.8)] * 3), seed=st.integers(0, 1000))
 def test_covers_of_boxes_contain_them(sides: tuple[float, float, float], seed: int) -> None:
     half = np.array(sides) / 2.0

@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from apex_ompl.diffusion.sampler import SAMPLERS, ddim, ddpm, dpm_solver
@@ -25,7 +25,6 @@ def test_noise_grows_from_almost_none_to_almost_all(kind: str, steps: int) -> No
     assert left[0] > 0.97 and left[-1] < 1e-3
 
 
-@settings(deadline=None)
 @given(st.sampled_from(PREDICTIONS), st.sampled_from(SCHEDULES), st.integers(1, 254), st.integers(0, 2**31))
 def test_what_a_perfect_network_says_gives_sample_and_noise_back(kind: str, name: str, t: int, seed: int) -> None:
     schedule, g = NoiseSchedule(256, name), torch.Generator().manual_seed(seed)
@@ -36,7 +35,6 @@ def test_what_a_perfect_network_says_gives_sample_and_noise_back(kind: str, name
     torch.testing.assert_close(found.noise, noise, atol=1e-4, rtol=1e-4)
 
 
-@settings(deadline=None)
 @given(st.integers(0, 255), st.data())
 def test_steps_fall_from_the_first(first: int, data: st.DataObject) -> None:
     count = data.draw(st.integers(1, first + 1))

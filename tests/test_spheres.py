@@ -157,7 +157,7 @@ SHAPES = st.one_of(
 
 
 @given(SHAPES, st.integers(0, 1000))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_covers_of_simple_shapes_are_proved(geometry: coal.CollisionGeometry, seed: int) -> None:
     cover = make_cover(geometry)
     assert len(unproved(geometry, cover)) == 0

@@ -34,7 +34,7 @@ def test_the_gram_matrix_is_an_integral(spline: Spline) -> None:
         assert control @ spline.gram(order) @ control == pytest.approx(value, rel=1e-7)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.integers(0, 2**32 - 1), st.sampled_from(SPLINES), st.integers(1, 16), st.floats(1e-6, 1e3), st.booleans())
 def test_ends_are_exact_and_limits_are_kept(seed: int, spline: Spline, dof: int, scale: float, batch: bool) -> None:
     rng = np.random.default_rng(seed)
@@ -63,7 +63,7 @@ def test_the_line_is_straight(spline: Spline) -> None:
         np.testing.assert_allclose(along, spline.parameters, atol=1e-12)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.integers(0, 2**32 - 1), st.integers(2, 12), st.sampled_from(SPLINES))
 def test_the_bound_of_a_fit_holds(seed: int, count: int, spline: Spline) -> None:
     rng = np.random.default_rng(seed)

@@ -52,7 +52,7 @@ def test_the_suites_and_levels_are_those_of_the_contract() -> None:
         assert set(suites[suite]) == {"free", "small", "medium", "large"} | moving and len(moving) == 15
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(which=st.sampled_from(EVERY), seed=st.integers(0, 799_999), other=st.integers(0, 799_999))
 def test_the_same_seed_gives_the_same_problem(which: tuple[str, str], seed: int, other: int) -> None:
     suite, level = which

@@ -69,7 +69,7 @@ def paths(draw: st.DrawFn) -> np.ndarray:
     return corners if kind == "corners" else np.concatenate([corners, corners[::-1]])
 
 
-@settings(max_examples=60, deadline=None, derandomize=True)
+@settings(max_examples=60)
 @given(path=paths(), deviation=st.sampled_from([0.2, 0.05, 0.01]), scale=st.sampled_from([1.0, 0.3, 0.01]))
 def test_motions_keep_all_limits_and_stay_near_their_paths(path: np.ndarray, deviation: float, scale: float) -> None:
     path = np.clip(path, -3.0, 3.0)
@@ -211,7 +211,7 @@ def test_scales_and_a_minimum_duration_slow_the_motion() -> None:
     assert timed(path, Timing(minimum_duration=0.01)).trajectory.duration == quick.duration
 
 
-@settings(max_examples=30, deadline=None, derandomize=True)
+@settings(max_examples=30)
 @given(path=paths(), seed=st.integers(0, 999), share=st.sampled_from([0.1, 0.6, 0.95]))
 def test_motions_begin_with_a_velocity(path: np.ndarray, seed: int, share: float) -> None:
     rng = np.random.default_rng(seed)

@@ -34,7 +34,7 @@ def test_bit_reversed_is_a_spread_out_permutation(n: int) -> None:
 motions = st.lists(st.floats(-2, 2), min_size=3, max_size=3).map(np.array)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(motions, motions, st.floats(0.01, 0.5))
 def test_states_between_are_even_and_close(a: np.ndarray, b: np.ndarray, resolution: float) -> None:
     all_states = np.concatenate([a[None], states_between(a, b, resolution), b[None]])
@@ -42,7 +42,7 @@ def test_states_between_are_even_and_close(a: np.ndarray, b: np.ndarray, resolut
     assert np.abs(steps).max(initial=0.0) <= resolution + 1e-12
     np.testing.assert_allclose(steps, np.broadcast_to((b - a) / len(steps), steps.shape), atol=1e-12)
     if len(steps) > 1:  # not finer than asked for
-        assert np.abs(b - a).max() / (len(steps) - 1) > resolution
+        assert np.abs(b - a).max() / (len(steps) - 1) > resolution * (1.0 - 1e-9)
 
 
 def test_sampling_a_path_keeps_its_states_bit_for_bit() -> None:

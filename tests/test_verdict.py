@@ -220,7 +220,7 @@ def test_links_never_hide_in_each_other(robot: Robot) -> None:
         assert not (inside and verdict.is_free(q))
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.lists(st.floats(-1.5, 1.5), min_size=3, max_size=3))
 def test_winding_number_tells_inside_from_outside_of_a_convex_mesh(point: list[float]) -> None:
     cloud = np.random.default_rng(1).normal(size=(40, 3))

@@ -120,10 +120,10 @@ class Trajectory:
                 a + since * j,
                 j,
             )[order]
-            if order == 0:
-                found = np.where((moments >= self.duration)[:, None], self.positions[-1], found)
-            else:
-                found = np.where(((moments < 0.0) | (moments > self.duration))[:, None], 0.0, found)
+            if order < len(STATES):  # without rounding at the end
+                found[moments >= self.duration] = (self.positions, self.velocities, self.accelerations)[order][-1]
+            if order > 0:
+                found[(moments < 0.0) | (moments > self.duration)] = 0.0
         return found[0] if given.ndim == 0 else found
 
     def sample(self, spacing: float) -> Sample:
@@ -221,7 +221,7 @@ class Trajectory:
 
     def after(self, time: float) -> Trajectory:
         """Return what is left of the motion after a moment [s]."""
-        later = self.times > time
+        later = self.times > time + 1e-9
         if not later.any():
             return Trajectory(
                 np.zeros(1), self.positions[-1:], self.velocities[-1:], self.accelerations[-1:], self.joint_names

@@ -14,7 +14,8 @@ from apex_ompl.trajectory.motion import Trajectory, joined
 Array = NDArray[np.float64]
 
 WITHIN = 1.0 - 1e-6  # of the limits that Ruckig is given, for its rounding
-JOINTS = 24  # places at which a motion may be joined
+BEYOND = 1.0 + 1e-10  # where it is given states that are at the limits
+JOINTS = 12  # places at which a motion may be joined
 SHORTEST = 1e-9  # piece [s]
 
 
@@ -45,8 +46,8 @@ def stops(corners: Array, limits: Limits, names: tuple[str, ...]) -> Trajectory:
 
 def from_motion(
     velocity: Array, acceleration: Array, rest: Trajectory, limits: Limits, minimum_duration: float
-) -> Iterator[Trajectory]:
-    """Yield motions that begin with a velocity and go over into another motion from the same state, fastest first.
+) -> Iterator[tuple[Trajectory, float]]:
+    """Yield motions that begin with a velocity and go over into another motion from the same state, and when they do.
 
     Args:
         velocity: At the start, shape (dof,) [rad/s].
@@ -55,12 +56,11 @@ def from_motion(
         limits: Of the joints.
         minimum_duration: Of the whole [s].
     """
-    found = []
     solver, task = ruckig.Ruckig(rest.dof), ruckig.InputParameter(rest.dof)
     task.current_position, task.current_velocity = rest.positions[0].tolist(), velocity.tolist()
     task.current_acceleration = acceleration.tolist()
     for name in ("velocity", "acceleration", "jerk"):
-        setattr(task, f"max_{name}", (WITHIN * getattr(limits, name)).tolist())
+        setattr(task, f"max_{name}", (BEYOND * getattr(limits, name)).tolist())
     for moment in np.linspace(0.0, rest.duration, JOINTS + 1) if rest.duration else [0.0]:
         left = rest.duration - moment
         task.target_position, task.target_velocity, task.target_acceleration = (
@@ -72,24 +72,19 @@ def from_motion(
             _calculate(solver, task, made)
         except ruckig.RuckigError:  # from this velocity that state cannot be reached within the limits
             continue
-        found.append((made.duration + left, moment, made))
-    for _, moment, made in sorted(found, key=lambda one: one[0]):
-        motion = _motion(made, rest, moment)
-        if motion.use(limits)["position"] <= 1.0:
-            yield motion
+        head = _head(made, rest, moment)
+        if head.use(limits)["position"] <= 1.0:
+            yield joined([head, rest.after(moment)]), head.duration
 
 
-def _motion(made: ruckig.Trajectory, rest: Trajectory, moment: float) -> Trajectory:
-    """Return Ruckig's motion, followed by what is left of another one."""
-    after = rest.after(moment)
+def _head(made: ruckig.Trajectory, rest: Trajectory, moment: float) -> Trajectory:
+    """Return Ruckig's motion to where another one is at a moment."""
     times = _breaks(made)
-    if len(times) < 2:
-        return after
     states = [np.array(v) for v in zip(*(made.at_time(float(t)) for t in times), strict=True)]
     states[0][0] = rest.positions[0]
-    for part, wanted in zip(states, (after.positions, after.velocities, after.accelerations), strict=True):
-        part[-1] = wanted[0]
-    return joined([Trajectory(times, states[0], states[1], states[2], rest.joint_names), after])
+    for order, part in enumerate(states):
+        part[-1] = rest(moment, order)
+    return Trajectory(times, states[0], states[1], states[2], rest.joint_names)
 
 
 def _calculate(solver: ruckig.Ruckig, task: ruckig.InputParameter, made: ruckig.Trajectory) -> None:

@@ -25,6 +25,7 @@ FINE = 0.008  # distance of moments at which the deviation is measured, at most 
 SPACING = 3.0  # of control points, as a multiple of the deviation; a corner is cut by a third
 FIRST = 4  # of the spacings of knots, that is tried first [s]
 CLOSER = 6  # times that the blending of corners is halved before the motion stops at them
+HEAD = 64  # moments of what comes before the path at a moving start, at which the deviation is measured
 NANOSECOND = 1e-9
 
 
@@ -36,7 +37,8 @@ class Timing:
         velocity_scale: Share of the limits of velocity that is used, over 0 to 1.
         acceleration_scale: The same of acceleration.
         jerk_scale: The same of jerk.
-        deviation: Largest distance of the motion from the path, over 0 [rad, Euclidean; synergies 0..1].
+        deviation: Largest distance of the motion from the path, over 0 [rad, Euclidean; synergies 0..1]; a motion from
+            a moving start may leave it by more, as little as can be.
         minimum_duration: The motion takes at least so long [s].
         start_velocity: Velocity at the start, one number a joint, or none for rest [rad/s].
         start_acceleration: Acceleration there [rad/s^2].
@@ -140,16 +142,13 @@ def time_path(
         raise ParameterError("path", states.shape, f"finite numbers of shape (N, {len(limits.velocity)})")
     scaled = timing.limits(limits)
     start = timing.start(scaled)
-    said = ""
-    for timed in _ways(Polyline.through(states), scaled, tuple(joint_names), timing):
-        rest = timed.trajectory
-        if rest.duration < timing.minimum_duration:
-            rest = _stretched(rest, timing.minimum_duration)
-        motions = [rest] if start is None else from_motion(*start, rest, scaled, timing.minimum_duration)
-        for motion in motions:
-            said = fault(motion)
+    said, line = "", Polyline.through(states)
+    for timed in _ways(line, scaled, tuple(joint_names), timing):
+        rest = replace(timed, trajectory=_lasting(timed.trajectory, timing.minimum_duration))
+        for one in [rest] if start is None else _moving(start, rest, line, scaled, timing):
+            said = fault(one.trajectory)
             if not said:
-                return replace(timed, trajectory=motion, way=("" if start is None else "moving start, ") + timed.way)
+                return one
     return said or "no motion from the velocity at the start stays within the limits"
 
 
@@ -236,13 +235,25 @@ def _spline(control: Array, apart: float, names: tuple[str, ...]) -> Trajectory:
     return Trajectory(times, positions, (after - before) / (2.0 * apart), (after - 2.0 * at + before) / apart**2, names)
 
 
+def _moving(start: tuple[Array, Array], timed: Timed, line: Polyline, limits: Limits, timing: Timing) -> list[Timed]:
+    """Return motions from a moving start, the fastest that stay near the path first, then those that leave it less."""
+    found = []
+    for motion, head in from_motion(*start, timed.trajectory, limits, timing.minimum_duration):
+        points = motion(np.linspace(0.0, head, HEAD))
+        off = float(farthest(points, np.zeros(HEAD), line.states, line.arc, line.length))
+        found.append(Timed(motion, max(off, timed.deviation), f"moving start, {timed.way}"))
+    return sorted(found, key=lambda one: (max(one.deviation, timing.deviation), one.trajectory.duration))
+
+
 def _standing(state: Array, names: tuple[str, ...]) -> Trajectory:
     still = np.zeros((1, len(state)))
     return Trajectory(np.zeros(1), state[None].copy(), still, still.copy(), names)
 
 
-def _stretched(motion: Trajectory, duration: float) -> Trajectory:
-    """Return the motion in a longer time; one without any stands still so long."""
+def _lasting(motion: Trajectory, duration: float) -> Trajectory:
+    """Return the motion in a time at least so long; one without any stands still so long."""
+    if motion.duration >= duration:
+        return motion
     if motion.duration:
         return motion.slower(duration / motion.duration)
     twice = [np.repeat(part, 2, axis=0) for part in (motion.positions, motion.velocities, motion.accelerations)]
