@@ -21,6 +21,7 @@ from apex_ompl.planners.apex_parameters import WITHOUT_MODEL, default_planner
 from apex_ompl.planning import Planning
 from apex_ompl.problem import Problem
 from apex_ompl.result import PlanResult
+from apex_ompl.robot import load_robot
 from apex_ompl.trajectory import Timing, warm_up
 
 
@@ -110,16 +111,17 @@ def plan(
         raise ParameterError("snapshot", snapshot, expected)
     with quiet_ompl():
         seed_ompl(seed)
-        ready = assemble(loaded, seed=seed)
-        if how is not None:
-            how.start(how.limits(ready.robot.limits))  # whether it fits the robot
-            warm_up()
+        robot = load_robot(loaded.robot)
         notes = [f"snapshot: {', '.join(loaded.moving)} taken to stand still"] if loaded.moving else []
         if planner is None:
-            planner = default_planner(ready.robot.name)
+            planner = default_planner(robot.name)
             if planner == WITHOUT_MODEL:
-                notes.append(f"no model of {ready.robot.name} ships, so {planner} plans")
+                notes.append(f"no model of {robot.name} ships, so {planner} plans")
         parameters = planners.parameters(planner, **dict(params or {}))
+        if how is not None:
+            how.start(how.limits(robot.limits))  # whether it fits the robot
+            warm_up()
+        ready = assemble(loaded, robot, seed=seed)
         run = Planning(ready, planner, seed, time.perf_counter() - started, tuple(notes))
         with Interrupt() as run.interrupt:
             result = run.solve(parameters, timeout, simplify)

@@ -6,7 +6,7 @@ import importlib
 import math
 import os
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
@@ -118,13 +118,12 @@ class Benchmarked(Planning):
         return noticed
 
 
-def _solved_at(progress: Iterable[Any]) -> Iterator[float]:
+def _solved_at(progress: Iterable[Mapping[str, str]]) -> Iterator[float]:
     """Yield the moments of a run at which the planner said that it had a path [s]."""
     for moment in progress:
-        said = moment.to_dict()
-        costs = (float(value) for name, value in said.items() if name.startswith("best cost"))
+        costs = (float(value) for name, value in moment.items() if name.startswith("best cost"))
         if any(math.isfinite(cost) for cost in costs):
-            yield float(said["time REAL"])
+            yield float(moment["time REAL"])
 
 
 def run(job: Job) -> Run:
