@@ -81,8 +81,8 @@ def plan(
         problem: A problem, its name, or its file.
         planner: Name of a planner, see ``apex_ompl.planners.names()``; by default apex, or rrtconnect+polish for a
             robot that no model ships for.
-        timeout: Seconds for finding and repairing a path; shortening, which is capped by counts, comes on top. Of
-            planners that stop at the timeout only, a tenth, at most 0.5 s, is kept for repair.
+        timeout: Seconds for finding and repairing a path; shortening, which is capped by counts, and timing come on
+            top. Of planners that stop at the timeout only, a tenth, at most 0.5 s, is kept for repair.
         seed: Seed of all random numbers, 0 or more. The same seed gives the same path for planners that are
             neither stopped by the clock nor threaded, as long as no other thread plans at the same time (OMPL
             seeds one generator per process).

@@ -57,18 +57,19 @@ def plan(parsed: argparse.Namespace) -> int:
         timing=timing if not parsed.no_timing else False,
     )
     if parsed.out is not None:
-        _save(result, parsed.out, parsed.controllers)
+        _save(result, parsed.out, timed=not parsed.no_timing, controllers=parsed.controllers)
     print(json.dumps(result.as_dict()) if parsed.json else _summary(result))
     return EXIT_CODES.get(result.status, 1)
 
 
-def _save(result: PlanResult, out: Path, controllers: bool) -> None:
+def _save(result: PlanResult, out: Path, *, timed: bool, controllers: bool) -> None:
     """Write what there is of a result, or say that there is nothing."""
     suffix = check_suffix(out)
-    wanted = result.trajectory if suffix in MESSAGES else result.path if suffix == ".csv" else result
+    wanted: object = result
+    if suffix in (*MESSAGES, ".csv"):
+        wanted = result.trajectory if timed else result.path
     if wanted is None:
-        what = "motion" if suffix in MESSAGES else "path"
-        print(f"apex-ompl: note: no {what}, so {out} is not written", file=sys.stderr)
+        print(f"apex-ompl: note: no {'motion' if timed else 'path'}, so {out} is not written", file=sys.stderr)
     elif controllers and result.trajectory is not None:
         from apex_ompl.robot import load_robot
 

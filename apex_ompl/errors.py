@@ -118,6 +118,10 @@ class FolderInUseError(ApexError):
         super().__init__(f"{folder}: another process writes here, expected one at a time")
 
 
+class TimingError(ApexError):
+    """A path for which no motion was found."""
+
+
 class RobotError(ApexError):
     """A robot description that cannot be made into a robot."""
 

@@ -6,6 +6,9 @@ import contextlib
 import fcntl
 import os
 import tempfile
+import tokenize
+import zipfile
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,6 +16,11 @@ from pathlib import Path
 from apex_ompl.errors import FolderInUseError, MissingFileError
 
 OUTPUT = "output file"
+BROKEN = (
+    KeyError, TypeError, ValueError, EOFError, OverflowError, NotImplementedError, RuntimeError, MemoryError,
+    tokenize.TokenError, zipfile.BadZipFile, zlib.error,
+)  # fmt: skip
+"""What reading an archive of NumPy that is damaged raises, and a file that holds something else."""
 
 
 def is_file(path: Path) -> bool:

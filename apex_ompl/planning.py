@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ompl import base as ob
 
 from apex_ompl.assembly import PlanningSetup, set_goals
-from apex_ompl.errors import ApexError
+from apex_ompl.errors import ApexError, TimingError
 from apex_ompl.interrupt import Interrupt
 from apex_ompl.repair import repair
 from apex_ompl.resolution import FULL_RESOLUTION
@@ -29,7 +29,8 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 CLEARANCE_SAMPLES = 32
-PROVED_EACH = 0.004  # of a timed motion, between two states [s]; at 20 rad/s^2 a chord is 0.04 mrad off
+CHORD = 4e-5  # that a timed motion is off the straight line between two states that are proved, at most [rad]
+MOST_STATES = 100_000  # that are proved of a timed motion
 ROUNDING = 1e-9  # of shares of limits
 STRAIGHT_LINE = "straight line"
 PROOF_SHARE, LONGEST_PROOF = 0.1, 0.5  # time kept from planners that stop at the timeout only, for repair [1, s]
@@ -153,16 +154,22 @@ class Planning:
 
         def fault(motion: Trajectory) -> str:
             with timed(proof, "proof"):
-                states = motion.sample(PROVED_EACH).position
-                check = full_check(ready.verdict, states, ready.start, ready.goals)
-                over = [f"{name} {share:.4f}" for name, share in motion.use(limits).items() if share > 1.0 + ROUNDING]
-            return check.reason or (f"the share of a limit that it uses is over 1: {', '.join(over)}" if over else "")
+                shares = motion.use(timing.limits(limits))
+                over = [f"{name} {share:.4f}" for name, share in shares.items() if share > 1.0 + ROUNDING]
+                if over:
+                    return f"the share of a limit that it uses is over 1: {', '.join(over)}"
+                bend = max(float(np.abs(motion.accelerations).max()), 1e-9)
+                states = motion.sample(max(np.sqrt(8.0 * CHORD / bend), motion.duration / MOST_STATES, 1e-6)).position
+                states = np.clip(states, limits.lower, limits.upper)  # of rounding, as was seen
+                return full_check(ready.verdict, states, ready.start, ready.goals).reason
 
-        made = time_path(path, limits, ready.robot.joint_names, timing, fault)
-        self.times["timing proof"] = proof.get("proof", 0.0)
-        self.times["timing"] = time.perf_counter() - began - self.times["timing proof"]
-        if isinstance(made, str):
-            return replace(result, status=PlanStatus.TIMING_FAILED, reason=f"the path cannot be timed, {made}")
+        try:
+            made = time_path(path, limits, ready.robot.joint_names, timing, fault)
+        except TimingError as error:
+            return replace(result, status=PlanStatus.TIMING_FAILED, reason=f"the path cannot be timed, {error}")
+        finally:
+            self.times["timing proof"] = proof.get("proof", 0.0)
+            self.times["timing"] = time.perf_counter() - began - self.times["timing proof"]
         motion = made.trajectory
         return replace(result, trajectory=motion, limit_use=motion.use(limits), deviation=made.deviation)
 

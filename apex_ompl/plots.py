@@ -18,6 +18,7 @@ from apex_ompl.trajectory.files import suffix_of
 
 FORMATS = (".png", ".pdf", ".svg")
 SPACING = 0.002  # between two moments of a curve [s]
+MOST = 4000  # moments of a curve
 MOMENTS = 128  # at which clearance is drawn
 ROWS = ("position", "velocity", "acceleration", "jerk")
 
@@ -32,7 +33,7 @@ def plot_motion(result: PlanResult, out: str | os.PathLike[str]) -> None:
         out: Picture to write, .png, .pdf or .svg.
 
     Raises:
-        ParameterError: The result has no trajectory, or ``out`` another suffix.
+        ParameterError: The result has no trajectory, or one of other joints, or ``out`` another suffix.
         MissingFileError: The file cannot be written.
         ApexError: The robot or the problem of the result cannot be made.
     """
@@ -44,7 +45,9 @@ def plot_motion(result: PlanResult, out: str | os.PathLike[str]) -> None:
     robot = load_robot(result.robot)
     verdict, limits = assemble(result.problem, robot).verdict, robot.limits
     middle, half = (limits.upper + limits.lower) / 2.0, (limits.upper - limits.lower) / 2.0
-    times = motion.sample(SPACING).time
+    if result.joint_names != robot.joint_names:
+        raise ParameterError("result", ", ".join(result.joint_names), f"the joints of {robot.name}")
+    times = motion.sample(max(SPACING, motion.duration / MOST)).time
     shares = [(motion(times) - middle) / half]
     bounds = (limits.velocity, limits.acceleration, limits.jerk)
     shares += [motion(times, order) / bound for order, bound in enumerate(bounds, 1)]

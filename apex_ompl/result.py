@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import json
 import os
-import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
@@ -17,16 +16,15 @@ from numpy.typing import NDArray
 from ompl import base as ob
 
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError
-from apex_ompl.files import write_atomically
+from apex_ompl.files import BROKEN, write_atomically
 from apex_ompl.problem import Problem
 from apex_ompl.schema import dump_yaml, read_yaml, validate
 from apex_ompl.trajectory import Trajectory
-from apex_ompl.trajectory.files import suffix_of
+from apex_ompl.trajectory.files import MESSAGES, STATES, suffix_of
 
 SCHEMA = "apex-ompl/result/2"
-MOTIONS = (".traj.yaml", ".traj.json")
-SUFFIXES = (*MOTIONS, ".npz", ".csv", ".json", ".yaml")
-KNOTS = ("times", "positions", "velocities", "accelerations")
+SUFFIXES = (*MESSAGES, ".npz", ".csv", ".json", ".yaml")
+KNOTS = ("times", *STATES)
 NUMBERS = ("length", "clearance", "deviation")
 
 INSIDE = "solve: "
@@ -148,7 +146,7 @@ class PlanResult:
         """
         path = Path(path)
         suffix = check_suffix(path)
-        if self.trajectory is not None and suffix in (*MOTIONS, ".csv"):
+        if self.trajectory is not None and suffix in (*MESSAGES, ".csv"):
             self.trajectory.save(path)
         else:
             write_atomically(path, self._encoded(suffix))
@@ -163,8 +161,8 @@ class PlanResult:
             ParameterError: It has another suffix; a .csv holds no problem.
         """
         path = Path(path)
-        suffixes = tuple(s for s in SUFFIXES if s not in (*MOTIONS, ".csv"))
-        if path.suffix not in suffixes or path.name.endswith(MOTIONS):
+        suffixes = tuple(s for s in SUFFIXES if s not in (*MESSAGES, ".csv"))
+        if path.suffix not in suffixes or path.name.endswith(MESSAGES):
             raise ParameterError("result file", str(path), f"a file name ending in {', '.join(suffixes)}")
         data = read_yaml(path, "result file") if path.suffix != ".npz" else _read_npz(path)
         if data.get("schema") != SCHEMA:
@@ -175,14 +173,16 @@ class PlanResult:
             knots, names = data["trajectory"], tuple(data["joint_names"])
             arrays = {} if knots is None else {key: np.array(knots[key], dtype=float) for key in KNOTS}
             motion = Trajectory(**arrays, joint_names=names) if arrays else None
+            if states is not None and (states.ndim != 2 or states.shape[1] != len(names)):
+                raise ValueError(f"a path of shape {states.shape} for {len(names)} joints")
             return cls(
                 status=PlanStatus(data["status"]), reason=data["reason"], robot=data["robot"], path=states,
                 problem=validate(Problem, data["problem_file"], str(path)), planner=data["planner"],
-                joint_names=names, trajectory=motion, limit_use=data["limit_use"], seed=int(data["seed"]),
+                joint_names=names, trajectory=motion, limit_use=dict(data["limit_use"]), seed=int(data["seed"]),
                 times=data["times"], checks=int(data["checks"]), solved_by=data["solved_by"],
                 notes=tuple(data["notes"]), **number,
             )  # fmt: skip
-        except (KeyError, TypeError, ValueError, ParameterError) as error:
+        except (*BROKEN, ParameterError) as error:
             raise FileFormatError(str(path), "", str(error), "expected a complete saved result") from error
 
     def _encoded(self, suffix: str) -> bytes:
@@ -191,7 +191,7 @@ class PlanResult:
             return (json.dumps(data, indent=1) + "\n").encode()
         if suffix == ".yaml":
             return dump_yaml(data).encode()
-        if suffix in MOTIONS:
+        if suffix in MESSAGES:
             raise ParameterError("output", suffix, "a result with a timed motion")
         if suffix == ".csv":
             if self.path is None:
@@ -218,7 +218,7 @@ def _read_npz(path: Path) -> dict[str, Any]:
             return data | {"path": archive["path"] if len(archive["path"]) else None, "trajectory": knots}
     except FileNotFoundError as error:
         raise MissingFileError(str(path), "result file") from error
-    except (OSError, KeyError, ValueError, zipfile.BadZipFile) as error:
+    except (OSError, *BROKEN) as error:
         raise FileFormatError(str(path), "", str(error), "expected a saved result") from error
 
 

@@ -40,8 +40,8 @@ from apex_ompl.result import PlanResult, PlanStatus
 from apex_ompl.trajectory import Timing, Trajectory, time_path
 from apex_ompl.trajectory.curve import Curve, Polyline
 from apex_ompl.trajectory.motion import joined
-from apex_ompl.trajectory.points import stops
-from apex_ompl.trajectory.timing import PER_PIECE, SPACING
+from apex_ompl.trajectory.points import breaks, calculate, stops
+from apex_ompl.trajectory.timing import PER_PIECE, SPACING, least_spacing, spline
 from apex_ompl.validity import full_check
 
 LIMITS, NAMES = robot().limits, robot().joint_names
@@ -108,13 +108,10 @@ def in_all_joints(states: list[tuple[np.ndarray, np.ndarray, np.ndarray]], least
                 setattr(task, f"{which}_{name}", value.tolist())
         made = ruckig.Trajectory(len(NAMES))
         try:
-            if solver.calculate(task, made) not in (ruckig.Result.Working, ruckig.Result.Finished):
-                return None
+            calculate(solver, task, made)
         except ruckig.RuckigError:
             return None
-        ends = [p.brake.duration + np.cumsum(p.t) for p in made.profiles[0]]
-        times = np.unique(np.clip(np.concatenate([[0.0, made.duration], *ends]), 0.0, made.duration))
-        times = times[np.append(True, np.diff(times) > 1e-9)]
+        times = breaks(made)
         q, v, a = (np.array(part) for part in zip(*(made.at_time(float(t)) for t in times), strict=True))
         parts.append(Trajectory(times, q, v, a, NAMES))
     return joined(parts)
@@ -198,14 +195,7 @@ def in_stretches(curve: Curve, first: np.ndarray, second: np.ndarray, count: int
         place[k] = made.at_time(float(time_ - begin))[0][0]
     points = curve.points(np.clip(place, 0.0, length))
     control = np.concatenate([points[[0, 0]], points, points[[-1, -1]]])
-    apart, worst, change = times[1], 0.0, control
-    for order, limit in enumerate((LIMITS.velocity, LIMITS.acceleration, LIMITS.jerk), 1):
-        change = np.diff(change, axis=0)
-        worst = max(worst, float(np.abs(change / limit).max()) ** (1.0 / order))
-    apart = worst * (1.0 + 1e-9)
-    before, at, after = control[:-2], control[1:-1], control[2:]
-    q, v, a = (before + 4 * at + after) / 6, (after - before) / (2 * apart), (after - 2 * at + before) / apart**2
-    return Trajectory(np.arange(len(q)) * apart, q, v, a, NAMES)
+    return spline(control, least_spacing(control, LIMITS), NAMES)
 
 
 def within_reach(slow: float, fast: float, push: float, jolt: float, distance: float) -> float:
@@ -246,7 +236,8 @@ def judge(figures: Figures, motion: Trajectory | None, path: np.ndarray, verdict
     figures.uses.append([motion.use(LIMITS)[name] for name in DERIVATIVES])
     figures.deviations.append(deviation_of(motion, path))
     figures.jerks.append(motion.jerk)
-    states = np.concatenate([path[:1], motion.sample(EACH).position[1:-1], path[-1:]])
+    states = np.clip(motion.sample(EACH).position, LIMITS.lower, LIMITS.upper)
+    states = np.concatenate([path[:1], states[1:-1], path[-1:]])
     figures.failed += not full_check(verdict, states, path[0], [path[-1]])
     if best is not None:
         figures.ratios.append(motion.duration / best)
@@ -261,8 +252,7 @@ def timed_way(way: Callable[[np.ndarray], Trajectory | None], path: np.ndarray) 
 
 def ours(path: np.ndarray) -> Trajectory | None:
     """Return the motion of ``time_path``."""
-    made = time_path(path, LIMITS, NAMES)
-    return None if isinstance(made, str) else made.trajectory
+    return time_path(path, LIMITS, NAMES).trajectory
 
 
 WAYS: dict[str, Callable[[np.ndarray], Trajectory | None]] = {

@@ -64,10 +64,9 @@ def test_use_of_limits_is_that_of_dense_samples(motion: Trajectory) -> None:
 def test_jerk_is_its_mean_square_and_smooth_motions_have_an_arc_nearer_to_zero(motion: Trajectory) -> None:
     times = np.linspace(0.0, motion.duration, 400_001)[:-1]
     assert motion.jerk == pytest.approx(np.sqrt(np.mean(np.sum(motion(times, 3) ** 2, axis=1))), rel=1e-3)
-    times = np.linspace(0.0, 1.0, 50)[:, None]
-    q, v, a = times**3 * (10 - 15 * times + 6 * times**2), 30 * times**2 * (1 - times) ** 2, 60 * times - 180 * times**2
-    a = a + 120 * times**3
-    smooth = Trajectory(times[:, 0], q, v, a, ("one",))
+    times = np.linspace(0.0, 1.0, 50)
+    bell = CubicSpline(times, (times**3 * (10 - 15 * times + 6 * times**2))[:, None], bc_type="clamped")
+    smooth = Trajectory(times, bell(times), bell(times, 1), bell(times, 2), ("one",))
     assert motion.spectral_arc_length < smooth.spectral_arc_length < 0.0
     still = Trajectory(np.zeros(1), np.ones((1, 2)), np.zeros((1, 2)), np.zeros((1, 2)), ("a", "b"))
     assert still.duration == still.jerk == still.spectral_arc_length == 0.0
@@ -83,11 +82,15 @@ def test_samples_and_streams_end_at_the_end(motion: Trajectory) -> None:
     assert len(stream) == int(np.ceil(motion.duration * 1000.0)) + 1
     np.testing.assert_array_equal(stream[123].velocity, motion(0.123, 1))
     np.testing.assert_array_equal(stream[-1].position, motion.positions[-1])
-    for wrong in (0.0, -1.0, np.nan, np.inf):
+    for wrong in (0.0, -1.0, np.nan, np.inf, "x", 1e-300):
         with pytest.raises(ParameterError):
             motion.sample(wrong)
+        if wrong != 1e-300:
+            with pytest.raises(ParameterError):
+                motion.stream(wrong)
         with pytest.raises(ParameterError):
-            list(motion.stream(wrong))
+            motion(np.nan)
+    assert next(motion.stream(1e12)).time == 0.0, "nothing but what is asked for is made"
 
 
 def test_motions_are_slowed_cut_and_joined(motion: Trajectory) -> None:
@@ -135,8 +138,16 @@ def test_messages_are_those_of_ros(motion: Trajectory, tmp_path: Path) -> None:
     again = Trajectory.load(tmp_path / "m.traj.json")
     assert again.joint_names == ("three", "two", "one")
     np.testing.assert_array_equal(again.velocities, motion.velocities[:, [2, 1, 0]])
-    for wrong in ({"a": ["one", "two"]}, {"a": [*NAMES, "four"]}, {"a": [*NAMES], "b": ["one"]}):
-        with pytest.raises(ParameterError, match="controllers: expected each joint"):
+    wrongs = (
+        {"a": ["one", "two"]},
+        {"a": [*NAMES, "four"]},
+        {"a": [*NAMES], "b": ["one"]},
+        list(NAMES),
+        {"a": 3},
+        {"a": "one"},
+    )
+    for wrong in wrongs:
+        with pytest.raises(ParameterError, match="controllers: expected"):
             motion.save(tmp_path / "x.traj.yaml", wrong)
     with pytest.raises(ParameterError, match="controllers"):
         motion.save(tmp_path / "x.csv", {"a": list(NAMES)})
@@ -164,7 +175,10 @@ def test_faulty_files_are_named(motion: Trajectory, tmp_path: Path) -> None:
         "d.traj.yaml": b"points: [1]\njoint_names: []\n",
         "e.csv": table.replace("0.0", "nan", 1).encode(), "f.csv": table.splitlines()[0].encode(),
         "g.traj.yaml": b"[1]",
-        "h.csv": b"\xff\xfe", "i.traj.yaml": b"a: {points: [], joint_names: []}\nb: 3\n",
+        "h.csv": b"\xff\xfe", "i.traj.yaml": b"a: {points: [], joint_names: []}\nb: 3\n", "j.npz": b"",
+        "k.csv": b"time,a,a_velocity,a_acceleration\n0,0,0,0\n1,9,0,0\n",
+        "l.csv": b"time,a,a_velocity,a_acceleration\n0,0,0,inf",
+        "m.csv": ("time," + 200_000 * "x").encode(),
     }  # fmt: skip
     for name, content in contents.items():
         (tmp_path / name).write_bytes(content)
@@ -175,8 +189,12 @@ def test_faulty_files_are_named(motion: Trajectory, tmp_path: Path) -> None:
 def test_faulty_knots_are_refused(motion: Trajectory) -> None:
     good = {name: getattr(motion, name) for name in ("times", "positions", "velocities", "accelerations")}
     for change in (
+        {"times": [0.0, np.inf]}, {"positions": "abc"}, {"positions": good["positions"] + np.eye(21, 3)},
+        {"times": 0.0},
         {"times": good["times"][::-1]}, {"times": good["times"] + 1.0}, {"times": good["times"][:-1]},
         {"positions": good["positions"][:, :2]}, {"velocities": good["velocities"] * np.nan},
     ):  # fmt: skip
         with pytest.raises(ParameterError):
             Trajectory(**{**good, **change}, joint_names=NAMES)
+    with pytest.raises(ParameterError, match="each once"):
+        Trajectory(**good, joint_names=("one", "two", "two"))

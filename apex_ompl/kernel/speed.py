@@ -101,6 +101,22 @@ def moments(x: Floats, step: float, spacing: float, place: Floats) -> float:
     return duration
 
 
+@inlined
+def _apart(points: Floats, n: int, path: Floats, k: int) -> float:
+    """Return the squared distance of a point from a side of a polyline."""
+    along, squared = 0.0, 0.0
+    for j in range(points.shape[1]):
+        side = path[k + 1, j] - path[k, j]
+        along += (points[n, j] - path[k, j]) * side
+        squared += side * side
+    share = min(max(along / squared, 0.0), 1.0) if squared > 0.0 else 0.0
+    apart = 0.0
+    for j in range(points.shape[1]):
+        gap = points[n, j] - path[k, j] - share * (path[k + 1, j] - path[k, j])
+        apart += gap * gap
+    return apart
+
+
 @entry
 def farthest(points: Floats, places: Floats, path: Floats, arc: Floats, window: float) -> float:
     """Return the largest distance of points from a polyline, each from the stretch about its own arc length.
@@ -108,27 +124,26 @@ def farthest(points: Floats, places: Floats, path: Floats, arc: Floats, window: 
     Args:
         points: Shape (N, dof).
         places: Their arc lengths, in rising order, shape (N,).
-        path: States of the polyline, shape (M, dof).
+        path: States of the polyline, two or more, shape (M, dof).
         arc: Arc lengths of its states, shape (M,).
         window: How far the stretch goes to both sides.
     """
-    dof, begin, worst = points.shape[1], 0, 0.0
+    middle, worst, last = 0, 0.0, arc.shape[0] - 2
     for n in range(points.shape[0]):
-        while begin < arc.shape[0] - 2 and arc[begin + 1] < places[n] - window:
-            begin += 1
-        k, least = begin, math.inf
-        while k < arc.shape[0] - 1 and arc[k] <= places[n] + window:
-            along, squared = 0.0, 0.0
-            for j in range(dof):
-                side = path[k + 1, j] - path[k, j]
-                along += (points[n, j] - path[k, j]) * side
-                squared += side * side
-            share = min(max(along / squared, 0.0), 1.0) if squared > 0.0 else 0.0
-            apart = 0.0
-            for j in range(dof):
-                gap = points[n, j] - path[k, j] - share * (path[k + 1, j] - path[k, j])
-                apart += gap * gap
-            least = min(least, apart)
-            k += 1
+        while middle < last and arc[middle + 1] < places[n]:
+            middle += 1
+        least = _apart(points, n, path, middle)
+        before, after = middle - 1, middle + 1
+        while least > worst:  # or the point changes nothing
+            more = after <= last and arc[after] <= places[n] + window
+            less = before >= 0 and arc[before + 1] >= places[n] - window
+            if not more and not less:
+                break
+            if more:
+                least = min(least, _apart(points, n, path, after))
+                after += 1
+            if less:
+                least = min(least, _apart(points, n, path, before))
+                before -= 1
         worst = max(worst, least)
     return math.sqrt(worst)

@@ -27,15 +27,21 @@ class Polyline:
 
     @classmethod
     def through(cls, path: ArrayLike) -> Polyline:
-        """Return the polyline through the states of a path, shape (N, dof); the ends stay as they are."""
+        """Return the polyline through the states of a path, shape (N, dof); the ends stay as they are.
+
+        Where all states count as one, it has the first and the last of them, or one if they are the same.
+        """
         states = np.array(path, dtype=float)
-        steps = np.linalg.norm(np.diff(states, axis=0), axis=1)
-        if len(states) > 1 and steps.sum() <= SAME:
-            return cls(states[[0]], np.zeros(1))
-        kept = np.append(True, steps > SAME)
-        last = states[-1]
+        kept = [0]
+        for k in range(1, len(states)):
+            if np.linalg.norm(states[k] - states[kept[-1]]) > SAME:
+                kept.append(k)
+        last = len(states) - 1
+        if kept[-1] != last and len(kept) > 1:
+            kept[-1] = last  # which is next to it
+        elif kept[-1] != last and not np.array_equal(states[0], states[last]):
+            kept.append(last)
         states = states[kept]
-        states[-1] = last
         return cls(states, np.append(0.0, np.cumsum(np.linalg.norm(np.diff(states, axis=0), axis=1))))
 
     @property

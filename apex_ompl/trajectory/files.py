@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import io
 import json
-import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ import yaml
 from numpy.typing import NDArray
 
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError
+from apex_ompl.files import BROKEN
 from apex_ompl.schema import read_yaml
 
 Array = NDArray[np.float64]
@@ -65,8 +65,9 @@ def encoded(
     if suffix == ".csv":
         head = ["time", *(f"{name}{more}" for more in COLUMNS for name in names)]
         table = np.hstack([times[:, None], *(states[name] for name in STATES)])
-        lines = [",".join(head), *(",".join(map(repr, row)) for row in table.tolist())]
-        return ("\n".join(lines) + "\n").encode()
+        sheet = io.StringIO()
+        csv.writer(sheet, lineterminator="\n").writerows([head, *([repr(v) for v in row] for row in table.tolist())])
+        return sheet.getvalue().encode()
     message: dict[str, Any]
     if controllers is None:
         message = _message(times, states, names, range(len(names)))
@@ -95,17 +96,20 @@ def decoded(path: Path) -> tuple[Array, list[Array], tuple[str, ...]]:
                 states = [archive[name].astype(float) for name in STATES]
                 return archive["times"].astype(float), states, tuple(str(name) for name in archive["joint_names"])
         if suffix == ".csv":
-            return _of_table(path.read_text(encoding="utf-8"))
+            return _of_table(path.read_text(encoding="utf-8-sig"))
         return _of_messages(read_yaml(path, ROLE))  # JSON is YAML
     except OSError as error:
         raise MissingFileError(str(path), ROLE, (error.strerror or "cannot be read").lower()) from error
-    except (KeyError, TypeError, ValueError, AttributeError, IndexError, zipfile.BadZipFile) as error:
+    except (*BROKEN, AttributeError, IndexError, csv.Error) as error:
         raise FileFormatError(str(path), "", str(error), "expected a saved trajectory") from error
 
 
 def _message(times: Array, states: Mapping[str, Array], names: Sequence[str], columns: Sequence[int]) -> dict[str, Any]:
     """Return a ``trajectory_msgs/JointTrajectory``."""
-    stamps = [divmod(round(time * BILLION), BILLION) for time in times.tolist()]
+    moments = [round(time * BILLION) for time in times.tolist()]
+    if len(set(moments)) < len(moments):
+        raise ParameterError("times", float(np.diff(times).min()), "knots a nanosecond apart or more, as ROS 2 counts")
+    stamps = [divmod(moment, BILLION) for moment in moments]
     chosen = {name: states[name][:, list(columns)].tolist() for name in STATES}
     points = [
         {**{name: chosen[name][k] for name in STATES}, "effort": [], "time_from_start": {"sec": sec, "nanosec": nano}}
@@ -116,11 +120,11 @@ def _message(times: Array, states: Mapping[str, Array], names: Sequence[str], co
 
 
 def _of_messages(data: Mapping[str, Any]) -> tuple[Array, list[Array], tuple[str, ...]]:
-    messages = [data] if "points" in data else list(data.values())
+    messages = [data] if "points" in data and "joint_names" in data else list(data.values())
     read = []
     for message in messages:
         points = message["points"]
-        stamps = [point["time_from_start"]["sec"] * BILLION + point["time_from_start"]["nanosec"] for point in points]
+        stamps = [int(at["sec"]) * BILLION + int(at["nanosec"]) for at in (p["time_from_start"] for p in points)]
         states = [np.array([point[name] for point in points], dtype=float) for name in STATES]
         read.append((np.array(stamps) / BILLION, states, [str(name) for name in message["joint_names"]]))
     if not read or any(not np.array_equal(times, read[0][0]) for times, _, _ in read):
@@ -130,7 +134,7 @@ def _of_messages(data: Mapping[str, Any]) -> tuple[Array, list[Array], tuple[str
 
 
 def _of_table(text: str) -> tuple[Array, list[Array], tuple[str, ...]]:
-    head, *rows = csv.reader(io.StringIO(text))
+    head, *rows = (row for row in csv.reader(io.StringIO(text)) if row)
     table = np.array(rows, dtype=float)
     dof = (len(head) - 1) // len(COLUMNS)
     names = tuple(head[1 : 1 + dof])
@@ -142,7 +146,12 @@ def _of_table(text: str) -> tuple[Array, list[Array], tuple[str, ...]]:
 def _check_controllers(controllers: Mapping[str, Sequence[str]], names: Sequence[str], suffix: str) -> None:
     if suffix not in MESSAGES:
         raise ParameterError("controllers", suffix, f"a file name ending in {' or '.join(MESSAGES)}")
-    given = [joint for joints in controllers.values() for joint in joints]
+    if not isinstance(controllers, Mapping) or any(isinstance(joints, str) for joints in controllers.values()):
+        raise ParameterError("controllers", controllers, "lists of joints by the names of controllers")
+    try:
+        given = [str(joint) for joints in controllers.values() for joint in joints]
+    except TypeError as error:
+        raise ParameterError("controllers", controllers, "lists of joints by the names of controllers") from error
     if sorted(given) != sorted(names):
         wrong = sorted(set(given) ^ set(names)) or sorted({joint for joint in given if given.count(joint) > 1})
         raise ParameterError("controllers", ", ".join(wrong), "each joint of the trajectory once")

@@ -20,7 +20,10 @@ from apex_ompl.trajectory.files import STATES, decoded, encoded, suffix_of
 
 Array = NDArray[np.float64]
 
-ORDERS = ("position", "velocity", "acceleration", "jerk")
+JOINED = 1e-6  # share by which a knot may be off what the one before it leads to; files of ROS round times
+MOST_SAMPLES = 10**7
+BLOCK = 1000  # moments of a stream that are made at once
+FINE, MOST = 0.001, 2**15  # samples of the speed [s], and how many at most
 
 
 class Sample(NamedTuple):
@@ -66,15 +69,28 @@ class Trajectory:
         """Check shapes and numbers.
 
         Raises:
-            ParameterError: Times that do not rise from 0, another shape, or a number that is none.
+            ParameterError: Times that do not rise from 0, another shape, a number that is none, a joint given twice, or
+                knots that no motion of constant jerk joins.
         """
-        shape = (len(self.times), len(self.joint_names))
+        for name in ("times", *STATES):
+            object.__setattr__(self, name, numbers(getattr(self, name), name))
+        names = tuple(self.joint_names)
+        object.__setattr__(self, "joint_names", names)
+        if not names or len(set(names)) < len(names):
+            raise ParameterError("joint_names", names, "one name or more, each once")
         if self.times.ndim != 1 or not len(self.times) or self.times[0] != 0.0 or not np.all(np.diff(self.times) > 0.0):
             raise ParameterError("times", self.times.shape, "one time or more, rising from 0")
-        for name in ("positions", "velocities", "accelerations"):
-            given = getattr(self, name)
-            if given.shape != shape or not np.isfinite(given).all():
-                raise ParameterError(name, given.shape, f"finite numbers of shape {shape}")
+        shape = (len(self.times), len(names))
+        for name in STATES:
+            if getattr(self, name).shape != shape:
+                raise ParameterError(name, getattr(self, name).shape, f"numbers of shape {shape}")
+        q, v, a, t = self.positions, self.velocities, self.accelerations, np.diff(self.times)[:, None]
+        reached = q[:-1] + t * (v[:-1] + t * (2.0 * a[:-1] + a[1:]) / 6.0), v[:-1] + t * (a[:-1] + a[1:]) / 2.0
+        for name, there, wanted in zip(STATES, reached, (q[1:], v[1:]), strict=False):
+            apart = np.abs(there - wanted) / np.maximum(1.0, np.abs(wanted))
+            if apart.size and apart.max() > JOINED:
+                k = int(apart.max(axis=1).argmax())
+                raise ParameterError(name, float(wanted[k][apart[k].argmax()]), f"constant jerk before knot {k + 1}")
 
     @property
     def duration(self) -> float:
@@ -102,11 +118,13 @@ class Trajectory:
             Shape (dof,), or (N, dof).
 
         Raises:
-            ParameterError: ``order`` is none of these.
+            ParameterError: ``order`` is none of these, or a time is no number.
         """
-        if order not in range(len(ORDERS)) or isinstance(order, bool):
+        if isinstance(order, bool) or not isinstance(order, int) or not 0 <= order <= len(STATES):
             raise ParameterError("order", order, "0, 1, 2 or 3")
-        given = np.asarray(time, dtype=float)
+        given = numbers(time, "time")
+        if given.ndim > 1:
+            raise ParameterError("time", given.shape, "one moment, or several of shape (N,)")
         moments = np.atleast_1d(given)
         if len(self.times) == 1:
             found = np.repeat(self.positions if order == 0 else np.zeros((1, self.dof)), len(moments), axis=0)
@@ -132,14 +150,15 @@ class Trajectory:
         Raises:
             ParameterError: ``spacing`` is not a positive number of seconds.
         """
-        if not 0.0 < spacing < np.inf:
-            raise ParameterError("spacing", spacing, "a positive number of seconds")
+        check_positive(spacing, "spacing", "a positive number of seconds")
+        if self.duration / spacing > MOST_SAMPLES:
+            raise ParameterError("spacing", spacing, f"at most {MOST_SAMPLES} samples")
         count = max(0, int(np.ceil(self.duration / spacing - 1e-9)))
         times = np.append(spacing * np.arange(count), self.duration)
         return Sample(times, self(times), self(times, 1), self(times, 2))
 
     def stream(self, rate: float = 1000.0) -> Iterator[Sample]:
-        """Yield the motion moment by moment, as a controller wants it, its end last.
+        """Return the motion moment by moment, as a controller wants it, its end last.
 
         Args:
             rate: Moments a second [Hz].
@@ -147,12 +166,17 @@ class Trajectory:
         Raises:
             ParameterError: ``rate`` is not a positive number.
         """
-        if not 0.0 < rate < np.inf:
-            raise ParameterError("rate", rate, "a positive number of moments a second")
-        made = self.sample(1.0 / rate)
-        assert isinstance(made.time, np.ndarray)
-        for k, time in enumerate(made.time):
-            yield Sample(float(time), made.position[k], made.velocity[k], made.acceleration[k])
+        check_positive(rate, "rate", "a positive number of moments a second")
+        return self._stream(rate)
+
+    def _stream(self, rate: float) -> Iterator[Sample]:
+        count = int(np.ceil(self.duration * rate - 1e-9))
+        for begin in range(0, count + 1, BLOCK):
+            which = np.arange(begin, min(begin + BLOCK, count + 1))
+            times = np.where(which == count, self.duration, which / rate)
+            states = self(times), self(times, 1), self(times, 2)
+            for k, time in enumerate(times.tolist()):
+                yield Sample(time, states[0][k], states[1][k], states[2][k])
 
     def use(self, limits: Limits) -> dict[str, float]:
         """Return the largest share of each limit that is used at any moment by any joint, by name of the derivative.
@@ -203,8 +227,9 @@ class Trajectory:
     @property
     def spectral_arc_length(self) -> float:
         """The spectral arc length of the joints' common speed, nearer to 0 for smoother motions; 0 without motion."""
-        speed = np.linalg.norm(self.sample(0.001).velocity, axis=1)
-        return spectral_arc_length(speed, 0.001) if len(speed) > 1 and speed.any() else 0.0
+        spacing = max(FINE, self.duration / MOST)
+        speed = np.linalg.norm(self.sample(spacing).velocity, axis=1)
+        return spectral_arc_length(speed, spacing) if len(speed) > 1 and speed.any() else 0.0
 
     def slower(self, factor: float) -> Trajectory:
         """Return the same motion in a time that is ``factor`` times as long.
@@ -212,15 +237,19 @@ class Trajectory:
         Raises:
             ParameterError: ``factor`` is not a positive number.
         """
-        if not 0.0 < factor < np.inf:
-            raise ParameterError("factor", factor, "a positive number")
+        check_positive(factor, "factor", "a positive number")
         return Trajectory(
             self.times * factor, self.positions, self.velocities / factor, self.accelerations / factor**2,
             self.joint_names,
         )  # fmt: skip
 
     def after(self, time: float) -> Trajectory:
-        """Return what is left of the motion after a moment [s]."""
+        """Return what is left of the motion after a moment [s].
+
+        Raises:
+            ParameterError: ``time`` is no number.
+        """
+        numbers(time, "time")
         later = self.times > time + 1e-9
         if not later.any():
             return Trajectory(
@@ -267,12 +296,35 @@ class Trajectory:
             raise FileFormatError(str(path), error.name, error.value, f"expected {error.expected}") from error
 
 
+def numbers(given: ArrayLike, name: str) -> Array:
+    """Return finite numbers as an array.
+
+    Raises:
+        ParameterError: They are none.
+    """
+    try:
+        found = np.array(given, dtype=float)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise ParameterError(name, given, "finite numbers") from error
+    if not np.isfinite(found).all():
+        raise ParameterError(name, found[~np.isfinite(found)].flat[0], "finite numbers")
+    return found
+
+
+def check_positive(value: float, name: str, expected: str) -> None:
+    """Check a number.
+
+    Raises:
+        ParameterError: It is none, or not positive and finite.
+    """
+    number = isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
+    if not number or not 0.0 < value < np.inf:
+        raise ParameterError(name, value, expected)
+
+
 def joined(parts: Sequence[Trajectory]) -> Trajectory:
     """Return motions one behind the other; each begins as the one before it ends."""
     ends = np.cumsum([0.0, *(part.duration for part in parts)])
     times = [part.times[(k > 0) :] + end for k, (part, end) in enumerate(zip(parts, ends[:-1], strict=True))]
-    states = [
-        np.concatenate([getattr(part, name)[(k > 0) :] for k, part in enumerate(parts)])
-        for name in ("positions", "velocities", "accelerations")
-    ]
+    states = [np.concatenate([getattr(part, name)[(k > 0) :] for k, part in enumerate(parts)]) for name in STATES]
     return Trajectory(np.concatenate(times), states[0], states[1], states[2], parts[0].joint_names)

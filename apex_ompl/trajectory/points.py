@@ -8,6 +8,7 @@ import numpy as np
 import ruckig
 from numpy.typing import NDArray
 
+from apex_ompl.errors import TimingError
 from apex_ompl.robot.model import Limits
 from apex_ompl.trajectory.motion import Trajectory, joined
 
@@ -16,6 +17,7 @@ Array = NDArray[np.float64]
 WITHIN = 1.0 - 1e-6  # of the limits that Ruckig is given, for its rounding
 BEYOND = 1.0 + 1e-10  # where it is given states that are at the limits
 JOINTS = 12  # places at which a motion may be joined
+ROUNDING = 1e-9  # of shares of limits
 SHORTEST = 1e-9  # piece [s]
 
 
@@ -23,6 +25,9 @@ def stops(corners: Array, limits: Limits, names: tuple[str, ...]) -> Trajectory:
     """Return the fastest motion from corner to corner, at rest at each, shape (n, dof) with n of 2 or more.
 
     Along each straight line one number moves, by Ruckig with the limits of the joint that has the least.
+
+    Raises:
+        TimingError: Ruckig finds none.
     """
     parts = []
     solver, task, made = ruckig.Ruckig(1), ruckig.InputParameter(1), ruckig.Trajectory(1)
@@ -34,8 +39,11 @@ def stops(corners: Array, limits: Limits, names: tuple[str, ...]) -> Trajectory:
         for name in ("velocity", "acceleration", "jerk"):
             most = WITHIN * np.min(getattr(limits, name)[moves] / np.abs(direction[moves]))
             setattr(task, f"max_{name}", [float(most)])
-        _calculate(solver, task, made)
-        times = _breaks(made)
+        try:
+            calculate(solver, task, made)
+        except ruckig.RuckigError as error:
+            raise TimingError(f"Ruckig finds no motion along a line of {length:.3g} rad, {error}") from error
+        times = breaks(made)
         place, speed, push = (np.array(v)[:, None] for v in zip(*(_one(made, t) for t in times), strict=True))
         positions = start + place * direction
         positions[0], positions[-1] = start, end
@@ -69,17 +77,17 @@ def from_motion(
         task.minimum_duration = max(minimum_duration - left, 0.0) or None
         made = ruckig.Trajectory(rest.dof)
         try:
-            _calculate(solver, task, made)
+            calculate(solver, task, made)
         except ruckig.RuckigError:  # from this velocity that state cannot be reached within the limits
             continue
         head = _head(made, rest, moment)
-        if head.use(limits)["position"] <= 1.0:
+        if max(head.use(limits).values()) <= 1.0 + ROUNDING:  # from a velocity near its limit Ruckig may go over it
             yield joined([head, rest.after(moment)]), head.duration
 
 
 def _head(made: ruckig.Trajectory, rest: Trajectory, moment: float) -> Trajectory:
     """Return Ruckig's motion to where another one is at a moment."""
-    times = _breaks(made)
+    times = breaks(made)
     states = [np.array(v) for v in zip(*(made.at_time(float(t)) for t in times), strict=True)]
     states[0][0] = rest.positions[0]
     for order, part in enumerate(states):
@@ -87,18 +95,21 @@ def _head(made: ruckig.Trajectory, rest: Trajectory, moment: float) -> Trajector
     return Trajectory(times, states[0], states[1], states[2], rest.joint_names)
 
 
-def _calculate(solver: ruckig.Ruckig, task: ruckig.InputParameter, made: ruckig.Trajectory) -> None:
-    """Solve a task.
+def calculate(solver: ruckig.Ruckig, task: ruckig.InputParameter, made: ruckig.Trajectory) -> None:
+    """Solve a task of Ruckig's.
 
     Raises:
         RuckigError: It has no solution.
     """
-    result = solver.calculate(task, made)
+    try:
+        result = solver.calculate(task, made)
+    except ValueError as error:  # a result that the bindings have no name for
+        raise ruckig.RuckigError(str(error)) from error
     if result not in (ruckig.Result.Working, ruckig.Result.Finished):
         raise ruckig.RuckigError(str(result))
 
 
-def _breaks(made: ruckig.Trajectory) -> Array:
+def breaks(made: ruckig.Trajectory) -> Array:
     """Return the moments between which all joints have constant jerk, ends included, shape (K,) [s]."""
     found = [0.0, made.duration]
     for profile in made.profiles[0]:

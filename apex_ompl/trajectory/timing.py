@@ -10,23 +10,30 @@ from functools import cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from apex_ompl.errors import ParameterError
+from apex_ompl.errors import ParameterError, TimingError
 from apex_ompl.kernel.speed import farthest, fastest, moments
 from apex_ompl.robot.model import Limits
-from apex_ompl.trajectory.curve import Curve, Polyline
-from apex_ompl.trajectory.motion import Trajectory
+from apex_ompl.trajectory.curve import SAME, Curve, Polyline
+from apex_ompl.trajectory.motion import Trajectory, numbers
 from apex_ompl.trajectory.points import from_motion, stops
 
 Array = NDArray[np.float64]
 
 PER_PIECE = 10  # points of the grid a piece of the curve
-SPACINGS = (0.004, 0.006, 0.008, 0.012, 0.016, 0.024, 0.032, 0.048, 0.064, 0.096, 0.128, 0.192, 0.256, 0.512)
-FINE = 0.008  # distance of moments at which the deviation is measured, at most [s]
+SPACINGS = tuple(0.001 * k * 2**n for n in range(2, 13) for k in (1, 1.5))  # of knots, from 0.004 to 6.144 [s]
+LITTLE = 1.0005  # longer a motion may be for fewer knots
+FASTER = 1.1  # than at the knots it may be between them
+MOST_SAMPLES, MOST_PIECES = 100_000, 20_000
+INSTANT = 1e-3  # that a motion takes between states that are as good as the same [s]
 SPACING = 3.0  # of control points, as a multiple of the deviation; a corner is cut by a third
 FIRST = 4  # of the spacings of knots, that is tried first [s]
 CLOSER = 6  # times that the blending of corners is halved before the motion stops at them
-HEAD = 64  # moments of what comes before the path at a moving start, at which the deviation is measured
+OUTSIDE = 1e-9  # of the limits of position a path may be, by rounding
 NANOSECOND = 1e-9
+RANGES = {
+    **dict.fromkeys(("velocity_scale", "acceleration_scale", "jerk_scale"), (1e-3, 1.0)),
+    "deviation": (1e-3, 10.0), "minimum_duration": (0.0, 3600.0),
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -34,12 +41,12 @@ class Timing:
     """How a path is timed.
 
     Attributes:
-        velocity_scale: Share of the limits of velocity that is used, over 0 to 1.
+        velocity_scale: Share of the limits of velocity that is used, 0.001 to 1.
         acceleration_scale: The same of acceleration.
         jerk_scale: The same of jerk.
-        deviation: Largest distance of the motion from the path, over 0 [rad, Euclidean; synergies 0..1]; a motion from
-            a moving start may leave it by more, as little as can be.
-        minimum_duration: The motion takes at least so long [s].
+        deviation: Largest distance of the motion from the path, 0.001 to 10 [rad, Euclidean; synergies 0..1]; a motion
+            from a moving start may leave it by more, as little as can be.
+        minimum_duration: The motion takes at least so long, up to 3600 [s].
         start_velocity: Velocity at the start, one number a joint, or none for rest [rad/s].
         start_acceleration: Acceleration there [rad/s^2].
     """
@@ -58,13 +65,12 @@ class Timing:
         Raises:
             ParameterError: One is out of its range.
         """
-        for name in ("velocity_scale", "acceleration_scale", "jerk_scale"):
-            if not _is_number(getattr(self, name)) or not 0.0 < getattr(self, name) <= 1.0:
-                raise ParameterError(name, getattr(self, name), "a number over 0, at most 1")
-        if not _is_number(self.deviation) or not 0.0 < self.deviation < math.inf:
-            raise ParameterError("deviation", self.deviation, "a positive number of radians")
-        if not _is_number(self.minimum_duration) or not 0.0 <= self.minimum_duration < math.inf:
-            raise ParameterError("minimum_duration", self.minimum_duration, "a number of seconds, 0 or more")
+        for name, (low, high) in RANGES.items():
+            value = getattr(self, name)
+            if not _is_number(value) or not low <= value <= high:
+                raise ParameterError(name, value, f"a number from {low:g} to {high:g}")
+        for name in ("start_velocity", "start_acceleration"):
+            object.__setattr__(self, name, tuple(np.atleast_1d(numbers(getattr(self, name), name)).ravel().tolist()))
 
     def limits(self, limits: Limits) -> Limits:
         """Return the scaled limits."""
@@ -84,7 +90,7 @@ class Timing:
             given = np.array(getattr(self, f"start_{name}"), dtype=float)
             if not given.size:
                 given = np.zeros(len(limit))
-            if given.shape != limit.shape or not np.isfinite(given).all():
+            if given.shape != limit.shape:
                 raise ParameterError(f"start_{name}", given.shape, f"{len(limit)} finite numbers, one a joint")
             if np.any(np.abs(given) > limit):
                 k = int(np.argmax(np.abs(given) / limit))
@@ -112,8 +118,8 @@ class Timed:
 def time_path(
     path: ArrayLike, limits: Limits, joint_names: Sequence[str], timing: Timing | None = None,
     fault: Callable[[Trajectory], str] = lambda trajectory: "",
-) -> Timed | str:  # fmt: skip
-    """Time a path, or say why it cannot be.
+) -> Timed:  # fmt: skip
+    """Time a path.
 
     A straight line is run along by a jerk-limited profile of Ruckig's (Berscheid and Kroeger 2021), which is the
     fastest. Any other path is made a curve that blends corners; reachability analysis gives the fastest way along it
@@ -130,16 +136,16 @@ def time_path(
         timing: How.
         fault: Says what is wrong with a motion, nothing if it is good.
 
-    Returns:
-        The timed path, or the fault of the last motion that was tried.
-
     Raises:
-        ParameterError: The path has another shape or a number that is none, or an option is out of its range.
+        TimingError: No motion was found, with the fault of the last one that was tried.
+        ParameterError: The path has another shape, a number that is none, or a position outside the limits; the names
+            are not those of the joints; or an option is out of its range.
     """
     timing = timing or Timing()
-    states = np.array(path, dtype=float)
-    if states.ndim != 2 or states.shape[1] != len(limits.velocity) or not len(states) or not np.isfinite(states).all():
-        raise ParameterError("path", states.shape, f"finite numbers of shape (N, {len(limits.velocity)})")
+    if not isinstance(timing, Timing):
+        raise ParameterError("timing", timing, "a Timing")
+    states = numbers(path, "path")
+    _check(states, limits, joint_names)
     scaled = timing.limits(limits)
     start = timing.start(scaled)
     said, line = "", Polyline.through(states)
@@ -149,13 +155,26 @@ def time_path(
             said = fault(one.trajectory)
             if not said:
                 return one
-    return said or "no motion from the velocity at the start stays within the limits"
+    raise TimingError(said or "no motion from the velocity at the start stays within the limits")
+
+
+def _check(states: Array, limits: Limits, joint_names: Sequence[str]) -> None:
+    dof = len(limits.velocity)
+    if states.ndim != 2 or states.shape[1] != dof or not len(states):
+        raise ParameterError("path", states.shape, f"states of shape (N, {dof})")
+    if len(joint_names) != dof:
+        raise ParameterError("joint_names", len(joint_names), f"{dof}, as there are joints")
+    over = (states < limits.lower - OUTSIDE) | (states > limits.upper + OUTSIDE)
+    if over.any():
+        k, joint = np.argwhere(over)[0]
+        allowed = f"{limits.lower[joint]:g} to {limits.upper[joint]:g} for {joint_names[joint]} in state {k}"
+        raise ParameterError("path", float(states[k, joint]), allowed)
 
 
 def _ways(line: Polyline, limits: Limits, names: tuple[str, ...], timing: Timing) -> Iterator[Timed]:
     """Yield motions from rest to rest, each closer to the path than the one before."""
-    if len(line.states) == 1:
-        yield Timed(_standing(line.states[0], names), 0.0, "line")
+    if line.length <= SAME:
+        yield Timed(_standing(line.states, names), 0.0, "line")
         return
     corners = line.corners()
     if len(corners.states) > 2:
@@ -169,6 +188,8 @@ def _ways(line: Polyline, limits: Limits, names: tuple[str, ...], timing: Timing
 
 def blended(line: Polyline, limits: Limits, names: tuple[str, ...], within: float) -> Timed | None:
     """Return the fastest motion along a curve that stays within a distance of a polyline, or None [rad]."""
+    if line.length > MOST_PIECES * SPACING * within:
+        return None
     curve = Curve.along(line, SPACING * within)
     first, second = curve.derivatives(PER_PIECE)
     step, window = curve.spacing / PER_PIECE, 2.0 * curve.spacing
@@ -191,28 +212,32 @@ def blended(line: Polyline, limits: Limits, names: tuple[str, ...], within: floa
             points = curve.points(place)
             points[0], points[-1] = line.states[0], line.states[-1]
             control = np.concatenate([points[:1], points[:1], points, points[-1:], points[-1:]])
-            tried[which] = (_least_spacing(control, limits), control, place)
+            tried[which] = (least_spacing(control, limits), control, place)
         least, knots, _ = tried[which]
         return float(least * (len(knots) - 3))
 
     best = FIRST
-    for direction in (1, -1):
-        while 0 <= best + direction < len(SPACINGS) and attempt(best + direction) < attempt(best):
-            best += direction
+    while best + 1 < len(SPACINGS) and attempt(best + 1) < LITTLE * attempt(best):
+        best += 1
+    while best > 0 and attempt(best - 1) * LITTLE < attempt(best):
+        best -= 1
     while best >= 0:  # knots that are far apart in time smooth the motion too much
         attempt(best)
         apart, control, place = tried[best]
-        motion = _spline(control, apart, names)
-        times = np.linspace(0.0, motion.duration, (len(motion.times) - 1) * math.ceil(apart / FINE) + 1)
-        at = np.interp(times, motion.times, np.concatenate([[0.0], place, [line.length]]))
-        deviation = float(farthest(motion(times), at, line.states, line.arc, window))
+        motion = spline(control, apart, names)
+        positions = motion.positions.clip(
+            line.states.min(axis=0), line.states.max(axis=0)
+        )  # where it is but for rounding
+        motion = replace(motion, positions=positions)
+        places = np.concatenate([[0.0], place, [line.length]])
+        deviation = _deviation(motion, line, (motion.times, places), window, within)
         if deviation <= within:
             return Timed(motion, deviation, "blended")
         best -= 1
     return None
 
 
-def _least_spacing(control: Array, limits: Limits) -> float:
+def least_spacing(control: Array, limits: Limits) -> float:
     """Return the least distance of knots at which a cubic B-spline in time keeps the limits [s].
 
     Velocity is a weighted mean of first differences of the control points; accelerations at knots are the second
@@ -226,7 +251,7 @@ def _least_spacing(control: Array, limits: Limits) -> float:
     return NANOSECOND * float(math.ceil(max(needs) * (1.0 + 1e-9) / NANOSECOND))
 
 
-def _spline(control: Array, apart: float, names: tuple[str, ...]) -> Trajectory:
+def spline(control: Array, apart: float, names: tuple[str, ...]) -> Trajectory:
     """Return the uniform cubic B-spline in time with control points ``apart`` [s]."""
     before, at, after = control[:-2], control[1:-1], control[2:]
     positions = (before + 4.0 * at + after) / 6.0
@@ -239,25 +264,51 @@ def _moving(start: tuple[Array, Array], timed: Timed, line: Polyline, limits: Li
     """Return motions from a moving start, the fastest that stay near the path first, then those that leave it less."""
     found = []
     for motion, head in from_motion(*start, timed.trajectory, limits, timing.minimum_duration):
-        points = motion(np.linspace(0.0, head, HEAD))
-        off = float(farthest(points, np.zeros(HEAD), line.states, line.arc, line.length))
+        nowhere = np.array([0.0, head]), np.zeros(2)
+        off = _deviation(motion, line, nowhere, line.length, timing.deviation)
         found.append(Timed(motion, max(off, timed.deviation), f"moving start, {timed.way}"))
     return sorted(found, key=lambda one: (max(one.deviation, timing.deviation), one.trajectory.duration))
 
 
-def _standing(state: Array, names: tuple[str, ...]) -> Trajectory:
-    still = np.zeros((1, len(state)))
-    return Trajectory(np.zeros(1), state[None].copy(), still, still.copy(), names)
+def _deviation(motion: Trajectory, line: Polyline, places: tuple[Array, Array], window: float, within: float) -> float:
+    """Return a bound on the distance of a motion from a polyline.
+
+    It is the largest distance of samples, and how far the motion may be from one of them.
+
+    Args:
+        motion: The motion.
+        line: The polyline.
+        places: Moments up to the last that counts, and how far along the polyline the motion is then.
+        window: How far from there the nearest place may be [rad].
+        within: The distance that is of interest; samples are a tenth of it apart [rad].
+    """
+    until = float(places[0][-1])
+    speed = float(np.linalg.norm(motion.velocities, axis=1).max()) * FASTER
+    count = min(MOST_SAMPLES, max(2, math.ceil(speed * until / (within / 10.0)) + 1))
+    times = np.linspace(0.0, until, count)
+    points = motion(times)
+    if len(line.states) == 1:
+        off = float(np.linalg.norm(points - line.states[0], axis=1).max())
+    else:
+        off = float(farthest(points, np.interp(times, *places), line.states, line.arc, window))
+    between = float(np.linalg.norm(np.diff(points, axis=0), axis=1).max(initial=0.0)) / 2.0
+    return off + between
+
+
+def _standing(states: Array, names: tuple[str, ...]) -> Trajectory:
+    """Return a motion at a state, or to another one that is as good as the same."""
+    still = np.zeros_like(states)
+    return Trajectory(np.linspace(0.0, INSTANT, len(states)), states.copy(), still, still.copy(), names)
 
 
 def _lasting(motion: Trajectory, duration: float) -> Trajectory:
     """Return the motion in a time at least so long; one without any stands still so long."""
     if motion.duration >= duration:
         return motion
-    if motion.duration:
+    if motion.duration > INSTANT:
         return motion.slower(duration / motion.duration)
-    twice = [np.repeat(part, 2, axis=0) for part in (motion.positions, motion.velocities, motion.accelerations)]
-    return Trajectory(np.array([0.0, duration]), twice[0], twice[1], twice[2], motion.joint_names)
+    still = np.zeros((2, motion.dof))
+    return Trajectory(np.array([0.0, duration]), motion.positions[[0, -1]], still, still, motion.joint_names)
 
 
 def _is_number(value: object) -> bool:
