@@ -1,7 +1,7 @@
 """The command line ``apex-ompl``: argument parsing and printing only.
 
-Results go to standard output, logs and faults to standard error. Exit codes: 0 exact, 1 no plan, 2 usage or a
-faulty file, 3 invalid start or goal, 4 approximate, 130 interrupted.
+Results go to standard output, logs and faults to standard error. Exit codes: 0 exact, 1 no plan or no timed motion, 2
+usage or a faulty file, 3 invalid start or goal, 4 approximate, 130 interrupted.
 """
 
 from __future__ import annotations

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 CLEARANCE_SAMPLES = 32
-CHORD = 4e-5  # that a timed motion is off the straight line between two states that are proved, at most [rad]
+CHORD = 1e-5  # that a timed motion is off the straight line between two states that are proved, at most [rad]
 MOST_STATES = 100_000  # that are proved of a timed motion
 ROUNDING = 1e-9  # of shares of limits
 STRAIGHT_LINE = "straight line"
@@ -161,7 +161,7 @@ class Planning:
                 bend = max(float(np.abs(motion.accelerations).max()), 1e-9)
                 states = motion.sample(max(np.sqrt(8.0 * CHORD / bend), motion.duration / MOST_STATES, 1e-6)).position
                 states = np.clip(states, limits.lower, limits.upper)  # of rounding, as was seen
-                return full_check(ready.verdict, states, ready.start, ready.goals).reason
+                return full_check(ready.verdict, states, ready.start, ready.goals, FULL_RESOLUTION / 2.0).reason
 
         try:
             made = time_path(path, limits, ready.robot.joint_names, timing, fault)
