@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -150,9 +151,10 @@ class Planning:
         ready, path, began = self.ready, result.path, time.perf_counter()
         if path is None or not result:
             return result
-        limits, proof = ready.robot.limits, dict[str, float]()
+        robot, proof = ready.robot, dict[str, float]()
+        limits = robot.limits
 
-        def fault(motion: Trajectory) -> str:
+        def fault(motion: Trajectory, resolution: float) -> str:
             with timed(proof, "proof"):
                 shares = motion.use(timing.limits(limits))
                 over = [f"{name} {share:.4f}" for name, share in shares.items() if share > 1.0 + ROUNDING]
@@ -161,10 +163,15 @@ class Planning:
                 bend = max(float(np.abs(motion.accelerations).max()), 1e-9)
                 states = motion.sample(max(np.sqrt(8.0 * CHORD / bend), motion.duration / MOST_STATES, 1e-6)).position
                 states = np.clip(states, limits.lower, limits.upper)  # of rounding, as was seen
-                return full_check(ready.verdict, states, ready.start, ready.goals, FULL_RESOLUTION / 2.0).reason
+                return full_check(ready.verdict, states, ready.start, ready.goals, resolution).reason
 
         try:
-            made = time_path(path, limits, ready.robot.joint_names, timing, fault)
+            try:  # twice as densely as the path, which may itself only just pass
+                made = time_path(
+                    path, limits, robot.joint_names, timing, partial(fault, resolution=FULL_RESOLUTION / 2.0)
+                )
+            except TimingError:
+                made = time_path(path, limits, robot.joint_names, timing, partial(fault, resolution=FULL_RESOLUTION))
         except TimingError as error:
             return replace(result, status=PlanStatus.TIMING_FAILED, reason=f"the path cannot be timed, {error}")
         finally:
