@@ -120,8 +120,9 @@ def plan(
         parameters = planners.parameters(planner, **dict(params or {}))
         if how is not None:
             how.start(how.limits(robot.limits))  # whether it fits the robot
-            warm_up()
         ready = assemble(loaded, robot, seed=seed)
+        if how is not None:
+            warm_up()
         run = Planning(ready, planner, seed, time.perf_counter() - started, tuple(notes))
         with Interrupt() as run.interrupt:
             result = run.solve(parameters, timeout, simplify)
