@@ -15,9 +15,9 @@ from types import ModuleType
 
 from apex_ompl import __version__
 from apex_ompl.errors import MissingFileError, ParameterError
-from apex_ompl.files import check_writable
+from apex_ompl.files import check_writable, suffix_of
 from apex_ompl.provenance import LIBRARIES, versions
-from apex_ompl.result import INSIDE, PlanResult, PlanStatus, check_suffix
+from apex_ompl.result import INSIDE, SUFFIXES, PlanResult, PlanStatus
 from apex_ompl.result import SCHEMA as RESULT
 from apex_ompl.schema import read_yaml
 from apex_ompl.trajectory import Timing
@@ -36,7 +36,7 @@ def plan(parsed: argparse.Namespace) -> int:
     from apex_ompl.api import plan as make_plan
 
     if parsed.out is not None:
-        check_suffix(parsed.out)
+        suffix_of(parsed.out, SUFFIXES)
         check_writable(parsed.out)
     params = {} if parsed.params is None else read_yaml(parsed.params, "file of planner parameters")
     params |= {name.replace("-", "_"): value for name, value in _pairs("--set", parsed.set).items()}
@@ -64,7 +64,7 @@ def plan(parsed: argparse.Namespace) -> int:
 
 def _save(result: PlanResult, out: Path, *, timed: bool, controllers: bool) -> None:
     """Write what there is of a result, or say that there is nothing."""
-    suffix = check_suffix(out)
+    suffix = suffix_of(out, SUFFIXES)
     wanted: object = result
     if suffix in (*MESSAGES, ".csv"):
         wanted = result.trajectory if timed else result.path
@@ -255,7 +255,7 @@ def info(_: argparse.Namespace) -> int:
     from apex_ompl.robot import load_robot, robot_names
 
     print(f"apex-ompl {__version__}, Python {platform.python_version()}, {platform.machine()}")
-    there = versions()
+    there = versions(LIBRARIES)
     for library in LIBRARIES[1:]:
         print(f"  {library:<20} {there.get(library, 'not installed')}")
     print("robots")

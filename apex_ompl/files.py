@@ -9,11 +9,11 @@ import tempfile
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from apex_ompl.errors import FolderInUseError, MissingFileError
+from apex_ompl.errors import FolderInUseError, MissingFileError, ParameterError
 
 OUTPUT = "output file"
 BROKEN = (
@@ -29,6 +29,18 @@ def is_file(path: Path) -> bool:
         return path.is_file()
     except (OSError, ValueError):
         return False
+
+
+def suffix_of(path: Path, known: Sequence[str]) -> str:
+    """Return which of some suffixes, such as ``.traj.yaml``, the name of an output file ends in.
+
+    Raises:
+        ParameterError: None of them.
+    """
+    found = next((suffix for suffix in known if path.name.endswith(suffix) and path.name != suffix), None)
+    if found is None:
+        raise ParameterError("output", path.name, f"a file name ending in {', '.join(known)}")
+    return found
 
 
 def check_writable(path: Path) -> None:

@@ -21,6 +21,7 @@ from apex_ompl.simplify import simplify as shorten
 from apex_ompl.space import path_length, path_to_array, resample
 from apex_ompl.stopwatch import timed
 from apex_ompl.trajectory import Timing, Trajectory, time_path
+from apex_ompl.trajectory.motion import ROUNDING
 from apex_ompl.validity import full_check
 
 if TYPE_CHECKING:
@@ -32,7 +33,6 @@ Array = NDArray[np.float64]
 CLEARANCE_SAMPLES = 32
 CHORD = 1e-5  # that a timed motion is off the straight line between two states that are proved, at most [rad]
 MOST_STATES = 100_000  # that are proved of a timed motion
-ROUNDING = 1e-9  # of shares of limits
 STRAIGHT_LINE = "straight line"
 PROOF_SHARE, LONGEST_PROOF = 0.1, 0.5  # time kept from planners that stop at the timeout only, for repair [1, s]
 LONGEST_TIMEOUT = 1e8  # OMPL counts nanoseconds in 64 bits [s]

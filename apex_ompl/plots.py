@@ -11,10 +11,9 @@ from matplotlib.figure import Figure
 
 from apex_ompl.assembly import assemble
 from apex_ompl.errors import ParameterError
-from apex_ompl.files import write_atomically
+from apex_ompl.files import suffix_of, write_atomically
 from apex_ompl.result import PlanResult
 from apex_ompl.robot import load_robot
-from apex_ompl.trajectory.files import suffix_of
 
 FORMATS = (".png", ".pdf", ".svg")
 SPACING = 0.002  # between two moments of a curve [s]

@@ -8,12 +8,12 @@ from collections.abc import Sequence
 from importlib import metadata
 from pathlib import Path
 
-LIBRARIES = (
-    "apex-ompl", "ompl", "pin", "coal", "numba", "numpy", "scipy", "pydantic", "example-robot-data", "torch", "ruckig",
-)  # fmt: skip
+FIGURES = ("apex-ompl", "ompl", "pin", "coal", "numba", "numpy", "torch")
+"""Libraries that measured figures depend on."""
+LIBRARIES = (*FIGURES, "ruckig", "scipy", "pydantic", "example-robot-data")
 
 
-def versions(libraries: Sequence[str] = LIBRARIES) -> dict[str, str]:
+def versions(libraries: Sequence[str] = FIGURES) -> dict[str, str]:
     """Return the versions of libraries by name, of those that are installed."""
     found = {}
     for name in libraries:

@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from ompl import base as ob
 
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError
-from apex_ompl.files import BROKEN, write_atomically
+from apex_ompl.files import BROKEN, suffix_of, write_atomically
 from apex_ompl.problem import Problem
 from apex_ompl.schema import dump_yaml, read_yaml, validate
 from apex_ompl.trajectory import Trajectory
-from apex_ompl.trajectory.files import MESSAGES, STATES, suffix_of
+from apex_ompl.trajectory.files import MESSAGES, STATES
 
 SCHEMA = "apex-ompl/result/2"
 SUFFIXES = (*MESSAGES, ".npz", ".csv", ".json", ".yaml")
@@ -145,7 +145,7 @@ class PlanResult:
             MissingFileError: The folder is missing or cannot be written.
         """
         path = Path(path)
-        suffix = check_suffix(path)
+        suffix = suffix_of(path, SUFFIXES)
         if self.trajectory is not None and suffix in (*MESSAGES, ".csv"):
             self.trajectory.save(path)
         else:
@@ -220,12 +220,3 @@ def _read_npz(path: Path) -> dict[str, Any]:
         raise MissingFileError(str(path), "result file") from error
     except (OSError, *BROKEN) as error:
         raise FileFormatError(str(path), "", str(error), "expected a saved result") from error
-
-
-def check_suffix(path: Path) -> str:
-    """Return the suffix of an output file.
-
-    Raises:
-        ParameterError: It is none of ``SUFFIXES``.
-    """
-    return suffix_of(path, SUFFIXES)

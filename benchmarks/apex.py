@@ -260,7 +260,7 @@ def main() -> None:
         levels.append({"level": ALL_HARD, "methods": figures(hard)})
     text = f"{table(levels)}\n\n{aims(levels)}"
     record.write(
-        args.name, {"levels": levels}, text, split=args.split, jobs=args.jobs, torch=torch.__version__,
+        args.name, {"levels": levels}, text, split=args.split, jobs=args.jobs,
         limits=f"{LIMIT:g} s, controls {SHORT_LIMIT:g} s", seeds="number of the problem modulo 1000",
     )  # fmt: skip
 

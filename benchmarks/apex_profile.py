@@ -167,7 +167,6 @@ def main() -> None:
     figures = {"stages": by_stage, "variants": by_variant, "sprints": by_sprint}
     record.write(
         "apex_profile", figures, text, split="validation", N=f"{len(hard)} hard, {len(scenes)} open", seed=SEED,
-        torch=torch.__version__,
     )  # fmt: skip
 
 

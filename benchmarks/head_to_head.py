@@ -21,16 +21,16 @@ from pathlib import Path
 import record
 
 from apex_ompl.benchmark import Row, Workers, bench, report, write_database, write_logs
+from apex_ompl.benchmark.rows import PAPER
 from apex_ompl.benchmark.summary import tables, warnings
 
 TIMEOUT = 10.0  # [s]
 TREELESS = {"fallback": False, "bridge": False}
-ALONE = {**TREELESS, "line": False, "repair": False, "polish": False, "first": 8, "second": 8, "third": 16}
 ROWS = (
     Row("apex", "apex"),
     Row("apex without trees", "apex", TREELESS),
     Row("apex guided", "apex", {"guidance": True}),
-    Row("apex-paper", "apex", {**ALONE, "model": "apex-paper", "guidance": True, "resample": 2}, runs=20),
+    Row("apex-paper", "apex", {**PAPER, "guidance": True}, runs=20),
     Row("straight line + repair", "apex", {**TREELESS, "first": 0, "second": 0, "third": 0, "resample": 0}, 2.0),
     Row(
         "8 bumps + repair",

@@ -80,9 +80,7 @@ def main() -> None:
             times = [f"{1e3 * t:.2f}" for t in (*row["stages"].values(), row["total_s"])]
             lines.append([name, row["count"], row["steps"], "yes" if row["guided"] else "no", *times])
     text = "\n".join(record.row(line) for line in lines) + "\n\n" + " ".join(notes)
-    record.write(
-        "model_latency", {"models": models}, text, problem=PROBLEM, threads=1, n=args.repeat, torch=torch.__version__
-    )
+    record.write("model_latency", {"models": models}, text, problem=PROBLEM, threads=1, n=args.repeat)
 
 
 if __name__ == "__main__":

@@ -113,7 +113,7 @@ def main() -> None:
     rows = {name: figures(folder, cases) for name, folder in (*folders.items(), ("apex as it ships", None))}
     record.write(
         "model_sweep", {"variants": rows}, table(rows), steps=args.steps, threads=args.threads,
-        data=Path(args.data).name if args.data else "that ships", n=len(cases), torch=torch.__version__, seed=0,
+        data=Path(args.data).name if args.data else "that ships", n=len(cases), seed=0,
     )  # fmt: skip
 
 

@@ -72,7 +72,7 @@ def main() -> None:
         errors = [f"{f[key]:.4f}" for key in ("mean_rad", "mean_of_max_rad", "max_rad")]
         lines.append([Path(name).name, f"{f['kind']}, {shape}", f["n"], *errors, f"{f['stay_valid']:.2f}"])
     text = "\n".join(record.row(line) for line in lines)
-    record.write("reconstruction", {"models": found}, text, seed=0, held_out=share, torch=torch.__version__)
+    record.write("reconstruction", {"models": found}, text, seed=0, held_out=share)
 
 
 if __name__ == "__main__":

@@ -19,7 +19,6 @@ from apex_ompl.metrics import next_percentile
 from apex_ompl.provenance import hardware, versions
 
 RESULTS = Path(__file__).parent / "results"
-LIBRARIES = ("apex-ompl", "ompl", "pin", "coal", "numba", "numpy", "torch")
 
 
 def commit() -> str:
@@ -55,7 +54,7 @@ def write(name: str, figures: dict[str, Any], table: str, **settings: Any) -> No
         "commit": commit(),
         "hardware": hardware(),
         "python": platform.python_version(),
-        "versions": versions(LIBRARIES),
+        "versions": versions(),
         **settings,
     }
     RESULTS.mkdir(exist_ok=True)

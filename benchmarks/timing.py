@@ -40,7 +40,7 @@ from apex_ompl.result import PlanResult, PlanStatus
 from apex_ompl.trajectory import Timing, Trajectory, time_path
 from apex_ompl.trajectory.curve import Curve, Polyline
 from apex_ompl.trajectory.motion import joined
-from apex_ompl.trajectory.points import breaks, calculate, stops
+from apex_ompl.trajectory.point_to_point import calculate, knots, stops
 from apex_ompl.trajectory.timing import PER_PIECE, SPACING, least_spacing, spline
 from apex_ompl.validity import full_check
 
@@ -111,9 +111,7 @@ def in_all_joints(states: list[tuple[np.ndarray, np.ndarray, np.ndarray]], least
             calculate(solver, task, made)
         except ruckig.RuckigError:
             return None
-        times = breaks(made)
-        q, v, a = (np.array(part) for part in zip(*(made.at_time(float(t)) for t in times), strict=True))
-        parts.append(Trajectory(times, q, v, a, NAMES))
+        parts.append(Trajectory(*knots(made), NAMES))
     return joined(parts)
 
 

@@ -31,6 +31,7 @@ from tqdm import tqdm
 from apex_ompl import metrics, problems
 from apex_ompl.assembly import assemble
 from apex_ompl.benchmark import Results, Row, bench
+from apex_ompl.benchmark.rows import PAPER
 from apex_ompl.benchmark.summary import Figures, Table, about, figures
 from apex_ompl.cluster import spread
 from apex_ompl.dataset import Store
@@ -51,11 +52,6 @@ ROOT = Path(__file__).resolve().parents[1]
 TASKS, SIZES = ("vertical", "horizontal"), ("small", "medium", "large")
 EDGES = {"free": 0.0, "small": 0.06, "medium": 0.10, "large": 0.15}  # of the cubes [m]
 TIMEOUT = 10.0  # [s]
-PAPER = {
-    "model": "apex-paper", "line": False, "repair": False, "bridge": False, "fallback": False, "polish": False,
-    "first": 8, "second": 8, "third": 16, "resample": 2,
-}  # fmt: skip
-"""The paper's algorithm without guidance: ancestral sampling in all steps, and resampling of what collides."""
 ALONE = {**PAPER, "model": "apex"}
 ROWS = (
     Row("apex", "apex"),

@@ -16,3 +16,11 @@ def states_around_home(robot: Robot, rng: np.random.Generator, count: int, sprea
     hands = robot.groups.get("hands", [])
     states[:, hands] = rng.uniform(0.0, 1.0, (count, len(hands)))
     return np.clip(states, robot.limits.lower, robot.limits.upper)
+
+
+def distance(points: np.ndarray, path: np.ndarray) -> float:
+    """The largest distance of points from a polyline, by all of its sides."""
+    sides = np.diff(path, axis=0)
+    squares = np.maximum(np.sum(sides**2, axis=1), 1e-300)
+    share = np.clip(np.einsum("nkd,kd->nk", points[:, None] - path[:-1], sides) / squares, 0.0, 1.0)
+    return float(np.linalg.norm(points[:, None] - path[:-1] - share[..., None] * sides, axis=2).min(axis=1).max())

@@ -269,6 +269,11 @@ def test_results_are_saved_in_every_format(problem: Problem, tmp_path: Path) -> 
         (tmp_path / name).write_bytes(content)
         with pytest.raises(FileFormatError, match=name):
             PlanResult.load(tmp_path / name)
+    data = json.loads((tmp_path / "r.json").read_text())
+    for change in ({"path": [[1.0, 2.0], [3.0, 4.0]]}, {"trajectory": {"times": None}}, {"limit_use": None}):
+        (tmp_path / "changed.json").write_text(json.dumps(data | change))
+        with pytest.raises(FileFormatError, match="changed.json"):
+            PlanResult.load(tmp_path / "changed.json")
     with pytest.raises(MissingFileError, match="gone.npz"):
         PlanResult.load(tmp_path / "gone.npz")
     assert np.array_equal(np.array(json.loads((tmp_path / "r.json").read_text())["path"]), result.path)

@@ -10,7 +10,7 @@ from support import ROOT
 
 LAYERS = [
     {"errors"},
-    {"cluster", "files", "meshes", "provenance", "resolution", "stopwatch"},
+    {"arguments", "cluster", "files", "meshes", "provenance", "resolution", "stopwatch"},
     {"schema"},
     {"kernel"},
     {"problem", "spline"},

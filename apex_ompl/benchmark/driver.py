@@ -24,8 +24,6 @@ from apex_ompl.files import locked, make_folder, write_atomically
 from apex_ompl.provenance import hardware, versions
 from apex_ompl.resolution import FULL_RESOLUTION, SEARCH_RESOLUTION
 
-LIBRARIES = ("apex-ompl", "ompl", "pin", "coal", "numba", "numpy", "torch")
-
 
 def bench(
     suites: Sequence[str], rows: Sequence[Row | str], out: str | os.PathLike[str], *, runs: int = 100,
@@ -93,7 +91,7 @@ def _session(workers: Workers, **more: Any) -> dict[str, Any]:
         "command": shlex.join([Path(sys.argv[0]).name or "python", *sys.argv[1:]]),
         "date": datetime.now(UTC).isoformat(timespec="seconds"), "hardware": hardware(), "jobs": workers.at_once,
         "address": workers.address or "", "python": platform.python_version(),
-        "versions": versions(LIBRARIES), **more,
+        "versions": versions(), **more,
     }  # fmt: skip
 
 

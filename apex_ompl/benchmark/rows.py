@@ -19,6 +19,13 @@ from apex_ompl.problems.catalogue import SPLITS
 
 WRITTEN = re.compile(r"(?P<planner>[^\[\]]+?)(\[(?P<params>[^\[\]]*)\])?")
 
+PAPER = {
+    "model": "apex-paper", "line": False, "repair": False, "bridge": False, "fallback": False, "polish": False,
+    "first": 8, "second": 8, "third": 16, "resample": 2,
+}  # fmt: skip
+"""Parameters of apex that leave the paper's algorithm alone, without guidance: ancestral sampling in all steps, and
+resampling of what collides."""
+
 
 @dataclass(frozen=True)
 class Row:

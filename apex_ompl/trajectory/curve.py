@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,9 +33,9 @@ class Polyline:
         Where all states count as one, it has the first and the last of them, or one if they are the same.
         """
         states = np.array(path, dtype=float)
-        kept = [0]
-        for k in range(1, len(states)):
-            if np.linalg.norm(states[k] - states[kept[-1]]) > SAME:
+        kept, rows = [0], states.tolist()
+        for k, row in enumerate(rows):
+            if math.dist(row, rows[kept[-1]]) > SAME:
                 kept.append(k)
         last = len(states) - 1
         if kept[-1] != last and len(kept) > 1:

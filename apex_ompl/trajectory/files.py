@@ -14,29 +14,17 @@ import yaml
 from numpy.typing import NDArray
 
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError
-from apex_ompl.files import BROKEN
+from apex_ompl.files import BROKEN, suffix_of
 from apex_ompl.schema import read_yaml
 
 Array = NDArray[np.float64]
 
-SUFFIXES = (".npz", ".csv", ".traj.yaml", ".traj.json")
 MESSAGES = (".traj.yaml", ".traj.json")
+SUFFIXES = (".npz", ".csv", *MESSAGES)
 ROLE = "trajectory"
 STATES = ("positions", "velocities", "accelerations")
 COLUMNS = ("", "_velocity", "_acceleration")  # behind the name of a joint
 BILLION = 1_000_000_000
-
-
-def suffix_of(path: Path, known: Sequence[str] = SUFFIXES) -> str:
-    """Return which suffix a file name ends in.
-
-    Raises:
-        ParameterError: None of them.
-    """
-    found = next((suffix for suffix in known if path.name.endswith(suffix)), None)
-    if found is None:
-        raise ParameterError("output", path.name, f"a file name ending in {', '.join(known)}")
-    return found
 
 
 def encoded(
@@ -89,7 +77,7 @@ def decoded(path: Path) -> tuple[Array, list[Array], tuple[str, ...]]:
         FileFormatError: It holds no trajectory.
         ParameterError: It has another suffix.
     """
-    suffix = suffix_of(path)
+    suffix = suffix_of(path, SUFFIXES)
     try:
         if suffix == ".npz":
             with np.load(path, allow_pickle=False) as archive:

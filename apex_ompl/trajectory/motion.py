@@ -12,14 +12,16 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from apex_ompl.arguments import check_positive, numbers
 from apex_ompl.errors import FileFormatError, ParameterError
-from apex_ompl.files import write_atomically
+from apex_ompl.files import suffix_of, write_atomically
 from apex_ompl.metrics import spectral_arc_length
 from apex_ompl.robot.model import Limits
-from apex_ompl.trajectory.files import STATES, decoded, encoded, suffix_of
+from apex_ompl.trajectory.files import STATES, SUFFIXES, decoded, encoded
 
 Array = NDArray[np.float64]
 
+ROUNDING = 1e-9  # of shares of limits
 JOINED = 1e-6  # share by which a knot may be off what the one before it leads to; files of ROS round times
 MOST_SAMPLES = 10**7
 BLOCK = 1000  # moments of a stream that are made at once
@@ -277,7 +279,7 @@ class Trajectory:
         """
         path = Path(path)
         states = {name: getattr(self, name) for name in STATES}
-        write_atomically(path, encoded(suffix_of(path), self.times, states, self.joint_names, controllers))
+        write_atomically(path, encoded(suffix_of(path, SUFFIXES), self.times, states, self.joint_names, controllers))
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Trajectory:
@@ -294,32 +296,6 @@ class Trajectory:
             return cls(times, states[0], states[1], states[2], names)
         except ParameterError as error:
             raise FileFormatError(str(path), error.name, error.value, f"expected {error.expected}") from error
-
-
-def numbers(given: ArrayLike, name: str) -> Array:
-    """Return finite numbers as an array.
-
-    Raises:
-        ParameterError: They are none.
-    """
-    try:
-        found = np.array(given, dtype=float)
-    except (TypeError, ValueError, OverflowError) as error:
-        raise ParameterError(name, given, "finite numbers") from error
-    if not np.isfinite(found).all():
-        raise ParameterError(name, found[~np.isfinite(found)].flat[0], "finite numbers")
-    return found
-
-
-def check_positive(value: float, name: str, expected: str) -> None:
-    """Check a number.
-
-    Raises:
-        ParameterError: It is none, or not positive and finite.
-    """
-    number = isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
-    if not number or not 0.0 < value < np.inf:
-        raise ParameterError(name, value, expected)
 
 
 def joined(parts: Sequence[Trajectory]) -> Trajectory:

@@ -10,12 +10,13 @@ from functools import cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from apex_ompl.arguments import is_number, numbers
 from apex_ompl.errors import ParameterError, TimingError
 from apex_ompl.kernel.speed import farthest, fastest, moments
 from apex_ompl.robot.model import Limits
 from apex_ompl.trajectory.curve import SAME, Curve, Polyline
-from apex_ompl.trajectory.motion import Trajectory, numbers
-from apex_ompl.trajectory.points import from_motion, stops
+from apex_ompl.trajectory.motion import Trajectory
+from apex_ompl.trajectory.point_to_point import from_motion, stops
 
 Array = NDArray[np.float64]
 
@@ -67,7 +68,7 @@ class Timing:
         """
         for name, (low, high) in RANGES.items():
             value = getattr(self, name)
-            if not _is_number(value) or not low <= value <= high:
+            if not is_number(value) or not low <= value <= high:
                 raise ParameterError(name, value, f"a number from {low:g} to {high:g}")
         for name in ("start_velocity", "start_acceleration"):
             object.__setattr__(self, name, tuple(np.atleast_1d(numbers(getattr(self, name), name)).ravel().tolist()))
@@ -225,10 +226,8 @@ def blended(line: Polyline, limits: Limits, names: tuple[str, ...], within: floa
         attempt(best)
         apart, control, place = tried[best]
         motion = spline(control, apart, names)
-        positions = motion.positions.clip(
-            line.states.min(axis=0), line.states.max(axis=0)
-        )  # where it is but for rounding
-        motion = replace(motion, positions=positions)
+        low, high = line.states.min(axis=0), line.states.max(axis=0)  # where it is, but for rounding
+        motion = replace(motion, positions=motion.positions.clip(low, high))
         places = np.concatenate([[0.0], place, [line.length]])
         deviation = _deviation(motion, line, (motion.times, places), window, within)
         if deviation <= within:
@@ -309,10 +308,6 @@ def _lasting(motion: Trajectory, duration: float) -> Trajectory:
         return motion.slower(duration / motion.duration)
     still = np.zeros((2, motion.dof))
     return Trajectory(np.array([0.0, duration]), motion.positions[[0, -1]], still, still, motion.joint_names)
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
 
 
 @cache

@@ -1,4 +1,4 @@
-"""Ruckig's part: from state to state, at the fastest within the limits."""
+"""Point to point by Ruckig: stops at corners, and what a moving start needs to join a motion."""
 
 from __future__ import annotations
 
@@ -10,14 +10,13 @@ from numpy.typing import NDArray
 
 from apex_ompl.errors import TimingError
 from apex_ompl.robot.model import Limits
-from apex_ompl.trajectory.motion import Trajectory, joined
+from apex_ompl.trajectory.motion import ROUNDING, Trajectory, joined
 
 Array = NDArray[np.float64]
 
 WITHIN = 1.0 - 1e-6  # of the limits that Ruckig is given, for its rounding
 BEYOND = 1.0 + 1e-10  # where it is given states that are at the limits
 JOINTS = 12  # places at which a motion may be joined
-ROUNDING = 1e-9  # of shares of limits
 SHORTEST = 1e-9  # piece [s]
 
 
@@ -43,8 +42,7 @@ def stops(corners: Array, limits: Limits, names: tuple[str, ...]) -> Trajectory:
             calculate(solver, task, made)
         except ruckig.RuckigError as error:
             raise TimingError(f"Ruckig finds no motion along a line of {length:.3g} rad, {error}") from error
-        times = breaks(made)
-        place, speed, push = (np.array(v)[:, None] for v in zip(*(_one(made, t) for t in times), strict=True))
+        times, place, speed, push = knots(made)
         positions = start + place * direction
         positions[0], positions[-1] = start, end
         speed[[0, -1]], push[[0, -1]] = 0.0, 0.0  # of rounding
@@ -87,8 +85,7 @@ def from_motion(
 
 def _head(made: ruckig.Trajectory, rest: Trajectory, moment: float) -> Trajectory:
     """Return Ruckig's motion to where another one is at a moment."""
-    times = breaks(made)
-    states = [np.array(v) for v in zip(*(made.at_time(float(t)) for t in times), strict=True)]
+    times, *states = knots(made)
     states[0][0] = rest.positions[0]
     for order, part in enumerate(states):
         part[-1] = rest(moment, order)
@@ -109,19 +106,19 @@ def calculate(solver: ruckig.Ruckig, task: ruckig.InputParameter, made: ruckig.T
         raise ruckig.RuckigError(str(result))
 
 
-def breaks(made: ruckig.Trajectory) -> Array:
-    """Return the moments between which all joints have constant jerk, ends included, shape (K,) [s]."""
+def knots(made: ruckig.Trajectory) -> tuple[Array, Array, Array, Array]:
+    """Return the moments between which all joints have constant jerk, ends included, and the states then.
+
+    Returns:
+        Times of shape (K,) [s]; positions, velocities and accelerations of shape (K, dof).
+    """
     found = [0.0, made.duration]
     for profile in made.profiles[0]:
         brake = np.cumsum(profile.brake.t)
         found += [*brake, *(profile.brake.duration + np.cumsum(profile.t))]
     times = np.unique(np.clip(found, 0.0, made.duration))
-    kept: Array = times[np.append(True, np.diff(times) > SHORTEST)]
-    if len(kept) > 1:
-        kept[-1] = made.duration
-    return kept
-
-
-def _one(made: ruckig.Trajectory, time: float) -> tuple[float, float, float]:
-    place, speed, push = made.at_time(float(time))
-    return place[0], speed[0], push[0]
+    times = times[np.append(True, np.diff(times) > SHORTEST)]
+    if len(times) > 1:
+        times[-1] = made.duration
+    q, v, a = (np.array(part) for part in zip(*(made.at_time(float(t)) for t in times), strict=True))
+    return times, q, v, a
