@@ -17,7 +17,13 @@ class ClusterError(ApexError):
 
 
 def spread(
-    work: Callable[..., Any], jobs: Mapping[str, tuple[Any, ...]], *, workers: int, address: str | None, ahead: int = 2
+    work: Callable[..., Any],
+    jobs: Mapping[str, tuple[Any, ...]],
+    *,
+    workers: int,
+    address: str | None,
+    ahead: int = 2,
+    lost: Callable[[str], Any] | None = None,
 ) -> Iterator[tuple[str, Any]]:
     """Call a function once for each job, and yield names and what came of them as they are done.
 
@@ -28,6 +34,7 @@ def spread(
         jobs: Its arguments, by names.
         workers: How many jobs run at once.
         ahead: How many jobs for each worker are under way or wait at Ray.
+        lost: What comes of a job whose worker died twice, by its name; by default that ends the work.
         address: Of a running cluster; by default Ray is started on this machine, and stopped again.
 
     Raises:
@@ -53,10 +60,12 @@ def spread(
             except ray.exceptions.RayTaskError as error:
                 raise ClusterError(f"{name}: {_first_line(error.cause)}") from error
             except ray.exceptions.RayError as error:
-                raise ClusterError(
-                    f"{name}: its worker died twice ({type(error).__name__}); what is written is whole, and "
-                    "the same command goes on from there"
-                ) from error
+                if lost is None or not isinstance(error, ray.exceptions.WorkerCrashedError):
+                    raise ClusterError(
+                        f"{name}: its worker died twice ({type(error).__name__}); what is written is whole, and "
+                        "the same command goes on from there"
+                    ) from error
+                found = lost(name)
             following = next(waiting, None)
             if following is not None:
                 under_way[task.remote(*following[1])] = following[0]

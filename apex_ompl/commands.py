@@ -154,6 +154,7 @@ def render(parsed: argparse.Namespace) -> int:
 def bench(parsed: argparse.Namespace) -> int:
     """Run a benchmark."""
     benchmark = _needing("apex_ompl.benchmark", "benchmarks", "bench")
+    _needing("scipy", "benchmarks", "bench")  # which is not asked before the runs are made
     results = benchmark.bench(
         parsed.suites, _split(parsed.planners), parsed.out, runs=parsed.runs, timeout=parsed.timeout, seed=parsed.seed,
         split=parsed.split, simplify=not parsed.no_simplify, quiet=parsed.quiet,

@@ -16,12 +16,13 @@ from ompl import geometric as og
 
 from apex_ompl import problems
 from apex_ompl.assembly import PlanningSetup, assemble
+from apex_ompl.bodies import Obstacle
 from apex_ompl.cases import WrittenCase
 from apex_ompl.engine import Case, Engine, Options, Row
 from apex_ompl.errors import ParameterError, UnknownNameError
 from apex_ompl.ompl_globals import quiet_ompl, seed_ompl
 from apex_ompl.optimize import Optimizer
-from apex_ompl.problem import Obstacle, Problem
+from apex_ompl.problem import Problem
 from apex_ompl.problems import scenes
 from apex_ompl.problems.catalogue import KNOWN, SPLITS, SuiteError
 from apex_ompl.problems.reach import robot

@@ -30,11 +30,12 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from apex_ompl.bodies import AttachedObject
 from apex_ompl.collision import Verdict
 from apex_ompl.errors import FileFormatError, UnknownNameError
 from apex_ompl.ik import Links, in_world
 from apex_ompl.kernel import Target, facing, gap, slope
-from apex_ompl.problem import ALIGNMENT_DEFAULTS, Alignment, AttachedObject, Problem, WorldVector
+from apex_ompl.problem import ALIGNMENT_DEFAULTS, Alignment, Problem, WorldVector
 from apex_ompl.robot import Robot
 
 Array = NDArray[np.float64]

@@ -8,10 +8,10 @@ import coal
 import numpy as np
 import pinocchio as pin
 
+from apex_ompl.bodies import AttachedObject
 from apex_ompl.collision.broadphase import exact_requests
 from apex_ompl.collision.shapes import coal_geometry
 from apex_ompl.errors import SceneError, UnknownNameError
-from apex_ompl.problem import AttachedObject
 from apex_ompl.robot import Robot
 from apex_ompl.robot.model import link_of
 

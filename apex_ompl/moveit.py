@@ -19,8 +19,9 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from apex_ompl.bodies import AttachedObject, Obstacle, pose_matrix
 from apex_ompl.errors import FileFormatError, UnknownNameError
-from apex_ompl.problem import AttachedObject, Goal, Obstacle, Problem, pose_matrix
+from apex_ompl.problem import Goal, Problem
 from apex_ompl.robot import Robot
 from apex_ompl.robot.assets import resolve
 from apex_ompl.schema import read_yaml

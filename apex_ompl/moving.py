@@ -10,9 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from apex_ompl.bodies import Obstacle
 from apex_ompl.collision import Verdict
 from apex_ompl.errors import ParameterError
-from apex_ompl.problem import Obstacle, Problem
+from apex_ompl.problem import Problem
 from apex_ompl.resolution import FULL_RESOLUTION
 from apex_ompl.robot import Robot
 

@@ -18,12 +18,13 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from apex_ompl.assembly import PlanningSetup, assemble
+from apex_ompl.bodies import Body
 from apex_ompl.collision.shapes import coal_geometry, is_shell
 from apex_ompl.errors import MissingFileError, ParameterError
 from apex_ompl.files import check_writable, write_atomically
 from apex_ompl.goals import Face
 from apex_ompl.meshes import triangles
-from apex_ompl.problem import Body, Problem
+from apex_ompl.problem import Problem
 from apex_ompl.result import PlanResult
 from apex_ompl.robot import Robot
 from apex_ompl.space import resample

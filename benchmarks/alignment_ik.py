@@ -14,9 +14,9 @@ import numpy as np
 import record
 
 from apex_ompl import load_problem
+from apex_ompl.bodies import Body
 from apex_ompl.collision import Verdict
 from apex_ompl.goals import alignment_goal
-from apex_ompl.problem import Body
 from apex_ompl.robot import Robot
 from apex_ompl.robot.assets import DATA
 from apex_ompl.robot.config import Part, read_config

@@ -1,9 +1,9 @@
 """Planners head to head on all static levels of the test split, through ``apex_ompl.benchmark``.
 
 Rows: apex; without the trees behind its proposals; with guidance; the paper's algorithm alone (``apex-paper``, on 20
-problems of a level); the straight line, and eight random bumps in the place of proposals, with the same repair, for
-2 s; rrtconnect+polish; rrtconnect; rrt on 20 problems of a level; and planners that use all the time they get, 5 s, on
-20 problems of the hard and large levels.
+problems of a level); the straight line and its repair, which ends by itself; rounds of eight random bumps in the place
+of proposals, with the same repair, for 2 s; rrtconnect+polish; rrtconnect; rrt on 20 problems of a level; and planners
+that use all the time they get, 5 s, on 20 problems of the hard and large levels.
 Runs are kept in benchmarks/runs/head_to_head as they end, with OMPL's logs and the database for Planner Arena; the
 command goes on where it was stopped.
 
@@ -15,16 +15,27 @@ Usage: python benchmarks/head_to_head.py [SUITE[/LEVEL] ...] [-n 50] [--jobs 1]
 from __future__ import annotations
 
 import argparse
+import math
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import record
 
 from apex_ompl.benchmark import Row, Workers, bench, report, write_database, write_logs
 from apex_ompl.benchmark.rows import PAPER
-from apex_ompl.benchmark.summary import tables, warnings
+from apex_ompl.benchmark.summary import MOMENTS, Figures, Table, figures, tables, warnings
+from apex_ompl.metrics import share_interval
 
 TIMEOUT = 10.0  # [s]
+TIMES = (("first", 50), ("first", 95), ("first", 99), ("total", 50))
+GROUPS = {
+    "free, easy, small": ("free", "easy", "small"),
+    "medium": ("medium",),
+    "hard, large": ("hard", "large"),
+    "all": ("free", "easy", "small", "medium", "hard", "large"),
+}
 TREELESS = {"fallback": False, "bridge": False}
 ROWS = (
     Row("apex", "apex"),
@@ -48,12 +59,38 @@ ROWS = (
 )
 
 
+def together(found: Sequence[Figures]) -> Table:
+    """Return what came of each row on levels of a kind, its paths beside those of apex for the same problems."""
+    rows = []
+    for group, levels in GROUPS.items():
+        mine = [f for f in found if f.experiment.split("/")[1] in levels]
+        best = {run["problem"]: run["length"] for f in mine if f.label == "apex" for run in f.solved}
+        for row in ROWS:
+            parts = [f for f in mine if f.label == row.label]
+            if not parts or (row.levels and group == "all"):
+                continue
+            f = Figures(group, row.label, [run for part in parts for run in part.runs])
+            low, high = share_interval(len(f.solved), len(f.runs))
+            both = [math.log(run["length"] / best[run["problem"]]) for run in f.solved if best.get(run["problem"])]
+            shares = [f"{f.share_within(t):.3f}" if t <= f.limit else "-" for t in MOMENTS]
+            times = [f.percentile(which, p) for which, p in TIMES]
+            rows.append([
+                group, row.label, str(len(f.runs)),
+                f"{len(f.solved) / len(f.runs):.3f} ({low:.3f} to {high:.3f})", *shares,
+                *(f"{1e3 * t:.0f}" if math.isfinite(t) else "-" for t in times),
+                f"{math.exp(np.mean(both)):.2f} ({len(both)})" if both else "-",
+            ])  # fmt: skip
+    head = ["levels", "planner", "N", "solved (95 %, Wilson)", *(f"in {t:g} s" for t in MOMENTS), "first path p50 ms",
+            "p95", "p99", "end p50 ms", "length / apex's (problems that both solved)"]  # fmt: skip
+    return Table("Levels together", head, rows)
+
+
 def main() -> None:
     """Run what is missing, and write the results."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("levels", nargs="*", metavar="SUITE[/LEVEL]")
-    parser.add_argument("-n", type=int, default=50, help="problems of a level (default: %(default)s)")
-    parser.add_argument("--jobs", type=int, default=1, help="runs at a time (default: one, as they are timed)")
+    parser.add_argument("-n", type=record.count, default=50, help="problems of a level (default: %(default)s)")
+    parser.add_argument("--jobs", type=record.count, default=1, help="runs at a time (default: one, as they are timed)")
     args = parser.parse_args()
     folder = Path(__file__).parent / "runs" / "head_to_head"
     workers = Workers(args.jobs, modules=("controls",))
@@ -62,12 +99,13 @@ def main() -> None:
     results = replace(results, runs=[run for run in results.runs if run["label"] in labels])
     write_database(results, write_logs(results))
     report(folder, folder)
-    found = [table for table in tables(results) if table.rows]
+    found = [table for table in (together(figures(results)), *tables(results)) if table.rows]
     text = "\n\n".join([*warnings(results), *(table.markdown() for table in found)])
-    figures = {"tables": [{"title": t.title, "head": list(t.head), "rows": [list(r) for r in t.rows]} for t in found]}
-    about = {"jobs": args.jobs, "timeout": f"{TIMEOUT:g} s but for rows that say otherwise", "seeds": "0 to N - 1"}
-    record.write("head_to_head", figures, text, split="test", **about)
+    said = {"tables": [{"title": t.title, "head": list(t.head), "rows": [list(r) for r in t.rows]} for t in found]}
+    about = {"timeout": f"{TIMEOUT:g} s but for rows that say otherwise", "seeds": "0 to N - 1"}
+    about |= record.made_with(results.about["sessions"])
+    record.write("head_to_head", said, text, split="test", **about)
 
 
 if __name__ == "__main__":
-    main()
+    record.command(main)

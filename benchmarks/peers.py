@@ -8,7 +8,7 @@ by the same full check, and planned anew where they fail it, as those of rrtconn
 straight line at first, and its path as it was found where the shortened one cannot be mended. Problems with shapes that
 it has not are left out.
 
-Usage: python benchmarks/peers.py [SUITE[/LEVEL] ...] [-n 100]    (needs the extra "peers")
+Usage: python benchmarks/peers.py [SUITE[/LEVEL] ...] [-n 30] [--jobs 1]    (needs the extra "peers")
 """
 
 from __future__ import annotations
@@ -39,8 +39,9 @@ from store import RunStore
 
 from apex_ompl import plan, problems
 from apex_ompl.assembly import PlanningSetup, assemble
+from apex_ompl.bodies import Body, pose_matrix
 from apex_ompl.ompl_globals import quiet_ompl
-from apex_ompl.problem import Body, Problem, pose_matrix
+from apex_ompl.problem import Problem
 from apex_ompl.problems.reach import robot
 from apex_ompl.repair import repair
 from apex_ompl.resolution import SEARCH_RESOLUTION
@@ -138,12 +139,12 @@ def run(job: tuple[str, str]) -> dict[str, Any]:
     if not about["carried"]:
         return {**about, "solved": False}
     if method != "roboplan":
-        result = plan(problem, method, timeout=LIMIT, seed=number)
+        result = plan(problem, method, timeout=LIMIT, seed=number, timing=False)
         times = result.times
         total = sum(times.get(stage, 0.0) for stage in ("line", "solve", "simplify", "verify", "repair"))
         proof = sum(times.get(stage, 0.0) for stage in ("verify", "repair")) if method == "rrtconnect" else 0.0
         first = times.get("line", 0.0) + times.get(FIRST, times.get("solve", 0.0)) + proof
-        failed = "repair" if result.solved_by.endswith("+repair") and method == "rrtconnect" else ""
+        failed = "repair" if "repair" in times and method == "rrtconnect" else ""
         about |= {"solved": bool(result), "first": first, "total": total, "failed": failed}
         return {**about, "length": result.length if result else None}
     ready = assemble(problem, robot())
@@ -205,7 +206,8 @@ def main() -> None:
     """Run what is missing, and write the results of all."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("levels", nargs="*", metavar="SUITE[/LEVEL]")
-    parser.add_argument("-n", type=int, default=100, help="problems of a level (default: %(default)s)")
+    parser.add_argument("-n", type=record.count, default=30, help="problems of a level (default: %(default)s)")
+    parser.add_argument("--jobs", type=record.count, default=1, help="runs at a time (default: one, as they are timed)")
     parser.add_argument("--split", choices=("validation", "test"), default="test")
     parser.add_argument("--store", type=Path, default=STORE)
     parser.add_argument("--name", default="peers", help="of the results (default: %(default)s)")
@@ -215,7 +217,7 @@ def main() -> None:
     jobs = sorted(((n, m) for n in names for m in METHODS), key=lambda job: int(job[0].rsplit("/", 1)[1]))
     store = RunStore(args.store, ("problem", "method"))
     done = store.read()
-    store.complete(run, [job for job in jobs if job not in done], 1, warm_up)
+    store.complete(run, [job for job in jobs if job not in done], args.jobs, warm_up)
     done = store.read()
     head = ["level", "method", "N", "solved", "failed the check at first", "first ms p50", "p95", "end ms p50", "p95"]
     rows = [record.row([*head, "length rad"]), record.row(["---", "---", *["---:"] * (len(head) - 1)])]
@@ -237,10 +239,10 @@ def main() -> None:
     text = f"\n\nRandom states near starts and goals: {', '.join(str(n) for n in same)} ({words}). "
     text += f"{left} problems have shapes that RoboPlan has not, and are left out."
     record.write(
-        args.name, {"levels": found}, "\n".join(rows) + text, split=args.split, jobs=1, limit=f"{LIMIT:g} s",
-        seeds="number of the problem modulo 1000",
+        args.name, {"levels": found}, "\n".join(rows) + text, split=args.split, limit=f"{LIMIT:g} s",
+        seeds="number of the problem modulo 1000", **record.made_with(done[job] for job in jobs),
     )  # fmt: skip
 
 
 if __name__ == "__main__":
-    main()
+    record.command(main)

@@ -19,10 +19,10 @@ import numpy as np
 import record
 from verdict import around_home, boxes, near_contact
 
+from apex_ompl.bodies import AttachedObject, MeshFile, Obstacle
 from apex_ompl.collision import Verdict
 from apex_ompl.collision.proofs import Tally
 from apex_ompl.collision.sweep import sample_path
-from apex_ompl.problem import AttachedObject, MeshFile, Obstacle
 from apex_ompl.resolution import FULL_RESOLUTION, SEARCH_RESOLUTION
 from apex_ompl.robot import Robot, load_robot
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import math
 import platform
 import subprocess
 import sys
+from collections.abc import Callable, Iterable
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -14,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from apex_ompl import problems
+from apex_ompl.errors import ApexError
 from apex_ompl.files import write_atomically
 from apex_ompl.metrics import next_percentile
 from apex_ompl.provenance import hardware, versions
@@ -41,7 +44,7 @@ def write(name: str, figures: dict[str, Any], table: str, **settings: Any) -> No
         name: Name of the measurement.
         figures: The figures, ready for JSON.
         table: A Markdown table of them.
-        **settings: Seed, N and other settings.
+        **settings: Seed, N and other settings; ``hardware`` where it is not that of this process.
     """
     about = {
         "command": " ".join(
@@ -60,7 +63,7 @@ def write(name: str, figures: dict[str, Any], table: str, **settings: Any) -> No
     RESULTS.mkdir(exist_ok=True)
     write_atomically(RESULTS / f"{name}.json", (json.dumps({"about": about, **figures}, indent=1) + "\n").encode())
     made_with = ", ".join(f"{k} {v}" for k, v in about["versions"].items())
-    rest = ", ".join(f"{k} {v}" for k, v in settings.items())
+    rest = ", ".join(f"{k} {v}" for k, v in settings.items() if k != "hardware")
     head = f"`{about['command']}` on {about['hardware']}; {about['date']}, commit {about['commit']}, "
     head += f"Python {about['python']}, {made_with}; {rest}."
     write_atomically(RESULTS / f"{name}.md", f"# {name}\n\n{head}\n\n{table}\n".encode())
@@ -78,6 +81,35 @@ def reached(values: list[float] | np.ndarray, p: float) -> float | None:
         return None
     value = next_percentile(values, p)
     return value if math.isfinite(value) else None
+
+
+def command(main: Callable[[], None]) -> None:
+    """Run a benchmark; what it cannot go by, or Ctrl-C, ends it with one sentence."""
+    try:
+        main()
+    except ApexError as error:
+        print(f"{Path(sys.argv[0]).name}: error: {error}", file=sys.stderr)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        print(f"{Path(sys.argv[0]).name}: stopped; the same command goes on from there", file=sys.stderr)
+        sys.exit(130)
+
+
+def count(text: str) -> int:
+    """Return a number of problems or processes, for ``argparse``.
+
+    Raises:
+        ArgumentTypeError: It is not 1 or more.
+    """
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text!r}, expected a whole number, 1 or more")
+    return int(text)
+
+
+def made_with(runs: Iterable[dict[str, Any]]) -> dict[str, str]:
+    """Return on what hardware runs of a store were made, and how many at a time."""
+    runs = list(runs)
+    return {name: "; ".join(sorted({str(run[name]) for run in runs})) for name in ("jobs", "hardware")}
 
 
 def static_levels(wanted: list[str]) -> list[str]:

@@ -23,11 +23,12 @@ from ompl import base as ob
 
 from apex_ompl import plan, problems
 from apex_ompl.assembly import assemble
+from apex_ompl.bodies import Obstacle
 from apex_ompl.errors import ApexError
 from apex_ompl.ompl_globals import quiet_ompl
 from apex_ompl.planners.apex import APEX
 from apex_ompl.planners.apex_parameters import ApexParameters
-from apex_ompl.problem import Goal, Obstacle, Problem
+from apex_ompl.problem import Goal, Problem
 from apex_ompl.problems.reach import robot
 from apex_ompl.space import to_state
 

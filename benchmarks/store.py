@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import json
 import multiprocessing
+import sys
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
+
+from apex_ompl.provenance import hardware
 
 EVERY = 500  # runs between two lines about how far it is
 
@@ -39,7 +42,7 @@ class RunStore:
         self, run: Callable[[Any], dict[str, Any]], jobs: Sequence[Any], workers: int,
         warm_up: Callable[..., None], *given: Any,
     ) -> None:  # fmt: skip
-        """Do jobs, and write what comes of them; those that raise are named and left for another time.
+        """Do jobs, and write what comes of them, with the number of processes and the hardware.
 
         Args:
             run: Does one.
@@ -47,6 +50,9 @@ class RunStore:
             workers: Processes.
             warm_up: Called in each process with ``given`` before its first run.
             *given: For ``warm_up``.
+
+        Raises:
+            SystemExit: Some raised, which are named, and left for another time.
         """
         if not jobs:
             return
@@ -55,13 +61,20 @@ class RunStore:
             self.path.write_text(self.path.read_text() + "\n")
         spawn = multiprocessing.get_context("spawn")
         pool = ProcessPoolExecutor(workers, spawn, initializer=warm_up, initargs=given)
-        with pool, self.path.open("a") as out:
+        failed = 0
+        with self.path.open("a") as out:
             futures = {pool.submit(run, job): job for job in jobs}
-            for k, future in enumerate(as_completed(futures)):
-                if future.exception() is None:
-                    out.write(json.dumps(future.result()) + "\n")
-                    out.flush()
-                else:
-                    print(f"{futures[future]}: {future.exception()!r}", flush=True)
-                if (k + 1) % EVERY == 0:
-                    print(f"{k + 1} of {len(jobs)} runs", flush=True)
+            try:
+                for k, future in enumerate(as_completed(futures)):
+                    if future.exception() is None:
+                        out.write(json.dumps({**future.result(), "jobs": workers, "hardware": hardware()}) + "\n")
+                        out.flush()
+                    else:
+                        failed += 1
+                        print(f"{futures[future]}: {future.exception()!r}", file=sys.stderr, flush=True)
+                    if (k + 1) % EVERY == 0:
+                        print(f"{k + 1} of {len(jobs)} runs", flush=True)
+            finally:
+                pool.shutdown(cancel_futures=True)
+        if failed:
+            raise SystemExit(f"{failed} of {len(jobs)} runs failed; what has ended is kept in {self.path}")

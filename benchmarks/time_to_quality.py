@@ -6,7 +6,7 @@ rrtconnect and OMPL's simplification, and rrtconnect+polish, begun anew with oth
 time, their best path kept; aorrtc. Paths count from when they are found, if they pass the full check, which is part of
 the time only where the planner makes it itself.
 
-Usage: python benchmarks/time_to_quality.py [--reference] [SUITE/hard ...] [-n 20]
+Usage: python benchmarks/time_to_quality.py [--reference] [SUITE/hard ...] [-n 20] [--jobs 1]
 """
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ def again(attempt: Callable[[float], np.ndarray | None], ready: PlanningSetup) -
     while (left := LIMIT - (time.perf_counter() - begin)) > 0.0:
         path = attempt(left)
         took = time.perf_counter() - begin
-        if path is not None and proven(ready, path):
+        if path is not None and took <= LIMIT and proven(ready, path):
             found.append((took, path_length(path)))
     return shorter(found)
 
@@ -160,17 +160,18 @@ def main() -> None:
     """Run what is missing, and write the results."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("levels", nargs="*", metavar="SUITE/hard")
-    parser.add_argument("-n", type=int, default=20, help="test problems of a level (default: %(default)s)")
+    parser.add_argument("-n", type=record.count, default=20, help="test problems of a level (default: %(default)s)")
     parser.add_argument(
         "--reference", action="store_true", help="make the lengths to come up to, 30 s for each problem"
     )
+    parser.add_argument("--jobs", type=record.count, default=1, help="runs at a time (default: one, as they are timed)")
     args = parser.parse_args()
     levels = [level for level in record.static_levels(args.levels) if level.endswith("/hard")]
     names = [name for level in levels for name in problems.frozen_names(*level.split("/"), "test")[: args.n]]
     jobs = [(name, method) for name in names for method in (("reference",) if args.reference else METHODS)]
     store = RunStore(STORE, ("problem", "method"))
     done = store.read()
-    store.complete(run, [job for job in jobs if job not in done], 1, warm_up)
+    store.complete(run, [job for job in jobs if job not in done], args.jobs, warm_up)
     done = store.read()
     kept = json.loads(REFERENCE.read_text()) if REFERENCE.is_file() else {}
     if args.reference:
@@ -196,9 +197,12 @@ def main() -> None:
                     [level if k == 0 else "", method, len(mine), f"{share:.2f}", *cells, len(mine) - len(ratios)]
                 )
             )
+    without = sum(name not in kept for name in names)
+    text = f"\n\n{without} of {len(names)} problems, for which aorrtc has no path after {LONG:g} s, are left out."
     limits = f"{LIMIT:g} s, within {WITHIN:g} of aorrtc's length after {LONG:g} s"
-    record.write("time_to_quality", {"levels": figures}, "\n".join(rows), split="test", jobs=1, limit=limits)
+    about = {"limit": limits, **record.made_with(done[job] for job in jobs)}
+    record.write("time_to_quality", {"levels": figures}, "\n".join(rows) + text, split="test", **about)
 
 
 if __name__ == "__main__":
-    main()
+    record.command(main)

@@ -19,9 +19,9 @@ import pinocchio as pin
 import record
 
 from apex_ompl import plan, problems
+from apex_ompl.bodies import Obstacle
 from apex_ompl.collision import Verdict
 from apex_ompl.collision.broadphase import exact_requests
-from apex_ompl.problem import Obstacle
 from apex_ompl.resolution import FULL_RESOLUTION
 from apex_ompl.robot import Robot, load_robot
 from apex_ompl.space import resample

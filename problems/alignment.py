@@ -17,12 +17,13 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
+from apex_ompl.bodies import AttachedObject, Obstacle
 from apex_ompl.collision import Verdict
 from apex_ompl.collision.shapes import coal_geometry
 from apex_ompl.goals import RESTART_SPREAD, AlignmentGoal
 from apex_ompl.ik import Links
 from apex_ompl.kernel import Inverse, Kernel, RobotTables
-from apex_ompl.problem import Alignment, AttachedObject, Obstacle
+from apex_ompl.problem import Alignment
 from apex_ompl.problems.objects import Held, block_and_peg, boxes, cup_and_ball, put_in_hands
 from apex_ompl.problems.outline import Outline
 from apex_ompl.problems.reach import keeps_clear, robot, scene_kernel

@@ -10,8 +10,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from apex_ompl.bodies import AttachedObject, Obstacle
 from apex_ompl.ik import Links
-from apex_ompl.problem import AttachedObject, Obstacle
 from apex_ompl.problems import alignment
 from apex_ompl.problems.outline import Outline
 from apex_ompl.problems.reach import MARGIN, HandPoses, Range, Region, bare_tables, robot, scene_kernel

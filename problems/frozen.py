@@ -21,9 +21,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from apex_ompl.bodies import located
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError
 from apex_ompl.files import write_atomically
-from apex_ompl.problem import Problem, located
+from apex_ompl.problem import Problem
 from apex_ompl.problems.catalogue import LEVELS, SPLITS, ProblemId
 from apex_ompl.problems.objects import DATA
 from apex_ompl.problems.reach import ROBOT, robot

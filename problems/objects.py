@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from apex_ompl.bodies import AttachedObject
 from apex_ompl.grasp import Grasp, grasp
-from apex_ompl.problem import AttachedObject
 from apex_ompl.robot import Robot
 
 Held = Sequence[tuple[str, AttachedObject]]

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from apex_ompl.problem import AttachedObject, Goal, Obstacle, Problem
+from apex_ompl.bodies import AttachedObject, Obstacle
+from apex_ompl.problem import Goal, Problem
 from apex_ompl.robot import Robot
 
 Array = NDArray[np.float64]

@@ -9,12 +9,12 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
+from apex_ompl.bodies import Obstacle
 from apex_ompl.collision import Verdict
 from apex_ompl.collision.shapes import world_geometry
 from apex_ompl.collision.tabulate import primitives, tabulate_scene
 from apex_ompl.ik import Links, in_world
 from apex_ompl.kernel import Kernel, RobotTables, facing, gap
-from apex_ompl.problem import Obstacle
 from apex_ompl.robot import Robot, load_robot
 
 Array = NDArray[np.float64]

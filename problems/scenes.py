@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apex_ompl.problem import Obstacle
+from apex_ompl.bodies import Obstacle
 from apex_ompl.problems.reach import Direction, Region
 
 FORWARD: Direction = (1.0, 0.0, 0.0)

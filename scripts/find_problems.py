@@ -19,10 +19,11 @@ import numpy as np
 
 from apex_ompl.api import plan
 from apex_ompl.assembly import assemble
+from apex_ompl.bodies import AttachedObject, Obstacle
 from apex_ompl.collision import Verdict
 from apex_ompl.ik import Links, in_world
 from apex_ompl.kernel import facing, gap
-from apex_ompl.problem import Alignment, AttachedObject, Goal, Obstacle, Problem
+from apex_ompl.problem import Alignment, Goal, Problem
 from apex_ompl.problems.objects import (
     DATA,
     Held,

@@ -6,47 +6,33 @@
 variational autoencoder of ``apex-paper`` and in principal components.
 
 The runs of ``failure`` and ``size`` are the same, and are kept as they end, beside those of benchmarks/head_to_head.py,
-some of which they are; so are the solutions of ``fid``. The paper's algorithm and rrt have 20 runs on each level. The
-command goes on where it was stopped.
+some of which they are; so are the solutions of ``fid``. All planners have the same problems. The command goes on where
+it was stopped.
 
-Usage: python scripts/reproduce.py failure|size|fid [-n 50] [--keep FOLDER] [-o FOLDER]
+Usage: python scripts/reproduce.py failure|size|fid [-n 20] [--jobs 1] [--keep FOLDER] [-o FOLDER]
 """
 
 from __future__ import annotations
 
 import argparse
+import io
 import json
 import sys
-import time
-from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from matplotlib.figure import Figure
-from tqdm import tqdm
+from paper import realism
 
-from apex_ompl import metrics, problems
-from apex_ompl.assembly import assemble
-from apex_ompl.benchmark import Results, Row, bench
+from apex_ompl import metrics
+from apex_ompl.benchmark import Results, Row, Workers, bench
 from apex_ompl.benchmark.rows import PAPER
-from apex_ompl.benchmark.summary import Figures, Table, about, figures
-from apex_ompl.cluster import spread
-from apex_ompl.dataset import Store
-from apex_ompl.diffusion.checkpoint import load_model
-from apex_ompl.diffusion.guidance import Guidance
-from apex_ompl.diffusion.proposals import Sampling
-from apex_ompl.engine import Options
+from apex_ompl.benchmark.summary import Figures, Table, about, figures, warnings
 from apex_ompl.errors import ApexError
 from apex_ompl.files import make_folder, write_atomically
-from apex_ompl.generation import plan_units, work
-from apex_ompl.ompl_globals import quiet_ompl
-from apex_ompl.problems.reach import robot
-from apex_ompl.queries import query_of
-from apex_ompl.records import SOURCES, Paths
-from apex_ompl.spline import Spline
+from apex_ompl.provenance import hardware, versions
 
 ROOT = Path(__file__).resolve().parents[1]
 TASKS, SIZES = ("vertical", "horizontal"), ("small", "medium", "large")
@@ -55,23 +41,25 @@ TIMEOUT = 10.0  # [s]
 ALONE = {**PAPER, "model": "apex"}
 ROWS = (
     Row("apex", "apex"),
-    Row("apex-paper", "apex", {**PAPER, "guidance": True}, runs=20),
-    Row("apex-paper, unguided", "apex", PAPER, runs=20),
-    Row("apex's model alone", "apex", {**ALONE, "guidance": True}, runs=20),
-    Row("apex's model alone, unguided", "apex", ALONE, runs=20),
-    Row("rrt", "rrt", runs=20),
+    Row("apex-paper", "apex", {**PAPER, "guidance": True}),
+    Row("apex-paper, unguided", "apex", PAPER),
+    Row("apex's model alone", "apex", {**ALONE, "guidance": True}),
+    Row("apex's model alone, unguided", "apex", ALONE),
+    Row("rrt", "rrt"),
     Row("rrtconnect", "rrtconnect"),
 )
 PAIRS = (("apex-paper", "apex-paper, unguided"), ("apex's model alone", "apex's model alone, unguided"))
 COLOURS = ("#0b6e4f", "#3d5a80", "#98b6d8", "#7a5195", "#c9a6d6", "#c8553d", "#e0a458")
 FID_LEVELS = [f"{task}/{size}" for task in TASKS for size in SIZES]
-STEPS = 8  # of DDIM, for apex-paper, whose own 256 would take hours
 
 
 def runs(args: argparse.Namespace) -> Results:
-    """Return the runs of the planners on the paper's tasks."""
-    levels = [f"{task}/{size}" for task in TASKS for size in EDGES]
-    return bench(levels, ROWS, args.keep / "head_to_head", runs=args.n, timeout=TIMEOUT)
+    """Return the runs of the planners on the paper's tasks, each on the same problems."""
+    levels, labels = [f"{task}/{size}" for task in TASKS for size in EDGES], {row.label for row in ROWS}
+    folder, workers = args.keep / "head_to_head", Workers(args.jobs)
+    found = bench(levels, ROWS, folder, runs=args.n, timeout=TIMEOUT, workers=workers)
+    mine = [r for r in found.runs if r["experiment"] in levels and r["label"] in labels and r["seed"] < args.n]
+    return replace(found, runs=mine)
 
 
 def failure(args: argparse.Namespace) -> tuple[dict[str, Any], list[Table], Figure, list[tuple[str, Any]]]:
@@ -107,8 +95,8 @@ def failure(args: argparse.Namespace) -> tuple[dict[str, Any], list[Table], Figu
         axis.set_xticks([middle, middle + len(ROWS) + 1], TASKS)
     axes[2].set_yscale("log")
     picture.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=8)
-    head = ["task", "planner", "N", "R_f %", "95 %", "S_r rad (median)", "as found", "time s (median)"]
-    return found, [Table("Failure ratio, smoothness, time", head, rows)], picture, about(results)
+    head = ["task", "planner", "N", "R_f %", "95 %", "S_r rad (median of solved)", "as found", "time s (median of all)"]
+    return found, [Table("Failure ratio, smoothness, time", head, rows)], picture, said_of(results)
 
 
 def size(args: argparse.Namespace) -> tuple[dict[str, Any], list[Table], Figure, list[tuple[str, Any]]]:
@@ -139,65 +127,25 @@ def size(args: argparse.Namespace) -> tuple[dict[str, Any], list[Table], Figure,
     picture.axes[0].set_ylabel("R_f %")
     picture.axes[0].legend(fontsize=8)
     head = ["task", "planner", "edge m", "N", "R_f %", "95 %"]
-    return found, [Table("Failure ratio over the size of obstacles", head, rows)], picture, about(results)
+    return found, [Table("Failure ratio over the size of obstacles", head, rows)], picture, said_of(results)
 
 
-def solutions(folder: Path, count: int, workers: int) -> list[Paths]:
-    """Return solutions of validation problems, at least ``count`` where as many can be had, kept in a folder."""
-    units = {unit.name: unit for unit in plan_units(int(1.2 * count), FID_LEVELS, "validation")}
-    options, spline = Options(copies=1, parts=0), Spline()
-    store = Store.create(folder, {"problems": count, "levels": FID_LEVELS, **asdict(spline)}, ("problems", "levels"))
-    with store.locked():
-        there = set(store.units())
-        jobs = {name: (unit, options, spline) for name, unit in units.items() if name not in there}
-        if jobs:
-            made = spread(work, jobs, workers=workers, address=None)
-            for name, (paths, _) in tqdm(made, total=len(jobs), unit="unit"):
-                store.write(name, paths)
-        return list(store)
+def said_of(results: Results) -> list[tuple[str, Any]]:
+    """Return how the runs were made, and what a reader of times must know."""
+    return [*about(results), *(("Note", said) for said in warnings(results))]
 
 
 def fid(args: argparse.Namespace) -> tuple[dict[str, Any], list[Table], Figure, list[tuple[str, Any]]]:
     """Return distances of guided and unguided paths from solutions of the same problems."""
-    models = {name: load_model(name) for name in ("apex", "apex-paper")}
-    own = {"apex": models["apex"].sampling, "apex-paper": Sampling("ddim", STEPS)}
-    variants = {
-        f"{name}{'' if guided else ', unguided'}": (name, replace(own[name], guidance=Guidance(gamma=float(guided))))
-        for name in models
-        for guided in (True, False)
-    }
-    units = solutions(args.keep / "solutions", args.n, args.workers)
-    real, made = list[np.ndarray](), {label: list[np.ndarray]() for label in variants}
-    seconds, generator = dict.fromkeys(variants, 0.0), torch.Generator().manual_seed(0)
-    torch.set_num_threads(1)
-    with quiet_ompl(), torch.no_grad(), tqdm(total=args.n, unit="problem") as bar:
-        for paths, k in ((unit, k) for unit in units for k in first_of_each(unit)):
-            if len(real) == args.n:
-                break
-            control = paths.control(slice(k, k + 1))[0]
-            verdict = assemble(problems.load(paths.problem_name(int(paths.arrays["problem"][k]))), robot()).verdict
-            query = query_of(verdict, control[0], control[-1])
-            for label, (name, sampling) in variants.items():
-                begin = time.process_time()  # other work on the machine does not count
-                found = models[name].propose(query, verdict.kernel, 1, sampling=sampling, generator=generator)
-                seconds[label] += time.process_time() - begin
-                made[label].append(found.control[0])
-            real.append(control)
-            bar.update()
-    spaces = {"VAE": models["apex-paper"].network.autoencoder, "PCA": models["apex"].network.autoencoder}
-
-    def features(paths: Sequence[np.ndarray], space: Any) -> np.ndarray:
-        parts = np.array_split(np.stack(paths), max(1, len(paths) // 500))
-        with torch.no_grad():
-            return np.concatenate([space.encode(torch.tensor(p, dtype=torch.float32)).flatten(1) for p in parts])
-
+    units = realism.solutions(args.keep / "solutions", args.n, FID_LEVELS, args.jobs)
+    real, made, seconds = realism.made_for(units, args.n, args.jobs)
     found_all: dict[str, Any] = {}
     rows = []
     picture = Figure(figsize=(8, 4), layout="constrained")
-    for axis, (name, space) in zip(picture.subplots(1, 2), spaces.items(), strict=True):
-        truth = features(real, space)
+    for axis, (name, features) in zip(picture.subplots(1, 2), realism.feature_spaces().items(), strict=True):
+        truth = features(real)
         for k, (label, paths) in enumerate(made.items()):
-            r = metrics.realism(truth, features(paths, space))
+            r = metrics.realism(truth, features(paths))
             found_all[f"{name}, {label}"] = {**asdict(r), "seconds a path": seconds[label] / len(real)}
             ends = f"{r.interval[0]:.2f} to {r.interval[1]:.2f}"
             cells = [str(r.made), str(r.dimension), f"{r.fid:.2f}", ends, f"{r.floor:.2f}", f"{r.kid:.4f}"]
@@ -210,49 +158,47 @@ def fid(args: argparse.Namespace) -> tuple[dict[str, Any], list[Table], Figure, 
     head = ["features", "paths", "N", "d", "FID", "95 %", "floor", "KID", "CPU ms a path"]
     says = [
         ("Real", f"solutions of {len(real)} validation problems, one each, of {', '.join(FID_LEVELS)}"),
-        ("Made", f"one path for each of them; apex by its own sampling, apex-paper by {STEPS} steps of DDIM"),
-        ("Floor", "FID between two halves of the real set"),
+        ("Made", f"one path for each of them; apex by its own sampling, apex-paper by {realism.STEPS} steps of DDIM"),
+        ("Floor", "FID between two halves of the real set, of other problems each: larger than it would be for all"),
+        ("Made with", f"{hardware()}, {args.jobs} processes; {', '.join(f'{k} {v}' for k, v in versions().items())}"),
     ]
     return found_all, [Table("FID and KID", head, rows)], picture, says
 
 
-def first_of_each(paths: Paths) -> list[int]:
-    """Return the first path of each problem that is not a reversal."""
-    found: dict[int, int] = {}
-    for k, (problem, source) in enumerate(zip(paths.arrays["problem"], paths.arrays["source"], strict=True)):
-        if SOURCES[source] != "reversed":
-            found.setdefault(int(problem), k)
-    return list(found.values())
-
-
-FIGURES = {"failure": (failure, 50), "size": (size, 50), "fid": (fid, 10_000)}
+FIGURES = {"failure": (failure, 20), "size": (size, 20), "fid": (fid, 10_000)}
 
 
 def main() -> None:
     """Make a figure."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("figure", choices=FIGURES)
-    parser.add_argument("-n", type=int, help="problems of a level, or for fid in all (default: 50, 10000)")
-    parser.add_argument("--workers", type=int, default=2, help="for the solutions of fid (default: %(default)s)")
+    parser.add_argument("-n", type=int, help="problems of a level, or for fid in all (default: 20, 10000)")
+    parser.add_argument("--jobs", type=int, default=1, help="runs at a time (default: one, as they are timed)")
     parser.add_argument("--keep", type=Path, default=ROOT / "benchmarks" / "runs", metavar="FOLDER", help="for runs")
     parser.add_argument("-o", "--out", type=Path, default=ROOT / "benchmarks" / "results", metavar="FOLDER")
     args = parser.parse_args()
     make, usual = FIGURES[args.figure]
     args.n = usual if args.n is None else args.n
     try:
-        if args.n < 4 or args.workers < 1:
-            parser.error("-n is 4 or more, --workers 1 or more")
+        if args.n < 4 or args.jobs < 1:
+            parser.error("-n is 4 or more, --jobs 1 or more")
         make_folder(args.keep)
+        make_folder(args.out)
         found, tables, picture, says = make(args)
         name = f"paper_{args.figure}"
         text = [f"# {name}", f"`python scripts/reproduce.py {args.figure} -n {args.n}`"]
         text += [*(table.markdown() for table in tables), "\n".join(f"- {key}: {value}" for key, value in says)]
         write_atomically(args.out / f"{name}.json", (json.dumps({"about": says, **found}, indent=1) + "\n").encode())
         write_atomically(args.out / f"{name}.md", ("\n\n".join(text) + "\n").encode())
-        picture.savefig(args.out / f"{name}.png", dpi=120)
+        drawn = io.BytesIO()
+        picture.savefig(drawn, format="png", dpi=120)
+        write_atomically(args.out / f"{name}.png", drawn.getvalue())
     except ApexError as error:
         print(f"reproduce: error: {error}", file=sys.stderr)
         sys.exit(2)
+    except KeyboardInterrupt:
+        print("reproduce: stopped; the same command goes on from there", file=sys.stderr)
+        sys.exit(130)
     print("\n\n".join(table.markdown() for table in tables))
 
 

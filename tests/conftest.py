@@ -13,10 +13,11 @@ from planning import HARD, at_hand
 from support import ROOT
 
 from apex_ompl.assembly import PlanningSetup, assemble
+from apex_ompl.bodies import Obstacle
 from apex_ompl.collision import Verdict
 from apex_ompl.dataset import load, save
 from apex_ompl.ompl_globals import quiet_ompl
-from apex_ompl.problem import Goal, Obstacle, Problem
+from apex_ompl.problem import Goal, Problem
 from apex_ompl.problems import reach
 from apex_ompl.records import Paths
 from apex_ompl.robot import Robot, load_robot

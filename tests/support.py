@@ -10,6 +10,28 @@ from apex_ompl.robot import Robot
 
 ROOT = Path(__file__).resolve().parent.parent
 
+CUBE_OBJ = """v 0 0 0
+v 1 0 0
+v 1 1 0
+v 0 1 0
+v 0 0 1
+v 1 0 1
+v 1 1 1
+v 0 1 1
+f 1 3 2
+f 1 4 3
+f 5 6 7
+f 5 7 8
+f 1 2 6
+f 1 6 5
+f 2 3 7
+f 2 7 6
+f 3 4 8
+f 3 8 7
+f 4 1 5
+f 4 5 8
+"""
+
 
 def states_around_home(robot: Robot, rng: np.random.Generator, count: int, spread: float = 0.4) -> np.ndarray:
     states = robot.home + rng.normal(0.0, spread, (count, robot.dof))

@@ -16,10 +16,11 @@ from support import ROOT
 import apex_ompl
 from apex_ompl import plan, planners
 from apex_ompl.assembly import PlanningSetup, assemble
+from apex_ompl.bodies import Obstacle
 from apex_ompl.errors import ApexError, MissingFileError, ParameterError, UnknownNameError
 from apex_ompl.planners import APEX
 from apex_ompl.planners.apex_parameters import ApexParameters
-from apex_ompl.problem import Obstacle, Problem
+from apex_ompl.problem import Problem
 from apex_ompl.problems.reach import robot
 from apex_ompl.result import PlanStatus
 from apex_ompl.space import state_space, to_state

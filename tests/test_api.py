@@ -17,10 +17,11 @@ from support import ROOT
 import apex_ompl
 from apex_ompl import PlanResult, PlanStatus, load_problem, plan, planners, planning
 from apex_ompl.assembly import assemble
+from apex_ompl.bodies import Obstacle
 from apex_ompl.collision import Verdict
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError, UnknownNameError
 from apex_ompl.ompl_globals import seed_ompl
-from apex_ompl.problem import Goal, Obstacle, Problem
+from apex_ompl.problem import Goal, Problem
 from apex_ompl.repair import repair
 from apex_ompl.robot import Robot, load_robot
 from apex_ompl.space import path_length, path_to_array, resample

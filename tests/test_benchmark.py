@@ -15,8 +15,8 @@ import pytest
 from ompl import tools as ot
 
 from apex_ompl import benchmark, problems
-from apex_ompl.benchmark import Results, Row, Workers, bench, runs
-from apex_ompl.benchmark.rows import Job, experiments, jobs
+from apex_ompl.benchmark import Results, Row, Workers, bench, workers
+from apex_ompl.benchmark.rows import experiments, jobs
 from apex_ompl.benchmark.summary import Figures, figures
 from apex_ompl.cli import main
 from apex_ompl.errors import ApexError, FileFormatError, MissingFileError, ParameterError, UnknownNameError
@@ -144,6 +144,25 @@ def test_what_is_there_is_not_run_again_and_broken_lines_are(results: Results, t
     assert time.perf_counter() - begin < 2.0, "nothing was left to run, and no process started"
 
 
+def test_a_last_line_that_is_whole_is_kept(results: Results, tmp_path: Path) -> None:
+    lines = (results.folder / "runs.jsonl").read_text().splitlines()
+    (tmp_path / "runs.jsonl").write_text("\n".join(lines[:-1]))
+    (tmp_path / "about.json").write_text((results.folder / "about.json").read_text())
+    again = bench([LEVEL], ROWS, tmp_path, runs=RUNS, timeout=10.0, split="validation", quiet=True)
+    assert outcome(again) == outcome(results)
+    kept = (tmp_path / "runs.jsonl").read_text().splitlines()
+    assert kept[:-1] == lines[:-1] and len(kept) == len(lines)
+
+
+def test_processes_are_renewed(results: Results, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    begun = []
+    monkeypatch.setattr(workers, "RENEWED", 2)
+    pool = Workers._pool
+    monkeypatch.setattr(Workers, "_pool", lambda self, *given: (begun.append(given[1]), pool(self, *given))[1])
+    found = bench([LEVEL], ROWS[1:], tmp_path, runs=RUNS, timeout=10.0, split="validation", quiet=True)
+    assert begun == [1, 1] and outcome(found) == [one for one in outcome(results) if one[1] == ROWS[1]]
+
+
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
 def test_a_stopped_command_goes_on(results: Results, tmp_path: Path, how: signal.Signals) -> None:
     folder, file = tmp_path / "stopped", tmp_path / "stopped" / "runs.jsonl"
@@ -173,28 +192,6 @@ def test_a_stopped_command_goes_on(results: Results, tmp_path: Path, how: signal
         assert outcome(found) == [one for one in outcome(results) if one[1] == ROWS[1]]
 
 
-def test_success_is_the_full_check_and_a_dead_process_is_a_crash(tmp_path: Path) -> None:
-    workers = Workers(modules=("bad_planners",))
-    rows = [Row("cheat", "cheat", runs=1), Row("dies", "dies", {"on": 1}, runs=1), Row("shaky", "dies", {"on": 2})]
-    rows.append(Row("rrtconnect", "rrtconnect", runs=1))
-    found = bench(["wall/hard"], rows, tmp_path, runs=2, timeout=0.3, split="validation", workers=workers, quiet=True)
-    by = {
-        label: [run for run in found.runs if run["label"] == label]
-        for label in ("cheat", "dies", "shaky", "rrtconnect")
-    }
-    for run in by["cheat"]:
-        assert not run["solved"] and run["properties"]["solved BOOLEAN"] == "1" and "full check" in run["reason"]
-    assert [run["reason"] for run in by["dies"]] == ["the process died"] and len(by["rrtconnect"]) == 1
-    assert [run["status"] for run in by["dies"]] == ["CRASH"]
-    assert [run["status"] for run in by["shaky"]] == ["TIMEOUT"] * 2, "it is tried again in a process of its own"
-    database = sqlite3.connect(benchmark.write_database(found, benchmark.write_logs(found)))
-    solved = "SELECT sum(solved) FROM runs JOIN plannerConfigs p ON p.id = plannerid WHERE p.name = 'cheat'"
-    assert database.execute(solved).fetchone() == (0,)
-    assert "Crashed: 1 x dies: the process died." in benchmark.markdown(found)
-    with pytest.raises(ParameterError, match="planners that do not end the process"):
-        bench(["wall/hard"], [Row("dies", "dies", {"on": 0})], tmp_path / "x", workers=workers, quiet=True)
-
-
 def made_up(firsts: list[float | None], timeout: float = 2.0) -> Figures:
     made = [
         {"solved": t is not None, "first": t, "total": None if t is None else t + 0.1, "by": "apex", "timeout": timeout,
@@ -202,13 +199,6 @@ def made_up(firsts: list[float | None], timeout: float = 2.0) -> Figures:
         for t in firsts
     ]  # fmt: skip
     return Figures("a/b", "apex", made)
-
-
-def test_first_paths_of_planners_that_use_all_their_time_are_noticed() -> None:
-    for name in ("aorrtc", "informedrrtstar"):
-        found = runs.run(Job("x", "wall/easy/800000", name, name, {}, 0, 3.0, True))
-        assert found["solved"] and found["raw_length"] is None
-        assert 0.0 < found["first"] < 0.5 * found["total"], name
 
 
 def test_figures_count_what_is_not_solved_as_endless() -> None:
@@ -233,6 +223,15 @@ def test_work_of_others_beside_runs_is_said(results: Results) -> None:
     for load, said in ((1.4, False), (1.6, True)):
         loaded = Results(results.folder, results.about, [{**run, "load": load} for run in results.runs])
         assert ("Other processes were at work beside 6 of 6 runs" in benchmark.markdown(loaded)) is said
+
+
+def test_planners_that_end_early_are_said(results: Results) -> None:
+    said = "aorrtc found no path in 5 s (OMPL says INVALID_GOAL)"
+    made = [{**run, "solved": False, "reason": said} for run in results.runs[:2]]
+    text = benchmark.markdown(Results(results.folder, results.about, made))
+    assert "Ended early, unsolved: " in text
+    for label in {run["label"] for run in made}:
+        assert f"{sum(run['label'] == label for run in made)} x {label}, INVALID_GOAL" in text
 
 
 def test_runs_at_the_same_time_are_said(results: Results, tmp_path: Path) -> None:
@@ -270,6 +269,8 @@ def test_faulty_results_are_named(results: Results, tmp_path: Path) -> None:
     options: dict = {"timeout": 10.0, "split": "validation", "quiet": True}
     with pytest.raises(ParameterError, match="the parameters that it has in"):
         bench([LEVEL], [Row("rrtconnect", "rrtconnect", {"range": 1.0})], tmp_path, **options)
+    with pytest.raises(ParameterError, match="the parameters that it has in"):
+        bench([LEVEL], [Row("rrtconnect", "rrtconnect", timeout=1.0)], tmp_path, **options)
     with pytest.raises(FileFormatError, match="one run or more"):
         benchmark.report(tmp_path, tmp_path / "out")
     (tmp_path / "runs.jsonl").write_text("nonsense\n{}\n")

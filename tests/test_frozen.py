@@ -13,10 +13,10 @@ import pytest
 from support import ROOT
 
 from apex_ompl import problems
+from apex_ompl.bodies import Obstacle
 from apex_ompl.collision import Verdict
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError, UnknownNameError
 from apex_ompl.moving import timed_check
-from apex_ompl.problem import Obstacle
 from apex_ompl.problems import frozen
 from apex_ompl.problems.catalogue import ProblemId
 from apex_ompl.robot import Robot

@@ -8,11 +8,12 @@ from scipy.spatial.transform import Rotation
 
 from apex_ompl import PlanStatus, load_problem, plan
 from apex_ompl.assembly import assemble
+from apex_ompl.bodies import AttachedObject, ContactFace
 from apex_ompl.collision import Verdict
 from apex_ompl.errors import ApexError, FileFormatError, UnknownNameError
 from apex_ompl.goals import AlignmentGoal, alignment_goal, angle
 from apex_ompl.ik import Links
-from apex_ompl.problem import Alignment, AttachedObject, ContactFace, Goal, Tolerance, WorldVector
+from apex_ompl.problem import Alignment, Goal, Tolerance, WorldVector
 from apex_ompl.robot import Robot
 
 KINDS = ("vertical", "horizontal", "pour", "handover")
@@ -140,7 +141,7 @@ def test_unreachable_says_so_with_the_best_error(robot: Robot) -> None:
 
 
 def test_aligned_states_that_all_collide_say_with_what(robot: Robot) -> None:
-    from apex_ompl.problem import Obstacle
+    from apex_ompl.bodies import Obstacle
 
     wall = Obstacle(name="wall", box=(3.0, 0.6, 3.0), position=(0.0, 0.0, 0.0))
     found = goal_of(robot, "horizontal").sample(Verdict(robot, [wall]), np.random.default_rng(0), max_attempts=5)

@@ -3,10 +3,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from apex_ompl.bodies import AttachedObject
 from apex_ompl.collision import Verdict
 from apex_ompl.errors import SceneError, UnknownNameError
 from apex_ompl.grasp import grasp
-from apex_ompl.problem import AttachedObject
 from apex_ompl.robot import Robot
 
 ALONG_X = (0.0, np.sqrt(0.5), 0.0, np.sqrt(0.5))

@@ -6,8 +6,6 @@ import subprocess
 import sys
 import threading
 from pathlib import Path
-from types import SimpleNamespace
-from unittest import mock
 
 import coal
 import numpy as np
@@ -15,17 +13,17 @@ import pinocchio as pin
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from random_robots import frames, pose, random_robot, unit
 from support import ROOT, states_around_home
 
+from apex_ompl.bodies import Obstacle
 from apex_ompl.collision import Verdict
-from apex_ompl.collision.tabulate import joint_specs, primitives
-from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError, UnknownNameError
-from apex_ompl.kernel import build, entries, views
+from apex_ompl.collision.tabulate import primitives
+from apex_ompl.errors import ParameterError
+from apex_ompl.kernel import build, entries
 from apex_ompl.kernel.face import Kernel
 from apex_ompl.kernel.scene import scene_tables
-from apex_ompl.kernel.tables import FIXED, PRISMATIC, REVOLUTE, RobotTables
-from apex_ompl.kernel.views import robot_view, scene_view
-from apex_ompl.problem import Obstacle
+from apex_ompl.kernel.tables import PRISMATIC, RobotTables
 from apex_ompl.robot import Robot
 
 SHAPES = {
@@ -35,62 +33,6 @@ SHAPES = {
     "capsule": lambda r: coal.Capsule(r.uniform(0.03, 0.2), r.uniform(0.05, 0.6)),
     "half-space": lambda r: coal.Halfspace(unit(r), r.uniform(-0.3, 0.3)),
 }
-
-
-def unit(rng: np.random.Generator) -> np.ndarray:
-    v = rng.normal(size=3)
-    return v / np.linalg.norm(v)
-
-
-def pose(rng: np.random.Generator, spread: float = 0.5) -> np.ndarray:
-    at = np.eye(4)
-    at[:3, :3] = pin.exp3(unit(rng) * rng.uniform(0.0, np.pi))
-    at[:3, 3] = rng.normal(0.0, spread, 3)
-    return at
-
-
-def balls(rng: np.random.Generator, leaves: int) -> dict[str, np.ndarray]:
-    """A root around some leaves, as a cover has them."""
-    centres, radii = rng.normal(0.0, 0.05, (leaves, 3)), rng.uniform(0.01, 0.06, leaves)
-    root = float((np.linalg.norm(centres, axis=1) + radii).max())
-    return {
-        "centres": np.concatenate([np.zeros((1, 3)), centres]), "radii": np.array([root, *radii]),
-        "first": np.array([1] + [0] * leaves), "count": np.array([leaves] + [0] * leaves),
-    }  # fmt: skip
-
-
-def random_robot(seed: int, joints: int = 9, dof: int = 4) -> tuple[RobotTables, list, list, list]:
-    """A random tree of revolute, prismatic, fixed and mimic joints with a body on each, and the parts it is of."""
-    rng = np.random.default_rng(seed)
-    specs = [build.JointSpec(0)]
-    for k in range(1, joints):
-        kind = int(rng.choice([REVOLUTE, REVOLUTE, PRISMATIC, FIXED]))
-        specs.append(
-            build.JointSpec(
-                int(rng.integers(0, k)), kind, pose(rng, 0.2), unit(rng), -1 if kind == FIXED else k % dof,
-                float(rng.uniform(-1.5, 1.5)), float(rng.normal(0.0, 0.3)),
-            )
-        )  # fmt: skip
-    bodies = [build.BodySpec(f"b{k}", k, pose(rng, 0.05), **balls(rng, 3)) for k in range(joints)]
-    pairs = [(a, b) for a in range(joints) for b in range(a) if rng.random() < 0.5]
-    names = [f"q{k}" for k in range(dof)]
-    box = np.ones(dof)
-    tables = build.robot_tables("tree", names, lower=-box, upper=box, joints=specs, bodies=bodies, pairs=pairs)
-    return tables, specs, bodies, pairs
-
-
-def frames(specs: list, q: np.ndarray) -> list[np.ndarray]:
-    """Forward kinematics from the book: placement, then rotation about or translation along the axis."""
-    found = [np.eye(4)]
-    for joint in specs[1:]:
-        motion = np.eye(4)
-        value = joint.ratio * q[joint.source] + joint.shift
-        if joint.kind == REVOLUTE:
-            motion[:3, :3] = pin.exp3(joint.axis * value)
-        elif joint.kind == PRISMATIC:
-            motion[:3, 3] = joint.axis * value
-        found.append(found[joint.parent] @ joint.placement @ motion)
-    return found
 
 
 def leaves_at(specs: list, bodies: list, q: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -232,86 +174,6 @@ def test_frames_and_gradients_of_real_robots(which: str, request: pytest.Fixture
     check_gradients(kernel, states)
 
 
-def test_tables_are_saved_and_loaded_without_pinocchio(robot: Robot, post: Obstacle, tmp_path: Path) -> None:
-    kernel = Verdict(robot, [post]).kernel
-    states = states_around_home(robot, np.random.default_rng(1), 5)
-    kernel.robot.save(tmp_path / "robot.npz")
-    np.save(tmp_path / "states.npy", states)
-    code = f"""
-import sys, numpy as np
-for name in ("pinocchio", "coal", "ompl"):
-    sys.modules[name] = None
-from apex_ompl.kernel.face import Kernel
-from apex_ompl.kernel.scene import Primitive, scene_tables
-from apex_ompl.kernel.tables import BOX, RobotTables
-at = np.eye(4)
-at[:3, 3] = {list(post.position)}
-box = Primitive(BOX, at, {tuple(e / 2 for e in post.box)})
-kernel = Kernel(RobotTables.load({str(tmp_path / "robot.npz")!r}), scene_tables([(0, box)]))
-np.save({str(tmp_path / "values.npy")!r}, kernel.clearance(np.load({str(tmp_path / "states.npy")!r})))
-"""
-    subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT, timeout=120)
-    alone = Kernel(kernel.robot, scene_tables([(0, p) for p in primitives(coal.Box(*post.box), post.pose)]))
-    assert np.array_equal(np.load(tmp_path / "values.npy"), alone.clearance(states))
-
-
-def test_faulty_tables_are_refused(tmp_path: Path) -> None:
-    tables, *_ = random_robot(0)
-    tables.save(tmp_path / "good.npz")
-    assert RobotTables.load(tmp_path / "good.npz").body_names == tables.body_names
-    with pytest.raises(MissingFileError, match="no.npz"):
-        RobotTables.load(tmp_path / "no.npz")
-    (tmp_path / "text.npz").write_text("hello")
-    with pytest.raises(FileFormatError, match=r"text.npz.*kernel tables"):
-        RobotTables.load(tmp_path / "text.npz")
-    (tmp_path / "short.npz").write_bytes((tmp_path / "good.npz").read_bytes()[:-400])
-    with pytest.raises(FileFormatError, match="short.npz"):
-        RobotTables.load(tmp_path / "short.npz")
-    for name, wrong in {
-        "joint_parent": tables.arrays.joint_parent + 7, "bodies": tables.arrays.bodies + 90,
-        "node_radius": tables.arrays.node_radius * np.nan, "node_first": tables.arrays.node_first * 0,
-        "pair_bodies": tables.arrays.pair_bodies + 50, "lower": tables.arrays.lower[:-1],
-        "node_count": -tables.arrays.node_count, "node_outer": -tables.arrays.node_outer,
-        "joint_source": np.full_like(tables.arrays.joint_source, -1), "eager": tables.arrays.eager[::-1].copy(),
-        "pair_common": np.full_like(tables.arrays.pair_common, len(tables.arrays.joint_parent) - 1),
-    }.items():  # fmt: skip
-        bad = RobotTables("bad", tables.joint_names, tables.body_names, tables.numbers,
-                          tables.arrays._replace(**{name: wrong}))  # fmt: skip
-        bad.save(tmp_path / "bad.npz")
-        with pytest.raises(FileFormatError, match=name):
-            RobotTables.load(tmp_path / "bad.npz")
-
-
-def test_damaged_tables_are_faults_and_no_crash(tmp_path: Path) -> None:
-    tables, *_ = random_robot(1)
-    tables.save(tmp_path / "good.npz")
-    good, rng = (tmp_path / "good.npz").read_bytes(), np.random.default_rng(0)
-    kernel = Kernel(tables, scene_tables([]))
-    expected = kernel.clearance(np.zeros(tables.dof))
-    for _ in range(200):
-        bad = bytearray(good)
-        for place in rng.integers(0, len(bad), 3):
-            bad[place] = rng.integers(0, 256)
-        (tmp_path / "bad.npz").write_bytes(bad)
-        try:
-            loaded = RobotTables.load(tmp_path / "bad.npz")
-        except FileFormatError:
-            continue
-        assert np.array_equal(Kernel(loaded, scene_tables([])).clearance(np.zeros(tables.dof)), expected)
-    np.save(tmp_path / "plain.npy", np.zeros(3))
-    with pytest.raises(FileFormatError, match="kernel tables"):
-        RobotTables.load(tmp_path / "plain.npy")
-
-
-def test_arrays_come_out_of_a_pack_as_they_went_in(robot: Robot, post: Obstacle) -> None:
-    kernel = Verdict(robot, [post]).kernel
-    for tables, view in ((kernel.robot, robot_view), (kernel.scene, scene_view)):
-        with mock.patch.multiple(views, _ints=views._ints.py_func, _floats=views._floats.py_func):
-            seen = view.py_func(*tables.packed)
-        for name, array in tables.arrays._asdict().items():
-            assert np.array_equal(getattr(seen, name), array), name
-
-
 def test_read_only_arrays_are_not_compiled_for_anew(robot: Robot) -> None:
     verdict = Verdict(robot)
     verdict.prepare()
@@ -342,26 +204,6 @@ def test_clearance_of_what_is_no_number_is_none(robot: Robot) -> None:
         assert np.isnan(kernel.clearance(q)).all()
     values, slopes = kernel.clearance_gradient(np.stack([robot.home, robot.home + 2.0]))
     assert np.isfinite(values[0]).all() and np.isfinite(slopes[0]).all() and np.isnan(slopes[1]).all()
-
-
-@pytest.mark.parametrize("ratio", [0.3, -1.57, 6.3, 10.0, -25.0, 40.0])
-@pytest.mark.parametrize("driver", ["revolute", "prismatic"])
-def test_mimic_ratios_are_read_as_they_are(ratio: float, driver: str) -> None:
-    limit = '<limit lower="-2" upper="2" velocity="1" effort="1"/>'
-    urdf = f"""<robot name="g">
-      <link name="a"/><link name="b"/><link name="c"/>
-      <joint name="slide" type="{driver}"><parent link="a"/><child link="b"/><axis xyz="0 0 1"/>{limit}</joint>
-      <joint name="turn" type="revolute"><parent link="b"/><child link="c"/><origin xyz="0.1 0 0" rpy="0.3 0.2 0.1"/>
-        <axis xyz="0 0.6 0.8"/>{limit}<mimic joint="slide" multiplier="{ratio}" offset="0.2"/></joint></robot>"""
-    model = pin.buildModelFromXML(urdf, mimic=True)
-    limits = SimpleNamespace(lower=np.array([-2.0]), upper=np.array([2.0]))
-    robot = SimpleNamespace(model=model, dof=1, limits=limits, to_pinocchio=lambda q: np.asarray(q, float))
-    specs = joint_specs(robot)  # type: ignore[arg-type]
-    assert specs[2].ratio == pytest.approx(abs(ratio), rel=1e-9)
-    data = model.createData()
-    for value in (-2.0, -0.7, 0.0, 0.3, 1.9):
-        pin.forwardKinematics(model, data, np.array([value]))
-        assert frames(specs, np.array([value]))[2] == pytest.approx(data.oMi[2].homogeneous, abs=1e-8)
 
 
 def test_states_of_another_shape_are_refused(robot: Robot) -> None:
@@ -435,56 +277,3 @@ def test_code_is_kept_where_it_can_be(tmp_path: Path, writable: bool) -> None:
         assert str(home) in first.stdout and "compiles" not in second.stderr
     else:
         assert first.stdout.strip() == "None" and "no cache folder" in first.stderr and "compiles" in second.stderr
-
-
-@settings(max_examples=60)
-@given(seed=st.integers(0, 2**32 - 1))
-def test_tables_for_one_side_judge_that_side_alone(robot: Robot, seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    ball = Obstacle(name="ball", sphere={"radius": 0.1}, position=tuple(rng.uniform([0.2, -0.6, 0.1], [0.7, 0.6, 0.8])))
-    whole = Verdict(robot, [ball]).kernel
-    sides = [[k for k, name in enumerate(robot.joint_names) if name.startswith(side)] for side in ("left", "right")]
-    kernels = [Kernel(whole.robot.judging(joints), whole.scene) for joints in sides]
-    q, other = states_around_home(robot, rng, 2)
-    everything, parts = whole.clearance(q)[0], [kernel.clearance(q)[0] for kernel in kernels]
-    assert everything[0] == min(parts[0][0], parts[1][0])  # all that moves is moved by one side or the other
-    assert everything[1] <= min(parts[0][1], parts[1][1])
-    for joints, kernel, part in zip(reversed(sides), kernels, parts, strict=True):
-        mixed = q.copy()
-        mixed[joints] = other[joints]  # the other side does not count
-        assert np.array_equal(kernel.clearance(mixed)[0], part)
-
-
-def test_pairs_between_the_sides_are_left_to_the_whole(robot: Robot) -> None:
-    whole = Verdict(robot).kernel
-    sides = [[k for k, name in enumerate(robot.joint_names) if name.startswith(side)] for side in ("left", "right")]
-    kernels = [Kernel(whole.robot.judging(joints), whole.scene) for joints in sides]
-    q = robot.home.copy()
-    q[[0, 1, 7, 8]] = -1.2, 0.3, 1.2, 0.3  # the hands meet in the middle
-    assert whole.clearance(q)[0, 1] < 0.0 < min(kernel.clearance(q)[0, 1] for kernel in kernels)
-
-
-def test_a_pair_can_be_left_out(robot: Robot) -> None:
-    whole = Verdict(robot).kernel
-    q = robot.home.copy()
-    q[[0, 1, 7, 8]] = -1.5, 0.3, 1.5, 0.3
-    found, counts = whole.unproved(q)
-    assert counts[0] == 1 and whole.clearance(q)[0, 1] < 0.0
-    a, b = (whole.robot.body_names[k] for k in found[0, 0])
-    smaller = Kernel(whole.robot.without_pair(b, a), whole.scene)
-    assert smaller.unproved(q)[1][0] == 0 and smaller.clearance(q)[0, 1] > 0.0
-    for other in states_around_home(robot, np.random.default_rng(5), 50):  # elsewhere nothing changes
-        assert np.array_equal(smaller.clearance(other), whole.clearance(other))
-    right = [k for k, name in enumerate(robot.joint_names) if name.startswith("right")]
-    one, other_order = whole.robot.judging(right).without_pair(a, b), whole.robot.without_pair(a, b).judging(right)
-    for state in states_around_home(robot, np.random.default_rng(6), 50, 1.0):
-        values = [
-            Kernel(tables, whole.scene).clearance(state) for tables in (one, other_order, whole.robot.judging(right))
-        ]
-        assert np.array_equal(values[0], values[1]) and np.array_equal(
-            values[0], values[2]
-        )  # the pair is not of one side
-    with pytest.raises(UnknownNameError, match="body"):
-        whole.robot.without_pair("no_such_body", a)
-    with pytest.raises(ParameterError, match="joints"):
-        whole.robot.judging([99])

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from random_robots import random_robot
 from support import states_around_home
-from test_kernel import random_robot
 
 from apex_ompl.collision import Verdict
 from apex_ompl.kernel.kinematics import bound_motion, cluster_sway, pair_sway, place_joint, place_robot

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from moveit_files import REQUEST, SCENE
 from scipy.spatial.transform import Rotation
-from test_verdict import CUBE_OBJ
+from support import CUBE_OBJ
 
 from apex_ompl.errors import ApexError, FileFormatError
 from apex_ompl.moveit import Conversion, convert

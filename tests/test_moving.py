@@ -7,10 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from apex_ompl.bodies import Obstacle
 from apex_ompl.collision import Verdict
 from apex_ompl.errors import ParameterError
 from apex_ompl.moving import at_time, even_times, grown, timed_check
-from apex_ompl.problem import Goal, Obstacle, Problem
+from apex_ompl.problem import Goal, Problem
 from apex_ompl.robot import Robot
 
 SHAPES = [

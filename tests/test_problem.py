@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from apex_ompl import errors, load_problem, problems
+from apex_ompl.bodies import AttachedObject, MeshFile, Obstacle, pose_matrix
 from apex_ompl.errors import ApexError, FileFormatError, MissingFileError, UnknownNameError
-from apex_ompl.problem import AttachedObject, Goal, MeshFile, Obstacle, Problem, pose_matrix
+from apex_ompl.problem import Goal, Problem
 from apex_ompl.robot import Robot
 from apex_ompl.schema import parse_yaml
 

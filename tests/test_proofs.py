@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from support import states_around_home
 
+from apex_ompl.bodies import AttachedObject, MeshFile, Obstacle
 from apex_ompl.collision import Verdict
 from apex_ompl.collision.sweep import sample_path
 from apex_ompl.errors import ParameterError
-from apex_ompl.problem import AttachedObject, MeshFile, Obstacle
 from apex_ompl.resolution import FULL_RESOLUTION
 from apex_ompl.robot import Robot
 from apex_ompl.validity import full_check

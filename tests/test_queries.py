@@ -8,10 +8,10 @@ import torch
 
 from apex_ompl import load_problem
 from apex_ompl.assembly import assemble
+from apex_ompl.bodies import HalfSpace, Obstacle
 from apex_ompl.collision import Verdict
 from apex_ompl.diffusion.conditions import Things, distances
 from apex_ompl.generation import row_of
-from apex_ompl.problem import HalfSpace, Obstacle
 from apex_ompl.problems.reach import robot
 from apex_ompl.queries import query_of
 

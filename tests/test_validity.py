@@ -154,7 +154,7 @@ def test_full_check_accepts_a_free_path_and_names_each_fault(robot: Robot, verdi
 
 def test_full_check_sees_what_the_search_resolution_steps_over(robot: Robot) -> None:
     """A speck that a finger passes within one coarse step: free at both ends, colliding between."""
-    from apex_ompl.problem import Obstacle
+    from apex_ompl.bodies import Obstacle
 
     a = robot.home.copy()
     a[[0, 1, 3]] = 0.1, 0.4, -1.6  # stretched forward

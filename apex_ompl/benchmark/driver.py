@@ -76,7 +76,7 @@ def bench(
         if not left:
             return before
         about["sessions"] = [*about["sessions"], _session(workers, split=split, seed=seed)]
-        results = Results(folder, about)
+        results = Results(folder, about, before.runs)
         results.note()
         try:
             _complete(results, left, len(wanted), workers, quiet)
@@ -109,7 +109,7 @@ def _about(
             raise ParameterError(name, value, f"{there!r}, as in {folder}; or another folder")
     known = {**before.get("rows", {})}
     for row in rows:
-        now = {"planner": row.planner, "all": row.settings()}
+        now = {"planner": row.planner, "all": row.settings(), "timeout": row.timeout}
         if known.setdefault(row.label, now) != now:
             raise ParameterError("planner", row.label, f"the parameters that it has in {folder}; or another folder")
     return {
@@ -122,8 +122,7 @@ def _complete(results: Results, left: Sequence[Job], of: int, workers: Workers, 
     """Make the runs that are left, and write each as it ends."""
     file = results.folder / RUNS
     if file.is_file() and not file.read_bytes().endswith(b"\n"):  # the process ended while it wrote
-        whole, end, _ = file.read_bytes().rpartition(b"\n")
-        write_atomically(file, whole + end)
+        write_atomically(file, "".join(json.dumps(one) + "\n" for one in results.runs).encode())
     solved = 0
     with file.open("a") as out, tqdm(total=of, initial=of - len(left), unit="run", disable=quiet) as bar:
         for done, one in enumerate(workers.made(left, results.about["warm_up"]), 1):

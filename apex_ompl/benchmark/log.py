@@ -89,6 +89,7 @@ def _planner(results: Results, label: str, runs: list[Run]) -> ot.PlannerExperim
     made.name = label
     own = results.about["rows"].get(label, {}).get("all", {})
     theirs: dict[str, str] = next((one["common"] for one in runs if one["common"]), {})
+    own = own | {"timeout": max(one["timeout"] for one in runs)}
     made.common = _properties({**{name: _line(str(value)) for name, value in own.items()}, **theirs})
     made.runs = [_properties(properties(one)) for one in sorted(runs, key=lambda one: int(one["seed"]))]
     return made

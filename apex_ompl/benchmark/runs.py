@@ -6,7 +6,7 @@ import importlib
 import math
 import os
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
@@ -29,6 +29,7 @@ from apex_ompl.result import FIRST, PlanResult, PlanStatus
 from apex_ompl.robot import Robot, load_robot
 from apex_ompl.space import path_length
 from apex_ompl.torch_threads import one_torch_thread
+from apex_ompl.validity import full_check
 
 if TYPE_CHECKING:
     from apex_ompl.planners import Parameters
@@ -81,13 +82,16 @@ class Benchmarked(Planning):
             judged.append(tally.states)
             reports.append(getattr(planner, "report", None))
 
-        noticed = self._notice_first() if parameters.optimizing else list[float]()
+        noticed, check = list[float](), self.ready.motions.check
+        if parameters.optimizing:
+            self.ready.motions.check = self._noticing(noticed)
         experiment = ot.Benchmark(self.ready.simple_setup, "run")
         experiment.addPlanner(planner)
         experiment.setPreRunEvent(begin)
         experiment.setPostRunEvent(end)
         request = ot.Request(solving_time(parameters, timeout), MEMORY, 1, UPDATES, False, False, False)
         experiment.benchmark(request)
+        self.ready.motions.check = check  # or it and OMPL's objects would keep each other, and all that was planned
         self.raise_faults()
         self.beside = judged[1] - judged[0] + tally.states - judged[2]
         if reports[0] is not None:
@@ -101,9 +105,21 @@ class Benchmarked(Planning):
             self.times[FIRST] = min(noticed)
         return PlanStatus(ob.PlannerStatus.PlannerStatusType(int(self.properties["status ENUM"])).name)
 
-    def _notice_first(self) -> list[float]:
-        """Let the first motion that is checked when there is a path note the time since the first motion [s]."""
-        noticed = list[float]()
+    def proof_of_first(self) -> float:
+        """Return how long it takes to prove the first path, or what comes of it in the end [s].
+
+        The shortened path may need a repair where the path as it was found does not. Of planners that use all their
+        time the first path is not known: the proof of the last one stands for its proof.
+        """
+        proof = {stage: self.times.get(stage, 0.0) for stage in PROOF}
+        if "repair" not in self.times or self.optimizing or self.raw is None:
+            return proof["verify"]
+        begin = time.perf_counter()
+        check = full_check(self.ready.verdict, self._with_exact_ends(self.raw), self.ready.start, self.ready.goals)
+        return time.perf_counter() - begin if check else sum(proof.values())
+
+    def _noticing(self, noticed: list[float]) -> Callable[[NDArray[np.float64], NDArray[np.float64]], bool]:
+        """Return a check whose first call when there is a path notes the time since the first call [s]."""
         check, definition = self.ready.motions.check, self.ready.simple_setup.getProblemDefinition()
         begin = 0.0
 
@@ -114,8 +130,7 @@ class Benchmarked(Planning):
                 noticed.append(time.perf_counter() - begin)
             return check(first, second)
 
-        self.ready.motions.check = watched
-        return noticed
+        return watched
 
 
 def _solved_at(progress: Iterable[Mapping[str, str]]) -> Iterator[float]:
@@ -177,7 +192,7 @@ def told(planning: Benchmarked, result: PlanResult) -> Run:
     total = sum(times.get(stage, 0.0) for stage in ("solve", "simplify", *PROOF))
     first = times.get(FIRST, times.get("solve", 0.0))
     if report is None or not report.judged:  # what the planner found had still to be proved
-        first += sum(times.get(stage, 0.0) for stage in PROOF)
+        first += planning.proof_of_first()
     return {
         "status": str(result.status), "reason": result.reason, "solved": found, "by": result.solved_by,
         "first": first if found else None, "total": total, "setup": times.get("setup"), "times": dict(times),
@@ -195,11 +210,19 @@ def told(planning: Benchmarked, result: PlanResult) -> Run:
     }  # fmt: skip
 
 
+def _robot_of(problem: str) -> str:
+    """Return the robot of a problem; that of the suites where no problem can be drawn."""
+    try:
+        return load_problem(problem).robot
+    except SuiteError:
+        return load_problem(WARM_UP).robot
+
+
 def warm_up(jobs: Sequence[Job], modules: Sequence[str] = ()) -> dict[str, float]:
     """Load what runs of some rows need, and return the seconds that the first run of each took.
 
     Args:
-        jobs: One of each row.
+        jobs: One of each row. Those on problems of another robot than ``WARM_UP`` are made as they are.
         modules: That are imported first, and register planners.
     """
     for module in modules:
@@ -207,6 +230,7 @@ def warm_up(jobs: Sequence[Job], modules: Sequence[str] = ()) -> dict[str, float
     seconds = {}
     for job in jobs:
         begin = time.perf_counter()
-        run(Job("warm-up", WARM_UP, job.label, job.planner, job.params, 0, job.timeout, job.simplify))
+        problem = WARM_UP if _robot_of(job.problem) == _robot_of(WARM_UP) else job.problem
+        run(Job("warm-up", problem, job.label, job.planner, job.params, 0, job.timeout, job.simplify))
         seconds[job.label] = time.perf_counter() - begin
     return seconds

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -186,6 +187,11 @@ def warnings(results: Results) -> list[str]:
     if crashed:
         reasons = Counter(f"{run['label']}: {run['reason']}" for run in crashed)
         said.append("Crashed: " + "; ".join(f"{n} x {reason}" for reason, n in reasons.most_common(5)) + ".")
+    refused = Counter(
+        f"{run['label']}, {match[1]}" for run in results.runs if (match := re.search(r"OMPL says (\w+)", run["reason"]))
+    )
+    if refused:
+        said.append("Ended early, unsolved: " + "; ".join(f"{n} x {name}" for name, n in refused.most_common(5)) + ".")
     faulty = Counter(
         f"{run['problem']}: {run['reason']}" for run in results.runs if run["status"].startswith("INVALID")
     )
@@ -196,7 +202,8 @@ def warnings(results: Results) -> list[str]:
         said.append(f"{skipped} seeds gave no problem and do not count.")
     if any(not run["raw_length"] for run in results.runs if run["solved"]):
         said.append(
-            "First paths of planners that use all their time are noticed up to 0.05 s late, without their length."
+            "First paths of planners that use all their time are noticed up to 0.05 s late, without their length, and "
+            "are not checked; the full check of the last path counts in their place, no repair of it."
         )
     said.append("OMPL's Benchmark looks at the clock every 0.1 s: runs may take so much longer than their limit.")
     return said
@@ -204,13 +211,14 @@ def warnings(results: Results) -> list[str]:
 
 def about(results: Results) -> list[tuple[str, Any]]:
     """Return how the results were made, as pairs of a name and a text."""
-    last = results.about["sessions"][-1]
-    pairs = [("Command", session["command"]) for session in results.about["sessions"]]
+    sessions = results.about["sessions"]
+    last = sessions[-1]
+    pairs = [("Command", f"{one['command']} ({one['date']}, {one['jobs']} at a time)") for one in sessions]
     versions = ", ".join(f"{name} {version}" for name, version in last["versions"].items())
     resolution = results.about["resolution"]
     warm = ", ".join(f"{label} {seconds:.2f} s" for label, seconds in results.about["warm_up"].items())
     pairs += [
-        ("Hardware", f"{last['hardware']}, {last['jobs']} run(s) at a time"), ("Date", last["date"]),
+        ("Hardware", "; ".join(dict.fromkeys(one["hardware"] for one in sessions))),
         ("Versions", f"Python {last['python']}, {versions}"),
         ("Split and first seed", f"{last['split']}, {last['seed']}"),
         ("Spacing of states", f"{resolution['search']} rad in searches, {resolution['full']} rad in the full check"),

@@ -16,6 +16,9 @@ from apex_ompl.benchmark.runs import CRASH, Run, run, told_of, unsolved, warm_up
 from apex_ompl.cluster import spread
 from apex_ompl.errors import ApexError, ParameterError
 
+DIED = "the process died"
+RENEWED = 500  # runs of a process, about, until another takes its place: OMPL's BIT* keeps 20 MB for each second
+
 
 @dataclass(frozen=True)
 class Workers:
@@ -48,30 +51,36 @@ class Workers:
             warm: Is told how many seconds the first run of each row took, on this machine.
 
         Raises:
-            ApexError: A planner kills the process before the first run; a file, a parameter or a checkpoint is at
-                fault; the cluster fails, or a worker there dies twice over one run.
+            ApexError: A planner kills the process while it warms up; a file, a parameter or a checkpoint is at
+                fault; the cluster fails.
         """
         first = list({job.label: job for job in jobs}.values())
         if self.address is not None:
             named = {job.key: (job, first, self.modules) for job in jobs}
-            yield from (one for _, one in spread(_remote, named, workers=self.at_once, address=self.address, ahead=1))
+
+            def lost(key: str) -> Run:
+                return told_of(named[key][0]) | unsolved(CRASH, DIED)
+
+            found = spread(_remote, named, workers=self.at_once, address=self.address, ahead=1, lost=lost)
+            yield from (one for _, one in found)
             return
         waiting, suspects, blamed = list(jobs[::-1]), list[Job](), set[str]()
         while waiting or suspects:  # those under way when a process died are made again, one by one
             under_way: dict[Future[Run], Job] = {}
+            before = len(waiting) + len(suspects)
             pool = self._pool(first, 1 if suspects else self.at_once)
             try:
                 warm.update(pool.submit(_warm_up_seconds).result())
                 yield from self._pooled(pool, suspects or waiting, 1 if suspects else self.at_once, under_way)
             except BrokenProcessPool:
                 died = list(under_way.values())
-                if not died and len(waiting) == len(jobs):
+                if not died and len(waiting) + len(suspects) == before:
                     raise ParameterError(
                         "planners", ", ".join(job.label for job in first), "planners that do not end the process"
                     ) from None
                 for job in died:  # the first time it may have been the doing of a run before
                     if job.key in blamed:
-                        yield told_of(job) | unsolved(CRASH, "the process died")
+                        yield told_of(job) | unsolved(CRASH, DIED)
                     else:
                         blamed.add(job.key)
                         suspects.append(job)
@@ -86,9 +95,11 @@ class Workers:
     def _pooled(
         pool: ProcessPoolExecutor, queue: list[Job], at_once: int, under_way: dict[Future[Run], Job]
     ) -> Iterator[Run]:
-        """Make runs of a queue, its end first, and take off what is under way."""
-        while queue or under_way:
-            while queue and len(under_way) < at_once:
+        """Make runs of a queue, its end first, and take off what is under way, as long as processes last."""
+        left = RENEWED * at_once
+        while (queue and left) or under_way:
+            while queue and left and len(under_way) < at_once:
+                left -= 1
                 under_way[pool.submit(_run, queue[-1])] = queue[-1]
                 queue.pop()
             done, _ = wait(under_way, return_when=FIRST_COMPLETED)

@@ -8,10 +8,10 @@ import coal
 import numpy as np
 from numpy.typing import NDArray
 
+from apex_ompl.bodies import Body
 from apex_ompl.errors import FileFormatError, MissingFileError
 from apex_ompl.files import is_file
 from apex_ompl.meshes import extent_fault, orientation_fault, triangles
-from apex_ompl.problem import Body
 
 
 def coal_geometry(body: Body) -> coal.CollisionGeometry:

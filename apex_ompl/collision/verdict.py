@@ -13,6 +13,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from apex_ompl.bodies import AttachedObject, Body, Obstacle
 from apex_ompl.collision.broadphase import CompiledScene, Contact
 from apex_ompl.collision.distance import Distance
 from apex_ompl.collision.proofs import NoGridError, Open, Proofs, Tally
@@ -21,7 +22,6 @@ from apex_ompl.collision.sweep import bit_reversed, sample_path
 from apex_ompl.errors import ParameterError, SceneError
 from apex_ompl.kernel import Kernel
 from apex_ompl.kernel.entries import MOST_STEPS
-from apex_ompl.problem import AttachedObject, Body, Obstacle
 from apex_ompl.robot import Robot
 from apex_ompl.schema import validate
 

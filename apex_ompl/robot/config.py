@@ -7,8 +7,8 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, PositiveFloat, model_validator
 
+from apex_ompl.bodies import Body, Name, Quaternion, Vector, located
 from apex_ompl.errors import FileFormatError
-from apex_ompl.problem import Body, Name, Quaternion, Vector, located
 from apex_ompl.schema import StrictModel, read_yaml, validate
 
 SCHEMA = "apex-ompl/robot/1"

@@ -14,9 +14,9 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from apex_ompl.bodies import Body
 from apex_ompl.errors import FileFormatError, ParameterError, RobotError, UnknownNameError
 from apex_ompl.meshes import extent_fault
-from apex_ompl.problem import Body
 from apex_ompl.robot.assets import DATA, resolve
 from apex_ompl.robot.compose import compose
 from apex_ompl.robot.config import Hand, RobotConfig, read_config, read_disabled_pairs

@@ -1,0 +1,43 @@
+"""All comparisons with other planners, one command after the other; each goes on where it was stopped.
+
+benchmarks/head_to_head.py, time_to_quality.py and peers.py, then the paper's figures by scripts/reproduce.py. The
+lengths that time_to_quality.py goes by are made again only where they are missing.
+
+Usage: python benchmarks/comparisons.py [--jobs 1]    (needs the extras "bench", "data" and "peers")
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+from pathlib import Path
+
+import record
+
+ROOT = Path(__file__).resolve().parents[1]
+REFERENCE = ROOT / "benchmarks" / "reference_lengths.json"
+COMMANDS = (
+    ("benchmarks/head_to_head.py",),
+    *(() if REFERENCE.is_file() else (("benchmarks/time_to_quality.py", "--reference"),)),
+    ("benchmarks/time_to_quality.py",),
+    ("benchmarks/peers.py",),
+    *(("scripts/reproduce.py", figure) for figure in ("failure", "size", "fid")),
+)
+
+
+def main() -> None:
+    """Run all commands; end with the first that fails."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--jobs", type=record.count, default=1, help="runs at a time (default: one, as they are timed)")
+    args = parser.parse_args()
+    for command in COMMANDS:
+        given = [*command, "--jobs", str(args.jobs)]
+        print("$ python", *given, flush=True)
+        ended = subprocess.run([sys.executable, *given], cwd=ROOT, check=False)
+        if ended.returncode:
+            sys.exit(ended.returncode)
+
+
+if __name__ == "__main__":
+    record.command(main)

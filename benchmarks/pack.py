@@ -1,0 +1,82 @@
+"""Pack the runs behind committed tables, or unpack them, so that a clone can make a table again, or a longer one.
+
+``pack`` puts what lies in benchmarks/runs under a name (a folder, or a file of JSON lines) into
+benchmarks/packed/NAME.tar.xz; ``unpack`` puts it back, where the command that made it goes on from. Pictures, pages,
+OMPL's logs and databases are left out: they are made of the runs.
+
+Usage: python benchmarks/pack.py pack|unpack NAME [NAME ...]    (as: pack head_to_head peers)
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import lzma
+import tarfile
+from pathlib import Path
+
+import record
+
+from apex_ompl.errors import MissingFileError, ParameterError
+from apex_ompl.files import make_folder, write_atomically
+
+RUNS, PACKED = Path(__file__).parent / "runs", Path(__file__).parent / "packed"
+KINDS = (".json", ".jsonl")
+
+
+def pack(name: str) -> Path:
+    """Pack the runs of a name, the same runs to the same bytes.
+
+    Raises:
+        MissingFileError: There are none.
+    """
+    files = [file for file in (RUNS / f"{name}.jsonl", *sorted((RUNS / name).glob("*"))) if file.suffix in KINDS]
+    files = [file for file in files if file.is_file()]
+    if not files:
+        raise MissingFileError(str(RUNS / name), "runs", "expected a folder or JSON lines, as the benchmarks keep them")
+    archive = io.BytesIO()
+    with tarfile.open(fileobj=archive, mode="w") as tar:
+        for file in files:
+            entry, data = tarfile.TarInfo(file.relative_to(RUNS).as_posix()), file.read_bytes()
+            entry.size = len(data)
+            tar.addfile(entry, io.BytesIO(data))
+    path = make_folder(PACKED) / f"{name}.tar.xz"
+    write_atomically(path, lzma.compress(archive.getvalue(), preset=9))
+    return path
+
+
+def unpack(name: str) -> list[Path]:
+    """Unpack the runs of a name.
+
+    Raises:
+        MissingFileError: They are not packed, or not as ``pack`` does it.
+        ParameterError: Others of that name are there.
+    """
+    path = PACKED / f"{name}.tar.xz"
+    try:
+        with tarfile.open(path, "r:xz") as tar:
+            files = {Path(e.name): found.read() for e in tar if (found := tar.extractfile(e)) is not None}
+    except (OSError, EOFError, lzma.LZMAError, tarfile.TarError) as error:
+        raise MissingFileError(str(path), "packed runs", f"expected an archive that pack has made ({error})") from error
+    for file, data in files.items():
+        if (RUNS / file).exists() and (RUNS / file).read_bytes() != data:
+            raise ParameterError("name", name, f"one without other runs in {RUNS / file}")
+    for file, data in files.items():
+        make_folder((RUNS / file).parent)
+        write_atomically(RUNS / file, data)
+    return [RUNS / file for file in files]
+
+
+def main() -> None:
+    """Pack or unpack."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("action", choices=("pack", "unpack"))
+    parser.add_argument("names", nargs="+", metavar="NAME")
+    args = parser.parse_args()
+    for name in args.names:
+        for path in [pack(name)] if args.action == "pack" else unpack(name):
+            print(f"{path.relative_to(Path(__file__).parents[1])}: {path.stat().st_size / 1024:.0f} KiB")
+
+
+if __name__ == "__main__":
+    record.command(main)

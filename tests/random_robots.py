@@ -1,0 +1,65 @@
+"""Robots of random joints and spheres, and where their bodies are."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+
+from apex_ompl.kernel import build
+from apex_ompl.kernel.tables import FIXED, PRISMATIC, REVOLUTE, RobotTables
+
+
+def unit(rng: np.random.Generator) -> np.ndarray:
+    v = rng.normal(size=3)
+    return v / np.linalg.norm(v)
+
+
+def pose(rng: np.random.Generator, spread: float = 0.5) -> np.ndarray:
+    at = np.eye(4)
+    at[:3, :3] = pin.exp3(unit(rng) * rng.uniform(0.0, np.pi))
+    at[:3, 3] = rng.normal(0.0, spread, 3)
+    return at
+
+
+def balls(rng: np.random.Generator, leaves: int) -> dict[str, np.ndarray]:
+    """A root around some leaves, as a cover has them."""
+    centres, radii = rng.normal(0.0, 0.05, (leaves, 3)), rng.uniform(0.01, 0.06, leaves)
+    root = float((np.linalg.norm(centres, axis=1) + radii).max())
+    return {
+        "centres": np.concatenate([np.zeros((1, 3)), centres]), "radii": np.array([root, *radii]),
+        "first": np.array([1] + [0] * leaves), "count": np.array([leaves] + [0] * leaves),
+    }  # fmt: skip
+
+
+def random_robot(seed: int, joints: int = 9, dof: int = 4) -> tuple[RobotTables, list, list, list]:
+    """A random tree of revolute, prismatic, fixed and mimic joints with a body on each, and the parts it is of."""
+    rng = np.random.default_rng(seed)
+    specs = [build.JointSpec(0)]
+    for k in range(1, joints):
+        kind = int(rng.choice([REVOLUTE, REVOLUTE, PRISMATIC, FIXED]))
+        specs.append(
+            build.JointSpec(
+                int(rng.integers(0, k)), kind, pose(rng, 0.2), unit(rng), -1 if kind == FIXED else k % dof,
+                float(rng.uniform(-1.5, 1.5)), float(rng.normal(0.0, 0.3)),
+            )
+        )  # fmt: skip
+    bodies = [build.BodySpec(f"b{k}", k, pose(rng, 0.05), **balls(rng, 3)) for k in range(joints)]
+    pairs = [(a, b) for a in range(joints) for b in range(a) if rng.random() < 0.5]
+    names = [f"q{k}" for k in range(dof)]
+    box = np.ones(dof)
+    tables = build.robot_tables("tree", names, lower=-box, upper=box, joints=specs, bodies=bodies, pairs=pairs)
+    return tables, specs, bodies, pairs
+
+
+def frames(specs: list, q: np.ndarray) -> list[np.ndarray]:
+    """Forward kinematics from the book: placement, then rotation about or translation along the axis."""
+    found = [np.eye(4)]
+    for joint in specs[1:]:
+        motion = np.eye(4)
+        value = joint.ratio * q[joint.source] + joint.shift
+        if joint.kind == REVOLUTE:
+            motion[:3, :3] = pin.exp3(joint.axis * value)
+        elif joint.kind == PRISMATIC:
+            motion[:3, 3] = joint.axis * value
+        found.append(found[joint.parent] @ joint.placement @ motion)
+    return found

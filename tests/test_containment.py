@@ -1,0 +1,216 @@
+"""Meshes as solids, and what is wholly inside of something."""
+
+from __future__ import annotations
+
+import coal
+import numpy as np
+import pinocchio as pin
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial import ConvexHull
+from support import CUBE_OBJ, states_around_home
+
+from apex_ompl.bodies import AttachedObject, Obstacle
+from apex_ompl.collision import Verdict
+from apex_ompl.collision.containment import may_contain
+from apex_ompl.errors import FileFormatError
+from apex_ompl.meshes import triangles, winding_number
+from apex_ompl.robot import Robot
+from apex_ompl.robot.model import link_of
+
+
+@pytest.mark.parametrize(
+    "shape",
+    [{"box": (0.02, 0.02, 0.02)}, {"sphere": {"radius": 0.02}}, {"cylinder": {"radius": 0.02, "length": 0.04}},
+     {"capsule": {"radius": 0.02, "length": 0.02}}],
+)  # fmt: skip
+def test_an_obstacle_wholly_inside_a_link_is_a_collision(robot: Robot, shape: dict) -> None:
+    for link in (f"{side}_link{k}" for side in ("left", "right") for k in range(1, 6)):
+        item = next(g for g in robot.geometry.geometryObjects if link_of(robot.model, g) == link)
+        vertices, _ = triangles(item.geometry)
+        centre = robot.link_pose(robot.home, link) @ item.placement.homogeneous @ [*vertices.mean(axis=0), 1.0]
+        verdict = Verdict(robot, [Obstacle(name="seed", position=tuple(centre[:3]), **shape)])
+        # Nothing touches the shell ...
+        assert shell_contacts(verdict, robot.home) == []
+        # ... and still the state is not free, also after the obstacle was moved away and back.
+        assert not verdict.is_free(robot.home)
+        assert "seed" in (c.second for c in verdict.contacts(robot.home))
+        verdict.move("seed", (0.0, 0.0, 3.0))
+        assert verdict.is_free(robot.home)
+        verdict.move("seed", tuple(centre[:3]))
+        assert not verdict.is_free(robot.home)
+
+
+def shell_contacts(verdict: Verdict, q: np.ndarray) -> list[tuple[str, str]]:
+    """The pairs that overlap by meshes and primitives alone, without the cases of containment."""
+    scene = verdict._scene()
+    model, geometry = verdict.robot.model, scene.geometry
+    data, geometry_data = model.createData(), geometry.createData()
+    pin.computeCollisions(model, data, geometry, geometry_data, verdict.robot.to_pinocchio(q), False)
+    pairs = [
+        (p.first, p.second)
+        for p, result in zip(geometry.collisionPairs, geometry_data.collisionResults, strict=True)
+        if result.isCollision() and all(scene.same[i] == i for i in (p.first, p.second))
+    ]
+    return [(scene.labels[a], scene.labels[b]) for a, b in pairs]
+
+
+def u_shape_obj(scale: float) -> str:
+    """A solid U of 3 x 3 x 3 units: legs and bottom 1 unit wide, the notch open towards +y."""
+    outline = [(0, 0), (3, 0), (3, 3), (2, 3), (2, 1), (1, 1), (1, 3), (0, 3)]
+    lines = [f"v {x * scale} {y * scale} {z * scale}" for z in (0, 3) for x, y in outline]
+    n = len(outline)
+    cap = [(0, 1, 4), (0, 4, 5), (1, 2, 3), (1, 3, 4), (0, 5, 6), (0, 6, 7)]
+    faces = [(c, b, a) for a, b, c in cap] + [(a + n, b + n, c + n) for a, b, c in cap]
+    for k in range(n):
+        j = (k + 1) % n
+        faces += [(k, j, j + n), (k, j + n, k + n)]
+    return "\n".join([*lines, *(f"f {a + 1} {b + 1} {c + 1}" for a, b, c in faces)]) + "\n"
+
+
+def test_a_link_inside_a_hollow_mesh_obstacle_is_a_collision_and_its_notch_is_not(robot: Robot, tmp_path) -> None:
+    file = tmp_path / "u.obj"
+    file.write_text(u_shape_obj(4.0))
+    u = Obstacle(name="u", mesh={"file": str(file)}, position=(-6.0, -2.0, -6.0))
+    verdict = Verdict(robot, [u])  # all of the robot in the solid bottom of the U
+    assert not shell_contacts(verdict, robot.home)
+    assert not verdict.is_free(robot.home)
+    assert {c.second for c in verdict.contacts(robot.home)} == {"u"}
+    verdict.move("u", (-6.0, -8.0, -6.0))  # all of it in the notch, inside the mesh's convex hull
+    assert not shell_contacts(verdict, robot.home)
+    assert verdict.is_free(robot.home)
+    assert verdict.contacts(robot.home) == []
+
+
+def test_a_held_object_inside_the_other_arm_is_a_collision(robot: Robot) -> None:
+    held = AttachedObject(name="pill", link="left_hand_palm", sphere={"radius": 0.01})
+    item = next(g for g in robot.geometry.geometryObjects if link_of(robot.model, g) == "right_link4")
+    vertices, _ = triangles(item.geometry)
+    inside = robot.link_pose(robot.home, "right_link4") @ item.placement.homogeneous @ [*vertices.mean(axis=0), 1.0]
+    local = np.linalg.inv(robot.link_pose(robot.home, "left_hand_palm")) @ inside
+    verdict = Verdict(robot, (), [held.model_copy(update={"position": tuple(local[:3])})])
+    assert not verdict.is_free(robot.home)
+    assert [(c.first, c.second) for c in verdict.contacts(robot.home)] == [("right_link4", "pill")]
+
+
+def test_links_never_hide_in_each_other(robot: Robot) -> None:
+    """The reason why links are no guests of each other: where one is inside another, the verdict knows."""
+    verdict = Verdict(robot)
+    items = list(robot.geometry.geometryObjects)
+    shells = {
+        i: np.array(triangles(g.geometry)[0])[triangles(g.geometry)[1]]
+        for i, g in enumerate(items)
+        if g.meshPath.endswith("stl")
+    }
+    data = robot.model.createData()
+    rng = np.random.default_rng(5)
+    for q in robot.random_state(rng, 25):
+        pin.forwardKinematics(robot.model, data, robot.to_pinocchio(q))
+        poses = [data.oMi[g.parentJoint] * g.placement for g in items]
+        inside = False
+        for pair in robot.geometry.collisionPairs:
+            for host, guest in ((pair.first, pair.second), (pair.second, pair.first)):
+                if host in shells and guest not in shells:
+                    point = poses[host].actInv(poses[guest].translation)
+                    inside |= abs(winding_number(point, shells[host])) > 0.5
+        assert not (inside and verdict.is_free(q))
+
+
+@settings(max_examples=60)
+@given(st.lists(st.floats(-1.5, 1.5), min_size=3, max_size=3))
+def test_winding_number_tells_inside_from_outside_of_a_convex_mesh(point: list[float]) -> None:
+    cloud = np.random.default_rng(1).normal(size=(40, 3))
+    hull = ConvexHull(cloud)
+    a, b, c = np.moveaxis(cloud[hull.simplices], 1, 0)
+    outward = np.einsum("ij,ij->i", np.cross(b - a, c - a), hull.equations[:, :3]) > 0
+    faces = np.where(outward[:, None], hull.simplices, hull.simplices[:, ::-1])
+    heights = hull.equations[:, :3] @ point + hull.equations[:, 3]
+    if np.abs(heights).min() < 1e-6:
+        return
+    winding = winding_number(np.array(point), cloud[faces])
+    assert winding == pytest.approx(1.0 if heights.max() < 0 else 0.0, abs=1e-6)
+
+
+def test_sizes_that_cannot_fit_are_not_looked_at(robot: Robot) -> None:
+    link = next(g.geometry for g in robot.geometry.geometryObjects if g.name.startswith("left_link5"))
+    assert may_contain(link, coal.Box(0.05, 0.05, 0.05))
+    assert not may_contain(link, coal.Box(0.4, 0.4, 0.4))
+    assert not may_contain(link, coal.Halfspace(np.array([0.0, 0.0, 1.0]), 0.0))
+
+
+def test_meshes_in_stl_and_obj_collide_like_the_box_they_are(robot: Robot, tmp_path) -> None:
+    obj = tmp_path / "cube.obj"
+    obj.write_text(CUBE_OBJ)
+    stl = tmp_path / "cube.stl"
+    vertices, faces = triangles(coal.MeshLoader().load(str(obj), np.ones(3)))
+    facets = []
+    for a, b, c in vertices[faces]:
+        n = np.cross(b - a, c - a)
+        points = "\n".join(f"vertex {p[0]} {p[1]} {p[2]}" for p in (a, b, c))
+        facets.append(f"facet normal {n[0]} {n[1]} {n[2]}\nouter loop\n{points}\nendloop\nendfacet")
+    stl.write_text("solid cube\n" + "\n".join(facets) + "\nendsolid cube\n")
+    rng = np.random.default_rng(2)
+    size, corner = (0.3, 0.2, 0.5), np.array([0.35, -0.1, 0.1])
+    box = Verdict(robot, [Obstacle(name="b", box=size, position=tuple(corner + np.array(size) / 2))])
+    states = states_around_home(robot, rng, 150, 0.7)
+    expected = [box.is_free(q) for q in states]
+    assert 0.1 < np.mean(expected) < 0.9
+    for file in (obj, stl):
+        mesh = Verdict(robot, [Obstacle(name="m", mesh={"file": str(file), "scale": size}, position=tuple(corner))])
+        assert [mesh.is_free(q) for q in states] == expected
+
+
+def cube(at: tuple[float, float, float], edge: float, first: int) -> tuple[list[str], list[str]]:
+    """Vertices and faces of a cube as OBJ lines; ``first`` is the number of its first vertex."""
+    lines = CUBE_OBJ.splitlines()
+    points = [[float(v) * edge + c for v, c in zip(x.split()[1:], at, strict=True)] for x in lines if x[0] == "v"]
+    faces = [[int(v) + first - 1 for v in x.split()[1:]] for x in lines if x[0] == "f"]
+    return [f"v {x} {y} {z}" for x, y, z in points], [f"f {a} {b} {c}" for a, b, c in faces]
+
+
+@pytest.mark.parametrize("swapped", [False, True])
+def test_each_piece_of_a_mesh_is_looked_for_inside_links(robot: Robot, tmp_path, swapped: bool) -> None:
+    item = next(g for g in robot.geometry.geometryObjects if link_of(robot.model, g) == "left_link4")
+    vertices, _ = triangles(item.geometry)
+    inside = robot.link_pose(robot.home, "left_link4") @ item.placement.homogeneous @ [*vertices.mean(axis=0), 1.0]
+    places = [tuple(inside[:3] - 0.01), (3.0, 3.0, 3.0)]
+    pieces = [cube(at, 0.02, 1 + 8 * k) for k, at in enumerate(places[::-1] if swapped else places)]
+    file = tmp_path / "two.obj"
+    file.write_text("\n".join([*(x for p in pieces for x in p[0]), *(x for p in pieces for x in p[1])]) + "\n")
+    verdict = Verdict(robot, [Obstacle(name="two", mesh={"file": str(file)})])
+    assert shell_contacts(verdict, robot.home) == []
+    assert not verdict.is_free(robot.home)
+
+
+FLAT = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\nf 1 2 3\nf 2 4 3\n"
+
+
+FLIPPED = CUBE_OBJ.replace("f 1 3 2", "f 1 2 3")
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (FLAT, "one plane"),
+        ("v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "one plane"),
+        (CUBE_OBJ.replace("v 1 1 1", "v nan 1 1"), "not finite"),
+        (CUBE_OBJ.replace("v 1 1 1", "v 1e300 1 1"), "too far"),
+        (FLIPPED, "oriented against each other"),
+        ("", "expected an STL or OBJ mesh"),
+    ],
+)
+def test_meshes_that_bound_no_solid_are_refused(robot: Robot, tmp_path, text: str, words: str) -> None:
+    """In Coal, flat and infinite ones end the process."""
+    file = tmp_path / "m.obj"
+    file.write_text(text)
+    with pytest.raises(FileFormatError, match=words):
+        Verdict(robot, [Obstacle(name="m", mesh={"file": str(file)})])
+
+
+def test_a_mesh_with_a_hole_is_judged_by_the_winding_number(robot: Robot, tmp_path) -> None:
+    file = tmp_path / "open.obj"
+    file.write_text(CUBE_OBJ.replace("f 5 6 7\n", ""))
+    for position, free in (((-3.0, -3.0, -3.0), False), ((20.0, 0.0, 0.0), True)):
+        room = Obstacle(name="room", mesh={"file": str(file), "scale": (6, 6, 6)}, position=position)
+        assert Verdict(robot, [room]).is_free(robot.home) == free

@@ -1,0 +1,182 @@
+"""Tables of robots and scenes: read, saved, and cut to some joints or pairs."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+from unittest import mock
+
+import coal
+import numpy as np
+import pinocchio as pin
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from random_robots import frames, random_robot
+from support import ROOT, states_around_home
+
+from apex_ompl.bodies import Obstacle
+from apex_ompl.collision import Verdict
+from apex_ompl.collision.tabulate import joint_specs, primitives
+from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError, UnknownNameError
+from apex_ompl.kernel import views
+from apex_ompl.kernel.face import Kernel
+from apex_ompl.kernel.scene import scene_tables
+from apex_ompl.kernel.tables import RobotTables
+from apex_ompl.kernel.views import robot_view, scene_view
+from apex_ompl.robot import Robot
+
+
+def test_tables_are_saved_and_loaded_without_pinocchio(robot: Robot, post: Obstacle, tmp_path: Path) -> None:
+    kernel = Verdict(robot, [post]).kernel
+    states = states_around_home(robot, np.random.default_rng(1), 5)
+    kernel.robot.save(tmp_path / "robot.npz")
+    np.save(tmp_path / "states.npy", states)
+    code = f"""
+import sys, numpy as np
+for name in ("pinocchio", "coal", "ompl"):
+    sys.modules[name] = None
+from apex_ompl.kernel.face import Kernel
+from apex_ompl.kernel.scene import Primitive, scene_tables
+from apex_ompl.kernel.tables import BOX, RobotTables
+at = np.eye(4)
+at[:3, 3] = {list(post.position)}
+box = Primitive(BOX, at, {tuple(e / 2 for e in post.box)})
+kernel = Kernel(RobotTables.load({str(tmp_path / "robot.npz")!r}), scene_tables([(0, box)]))
+np.save({str(tmp_path / "values.npy")!r}, kernel.clearance(np.load({str(tmp_path / "states.npy")!r})))
+"""
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT, timeout=120)
+    alone = Kernel(kernel.robot, scene_tables([(0, p) for p in primitives(coal.Box(*post.box), post.pose)]))
+    assert np.array_equal(np.load(tmp_path / "values.npy"), alone.clearance(states))
+
+
+def test_faulty_tables_are_refused(tmp_path: Path) -> None:
+    tables, *_ = random_robot(0)
+    tables.save(tmp_path / "good.npz")
+    assert RobotTables.load(tmp_path / "good.npz").body_names == tables.body_names
+    with pytest.raises(MissingFileError, match="no.npz"):
+        RobotTables.load(tmp_path / "no.npz")
+    (tmp_path / "text.npz").write_text("hello")
+    with pytest.raises(FileFormatError, match=r"text.npz.*kernel tables"):
+        RobotTables.load(tmp_path / "text.npz")
+    (tmp_path / "short.npz").write_bytes((tmp_path / "good.npz").read_bytes()[:-400])
+    with pytest.raises(FileFormatError, match="short.npz"):
+        RobotTables.load(tmp_path / "short.npz")
+    for name, wrong in {
+        "joint_parent": tables.arrays.joint_parent + 7, "bodies": tables.arrays.bodies + 90,
+        "node_radius": tables.arrays.node_radius * np.nan, "node_first": tables.arrays.node_first * 0,
+        "pair_bodies": tables.arrays.pair_bodies + 50, "lower": tables.arrays.lower[:-1],
+        "node_count": -tables.arrays.node_count, "node_outer": -tables.arrays.node_outer,
+        "joint_source": np.full_like(tables.arrays.joint_source, -1), "eager": tables.arrays.eager[::-1].copy(),
+        "pair_common": np.full_like(tables.arrays.pair_common, len(tables.arrays.joint_parent) - 1),
+    }.items():  # fmt: skip
+        bad = RobotTables("bad", tables.joint_names, tables.body_names, tables.numbers,
+                          tables.arrays._replace(**{name: wrong}))  # fmt: skip
+        bad.save(tmp_path / "bad.npz")
+        with pytest.raises(FileFormatError, match=name):
+            RobotTables.load(tmp_path / "bad.npz")
+
+
+def test_damaged_tables_are_faults_and_no_crash(tmp_path: Path) -> None:
+    tables, *_ = random_robot(1)
+    tables.save(tmp_path / "good.npz")
+    good, rng = (tmp_path / "good.npz").read_bytes(), np.random.default_rng(0)
+    kernel = Kernel(tables, scene_tables([]))
+    expected = kernel.clearance(np.zeros(tables.dof))
+    for _ in range(200):
+        bad = bytearray(good)
+        for place in rng.integers(0, len(bad), 3):
+            bad[place] = rng.integers(0, 256)
+        (tmp_path / "bad.npz").write_bytes(bad)
+        try:
+            loaded = RobotTables.load(tmp_path / "bad.npz")
+        except FileFormatError:
+            continue
+        assert np.array_equal(Kernel(loaded, scene_tables([])).clearance(np.zeros(tables.dof)), expected)
+    np.save(tmp_path / "plain.npy", np.zeros(3))
+    with pytest.raises(FileFormatError, match="kernel tables"):
+        RobotTables.load(tmp_path / "plain.npy")
+
+
+def test_arrays_come_out_of_a_pack_as_they_went_in(robot: Robot, post: Obstacle) -> None:
+    kernel = Verdict(robot, [post]).kernel
+    for tables, view in ((kernel.robot, robot_view), (kernel.scene, scene_view)):
+        with mock.patch.multiple(views, _ints=views._ints.py_func, _floats=views._floats.py_func):
+            seen = view.py_func(*tables.packed)
+        for name, array in tables.arrays._asdict().items():
+            assert np.array_equal(getattr(seen, name), array), name
+
+
+@pytest.mark.parametrize("ratio", [0.3, -1.57, 6.3, 10.0, -25.0, 40.0])
+@pytest.mark.parametrize("driver", ["revolute", "prismatic"])
+def test_mimic_ratios_are_read_as_they_are(ratio: float, driver: str) -> None:
+    limit = '<limit lower="-2" upper="2" velocity="1" effort="1"/>'
+    urdf = f"""<robot name="g">
+      <link name="a"/><link name="b"/><link name="c"/>
+      <joint name="slide" type="{driver}"><parent link="a"/><child link="b"/><axis xyz="0 0 1"/>{limit}</joint>
+      <joint name="turn" type="revolute"><parent link="b"/><child link="c"/><origin xyz="0.1 0 0" rpy="0.3 0.2 0.1"/>
+        <axis xyz="0 0.6 0.8"/>{limit}<mimic joint="slide" multiplier="{ratio}" offset="0.2"/></joint></robot>"""
+    model = pin.buildModelFromXML(urdf, mimic=True)
+    limits = SimpleNamespace(lower=np.array([-2.0]), upper=np.array([2.0]))
+    robot = SimpleNamespace(model=model, dof=1, limits=limits, to_pinocchio=lambda q: np.asarray(q, float))
+    specs = joint_specs(robot)  # type: ignore[arg-type]
+    assert specs[2].ratio == pytest.approx(abs(ratio), rel=1e-9)
+    data = model.createData()
+    for value in (-2.0, -0.7, 0.0, 0.3, 1.9):
+        pin.forwardKinematics(model, data, np.array([value]))
+        assert frames(specs, np.array([value]))[2] == pytest.approx(data.oMi[2].homogeneous, abs=1e-8)
+
+
+@settings(max_examples=60)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_tables_for_one_side_judge_that_side_alone(robot: Robot, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    ball = Obstacle(name="ball", sphere={"radius": 0.1}, position=tuple(rng.uniform([0.2, -0.6, 0.1], [0.7, 0.6, 0.8])))
+    whole = Verdict(robot, [ball]).kernel
+    sides = [[k for k, name in enumerate(robot.joint_names) if name.startswith(side)] for side in ("left", "right")]
+    kernels = [Kernel(whole.robot.judging(joints), whole.scene) for joints in sides]
+    q, other = states_around_home(robot, rng, 2)
+    everything, parts = whole.clearance(q)[0], [kernel.clearance(q)[0] for kernel in kernels]
+    assert everything[0] == min(parts[0][0], parts[1][0])  # all that moves is moved by one side or the other
+    assert everything[1] <= min(parts[0][1], parts[1][1])
+    for joints, kernel, part in zip(reversed(sides), kernels, parts, strict=True):
+        mixed = q.copy()
+        mixed[joints] = other[joints]  # the other side does not count
+        assert np.array_equal(kernel.clearance(mixed)[0], part)
+
+
+def test_pairs_between_the_sides_are_left_to_the_whole(robot: Robot) -> None:
+    whole = Verdict(robot).kernel
+    sides = [[k for k, name in enumerate(robot.joint_names) if name.startswith(side)] for side in ("left", "right")]
+    kernels = [Kernel(whole.robot.judging(joints), whole.scene) for joints in sides]
+    q = robot.home.copy()
+    q[[0, 1, 7, 8]] = -1.2, 0.3, 1.2, 0.3  # the hands meet in the middle
+    assert whole.clearance(q)[0, 1] < 0.0 < min(kernel.clearance(q)[0, 1] for kernel in kernels)
+
+
+def test_a_pair_can_be_left_out(robot: Robot) -> None:
+    whole = Verdict(robot).kernel
+    q = robot.home.copy()
+    q[[0, 1, 7, 8]] = -1.5, 0.3, 1.5, 0.3
+    found, counts = whole.unproved(q)
+    assert counts[0] == 1 and whole.clearance(q)[0, 1] < 0.0
+    a, b = (whole.robot.body_names[k] for k in found[0, 0])
+    smaller = Kernel(whole.robot.without_pair(b, a), whole.scene)
+    assert smaller.unproved(q)[1][0] == 0 and smaller.clearance(q)[0, 1] > 0.0
+    for other in states_around_home(robot, np.random.default_rng(5), 50):  # elsewhere nothing changes
+        assert np.array_equal(smaller.clearance(other), whole.clearance(other))
+    right = [k for k, name in enumerate(robot.joint_names) if name.startswith("right")]
+    one, other_order = whole.robot.judging(right).without_pair(a, b), whole.robot.without_pair(a, b).judging(right)
+    for state in states_around_home(robot, np.random.default_rng(6), 50, 1.0):
+        values = [
+            Kernel(tables, whole.scene).clearance(state) for tables in (one, other_order, whole.robot.judging(right))
+        ]
+        assert np.array_equal(values[0], values[1]) and np.array_equal(
+            values[0], values[2]
+        )  # the pair is not of one side
+    with pytest.raises(UnknownNameError, match="body"):
+        whole.robot.without_pair("no_such_body", a)
+    with pytest.raises(ParameterError, match="joints"):
+        whole.robot.judging([99])
