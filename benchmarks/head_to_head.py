@@ -96,7 +96,7 @@ def main() -> None:
     workers = Workers(args.jobs, modules=("controls",))
     levels, labels = record.static_levels(args.levels), {row.label for row in ROWS}
     results = bench(levels, ROWS, folder, runs=args.n, timeout=TIMEOUT, workers=workers)
-    results = replace(results, runs=[run for run in results.runs if run["label"] in labels])
+    results = replace(results, runs=[run for run in results.runs if run["label"] in labels and run["seed"] < args.n])
     write_database(results, write_logs(results))
     report(folder, folder)
     found = [table for table in (together(figures(results)), *tables(results)) if table.rows]
