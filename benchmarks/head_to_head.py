@@ -9,7 +9,7 @@ command goes on where it was stopped.
 
 scripts/reproduce.py takes its runs from there, and adds some.
 
-Usage: python benchmarks/head_to_head.py [SUITE[/LEVEL] ...] [-n 50] [--jobs 1]
+Usage: python benchmarks/head_to_head.py [SUITE[/LEVEL] ...] [-n 30] [--jobs 1]
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ def main() -> None:
     """Run what is missing, and write the results."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("levels", nargs="*", metavar="SUITE[/LEVEL]")
-    parser.add_argument("-n", type=record.count, default=50, help="problems of a level (default: %(default)s)")
+    parser.add_argument("-n", type=record.count, default=30, help="problems of a level (default: %(default)s)")
     parser.add_argument("--jobs", type=record.count, default=1, help="runs at a time (default: one, as they are timed)")
     args = parser.parse_args()
     folder = Path(__file__).parent / "runs" / "head_to_head"
