@@ -12,7 +12,7 @@ LAYERS = [
     {"errors"},
     {"arguments", "cluster", "files", "meshes", "provenance", "resolution", "stopwatch"},
     {"schema"},
-    {"kernel"},
+    {"bodies", "kernel"},
     {"problem", "spline"},
     {"optimize", "records"},
     {"dataset", "pool"},
