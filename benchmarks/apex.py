@@ -230,10 +230,10 @@ def main() -> None:
     """Run what is missing, and write the results of all."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("levels", nargs="*", metavar="SUITE[/LEVEL]")
-    parser.add_argument("-n", type=int, default=100, help="problems of a level (default: %(default)s)")
+    parser.add_argument("-n", type=record.count, default=100, help="problems of a level (default: %(default)s)")
     parser.add_argument("--controls", type=int, default=50, help="of a hard level, for controls (default: %(default)s)")
     parser.add_argument("--split", choices=("validation", "test"), default="test")
-    parser.add_argument("--jobs", type=int, default=1, help="processes (default: one, as runs are timed)")
+    parser.add_argument("--jobs", type=record.count, default=1, help="processes (default: one, as runs are timed)")
     parser.add_argument("--methods", nargs="*", choices=list(METHODS), default=list(METHODS), metavar="NAME")
     parser.add_argument("--store", type=Path, default=STORE)
     parser.add_argument("--name", default="apex", help="of the results (default: %(default)s)")
@@ -260,10 +260,10 @@ def main() -> None:
         levels.append({"level": ALL_HARD, "methods": figures(hard)})
     text = f"{table(levels)}\n\n{aims(levels)}"
     record.write(
-        args.name, {"levels": levels}, text, split=args.split, jobs=args.jobs,
-        limits=f"{LIMIT:g} s, controls {SHORT_LIMIT:g} s", seeds="number of the problem modulo 1000",
+        args.name, {"levels": levels}, text, split=args.split, limits=f"{LIMIT:g} s, controls {SHORT_LIMIT:g} s",
+        seeds="number of the problem modulo 1000", **record.made_with(runs),
     )  # fmt: skip
 
 
 if __name__ == "__main__":
-    main()
+    record.command(main)

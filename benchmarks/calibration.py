@@ -104,9 +104,9 @@ def main() -> None:
     """Run what is missing, and write the results of all."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("levels", nargs="*", metavar="SUITE[/LEVEL]")
-    parser.add_argument("-n", type=int, default=50, help="problems for rrtconnect (default: %(default)s)")
+    parser.add_argument("-n", type=record.count, default=50, help="problems for rrtconnect (default: %(default)s)")
     parser.add_argument("--rrt", type=int, default=20, help="problems for rrt (default: %(default)s)")
-    parser.add_argument("--jobs", type=int, default=2, help="processes (default: %(default)s)")
+    parser.add_argument("--jobs", type=record.count, default=2, help="processes (default: %(default)s)")
     parser.add_argument("--store", type=Path, default=STORE)
     parser.add_argument("--report", action="store_true", help="run nothing; write the results of what the store holds")
     args = parser.parse_args()
@@ -128,7 +128,8 @@ def main() -> None:
     store.complete(run, todo, args.jobs, warm_up)
     figures: list[dict[str, Any]] = []
     by_level: dict[str, list[dict[str, Any]]] = {}
-    for (name, _), one in store.read().items():
+    runs = store.read()
+    for (name, _), one in runs.items():
         by_level.setdefault(name.rsplit("/", 1)[0], []).append(one)
     for level in every:
         mine = by_level.get(level, [])
@@ -138,10 +139,10 @@ def main() -> None:
             planners = {p: summary(of[p]) for p in ("rrtconnect", "rrt") if of[p]}
             figures.append({"level": level, "line": line, "line_n": len(of[LINE]), "planners": planners})
     record.write(
-        "calibration", {"levels": figures}, table(figures), split="test", timeout=TIMEOUT, jobs=args.jobs,
-        seeds="number of the problem modulo 1000",
+        "calibration", {"levels": figures}, table(figures), split="test", timeout=TIMEOUT,
+        seeds="number of the problem modulo 1000", **record.made_with(runs.values()),
     )  # fmt: skip
 
 
 if __name__ == "__main__":
-    main()
+    record.command(main)

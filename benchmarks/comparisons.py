@@ -9,6 +9,7 @@ Usage: python benchmarks/comparisons.py [--jobs 1]    (needs the extras "bench",
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import subprocess
 import sys
 from pathlib import Path
@@ -17,6 +18,7 @@ import record
 
 ROOT = Path(__file__).resolve().parents[1]
 REFERENCE = ROOT / "benchmarks" / "reference_lengths.json"
+NEEDED = ("matplotlib", "ray", "roboplan")
 COMMANDS = (
     ("benchmarks/head_to_head.py",),
     *(() if REFERENCE.is_file() else (("benchmarks/time_to_quality.py", "--reference"),)),
@@ -31,6 +33,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--jobs", type=record.count, default=1, help="runs at a time (default: one, as they are timed)")
     args = parser.parse_args()
+    missing = [name for name in NEEDED if importlib.util.find_spec(name) is None]
+    if missing:  # said now, not after hours
+        parser.error(f"no {', '.join(missing)}, expected: pip install 'apex-ompl[bench,data,peers]'")
     for command in COMMANDS:
         given = [*command, "--jobs", str(args.jobs)]
         print("$ python", *given, flush=True)

@@ -77,7 +77,7 @@ def main() -> None:
         default=2,
         help=f"of {UNIT} problems, a level (default: %(default)s)",
     )
-    parser.add_argument("--workers", type=int, default=2, help="processes at once (default: %(default)s)")
+    parser.add_argument("--workers", type=record.count, default=2, help="processes at once (default: %(default)s)")
     parser.add_argument("--first", type=int, default=40_000, help="number of the first unit (default: %(default)s)")
     args = parser.parse_args()
     units = [Unit(s, v, args.first + k) for s, v in static_levels() for k in range(args.units)]
@@ -154,4 +154,4 @@ def _table(rows: list[dict[str, Any]]) -> str:
 
 
 if __name__ == "__main__":
-    main()
+    record.command(main)

@@ -99,9 +99,9 @@ def table(rows: dict[str, dict[str, Any]]) -> str:
 def main() -> None:
     """Train, judge, and write the results."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--steps", type=int, default=3000, help="of each (default: %(default)s)")
-    parser.add_argument("--threads", type=int, default=1, help="of each (default: %(default)s)")
-    parser.add_argument("--jobs", type=int, default=2, help="trained at a time (default: %(default)s)")
+    parser.add_argument("--steps", type=record.count, default=3000, help="of each (default: %(default)s)")
+    parser.add_argument("--threads", type=record.count, default=1, help="of each (default: %(default)s)")
+    parser.add_argument("--jobs", type=record.count, default=2, help="trained at a time (default: %(default)s)")
     parser.add_argument("--data", help="data set (default: the one that ships)")
     parser.add_argument("--runs", type=Path, default=record.RESULTS.parent / "runs" / "sweep")
     parser.add_argument("--only", nargs="*", default=list(VARIANTS), choices=list(VARIANTS), metavar="NAME")
@@ -118,4 +118,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    record.command(main)

@@ -117,9 +117,9 @@ def main() -> None:
     """Run what is missing, and write the results of all."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("levels", nargs="*", metavar="SUITE[/LEVEL]")
-    parser.add_argument("-n", type=int, default=10, help="problems of a level, at most 30 (default: %(default)s)")
+    parser.add_argument("-n", type=record.count, default=10, help="of a level, at most 30 (default: %(default)s)")
     parser.add_argument("--hard", type=int, default=20, help="of a hard level (default: %(default)s)")
-    parser.add_argument("--jobs", type=int, default=2, help="processes (default: %(default)s)")
+    parser.add_argument("--jobs", type=record.count, default=2, help="processes (default: %(default)s)")
     parser.add_argument("--store", type=Path, default=STORE)
     parser.add_argument("--report", action="store_true", help="run nothing; write the results of what the store holds")
     args = parser.parse_args()
@@ -137,10 +137,10 @@ def main() -> None:
     levels = [{"level": level, "methods": figures(runs, level)} for level in record.static_levels([])]
     levels = [level for level in levels if level["methods"]]
     record.write(
-        "optimizer", {"levels": levels}, table(levels), split="validation", jobs=args.jobs,
-        time_limits=PLANNERS, seeds="number of the problem modulo 1000",
+        "optimizer", {"levels": levels}, table(levels), split="validation", time_limits=PLANNERS,
+        seeds="number of the problem modulo 1000", **record.made_with(runs.values()),
     )  # fmt: skip
 
 
 if __name__ == "__main__":
-    main()
+    record.command(main)

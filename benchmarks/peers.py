@@ -3,10 +3,11 @@
 RoboPlan loads this project's URDF, with the same pairs of links, obstacles and held objects; how often it says of
 random states what the verdict says is part of the results. It plans with the same spacing of states, as a Euclidean
 distance, which is finer than the greatest step of a joint that OMPL's planners go by here. What differs: it has no
-proofs of stretches; its paths are shortened by its own shortcuts; of several goals it takes the first. They are judged
-by the same full check, and planned anew where they fail it, as those of rrtconnect are, which has two turns more: the
-straight line at first, and its path as it was found where the shortened one cannot be mended. Problems with shapes that
-it has not are left out.
+proofs of stretches; its paths are shortened by its own shortcuts; of several goals it takes the first. Its paths then
+go the way of rrtconnect's: the shortened one has to pass the full check, or is repaired; if it cannot be, the path as
+it was found has its turn. The first path counts from when it was found and checked, if it passes, else from the end.
+None looks at the straight line before it plans, but apex, which does so itself. Problems with shapes that RoboPlan has
+not are left out.
 
 Usage: python benchmarks/peers.py [SUITE[/LEVEL] ...] [-n 30] [--jobs 1]    (needs the extra "peers")
 """
@@ -14,6 +15,7 @@ Usage: python benchmarks/peers.py [SUITE[/LEVEL] ...] [-n 30] [--jobs 1]    (nee
 from __future__ import annotations
 
 import argparse
+import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -23,33 +25,38 @@ import numpy as np
 import record
 import torch
 from numpy.typing import NDArray
-from roboplan.core import (
-    Box,
-    Cylinder,
-    JointConfiguration,
-    Mesh,
-    PathShortcutter,
-    PathShortcuttingOptions,
-    Scene,
-    Sphere,
-    loadUrdfSceneDescriptionFromXml,
-)  # fmt: skip
-from roboplan.rrt import RRT, RRTOptions
 from store import RunStore
 
-from apex_ompl import plan, problems
+from apex_ompl import problems
 from apex_ompl.assembly import PlanningSetup, assemble
+from apex_ompl.benchmark import runs
+from apex_ompl.benchmark.rows import Job
 from apex_ompl.bodies import Body, pose_matrix
 from apex_ompl.ompl_globals import quiet_ompl
 from apex_ompl.problem import Problem
 from apex_ompl.problems.reach import robot
 from apex_ompl.repair import repair
 from apex_ompl.resolution import SEARCH_RESOLUTION
-from apex_ompl.result import FIRST
 from apex_ompl.robot import Robot
 from apex_ompl.robot.model import link_of
 from apex_ompl.space import path_length
 from apex_ompl.validity import full_check
+
+try:
+    from roboplan.core import (
+        Box,
+        Cylinder,
+        JointConfiguration,
+        Mesh,
+        PathShortcutter,
+        PathShortcuttingOptions,
+        Scene,
+        Sphere,
+        loadUrdfSceneDescriptionFromXml,
+    )
+    from roboplan.rrt import RRT, RRTOptions
+except ImportError as error:
+    sys.exit(f"peers.py: error: no RoboPlan ({error}), expected: pip install 'apex-ompl[peers]'")
 
 Array = NDArray[np.float64]
 
@@ -139,14 +146,9 @@ def run(job: tuple[str, str]) -> dict[str, Any]:
     if not about["carried"]:
         return {**about, "solved": False}
     if method != "roboplan":
-        result = plan(problem, method, timeout=LIMIT, seed=number, timing=False)
-        times = result.times
-        total = sum(times.get(stage, 0.0) for stage in ("line", "solve", "simplify", "verify", "repair"))
-        proof = sum(times.get(stage, 0.0) for stage in ("verify", "repair")) if method == "rrtconnect" else 0.0
-        first = times.get("line", 0.0) + times.get(FIRST, times.get("solve", 0.0)) + proof
-        failed = "repair" if "repair" in times and method == "rrtconnect" else ""
-        about |= {"solved": bool(result), "first": first, "total": total, "failed": failed}
-        return {**about, "length": result.length if result else None}
+        made = runs.run(Job(name, name, method, method, {}, number, LIMIT, simplify=True))
+        told = {key: made[key] for key in ("solved", "first", "total", "length", "reason")}
+        return {**about, **told, "failed": "repair" in made["times"]}
     ready = assemble(problem, robot())
     scene = roboplan_scene(ready)
     same = agreement(ready, scene, np.random.default_rng(number))
@@ -162,22 +164,32 @@ def run(job: tuple[str, str]) -> dict[str, Any]:
     try:
         path = planner.plan(start, goal)
     except RuntimeError as error:
-        return {**about, "solved": False, "why": str(error)[:80], "agreement": same, "failed": ""}
-    first = time.perf_counter() - begin
+        return {**about, "solved": False, "reason": str(error)[:80], "agreement": same, "failed": False}
+    took = time.perf_counter() - begin
     shortcuts = PathShortcuttingOptions(max_step_size=SEARCH_RESOLUTION, seed=number)
-    path = PathShortcutter(scene, shortcuts).shortcut(path)
+    shortened = PathShortcutter(scene, shortcuts).shortcut(path)
+    order, mended, failed = [names.index(joint) for joint in ready.robot.joint_names], None, False
+    candidates = [np.array(one.positions)[:, order] for one in (shortened, path)]
+    for states in candidates:
+        states[0], states[-1] = ready.start, ready.goals[0]
+        check = full_check(ready.verdict, states, ready.start, ready.goals)
+        if check:
+            mended = states
+            break
+        failed = True
+        with quiet_ompl():
+            mended = repair(ready, states, check, begin + LIMIT)
+        if mended is not None:
+            break
     total = time.perf_counter() - begin
-    order = [names.index(joint) for joint in ready.robot.joint_names]
-    states = np.array(path.positions)[:, order]
-    states[0], states[-1] = ready.start, ready.goals[0]
     begin = time.perf_counter()
-    check = full_check(ready.verdict, states, ready.start, ready.goals)
-    with quiet_ompl():
-        mended = states if check else repair(ready, states, check, begin + LIMIT - total)
-    proof = time.perf_counter() - begin
+    first = total
+    if full_check(ready.verdict, candidates[-1], ready.start, ready.goals):
+        first = took + time.perf_counter() - begin
     return {
-        **about, "solved": mended is not None, "failed": check.reason, "first": first + proof, "total": total + proof,
-        "length": None if mended is None else path_length(mended), "agreement": same,
+        **about, "solved": mended is not None, "failed": failed, "first": first, "total": total, "agreement": same,
+        "length": None if mended is None else path_length(mended),
+        "reason": "" if mended is not None else f"the path found failed the full check and repair, {check.reason}",
     }  # fmt: skip
 
 
@@ -188,14 +200,14 @@ def warm_up() -> None:
         run(("wall/easy/800000", method))
 
 
-def figures(runs: Sequence[dict[str, Any]]) -> dict[str, Any]:
+def figures(made: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Return what came of a method on a level."""
-    first, total = (np.array([r[key] if r["solved"] else np.inf for r in runs]) for key in ("first", "total"))
-    lengths = [r["length"] for r in runs if r["solved"]]
-    same = np.sum([r["agreement"] for r in runs if "agreement" in r] or [[0] * 4], axis=0)
+    first, total = (np.array([r[key] if r["solved"] else np.inf for r in made]) for key in ("first", "total"))
+    lengths = [r["length"] for r in made if r["solved"]]
+    same = np.sum([r["agreement"] for r in made if "agreement" in r] or [[0] * 4], axis=0)
     return {
-        "n": len(runs), "solved": float(np.mean([r["solved"] for r in runs])),
-        "failed_check": sum(bool(r["failed"]) for r in runs),
+        "n": len(made), "solved": float(np.mean([r["solved"] for r in made])),
+        "failed_check": sum(r["failed"] for r in made),
         "first_s": [record.reached(first, p) for p in (50, 95)],
         "total_s": [record.reached(total, p) for p in (50, 95)],
         "length": float(np.median(lengths)) if lengths else None, "agreement": same.tolist(),
@@ -224,11 +236,11 @@ def main() -> None:
     found: dict[str, Any] = {}
     for level in chosen:
         for k, method in enumerate(METHODS):
-            runs = [done[job] for job in jobs if job in done and job[1] == method and job[0].startswith(f"{level}/")]
-            runs = [one for one in runs if one["carried"]]
-            if not runs:
+            mine = [done[job] for job in jobs if job in done and job[1] == method and job[0].startswith(f"{level}/")]
+            mine = [one for one in mine if one["carried"]]
+            if not mine:
                 continue
-            f = found[f"{level}, {method}"] = figures(runs)
+            f = found[f"{level}, {method}"] = figures(mine)
             times = ["-" if v is None else f"{1e3 * v:.0f}" for v in (*f["first_s"], *f["total_s"])]
             length = "-" if f["length"] is None else f"{f['length']:.1f}"
             cells = [level if k == 0 else "", method, f["n"], f"{f['solved']:.2f}", f["failed_check"], *times, length]

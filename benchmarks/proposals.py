@@ -269,13 +269,13 @@ def main() -> None:
     """Run what is missing, and write the results of all."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("levels", nargs="*", metavar="SUITE[/LEVEL]")
-    parser.add_argument("-n", type=int, default=10, help="problems of a level (default: %(default)s)")
+    parser.add_argument("-n", type=record.count, default=10, help="problems of a level (default: %(default)s)")
     parser.add_argument("--hard", type=int, default=30, help="of a hard level (default: %(default)s)")
     parser.add_argument("--paper", type=int, default=5, help="of a level for apex-paper (default: %(default)s)")
     parser.add_argument(
         "--data", default=str(ROOT / "data" / "dual_panda_softhand" / "paths.zip"), help="for neighbours"
     )
-    parser.add_argument("--jobs", type=int, default=2, help="processes (default: %(default)s)")
+    parser.add_argument("--jobs", type=record.count, default=2, help="processes (default: %(default)s)")
     parser.add_argument("--split", choices=("validation", "test"), default="test")
     parser.add_argument("--methods", nargs="*", choices=list(METHODS), default=list(METHODS), metavar="NAME")
     parser.add_argument("--regression", default=str(ROOT / "benchmarks" / "runs" / "regression" / "checkpoint"))
@@ -306,10 +306,10 @@ def main() -> None:
     if hard:
         levels.insert(0, {"level": "all hard levels", "methods": figures(hard)})
     record.write(
-        "proposals", {"levels": levels, "made_of": kinds}, table(levels), split=args.split, jobs=args.jobs,
-        time_limit=TIME_LIMIT, seeds="number of the problem modulo 1000",
+        "proposals", {"levels": levels, "made_of": kinds}, table(levels), split=args.split,
+        time_limit=TIME_LIMIT, seeds="number of the problem modulo 1000", **record.made_with(runs),
     )  # fmt: skip
 
 
 if __name__ == "__main__":
-    main()
+    record.command(main)

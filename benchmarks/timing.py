@@ -265,7 +265,7 @@ def main() -> None:
     """Time paths, and write the results."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("levels", nargs="*", metavar="SUITE[/LEVEL]")
-    parser.add_argument("-n", type=int, default=18, help="problems of a level (default: %(default)s)")
+    parser.add_argument("-n", type=record.count, default=18, help="problems of a level (default: %(default)s)")
     parser.add_argument("--ways", type=int, default=3, help="of them for the other ways (default: %(default)s)")
     args = parser.parse_args()
     toppra.setup_logging("ERROR")
@@ -317,4 +317,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    record.command(main)

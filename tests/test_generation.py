@@ -221,6 +221,8 @@ def test_workers_of_ray_make_the_same_paths_and_may_die(made: list[Paths]) -> No
             for name, _ in spread(fails, {"a": (0,), "b": (1,)}, **options):
                 done.append(name)
         assert done == ["a"]
+        rest = dict(spread(fails, {"a": (0,), "b": (1,), "d": (3,)}, lost=lambda name: f"{name} lost", **options))
+        assert rest == {"a": 0, "b": "b lost", "d": 3}
         with pytest.raises(ClusterError, match="c: no unit 2"):
             list(spread(fails, {"c": (2,)}, **options))
     finally:

@@ -90,8 +90,10 @@ class Benchmarked(Planning):
         experiment.setPreRunEvent(begin)
         experiment.setPostRunEvent(end)
         request = ot.Request(solving_time(parameters, timeout), MEMORY, 1, UPDATES, False, False, False)
-        experiment.benchmark(request)
-        self.ready.motions.check = check  # or it and OMPL's objects would keep each other, and all that was planned
+        try:
+            experiment.benchmark(request)
+        finally:
+            self.ready.motions.check = check  # or it and OMPL's objects would keep each other, and all that was planned
         self.raise_faults()
         self.beside = judged[1] - judged[0] + tally.states - judged[2]
         if reports[0] is not None:
@@ -103,7 +105,7 @@ class Benchmarked(Planning):
         noticed += [moment for data in recorded.runsProgressData for moment in _solved_at(data)]
         if noticed:
             self.times[FIRST] = min(noticed)
-        return PlanStatus(ob.PlannerStatus.PlannerStatusType(int(self.properties["status ENUM"])).name)
+        return ompl_status(self.properties)
 
     def proof_of_first(self) -> float:
         """Return how long it takes to prove the first path, or what comes of it in the end [s].
@@ -131,6 +133,11 @@ class Benchmarked(Planning):
             return check(first, second)
 
         return watched
+
+
+def ompl_status(properties: Mapping[str, str]) -> PlanStatus:
+    """Return what a planner itself said in the end, of OMPL's properties of a run."""
+    return PlanStatus(ob.PlannerStatus.PlannerStatusType(int(properties["status ENUM"])).name)
 
 
 def _solved_at(progress: Iterable[Mapping[str, str]]) -> Iterator[float]:

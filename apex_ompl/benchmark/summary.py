@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -12,11 +11,13 @@ from typing import Any
 import numpy as np
 
 from apex_ompl.benchmark.results import Results
-from apex_ompl.benchmark.runs import NO_PROBLEM, Run
+from apex_ompl.benchmark.runs import NO_PROBLEM, Run, ompl_status
 from apex_ompl.metrics import next_percentile, percentile_interval, share_interval
+from apex_ompl.result import PlanStatus
 
 OTHERS = 0.5  # load average of other processes that is let pass
 MOMENTS = (0.1, 0.5, 2.0, 10.0)  # at which shares of solved runs are given [s]
+FULL_TIME = (PlanStatus.TIMEOUT, PlanStatus.APPROXIMATE_SOLUTION, PlanStatus.EXACT_SOLUTION)
 TREES = ("rrtconnect", "sprint")  # what of apex is a tree's work alone
 
 
@@ -187,9 +188,8 @@ def warnings(results: Results) -> list[str]:
     if crashed:
         reasons = Counter(f"{run['label']}: {run['reason']}" for run in crashed)
         said.append("Crashed: " + "; ".join(f"{n} x {reason}" for reason, n in reasons.most_common(5)) + ".")
-    refused = Counter(
-        f"{run['label']}, {match[1]}" for run in results.runs if (match := re.search(r"OMPL says (\w+)", run["reason"]))
-    )
+    ended = ((run["label"], ompl_status(run["properties"])) for run in results.runs if run["properties"])
+    refused = Counter(f"{label}, {status}" for label, status in ended if status not in FULL_TIME)
     if refused:
         said.append("Ended early, unsolved: " + "; ".join(f"{n} x {name}" for name, n in refused.most_common(5)) + ".")
     faulty = Counter(

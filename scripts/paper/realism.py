@@ -96,13 +96,14 @@ def propose(part: Sequence[tuple[str, Array]], seed: int) -> dict[str, tuple[lis
     """Return the paths of each variant for some problems, from their ends, and the CPU time that they took [s]."""
     generator = torch.Generator().manual_seed(seed)
     torch.set_num_threads(1)
-    made: dict[str, list[Array]] = {label: [] for label in variants()}
+    sampled = variants()
+    made: dict[str, list[Array]] = {label: [] for label in sampled}
     seconds = dict.fromkeys(made, 0.0)
     with quiet_ompl(), torch.no_grad():
         for problem, control in part:
             verdict = assemble(problems.load(problem), robot()).verdict
             query = query_of(verdict, control[0], control[-1])
-            for label, (name, sampling) in variants().items():
+            for label, (name, sampling) in sampled.items():
                 begin = time.process_time()  # other work on the machine does not count
                 found = load(name).propose(query, verdict.kernel, 1, sampling=sampling, generator=generator)
                 seconds[label] += time.process_time() - begin
