@@ -16,6 +16,7 @@ import record
 from apex_ompl import load_problem
 from apex_ompl.bodies import Body
 from apex_ompl.collision import Verdict
+from apex_ompl.endings import run_command
 from apex_ompl.goals import alignment_goal
 from apex_ompl.robot import Robot
 from apex_ompl.robot.assets import DATA
@@ -78,4 +79,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    record.command(main)
+    run_command(main)

@@ -32,6 +32,7 @@ from store import RunStore
 from apex_ompl import plan, problems
 from apex_ompl.assembly import assemble
 from apex_ompl.diffusion.checkpoint import SHIPPED
+from apex_ompl.endings import run_command
 from apex_ompl.problems.reach import robot
 from apex_ompl.resolution import FULL_RESOLUTION
 from apex_ompl.result import FIRST, INSIDE, PlanResult
@@ -266,4 +267,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    record.command(main)
+    run_command(main)

@@ -25,6 +25,7 @@ from ompl import base as ob
 
 from apex_ompl import problems
 from apex_ompl.assembly import PlanningSetup, assemble
+from apex_ompl.endings import run_command
 from apex_ompl.ompl_globals import quiet_ompl, seed_ompl
 from apex_ompl.optimize import Optimizer, Settings
 from apex_ompl.planners import solve_loop
@@ -171,4 +172,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    record.command(main)
+    run_command(main)

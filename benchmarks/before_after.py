@@ -19,6 +19,7 @@ from shipped_problems import BAXTER
 
 from apex_ompl import PlanResult, assembly, plan, problems
 from apex_ompl.collision import Verdict
+from apex_ompl.endings import run_command
 
 WORK = ("line", "solve", "simplify", "verify", "repair")
 
@@ -78,4 +79,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    record.command(main)
+    run_command(main)

@@ -22,6 +22,7 @@ import record
 from store import RunStore
 
 from apex_ompl import plan, problems
+from apex_ompl.endings import run_command
 from apex_ompl.moving import even_times, timed_check
 from apex_ompl.problems.alignment import PACE
 from apex_ompl.problems.reach import robot
@@ -145,4 +146,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    record.command(main)
+    run_command(main)

@@ -16,6 +16,8 @@ from pathlib import Path
 
 import record
 
+from apex_ompl.endings import run_command
+
 ROOT = Path(__file__).resolve().parents[1]
 REFERENCE = ROOT / "benchmarks" / "reference_lengths.json"
 NEEDED = ("matplotlib", "ray", "roboplan")
@@ -45,4 +47,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    record.command(main)
+    run_command(main)

@@ -22,6 +22,7 @@ from verdict import around_home, boxes, microseconds, of_batch
 from apex_ompl import assembly, plan
 from apex_ompl.collision import Verdict
 from apex_ompl.collision.spheres import quality, read_covers, shape_key
+from apex_ompl.endings import run_command
 from apex_ompl.resolution import FULL_RESOLUTION, SEARCH_RESOLUTION
 from apex_ompl.robot import load_robot
 
@@ -83,4 +84,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    record.command(main)
+    run_command(main)

@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 import record
 
+from apex_ompl.endings import run_command
 from apex_ompl.engine import Options
 from apex_ompl.generation import SHARES, UNIT, Unit, static_levels, work
 from apex_ompl.problems import scenes
@@ -154,4 +155,4 @@ def _table(rows: list[dict[str, Any]]) -> str:
 
 
 if __name__ == "__main__":
-    record.command(main)
+    run_command(main)

@@ -26,6 +26,7 @@ import record
 from apex_ompl.benchmark import Row, Workers, bench, report, write_database, write_logs
 from apex_ompl.benchmark.rows import PAPER
 from apex_ompl.benchmark.summary import MOMENTS, Figures, Table, figures, tables, warnings
+from apex_ompl.endings import run_command
 from apex_ompl.metrics import share_interval
 
 TIMEOUT = 10.0  # [s]
@@ -108,4 +109,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    record.command(main)
+    run_command(main)

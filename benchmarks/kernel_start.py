@@ -18,6 +18,8 @@ import tempfile
 import numpy as np
 import record
 
+from apex_ompl.endings import run_command
+
 CODE = """
 import json, time
 marks = [time.perf_counter()]
@@ -64,4 +66,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    record.command(main)
+    run_command(main)

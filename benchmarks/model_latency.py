@@ -22,6 +22,7 @@ from apex_ompl.assembly import assemble
 from apex_ompl.diffusion.checkpoint import shipped
 from apex_ompl.diffusion.guidance import Guidance
 from apex_ompl.diffusion.proposals import Sampling
+from apex_ompl.endings import run_command
 from apex_ompl.problems.reach import robot
 from apex_ompl.queries import query_of
 
@@ -84,4 +85,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    record.command(main)
+    run_command(main)

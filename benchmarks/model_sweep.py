@@ -24,6 +24,7 @@ from apex_ompl.cases import load_cases
 from apex_ompl.diffusion.checkpoint import load_model
 from apex_ompl.diffusion.runlog import read_log
 from apex_ompl.diffusion.validation import judged
+from apex_ompl.endings import run_command
 
 LOSSES = ("loss", "held_out")
 ROOT = record.RESULTS.parent.parent
@@ -118,4 +119,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    record.command(main)
+    run_command(main)

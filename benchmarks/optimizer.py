@@ -23,6 +23,7 @@ from store import RunStore
 
 from apex_ompl import plan, problems
 from apex_ompl.assembly import assemble
+from apex_ompl.endings import run_command
 from apex_ompl.optimize import Optimizer
 from apex_ompl.pool import first_valid
 from apex_ompl.problems.reach import robot
@@ -143,4 +144,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    record.command(main)
+    run_command(main)

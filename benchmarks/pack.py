@@ -15,8 +15,7 @@ import lzma
 import tarfile
 from pathlib import Path
 
-import record
-
+from apex_ompl.endings import run_command
 from apex_ompl.errors import MissingFileError, ParameterError
 from apex_ompl.files import make_folder, write_atomically
 
@@ -79,4 +78,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    record.command(main)
+    run_command(main)

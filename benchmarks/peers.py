@@ -32,6 +32,7 @@ from apex_ompl.assembly import PlanningSetup, assemble
 from apex_ompl.benchmark import runs
 from apex_ompl.benchmark.rows import Job
 from apex_ompl.bodies import Body, pose_matrix
+from apex_ompl.endings import run_command
 from apex_ompl.ompl_globals import quiet_ompl
 from apex_ompl.problem import Problem
 from apex_ompl.problems.reach import robot
@@ -257,4 +258,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    record.command(main)
+    run_command(main)

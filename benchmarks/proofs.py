@@ -23,6 +23,7 @@ from apex_ompl.bodies import AttachedObject, MeshFile, Obstacle
 from apex_ompl.collision import Verdict
 from apex_ompl.collision.proofs import Tally
 from apex_ompl.collision.sweep import sample_path
+from apex_ompl.endings import run_command
 from apex_ompl.resolution import FULL_RESOLUTION, SEARCH_RESOLUTION
 from apex_ompl.robot import Robot, load_robot
 
@@ -189,4 +190,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    record.command(main)
+    run_command(main)

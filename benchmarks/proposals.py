@@ -35,6 +35,7 @@ from apex_ompl.diffusion.checkpoint import SHIPPED, read_config
 from apex_ompl.diffusion.data import Mirror, window_paths
 from apex_ompl.diffusion.guidance import Guidance
 from apex_ompl.diffusion.proposals import Sampling, TrajectoryModel
+from apex_ompl.endings import run_command
 from apex_ompl.kernel import Kernel, RobotTables
 from apex_ompl.kernel.scene import scene_tables
 from apex_ompl.optimize import Optimizer
@@ -312,4 +313,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    record.command(main)
+    run_command(main)

@@ -22,6 +22,7 @@ from apex_ompl.dataset import load
 from apex_ompl.diffusion.autoencoder import LinearLatent
 from apex_ompl.diffusion.checkpoint import shipped
 from apex_ompl.diffusion.data import split
+from apex_ompl.endings import run_command
 from apex_ompl.problems.reach import robot
 from apex_ompl.records import Paths
 from apex_ompl.validity import full_check
@@ -76,4 +77,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    record.command(main)
+    run_command(main)

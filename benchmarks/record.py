@@ -8,7 +8,7 @@ import math
 import platform
 import subprocess
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 
 from apex_ompl import problems
-from apex_ompl.errors import ApexError
 from apex_ompl.files import write_atomically
 from apex_ompl.metrics import next_percentile
 from apex_ompl.provenance import hardware, versions
@@ -81,18 +80,6 @@ def reached(values: list[float] | np.ndarray, p: float) -> float | None:
         return None
     value = next_percentile(values, p)
     return value if math.isfinite(value) else None
-
-
-def command(main: Callable[[], None]) -> None:
-    """Run a benchmark; what it cannot go by, or Ctrl-C, ends it with one sentence."""
-    try:
-        main()
-    except ApexError as error:
-        print(f"{Path(sys.argv[0]).name}: error: {error}", file=sys.stderr)
-        sys.exit(2)
-    except KeyboardInterrupt:
-        print(f"{Path(sys.argv[0]).name}: stopped; the same command goes on from there", file=sys.stderr)
-        sys.exit(130)
 
 
 def count(text: str) -> int:

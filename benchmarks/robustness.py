@@ -24,6 +24,7 @@ from ompl import base as ob
 from apex_ompl import plan, problems
 from apex_ompl.assembly import assemble
 from apex_ompl.bodies import Obstacle
+from apex_ompl.endings import run_command
 from apex_ompl.errors import ApexError
 from apex_ompl.ompl_globals import quiet_ompl
 from apex_ompl.planners.apex import APEX
@@ -222,4 +223,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    record.command(main)
+    run_command(main)

@@ -12,6 +12,7 @@ import numpy as np
 import record
 
 from apex_ompl import problems
+from apex_ompl.endings import run_command
 
 FIRST = 100_000  # seed of the first problem, of the training split
 
@@ -42,4 +43,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    record.command(main)
+    run_command(main)

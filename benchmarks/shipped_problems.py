@@ -12,6 +12,7 @@ import record
 
 from apex_ompl import PlanResult, plan, problems
 from apex_ompl.api import STRAIGHT_LINE
+from apex_ompl.endings import run_command
 
 BAXTER = Path(__file__).resolve().parent.parent / "examples" / "baxter_table.yaml"
 
@@ -66,4 +67,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    record.command(main)
+    run_command(main)

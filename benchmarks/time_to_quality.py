@@ -28,6 +28,7 @@ from store import RunStore
 
 from apex_ompl import planners, problems
 from apex_ompl.assembly import PlanningSetup, assemble
+from apex_ompl.endings import run_command
 from apex_ompl.files import write_atomically
 from apex_ompl.ompl_globals import quiet_ompl, seed_ompl
 from apex_ompl.problems.reach import robot
@@ -205,4 +206,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    record.command(main)
+    run_command(main)

@@ -34,6 +34,7 @@ from tqdm import tqdm
 
 from apex_ompl import plan, problems
 from apex_ompl.assembly import assemble
+from apex_ompl.endings import run_command
 from apex_ompl.kernel.speed import farthest, fastest
 from apex_ompl.problems.reach import robot
 from apex_ompl.result import PlanResult, PlanStatus
@@ -317,4 +318,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    record.command(main)
+    run_command(main)

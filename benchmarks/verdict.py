@@ -22,6 +22,7 @@ from apex_ompl import plan, problems
 from apex_ompl.bodies import Obstacle
 from apex_ompl.collision import Verdict
 from apex_ompl.collision.broadphase import exact_requests
+from apex_ompl.endings import run_command
 from apex_ompl.resolution import FULL_RESOLUTION
 from apex_ompl.robot import Robot, load_robot
 from apex_ompl.space import resample
@@ -225,4 +226,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    record.command(main)
+    run_command(main)

@@ -11,6 +11,7 @@ import numpy as np
 
 from apex_ompl import problems
 from apex_ompl.assembly import assemble
+from apex_ompl.endings import run_command
 from apex_ompl.errors import ApexError
 from apex_ompl.moving import timed_check
 from apex_ompl.problems import frozen
@@ -66,4 +67,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

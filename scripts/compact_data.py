@@ -8,14 +8,13 @@ Usage: python scripts/compact_data.py FOLDER FILE.zip [--mib 24] [--seed 0]
 from __future__ import annotations
 
 import argparse
-import sys
 import tempfile
 from pathlib import Path
 
 import numpy as np
 
 from apex_ompl.dataset import Store, save
-from apex_ompl.errors import ApexError
+from apex_ompl.endings import run_command
 from apex_ompl.files import check_writable, write_atomically
 from apex_ompl.records import PATH_FIELDS, SOURCES, DatasetError, Paths
 
@@ -87,12 +86,8 @@ def main() -> None:
     parser.add_argument("--mib", type=mebibytes, default=24.0, help="largest size (default: %(default)s)")
     parser.add_argument("--seed", type=whole, default=0, help="of the random choice (default: %(default)s)")
     args = parser.parse_args()
-    try:
-        compact(args)
-    except ApexError as error:
-        print(f"compact_data: error: {error}", file=sys.stderr)
-        sys.exit(2)
+    compact(args)
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main, "data")

@@ -22,6 +22,7 @@ import pinocchio as pin
 from scipy.optimize import minimize
 
 from apex_ompl.collision.shapes import convex_hull
+from apex_ompl.endings import run_command
 from apex_ompl.files import write_atomically
 from apex_ompl.robot import Robot
 from apex_ompl.robot.assets import DATA
@@ -160,4 +161,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

@@ -8,7 +8,6 @@ Usage: python scripts/describe_data.py DATA [--out FOLDER] [--check 200] [--moti
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +15,7 @@ import numpy as np
 from apex_ompl import description, problems
 from apex_ompl.assembly import assemble
 from apex_ompl.dataset import Store, load
-from apex_ompl.errors import ApexError
+from apex_ompl.endings import run_command
 from apex_ompl.files import check_writable, is_file, write_atomically
 from apex_ompl.problems.reach import robot
 from apex_ompl.records import SOURCES, DatasetError, Paths
@@ -153,18 +152,8 @@ def main() -> None:
     parser.add_argument("--motions", type=some, default=MOTIONS, help="that are drawn (default: %(default)s)")
     parser.add_argument("--seed", type=whole, default=0, help="of the random choices (default: %(default)s)")
     args = parser.parse_args()
-    try:
-        describe(args)
-    except ImportError as error:
-        print(
-            f"describe_data: error: no {error.name}, expected: pip install -c constraints.txt '.[data]'",
-            file=sys.stderr,
-        )
-        sys.exit(2)
-    except ApexError as error:
-        print(f"describe_data: error: {error}", file=sys.stderr)
-        sys.exit(2)
+    describe(args)
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main, "data")

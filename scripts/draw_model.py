@@ -10,7 +10,6 @@ Usage: python scripts/draw_model.py [--model apex-paper] [--problem NAME] [--fol
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +20,7 @@ from apex_ompl import load_model, load_problem
 from apex_ompl.assembly import PlanningSetup, assemble
 from apex_ompl.diffusion.guidance import Guidance
 from apex_ompl.diffusion.proposals import Sampling
-from apex_ompl.errors import ApexError
+from apex_ompl.endings import run_command
 from apex_ompl.files import make_folder
 from apex_ompl.kernel import Kernel
 from apex_ompl.kernel.tables import BOX, HALF_SPACE, SPHERE
@@ -143,20 +142,12 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--folder", type=Path, default=Path("docs/pictures"))
     args = parser.parse_args()
-    try:
-        make_folder(args.folder)
-        one, many = (assemble(load_problem(name), robot()) for name in (args.problem, args.many))
-        denoising(args.model, one, args.seed, args.folder / "denoising.png")
-        count = diversity(args.diverse, many, args.seed, args.folder / "diversity.png")
-    except ImportError as error:
-        expected = "expected: pip install -c constraints.txt '.[data]'"
-        print(f"draw_model: error: no {error.name}, {expected}", file=sys.stderr)
-        sys.exit(2)
-    except (ApexError, OSError) as error:
-        print(f"draw_model: error: {error}", file=sys.stderr)
-        sys.exit(2)
+    make_folder(args.folder)
+    one, many = (assemble(load_problem(name), robot()) for name in (args.problem, args.many))
+    denoising(args.model, one, args.seed, args.folder / "denoising.png")
+    count = diversity(args.diverse, many, args.seed, args.folder / "diversity.png")
     print(f"{args.folder}: denoising.png, diversity.png with {count} valid trajectories of {args.many}")
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main, "data")

@@ -9,7 +9,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from apex_ompl.errors import ApexError
+from apex_ompl.endings import run_command
 
 LARGEST = 24.0  # of all that ship together [MiB]
 
@@ -33,12 +33,8 @@ def main() -> None:
     parser.add_argument("run", type=Path, metavar="RUN", help="folder of a training run, or a checkpoint")
     parser.add_argument("name", metavar="NAME", help="for example apex")
     args = parser.parse_args()
-    try:
-        export(args.run, args.name)
-    except ApexError as error:
-        print(f"export_checkpoint: error: {error}", file=sys.stderr)
-        sys.exit(2)
+    export(args.run, args.name)
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

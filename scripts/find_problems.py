@@ -21,6 +21,7 @@ from apex_ompl.api import plan
 from apex_ompl.assembly import assemble
 from apex_ompl.bodies import AttachedObject, Obstacle
 from apex_ompl.collision import Verdict
+from apex_ompl.endings import run_command
 from apex_ompl.ik import Links, in_world
 from apex_ompl.kernel import facing, gap
 from apex_ompl.problem import Alignment, Goal, Problem
@@ -354,4 +355,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

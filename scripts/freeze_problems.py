@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from apex_ompl.api import plan
 from apex_ompl.assembly import assemble
 from apex_ompl.collision import Verdict
+from apex_ompl.endings import run_command
 from apex_ompl.moving import at_time, even_times, timed_check
 from apex_ompl.problem import Problem
 from apex_ompl.problems import frozen
@@ -159,4 +160,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

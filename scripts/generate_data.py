@@ -14,7 +14,6 @@ from __future__ import annotations
 import argparse
 import json
 import platform
-import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -23,8 +22,9 @@ from typing import Any
 from apex_ompl.cases import load_cases, save_cases, work_cases
 from apex_ompl.cluster import spread
 from apex_ompl.dataset import Store
+from apex_ompl.endings import run_command
 from apex_ompl.engine import Options
-from apex_ompl.errors import ApexError, ParameterError
+from apex_ompl.errors import ParameterError
 from apex_ompl.files import check_writable, make_folder
 from apex_ompl.kernel import RobotTables
 from apex_ompl.provenance import versions
@@ -203,19 +203,7 @@ def main() -> None:
         parser.error("--model goes with problems that are drawn here")
     if args.split != "train" and not args.write_cases:
         parser.error("--split validation goes with --write-cases: data are of the training split")
-    try:
-        write_cases(args) if args.write_cases else generate(args)
-    except KeyboardInterrupt:
-        sys.exit(130)
-    except ImportError as error:
-        print(
-            f"generate_data: error: no {error.name}, expected: pip install -c constraints.txt '.[data]'",
-            file=sys.stderr,
-        )
-        sys.exit(2)
-    except ApexError as error:
-        print(f"generate_data: error: {error}", file=sys.stderr)
-        sys.exit(2)
+    write_cases(args) if args.write_cases else generate(args)
 
 
 def _whole(text: str) -> int:
@@ -232,4 +220,4 @@ def _count(text: str) -> int:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main, "data")

@@ -14,6 +14,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from apex_ompl import problems
+from apex_ompl.endings import run_command
 from apex_ompl.files import write_atomically
 from apex_ompl.render import render
 
@@ -61,4 +62,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

@@ -10,7 +10,6 @@ Usage: python scripts/make_covers.py dual_panda_softhand [--gaps 0.02 0.007 0.00
 from __future__ import annotations
 
 import argparse
-import sys
 import time
 from pathlib import Path
 
@@ -18,7 +17,7 @@ import coal
 import numpy as np
 
 from apex_ompl.collision.spheres import GAPS, Cover, make_cover, quality, shape_key, unproved, write_covers
-from apex_ompl.errors import ApexError
+from apex_ompl.endings import run_command
 from apex_ompl.files import check_writable
 from apex_ompl.robot import load_robot
 from apex_ompl.robot.assets import DATA
@@ -76,8 +75,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main()
-    except ApexError as error:
-        print(f"make_covers: error: {error}", file=sys.stderr)
-        sys.exit(2)
+    run_command(main)

@@ -9,6 +9,7 @@ import argparse
 from pathlib import Path
 
 from apex_ompl import load_problem, plan, problems
+from apex_ompl.endings import run_command
 from apex_ompl.plots import plot_motion
 from apex_ompl.render import render
 
@@ -32,4 +33,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main, "viz")

@@ -20,6 +20,8 @@ import numpy as np
 import pinocchio as pin
 from scipy.spatial.transform import Rotation
 
+from apex_ompl.endings import run_command
+
 RADIUS = 0.007
 HALF_GAP = 0.0065  # half the distance between the two rolling halves of a joint [m]
 MEDIUM, SHORT, DISTAL = 0.017, 0.009, 0.0225
@@ -191,4 +193,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

@@ -17,22 +17,22 @@ from __future__ import annotations
 import argparse
 import io
 import json
-import sys
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.figure import Figure
-from paper import realism
 
 from apex_ompl import metrics
 from apex_ompl.benchmark import Results, Row, Workers, bench
 from apex_ompl.benchmark.rows import PAPER
 from apex_ompl.benchmark.summary import Figures, Table, about, figures, warnings
-from apex_ompl.errors import ApexError
+from apex_ompl.endings import run_command
 from apex_ompl.files import make_folder, write_atomically
 from apex_ompl.provenance import hardware, versions
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 ROOT = Path(__file__).resolve().parents[1]
 TASKS, SIZES = ("vertical", "horizontal"), ("small", "medium", "large")
@@ -53,6 +53,13 @@ COLOURS = ("#0b6e4f", "#3d5a80", "#98b6d8", "#7a5195", "#c9a6d6", "#c8553d", "#e
 FID_LEVELS = [f"{task}/{size}" for task in TASKS for size in SIZES]
 
 
+def blank(width: float, height: float) -> Figure:
+    """Return an empty picture, of a size in inches."""
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width, height), layout="constrained")
+
+
 def runs(args: argparse.Namespace) -> Results:
     """Return the runs of the planners on the paper's tasks, each on the same problems."""
     levels, labels = [f"{task}/{size}" for task in TASKS for size in EDGES], {row.label for row in ROWS}
@@ -68,7 +75,7 @@ def failure(args: argparse.Namespace) -> tuple[dict[str, Any], list[Table], Figu
     per_level = [f for f in figures(results) if f.experiment.split("/")[1] in SIZES]
     found: dict[str, Any] = {}
     rows = []
-    picture = Figure(figsize=(11, 4), layout="constrained")
+    picture = blank(11, 4)
     axes = picture.subplots(1, 3)
     for t, task in enumerate(TASKS):
         for k, row in enumerate(ROWS):
@@ -105,7 +112,7 @@ def size(args: argparse.Namespace) -> tuple[dict[str, Any], list[Table], Figure,
     by = {(f.experiment, f.label): f for f in figures(results)}
     found: dict[str, Any] = {}
     rows = []
-    picture = Figure(figsize=(9, 4), layout="constrained")
+    picture = blank(9, 4)
     labels = [label for pair in PAIRS for label in pair]
     for axis, task in zip(picture.subplots(1, 2, sharey=True), TASKS, strict=True):
         for label in labels:
@@ -137,11 +144,13 @@ def said_of(results: Results) -> list[tuple[str, Any]]:
 
 def fid(args: argparse.Namespace) -> tuple[dict[str, Any], list[Table], Figure, list[tuple[str, Any]]]:
     """Return distances of guided and unguided paths from solutions of the same problems."""
+    from paper import realism
+
     units = realism.solutions(args.keep / "solutions", args.n, FID_LEVELS, args.jobs)
     real, made, seconds = realism.made_for(units, args.n, args.jobs)
     found_all: dict[str, Any] = {}
     rows = []
-    picture = Figure(figsize=(8, 4), layout="constrained")
+    picture = blank(8, 4)
     for axis, (name, features) in zip(picture.subplots(1, 2), realism.feature_spaces().items(), strict=True):
         truth = features(real)
         for k, (label, paths) in enumerate(made.items()):
@@ -177,30 +186,24 @@ def main() -> None:
     parser.add_argument("--keep", type=Path, default=ROOT / "benchmarks" / "runs", metavar="FOLDER", help="for runs")
     parser.add_argument("-o", "--out", type=Path, default=ROOT / "benchmarks" / "results", metavar="FOLDER")
     args = parser.parse_args()
+    blank(1.0, 1.0)  # says now that matplotlib is missing, not after hours
     make, usual = FIGURES[args.figure]
     args.n = usual if args.n is None else args.n
-    try:
-        if args.n < 4 or args.jobs < 1:
-            parser.error("-n is 4 or more, --jobs 1 or more")
-        make_folder(args.keep)
-        make_folder(args.out)
-        found, tables, picture, says = make(args)
-        name = f"paper_{args.figure}"
-        text = [f"# {name}", f"`python scripts/reproduce.py {args.figure} -n {args.n}`"]
-        text += [*(table.markdown() for table in tables), "\n".join(f"- {key}: {value}" for key, value in says)]
-        write_atomically(args.out / f"{name}.json", (json.dumps({"about": says, **found}, indent=1) + "\n").encode())
-        write_atomically(args.out / f"{name}.md", ("\n\n".join(text) + "\n").encode())
-        drawn = io.BytesIO()
-        picture.savefig(drawn, format="png", dpi=120)
-        write_atomically(args.out / f"{name}.png", drawn.getvalue())
-    except ApexError as error:
-        print(f"reproduce: error: {error}", file=sys.stderr)
-        sys.exit(2)
-    except KeyboardInterrupt:
-        print("reproduce: stopped; the same command goes on from there", file=sys.stderr)
-        sys.exit(130)
+    if args.n < 4 or args.jobs < 1:
+        parser.error("-n is 4 or more, --jobs 1 or more")
+    make_folder(args.keep)
+    make_folder(args.out)
+    found, tables, picture, says = make(args)
+    name = f"paper_{args.figure}"
+    text = [f"# {name}", f"`python scripts/reproduce.py {args.figure} -n {args.n}`"]
+    text += [*(table.markdown() for table in tables), "\n".join(f"- {key}: {value}" for key, value in says)]
+    write_atomically(args.out / f"{name}.json", (json.dumps({"about": says, **found}, indent=1) + "\n").encode())
+    write_atomically(args.out / f"{name}.md", ("\n\n".join(text) + "\n").encode())
+    drawn = io.BytesIO()
+    picture.savefig(drawn, format="png", dpi=120)
+    write_atomically(args.out / f"{name}.png", drawn.getvalue())
     print("\n\n".join(table.markdown() for table in tables))
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main, "bench,data")

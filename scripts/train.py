@@ -10,14 +10,13 @@ Usage: python scripts/train.py CONFIG.yaml [--out FOLDER] [--set KEY=VALUE ...] 
 from __future__ import annotations
 
 import argparse
-import sys
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-from apex_ompl.errors import ApexError
+from apex_ompl.endings import run_command
 from apex_ompl.files import locked, make_folder
 
 
@@ -68,17 +67,7 @@ def main() -> None:
     parser.add_argument("--minutes", type=_minutes, default=float("inf"), help="end after these, to go on another time")
     parser.add_argument("--quiet", action="store_true", help="show no progress")
     args = parser.parse_args()
-    try:
-        train(args)
-    except KeyboardInterrupt:
-        sys.exit(130)
-    except ImportError as error:
-        expected = "expected: pip install -c constraints.txt '.[train]'"
-        print(f"train: error: no {error.name}, {expected}", file=sys.stderr)
-        sys.exit(2)
-    except ApexError as error:
-        print(f"train: error: {error}", file=sys.stderr)
-        sys.exit(2)
+    train(args)
 
 
 def _setting(text: str) -> tuple[str, Any]:
@@ -102,4 +91,4 @@ def _minutes(text: str) -> float:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main, "train")

@@ -10,7 +10,7 @@ from support import ROOT
 
 LAYERS = [
     {"errors"},
-    {"arguments", "cluster", "files", "meshes", "provenance", "resolution", "stopwatch"},
+    {"arguments", "cluster", "endings", "files", "meshes", "provenance", "resolution", "stopwatch"},
     {"schema"},
     {"bodies", "kernel"},
     {"problem", "spline"},
