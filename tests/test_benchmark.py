@@ -227,7 +227,7 @@ def test_work_of_others_beside_runs_is_said(results: Results) -> None:
 
 
 def test_planners_that_end_early_are_said(results: Results) -> None:
-    refused = {"status ENUM": str(int(ob.PlannerStatus.PlannerStatusType.INVALID_GOAL))}
+    refused = {"status ENUM": str(ob.PlannerStatus.PlannerStatusType.INVALID_GOAL.value)}
     made = [{**run, "solved": False, "properties": refused} for run in results.runs[:2]]
     text = benchmark.markdown(Results(results.folder, results.about, made))
     assert "Ended early, unsolved: " in text
