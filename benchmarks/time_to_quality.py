@@ -39,6 +39,7 @@ from apex_ompl.validity import full_check
 REFERENCE = Path(__file__).parent / "reference_lengths.json"
 STORE = Path(__file__).parent / "runs" / "time_to_quality.jsonl"
 LONG, LIMIT, WITHIN = 30.0, 10.0, 1.1  # [s], [s], factor on the length
+ALL_HARD = "all"
 LOOK = 0.005  # between two looks at a planner's best path [s]
 METHODS = ("apex", "rrtconnect", "rrtconnect+polish", "aorrtc")
 Lengths = list[tuple[float, float]]
@@ -157,6 +158,22 @@ def reached(lengths: Lengths, wanted: float) -> float:
     return next((took for took, length in lengths if length <= wanted), math.inf)
 
 
+def quality(done: dict[Any, Any], names: list[str], method: str, kept: dict[str, float]) -> dict[str, Any]:
+    """Return how many of some problems a planner reached the wanted lengths on, and when."""
+    lengths = [done[name, method]["lengths"] for name in names]
+    ratios = [one[-1][1] / kept[name] for name, one in zip(names, lengths, strict=True) if one]
+    known = [min([kept[n]] + [one[-1][1] for m in METHODS if (one := done[n, m]["lengths"])]) for n in names]
+    found: dict[str, Any] = {
+        "n": len(names), "ratio": float(np.exp(np.mean(np.log(ratios)))) if ratios else None,
+        "no_path": len(names) - len(ratios),
+    }  # fmt: skip
+    for end, wanted in (("", [kept[name] for name in names]), ("_shortest", known)):
+        times = [reached(one, WITHIN * length) for one, length in zip(lengths, wanted, strict=True)]
+        found |= {f"reached{end}": float(np.mean(np.isfinite(times)))}
+        found |= {f"s{end}": [record.reached(times, p) for p in (50, 95)]}
+    return found
+
+
 def main() -> None:
     """Run what is missing, and write the results."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -181,23 +198,19 @@ def main() -> None:
         print(f"{REFERENCE.name}: {len(kept | made)} lengths")
         return
     head = ["level", "method", "N", "reached", "s p50", "p95", "last length / reference (geometric mean)", "no path"]
+    head += ["reached the shortest known", "s p50", "p95"]
     rows = [record.row(head), record.row(["---", "---", *["---:"] * (len(head) - 2)])]
     figures: dict[str, Any] = {}
-    for level in levels:
-        mine = [name for name in names if name.startswith(f"{level}/") and name in kept]
+    measured = [name for name in names if name in kept]
+    for level in (*levels, ALL_HARD):
+        mine = [name for name in measured if level == ALL_HARD or name.startswith(f"{level}/")]
         for k, method in enumerate(METHODS if mine else ()):
-            lengths = [done[name, method]["lengths"] for name in mine]
-            times = [reached(one, WITHIN * kept[name]) for name, one in zip(mine, lengths, strict=True)]
-            ratios = [one[-1][1] / kept[name] for name, one in zip(mine, lengths, strict=True) if one]
-            mean = float(np.exp(np.mean(np.log(ratios)))) if ratios else None
-            share, slow = float(np.mean(np.isfinite(times))), [record.reached(times, p) for p in (50, 95)]
-            figures[f"{level}, {method}"] = {"n": len(mine), "reached": share, "s": slow, "ratio": mean}
-            cells = ["-" if v is None else f"{v:.2f}" for v in (*slow, mean)]
-            rows.append(
-                record.row(
-                    [level if k == 0 else "", method, len(mine), f"{share:.2f}", *cells, len(mine) - len(ratios)]
-                )
-            )
+            f = figures[f"{level}, {method}"] = quality(done, mine, method, kept)
+            shares = [f"{f[key]:.2f}" for key in ("reached", "reached_shortest")]
+            slow = [["-" if v is None else f"{v:.2f}" for v in f[key]] for key in ("s", "s_shortest")]
+            ratio = "-" if f["ratio"] is None else f"{f['ratio']:.2f}"
+            cells = [level if k == 0 else "", method, f["n"], shares[0], *slow[0], ratio, f["no_path"], shares[1]]
+            rows.append(record.row([*cells, *slow[1]]))
     without = sum(name not in kept for name in names)
     text = f"\n\n{without} of {len(names)} problems, for which aorrtc has no path after {LONG:g} s, are left out."
     limits = f"{LIMIT:g} s, within {WITHIN:g} of aorrtc's length after {LONG:g} s"
