@@ -65,6 +65,7 @@ STORE = Path(__file__).parent / "runs" / "peers.jsonl"
 LIMIT = 10.0  # [s]
 METHODS = ("apex", "rrtconnect", "roboplan")
 NODES, REACH = 1_000_000, 3.0  # of RoboPlan's trees, and their longest step, its default [rad]
+TOGETHER = ("all hard", "all")
 STATES = 200  # on which the verdicts are compared, for each problem
 ORIGIN = np.eye(4)
 COLOUR = np.array([0.5, 0.5, 0.5, 1.0])
@@ -215,6 +216,11 @@ def figures(made: Sequence[dict[str, Any]]) -> dict[str, Any]:
     }  # fmt: skip
 
 
+def is_of(problem: str, level: str) -> bool:
+    """Whether a problem is one of a level, or of several levels together."""
+    return problem.startswith(f"{level}/") or level == "all" or (level == "all hard" and "/hard/" in problem)
+
+
 def main() -> None:
     """Run what is missing, and write the results of all."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -235,9 +241,9 @@ def main() -> None:
     head = ["level", "method", "N", "solved", "failed the check at first", "first ms p50", "p95", "end ms p50", "p95"]
     rows = [record.row([*head, "length rad"]), record.row(["---", "---", *["---:"] * (len(head) - 1)])]
     found: dict[str, Any] = {}
-    for level in chosen:
+    for level in (*chosen, *TOGETHER):
         for k, method in enumerate(METHODS):
-            mine = [done[job] for job in jobs if job in done and job[1] == method and job[0].startswith(f"{level}/")]
+            mine = [done[job] for job in jobs if job in done and job[1] == method and is_of(job[0], level)]
             mine = [one for one in mine if one["carried"]]
             if not mine:
                 continue
@@ -246,7 +252,7 @@ def main() -> None:
             length = "-" if f["length"] is None else f"{f['length']:.1f}"
             cells = [level if k == 0 else "", method, f["n"], f"{f['solved']:.2f}", f["failed_check"], *times, length]
             rows.append(record.row(cells))
-    same = np.sum([f["agreement"] for f in found.values()], axis=0)
+    same = np.sum([f["agreement"] for name, f in found.items() if name.startswith("all,")], axis=0)
     left = sum(not done[job]["carried"] for job in jobs if job in done) // len(METHODS)
     words = "both free, both colliding, free to RoboPlan alone, free to the verdict alone"
     text = f"\n\nRandom states near starts and goals: {', '.join(str(n) for n in same)} ({words}). "
