@@ -18,6 +18,7 @@ import argparse
 import sys
 import time
 from collections.abc import Sequence
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -259,7 +260,8 @@ def main() -> None:
     text += f"{left} problems have shapes that RoboPlan has not, and are left out."
     record.write(
         args.name, {"levels": found}, "\n".join(rows) + text, split=args.split, limit=f"{LIMIT:g} s",
-        seeds="number of the problem modulo 1000", **record.made_with(done[job] for job in jobs),
+        seeds="number of the problem modulo 1000", roboplan=version("roboplan"),
+        **record.made_with(done[job] for job in jobs),
     )  # fmt: skip
 
 
