@@ -96,7 +96,7 @@ def failure(args: argparse.Namespace) -> tuple[dict[str, Any], list[Table], Figu
             for axis, value in zip(axes, (ratio, length, took), strict=True):
                 axis.bar(at, value if np.isfinite(value) else 0.0, color=colour, label=row.label if t == 0 else None)
             axes[0].plot([at, at], [high, low], color="black", linewidth=1)
-    for axis, title in zip(axes, ("R_f %", "S_r rad", "median time s"), strict=True):
+    for axis, title in zip(axes, ("R_f %", "S_r rad", "median time s, where most are solved"), strict=True):
         axis.set_title(title)
         middle = (len(ROWS) - 1) / 2
         axis.set_xticks([middle, middle + len(ROWS) + 1], TASKS)
