@@ -277,10 +277,6 @@ class Optimizer:
         return Bent(control, cost, shortfall, clearance, about[:, bending.TAKEN].astype(np.int64), about[:, -1])
 
 
-NEARLY = -0.005
-"""Clearance of the spheres below which a path is not worth the full check [m]: they reach out of what they cover."""
-
-
 @lru_cache(maxsize=32)
 def _grid(spline: Spline, samples: int) -> tuple[Array, NDArray[np.int64], Array]:
     """Return weights at the samples without their zeros, where they begin, and the Gram matrix of the speed."""

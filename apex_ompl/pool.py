@@ -8,13 +8,14 @@ from dataclasses import dataclass
 from numpy.typing import ArrayLike
 
 from apex_ompl.kernel.face import Kernel
-from apex_ompl.optimize import LAST_RESORT, NEARLY, Array, Check, Optimizer
+from apex_ompl.optimize import LAST_RESORT, Array, Check, Optimizer
 
 ROUND, ROUNDS = 4, 12  # steps between two checks of a path, and how often
 SOFT_ROUNDS = 2  # the last of them are softer
 IMPATIENCE = 2.0  # factor on the shortfall of a path for every round that was spent on it
 PER_PATH = 16  # steps, in the mean
 CLEAR = 0.01  # clearance at the samples at which a path is checked at once [m]
+NEARLY = -0.005  # below it a path that is worked on is not checked yet; spheres reach out of what they cover [m]
 
 
 @dataclass
@@ -120,15 +121,13 @@ class Pool:
             chosen.rounds += 1
             left -= ROUND
             self.steps += int(bent.steps[0])
-            if self._passes(chosen):
+            if chosen.clearance >= NEARLY and self._passes(chosen):
                 return chosen
             if not bent.steps[0]:  # nothing is short of clearance, and yet it is not valid
                 chosen.given_up, chosen.fine = chosen.fine, True
         return None
 
     def _passes(self, candidate: Candidate) -> bool:
-        if candidate.clearance < NEARLY:
-            return False
         path = self._optimizer.spline.path(candidate.control)
         if not self._is_valid(path):
             return False

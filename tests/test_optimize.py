@@ -8,7 +8,7 @@ from apex_ompl.assembly import PlanningSetup, assemble
 from apex_ompl.collision import Verdict
 from apex_ompl.errors import ParameterError
 from apex_ompl.optimize import Optimizer, Settings
-from apex_ompl.pool import first_valid
+from apex_ompl.pool import Pool, first_valid
 from apex_ompl.resolution import FULL_RESOLUTION
 from apex_ompl.robot import Robot
 from apex_ompl.space import path_length
@@ -123,6 +123,18 @@ def test_valid_paths_are_found_where_the_line_is_not_one(robot: Robot) -> None:
         assert shorter is not None and is_valid(optimizer.spline.path(shorter))
         assert path_length(optimizer.spline.path(shorter)) < 1.05 * path_length(path)
     assert solved >= 8
+
+
+def test_valid_paths_are_taken_as_they_are(robot: Robot) -> None:
+    """Spheres reach out of what they cover: a path may be valid by the meshes where they are in each other."""
+    ready = assemble(problems.load("vertical/free/800005"), robot)
+    optimizer, kernel = Optimizer(), ready.verdict.kernel
+    line = optimizer.spline.line(ready.start, ready.goals[0])
+    assert full_check(ready.verdict, optimizer.spline.path(line), ready.start, ready.goals)
+    assert optimizer.improve(kernel, line[None], steps=0).clearance.min() < -0.01
+    pool = Pool(optimizer, kernel, lambda path: ready.verdict.first_collision(path, FULL_RESOLUTION) is None)
+    found = pool.add(line[None], "line")
+    assert found is not None and np.array_equal(found.control, line) and pool.steps == 0
 
 
 def test_it_gives_up_when_told(ready: PlanningSetup) -> None:
