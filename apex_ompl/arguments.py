@@ -1,6 +1,8 @@
-"""Checks of the numbers that callers give."""
+"""Checks of the numbers that callers give, in Python or on a command line."""
 
 from __future__ import annotations
+
+import argparse
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -36,3 +38,25 @@ def numbers(given: ArrayLike, name: str) -> NDArray[np.float64]:
     if not np.isfinite(found).all():
         raise ParameterError(name, found[~np.isfinite(found)].flat[0], "finite numbers")
     return found
+
+
+def whole_number(text: str) -> int:
+    """Return a whole number, for ``argparse``.
+
+    Raises:
+        ArgumentTypeError: It is not one from 0 to 2147483647.
+    """
+    if not text.isdecimal() or not int(text) < 2**31:
+        raise argparse.ArgumentTypeError(f"{text!r}, expected a whole number from 0 to 2147483647")
+    return int(text)
+
+
+def one_or_more(text: str) -> int:
+    """Return a number of things, for ``argparse``.
+
+    Raises:
+        ArgumentTypeError: It is not a whole number from 1 to 2147483647.
+    """
+    if whole_number(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text!r}, expected a whole number, 1 or more")
+    return int(text)

@@ -51,9 +51,10 @@ class Candidate:
 class Pool:
     """Candidates for a valid path among the obstacles of a kernel.
 
-    Always the candidate with the least shortfall is improved by a few steps, one that was worked on before a little
-    later than a fresh one; as soon as it is clear at the samples it is checked. One that is clear at them and yet not
-    valid is looked at more closely. The last steps for a candidate are softer.
+    All are checked as they come. Then always the candidate with the least shortfall is improved by a few steps, one
+    that was worked on before a little later than a fresh one; as soon as it is nearly clear at the samples it is
+    checked again. One that is clear at them and yet not valid is looked at more closely. The last steps for a candidate
+    are softer.
 
     Attributes:
         candidates: All that there are.

@@ -30,6 +30,7 @@ from controls import OTHER, checkpoint_digest, next_query
 from store import RunStore
 
 from apex_ompl import plan, problems
+from apex_ompl.arguments import one_or_more, whole_number
 from apex_ompl.assembly import assemble
 from apex_ompl.diffusion.checkpoint import SHIPPED
 from apex_ompl.endings import run_command
@@ -231,10 +232,10 @@ def main() -> None:
     """Run what is missing, and write the results of all."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("levels", nargs="*", metavar="SUITE[/LEVEL]")
-    parser.add_argument("-n", type=record.count, default=100, help="problems of a level (default: %(default)s)")
-    parser.add_argument("--controls", type=int, default=50, help="of a hard level, for controls (default: %(default)s)")
+    parser.add_argument("-n", type=one_or_more, default=100, help="problems of a level (default: %(default)s)")
+    parser.add_argument("--controls", type=whole_number, default=50, help="of a hard level (default: %(default)s)")
     parser.add_argument("--split", choices=("validation", "test"), default="test")
-    parser.add_argument("--jobs", type=record.count, default=1, help="processes (default: one, as runs are timed)")
+    parser.add_argument("--jobs", type=one_or_more, default=1, help="processes (default: one, as runs are timed)")
     parser.add_argument("--methods", nargs="*", choices=list(METHODS), default=list(METHODS), metavar="NAME")
     parser.add_argument("--store", type=Path, default=STORE)
     parser.add_argument("--name", default="apex", help="of the results (default: %(default)s)")

@@ -22,6 +22,7 @@ import record
 from store import RunStore
 
 from apex_ompl import plan, problems
+from apex_ompl.arguments import one_or_more, whole_number
 from apex_ompl.endings import run_command
 from apex_ompl.moving import even_times, timed_check
 from apex_ompl.problems.alignment import PACE
@@ -105,9 +106,9 @@ def main() -> None:
     """Run what is missing, and write the results of all."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("levels", nargs="*", metavar="SUITE[/LEVEL]")
-    parser.add_argument("-n", type=record.count, default=50, help="problems for rrtconnect (default: %(default)s)")
-    parser.add_argument("--rrt", type=int, default=20, help="problems for rrt (default: %(default)s)")
-    parser.add_argument("--jobs", type=record.count, default=2, help="processes (default: %(default)s)")
+    parser.add_argument("-n", type=one_or_more, default=50, help="problems for rrtconnect (default: %(default)s)")
+    parser.add_argument("--rrt", type=whole_number, default=20, help="problems for rrt (default: %(default)s)")
+    parser.add_argument("--jobs", type=one_or_more, default=2, help="processes (default: %(default)s)")
     parser.add_argument("--store", type=Path, default=STORE)
     parser.add_argument("--report", action="store_true", help="run nothing; write the results of what the store holds")
     args = parser.parse_args()

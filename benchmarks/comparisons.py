@@ -14,8 +14,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-import record
-
+from apex_ompl.arguments import one_or_more
 from apex_ompl.endings import run_command
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -33,7 +32,7 @@ COMMANDS = (
 def main() -> None:
     """Run all commands; end with the first that fails."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--jobs", type=record.count, default=1, help="runs at a time (default: one, as they are timed)")
+    parser.add_argument("--jobs", type=one_or_more, default=1, help="runs at a time (default: one, as they are timed)")
     args = parser.parse_args()
     missing = [name for name in NEEDED if importlib.util.find_spec(name) is None]
     if missing:  # said now, not after hours

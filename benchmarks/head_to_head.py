@@ -23,6 +23,7 @@ from pathlib import Path
 import numpy as np
 import record
 
+from apex_ompl.arguments import one_or_more
 from apex_ompl.benchmark import Row, Workers, bench, report, write_database, write_logs
 from apex_ompl.benchmark.rows import PAPER
 from apex_ompl.benchmark.summary import MOMENTS, Figures, Table, figures, tables, warnings
@@ -90,8 +91,8 @@ def main() -> None:
     """Run what is missing, and write the results."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("levels", nargs="*", metavar="SUITE[/LEVEL]")
-    parser.add_argument("-n", type=record.count, default=30, help="problems of a level (default: %(default)s)")
-    parser.add_argument("--jobs", type=record.count, default=1, help="runs at a time (default: one, as they are timed)")
+    parser.add_argument("-n", type=one_or_more, default=30, help="problems of a level (default: %(default)s)")
+    parser.add_argument("--jobs", type=one_or_more, default=1, help="runs at a time (default: one, as they are timed)")
     args = parser.parse_args()
     folder = Path(__file__).parent / "runs" / "head_to_head"
     workers = Workers(args.jobs, modules=("controls",))

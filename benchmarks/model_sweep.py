@@ -20,6 +20,7 @@ from typing import Any
 import record
 import torch
 
+from apex_ompl.arguments import one_or_more
 from apex_ompl.cases import load_cases
 from apex_ompl.diffusion.checkpoint import load_model
 from apex_ompl.diffusion.runlog import read_log
@@ -100,9 +101,9 @@ def table(rows: dict[str, dict[str, Any]]) -> str:
 def main() -> None:
     """Train, judge, and write the results."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--steps", type=record.count, default=3000, help="of each (default: %(default)s)")
-    parser.add_argument("--threads", type=record.count, default=1, help="of each (default: %(default)s)")
-    parser.add_argument("--jobs", type=record.count, default=2, help="trained at a time (default: %(default)s)")
+    parser.add_argument("--steps", type=one_or_more, default=3000, help="of each (default: %(default)s)")
+    parser.add_argument("--threads", type=one_or_more, default=1, help="of each (default: %(default)s)")
+    parser.add_argument("--jobs", type=one_or_more, default=2, help="trained at a time (default: %(default)s)")
     parser.add_argument("--data", help="data set (default: the one that ships)")
     parser.add_argument("--runs", type=Path, default=record.RESULTS.parent / "runs" / "sweep")
     parser.add_argument("--only", nargs="*", default=list(VARIANTS), choices=list(VARIANTS), metavar="NAME")

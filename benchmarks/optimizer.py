@@ -22,6 +22,7 @@ import record
 from store import RunStore
 
 from apex_ompl import plan, problems
+from apex_ompl.arguments import one_or_more, whole_number
 from apex_ompl.assembly import assemble
 from apex_ompl.endings import run_command
 from apex_ompl.optimize import Optimizer
@@ -118,9 +119,9 @@ def main() -> None:
     """Run what is missing, and write the results of all."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("levels", nargs="*", metavar="SUITE[/LEVEL]")
-    parser.add_argument("-n", type=record.count, default=10, help="of a level, at most 30 (default: %(default)s)")
-    parser.add_argument("--hard", type=int, default=20, help="of a hard level (default: %(default)s)")
-    parser.add_argument("--jobs", type=record.count, default=2, help="processes (default: %(default)s)")
+    parser.add_argument("-n", type=one_or_more, default=10, help="of a level, at most 30 (default: %(default)s)")
+    parser.add_argument("--hard", type=whole_number, default=20, help="of a hard level (default: %(default)s)")
+    parser.add_argument("--jobs", type=one_or_more, default=2, help="processes (default: %(default)s)")
     parser.add_argument("--store", type=Path, default=STORE)
     parser.add_argument("--report", action="store_true", help="run nothing; write the results of what the store holds")
     args = parser.parse_args()

@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 from store import RunStore
 
 from apex_ompl import problems
+from apex_ompl.arguments import one_or_more
 from apex_ompl.assembly import PlanningSetup, assemble
 from apex_ompl.benchmark import runs
 from apex_ompl.benchmark.rows import Job
@@ -226,8 +227,8 @@ def main() -> None:
     """Run what is missing, and write the results of all."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("levels", nargs="*", metavar="SUITE[/LEVEL]")
-    parser.add_argument("-n", type=record.count, default=30, help="problems of a level (default: %(default)s)")
-    parser.add_argument("--jobs", type=record.count, default=1, help="runs at a time (default: one, as they are timed)")
+    parser.add_argument("-n", type=one_or_more, default=30, help="problems of a level (default: %(default)s)")
+    parser.add_argument("--jobs", type=one_or_more, default=1, help="runs at a time (default: one, as they are timed)")
     parser.add_argument("--split", choices=("validation", "test"), default="test")
     parser.add_argument("--store", type=Path, default=STORE)
     parser.add_argument("--name", default="peers", help="of the results (default: %(default)s)")
@@ -253,7 +254,7 @@ def main() -> None:
             length = "-" if f["length"] is None else f"{f['length']:.1f}"
             cells = [level if k == 0 else "", method, f["n"], f"{f['solved']:.2f}", f["failed_check"], *times, length]
             rows.append(record.row(cells))
-    same = np.sum([f["agreement"] for name, f in found.items() if name.startswith("all,")], axis=0)
+    same = np.sum([f["agreement"] for name, f in found.items() if name.startswith("all,")] or [[0] * 4], axis=0)
     left = sum(not done[job]["carried"] for job in jobs if job in done) // len(METHODS)
     words = "both free, both colliding, free to RoboPlan alone, free to the verdict alone"
     text = f"\n\nRandom states near starts and goals: {', '.join(str(n) for n in same)} ({words}). "

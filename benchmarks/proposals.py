@@ -30,6 +30,7 @@ from neighbours import Neighbours
 from store import RunStore
 
 from apex_ompl import load_model, plan, problems
+from apex_ompl.arguments import one_or_more, whole_number
 from apex_ompl.assembly import PlanningSetup, assemble
 from apex_ompl.diffusion.checkpoint import SHIPPED, read_config
 from apex_ompl.diffusion.data import Mirror, window_paths
@@ -270,13 +271,15 @@ def main() -> None:
     """Run what is missing, and write the results of all."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("levels", nargs="*", metavar="SUITE[/LEVEL]")
-    parser.add_argument("-n", type=record.count, default=10, help="problems of a level (default: %(default)s)")
-    parser.add_argument("--hard", type=int, default=30, help="of a hard level (default: %(default)s)")
-    parser.add_argument("--paper", type=int, default=5, help="of a level for apex-paper (default: %(default)s)")
+    parser.add_argument("-n", type=one_or_more, default=10, help="problems of a level (default: %(default)s)")
+    parser.add_argument("--hard", type=whole_number, default=30, help="of a hard level (default: %(default)s)")
+    parser.add_argument(
+        "--paper", type=whole_number, default=5, help="of a level for apex-paper (default: %(default)s)"
+    )
     parser.add_argument(
         "--data", default=str(ROOT / "data" / "dual_panda_softhand" / "paths.zip"), help="for neighbours"
     )
-    parser.add_argument("--jobs", type=record.count, default=2, help="processes (default: %(default)s)")
+    parser.add_argument("--jobs", type=one_or_more, default=2, help="processes (default: %(default)s)")
     parser.add_argument("--split", choices=("validation", "test"), default="test")
     parser.add_argument("--methods", nargs="*", choices=list(METHODS), default=list(METHODS), metavar="NAME")
     parser.add_argument("--regression", default=str(ROOT / "benchmarks" / "runs" / "regression" / "checkpoint"))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 import platform
@@ -80,17 +79,6 @@ def reached(values: list[float] | np.ndarray, p: float) -> float | None:
         return None
     value = next_percentile(values, p)
     return value if math.isfinite(value) else None
-
-
-def count(text: str) -> int:
-    """Return a number of problems or processes, for ``argparse``.
-
-    Raises:
-        ArgumentTypeError: It is not 1 or more.
-    """
-    if not text.isdecimal() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"{text!r}, expected a whole number, 1 or more")
-    return int(text)
 
 
 def made_with(runs: Iterable[dict[str, Any]]) -> dict[str, str]:

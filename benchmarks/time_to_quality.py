@@ -27,6 +27,7 @@ from ompl import geometric as og
 from store import RunStore
 
 from apex_ompl import planners, problems
+from apex_ompl.arguments import one_or_more
 from apex_ompl.assembly import PlanningSetup, assemble
 from apex_ompl.endings import run_command
 from apex_ompl.files import write_atomically
@@ -178,11 +179,11 @@ def main() -> None:
     """Run what is missing, and write the results."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("levels", nargs="*", metavar="SUITE/hard")
-    parser.add_argument("-n", type=record.count, default=20, help="test problems of a level (default: %(default)s)")
+    parser.add_argument("-n", type=one_or_more, default=20, help="test problems of a level (default: %(default)s)")
     parser.add_argument(
         "--reference", action="store_true", help="make the lengths to come up to, 30 s for each problem"
     )
-    parser.add_argument("--jobs", type=record.count, default=1, help="runs at a time (default: one, as they are timed)")
+    parser.add_argument("--jobs", type=one_or_more, default=1, help="runs at a time (default: one, as they are timed)")
     args = parser.parse_args()
     levels = [level for level in record.static_levels(args.levels) if level.endswith("/hard")]
     names = [name for level in levels for name in problems.frozen_names(*level.split("/"), "test")[: args.n]]

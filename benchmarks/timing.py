@@ -33,6 +33,7 @@ from toppra import algorithm, constraint
 from tqdm import tqdm
 
 from apex_ompl import plan, problems
+from apex_ompl.arguments import one_or_more, whole_number
 from apex_ompl.assembly import assemble
 from apex_ompl.endings import run_command
 from apex_ompl.kernel.speed import farthest, fastest
@@ -266,8 +267,10 @@ def main() -> None:
     """Time paths, and write the results."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("levels", nargs="*", metavar="SUITE[/LEVEL]")
-    parser.add_argument("-n", type=record.count, default=18, help="problems of a level (default: %(default)s)")
-    parser.add_argument("--ways", type=int, default=3, help="of them for the other ways (default: %(default)s)")
+    parser.add_argument("-n", type=one_or_more, default=18, help="problems of a level (default: %(default)s)")
+    parser.add_argument(
+        "--ways", type=whole_number, default=3, help="of them for the other ways (default: %(default)s)"
+    )
     args = parser.parse_args()
     toppra.setup_logging("ERROR")
     names = [

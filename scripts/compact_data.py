@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from apex_ompl.arguments import whole_number
 from apex_ompl.dataset import Store, save
 from apex_ompl.endings import run_command
 from apex_ompl.files import check_writable, write_atomically
@@ -67,24 +68,13 @@ def mebibytes(text: str) -> float:
     return value
 
 
-def whole(text: str) -> int:
-    """Read a whole number.
-
-    Raises:
-        ArgumentTypeError: It is none.
-    """
-    if not text.isdecimal() or not int(text) < 2**31:
-        raise argparse.ArgumentTypeError(f"{text!r}, expected a whole number from 0 to 2147483647")
-    return int(text)
-
-
 def main() -> None:
     """Read the command line."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path, metavar="FOLDER")
     parser.add_argument("file", type=Path, metavar="FILE.zip")
     parser.add_argument("--mib", type=mebibytes, default=24.0, help="largest size (default: %(default)s)")
-    parser.add_argument("--seed", type=whole, default=0, help="of the random choice (default: %(default)s)")
+    parser.add_argument("--seed", type=whole_number, default=0, help="of the random choice (default: %(default)s)")
     args = parser.parse_args()
     compact(args)
 

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from apex_ompl import description, problems
+from apex_ompl.arguments import one_or_more, whole_number
 from apex_ompl.assembly import assemble
 from apex_ompl.dataset import Store, load
 from apex_ompl.endings import run_command
@@ -121,36 +122,16 @@ def describe(args: argparse.Namespace) -> None:
     write_atomically(args.out / "description.md", "\n".join(text).encode())
 
 
-def whole(text: str) -> int:
-    """Read a whole number.
-
-    Raises:
-        ArgumentTypeError: It is none.
-    """
-    if not text.isdecimal() or not int(text) < 2**31:
-        raise argparse.ArgumentTypeError(f"{text!r}, expected a whole number from 0 to 2147483647")
-    return int(text)
-
-
-def some(text: str) -> int:
-    """Read a whole number, 1 or more.
-
-    Raises:
-        ArgumentTypeError: It is none.
-    """
-    if whole(text) < 1:
-        raise argparse.ArgumentTypeError(f"{text!r}, expected a whole number, 1 or more")
-    return int(text)
-
-
 def main() -> None:
     """Read the command line."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("data", type=Path, metavar="DATA")
     parser.add_argument("--out", type=Path, default=Path(), help="folder (default: this one)")
-    parser.add_argument("--check", type=whole, default=200, help="paths that are proved again (default: %(default)s)")
-    parser.add_argument("--motions", type=some, default=MOTIONS, help="that are drawn (default: %(default)s)")
-    parser.add_argument("--seed", type=whole, default=0, help="of the random choices (default: %(default)s)")
+    parser.add_argument(
+        "--check", type=whole_number, default=200, help="paths that are proved again (default: %(default)s)"
+    )
+    parser.add_argument("--motions", type=one_or_more, default=MOTIONS, help="that are drawn (default: %(default)s)")
+    parser.add_argument("--seed", type=whole_number, default=0, help="of the random choices (default: %(default)s)")
     args = parser.parse_args()
     describe(args)
 

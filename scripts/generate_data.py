@@ -19,6 +19,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from typing import Any
 
+from apex_ompl.arguments import one_or_more, whole_number
 from apex_ompl.cases import load_cases, save_cases, work_cases
 from apex_ompl.cluster import spread
 from apex_ompl.dataset import Store
@@ -182,15 +183,21 @@ def main() -> None:
     parser.add_argument("folder", metavar="FOLDER")
     parser.add_argument("levels", nargs="*", metavar="SUITE[/LEVEL]", help="by default all static ones, and broad")
     parser.add_argument(
-        "--problems", type=_count, default=10_000, help="how many to draw, about (default: %(default)s)"
+        "--problems", type=one_or_more, default=10_000, help="how many to draw, about (default: %(default)s)"
     )
-    parser.add_argument("--seed", type=_whole, default=0, help="of the random choices (default: %(default)s)")
-    parser.add_argument("--copies", type=_count, default=Options.copies, help="paths sought (default: %(default)s)")
-    parser.add_argument("--parts", type=_whole, default=Options.parts, help="parts of each path (default: %(default)s)")
+    parser.add_argument("--seed", type=whole_number, default=0, help="of the random choices (default: %(default)s)")
+    parser.add_argument(
+        "--copies", type=one_or_more, default=Options.copies, help="paths sought (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--parts", type=whole_number, default=Options.parts, help="parts of each path (default: %(default)s)"
+    )
     parser.add_argument("--model", default="", help="whose proposals are tried first, for example apex (default: none)")
-    parser.add_argument("--control-points", type=_count, default=Spline.points, help="(default: %(default)s)")
-    parser.add_argument("--pinned", type=_count, default=Spline.pinned, help="at each end (default: %(default)s)")
-    parser.add_argument("--workers", type=_count, default=1, help="more than one are run by Ray (default: %(default)s)")
+    parser.add_argument("--control-points", type=one_or_more, default=Spline.points, help="(default: %(default)s)")
+    parser.add_argument("--pinned", type=one_or_more, default=Spline.pinned, help="at each end (default: %(default)s)")
+    parser.add_argument(
+        "--workers", type=one_or_more, default=1, help="more than one are run by Ray (default: %(default)s)"
+    )
     parser.add_argument("--address", help="of a Ray cluster, for example 10.0.0.1:6379, or auto")
     parser.add_argument("--write-cases", action="store_true", help="draw problems only, and write them to FOLDER")
     parser.add_argument(
@@ -204,19 +211,6 @@ def main() -> None:
     if args.split != "train" and not args.write_cases:
         parser.error("--split validation goes with --write-cases: data are of the training split")
     write_cases(args) if args.write_cases else generate(args)
-
-
-def _whole(text: str) -> int:
-    if not text.isdecimal() or not int(text) < 2**31:
-        raise argparse.ArgumentTypeError(f"{text!r}, expected a whole number from 0 to 2147483647")
-    return int(text)
-
-
-def _count(text: str) -> int:
-    value = _whole(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"{text!r}, expected a whole number, 1 or more")
-    return value
 
 
 if __name__ == "__main__":

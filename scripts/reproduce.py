@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from apex_ompl import metrics
+from apex_ompl.arguments import one_or_more
 from apex_ompl.benchmark import Results, Row, Workers, bench
 from apex_ompl.benchmark.rows import PAPER
 from apex_ompl.benchmark.summary import Figures, Table, about, figures, warnings
@@ -181,16 +182,16 @@ def main() -> None:
     """Make a figure."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("figure", choices=FIGURES)
-    parser.add_argument("-n", type=int, help="problems of a level, or for fid in all (default: 20, 10000)")
-    parser.add_argument("--jobs", type=int, default=1, help="runs at a time (default: one, as they are timed)")
+    parser.add_argument("-n", type=one_or_more, help="problems of a level, or for fid in all (default: 20, 10000)")
+    parser.add_argument("--jobs", type=one_or_more, default=1, help="runs at a time (default: one, as they are timed)")
     parser.add_argument("--keep", type=Path, default=ROOT / "benchmarks" / "runs", metavar="FOLDER", help="for runs")
     parser.add_argument("-o", "--out", type=Path, default=ROOT / "benchmarks" / "results", metavar="FOLDER")
     args = parser.parse_args()
     blank(1.0, 1.0)  # says now that matplotlib is missing, not after hours
     make, usual = FIGURES[args.figure]
     args.n = usual if args.n is None else args.n
-    if args.n < 4 or args.jobs < 1:
-        parser.error("-n is 4 or more, --jobs 1 or more")
+    if args.n < 4:
+        parser.error("-n is 4 or more")
     make_folder(args.keep)
     make_folder(args.out)
     found, tables, picture, says = make(args)
