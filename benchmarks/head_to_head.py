@@ -96,9 +96,9 @@ def main() -> None:
     args = parser.parse_args()
     folder = Path(__file__).parent / "runs" / "head_to_head"
     workers = Workers(args.jobs, modules=("controls",))
-    levels, labels = record.static_levels(args.levels), {row.label for row in ROWS}
+    levels, seeds = record.static_levels(args.levels), {row.label: min(args.n, row.runs or args.n) for row in ROWS}
     results = bench(levels, ROWS, folder, runs=args.n, timeout=TIMEOUT, workers=workers)
-    results = replace(results, runs=[run for run in results.runs if run["label"] in labels and run["seed"] < args.n])
+    results = replace(results, runs=[run for run in results.runs if run["seed"] < seeds.get(run["label"], 0)])
     write_database(results, write_logs(results))
     report(folder, folder)
     found = [table for table in (together(figures(results)), *tables(results)) if table.rows]

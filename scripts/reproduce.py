@@ -9,7 +9,7 @@ The runs of ``failure`` and ``size`` are the same, and are kept as they end, bes
 some of which they are; so are the solutions of ``fid``. All planners have the same problems. The command goes on where
 it was stopped.
 
-Usage: python scripts/reproduce.py failure|size|fid [-n 20] [--jobs 1] [--keep FOLDER] [-o FOLDER]
+Usage: python scripts/reproduce.py failure|size|fid [-n 40] [--jobs 1] [--keep FOLDER] [-o FOLDER]
 """
 
 from __future__ import annotations
@@ -113,11 +113,11 @@ def size(args: argparse.Namespace) -> tuple[dict[str, Any], list[Table], Figure,
     by = {(f.experiment, f.label): f for f in figures(results)}
     found: dict[str, Any] = {}
     rows = []
-    picture = blank(9, 4)
+    picture = blank(9, 4.4)
     labels = [label for pair in PAIRS for label in pair]
     for axis, task in zip(picture.subplots(1, 2, sharey=True), TASKS, strict=True):
-        for label in labels:
-            line = []
+        for k, label in enumerate(labels):
+            line, ends = [], []
             for level, edge in EDGES.items():
                 f = by[f"{task}/{level}", label]
                 ratio = metrics.failure_ratio([run["solved"] for run in f.runs])
@@ -126,14 +126,17 @@ def size(args: argparse.Namespace) -> tuple[dict[str, Any], list[Table], Figure,
                 cells = [f"{edge:.2f}", str(len(f.runs)), f"{ratio:.1f}", f"{high:.1f} to {low:.1f}"]
                 rows.append([task, label, *cells])
                 line.append(ratio)
+                ends.append((ratio - high, low - ratio))
             style = "--" if "unguided" in label else "-"
             colour = COLOURS[1 if "paper" in label else 3]
-            axis.plot(list(EDGES.values()), line, style, color=colour, marker="o", label=label)
+            at = np.array(list(EDGES.values())) + 0.0012 * (k - 1.5)  # beside each other, for the intervals
+            axis.errorbar(at, line, np.transpose(ends), fmt=style, color=colour, marker="o", linewidth=1.5,
+                          elinewidth=0.8, label=label)  # fmt: skip
         axis.set_title(task)
         axis.set_xlabel("edge of the cubes m")
         axis.grid(alpha=0.3)
     picture.axes[0].set_ylabel("R_f %")
-    picture.axes[0].legend(fontsize=8)
+    picture.legend(*picture.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=8)
     head = ["task", "planner", "edge m", "N", "R_f %", "95 %"]
     return found, [Table("Failure ratio over the size of obstacles", head, rows)], picture, said_of(results)
 
@@ -175,14 +178,14 @@ def fid(args: argparse.Namespace) -> tuple[dict[str, Any], list[Table], Figure, 
     return found_all, [Table("FID and KID", head, rows)], picture, says
 
 
-FIGURES = {"failure": (failure, 20), "size": (size, 20), "fid": (fid, 10_000)}
+FIGURES = {"failure": (failure, 40), "size": (size, 40), "fid": (fid, 10_000)}
 
 
 def main() -> None:
     """Make a figure."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("figure", choices=FIGURES)
-    parser.add_argument("-n", type=one_or_more, help="problems of a level, or for fid in all (default: 20, 10000)")
+    parser.add_argument("-n", type=one_or_more, help="problems of a level, or for fid in all (default: 40, 10000)")
     parser.add_argument("--jobs", type=one_or_more, default=1, help="runs at a time (default: one, as they are timed)")
     parser.add_argument("--keep", type=Path, default=ROOT / "benchmarks" / "runs", metavar="FOLDER", help="for runs")
     parser.add_argument("-o", "--out", type=Path, default=ROOT / "benchmarks" / "results", metavar="FOLDER")
