@@ -163,7 +163,7 @@ def fid(args: argparse.Namespace) -> tuple[dict[str, Any], list[Table], Figure, 
             ends = f"{r.interval[0]:.2f} to {r.interval[1]:.2f}"
             cells = [str(r.made), str(r.dimension), f"{r.fid:.2f}", ends, f"{r.floor:.2f}", f"{r.kid:.4f}"]
             rows.append([name, label, *cells, f"{1e3 * seconds[label] / len(real):.1f}"])
-            axis.bar(k, r.fid, color=COLOURS[k + 1])
+            axis.bar(k, r.fid, color=COLOURS[(1 if "paper" in label else 3) + ("unguided" in label)])
             axis.plot([k, k], r.interval, color="black", linewidth=1)
         axis.axhline(r.floor, color="grey", linestyle=":")
         axis.set_title(f"FID, {name} features (dots: floor)")
@@ -172,6 +172,7 @@ def fid(args: argparse.Namespace) -> tuple[dict[str, Any], list[Table], Figure, 
     says = [
         ("Real", f"solutions of {len(real)} validation problems, one each, of {', '.join(FID_LEVELS)}"),
         ("Made", f"one path for each of them; apex by its own sampling, apex-paper by {realism.STEPS} steps of DDIM"),
+        ("Seeds", f"the number of the first of {realism.PART} problems at a time, 0 to {len(real) - 1}"),
         ("Floor", "FID between two halves of the real set, of other problems each: larger than it would be for all"),
         ("Made with", f"{hardware()}, {args.jobs} processes; {', '.join(f'{k} {v}' for k, v in versions().items())}"),
     ]
