@@ -219,11 +219,11 @@ def test_the_report_opens_without_a_network(results: Results, tmp_path: Path) ->
     assert "at the same time" not in found
 
 
-def test_work_of_others_beside_runs_is_said(results: Results) -> None:
+def test_load_beyond_the_runs_is_said(results: Results) -> None:
     assert all(run["load"] >= 0.0 for run in results.runs)
     for load, said in ((1.4, False), (1.6, True)):
         loaded = Results(results.folder, results.about, [{**run, "load": load} for run in results.runs])
-        assert ("Other processes were at work beside 6 of 6 runs" in benchmark.markdown(loaded)) is said
+        assert ("The load was over 1.5 in 6 of 6 runs" in benchmark.markdown(loaded)) is said
 
 
 def test_planners_that_end_early_are_said(results: Results) -> None:

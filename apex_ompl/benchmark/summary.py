@@ -15,7 +15,7 @@ from apex_ompl.benchmark.runs import NO_PROBLEM, Run, ompl_status
 from apex_ompl.metrics import next_percentile, percentile_interval, share_interval
 from apex_ompl.result import PlanStatus
 
-OTHERS = 0.5  # load average of other processes that is let pass
+BESIDE = 0.5  # load average above that of the runs that is let pass
 MOMENTS = (0.1, 0.5, 2.0, 10.0)  # at which shares of solved runs are given [s]
 FULL_TIME = (PlanStatus.TIMEOUT, PlanStatus.APPROXIMATE_SOLUTION, PlanStatus.EXACT_SOLUTION)
 TREES = ("rrtconnect", "sprint")  # what of apex is a tree's work alone
@@ -176,10 +176,11 @@ def warnings(results: Results) -> list[str]:
         said.append("Runs were made on a cluster, whose machines are not said.")
     if any(session["jobs"] > 1 for session in sessions):
         said.append("Several runs went at the same time, so that times are longer than those of runs alone.")
-    most = max(session["jobs"] for session in sessions) + OTHERS
+    most = max(session["jobs"] for session in sessions) + BESIDE
     beside = sum(run["load"] is not None and run["load"] > most for run in results.runs)
     if beside:
-        said.append(f"Other processes were at work beside {beside} of {len(results.runs)} runs (load over {most:g}).")
+        of = len(results.runs)
+        said.append(f"The load was over {most:g} in {beside} of {of} runs: other processes, or many threads that wake.")
     if len({session["hardware"] for session in sessions}) > 1:
         said.append("The runs were made on different machines.")
     if len({str(session["versions"]) for session in sessions}) > 1:
