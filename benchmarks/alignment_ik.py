@@ -14,6 +14,7 @@ import numpy as np
 import record
 
 from apex_ompl import load_problem
+from apex_ompl.arguments import one_or_more, whole_number
 from apex_ompl.bodies import Body
 from apex_ompl.collision import Verdict
 from apex_ompl.endings import run_command
@@ -46,8 +47,8 @@ def robot_with_gap(gap: float) -> Robot:
 def main() -> None:
     """Measure and write."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--attempts", type=int, default=300)
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--attempts", type=one_or_more, default=300)
+    parser.add_argument("--seed", type=whole_number, default=0)
     args = parser.parse_args()
     rows, figures = [], []
     for gap in (1.0, 0.7):

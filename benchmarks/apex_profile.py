@@ -24,6 +24,7 @@ import torch
 from ompl import base as ob
 
 from apex_ompl import problems
+from apex_ompl.arguments import one_or_more
 from apex_ompl.assembly import PlanningSetup, assemble
 from apex_ompl.endings import run_command
 from apex_ompl.ompl_globals import quiet_ompl, seed_ompl
@@ -148,7 +149,9 @@ def sprints(hard: Sequence[PlanningSetup], scenes: Sequence[PlanningSetup]) -> t
 def main() -> None:
     """Measure and write the results."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("-n", type=int, default=30, help="validation problems of a level (default: %(default)s)")
+    parser.add_argument(
+        "-n", type=one_or_more, default=30, help="validation problems of a level (default: %(default)s)"
+    )
     args = parser.parse_args()
     torch.set_num_threads(1)
 

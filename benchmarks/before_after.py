@@ -18,6 +18,7 @@ import record
 from shipped_problems import BAXTER
 
 from apex_ompl import PlanResult, assembly, plan, problems
+from apex_ompl.arguments import one_or_more
 from apex_ompl.collision import Verdict
 from apex_ompl.endings import run_command
 
@@ -34,7 +35,7 @@ def main() -> None:
     """Measure and write."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--planner", default="rrtconnect")
-    parser.add_argument("--seeds", type=int, default=20)
+    parser.add_argument("--seeds", type=one_or_more, default=20)
     parser.add_argument("--timeout", type=float, default=10.0)
     args = parser.parse_args()
     rows, figures = [], []

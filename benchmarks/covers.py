@@ -20,6 +20,7 @@ import record
 from verdict import around_home, boxes, microseconds, of_batch
 
 from apex_ompl import assembly, plan
+from apex_ompl.arguments import one_or_more
 from apex_ompl.collision import Verdict
 from apex_ompl.collision.spheres import quality, read_covers, shape_key
 from apex_ompl.endings import run_command
@@ -72,8 +73,8 @@ def main() -> None:
     """Measure and write."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("files", nargs="+", type=Path)
-    parser.add_argument("--states", type=int, default=3000)
-    parser.add_argument("--seeds", type=int, default=10)
+    parser.add_argument("--states", type=one_or_more, default=3000)
+    parser.add_argument("--seeds", type=one_or_more, default=10)
     args = parser.parse_args()
     figures = [{"covers": path.stem, **measure(path, args.states, args.seeds)} for path in args.files]
     head = list(figures[0])

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 import record
 
-from apex_ompl.arguments import one_or_more
+from apex_ompl.arguments import one_or_more, whole_number
 from apex_ompl.endings import run_command
 from apex_ompl.engine import Options
 from apex_ompl.generation import SHARES, UNIT, Unit, static_levels, work
@@ -73,14 +73,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument(
         "--units",
-        type=int,
+        type=one_or_more,
         choices=range(1, 100),
         metavar="N",
         default=2,
         help=f"of {UNIT} problems, a level (default: %(default)s)",
     )
     parser.add_argument("--workers", type=one_or_more, default=2, help="processes at once (default: %(default)s)")
-    parser.add_argument("--first", type=int, default=40_000, help="number of the first unit (default: %(default)s)")
+    parser.add_argument(
+        "--first", type=whole_number, default=40_000, help="number of the first unit (default: %(default)s)"
+    )
     args = parser.parse_args()
     units = [Unit(s, v, args.first + k) for s, v in static_levels() for k in range(args.units)]
     units.sort(key=lambda unit: unit.level != "hard")  # long ones first, so that workers end together

@@ -18,6 +18,7 @@ import tempfile
 import numpy as np
 import record
 
+from apex_ompl.arguments import one_or_more
 from apex_ompl.endings import run_command
 
 CODE = """
@@ -47,7 +48,7 @@ STAGES = ("import", "robot", "prepare", "first state", "first motion", "first pl
 def main() -> None:
     """Measure and write."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--runs", type=int, default=5)
+    parser.add_argument("--runs", type=one_or_more, default=5)
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         env = {**os.environ, "NUMBA_CACHE_DIR": folder}

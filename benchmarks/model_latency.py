@@ -18,6 +18,7 @@ import record
 import torch
 
 from apex_ompl import load_model, problems
+from apex_ompl.arguments import one_or_more
 from apex_ompl.assembly import assemble
 from apex_ompl.diffusion.checkpoint import shipped
 from apex_ompl.diffusion.guidance import Guidance
@@ -66,7 +67,7 @@ def load_seconds(name: str, repeat: int = 5) -> float:
 def main() -> None:
     """Measure all that ship, and write the results."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--repeat", type=int, default=30)
+    parser.add_argument("--repeat", type=one_or_more, default=30)
     args = parser.parse_args()
     torch.set_num_threads(1)
     lines = [["model", "B", "steps", "guided", "condition ms", "network ms", "guidance ms", "decode ms", "total ms"]]

@@ -19,6 +19,7 @@ import numpy as np
 import record
 from verdict import around_home, boxes, near_contact
 
+from apex_ompl.arguments import one_or_more, whole_number
 from apex_ompl.bodies import AttachedObject, MeshFile, Obstacle
 from apex_ompl.collision import Verdict
 from apex_ompl.collision.proofs import Tally
@@ -146,10 +147,10 @@ def _add(total: Tally, part: Tally) -> None:
 def main() -> None:
     """Measure and write."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--states", type=int, default=1_000_000)
-    parser.add_argument("--motions", type=int, default=2000)
+    parser.add_argument("--states", type=one_or_more, default=1_000_000)
+    parser.add_argument("--motions", type=one_or_more, default=2000)
     parser.add_argument("--robot", action="append", default=[])
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seed", type=whole_number, default=0)
     args = parser.parse_args()
     rows, figures, motion_rows = [], [], []
     with tempfile.TemporaryDirectory() as folder:

@@ -17,6 +17,7 @@ import record
 import torch
 
 from apex_ompl import load_model, problems
+from apex_ompl.arguments import one_or_more
 from apex_ompl.assembly import assemble
 from apex_ompl.dataset import load
 from apex_ompl.diffusion.autoencoder import LinearLatent
@@ -58,7 +59,7 @@ def lost(name: str, paths: Paths, which: np.ndarray) -> dict[str, Any]:
 def main() -> None:
     """Measure, and write the results."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("-n", type=int, default=300, help="paths (default: %(default)s)")
+    parser.add_argument("-n", type=one_or_more, default=300, help="paths (default: %(default)s)")
     parser.add_argument("--data", type=Path, default=DATA)
     parser.add_argument("--models", nargs="*", default=list(shipped()), metavar="NAME|FOLDER")
     args = parser.parse_args()

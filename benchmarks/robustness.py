@@ -22,6 +22,7 @@ import record
 from ompl import base as ob
 
 from apex_ompl import plan, problems
+from apex_ompl.arguments import one_or_more
 from apex_ompl.assembly import assemble
 from apex_ompl.bodies import Obstacle
 from apex_ompl.endings import run_command
@@ -198,7 +199,7 @@ def pieces(count: int) -> Callable[[], tuple[str, bool]]:
 def main() -> None:
     """Do all of it."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--solves", type=int, default=10_000)
+    parser.add_argument("--solves", type=one_or_more, default=10_000)
     args = parser.parse_args()
     checks: dict[str, Callable[[], tuple[str, bool]]] = {
         "two plans in two threads": in_threads, "eight plans in eight processes": in_processes,

@@ -12,6 +12,7 @@ import numpy as np
 import record
 
 from apex_ompl import problems
+from apex_ompl.arguments import one_or_more
 from apex_ompl.endings import run_command
 
 FIRST = 100_000  # seed of the first problem, of the training split
@@ -21,7 +22,7 @@ def main() -> None:
     """Measure and write."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("levels", nargs="*", metavar="SUITE[/LEVEL]")
-    parser.add_argument("-n", type=int, default=200, help="problems a level (default: %(default)s)")
+    parser.add_argument("-n", type=one_or_more, default=200, help="problems a level (default: %(default)s)")
     args = parser.parse_args()
     every = [f"{suite}/{level}" for suite, levels in problems.suites().items() for level in levels]
     figures, rows = [], [["suite/level", "problems/s", "ms p50", "p95"], ["---", *["---:"] * 3]]

@@ -11,8 +11,9 @@ from pathlib import Path
 import record
 
 from apex_ompl import PlanResult, plan, problems
-from apex_ompl.api import STRAIGHT_LINE
+from apex_ompl.arguments import one_or_more
 from apex_ompl.endings import run_command
+from apex_ompl.planning import STRAIGHT_LINE
 
 BAXTER = Path(__file__).resolve().parent.parent / "examples" / "baxter_table.yaml"
 
@@ -27,7 +28,7 @@ def main() -> None:
     """Measure and write."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--planner", action="append", default=[])
-    parser.add_argument("--seeds", type=int, default=10)
+    parser.add_argument("--seeds", type=one_or_more, default=10)
     parser.add_argument("--timeout", type=float, default=10.0)
     args = parser.parse_args()
     rows, figures = [], []

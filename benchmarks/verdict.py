@@ -19,6 +19,7 @@ import pinocchio as pin
 import record
 
 from apex_ompl import plan, problems
+from apex_ompl.arguments import one_or_more, whole_number
 from apex_ompl.bodies import Obstacle
 from apex_ompl.collision import Verdict
 from apex_ompl.collision.broadphase import exact_requests
@@ -184,9 +185,9 @@ def judge_paths(verdicts: tuple[Verdict, Verdict], paths: list[np.ndarray]) -> d
 def main() -> None:
     """Measure and write."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--states", type=int, default=50_000, help="states judged, over all scenes")
-    parser.add_argument("--paths", type=int, default=200, help="straight paths a scene")
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--states", type=one_or_more, default=50_000, help="states judged, over all scenes")
+    parser.add_argument("--paths", type=one_or_more, default=200, help="straight paths a scene")
+    parser.add_argument("--seed", type=whole_number, default=0)
     args = parser.parse_args()
     rng = np.random.default_rng(args.seed)
     robot = load_robot("dual_panda_softhand")

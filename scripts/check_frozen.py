@@ -10,6 +10,7 @@ import argparse
 import numpy as np
 
 from apex_ompl import problems
+from apex_ompl.arguments import whole_number
 from apex_ompl.assembly import assemble
 from apex_ompl.endings import run_command
 from apex_ompl.errors import ApexError
@@ -41,7 +42,9 @@ def main() -> None:
     """Check the levels named, or all."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("levels", nargs="*", metavar="SUITE[/LEVEL]")
-    parser.add_argument("--redraw", type=int, default=0, metavar="N", help="draw N of each level anew, and compare")
+    parser.add_argument(
+        "--redraw", type=whole_number, default=0, metavar="N", help="draw N of each level anew, and compare"
+    )
     args = parser.parse_args()
     every = [f"{suite}/{level}" for suite, level in frozen.files()]
     for name in args.levels:

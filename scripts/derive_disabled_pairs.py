@@ -21,6 +21,7 @@ import numpy as np
 import pinocchio as pin
 from scipy.optimize import minimize
 
+from apex_ompl.arguments import one_or_more, whole_number
 from apex_ompl.collision.shapes import convex_hull
 from apex_ompl.endings import run_command
 from apex_ompl.files import write_atomically
@@ -133,9 +134,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("robot")
     parser.add_argument("--soft", action="append", default=[], metavar="PART")
-    parser.add_argument("--samples", type=int, default=200_000)
+    parser.add_argument("--samples", type=one_or_more, default=200_000)
     parser.add_argument("--margin", type=float, default=0.02, help="metres")
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seed", type=whole_number, default=0)
     args = parser.parse_args()
     path = DATA / f"{args.robot}.robot.yaml"
     config = read_config(path)

@@ -17,6 +17,7 @@ import numpy as np
 import torch
 
 from apex_ompl import load_model, load_problem
+from apex_ompl.arguments import whole_number
 from apex_ompl.assembly import PlanningSetup, assemble
 from apex_ompl.diffusion.guidance import Guidance
 from apex_ompl.diffusion.proposals import Sampling
@@ -139,7 +140,7 @@ def main() -> None:
     parser.add_argument("--diverse", default="apex", help="for the diversity (default: %(default)s)")
     parser.add_argument("--problem", default="horizontal/large/900003")
     parser.add_argument("--many", default="posts/hard/900004", help="problem of the diversity (default: %(default)s)")
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seed", type=whole_number, default=0)
     parser.add_argument("--folder", type=Path, default=Path("docs/pictures"))
     args = parser.parse_args()
     make_folder(args.folder)

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apex_ompl.api import plan
+from apex_ompl.arguments import one_or_more
 from apex_ompl.assembly import assemble
 from apex_ompl.collision import Verdict
 from apex_ompl.endings import run_command
@@ -132,7 +133,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("levels", nargs="*", metavar="SUITE/LEVEL")
     parser.add_argument("--replace", action="store_true", help="draw levels again whose files exist")
-    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--jobs", type=one_or_more, default=2)
     args = parser.parse_args()
     every = {f"{suite}/{level}": (suite, level) for suite, level in frozen.files()}
     for name in args.levels:

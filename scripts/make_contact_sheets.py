@@ -14,6 +14,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from apex_ompl import problems
+from apex_ompl.arguments import one_or_more, whole_number
 from apex_ompl.endings import run_command
 from apex_ompl.files import write_atomically
 from apex_ompl.render import render
@@ -50,8 +51,10 @@ def main() -> None:
     """Draw the sheets of the suites named, or of all."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("suites", nargs="*")
-    parser.add_argument("--first", type=int, default=0, help="seed of the first problem (default: %(default)s)")
-    parser.add_argument("--columns", type=int, default=3)
+    parser.add_argument(
+        "--first", type=whole_number, default=0, help="seed of the first problem (default: %(default)s)"
+    )
+    parser.add_argument("--columns", type=one_or_more, default=3)
     args = parser.parse_args()
     OUT.mkdir(parents=True, exist_ok=True)
     for suite in args.suites or problems.suites():
