@@ -14,9 +14,9 @@ if TYPE_CHECKING:
     from apex_ompl.api import load_problem, plan, setup
     from apex_ompl.diffusion.checkpoint import load_model
     from apex_ompl.errors import ApexError
-    from apex_ompl.problem import Problem
     from apex_ompl.result import PlanResult, PlanStatus
     from apex_ompl.robot import Robot, load_robot
+    from apex_ompl.scene.problem import Problem
     from apex_ompl.trajectory import Timing, Trajectory, time_path
 
 __version__ = "0.1.0"
@@ -25,7 +25,7 @@ _HOMES = {
     "ApexError": "errors",
     "PlanResult": "result",
     "PlanStatus": "result",
-    "Problem": "problem",
+    "Problem": "scene.problem",
     "Robot": "robot",
     "Timing": "trajectory",
     "Trajectory": "trajectory",

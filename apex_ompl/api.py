@@ -12,17 +12,17 @@ import numpy as np
 from ompl import geometric as og
 
 from apex_ompl import planners, problems
-from apex_ompl.assembly import assemble
 from apex_ompl.errors import ParameterError
-from apex_ompl.files import is_file
-from apex_ompl.interrupt import Interrupt
-from apex_ompl.ompl_globals import quiet_ompl, seed_ompl
+from apex_ompl.ompl_adapter.interrupt import Interrupt
+from apex_ompl.ompl_adapter.process import quiet_ompl, seed_ompl
+from apex_ompl.ompl_adapter.setup import assemble
 from apex_ompl.planners.apex_parameters import WITHOUT_MODEL, default_planner
 from apex_ompl.planning import Planning
-from apex_ompl.problem import Problem
 from apex_ompl.result import PlanResult
 from apex_ompl.robot import load_robot
+from apex_ompl.scene.problem import Problem
 from apex_ompl.trajectory import Timing, warm_up
+from apex_ompl.util.files import is_file
 
 
 def load_problem(name_or_path: str | os.PathLike[str]) -> Problem:
@@ -48,7 +48,7 @@ def load_problem(name_or_path: str | os.PathLike[str]) -> Problem:
 def setup(problem: Problem | str | os.PathLike[str]) -> og.SimpleSetup:
     """Return OMPL's SimpleSetup of a problem, for planners and tools of OMPL's own.
 
-    Space, verdict, motion validator, start and goals are set, and the default planner is allocated unless another one
+    Space, checker, motion validator, start and goals are set, and the default planner is allocated unless another one
     is set. Moving obstacles stand where they are at time 0.
 
     Raises:

@@ -8,27 +8,27 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 from ompl import base as ob
 
-from apex_ompl.assembly import PlanningSetup, set_goals
 from apex_ompl.errors import ApexError, TimingError
-from apex_ompl.interrupt import Interrupt
-from apex_ompl.repair import repair
-from apex_ompl.resolution import FULL_RESOLUTION
+from apex_ompl.ompl_adapter.interrupt import Interrupt
+from apex_ompl.ompl_adapter.repair import repair
+from apex_ompl.ompl_adapter.setup import PlanningSetup, set_goals
+from apex_ompl.ompl_adapter.simplify import simplify as shorten
+from apex_ompl.ompl_adapter.space import path_to_array
+from apex_ompl.ompl_adapter.validity import full_check
 from apex_ompl.result import FIRST, INSIDE, PlanResult, PlanStatus
-from apex_ompl.simplify import simplify as shorten
-from apex_ompl.space import path_length, path_to_array, resample
-from apex_ompl.stopwatch import timed
 from apex_ompl.trajectory import Timing, Trajectory, time_path
 from apex_ompl.trajectory.motion import ROUNDING
-from apex_ompl.validity import full_check
+from apex_ompl.trajopt.path import path_length, resample
+from apex_ompl.types import Array
+from apex_ompl.util.resolution import FULL_RESOLUTION
+from apex_ompl.util.stopwatch import timed
 
 if TYPE_CHECKING:
+    from apex_ompl.ompl_adapter.report import Report
     from apex_ompl.planners import Parameters
-    from apex_ompl.report import Report
 
-Array = NDArray[np.float64]
 
 CLEARANCE_SAMPLES = 32
 CHORD = 1e-5  # that a timed motion is off the straight line between two states that are proved, at most [rad]
@@ -110,8 +110,8 @@ class Planning:
         ready = self.ready
         goals = sorted(ready.valid_goals, key=lambda goal: float(np.linalg.norm(goal - ready.start)))
         lines = (np.stack([ready.start, goal]) for goal in goals)
-        free = (line for line in lines if ready.verdict.first_collision(line, FULL_RESOLUTION) is None)
-        return next((line for line in free if full_check(ready.verdict, line, ready.start, goals)), None)
+        free = (line for line in lines if ready.checker.first_collision(line, FULL_RESOLUTION) is None)
+        return next((line for line in free if full_check(ready.checker, line, ready.start, goals)), None)
 
     def _set_up(self, parameters: Parameters) -> ob.Planner:
         """Make the planner, warm."""
@@ -142,7 +142,7 @@ class Planning:
 
     def raise_faults(self) -> None:
         """Raise what the checkers met inside of OMPL."""
-        fault = self.ready.checker.fault or self.ready.motions.fault
+        fault = self.ready.validity_checker.fault or self.ready.motion_validator.fault
         if fault is not None:
             raise fault
 
@@ -163,7 +163,7 @@ class Planning:
                 bend = max(float(np.abs(motion.accelerations).max()), 1e-9)
                 states = motion.sample(max(np.sqrt(8.0 * CHORD / bend), motion.duration / MOST_STATES, 1e-6)).position
                 states = np.clip(states, limits.lower, limits.upper)  # of rounding, as was seen
-                return full_check(ready.verdict, states, ready.start, ready.goals, resolution).reason
+                return full_check(ready.checker, states, ready.start, ready.goals, resolution).reason
 
         try:
             try:  # twice as densely as the path, which may itself only just pass
@@ -183,11 +183,11 @@ class Planning:
     def finish(self, started: float, result: PlanResult) -> PlanResult:
         """Add clearance, length, counts and times."""
         path = result.path
-        checks = self.ready.verdict.tally.states
+        checks = self.ready.checker.check_counts.states
         if path is not None:
             with timed(self.times, "clearance"):
                 states = resample(path, CLEARANCE_SAMPLES)
-                clearance = min(self.ready.verdict.clearance(q) for q in states)
+                clearance = min(self.ready.checker.clearance(q) for q in states)
             result = replace(result, length=path_length(path), clearance=clearance)
         self.times["total"] = time.perf_counter() - started
         return replace(result, checks=checks, times=dict(self.times))
@@ -205,7 +205,7 @@ class Planning:
         ready, reason = self.ready, ""
         for candidate in candidates:
             with timed(self.times, "verify"):
-                check = full_check(ready.verdict, candidate, ready.start, ready.goals)
+                check = full_check(ready.checker, candidate, ready.start, ready.goals)
             if check:
                 return self._exact(candidate, solved_by)
             reason = reason or check.reason
@@ -230,7 +230,7 @@ class Planning:
         path[0] = ready.start
         gap = float(np.linalg.norm(ready.goals - path[-1], axis=1).min())
         reason = f"the nearest state found is {gap:.3g} rad from the goal"
-        check = full_check(ready.verdict, path, ready.start)
+        check = full_check(ready.checker, path, ready.start)
         if not check:
             reason += f", and the path fails the full check, {check.reason}"
         return replace(

@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from ompl import base as ob
 
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError
-from apex_ompl.files import BROKEN, suffix_of, write_atomically
-from apex_ompl.problem import Problem
-from apex_ompl.schema import dump_yaml, read_yaml, validate
+from apex_ompl.scene.problem import Problem
 from apex_ompl.trajectory import Trajectory
 from apex_ompl.trajectory.files import MESSAGES, STATES
+from apex_ompl.util.files import BROKEN, suffix_of, write_atomically
+from apex_ompl.util.schema import dump_yaml, read_yaml, validate
 
 SCHEMA = "apex-ompl/result/2"
 SUFFIXES = (*MESSAGES, ".npz", ".csv", ".json", ".yaml")
@@ -78,8 +78,8 @@ class PlanResult:
         clearance: Least distance of any checked pair at 32 states spread over the path [m], NaN without a path.
         checks: How many states were judged one by one; those inside proved stretches of motions do not count.
         solved_by: What found the path: the planner's name, or the stage of apex that did (see
-            ``apex_ompl.report.Report``), with ``+repair`` when a stretch of it failed the full check and was planned
-            anew; ``straight line`` when that was a solution, so that no planner ran; empty without a path.
+            ``apex_ompl.ompl_adapter.report.Report``), with ``+repair`` where a stretch of it failed the full check and
+            was planned anew; ``straight line`` when that was a solution, so that no planner ran; empty without a path.
         notes: What a user should know about this run, such as a snapshot of moving obstacles.
     """
 

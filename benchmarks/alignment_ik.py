@@ -14,15 +14,15 @@ import numpy as np
 import record
 
 from apex_ompl import load_problem
-from apex_ompl.arguments import one_or_more, whole_number
-from apex_ompl.bodies import Body
-from apex_ompl.collision import Verdict
-from apex_ompl.endings import run_command
-from apex_ompl.goals import alignment_goal
+from apex_ompl.collision import CollisionChecker
 from apex_ompl.robot import Robot
 from apex_ompl.robot.assets import DATA
 from apex_ompl.robot.config import Part, read_config
 from apex_ompl.robot.model import build_robot
+from apex_ompl.scene.bodies import Body
+from apex_ompl.tasks.alignment import alignment_goal
+from apex_ompl.util.scripts import run_command
+from apex_ompl.util.validation import one_or_more, whole_number
 
 PROBLEMS = ("stack_boxes", "ball_in_cup", "peg_in_hole", "pour", "handover")
 
@@ -57,10 +57,10 @@ def main() -> None:
             problem = load_problem(name)
             goal = alignment_goal(robot, problem)
             assert goal is not None
-            verdict = Verdict(robot, (), problem.attached)
-            verdict.is_free(robot.home)
+            checker = CollisionChecker(robot, (), problem.attached)
+            checker.is_free(robot.home)
             begin = time.perf_counter()
-            found = goal.sample(verdict, np.random.default_rng(args.seed), args.attempts, args.attempts)
+            found = goal.sample(checker, np.random.default_rng(args.seed), args.attempts, args.attempts)
             spent = (time.perf_counter() - begin) * 1e3
             figure = {
                 "problem": name,

@@ -1,6 +1,6 @@
 """APEX head to head: with and without trees, against controls of its model, RRTConnect, and RRTConnect polished.
 
-Every run is a call of ``plan`` in the same space, by the same verdict, at the same resolution, with the same seed (the
+Every run is a call of ``plan`` in the same space, by the same checker, at the same resolution, with the same seed (the
 number of the problem modulo 1000). "Without trees" is APEX with ``fallback=false`` and ``bridge=false``; the controls
 are the same pipeline with random weights, with the conditions of another problem, with random bumps instead of
 proposals, and with the straight line and its repair alone. Times leave out the setup of problem and planner, which is
@@ -30,14 +30,14 @@ from controls import OTHER, checkpoint_digest, next_query
 from store import RunStore
 
 from apex_ompl import plan, problems
-from apex_ompl.arguments import one_or_more, whole_number
-from apex_ompl.assembly import assemble
 from apex_ompl.diffusion.checkpoint import SHIPPED
-from apex_ompl.endings import run_command
+from apex_ompl.ompl_adapter.setup import assemble
+from apex_ompl.ompl_adapter.validity import full_check
 from apex_ompl.problems.reach import robot
-from apex_ompl.resolution import FULL_RESOLUTION
 from apex_ompl.result import FIRST, INSIDE, PlanResult
-from apex_ompl.validity import full_check
+from apex_ompl.util.resolution import FULL_RESOLUTION
+from apex_ompl.util.scripts import run_command
+from apex_ompl.util.validation import one_or_more, whole_number
 
 STORE = record.RESULTS.parent / "runs" / "apex.jsonl"
 LIMIT, SHORT_LIMIT = 10.0, 2.0  # [s]; of controls
@@ -94,7 +94,7 @@ def run(job: tuple[str, str, str]) -> dict[str, Any]:
     }  # fmt: skip
     if result:
         ready = assemble(problems.load(name), robot())
-        found["false"] = not full_check(ready.verdict, result.path, resolution=FULL_RESOLUTION / 10)
+        found["false"] = not full_check(ready.checker, result.path, resolution=FULL_RESOLUTION / 10)
     return found
 
 

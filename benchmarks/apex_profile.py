@@ -24,15 +24,15 @@ import torch
 from ompl import base as ob
 
 from apex_ompl import problems
-from apex_ompl.arguments import one_or_more
-from apex_ompl.assembly import PlanningSetup, assemble
-from apex_ompl.endings import run_command
-from apex_ompl.ompl_globals import quiet_ompl, seed_ompl
-from apex_ompl.optimize import Optimizer, Settings
-from apex_ompl.planners import solve_loop
+from apex_ompl.apex import solver
+from apex_ompl.ompl_adapter.process import quiet_ompl, seed_ompl
+from apex_ompl.ompl_adapter.setup import PlanningSetup, assemble
 from apex_ompl.planners.apex import APEX
 from apex_ompl.planners.apex_parameters import ApexParameters
 from apex_ompl.problems.reach import robot
+from apex_ompl.trajopt.optimizer import Optimizer, Settings
+from apex_ompl.util.scripts import run_command
+from apex_ompl.util.validation import one_or_more
 
 LIMIT, SEED = 5.0, 1  # [s]
 TREELESS = {"fallback": False, "bridge": False}
@@ -165,7 +165,7 @@ def main() -> None:
         run(hard[0], **TREELESS)
         by_stage, first = stages(hard)
         by_variant, second = variants(hard)
-        solve_loop.LONGER = (1, 0, 0)
+        solver.LONGER = (1, 0, 0)
         by_sprint, third = sprints(hard, scenes)
     text = "\n".join([*first, "", *second, "", *third])
     figures = {"stages": by_stage, "variants": by_variant, "sprints": by_sprint}

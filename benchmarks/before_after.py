@@ -1,4 +1,4 @@
-"""rrtconnect with the verdict in two stages and with the meshes alone, on every ready-made problem and on Baxter.
+"""rrtconnect with the checker in two stages and with the meshes alone, on every ready-made problem and on Baxter.
 
 Both run in turn with the same seeds, so the searches are the same as far as the clock lets them. Times are those of
 the search itself, and of everything after the problem was set up (straight lines, search, simplification, proof,
@@ -17,10 +17,11 @@ import numpy as np
 import record
 from shipped_problems import BAXTER
 
-from apex_ompl import PlanResult, assembly, plan, problems
-from apex_ompl.arguments import one_or_more
-from apex_ompl.collision import Verdict
-from apex_ompl.endings import run_command
+from apex_ompl import PlanResult, plan, problems
+from apex_ompl.collision import CollisionChecker
+from apex_ompl.ompl_adapter import setup
+from apex_ompl.util.scripts import run_command
+from apex_ompl.util.validation import one_or_more
 
 WORK = ("line", "solve", "simplify", "verify", "repair")
 
@@ -45,7 +46,7 @@ def main() -> None:
         runs: dict[bool, list[PlanResult]] = {True: [], False: []}
         for seed in range(args.seeds):
             for proofs in (True, False):
-                with mock.patch.object(assembly, "Verdict", partial(Verdict, proofs=proofs)):
+                with mock.patch.object(setup, "CollisionChecker", partial(CollisionChecker, proofs=proofs)):
                     runs[proofs].append(plan(name, args.planner, timeout=args.timeout, seed=seed))
         row: list[object] = [
             runs[True][0].problem.name,

@@ -22,11 +22,11 @@ import record
 from store import RunStore
 
 from apex_ompl import plan, problems
-from apex_ompl.arguments import one_or_more, whole_number
-from apex_ompl.endings import run_command
-from apex_ompl.moving import even_times, timed_check
+from apex_ompl.live.moving import even_times, timed_check
 from apex_ompl.problems.alignment import PACE
 from apex_ompl.problems.reach import robot
+from apex_ompl.util.scripts import run_command
+from apex_ompl.util.validation import one_or_more, whole_number
 
 FIRST = 900_000  # seed of the first test problem
 TIMEOUT, LIMITS = 10.0, (0.5, 2.0, 10.0)  # [s]

@@ -14,8 +14,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-from apex_ompl.arguments import one_or_more
-from apex_ompl.endings import run_command
+from apex_ompl.util.scripts import run_command
+from apex_ompl.util.validation import one_or_more
 
 ROOT = Path(__file__).resolve().parents[1]
 REFERENCE = ROOT / "benchmarks" / "reference_lengths.json"

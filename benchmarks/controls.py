@@ -16,16 +16,16 @@ import torch
 from ompl import base as ob
 
 from apex_ompl import problems
-from apex_ompl.assembly import assemble
+from apex_ompl.apex.query import make_query
 from apex_ompl.diffusion.conditions import Query
 from apex_ompl.diffusion.model import LatentDiffusion
 from apex_ompl.diffusion.proposals import Proposals, TrajectoryModel
-from apex_ompl.optimize import Optimizer
+from apex_ompl.ompl_adapter.setup import assemble
 from apex_ompl.planners.apex import APEX
 from apex_ompl.planners.apex_parameters import ApexParameters
 from apex_ompl.planners.registry import register
 from apex_ompl.problems.reach import robot
-from apex_ompl.queries import query_of
+from apex_ompl.trajopt.optimizer import Optimizer
 
 
 class Bumps(TrajectoryModel):
@@ -95,7 +95,7 @@ def next_query(name: str) -> Query:
     """Return the query of the next problem of a level."""
     level, number = name.rsplit("/", 1)
     setup = assemble(problems.load(f"{level}/{int(number) + 1}"), robot())
-    return query_of(setup.verdict, setup.start, setup.goals[0])
+    return make_query(setup.checker, setup.start, setup.goals[0])
 
 
 @cache

@@ -1,8 +1,8 @@
-"""How many spheres pay: covers of different gaps, by what proofs and verdicts cost with them.
+"""How many spheres pay: covers of different gaps, by what proofs and checkers cost with them.
 
 The covers are files that scripts/make_covers.py wrote with different --gaps. For each: leaves of an arm link and of
 the whole robot, how large and how far from the meshes they are, the share of free states that they prove, the cost of
-proofs and of the two stages of the verdict, of free 256-state paths, and of rrtconnect's search on two problems.
+proofs and of the two stages of the checker, of free 256-state paths, and of rrtconnect's search on two problems.
 
 Usage: python benchmarks/covers.py FILE.json...
 """
@@ -17,15 +17,16 @@ from unittest import mock
 
 import numpy as np
 import record
-from verdict import around_home, boxes, microseconds, of_batch
+from collision_checker import around_home, boxes, microseconds, of_batch
 
-from apex_ompl import assembly, plan
-from apex_ompl.arguments import one_or_more
-from apex_ompl.collision import Verdict
-from apex_ompl.collision.spheres import quality, read_covers, shape_key
-from apex_ompl.endings import run_command
-from apex_ompl.resolution import FULL_RESOLUTION, SEARCH_RESOLUTION
+from apex_ompl import plan
+from apex_ompl.collision import CollisionChecker
+from apex_ompl.collision.cover.spheres import quality, read_covers, shape_key
+from apex_ompl.ompl_adapter import setup
 from apex_ompl.robot import load_robot
+from apex_ompl.util.resolution import FULL_RESOLUTION, SEARCH_RESOLUTION
+from apex_ompl.util.scripts import run_command
+from apex_ompl.util.validation import one_or_more
 
 PROBLEMS = ("shelf_swap", "reach_past_post")
 
@@ -46,23 +47,23 @@ def measure(path: Path, states: int, seeds: int) -> dict[str, float]:
     found = {"leaves": total, "volume_ratio": float(np.mean(ratios)), "mean_gap_mm": float(np.mean(gaps))}
     proved, kernel_us, free_us, search_ms, full_ms = [], [], [], [], []
     for count in (3, 10, 30):
-        verdict = Verdict(robot, boxes(count, rng))
+        checker = CollisionChecker(robot, boxes(count, rng))
         drawn = around_home(robot, rng, states)
-        free = drawn[verdict.are_free(drawn)]
-        kernel = verdict.kernel
+        free = drawn[checker.are_free(drawn)]
+        kernel = checker.kernel
         proved.append(float((kernel.unproved(free)[1] == 0).mean()))
         kernel_us.append(of_batch(kernel.unproved, free))
-        free_us.append(microseconds(verdict.is_free, free))
+        free_us.append(microseconds(checker.is_free, free))
         for a, b in zip(free[:150], free[150:300], strict=False):
             for resolution, times in ((SEARCH_RESOLUTION, search_ms), (FULL_RESOLUTION, full_ms)):
                 begin = time.perf_counter()
-                clear = verdict.first_collision(np.stack([a, b]), resolution) is None
+                clear = checker.first_collision(np.stack([a, b]), resolution) is None
                 if clear:
                     times.append((time.perf_counter() - begin) * 1e3)
     found |= {"proved_of_free": float(np.mean(proved)), "proof_us": float(np.mean(kernel_us))}
     found |= {"two_stages_free_us": float(np.mean(free_us))}
     found |= {"free_motion_search_ms": float(np.median(search_ms)), "free_motion_full_ms": float(np.median(full_ms))}
-    with mock.patch.object(assembly, "load_robot", lambda *_: robot):
+    with mock.patch.object(setup, "load_robot", lambda *_: robot):
         for name in PROBLEMS:
             runs = [plan(name, "rrtconnect", timeout=10.0, seed=seed) for seed in range(seeds)]
             found[f"{name}_solve_ms"] = float(np.median([r.times["solve"] for r in runs])) * 1e3

@@ -23,13 +23,13 @@ from typing import Any
 import numpy as np
 import record
 
-from apex_ompl.arguments import one_or_more, whole_number
-from apex_ompl.endings import run_command
-from apex_ompl.engine import Options
-from apex_ompl.generation import SHARES, UNIT, Unit, static_levels, work
+from apex_ompl.datasets.engine import Options
+from apex_ompl.datasets.records import SOURCES
+from apex_ompl.generation.worker import SHARES, UNIT, Unit, static_levels, work
 from apex_ompl.problems import scenes
-from apex_ompl.records import SOURCES
-from apex_ompl.spline import Spline
+from apex_ompl.trajopt.spline import Spline
+from apex_ompl.util.scripts import run_command
+from apex_ompl.util.validation import one_or_more, whole_number
 
 SCRIPT = Path(__file__).resolve().parent.parent / "scripts" / "generate_data.py"
 WANTED, CORES = 500_000, (2, 16, 64)

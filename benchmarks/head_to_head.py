@@ -23,12 +23,12 @@ from pathlib import Path
 import numpy as np
 import record
 
-from apex_ompl.arguments import one_or_more
 from apex_ompl.benchmark import Row, Workers, bench, report, write_database, write_logs
+from apex_ompl.benchmark.metrics import share_interval
 from apex_ompl.benchmark.rows import PAPER
 from apex_ompl.benchmark.summary import MOMENTS, Figures, Table, figures, tables, warnings
-from apex_ompl.endings import run_command
-from apex_ompl.metrics import share_interval
+from apex_ompl.util.scripts import run_command
+from apex_ompl.util.validation import one_or_more
 
 TIMEOUT = 10.0  # [s]
 TIMES = (("first", 50), ("first", 95), ("first", 99), ("total", 50))

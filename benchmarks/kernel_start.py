@@ -1,6 +1,6 @@
 """How long the compiled kernel takes to be ready: compiled for the first time, and loaded from the cache.
 
-Runs fresh processes, the first with an empty cache folder, and times the import, the robot, ``Verdict.prepare``, the
+Runs fresh processes, the first with an empty cache folder, and times import, robot, ``CollisionChecker.prepare``, the
 first state and motion judged, and the first plan by the default planner.
 
 Usage: python benchmarks/kernel_start.py [--runs 5]
@@ -18,25 +18,25 @@ import tempfile
 import numpy as np
 import record
 
-from apex_ompl.arguments import one_or_more
-from apex_ompl.endings import run_command
+from apex_ompl.util.scripts import run_command
+from apex_ompl.util.validation import one_or_more
 
 CODE = """
 import json, time
 marks = [time.perf_counter()]
 import apex_ompl.api
 marks.append(time.perf_counter())
-from apex_ompl.collision import Verdict
+from apex_ompl.collision import CollisionChecker
 robot = apex_ompl.load_robot("dual_panda_softhand")
 marks.append(time.perf_counter())
-verdict = Verdict(robot)
-verdict.prepare()
+checker = CollisionChecker(robot)
+checker.prepare()
 marks.append(time.perf_counter())
-assert verdict.is_free(robot.home)
+assert checker.is_free(robot.home)
 marks.append(time.perf_counter())
 other = robot.home.copy()
 other[:3] += 0.1
-assert verdict.first_collision([robot.home, other], 0.031) is None
+assert checker.first_collision([robot.home, other], 0.031) is None
 marks.append(time.perf_counter())
 assert apex_ompl.plan("ball_in_cup")
 marks.append(time.perf_counter())

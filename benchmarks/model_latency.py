@@ -18,14 +18,14 @@ import record
 import torch
 
 from apex_ompl import load_model, problems
-from apex_ompl.arguments import one_or_more
-from apex_ompl.assembly import assemble
+from apex_ompl.apex.query import make_query
 from apex_ompl.diffusion.checkpoint import shipped
 from apex_ompl.diffusion.guidance import Guidance
 from apex_ompl.diffusion.proposals import Sampling
-from apex_ompl.endings import run_command
+from apex_ompl.ompl_adapter.setup import assemble
 from apex_ompl.problems.reach import robot
-from apex_ompl.queries import query_of
+from apex_ompl.util.scripts import run_command
+from apex_ompl.util.validation import one_or_more
 
 PROBLEM = "shelf/hard/800003"
 COUNTS = (1, 8, 32)
@@ -38,11 +38,11 @@ LOAD += "print(time.perf_counter() - b)"
 def latency(name: str, repeat: int) -> list[dict[str, Any]]:
     """Return the seconds of each stage for every number of proposals and steps."""
     model, ready = load_model(name), assemble(problems.load(PROBLEM), robot())
-    kernel, rows = ready.verdict.kernel, []
+    kernel, rows = ready.checker.kernel, []
     took = []
     for _ in range(repeat + 3):
         begin = time.perf_counter()
-        query = query_of(ready.verdict, ready.start, ready.goals[0], point=model.sees_point)
+        query = make_query(ready.checker, ready.start, ready.goals[0], point=model.sees_point)
         took.append(time.perf_counter() - begin)
     query_s = float(np.median(took[3:]))
     for count in COUNTS:

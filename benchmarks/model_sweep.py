@@ -20,12 +20,12 @@ from typing import Any
 import record
 import torch
 
-from apex_ompl.arguments import one_or_more
-from apex_ompl.cases import load_cases
+from apex_ompl.datasets.cases import load_cases
 from apex_ompl.diffusion.checkpoint import load_model
 from apex_ompl.diffusion.runlog import read_log
 from apex_ompl.diffusion.validation import judged
-from apex_ompl.endings import run_command
+from apex_ompl.util.scripts import run_command
+from apex_ompl.util.validation import one_or_more
 
 LOSSES = ("loss", "held_out")
 ROOT = record.RESULTS.parent.parent

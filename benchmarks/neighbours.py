@@ -8,13 +8,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from apex_ompl.datasets.records import Paths
 from apex_ompl.diffusion.conditions import Conditions, Probes, Query, Table, batched, pooled
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel import Kernel, RobotTables
-from apex_ompl.kernel.scene import scene_tables
-from apex_ompl.records import Paths
-
-Array = NDArray[np.float64]
+from apex_ompl.kernel.scene_builder import scene_tables
+from apex_ompl.types import Array
 
 ALONG = 7  # states of the straight line at which clearances are compared
 NEAR = 0.3  # clearances are told apart up to here [m]

@@ -22,14 +22,14 @@ import record
 from store import RunStore
 
 from apex_ompl import plan, problems
-from apex_ompl.arguments import one_or_more, whole_number
-from apex_ompl.assembly import assemble
-from apex_ompl.endings import run_command
-from apex_ompl.optimize import Optimizer
-from apex_ompl.pool import first_valid
+from apex_ompl.ompl_adapter.setup import assemble
+from apex_ompl.ompl_adapter.validity import full_check
 from apex_ompl.problems.reach import robot
-from apex_ompl.space import path_length
-from apex_ompl.validity import full_check
+from apex_ompl.trajopt.candidates import first_valid
+from apex_ompl.trajopt.optimizer import Optimizer
+from apex_ompl.trajopt.path import path_length
+from apex_ompl.util.scripts import run_command
+from apex_ompl.util.validation import one_or_more, whole_number
 
 STORE = record.RESULTS.parent / "runs" / "optimizer.jsonl"
 STARTS = {"line": 1, "8 bumps": 8, "32 bumps": 32}
@@ -52,10 +52,10 @@ def run(job: tuple[str, str]) -> dict[str, Any]:
 
 def _optimised(name: str, count: int, seed: int) -> dict[str, Any]:
     ready, optimizer = assemble(problems.load(name), robot()), Optimizer()
-    kernel, start, goal = ready.verdict.kernel, ready.start, ready.goals[0]
+    kernel, start, goal = ready.checker.kernel, ready.start, ready.goals[0]
 
     def is_valid(path: np.ndarray) -> bool:
-        return bool(full_check(ready.verdict, path, start, [goal]))
+        return bool(full_check(ready.checker, path, start, [goal]))
 
     begin = time.perf_counter()
     starts = optimizer.starts(start, goal, count, np.random.default_rng(seed))

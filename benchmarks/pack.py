@@ -15,9 +15,9 @@ import lzma
 import tarfile
 from pathlib import Path
 
-from apex_ompl.endings import run_command
 from apex_ompl.errors import MissingFileError, ParameterError
-from apex_ompl.files import make_folder, write_atomically
+from apex_ompl.util.files import make_folder, write_atomically
+from apex_ompl.util.scripts import run_command
 
 RUNS, PACKED = Path(__file__).parent / "runs", Path(__file__).parent / "packed"
 KINDS = (".json", ".jsonl")

@@ -1,7 +1,7 @@
 """RoboPlan's RRT-Connect (C++ on Pinocchio and Coal) beside apex and rrtconnect, on the same problems.
 
 RoboPlan loads this project's URDF, with the same pairs of links, obstacles and held objects; how often it says of
-random states what the verdict says is part of the results. It plans with the same spacing of states, as a Euclidean
+random states what the checker says is part of the results. It plans with the same spacing of states, as a Euclidean
 distance, which is finer than the greatest step of a joint that OMPL's planners go by here. What differs: it has no
 proofs of stretches; its paths are shortened by its own shortcuts; of several goals it takes the first. Its paths then
 go the way of rrtconnect's: the shortened one has to pass the full check, or is repaired; if it cannot be, the path as
@@ -25,25 +25,25 @@ from typing import Any
 import numpy as np
 import record
 import torch
-from numpy.typing import NDArray
 from store import RunStore
 
 from apex_ompl import problems
-from apex_ompl.arguments import one_or_more
-from apex_ompl.assembly import PlanningSetup, assemble
 from apex_ompl.benchmark import runs
 from apex_ompl.benchmark.rows import Job
-from apex_ompl.bodies import Body, pose_matrix
-from apex_ompl.endings import run_command
-from apex_ompl.ompl_globals import quiet_ompl
-from apex_ompl.problem import Problem
+from apex_ompl.ompl_adapter.process import quiet_ompl
+from apex_ompl.ompl_adapter.repair import repair
+from apex_ompl.ompl_adapter.setup import PlanningSetup, assemble
+from apex_ompl.ompl_adapter.validity import full_check
 from apex_ompl.problems.reach import robot
-from apex_ompl.repair import repair
-from apex_ompl.resolution import SEARCH_RESOLUTION
 from apex_ompl.robot import Robot
 from apex_ompl.robot.model import link_of
-from apex_ompl.space import path_length
-from apex_ompl.validity import full_check
+from apex_ompl.scene.bodies import Body, pose_matrix
+from apex_ompl.scene.problem import Problem
+from apex_ompl.trajopt.path import path_length
+from apex_ompl.types import Array
+from apex_ompl.util.resolution import SEARCH_RESOLUTION
+from apex_ompl.util.scripts import run_command
+from apex_ompl.util.validation import one_or_more
 
 try:
     from roboplan.core import (
@@ -61,14 +61,13 @@ try:
 except ImportError as error:
     sys.exit(f"peers.py: error: no RoboPlan ({error}), expected: pip install 'apex-ompl[peers]'")
 
-Array = NDArray[np.float64]
 
 STORE = Path(__file__).parent / "runs" / "peers.jsonl"
 LIMIT = 10.0  # [s]
 METHODS = ("apex", "rrtconnect", "roboplan")
 NODES, REACH = 1_000_000, 3.0  # of RoboPlan's trees, and their longest step, its default [rad]
 TOGETHER = ("all hard", "all")
-STATES = 200  # on which the verdicts are compared, for each problem
+STATES = 200  # on which the checkers are compared, for each problem
 ORIGIN = np.eye(4)
 COLOUR = np.array([0.5, 0.5, 0.5, 1.0])
 
@@ -130,13 +129,13 @@ def roboplan_scene(ready: PlanningSetup) -> Scene:
 
 
 def agreement(ready: PlanningSetup, scene: Scene, rng: np.random.Generator) -> list[int]:
-    """Return how many random states both call free, both colliding, only RoboPlan free, only the verdict free."""
+    """Return how many random states both call free, both colliding, only RoboPlan free, only the checker free."""
     ends = np.stack([ready.start, ready.goals[0]])
     limits = ready.robot.limits
     states = ends[rng.integers(2, size=STATES)] + rng.normal(0.0, 0.3, (STATES, ready.robot.dof))
     counts = [0, 0, 0, 0]
     for q in np.clip(states, limits.lower, limits.upper):
-        theirs, ours = not scene.hasCollisions(ready.robot.to_pinocchio(q)), ready.verdict.is_free(q)
+        theirs, ours = not scene.hasCollisions(ready.robot.to_pinocchio(q)), ready.checker.is_free(q)
         counts[{(True, True): 0, (False, False): 1, (True, False): 2, (False, True): 3}[theirs, ours]] += 1
     return counts
 
@@ -176,7 +175,7 @@ def run(job: tuple[str, str]) -> dict[str, Any]:
     candidates = [np.array(one.positions)[:, order] for one in (shortened, path)]
     for states in candidates:
         states[0], states[-1] = ready.start, ready.goals[0]
-        check = full_check(ready.verdict, states, ready.start, ready.goals)
+        check = full_check(ready.checker, states, ready.start, ready.goals)
         if check:
             mended = states
             break
@@ -188,7 +187,7 @@ def run(job: tuple[str, str]) -> dict[str, Any]:
     total = time.perf_counter() - begin
     begin = time.perf_counter()
     first = total
-    if full_check(ready.verdict, candidates[-1], ready.start, ready.goals):
+    if full_check(ready.checker, candidates[-1], ready.start, ready.goals):
         first = took + time.perf_counter() - begin
     return {
         **about, "solved": mended is not None, "failed": failed, "first": first, "total": total, "agreement": same,
@@ -256,7 +255,7 @@ def main() -> None:
             rows.append(record.row(cells))
     same = np.sum([f["agreement"] for name, f in found.items() if name.startswith("all,")] or [[0] * 4], axis=0)
     left = sum(not done[job]["carried"] for job in jobs if job in done) // len(METHODS)
-    words = "both free, both colliding, free to RoboPlan alone, free to the verdict alone"
+    words = "both free, both colliding, free to RoboPlan alone, free to the checker alone"
     text = f"\n\nRandom states near starts and goals: {', '.join(str(n) for n in same)} ({words}). "
     text += f"{left} problems have shapes that RoboPlan has not, and are left out."
     record.write(

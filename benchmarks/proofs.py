@@ -1,7 +1,7 @@
 """Soundness and reach of the sphere proofs: they must never call free what the meshes call colliding.
 
 For each robot, over scenes of all kinds of obstacles, with and without held objects: states drawn widely, states
-pushed to within a thousandth of the border of collision, and states with a small obstacle inside a link. The verdict
+pushed to within a thousandth of the border of collision, and states with a small obstacle inside a link. The checker
 with proofs is compared with that of the meshes alone. Motions that were proved without the meshes are sampled a
 hundred times as densely as planners sample. Then the share of states and of motion length that the spheres prove.
 
@@ -17,16 +17,16 @@ from pathlib import Path
 import coal
 import numpy as np
 import record
-from verdict import around_home, boxes, near_contact
+from collision_checker import around_home, boxes, near_contact
 
-from apex_ompl.arguments import one_or_more, whole_number
-from apex_ompl.bodies import AttachedObject, MeshFile, Obstacle
-from apex_ompl.collision import Verdict
-from apex_ompl.collision.proofs import Tally
-from apex_ompl.collision.sweep import sample_path
-from apex_ompl.endings import run_command
-from apex_ompl.resolution import FULL_RESOLUTION, SEARCH_RESOLUTION
+from apex_ompl.collision import CollisionChecker
+from apex_ompl.collision.conservative import CheckCounts
+from apex_ompl.collision.path_grid import sample_path
 from apex_ompl.robot import Robot, load_robot
+from apex_ompl.scene.bodies import AttachedObject, MeshFile, Obstacle
+from apex_ompl.util.resolution import FULL_RESOLUTION, SEARCH_RESOLUTION
+from apex_ompl.util.scripts import run_command
+from apex_ompl.util.validation import one_or_more, whole_number
 
 SCENES = 20
 INSIDE_SCENES = 100
@@ -56,9 +56,11 @@ def held(robot: Robot) -> list[AttachedObject]:
     ]
 
 
-def pair(robot: Robot, obstacles: list[Obstacle], hands: list[AttachedObject]) -> tuple[Verdict, Verdict]:
-    """Return the verdict in two stages, and of the meshes alone."""
-    return Verdict(robot, obstacles, hands), Verdict(robot, obstacles, hands, proofs=False)
+def pair(
+    robot: Robot, obstacles: list[Obstacle], hands: list[AttachedObject]
+) -> tuple[CollisionChecker, CollisionChecker]:
+    """Return the checker in two stages, and of the meshes alone."""
+    return CollisionChecker(robot, obstacles, hands), CollisionChecker(robot, obstacles, hands, proofs=False)
 
 
 class Count:
@@ -68,8 +70,8 @@ class Count:
         """Count states of a kind."""
         self.kind, self.states, self.free, self.proved, self.false_free, self.differ = kind, 0, 0, 0, 0, 0
 
-    def add(self, both: Verdict, meshes: Verdict, states: np.ndarray) -> None:
-        """Judge states by both verdicts."""
+    def add(self, both: CollisionChecker, meshes: CollisionChecker, states: np.ndarray) -> None:
+        """Check states by both checkers."""
         proved = both.kernel.unproved(states)[1] == 0
         truth = meshes.are_free(states)
         self.states += len(states)
@@ -85,7 +87,7 @@ class Count:
 
 
 def inside_a_link(robot: Robot, rng: np.random.Generator, count: Count, states: int) -> None:
-    """Judge states with a small obstacle at a random place inside a random link, and states near by."""
+    """Check states with a small obstacle at a random place inside a random link, and states near by."""
     items = [g for g in robot.geometry.geometryObjects if g.parentJoint > 0]
     large = [g for g in items if g.geometry.getObjectType() == coal.OT_BVH] or items
     for _ in range(INSIDE_SCENES):
@@ -108,7 +110,7 @@ def inside_a_link(robot: Robot, rng: np.random.Generator, count: Count, states: 
 def motions(robot: Robot, rng: np.random.Generator, wanted: int, mesh: Path) -> dict[str, float]:
     """Sample motions that the spheres proved, densely; and count how much of free motions they prove."""
     found = {"proved": 0, "samples": 0, "colliding": 0}
-    search, full = Tally(), Tally()
+    search, full = CheckCounts(), CheckCounts()
     while found["proved"] < wanted:
         both, meshes = pair(robot, scene(rng, int(rng.choice([3, 10, 30])), mesh), held(robot))
         states = around_home(robot, rng, 500)
@@ -119,27 +121,27 @@ def motions(robot: Robot, rng: np.random.Generator, wanted: int, mesh: Path) -> 
         for a in starts:
             step = rng.normal(0.0, 1.0, robot.dof) * rng.uniform(0.01, 0.3)
             path = np.stack([a, np.clip(a + step, robot.limits.lower, robot.limits.upper)])
-            both.tally = Tally()
+            both.check_counts = CheckCounts()
             free = both.first_collision(path, SEARCH_RESOLUTION) is None
             if free:
-                _add(search, both.tally)
-            if free and both.tally.meshes == 0:
+                _add(search, both.check_counts)
+            if free and both.check_counts.meshes == 0:
                 dense = sample_path(path, SEARCH_RESOLUTION / DENSER)[0]
                 found["proved"] += 1
                 found["samples"] += len(dense)
                 found["colliding"] += int((~meshes.are_free(dense)).sum())
             if free:
-                both.tally = Tally()
+                both.check_counts = CheckCounts()
                 if both.first_collision(path, FULL_RESOLUTION) is None:
-                    _add(full, both.tally)
-    for name, tally in (("search", search), ("full", full)):
-        found[f"{name}_steps_proved"] = tally.proved_steps / tally.steps
-        found[f"{name}_states_proved"] = tally.proved / max(tally.states, 1)
-        found[f"{name}_to_meshes"] = tally.meshes / tally.steps
+                    _add(full, both.check_counts)
+    for name, check_counts in (("search", search), ("full", full)):
+        found[f"{name}_steps_proved"] = check_counts.proved_steps / check_counts.steps
+        found[f"{name}_states_proved"] = check_counts.proved / max(check_counts.states, 1)
+        found[f"{name}_to_meshes"] = check_counts.meshes / check_counts.steps
     return found
 
 
-def _add(total: Tally, part: Tally) -> None:
+def _add(total: CheckCounts, part: CheckCounts) -> None:
     for name, value in vars(part).items():
         setattr(total, name, getattr(total, name) + value)
 

@@ -30,22 +30,22 @@ from neighbours import Neighbours
 from store import RunStore
 
 from apex_ompl import load_model, plan, problems
-from apex_ompl.arguments import one_or_more, whole_number
-from apex_ompl.assembly import PlanningSetup, assemble
+from apex_ompl.apex.query import make_query
 from apex_ompl.diffusion.checkpoint import SHIPPED, read_config
 from apex_ompl.diffusion.data import Mirror, window_paths
 from apex_ompl.diffusion.guidance import Guidance
 from apex_ompl.diffusion.proposals import Sampling, TrajectoryModel
-from apex_ompl.endings import run_command
 from apex_ompl.kernel import Kernel, RobotTables
-from apex_ompl.kernel.scene import scene_tables
-from apex_ompl.optimize import Optimizer
-from apex_ompl.pool import first_valid
+from apex_ompl.kernel.scene_builder import scene_tables
+from apex_ompl.ompl_adapter.setup import PlanningSetup, assemble
+from apex_ompl.ompl_adapter.validity import full_check
 from apex_ompl.problems.reach import robot
-from apex_ompl.queries import query_of
 from apex_ompl.result import INSIDE
-from apex_ompl.space import path_length
-from apex_ompl.validity import full_check
+from apex_ompl.trajopt.candidates import first_valid
+from apex_ompl.trajopt.optimizer import Optimizer
+from apex_ompl.trajopt.path import path_length
+from apex_ompl.util.scripts import run_command
+from apex_ompl.util.validation import one_or_more, whole_number
 
 ROOT = record.RESULTS.parent.parent
 STORE = record.RESULTS.parent / "runs" / "proposals.jsonl"
@@ -151,16 +151,16 @@ def run(job: Job) -> dict[str, Any]:
     make = proposer(ready, optimizer, job, seed)
 
     def is_valid(path: np.ndarray) -> bool:
-        return bool(full_check(ready.verdict, path, ready.start, [ready.goals[0]]))
+        return bool(full_check(ready.checker, path, ready.start, [ready.goals[0]]))
 
     begin = time.perf_counter()
     control = make(count)
     proposed = time.perf_counter()
     valid = next((c for c in control if is_valid(optimizer.spline.path(c))), None)
     judged = time.perf_counter()
-    found = valid if valid is not None else first_valid(optimizer, ready.verdict.kernel, control, is_valid)
+    found = valid if valid is not None else first_valid(optimizer, ready.checker.kernel, control, is_valid)
     found_s = time.perf_counter() - begin
-    best = None if found is None else optimizer.shorten(ready.verdict.kernel, found, is_valid)
+    best = None if found is None else optimizer.shorten(ready.checker.kernel, found, is_valid)
     best = found if best is None else best
     took = time.perf_counter() - begin
     length = None if best is None else path_length(optimizer.spline.path(best))
@@ -173,21 +173,21 @@ def run(job: Job) -> dict[str, Any]:
 def proposer(ready: PlanningSetup, optimizer: Optimizer, job: Job, seed: int) -> Callable[[int], np.ndarray]:
     """Return what makes proposals; what needs no problem is made ready."""
     method = job.method
-    kernel, start, goal = ready.verdict.kernel, ready.start, ready.goals[0]
+    kernel, start, goal = ready.checker.kernel, ready.start, ready.goals[0]
     if method in ("line", "bumps"):
         return lambda count: optimizer.starts(start, goal, count, np.random.default_rng(seed))
     if method == "nearest paths":
         near = neighbours(job.data)
-        return lambda count: near.refitted(query_of(ready.verdict, start, goal, point=False), kernel, count)
+        return lambda count: near.refitted(make_query(ready.checker, start, goal, point=False), kernel, count)
     kinds = {"regression": job.regression, "random weights": method, "shuffled conditions": method}
     network = model(kinds.get(method, "apex-paper" if method.startswith("apex-paper") else "apex"))
     if isinstance(network, Shuffled):
         network.other = next_query(job.problem)
     sampling = {"apex, guided": Sampling(guidance=GUIDED), "apex-paper": PAPER, "apex-paper, guided": GUIDED_PAPER}
-    ready.verdict.obstacle_point(start)  # GJK's pairs are made ready once for a scene
+    ready.checker.obstacle_point(start)  # GJK's pairs are made ready once for a scene
 
     def made(count: int) -> np.ndarray:
-        query = query_of(ready.verdict, start, goal, point=network.sees_point)
+        query = make_query(ready.checker, start, goal, point=network.sees_point)
         generator = torch.Generator().manual_seed(seed)
         return network.propose(query, kernel, count, sampling=sampling.get(method), generator=generator).control
 

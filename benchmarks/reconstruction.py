@@ -17,16 +17,16 @@ import record
 import torch
 
 from apex_ompl import load_model, problems
-from apex_ompl.arguments import one_or_more
-from apex_ompl.assembly import assemble
-from apex_ompl.dataset import load
+from apex_ompl.datasets.records import Paths
+from apex_ompl.datasets.store import load
 from apex_ompl.diffusion.autoencoder import LinearLatent
 from apex_ompl.diffusion.checkpoint import shipped
 from apex_ompl.diffusion.data import split
-from apex_ompl.endings import run_command
+from apex_ompl.ompl_adapter.setup import assemble
+from apex_ompl.ompl_adapter.validity import full_check
 from apex_ompl.problems.reach import robot
-from apex_ompl.records import Paths
-from apex_ompl.validity import full_check
+from apex_ompl.util.scripts import run_command
+from apex_ompl.util.validation import one_or_more
 
 DATA = record.RESULTS.parent.parent / "data" / "dual_panda_softhand" / "paths.zip"
 
@@ -47,7 +47,7 @@ def lost(name: str, paths: Paths, which: np.ndarray) -> dict[str, Any]:
         ends = paths.start[k], paths.goal[k]
         limits = ready.robot.limits
         states = np.concatenate([ends[0][None], np.clip(path[1:-1], limits.lower, limits.upper), ends[1][None]])
-        kept.append(bool(full_check(ready.verdict, states)))
+        kept.append(bool(full_check(ready.checker, states)))
     linear = isinstance(autoencoder, LinearLatent)
     return {
         "latent": list(network.latent), "kind": "linear" if linear else "variational", "max_rad": float(apart.max()),

@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 
 from apex_ompl import problems
-from apex_ompl.files import write_atomically
-from apex_ompl.metrics import next_percentile
-from apex_ompl.provenance import hardware, versions
+from apex_ompl.benchmark.metrics import next_percentile
+from apex_ompl.util.files import write_atomically
+from apex_ompl.util.provenance import hardware, versions
 
 RESULTS = Path(__file__).parent / "results"
 

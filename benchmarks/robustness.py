@@ -22,17 +22,17 @@ import record
 from ompl import base as ob
 
 from apex_ompl import plan, problems
-from apex_ompl.arguments import one_or_more
-from apex_ompl.assembly import assemble
-from apex_ompl.bodies import Obstacle
-from apex_ompl.endings import run_command
 from apex_ompl.errors import ApexError
-from apex_ompl.ompl_globals import quiet_ompl
+from apex_ompl.ompl_adapter.process import quiet_ompl
+from apex_ompl.ompl_adapter.setup import assemble
+from apex_ompl.ompl_adapter.space import to_state
 from apex_ompl.planners.apex import APEX
 from apex_ompl.planners.apex_parameters import ApexParameters
-from apex_ompl.problem import Goal, Problem
 from apex_ompl.problems.reach import robot
-from apex_ompl.space import to_state
+from apex_ompl.scene.bodies import Obstacle
+from apex_ompl.scene.problem import Goal, Problem
+from apex_ompl.util.scripts import run_command
+from apex_ompl.util.validation import one_or_more
 
 HARD = "shelf/hard/800012"
 MIB = 2**20
@@ -144,7 +144,7 @@ def goal_in_collision() -> tuple[str, bool]:
     panda, ready = robot(), assemble(problems.load(HARD), robot())
     rng = np.random.default_rng(0)
     drawn = (rng.uniform(panda.limits.lower, panda.limits.upper) for _ in range(1000))
-    q = next(q for q in drawn if not ready.verdict.is_free(q))
+    q = next(q for q in drawn if not ready.checker.is_free(q))
     joints = dict(zip(panda.joint_names, q.tolist(), strict=True))
     result = plan(changed(goal=Goal(joints=(joints,))), timeout=5.0)
     return f"{result.status}: {result.reason}", str(result.status) == "INVALID_GOAL" and bool(result.reason)

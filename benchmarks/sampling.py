@@ -12,8 +12,8 @@ import numpy as np
 import record
 
 from apex_ompl import problems
-from apex_ompl.arguments import one_or_more
-from apex_ompl.endings import run_command
+from apex_ompl.util.scripts import run_command
+from apex_ompl.util.validation import one_or_more
 
 FIRST = 100_000  # seed of the first problem, of the training split
 

@@ -11,9 +11,9 @@ from pathlib import Path
 import record
 
 from apex_ompl import PlanResult, plan, problems
-from apex_ompl.arguments import one_or_more
-from apex_ompl.endings import run_command
 from apex_ompl.planning import STRAIGHT_LINE
+from apex_ompl.util.scripts import run_command
+from apex_ompl.util.validation import one_or_more
 
 BAXTER = Path(__file__).resolve().parent.parent / "examples" / "baxter_table.yaml"
 

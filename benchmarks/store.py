@@ -10,7 +10,7 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
 
-from apex_ompl.provenance import hardware
+from apex_ompl.util.provenance import hardware
 
 EVERY = 500  # runs between two lines about how far it is
 

@@ -27,15 +27,16 @@ from ompl import geometric as og
 from store import RunStore
 
 from apex_ompl import planners, problems
-from apex_ompl.arguments import one_or_more
-from apex_ompl.assembly import PlanningSetup, assemble
-from apex_ompl.endings import run_command
-from apex_ompl.files import write_atomically
-from apex_ompl.ompl_globals import quiet_ompl, seed_ompl
+from apex_ompl.ompl_adapter.process import quiet_ompl, seed_ompl
+from apex_ompl.ompl_adapter.setup import PlanningSetup, assemble
+from apex_ompl.ompl_adapter.simplify import simplify
+from apex_ompl.ompl_adapter.space import path_to_array
+from apex_ompl.ompl_adapter.validity import full_check
 from apex_ompl.problems.reach import robot
-from apex_ompl.simplify import simplify
-from apex_ompl.space import path_length, path_to_array
-from apex_ompl.validity import full_check
+from apex_ompl.trajopt.path import path_length
+from apex_ompl.util.files import write_atomically
+from apex_ompl.util.scripts import run_command
+from apex_ompl.util.validation import one_or_more
 
 REFERENCE = Path(__file__).parent / "reference_lengths.json"
 STORE = Path(__file__).parent / "runs" / "time_to_quality.jsonl"
@@ -50,7 +51,7 @@ Lengths = list[tuple[float, float]]
 def proven(ready: PlanningSetup, path: np.ndarray) -> bool:
     """Whether a path passes the full check between the given ends, as they are bit for bit."""
     states = np.concatenate([ready.start[None], path[1:-1], ready.goals[0][None]])
-    return bool(full_check(ready.verdict, states, ready.start, ready.goals))
+    return bool(full_check(ready.checker, states, ready.start, ready.goals))
 
 
 def watched(ready: PlanningSetup, planner: ob.Planner, limit: float) -> Lengths:

@@ -33,10 +33,9 @@ from toppra import algorithm, constraint
 from tqdm import tqdm
 
 from apex_ompl import plan, problems
-from apex_ompl.arguments import one_or_more, whole_number
-from apex_ompl.assembly import assemble
-from apex_ompl.endings import run_command
-from apex_ompl.kernel.speed import farthest, fastest
+from apex_ompl.kernel.reachability import farthest, fastest
+from apex_ompl.ompl_adapter.setup import assemble
+from apex_ompl.ompl_adapter.validity import full_check
 from apex_ompl.problems.reach import robot
 from apex_ompl.result import PlanResult, PlanStatus
 from apex_ompl.trajectory import Timing, Trajectory, time_path
@@ -44,7 +43,8 @@ from apex_ompl.trajectory.curve import Curve, Polyline
 from apex_ompl.trajectory.motion import joined
 from apex_ompl.trajectory.point_to_point import calculate, knots, stops
 from apex_ompl.trajectory.timing import PER_PIECE, SPACING, least_spacing, spline
-from apex_ompl.validity import full_check
+from apex_ompl.util.scripts import run_command
+from apex_ompl.util.validation import one_or_more, whole_number
 
 LIMITS, NAMES = robot().limits, robot().joint_names
 APART_ON_PATH = SPACING * Timing().deviation  # of control points, as the first that time_path tries [rad]
@@ -227,7 +227,7 @@ def deviation_of(motion: Trajectory, path: np.ndarray) -> float:
     return float(farthest(states, arc * line.length / max(arc[-1], 1e-12), line.states, line.arc, 1.5))
 
 
-def judge(figures: Figures, motion: Trajectory | None, path: np.ndarray, verdict: Any, best: float | None) -> None:
+def judge(figures: Figures, motion: Trajectory | None, path: np.ndarray, checker: Any, best: float | None) -> None:
     """Add the figures of a motion."""
     if motion is None:
         figures.none += 1
@@ -238,7 +238,7 @@ def judge(figures: Figures, motion: Trajectory | None, path: np.ndarray, verdict
     figures.jerks.append(motion.jerk)
     states = np.clip(motion.sample(EACH).position, LIMITS.lower, LIMITS.upper)
     states = np.concatenate([path[:1], states[1:-1], path[-1:]])
-    figures.failed += not full_check(verdict, states, path[0], [path[-1]])
+    figures.failed += not full_check(checker, states, path[0], [path[-1]])
     if best is not None:
         figures.ratios.append(motion.duration / best)
 
@@ -282,7 +282,7 @@ def main() -> None:
     ways = {**{name: Figures() for name in WAYS}, "Ruckig from corner to corner": Figures()}
     stages: dict[str, list[float]] = {}
     for name, k in tqdm(names, unit="problem"):
-        verdict = assemble(problems.load(name), robot()).verdict
+        checker = assemble(problems.load(name), robot()).checker
         for planner, figures in whole.items():
             result: PlanResult = plan(name, planner, timeout=10.0, seed=k)
             if result.status is PlanStatus.TIMING_FAILED:
@@ -292,7 +292,7 @@ def main() -> None:
             path, motion = result.path, result.trajectory
             found = optimum(path) if planner == "apex" and len(path) > 2 else None
             best = None if found is None else found[1]
-            judge(figures, motion, path, verdict, best)
+            judge(figures, motion, path, checker, best)
             figures.seconds.append(result.times["timing"])
             for stage in ("setup", "solve", "verify", "timing", "timing proof", "clearance", "total"):
                 if planner == "apex":
@@ -301,12 +301,12 @@ def main() -> None:
                 continue
             if planner == "rrtconnect":
                 made, took = timed_way(from_corner_to_corner, path)
-                judge(ways["Ruckig from corner to corner"], made, path, verdict, None)
+                judge(ways["Ruckig from corner to corner"], made, path, checker, None)
                 ways["Ruckig from corner to corner"].seconds.append(took)
             elif len(path) > 2:
                 for label, way in WAYS.items():
                     made, took = timed_way(way, path)
-                    judge(ways[label], made, path, verdict, best)
+                    judge(ways[label], made, path, checker, best)
                     ways[label].seconds.append(took)
     rows = [record.row(["paths", *HEAD]), record.row(["---", *["---:"] * len(HEAD)])]
     rows += [record.row([planner, *figures.cells()]) for planner, figures in whole.items()]

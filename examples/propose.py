@@ -10,13 +10,13 @@ import sys
 import time
 
 import apex_ompl
-from apex_ompl.assembly import assemble
+from apex_ompl.apex.query import make_query
 from apex_ompl.errors import ApexError
-from apex_ompl.optimize import Optimizer
-from apex_ompl.pool import first_valid
-from apex_ompl.queries import query_of
-from apex_ompl.space import path_length
-from apex_ompl.validity import full_check
+from apex_ompl.ompl_adapter.setup import assemble
+from apex_ompl.ompl_adapter.validity import full_check
+from apex_ompl.trajopt.candidates import first_valid
+from apex_ompl.trajopt.optimizer import Optimizer
+from apex_ompl.trajopt.path import path_length
 
 
 def main() -> None:
@@ -28,19 +28,19 @@ def main() -> None:
     try:
         model = apex_ompl.load_model("apex")
         ready = assemble(apex_ompl.load_problem(args.problem))
-        start, goal, kernel = ready.start, ready.goals[0], ready.verdict.kernel
-        query = query_of(ready.verdict, start, goal)
+        start, goal, kernel = ready.start, ready.goals[0], ready.checker.kernel
+        query = make_query(ready.checker, start, goal)
         begin = time.perf_counter()
         proposed = model.propose(query, kernel, args.count).control
     except ApexError as error:
         print(f"propose: error: {error}", file=sys.stderr)
         sys.exit(2)
     took = time.perf_counter() - begin
-    valid = [bool(full_check(ready.verdict, model.spline.path(c), start, [goal])) for c in proposed]
+    valid = [bool(full_check(ready.checker, model.spline.path(c), start, [goal])) for c in proposed]
     print(f"{args.count} paths in {1e3 * took:.0f} ms, {sum(valid)} of them valid as they are")
     begin = time.perf_counter()
     found = first_valid(
-        Optimizer(model.spline), kernel, proposed, lambda path: bool(full_check(ready.verdict, path, start, [goal]))
+        Optimizer(model.spline), kernel, proposed, lambda path: bool(full_check(ready.checker, path, start, [goal]))
     )
     took = time.perf_counter() - begin
     if found is None:

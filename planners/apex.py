@@ -4,22 +4,20 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
-from numpy.typing import NDArray
 from ompl import base as ob
 from ompl import util as ou
 
+from apex_ompl.apex.path_validator import PathValidator
+from apex_ompl.apex.query import make_query
+from apex_ompl.apex.solver import LOG, SolveLoop
 from apex_ompl.diffusion.checkpoint import shared_model
 from apex_ompl.errors import ParameterError
-from apex_ompl.optimize import Optimizer
+from apex_ompl.ompl_adapter.report import Report
 from apex_ompl.planners.apex_parameters import NAME, ApexParameters
-from apex_ompl.planners.judge import Judge
-from apex_ompl.planners.solve_loop import LOG, SolveLoop
-from apex_ompl.queries import query_of
-from apex_ompl.report import Report
-from apex_ompl.torch_threads import one_torch_thread
+from apex_ompl.trajopt.optimizer import Optimizer
+from apex_ompl.types import Array
+from apex_ompl.util.threads import one_torch_thread
 
-Array = NDArray[np.float64]
 Status = ob.PlannerStatus
 
 
@@ -47,8 +45,8 @@ class APEX(ob.Planner):
         """
         super().__init__(si, NAME)
         self.parameters = parameters or ApexParameters()
-        self.judge = Judge(si, self.parameters.robot)
-        robot = self.judge.verdict.robot.name
+        self.judge = PathValidator(si, self.parameters.robot)
+        robot = self.judge.checker.robot.name
         self.model = shared_model(self.parameters.model, device=self.parameters.device, robot=robot)
         steps, most = self.parameters.denoising_steps, self.model.network.schedule.steps
         if steps > most:
@@ -66,16 +64,16 @@ class APEX(ob.Planner):
 
     def _prepare(self) -> None:
         if self.judge.outdated:
-            self.judge, self._warm = Judge(self.getSpaceInformation(), self.parameters.robot), False
+            self.judge, self._warm = PathValidator(self.getSpaceInformation(), self.parameters.robot), False
         if self._warm:
             return
-        verdict = self.judge.verdict
-        self.optimizer.prepare(verdict.kernel)
-        query = query_of(verdict, verdict.robot.home, verdict.robot.home, point=self.model.sees_point)
+        checker = self.judge.checker
+        self.optimizer.prepare(checker.kernel)
+        query = make_query(checker, checker.robot.home, checker.robot.home, point=self.model.sees_point)
         sampling = self.parameters.search(self.model.sampling).sampling
         quick = replace(sampling, sampler="ddim", steps=min(2, sampling.steps))
         with one_torch_thread():
-            proposed = self.model.propose(query, verdict.kernel, 1, sampling=quick)
+            proposed = self.model.propose(query, checker.kernel, 1, sampling=quick)
         if self.parameters.lambda_obs > 0.0:
             self.judge.gap(self.model.spline.path(proposed.control[0]))
         self._warm = True

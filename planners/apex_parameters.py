@@ -13,8 +13,8 @@ from apex_ompl import diffusion
 from apex_ompl.planners.registry import Parameters, bounded, one_of, register
 
 if TYPE_CHECKING:
+    from apex_ompl.apex.search import SearchSettings
     from apex_ompl.diffusion.proposals import Sampling
-    from apex_ompl.search import SearchSettings
 
 NAME = "apex"
 WITHOUT_MODEL = "rrtconnect+polish"
@@ -102,9 +102,9 @@ class ApexParameters(Parameters):
 
     def search(self, own: Sampling) -> SearchSettings:
         """Return what of it concerns the search before trees; ``own`` is how the checkpoint samples by itself."""
+        from apex_ompl.apex.search import SearchSettings
         from apex_ompl.diffusion import proposals
         from apex_ompl.diffusion.guidance import Guidance
-        from apex_ompl.search import SearchSettings
 
         guidance = Guidance(gamma=self.gamma if self.guidance else 0.0)
         sampler = own.sampler if self.sampler == "model" else self.sampler

@@ -7,40 +7,38 @@ import time
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-import numpy as np
-from numpy.typing import NDArray
 from ompl import base as ob
 from ompl import geometric as og
 
-from apex_ompl.collision import Verdict
+from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ParameterError
-from apex_ompl.optimize import Optimizer, Settings
+from apex_ompl.ompl_adapter.report import Report
+from apex_ompl.ompl_adapter.simplify import simplify
+from apex_ompl.ompl_adapter.space import array_to_path, path_to_array
+from apex_ompl.ompl_adapter.validity import StateValidityChecker
 from apex_ompl.planners.registry import Parameters, bounded, register
-from apex_ompl.report import Report
-from apex_ompl.resolution import FULL_RESOLUTION
-from apex_ompl.simplify import simplify
-from apex_ompl.space import array_to_path, path_length, path_to_array
-from apex_ompl.spline import Spline
-from apex_ompl.validity import VerdictChecker
-
-Array = NDArray[np.float64]
+from apex_ompl.trajopt.optimizer import Optimizer, Settings
+from apex_ompl.trajopt.path import path_length
+from apex_ompl.trajopt.spline import Spline
+from apex_ompl.types import Array
+from apex_ompl.util.resolution import FULL_RESOLUTION
 
 NAME = "rrtconnect+polish"
 LOG = logging.getLogger("apex_ompl")
 
 
-def polished(optimizer: Optimizer, verdict: Verdict, path: Array, stop: Any = lambda: False) -> Array | None:
+def polished(optimizer: Optimizer, checker: CollisionChecker, path: Array, stop: Any = lambda: False) -> Array | None:
     """Return a short path of ``optimizer.spline.states`` states near a given one, proved by the full check, or None.
 
     The path, shape (N, dof), is fitted by a spline, whose control points are optimised.
     """
-    limits = verdict.robot.limits
+    limits = checker.robot.limits
     control = optimizer.spline.fit(path, limits.lower, limits.upper).control
 
     def is_valid(states: Array) -> bool:
-        return verdict.first_collision(states, FULL_RESOLUTION) is None
+        return checker.first_collision(states, FULL_RESOLUTION) is None
 
-    best = optimizer.shorten(verdict.kernel, control, is_valid, stop)
+    best = optimizer.shorten(checker.kernel, control, is_valid, stop)
     return None if best is None else optimizer.spline.path(best)
 
 
@@ -54,11 +52,13 @@ class PolishedRRTConnect(ob.Planner):
         report: What the last call of ``solve`` did.
     """
 
-    def __init__(self, si: ob.SpaceInformation, verdict: Verdict, optimizer: Optimizer, inner: og.RRTConnect) -> None:
-        """Optimise by ``verdict`` what ``inner`` finds."""
+    def __init__(
+        self, si: ob.SpaceInformation, checker: CollisionChecker, optimizer: Optimizer, inner: og.RRTConnect
+    ) -> None:
+        """Optimise by ``checker`` what ``inner`` finds."""
         super().__init__(si, NAME)
         inner.setup()
-        self._verdict = verdict
+        self._checker = checker
         self._optimizer = optimizer
         self._inner = inner
         self.report, self._begin = Report(), 0.0
@@ -79,7 +79,7 @@ class PolishedRRTConnect(ob.Planner):
             return ob.PlannerStatus(ob.PlannerStatus.CRASH)
 
     def _solve(self, ptc: ob.PlannerTerminationCondition) -> ob.PlannerStatus:
-        si, pdef, dof = self.getSpaceInformation(), self.getProblemDefinition(), self._verdict.robot.dof
+        si, pdef, dof = self.getSpaceInformation(), self.getProblemDefinition(), self._checker.robot.dof
         self._inner.setProblemDefinition(pdef)
         begin = self._begin = time.perf_counter()
         with self.report.timed("rrtconnect"):
@@ -94,7 +94,7 @@ class PolishedRRTConnect(ob.Planner):
         self._add(path)
         if not ptc():
             with self.report.timed("polish"):
-                better = polished(self._optimizer, self._verdict, path, lambda: bool(ptc()))
+                better = polished(self._optimizer, self._checker, path, lambda: bool(ptc()))
             if better is not None:
                 self._add(better)
         return status
@@ -140,15 +140,15 @@ class RRTConnectPolish(Parameters):
         """Return the planner.
 
         Raises:
-            ParameterError: ``si`` has no verdict to judge by.
+            ParameterError: ``si`` has no checker to judge by.
         """
-        checker = si.getStateValidityChecker()
-        if not isinstance(checker, VerdictChecker):
-            expected = "apex_ompl's VerdictChecker, as apex_ompl.setup sets it"
-            raise ParameterError(f"state validity checker for {NAME}", type(checker).__name__, expected)
+        validity_checker = si.getStateValidityChecker()
+        if not isinstance(validity_checker, StateValidityChecker):
+            expected = "apex_ompl's StateValidityChecker, as apex_ompl.setup sets it"
+            raise ParameterError(f"state validity checker for {NAME}", type(validity_checker).__name__, expected)
         settings = Settings(scene_margin=self.scene_margin, own_margin=self.own_margin, stiffness=self.stiffness)
         optimizer = Optimizer(Spline(self.control_points, self.pinned), settings)
-        optimizer.prepare(checker.verdict.kernel)
+        optimizer.prepare(validity_checker.checker.kernel)
         inner = og.RRTConnect(si)
         inner.setRange(self.range)
-        return PolishedRRTConnect(si, checker.verdict, optimizer, inner)
+        return PolishedRRTConnect(si, validity_checker.checker, optimizer, inner)

@@ -14,7 +14,7 @@ if not __name__.startswith("apex_ompl."):  # the folder also lies at the top of 
     raise ImportError("import apex_ompl.problems, not problems")
 
 from apex_ompl.errors import ParameterError, UnknownNameError
-from apex_ompl.problem import Problem
+from apex_ompl.scene.problem import Problem
 
 if TYPE_CHECKING:
     from apex_ompl.problems.frozen import Witness

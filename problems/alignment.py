@@ -17,18 +17,17 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from apex_ompl.bodies import AttachedObject, Obstacle
-from apex_ompl.collision import Verdict
+from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.shapes import coal_geometry
-from apex_ompl.goals import RESTART_SPREAD, AlignmentGoal
-from apex_ompl.ik import Links
 from apex_ompl.kernel import Inverse, Kernel, RobotTables
-from apex_ompl.problem import Alignment
 from apex_ompl.problems.objects import Held, block_and_peg, boxes, cup_and_ball, put_in_hands
 from apex_ompl.problems.outline import Outline
 from apex_ompl.problems.reach import keeps_clear, robot, scene_kernel
-
-Array = NDArray[np.float64]
+from apex_ompl.scene.bodies import AttachedObject, Obstacle
+from apex_ompl.scene.problem import Alignment
+from apex_ompl.tasks.alignment import RESTART_SPREAD, AlignmentGoal
+from apex_ompl.tasks.inverse_kinematics import Links
+from apex_ompl.types import Array
 
 SIZES = {"small": 0.06, "medium": 0.10, "large": 0.15, "xlarge": 0.20, "huge": 0.30}  # edges of the cubes [m]
 STATIC = ("small", "medium", "large")
@@ -51,7 +50,7 @@ class Holding:
         goal: The alignment.
         inverse: Its inverse kinematics, for the arms.
         tables: The robot with the objects; they are not judged against each other, as they end up close together.
-        verdict: Judges the robot with the objects among its tables, the objects against each other too.
+        checker: Judges the robot with the objects among its tables, the objects against each other too.
         corners: Corners of a box around each object in the frame of a joint: its number, and shape (8, 3) [m].
     """
 
@@ -60,7 +59,7 @@ class Holding:
     goal: AlignmentGoal
     inverse: Inverse
     tables: RobotTables
-    verdict: Verdict
+    checker: CollisionChecker
     corners: tuple[tuple[int, Array], ...]
 
     @classmethod
@@ -68,7 +67,7 @@ class Holding:
         """Close the hands of the robot on objects."""
         some = robot()
         attached, home, _ = put_in_hands(some, held)
-        verdict, links = Verdict(some, (), attached), Links.of(some)
+        checker, links = CollisionChecker(some, (), attached), Links.of(some)
         goal = AlignmentGoal(some, alignment, attached, home)
         corners = []
         for body in attached:
@@ -79,9 +78,9 @@ class Holding:
             fixed = [links.point(body.link, body.pose[:3, :3] @ corner + body.pose[:3, 3]) for corner in local]
             corners.append((fixed[0].joint, np.array([f.vector for f in fixed])))
         names = [body.name for body in attached]
-        tables = verdict.kernel.robot.without_pair(names[0], names[1])
+        tables = checker.kernel.robot.without_pair(names[0], names[1])
         inverse = links.inverse(goal.targets(), some.groups["hands"])
-        return cls(attached, home, goal, inverse, tables, verdict, tuple(corners))
+        return cls(attached, home, goal, inverse, tables, checker, tuple(corners))
 
     def placed(self, kernel: Kernel, states: Array) -> Array:
         """Return the corners of the boxes around the objects at states (N, dof); shape (N, objects, 8, 3) [m]."""
@@ -152,7 +151,7 @@ def _start(rng: np.random.Generator, holding: Holding, kernel: Kernel) -> Array 
     centres = boxes_of.mean(axis=2)
     apart = np.linalg.norm(centres[:, 0] - centres[:, 1], axis=1)
     good = _inside(states) & (boxes_of[..., 2].min(axis=(1, 2)) >= ABOVE_TABLE) & (apart >= APART)
-    return next((q for q in states[good] if keeps_clear(kernel, q)[0] and holding.verdict.is_free(q)), None)
+    return next((q for q in states[good] if keeps_clear(kernel, q)[0] and holding.checker.is_free(q)), None)
 
 
 def _goal(rng: np.random.Generator, holding: Holding, kernel: Kernel) -> Array | None:
@@ -164,7 +163,7 @@ def _goal(rng: np.random.Generator, holding: Holding, kernel: Kernel) -> Array |
     found = np.round(ends.states[ends.errors < 1e-3], 6)
     found = found[_inside(found)]
     good = (q for q in found[keeps_clear(kernel, found)] if holding.goal.is_satisfied(q))
-    return next((q for q in good if holding.verdict.is_free(q)), None)
+    return next((q for q in good if holding.checker.is_free(q)), None)
 
 
 def _cube(

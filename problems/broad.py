@@ -8,16 +8,13 @@ hands' way.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from apex_ompl.bodies import AttachedObject, Obstacle
-from apex_ompl.ik import Links
 from apex_ompl.problems import alignment
 from apex_ompl.problems.outline import Outline
 from apex_ompl.problems.reach import MARGIN, HandPoses, Range, Region, bare_tables, robot, scene_kernel
 from apex_ompl.problems.scenes import DOWN, FORWARD, primitive
-
-Array = NDArray[np.float64]
+from apex_ompl.scene.bodies import AttachedObject, Obstacle
+from apex_ompl.tasks.inverse_kinematics import Links
 
 SUITE = "broad"
 LEVELS = ("free", "alignment")

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from apex_ompl.errors import ApexError, ParameterError, UnknownNameError
-from apex_ompl.problem import Problem
 from apex_ompl.problems import alignment, broad, scenes
 from apex_ompl.problems.outline import Outline
 from apex_ompl.problems.reach import HandPoses, robot
+from apex_ompl.scene.problem import Problem
 
 SPLITS = {"train": range(800_000), "validation": range(800_000, 900_000), "test": range(900_000, 1_000_000)}
 SYNERGIES = (0.0, 0.4)  # range of the hands where they hold nothing

@@ -21,16 +21,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apex_ompl.bodies import located
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError
-from apex_ompl.files import write_atomically
-from apex_ompl.problem import Problem
 from apex_ompl.problems.catalogue import LEVELS, SPLITS, ProblemId
 from apex_ompl.problems.objects import DATA
 from apex_ompl.problems.reach import ROBOT, robot
-from apex_ompl.schema import validate
-
-Array = NDArray[np.float64]
+from apex_ompl.scene.bodies import located
+from apex_ompl.scene.problem import Problem
+from apex_ompl.types import Array
+from apex_ompl.util.files import write_atomically
+from apex_ompl.util.schema import validate
 
 FOLDER = Path(__file__).parent / "frozen"
 SUMS = "SHA256SUMS"

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apex_ompl.bodies import AttachedObject
-from apex_ompl.grasp import Grasp, grasp
 from apex_ompl.robot import Robot
+from apex_ompl.scene.bodies import AttachedObject
+from apex_ompl.tasks.grasp import Grasp, grasp
 
 Held = Sequence[tuple[str, AttachedObject]]
 

@@ -4,14 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
-from apex_ompl.bodies import AttachedObject, Obstacle
-from apex_ompl.problem import Goal, Problem
 from apex_ompl.robot import Robot
-
-Array = NDArray[np.float64]
+from apex_ompl.scene.bodies import AttachedObject, Obstacle
+from apex_ompl.scene.problem import Goal, Problem
+from apex_ompl.types import Array
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,15 +9,15 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from apex_ompl.bodies import Obstacle
-from apex_ompl.collision import Verdict
+from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.shapes import world_geometry
 from apex_ompl.collision.tabulate import primitives, tabulate_scene
-from apex_ompl.ik import Links, in_world
 from apex_ompl.kernel import Kernel, RobotTables, facing, gap
 from apex_ompl.robot import Robot, load_robot
+from apex_ompl.scene.bodies import Obstacle
+from apex_ompl.tasks.inverse_kinematics import Links, in_world
+from apex_ompl.types import Array
 
-Array = NDArray[np.float64]
 Range = tuple[float, float]
 Direction = tuple[float, float, float]
 
@@ -44,7 +44,7 @@ def sides() -> tuple[tuple[int, ...], ...]:
 @cache
 def bare_tables() -> RobotTables:
     """Return the kernel's tables of the robot with empty hands."""
-    return Verdict(robot()).kernel.robot
+    return CollisionChecker(robot()).kernel.robot
 
 
 @cache

@@ -11,15 +11,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from apex_ompl.bodies import Obstacle
 from apex_ompl.problems.reach import Direction, Region
+from apex_ompl.scene.bodies import Obstacle
+from apex_ompl.types import Array
 
 FORWARD: Direction = (1.0, 0.0, 0.0)
 DOWN: Direction = (0.0, 0.0, -1.0)
 BOARD = 0.02
-Array = NDArray[np.float64]
 Pair = tuple[Region, Region]
 Point = tuple[float, float, float]
 

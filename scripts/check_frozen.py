@@ -10,15 +10,15 @@ import argparse
 import numpy as np
 
 from apex_ompl import problems
-from apex_ompl.arguments import whole_number
-from apex_ompl.assembly import assemble
-from apex_ompl.endings import run_command
 from apex_ompl.errors import ApexError
-from apex_ompl.moving import timed_check
+from apex_ompl.live.moving import timed_check
+from apex_ompl.ompl_adapter.setup import assemble
+from apex_ompl.ompl_adapter.validity import full_check
 from apex_ompl.problems import frozen
 from apex_ompl.problems.catalogue import ProblemId, first_draw
 from apex_ompl.problems.reach import robot
-from apex_ompl.validity import full_check
+from apex_ompl.util.scripts import run_command
+from apex_ompl.util.validation import whole_number
 
 
 def fault(name: str) -> str:
@@ -35,7 +35,7 @@ def fault(name: str) -> str:
         return timed_check(robot(), problem, witness.path, witness.times).reason
     ready = assemble(problem)
     faults = (ready.start_fault, *ready.goal_faults)
-    return "".join(faults) or full_check(ready.verdict, witness.path, ready.start, ready.goals).reason
+    return "".join(faults) or full_check(ready.checker, witness.path, ready.start, ready.goals).reason
 
 
 def main() -> None:

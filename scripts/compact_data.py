@@ -13,11 +13,11 @@ from pathlib import Path
 
 import numpy as np
 
-from apex_ompl.arguments import whole_number
-from apex_ompl.dataset import Store, save
-from apex_ompl.endings import run_command
-from apex_ompl.files import check_writable, write_atomically
-from apex_ompl.records import PATH_FIELDS, SOURCES, DatasetError, Paths
+from apex_ompl.datasets.records import PATH_FIELDS, SOURCES, DatasetError, Paths
+from apex_ompl.datasets.store import Store, save
+from apex_ompl.util.files import check_writable, write_atomically
+from apex_ompl.util.scripts import run_command
+from apex_ompl.util.validation import whole_number
 
 CLOSE = 200  # how closely the limit is met: to one part in this
 

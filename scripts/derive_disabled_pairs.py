@@ -21,14 +21,14 @@ import numpy as np
 import pinocchio as pin
 from scipy.optimize import minimize
 
-from apex_ompl.arguments import one_or_more, whole_number
 from apex_ompl.collision.shapes import convex_hull
-from apex_ompl.endings import run_command
-from apex_ompl.files import write_atomically
 from apex_ompl.robot import Robot
 from apex_ompl.robot.assets import DATA
 from apex_ompl.robot.config import PAIRS_SCHEMA, RobotConfig, read_config
 from apex_ompl.robot.model import build_robot, link_of
+from apex_ompl.util.files import write_atomically
+from apex_ompl.util.scripts import run_command
+from apex_ompl.util.validation import one_or_more, whole_number
 
 
 def root_part(robot: Robot, config: RobotConfig, link: str) -> str:

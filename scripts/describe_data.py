@@ -12,15 +12,16 @@ from pathlib import Path
 
 import numpy as np
 
-from apex_ompl import description, problems
-from apex_ompl.arguments import one_or_more, whole_number
-from apex_ompl.assembly import assemble
-from apex_ompl.dataset import Store, load
-from apex_ompl.endings import run_command
-from apex_ompl.files import check_writable, is_file, write_atomically
+from apex_ompl import problems
+from apex_ompl.datasets import description
+from apex_ompl.datasets.records import SOURCES, DatasetError, Paths
+from apex_ompl.datasets.store import Store, load
+from apex_ompl.ompl_adapter.setup import assemble
+from apex_ompl.ompl_adapter.validity import full_check
 from apex_ompl.problems.reach import robot
-from apex_ompl.records import SOURCES, DatasetError, Paths
-from apex_ompl.validity import full_check
+from apex_ompl.util.files import check_writable, is_file, write_atomically
+from apex_ompl.util.scripts import run_command
+from apex_ompl.util.validation import one_or_more, whole_number
 
 SHOTS, MOTIONS, SIZE = 5, 10, (320, 240)
 
@@ -42,7 +43,7 @@ def checked(paths: Paths, which: np.ndarray) -> str:
     control, spline, good = paths.control(which), paths.spline, 0
     for k, points in zip(which, control, strict=True):
         ready = assemble(problems.load(paths.problem_name(int(paths.arrays["problem"][k]))), robot())
-        good += bool(full_check(ready.verdict, spline.path(points), paths.start[k], [paths.goal[k]]))
+        good += bool(full_check(ready.checker, spline.path(points), paths.start[k], [paths.goal[k]]))
     return f"{good} of {len(which)} random paths pass the full check as they are stored."
 
 
@@ -86,7 +87,7 @@ def draw(paths: Paths, which: np.ndarray, file: Path) -> list[str]:
     """Draw some motions, a row each, and return what they are."""
     import imageio.v3 as iio
 
-    from apex_ompl.render import Stage
+    from apex_ompl.viz.render import Stage
 
     rows, captions, spline = [], [], paths.spline
     for k, points in zip(which, paths.control(which), strict=True):

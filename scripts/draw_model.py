@@ -17,19 +17,19 @@ import numpy as np
 import torch
 
 from apex_ompl import load_model, load_problem
-from apex_ompl.arguments import whole_number
-from apex_ompl.assembly import PlanningSetup, assemble
+from apex_ompl.apex.query import make_query
 from apex_ompl.diffusion.guidance import Guidance
 from apex_ompl.diffusion.proposals import Sampling
-from apex_ompl.endings import run_command
-from apex_ompl.files import make_folder
 from apex_ompl.kernel import Kernel
 from apex_ompl.kernel.tables import BOX, HALF_SPACE, SPHERE
-from apex_ompl.optimize import Optimizer
-from apex_ompl.pool import first_valid
+from apex_ompl.ompl_adapter.setup import PlanningSetup, assemble
+from apex_ompl.ompl_adapter.validity import full_check
 from apex_ompl.problems.reach import robot
-from apex_ompl.queries import query_of
-from apex_ompl.validity import full_check
+from apex_ompl.trajopt.candidates import first_valid
+from apex_ompl.trajopt.optimizer import Optimizer
+from apex_ompl.util.files import make_folder
+from apex_ompl.util.scripts import run_command
+from apex_ompl.util.validation import whole_number
 
 MOMENTS = (0.0, 0.25, 0.5, 1.0)  # as shares of the reverse process
 HANDS = {"left_hand_palm_0": "tab:blue", "right_hand_palm_0": "tab:orange"}
@@ -47,7 +47,7 @@ def outlines(axes: Any, ready: PlanningSetup, first: int, second: int) -> None:
     """Draw the obstacles' boxes onto two of the world's axes."""
     from matplotlib.patches import Rectangle
 
-    scene = ready.verdict.kernel.scene.arrays
+    scene = ready.checker.kernel.scene.arrays
     for kind, rotation, offset, size in zip(scene.kind, scene.rotation, scene.offset, scene.size, strict=True):
         if kind == HALF_SPACE:
             continue
@@ -62,7 +62,7 @@ def denoising(name: str, ready: PlanningSetup, seed: int, file: Path) -> None:
     """Draw what the reverse process is at some moments."""
     import matplotlib.pyplot as plt
 
-    model, kernel = load_model(name), ready.verdict.kernel
+    model, kernel = load_model(name), ready.checker.kernel
     network, snapshots = model.network, {}
     ends = [torch.tensor(q, dtype=torch.float32)[None] for q in (ready.start, ready.goals[0])]
     steps = network.schedule.steps
@@ -73,7 +73,7 @@ def denoising(name: str, ready: PlanningSetup, seed: int, file: Path) -> None:
         if steps - 1 - t in moments:
             snapshots[steps - 1 - t] = network.autoencoder.decode(sample, *ends)[0].double().numpy()
 
-    query, generator = query_of(ready.verdict, ready.start, ready.goals[0]), torch.Generator().manual_seed(seed)
+    query, generator = make_query(ready.checker, ready.start, ready.goals[0]), torch.Generator().manual_seed(seed)
     sampling = Sampling("ddpm", steps, guidance=GUIDED)
     made = model.propose(query, kernel, 1, sampling=sampling, generator=generator, callback=keep)
     snapshots[steps] = network.autoencoder.decode(made.latent, *ends)[0].double().numpy()
@@ -100,12 +100,12 @@ def diversity(name: str, ready: PlanningSetup, seed: int, file: Path, wanted: in
     """Draw valid trajectories of one problem; return how many there are."""
     import matplotlib.pyplot as plt
 
-    model, kernel = load_model(name), ready.verdict.kernel
+    model, kernel = load_model(name), ready.checker.kernel
     optimizer = Optimizer(model.spline)
-    query, found = query_of(ready.verdict, ready.start, ready.goals[0]), []
+    query, found = make_query(ready.checker, ready.start, ready.goals[0]), []
 
     def is_valid(path: np.ndarray) -> bool:
-        return bool(full_check(ready.verdict, path, ready.start, [ready.goals[0]]))
+        return bool(full_check(ready.checker, path, ready.start, [ready.goals[0]]))
 
     generator = torch.Generator().manual_seed(seed)
     sampling = Sampling("ddim", 8, guidance=Guidance(1.0))

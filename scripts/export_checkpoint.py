@@ -9,7 +9,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from apex_ompl.endings import run_command
+from apex_ompl.util.scripts import run_command
 
 LARGEST = 24.0  # of all that ship together [MiB]
 

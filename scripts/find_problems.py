@@ -18,13 +18,10 @@ from pathlib import Path
 import numpy as np
 
 from apex_ompl.api import plan
-from apex_ompl.assembly import assemble
-from apex_ompl.bodies import AttachedObject, Obstacle
-from apex_ompl.collision import Verdict
-from apex_ompl.endings import run_command
-from apex_ompl.ik import Links, in_world
+from apex_ompl.collision import CollisionChecker
 from apex_ompl.kernel import facing, gap
-from apex_ompl.problem import Alignment, Goal, Problem
+from apex_ompl.ompl_adapter.setup import assemble
+from apex_ompl.ompl_adapter.validity import full_check
 from apex_ompl.problems.objects import (
     DATA,
     Held,
@@ -37,7 +34,10 @@ from apex_ompl.problems.objects import (
     two_cups,
 )
 from apex_ompl.robot import Robot, load_robot
-from apex_ompl.validity import full_check
+from apex_ompl.scene.bodies import AttachedObject, Obstacle
+from apex_ompl.scene.problem import Alignment, Goal, Problem
+from apex_ompl.tasks.inverse_kinematics import Links, in_world
+from apex_ompl.util.scripts import run_command
 
 ROOT = Path(__file__).resolve().parent.parent
 MARGIN = 0.01  # [m]
@@ -241,7 +241,13 @@ def hold(robot: Robot, held: Held) -> tuple[tuple[AttachedObject, ...], np.ndarr
 
 
 def hand_states(
-    robot: Robot, verdict: Verdict, home: np.ndarray, poses: tuple[HandPose, HandPose], *, seed: int, count: int
+    robot: Robot,
+    checker: CollisionChecker,
+    home: np.ndarray,
+    poses: tuple[HandPose, HandPose],
+    *,
+    seed: int,
+    count: int,
 ) -> list[np.ndarray]:
     """Return free states with both hands at their poses."""
     rng, links = np.random.default_rng(seed), Links.of(robot)
@@ -257,7 +263,7 @@ def hand_states(
         q0[fixed] = home[fixed]
         end = inverse.descend(q0)
         q = end.states[0]
-        if end.errors[0] < 1e-3 and verdict.is_free(q) and verdict.clearance(q) > MARGIN:
+        if end.errors[0] < 1e-3 and checker.is_free(q) and checker.clearance(q) > MARGIN:
             found.append(np.round(q, 4))
             if len(found) == count:
                 break
@@ -273,7 +279,7 @@ def is_hard_enough(problem: Problem, robot: Robot) -> bool:
     """Whether no straight line solves a problem for seed 0, and rrtconnect does for three seeds."""
     ready = assemble(problem, robot, seed=0)
     lines = [np.array([ready.start, goal]) for goal in ready.goals]
-    if not lines or any(full_check(ready.verdict, line) for line in lines):
+    if not lines or any(full_check(ready.checker, line) for line in lines):
         return False
     results = [plan(problem, "rrtconnect", timeout=10.0, seed=seed) for seed in range(3)]
     print("  " + ", ".join(f"{r.status} {r.times['total']:.2f} s {r.reason}" for r in results), flush=True)
@@ -287,9 +293,9 @@ def find_reach(recipe: Reach) -> Problem:
     attached, home = hold(robot, recipe.held())
     for joint, value in zip((h.synergy for h in robot.hands.values()), recipe.synergies, strict=False):
         home[robot.joint_names.index(str(joint))] = value
-    verdict = Verdict(robot, scene, attached)
-    starts = hand_states(robot, verdict, home, recipe.start, seed=1, count=6)
-    goals = hand_states(robot, verdict, home, recipe.goal, seed=2, count=6)
+    checker = CollisionChecker(robot, scene, attached)
+    starts = hand_states(robot, checker, home, recipe.start, seed=1, count=6)
+    goals = hand_states(robot, checker, home, recipe.goal, seed=2, count=6)
     print(f"  {len(starts)} starts, {len(goals)} goals")
     pairs = sorted((float(np.linalg.norm(a - b)), i, j) for i, a in enumerate(starts) for j, b in enumerate(goals))
     for _, i, j in pairs:
@@ -307,7 +313,7 @@ def find_align(recipe: Align) -> Problem:
     robot = load_robot("dual_panda_softhand")
     scene = tuple(recipe.scene())
     attached, home = hold(robot, recipe.held())
-    verdict = Verdict(robot, scene, attached)
+    checker = CollisionChecker(robot, scene, attached)
     rng = np.random.default_rng(recipe.seed)
     fixed = [robot.joint_names.index(str(h.synergy)) for h in robot.hands.values()]
     palms = [h.palm for h in robot.hands.values()]
@@ -317,7 +323,7 @@ def find_align(recipe: Align) -> Problem:
         start = np.round(np.clip(start, robot.limits.lower, robot.limits.upper), 4)
         left, right = (robot.link_pose(start, palm)[:3, 3] for palm in palms)
         apart = np.linalg.norm(left - right) > 0.4 and 0.1 < min(left[2], right[2]) and max(left[2], right[2]) < 0.4
-        if not apart or not verdict.is_free(start) or verdict.clearance(start) < MARGIN:
+        if not apart or not checker.is_free(start) or checker.clearance(start) < MARGIN:
             continue
         problem = Problem(
             name=Path(recipe.file).stem, robot=robot.name, scene=scene, attached=attached,

@@ -15,24 +15,22 @@ from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 
 import numpy as np
-from numpy.typing import NDArray
 
 from apex_ompl.api import plan
-from apex_ompl.arguments import one_or_more
-from apex_ompl.assembly import assemble
-from apex_ompl.collision import Verdict
-from apex_ompl.endings import run_command
-from apex_ompl.moving import at_time, even_times, timed_check
-from apex_ompl.problem import Problem
+from apex_ompl.collision import CollisionChecker
+from apex_ompl.live.moving import at_time, even_times, timed_check
+from apex_ompl.ompl_adapter.setup import assemble
+from apex_ompl.ompl_adapter.validity import full_check
 from apex_ompl.problems import frozen
 from apex_ompl.problems.alignment import PACE, duration
 from apex_ompl.problems.catalogue import ProblemId, first_draw
 from apex_ompl.problems.frozen import Frozen, Witness
 from apex_ompl.problems.reach import robot
-from apex_ompl.resolution import SEARCH_RESOLUTION
-from apex_ompl.validity import full_check
-
-Array = NDArray[np.float64]
+from apex_ompl.scene.problem import Problem
+from apex_ompl.types import Array
+from apex_ompl.util.resolution import SEARCH_RESOLUTION
+from apex_ompl.util.scripts import run_command
+from apex_ompl.util.validation import one_or_more
 
 LIMITS = ((0, 10.0), (1, 20.0))  # seeds and time limits of rrtconnect [s]
 QUICK = 1.0  # time limit among obstacles that were stopped [s]
@@ -54,7 +52,7 @@ def _static_witness(problem: Problem) -> Witness | None:
             if not result or result.path is None:
                 break
             found = Witness(result.path).rounded()
-            if full_check(ready.verdict, found.path, ready.start, ready.goals):
+            if full_check(ready.checker, found.path, ready.start, ready.goals):
                 return found
     return None
 
@@ -96,13 +94,13 @@ def _timed_paths(problem: Problem) -> Iterator[tuple[Array, Array]]:
 def _ways_aside(problem: Problem, line: Array) -> Iterator[tuple[Array, Array]]:
     """Yield timed paths by way of random states, where they wait for the obstacles to pass."""
     some, rng = robot(), np.random.default_rng(0)
-    verdict = Verdict(some, (), problem.attached)
+    checker = CollisionChecker(some, (), problem.attached)
     hands = some.groups["hands"]
     for k in range(ASIDE):
         via = (line[0] if k % 2 else some.home) + rng.normal(0.0, 0.5, some.dof)
         via[hands] = line[0, hands]
         via = np.clip(via, some.limits.lower, some.limits.upper)
-        if verdict.first_collision(np.stack([line[0], via, line[1]]), SEARCH_RESOLUTION) is not None:
+        if checker.first_collision(np.stack([line[0], via, line[1]]), SEARCH_RESOLUTION) is not None:
             continue
         away, on = np.stack([line[0], via]), np.stack([via, line[1]])
         for wait in (0.01, *WAITS):

@@ -19,18 +19,18 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from apex_ompl.arguments import one_or_more, whole_number
-from apex_ompl.cases import load_cases, save_cases, work_cases
-from apex_ompl.cluster import spread
-from apex_ompl.dataset import Store
-from apex_ompl.endings import run_command
-from apex_ompl.engine import Options
+from apex_ompl.datasets.cases import load_cases, save_cases, work_cases
+from apex_ompl.datasets.engine import Options
+from apex_ompl.datasets.records import Paths
+from apex_ompl.datasets.store import Store
 from apex_ompl.errors import ParameterError
-from apex_ompl.files import check_writable, make_folder
 from apex_ompl.kernel import RobotTables
-from apex_ompl.provenance import versions
-from apex_ompl.records import Paths
-from apex_ompl.spline import Spline
+from apex_ompl.trajopt.spline import Spline
+from apex_ompl.util.cluster import spread
+from apex_ompl.util.files import check_writable, make_folder
+from apex_ompl.util.provenance import versions
+from apex_ompl.util.scripts import run_command
+from apex_ompl.util.validation import one_or_more, whole_number
 
 # Pinocchio, Coal and OMPL are imported where problems are drawn: --cases needs none of them.
 
@@ -124,14 +124,14 @@ def _make(store: Store, source: Iterator[Done], units: int, left: int, args: arg
 
 def _drawn(args: argparse.Namespace) -> tuple[Work, dict[str, Any], dict[str, Any], RobotTables]:
     """Return what works, units to draw, what the manifest says of the robot, and its tables with empty hands."""
-    from apex_ompl.collision import Verdict
-    from apex_ompl.generation import plan_units, work
+    from apex_ompl.collision import CollisionChecker
+    from apex_ompl.generation.worker import plan_units, work
     from apex_ompl.problems.reach import robot
 
     units = {unit.name: unit for unit in plan_units(args.problems, args.levels)}
     sizes = {unit.size for unit in units.values()}
     about = {"robot": robot().name, "joints": list(robot().joint_names), "problems_per_unit": max(sizes)}
-    return work, units, about, Verdict(robot()).kernel.robot
+    return work, units, about, CollisionChecker(robot()).kernel.robot
 
 
 def _given(args: argparse.Namespace) -> tuple[Work, dict[str, Any], dict[str, Any], RobotTables | None]:
@@ -158,7 +158,7 @@ def write_cases(args: argparse.Namespace) -> None:
     Raises:
         MissingFileError: The folder cannot be made.
     """
-    from apex_ompl.generation import plan_units, written
+    from apex_ompl.generation.worker import plan_units, written
 
     check_writable(make_folder(args.folder, "folder for problems") / "cases.npz")
     units = plan_units(args.problems, args.levels, args.split)

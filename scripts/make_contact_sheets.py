@@ -14,10 +14,10 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from apex_ompl import problems
-from apex_ompl.arguments import one_or_more, whole_number
-from apex_ompl.endings import run_command
-from apex_ompl.files import write_atomically
-from apex_ompl.render import render
+from apex_ompl.util.files import write_atomically
+from apex_ompl.util.scripts import run_command
+from apex_ompl.util.validation import one_or_more, whole_number
+from apex_ompl.viz.render import render
 
 OUT = Path(__file__).resolve().parent.parent / "docs" / "pictures" / "suites"
 SIZE, DRAWN = (400, 300), (1200, 900)  # of a picture on the sheet, and as it is drawn [pixels]

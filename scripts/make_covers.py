@@ -16,11 +16,11 @@ from pathlib import Path
 import coal
 import numpy as np
 
-from apex_ompl.collision.spheres import GAPS, Cover, make_cover, quality, shape_key, unproved, write_covers
-from apex_ompl.endings import run_command
-from apex_ompl.files import check_writable
+from apex_ompl.collision.cover.spheres import GAPS, Cover, make_cover, quality, shape_key, unproved, write_covers
 from apex_ompl.robot import load_robot
 from apex_ompl.robot.assets import DATA
+from apex_ompl.util.files import check_writable
+from apex_ompl.util.scripts import run_command
 
 
 def shapes_of(robot: str) -> dict[str, tuple[list[str], coal.CollisionGeometry]]:

@@ -9,9 +9,9 @@ import argparse
 from pathlib import Path
 
 from apex_ompl import load_problem, plan, problems
-from apex_ompl.endings import run_command
-from apex_ompl.plots import plot_motion
-from apex_ompl.render import render
+from apex_ompl.util.scripts import run_command
+from apex_ompl.viz.plots import plot_motion
+from apex_ompl.viz.render import render
 
 OUT = Path(__file__).resolve().parent.parent / "docs" / "pictures"
 SIZE = (960, 720)

@@ -20,7 +20,7 @@ import numpy as np
 import pinocchio as pin
 from scipy.spatial.transform import Rotation
 
-from apex_ompl.endings import run_command
+from apex_ompl.util.scripts import run_command
 
 RADIUS = 0.007
 HALF_GAP = 0.0065  # half the distance between the two rolling halves of a joint [m]

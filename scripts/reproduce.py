@@ -23,14 +23,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from apex_ompl import metrics
-from apex_ompl.arguments import one_or_more
-from apex_ompl.benchmark import Results, Row, Workers, bench
+from apex_ompl.benchmark import Results, Row, Workers, bench, metrics
 from apex_ompl.benchmark.rows import PAPER
 from apex_ompl.benchmark.summary import Figures, Table, about, figures, warnings
-from apex_ompl.endings import run_command
-from apex_ompl.files import make_folder, write_atomically
-from apex_ompl.provenance import hardware, versions
+from apex_ompl.util.files import make_folder, write_atomically
+from apex_ompl.util.provenance import hardware, versions
+from apex_ompl.util.scripts import run_command
+from apex_ompl.util.validation import one_or_more
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

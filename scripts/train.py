@@ -16,15 +16,15 @@ from typing import Any
 
 import yaml
 
-from apex_ompl.endings import run_command
-from apex_ompl.files import locked, make_folder
+from apex_ompl.util.files import locked, make_folder
+from apex_ompl.util.scripts import run_command
 
 
 def train(args: argparse.Namespace) -> None:
     """Train until the end, or until the time is up."""
     from tqdm import tqdm
 
-    from apex_ompl.cases import load_cases
+    from apex_ompl.datasets.cases import load_cases
     from apex_ompl.diffusion.config import TrainingConfig
     from apex_ompl.diffusion.objective import Place
     from apex_ompl.diffusion.training import Trainer

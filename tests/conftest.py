@@ -12,15 +12,15 @@ from hypothesis import settings as hypothesis_settings
 from planning import HARD, at_hand
 from support import ROOT
 
-from apex_ompl.assembly import PlanningSetup, assemble
-from apex_ompl.bodies import Obstacle
-from apex_ompl.collision import Verdict
-from apex_ompl.dataset import load, save
-from apex_ompl.ompl_globals import quiet_ompl
-from apex_ompl.problem import Goal, Problem
+from apex_ompl.collision import CollisionChecker
+from apex_ompl.datasets.records import Paths
+from apex_ompl.datasets.store import load, save
+from apex_ompl.ompl_adapter.process import quiet_ompl
+from apex_ompl.ompl_adapter.setup import PlanningSetup, assemble
 from apex_ompl.problems import reach
-from apex_ompl.records import Paths
 from apex_ompl.robot import Robot, load_robot
+from apex_ompl.scene.bodies import Obstacle
+from apex_ompl.scene.problem import Goal, Problem
 
 hypothesis_settings.register_profile("here", derandomize=True, deadline=None)  # the same examples on every machine
 hypothesis_settings.load_profile("here")
@@ -42,8 +42,8 @@ def post() -> Obstacle:
 
 
 @pytest.fixture
-def verdict(robot: Robot, post: Obstacle) -> Verdict:
-    return Verdict(robot, [post])
+def checker(robot: Robot, post: Obstacle) -> CollisionChecker:
+    return CollisionChecker(robot, [post])
 
 
 @pytest.fixture
@@ -66,7 +66,7 @@ def apex_cli():
     """Run the command line in a fresh process: exit code, standard output, standard error."""
 
     def run(*arguments: object, **options: object) -> subprocess.CompletedProcess[str]:
-        command = [sys.executable, "-m", "apex_ompl.cli", *map(str, arguments)]
+        command = [sys.executable, "-m", "apex_ompl.cli.parser", *map(str, arguments)]
         settings = {"capture_output": True, "text": True, "timeout": 120, "env": os.environ, **options}
         return subprocess.run(command, check=False, **settings)
 

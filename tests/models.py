@@ -8,9 +8,10 @@ import numpy as np
 import torch
 from support import ROOT
 
-from apex_ompl.dataset import load
+from apex_ompl.datasets.records import Paths
+from apex_ompl.datasets.store import load
 from apex_ompl.diffusion.autoencoder import LinearLatent
-from apex_ompl.diffusion.conditions import Probes, Query, Things
+from apex_ompl.diffusion.conditions import ObstacleSet, Probes, Query
 from apex_ompl.diffusion.model import (
     ConditionConfig,
     DenoiserConfig,
@@ -20,9 +21,8 @@ from apex_ompl.diffusion.model import (
     NoiseConfig,
 )
 from apex_ompl.kernel import Kernel, RobotTables
-from apex_ompl.kernel.scene import Primitive, scene_tables
+from apex_ompl.kernel.scene_builder import Primitive, scene_tables
 from apex_ompl.kernel.tables import BOX, CAPSULE, CYLINDER, SPHERE
-from apex_ompl.records import Paths
 
 DATA = ROOT / "data" / "dual_panda_softhand"
 DOF = 16
@@ -88,4 +88,4 @@ def query(seed: int = 0) -> Query:
     middle, span = (limits.lower + limits.upper) / 2, limits.upper - limits.lower
     ends = middle + 0.3 * span * rng.uniform(-0.5, 0.5, (2, DOF))
     rows = [(0, WALL[1], (0, 0, 0, 1), (0.1, 0.8, 0.6)), (2, POST[1], (0, 0, 0, 1), (0.05, 0.6, 0.0))]
-    return Query(ends[0], ends[1], np.array([0.4, 0.0, 0.5]), Things.of(rows))
+    return Query(ends[0], ends[1], np.array([0.4, 0.0, 0.5]), ObstacleSet.of(rows))

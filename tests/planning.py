@@ -11,9 +11,9 @@ from ompl import base as ob
 from ompl import geometric as og
 
 from apex_ompl import problems
-from apex_ompl.problem import Problem
+from apex_ompl.ompl_adapter.space import path_to_array
 from apex_ompl.problems.reach import robot
-from apex_ompl.space import path_to_array
+from apex_ompl.scene.problem import Problem
 
 EXACT, TIMEOUT = ob.PlannerStatus.EXACT_SOLUTION, ob.PlannerStatus.TIMEOUT
 HARD = "shelf/hard/800012"
@@ -37,7 +37,7 @@ ALONE = {"bridge": False, "fallback": False, "polish": False}
 
 
 class Plain(ob.StateValidityChecker):
-    """A checker that knows nothing of this project but its verdict, as that of a user's might."""
+    """A checker that knows nothing of this project but its checker, as that of a user's might."""
 
     def __init__(self, si: ob.SpaceInformation, free: Callable[[np.ndarray], bool]) -> None:
         super().__init__(si)

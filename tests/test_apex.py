@@ -15,14 +15,15 @@ from planning import EASY, EXACT, HARD, Plain, at_hand, states, within
 from support import ROOT
 
 from apex_ompl import plan, planners
-from apex_ompl.assembly import PlanningSetup, assemble
 from apex_ompl.diffusion.proposals import TrajectoryModel
+from apex_ompl.ompl_adapter.setup import PlanningSetup, assemble
+from apex_ompl.ompl_adapter.space import path_to_array, state_space, to_state
+from apex_ompl.ompl_adapter.validity import StateValidityChecker, full_check
 from apex_ompl.planners import APEX
 from apex_ompl.planners.apex_parameters import ApexParameters
 from apex_ompl.problems.reach import robot
 from apex_ompl.result import INSIDE
-from apex_ompl.space import path_length, path_to_array, state_space, to_state
-from apex_ompl.validity import VerdictChecker, full_check
+from apex_ompl.trajopt.path import path_length
 
 pytestmark = pytest.mark.usefixtures("quiet")
 
@@ -30,8 +31,8 @@ pytestmark = pytest.mark.usefixtures("quiet")
 def test_it_is_the_default_and_proves_what_it_finds() -> None:
     result = plan(at_hand(HARD), timeout=20.0)
     assert result and result.planner == "apex", result.reason
-    verdict = assemble(at_hand(HARD), robot()).verdict
-    assert full_check(verdict, result.path, result.path[0], [result.path[-1]], resolution=0.0005)
+    checker = assemble(at_hand(HARD), robot()).checker
+    assert full_check(checker, result.path, result.path[0], [result.path[-1]], resolution=0.0005)
     inside = {name.removeprefix(INSIDE): seconds for name, seconds in result.times.items() if name.startswith(INSIDE)}
     assert 0.0 < inside.pop("first") < result.times["solve"]
     assert {"query", "known", "polish"} <= inside.keys()
@@ -49,7 +50,7 @@ def test_simple_setup_takes_it(how: str, ready: PlanningSetup) -> None:
         setup.setPlannerAllocator(planners.allocator("apex", seed=3))
     assert setup.solve(within(20.0)).getStatus() == EXACT
     path = states(setup)
-    assert full_check(ready.verdict, path, ready.start, ready.goals)
+    assert full_check(ready.checker, path, ready.start, ready.goals)
     assert setup.getProblemDefinition().getSolutionDifference() == 0.0
 
 
@@ -97,7 +98,7 @@ def test_a_new_problem_definition_is_taken_and_experience_helps(ready: PlanningS
         planner.setProblemDefinition(pdef)
         assert planner.solve(within(20.0)).getStatus() == EXACT
         path = path_to_array(pdef.getSolutionPath(), robot().dof)
-        assert full_check(ready.verdict, path, start, [goal])
+        assert full_check(ready.checker, path, start, [goal])
         found.append(planner.report.solved_by)
         planner.clearQuery()
     assert found[2] == "experience"
@@ -147,7 +148,7 @@ def test_several_starts_and_goals_of_all_kinds(kind: str, ready: PlanningSetup) 
     np.testing.assert_array_equal(path[0], ready.start)
     wanted = [ready.start] if kind == "region" else [ready.goals[0], far]  # the region holds the start itself
     assert any(np.array_equal(path[-1], one) for one in wanted)
-    assert full_check(ready.verdict, path)
+    assert full_check(ready.checker, path)
 
 
 def test_a_goal_that_cannot_be_sampled_is_refused(ready: PlanningSetup) -> None:
@@ -183,7 +184,7 @@ def foreign(name: str) -> tuple[PlanningSetup, og.SimpleSetup]:
     ready = assemble(at_hand(name), robot())
     setup = og.SimpleSetup(state_space(robot()))
     si = setup.getSpaceInformation()
-    setup.setStateValidityChecker(Plain(si, ready.verdict.is_free))
+    setup.setStateValidityChecker(Plain(si, ready.checker.is_free))
     setup.setStartAndGoalStates(to_state(si, ready.start), to_state(si, ready.goals[0]))
     return ready, setup
 
@@ -194,7 +195,7 @@ def test_another_checker_judges_and_is_told_of_once(caplog: pytest.LogCaptureFix
     planner = APEX(setup.getSpaceInformation())
     setup.setPlanner(planner)
     assert setup.solve(within(30.0)).getStatus() == EXACT
-    assert full_check(ready.verdict, states(setup), ready.start, ready.goals, resolution=0.02)
+    assert full_check(ready.checker, states(setup), ready.start, ready.goals, resolution=0.02)
     assert setup.solve(within(30.0)).getStatus() == EXACT
     assert sum("is not apex_ompl's" in record.message for record in caplog.records) == 1
 
@@ -206,9 +207,9 @@ def test_the_example_with_a_checker_of_its_own_runs(capsys: pytest.CaptureFixtur
 
 
 def test_the_checkers_of_the_moment_judge(ready: PlanningSetup) -> None:
-    """One that says more than the verdict is asked, and one that is set later on takes the place of the first."""
+    """One that says more than the checker is asked, and one that is set later on takes the place of the first."""
 
-    class Wary(VerdictChecker):
+    class Wary(StateValidityChecker):
         def isValid(self, state: Any) -> bool:  # noqa: N802
             return super().isValid(state) and state[14] < 0.9
 
@@ -218,7 +219,7 @@ def test_the_checkers_of_the_moment_judge(ready: PlanningSetup) -> None:
     setup.setPlanner(planner)
     assert setup.solve(within(20.0)).getStatus() == EXACT and planner.judge.alone
     setup.clear()
-    wary = Wary(si, ready.verdict)
+    wary = Wary(si, ready.checker)
     setup.setStateValidityChecker(wary)
     assert setup.solve(within(20.0)).getStatus() == EXACT
     assert planner.judge.knows_obstacles and not planner.judge.alone
@@ -237,4 +238,4 @@ def test_paths_of_trees_pass_the_full_check_too() -> None:
         setup = ready.simple_setup
         setup.setPlanner(planners.make("apex", setup.getSpaceInformation(), seed=3, **alone))
         if setup.solve(within(8.0)).getStatus() == EXACT:
-            assert full_check(ready.verdict, states(setup), ready.start, ready.goals)
+            assert full_check(ready.checker, states(setup), ready.start, ready.goals)

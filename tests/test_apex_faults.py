@@ -15,16 +15,16 @@ from support import ROOT
 
 import apex_ompl
 from apex_ompl import plan, planners
-from apex_ompl.assembly import PlanningSetup, assemble
-from apex_ompl.bodies import Obstacle
 from apex_ompl.errors import ApexError, MissingFileError, ParameterError, UnknownNameError
+from apex_ompl.ompl_adapter.setup import PlanningSetup, assemble
+from apex_ompl.ompl_adapter.space import state_space, to_state
+from apex_ompl.ompl_adapter.validity import full_check
 from apex_ompl.planners import APEX
 from apex_ompl.planners.apex_parameters import ApexParameters
-from apex_ompl.problem import Problem
 from apex_ompl.problems.reach import robot
 from apex_ompl.result import PlanStatus
-from apex_ompl.space import state_space, to_state
-from apex_ompl.validity import full_check
+from apex_ompl.scene.bodies import Obstacle
+from apex_ompl.scene.problem import Problem
 
 pytestmark = pytest.mark.usefixtures("quiet")
 
@@ -86,7 +86,7 @@ def test_faulty_starts_and_goals_get_a_status_and_a_reason(ready: PlanningSetup)
     start, goal = ready.start, ready.goals[0]
     limits, rng = robot().limits, np.random.default_rng(0)
     drawn = (rng.uniform(limits.lower, limits.upper) for _ in range(1000))
-    crossed = next(q for q in drawn if not ready.verdict.is_free(q))
+    crossed = next(q for q in drawn if not ready.checker.is_free(q))
     wild, nan = goal.copy(), start.copy()
     wild[3], nan[2] = 5.0, np.nan
     assert _outcome(ready, crossed, goal) == ("INVALID_START", "no start state is valid")
@@ -98,15 +98,15 @@ def test_faulty_starts_and_goals_get_a_status_and_a_reason(ready: PlanningSetup)
 
 def test_behind_a_wall_there_is_no_way(ready: PlanningSetup) -> None:
     """The wall begins 12 cm from the first axis of the left arm, whose first link cannot pass, and must."""
-    verdict = assemble(at_hand(HARD).model_copy(update={"scene": ()}), robot())
+    checker = assemble(at_hand(HARD).model_copy(update={"scene": ()}), robot())
     start, goal = robot().home.copy(), robot().home.copy()
     start[0], goal[0] = 0.6, 2.12
-    verdict.verdict.add(Obstacle(name="wall", box=(2.0, 0.04, 3.0), position=(1.12, 0.5, 1.5)))
+    checker.checker.add(Obstacle(name="wall", box=(2.0, 0.04, 3.0), position=(1.12, 0.5, 1.5)))
     for q0 in np.linspace(1.15, 2.0, 20):
         between = start.copy()
         between[0] = q0
-        assert any("left_link1" in str(contact) for contact in verdict.verdict.contacts(between))
-    assert _outcome(verdict, start, goal)[0] == "TIMEOUT"
+        assert any("left_link1" in str(contact) for contact in checker.checker.contacts(between))
+    assert _outcome(checker, start, goal)[0] == "TIMEOUT"
 
 
 def test_without_a_way_there_is_none_in_time() -> None:
@@ -137,7 +137,7 @@ def test_approximate_solutions_come_with_their_difference(ready: PlanningSetup) 
     path = states(setup)
     gap = np.linalg.norm(path[-1] - ready.goals[0])
     assert gap > 0.0 and setup.getProblemDefinition().getSolutionDifference() == pytest.approx(gap)
-    assert full_check(ready.verdict, path, ready.start)
+    assert full_check(ready.checker, path, ready.start)
     setup.clear()
     setup.setPlanner(planners.make("apex", si, seed=0, **nothing))
     assert setup.solve(within(1.0)).getStatus() == TIMEOUT and not setup.haveSolutionPath()

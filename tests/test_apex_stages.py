@@ -12,13 +12,13 @@ from ompl import base as ob
 from planning import ALONE, EXACT, HARD, TIMEOUT, at_hand, states, within
 
 from apex_ompl import plan, planners
-from apex_ompl.assembly import PlanningSetup
+from apex_ompl.apex.path_validator import PathValidator
+from apex_ompl.ompl_adapter.setup import PlanningSetup
+from apex_ompl.ompl_adapter.validity import full_check
 from apex_ompl.planners import APEX
 from apex_ompl.planners.apex_parameters import ApexParameters
-from apex_ompl.planners.judge import Judge
 from apex_ompl.result import INSIDE
-from apex_ompl.space import path_length
-from apex_ompl.validity import full_check
+from apex_ompl.trajopt.path import path_length
 
 pytestmark = pytest.mark.usefixtures("quiet")
 
@@ -82,19 +82,19 @@ def test_the_algorithm_of_the_paper_alone_runs(ready: PlanningSetup) -> None:
     assert planner.report.times.keys() >= {"propose", "judge"}
     assert planner.report.candidates >= 8
     if status == EXACT:
-        assert full_check(ready.verdict, states(setup), ready.start, ready.goals)
+        assert full_check(ready.checker, states(setup), ready.start, ready.goals)
 
 
 def test_valid_paths_that_pass_too_near_are_resampled(ready: PlanningSetup) -> None:
-    judge = Judge(ready.simple_setup.getSpaceInformation(), "")
+    judge = PathValidator(ready.simple_setup.getSpaceInformation(), "")
     plain = plan(at_hand(HARD), timeout=20.0, params={"polish": False})
     wary = plan(at_hand(HARD), timeout=20.0, params={"polish": False, "lambda_obs": 0.5})
     assert plain and wary
     gaps = [judge.gap(result.path) for result in (plain, wary)]
     assert gaps[1] >= gaps[0] - 1e-9, "nothing is half a metre off, so the one that keeps most distance stands"
     assert wary.times[INSIDE + "resample"] > plain.times.get(INSIDE + "resample", 0.0)
-    by_hand = min(ready.verdict.distance(q).value for q in wary.path[::4])
-    assert gaps[1] == pytest.approx(min(by_hand, ready.verdict.distance(wary.path[-1]).value))
+    by_hand = min(ready.checker.distance(q).value for q in wary.path[::4])
+    assert gaps[1] == pytest.approx(min(by_hand, ready.checker.distance(wary.path[-1]).value))
 
 
 def test_the_same_seed_gives_the_same_path_also_in_threads() -> None:
@@ -123,7 +123,7 @@ def test_with_time_left_paths_only_get_shorter(ready: PlanningSetup) -> None:
     once = plan(at_hand(HARD), timeout=20.0, params={"seed": 0})
     assert found >= 1 + planner.report.improved
     assert path_length(states(setup)) <= once.length + 1e-9
-    assert full_check(ready.verdict, states(setup), ready.start, ready.goals)
+    assert full_check(ready.checker, states(setup), ready.start, ready.goals)
     objective = ob.PathLengthOptimizationObjective(si)
     objective.setCostThreshold(ob.Cost(100.0))
     setup.clear()

@@ -16,16 +16,17 @@ from support import ROOT
 
 import apex_ompl
 from apex_ompl import PlanResult, PlanStatus, load_problem, plan, planners, planning
-from apex_ompl.assembly import assemble
-from apex_ompl.bodies import Obstacle
-from apex_ompl.collision import Verdict
+from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError, UnknownNameError
-from apex_ompl.ompl_globals import seed_ompl
-from apex_ompl.problem import Goal, Problem
-from apex_ompl.repair import repair
+from apex_ompl.ompl_adapter.process import seed_ompl
+from apex_ompl.ompl_adapter.repair import repair
+from apex_ompl.ompl_adapter.setup import assemble
+from apex_ompl.ompl_adapter.space import path_to_array
+from apex_ompl.ompl_adapter.validity import FullCheck, full_check
 from apex_ompl.robot import Robot, load_robot
-from apex_ompl.space import path_length, path_to_array, resample
-from apex_ompl.validity import FullCheck, full_check
+from apex_ompl.scene.bodies import Obstacle
+from apex_ompl.scene.problem import Goal, Problem
+from apex_ompl.trajopt.path import path_length, resample
 
 BAXTER = ROOT / "examples" / "baxter_table.yaml"
 
@@ -39,15 +40,19 @@ def test_shipped_problems_are_solved_and_proved(name: str | Path) -> None:
     assert result.path is not None and result.path.shape[1] == robot.dof
     start, goals = problem.start_state(robot.joint_names), problem.goal_states(robot.joint_names)
     assert np.array_equal(result.path[0], start) and np.array_equal(result.path[-1], goals[0])
-    # Judged anew by a fresh verdict, on a grid that the planner did not use.
-    check = full_check(Verdict(robot, problem.scene, problem.attached), result.path, start, goals, resolution=0.0047)
+    # Judged anew by a fresh checker, on a grid that the planner did not use.
+    check = full_check(
+        CollisionChecker(robot, problem.scene, problem.attached), result.path, start, goals, resolution=0.0047
+    )
     assert check, check.reason
     assert result.length == pytest.approx(path_length(result.path)) and result.length < 40
     assert result.clearance > 0.0 and result.checks > 100
     assert result.planner == ("apex" if problem.robot == "dual_panda_softhand" else "rrtconnect+polish")
     assert result.solved_by and any("no model of" in note for note in result.notes) == (result.planner != "apex")
     assert {"setup", "solve", "verify", "total"} <= set(result.times)
-    assert not full_check(Verdict(robot, problem.scene), np.array([start, goals[0]])), "the straight line is too easy"
+    assert not full_check(CollisionChecker(robot, problem.scene), np.array([start, goals[0]])), (
+        "the straight line is too easy"
+    )
 
 
 @pytest.mark.parametrize(
@@ -139,7 +144,7 @@ def test_several_goals_never_hang(planner: str, problem: Problem, tmp_path: Path
     """In a process of its own: OMPL's threaded planners deadlock over several goals."""
     other = dict(problem.goal.joints[0], right_joint1=0.3)
     problem.model_copy(update={"goal": Goal(joints=(*problem.goal.joints, other))}).save(tmp_path / "p.yaml")
-    command = [sys.executable, "-m", "apex_ompl.cli", "plan", tmp_path / "p.yaml", "--planner", planner]
+    command = [sys.executable, "-m", "apex_ompl.cli.parser", "plan", tmp_path / "p.yaml", "--planner", planner]
     done = subprocess.run([*command, "--timeout", "2"], check=False, capture_output=True, text=True, timeout=30)
     assert done.returncode in (0, 1, 4), done.stderr
     if planner.startswith("prm"):
@@ -179,14 +184,14 @@ def test_plans_in_threads_leave_ompls_log_level_alone(problem: Problem) -> None:
 
 def test_a_broken_checker_is_a_crash_status(problem: Problem, monkeypatch: pytest.MonkeyPatch) -> None:
     calls = iter(range(10**9))
-    honest = Verdict.first_collision
+    honest = CollisionChecker.first_collision
 
-    def breaks(self: Verdict, *arguments: object, **options: object) -> object:
+    def breaks(self: CollisionChecker, *arguments: object, **options: object) -> object:
         if next(calls) > 3:
             raise RuntimeError("broken on purpose")
         return honest(self, *arguments, **options)
 
-    monkeypatch.setattr(Verdict, "first_collision", breaks)
+    monkeypatch.setattr(CollisionChecker, "first_collision", breaks)
     result = plan(problem, timeout=0.5)
     assert result.status is PlanStatus.CRASH and "broken on purpose" in result.reason
 
@@ -230,24 +235,24 @@ def test_a_path_that_fails_the_full_check_is_repaired(problem: Problem) -> None:
     """The straight line through the post, as if a planner had missed the collision."""
     ready = assemble(problem)
     path = np.array([ready.start, ready.goals[0]])
-    fault = full_check(ready.verdict, path, ready.start, ready.goals)
+    fault = full_check(ready.checker, path, ready.start, ready.goals)
     assert not fault
     import time
 
     mended = repair(ready, path, fault, time.perf_counter() + 30.0)
-    assert mended is not None and full_check(ready.verdict, mended, ready.start, ready.goals)
+    assert mended is not None and full_check(ready.checker, mended, ready.start, ready.goals)
     assert repair(ready, path, fault, time.perf_counter() - 1.0) is None
 
 
 def test_repair_goes_past_states_that_collide_themselves(problem: Problem) -> None:
     ready = assemble(problem)
     line = resample(np.array([ready.start, ready.goals[0]]), 9)
-    fault = full_check(ready.verdict, line, ready.start, ready.goals)
-    assert not fault and not all(ready.verdict.is_free(q) for q in line)
+    fault = full_check(ready.checker, line, ready.start, ready.goals)
+    assert not fault and not all(ready.checker.is_free(q) for q in line)
     import time
 
     mended = repair(ready, line, fault, time.perf_counter() + 30.0)
-    assert mended is not None and full_check(ready.verdict, mended, ready.start, ready.goals)
+    assert mended is not None and full_check(ready.checker, mended, ready.start, ready.goals)
 
 
 def test_results_are_saved_in_every_format(problem: Problem, tmp_path: Path) -> None:

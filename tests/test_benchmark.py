@@ -19,7 +19,7 @@ from apex_ompl import benchmark, problems
 from apex_ompl.benchmark import Results, Row, Workers, bench, workers
 from apex_ompl.benchmark.rows import experiments, jobs
 from apex_ompl.benchmark.summary import Figures, figures
-from apex_ompl.cli import main
+from apex_ompl.cli.parser import main
 from apex_ompl.errors import ApexError, FileFormatError, MissingFileError, ParameterError, UnknownNameError
 
 LEVEL, RUNS = "swap/easy", 3
@@ -167,7 +167,7 @@ def test_processes_are_renewed(results: Results, tmp_path: Path, monkeypatch: py
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
 def test_a_stopped_command_goes_on(results: Results, tmp_path: Path, how: signal.Signals) -> None:
     folder, file = tmp_path / "stopped", tmp_path / "stopped" / "runs.jsonl"
-    command = [sys.executable, "-m", "apex_ompl.cli", "bench", LEVEL, "--planners", ROWS[1], "--runs", str(RUNS)]
+    command = [sys.executable, "-m", "apex_ompl.cli.parser", "bench", LEVEL, "--planners", ROWS[1], "--runs", str(RUNS)]
     command += ["--timeout", "10", "--split", "validation", "-o", str(folder)]
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # what a shell starts behind it ignores Ctrl-C
     try:

@@ -10,12 +10,12 @@ import pytest
 from support import ROOT
 
 from apex_ompl import benchmark, problems
-from apex_ompl.assembly import assemble
 from apex_ompl.benchmark import Row, Workers, bench, runs
 from apex_ompl.benchmark.rows import Job
 from apex_ompl.errors import ParameterError
+from apex_ompl.ompl_adapter.setup import assemble
+from apex_ompl.ompl_adapter.validity import full_check
 from apex_ompl.robot import Robot
-from apex_ompl.validity import full_check
 
 
 def test_the_first_path_counts_where_the_shortened_one_is_repaired(robot: Robot) -> None:
@@ -30,7 +30,7 @@ def test_the_first_path_counts_where_the_shortened_one_is_repaired(robot: Robot)
     assert planning.proof_of_first() == 0.25, "of a planner whose first path is not known"
     planning.raw = witness
     assert 0.0 < planning.proof_of_first() < 30.0
-    assert not full_check(ready.verdict, line, ready.start, ready.goals)
+    assert not full_check(ready.checker, line, ready.start, ready.goals)
     planning.raw = line
     assert planning.proof_of_first() == 30.25
 

@@ -10,16 +10,16 @@ import pytest
 from support import ROOT
 
 from apex_ompl import problems
-from apex_ompl.assembly import assemble
-from apex_ompl.cases import WrittenCase, load_cases, save_cases
-from apex_ompl.dataset import Store
+from apex_ompl.datasets.cases import WrittenCase, load_cases, save_cases
+from apex_ompl.datasets.records import SOURCES
+from apex_ompl.datasets.store import Store
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError
-from apex_ompl.generation import Unit, written
+from apex_ompl.generation.worker import Unit, written
 from apex_ompl.kernel import RobotTables
+from apex_ompl.ompl_adapter.setup import assemble
+from apex_ompl.ompl_adapter.validity import full_check
 from apex_ompl.problems.reach import robot
-from apex_ompl.records import SOURCES
-from apex_ompl.spline import Spline
-from apex_ompl.validity import full_check
+from apex_ompl.trajopt.spline import Spline
 
 WITHOUT = """
 import runpy, sys
@@ -66,7 +66,7 @@ def test_they_are_solved_without_pinocchio_coal_and_ompl(cases: list[WrittenCase
     for paths in store:
         for k, control in enumerate(paths.control()):
             ready = assemble(problems.load(paths.problem_name(int(paths.arrays["problem"][k]))), robot())
-            assert full_check(ready.verdict, spline.path(control), paths.start[k], [paths.goal[k]])
+            assert full_check(ready.checker, spline.path(control), paths.start[k], [paths.goal[k]])
             assert SOURCES[paths.arrays["source"][k]] in ("line", "bumps", "reversed")
             seen += 1
     assert seen >= 8

@@ -16,13 +16,13 @@ from safetensors.torch import load_file, save_file
 from trainings import DATA, HERE, config, query_of_path
 
 import apex_ompl
-from apex_ompl.dataset import load
+from apex_ompl.datasets.store import load
 from apex_ompl.diffusion.checkpoint import load_model, save_model
 from apex_ompl.diffusion.training import Trainer
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError, UnknownNameError
 from apex_ompl.kernel import Kernel, RobotTables
-from apex_ompl.kernel.scene import scene_tables
-from apex_ompl.torch_threads import one_torch_thread
+from apex_ompl.kernel.scene_builder import scene_tables
+from apex_ompl.util.threads import one_torch_thread
 
 
 @pytest.fixture(autouse=True)

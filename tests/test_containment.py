@@ -11,13 +11,13 @@ from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 from support import CUBE_OBJ, states_around_home
 
-from apex_ompl.bodies import AttachedObject, Obstacle
-from apex_ompl.collision import Verdict
+from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.containment import may_contain
 from apex_ompl.errors import FileFormatError
-from apex_ompl.meshes import triangles, winding_number
 from apex_ompl.robot import Robot
 from apex_ompl.robot.model import link_of
+from apex_ompl.scene.bodies import AttachedObject, Obstacle
+from apex_ompl.scene.meshes import triangles, winding_number
 
 
 @pytest.mark.parametrize(
@@ -30,24 +30,24 @@ def test_an_obstacle_wholly_inside_a_link_is_a_collision(robot: Robot, shape: di
         item = next(g for g in robot.geometry.geometryObjects if link_of(robot.model, g) == link)
         vertices, _ = triangles(item.geometry)
         centre = robot.link_pose(robot.home, link) @ item.placement.homogeneous @ [*vertices.mean(axis=0), 1.0]
-        verdict = Verdict(robot, [Obstacle(name="seed", position=tuple(centre[:3]), **shape)])
+        checker = CollisionChecker(robot, [Obstacle(name="seed", position=tuple(centre[:3]), **shape)])
         # Nothing touches the shell ...
-        assert shell_contacts(verdict, robot.home) == []
+        assert shell_contacts(checker, robot.home) == []
         # ... and still the state is not free, also after the obstacle was moved away and back.
-        assert not verdict.is_free(robot.home)
-        assert "seed" in (c.second for c in verdict.contacts(robot.home))
-        verdict.move("seed", (0.0, 0.0, 3.0))
-        assert verdict.is_free(robot.home)
-        verdict.move("seed", tuple(centre[:3]))
-        assert not verdict.is_free(robot.home)
+        assert not checker.is_free(robot.home)
+        assert "seed" in (c.second for c in checker.contacts(robot.home))
+        checker.move("seed", (0.0, 0.0, 3.0))
+        assert checker.is_free(robot.home)
+        checker.move("seed", tuple(centre[:3]))
+        assert not checker.is_free(robot.home)
 
 
-def shell_contacts(verdict: Verdict, q: np.ndarray) -> list[tuple[str, str]]:
+def shell_contacts(checker: CollisionChecker, q: np.ndarray) -> list[tuple[str, str]]:
     """The pairs that overlap by meshes and primitives alone, without the cases of containment."""
-    scene = verdict._scene()
-    model, geometry = verdict.robot.model, scene.geometry
+    scene = checker._scene()
+    model, geometry = checker.robot.model, scene.geometry
     data, geometry_data = model.createData(), geometry.createData()
-    pin.computeCollisions(model, data, geometry, geometry_data, verdict.robot.to_pinocchio(q), False)
+    pin.computeCollisions(model, data, geometry, geometry_data, checker.robot.to_pinocchio(q), False)
     pairs = [
         (p.first, p.second)
         for p, result in zip(geometry.collisionPairs, geometry_data.collisionResults, strict=True)
@@ -73,14 +73,14 @@ def test_a_link_inside_a_hollow_mesh_obstacle_is_a_collision_and_its_notch_is_no
     file = tmp_path / "u.obj"
     file.write_text(u_shape_obj(4.0))
     u = Obstacle(name="u", mesh={"file": str(file)}, position=(-6.0, -2.0, -6.0))
-    verdict = Verdict(robot, [u])  # all of the robot in the solid bottom of the U
-    assert not shell_contacts(verdict, robot.home)
-    assert not verdict.is_free(robot.home)
-    assert {c.second for c in verdict.contacts(robot.home)} == {"u"}
-    verdict.move("u", (-6.0, -8.0, -6.0))  # all of it in the notch, inside the mesh's convex hull
-    assert not shell_contacts(verdict, robot.home)
-    assert verdict.is_free(robot.home)
-    assert verdict.contacts(robot.home) == []
+    checker = CollisionChecker(robot, [u])  # all of the robot in the solid bottom of the U
+    assert not shell_contacts(checker, robot.home)
+    assert not checker.is_free(robot.home)
+    assert {c.second for c in checker.contacts(robot.home)} == {"u"}
+    checker.move("u", (-6.0, -8.0, -6.0))  # all of it in the notch, inside the mesh's convex hull
+    assert not shell_contacts(checker, robot.home)
+    assert checker.is_free(robot.home)
+    assert checker.contacts(robot.home) == []
 
 
 def test_a_held_object_inside_the_other_arm_is_a_collision(robot: Robot) -> None:
@@ -89,14 +89,14 @@ def test_a_held_object_inside_the_other_arm_is_a_collision(robot: Robot) -> None
     vertices, _ = triangles(item.geometry)
     inside = robot.link_pose(robot.home, "right_link4") @ item.placement.homogeneous @ [*vertices.mean(axis=0), 1.0]
     local = np.linalg.inv(robot.link_pose(robot.home, "left_hand_palm")) @ inside
-    verdict = Verdict(robot, (), [held.model_copy(update={"position": tuple(local[:3])})])
-    assert not verdict.is_free(robot.home)
-    assert [(c.first, c.second) for c in verdict.contacts(robot.home)] == [("right_link4", "pill")]
+    checker = CollisionChecker(robot, (), [held.model_copy(update={"position": tuple(local[:3])})])
+    assert not checker.is_free(robot.home)
+    assert [(c.first, c.second) for c in checker.contacts(robot.home)] == [("right_link4", "pill")]
 
 
 def test_links_never_hide_in_each_other(robot: Robot) -> None:
-    """The reason why links are no guests of each other: where one is inside another, the verdict knows."""
-    verdict = Verdict(robot)
+    """The reason why links are no guests of each other: where one is inside another, the checker knows."""
+    checker = CollisionChecker(robot)
     items = list(robot.geometry.geometryObjects)
     shells = {
         i: np.array(triangles(g.geometry)[0])[triangles(g.geometry)[1]]
@@ -114,7 +114,7 @@ def test_links_never_hide_in_each_other(robot: Robot) -> None:
                 if host in shells and guest not in shells:
                     point = poses[host].actInv(poses[guest].translation)
                     inside |= abs(winding_number(point, shells[host])) > 0.5
-        assert not (inside and verdict.is_free(q))
+        assert not (inside and checker.is_free(q))
 
 
 @settings(max_examples=60)
@@ -152,12 +152,14 @@ def test_meshes_in_stl_and_obj_collide_like_the_box_they_are(robot: Robot, tmp_p
     stl.write_text("solid cube\n" + "\n".join(facets) + "\nendsolid cube\n")
     rng = np.random.default_rng(2)
     size, corner = (0.3, 0.2, 0.5), np.array([0.35, -0.1, 0.1])
-    box = Verdict(robot, [Obstacle(name="b", box=size, position=tuple(corner + np.array(size) / 2))])
+    box = CollisionChecker(robot, [Obstacle(name="b", box=size, position=tuple(corner + np.array(size) / 2))])
     states = states_around_home(robot, rng, 150, 0.7)
     expected = [box.is_free(q) for q in states]
     assert 0.1 < np.mean(expected) < 0.9
     for file in (obj, stl):
-        mesh = Verdict(robot, [Obstacle(name="m", mesh={"file": str(file), "scale": size}, position=tuple(corner))])
+        mesh = CollisionChecker(
+            robot, [Obstacle(name="m", mesh={"file": str(file), "scale": size}, position=tuple(corner))]
+        )
         assert [mesh.is_free(q) for q in states] == expected
 
 
@@ -178,9 +180,9 @@ def test_each_piece_of_a_mesh_is_looked_for_inside_links(robot: Robot, tmp_path,
     pieces = [cube(at, 0.02, 1 + 8 * k) for k, at in enumerate(places[::-1] if swapped else places)]
     file = tmp_path / "two.obj"
     file.write_text("\n".join([*(x for p in pieces for x in p[0]), *(x for p in pieces for x in p[1])]) + "\n")
-    verdict = Verdict(robot, [Obstacle(name="two", mesh={"file": str(file)})])
-    assert shell_contacts(verdict, robot.home) == []
-    assert not verdict.is_free(robot.home)
+    checker = CollisionChecker(robot, [Obstacle(name="two", mesh={"file": str(file)})])
+    assert shell_contacts(checker, robot.home) == []
+    assert not checker.is_free(robot.home)
 
 
 FLAT = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\nf 1 2 3\nf 2 4 3\n"
@@ -205,7 +207,7 @@ def test_meshes_that_bound_no_solid_are_refused(robot: Robot, tmp_path, text: st
     file = tmp_path / "m.obj"
     file.write_text(text)
     with pytest.raises(FileFormatError, match=words):
-        Verdict(robot, [Obstacle(name="m", mesh={"file": str(file)})])
+        CollisionChecker(robot, [Obstacle(name="m", mesh={"file": str(file)})])
 
 
 def test_a_mesh_with_a_hole_is_judged_by_the_winding_number(robot: Robot, tmp_path) -> None:
@@ -213,4 +215,4 @@ def test_a_mesh_with_a_hole_is_judged_by_the_winding_number(robot: Robot, tmp_pa
     file.write_text(CUBE_OBJ.replace("f 5 6 7\n", ""))
     for position, free in (((-3.0, -3.0, -3.0), False), ((20.0, 0.0, 0.0), True)):
         room = Obstacle(name="room", mesh={"file": str(file), "scale": (6, 6, 6)}, position=position)
-        assert Verdict(robot, [room]).is_free(robot.home) == free
+        assert CollisionChecker(robot, [room]).is_free(robot.home) == free

@@ -11,8 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from models import DOF, VARIATIONAL, WALL, kernel, network, query, some_paths
 
+from apex_ompl.datasets.records import SHAPES
 from apex_ompl.diffusion.autoencoder import LinearLatent, VariationalLatent
-from apex_ompl.diffusion.conditions import Probes, Query, Table, Things, batched, distances, rotations
+from apex_ompl.diffusion.conditions import ObstacleSet, Probes, Query, Table, batched, distances, rotations
 from apex_ompl.diffusion.denoisers import UNetDenoiser
 from apex_ompl.diffusion.encoders import ConditionEncoder
 from apex_ompl.diffusion.model import (
@@ -21,8 +22,7 @@ from apex_ompl.diffusion.model import (
 from apex_ompl.diffusion.proposals import Sampling, TrajectoryModel
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel import Kernel
-from apex_ompl.records import SHAPES
-from apex_ompl.spline import Spline
+from apex_ompl.trajopt.spline import Spline
 
 # Latent spaces
 
@@ -122,7 +122,7 @@ def test_distances_are_those_of_the_meshes_library(shape: str) -> None:
         "capsule": coal.Capsule(0.15, 0.4),
     }[shape]  # fmt: skip
     quaternion = rng.normal(size=4)
-    things = Things.of([(SHAPES.index(shape), (0.1, -0.2, 0.3), quaternion, size)])
+    things = ObstacleSet.of([(SHAPES.index(shape), (0.1, -0.2, 0.3), quaternion, size)])
     ends = np.zeros(DOF)
     given_ = batched([Query(ends, ends, np.zeros(3), things)], Probes.of(kernel().robot, 2), kernel())
     points = rng.uniform(-0.8, 0.8, (60, 3))
@@ -163,8 +163,8 @@ def test_the_order_of_obstacles_does_not_matter(scene: str) -> None:
 
     def encoded(chosen: list[int], beside: int = 0) -> torch.Tensor:
         """The code of a query, in a batch with another one of ``beside`` obstacles."""
-        mine = Query(q.start, q.goal, q.point, Things.of([rows[k] for k in chosen]))
-        other = Query(q.goal, q.start, q.point, Things.of(rows[:beside]))
+        mine = Query(q.start, q.goal, q.point, ObstacleSet.of([rows[k] for k in chosen]))
+        other = Query(q.goal, q.start, q.point, ObstacleSet.of(rows[:beside]))
         return encoder(batched([mine, other], probes, kernel()))[0]
 
     first = encoded(list(range(9)))
@@ -188,7 +188,7 @@ def test_conditions_of_stored_paths_are_those_of_their_problems() -> None:
         p = a["problem"][k]
         span = slice(int(first[p]), int(first[p + 1]))
         columns = (a[name][span] for name in ("shape", "position", "orientation", "size"))
-        things = Things.of(list(zip(*columns, strict=True)))
+        things = ObstacleSet.of(list(zip(*columns, strict=True)))
         queries.append(Query(paths.start[k], paths.goal[k], a["point"][k], things))
     wanted = batched(queries, probes, kernel())
     torch.manual_seed(0)
@@ -233,7 +233,7 @@ def test_noise_up_to_a_step_leaves_paths_near() -> None:
     """One step of noise, and of denoising by whatever network, strays less than all of it."""
     model = TrajectoryModel(network(), {})
     control = some_paths().control(slice(0, 1)).repeat(6, axis=0)
-    ends = Query(control[0, 0], control[0, -1], np.zeros(3), Things.of([]))
+    ends = Query(control[0, 0], control[0, -1], np.zeros(3), ObstacleSet.of([]))
 
     def strayed(step: int) -> float:
         generator = torch.Generator().manual_seed(0)
@@ -252,7 +252,7 @@ def test_noise_up_to_a_step_leaves_paths_near() -> None:
 def test_a_query_of_another_robot_is_refused() -> None:
     model = TrajectoryModel(network(), {})
     with pytest.raises(ParameterError, match=r"start: expected a finite state of shape \(16,\)"):
-        model.propose(Query(np.zeros(7), np.zeros(7), np.zeros(3), Things.of([])), kernel(), 1)
+        model.propose(Query(np.zeros(7), np.zeros(7), np.zeros(3), ObstacleSet.of([])), kernel(), 1)
     tables = kernel().robot
     other = Kernel(dataclasses.replace(tables, name="baxter"), kernel().scene)
     with pytest.raises(ParameterError, match="robot: expected dual_panda_softhand, which .* got 'baxter'"):

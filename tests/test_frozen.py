@@ -13,15 +13,15 @@ import pytest
 from support import ROOT
 
 from apex_ompl import problems
-from apex_ompl.bodies import Obstacle
-from apex_ompl.collision import Verdict
+from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError, UnknownNameError
-from apex_ompl.moving import timed_check
+from apex_ompl.live.moving import timed_check
+from apex_ompl.ompl_adapter.validity import full_check
 from apex_ompl.problems import frozen
 from apex_ompl.problems.catalogue import ProblemId
 from apex_ompl.robot import Robot
-from apex_ompl.space import resample
-from apex_ompl.validity import full_check
+from apex_ompl.scene.bodies import Obstacle
+from apex_ompl.trajopt.path import resample
 
 FOLDER = ROOT / "problems" / "frozen"
 EVERY = [(suite, level) for suite, levels in problems.suites().items() for level in levels]
@@ -62,13 +62,13 @@ def test_witnesses_pass_the_full_check(robot: Robot, suite: str, level: str) -> 
     """Some of each level; scripts/check_frozen.py looks at all."""
     for name in problems.frozen_names(suite, level)[::20]:
         problem, witness = problems.load(name), problems.witness(name)
-        verdict = Verdict(robot, problem.scene, problem.attached)
-        check = full_check(verdict, witness.path, witness.path[0], problem.goal_states(robot.joint_names))
+        checker = CollisionChecker(robot, problem.scene, problem.attached)
+        check = full_check(checker, witness.path, witness.path[0], problem.goal_states(robot.joint_names))
         assert check, check.reason
         # An obstacle in the way of the right palm, in the middle of the path, is met.
         at = robot.link_pose(resample(witness.path, 3)[1], "right_hand_palm")[:3, 3]
-        verdict.add(Obstacle(name="in_the_way", sphere={"radius": 0.03}, position=tuple(at)))
-        assert "in_the_way" in full_check(verdict, witness.path, witness.path[0], [witness.path[-1]]).reason
+        checker.add(Obstacle(name="in_the_way", sphere={"radius": 0.03}, position=tuple(at)))
+        assert "in_the_way" in full_check(checker, witness.path, witness.path[0], [witness.path[-1]]).reason
 
 
 @pytest.mark.parametrize(("suite", "level"), MOVING)

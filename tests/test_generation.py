@@ -12,18 +12,18 @@ import pytest
 from support import ROOT
 
 from apex_ompl import problems
-from apex_ompl.assembly import assemble
-from apex_ompl.cluster import ClusterError, spread
-from apex_ompl.collision.verdict import NO_POINT
-from apex_ompl.dataset import Store, load
-from apex_ompl.engine import STRAIGHT_SHARE, Options
+from apex_ompl.collision.checker import NO_POINT
+from apex_ompl.datasets.engine import STRAIGHT_SHARE, Options
+from apex_ompl.datasets.records import FIELDS, SHAPES, SOURCES, Paths, rounded
+from apex_ompl.datasets.store import Store, load
 from apex_ompl.errors import ParameterError, UnknownNameError
-from apex_ompl.generation import Unit, plan_units, static_levels, work
+from apex_ompl.generation.worker import Unit, plan_units, static_levels, work
+from apex_ompl.ompl_adapter.setup import assemble
+from apex_ompl.ompl_adapter.validity import full_check
 from apex_ompl.problems.reach import robot
-from apex_ompl.records import FIELDS, SHAPES, SOURCES, Paths, rounded
-from apex_ompl.space import path_length
-from apex_ompl.spline import Spline
-from apex_ompl.validity import full_check
+from apex_ompl.trajopt.path import path_length
+from apex_ompl.trajopt.spline import Spline
+from apex_ompl.util.cluster import ClusterError, spread
 
 SCRIPT = ROOT / "scripts" / "generate_data.py"
 UNITS = [Unit("vertical", "medium", 3, 4), Unit("wall", "easy", 3, 3), Unit("broad", "free", 3, 4)]
@@ -49,10 +49,10 @@ def test_every_path_is_proven_and_described_truly(made: list[Paths]) -> None:
             problem = problems.load(paths.problem_name(owner))
             ready = assemble(problem, robot())
             path = spline.path(control[k])
-            assert full_check(ready.verdict, path, paths.start[k], [paths.goal[k]])
+            assert full_check(ready.checker, path, paths.start[k], [paths.goal[k]])
             assert a["length"][k] == pytest.approx(path_length(path), rel=1e-5)
             # No sphere of the cover is nearer than it says, at the states that were looked at.
-            assert ready.verdict.kernel.clearance(path[::2], 0.2).min() == pytest.approx(a["clearance"][k], abs=1e-6)
+            assert ready.checker.kernel.clearance(path[::2], 0.2).min() == pytest.approx(a["clearance"][k], abs=1e-6)
             source = SOURCES[a["source"][k]]
             sources.add(source)
             ends = ready.start, ready.goals[0]
@@ -62,9 +62,9 @@ def test_every_path_is_proven_and_described_truly(made: list[Paths]) -> None:
                 assert np.array_equal(path[-1], ends[1])
             else:
                 assert any(np.array_equal(path[-1], end) for end in ends)
-            straight = bool(full_check(ready.verdict, path[[0, -1]]))
+            straight = bool(full_check(ready.checker, path[[0, -1]]))
             assert not straight or source in ("line", "reversed")
-            nearest = ready.verdict.distance(path[0])
+            nearest = ready.checker.distance(path[0])
             point = nearest.points[1] if problem.scene else NO_POINT
             np.testing.assert_allclose(a["point"][k], point, atol=1e-3)
             mine = slice(things[owner], things[owner + 1])
@@ -236,6 +236,6 @@ def test_proposals_of_a_model_are_proven_like_all_else() -> None:
     assert same(paths, work(unit, options, Spline())[0])
     for k in range(len(paths)):
         ready = assemble(problems.load(paths.problem_name(paths.arrays["problem"][k])), robot())
-        assert full_check(ready.verdict, paths.spline.path(paths.control(slice(k, k + 1))[0]))
+        assert full_check(ready.checker, paths.spline.path(paths.control(slice(k, k + 1))[0]))
     with pytest.raises(ParameterError, match="model: expected one of paths by"):
         work(unit, options, Spline(16))

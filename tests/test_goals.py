@@ -7,14 +7,14 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from apex_ompl import PlanStatus, load_problem, plan
-from apex_ompl.assembly import assemble
-from apex_ompl.bodies import AttachedObject, ContactFace
-from apex_ompl.collision import Verdict
+from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ApexError, FileFormatError, UnknownNameError
-from apex_ompl.goals import AlignmentGoal, alignment_goal, angle
-from apex_ompl.ik import Links
-from apex_ompl.problem import Alignment, Goal, Tolerance, WorldVector
+from apex_ompl.ompl_adapter.setup import assemble
 from apex_ompl.robot import Robot
+from apex_ompl.scene.bodies import AttachedObject, ContactFace
+from apex_ompl.scene.problem import Alignment, Goal, Tolerance, WorldVector
+from apex_ompl.tasks.alignment import AlignmentGoal, alignment_goal, angle
+from apex_ompl.tasks.inverse_kinematics import Links
 
 KINDS = ("vertical", "horizontal", "pour", "handover")
 UP = np.array([0.0, 0.0, 1.0])
@@ -50,11 +50,11 @@ def test_jacobian_is_that_of_finite_differences(robot: Robot, kind: str) -> None
 @pytest.mark.parametrize("kind", KINDS)
 def test_sampled_states_are_free_and_hold_by_their_definition(robot: Robot, kind: str) -> None:
     goal = goal_of(robot, kind)
-    verdict = Verdict(robot, (), [held("a", "left")])
-    found = goal.sample(verdict, np.random.default_rng(1), count=5)
+    checker = CollisionChecker(robot, (), [held("a", "left")])
+    found = goal.sample(checker, np.random.default_rng(1), count=5)
     assert len(found.states) == 5 and found.fault == "" and found.converged >= 5
     for q in found.states:
-        assert verdict.is_free(q) and robot.limit_fault(q) is None and goal.is_satisfied(q)
+        assert checker.is_free(q) and robot.limit_fault(q) is None and goal.is_satisfied(q)
         assert np.array_equal(q[robot.groups["hands"]], robot.home[robot.groups["hands"]])
         p1, a1, p2, a2 = goal.faces(q)
         # Against the links' poses, not by the module's own kinematics.
@@ -129,7 +129,7 @@ def test_angles_are_exact_where_axes_are_nearly_parallel() -> None:
 
 def test_unreachable_says_so_with_the_best_error(robot: Robot) -> None:
     far = goal_of(robot, "horizontal", distance=5.0)
-    found = far.sample(Verdict(robot), np.random.default_rng(0), count=3, max_attempts=6)
+    found = far.sample(CollisionChecker(robot), np.random.default_rng(0), count=3, max_attempts=6)
     assert len(found.states) == 0 and found.attempts == 6 and found.converged == 0
     assert found.fault.startswith("not reached in 6 attempts; the best has lateral ") and " m off" in found.fault
     problem = load_problem("ball_in_cup")
@@ -141,10 +141,12 @@ def test_unreachable_says_so_with_the_best_error(robot: Robot) -> None:
 
 
 def test_aligned_states_that_all_collide_say_with_what(robot: Robot) -> None:
-    from apex_ompl.bodies import Obstacle
+    from apex_ompl.scene.bodies import Obstacle
 
     wall = Obstacle(name="wall", box=(3.0, 0.6, 3.0), position=(0.0, 0.0, 0.0))
-    found = goal_of(robot, "horizontal").sample(Verdict(robot, [wall]), np.random.default_rng(0), max_attempts=5)
+    found = goal_of(robot, "horizontal").sample(
+        CollisionChecker(robot, [wall]), np.random.default_rng(0), max_attempts=5
+    )
     assert "collide, " in found.fault and "mm deep" in found.fault
 
 
@@ -184,7 +186,7 @@ def test_faulty_alignments_are_named(robot: Robot) -> None:
 
 def test_the_lip_that_pours_is_the_lowest_of_the_rim(robot: Robot) -> None:
     goal = goal_of(robot, "pour")
-    found = goal.sample(Verdict(robot), np.random.default_rng(3), count=3)
+    found = goal.sample(CollisionChecker(robot), np.random.default_rng(3), count=3)
     vessel = held("a", "left", (0.02, 0.0, 0.06))
     for q in found.states:
         pose = robot.link_pose(q, "left_hand_palm") @ vessel.pose
@@ -213,7 +215,7 @@ def test_contact_faces_turn_with_their_object() -> None:
         name="x", link="l", sphere={"radius": 0.1}, position=(1.0, 0.0, 0.0),
         orientation=(0.0, np.sqrt(0.5), 0.0, np.sqrt(0.5)), contact=face,
     )  # fmt: skip
-    from apex_ompl.goals import Face
+    from apex_ompl.tasks.alignment import Face
 
     found = Face.of_object(turned)
     np.testing.assert_allclose(found.point, [1.1, 0.0, 0.0], atol=1e-12)

@@ -3,11 +3,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from apex_ompl.bodies import AttachedObject
-from apex_ompl.collision import Verdict
+from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import SceneError, UnknownNameError
-from apex_ompl.grasp import grasp
 from apex_ompl.robot import Robot
+from apex_ompl.scene.bodies import AttachedObject
+from apex_ompl.tasks.grasp import grasp
 
 ALONG_X = (0.0, np.sqrt(0.5), 0.0, np.sqrt(0.5))
 
@@ -19,12 +19,12 @@ def bar(radius: float, **changes: object) -> AttachedObject:
 
 
 def strict_contacts(robot: Robot, held: AttachedObject, hand: str, synergy: float) -> list[str]:
-    """Finger links that touch the object when only the palm may, by the verdict."""
+    """Finger links that touch the object when only the palm may, by the checker."""
     palm = robot.hands[hand].palm
-    verdict = Verdict(robot, (), [held.model_copy(update={"link": palm, "touch_links": (palm,)})])
+    checker = CollisionChecker(robot, (), [held.model_copy(update={"link": palm, "touch_links": (palm,)})])
     q = robot.home.copy()
     q[robot.joint_names.index(robot.hands[hand].synergy)] = synergy
-    return [c.first for c in verdict.contacts(q) if c.second == "bar" and "hand" in c.first]
+    return [c.first for c in checker.contacts(q) if c.second == "bar" and "hand" in c.first]
 
 
 @pytest.mark.parametrize("hand", ["left_hand", "right_hand"])
@@ -36,7 +36,7 @@ def test_the_synergy_is_that_of_first_contact(robot: Robot, hand: str, radius: f
     assert closed.touched in strict_contacts(robot, bar(radius), hand, closed.synergy + 2e-3)
     q = robot.home.copy()
     q[robot.joint_names.index(closed.synergy_joint)] = closed.synergy
-    assert Verdict(robot, (), [closed.held]).is_free(q)
+    assert CollisionChecker(robot, (), [closed.held]).is_free(q)
     assert set(closed.held.touch_links or ()) == set(robot.hand_of(robot.hands[hand].palm))
 
 

@@ -10,7 +10,7 @@ import pytest
 import torch
 from models import POST, VARIATIONAL, WALL, kernel, network, query, some_paths
 
-from apex_ompl.diffusion.conditions import Query, Things
+from apex_ompl.diffusion.conditions import ObstacleSet, Query
 from apex_ompl.diffusion.denoisers import UNetDenoiser
 from apex_ompl.diffusion.guidance import Guidance, collision_cost, gradient, log_likelihood
 from apex_ompl.diffusion.model import (
@@ -21,7 +21,7 @@ from apex_ompl.diffusion.proposals import Sampling, TrajectoryModel
 from apex_ompl.diffusion.sampler import SAMPLERS
 from apex_ompl.errors import ParameterError, UnknownNameError
 from apex_ompl.kernel import Kernel
-from apex_ompl.spline import Spline
+from apex_ompl.trajopt.spline import Spline
 
 
 @pytest.mark.parametrize("parts", [{}, VARIATIONAL], ids=["linear", "variational"])
@@ -78,7 +78,7 @@ def test_guided_paths_stay_near_where_little_is_left_of_the_sample() -> None:
             sizes.append(float(found.latent.abs().max()))
     assert max(sizes) <= 4.0
     control = some_paths().control(slice(0, 4))
-    ends = Query(control[0, 0], control[0, -1], np.zeros(3), Things.of([]))
+    ends = Query(control[0, 0], control[0, -1], np.zeros(3), ObstacleSet.of([]))
     sampling = Sampling("ddim", 4, 1.0, Guidance(1.0, "noise"))
     again = model.renoise(ends, kernel(WALL, POST), control, 100, sampling=sampling)
     assert np.isfinite(again.control).all() and float(again.latent.abs().max()) <= 4.0

@@ -16,15 +16,15 @@ from hypothesis import strategies as st
 from random_robots import frames, pose, random_robot, unit
 from support import ROOT, states_around_home
 
-from apex_ompl.bodies import Obstacle
-from apex_ompl.collision import Verdict
+from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.tabulate import primitives
 from apex_ompl.errors import ParameterError
-from apex_ompl.kernel import build, entries
-from apex_ompl.kernel.face import Kernel
-from apex_ompl.kernel.scene import scene_tables
+from apex_ompl.kernel import entries, robot_builder
+from apex_ompl.kernel.interface import Kernel
+from apex_ompl.kernel.scene_builder import scene_tables
 from apex_ompl.kernel.tables import PRISMATIC, RobotTables
 from apex_ompl.robot import Robot
+from apex_ompl.scene.bodies import Obstacle
 
 SHAPES = {
     "box": lambda r: coal.Box(*r.uniform(0.05, 0.5, 3)),
@@ -83,17 +83,17 @@ def test_clearance_of_random_trees_is_that_of_all_spheres(seed: int) -> None:
 
 def single_ball() -> RobotTables:
     """A ball of 1 cm on three sliders: its state is where it is."""
-    specs = [build.JointSpec(0)]
-    specs += [build.JointSpec(k, PRISMATIC, np.eye(4), np.eye(3)[k], k) for k in range(3)]
+    specs = [robot_builder.JointSpec(0)]
+    specs += [robot_builder.JointSpec(k, PRISMATIC, np.eye(4), np.eye(3)[k], k) for k in range(3)]
     cover = {
         "centres": np.zeros((1, 3)),
         "radii": np.array([0.01]),
         "first": np.zeros(1, int),
         "count": np.zeros(1, int),
     }
-    body = build.BodySpec("ball", 3, np.eye(4), **cover)
+    body = robot_builder.BodySpec("ball", 3, np.eye(4), **cover)
     box = 10.0 * np.ones(3)
-    return build.robot_tables("ball", "xyz", lower=-box, upper=box, joints=specs, bodies=[body], pairs=[])
+    return robot_builder.robot_tables("ball", "xyz", lower=-box, upper=box, joints=specs, bodies=[body], pairs=[])
 
 
 def cylinder_surface(shape: coal.Cylinder, at: np.ndarray) -> np.ndarray:
@@ -150,8 +150,8 @@ def check_gradients(kernel: Kernel, states: np.ndarray) -> None:
         shifts = step * np.eye(len(q))
         ahead, behind = kernel.clearance(q + shifts), kernel.clearance(q - shifts)
         numeric = (ahead - behind) / (2 * step)
-        bent = np.abs(ahead + behind - 2 * value) > 1e-8  # another sphere takes over between the two
-        where = np.isfinite(value) & ~bent.any(axis=0)
+        improved = np.abs(ahead + behind - 2 * value) > 1e-8  # another sphere takes over between the two
+        where = np.isfinite(value) & ~improved.any(axis=0)
         smooth += int(where.sum())
         assert np.abs(numeric - slope.T)[:, where] == pytest.approx(0.0, abs=1e-5)
     assert smooth >= len(states)
@@ -160,7 +160,7 @@ def check_gradients(kernel: Kernel, states: np.ndarray) -> None:
 @pytest.mark.parametrize("which", ["robot", "baxter"])
 def test_frames_and_gradients_of_real_robots(which: str, request: pytest.FixtureRequest, post: Obstacle) -> None:
     robot: Robot = request.getfixturevalue(which)
-    kernel = Verdict(robot, [post]).kernel
+    kernel = CollisionChecker(robot, [post]).kernel
     states = states_around_home(robot, np.random.default_rng(0), 20)
     turn, origin = kernel.joint_frames(states)
     data = robot.model.createData()
@@ -175,13 +175,13 @@ def test_frames_and_gradients_of_real_robots(which: str, request: pytest.Fixture
 
 
 def test_read_only_arrays_are_not_compiled_for_anew(robot: Robot) -> None:
-    verdict = Verdict(robot)
-    verdict.prepare()
+    checker = CollisionChecker(robot)
+    checker.prepare()
     before = [len(f.dispatcher.signatures) for f in (entries.judge_states, entries.advance, entries.lay_grid)]
     path = np.tile(robot.home, (3, 1))
     path.flags.writeable = False
-    assert verdict.first_collision(path, 0.031) is None and verdict.is_free(robot.home)
-    verdict.kernel.unproved(robot.home)
+    assert checker.first_collision(path, 0.031) is None and checker.is_free(robot.home)
+    checker.kernel.unproved(robot.home)
     after = [len(f.dispatcher.signatures) for f in (entries.judge_states, entries.advance, entries.lay_grid)]
     assert before == after == [1, 1, 1]
 
@@ -197,7 +197,7 @@ def test_grids_hold_no_more_steps_than_they_can_count(step: float) -> None:
 
 
 def test_clearance_of_what_is_no_number_is_none(robot: Robot) -> None:
-    kernel = Verdict(robot).kernel
+    kernel = CollisionChecker(robot).kernel
     for k in range(robot.dof):
         q = robot.home.copy()
         q[k] = np.nan
@@ -207,13 +207,13 @@ def test_clearance_of_what_is_no_number_is_none(robot: Robot) -> None:
 
 
 def test_states_of_another_shape_are_refused(robot: Robot) -> None:
-    kernel = Verdict(robot).kernel
+    kernel = CollisionChecker(robot).kernel
     with pytest.raises(ParameterError, match=r"\(N, 16\)"):
         kernel.clearance(np.zeros(7))
 
 
 def test_what_is_no_number_is_never_proved(robot: Robot) -> None:
-    kernel = Verdict(robot).kernel
+    kernel = CollisionChecker(robot).kernel
     assert kernel.unproved(robot.home)[1][0] == 0
     for k in range(robot.dof):
         for value in (np.nan, np.inf, -np.inf):
@@ -226,7 +226,7 @@ def test_what_is_no_number_is_never_proved(robot: Robot) -> None:
 
 
 def test_threads_do_not_disturb_each_other(robot: Robot, post: Obstacle) -> None:
-    kernel = Verdict(robot, [post]).kernel
+    kernel = CollisionChecker(robot, [post]).kernel
     rng = np.random.default_rng(2)
     batches = [states_around_home(robot, rng, 4000) for _ in range(4)]
     expected = [kernel.clearance(batch) for batch in batches]

@@ -17,20 +17,20 @@ from hypothesis import strategies as st
 from random_robots import frames, random_robot
 from support import ROOT, states_around_home
 
-from apex_ompl.bodies import Obstacle
-from apex_ompl.collision import Verdict
+from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.tabulate import joint_specs, primitives
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError, UnknownNameError
 from apex_ompl.kernel import views
-from apex_ompl.kernel.face import Kernel
-from apex_ompl.kernel.scene import scene_tables
+from apex_ompl.kernel.interface import Kernel
+from apex_ompl.kernel.scene_builder import scene_tables
 from apex_ompl.kernel.tables import RobotTables
 from apex_ompl.kernel.views import robot_view, scene_view
 from apex_ompl.robot import Robot
+from apex_ompl.scene.bodies import Obstacle
 
 
 def test_tables_are_saved_and_loaded_without_pinocchio(robot: Robot, post: Obstacle, tmp_path: Path) -> None:
-    kernel = Verdict(robot, [post]).kernel
+    kernel = CollisionChecker(robot, [post]).kernel
     states = states_around_home(robot, np.random.default_rng(1), 5)
     kernel.robot.save(tmp_path / "robot.npz")
     np.save(tmp_path / "states.npy", states)
@@ -38,8 +38,8 @@ def test_tables_are_saved_and_loaded_without_pinocchio(robot: Robot, post: Obsta
 import sys, numpy as np
 for name in ("pinocchio", "coal", "ompl"):
     sys.modules[name] = None
-from apex_ompl.kernel.face import Kernel
-from apex_ompl.kernel.scene import Primitive, scene_tables
+from apex_ompl.kernel.interface import Kernel
+from apex_ompl.kernel.scene_builder import Primitive, scene_tables
 from apex_ompl.kernel.tables import BOX, RobotTables
 at = np.eye(4)
 at[:3, 3] = {list(post.position)}
@@ -101,7 +101,7 @@ def test_damaged_tables_are_faults_and_no_crash(tmp_path: Path) -> None:
 
 
 def test_arrays_come_out_of_a_pack_as_they_went_in(robot: Robot, post: Obstacle) -> None:
-    kernel = Verdict(robot, [post]).kernel
+    kernel = CollisionChecker(robot, [post]).kernel
     for tables, view in ((kernel.robot, robot_view), (kernel.scene, scene_view)):
         with mock.patch.multiple(views, _ints=views._ints.py_func, _floats=views._floats.py_func):
             seen = view.py_func(*tables.packed)
@@ -134,7 +134,7 @@ def test_mimic_ratios_are_read_as_they_are(ratio: float, driver: str) -> None:
 def test_tables_for_one_side_judge_that_side_alone(robot: Robot, seed: int) -> None:
     rng = np.random.default_rng(seed)
     ball = Obstacle(name="ball", sphere={"radius": 0.1}, position=tuple(rng.uniform([0.2, -0.6, 0.1], [0.7, 0.6, 0.8])))
-    whole = Verdict(robot, [ball]).kernel
+    whole = CollisionChecker(robot, [ball]).kernel
     sides = [[k for k, name in enumerate(robot.joint_names) if name.startswith(side)] for side in ("left", "right")]
     kernels = [Kernel(whole.robot.judging(joints), whole.scene) for joints in sides]
     q, other = states_around_home(robot, rng, 2)
@@ -148,7 +148,7 @@ def test_tables_for_one_side_judge_that_side_alone(robot: Robot, seed: int) -> N
 
 
 def test_pairs_between_the_sides_are_left_to_the_whole(robot: Robot) -> None:
-    whole = Verdict(robot).kernel
+    whole = CollisionChecker(robot).kernel
     sides = [[k for k, name in enumerate(robot.joint_names) if name.startswith(side)] for side in ("left", "right")]
     kernels = [Kernel(whole.robot.judging(joints), whole.scene) for joints in sides]
     q = robot.home.copy()
@@ -157,7 +157,7 @@ def test_pairs_between_the_sides_are_left_to_the_whole(robot: Robot) -> None:
 
 
 def test_a_pair_can_be_left_out(robot: Robot) -> None:
-    whole = Verdict(robot).kernel
+    whole = CollisionChecker(robot).kernel
     q = robot.home.copy()
     q[[0, 1, 7, 8]] = -1.5, 0.3, 1.5, 0.3
     found, counts = whole.unproved(q)

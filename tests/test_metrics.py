@@ -9,8 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import linalg
 
-from apex_ompl import metrics
+from apex_ompl.benchmark import metrics
 from apex_ompl.errors import ParameterError
+from apex_ompl.trajectory import smoothness
 
 
 def test_failure_ratio_is_a_percentage() -> None:
@@ -49,12 +50,12 @@ def test_jerk_of_a_circle_is_known() -> None:
     turn = np.linspace(0.0, angle, 4001)
     circle = radius * np.stack([np.cos(turn), np.sin(turn)], axis=1)
     for duration in (1.0, 2.5):
-        assert metrics.jerk(circle, duration) == pytest.approx(radius * (angle / duration) ** 3, rel=1e-3)
+        assert smoothness.jerk(circle, duration) == pytest.approx(radius * (angle / duration) ** 3, rel=1e-3)
     line = np.linspace([0.0, 0.0], [1.0, 2.0], 7)
-    assert metrics.jerk(line) < 1e-6 < metrics.jerk([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]])
+    assert smoothness.jerk(line) < 1e-6 < smoothness.jerk([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]])
     for path, duration in (([[0.0]], 1.0), ([[0.0], [math.nan]], 1.0), (line, 0.0)):
         with pytest.raises(ParameterError):
-            metrics.jerk(path, duration)
+            smoothness.jerk(path, duration)
 
 
 def by_sums(speed: np.ndarray, spacing: float, cutoff: float, threshold: float, padding: int) -> float:
@@ -74,15 +75,15 @@ def by_sums(speed: np.ndarray, spacing: float, cutoff: float, threshold: float, 
 def test_spectral_arc_length_is_that_of_the_definition() -> None:
     time = np.linspace(0.0, 1.0, 51)
     smooth = 30.0 * time**2 * (1.0 - time) ** 2  # of least jerk
-    found = metrics.spectral_arc_length(smooth, 0.02)
+    found = smoothness.spectral_arc_length(smooth, 0.02)
     assert found == pytest.approx(by_sums(smooth, 0.02, 10.0, 0.05, 4), abs=1e-9)
     assert found == pytest.approx(-1.41, abs=0.02)  # as published for it
     rough = smooth * (1.0 + 0.5 * np.sin(40.0 * time))
-    assert metrics.spectral_arc_length(rough, 0.02) < found - 0.1
-    assert metrics.spectral_arc_length(3.0 * smooth, 0.02) == pytest.approx(found)
+    assert smoothness.spectral_arc_length(rough, 0.02) < found - 0.1
+    assert smoothness.spectral_arc_length(3.0 * smooth, 0.02) == pytest.approx(found)
     for speed, spacing in (([0.0, 0.0], 0.1), ([1.0], 0.1), ([1.0, math.nan], 0.1), ([1.0, 2.0], 0.0)):
         with pytest.raises(ParameterError):
-            metrics.spectral_arc_length(speed, spacing)
+            smoothness.spectral_arc_length(speed, spacing)
 
 
 def test_diversity_of_parallel_lines_is_their_mean_distance() -> None:

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from random_robots import random_robot
 from support import states_around_home
 
-from apex_ompl.collision import Verdict
+from apex_ompl.collision import CollisionChecker
 from apex_ompl.kernel.kinematics import bound_motion, cluster_sway, pair_sway, place_joint, place_robot
 from apex_ompl.kernel.tables import RobotTables
 from apex_ompl.kernel.views import Work
@@ -76,11 +76,11 @@ def check(tables: RobotTables, middle: np.ndarray, step: np.ndarray, stray: np.n
 
 
 @settings(max_examples=40)
-@given(seed=st.integers(0, 10**6), size=st.floats(1e-3, 1.0), bent=st.floats(0.0, 0.3))
-def test_spheres_of_random_trees_stay_within_their_bounds(seed: int, size: float, bent: float) -> None:
+@given(seed=st.integers(0, 10**6), size=st.floats(1e-3, 1.0), improved=st.floats(0.0, 0.3))
+def test_spheres_of_random_trees_stay_within_their_bounds(seed: int, size: float, improved: float) -> None:
     tables, *_ = random_robot(seed)
     rng = np.random.default_rng(seed)
-    step, stray = rng.normal(0.0, size, tables.dof), np.abs(rng.normal(0.0, size * bent, tables.dof))
+    step, stray = rng.normal(0.0, size, tables.dof), np.abs(rng.normal(0.0, size * improved, tables.dof))
     over = (np.abs(step) + stray).max() / 0.9  # the balls of clusters hold inside the limits, which are 1
     step, stray = step / max(1.0, over), stray / max(1.0, over)
     room_left = 1.0 - np.abs(step) - stray
@@ -93,7 +93,7 @@ def test_spheres_of_real_robots_stay_within_their_bounds(
     which: str, size: float, request: pytest.FixtureRequest
 ) -> None:
     robot: Robot = request.getfixturevalue(which)
-    tables = Verdict(robot).kernel.robot
+    tables = CollisionChecker(robot).kernel.robot
     rng = np.random.default_rng(6)
     tightest = 0.0
     for q in states_around_home(robot, rng, 6):

@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 from support import CUBE_OBJ
 
 from apex_ompl.errors import ApexError, FileFormatError
-from apex_ompl.moveit import Conversion, convert
 from apex_ompl.robot import Robot
+from apex_ompl.tasks.moveit import Conversion, convert
 
 JOINTS = {f"panda_joint{k}": f"left_joint{k}" for k in range(1, 8)}
 FRAMES = {"base_link": "world", "palm": "left_hand_palm"}

@@ -7,12 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from apex_ompl.bodies import Obstacle
-from apex_ompl.collision import Verdict
+from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ParameterError
-from apex_ompl.moving import at_time, even_times, grown, timed_check
-from apex_ompl.problem import Goal, Problem
+from apex_ompl.live.moving import at_time, even_times, grown, timed_check
 from apex_ompl.robot import Robot
+from apex_ompl.scene.bodies import Obstacle
+from apex_ompl.scene.problem import Goal, Problem
 
 SHAPES = [
     {"box": (0.12, 0.1, 0.08)}, {"sphere": {"radius": 0.06}}, {"cylinder": {"radius": 0.05, "length": 0.15}},
@@ -43,15 +43,15 @@ def test_what_passes_is_free_at_all_times_and_what_fails_nearly_touches(robot: R
         {"name": "mover", "position": at.tolist(), "velocity": velocity.tolist(), **SHAPES[seed % len(SHAPES)]}
     )
     check = timed_check(robot, problem_with(robot, mover), path, times)
-    verdict = Verdict(robot, [mover], proofs=False)
+    checker = CollisionChecker(robot, [mover], proofs=False)
     nearest = np.inf
     for time in np.linspace(0.0, times[-1], 150):
         q = np.array([np.interp(time, times, column) for column in path.T])
-        verdict.move("mover", at_time(mover, time).position)
+        checker.move("mover", at_time(mover, time).position)
         if check:
-            assert verdict.is_free(q), time
-        elif verdict.is_free(q):
-            nearest = min(nearest, verdict.clearance(q))
+            assert checker.is_free(q), time
+        elif checker.is_free(q):
+            nearest = min(nearest, checker.clearance(q))
         else:
             nearest = 0.0
     assert check or nearest < 0.02  # the grown obstacle was 2.5 mm larger, samples are some 10 mm apart

@@ -8,10 +8,10 @@ from ompl import base as ob
 from ompl import geometric as og
 
 from apex_ompl import plan, planners
-from apex_ompl.assembly import assemble
 from apex_ompl.errors import ParameterError, UnknownNameError
+from apex_ompl.ompl_adapter.setup import assemble
 from apex_ompl.planners.sampling import OmplParameters, setter_stem
-from apex_ompl.problem import Problem
+from apex_ompl.scene.problem import Problem
 
 
 def plain_space() -> ob.SpaceInformation:
@@ -79,7 +79,7 @@ def test_records_are_frozen_and_read_text() -> None:
         ("prm", {"max_nearest_neighbors": True}, ParameterError, ["a whole number"]),
         ("rrtconnect+polish", {"pinned": 7}, ParameterError, ["pinned", "less than half of the 14 points"]),
         ("rrtconnect+polish", {"control_points": 5}, ParameterError, ["control_points", "[6, 200]"]),
-        ("rrtconnect+polish", {}, ParameterError, ["state validity checker", "VerdictChecker"]),
+        ("rrtconnect+polish", {}, ParameterError, ["state validity checker", "StateValidityChecker"]),
     ],
 )
 def test_faults_name_the_thing(name: str, values: dict, error: type[Exception], words: list[str]) -> None:
@@ -97,7 +97,7 @@ def test_every_planner_solves_the_robots_problem(name: str, problem: Problem) ->
     simple_setup.setPlannerAllocator(planners.allocator(name))
     optimizing = planners.parameters(name).optimizing
     status = simple_setup.solve(ob.timedPlannerTerminationCondition(1.5 if optimizing else 8.0))
-    assert ready.checker.fault is None and ready.motions.fault is None
+    assert ready.validity_checker.fault is None and ready.motion_validator.fault is None
     if name in ("rrtconnect", "rrtconnect+polish", "aorrtc", "prm", "bkpiece1", "lbkpiece1", "bitstar"):
         assert status.getStatus() == ob.PlannerStatus.EXACT_SOLUTION
     if status.getStatus() == ob.PlannerStatus.EXACT_SOLUTION:

@@ -12,11 +12,11 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from apex_ompl import errors, load_problem, problems
-from apex_ompl.bodies import AttachedObject, MeshFile, Obstacle, pose_matrix
 from apex_ompl.errors import ApexError, FileFormatError, MissingFileError, UnknownNameError
-from apex_ompl.problem import Goal, Problem
 from apex_ompl.robot import Robot
-from apex_ompl.schema import parse_yaml
+from apex_ompl.scene.bodies import AttachedObject, MeshFile, Obstacle, pose_matrix
+from apex_ompl.scene.problem import Goal, Problem
+from apex_ompl.util.schema import parse_yaml
 
 FILE = """schema: apex-ompl/problem/1
 name: small

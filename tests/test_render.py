@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from apex_ompl import plan
-from apex_ompl.assembly import assemble
 from apex_ompl.errors import MissingFileError, ParameterError
-from apex_ompl.problem import Problem
-from apex_ompl.render import Stage, render
+from apex_ompl.ompl_adapter.setup import assemble
+from apex_ompl.scene.problem import Problem
+from apex_ompl.viz.render import Stage, render
 
 SMALL = (320, 240)
 

@@ -8,16 +8,16 @@ import torch
 from support import ROOT
 
 from apex_ompl import load_model
-from apex_ompl.cases import load_cases
+from apex_ompl.datasets.cases import load_cases
 from apex_ompl.diffusion.checkpoint import SHIPPED, shipped
 from apex_ompl.diffusion.proposals import Sampling
 from apex_ompl.diffusion.validation import query_of_case
 from apex_ompl.kernel import Kernel
-from apex_ompl.optimize import Optimizer
-from apex_ompl.pool import first_valid
 from apex_ompl.problems.reach import robot
-from apex_ompl.resolution import FULL_RESOLUTION
-from apex_ompl.torch_threads import one_torch_thread
+from apex_ompl.trajopt.candidates import first_valid
+from apex_ompl.trajopt.optimizer import Optimizer
+from apex_ompl.util.resolution import FULL_RESOLUTION
+from apex_ompl.util.threads import one_torch_thread
 
 CASES = load_cases(ROOT / "data" / "dual_panda_softhand" / "validation")
 

@@ -10,12 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import ConvexHull, Delaunay
 
-from apex_ompl.collision.solids import solid_of
-from apex_ompl.collision.spheres import Cover, make_cover, quality, read_covers, shape_key, unproved, write_covers
+from apex_ompl.collision.cover.solids import solid_of
+from apex_ompl.collision.cover.spheres import Cover, make_cover, quality, read_covers, shape_key, unproved, write_covers
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError
-from apex_ompl.meshes import triangles, winding_number
 from apex_ompl.robot import load_robot
 from apex_ompl.robot.assets import DATA
+from apex_ompl.scene.meshes import triangles, winding_number
 
 NAMES = ("dual_panda_softhand", "baxter")
 CASES = [(name, key) for name in NAMES for key in read_covers(DATA / f"{name}.spheres.json")]

@@ -12,15 +12,15 @@ from hypothesis import strategies as st
 
 from apex_ompl import problems
 from apex_ompl.api import load_problem
-from apex_ompl.collision import Verdict
+from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ApexError, ParameterError, UnknownNameError
-from apex_ompl.goals import AlignmentGoal
-from apex_ompl.moving import at_time
-from apex_ompl.problem import Alignment, Problem
+from apex_ompl.live.moving import at_time
 from apex_ompl.problems import alignment, scenes
 from apex_ompl.problems.catalogue import SPLITS, ProblemId
 from apex_ompl.problems.frozen import digest
 from apex_ompl.robot import Robot
+from apex_ompl.scene.problem import Alignment, Problem
+from apex_ompl.tasks.alignment import AlignmentGoal
 
 EVERY = [(suite, level) for suite, levels in problems.suites().items() for level in levels]
 HARD = ("shelf", "bins", "cage", "posts", "wall", "swap", "clutter")
@@ -89,9 +89,9 @@ def test_starts_and_goals_of_the_hard_suites_keep_a_centimetre(robot: Robot, sui
     """By Coal's distances, the links against each other included; the hands hold nothing."""
     for seed in range(3):
         problem = problems.sample(suite, level=level, seed=seed)
-        verdict = Verdict(robot, problem.scene, proofs=False)
+        checker = CollisionChecker(robot, problem.scene, proofs=False)
         for q in ends(problem, robot):
-            assert robot.limit_fault(q) is None and verdict.is_free(q) and verdict.clearance(q) >= 0.01
+            assert robot.limit_fault(q) is None and checker.is_free(q) and checker.clearance(q) >= 0.01
             assert (q[robot.groups["hands"]] <= 0.4).all()
         if suite == "clutter":
             assert len(problem.scene) == {"easy": 10, "medium": 20, "hard": 30}[level]
@@ -110,7 +110,7 @@ def test_alignment_problems_are_as_the_paper_has_them(robot: Robot, suite: str, 
         task = AlignmentGoal(robot, Alignment(kind=suite, first=names[0], second=names[1]), problem.attached, start)
         assert task.is_satisfied(goal) and not task.is_satisfied(start)
         assert np.array_equal(start[robot.groups["hands"]], goal[robot.groups["hands"]])
-        bare = Verdict(robot, (), problem.attached, proofs=False)
+        bare = CollisionChecker(robot, (), problem.attached, proofs=False)
         assert bare.is_free(start) and bare.is_free(goal)
         assert min(bare.distance(q, fixtures=True).value for q in (start, goal)) >= 0.01
         assert bare.clearance(start) >= 0.01  # of every pair; at the goal the objects are where they are wanted
@@ -138,7 +138,7 @@ def test_cubes_have_their_size_and_speed_and_keep_off_start_and_goal(robot: Robo
                 assert np.linalg.norm(cube.velocity) == pytest.approx(float(speed), abs=1e-4)
         for q, time in ((start, 0.0), (goal, lasts)):
             scene = [at_time(cube, time) for cube in problem.scene]
-            assert Verdict(robot, scene, problem.attached).distance(q).value >= 0.03
+            assert CollisionChecker(robot, scene, problem.attached).distance(q).value >= 0.03
     assert counts == {1} if speed else 1 < len(counts) and counts <= {1, 2, 3}
 
 

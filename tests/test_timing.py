@@ -9,14 +9,14 @@ from hypothesis import strategies as st
 from support import distance
 
 from apex_ompl import api, cli, plan, planning
-from apex_ompl.assembly import assemble
 from apex_ompl.errors import ParameterError, TimingError
-from apex_ompl.kernel.speed import fastest, moments
+from apex_ompl.kernel.reachability import fastest, moments
+from apex_ompl.ompl_adapter.setup import assemble
+from apex_ompl.ompl_adapter.validity import full_check
 from apex_ompl.result import PlanResult, PlanStatus
 from apex_ompl.robot import Limits
-from apex_ompl.trajectory import Timed, Timing, Trajectory, time_path
+from apex_ompl.trajectory import TimedPath, Timing, Trajectory, time_path
 from apex_ompl.trajectory.curve import Curve, Polyline
-from apex_ompl.validity import full_check
 
 NAMES = ("one", "two", "three")
 LIMITS = Limits(
@@ -26,7 +26,7 @@ LIMITS = Limits(
 RATE = 0.001
 
 
-def timed(path: np.ndarray, timing: Timing | None = None, limits: Limits = LIMITS, **more: object) -> Timed:
+def timed(path: np.ndarray, timing: Timing | None = None, limits: Limits = LIMITS, **more: object) -> TimedPath:
     return time_path(path, limits, NAMES, timing, **more)  # type: ignore[arg-type]
 
 
@@ -272,7 +272,7 @@ def test_plans_are_timed_and_proved() -> None:
     assert 0.9 < max(result.limit_use.values()) <= 1.0 + 1e-9 and result.deviation <= Timing().deviation
     ready = assemble(result.problem)
     states = motion.sample(0.001).position
-    assert full_check(ready.verdict, states, ready.start, ready.goals)
+    assert full_check(ready.checker, states, ready.start, ready.goals)
     assert result.times["timing"] > 0.0 and result.times["timing proof"] > 0.0
     assert result.as_dict()["duration"] == motion.duration
 
@@ -295,9 +295,9 @@ def test_collisions_of_the_timed_motion_are_seen(monkeypatch: pytest.MonkeyPatch
     ready = assemble(tight.problem)
     for result in (tight, wide):
         assert result and result.trajectory is not None
-        assert full_check(ready.verdict, result.trajectory.sample(0.002).position, ready.start, ready.goals)
+        assert full_check(ready.checker, result.trajectory.sample(0.002).position, ready.start, ready.goals)
     blind = time_path(wide.path, ready.robot.limits, ready.robot.joint_names, Timing(deviation=0.5))  # type: ignore[arg-type]
-    assert not full_check(ready.verdict, blind.trajectory.sample(0.002).position), "or the test shows nothing"
+    assert not full_check(ready.checker, blind.trajectory.sample(0.002).position), "or the test shows nothing"
 
 
 def test_what_is_no_timing_is_refused() -> None:

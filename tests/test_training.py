@@ -19,8 +19,9 @@ import yaml
 from support import ROOT
 from trainings import DATA, HERE, SCRIPT, SMALL, VARIATIONAL, assert_same, config, query_of_path, weights
 
-from apex_ompl.cases import load_cases, save_cases
-from apex_ompl.dataset import Store, load, save
+from apex_ompl.datasets.cases import load_cases, save_cases
+from apex_ompl.datasets.records import Paths
+from apex_ompl.datasets.store import Store, load, save
 from apex_ompl.diffusion.checkpoint import load_model
 from apex_ompl.diffusion.config import TrainingConfig
 from apex_ompl.diffusion.objective import Place
@@ -30,12 +31,11 @@ from apex_ompl.diffusion.training import Trainer, TrainingError
 from apex_ompl.diffusion.validation import judged, query_of_case
 from apex_ompl.errors import ApexError, FileFormatError, MissingFileError
 from apex_ompl.kernel import Kernel, RobotTables
-from apex_ompl.kernel.scene import scene_tables
-from apex_ompl.optimize import Optimizer
-from apex_ompl.pool import first_valid
-from apex_ompl.records import Paths
-from apex_ompl.resolution import FULL_RESOLUTION
-from apex_ompl.torch_threads import one_torch_thread
+from apex_ompl.kernel.scene_builder import scene_tables
+from apex_ompl.trajopt.candidates import first_valid
+from apex_ompl.trajopt.optimizer import Optimizer
+from apex_ompl.util.resolution import FULL_RESOLUTION
+from apex_ompl.util.threads import one_torch_thread
 
 
 @pytest.fixture(autouse=True)

@@ -11,14 +11,14 @@ import yaml
 from support import ROOT
 from trainings import DATA, HERE, config, query_of_path
 
-from apex_ompl.dataset import Store, save
+from apex_ompl.datasets.records import Paths
+from apex_ompl.datasets.store import Store, save
 from apex_ompl.diffusion.data import Mirror, held_out, split, window_paths
 from apex_ompl.diffusion.training import Trainer
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel import Kernel, RobotTables
-from apex_ompl.kernel.scene import Primitive, scene_tables
+from apex_ompl.kernel.scene_builder import Primitive, scene_tables
 from apex_ompl.kernel.tables import BOX
-from apex_ompl.records import Paths
 
 
 def test_mirror_images_are_valid_where_paths_are(paths: Paths) -> None:

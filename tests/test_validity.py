@@ -10,14 +10,15 @@ from ompl import base as ob
 from ompl import geometric as og
 from support import states_around_home
 
-from apex_ompl.assembly import assemble
-from apex_ompl.collision import Verdict
-from apex_ompl.collision.sweep import bit_reversed, sample_path, states_between
+from apex_ompl.collision import CollisionChecker
+from apex_ompl.collision.path_grid import bit_reversed, sample_path, states_between
 from apex_ompl.errors import ParameterError
-from apex_ompl.problem import Problem
+from apex_ompl.ompl_adapter.setup import assemble
+from apex_ompl.ompl_adapter.space import array_to_path, path_to_array, state_space, to_array, to_state
+from apex_ompl.ompl_adapter.validity import MotionCheck, StateValidityChecker, full_check
 from apex_ompl.robot import Robot
-from apex_ompl.space import array_to_path, path_length, path_to_array, state_space, to_array, to_state
-from apex_ompl.validity import MotionCheck, VerdictChecker, full_check
+from apex_ompl.scene.problem import Problem
+from apex_ompl.trajopt.path import path_length
 
 
 @pytest.mark.parametrize("n", [0, 1, 2, 3, 5, 8, 13, 100, 257])
@@ -91,18 +92,18 @@ def test_ompl_judges_as_the_verdict_does(problem: Problem) -> None:
     states[1::2] = states[::2] + rng.normal(0.0, 0.1, states[::2].shape)
     states = np.clip(states, ready.robot.limits.lower, ready.robot.limits.upper)
     ompl_states = [to_state(si, q) for q in states]
-    free = [ready.verdict.is_free(q) for q in states]
+    free = [ready.checker.is_free(q) for q in states]
     assert [si.isValid(s) for s in ompl_states] == free and 0.1 < np.mean(free) < 0.95
     good = [k for k, f in enumerate(free) if f]
     seen = set()
     for i, j in zip(good, good[1:], strict=False):
         dense = np.concatenate([states_between(states[i], states[j], 0.031), states[j : j + 1]])
-        expected = all(ready.verdict.is_free(q) for q in dense)
+        expected = all(ready.checker.is_free(q) for q in dense)
         assert si.checkMotion(ompl_states[i], ompl_states[j]) == expected
         seen.add(expected)
     assert seen == {True, False}
-    clear = ready.checker.clearance(ompl_states[good[0]])
-    assert clear == pytest.approx(ready.verdict.clearance(states[good[0]]))
+    clear = ready.validity_checker.clearance(ompl_states[good[0]])
+    assert clear == pytest.approx(ready.checker.clearance(states[good[0]]))
 
 
 def test_a_faulty_verdict_never_raises_inside_ompl(problem: Problem, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -113,11 +114,13 @@ def test_a_faulty_verdict_never_raises_inside_ompl(problem: Problem, monkeypatch
     def broken(*_: object, **__: object) -> bool:
         raise RuntimeError("broken on purpose")
 
-    monkeypatch.setattr(ready.verdict, "is_free", broken)
-    monkeypatch.setattr(ready.verdict, "first_collision", broken)
+    monkeypatch.setattr(ready.checker, "is_free", broken)
+    monkeypatch.setattr(ready.checker, "first_collision", broken)
     assert not si.isValid(state)
     assert not si.checkMotion(state, state)
-    assert "broken on purpose" in str(ready.checker.fault) and "broken on purpose" in str(ready.motions.fault)
+    assert "broken on purpose" in str(ready.validity_checker.fault) and "broken on purpose" in str(
+        ready.motion_validator.fault
+    )
 
 
 def test_checkers_live_as_long_as_the_setup_that_uses_them(problem: Problem) -> None:
@@ -129,32 +132,32 @@ def test_checkers_live_as_long_as_the_setup_that_uses_them(problem: Problem) -> 
     assert simple_setup.getSolutionPath().check()
 
 
-def test_full_check_accepts_a_free_path_and_names_each_fault(robot: Robot, verdict: Verdict) -> None:
+def test_full_check_accepts_a_free_path_and_names_each_fault(robot: Robot, checker: CollisionChecker) -> None:
     home = robot.home
     near = home.copy()
     near[0] += 0.2
     path = np.array([home, near])
-    good = full_check(verdict, path, home, [near])
+    good = full_check(checker, path, home, [near])
     assert good and good.reason == "" and good.segment is None and good.states >= 0.2 / 0.0031
-    assert "start" in full_check(verdict, path, near).reason
-    assert "goal" in full_check(verdict, path, home, [home]).reason
+    assert "start" in full_check(checker, path, near).reason
+    assert "goal" in full_check(checker, path, home, [home]).reason
     wild = near.copy()
     wild[3] = 0.0
-    assert "state 2: left_joint4 = 0" in full_check(verdict, np.array([home, near, wild])).reason
+    assert "state 2: left_joint4 = 0" in full_check(checker, np.array([home, near, wild])).reason
     wild[3] = np.nan
-    assert not full_check(verdict, np.array([home, near, wild]))
+    assert not full_check(checker, np.array([home, near, wild]))
     sweep = home.copy()
     sweep[[0, 1, 3]] = -1.2, 0.5, -1.4
-    bad = full_check(verdict, np.array([near, home, sweep]))
+    bad = full_check(checker, np.array([near, home, sweep]))
     assert not bad and bad.segment == 1 and "post" in bad.reason and "mm deep" in bad.reason
     for shape in [(0, 16), (16,), (3, 15)]:
         with pytest.raises(ParameterError, match=r"path: expected an array of shape \(N, 16\)"):
-            full_check(verdict, np.zeros(shape))
+            full_check(checker, np.zeros(shape))
 
 
 def test_full_check_sees_what_the_search_resolution_steps_over(robot: Robot) -> None:
     """A speck that a finger passes within one coarse step: free at both ends, colliding between."""
-    from apex_ompl.bodies import Obstacle
+    from apex_ompl.scene.bodies import Obstacle
 
     a = robot.home.copy()
     a[[0, 1, 3]] = 0.1, 0.4, -1.6  # stretched forward
@@ -163,16 +166,16 @@ def test_full_check_sees_what_the_search_resolution_steps_over(robot: Robot) -> 
     tips = [robot.link_pose(q, "left_hand_middle_distal")[:3, 3] for q in (a, b)]
     middle = (tips[0] + tips[1]) / 2
     speck = Obstacle(name="speck", sphere={"radius": 0.0005}, position=tuple(middle))
-    verdict = Verdict(robot, [speck])
-    assert verdict.is_free(a) and verdict.is_free(b)
-    assert MotionCheck(verdict, 0.031)(a, b)
-    assert not full_check(verdict, np.array([a, b]))
+    checker = CollisionChecker(robot, [speck])
+    assert checker.is_free(a) and checker.is_free(b)
+    assert MotionCheck(checker, 0.031)(a, b)
+    assert not full_check(checker, np.array([a, b]))
 
 
 def test_clearance_callback_survives_a_fault(problem: Problem, monkeypatch: pytest.MonkeyPatch) -> None:
     ready = assemble(problem)
-    monkeypatch.setattr(Verdict, "clearance", lambda *_: 1 / 0)
-    checker: VerdictChecker = ready.checker
+    monkeypatch.setattr(CollisionChecker, "clearance", lambda *_: 1 / 0)
+    validity_checker: StateValidityChecker = ready.validity_checker
     si = ready.simple_setup.getSpaceInformation()
-    assert checker.clearance(to_state(si, ready.start)) == 0.0
-    assert isinstance(checker.fault, ZeroDivisionError)
+    assert validity_checker.clearance(to_state(si, ready.start)) == 0.0
+    assert isinstance(validity_checker.fault, ZeroDivisionError)

@@ -8,11 +8,11 @@ from typing import Any
 import torch
 from support import ROOT
 
-from apex_ompl.diffusion.conditions import Query, Things
+from apex_ompl.datasets.records import Paths
+from apex_ompl.diffusion.conditions import ObstacleSet, Query
 from apex_ompl.diffusion.config import TrainingConfig
 from apex_ompl.diffusion.objective import Place
 from apex_ompl.diffusion.training import Trainer
-from apex_ompl.records import Paths
 
 DATA = ROOT / "data" / "dual_panda_softhand"
 SCRIPT = ROOT / "scripts" / "train.py"
@@ -48,5 +48,5 @@ def query_of_path(paths: Paths, k: int) -> Query:
     first = int(a["things"][:p].sum())
     span = slice(first, first + int(a["things"][p]))
     columns = (a[name][span] for name in ("shape", "position", "orientation", "size"))
-    things = Things.of(list(zip(*columns, strict=True)))
+    things = ObstacleSet.of(list(zip(*columns, strict=True)))
     return Query(paths.start[k], paths.goal[k], a["point"][k], things)

@@ -20,9 +20,9 @@ from apex_ompl.benchmark.results import ABOUT, RUNS, SCHEMA, Results
 from apex_ompl.benchmark.rows import Job, Row, jobs
 from apex_ompl.benchmark.workers import Workers
 from apex_ompl.errors import FileFormatError, ParameterError
-from apex_ompl.files import locked, make_folder, write_atomically
-from apex_ompl.provenance import hardware, versions
-from apex_ompl.resolution import FULL_RESOLUTION, SEARCH_RESOLUTION
+from apex_ompl.util.files import locked, make_folder, write_atomically
+from apex_ompl.util.provenance import hardware, versions
+from apex_ompl.util.resolution import FULL_RESOLUTION, SEARCH_RESOLUTION
 
 
 def bench(
@@ -30,7 +30,7 @@ def bench(
     timeout: float = 5.0, seed: int = 0, split: str = "test", simplify: bool = True, workers: Workers | None = None,
     quiet: bool = False,
 ) -> Results:  # fmt: skip
-    """Run planners on problems through OMPL's Benchmark, in the same space, by the same verdict and resolution.
+    """Run planners on problems through OMPL's Benchmark, in the same space, by the same checker and resolution.
 
     A run is solved when its path passed the full check. What was run before with the same settings is not run again.
     Every process has run each row once before its first run.

@@ -13,18 +13,18 @@ from typing import Any
 from ompl import tools as ot
 
 from apex_ompl.api import load_problem
-from apex_ompl.assembly import assemble
 from apex_ompl.benchmark.results import Results
 from apex_ompl.benchmark.runs import MEMORY, NO_PROBLEM, Run
-from apex_ompl.files import check_writable
-from apex_ompl.ompl_globals import quiet_ompl
+from apex_ompl.ompl_adapter.process import quiet_ompl
+from apex_ompl.ompl_adapter.setup import assemble
 from apex_ompl.result import INSIDE
+from apex_ompl.util.files import check_writable
 
 DATABASE, LOGS = "benchmark.db", "logs"
 OWN = {
     "first solution time REAL": "first", "total time REAL": "total", "path length REAL": "length",
     "raw path length REAL": "raw_length", "jerk REAL": "jerk", "raw jerk REAL": "raw_jerk",
-    "clearance REAL": "clearance", "verdict calls INTEGER": "checks",
+    "clearance REAL": "clearance", "checker calls INTEGER": "checks",
 }  # fmt: skip
 """Names of properties in the log, and in runs."""
 BEHIND = ("simplify", "verify", "repair")  # the planner, in a plan

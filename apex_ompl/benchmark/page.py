@@ -19,7 +19,7 @@ from apex_ompl.benchmark.log import short
 from apex_ompl.benchmark.results import Results
 from apex_ompl.benchmark.summary import Figures, about, figures, tables, warnings
 from apex_ompl.errors import FileFormatError
-from apex_ompl.files import make_folder, write_atomically
+from apex_ompl.util.files import make_folder, write_atomically
 
 COLUMNS = 4  # of small pictures
 COLOURS = (

@@ -10,7 +10,7 @@ from typing import Any
 
 from apex_ompl.benchmark.runs import Run
 from apex_ompl.errors import FileFormatError, MissingFileError
-from apex_ompl.files import write_atomically
+from apex_ompl.util.files import write_atomically
 
 SCHEMA = "apex-ompl/benchmark/1"
 RUNS, ABOUT = "runs.jsonl", "about.json"

@@ -17,19 +17,19 @@ from ompl import tools as ot
 
 from apex_ompl import planners
 from apex_ompl.api import load_problem
-from apex_ompl.assembly import assemble
 from apex_ompl.benchmark.rows import Job
 from apex_ompl.errors import ApexError
-from apex_ompl.metrics import jerk
-from apex_ompl.ompl_globals import quiet_ompl, seed_ompl
+from apex_ompl.ompl_adapter.process import quiet_ompl, seed_ompl
+from apex_ompl.ompl_adapter.report import Report
+from apex_ompl.ompl_adapter.setup import assemble
+from apex_ompl.ompl_adapter.validity import full_check
 from apex_ompl.planning import Planning, solving_time
 from apex_ompl.problems.catalogue import SuiteError
-from apex_ompl.report import Report
 from apex_ompl.result import FIRST, PlanResult, PlanStatus
 from apex_ompl.robot import Robot, load_robot
-from apex_ompl.space import path_length
-from apex_ompl.torch_threads import one_torch_thread
-from apex_ompl.validity import full_check
+from apex_ompl.trajectory.smoothness import jerk
+from apex_ompl.trajopt.path import path_length
+from apex_ompl.util.threads import one_torch_thread
 
 if TYPE_CHECKING:
     from apex_ompl.planners import Parameters
@@ -71,20 +71,20 @@ class Benchmarked(Planning):
 
     def run_ompl(self, planner: ob.Planner, parameters: Parameters, timeout: float) -> PlanStatus:
         """Run the planner, and return its status; faults of the checkers are raised."""
-        tally, reports = self.ready.verdict.tally, list[Report | None]()
-        judged = [tally.states]
+        check_counts, reports = self.ready.checker.check_counts, list[Report | None]()
+        judged = [check_counts.states]
 
         def begin(_: ob.Planner) -> None:
             seed_ompl(self.blank.seed)  # the experiment itself has drawn and judged states by then
-            judged.append(tally.states)
+            judged.append(check_counts.states)
 
         def end(*_: object) -> None:  # behind it the experiment judges the path, and clears the planner
-            judged.append(tally.states)
+            judged.append(check_counts.states)
             reports.append(getattr(planner, "report", None))
 
-        noticed, check = list[float](), self.ready.motions.check
+        noticed, check = list[float](), self.ready.motion_validator.check
         if parameters.optimizing:
-            self.ready.motions.check = self._noticing(noticed)
+            self.ready.motion_validator.check = self._noticing(noticed)
         experiment = ot.Benchmark(self.ready.simple_setup, "run")
         experiment.addPlanner(planner)
         experiment.setPreRunEvent(begin)
@@ -93,9 +93,11 @@ class Benchmarked(Planning):
         try:
             experiment.benchmark(request)
         finally:
-            self.ready.motions.check = check  # or it and OMPL's objects would keep each other, and all that was planned
+            self.ready.motion_validator.check = (
+                check  # or it and OMPL's objects would keep each other, and all that was planned
+            )
         self.raise_faults()
-        self.beside = judged[1] - judged[0] + tally.states - judged[2]
+        self.beside = judged[1] - judged[0] + check_counts.states - judged[2]
         if reports[0] is not None:
             planner.report = reports[0]
         recorded = experiment.getRecordedExperimentData().planners[0]
@@ -117,12 +119,12 @@ class Benchmarked(Planning):
         if "repair" not in self.times or self.optimizing or self.raw is None:
             return proof["verify"]
         begin = time.perf_counter()
-        check = full_check(self.ready.verdict, self._with_exact_ends(self.raw), self.ready.start, self.ready.goals)
+        check = full_check(self.ready.checker, self._with_exact_ends(self.raw), self.ready.start, self.ready.goals)
         return time.perf_counter() - begin if check else sum(proof.values())
 
     def _noticing(self, noticed: list[float]) -> Callable[[NDArray[np.float64], NDArray[np.float64]], bool]:
         """Return a check whose first call when there is a path notes the time since the first call [s]."""
-        check, definition = self.ready.motions.check, self.ready.simple_setup.getProblemDefinition()
+        check, definition = self.ready.motion_validator.check, self.ready.simple_setup.getProblemDefinition()
         begin = 0.0
 
         def watched(first: NDArray[np.float64], second: NDArray[np.float64]) -> bool:

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from apex_ompl.benchmark.metrics import next_percentile, percentile_interval, share_interval
 from apex_ompl.benchmark.results import Results
 from apex_ompl.benchmark.runs import NO_PROBLEM, Run, ompl_status
-from apex_ompl.metrics import next_percentile, percentile_interval, share_interval
 from apex_ompl.result import PlanStatus
 
 BESIDE = 0.5  # load average above that of the runs that is let pass

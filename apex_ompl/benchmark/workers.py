@@ -13,8 +13,8 @@ from dataclasses import dataclass
 
 from apex_ompl.benchmark.rows import Job
 from apex_ompl.benchmark.runs import CRASH, Run, run, told_of, unsolved, warm_up
-from apex_ompl.cluster import spread
 from apex_ompl.errors import ApexError, ParameterError
+from apex_ompl.util.cluster import spread
 
 DIED = "the process died"
 RENEWED = 500  # runs of a process, about, until another takes its place: OMPL's BIT* keeps 20 MB for each second

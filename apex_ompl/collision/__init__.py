@@ -1,7 +1,7 @@
-"""Collision: the verdict over Coal's meshes, distances by GJK, shapes, containment."""
+"""Collision: the checker over Coal's meshes, distances by GJK, shapes, containment."""
 
 from apex_ompl.collision.broadphase import Contact
+from apex_ompl.collision.checker import CollisionChecker
 from apex_ompl.collision.distance import Distance
-from apex_ompl.collision.verdict import Verdict
 
-__all__ = ["Contact", "Distance", "Verdict"]
+__all__ = ["Contact", "Distance", "CollisionChecker"]

@@ -12,16 +12,15 @@ from weakref import WeakKeyDictionary
 import coal
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
-from apex_ompl.bodies import AttachedObject, Body
 from apex_ompl.collision.containment import ANCHOR_RADIUS, Host, anchor_points, may_contain
 from apex_ompl.collision.distance import HullDistances
 from apex_ompl.collision.shapes import is_shell
 from apex_ompl.robot import Robot
 from apex_ompl.robot.model import link_of
+from apex_ompl.scene.bodies import AttachedObject, Body
+from apex_ompl.types import Array
 
-Array = NDArray[np.float64]
 Manager = pin.BroadPhaseManager_DynamicAABBTreeCollisionManager
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apex_ompl.collision.shapes import convex_hull, is_shell
-from apex_ompl.meshes import capped, is_closed, piece_points, triangles, winding_number
+from apex_ompl.scene.meshes import capped, is_closed, piece_points, triangles, winding_number
 
 ANCHOR_RADIUS = 1e-6  # [m]
 CONVEX_TOLERANCE = 5e-4  # a mesh is convex when its triangles' centres are no deeper than this below its hull [m]
@@ -25,7 +25,7 @@ CONVEX_TOLERANCE = 5e-4  # a mesh is convex when its triangles' centres are no d
 class Host:
     """A mesh that may contain others: its hull, whether the hull stands for the solid, and its triangles.
 
-    Holes are closed by fans of triangles (see ``apex_ompl.meshes.capped``). The hull stands for the solid where no
+    Holes are closed by fans of triangles (``apex_ompl.scene.meshes.capped``). The hull stands for the solid where no
     triangle is deeper than three times ``CONVEX_TOLERANCE`` below it: the depth is a concave function, so that it is
     at most three times its value at the centre of a triangle.
     """

@@ -8,10 +8,10 @@ import coal
 import numpy as np
 from numpy.typing import NDArray
 
-from apex_ompl.bodies import Body
 from apex_ompl.errors import FileFormatError, MissingFileError
-from apex_ompl.files import is_file
-from apex_ompl.meshes import extent_fault, orientation_fault, triangles
+from apex_ompl.scene.bodies import Body
+from apex_ompl.scene.meshes import extent_fault, orientation_fault, triangles
+from apex_ompl.util.files import is_file
 
 
 def coal_geometry(body: Body) -> coal.CollisionGeometry:
@@ -22,7 +22,7 @@ def coal_geometry(body: Body) -> coal.CollisionGeometry:
 
     Raises:
         MissingFileError: The mesh file cannot be read.
-        FileFormatError: The mesh file holds no solid; see ``apex_ompl.meshes``.
+        FileFormatError: The mesh file holds no solid; see ``apex_ompl.scene.meshes``.
     """
     if body.box is not None:
         return coal.Box(*body.box)

@@ -7,13 +7,12 @@ from collections.abc import Iterable, Mapping, Sequence
 import coal
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
 from apex_ompl.collision.containment import Host
-from apex_ompl.collision.sphere_proof import Cover
+from apex_ompl.collision.cover.proof import Cover
 from apex_ompl.errors import RobotError
-from apex_ompl.kernel.build import BodySpec, JointSpec, robot_tables
-from apex_ompl.kernel.scene import Primitive, scene_tables
+from apex_ompl.kernel.robot_builder import BodySpec, JointSpec, robot_tables
+from apex_ompl.kernel.scene_builder import Primitive, scene_tables
 from apex_ompl.kernel.tables import (
     BOX,
     CAPSULE,
@@ -25,10 +24,9 @@ from apex_ompl.kernel.tables import (
     RobotTables,
     SceneTables,
 )  # fmt: skip
-from apex_ompl.meshes import bounding_boxes
 from apex_ompl.robot import Robot
-
-Array = NDArray[np.float64]
+from apex_ompl.scene.meshes import bounding_boxes
+from apex_ompl.types import Array
 
 PROBE = 1e-3  # value of a planned joint at which the motion of the others is read off: less than half a turn of any
 CHECKS = (0.37, -1.13, 2.71)  # where it is looked at again, besides the limits

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from apex_ompl.errors import ParameterError
-from apex_ompl.spline import Spline
+from apex_ompl.trajopt.spline import Spline
 
 MOST_GROUPS = 8  # of channels that are normalised together
 FLAT = 1e-3  # deviations below this share of the largest are not blown up to one

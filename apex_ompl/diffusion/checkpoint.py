@@ -22,8 +22,8 @@ from safetensors.torch import save as save_tensors
 from apex_ompl.diffusion.model import LatentDiffusion, ModelConfig
 from apex_ompl.diffusion.proposals import TrajectoryModel
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError, UnknownNameError
-from apex_ompl.files import is_file
-from apex_ompl.schema import StrictModel, validate
+from apex_ompl.util.files import is_file
+from apex_ompl.util.schema import StrictModel, validate
 
 SCHEMA = "apex-ompl/model/1"
 SHIPPED = Path(__file__).parent / "checkpoints"

@@ -10,23 +10,21 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from apex_ompl.datasets.records import SHAPES, Paths
 from apex_ompl.kernel import Kernel, RobotTables
 from apex_ompl.kernel.tables import BOX, HALF_SPACE, SceneArrays
-from apex_ompl.records import SHAPES, Paths
-
-Array = NDArray[np.float64]
-
+from apex_ompl.types import Array
 
 HALVES = np.array([[0.5, 0.5, 0.5], [1.0, 0.5, 0.5], [1.0, 0.5, 0.5], [1.0, 0.5, 0.5]], np.float32)
 """From sizes as they are stored to those of the networks: half edges, radii, half lengths."""
 
 
 @dataclass(frozen=True, eq=False)
-class Things:
+class ObstacleSet:
     """Obstacles.
 
     Attributes:
-        shape: Number of each one's shape in ``apex_ompl.records.SHAPES``, shape (M,).
+        shape: Number of each one's shape in ``apex_ompl.datasets.records.SHAPES``, shape (M,).
         position: Shape (M, 3) [m].
         turn: Rotations, shape (M, 3, 3).
         size: Half edges; radius; or radius and half length along z, shape (M, 3) [m].
@@ -38,7 +36,7 @@ class Things:
     size: Array
 
     @classmethod
-    def of(cls, rows: Sequence[tuple[int, Sequence[float], Sequence[float], Sequence[float]]]) -> Things:
+    def of(cls, rows: Sequence[tuple[int, Sequence[float], Sequence[float], Sequence[float]]]) -> ObstacleSet:
         """Return obstacles from rows of shape, position, orientation and size, as data sets hold them."""
         columns = list(zip(*rows, strict=True)) or [(), (), (), ()]
         shape = np.array(columns[0], np.int64)
@@ -46,7 +44,7 @@ class Things:
         return cls(shape, place, rotations(turn).astype(float), size * HALVES[shape])
 
     @classmethod
-    def among(cls, scene: SceneArrays, chosen: NDArray[np.bool_]) -> Things:
+    def among(cls, scene: SceneArrays, chosen: NDArray[np.bool_]) -> ObstacleSet:
         """Return some of the kernel's obstacles; a half-space is a large box, as far as a robot can tell."""
         shape, position = scene.kind[chosen].copy(), scene.offset[chosen].copy()
         turn, size = scene.rotation[chosen].copy(), scene.size[chosen].copy()
@@ -89,7 +87,7 @@ class Query:
     start: Array
     goal: Array
     point: Array
-    things: Things
+    things: ObstacleSet
 
 
 @dataclass(frozen=True)
@@ -260,7 +258,7 @@ class Table:
 def distances(shape: Tensor, position: Tensor, turn: Tensor, size: Tensor, points: Tensor) -> Tensor:
     """Return signed distances [m] of points to obstacles, each with points of its own: shape (T, K).
 
-    The formulas are those of the kernel, see :mod:`apex_ompl.kernel.shapes`.
+    The formulas are those of the kernel, see :mod:`apex_ompl.kernel.primitives`.
 
     Args:
         shape: Numbers of shapes, shape (T,).

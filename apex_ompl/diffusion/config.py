@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 
 from apex_ompl.diffusion.model import ConditionConfig, Count, DenoiserConfig, LatentConfig, NoiseConfig, SamplingConfig
 from apex_ompl.errors import FileFormatError
-from apex_ompl.schema import StrictModel, read_yaml, validate
+from apex_ompl.util.schema import StrictModel, read_yaml, validate
 
 SCHEMA = "apex-ompl/training/1"
 Share = Annotated[float, Field(ge=0.0, le=1.0)]

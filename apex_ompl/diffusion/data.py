@@ -13,16 +13,15 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from apex_ompl.dataset import Store, load
+from apex_ompl.datasets.records import SPLINE, Paths, rounded, to_micro
+from apex_ompl.datasets.store import Store, load
 from apex_ompl.diffusion.conditions import Conditions, Probes, Table
 from apex_ompl.diffusion.config import TrainingConfig
 from apex_ompl.errors import ParameterError
-from apex_ompl.files import is_file
 from apex_ompl.kernel import Kernel, RobotTables
-from apex_ompl.kernel.scene import scene_tables
-from apex_ompl.records import SPLINE, Paths, rounded, to_micro
-
-Array = NDArray[np.float64]
+from apex_ompl.kernel.scene_builder import scene_tables
+from apex_ompl.types import Array
+from apex_ompl.util.files import is_file
 
 NOTHING_HELD = "[]"
 MEASURED = 100_000  # paths that the latent space is measured on, at most

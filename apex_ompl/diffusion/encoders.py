@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from apex_ompl.datasets.records import SHAPES
 from apex_ompl.diffusion.conditions import Conditions, pooled
-from apex_ompl.records import SHAPES
 
 MIDDLE = (0.4, 0.0, 0.6)  # about where the robot works, from which points are counted [m]
 NEAR = 0.4  # distances are told apart up to here [m]

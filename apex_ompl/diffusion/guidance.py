@@ -1,4 +1,4 @@
-"""Obstacle guidance: denoising bent by the collision cost of the decoded path (section III-C of the paper)."""
+"""Obstacle guidance: denoising improved by the collision cost of the decoded path (section III-C of the paper)."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from apex_ompl.diffusion.autoencoder import Autoencoder
@@ -16,8 +15,8 @@ from apex_ompl.diffusion.sampler import Predict
 from apex_ompl.diffusion.schedule import Estimate, NoiseSchedule
 from apex_ompl.errors import ParameterError, UnknownNameError
 from apex_ompl.kernel import Kernel
+from apex_ompl.types import Array
 
-Array = NDArray[np.float64]
 SCALINGS = ("noise", "clean")
 
 
@@ -64,7 +63,7 @@ class Guidance:
 def collision_cost(kernel: Kernel, paths: Array, margin: float) -> tuple[Array, Array]:
     """Return what paths, shape (B, N, dof), cost, shape (B,), and its gradient, shape (B, N, dof) [1/rad].
 
-    The cost is the sum over states, divided by their number, of half the squared shortfall of the smallest clearance
+    The cost is the sum over states, divided by their number, of half the squared shortfall of the least clearance
     from ``margin``, to the obstacles and of the robot to itself, in margins. It is minus log p(g given x) in equation 6
     of the paper.
     """
@@ -132,7 +131,7 @@ def guided(
     if guidance.gamma == 0.0:
         return predict
 
-    def bent(sample: Tensor, t: int) -> Estimate:
+    def improved(sample: Tensor, t: int) -> Estimate:
         found = predict(sample, t)
         if t >= guidance.begin * schedule.steps:
             return found
@@ -146,7 +145,7 @@ def guided(
             noise = (sample - signal * clean) / sigma
         return schedule.clipped(Estimate(noise, clean), sample, t, most)
 
-    return bent
+    return improved
 
 
 def gradient(function: Callable[[Tensor], Tensor], at: Tensor) -> Tensor:

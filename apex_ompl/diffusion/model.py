@@ -15,14 +15,14 @@ from apex_ompl.diffusion.denoisers import MLPDenoiser, UNetDenoiser
 from apex_ompl.diffusion.encoders import ConditionEncoder
 from apex_ompl.diffusion.sampler import Predict
 from apex_ompl.diffusion.schedule import Estimate, NoiseSchedule
-from apex_ompl.schema import StrictModel
-from apex_ompl.spline import Spline
+from apex_ompl.trajopt.spline import Spline
+from apex_ompl.util.schema import StrictModel
 
 Count = Annotated[int, Field(ge=1)]
 
 
 class SplineConfig(StrictModel):
-    """The spline of the control points, see ``apex_ompl.spline.Spline``."""
+    """The spline of the control points, see ``apex_ompl.trajopt.spline.Spline``."""
 
     points: Count = 14
     pinned: Count = 1

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from apex_ompl.diffusion.conditions import Conditions, Probes, Query, batched
@@ -19,9 +18,8 @@ from apex_ompl.diffusion.model import LatentDiffusion
 from apex_ompl.diffusion.sampler import SAMPLERS, Callback, ddpm, noise_like
 from apex_ompl.errors import ParameterError, UnknownNameError
 from apex_ompl.kernel import Kernel
-from apex_ompl.spline import Spline
-
-Array = NDArray[np.float64]
+from apex_ompl.trajopt.spline import Spline
+from apex_ompl.types import Array
 
 PLAIN = Guidance(gamma=0.0)
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from apex_ompl.errors import FileFormatError, MissingFileError
-from apex_ompl.files import is_file, write_atomically
+from apex_ompl.util.files import is_file, write_atomically
 
 FIELDS = ("phase", "step", "loss", "held_out", "rate", "seconds", "sampled", "repaired", "levels")
 PLOTTED = ("loss", "held_out", "rate", "sampled", "repaired")

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor, distributed, nn
 
-from apex_ompl.cases import WrittenCase
+from apex_ompl.datasets.cases import WrittenCase
 from apex_ompl.diffusion.autoencoder import LinearLatent, VariationalLatent
 from apex_ompl.diffusion.checkpoint import save_model
 from apex_ompl.diffusion.conditions import Conditions
@@ -28,8 +28,8 @@ from apex_ompl.diffusion.proposals import Sampling, TrajectoryModel
 from apex_ompl.diffusion.runlog import RunLog
 from apex_ompl.diffusion.validation import judged
 from apex_ompl.errors import ApexError, FileFormatError
-from apex_ompl.files import check_writable, is_file, write_atomically
 from apex_ompl.kernel import RobotTables
+from apex_ompl.util.files import check_writable, is_file, write_atomically
 
 WATCHED = 2048  # held-out paths that the validation loss is taken on, at most
 PHASES = ("autoencoder", "denoiser")

@@ -9,18 +9,18 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from apex_ompl.cases import WrittenCase
-from apex_ompl.diffusion.conditions import Query, Things
+from apex_ompl.datasets.cases import WrittenCase
+from apex_ompl.diffusion.conditions import ObstacleSet, Query
 from apex_ompl.diffusion.proposals import Sampling, TrajectoryModel
 from apex_ompl.kernel import Kernel
-from apex_ompl.optimize import Optimizer
-from apex_ompl.pool import first_valid
-from apex_ompl.resolution import FULL_RESOLUTION
+from apex_ompl.trajopt.candidates import first_valid
+from apex_ompl.trajopt.optimizer import Optimizer
+from apex_ompl.util.resolution import FULL_RESOLUTION
 
 
 def query_of_case(case: WrittenCase) -> Query:
     """Return a written problem as the model sees it."""
-    return Query(case.start, case.goal, case.points[0], Things.of(case.row.things))
+    return Query(case.start, case.goal, case.points[0], ObstacleSet.of(case.row.things))
 
 
 def judged(

@@ -28,7 +28,14 @@ from numba.core import config
 F = TypeVar("F", bound=Callable[..., Any])
 
 LOG = logging.getLogger("apex_ompl")
-NOT_COMPILED = ("__init__.py", "build.py", "face.py", "faults.py", "inverse.py", "scene.py")
+NOT_COMPILED = (
+    "__init__.py",
+    "robot_builder.py",
+    "interface.py",
+    "table_checks.py",
+    "inverse_kinematics.py",
+    "scene_builder.py",
+)
 TYPICAL_SECONDS = 45
 
 # Without numba's runtime no array is counted, which costs most of the time otherwise; nothing may be allocated.

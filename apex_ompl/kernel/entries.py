@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 
+from apex_ompl.kernel.clearance import gradient_of_two, gradient_to_obstacle, nearest_bodies, nearest_obstacle
 from apex_ompl.kernel.compiled import entry, inlined
 from apex_ompl.kernel.kinematics import bound_motion, place_joint, place_robot
-from apex_ompl.kernel.nearest import gradient_of_two, gradient_to_obstacle, nearest_bodies, nearest_obstacle
-from apex_ompl.kernel.proof import judged, known, proved
+from apex_ompl.kernel.separation import judged, known, proved
 from apex_ompl.kernel.tables import Floats, Integers
 from apex_ompl.kernel.views import Work, robot_view, scene_view, work_view
 
@@ -169,7 +169,7 @@ def _describe(path: Floats, starts: Integers, a: int, b: int, middle: Floats, w:
 @entry
 def advance(
     ri: Integers, rf: Floats, si: Integers, sf: Floats, wi: Integers, wf: Floats, path: Floats, starts: Integers,
-    queue: Integers, ends: Integers, state: Floats, found: Integers, tally: Integers,
+    queue: Integers, ends: Integers, state: Floats, found: Integers, check_counts: Integers,
 ) -> int:  # fmt: skip
     """Prove a path until a state is met that only the meshes can judge.
 
@@ -194,21 +194,21 @@ def advance(
         _state(path, starts, middle, state)
         ends[2] = judged(t, s, w, state, found)
         if ends[2] == 0:
-            tally[PROVED_STATES] += 1
+            check_counts[PROVED_STATES] += 1
             if b - a >= 3:
-                tally[TRIED_BOXES] += 1
+                check_counts[TRIED_BOXES] += 1
                 _describe(path, starts, a, b, state, w)
                 if known(t, state, w.reach):
                     bound_motion(t, w)
                     if proved(t, s, w, state, w.pair):
-                        tally[PROVED_BOXES] += 1
-                        tally[PROVED_STEPS] += b - a
+                        check_counts[PROVED_BOXES] += 1
+                        check_counts[PROVED_STEPS] += b - a
                         continue
         if b - a >= 2:
             queue[ends[1], 0], queue[ends[1], 1] = a, middle
             queue[ends[1] + 1, 0], queue[ends[1] + 1, 1] = middle, b
             ends[1] += 2
         if ends[2] != 0:
-            tally[OPEN_STATES] += 1
+            check_counts[OPEN_STATES] += 1
             return int(middle)
     return DONE

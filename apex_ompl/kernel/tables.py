@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError, UnknownNameError
-from apex_ompl.files import is_file, write_atomically
+from apex_ompl.util.files import is_file, write_atomically
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -246,7 +246,7 @@ class RobotTables:
             if array.dtype != wanted or array.shape[1:] != ROWS.get(name, ()):
                 expected = f"expected {np.dtype(wanted)} in rows of shape {ROWS.get(name, ())}"
                 raise FileFormatError(str(path), name, f"{array.dtype} {array.shape}", expected)
-        from apex_ompl.kernel.faults import head_fault, table_fault
+        from apex_ompl.kernel.table_checks import head_fault, table_fault
 
         fault = head_fault(head)
         if not fault:

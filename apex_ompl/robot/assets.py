@@ -7,7 +7,7 @@ from functools import cache
 from pathlib import Path
 
 from apex_ompl.errors import MissingFileError
-from apex_ompl.files import is_file
+from apex_ompl.util.files import is_file
 
 DATA = Path(__file__).parent / "data"
 

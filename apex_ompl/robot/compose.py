@@ -10,10 +10,10 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import pinocchio as pin
 
-from apex_ompl.bodies import pose_matrix
 from apex_ompl.errors import MissingFileError, RobotError
 from apex_ompl.robot.assets import resolve
 from apex_ompl.robot.config import Part, RobotConfig
+from apex_ompl.scene.bodies import pose_matrix
 
 
 @dataclass(frozen=True)

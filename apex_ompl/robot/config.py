@@ -7,9 +7,9 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, PositiveFloat, model_validator
 
-from apex_ompl.bodies import Body, Name, Quaternion, Vector, located
 from apex_ompl.errors import FileFormatError
-from apex_ompl.schema import StrictModel, read_yaml, validate
+from apex_ompl.scene.bodies import Body, Name, Quaternion, Vector, located
+from apex_ompl.util.schema import StrictModel, read_yaml, validate
 
 SCHEMA = "apex-ompl/robot/1"
 PAIRS_SCHEMA = "apex-ompl/disabled-pairs/1"

@@ -14,14 +14,13 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from apex_ompl.bodies import Body
 from apex_ompl.errors import FileFormatError, ParameterError, RobotError, UnknownNameError
-from apex_ompl.meshes import extent_fault
 from apex_ompl.robot.assets import DATA, resolve
 from apex_ompl.robot.compose import compose
 from apex_ompl.robot.config import Hand, RobotConfig, read_config, read_disabled_pairs
-
-Array = NDArray[np.float64]
+from apex_ompl.scene.bodies import Body
+from apex_ompl.scene.meshes import extent_fault
+from apex_ompl.types import Array
 
 
 @dataclass(frozen=True)

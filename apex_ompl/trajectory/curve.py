@@ -6,9 +6,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from apex_ompl.types import Array
 
 SAME = 1e-9  # distance of states that count as one [rad]
 STRAIGHT = 1e-7  # change of direction that is none

@@ -11,13 +11,11 @@ from typing import Any
 
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError
-from apex_ompl.files import BROKEN, suffix_of
-from apex_ompl.schema import read_yaml
-
-Array = NDArray[np.float64]
+from apex_ompl.types import Array
+from apex_ompl.util.files import BROKEN, suffix_of
+from apex_ompl.util.schema import read_yaml
 
 MESSAGES = (".traj.yaml", ".traj.json")
 SUFFIXES = (".npz", ".csv", *MESSAGES)

@@ -10,16 +10,15 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from apex_ompl.arguments import check_positive, numbers
 from apex_ompl.errors import FileFormatError, ParameterError
-from apex_ompl.files import suffix_of, write_atomically
-from apex_ompl.metrics import spectral_arc_length
 from apex_ompl.robot.model import Limits
 from apex_ompl.trajectory.files import STATES, SUFFIXES, decoded, encoded
-
-Array = NDArray[np.float64]
+from apex_ompl.trajectory.smoothness import spectral_arc_length
+from apex_ompl.types import Array
+from apex_ompl.util.files import suffix_of, write_atomically
+from apex_ompl.util.validation import check_positive, numbers
 
 ROUNDING = 1e-9  # of shares of limits
 JOINED = 1e-6  # share by which a knot may be off what the one before it leads to; files of ROS round times

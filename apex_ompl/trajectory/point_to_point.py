@@ -6,13 +6,11 @@ from collections.abc import Iterator
 
 import numpy as np
 import ruckig
-from numpy.typing import NDArray
 
 from apex_ompl.errors import TimingError
 from apex_ompl.robot.model import Limits
 from apex_ompl.trajectory.motion import ROUNDING, Trajectory, joined
-
-Array = NDArray[np.float64]
+from apex_ompl.types import Array
 
 WITHIN = 1.0 - 1e-6  # of the limits that Ruckig is given, for its rounding
 BEYOND = 1.0 + 1e-10  # where it is given states that are at the limits

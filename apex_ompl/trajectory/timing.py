@@ -8,17 +8,16 @@ from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from apex_ompl.arguments import is_number, numbers
 from apex_ompl.errors import ParameterError, TimingError
-from apex_ompl.kernel.speed import farthest, fastest, moments
+from apex_ompl.kernel.reachability import farthest, fastest, moments
 from apex_ompl.robot.model import Limits
 from apex_ompl.trajectory.curve import SAME, Curve, Polyline
 from apex_ompl.trajectory.motion import Trajectory
 from apex_ompl.trajectory.point_to_point import from_motion, stops
-
-Array = NDArray[np.float64]
+from apex_ompl.types import Array
+from apex_ompl.util.validation import is_number, numbers
 
 PER_PIECE = 10  # points of the grid a piece of the curve
 SPACINGS = tuple(0.001 * k * 2**n for n in range(2, 13) for k in (1, 1.5))  # of knots, from 0.004 to 6.144 [s]
@@ -101,7 +100,7 @@ class Timing:
 
 
 @dataclass(frozen=True, eq=False)
-class Timed:
+class TimedPath:
     """A path that is timed.
 
     Attributes:
@@ -119,12 +118,12 @@ class Timed:
 def time_path(
     path: ArrayLike, limits: Limits, joint_names: Sequence[str], timing: Timing | None = None,
     fault: Callable[[Trajectory], str] = lambda trajectory: "",
-) -> Timed:  # fmt: skip
+) -> TimedPath:  # fmt: skip
     """Time a path.
 
     A straight line is run along by a jerk-limited profile of Ruckig's (Berscheid and Kroeger 2021), which is the
     fastest. Any other path is made a curve that blends corners; reachability analysis gives the fastest way along it
-    within the limits of velocity and acceleration (:mod:`apex_ompl.kernel.speed`). The states on this way at even times
+    within the limits of velocity and acceleration (:mod:`apex_ompl.kernel.reachability`). States at even times there
     are control points of a uniform cubic B-spline in time: averages of what is within the limits are, and its jerk, the
     change of acceleration from one knot to the next, is bounded by the distance of the knots, which is chosen so that
     the motion is shortest. What is left over a limit is taken away by stretching time. Where ``fault`` finds one, the
@@ -172,10 +171,10 @@ def _check(states: Array, limits: Limits, joint_names: Sequence[str]) -> None:
         raise ParameterError("path", float(states[k, joint]), allowed)
 
 
-def _ways(line: Polyline, limits: Limits, names: tuple[str, ...], timing: Timing) -> Iterator[Timed]:
+def _ways(line: Polyline, limits: Limits, names: tuple[str, ...], timing: Timing) -> Iterator[TimedPath]:
     """Yield motions from rest to rest, each closer to the path than the one before."""
     if line.length <= SAME:
-        yield Timed(_standing(line.states, names), 0.0, "line")
+        yield TimedPath(_standing(line.states, names), 0.0, "line")
         return
     corners = line.corners()
     if len(corners.states) > 2:
@@ -184,10 +183,10 @@ def _ways(line: Polyline, limits: Limits, names: tuple[str, ...], timing: Timing
             if timed is not None:
                 yield timed
     deviation = float(np.linalg.norm(line.states - corners.at(line.arc), axis=1).max())
-    yield Timed(stops(corners.states, limits, names), deviation, "line" if len(corners.states) == 2 else "stops")
+    yield TimedPath(stops(corners.states, limits, names), deviation, "line" if len(corners.states) == 2 else "stops")
 
 
-def blended(line: Polyline, limits: Limits, names: tuple[str, ...], within: float) -> Timed | None:
+def blended(line: Polyline, limits: Limits, names: tuple[str, ...], within: float) -> TimedPath | None:
     """Return the fastest motion along a curve that stays within a distance of a polyline, or None [rad]."""
     if line.length > MOST_PIECES * SPACING * within:
         return None
@@ -231,7 +230,7 @@ def blended(line: Polyline, limits: Limits, names: tuple[str, ...], within: floa
         places = np.concatenate([[0.0], place, [line.length]])
         deviation = _deviation(motion, line, (motion.times, places), window, within)
         if deviation <= within:
-            return Timed(motion, deviation, "blended")
+            return TimedPath(motion, deviation, "blended")
         best -= 1
     return None
 
@@ -259,13 +258,15 @@ def spline(control: Array, apart: float, names: tuple[str, ...]) -> Trajectory:
     return Trajectory(times, positions, (after - before) / (2.0 * apart), (after - 2.0 * at + before) / apart**2, names)
 
 
-def _moving(start: tuple[Array, Array], timed: Timed, line: Polyline, limits: Limits, timing: Timing) -> list[Timed]:
+def _moving(
+    start: tuple[Array, Array], timed: TimedPath, line: Polyline, limits: Limits, timing: Timing
+) -> list[TimedPath]:
     """Return motions from a moving start, the fastest that stay near the path first, then those that leave it less."""
     found = []
     for motion, head in from_motion(*start, timed.trajectory, limits, timing.minimum_duration):
         nowhere = np.array([0.0, head]), np.zeros(2)
         off = _deviation(motion, line, nowhere, line.length, timing.deviation)
-        found.append(Timed(motion, max(off, timed.deviation), f"moving start, {timed.way}"))
+        found.append(TimedPath(motion, max(off, timed.deviation), f"moving start, {timed.way}"))
     return sorted(found, key=lambda one: (max(one.deviation, timing.deviation), one.trajectory.duration))
 
 

@@ -11,26 +11,24 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from tqdm import tqdm
 
 from apex_ompl import problems
-from apex_ompl.assembly import assemble
-from apex_ompl.cluster import spread
-from apex_ompl.dataset import Store
+from apex_ompl.apex.query import make_query
+from apex_ompl.datasets.engine import Options
+from apex_ompl.datasets.records import SOURCES, Paths
+from apex_ompl.datasets.store import Store
 from apex_ompl.diffusion.autoencoder import Autoencoder
 from apex_ompl.diffusion.checkpoint import load_model
 from apex_ompl.diffusion.guidance import Guidance
 from apex_ompl.diffusion.proposals import Sampling
-from apex_ompl.engine import Options
-from apex_ompl.generation import plan_units, work
-from apex_ompl.ompl_globals import quiet_ompl
+from apex_ompl.generation.worker import plan_units, work
+from apex_ompl.ompl_adapter.process import quiet_ompl
+from apex_ompl.ompl_adapter.setup import assemble
 from apex_ompl.problems.reach import robot
-from apex_ompl.queries import query_of
-from apex_ompl.records import SOURCES, Paths
-from apex_ompl.spline import Spline
-
-Array = NDArray[np.float64]
+from apex_ompl.trajopt.spline import Spline
+from apex_ompl.types import Array
+from apex_ompl.util.cluster import spread
 
 MODELS = ("apex", "apex-paper")
 STEPS = 8  # of DDIM, for apex-paper, whose own 256 would take hours
@@ -101,11 +99,11 @@ def propose(part: Sequence[tuple[str, Array]], seed: int) -> dict[str, tuple[lis
     seconds = dict.fromkeys(made, 0.0)
     with quiet_ompl(), torch.no_grad():
         for problem, control in part:
-            verdict = assemble(problems.load(problem), robot()).verdict
-            query = query_of(verdict, control[0], control[-1])
+            checker = assemble(problems.load(problem), robot()).checker
+            query = make_query(checker, control[0], control[-1])
             for label, (name, sampling) in sampled.items():
                 begin = time.process_time()  # other work on the machine does not count
-                found = load(name).propose(query, verdict.kernel, 1, sampling=sampling, generator=generator)
+                found = load(name).propose(query, checker.kernel, 1, sampling=sampling, generator=generator)
                 seconds[label] += time.process_time() - begin
                 made[label].append(found.control[0])
     return {label: (made[label], seconds[label]) for label in made}

@@ -1,0 +1,1 @@
+"""APEX: the stages of ``solve``, their context and report."""

@@ -1,0 +1,108 @@
+"""What decides for a planner whether paths are valid: this project's checker, or whatever checkers OMPL was given."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+
+import numpy as np
+from ompl import base as ob
+
+from apex_ompl.collision import CollisionChecker
+from apex_ompl.errors import ParameterError
+from apex_ompl.ompl_adapter.space import to_state
+from apex_ompl.ompl_adapter.validity import MotionValidator, StateValidityChecker
+from apex_ompl.robot import load_robot
+from apex_ompl.types import Array
+from apex_ompl.util.resolution import FULL_RESOLUTION
+
+Stop = Callable[[], bool]
+
+LOG = logging.getLogger("apex_ompl")
+PLAIN = (ob.MotionValidator, MotionValidator)  # OMPL's own, as bound, and this project's
+EVERY = 4  # states of a path whose distance from the obstacles is measured
+
+
+class PathValidator:
+    """Judges states and paths of a space information.
+
+    With a ``StateValidityChecker`` of this project a path is valid by the full check. With another checker, or a
+    subclass that refines it, a path is valid when all of its states are and all motions between them, by
+    ``isValid`` and ``checkMotion``. Another checker knows the robot by name, and its obstacles are not known.
+
+    Attributes:
+        checker: The robot, among its obstacles where they are known.
+        knows_obstacles: Whether they are.
+        alone: Whether the checker decides alone.
+    """
+
+    def __init__(self, si: ob.SpaceInformation, robot: str) -> None:
+        """Check by what ``si`` brings.
+
+        Raises:
+            ApexError: There is no such robot.
+            ParameterError: The space has another dimension than the robot.
+        """
+        self._si = si
+        self._checkers = _checkers(si)
+        validity_checker, motions = self._checkers
+        self.knows_obstacles = isinstance(validity_checker, StateValidityChecker)
+        plain = type(validity_checker).isValid is StateValidityChecker.isValid and type(motions) in PLAIN
+        self.alone = self.knows_obstacles and plain
+        self.checker = (
+            validity_checker.checker
+            if isinstance(validity_checker, StateValidityChecker)
+            else CollisionChecker(load_robot(robot))
+        )
+        dof, dimension = self.checker.robot.dof, int(si.getStateSpace().getDimension())
+        if dof != dimension:
+            raise ParameterError("state space", dimension, f"{dof} dimensions, those of {self.checker.robot.name}")
+        if not self.knows_obstacles:
+            LOG.warning(
+                "the validity checker is not apex_ompl's: it judges, and proposals are kept clear of %s itself alone",
+                self.checker.robot.name,
+            )
+
+    @property
+    def outdated(self) -> bool:
+        """Whether the space information has other checkers by now."""
+        return any(mine is not theirs for mine, theirs in zip(self._checkers, _checkers(self._si), strict=True))
+
+    def is_free(self, q: Array) -> bool:
+        """Whether a state, shape (dof,), is valid."""
+        if self.alone:
+            return self.checker.is_free(q)
+        return bool(self._si.isValid(to_state(self._si, q)))
+
+    def is_valid(self, path: Array, stop: Stop = lambda: False) -> bool:
+        """Whether a path, shape (N, dof), is valid; with another checker, not when it is told to stop meanwhile."""
+        if self.knows_obstacles and self.checker.first_collision(path, FULL_RESOLUTION) is not None:
+            return False
+        return self.alone or self._valid_by_ompl(path, stop)
+
+    def _valid_by_ompl(self, path: Array, stop: Stop) -> bool:
+        states = [to_state(self._si, q) for q in path]
+        order = sorted(range(len(states)), key=lambda k: (-(k & -k), k))  # coarse before fine
+        for k in order:
+            if stop() or not self._si.isValid(states[k]):
+                return False
+        return all(not stop() and self._si.checkMotion(a, b) for a, b in zip(states, states[1:], strict=False))
+
+    def gap(self, path: Array) -> float:
+        """Return the distance of states, shape (N, dof), from the obstacles by GJK, fixtures left out [m].
+
+        Every fourth state is measured; infinite where the obstacles are not known.
+        """
+        if not self.knows_obstacles:
+            return np.inf
+        states = np.concatenate([path[::EVERY], path[-1:]])
+        bound, least = self.checker.kernel.clearance(states)[:, 0], np.inf
+        for k in np.argsort(bound):  # the spheres' clearance is at most that of the meshes
+            if bound[k] >= least:
+                break
+            least = min(least, self.checker.distance(states[k]).value)
+        return float(least)
+
+
+def _checkers(si: ob.SpaceInformation) -> tuple[ob.StateValidityChecker, ob.MotionValidator]:
+    return si.getStateValidityChecker(), si.getMotionValidator()

@@ -1,0 +1,26 @@
+"""Problems as the model sees them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from apex_ompl.collision import CollisionChecker
+from apex_ompl.collision.checker import NO_POINT
+from apex_ompl.diffusion.conditions import ObstacleSet, Query
+from apex_ompl.types import Array
+
+
+def make_query(checker: CollisionChecker, start: Array, goal: Array, *, point: bool = True) -> Query:
+    """Return the query of going from a state to another, among the obstacles of now.
+
+    Fixtures of the robot are left out. Meshes are seen as the boxes that the kernel takes them for.
+
+    Args:
+        checker: The robot among obstacles.
+        start: Shape (dof,) [rad].
+        goal: Shape (dof,) [rad].
+        point: Whether the obstacle point is looked for; models that do not see it can do without.
+    """
+    things = ObstacleSet.among(checker.kernel.scene.arrays, checker.movable)
+    place = checker.obstacle_point(start) if point else np.array(NO_POINT)
+    return Query(np.asarray(start, float), np.asarray(goal, float), place, things)

@@ -1,0 +1,1 @@
+"""Sphere covers: made offline, and proved to contain their solids."""

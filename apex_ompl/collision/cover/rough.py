@@ -1,0 +1,59 @@
+"""A cover of a box or of any closed mesh in milliseconds, for shapes that nobody made a better one of."""
+
+from __future__ import annotations
+
+import coal
+import numpy as np
+
+from apex_ompl.collision.containment import Host
+from apex_ompl.collision.cover.proof import PAD, Cover
+from apex_ompl.scene.meshes import bounding_boxes
+from apex_ompl.types import Array
+
+COLUMNS = 6
+LEAVES = 64  # at most, of a box
+LEAVES_IN_MESH = 200
+
+
+def rough_cover(geometry: coal.CollisionGeometry) -> Cover:
+    """Return a cover of a box or of the solid of a mesh: balls around boxes that contain it, halved again and again.
+
+    The boxes of a mesh are those of ``apex_ompl.scene.meshes.bounding_boxes``. Nothing is left to prove: a ball around
+    all corners of a box contains the box.
+    """
+    if geometry.getNodeType() == coal.GEOM_BOX:
+        boxes, most = np.array([[-geometry.halfSide, geometry.halfSide]]), LEAVES
+    else:
+        boxes, most = bounding_boxes(Host.of(geometry).outline, COLUMNS), LEAVES_IN_MESH
+    sides = boxes[:, 1] - boxes[:, 0]
+    longest = float(sides.max())
+    while len(boxes) < most and _leaves(sides, longest / 1.1) <= most:
+        longest /= 1.1
+    queue = [np.stack([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)])]
+    first, count, at = [], [], 0
+    while at < len(queue):
+        parts = list(boxes) if at == 0 and len(boxes) > 1 else _halves(queue[at], longest)
+        first.append(len(queue) if parts else 0)
+        count.append(len(parts))
+        queue += parts
+        at += 1
+    nodes = np.array(queue)
+    radii = np.linalg.norm(nodes[:, 1] - nodes[:, 0], axis=1) / 2.0 + PAD
+    return Cover(nodes.mean(axis=1), radii, np.array(first, np.int64), np.array(count, np.int64))
+
+
+def _leaves(sides: Array, longest: float) -> float:
+    """Return how many parts boxes, shape (boxes, 3), fall into when sides are halved until none is too long."""
+    return float(np.prod(2.0 ** np.ceil(np.log2(np.maximum(sides / longest, 1.0))), axis=1).sum())
+
+
+def _halves(box: Array, longest: float) -> list[Array]:
+    """Return the halves of a box along its longest side, shape (2, 3) each, or nothing when that is short enough."""
+    sides = box[1] - box[0]
+    axis = int(np.argmax(sides))
+    if sides[axis] <= longest:
+        return []
+    middle = (box[0, axis] + box[1, axis]) / 2.0
+    lower, upper = box.copy(), box.copy()
+    lower[1, axis] = upper[0, axis] = middle
+    return [lower, upper]

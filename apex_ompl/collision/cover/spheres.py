@@ -1,0 +1,243 @@
+"""Covers: trees of balls that provably contain a solid, to prove two solids apart before their meshes are asked.
+
+:func:`make_cover` builds one (``sphere_search``), :func:`unproved` proves it (``sphere_proof``).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import coal
+import numpy as np
+
+from apex_ompl.collision.cover.proof import PAD, Cover, boxes_left, distances, grown
+from apex_ompl.collision.cover.search import search
+from apex_ompl.collision.cover.solids import Round, solid_of
+from apex_ompl.collision.shapes import is_shell
+from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError
+from apex_ompl.scene.meshes import triangles
+from apex_ompl.types import Array
+from apex_ompl.util.files import write_atomically
+
+__all__ = ["GAPS", "Cover", "make_cover", "quality", "read_covers", "shape_key", "unproved", "write_covers"]
+
+SCHEMA = "apex-ompl/spheres/1"
+COLUMNS = ["x", "y", "z", "radius", "first child", "children"]
+LARGEST = 1e6  # numbers of a file beyond are a fault [m]
+GAPS = (0.02, 0.007, 0.0025)  # [m]
+MOST = (64, 96, 256)  # leaves of a cover: of a quick one, of others, of a mesh that is not convex; the gap gives way
+QUICK = 4.0  # a quick cover grows by boxes so much larger, which takes less time and leaves more to spare
+
+
+def shape_key(geometry: coal.CollisionGeometry) -> str:
+    """Return 16 hexadecimal digits that tell a shape from others: of its kind and sizes, or of its triangles.
+
+    Raises:
+        ParameterError: A kind of geometry that has no cover.
+    """
+    kind = geometry.getNodeType()
+    names = {coal.GEOM_BOX: "box", coal.GEOM_SPHERE: "sphere", coal.GEOM_CYLINDER: "cylinder"}
+    names |= {coal.GEOM_CAPSULE: "capsule", coal.GEOM_CONVEX: "convex"}
+    digest = hashlib.sha256()
+    if is_shell(geometry):
+        vertices, faces = triangles(geometry)
+        digest.update(b"mesh" + (np.round(vertices, 9) + 0.0).tobytes() + faces.astype(np.int64).tobytes())
+    elif kind not in names:
+        raise ParameterError("geometry", kind, "a box, sphere, cylinder, capsule, convex body or mesh")
+    else:
+        sizes: list[Any] = [getattr(geometry, name) for name in ("radius", "halfLength") if hasattr(geometry, name)]
+        if kind == coal.GEOM_BOX:
+            sizes = [geometry.halfSide]
+        if kind == coal.GEOM_CONVEX:
+            sizes = [np.round(np.array(geometry.points()), 9) + 0.0]
+        digest.update(names[kind].encode() + b"".join(np.asarray(s, float).tobytes() for s in sizes))
+    return digest.hexdigest()[:16]
+
+
+def make_cover(
+    geometry: coal.CollisionGeometry,
+    gaps: Sequence[float] = GAPS,
+    *,
+    most: int | None = None,
+    effort: int | None = None,
+) -> Cover:
+    """Return a proved cover of a geometry.
+
+    Args:
+        geometry: Box, sphere, cylinder, capsule, convex body or mesh.
+        gaps: How far the balls of each level below the root may stand out of the solid [m], descending. Sides that
+            would need more than ``most`` leaves get a larger gap.
+        most: Largest number of leaves, by default 64 with effort 1, 96 with more, 256 for a mesh that is not convex.
+        effort: How thorough the search is, 1 (tens of milliseconds) to 3 (seconds); by default 1 for simple shapes
+            and 3 for meshes.
+
+    Raises:
+        ParameterError: Gaps that are not positive and descending, or a geometry without a cover.
+    """
+    if not gaps or min(gaps) <= 0.0 or sorted(gaps, reverse=True) != list(gaps):
+        raise ParameterError("gaps", gaps, "positive numbers, descending")
+    solid = solid_of(geometry)
+    if effort is None:
+        effort = 3 if is_shell(geometry) else 1
+    if most is None:
+        most = MOST[2] if len(solid.parts) > 1 else MOST[min(effort, 2) - 1]
+    part = solid.parts[0]
+    if isinstance(part, Round) and part.capped:
+        return _capsule(part, gaps[-1], most)
+    cover = search(solid, gaps, most, effort)
+    made = _rounded(grown(solid, cover, QUICK if effort == 1 else 1.0))
+    if len(boxes_left(solid, made)):
+        raise AssertionError("a cover that has grown to its proof is not proved")
+    return made
+
+
+def unproved(geometry: coal.CollisionGeometry, cover: Cover) -> Array:
+    """Return the centres of the boxes that could not be proved to be covered, shape (N, 3) [m]; none: proved."""
+    return boxes_left(solid_of(geometry), cover)
+
+
+def quality(
+    geometry: coal.CollisionGeometry, cover: Cover, rng: np.random.Generator, samples: int = 20_000
+) -> tuple[float, float, float]:
+    """Return how tight the leaves are: volume relative to the solid, mean and largest gap [m].
+
+    The gaps are distances to the solid from ``samples`` / 10 points on the surface of the union of the leaves, the
+    volumes come from ``samples`` points each. Meshes that are not convex are measured against the parts that stand
+    for them, the gaps against their triangles.
+    """
+    solid = solid_of(geometry)
+    centres, radii = cover.centres[cover.leaves], cover.radii[cover.leaves]
+    low, high = (centres - radii[:, None]).min(axis=0), (centres + radii[:, None]).max(axis=0)
+    points = rng.uniform(low, high, (samples, 3))
+    in_leaf = (distances(points, centres) <= radii).any(axis=1)
+    inner = rng.uniform(solid.low, solid.high, (samples, 3))
+    volume = float(solid.contains(inner).mean() * np.prod(solid.high - solid.low))
+    ratio = float(in_leaf.mean() * np.prod(high - low)) / max(volume, 1e-12)
+    chosen = rng.choice(len(radii), samples, p=radii**2 / (radii**2).sum())
+    directions = rng.normal(size=(samples, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    points = centres[chosen] + radii[chosen, None] * directions
+    gaps_to = distances(points, centres) - radii
+    gaps_to[np.arange(samples), chosen] = np.inf
+    points = points[(gaps_to > 0.0).all(axis=1)][: max(samples // 10, 1)]
+    dot, request = coal.Sphere(1e-9), coal.DistanceRequest()
+    gaps = []
+    for point in points:
+        result = coal.DistanceResult()
+        place = coal.Transform3s(np.eye(3), point)
+        gaps.append(max(0.0, coal.distance(geometry, coal.Transform3s.Identity(), dot, place, request, result)))
+    return ratio, float(np.mean(gaps)), float(np.max(gaps))
+
+
+def write_covers(path: Path | str, covers: Mapping[str, Cover]) -> None:
+    """Write covers by the keys of their shapes, in micrometres rounded so that the proof holds for what is written.
+
+    Raises:
+        MissingFileError: The file cannot be written.
+    """
+    rows = []
+    for key in sorted(covers):
+        cover = _rounded(covers[key])
+        balls = [
+            [*(round(float(x), 6) + 0.0 for x in c), round(float(r), 6), int(f), int(n)]
+            for c, r, f, n in zip(cover.centres, cover.radii, cover.first, cover.count, strict=True)
+        ]
+        rows.append(f"  {json.dumps(key)}: [\n" + ",\n".join(f"   {json.dumps(ball)}" for ball in balls) + "\n  ]")
+    text = f'{{\n "schema": {json.dumps(SCHEMA)},\n "columns": {json.dumps(COLUMNS)},\n "covers": {{\n'
+    write_atomically(Path(path), (text + ",\n".join(rows) + "\n }\n}\n").encode())
+
+
+def read_covers(path: Path | str) -> dict[str, Cover]:
+    """Read a file of covers: shape key -> cover.
+
+    Raises:
+        MissingFileError: The file cannot be read.
+        FileFormatError: It does not hold covers.
+    """
+    name = str(path)
+    try:
+        data = json.loads(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise MissingFileError(name, "sphere covers", (error.strerror or "cannot be read").lower()) from error
+    except (ValueError, RecursionError) as error:
+        raise FileFormatError(name, "", str(error), "expected JSON") from error
+    if not isinstance(data, dict) or data.get("schema") != SCHEMA:
+        found = data.get("schema") if isinstance(data, dict) else data
+        raise FileFormatError(name, "schema", found, f"expected {SCHEMA!r}")
+    if data.get("columns") != COLUMNS:
+        raise FileFormatError(name, "columns", data.get("columns"), f"expected {COLUMNS}")
+    if not isinstance(data.get("covers"), dict):
+        raise FileFormatError(name, "covers", data.get("covers"), "expected a mapping of shape keys to balls")
+    return {key: _cover_of(rows, name, f"covers.{key}") for key, rows in data["covers"].items()}
+
+
+def _is_number(value: Any) -> bool:
+    return type(value) in (int, float) and abs(value) < LARGEST
+
+
+def _cover_of(rows: Any, file: str, field: str) -> Cover:
+    """Return the cover that rows of a file describe, or say what is wrong with them."""
+    if not isinstance(rows, list) or not rows:
+        raise FileFormatError(file, field, rows, "expected a list of balls")
+    following = 1
+    for k, row in enumerate(rows):
+        where = f"{field}.{k}"
+        numbers = isinstance(row, list) and len(row) == len(COLUMNS) and all(_is_number(x) for x in row)
+        if not numbers:
+            raise FileFormatError(file, where, row, f"expected the numbers {', '.join(COLUMNS)}")
+        if row[3] <= 0.0:
+            raise FileFormatError(file, where, row[3], "expected a positive radius")
+        first, count = row[4], row[5]
+        if type(first) is not int or type(count) is not int or count < 0:
+            raise FileFormatError(file, where, row[4:], "expected the first child and the number of children")
+        if count and (first != following or first <= k or first + count > len(rows)):
+            raise FileFormatError(file, where, row[4:], "expected children that follow those of the balls before")
+        following += count
+    if following != len(rows):
+        raise FileFormatError(file, field, len(rows), f"expected {following} balls below one root")
+    table = np.array([row[:4] for row in rows], float)
+    links = np.array([row[4:] for row in rows], np.int64)
+    return Cover(table[:, :3].copy(), table[:, 3].copy(), links[:, 0].copy(), links[:, 1].copy())
+
+
+def _capsule(part: Round, gap: float, most: int) -> Cover:
+    """Return balls along the axis of a capsule, all of one size.
+
+    A ball at the end stands out by e, so its radius is r + e, and its centre is e before the end of the axis. It
+    holds the capsule for a length s = sqrt(2 r e + e^2) to either side of its centre, so n balls reach from the
+    middle to the end of the axis when e + (n - 1) s is the half length.
+    """
+    gap = min(gap, max(0.5 * part.radius, 1e-3))
+    number = 1
+    while True:
+        low, high = 0.0, part.half_length
+        for _ in range(60):
+            e = 0.5 * (low + high)
+            reach = e + (number - 1) * np.sqrt(2 * part.radius * e + e * e)
+            low, high = (low, e) if reach >= part.half_length else (e, high)
+        if high <= gap or number >= most:
+            break
+        number += 1
+    step = np.sqrt(2 * part.radius * high + high * high)
+    z = (2.0 * np.arange(number) - (number - 1)) * step
+    centres = np.stack([0.0 * z, 0.0 * z, z], axis=1)
+    radii = np.full(number, part.radius + high)
+    if number > 1:
+        centres = np.concatenate([np.zeros((1, 3)), centres])
+        radii = np.concatenate([[part.half_length + part.radius], radii])
+    first, count = np.zeros(len(radii), np.int64), np.zeros(len(radii), np.int64)
+    if number > 1:
+        first[0], count[0] = 1, number
+    return _rounded(Cover(centres, radii + 4 * PAD, first, count))
+
+
+def _rounded(cover: Cover) -> Cover:
+    """Return a cover in whole micrometres whose balls contain those given."""
+    centres = np.round(cover.centres, 6)
+    shift = np.linalg.norm(centres - cover.centres, axis=1)
+    radii = np.round(np.ceil((cover.radii + shift) * 1e6 - 1e-4) / 1e6, 6)
+    return Cover(centres, radii, cover.first, cover.count)

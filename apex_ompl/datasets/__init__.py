@@ -1,0 +1,1 @@
+"""Data sets of proven paths: records, store, engine, description."""

@@ -1,0 +1,219 @@
+"""Proven paths, and the problems that they solve, as arrays: what a data set holds."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from apex_ompl.errors import ApexError
+from apex_ompl.trajopt.spline import Spline
+from apex_ompl.types import Array
+
+MICRO = 1e-6  # states are kept in millionths of a radian, in which the suites draw them
+SOURCES = ("line", "bumps", "rrtconnect", "reversed", "part", "model")
+"""Where a path comes from: the straight line, optimisation from bumps, rrtconnect and optimisation, another path
+backwards, the rest of another path from a state on it, or optimisation from what a model proposed."""
+
+SHAPES = ("box", "sphere", "cylinder", "capsule")
+"""Kinds of obstacles. Sizes are edges; radius; or radius and length along z [m]."""
+
+PROBLEM_FIELDS: dict[str, tuple[Any, tuple[int, ...]]] = {
+    "seed": (np.int32, ()), "suite": (np.uint8, ()), "level": (np.uint8, ()), "held": (np.uint8, ()),
+    "things": (np.uint16, ()),
+}  # fmt: skip
+THING_FIELDS: dict[str, tuple[Any, tuple[int, ...]]] = {
+    "shape": (np.uint8, ()), "position": (np.float32, (3,)), "orientation": (np.float32, (4,)),
+    "size": (np.float32, (3,)),
+}  # fmt: skip
+PATH_FIELDS: dict[str, tuple[Any, tuple[int, ...]]] = {
+    "problem": (np.int32, ()), "start": (np.int32, (-1,)), "goal": (np.int32, (-1,)),
+    "control": (np.float16, (-1, -1)), "point": (np.float32, (3,)), "clearance": (np.float32, ()),
+    "length": (np.float32, ()), "source": (np.uint8, ()), "homotopy": (np.uint8, ()),
+}  # fmt: skip
+FIELDS = {**PROBLEM_FIELDS, **THING_FIELDS, **PATH_FIELDS}
+SPLINE = ("points", "pinned", "states", "degree")
+
+
+class DatasetError(ApexError):
+    """A data set that cannot be read or written as asked."""
+
+
+@dataclass(frozen=True, eq=False)
+class Paths:
+    """Proven paths, and the problems that they solve, as arrays.
+
+    Attributes:
+        arrays: Of each problem, ``suite`` and ``level`` (numbers in ``names``), ``seed``, ``held`` (a number in
+            ``names``, what the hands hold), and how many ``things`` stand around. Of each thing, in the order of the
+            problems, ``shape`` (a number in :data:`SHAPES`), ``position`` [m], ``orientation`` (xyzw) and ``size`` [m].
+            Of each path, the number of its ``problem``, ``start`` and ``goal`` [1e-6 rad], free ``control`` points
+            [rad], the obstacle ``point`` nearest to the robot at the start [m], ``clearance`` [m] and ``length``
+            [rad], ``source`` (a number in :data:`SOURCES`), and ``homotopy``, which tells paths of a problem apart that
+            could not be deformed into each other along straight lines.
+        names: What numbers stand for: ``suite``, ``level``, ``held``.
+        about: Whose paths these are: ``robot``, ``joints``, and the fields of their :class:`Spline`.
+        counts: What was tried, and what came of it.
+    """
+
+    arrays: Mapping[str, NDArray[Any]]
+    names: Mapping[str, tuple[str, ...]]
+    about: Mapping[str, Any]
+    counts: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Check that the arrays belong together.
+
+        Raises:
+            DatasetError: They do not.
+        """
+        fault = arrays_fault(self.arrays) or about_fault(self.about, self.arrays)
+        if fault:
+            raise DatasetError(f"data set: {fault}")
+
+    def __len__(self) -> int:
+        """Return the number of paths."""
+        return len(self.arrays["problem"])
+
+    @property
+    def problems(self) -> int:
+        """The number of problems."""
+        return len(self.arrays["seed"])
+
+    @property
+    def start(self) -> Array:
+        """Start of each path, shape (N, dof) [rad]."""
+        return from_micro(self.arrays["start"])
+
+    @property
+    def goal(self) -> Array:
+        """Goal of each path, shape (N, dof) [rad]."""
+        return from_micro(self.arrays["goal"])
+
+    @property
+    def spline(self) -> Spline:
+        """What the control points belong to."""
+        return Spline(**{key: self.about[key] for key in SPLINE})
+
+    def control(self, which: Any = slice(None)) -> Array:
+        """Return all control points of paths, shape (n, points, dof) [rad]."""
+        spline = self.spline
+        free = np.asarray(self.arrays["control"][which], float)
+        points = np.zeros((len(free), spline.points, free.shape[2]))
+        points[:, spline.inner] = free
+        return spline.with_ends(points, self.start[which], self.goal[which])
+
+    def problem_name(self, k: int) -> str:
+        """Return the id of problem k, for example ``shelf/hard/12``."""
+        a = self.arrays
+        return f"{self.names['suite'][a['suite'][k]]}/{self.names['level'][a['level'][k]]}/{a['seed'][k]}"
+
+    def chosen(self, problems: ArrayLike) -> Paths:
+        """Return the paths of some problems, whose numbers are given."""
+        wanted = np.sort(np.asarray(problems, int))
+        a = self.arrays
+        first = np.concatenate([[0], np.cumsum(a["things"])]).astype(int)
+        things = np.concatenate([np.arange(first[k], first[k + 1]) for k in wanted] or [np.zeros(0, int)])
+        place = np.full(self.problems, -1)
+        place[wanted] = np.arange(len(wanted))
+        kept = place[a["problem"]] >= 0
+        arrays = {name: a[name][wanted] for name in PROBLEM_FIELDS}
+        arrays |= {name: a[name][things] for name in THING_FIELDS}
+        arrays |= {name: a[name][kept] for name in PATH_FIELDS}
+        arrays["problem"] = place[a["problem"][kept]].astype(np.int32)
+        return Paths(arrays, self.names, self.about)
+
+    @classmethod
+    def joined(cls, several: Iterable[Paths]) -> Paths:
+        """Return all paths of several sets as one.
+
+        Raises:
+            DatasetError: There is none, or their states have not the same number of joints.
+        """
+        parts = list(several)
+        if not parts:
+            raise DatasetError("data set: no paths to join")
+        names: dict[str, list[str]] = {key: [] for key in ("suite", "level", "held")}
+        columns: dict[str, list[NDArray[Any]]] = {name: [] for name in FIELDS}
+        if any(dict(part.about) != dict(parts[0].about) for part in parts):
+            raise DatasetError("data set: its units have states of different robots or splines")
+        before = 0
+        for part in parts:
+            for name in FIELDS:
+                column = part.arrays[name]
+                if name in names:
+                    column = _renumbered(column, part.names[name], names[name])
+                columns[name].append(column + np.int32(before) if name == "problem" else column)
+            before += part.problems
+        arrays = {name: np.concatenate(column) for name, column in columns.items()}
+        return cls(arrays, {key: tuple(values) for key, values in names.items()}, parts[0].about)
+
+
+def rounded(control: Array, lower: Array, upper: Array) -> Array:
+    """Return control points as half-precision numbers inside the limits, shape (..., dof)."""
+    half = control.astype(np.float16)
+    half = np.where(half.astype(float) > upper, np.nextafter(half, np.float16(-np.inf)), half)
+    half = np.where(half.astype(float) < lower, np.nextafter(half, np.float16(np.inf)), half)
+    return half.astype(float)
+
+
+def to_micro(states: ArrayLike) -> NDArray[np.int32]:
+    """Return states [rad] in whole millionths."""
+    return np.rint(np.asarray(states, float) / MICRO).astype(np.int32)
+
+
+def from_micro(states: NDArray[np.int32]) -> Array:
+    """Return states [rad] from whole millionths; the states nearest to six decimals, bit for bit."""
+    return np.asarray(states, float) / 1e6
+
+
+def _renumbered(numbers: NDArray[Any], names: Iterable[str], known: list[str]) -> NDArray[Any]:
+    """Return numbers of ``names`` as numbers of ``known``, to which new names are added."""
+    table = []
+    for name in names:
+        if name not in known:
+            known.append(name)
+        table.append(known.index(name))
+    return np.array(table, np.uint8)[numbers] if len(numbers) else numbers
+
+
+def arrays_fault(arrays: Mapping[str, NDArray[Any]]) -> str:
+    """Return what is wrong with arrays, or nothing."""
+    if set(arrays) != set(FIELDS):
+        return "fields"
+    for name, (kind, shape) in FIELDS.items():
+        array = arrays[name]
+        fits = array.ndim == 1 + len(shape) and all(b in (-1, a) for a, b in zip(array.shape[1:], shape, strict=True))
+        if array.dtype != kind or not fits:
+            return name
+    for names in (PROBLEM_FIELDS, THING_FIELDS, PATH_FIELDS):
+        if len({len(arrays[name]) for name in names}) > 1:
+            return "lengths"
+    if int(arrays["things"].sum()) != len(arrays["shape"]):
+        return "things"
+    if len(arrays["problem"]):
+        if not 0 <= arrays["problem"].min() <= arrays["problem"].max() < len(arrays["seed"]):
+            return "problem"
+        if arrays["start"].shape != arrays["goal"].shape or arrays["start"].shape[1] != arrays["control"].shape[2]:
+            return "control"
+        if arrays["source"].max() >= len(SOURCES) or not np.isfinite(arrays["control"]).all():
+            return "source or control"
+    return ""
+
+
+def about_fault(about: Any, arrays: Mapping[str, NDArray[Any]]) -> str:
+    """Return what is wrong with what is said about arrays, or nothing."""
+    try:
+        spline, joints = Spline(**{key: about[key] for key in SPLINE}), about["joints"]
+        fits = isinstance(about["robot"], str) and all(isinstance(name, str) for name in joints)
+        return "" if fits and arrays["control"].shape[1:] == (spline.free, len(joints)) else "about"
+    except (ApexError, KeyError, TypeError):
+        return "about"
+
+
+def names_fault(arrays: Mapping[str, NDArray[Any]], names: Mapping[str, tuple[str, ...]]) -> str:
+    """Return what is wrong with the names that numbers stand for, or nothing."""
+    return next((k for k, v in names.items() if len(arrays[k]) and arrays[k].max() >= len(v)), "")

@@ -1,0 +1,1 @@
+"""OMPL: state space, validity checkers, planning setup, simplification, repair."""

@@ -1,0 +1,84 @@
+"""Mending a path that a planner found at its search resolution and that fails the full check."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+from ompl import base as ob
+from ompl import geometric as og
+
+from apex_ompl.ompl_adapter.interrupt import Interrupt
+from apex_ompl.ompl_adapter.setup import PlanningSetup
+from apex_ompl.ompl_adapter.space import path_to_array, state_space, to_state
+from apex_ompl.ompl_adapter.validity import FullCheck, MotionCheck, MotionValidator, StateValidityChecker, full_check
+from apex_ompl.types import Array
+from apex_ompl.util.resolution import FULL_RESOLUTION
+
+MAX_BRIDGES = 20
+
+
+def repair(
+    ready: PlanningSetup, path: Array, fault: FullCheck, deadline: float, interrupt: Interrupt | None = None
+) -> Array | None:
+    """Plan stretches that fail the full check anew, at the resolution of the full check.
+
+    Args:
+        ready: The problem.
+        path: States, shape (N, dof), the first and the last of them free.
+        fault: What the full check said of ``path``.
+        deadline: Value of ``time.perf_counter`` at which to give up [s].
+        interrupt: Ends the work in good order when it was pressed.
+
+    Returns:
+        A path that passes the full check, or None.
+    """
+    interrupt = interrupt or Interrupt()
+    for _ in range(MAX_BRIDGES):
+        left = deadline - time.perf_counter()
+        if left <= 0.0 or fault.segment is None or interrupt.pressed:
+            return None
+        first, last = _free_ends(ready, path, fault.segment)
+        bridge = _bridge(ready, path[first], path[last], left, interrupt)
+        if bridge is None:
+            return None
+        path = np.concatenate([path[:first], bridge, path[last + 1 :]])
+        fault = full_check(ready.checker, path, ready.start, ready.goals)
+        if fault:
+            return path
+    return None
+
+
+def _free_ends(ready: PlanningSetup, path: Array, segment: int) -> tuple[int, int]:
+    """Return the states nearest to a segment, before and after it, that are free.
+
+    Shortcuts may put a state between those that were judged, so that a state of the path itself collides.
+    """
+    first, last = segment, segment + 1
+    while first > 0 and not ready.checker.is_free(path[first]):
+        first -= 1
+    while last < len(path) - 1 and not ready.checker.is_free(path[last]):
+        last += 1
+    return first, last
+
+
+def _bridge(ready: PlanningSetup, a: Array, b: Array, timeout: float, interrupt: Interrupt) -> Array | None:
+    """Return a path between two free states, judged at the resolution of the full check, or None."""
+    space = state_space(ready.robot)
+    setup = og.SimpleSetup(space)
+    si = setup.getSpaceInformation()
+    validity_checker = StateValidityChecker(si, ready.checker)
+    motions = MotionValidator(si, MotionCheck(ready.checker, FULL_RESOLUTION))
+    setup.setStateValidityChecker(validity_checker)
+    si.setMotionValidator(motions)
+    setup.setStartAndGoalStates(to_state(si, a), to_state(si, b))
+    setup.setPlanner(og.RRTConnect(si))
+    with interrupt.ends(ob.timedPlannerTerminationCondition(timeout)) as ptc:
+        status = setup.solve(ptc)
+    fault = validity_checker.fault or motions.fault
+    if fault is not None:
+        raise fault
+    if status.getStatus() != ob.PlannerStatus.EXACT_SOLUTION:
+        return None
+    bridge = path_to_array(setup.getSolutionPath(), ready.robot.dof)
+    return np.stack([a, b]) if len(bridge) < 2 else np.concatenate([a[None], bridge[1:-1], b[None]])

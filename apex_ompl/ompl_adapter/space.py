@@ -1,0 +1,64 @@
+"""The OMPL state space of a robot, and states and paths as arrays.
+
+Positions enter as they are: radians for joints, and a hand synergy's 0 (open) .. 1 (closed) counts as one
+radian, so that OMPL's Euclidean distance is the joint-space distance with hands scaled by 1 rad.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from ompl import base as ob
+from ompl import geometric as og
+
+from apex_ompl.robot import Robot
+from apex_ompl.types import Array
+from apex_ompl.util.resolution import SEARCH_RESOLUTION
+
+
+def state_space(robot: Robot, resolution: float = SEARCH_RESOLUTION) -> ob.RealVectorStateSpace:
+    """Return the state space of a robot: one real dimension per planned joint, bounded by its limits.
+
+    Args:
+        robot: The robot.
+        resolution: Longest step that OMPL's own interpolation leaves between states [rad].
+    """
+    space = ob.RealVectorStateSpace(robot.dof)
+    bounds = ob.RealVectorBounds(robot.dof)
+    for k, name in enumerate(robot.joint_names):
+        bounds.setLow(k, float(robot.limits.lower[k]))
+        bounds.setHigh(k, float(robot.limits.upper[k]))
+        space.setDimensionName(k, name)
+    space.setBounds(bounds)
+    space.setName(robot.name)
+    space.setLongestValidSegmentFraction(resolution / space.getMaximumExtent())
+    return space
+
+
+def to_array(state: Any, dof: int) -> Array:
+    """Return an OMPL state as an array, shape (dof,)."""
+    return np.array(state[0:dof])
+
+
+def to_state(si: ob.SpaceInformation, q: Array) -> Any:
+    """Return a new OMPL state with the values of ``q``, shape (dof,), which is freed when Python drops it.
+
+    In OMPL's bindings states that a space allocates, and not a space information, are never freed.
+    """
+    state = si.allocState()
+    state[0 : len(q)] = [float(v) for v in q]
+    return state
+
+
+def path_to_array(path: og.PathGeometric, dof: int) -> Array:
+    """Return the states of an OMPL path, shape (N, dof)."""
+    return np.array([path.getState(k)[0:dof] for k in range(path.getStateCount())]).reshape(-1, dof)
+
+
+def array_to_path(si: ob.SpaceInformation, states: Array) -> og.PathGeometric:
+    """Return an OMPL path through ``states``, shape (N, dof)."""
+    path = og.PathGeometric(si)
+    for q in states:
+        path.append(to_state(si, q))  # a copy
+    return path

@@ -1,0 +1,1 @@
+"""Problem files: bodies, meshes, planning problems."""

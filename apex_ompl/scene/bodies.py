@@ -1,0 +1,172 @@
+"""Solids as files name them: shapes, poses, obstacles and held objects.
+
+Lengths are in metres, the world has z up, quaternions are ordered xyzw.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Annotated, Self, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydantic import AfterValidator, Field, field_validator, model_validator
+
+from apex_ompl.util.schema import StrictModel
+
+MESH_SUFFIXES = (".stl", ".obj")
+LARGEST = 1e4  # lengths beyond are taken for a fault [m]
+
+
+def _unit_quaternion(q: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
+    if abs(float(np.linalg.norm(q)) - 1.0) > 1e-3:
+        raise ValueError("expected a unit quaternion [x, y, z, w]")
+    return q
+
+
+def _non_zero(v: tuple[float, float, float]) -> tuple[float, float, float]:
+    if float(np.linalg.norm(v)) < 1e-9:
+        raise ValueError("expected a direction that is not zero")
+    return v
+
+
+Coordinate = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
+Size = Annotated[float, Field(gt=0.0, le=LARGEST)]
+Vector = tuple[Coordinate, Coordinate, Coordinate]
+Direction = Annotated[Vector, AfterValidator(_non_zero)]
+Quaternion = Annotated[tuple[float, float, float, float], AfterValidator(_unit_quaternion)]
+Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_./-]*$")]
+
+
+class Sphere(StrictModel):
+    """A ball centred on the object's origin; radius [m]."""
+
+    radius: Size
+
+
+class RoundBar(StrictModel):
+    """A cylinder along z centred on the origin, or a capsule whose ``length`` excludes its end caps [m]."""
+
+    radius: Size
+    length: Size
+
+
+class MeshFile(StrictModel):
+    """A closed triangle mesh from an STL or OBJ file; a relative path starts at the problem file."""
+
+    file: str
+    scale: Vector = (1.0, 1.0, 1.0)
+
+    @field_validator("file")
+    @classmethod
+    def _known_suffix(cls, file: str) -> str:
+        if not file.lower().endswith(MESH_SUFFIXES):
+            raise ValueError(f"expected a mesh file ending in {' or '.join(MESH_SUFFIXES)}")
+        return file
+
+    @field_validator("scale")
+    @classmethod
+    def _positive_scale(cls, scale: Vector) -> Vector:
+        if min(scale) <= 0.0:
+            raise ValueError("expected three positive factors")
+        return scale
+
+
+class HalfSpace(StrictModel):
+    """All points x of the object's frame with normal . x <= offset [m]; the normal points out of the solid."""
+
+    normal: Direction
+    offset: Coordinate = 0.0
+
+
+class Body(StrictModel):
+    """A named solid: exactly one shape, and its pose."""
+
+    name: Name
+    box: tuple[Size, Size, Size] | None = None
+    sphere: Sphere | None = None
+    cylinder: RoundBar | None = None
+    capsule: RoundBar | None = None
+    mesh: MeshFile | None = None
+    half_space: HalfSpace | None = None
+    position: Vector = (0.0, 0.0, 0.0)
+    orientation: Quaternion = (0.0, 0.0, 0.0, 1.0)
+
+    @model_validator(mode="after")
+    def _one_shape(self) -> Self:
+        given = [k for k in SHAPES if getattr(self, k) is not None]
+        if len(given) != 1:
+            found = " and ".join(given) or "none"
+            raise ValueError(f"{self.name!r}: expected exactly one of {', '.join(SHAPES)}; found {found}")
+        return self
+
+    @property
+    def shape(self) -> str:
+        """The kind of the shape: one of ``SHAPES``."""
+        return next(k for k in SHAPES if getattr(self, k) is not None)
+
+    @property
+    def pose(self) -> NDArray[np.float64]:
+        """Homogeneous transform, shape (4, 4) [m]."""
+        return pose_matrix(self.position, self.orientation)
+
+
+BodyT = TypeVar("BodyT", bound=Body)
+SHAPES = ("box", "sphere", "cylinder", "capsule", "mesh", "half_space")
+
+
+class Obstacle(Body):
+    """A solid of the scene, in the world frame; ``velocity`` [m/s] makes it a moving one."""
+
+    velocity: Vector | None = None
+
+    @property
+    def moving(self) -> bool:
+        """Whether the obstacle has a velocity other than zero."""
+        return self.velocity is not None and any(v != 0.0 for v in self.velocity)
+
+
+class ContactFace(StrictModel):
+    """Where a held object meets another: face centre [m] and outward axis, in the object's frame."""
+
+    point: Vector = (0.0, 0.0, 0.0)
+    axis: Direction = (0.0, 0.0, 1.0)
+
+
+class AttachedObject(Body):
+    """A held solid, posed in the frame of the link that holds it.
+
+    ``touch_links`` are links it may touch; None means all links of the hand that holds it.
+    """
+
+    link: Name
+    touch_links: tuple[Name, ...] | None = None
+    contact: ContactFace | None = None
+
+    @model_validator(mode="after")
+    def _bounded(self) -> Self:
+        if self.half_space is not None:
+            raise ValueError(f"{self.name!r}: a half_space cannot be held")
+        return self
+
+
+def located(body: BodyT, folder: Path) -> BodyT:
+    """Return a body whose mesh, if it has one, is named by its absolute path; a relative one starts at ``folder``."""
+    if body.mesh is None:
+        return body
+    file = os.path.abspath(folder / body.mesh.file)
+    return body.model_copy(update={"mesh": body.mesh.model_copy(update={"file": file})})
+
+
+def pose_matrix(position: ArrayLike, orientation: ArrayLike) -> NDArray[np.float64]:
+    """Return the homogeneous transform of a position [m] and a quaternion xyzw, shape (4, 4)."""
+    x, y, z, w = np.asarray(orientation, float) / np.linalg.norm(orientation)
+    pose = np.eye(4)
+    pose[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    pose[:3, 3] = position
+    return pose

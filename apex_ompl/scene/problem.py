@@ -1,0 +1,235 @@
+"""Planning problems: the robot's name, a scene, held objects, a start and a goal; as records and as YAML.
+
+The file format is ``schema: apex-ompl/problem/1``. Joints go by name [rad; hand synergies 0 open to 1
+closed]; lengths are in metres, the world has z up, quaternions are ordered xyzw.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BeforeValidator, Field, PositiveFloat, Strict, field_validator, model_validator
+
+from apex_ompl.errors import FileFormatError, nearest_name
+from apex_ompl.scene.bodies import AttachedObject, Name, Obstacle, Vector, located
+from apex_ompl.util.files import write_atomically
+from apex_ompl.util.schema import StrictModel, dump_yaml, read_yaml, validate
+
+SCHEMA = "apex-ompl/problem/1"
+
+
+JointValues = dict[str, Annotated[float, Strict()]]
+
+
+def _one_or_many(value: Any) -> Any:
+    return [value] if isinstance(value, Mapping) else value
+
+
+class WorldVector(StrictModel):
+    """A vector seen in the world at the start state, fixed to the link that holds what it was drawn along.
+
+    This is how the paper states a task (its section III-A): ``tip`` is the point of contact [m], and the direction
+    from ``tail`` to ``tip`` the outward axis.
+    """
+
+    link: Name
+    tail: Vector
+    tip: Vector
+
+    @model_validator(mode="after")
+    def _not_a_point(self) -> Self:
+        if float(np.linalg.norm(np.subtract(self.tip, self.tail))) < 1e-6:
+            raise ValueError("expected a tail and a tip that differ")
+        return self
+
+
+class Tolerance(StrictModel):
+    """How far an alignment may be off: across and along the axis [m], and in angle [rad]."""
+
+    lateral: PositiveFloat
+    axial: PositiveFloat
+    angle: PositiveFloat
+
+
+ALIGNMENT_DEFAULTS: dict[str, tuple[float, Tolerance]] = {
+    "vertical": (0.01, Tolerance(lateral=0.01, axial=0.01, angle=float(np.radians(5)))),
+    "horizontal": (0.03, Tolerance(lateral=0.01, axial=0.01, angle=float(np.radians(8)))),
+    "pour": (0.05, Tolerance(lateral=0.015, axial=0.02, angle=float(np.radians(10)))),
+    "handover": (0.01, Tolerance(lateral=0.015, axial=0.01, angle=float(np.radians(12)))),
+}
+"""Kind -> distance [m] and tolerance where an alignment does not say."""
+
+
+class Alignment(StrictModel):
+    """Two contact faces brought together (section III-A of the paper), as ``apex_ompl.tasks.alignment`` defines it.
+
+    Attributes:
+        kind: ``vertical`` (stacking), ``horizontal`` (insertion), ``pour`` or ``handover``.
+        first: Name of a held object that has a contact face, or a vector in the world.
+        second: The same; for a handover the name of the hand that receives.
+        distance: Gap between the faces along the axis; for ``pour`` the height of the lip above the opening [m].
+        tolerance: How far off is still good; the kind's own by default.
+        tilt: Least and largest angle between the axis of ``first`` and up, for ``pour`` [rad].
+    """
+
+    kind: Literal["vertical", "horizontal", "pour", "handover"]
+    first: Name | WorldVector
+    second: Name | WorldVector
+    distance: float | None = None
+    tolerance: Tolerance | None = None
+    tilt: tuple[float, float] | None = None
+
+    @model_validator(mode="after")
+    def _tilt_of_pouring(self) -> Self:
+        if self.tilt is not None and self.kind != "pour":
+            raise ValueError(f"tilt is for pour only, not for {self.kind}")
+        if self.tilt is not None and not 0.0 <= self.tilt[0] < self.tilt[1] <= float(np.pi):
+            raise ValueError("expected a tilt range [least, largest] inside [0, 3.1416]")
+        if self.first == self.second:
+            raise ValueError("first and second are the same")
+        return self
+
+
+class Goal(StrictModel):
+    """What is to be reached: one of several complete joint configurations, or an alignment of held objects."""
+
+    joints: (
+        Annotated[
+            tuple[JointValues, ...],
+            Field(min_length=1),
+            BeforeValidator(_one_or_many, json_schema_input_type=JointValues | tuple[JointValues, ...]),
+        ]
+        | None
+    ) = None
+    alignment: Alignment | None = None
+
+    @model_validator(mode="after")
+    def _one_kind(self) -> Self:
+        if (self.joints is None) == (self.alignment is None):
+            found = "none" if self.joints is None else "both"
+            raise ValueError(f"expected exactly one of joints, alignment; found {found}")
+        return self
+
+
+class Problem(StrictModel):
+    """A motion planning problem.
+
+    Attributes:
+        name: Name of the problem.
+        robot: Name of a robot that ships with the package, or path of a robot file.
+        scene: Obstacles in the world frame, besides the robot's own fixtures.
+        attached: Held objects.
+        start: Joint name -> value of the start state.
+        goal: What is to be reached.
+    """
+
+    schema_id: Literal["apex-ompl/problem/1"] = Field(default="apex-ompl/problem/1", alias="schema")
+    name: Name
+    robot: str
+    scene: tuple[Obstacle, ...] = ()
+    attached: tuple[AttachedObject, ...] = ()
+    start: JointValues
+    goal: Goal
+
+    @field_validator("scene", "attached", mode="before")
+    @classmethod
+    def _nothing_is_empty(cls, value: Any) -> Any:
+        return () if value is None else value
+
+    @model_validator(mode="after")
+    def _unique_names(self) -> Self:
+        names = [body.name for body in (*self.scene, *self.attached)]
+        twice = sorted({n for n in names if names.count(n) > 1})
+        if twice:
+            raise ValueError(f"the name {twice[0]!r} is given to more than one object")
+        return self
+
+    @property
+    def moving(self) -> tuple[str, ...]:
+        """Names of the obstacles that move."""
+        return tuple(o.name for o in self.scene if o.moving)
+
+    def start_state(self, joint_names: Sequence[str]) -> NDArray[np.float64]:
+        """Return the start in the order of ``joint_names``, shape (dof,).
+
+        Raises:
+            FileFormatError: A joint is missing or unknown.
+        """
+        return _in_order(self.start, joint_names, self.name, "start")
+
+    def goal_states(self, joint_names: Sequence[str]) -> NDArray[np.float64]:
+        """Return the goals in the order of ``joint_names``, shape (goals, dof); none for an alignment.
+
+        Raises:
+            FileFormatError: A joint is missing or unknown.
+        """
+        several = len(self.goal.joints or ()) > 1
+        rows = []
+        for k, values in enumerate(self.goal.joints or ()):
+            field = f"goal.joints.{k}" if several else "goal.joints"
+            rows.append(_in_order(values, joint_names, self.name, field))
+        return np.array(rows).reshape(-1, len(joint_names))
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Problem:
+        """Read a problem file; the paths of meshes and of a robot file become absolute.
+
+        Raises:
+            MissingFileError: The file, or a mesh that it names, cannot be read.
+            FileFormatError: The file does not follow the schema; the message names the field.
+        """
+        path = Path(path)
+        data = read_yaml(path, "problem file")
+        if data.get("schema") != SCHEMA:
+            raise FileFormatError(str(path), "schema", data.get("schema"), f"expected {SCHEMA!r}")
+        problem = validate(cls, data, str(path))
+        return problem._located(path.resolve().parent)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the problem as YAML, under a temporary name first.
+
+        Raises:
+            MissingFileError: The folder is missing or cannot be written.
+        """
+        write_atomically(Path(path), self.to_yaml().encode())
+
+    def to_yaml(self) -> str:
+        """Return the YAML text of the problem."""
+        return dump_yaml(self.as_dict())
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the problem as plain data in the form of its file."""
+        data = self.model_dump(by_alias=True, exclude_none=True, exclude_defaults=True)
+        head = {"schema": SCHEMA, "name": data.pop("name"), "robot": data.pop("robot")}
+        goals = data["goal"].get("joints", ())
+        if goals:
+            data["goal"]["joints"] = goals[0] if len(goals) == 1 else list(goals)
+        return head | data
+
+    def _located(self, folder: Path) -> Problem:
+        update: dict[str, Any] = {
+            "scene": tuple(located(o, folder) for o in self.scene),
+            "attached": tuple(located(o, folder) for o in self.attached),
+        }
+        if self.robot.endswith((".yaml", ".yml")):
+            update["robot"] = os.path.normpath(folder / self.robot)
+        return self.model_copy(update=update)
+
+
+def _in_order(values: Mapping[str, float], joint_names: Sequence[str], source: str, field: str) -> NDArray[np.float64]:
+    unknown = [name for name in values if name not in joint_names]
+    if unknown:
+        near = nearest_name(unknown[0], joint_names)
+        hint = f"did you mean {near!r}?" if near else f"known: {', '.join(joint_names)}"
+        raise FileFormatError(source, field, unknown[0], f"unknown joint, {hint}")
+    missing = [name for name in joint_names if name not in values]
+    if missing:
+        raise FileFormatError(
+            source, field, f"{len(values)} of {len(joint_names)} joints", f"joint {missing[0]!r} is missing"
+        )
+    return np.array([values[name] for name in joint_names], float)

@@ -1,0 +1,1 @@
+"""Tasks: alignment goals, grasps, inverse kinematics, MoveIt files."""

@@ -1,0 +1,110 @@
+"""Grasps: a held object, the hand synergy that holds it, and the links that may touch it, as one thing."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import coal
+import numpy as np
+import pinocchio as pin
+
+from apex_ompl.collision.broadphase import exact_requests
+from apex_ompl.collision.shapes import coal_geometry
+from apex_ompl.errors import SceneError, UnknownNameError
+from apex_ompl.robot import Robot
+from apex_ompl.robot.model import link_of
+from apex_ompl.scene.bodies import AttachedObject
+
+SCAN = 200  # synergies tried from open to closed before bisection
+TOLERANCE = 1e-4
+
+
+@dataclass(frozen=True)
+class Grasp:
+    """An object in a hand.
+
+    Attributes:
+        held: The object, fixed to the palm; it may touch the links of the hand.
+        hand: Name of the hand.
+        synergy_joint: The joint that closes the hand, or None for a hand without one.
+        synergy: Its value at first contact, just short of touching.
+        touched: The finger link that would touch first, or an empty text when none does.
+    """
+
+    held: AttachedObject
+    hand: str
+    synergy_joint: str | None
+    synergy: float
+    touched: str
+
+
+def grasp(robot: Robot, hand: str, held: AttachedObject) -> Grasp:
+    """Close a hand on an object until the first finger link would touch it.
+
+    Args:
+        robot: The robot.
+        hand: Name of one of its hands.
+        held: The object, posed in the frame of the hand's palm; its ``link`` and ``touch_links`` are set here.
+
+    Raises:
+        UnknownNameError: No such hand.
+        SceneError: A finger of the open hand is inside the object already.
+    """
+    if hand not in robot.hands:
+        raise UnknownNameError("hand", hand, robot.hands)
+    record = robot.hands[hand]
+    links = robot.hand_of(record.palm)
+    held = held.model_copy(update={"link": record.palm, "touch_links": links})
+    if record.synergy is None:
+        return Grasp(held, hand, None, 0.0, "")
+    closing = _Closing(robot, held, record.synergy, links)
+    low = 0.0
+    touched = closing.touched(low)
+    if touched:
+        raise SceneError(f"the open {hand} does not clear {held.name!r}: {touched} is inside it")
+    for high in np.linspace(0.0, 1.0, SCAN + 1)[1:]:
+        touched = closing.touched(float(high))
+        if touched:
+            break
+        low = float(high)
+    else:
+        return Grasp(held, hand, record.synergy, 1.0, "")
+    high = float(high)
+    while high - low > TOLERANCE:
+        middle = (low + high) / 2
+        found = closing.touched(middle)
+        low, high, touched = (low, middle, found) if found else (middle, high, touched)
+    return Grasp(held, hand, record.synergy, low, touched)
+
+
+class _Closing:
+    """Contact between the fingers of a hand and an object in its palm, as a function of the synergy."""
+
+    def __init__(self, robot: Robot, held: AttachedObject, synergy: str, links: tuple[str, ...]) -> None:
+        self.robot = robot
+        self.index = robot.joint_names.index(synergy)
+        palm = robot.model.frames[robot.link_frame(held.link)]
+        self.geometry = pin.GeometryModel()
+        fingers = [
+            item
+            for item in robot.geometry.geometryObjects
+            if link_of(robot.model, item) in links and item.parentJoint != palm.parentJoint
+        ]
+        self.names = [link_of(robot.model, item) for item in fingers]
+        shape: coal.CollisionGeometry = coal_geometry(held)
+        placement = palm.placement * pin.SE3(held.pose)
+        body = self.geometry.addGeometryObject(
+            pin.GeometryObject(held.name, palm.parentJoint, robot.link_frame(held.link), placement, shape)
+        )
+        for item in fingers:
+            self.geometry.addCollisionPair(pin.CollisionPair(self.geometry.addGeometryObject(item.copy()), body))
+        self.data, self.geometry_data = robot.model.createData(), exact_requests(self.geometry.createData())
+
+    def touched(self, synergy: float) -> str:
+        """Return the first finger link that overlaps the object at a synergy, or an empty text."""
+        q = self.robot.home.copy()
+        q[self.index] = synergy
+        order = self.robot.to_pinocchio(q)
+        pin.computeCollisions(self.robot.model, self.data, self.geometry, self.geometry_data, order, False)
+        hits = [r.isCollision() for r in self.geometry_data.collisionResults]
+        return next((name for name, hit in zip(self.names, hits, strict=True) if hit), "")

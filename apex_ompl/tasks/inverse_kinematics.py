@@ -1,0 +1,82 @@
+"""Inverse kinematics by links: points and directions of links for the kernel's descents."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Sequence
+from weakref import WeakKeyDictionary
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import ArrayLike, NDArray
+
+from apex_ompl.collision.tabulate import joint_specs
+from apex_ompl.errors import UnknownNameError
+from apex_ompl.kernel import Fixed, Inverse, RobotTables, Target
+from apex_ompl.kernel.robot_builder import robot_tables, turn_to
+from apex_ompl.kernel.tables import FIXED
+from apex_ompl.robot import Robot
+
+
+def in_world(vector: ArrayLike) -> Fixed:
+    """Return a point [m] or a unit direction of the world, shape (3,), as a part of targets."""
+    return Fixed(0, vector)
+
+
+class Links:
+    """A robot's links as parts of targets; safe to use from several threads."""
+
+    def __init__(self, robot: Robot) -> None:
+        """Tabulate the joints of ``robot``.
+
+        Raises:
+            RobotError: A joint moves in a way that the kernel does not know.
+        """
+        # The robot itself is not kept: `of` would keep it alive for good.
+        specs = joint_specs(robot)
+        frames = (f for f in robot.model.frames if f.type == pin.FrameType.BODY)
+        self._placements = {f.name: (int(f.parentJoint), f.placement.copy()) for f in frames}
+        self._turns = [turn_to(spec.axis if spec.kind != FIXED else None)[:3, :3] for spec in specs]
+        limits = robot.limits
+        self.tables: RobotTables = robot_tables(
+            robot.name, robot.joint_names, lower=limits.lower, upper=limits.upper, joints=specs, bodies=[], pairs=[]
+        )
+
+    @classmethod
+    def of(cls, robot: Robot) -> Links:
+        """Return the links of a robot, made once."""
+        with _lock:
+            if robot not in _known:
+                _known[robot] = cls(robot)
+            return _known[robot]
+
+    def point(self, link: str, point: ArrayLike) -> Fixed:
+        """Return a point in a link's frame, shape (3,) [m].
+
+        Raises:
+            UnknownNameError: No such link.
+        """
+        joint, placement = self._placement(link)
+        return Fixed(joint, self._turns[joint].T @ placement.act(np.asarray(point, float)))
+
+    def direction(self, link: str, direction: ArrayLike) -> Fixed:
+        """Return a unit direction in a link's frame, shape (3,).
+
+        Raises:
+            UnknownNameError: No such link.
+        """
+        joint, placement = self._placement(link)
+        return Fixed(joint, self._turns[joint].T @ placement.rotation @ np.asarray(direction, float))
+
+    def inverse(self, targets: Sequence[Target], fixed: Sequence[int] | NDArray[np.intp] = ()) -> Inverse:
+        """Return the inverse kinematics for targets; the planned joints whose numbers are ``fixed`` stay."""
+        return Inverse(self.tables, targets, fixed)
+
+    def _placement(self, link: str) -> tuple[int, pin.SE3]:
+        if link not in self._placements:
+            raise UnknownNameError("link", link, self._placements)
+        return self._placements[link]
+
+
+_known: WeakKeyDictionary[Robot, Links] = WeakKeyDictionary()
+_lock = threading.Lock()

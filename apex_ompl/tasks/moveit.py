@@ -1,0 +1,278 @@
+"""Problems out of MoveIt and MotionBenchMaker files: a planning scene and a motion plan request, both as YAML.
+
+Read are ``moveit_msgs/PlanningScene`` (or its ``world`` alone) and ``moveit_msgs/MotionPlanRequest`` in the two
+spellings that are about: poses as lists or as x/y/z(/w) mappings, primitive types by name or by number.
+A primitive's pose is composed with that of its object and of the frame the object is given in; every primitive of
+an object becomes an obstacle. What would change the problem and cannot be read is an error that names it; what is
+left out without harm is listed in the notes.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from apex_ompl.errors import FileFormatError, UnknownNameError
+from apex_ompl.robot import Robot
+from apex_ompl.robot.assets import resolve
+from apex_ompl.scene.bodies import AttachedObject, Obstacle, pose_matrix
+from apex_ompl.scene.problem import Goal, Problem
+from apex_ompl.types import Array
+from apex_ompl.util.schema import read_yaml
+
+PRIMITIVES = {1: "box", 2: "sphere", 3: "cylinder", 4: "cone"}
+WORLD_FRAMES = ("", "world", "map")
+HARMLESS = ("workspace_parameters", "planner_id", "num_planning_attempts", "allowed_planning_time", "pipeline_id")
+
+
+@dataclass
+class Conversion:
+    """A problem, and what was not taken over into it."""
+
+    problem: Problem
+    notes: list[str] = field(default_factory=list)
+
+
+@dataclass
+class _Reader:
+    robot: Robot
+    joint_map: Mapping[str, str]
+    frame_map: Mapping[str, str]
+    file: Path
+    notes: list[str] = field(default_factory=list)
+
+    def fail(self, where: str, value: object, expected: str) -> FileFormatError:
+        return FileFormatError(str(self.file), where, value, expected)
+
+    def joint(self, name: str, where: str) -> str | None:
+        """Return our name of a joint, or None for one that this robot does not plan."""
+        mapped = self.joint_map.get(name, name)
+        if mapped in self.robot.joint_names:
+            return mapped
+        if name in self.joint_map:
+            raise UnknownNameError(f"joint in the map of {name!r}", mapped, self.robot.joint_names)
+        note = f"{where}: joint {name!r} is not planned by {self.robot.name}"
+        if note not in self.notes:
+            self.notes.append(note)
+        return None
+
+    def frame(self, name: str, start: Array, where: str) -> Array:
+        """Return the pose of a frame in the world at the start state, shape (4, 4)."""
+        name = self.frame_map.get(name, name).lstrip("/")
+        if name in WORLD_FRAMES:
+            return np.eye(4)
+        if name in self.robot.link_names:
+            return self.robot.link_pose(start, name)
+        expected = f"expected the frame world or a link of {self.robot.name}; map it with --frame {name}=LINK"
+        raise self.fail(f"{where}.header.frame_id", name, expected)
+
+    def pose(self, data: Any, where: str) -> Array:
+        """Return a pose message as a matrix; a missing one is the identity."""
+        if not data:
+            return np.eye(4)
+        position = self.numbers(data.get("position"), "xyz", (0.0, 0.0, 0.0), f"{where}.position")
+        turn = self.numbers(data.get("orientation"), "xyzw", (0.0, 0.0, 0.0, 1.0), f"{where}.orientation")
+        if not float(np.linalg.norm(turn)) > 1e-6:
+            turn = np.array([0.0, 0.0, 0.0, 1.0])  # an empty message means no rotation
+        return pose_matrix(position, turn)
+
+    def numbers(self, data: Any, keys: str, default: Sequence[float], where: str) -> Array:
+        if data is None:
+            return np.array(default)
+        values = [data.get(k, d) for k, d in zip(keys, default, strict=True)] if isinstance(data, Mapping) else data
+        try:
+            array = np.array(values, dtype=float)
+        except (TypeError, ValueError) as error:
+            raise self.fail(where, data, f"expected {len(keys)} numbers") from error
+        if array.shape != (len(keys),) or not np.isfinite(array).all():
+            raise self.fail(where, data, f"expected {len(keys)} finite numbers")
+        return array
+
+    def state(self, data: Mapping[str, Any], where: str) -> dict[str, float]:
+        """Return the planned joints of a robot state message."""
+        joints = data.get("joint_state") or {}
+        names, positions = joints.get("name") or [], joints.get("position") or []
+        if len(names) != len(positions):
+            raise self.fail(f"{where}.joint_state", len(positions), f"expected {len(names)} positions")
+        if (data.get("multi_dof_joint_state") or {}).get("joint_names"):
+            self.notes.append(f"{where}.multi_dof_joint_state: the robot's base does not move")
+        found = {}
+        for name, position in zip(names, positions, strict=True):
+            ours = self.joint(str(name), f"{where}.joint_state")
+            if ours is not None:
+                found[ours] = float(position)
+        return found
+
+    def shapes(self, item: Mapping[str, Any], where: str) -> Iterator[tuple[dict[str, Any], Array]]:
+        """Yield (shape fields, pose in the object's frame) of an object message."""
+        for k, (primitive, pose) in enumerate(self.paired(item, "primitives", "primitive_poses", where)):
+            yield self.primitive(primitive, f"{where}.primitives.{k}"), pose
+        for k, (mesh, pose) in enumerate(self.paired(item, "meshes", "mesh_poses", where)):
+            yield self.mesh(mesh, f"{where}.meshes.{k}"), pose
+        for k, (plane, pose) in enumerate(self.paired(item, "planes", "plane_poses", where)):
+            a, b, c, d = self.numbers(plane.get("coef"), "abcd", (0, 0, 1, 0), f"{where}.planes.{k}.coef")
+            self.notes.append(f"{where}.planes.{k}: read as the half-space below the plane")
+            yield {"half_space": {"normal": (a, b, c), "offset": -d}}, pose
+
+    def paired(self, item: Mapping[str, Any], shapes: str, poses: str, where: str) -> list[tuple[Any, Array]]:
+        found, placed = item.get(shapes) or [], item.get(poses) or []
+        if placed and len(placed) != len(found):
+            raise self.fail(f"{where}.{poses}", len(placed), f"expected {len(found)} poses, one per shape")
+        placed = placed or [None] * len(found)
+        return [(s, self.pose(p, f"{where}.{poses}.{k}")) for k, (s, p) in enumerate(zip(found, placed, strict=True))]
+
+    def primitive(self, data: Mapping[str, Any], where: str) -> dict[str, Any]:
+        kind = data.get("type")
+        kind = PRIMITIVES.get(kind, kind) if isinstance(kind, int) else str(kind).lower()
+        size = data.get("dimensions") or []
+        counts = {"box": 3, "sphere": 1, "cylinder": 2}
+        if kind not in counts:
+            raise self.fail(f"{where}.type", data.get("type"), "cannot be read, expected box, sphere or cylinder")
+        if len(size) != counts[kind]:
+            raise self.fail(f"{where}.dimensions", size, f"expected {counts[kind]} numbers for a {kind}")
+        values = [float(v) for v in size]
+        if kind == "box":
+            return {"box": tuple(values)}
+        if kind == "sphere":
+            return {"sphere": {"radius": values[0]}}
+        return {"cylinder": {"radius": values[1], "length": values[0]}}
+
+    def mesh(self, data: Mapping[str, Any], where: str) -> dict[str, Any]:
+        resource = data.get("resource")
+        if not resource:
+            raise self.fail(where, sorted(data), "cannot be read, expected a mesh by path (resource)")
+        scale = data.get("dimensions") or data.get("scale") or (1.0, 1.0, 1.0)
+        file = resolve(str(resource), self.file.resolve().parent, f"mesh {where}")
+        return {"mesh": {"file": str(file), "scale": tuple(float(v) for v in scale)}}
+
+
+def convert(
+    scene: Path,
+    request: Path,
+    robot: Robot,
+    joint_map: Mapping[str, str] | None = None,
+    frame_map: Mapping[str, str] | None = None,
+) -> Conversion:
+    """Read a scene and a request as a problem for one of our robots.
+
+    Args:
+        scene: YAML of a ``moveit_msgs/PlanningScene`` or its world.
+        request: YAML of a ``moveit_msgs/MotionPlanRequest``.
+        robot: The robot.
+        joint_map: Their joint name -> ours.
+        frame_map: Their frame -> ``world`` or a link of ours.
+
+    Raises:
+        MissingFileError: A file or a mesh cannot be read.
+        FileFormatError: Something that matters cannot be read; the message names it.
+        UnknownNameError: The joint map names an unknown joint.
+    """
+    scene_data, request_data = read_yaml(scene, "scene file"), read_yaml(request, "request file")
+    notes: list[str] = []
+    at_scene = _Reader(robot, joint_map or {}, frame_map or {}, scene, notes)
+    at_request = _Reader(robot, joint_map or {}, frame_map or {}, request, notes)
+    scene_state, start_state = scene_data.get("robot_state") or {}, request_data.get("start_state") or {}
+    start = dict(zip(robot.joint_names, robot.home.tolist(), strict=True))
+    given = at_scene.state(scene_state, "robot_state") | at_request.state(start_state, "start_state")
+    if not given:
+        raise at_request.fail("start_state.joint_state", None, "expected joints of the robot; is a joint map missing?")
+    missing = [name for name in robot.joint_names if name not in given]
+    if missing:
+        notes.append(f"start: {', '.join(missing)} not given, taken at home")
+    start |= given
+    q = np.array([start[name] for name in robot.joint_names])
+    obstacles = _obstacles(at_scene, scene_data, q)
+    attached = list(_attached(at_scene, scene_state, "robot_state", q))
+    attached += list(_attached(at_request, start_state, "start_state", q))
+    goals = _goals(at_request, request_data, start)
+    for key in HARMLESS:
+        if request_data.get(key):
+            notes.append(f"{key}: not used")
+    name = re.sub(r"[^A-Za-z0-9_.-]+", "_", scene.stem).strip("_.-") or "converted"
+    problem = Problem(
+        name=name, robot=robot.name, scene=tuple(obstacles), attached=tuple(attached), start=start,
+        goal=Goal(joints=tuple(goals)),
+    )  # fmt: skip
+    return Conversion(problem, notes)
+
+
+def _obstacles(reader: _Reader, data: Mapping[str, Any], start: Array) -> list[Obstacle]:
+    world = data.get("world", data) or {}
+    if (world.get("octomap") or {}).get("octomap", {}).get("data"):
+        raise reader.fail("world.octomap", "an octomap", "cannot be read, expected primitives and meshes")
+    found: list[Obstacle] = []
+    for k, item in enumerate(world.get("collision_objects") or []):
+        where = f"collision_objects.{k}"
+        base = reader.frame(str((item.get("header") or {}).get("frame_id", "")), start, where)
+        for label, shape, pose in _bodies(reader, item, where):
+            placed = base @ pose
+            found.append(Obstacle(name=label, **shape, **_placement(placed)))
+    return found
+
+
+def _attached(reader: _Reader, state: Mapping[str, Any], where: str, start: Array) -> Iterator[AttachedObject]:
+    for k, entry in enumerate(state.get("attached_collision_objects") or []):
+        here = f"{where}.attached_collision_objects.{k}"
+        link = reader.frame_map.get(str(entry.get("link_name")), str(entry.get("link_name")))
+        item = entry.get("object") or {}
+        frame = str((item.get("header") or {}).get("frame_id", ""))
+        inside = np.linalg.inv(reader.robot.link_pose(start, link))
+        # MoveIt gives an attached object in the frame of its link unless the header says otherwise.
+        base = np.eye(4) if frame in ("", str(entry.get("link_name"))) else inside @ reader.frame(frame, start, here)
+        touch = [reader.frame_map.get(str(t), str(t)) for t in entry.get("touch_links") or []]
+        unknown = [t for t in touch if t not in reader.robot.link_names]
+        if unknown:
+            reader.notes.append(f"{here}.touch_links: {', '.join(unknown)} are no links of {reader.robot.name}")
+        known = tuple(t for t in touch if t in reader.robot.link_names)
+        for label, shape, pose in _bodies(reader, item, here):
+            yield AttachedObject(
+                name=label, link=link, touch_links=tuple({*known, *reader.robot.hand_of(link)}) if known else None,
+                **shape, **_placement(base @ pose),
+            )  # fmt: skip
+
+
+def _bodies(reader: _Reader, item: Mapping[str, Any], where: str) -> list[tuple[str, dict[str, Any], Array]]:
+    """Return (name, shape fields, pose in the object's header frame) of every shape of an object."""
+    label = re.sub(r"[^A-Za-z0-9_.-]+", "_", str(item.get("id", "")).strip()).strip("_.-")
+    label = label or where.replace(".", "_")
+    own = reader.pose(item.get("pose"), f"{where}.pose")
+    shapes = list(reader.shapes(item, where))
+    if not shapes:
+        raise reader.fail(where, sorted(item), "expected primitives, meshes or planes")
+    names = [label] if len(shapes) == 1 else [f"{label}/{k}" for k in range(len(shapes))]
+    return [(name, shape, own @ pose) for name, (shape, pose) in zip(names, shapes, strict=True)]
+
+
+def _goals(reader: _Reader, data: Mapping[str, Any], start: Mapping[str, float]) -> list[dict[str, float]]:
+    for key in ("path_constraints", "trajectory_constraints"):
+        if any((data.get(key) or {}).values()) if isinstance(data.get(key), Mapping) else data.get(key):
+            raise reader.fail(key, "constraints along the path", "cannot be read, expected none")
+    goals = []
+    for k, goal in enumerate(data.get("goal_constraints") or []):
+        where = f"goal_constraints.{k}"
+        for other in ("position_constraints", "orientation_constraints", "visibility_constraints"):
+            if goal.get(other):
+                raise reader.fail(f"{where}.{other}", "a list", "cannot be read, expected joint_constraints only")
+        values = dict(start)
+        reached = False
+        for j, constraint in enumerate(goal.get("joint_constraints") or []):
+            ours = reader.joint(str(constraint.get("joint_name")), f"{where}.joint_constraints.{j}")
+            if ours is not None:
+                values[ours], reached = float(constraint["position"]), True
+        if not reached:
+            raise reader.fail(where, sorted(goal), "expected joint_constraints on joints of the robot")
+        goals.append(values)
+    if not goals:
+        raise reader.fail("goal_constraints", None, "expected at least one goal")
+    return goals
+
+
+def _placement(pose: Array) -> dict[str, Any]:
+    turn = pin.Quaternion(pose[:3, :3]).coeffs()
+    return {"position": tuple(pose[:3, 3].tolist()), "orientation": tuple(float(v) for v in turn)}

@@ -1,0 +1,1 @@
+"""Trajectory optimisation: B-spline paths, the optimiser, the candidate pool."""

@@ -1,0 +1,301 @@
+"""Trajectory optimisation on control points: paths made clear of obstacles, and then short.
+
+One optimiser serves repair, polish and the making of data. It needs NumPy and the compiled kernel alone; what decides
+whether a path is valid is handed in.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from apex_ompl.errors import ParameterError
+from apex_ompl.kernel import optimization
+from apex_ompl.kernel.interface import Kernel
+from apex_ompl.trajopt.spline import Spline
+from apex_ompl.types import Array
+
+Check = Callable[[Array], bool]
+"""Whether a path, shape (states, dof), is valid."""
+
+STIFFER, SHORTENINGS = 5.0, 4  # factor from one round of shortening to the next, and how many rounds
+PART = 8  # steps between two looks at the clock
+FINER = 2  # factor on the number of samples for paths that are clear at them and yet not valid
+LAST_RESORT = 0.1  # factor on the stiffness where nothing came out valid
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What a path costs, and how long it is worked on.
+
+    Attributes:
+        samples: How many states are judged: the middles of as many even stretches of the parameter, as dense as every
+            fourth state of a path of 256.
+        scene_margin: Clearance to obstacles below which a state costs [m].
+        own_margin: Clearance between the robot's own links, its arms among them, below which a state costs [m].
+        stiffness: Weight of half the integral of the speed squared, [1/rad^2]; for an even speed this is half the
+            length squared. A clearance_cost of a whole margin, all along, costs 1/2.
+        damping: Weight of the speed of the change at the first step.
+        steps: Most steps in one go.
+        tolerance: A step that lowers the cost by less than this share is the last.
+    """
+
+    samples: int = 64
+    scene_margin: float = 0.04
+    own_margin: float = 0.02
+    stiffness: float = 1e-3
+    damping: float = 1e-2
+    steps: int = 30
+    tolerance: float = 2e-3
+
+    def __post_init__(self) -> None:
+        """Check the numbers.
+
+        Raises:
+            ParameterError: One is out of range.
+        """
+        for field in fields(self):
+            value, whole = getattr(self, field.name), field.name in ("samples", "steps")
+            kinds = (int, np.integer) if whole else (int, float, np.integer, np.floating)
+            low = 1 if field.name == "samples" else 0
+            good = isinstance(value, kinds) and not isinstance(value, bool) and low <= value < np.inf
+            if not good or (value == 0 and field.name in ("scene_margin", "own_margin", "stiffness")):
+                least = f"{low} or more" if whole or field.name in ("damping", "tolerance") else "more than 0"
+                raise ParameterError(field.name, value, f"{'a whole' if whole else 'a'} number, {least}")
+
+
+@dataclass(frozen=True, eq=False)
+class OptimizationResult:
+    """Paths after some steps.
+
+    Attributes:
+        control: Control points, shape (B, points, dof).
+        cost: What they cost, shape (B,).
+        clearance_cost: The part of it that is due to clearance, shape (B,).
+        clearance: Smallest clearances of the sphere cover at the samples, to the scene and of the robot to itself,
+            where they are below the margins, and else the margins; shape (B, 2) [m].
+        steps: Steps that were taken, shape (B,).
+        damping: The damping to go on with, shape (B,).
+    """
+
+    control: Array
+    cost: Array
+    clearance_cost: Array
+    clearance: Array
+    steps: NDArray[np.int64]
+    damping: Array
+
+
+class Optimizer:
+    """Improves batches of paths; safe to use from several threads, and without random numbers of its own.
+
+    The method is that of Levenberg and Marquardt on squared clearance_costs of clearance and the squared speed, see
+    :mod:`apex_ompl.kernel.optimization`. Limits are kept by the control points.
+    """
+
+    def __init__(self, spline: Spline | None = None, settings: Settings | None = None) -> None:
+        """Work on control points of ``spline``."""
+        self.spline = spline or Spline()
+        self.settings = settings or Settings()
+
+    def prepare(self, kernel: Kernel) -> None:
+        """Load or compile now what the first steps need."""
+        self.improve(kernel, np.zeros((1, self.spline.points, kernel.robot.dof)), steps=0)
+
+    def finer(self) -> Optimizer:
+        """Return an optimiser that judges more states."""
+        return Optimizer(self.spline, replace(self.settings, samples=FINER * self.settings.samples))
+
+    def starts(self, start: Array, goal: Array, count: int, rng: np.random.Generator, size: float = 1.0) -> Array:
+        """Return the straight line, and bumped ones: count paths from a state to another, shape (count, points, dof).
+
+        Bumps are drawn from the normal distribution whose inverse covariance is the integral of the acceleration
+        squared (the prior of STOMP, Kalakrishnan et al. 2011); each joint strays by about ``size`` [rad] at most.
+
+        Raises:
+            ParameterError: ``count`` is not positive.
+        """
+        if count < 1:
+            raise ParameterError("count", count, "a positive number of paths")
+        line = self.spline.line(start, goal)
+        bumps = _bumps(self.spline) @ rng.normal(size=(count, self.spline.free, line.shape[1]))
+        bumps[0] = 0.0
+        paths = np.repeat(line[None], count, axis=0)
+        paths[:, self.spline.inner] += size * bumps
+        return paths
+
+    def evaluate(self, kernel: Kernel, control: ArrayLike) -> tuple[OptimizationResult, Array]:
+        """Return what paths, shape (B, points, dof), cost, and its gradient, shape (B, free points, dof).
+
+        Raises:
+            ParameterError: Control points of another shape.
+        """
+        control = self._control(kernel, control)
+        grid, sizes = _grid(self.spline, self.settings.samples), (self.spline.free, control.shape[2])
+        scratch, about = self._scratch(kernel), np.empty((len(control), 6))
+        slopes = np.empty((len(control), sizes[0] * sizes[1]))
+        for points, row, slope in zip(control, about, slopes, strict=True):
+            optimization.path_cost(
+                *kernel.packed,
+                *kernel.room(),
+                *grid,
+                self.spline.pinned,
+                points,
+                self._numbers(),
+                scratch,
+                row[:5],
+                slope,
+            )
+        about[:, 5] = self.settings.damping
+        return self._bent(control, about), slopes.reshape(-1, *sizes)
+
+    def improve(
+        self,
+        kernels: Kernel | Sequence[Kernel],
+        control: ArrayLike,
+        *,
+        steps: int | None = None,
+        stiffness: float | None = None,
+        damping: ArrayLike | None = None,
+        enough: float = np.inf,
+    ) -> OptimizationResult:
+        """Return paths with lower costs.
+
+        Args:
+            kernels: The robot among its obstacles: one for all paths, or one for each, of the same number of joints.
+            control: Control points, shape (B, points, dof); the pinned ones stay, the others are put inside limits.
+            steps: Most steps, those that failed among them; by default the settings'.
+            stiffness: By default the settings'.
+            damping: Damping of the first step, one for all or one for each; by default the settings'.
+            enough: A path is left alone as soon as both of its clearances reach this [m].
+
+        Raises:
+            ParameterError: Control points of another shape, or another number of kernels.
+        """
+        several = [kernels] if isinstance(kernels, Kernel) else list(kernels)
+        control = self._control(several[0], control).copy() if several else np.asarray(control, float)
+        each = several * len(control) if isinstance(kernels, Kernel) else several
+        if len(each) != len(control) or any(k.robot.dof != control.shape[2] for k in each):
+            raise ParameterError("kernels", len(each), f"{len(control)}, one for each path, or one alone")
+        about = np.empty((len(control), 6))
+        if not len(control):
+            return self._bent(control, about)
+        for name, number in (("steps", steps), ("stiffness", stiffness), ("damping", damping)):
+            if number is not None and not (np.asarray(number) >= 0.0).all():
+                raise ParameterError(name, number, "a number, 0 or more")
+        grid = _grid(self.spline, self.settings.samples)
+        numbers = self._numbers()
+        numbers[optimization.STEPS] = self.settings.steps if steps is None else steps
+        numbers[optimization.STIFFNESS] = self.settings.stiffness if stiffness is None else stiffness
+        numbers[optimization.ENOUGH_SCENE] = numbers[optimization.ENOUGH_OWN] = enough
+        dampings = np.broadcast_to(self.settings.damping if damping is None else damping, len(control))
+        scratch, held = self._scratch(each[0]), np.empty(self.spline.free * control.shape[2], np.int64)
+        for kernel, points, row, first in zip(each, control, about, dampings, strict=True):
+            numbers[optimization.DAMPING] = first
+            optimization.bend(
+                *kernel.packed, *kernel.room(), *grid, self.spline.pinned, points, numbers, scratch, held, row
+            )
+        return self._bent(control, about)
+
+    def shorten(
+        self, kernel: Kernel, control: ArrayLike, is_valid: Check, stop: Callable[[], bool] = lambda: False
+    ) -> Array | None:
+        """Return the last valid path of stiffer and stiffer ones, control points of shape (points, dof), or None.
+
+        Stiffer paths are shorter. The stiffness grows from round to round, until a path fails the check; where the
+        first one fails already, a softer one has its turn, judged at more states.
+
+        Args:
+            kernel: The robot among its obstacles.
+            control: Where to start from, shape (points, dof); it need not be valid.
+            is_valid: Decides; called with the states of a path.
+            stop: Asked between parts of rounds whether to end.
+
+        Raises:
+            ParameterError: Control points of another shape.
+        """
+        now, stiffness = self._control(kernel, control)[:1], self.settings.stiffness
+        best: Array | None = None
+        optimizer = self
+        for k in range(SHORTENINGS):
+            if stop():
+                break
+            improved = optimizer._in_parts(kernel, now, stiffness, stop)
+            if improved is None:
+                break
+            if is_valid(self.spline.path(improved[0])):
+                best, now = improved[0], improved
+                stiffness *= STIFFER
+            elif best is None and k < 2:
+                now, stiffness, optimizer = improved, LAST_RESORT * stiffness, self.finer()
+            else:
+                break
+        return best
+
+    def _in_parts(self, kernel: Kernel, control: Array, stiffness: float, stop: Callable[[], bool]) -> Array | None:
+        """Return a path, shape (1, points, dof), improved as far as it goes, or None when told to stop meanwhile."""
+        left, damping = self.settings.steps, None
+        while True:
+            steps = min(PART, left)
+            improved = self.improve(kernel, control, steps=steps, stiffness=stiffness, damping=damping)
+            control, damping, left = improved.control, improved.damping, left - steps
+            if improved.steps[0] < steps or left == 0:
+                return control
+            if stop():
+                return None
+
+    def _control(self, kernel: Kernel, control: ArrayLike) -> Array:
+        points = np.require(control, float, ["C", "W"])
+        if points.ndim == 2:
+            points = points[None]
+        wanted = (self.spline.points, kernel.robot.dof)
+        if points.ndim != 3 or points.shape[1:] != wanted or not np.isfinite(points).all():
+            raise ParameterError(
+                "control points", points.shape, f"finite numbers of shape (B, {wanted[0]}, {wanted[1]})"
+            )
+        return points
+
+    def _numbers(self) -> Array:
+        s = self.settings
+        return np.array(
+            [s.scene_margin, s.own_margin, s.stiffness, s.damping, np.inf, np.inf, s.tolerance, s.steps], float
+        )
+
+    def _scratch(self, kernel: Kernel) -> Array:
+        dof = kernel.robot.dof
+        return np.empty(optimization.room_for(self.spline.free * dof, self.spline.points, dof))
+
+    @staticmethod
+    def _bent(control: Array, about: Array) -> OptimizationResult:
+        cost, clearance_cost, clearance = (
+            about[:, optimization.COST],
+            about[:, optimization.CLEARANCE_COST],
+            about[:, optimization.SCENE :][:, :2],
+        )
+        return OptimizationResult(
+            control, cost, clearance_cost, clearance, about[:, optimization.TAKEN].astype(np.int64), about[:, -1]
+        )
+
+
+@lru_cache(maxsize=32)
+def _grid(spline: Spline, samples: int) -> tuple[Array, NDArray[np.int64], Array]:
+    """Return weights at the samples without their zeros, where they begin, and the Gram matrix of the speed."""
+    weights = spline.basis((np.arange(samples) + 0.5) / samples)
+    width = spline.degree + 1
+    first = np.minimum(np.argmax(weights != 0.0, axis=1), spline.points - width).astype(np.int64)
+    packed = np.take_along_axis(weights, first[:, None] + np.arange(width), axis=1)
+    return np.ascontiguousarray(packed), first, np.ascontiguousarray(spline.gram(1))
+
+
+@lru_cache(maxsize=32)
+def _bumps(spline: Spline) -> Array:
+    """Return what turns normal numbers for the free control points into smooth bumps, shape (free, free)."""
+    order = min(2, spline.degree)
+    root = np.linalg.inv(np.linalg.cholesky(spline.gram(order)[spline.inner, spline.inner])).T
+    weights = spline.basis(np.linspace(0.0, 1.0, 65))[:, spline.inner]
+    spread = np.sqrt(((weights @ root) ** 2).sum(axis=1)).max()
+    return np.asarray(root / spread)

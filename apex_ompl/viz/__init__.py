@@ -1,0 +1,1 @@
+"""Pictures: rendered scenes, films, plots."""

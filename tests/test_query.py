@@ -1,0 +1,57 @@
+"""Problems as the model sees them, against what data sets hold of the same problems."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from apex_ompl import load_problem
+from apex_ompl.apex.query import make_query
+from apex_ompl.collision import CollisionChecker
+from apex_ompl.diffusion.conditions import ObstacleSet, distances
+from apex_ompl.generation.worker import row_of
+from apex_ompl.ompl_adapter.setup import assemble
+from apex_ompl.problems.reach import robot
+from apex_ompl.scene.bodies import HalfSpace, Obstacle
+
+
+def sorted_rows(things: ObstacleSet) -> np.ndarray:
+    """Shape, position, half sizes of boxes in the world, and so on, in an order of their own."""
+    rows = np.column_stack([things.shape, things.position, things.size, things.turn.reshape(-1, 9)])
+    return rows[np.lexsort(np.round(rows[:, ::-1], 5).T)]
+
+
+@pytest.mark.parametrize("name", ["shelf/hard/800000", "clutter/medium/800001", "posts/easy/800002"])
+def test_queries_are_what_data_sets_hold(name: str) -> None:
+    ready = assemble(load_problem(name), robot())
+    query = make_query(ready.checker, ready.start, ready.goals[0])
+    stored = ObstacleSet.of(row_of(ready.problem, 0).things)
+    assert len(query.things) == len(stored) > 0
+    np.testing.assert_allclose(sorted_rows(query.things), sorted_rows(stored), atol=1e-5)
+    assert (query.start == ready.start).all() and (query.goal == ready.goals[0]).all()
+    nearest = ready.checker.distance(ready.start)
+    near = [abs(_distance(stored, query.point)[k]) for k in range(len(stored))]
+    assert min(near) < 1e-3 and nearest.value > 0
+
+
+def _distance(things: ObstacleSet, point: np.ndarray) -> np.ndarray:
+    arrays = [torch.tensor(v).float() for v in (things.position, things.turn, things.size)]
+    points = torch.tensor(point).float().expand(len(things), 1, 3)
+    return distances(torch.tensor(things.shape), *arrays, points)[:, 0].numpy()
+
+
+def test_without_obstacles_nothing_is_seen() -> None:
+    checker = CollisionChecker(robot())
+    query = make_query(checker, robot().home, robot().home)
+    assert len(query.things) == 0 and query.point.tolist() == [0.0, 0.0, -1.0]
+
+
+def test_half_spaces_are_seen_as_large_boxes() -> None:
+    normal = np.array([0.6, 0.0, 0.8])
+    plane = Obstacle(name="plane", half_space=HalfSpace(normal=tuple(normal), offset=-0.7))
+    checker = CollisionChecker(robot(), [plane])
+    query = make_query(checker, robot().home, robot().home)
+    points = np.random.default_rng(0).uniform([-0.3, -0.8, 0.0], [1.2, 0.8, 1.2], (50, 3))
+    for point in points:
+        assert _distance(query.things, point)[0] == pytest.approx(normal @ point + 0.7, abs=1e-4)
