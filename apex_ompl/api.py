@@ -17,7 +17,7 @@ from apex_ompl.ompl_adapter.interrupt import Interrupt
 from apex_ompl.ompl_adapter.process import quiet_ompl, seed_ompl
 from apex_ompl.ompl_adapter.setup import assemble
 from apex_ompl.planners.apex_parameters import WITHOUT_MODEL, default_planner
-from apex_ompl.planning import Planning
+from apex_ompl.planning import PlanRun, find_path, finish, parameterize
 from apex_ompl.result import PlanResult
 from apex_ompl.robot import load_robot
 from apex_ompl.scene.problem import Problem
@@ -123,12 +123,12 @@ def plan(
         ready = assemble(loaded, robot, seed=seed)
         if how is not None:
             warm_up()
-        run = Planning(ready, planner, seed, time.perf_counter() - started, tuple(notes))
+        run = PlanRun(ready, planner, parameters, seed, {"setup": time.perf_counter() - started}, notes)
         with Interrupt() as run.interrupt:
-            result = run.solve(parameters, timeout, simplify)
+            result = find_path(run, timeout, simplify)
             if how is not None:
-                result = run.with_timing(result, how)
-        return run.finish(started, result)
+                result = parameterize(run, result, how)
+        return finish(run, result, started)
 
 
 def check_arguments(timeout: float, seed: int) -> None:

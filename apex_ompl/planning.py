@@ -1,9 +1,10 @@
-"""What ``plan`` does with a problem that is made ready: line, planner, shortening, proof, repair."""
+"""Steps of ``plan``: query, straight line, solve, verify, repair, time; the benchmark composes the same steps."""
 
 from __future__ import annotations
 
 import time
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -13,6 +14,7 @@ from ompl import base as ob
 from apex_ompl.errors import ApexError, TimingError
 from apex_ompl.ompl_adapter.interrupt import Interrupt
 from apex_ompl.ompl_adapter.repair import repair
+from apex_ompl.ompl_adapter.report import LineAwarePlanner, SolveReport, report_of
 from apex_ompl.ompl_adapter.setup import PlanningSetup, set_goals
 from apex_ompl.ompl_adapter.simplify import simplify as shorten
 from apex_ompl.ompl_adapter.space import path_to_array
@@ -20,230 +22,242 @@ from apex_ompl.ompl_adapter.validity import full_check
 from apex_ompl.result import FIRST, INSIDE, PlanResult, PlanStatus
 from apex_ompl.trajectory import Timing, Trajectory, time_path
 from apex_ompl.trajectory.motion import ROUNDING
-from apex_ompl.trajopt.path import path_length, resample
+from apex_ompl.trajopt.path import Path, resample
 from apex_ompl.types import Array
 from apex_ompl.util.resolution import FULL_RESOLUTION
 from apex_ompl.util.stopwatch import timed
 
 if TYPE_CHECKING:
-    from apex_ompl.ompl_adapter.report import Report
     from apex_ompl.planners import Parameters
 
-
 CLEARANCE_SAMPLES = 32
-CHORD = 1e-5  # that a timed motion is off the straight line between two states that are proved, at most [rad]
-MOST_STATES = 100_000  # that are proved of a timed motion
+CHORD = 1e-5  # largest distance of a timed motion from the straight line between two states that are checked [rad]
+MAX_STATES = 100_000  # that are checked of a timed motion
 STRAIGHT_LINE = "straight line"
-PROOF_SHARE, LONGEST_PROOF = 0.1, 0.5  # time kept from planners that stop at the timeout only, for repair [1, s]
-LONGEST_TIMEOUT = 1e8  # OMPL counts nanoseconds in 64 bits [s]
+PROOF_SHARE, MAX_PROOF = 0.1, 0.5  # time kept from planners that stop at the timeout only, for repair [1, s]
+MAX_TIMEOUT = 1e8  # OMPL counts nanoseconds in 64 bits [s]
 
 
-class Planning:
-    """One call of ``plan`` on an assembled problem.
+@dataclass(eq=False)
+class PlanRun:
+    """One call of ``plan`` on a problem that is set up.
 
     Attributes:
-        ready: The problem.
+        setup: The problem.
+        planner: Name of the planner.
+        parameters: Its parameters.
+        seed: The seed used.
+        times: Seconds by stage so far.
+        notes: What a user should know about this run.
         interrupt: Holds Ctrl-C back.
-        times: Seconds per stage so far.
-        blank: The result before anything is known.
-        raw: The first path that the planner found, shape (N, dof), or None.
-        report: What the planner says of its call of ``solve``, of planners that say it.
+        rejected_lines: Straight lines to goals that failed the full check, each of shape (2, dof).
+        first_path: First path that the planner found, or None.
+        report: Report of the planner, of planners that make one.
     """
 
-    def __init__(
-        self, ready: PlanningSetup, planner: str, seed: int, setup_time: float, notes: tuple[str, ...]
-    ) -> None:
-        """Plan for ``ready`` with a planner by its name; ``setup_time`` went by already [s]."""
-        self.ready = ready
-        self.planner = planner
-        self.interrupt = Interrupt()
-        self.times = {"setup": setup_time}
-        self.raw: Array | None = None
-        self.report: Report | None = None
-        self.blank = PlanResult(
-            status=PlanStatus.UNKNOWN, reason="", problem=ready.problem, robot=ready.robot.name,
-            joint_names=ready.robot.joint_names, planner=planner, seed=seed, notes=notes,
+    setup: PlanningSetup
+    planner: str
+    parameters: Parameters
+    seed: int
+    times: dict[str, float] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+    interrupt: Interrupt = field(default_factory=Interrupt)
+    rejected_lines: list[Array] = field(default_factory=list)
+    first_path: Path | None = None
+    report: SolveReport | None = None
+
+    def result(self, status: PlanStatus, reason: str = "", path: Path | None = None, solved_by: str = "") -> PlanResult:
+        """Return a result without what :func:`finish` adds."""
+        robot = self.setup.robot
+        return PlanResult(
+            status=status, reason=reason, problem=self.setup.problem, robot=robot.name, joint_names=robot.joint_names,
+            planner=self.planner, seed=self.seed, path=path, solved_by=solved_by, notes=tuple(self.notes),
         )  # fmt: skip
 
-    def solve(self, parameters: Parameters, timeout: float, simplify: bool) -> PlanResult:
-        """Return the result without what ``finish`` adds."""
-        ready = self.ready
-        if ready.start_fault:
-            return self._failed(PlanStatus.INVALID_START, ready.start_fault)
-        if all(ready.goal_faults):
-            return self._failed(PlanStatus.INVALID_GOAL, "; ".join(ready.goal_faults))
-        with timed(self.times, "line"):
-            line = self.straight_line()
-        if line is not None:
-            return self._exact(line, STRAIGHT_LINE)
-        try:
-            with timed(self.times, "setup"):
-                planner = self._set_up(parameters)
-            status = self.run_ompl(planner, parameters, timeout)
-            deadline = time.perf_counter() + timeout - self.times["solve"]
-            report = self.report = getattr(planner, "report", None)
-            if report is not None:
-                self.times |= {INSIDE + stage: seconds for stage, seconds in report.times.items()}
-                if report.solved_by:
-                    self.times[FIRST] = report.first
-            if status is PlanStatus.APPROXIMATE_SOLUTION:
-                return self._approximate()
-            if status is not PlanStatus.EXACT_SOLUTION:
-                said = "" if status is PlanStatus.TIMEOUT else f" (OMPL says {status})"
-                said += f", {report.reason}" if report is not None and report.reason else ""
-                ours = PlanStatus.TIMEOUT if status in (PlanStatus.INVALID_START, PlanStatus.INVALID_GOAL) else status
-                return self._failed(ours, f"{self.planner} found no path in {timeout:g} s{said}")
-            states = path_to_array(ready.simple_setup.getSolutionPath(), ready.robot.dof)
-            self.raw = states if report is None or report.path is None else report.path
-            solved_by = self.planner if report is None else report.solved_by
-            return self._proved(states, deadline, simplify and not parameters.smooth, solved_by)
-        except ApexError:  # a checkpoint that is missing, for one
-            raise
-        except Exception as error:
-            return self._failed(PlanStatus.CRASH, f"{self.planner} failed, {error!r}")
 
-    def straight_line(self) -> Array | None:
-        """Return the straight line to the nearest goal for which it is a solution, or None.
+Execute = Callable[[PlanRun, ob.Planner, float], PlanStatus]
+"""Runs a planner that is set, for a time [s], and returns its status."""
 
-        Some of OMPL's planners hang, give up or raise where there is nothing to search for.
-        """
-        ready = self.ready
-        goals = sorted(ready.valid_goals, key=lambda goal: float(np.linalg.norm(goal - ready.start)))
-        lines = (np.stack([ready.start, goal]) for goal in goals)
-        free = (line for line in lines if ready.checker.first_collision(line, FULL_RESOLUTION) is None)
-        return next((line for line in free if full_check(ready.checker, line, ready.start, goals)), None)
 
-    def _set_up(self, parameters: Parameters) -> ob.Planner:
-        """Make the planner, warm."""
-        simple_setup = self.ready.simple_setup
-        si = simple_setup.getSpaceInformation()
-        goals = self.ready.valid_goals
-        if parameters.threaded and len(goals) > 1:
-            nearest = goals[int(np.argmin(np.linalg.norm(goals - self.ready.start, axis=1)))]
-            set_goals(simple_setup, [nearest])
-            note = f"{self.planner} runs threads and takes one goal: the nearest of {len(goals)}"
-            self.blank = replace(self.blank, notes=(*self.blank.notes, note))
-        if parameters.optimizing:  # others would go on after their first solution, prm for one
-            simple_setup.setOptimizationObjective(ob.PathLengthOptimizationObjective(si))
-        planner = parameters.build(si)
-        simple_setup.setPlanner(planner)
-        simple_setup.setup()
-        return planner
+def find_path(run: PlanRun, timeout: float, simplify: bool) -> PlanResult:
+    """Return a path that passes the full check, the straight line where it does, or why there is none.
 
-    def run_ompl(self, planner: ob.Planner, parameters: Parameters, timeout: float) -> PlanStatus:
-        """Run the planner, which is set, and return its status; faults of the checkers are raised."""
-        del planner
-        # A condition made in C++: planners that run threads deadlock with one made in Python.
-        condition = ob.timedPlannerTerminationCondition(solving_time(parameters, timeout))
-        with self.interrupt.ends(condition) as ptc, timed(self.times, "solve"):
-            status = PlanStatus.of(self.ready.simple_setup.solve(ptc))
-        self.raise_faults()
-        return status
+    Args:
+        run: The call of ``plan``.
+        timeout: Seconds for finding and repairing a path.
+        simplify: Whether paths of planners that leave it to others are shortened.
+    """
+    result = query_fault(run)
+    if result is None:
+        result = straight_line(run)
+    return solve(run, timeout, simplify) if result is None else result
 
-    def raise_faults(self) -> None:
-        """Raise what the checkers met inside of OMPL."""
-        fault = self.ready.validity_checker.fault or self.ready.motion_validator.fault
-        if fault is not None:
-            raise fault
 
-    def with_timing(self, result: PlanResult, timing: Timing) -> PlanResult:
-        """Return a result with its path timed and the motion proved, or with the status TIMING_FAILED."""
-        ready, path, began = self.ready, result.path, time.perf_counter()
-        if path is None or not result:
-            return result
-        robot, proof = ready.robot, dict[str, float]()
-        limits = robot.limits
+def query_fault(run: PlanRun) -> PlanResult | None:
+    """Return the result of a problem whose start is invalid, or all of whose goals are; else None."""
+    setup = run.setup
+    if setup.start_fault:
+        return run.result(PlanStatus.INVALID_START, setup.start_fault)
+    if all(setup.goal_faults):
+        return run.result(PlanStatus.INVALID_GOAL, "; ".join(setup.goal_faults))
+    return None
 
-        def fault(motion: Trajectory, resolution: float) -> str:
-            with timed(proof, "proof"):
-                shares = motion.use(timing.limits(limits))
-                over = [f"{name} {share:.4f}" for name, share in shares.items() if share > 1.0 + ROUNDING]
-                if over:
-                    return f"the share of a limit that it uses is over 1: {', '.join(over)}"
-                bend = max(float(np.abs(motion.accelerations).max()), 1e-9)
-                states = motion.sample(max(np.sqrt(8.0 * CHORD / bend), motion.duration / MOST_STATES, 1e-6)).position
-                states = np.clip(states, limits.lower, limits.upper)  # of rounding, as was seen
-                return full_check(ready.checker, states, ready.start, ready.goals, resolution).reason
 
-        try:
-            try:  # twice as densely as the path, which may itself only just pass
-                made = time_path(
-                    path, limits, robot.joint_names, timing, partial(fault, resolution=FULL_RESOLUTION / 2.0)
-                )
-            except TimingError:
-                made = time_path(path, limits, robot.joint_names, timing, partial(fault, resolution=FULL_RESOLUTION))
-        except TimingError as error:
-            return replace(result, status=PlanStatus.TIMING_FAILED, reason=f"the path cannot be timed, {error}")
-        finally:
-            self.times["timing proof"] = proof.get("proof", 0.0)
-            self.times["timing"] = time.perf_counter() - began - self.times["timing proof"]
-        motion = made.trajectory
-        return replace(result, trajectory=motion, limit_use=motion.use(limits), deviation=made.deviation)
+def straight_line(run: PlanRun) -> PlanResult | None:
+    """Return the straight line to the nearest goal for which it is a solution, or None.
 
-    def finish(self, started: float, result: PlanResult) -> PlanResult:
-        """Add clearance, length, counts and times."""
-        path = result.path
-        checks = self.ready.checker.check_counts.states
-        if path is not None:
-            with timed(self.times, "clearance"):
-                states = resample(path, CLEARANCE_SAMPLES)
-                clearance = min(self.ready.checker.clearance(q) for q in states)
-            result = replace(result, length=path_length(path), clearance=clearance)
-        self.times["total"] = time.perf_counter() - started
-        return replace(result, checks=checks, times=dict(self.times))
+    Some of OMPL's planners hang, give up or raise where there is nothing to search for. Limits are convex, and start
+    and goals are inside of them, so that a line without collision passes the full check.
+    """
+    setup = run.setup
+    with timed(run.times, "line"):
+        for goal in sorted(setup.valid_goals, key=lambda goal: float(np.linalg.norm(goal - setup.start))):
+            line = np.stack([setup.start, goal])
+            if setup.checker.first_collision(line, FULL_RESOLUTION) is None:
+                return run.result(PlanStatus.EXACT_SOLUTION, path=Path(line), solved_by=STRAIGHT_LINE)
+            run.rejected_lines.append(line)
+    return None
 
-    def _proved(self, path: Array, deadline: float, simplify: bool, solved_by: str) -> PlanResult:
-        """Put the exact start and goal in, shorten the path, prove it, and repair it where it fails.
 
-        When a shortened path can neither be proved nor repaired, the path as it was found has its turn.
-        """
-        candidates = [self._with_exact_ends(path)]
-        if simplify:
-            with timed(self.times, "simplify"):
-                candidates.insert(0, self._shortened(candidates[0]))
-            self.raise_faults()
-        ready, reason = self.ready, ""
-        for candidate in candidates:
-            with timed(self.times, "verify"):
-                check = full_check(ready.checker, candidate, ready.start, ready.goals)
-            if check:
-                return self._exact(candidate, solved_by)
-            reason = reason or check.reason
-            with timed(self.times, "repair"):
-                mended = repair(ready, candidate, check, deadline, self.interrupt)
-            if mended is not None:
-                return self._exact(mended, f"{solved_by}+repair")
-        return self._failed(PlanStatus.TIMEOUT, f"the path found failed the full check and repair, {reason}")
+def execute(run: PlanRun, planner: ob.Planner, timeout: float) -> PlanStatus:
+    """Run a planner that is set, and return its status; faults of the checkers are raised."""
+    del planner
+    # A condition made in C++: planners that run threads deadlock with one made in Python.
+    condition = ob.timedPlannerTerminationCondition(solving_time(run.parameters, timeout))
+    with run.interrupt.ends(condition) as ptc, timed(run.times, "solve"):
+        status = PlanStatus.of(run.setup.simple_setup.solve(ptc))
+    run.setup.raise_faults()
+    return status
 
-    def _shortened(self, path: Array) -> Array:
-        simple_setup = self.ready.simple_setup
-        si = simple_setup.getSpaceInformation()
-        return shorten(simple_setup.getPathSimplifier(), si, path, lambda: self.interrupt.pressed)
 
-    def _exact(self, path: Array, solved_by: str) -> PlanResult:
-        return replace(self.blank, status=PlanStatus.EXACT_SOLUTION, path=path, solved_by=solved_by)
+def solve(run: PlanRun, timeout: float, simplify: bool, execute: Execute = execute) -> PlanResult:
+    """Run the planner, verify what it finds, and repair it where it fails the full check.
 
-    def _approximate(self) -> PlanResult:
-        ready = self.ready
-        simple_setup = ready.simple_setup
-        path = path_to_array(simple_setup.getSolutionPath(), ready.robot.dof)
-        path[0] = ready.start
-        gap = float(np.linalg.norm(ready.goals - path[-1], axis=1).min())
-        reason = f"the nearest state found is {gap:.3g} rad from the goal"
-        check = full_check(ready.checker, path, ready.start)
-        if not check:
-            reason += f", and the path fails the full check, {check.reason}"
-        return replace(
-            self.blank, status=PlanStatus.APPROXIMATE_SOLUTION, reason=reason, path=path, solved_by=self.planner
-        )
+    Args:
+        run: The call of ``plan``.
+        timeout: Seconds for finding and repairing a path.
+        simplify: Whether paths of planners that leave it to others are shortened.
+        execute: Runs the planner.
 
-    def _with_exact_ends(self, path: Array) -> Array:
-        goals = self.ready.valid_goals
-        goal = goals[int(np.argmin(np.linalg.norm(goals - path[-1], axis=1)))]
-        return np.concatenate([self.ready.start[None], path[1:-1], goal[None]])
+    Raises:
+        ApexError: The planner cannot be built; a checkpoint is missing, for one.
+    """
+    try:
+        with timed(run.times, "setup"):
+            planner = _set_up(run)
+        status = execute(run, planner, timeout)
+        deadline = time.perf_counter() + timeout - run.times["solve"]
+        report = run.report = report_of(planner)
+        if report is not None:
+            run.times |= {INSIDE + stage: seconds for stage, seconds in report.times.items()}
+            if report.solved_by:
+                run.times[FIRST] = report.first
+        if status is PlanStatus.APPROXIMATE_SOLUTION:
+            return _approximate(run)
+        if status is not PlanStatus.EXACT_SOLUTION:
+            return _unsolved(run, status, timeout)
+        path = _found_path(run)
+        run.first_path = path if report is None or report.first_path is None else report.first_path
+        solved_by = run.planner if report is None else report.solved_by
+        return verify(run, path, deadline, simplify and not run.parameters.smooth, solved_by)
+    except ApexError:
+        raise
+    except Exception as error:
+        return run.result(PlanStatus.CRASH, f"{run.planner} failed, {error!r}")
 
-    def _failed(self, status: PlanStatus, reason: str) -> PlanResult:
-        return replace(self.blank, status=status, reason=reason)
+
+def verify(run: PlanRun, path: Path, deadline: float, simplify: bool, solved_by: str) -> PlanResult:
+    """Put the exact start and goal in, shorten the path, check it in full, and repair it where it fails.
+
+    When a shortened path neither passes nor can be repaired, the path as it was found has its turn.
+
+    Args:
+        run: The call of ``plan``.
+        path: Path of the planner.
+        deadline: Value of ``time.perf_counter`` at which repair gives up [s].
+        simplify: Whether the path is shortened.
+        solved_by: What found the path.
+    """
+    setup, reason = run.setup, ""
+    candidates = [with_exact_ends(setup, path)]
+    if simplify:
+        with timed(run.times, "simplify"):
+            candidates.insert(0, _simplified(run, candidates[0]))
+        setup.raise_faults()
+    for candidate in candidates:
+        with timed(run.times, "verify"):
+            check = full_check(setup.checker, candidate.states, setup.start, setup.goals)
+        if check:
+            return run.result(PlanStatus.EXACT_SOLUTION, path=candidate, solved_by=solved_by)
+        reason = reason or check.reason
+        with timed(run.times, "repair"):
+            repaired = repair(setup, candidate.states, check, deadline, run.interrupt)
+        if repaired is not None:
+            path = Path(repaired)
+            return run.result(PlanStatus.EXACT_SOLUTION, path=path, solved_by=f"{solved_by}+repair")
+    return run.result(PlanStatus.TIMEOUT, f"the path found failed the full check and repair, {reason}")
+
+
+def parameterize(run: PlanRun, result: PlanResult, timing: Timing) -> PlanResult:
+    """Return a result with its path timed and the motion proved, or with the status TIMING_FAILED."""
+    setup, path, began = run.setup, result.path, time.perf_counter()
+    if path is None or not result:
+        return result
+    robot, proof = setup.robot, dict[str, float]()
+    limits = robot.limits
+
+    def fault(motion: Trajectory, resolution: float) -> str:
+        with timed(proof, "proof"):
+            shares = motion.use(timing.limits(limits))
+            over = [f"{name} {share:.4f}" for name, share in shares.items() if share > 1.0 + ROUNDING]
+            if over:
+                return f"the share of a limit that it uses is over 1: {', '.join(over)}"
+            bend = max(float(np.abs(motion.accelerations).max()), 1e-9)
+            states = motion.sample(max(np.sqrt(8.0 * CHORD / bend), motion.duration / MAX_STATES, 1e-6)).position
+            states = np.clip(states, limits.lower, limits.upper)  # of rounding, as was seen
+            return full_check(setup.checker, states, setup.start, setup.goals, resolution).reason
+
+    try:
+        try:  # twice as densely as the path, which may itself only just pass
+            made = time_path(
+                path.states, limits, robot.joint_names, timing, partial(fault, resolution=FULL_RESOLUTION / 2.0)
+            )
+        except TimingError:
+            made = time_path(path.states, limits, robot.joint_names, timing, partial(fault, resolution=FULL_RESOLUTION))
+    except TimingError as error:
+        return replace(result, status=PlanStatus.TIMING_FAILED, reason=f"the path cannot be timed, {error}")
+    finally:
+        run.times["timing proof"] = proof.get("proof", 0.0)
+        run.times["timing"] = time.perf_counter() - began - run.times["timing proof"]
+    motion = made.trajectory
+    return replace(result, trajectory=motion, limit_use=motion.use(limits), deviation=made.deviation)
+
+
+def finish(run: PlanRun, result: PlanResult, started: float) -> PlanResult:
+    """Add clearance, length, counts and times.
+
+    Args:
+        run: The call of ``plan``.
+        result: What came of it.
+        started: Value of ``time.perf_counter`` when the call began [s].
+    """
+    checks = run.setup.checker.check_counts.states
+    if result.path is not None:
+        with timed(run.times, "clearance"):
+            states = resample(result.path.states, CLEARANCE_SAMPLES)
+            clearance = min(run.setup.checker.clearance(q) for q in states)
+        result = replace(result, length=result.path.length, clearance=clearance)
+    run.times["total"] = time.perf_counter() - started
+    return replace(result, checks=checks, times=dict(run.times))
+
+
+def with_exact_ends(setup: PlanningSetup, path: Path) -> Path:
+    """Return a path whose ends are the given start and the nearest goal, bit for bit."""
+    goals, states = setup.valid_goals, path.states
+    goal = goals[int(np.argmin(np.linalg.norm(goals - states[-1], axis=1)))]
+    if np.array_equal(states[0], setup.start) and np.array_equal(states[-1], goal):
+        return path
+    return Path(np.concatenate([setup.start[None], states[1:-1], goal[None]]))
 
 
 def solving_time(parameters: Parameters, timeout: float) -> float:
@@ -252,5 +266,57 @@ def solving_time(parameters: Parameters, timeout: float) -> float:
     Planners that stop at the timeout only leave a tenth of it, at most half a second.
     """
     if parameters.optimizing:
-        timeout -= min(PROOF_SHARE * timeout, LONGEST_PROOF)
-    return min(timeout, LONGEST_TIMEOUT)
+        timeout -= min(PROOF_SHARE * timeout, MAX_PROOF)
+    return min(timeout, MAX_TIMEOUT)
+
+
+def _set_up(run: PlanRun) -> ob.Planner:
+    """Return the planner, warm."""
+    setup, parameters = run.setup, run.parameters
+    simple_setup = setup.simple_setup
+    si = simple_setup.getSpaceInformation()
+    goals = setup.valid_goals
+    if parameters.threaded and len(goals) > 1:
+        nearest = goals[int(np.argmin(np.linalg.norm(goals - setup.start, axis=1)))]
+        set_goals(simple_setup, [nearest])
+        run.notes.append(f"{run.planner} runs threads and takes one goal: the nearest of {len(goals)}")
+    if parameters.optimizing:  # others would go on after their first solution, prm for one
+        simple_setup.setOptimizationObjective(ob.PathLengthOptimizationObjective(si))
+    planner = parameters.build(si)
+    simple_setup.setPlanner(planner)
+    simple_setup.setup()
+    if isinstance(planner, LineAwarePlanner):
+        planner.rejected_lines = run.rejected_lines
+    return planner
+
+
+def _found_path(run: PlanRun) -> Path:
+    """Return OMPL's solution; as the planner reports it, with its spline, where the states are the same."""
+    states = path_to_array(run.setup.simple_setup.getSolutionPath(), run.setup.robot.dof)
+    best = None if run.report is None else run.report.best_path
+    return best if best is not None and np.array_equal(best.states, states) else Path(states)
+
+
+def _simplified(run: PlanRun, path: Path) -> Path:
+    simple_setup = run.setup.simple_setup
+    si = simple_setup.getSpaceInformation()
+    return Path(shorten(simple_setup.getPathSimplifier(), si, path.states, lambda: run.interrupt.pressed))
+
+
+def _unsolved(run: PlanRun, status: PlanStatus, timeout: float) -> PlanResult:
+    report, details = run.report, "" if status is PlanStatus.TIMEOUT else f" (OMPL says {status})"
+    details += f", {report.reason}" if report is not None and report.reason else ""
+    ours = PlanStatus.TIMEOUT if status in (PlanStatus.INVALID_START, PlanStatus.INVALID_GOAL) else status
+    return run.result(ours, f"{run.planner} found no path in {timeout:g} s{details}")
+
+
+def _approximate(run: PlanRun) -> PlanResult:
+    setup = run.setup
+    states = path_to_array(setup.simple_setup.getSolutionPath(), setup.robot.dof)
+    states[0] = setup.start
+    distance = float(np.linalg.norm(setup.goals - states[-1], axis=1).min())
+    reason = f"the nearest state found is {distance:.3g} rad from the goal"
+    check = full_check(setup.checker, states, setup.start)
+    if not check:
+        reason += f", and the path fails the full check, {check.reason}"
+    return run.result(PlanStatus.APPROXIMATE_SOLUTION, reason, Path(states), run.planner)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import io
 import json
 import os
+import pathlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,8 @@ from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError
 from apex_ompl.scene.problem import Problem
 from apex_ompl.trajectory import Trajectory
 from apex_ompl.trajectory.files import MESSAGES, STATES
+from apex_ompl.trajopt.path import Path
+from apex_ompl.trajopt.spline import Spline
 from apex_ompl.util.files import BROKEN, suffix_of, write_atomically
 from apex_ompl.util.schema import dump_yaml, read_yaml, validate
 
@@ -67,7 +69,7 @@ class PlanResult:
         joint_names: Order of the columns of ``path``.
         planner: Name of the planner.
         seed: The seed used.
-        path: States to be joined by straight lines, shape (N, dof) [rad; synergies 0..1], or None.
+        path: Path whose states, joined by straight lines, passed the full check, with its spline if any; or None.
         trajectory: The timed motion, which passed the full check along its own samples and keeps all limits, or None.
         limit_use: Largest share of each limit that ``trajectory`` uses, by ``position``, ``velocity``,
             ``acceleration`` and ``jerk``; empty without one.
@@ -78,8 +80,9 @@ class PlanResult:
         clearance: Least distance of any checked pair at 32 states spread over the path [m], NaN without a path.
         checks: How many states were judged one by one; those inside proved stretches of motions do not count.
         solved_by: What found the path: the planner's name, or the stage of apex that did (see
-            ``apex_ompl.ompl_adapter.report.Report``), with ``+repair`` where a stretch of it failed the full check and
-            was planned anew; ``straight line`` when that was a solution, so that no planner ran; empty without a path.
+            ``apex_ompl.ompl_adapter.report.SolveReport``), with ``+repair`` where a stretch of it failed the full check
+            and was planned anew; ``straight line`` where that is a solution, so that no planner ran; empty without a
+            path.
         notes: What a user should know about this run, such as a snapshot of moving obstacles.
     """
 
@@ -90,7 +93,7 @@ class PlanResult:
     joint_names: tuple[str, ...]
     planner: str
     seed: int
-    path: NDArray[np.float64] | None = None
+    path: Path | None = None
     trajectory: Trajectory | None = None
     limit_use: Mapping[str, float] = field(default_factory=dict)
     deviation: float = float("nan")
@@ -123,7 +126,8 @@ class PlanResult:
             "times": dict(self.times),
             "notes": list(self.notes),
             "joint_names": list(self.joint_names),
-            "path": None if self.path is None else self.path.tolist(),
+            "path": None if self.path is None else self.path.states.tolist(),
+            "spline": None if self.path is None else _spline_fields(self.path),
             "duration": None if motion is None else motion.duration,
             "limit_use": dict(self.limit_use),
             "deviation": None if np.isnan(self.deviation) else self.deviation,
@@ -144,7 +148,7 @@ class PlanResult:
             ParameterError: Another suffix, or nothing of the kind in the result.
             MissingFileError: The folder is missing or cannot be written.
         """
-        path = Path(path)
+        path = pathlib.Path(path)
         suffix = suffix_of(path, SUFFIXES)
         if self.trajectory is not None and suffix in (*MESSAGES, ".csv"):
             self.trajectory.save(path)
@@ -160,7 +164,7 @@ class PlanResult:
             FileFormatError: It is not a saved result.
             ParameterError: It has another suffix; a .csv holds no problem.
         """
-        path = Path(path)
+        path = pathlib.Path(path)
         suffixes = tuple(s for s in SUFFIXES if s not in (*MESSAGES, ".csv"))
         if path.suffix not in suffixes or path.name.endswith(MESSAGES):
             raise ParameterError("result file", str(path), f"a file name ending in {', '.join(suffixes)}")
@@ -176,7 +180,8 @@ class PlanResult:
             if states is not None and (states.ndim != 2 or states.shape[1] != len(names)):
                 raise ValueError(f"a path of shape {states.shape} for {len(names)} joints")
             return cls(
-                status=PlanStatus(data["status"]), reason=data["reason"], robot=data["robot"], path=states,
+                status=PlanStatus(data["status"]), reason=data["reason"], robot=data["robot"],
+                path=None if states is None else _path(states, data.get("spline")),
                 problem=validate(Problem, data["problem_file"], str(path)), planner=data["planner"],
                 joint_names=names, trajectory=motion, limit_use=dict(data["limit_use"]), seed=int(data["seed"]),
                 times=data["times"], checks=int(data["checks"]), solved_by=data["solved_by"],
@@ -197,10 +202,10 @@ class PlanResult:
             if self.path is None:
                 raise ParameterError("output", suffix, "a result with a path")
             rows = [",".join(self.joint_names)]
-            rows += [",".join(repr(float(v)) for v in q) for q in self.path]
+            rows += [",".join(repr(float(v)) for v in q) for q in self.path.states]
             return ("\n".join(rows) + "\n").encode()
         buffer = io.BytesIO()
-        states = np.empty((0, len(self.joint_names))) if self.path is None else self.path
+        states = np.empty((0, len(self.joint_names))) if self.path is None else self.path.states
         del data["path"], data["trajectory"]
         arrays = {} if self.trajectory is None else {key: getattr(self.trajectory, key) for key in KNOTS}
         names = np.array(self.joint_names)
@@ -208,7 +213,23 @@ class PlanResult:
         return buffer.getvalue()
 
 
-def _read_npz(path: Path) -> dict[str, Any]:
+def _spline_fields(path: Path) -> dict[str, Any] | None:
+    """Return the spline of a path as plain data, or None for a polyline."""
+    if path.spline is None or path.control is None:
+        return None
+    return {"control": path.control.tolist(), "degree": path.spline.degree, "pinned": path.spline.pinned}
+
+
+def _path(states: NDArray[np.float64], spline: dict[str, Any] | None) -> Path:
+    """Return a path as it was saved."""
+    if spline is None:
+        return Path(states)
+    control = np.array(spline["control"], dtype=float)
+    basis = Spline(len(control), int(spline["pinned"]), len(states), int(spline["degree"]))
+    return Path(states, basis, control)
+
+
+def _read_npz(path: pathlib.Path) -> dict[str, Any]:
     try:
         with np.load(path, allow_pickle=False) as archive:
             data = json.loads(str(archive["result"]))

@@ -24,9 +24,9 @@ import torch
 from ompl import base as ob
 
 from apex_ompl import problems
-from apex_ompl.apex import solver
 from apex_ompl.ompl_adapter.process import quiet_ompl, seed_ompl
 from apex_ompl.ompl_adapter.setup import PlanningSetup, assemble
+from apex_ompl.planners import apex_parameters
 from apex_ompl.planners.apex import APEX
 from apex_ompl.planners.apex_parameters import ApexParameters
 from apex_ompl.problems.reach import robot
@@ -165,7 +165,7 @@ def main() -> None:
         run(hard[0], **TREELESS)
         by_stage, first = stages(hard)
         by_variant, second = variants(hard)
-        solver.LONGER = (1, 0, 0)
+        apex_parameters.SPRINT_FACTORS = (1, 0, 0)
         by_sprint, third = sprints(hard, scenes)
     text = "\n".join([*first, "", *second, "", *third])
     figures = {"stages": by_stage, "variants": by_variant, "sprints": by_sprint}

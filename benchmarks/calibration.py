@@ -44,7 +44,7 @@ def run(job: tuple[str, str]) -> dict[str, Any]:
     result = plan(problem, planner, timeout=TIMEOUT, seed=int(name.rsplit("/", 1)[1]) % 1000, snapshot=True)
     solved, reason = bool(result), result.reason
     if solved and problem.moving:
-        check = timed_check(robot(), problem, result.path, even_times(robot(), result.path, PACE))
+        check = timed_check(robot(), problem, result.path.states, even_times(robot(), result.path.states, PACE))
         solved, reason = bool(check), check.reason
     return {
         "problem": name, "planner": planner, "solved": solved, "by": result.solved_by, "status": str(result.status),

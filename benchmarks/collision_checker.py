@@ -206,7 +206,7 @@ def main() -> None:
         robot = load_robot(problem.robot)
         pair = tuple(CollisionChecker(robot, problem.scene, problem.attached, proofs=p) for p in (True, False))
         results = [plan(problem, "rrtconnect", timeout=10.0, seed=seed) for seed in range(5)]
-        done = [resample(r.path, 256) for r in results if r]
+        done = [resample(r.path.states, 256) for r in results if r]
         done = [p for p in done if full_check(pair[1], p)]  # resampling cuts corners
         for key, values in judge_paths(pair, done).items():  # type: ignore[arg-type]
             solved.setdefault(key, []).extend(values)

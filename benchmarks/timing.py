@@ -289,7 +289,7 @@ def main() -> None:
                 figures.none += 1
             if result.trajectory is None or result.path is None:
                 continue
-            path, motion = result.path, result.trajectory
+            path, motion = result.path.states, result.trajectory
             found = optimum(path) if planner == "apex" and len(path) > 2 else None
             best = None if found is None else found[1]
             judge(figures, motion, path, checker, best)

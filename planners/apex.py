@@ -1,18 +1,22 @@
-"""APEX: paths proposed by latent diffusion, judged, repaired, resampled, and completed by RRTConnect."""
+"""APEX: paths proposed by latent diffusion, checked, repaired, resampled, and completed by RRTConnect."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
+import torch
 from ompl import base as ob
 from ompl import util as ou
 
+from apex_ompl.apex.context import SolveContext
 from apex_ompl.apex.path_validator import PathValidator
 from apex_ompl.apex.query import make_query
-from apex_ompl.apex.solver import LOG, SolveLoop
+from apex_ompl.apex.sampler import ProposalSampler
+from apex_ompl.apex.solver import LOG, solve
+from apex_ompl.apex.stages import Anytime, Shorten
 from apex_ompl.diffusion.checkpoint import shared_model
 from apex_ompl.errors import ParameterError
-from apex_ompl.ompl_adapter.report import Report
+from apex_ompl.ompl_adapter.report import SolveReport
 from apex_ompl.planners.apex_parameters import NAME, ApexParameters
 from apex_ompl.trajopt.optimizer import Optimizer
 from apex_ompl.types import Array
@@ -22,19 +26,20 @@ Status = ob.PlannerStatus
 
 
 class APEX(ob.Planner):
-    """OMPL planner: section III of the paper inside ``solve``, and complete in the limit by RRTConnect.
+    """OMPL planner APEX: section III of the paper inside ``solve``, probabilistically complete by RRTConnect.
 
     It works with any validity checker, and takes the one that is set when ``solve`` begins. With this project's,
-    proposals are repaired, and guided where that is asked for, among the obstacles; with another one they are judged
-    by it. A first path is shortened; with a path length objective it is improved until the termination condition holds.
+    proposals are repaired, and guided if asked, among the obstacles; with another one they are checked by it. The first
+    valid path is shortened; with a path length objective it is improved until the termination condition holds.
 
     Attributes:
-        parameters: How it plans.
-        judge: Decides what is valid.
-        model: Proposes.
+        parameters: Its parameters.
+        validator: Decides what is valid.
+        model: Makes proposals.
         optimizer: Repairs and shortens.
-        experience: What earlier paths differed in from their straight lines, each of shape (points, dof).
-        report: What the last call of ``solve`` did.
+        experience: Control points of earlier paths minus those of their straight lines, each of shape (points, dof).
+        rejected_lines: Straight lines that were found invalid before ``solve``, each of shape (2, dof).
+        report: Report on the last call of ``solve``.
     """
 
     def __init__(self, si: ob.SpaceInformation, parameters: ApexParameters | None = None) -> None:
@@ -45,17 +50,18 @@ class APEX(ob.Planner):
         """
         super().__init__(si, NAME)
         self.parameters = parameters or ApexParameters()
-        self.judge = PathValidator(si, self.parameters.robot)
-        robot = self.judge.checker.robot.name
+        self.validator = PathValidator(si, self.parameters.robot)
+        robot = self.validator.checker.robot.name
         self.model = shared_model(self.parameters.model, device=self.parameters.device, robot=robot)
         steps, most = self.parameters.denoising_steps, self.model.network.schedule.steps
         if steps > most:
             raise ParameterError("parameter 'denoising_steps'", steps, f"at most {most}, those of the checkpoint")
         self.optimizer = Optimizer(self.model.spline)
         self.experience: list[Array] = []
+        self.rejected_lines: list[Array] = []
         self._solves = 0
         self._warm = False
-        self.report = Report()
+        self.report = SolveReport()
 
     def setup(self) -> None:
         """Make all ready that the first call of ``solve`` would have to: kernel, network, optimiser."""
@@ -63,30 +69,30 @@ class APEX(ob.Planner):
         self._prepare()
 
     def _prepare(self) -> None:
-        if self.judge.outdated:
-            self.judge, self._warm = PathValidator(self.getSpaceInformation(), self.parameters.robot), False
+        if self.validator.outdated:
+            self.validator, self._warm = PathValidator(self.getSpaceInformation(), self.parameters.robot), False
         if self._warm:
             return
-        checker = self.judge.checker
+        checker = self.validator.checker
         self.optimizer.prepare(checker.kernel)
         query = make_query(checker, checker.robot.home, checker.robot.home, point=self.model.sees_point)
-        sampling = self.parameters.search(self.model.sampling).sampling
+        sampling = self.parameters.sampling(self.model.sampling)
         quick = replace(sampling, sampler="ddim", steps=min(2, sampling.steps))
         with one_torch_thread():
             proposed = self.model.propose(query, checker.kernel, 1, sampling=quick)
         if self.parameters.lambda_obs > 0.0:
-            self.judge.gap(self.model.spline.path(proposed.control[0]))
+            self.validator.obstacle_distance(self.model.spline.path(proposed.control[0]))
         self._warm = True
 
     def clear(self) -> None:
-        """Forget all that was found."""
+        """Forget everything found so far."""
         super().clear()
         self.clearQuery()
         self.experience = []
 
     def clearQuery(self) -> None:  # noqa: N802 - OMPL's name
         """Forget the query; earlier paths stay candidates for the next one."""
-        self._solves, self.report = 0, Report()
+        self._solves, self.report, self.rejected_lines = 0, SolveReport(), []
 
     def next_seed(self) -> int:
         """Return the seed of the next call of ``solve``: one that follows from the given one, or from OMPL's."""
@@ -99,13 +105,29 @@ class APEX(ob.Planner):
 
         Starts and goals are read anew by every call. ``report`` says what was done, and why where nothing was found.
         """
-        self.report = Report()
+        self.report = SolveReport()
         try:
             self._prepare()
             with one_torch_thread():
-                status = SolveLoop(self, ptc).run()
+                status = self._solve(ptc)
         except Exception as error:
             LOG.exception("%s failed", NAME)
             self.report.reason = f"{NAME} failed, {error!r}"
             status = Status.CRASH
         return Status(status)
+
+    def _solve(self, ptc: ob.PlannerTerminationCondition) -> ob.PlannerStatus:
+        parameters = self.parameters
+        generator = torch.Generator().manual_seed(self.next_seed())
+        sampler = ProposalSampler(
+            self.model, self.validator.checker.kernel, parameters.sampling(self.model.sampling),
+            generator=generator, stop=lambda: bool(ptc()), report=self.report,
+        )  # fmt: skip
+        context = SolveContext(
+            self.getSpaceInformation(), self.getProblemDefinition(), ptc, validator=self.validator, sampler=sampler,
+            optimizer=self.optimizer, report=self.report, experience=self.experience,
+            rejected_lines=self.rejected_lines, lambda_obs=parameters.lambda_obs,
+        )  # fmt: skip
+        shorten = Shorten() if parameters.polish else None
+        inputs = self.getPlannerInputStates()
+        return solve(context, inputs, parameters.stages(), shorten, Anytime(parameters.anytime))

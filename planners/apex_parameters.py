@@ -13,19 +13,17 @@ from apex_ompl import diffusion
 from apex_ompl.planners.registry import Parameters, bounded, one_of, register
 
 if TYPE_CHECKING:
-    from apex_ompl.apex.search import SearchSettings
+    from apex_ompl.apex.stages import Stage
     from apex_ompl.diffusion.proposals import Sampling
 
 NAME = "apex"
 WITHOUT_MODEL = "rrtconnect+polish"
+SPRINT_FACTORS = (1, 32, 128)  # on the iterations of the sprints before each round of proposals
 CHECKPOINTS = Path(diffusion.__path__[0]) / "checkpoints"
 
 
 def default_planner(robot: str) -> str:
-    """Return the planner that is taken for a robot where none is named: apex where its model is there for it.
-
-    Otherwise it is rrtconnect+polish, which needs no model.
-    """
+    """Return the default planner for a robot: apex where a model ships for it, else rrtconnect+polish."""
     try:
         config = json.loads((CHECKPOINTS / ApexParameters.model / "config.json").read_text(encoding="utf-8"))
         there = config["model"]["robot"] == robot
@@ -100,17 +98,45 @@ class ApexParameters(Parameters):
         """Whether RRTConnect has short tries before proposals are made."""
         return self.fallback and self.sprint > 0 and self.lambda_obs == 0.0
 
-    def search(self, own: Sampling) -> SearchSettings:
-        """Return what of it concerns the search before trees; ``own`` is how the checkpoint samples by itself."""
-        from apex_ompl.apex.search import SearchSettings
+    @property
+    def batches(self) -> tuple[int, ...]:
+        """Numbers of proposals in the rounds that make any."""
+        return tuple(count for count in (self.first, self.second, self.third) if count)
+
+    def sampling(self, default: Sampling) -> Sampling:
+        """Return how proposals are denoised; ``default`` is the checkpoint's own sampling."""
         from apex_ompl.diffusion import proposals
         from apex_ompl.diffusion.guidance import Guidance
 
         guidance = Guidance(gamma=self.gamma if self.guidance else 0.0)
-        sampler = own.sampler if self.sampler == "model" else self.sampler
-        sampling = proposals.Sampling(sampler, self.denoising_steps or own.steps, self.temperature, guidance)
-        batches = tuple(count for count in (self.first, self.second, self.third) if count)
-        return SearchSettings(self.line, batches, sampling, self.resample, self.noise, self.repair, self.lambda_obs)
+        sampler = default.sampler if self.sampler == "model" else self.sampler
+        return proposals.Sampling(sampler, self.denoising_steps or default.steps, self.temperature, guidance)
+
+    def stages(self) -> list[Stage]:
+        """Return the stages of ``solve`` up to the first valid path, in their order."""
+        from apex_ompl.apex import stages
+
+        def proposal_round(count: int) -> list[Stage]:
+            return stages.proposal_round(count, repair=self.repair, resample=self.resample, noise=self.noise)
+
+        found: list[Stage] = [stages.KnownCandidates(self.line)]
+        for number, count in enumerate(self.batches or (0,)):
+            if self.sprints:
+                found.append(stages.Sprint(self.sprint * SPRINT_FACTORS[number], self.range))
+            if number == 0:
+                found.append(stages.CheckKnown())
+            found += proposal_round(count)
+        found.append(stages.Farthest())
+        if self.bridge:
+            found.append(stages.Bridging(self.range))
+        if self.approximate:
+            found.append(stages.NearestToGoal())
+        if self.fallback:
+            found.append(stages.GrowTrees(self.range, self.approximate))
+        else:
+            largest = max(self.batches, default=0)
+            found.append(stages.MoreRounds(tuple(proposal_round(largest)) if largest else ()))
+        return found
 
     def build(self, si: ob.SpaceInformation) -> ob.Planner:
         """Return the planner.

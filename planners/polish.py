@@ -4,21 +4,22 @@ from __future__ import annotations
 
 import logging
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 from ompl import base as ob
 from ompl import geometric as og
 
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ParameterError
-from apex_ompl.ompl_adapter.report import Report
+from apex_ompl.ompl_adapter.report import SolveReport
 from apex_ompl.ompl_adapter.simplify import simplify
 from apex_ompl.ompl_adapter.space import array_to_path, path_to_array
 from apex_ompl.ompl_adapter.validity import StateValidityChecker
 from apex_ompl.planners.registry import Parameters, bounded, register
 from apex_ompl.trajopt.optimizer import Optimizer, Settings
-from apex_ompl.trajopt.path import path_length
+from apex_ompl.trajopt.path import Path
 from apex_ompl.trajopt.spline import Spline
 from apex_ompl.types import Array
 from apex_ompl.util.resolution import FULL_RESOLUTION
@@ -27,19 +28,21 @@ NAME = "rrtconnect+polish"
 LOG = logging.getLogger("apex_ompl")
 
 
-def polished(optimizer: Optimizer, checker: CollisionChecker, path: Array, stop: Any = lambda: False) -> Array | None:
-    """Return a short path of ``optimizer.spline.states`` states near a given one, proved by the full check, or None.
+def polished(
+    optimizer: Optimizer, checker: CollisionChecker, states: Array, stop: Callable[[], bool] = lambda: False
+) -> Path | None:
+    """Return a short path near a given one, shape (N, dof), that passes the full check, or None.
 
-    The path, shape (N, dof), is fitted by a spline, whose control points are optimised.
+    The given path is fitted by ``optimizer.spline``, whose control points are optimised.
     """
     limits = checker.robot.limits
-    control = optimizer.spline.fit(path, limits.lower, limits.upper).control
+    control = optimizer.spline.fit(states, limits.lower, limits.upper).control
 
-    def is_valid(states: Array) -> bool:
-        return checker.first_collision(states, FULL_RESOLUTION) is None
+    def is_valid(found: Array) -> bool:
+        return checker.first_collision(found, FULL_RESOLUTION) is None
 
     best = optimizer.shorten(checker.kernel, control, is_valid, stop)
-    return None if best is None else optimizer.spline.path(best)
+    return None if best is None else Path.on(optimizer.spline, best)
 
 
 class PolishedRRTConnect(ob.Planner):
@@ -61,7 +64,7 @@ class PolishedRRTConnect(ob.Planner):
         self._checker = checker
         self._optimizer = optimizer
         self._inner = inner
-        self.report, self._begin = Report(), 0.0
+        self.report, self._begin = SolveReport(), 0.0
 
     def clear(self) -> None:
         """Forget what was found."""
@@ -70,7 +73,7 @@ class PolishedRRTConnect(ob.Planner):
 
     def solve(self, ptc: ob.PlannerTerminationCondition) -> ob.PlannerStatus:
         """Solve the problem; no exception leaves it, since one would end the process inside OMPL."""
-        self.report = Report()
+        self.report = SolveReport()
         try:
             return self._solve(ptc)
         except Exception as error:
@@ -88,21 +91,23 @@ class PolishedRRTConnect(ob.Planner):
             self.report.solved_by, self.report.first = NAME, time.perf_counter() - begin
         if status.getStatus() != ob.PlannerStatus.EXACT_SOLUTION or ptc():
             return status
-        self.report.path = path = path_to_array(pdef.getSolutionPath(), dof)
+        self.report.first_path = path = Path(path_to_array(pdef.getSolutionPath(), dof))
         with self.report.timed("simplify"):
-            path = simplify(og.PathSimplifier(si), si, path, lambda: bool(ptc()))
+            path = Path(simplify(og.PathSimplifier(si), si, path.states, lambda: bool(ptc())))
         self._add(path)
         if not ptc():
             with self.report.timed("polish"):
-                better = polished(self._optimizer, self._checker, path, lambda: bool(ptc()))
+                better = polished(self._optimizer, self._checker, path.states, lambda: bool(ptc()))
             if better is not None:
                 self._add(better)
         return status
 
-    def _add(self, path: Array) -> None:
-        self.report.lengths.append((time.perf_counter() - self._begin, path_length(path)))
+    def _add(self, path: Path) -> None:
+        self.report.lengths.append((time.perf_counter() - self._begin, path.length))
+        if self.report.best_path is None or path.length < self.report.best_path.length:
+            self.report.best_path = path
         si, pdef = self.getSpaceInformation(), self.getProblemDefinition()
-        pdef.addSolutionPath(array_to_path(si, path), False, 0.0, NAME)
+        pdef.addSolutionPath(array_to_path(si, path.states), False, 0.0, NAME)
 
 
 @register(NAME)

@@ -51,7 +51,7 @@ def _static_witness(problem: Problem) -> Witness | None:
             result = plan(problem, "rrtconnect", timeout=timeout, seed=seed, simplify=shorter)
             if not result or result.path is None:
                 break
-            found = Witness(result.path).rounded()
+            found = Witness(result.path.states).rounded()
             if full_check(ready.checker, found.path, ready.start, ready.goals):
                 return found
     return None
@@ -84,10 +84,10 @@ def _timed_paths(problem: Problem) -> Iterator[tuple[Array, Array]]:
             if not result or result.path is None:
                 break
             for pace in PACES:
-                yield result.path, even_times(robot(), result.path, pace)
+                yield result.path.states, even_times(robot(), result.path.states, pace)
             for wait in WAITS:
-                times = even_times(robot(), result.path, PACE)
-                yield np.concatenate([line[:1], result.path]), np.concatenate([[0.0], wait + times])
+                times = even_times(robot(), result.path.states, PACE)
+                yield np.concatenate([line[:1], result.path.states]), np.concatenate([[0.0], wait + times])
     yield from _ways_aside(problem, line)
 
 

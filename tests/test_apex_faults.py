@@ -153,7 +153,7 @@ def test_no_exception_leaves_solve(
     def fail(*_: object, **__: object) -> None:
         raise ZeroDivisionError("of the test")
 
-    monkeypatch.setattr(planner.judge, "is_valid", fail)
+    monkeypatch.setattr(planner.validator, "is_valid", fail)
     ready.simple_setup.setPlanner(planner)
     assert ready.simple_setup.solve(within(1.0)).getStatus() == ob.PlannerStatus.CRASH
     assert "ZeroDivisionError" in planner.report.reason

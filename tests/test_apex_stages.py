@@ -79,18 +79,18 @@ def test_the_algorithm_of_the_paper_alone_runs(ready: PlanningSetup) -> None:
     setup.setup()  # the kernel may have to be compiled
     status = setup.solve(within(6.0)).getStatus()
     assert status in (EXACT, TIMEOUT)
-    assert planner.report.times.keys() >= {"propose", "judge"}
+    assert planner.report.times.keys() >= {"propose", "check"}
     assert planner.report.candidates >= 8
     if status == EXACT:
         assert full_check(ready.checker, states(setup), ready.start, ready.goals)
 
 
 def test_valid_paths_that_pass_too_near_are_resampled(ready: PlanningSetup) -> None:
-    judge = PathValidator(ready.simple_setup.getSpaceInformation(), "")
+    validator = PathValidator(ready.simple_setup.getSpaceInformation(), "")
     plain = plan(at_hand(HARD), timeout=20.0, params={"polish": False})
     wary = plan(at_hand(HARD), timeout=20.0, params={"polish": False, "lambda_obs": 0.5})
     assert plain and wary
-    gaps = [judge.gap(result.path) for result in (plain, wary)]
+    gaps = [validator.obstacle_distance(result.path.states) for result in (plain, wary)]
     assert gaps[1] >= gaps[0] - 1e-9, "nothing is half a metre off, so the one that keeps most distance stands"
     assert wary.times[INSIDE + "resample"] > plain.times.get(INSIDE + "resample", 0.0)
     by_hand = min(ready.checker.distance(q).value for q in wary.path[::4])

@@ -37,7 +37,7 @@ def test_shipped_problems_are_solved_and_proved(name: str | Path) -> None:
     result = plan(problem, timeout=20.0, seed=1)
     assert result and result.status is PlanStatus.EXACT_SOLUTION and result.reason == ""
     robot = load_robot(problem.robot)
-    assert result.path is not None and result.path.shape[1] == robot.dof
+    assert result.path is not None and result.path.dof == robot.dof
     start, goals = problem.start_state(robot.joint_names), problem.goal_states(robot.joint_names)
     assert np.array_equal(result.path[0], start) and np.array_equal(result.path[-1], goals[0])
     # Judged anew by a fresh checker, on a grid that the planner did not use.
@@ -45,7 +45,7 @@ def test_shipped_problems_are_solved_and_proved(name: str | Path) -> None:
         CollisionChecker(robot, problem.scene, problem.attached), result.path, start, goals, resolution=0.0047
     )
     assert check, check.reason
-    assert result.length == pytest.approx(path_length(result.path)) and result.length < 40
+    assert result.length == pytest.approx(path_length(result.path.states)) and result.length < 40
     assert result.clearance > 0.0 and result.checks > 100
     assert result.planner == ("apex" if problem.robot == "dual_panda_softhand" else "rrtconnect+polish")
     assert result.solved_by and any("no model of" in note for note in result.notes) == (result.planner != "apex")

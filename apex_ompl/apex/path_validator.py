@@ -1,4 +1,4 @@
-"""What decides for a planner whether paths are valid: this project's checker, or whatever checkers OMPL was given."""
+"""Validity of states and paths for a planner: this project's full check, or other checkers that OMPL was given."""
 
 from __future__ import annotations
 
@@ -19,25 +19,29 @@ from apex_ompl.util.resolution import FULL_RESOLUTION
 Stop = Callable[[], bool]
 
 LOG = logging.getLogger("apex_ompl")
-PLAIN = (ob.MotionValidator, MotionValidator)  # OMPL's own, as bound, and this project's
-EVERY = 4  # states of a path whose distance from the obstacles is measured
+PLAIN = (ob.MotionValidator, MotionValidator)  # OMPL's own, and this project's
+STRIDE = 4  # of the states whose distance from obstacles is measured
 
 
 class PathValidator:
-    """Judges states and paths of a space information.
+    """Validity of states and paths of a space information.
 
     With a ``StateValidityChecker`` of this project a path is valid by the full check. With another checker, or a
     subclass that refines it, a path is valid when all of its states are and all motions between them, by
     ``isValid`` and ``checkMotion``. Another checker knows the robot by name, and its obstacles are not known.
 
     Attributes:
-        checker: The robot, among its obstacles where they are known.
-        knows_obstacles: Whether they are.
-        alone: Whether the checker decides alone.
+        checker: Collision checker of the robot, among its obstacles where they are known.
+        knows_obstacles: Whether the obstacles are known.
+        exclusive: Whether this project's checker alone decides.
     """
 
     def __init__(self, si: ob.SpaceInformation, robot: str) -> None:
-        """Check by what ``si`` brings.
+        """Take the checkers of ``si``.
+
+        Args:
+            si: OMPL's space information, its checkers set.
+            robot: Name of the robot, where the checker is not this project's.
 
         Raises:
             ApexError: There is no such robot.
@@ -48,7 +52,7 @@ class PathValidator:
         validity_checker, motions = self._checkers
         self.knows_obstacles = isinstance(validity_checker, StateValidityChecker)
         plain = type(validity_checker).isValid is StateValidityChecker.isValid and type(motions) in PLAIN
-        self.alone = self.knows_obstacles and plain
+        self.exclusive = self.knows_obstacles and plain
         self.checker = (
             validity_checker.checker
             if isinstance(validity_checker, StateValidityChecker)
@@ -59,7 +63,7 @@ class PathValidator:
             raise ParameterError("state space", dimension, f"{dof} dimensions, those of {self.checker.robot.name}")
         if not self.knows_obstacles:
             LOG.warning(
-                "the validity checker is not apex_ompl's: it judges, and proposals are kept clear of %s itself alone",
+                "the validity checker is not apex_ompl's: it decides, and proposals are kept clear of %s itself only",
                 self.checker.robot.name,
             )
 
@@ -70,7 +74,7 @@ class PathValidator:
 
     def is_free(self, q: Array) -> bool:
         """Whether a state, shape (dof,), is valid."""
-        if self.alone:
+        if self.exclusive:
             return self.checker.is_free(q)
         return bool(self._si.isValid(to_state(self._si, q)))
 
@@ -78,7 +82,7 @@ class PathValidator:
         """Whether a path, shape (N, dof), is valid; with another checker, not when it is told to stop meanwhile."""
         if self.knows_obstacles and self.checker.first_collision(path, FULL_RESOLUTION) is not None:
             return False
-        return self.alone or self._valid_by_ompl(path, stop)
+        return self.exclusive or self._valid_by_ompl(path, stop)
 
     def _valid_by_ompl(self, path: Array, stop: Stop) -> bool:
         states = [to_state(self._si, q) for q in path]
@@ -88,14 +92,14 @@ class PathValidator:
                 return False
         return all(not stop() and self._si.checkMotion(a, b) for a, b in zip(states, states[1:], strict=False))
 
-    def gap(self, path: Array) -> float:
-        """Return the distance of states, shape (N, dof), from the obstacles by GJK, fixtures left out [m].
+    def obstacle_distance(self, path: Array) -> float:
+        """Return the least distance between robot and obstacles along a path, shape (N, dof), by GJK [m].
 
-        Every fourth state is measured; infinite where the obstacles are not known.
+        Every fourth state is measured, fixtures are left out; infinite where the obstacles are not known.
         """
         if not self.knows_obstacles:
             return np.inf
-        states = np.concatenate([path[::EVERY], path[-1:]])
+        states = np.concatenate([path[::STRIDE], path[-1:]])
         bound, least = self.checker.kernel.clearance(states)[:, 0], np.inf
         for k in np.argsort(bound):  # the spheres' clearance is at most that of the meshes
             if bound[k] >= least:

@@ -7,11 +7,10 @@ import math
 import os
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 from ompl import base as ob
 from ompl import tools as ot
 
@@ -20,19 +19,20 @@ from apex_ompl.api import load_problem
 from apex_ompl.benchmark.rows import Job
 from apex_ompl.errors import ApexError
 from apex_ompl.ompl_adapter.process import quiet_ompl, seed_ompl
-from apex_ompl.ompl_adapter.report import Report
+from apex_ompl.ompl_adapter.report import SolveReport, report_of
 from apex_ompl.ompl_adapter.setup import assemble
 from apex_ompl.ompl_adapter.validity import full_check
-from apex_ompl.planning import Planning, solving_time
+from apex_ompl.planning import PlanRun, finish, query_fault, solve, solving_time, with_exact_ends
 from apex_ompl.problems.catalogue import SuiteError
 from apex_ompl.result import FIRST, PlanResult, PlanStatus
 from apex_ompl.robot import Robot, load_robot
 from apex_ompl.trajectory.smoothness import jerk
 from apex_ompl.trajopt.path import path_length
+from apex_ompl.types import Array
 from apex_ompl.util.threads import one_torch_thread
 
 if TYPE_CHECKING:
-    from apex_ompl.planners import Parameters
+    pass
 
 Run = dict[str, Any]
 """A run as it is stored, ready for JSON."""
@@ -46,95 +46,87 @@ PROOF = ("verify", "repair")
 _robots: dict[str, Robot] = {}
 
 
-class Benchmarked(Planning):
-    """One call of ``plan`` whose planner runs in an experiment of ``ompl.tools.Benchmark``.
-
-    The planner runs even where the straight line is a solution.
+@dataclass(eq=False)
+class Experiment:
+    """Runs a planner in an experiment of ``ompl.tools.Benchmark``, in the place of :func:`apex_ompl.planning.execute`.
 
     Attributes:
-        optimizing: Whether the planner goes on until its time is up; the length of its first path is not known then.
-        beside: States that the experiment judged for itself.
+        checked_aside: Number of states that the experiment checked for itself.
         properties: OMPL's properties of the run.
         common: OMPL's parameters of the planner.
     """
 
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        """Take what a call of ``plan`` takes."""
-        super().__init__(*args, **kwargs)
-        self.optimizing, self.beside = False, 0
-        self.properties: dict[str, str] = {}
-        self.common: dict[str, str] = {}
+    checked_aside: int = 0
+    properties: dict[str, str] = field(default_factory=dict)
+    common: dict[str, str] = field(default_factory=dict)
 
-    def straight_line(self) -> NDArray[np.float64] | None:
-        """Return None: the planner has to find it."""
-        return None
-
-    def run_ompl(self, planner: ob.Planner, parameters: Parameters, timeout: float) -> PlanStatus:
+    def __call__(self, run: PlanRun, planner: ob.Planner, timeout: float) -> PlanStatus:
         """Run the planner, and return its status; faults of the checkers are raised."""
-        check_counts, reports = self.ready.checker.check_counts, list[Report | None]()
-        judged = [check_counts.states]
+        check_counts, reports = run.setup.checker.check_counts, list[SolveReport | None]()
+        states = [check_counts.states]
 
         def begin(_: ob.Planner) -> None:
-            seed_ompl(self.blank.seed)  # the experiment itself has drawn and judged states by then
-            judged.append(check_counts.states)
+            seed_ompl(run.seed)  # the experiment itself has drawn and checked states by then
+            states.append(check_counts.states)
 
-        def end(*_: object) -> None:  # behind it the experiment judges the path, and clears the planner
-            judged.append(check_counts.states)
-            reports.append(getattr(planner, "report", None))
+        def end(*_: object) -> None:  # after it the experiment checks the path, and clears the planner
+            states.append(check_counts.states)
+            reports.append(report_of(planner))
 
-        noticed, check = list[float](), self.ready.motion_validator.check
-        if parameters.optimizing:
-            self.ready.motion_validator.check = self._noticing(noticed)
-        experiment = ot.Benchmark(self.ready.simple_setup, "run")
+        moments, validator = list[float](), run.setup.motion_validator
+        original = validator.check
+        if run.parameters.optimizing:
+            validator.check = _watched(run, moments)
+        experiment = ot.Benchmark(run.setup.simple_setup, "run")
         experiment.addPlanner(planner)
         experiment.setPreRunEvent(begin)
         experiment.setPostRunEvent(end)
-        request = ot.Request(solving_time(parameters, timeout), MEMORY, 1, UPDATES, False, False, False)
+        request = ot.Request(solving_time(run.parameters, timeout), MEMORY, 1, UPDATES, False, False, False)
         try:
             experiment.benchmark(request)
         finally:
-            self.ready.motion_validator.check = (
-                check  # or it and OMPL's objects would keep each other, and all that was planned
-            )
-        self.raise_faults()
-        self.beside = judged[1] - judged[0] + check_counts.states - judged[2]
+            validator.check = original  # or it and OMPL's objects would keep each other, and all that was planned
+        run.setup.raise_faults()
+        self.checked_aside = states[1] - states[0] + check_counts.states - states[2]
         if reports[0] is not None:
             planner.report = reports[0]
         recorded = experiment.getRecordedExperimentData().planners[0]
-        self.optimizing = parameters.optimizing
         self.properties, self.common = recorded.runs[0].to_dict(), recorded.common.to_dict()
-        self.times["solve"] = float(self.properties["time REAL"])
-        noticed += [moment for data in recorded.runsProgressData for moment in _solved_at(data)]
-        if noticed:
-            self.times[FIRST] = min(noticed)
+        run.times["solve"] = float(self.properties["time REAL"])
+        moments += [moment for data in recorded.runsProgressData for moment in _solved_at(data)]
+        if moments:
+            run.times[FIRST] = min(moments)
         return ompl_status(self.properties)
 
-    def proof_of_first(self) -> float:
-        """Return how long it takes to prove the first path, or what comes of it in the end [s].
 
-        The shortened path may need a repair where the path as it was found does not. Of planners that use all their
-        time the first path is not known: the proof of the last one stands for its proof.
-        """
-        proof = {stage: self.times.get(stage, 0.0) for stage in PROOF}
-        if "repair" not in self.times or self.optimizing or self.raw is None:
-            return proof["verify"]
-        begin = time.perf_counter()
-        check = full_check(self.ready.checker, self._with_exact_ends(self.raw), self.ready.start, self.ready.goals)
-        return time.perf_counter() - begin if check else sum(proof.values())
+def proof_of_first(run: PlanRun) -> float:
+    """Return how long the full check of the first path takes, or the check and repair of the final one [s].
 
-    def _noticing(self, noticed: list[float]) -> Callable[[NDArray[np.float64], NDArray[np.float64]], bool]:
-        """Return a check whose first call when there is a path notes the time since the first call [s]."""
-        check, definition = self.ready.motion_validator.check, self.ready.simple_setup.getProblemDefinition()
-        begin = 0.0
+    The shortened path may need a repair where the path as it was found does not. Of planners that use all their time
+    the first path is not known: the check of the last one stands for its check.
+    """
+    proof = {stage: run.times.get(stage, 0.0) for stage in PROOF}
+    if "repair" not in run.times or run.parameters.optimizing or run.first_path is None:
+        return proof["verify"]
+    begin = time.perf_counter()
+    path = with_exact_ends(run.setup, run.first_path)
+    check = full_check(run.setup.checker, path.states, run.setup.start, run.setup.goals)
+    return time.perf_counter() - begin if check else sum(proof.values())
 
-        def watched(first: NDArray[np.float64], second: NDArray[np.float64]) -> bool:
-            nonlocal begin
-            begin = begin or time.perf_counter()
-            if not noticed and definition.hasExactSolution():
-                noticed.append(time.perf_counter() - begin)
-            return check(first, second)
 
-        return watched
+def _watched(run: PlanRun, moments: list[float]) -> Callable[[Array, Array], bool]:
+    """Return a motion check whose first call after a path was found notes the time since its first call [s]."""
+    check, definition = run.setup.motion_validator.check, run.setup.simple_setup.getProblemDefinition()
+    begin = 0.0
+
+    def watched(first: Array, second: Array) -> bool:
+        nonlocal begin
+        begin = begin or time.perf_counter()
+        if not moments and definition.hasExactSolution():
+            moments.append(time.perf_counter() - begin)
+        return check(first, second)
+
+    return watched
 
 
 def ompl_status(properties: Mapping[str, str]) -> PlanStatus:
@@ -188,20 +180,26 @@ def _outcome(job: Job) -> Run:
     with quiet_ompl(), one_torch_thread():
         seed_ompl(job.seed)
         ready = assemble(problem, _robots[problem.robot], seed=job.seed)
-        planning = Benchmarked(ready, job.planner, job.seed, time.perf_counter() - started, ())
-        result = planning.finish(started, planning.solve(parameters, job.timeout, job.simplify))
-    return told(planning, result)
+        planning = PlanRun(ready, job.planner, parameters, job.seed, {"setup": time.perf_counter() - started})
+        experiment = Experiment()
+        result = query_fault(planning)  # the planner runs even where the straight line is a solution
+        if result is None:
+            result = solve(planning, job.timeout, job.simplify, experiment)
+        result = finish(planning, result, started)
+    return told(planning, experiment, result)
 
 
-def told(planning: Benchmarked, result: PlanResult) -> Run:
+def told(planning: PlanRun, experiment: Experiment, result: PlanResult) -> Run:
     """Return what is stored of a run."""
-    times, path, report = result.times, result.path if result else None, planning.report
-    raw = None if planning.optimizing else planning.raw  # others go on behind their first path
+    times, report = result.times, planning.report
+    path = result.path.states if result and result.path is not None else None
+    first_path = None if planning.parameters.optimizing else planning.first_path  # others go on after their first path
+    raw = None if first_path is None else first_path.states
     found = path is not None
     total = sum(times.get(stage, 0.0) for stage in ("solve", "simplify", *PROOF))
     first = times.get(FIRST, times.get("solve", 0.0))
-    if report is None or not report.judged:  # what the planner found had still to be proved
-        first += planning.proof_of_first()
+    if report is None or not report.first_verified:  # what the planner found had still to be proved
+        first += proof_of_first(planning)
     return {
         "status": str(result.status), "reason": result.reason, "solved": found, "by": result.solved_by,
         "first": first if found else None, "total": total, "setup": times.get("setup"), "times": dict(times),
@@ -210,7 +208,8 @@ def told(planning: Benchmarked, result: PlanResult) -> Run:
         "jerk": jerk(path) if path is not None and path_length(path) > 0.0 else None,
         "raw_jerk": jerk(raw) if found and raw is not None and path_length(raw) > 0.0 else None,
         "clearance": result.clearance if path is not None and np.isfinite(result.clearance) else None,
-        "checks": result.checks - planning.beside, "properties": planning.properties, "common": planning.common,
+        "checks": result.checks - experiment.checked_aside,
+        "properties": experiment.properties, "common": experiment.common,
         "load": os.getloadavg()[0],
         "counts": {} if report is None else {
             "candidates": report.candidates, "proposals": report.proposed, "resamples": report.resampled,

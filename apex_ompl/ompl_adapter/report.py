@@ -1,43 +1,44 @@
-"""What a planner of this project says of its last call of ``solve``."""
+"""Reports of planners: what one call of ``solve`` did."""
 
 from __future__ import annotations
 
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
+from typing import Any, Protocol, runtime_checkable
 
-import numpy as np
-from numpy.typing import NDArray
-
+from apex_ompl.trajopt.path import Path
 from apex_ompl.util.stopwatch import timed
 
 
 @dataclass
-class Report:
-    """What a call of ``solve`` did.
+class SolveReport:
+    """Outcome of one call of ``solve``, by stages.
 
     Attributes:
-        solved_by: The stage that found the first valid path: ``line``, ``experience``, ``apex`` or ``apex+resample``,
+        solved_by: Stage that found the first valid path: ``line``, ``experience``, ``apex`` or ``apex+resample``,
             with ``+repair`` where the optimiser had to help; ``sprint``, ``apex+bridge`` or ``rrtconnect``; empty
             without one.
         reason: One sentence where there is no exact solution.
         times: Seconds by stage; those of ``guidance`` and ``distance`` are part of other stages.
         first: Seconds until the first valid path, NaN without one.
-        judged: Whether that had passed the full check by then.
-        path: The first valid path, shape (N, dof), or None.
-        lengths: Seconds, and length [rad], of each path that was taken as a solution.
-        candidates: Paths that were looked at before trees: straight lines, earlier paths, proposals.
-        proposed: Those of them that the model proposed.
-        resampled: Those that it proposed on resampling.
-        steps: Steps of the optimiser in repair.
-        improved: How often a shorter path was found behind the first one.
+        first_verified: Whether the first valid path had passed the full check by then.
+        first_path: First valid path, or None.
+        best_path: Shortest valid path, or None.
+        lengths: Time [s] and length [rad] of each path that was accepted as a solution.
+        candidates: Number of candidates before trees: straight lines, earlier paths, proposals.
+        proposed: Number of candidates that the model proposed.
+        resampled: Number of candidates from collision-triggered resampling.
+        steps: Number of optimiser steps in repair.
+        improved: Number of shorter paths that were found after the first one.
     """
 
     solved_by: str = ""
     reason: str = ""
     times: dict[str, float] = field(default_factory=dict)
     first: float = float("nan")
-    judged: bool = False
-    path: NDArray[np.float64] | None = None
+    first_verified: bool = False
+    first_path: Path | None = None
+    best_path: Path | None = None
     lengths: list[tuple[float, float]] = field(default_factory=list)
     candidates: int = 0
     proposed: int = 0
@@ -48,3 +49,26 @@ class Report:
     def timed(self, stage: str) -> AbstractContextManager[None]:
         """Count the time of a block to a stage."""
         return timed(self.times, stage)
+
+
+@runtime_checkable
+class ReportingPlanner(Protocol):
+    """Planner that reports on its last call of ``solve``."""
+
+    report: SolveReport
+
+
+@runtime_checkable
+class LineAwarePlanner(Protocol):
+    """Planner that tries straight lines itself, and need not try those that were found invalid before ``solve``.
+
+    Attributes:
+        rejected_lines: Ends of the lines, each of shape (2, dof).
+    """
+
+    rejected_lines: list[Any]
+
+
+def report_of(planner: Any) -> SolveReport | None:
+    """Return the report of a planner that makes one, or None."""
+    return planner.report if isinstance(planner, ReportingPlanner) else None

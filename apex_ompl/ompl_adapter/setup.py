@@ -54,6 +54,12 @@ class PlanningSetup:
     goal_faults: tuple[str, ...]
     alignment: AlignmentGoal | None
 
+    def raise_faults(self) -> None:
+        """Raise what the checkers kept inside of OMPL's callbacks, Ctrl-C among it."""
+        fault = self.validity_checker.fault or self.motion_validator.fault
+        if fault is not None:
+            raise fault
+
     @property
     def valid_goals(self) -> Array:
         """The goals that are inside the limits and free, shape (valid, dof)."""

@@ -1,4 +1,4 @@
-"""Paths on the way to be valid: always the most promising one is improved next."""
+"""Candidate paths: repaired by the optimiser, the most promising one first."""
 
 from __future__ import annotations
 
@@ -11,27 +11,27 @@ from apex_ompl.kernel.interface import Kernel
 from apex_ompl.trajopt.optimizer import LAST_RESORT, Check, Optimizer
 from apex_ompl.types import Array
 
-ROUND, ROUNDS = 4, 12  # steps between two checks of a path, and how often
-SOFT_ROUNDS = 2  # the last of them are softer
-IMPATIENCE = 2.0  # factor on the clearance_cost of a path for every round that was spent on it
-PER_PATH = 16  # steps, in the mean
-CLEAR = 0.01  # clearance at the samples at which a path is checked at once [m]
-NEARLY = -0.005  # below it a path that is worked on is not checked yet; spheres reach out of what they cover [m]
+ROUND, ROUNDS = 4, 12  # optimiser steps in a round of repair, and rounds a candidate has at most
+SOFT_ROUNDS = 2  # the last rounds, with less weight on the speed term
+PENALTY = 2.0  # factor on the priority of a candidate for every round spent on it
+STEPS_PER_PATH = 16  # on average
+CLEAR = 0.01  # clearance at the samples at which a round ends early [m]
+MIN_CLEARANCE = -0.005  # at the samples, for the full check; spheres protrude from what they cover [m]
 
 
 @dataclass
 class Candidate:
-    """A path that is worked on.
+    """A path under repair.
 
     Attributes:
         control: Control points, shape (points, dof).
-        origin: Where it comes from.
-        clearance_cost: Its cost that is due to clearance.
+        origin: Name of what made it.
+        clearance_cost: Part of its cost that is due to clearance.
         clearance: Smallest clearance at the samples [m].
-        damping: Of the next step.
-        rounds: How often it was worked on.
-        fine: Whether more samples are looked at.
-        given_up: Whether nothing more comes of it.
+        damping: Damping of the next step.
+        rounds: Number of rounds of repair that it had.
+        fine: Whether it is sampled more densely.
+        given_up: Whether repair has nothing left to try on it.
     """
 
     control: Array
@@ -44,35 +44,34 @@ class Candidate:
     given_up: bool = False
 
     @property
-    def hope(self) -> float:
-        """What is least for the candidate to be improved next."""
-        return self.clearance_cost * IMPATIENCE**self.rounds
+    def priority(self) -> float:
+        """Clearance cost, doubled for every round of repair; the candidate with the least is improved next."""
+        return self.clearance_cost * PENALTY**self.rounds
 
 
 class CandidatePool:
     """Candidates for a valid path among the obstacles of a kernel.
 
-    All are checked as they come. Then always the candidate with the least clearance cost is improved by a few steps,
-    one that was worked on before a little later than a fresh one; as soon as it is nearly clear at the samples it is
-    checked again. One that is clear at them and yet not valid is looked at more closely. The last steps for a candidate
-    are softer.
+    Candidates are checked when they are added. Repair improves the one with the least priority value by a few
+    optimiser steps, and checks it again as soon as it is nearly clear at its samples. A candidate that is clear at the
+    samples and still invalid is sampled more densely. In the last rounds of a candidate the speed term counts less.
 
     Attributes:
-        candidates: All that there are.
-        steps: Steps that were taken.
+        candidates: All candidates.
+        steps: Number of optimiser steps taken.
     """
 
     def __init__(
         self, optimizer: Optimizer, kernel: Kernel, is_valid: Check,
         is_wanted: Callable[[Candidate, Array], bool] = lambda candidate, path: True,
     ) -> None:  # fmt: skip
-        """Let ``is_valid`` decide about the states of paths.
+        """Start an empty pool.
 
         Args:
             optimizer: Improves them.
             kernel: The robot among its obstacles.
-            is_valid: Decides; called with the states of a path.
-            is_wanted: Asked about valid ones, with the states; nothing more is done for those that are not.
+            is_valid: Full check; called with the states of a path.
+            is_wanted: Further condition on valid candidates; those that fail it are given up.
         """
         self._optimizer, self._kernel, self._is_valid, self._is_wanted = optimizer, kernel, is_valid, is_wanted
         self._fine = optimizer.finer()
@@ -80,7 +79,7 @@ class CandidatePool:
         self.steps = 0
 
     def add(self, control: ArrayLike, origin: str = "", stop: Callable[[], bool] = lambda: False) -> Candidate | None:
-        """Take in paths, control points of shape (B, points, dof), and return the first that is valid as it is.
+        """Add paths, control points of shape (B, points, dof), and return the first that is valid as it is.
 
         Raises:
             ParameterError: Control points of another shape.
@@ -98,20 +97,20 @@ class CandidatePool:
                 return candidate
         return None
 
-    def work(self, steps: int, stop: Callable[[], bool] = lambda: False) -> Candidate | None:
-        """Improve candidates until one is valid, by at most so many steps in all.
+    def improve(self, steps: int, stop: Callable[[], bool] = lambda: False) -> Candidate | None:
+        """Improve candidates until one is valid.
 
         Args:
-            steps: Most steps.
+            steps: Largest number of steps in all.
             stop: Asked between rounds whether to give up.
 
         Returns:
-            The valid one, or None.
+            The valid candidate, or None.
         """
         left, settings = steps, self._optimizer.settings
         while left > 0 and not stop():
-            hopeful = (one for one in self.candidates if one.rounds < ROUNDS and not one.given_up)
-            chosen = min(hopeful, key=lambda one: one.hope, default=None)
+            open_candidates = (one for one in self.candidates if one.rounds < ROUNDS and not one.given_up)
+            chosen = min(open_candidates, key=lambda one: one.priority, default=None)
             if chosen is None:
                 break
             soft = chosen.rounds >= ROUNDS - SOFT_ROUNDS
@@ -125,9 +124,9 @@ class CandidatePool:
             chosen.rounds += 1
             left -= ROUND
             self.steps += int(improved.steps[0])
-            if chosen.clearance >= NEARLY and self._passes(chosen):
+            if chosen.clearance >= MIN_CLEARANCE and self._passes(chosen):
                 return chosen
-            if not improved.steps[0]:  # nothing is short of clearance, and yet it is not valid
+            if not improved.steps[0]:  # no sample violates a margin, and yet the path is invalid
                 chosen.given_up, chosen.fine = chosen.fine, True
         return None
 
@@ -146,7 +145,7 @@ def first_valid(
     """Return control points, shape (points, dof), of the first of some paths that comes out valid, or None.
 
     Args:
-        optimizer: Improves them, by ``PER_PATH`` steps for each and some more.
+        optimizer: Improves them, by ``STEPS_PER_PATH`` steps for each and some more.
         kernel: The robot among its obstacles.
         control: Where to start from, shape (B, points, dof).
         is_valid: Decides; called with the states of a path.
@@ -156,5 +155,5 @@ def first_valid(
         ParameterError: Control points of another shape.
     """
     pool = CandidatePool(optimizer, kernel, is_valid)
-    found = pool.add(control, stop=stop) or pool.work(PER_PATH * (len(pool.candidates) + 2), stop)
+    found = pool.add(control, stop=stop) or pool.improve(STEPS_PER_PATH * (len(pool.candidates) + 2), stop)
     return None if found is None else found.control

@@ -84,13 +84,13 @@ def render(
     if out.suffix in FILMS:
         motion = source.trajectory
         each = 0.0 if motion is None else max(1.0 / FRAME_RATE, motion.duration / MOST_FRAMES)
-        states = resample(source.path, FRAMES) if motion is None else motion.sample(each).position
+        states = resample(source.path.states, FRAMES) if motion is None else motion.sample(each).position
         frames = [stage.shoot(q) for q in states]
         pause = [frames[-1]] * (FRAME_RATE // 2)
         write_atomically(out, _encode([*frames, *pause], out.suffix))
         return
     columns, rows = STRIP
-    shots = [stage.shoot(q) for q in resample(source.path, columns * rows)]
+    shots = [stage.shoot(q) for q in resample(source.path.states, columns * rows)]
     grid = [np.concatenate(shots[k * columns : (k + 1) * columns], axis=1) for k in range(rows)]
     write_atomically(out, _encode([np.concatenate(grid, axis=0)], ".png"))
 

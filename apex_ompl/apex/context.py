@@ -1,0 +1,166 @@
+"""Context of one call of ``solve``: what the stages of APEX share."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from ompl import base as ob
+from ompl import geometric as og
+
+from apex_ompl.apex.path_validator import PathValidator
+from apex_ompl.apex.query import make_query
+from apex_ompl.ompl_adapter.report import SolveReport
+from apex_ompl.ompl_adapter.space import array_to_path
+from apex_ompl.trajopt.candidates import Candidate, CandidatePool
+from apex_ompl.trajopt.optimizer import Optimizer
+from apex_ompl.trajopt.path import Path
+from apex_ompl.types import Array
+
+if TYPE_CHECKING:
+    from apex_ompl.apex.sampler import ProposalSampler
+    from apex_ompl.diffusion.conditions import Query
+
+MIN_GAIN = 1e-3  # least decrease of length that counts as an improvement [rad]
+CLEARANCE_SPACING = 0.1  # of a path's states whose distance from obstacles is compared [rad, max-norm]
+
+
+class SolveContext:
+    """Query, checker, candidates, best path and budget of one call of ``solve``.
+
+    Attributes:
+        si: OMPL's space information.
+        pdef: OMPL's problem definition; solutions are added to it.
+        ptc: OMPL's termination condition, the budget.
+        validator: Decides what is valid.
+        sampler: Makes proposals.
+        optimizer: Repairs and shortens paths.
+        report: Times and counts.
+        starts: Start states, each of shape (dof,).
+        goals: Goal states, each of shape (dof,).
+        pairs: Pairs of start and goal that proposals are made for, the nearest first.
+        experience: Control points of earlier paths minus those of their straight lines, each of shape (points, dof).
+        rejected_lines: Straight lines that were found invalid before, each of shape (2, dof).
+        lambda_obs: Wanted distance from obstacles [m].
+        pool: Candidates of the round of proposals.
+        unchecked: Known candidates that wait for the first round: origin and control points.
+        set_aside: Valid candidates nearer to obstacles than ``lambda_obs``, each with its distance [m].
+        best: Shortest valid path, or None.
+        nearest: Path that ends near a goal and its distance from it [rad], or None.
+        trees: RRTConnect that a sprint began and its problem definition, or None.
+    """
+
+    def __init__(
+        self, si: ob.SpaceInformation, pdef: ob.ProblemDefinition, ptc: ob.PlannerTerminationCondition, *,
+        validator: PathValidator, sampler: ProposalSampler, optimizer: Optimizer, report: SolveReport,
+        experience: list[Array], rejected_lines: list[Array], lambda_obs: float,
+    ) -> None:  # fmt: skip
+        """Share what is given; starts and goals are read before the stages run."""
+        self.begin = time.perf_counter()
+        self.si, self.pdef, self.ptc = si, pdef, ptc
+        self.validator, self.sampler, self.optimizer, self.report = validator, sampler, optimizer, report
+        self.experience, self.rejected_lines, self.lambda_obs = experience, rejected_lines, lambda_obs
+        self.starts: list[Array] = []
+        self.goals: list[Array] = []
+        self.pairs: list[tuple[Array, Array]] = []
+        self.kernel = validator.checker.kernel
+        self.pool = self.new_pool()
+        self.unchecked: list[tuple[str, Array]] = []
+        self.set_aside: list[tuple[float, Candidate]] = []
+        self.best: Path | None = None
+        self.nearest: tuple[Path, float] | None = None
+        self.trees: tuple[og.RRTConnect, ob.ProblemDefinition] | None = None
+        self._queries: list[Query] = []
+
+    @property
+    def queries(self) -> list[Query]:
+        """What the model is conditioned on, one query a pair of start and goal."""
+        if not self._queries:
+            point = self.sampler.model.sees_point
+            with self.report.timed("query"):
+                self._queries = [make_query(self.validator.checker, a, b, point=point) for a, b in self.pairs]
+        return self._queries
+
+    def stop(self) -> bool:
+        """Whether time is up."""
+        return bool(self.ptc())
+
+    def is_valid(self, states: Array) -> bool:
+        """Whether a path, shape (N, dof), passes the full check."""
+        return self.validator.is_valid(states, self.stop)
+
+    def new_pool(self) -> CandidatePool:
+        """Return an empty pool of candidates."""
+        return CandidatePool(self.optimizer, self.kernel, self.is_valid, self.keeps_distance)
+
+    def path_of(self, candidate: Candidate) -> Path:
+        """Return the path of a candidate's control points."""
+        return Path.on(self.optimizer.spline, candidate.control)
+
+    def fit(self, states: Array) -> Array:
+        """Return control points of the spline nearest to a polyline, shape (points, dof)."""
+        limits = self.kernel.robot.arrays
+        return self.optimizer.spline.fit(states, limits.lower, limits.upper).control
+
+    def keeps_distance(self, candidate: Candidate, states: Array) -> bool:
+        """Whether a valid path keeps ``lambda_obs`` from obstacles; one that does not is set aside."""
+        if self.lambda_obs <= 0.0:
+            return True
+        with self.report.timed("distance"):
+            distance = self.validator.obstacle_distance(states)
+        if distance < self.lambda_obs:
+            self.set_aside.append((distance, candidate))
+        return distance >= self.lambda_obs
+
+    def farthest(self) -> Candidate | None:
+        """Return the candidate set aside that keeps the largest distance from obstacles, or None."""
+        return max(self.set_aside, key=lambda pair: pair[0])[1] if self.set_aside else None
+
+    def accept(self, path: Path) -> None:
+        """Add a valid path to OMPL's solutions."""
+        elapsed = time.perf_counter() - self.begin
+        if self.best is None:
+            self.report.first, self.report.first_path = elapsed, path
+            self.report.first_verified = self.validator.knows_obstacles
+        self.report.lengths.append((elapsed, path.length))
+        self.best = self.report.best_path = path
+        self.pdef.addSolutionPath(array_to_path(self.si, path.states), False, 0.0, "apex")
+
+    def accept_if_shorter(self, control: Array) -> bool:
+        """Accept a valid path if it is shorter, and no nearer to obstacles than is wanted, or than the best path.
+
+        Args:
+            control: Control points, shape (points, dof).
+
+        Returns:
+            Whether it was accepted.
+        """
+        path = Path.on(self.optimizer.spline, control)
+        if self.best is not None:
+            if path.length > self.best.length - MIN_GAIN:
+                return False
+            if self.lambda_obs > 0.0:
+                with self.report.timed("distance"):
+                    distance = self.validator.obstacle_distance(path.states)
+                    best = self.best.sample(CLEARANCE_SPACING)
+                    if distance < self.lambda_obs and distance < self.validator.obstacle_distance(best):
+                        return False
+        self.accept(path)
+        return True
+
+    def counted(self, calls: int) -> ob.PlannerTerminationCondition:
+        """Return a termination condition that also holds after some calls."""
+        return stop_after(calls, self.stop)
+
+
+def stop_after(calls: int, stop: Callable[[], bool]) -> Any:
+    """Return OMPL's termination condition that holds when ``stop`` does, or after some calls."""
+    left = iter(range(calls))
+    return ob.PlannerTerminationCondition(lambda: stop() or next(left, None) is None)
+
+
+def joins(control: Array, query: Query) -> bool:
+    """Whether control points, shape (points, dof), begin and end at a query's start and goal."""
+    return np.array_equal(control[0], query.start) and np.array_equal(control[-1], query.goal)

@@ -1,0 +1,33 @@
+"""Stages of APEX inside ``solve``; each returns the first valid path that it finds, or None.
+
+A stage is a small record of its parameters with one method, ``run(context)``. Their order and their parameters are
+chosen by ``apex_ompl.planners.apex.stages_of``.
+"""
+
+from apex_ompl.apex.stages.anytime import Anytime
+from apex_ompl.apex.stages.bridging import Bridging
+from apex_ompl.apex.stages.known import CheckKnown, KnownCandidates
+from apex_ompl.apex.stages.nearest import NearestToGoal
+from apex_ompl.apex.stages.proposals import Farthest, MoreRounds, Propose, Repair, Resample, proposal_round
+from apex_ompl.apex.stages.shorten import Shorten
+from apex_ompl.apex.stages.stage import Solution, Stage
+from apex_ompl.apex.stages.trees import GrowTrees, Sprint
+
+__all__ = [
+    "Anytime",
+    "Bridging",
+    "CheckKnown",
+    "Farthest",
+    "GrowTrees",
+    "KnownCandidates",
+    "MoreRounds",
+    "NearestToGoal",
+    "Propose",
+    "Repair",
+    "Resample",
+    "Shorten",
+    "Solution",
+    "Sprint",
+    "Stage",
+    "proposal_round",
+]

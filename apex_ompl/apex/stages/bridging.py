@@ -1,0 +1,35 @@
+"""Bridges: blocked stretches of the best candidates, joined by short trees."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from apex_ompl.apex.bridge import bridge_blocked, every_other
+from apex_ompl.apex.context import SolveContext
+from apex_ompl.apex.stages.stage import Solution
+from apex_ompl.trajopt.path import Path
+
+MAX_BRIDGED = 2  # candidates
+
+
+@dataclass(frozen=True)
+class Bridging:
+    """Short trees between the free stretches of the best candidates.
+
+    Attributes:
+        tree_range: Longest step of the trees; 0 lets OMPL choose [rad].
+    """
+
+    tree_range: float
+
+    def run(self, context: SolveContext) -> Solution | None:
+        """Return the first candidate whose blocked stretches are bridged, or None."""
+        for candidate in sorted(context.pool.candidates, key=lambda one: one.clearance_cost)[:MAX_BRIDGED]:
+            if context.stop():
+                return None
+            with context.report.timed("bridge"):
+                states = every_other(context.path_of(candidate).states)
+                found = bridge_blocked(context.si, context.validator, states, context.stop, self.tree_range)
+            if found is not None:
+                return Solution(Path(found), "apex+bridge")
+        return None

@@ -1,0 +1,156 @@
+"""Rounds of proposals: propose, check, repair, resample (Algorithm 1 of the paper, execute)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from apex_ompl.apex.context import SolveContext, joins
+from apex_ompl.apex.stages.stage import Solution, Stage, solution_of
+from apex_ompl.trajopt.candidates import STEPS_PER_PATH
+from apex_ompl.types import Array
+
+PROPOSED, RESAMPLED = "apex", "apex+resample"
+BATCH = 8  # proposals between two looks at the clock
+MIN_REPAIR_STEPS = 48  # of repair in a round
+MAX_RESAMPLED = 4  # candidates that are resampled in a round
+
+
+def proposal_round(count: int, *, repair: bool, resample: int, noise: float) -> list[Stage]:
+    """Return the stages of a round of proposals.
+
+    Args:
+        count: Number of proposals for each pair of start and goal.
+        repair: Whether candidates are improved by the optimiser.
+        resample: How often colliding candidates are resampled.
+        noise: How far they are noised for that, as a share of the schedule.
+    """
+    stages: list[Stage] = [Propose(count)]
+    if repair:
+        stages.append(Repair(MIN_REPAIR_STEPS, STEPS_PER_PATH * count))
+    for _ in range(resample):
+        stages.append(Resample(noise))
+        if repair:
+            stages.append(Repair(STEPS_PER_PATH * MAX_RESAMPLED, 0))
+    return stages
+
+
+@dataclass(frozen=True)
+class Propose:
+    """Proposals of the model, checked as they come.
+
+    Attributes:
+        count: Number of proposals for each pair of start and goal.
+    """
+
+    count: int
+
+    def run(self, context: SolveContext) -> Solution | None:
+        """Return the first valid proposal, or None."""
+        if context.stop():
+            return None
+        at_once = max(1, BATCH // len(context.queries))
+        for first in range(0, self.count, at_once):
+            if context.stop():
+                return None
+            with context.report.timed("propose"):
+                control = context.sampler.propose(context.queries, min(at_once, self.count - first))
+            with context.report.timed("check"):
+                found = None if control is None else check(context, control, PROPOSED)
+            if found is not None:
+                return found
+        return None
+
+
+@dataclass(frozen=True)
+class Repair:
+    """Optimiser steps on the candidates, the most promising one first.
+
+    Attributes:
+        least: Least number of steps.
+        steps: Number of steps for each pair of start and goal.
+    """
+
+    least: int
+    steps: int
+
+    def run(self, context: SolveContext) -> Solution | None:
+        """Return the first candidate that becomes valid, or None."""
+        if context.stop():
+            return None
+        steps, before = max(self.least, self.steps * len(context.queries)), context.pool.steps
+        with context.report.timed("repair"):
+            found = context.pool.improve(steps, context.stop)
+        context.report.steps += context.pool.steps - before
+        return solution_of(found, context)
+
+
+@dataclass(frozen=True)
+class Resample:
+    """Collision-triggered resampling: the candidates nearest to being valid, noised and denoised again.
+
+    Attributes:
+        noise: How far they are noised, as a share of the schedule.
+    """
+
+    noise: float
+
+    def run(self, context: SolveContext) -> Solution | None:
+        """Return the first resampled path that is valid, or None."""
+        if context.stop():
+            return None
+        with context.report.timed("resample"):
+            best = sorted(context.pool.candidates, key=lambda one: one.clearance_cost)[:MAX_RESAMPLED]
+            for query in context.queries:
+                mine = [one.control for one in best if joins(one.control, query)]
+                control = context.sampler.renoise(np.stack(mine), query, self.noise) if mine else None
+                found = None if control is None else check(context, control, RESAMPLED)
+                if found is not None or context.stop():
+                    return found
+        return None
+
+
+@dataclass(frozen=True)
+class Farthest:
+    """Of valid paths nearer to obstacles than ``lambda_obs``, the one that keeps the largest distance."""
+
+    def run(self, context: SolveContext) -> Solution | None:
+        """Return that path, or None where no valid path was set aside."""
+        return solution_of(context.farthest(), context)
+
+
+@dataclass(frozen=True)
+class MoreRounds:
+    """Rounds of proposals until time is up.
+
+    Attributes:
+        stages: Stages of a round.
+    """
+
+    stages: tuple[Stage, ...]
+
+    def run(self, context: SolveContext) -> Solution | None:
+        """Return the first valid path, or else the one set aside that is farthest from obstacles, or None."""
+        while self.stages and not context.stop():
+            context.pool = context.new_pool()
+            for stage in self.stages:
+                found = stage.run(context)
+                if found is not None:
+                    return found
+        return Farthest().run(context)
+
+
+def check(context: SolveContext, control: Array, origin: str) -> Solution | None:
+    """Take paths into the pool, count them, and return the first that is valid as it is, or None.
+
+    Args:
+        context: Shared by the stages.
+        control: Control points, shape (B, points, dof).
+        origin: Name of what made them.
+    """
+    report = context.report
+    report.candidates += len(control)
+    report.proposed += len(control) if origin == PROPOSED else 0
+    report.resampled += len(control) if origin == RESAMPLED else 0
+    return solution_of(context.pool.add(control, origin, context.stop), context)

@@ -1,0 +1,110 @@
+"""RRTConnect inside APEX: short sprints before proposals, and the fallback that makes it complete."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from ompl import base as ob
+from ompl import geometric as og
+
+from apex_ompl.apex.bridge import bridge_blocked, make_tree
+from apex_ompl.apex.context import SolveContext
+from apex_ompl.apex.stages.stage import Solution
+from apex_ompl.ompl_adapter.space import path_to_array, to_state
+from apex_ompl.trajopt.path import Path
+from apex_ompl.types import Array
+
+SPACING = 0.1  # of states on a tree's path whose blocked stretches are bridged [rad, max-norm]
+EXACT, APPROXIMATE = ob.PlannerStatus.EXACT_SOLUTION, ob.PlannerStatus.APPROXIMATE_SOLUTION
+
+
+@dataclass(frozen=True)
+class Sprint:
+    """RRTConnect for some iterations between the nearest start and goal; it goes on where it stopped before.
+
+    In open scenes it is done sooner than proposals are made.
+
+    Attributes:
+        iterations: Number of iterations.
+        tree_range: Longest step of the trees; 0 lets OMPL choose [rad].
+    """
+
+    iterations: int
+    tree_range: float
+
+    def run(self, context: SolveContext) -> Solution | None:
+        """Return the path of the trees, or None."""
+        if context.stop():
+            return None
+        with context.report.timed("sprint"):
+            if context.trees is None:
+                pdef = ob.ProblemDefinition(context.si)
+                pdef.setStartAndGoalStates(*(to_state(context.si, q) for q in context.pairs[0]))
+                context.trees = make_tree(context.si, pdef, self.tree_range), pdef
+            tree, pdef = context.trees
+            solved = tree.solve(context.counted(self.iterations)).getStatus() == EXACT
+        if not solved:
+            return None
+        context.trees = None
+        return verified(context, path_to_array(pdef.getSolutionPath(), context.kernel.robot.dof), "sprint", self)
+
+
+@dataclass(frozen=True)
+class GrowTrees:
+    """RRTConnect with the time that is left, for all starts and goals.
+
+    The trees of sprints go on where there is only one pair of start and goal.
+
+    Attributes:
+        tree_range: Longest step of the trees; 0 lets OMPL choose [rad].
+        approximate: Whether a path that ends near a goal is noted.
+    """
+
+    tree_range: float
+    approximate: bool
+
+    def run(self, context: SolveContext) -> Solution | None:
+        """Return the first path of the trees that is valid, or None."""
+        while not context.stop():
+            whole = len(context.pairs) == 1
+            tree, pdef = context.trees if context.trees is not None and whole else self._plant(context)
+            context.trees = None
+            with context.report.timed("rrtconnect"):
+                status = tree.solve(context.ptc).getStatus()
+            if status not in (EXACT, APPROXIMATE):
+                return None
+            states = path_to_array(pdef.getSolutionPath(), context.kernel.robot.dof)
+            if status == EXACT:
+                found = verified(context, states, "rrtconnect", self)
+                if found is not None:
+                    return found
+            elif self.approximate:
+                distance = pdef.getSolutionDifference()
+                if context.nearest is None or distance < context.nearest[1]:
+                    context.nearest = Path(states), distance
+        return None
+
+    def _plant(self, context: SolveContext) -> tuple[og.RRTConnect, ob.ProblemDefinition]:
+        """Return RRTConnect for all starts and goals, and its problem definition."""
+        pdef = ob.ProblemDefinition(context.si)
+        for start in context.starts:
+            pdef.addStartState(to_state(context.si, start))
+        pdef.setGoal(context.pdef.getGoal())
+        return make_tree(context.si, pdef, self.tree_range), pdef
+
+
+def verified(context: SolveContext, states: Array, stage: str, trees: Sprint | GrowTrees) -> Solution | None:
+    """Return a tree's path if it passes the full check, whose states are closer, or after bridging; else None.
+
+    Args:
+        context: Shared by the stages.
+        states: The path, shape (N, dof).
+        stage: Name of the stage.
+        trees: Gives the range of the trees that bridge.
+    """
+    found: Array | None = states
+    if context.validator.exclusive and not context.is_valid(states):
+        with context.report.timed("bridge"):
+            dense = Path(states).sample(SPACING)
+            found = bridge_blocked(context.si, context.validator, dense, context.stop, trees.tree_range)
+    return None if found is None else Solution(Path(found), stage)
