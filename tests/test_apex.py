@@ -217,12 +217,12 @@ def test_the_checkers_of_the_moment_judge(ready: PlanningSetup) -> None:
     si = setup.getSpaceInformation()
     planner = APEX(si, ApexParameters(seed=0))
     setup.setPlanner(planner)
-    assert setup.solve(within(20.0)).getStatus() == EXACT and planner.validator.alone
+    assert setup.solve(within(20.0)).getStatus() == EXACT and planner.validator.exclusive
     setup.clear()
     wary = Wary(si, ready.checker)
     setup.setStateValidityChecker(wary)
     assert setup.solve(within(20.0)).getStatus() == EXACT
-    assert planner.validator.knows_obstacles and not planner.validator.alone
+    assert planner.validator.knows_obstacles and not planner.validator.exclusive
     path = setup.getSolutionPath()
     assert all(wary.isValid(path.getState(k)) for k in range(path.getStateCount()))
     setup.clear()

@@ -9,13 +9,15 @@ import numpy as np
 import pytest
 from support import ROOT
 
-from apex_ompl import benchmark, problems
+from apex_ompl import benchmark, planners, problems
 from apex_ompl.benchmark import Row, Workers, bench, runs
 from apex_ompl.benchmark.rows import Job
 from apex_ompl.errors import ParameterError
 from apex_ompl.ompl_adapter.setup import assemble
 from apex_ompl.ompl_adapter.validity import full_check
+from apex_ompl.planning import PlanRun
 from apex_ompl.robot import Robot
+from apex_ompl.trajopt.path import Path as JointPath
 
 
 def test_the_first_path_counts_where_the_shortened_one_is_repaired(robot: Robot) -> None:
@@ -23,16 +25,16 @@ def test_the_first_path_counts_where_the_shortened_one_is_repaired(robot: Robot)
     ready = assemble(problem, robot)
     witness = problems.witness("wall/easy/800000").path
     line = np.stack([ready.start, ready.goals[0]])
-    planning = runs.Benchmarked(ready, "rrtconnect", 0, 0.0, ())
+    planning = PlanRun(ready, "rrtconnect", planners.parameters("rrtconnect"), 0)
     planning.times |= {"verify": 0.25}
-    assert planning.proof_of_first() == 0.25
+    assert runs.proof_of_first(planning) == 0.25
     planning.times |= {"repair": 30.0}
-    assert planning.proof_of_first() == 0.25, "of a planner whose first path is not known"
-    planning.raw = witness
-    assert 0.0 < planning.proof_of_first() < 30.0
+    assert runs.proof_of_first(planning) == 0.25, "of a planner whose first path is not known"
+    planning.first_path = JointPath(witness)
+    assert 0.0 < runs.proof_of_first(planning) < 30.0
     assert not full_check(ready.checker, line, ready.start, ready.goals)
-    planning.raw = line
-    assert planning.proof_of_first() == 30.25
+    planning.first_path = JointPath(line)
+    assert runs.proof_of_first(planning) == 30.25
 
 
 def test_another_robot_warms_up_on_its_own_problem(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support import distance
 
-from apex_ompl import api, cli, plan, planning
+from apex_ompl import api, cli, plan, planners, planning
 from apex_ompl.errors import ParameterError, TimingError
 from apex_ompl.kernel.reachability import fastest, moments
 from apex_ompl.ompl_adapter.setup import assemble
@@ -17,6 +17,7 @@ from apex_ompl.result import PlanResult, PlanStatus
 from apex_ompl.robot import Limits
 from apex_ompl.trajectory import TimedPath, Timing, Trajectory, time_path
 from apex_ompl.trajectory.curve import Curve, Polyline
+from apex_ompl.trajopt.path import Path
 
 NAMES = ("one", "two", "three")
 LIMITS = Limits(
@@ -247,9 +248,9 @@ def test_joints_that_stay_at_their_limits_do_not_stop_the_motion() -> None:
     states[:, 6], states[:, 13] = robot.limits.upper[6], robot.limits.lower[13]
     states[:, 5] += 0.2 * np.sin(5.0 * t)
     ready = replace(ready, start=states[0], goals=states[-1:])
-    result = planning.Planning(ready, "rrtconnect", 0, 0.0, ())
-    exact = result._exact(states, "test")
-    assert result.with_timing(exact, Timing()).trajectory.duration < 5.0
+    run = planning.PlanRun(ready, "rrtconnect", planners.parameters("rrtconnect"), 0)
+    exact = run.result(PlanStatus.EXACT_SOLUTION, path=Path(states))
+    assert planning.parameterize(run, exact, Timing()).trajectory.duration < 5.0
 
 
 def test_extreme_options_take_no_extreme_time() -> None:
