@@ -78,7 +78,7 @@ class PlanResult:
             ``solve``.
         length: Sum of Euclidean joint-space steps [rad], NaN without a path.
         clearance: Least distance of any checked pair at 32 states spread over the path [m], NaN without a path.
-        checks: How many states were judged one by one; those inside proved stretches of motions do not count.
+        checks: Number of states checked one by one; those inside proved stretches of motions do not count.
         solved_by: What found the path: the planner's name, or the stage of apex that did (see
             ``apex_ompl.ompl_adapter.report.SolveReport``), with ``+repair`` where a stretch of it failed the full check
             and was planned anew; ``straight line`` where that is a solution, so that no planner ran; empty without a

@@ -145,7 +145,7 @@ class RRTConnectPolish(Parameters):
         """Return the planner.
 
         Raises:
-            ParameterError: ``si`` has no checker to judge by.
+            ParameterError: ``si`` has no validity checker of this project.
         """
         validity_checker = si.getStateValidityChecker()
         if not isinstance(validity_checker, StateValidityChecker):

@@ -14,7 +14,7 @@ from ompl import geometric as og
 from apex_ompl.planners.registry import Parameters, bounded, register
 
 UNIT = "rad"
-# OMPL spells these setters its own way.
+# OMPL spells these setters differently.
 _SETTERS = {"delay_cc": "DelayCC", "cache_cc": "CacheCC", "extended_fmt": "ExtendedFMT"}
 
 

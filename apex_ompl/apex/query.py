@@ -1,4 +1,4 @@
-"""Problems as the model sees them."""
+"""Queries of the trajectory model: what it is conditioned on."""
 
 from __future__ import annotations
 
@@ -21,6 +21,6 @@ def make_query(checker: CollisionChecker, start: Array, goal: Array, *, point: b
         goal: Shape (dof,) [rad].
         point: Whether the obstacle point is looked for; models that do not see it can do without.
     """
-    things = ObstacleSet.among(checker.kernel.scene.arrays, checker.movable)
+    obstacles = ObstacleSet.among(checker.kernel.scene.arrays, checker.movable)
     place = checker.obstacle_point(start) if point else np.array(NO_POINT)
-    return Query(np.asarray(start, float), np.asarray(goal, float), place, things)
+    return Query(np.asarray(start, float), np.asarray(goal, float), place, obstacles)

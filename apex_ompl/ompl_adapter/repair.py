@@ -1,4 +1,4 @@
-"""Mending a path that a planner found at its search resolution and that fails the full check."""
+"""Repair of paths that pass the search resolution and fail the full check."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def repair(
     Args:
         ready: The problem.
         path: States, shape (N, dof), the first and the last of them free.
-        fault: What the full check said of ``path``.
+        fault: Outcome of the full check of ``path``.
         deadline: Value of ``time.perf_counter`` at which to give up [s].
         interrupt: Ends the work in good order when it was pressed.
 
@@ -52,7 +52,7 @@ def repair(
 def _free_ends(ready: PlanningSetup, path: Array, segment: int) -> tuple[int, int]:
     """Return the states nearest to a segment, before and after it, that are free.
 
-    Shortcuts may put a state between those that were judged, so that a state of the path itself collides.
+    Shortcuts may put a state between those that were checked, so that a state of the path itself collides.
     """
     first, last = segment, segment + 1
     while first > 0 and not ready.checker.is_free(path[first]):
@@ -63,7 +63,7 @@ def _free_ends(ready: PlanningSetup, path: Array, segment: int) -> tuple[int, in
 
 
 def _bridge(ready: PlanningSetup, a: Array, b: Array, timeout: float, interrupt: Interrupt) -> Array | None:
-    """Return a path between two free states, judged at the resolution of the full check, or None."""
+    """Return a path between two free states, checked at the resolution of the full check, or None."""
     space = state_space(ready.robot)
     setup = og.SimpleSetup(space)
     si = setup.getSpaceInformation()

@@ -28,8 +28,8 @@ class PlanningSetup:
     Attributes:
         problem: The problem.
         robot: Its robot.
-        checker: Judges states.
-        check: Judges motions at the search resolution.
+        checker: Collision checker of the robot in the scene.
+        check: Check of straight motions at the search resolution.
         simple_setup: OMPL's setup, with start and goals set and no planner chosen.
         validity_checker: OMPL's state validity checker.
         motion_validator: OMPL's motion validator.

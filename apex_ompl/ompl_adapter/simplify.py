@@ -25,14 +25,14 @@ def simplify(
 ) -> NDArray[np.float64]:
     """Return a shorter path with the same ends, by OMPL's vertex reduction and partial shortcuts.
 
-    Motions are judged by the motion validator of ``si``.
+    Motions are checked by the motion validator of ``si``.
 
     Args:
         simplifier: OMPL's simplifier for ``si``.
         si: OMPL's space information of the problem.
         path: States, shape (N, dof).
         stop: Asked before every round whether to end.
-        at_once: Attempts to shorten in a round; 0 means as many as OMPL takes for its own.
+        at_once: Attempts to shorten the path in a round; 0 means as many as OMPL takes for its own.
     """
     if len(path) < 3:
         return path

@@ -17,7 +17,7 @@ from apex_ompl.util.resolution import FULL_RESOLUTION, SEARCH_RESOLUTION
 
 
 class MotionCheck:
-    """Judges straight motions between states at a spacing; a plain callable, without OMPL."""
+    """Collision check of straight motions between states at a spacing; a plain callable, without OMPL."""
 
     def __init__(self, checker: CollisionChecker, resolution: float = SEARCH_RESOLUTION) -> None:
         """Check by ``checker`` at a spacing of ``resolution`` [rad, max-norm]."""
@@ -30,7 +30,7 @@ class MotionCheck:
 
 
 class StateValidityChecker(ob.StateValidityChecker):
-    """OMPL's state validity by the checker.
+    """OMPL state validity checker over a collision checker.
 
     No exception leaves it, since one would end the process inside OMPL: a fault makes states invalid and is
     kept in ``fault``.
@@ -61,7 +61,7 @@ class StateValidityChecker(ob.StateValidityChecker):
 
 
 class MotionValidator(ob.MotionValidator):
-    """OMPL's motion validity by the checker, in bit-reversed order; no exception leaves it."""
+    """OMPL motion validator over a collision checker, in bit-reversed order; no exception leaves it."""
 
     def __init__(self, si: ob.SpaceInformation, check: MotionCheck) -> None:
         """Check motions of ``si`` by ``check``."""
@@ -87,7 +87,7 @@ class FullCheck:
         ok: Whether the path is a solution.
         reason: One sentence about the first fault found, empty when there is none.
         segment: Index of the segment (states k and k + 1) with the fault, or None.
-        states: How many states were judged one by one.
+        states: Number of states that were checked one by one.
     """
 
     ok: bool
@@ -114,7 +114,7 @@ def full_check(
     sampled.
 
     Args:
-        checker: Judges the states.
+        checker: Collision checker.
         path: States, shape (N, dof).
         start: The given start, shape (dof,), or None for any.
         goals: Goal states; none means any end.
@@ -138,9 +138,9 @@ def full_check(
         return FullCheck(False, "the path does not end at a goal", len(path) - 2, 0)
     before = checker.check_counts.states
     hit = checker.first_collision(path, resolution)
-    judged = checker.check_counts.states - before
+    checked = checker.check_counts.states - before
     if hit is None:
-        return FullCheck(True, "", None, judged)
+        return FullCheck(True, "", None, checked)
     contacts = checker.contacts(hit.state)
     what = str(contacts[0]) if contacts else "in collision"
-    return FullCheck(False, f"between states {hit.segment} and {hit.segment + 1}: {what}", hit.segment, judged)
+    return FullCheck(False, f"between states {hit.segment} and {hit.segment + 1}: {what}", hit.segment, checked)

@@ -1,7 +1,7 @@
-"""Trajectory optimisation on control points: paths made clear of obstacles, and then short.
+"""Trajectory optimisation on B-spline control points: paths made clear of obstacles, and then short.
 
-One optimiser serves repair, polish and the making of data. It needs NumPy and the compiled kernel alone; what decides
-whether a path is valid is handed in.
+One optimiser serves repair, shortening and data generation. It needs NumPy and the compiled kernel only; the full
+check is handed in.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class Settings:
     """What a path costs, and how long it is worked on.
 
     Attributes:
-        samples: How many states are judged: the middles of as many even stretches of the parameter, as dense as every
+        samples: Number of states whose clearance counts: the middles of as many even stretches of the parameter, as dense as every
             fourth state of a path of 256.
         scene_margin: Clearance to obstacles below which a state costs [m].
         own_margin: Clearance between the robot's own links, its arms among them, below which a state costs [m].
@@ -107,7 +107,7 @@ class Optimizer:
         self.improve(kernel, np.zeros((1, self.spline.points, kernel.robot.dof)), steps=0)
 
     def finer(self) -> Optimizer:
-        """Return an optimiser that judges more states."""
+        """Return an optimiser with more samples."""
         return Optimizer(self.spline, replace(self.settings, samples=FINER * self.settings.samples))
 
     def starts(self, start: Array, goal: Array, count: int, rng: np.random.Generator, size: float = 1.0) -> Array:
@@ -207,7 +207,7 @@ class Optimizer:
         """Return the last valid path of stiffer and stiffer ones, control points of shape (points, dof), or None.
 
         Stiffer paths are shorter. The stiffness grows from round to round, until a path fails the check; where the
-        first one fails already, a softer one has its turn, judged at more states.
+        first one fails already, a softer one has its turn, with more samples.
 
         Args:
             kernel: The robot among its obstacles.
