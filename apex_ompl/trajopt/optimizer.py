@@ -30,17 +30,17 @@ LAST_RESORT = 0.1  # factor on the stiffness where nothing came out valid
 
 @dataclass(frozen=True)
 class Settings:
-    """What a path costs, and how long it is worked on.
+    """Cost of a path, and when its optimisation ends.
 
     Attributes:
-        samples: Number of states whose clearance counts: the middles of as many even stretches of the parameter, as dense as every
-            fourth state of a path of 256.
+        samples: Number of states whose clearance counts: the middles of as many even intervals of the parameter, as
+            dense as every fourth state of a path of 256.
         scene_margin: Clearance to obstacles below which a state costs [m].
         own_margin: Clearance between the robot's own links, its arms among them, below which a state costs [m].
         stiffness: Weight of half the integral of the speed squared, [1/rad^2]; for an even speed this is half the
-            length squared. A clearance_cost of a whole margin, all along, costs 1/2.
+            length squared. A clearance of 0 all along the path costs 1/2.
         damping: Weight of the speed of the change at the first step.
-        steps: Most steps in one go.
+        steps: Largest number of steps of one call.
         tolerance: A step that lowers the cost by less than this share is the last.
     """
 
@@ -70,16 +70,16 @@ class Settings:
 
 @dataclass(frozen=True, eq=False)
 class OptimizationResult:
-    """Paths after some steps.
+    """Paths after some optimiser steps.
 
     Attributes:
         control: Control points, shape (B, points, dof).
-        cost: What they cost, shape (B,).
-        clearance_cost: The part of it that is due to clearance, shape (B,).
+        cost: Total cost, shape (B,).
+        clearance_cost: Part of the cost that is due to clearance, shape (B,).
         clearance: Smallest clearances of the sphere cover at the samples, to the scene and of the robot to itself,
             where they are below the margins, and else the margins; shape (B, 2) [m].
-        steps: Steps that were taken, shape (B,).
-        damping: The damping to go on with, shape (B,).
+        steps: Number of steps taken, shape (B,).
+        damping: Damping of the next step, shape (B,).
     """
 
     control: Array
@@ -91,10 +91,10 @@ class OptimizationResult:
 
 
 class Optimizer:
-    """Improves batches of paths; safe to use from several threads, and without random numbers of its own.
+    """Levenberg-Marquardt on control points of batches of paths; thread-safe, without random numbers of its own.
 
-    The method is that of Levenberg and Marquardt on squared clearance_costs of clearance and the squared speed, see
-    :mod:`apex_ompl.kernel.optimization`. Limits are kept by the control points.
+    The cost is the squared speed and the squared violations of the margins, see :mod:`apex_ompl.kernel.optimization`.
+    Limits are kept by the control points.
     """
 
     def __init__(self, spline: Spline | None = None, settings: Settings | None = None) -> None:
