@@ -9,6 +9,7 @@ import numpy as np
 from apex_ompl.robot import Robot
 
 ROOT = Path(__file__).resolve().parent.parent
+DATA = ROOT / "tests" / "data" / "dual_panda_softhand"  # drawn by scripts/make_test_data.py
 
 CUBE_OBJ = """v 0 0 0
 v 1 0 0
