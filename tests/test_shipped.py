@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from support import DATA, ROOT
+from support import DATA, ROOT, needs
 
 from apex_ompl import load_model
 from apex_ompl.datasets.cases import load_cases
@@ -56,7 +56,7 @@ def test_a_sample_of_the_model_is_shorter_to_repair_than_the_line(name: str) -> 
     assert solved["model"] > solved["line"], solved
 
 
-@pytest.mark.skipif(not FULL.exists(), reason="data/ is not in the source distribution; run this in a clone")
+@needs("data")
 def test_the_data_of_the_tests_are_drawn_from_the_set_in_the_repository() -> None:
     full, few = load(FULL / "paths.zip"), load(DATA / "paths.zip")
     every = {full.problem_name(k) for k in range(full.problems)}
