@@ -30,7 +30,7 @@ print(result.status, apex_ompl.problems.names(), len(apex_ompl.planners.names())
 
 
 def run(*command: object, cwd: Path) -> str:
-    done = subprocess.run([str(c) for c in command], check=False, capture_output=True, text=True, cwd=cwd, timeout=300)
+    done = subprocess.run([str(c) for c in command], check=False, capture_output=True, text=True, cwd=cwd, timeout=600)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 
