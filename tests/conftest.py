@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import settings as hypothesis_settings
 from planning import HARD, at_hand
-from support import ROOT
+from support import DATA
 
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.datasets.records import Paths
@@ -76,8 +76,7 @@ def apex_cli():
 @pytest.fixture(scope="session")
 def paths() -> Paths:
     """Paths of a few problems of every level."""
-    whole = load(ROOT / "data" / "dual_panda_softhand" / "paths.zip")
-    return whole.chosen(np.arange(0, whole.problems, 60))
+    return load(DATA / "paths.zip")
 
 
 @pytest.fixture(scope="session")

@@ -6,7 +6,7 @@ from functools import cache
 
 import numpy as np
 import torch
-from support import ROOT
+from support import DATA
 
 from apex_ompl.datasets.records import Paths
 from apex_ompl.datasets.store import load
@@ -24,7 +24,6 @@ from apex_ompl.kernel import Kernel, RobotTables
 from apex_ompl.kernel.scene_builder import Primitive, scene_tables
 from apex_ompl.kernel.tables import BOX, CAPSULE, CYLINDER, SPHERE
 
-DATA = ROOT / "data" / "dual_panda_softhand"
 DOF = 16
 KINDS = {"box": BOX, "sphere": SPHERE, "cylinder": CYLINDER, "capsule": CAPSULE}
 
@@ -32,8 +31,7 @@ KINDS = {"box": BOX, "sphere": SPHERE, "cylinder": CYLINDER, "capsule": CAPSULE}
 @cache
 def some_paths() -> Paths:
     """Paths of a few problems of every level."""
-    paths = load(DATA / "paths.zip")
-    return paths.chosen(np.arange(0, paths.problems, 100))
+    return load(DATA / "paths.zip")
 
 
 @cache

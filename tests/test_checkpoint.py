@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
-from trainings import DATA, HERE, config, query_of_path
+from support import DATA
+from trainings import HERE, config, query_of_path
 
 import apex_ompl
 from apex_ompl.datasets.store import load

@@ -1,14 +1,15 @@
-"""The checkpoints in the package: what they are, and that they were trained."""
+"""Checkpoints in the package: their files, and that they were trained; and the data set that they learned from."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 import torch
-from support import ROOT
+from support import DATA, ROOT, needs
 
 from apex_ompl import load_model
 from apex_ompl.datasets.cases import load_cases
+from apex_ompl.datasets.store import load
 from apex_ompl.diffusion.checkpoint import SHIPPED, shipped
 from apex_ompl.diffusion.proposals import Sampling
 from apex_ompl.diffusion.validation import query_of_case
@@ -19,7 +20,7 @@ from apex_ompl.trajopt.optimizer import Optimizer
 from apex_ompl.util.resolution import FULL_RESOLUTION
 from apex_ompl.util.threads import one_torch_thread
 
-CASES = load_cases(ROOT / "data" / "dual_panda_softhand" / "validation")
+FULL = ROOT / "data" / "dual_panda_softhand"
 
 
 def test_what_ships_is_small_and_named() -> None:
@@ -34,11 +35,10 @@ def test_what_ships_is_small_and_named() -> None:
 
 @pytest.mark.parametrize("name", shipped())
 def test_a_sample_of_the_model_is_shorter_to_repair_than_the_line(name: str) -> None:
-    """One proposal for each of some problems that no training saw, against the straight line, both repaired alike."""
+    """One proposal for each of some hard problems that no training saw, and the straight line, both repaired alike."""
     model, solved = load_model(name), {"model": 0, "line": 0}
     quick = Sampling("ddim", 8) if model.sampling.steps > 8 else None
-    hard = [case for case in CASES if case.level == "hard" and case.suite != "bins"][::4]
-    for case in hard:
+    for case in load_cases(DATA / "validation"):
         kernel = Kernel(case.robot, case.scene)
         generator = torch.Generator().manual_seed(1)
         with one_torch_thread():
@@ -54,3 +54,12 @@ def test_a_sample_of_the_model_is_shorter_to_repair_than_the_line(name: str) -> 
 
             solved[kind] += first_valid(Optimizer(model.spline), kernel, control, is_valid) is not None
     assert solved["model"] > solved["line"], solved
+
+
+@needs("data")
+def test_the_data_of_the_tests_are_drawn_from_the_set_in_the_repository() -> None:
+    full, few = load(FULL / "paths.zip"), load(DATA / "paths.zip")
+    every = {full.problem_name(k) for k in range(full.problems)}
+    assert 0 < few.problems < full.problems and all(few.problem_name(k) in every for k in range(few.problems))
+    assert len(load_cases(FULL / "validation")) > len(load_cases(DATA / "validation"))
+    assert (FULL / "robot.npz").read_bytes() == (DATA / "robot.npz").read_bytes()

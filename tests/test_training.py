@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from support import ROOT
-from trainings import DATA, HERE, SCRIPT, SMALL, VARIATIONAL, assert_same, config, query_of_path, weights
+from support import DATA, ROOT
+from trainings import HERE, SCRIPT, SMALL, VARIATIONAL, assert_same, config, query_of_path, weights
 
 from apex_ompl.datasets.cases import load_cases, save_cases
 from apex_ompl.datasets.records import Paths
@@ -197,7 +197,7 @@ class _Given:
 
 
 def test_proposals_are_judged_by_repair_and_proof(few: Path, tmp_path: Path) -> None:
-    cases = load_cases(DATA / "validation")[::60]
+    cases = load_cases(DATA / "validation")[::4]
     model = TrajectoryModel(Trainer(config(few), tmp_path, HERE).averaged_network(), {})
     said = judged(model, cases, 3)
     wanted = []
@@ -291,7 +291,7 @@ def test_steps_without_a_finite_gradient_change_nothing(few: Path, tmp_path: Pat
 
 def test_training_needs_no_ompl_and_no_pinocchio(few: Path, tmp_path: Path) -> None:
     file = tmp_path / "small.yaml"
-    save_cases(tmp_path / "cases", load_cases(DATA / "validation")[::120])
+    save_cases(tmp_path / "cases", load_cases(DATA / "validation")[::8])
     file.write_text(yaml.safe_dump({**SMALL, "data": str(few), "steps": 2, "cases": str(tmp_path / "cases")}))
     code = "import sys\nfor name in ('ompl', 'pinocchio', 'coal', 'ruckig'):\n    sys.modules[name] = None\n"
     code += f"sys.argv = ['train.py', {str(file)!r}, '--out', {str(tmp_path / 'run')!r}, '--quiet']\n"

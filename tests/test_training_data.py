@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from support import ROOT
-from trainings import DATA, HERE, config, query_of_path
+from support import DATA, ROOT
+from trainings import HERE, config, query_of_path
 
 from apex_ompl.datasets.records import Paths
 from apex_ompl.datasets.store import Store, save

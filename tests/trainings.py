@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from support import ROOT
+from support import DATA, ROOT
 
 from apex_ompl.datasets.records import Paths
 from apex_ompl.diffusion.conditions import ObstacleSet, Query
@@ -14,7 +14,6 @@ from apex_ompl.diffusion.config import TrainingConfig
 from apex_ompl.diffusion.objective import Place
 from apex_ompl.diffusion.training import Trainer
 
-DATA = ROOT / "data" / "dual_panda_softhand"
 SCRIPT = ROOT / "scripts" / "train.py"
 HERE = Place(0, 1, torch.device("cpu"))
 SMALL = {
