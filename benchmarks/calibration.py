@@ -24,7 +24,7 @@ from store import RunStore
 from apex_ompl import plan, problems
 from apex_ompl.live.moving import even_times, timed_check
 from apex_ompl.problems.alignment import PACE
-from apex_ompl.problems.reach import robot
+from apex_ompl.problems.suite_robot import robot
 from apex_ompl.util.scripts import run_command
 from apex_ompl.util.validation import one_or_more, whole_number
 

@@ -17,7 +17,7 @@ from apex_ompl.datasets.records import Paths
 from apex_ompl.datasets.store import load, save
 from apex_ompl.ompl_adapter.process import quiet_ompl
 from apex_ompl.ompl_adapter.setup import PlanningSetup, assemble
-from apex_ompl.problems import reach
+from apex_ompl.problems.suite_robot import robot as suite_robot
 from apex_ompl.robot import Robot, load_robot
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Goal, Problem
@@ -102,4 +102,4 @@ def quiet() -> Iterator[None]:
 @pytest.fixture
 def ready() -> PlanningSetup:
     """A hard problem, set up."""
-    return assemble(at_hand(HARD), reach.robot())
+    return assemble(at_hand(HARD), suite_robot())

@@ -12,7 +12,7 @@ from ompl import geometric as og
 
 from apex_ompl import problems
 from apex_ompl.ompl_adapter.space import path_to_array
-from apex_ompl.problems.reach import robot
+from apex_ompl.problems.suite_robot import robot
 from apex_ompl.scene.problem import Problem
 
 EXACT, TIMEOUT = ob.PlannerStatus.EXACT_SOLUTION, ob.PlannerStatus.TIMEOUT

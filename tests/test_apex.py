@@ -21,7 +21,7 @@ from apex_ompl.ompl_adapter.space import path_to_array, state_space, to_state
 from apex_ompl.ompl_adapter.validity import StateValidityChecker, full_check
 from apex_ompl.planners import APEX
 from apex_ompl.planners.apex_parameters import ApexParameters
-from apex_ompl.problems.reach import robot
+from apex_ompl.problems.suite_robot import robot
 from apex_ompl.result import INSIDE
 from apex_ompl.trajopt.path import path_length
 

@@ -21,7 +21,7 @@ from apex_ompl.ompl_adapter.space import state_space, to_state
 from apex_ompl.ompl_adapter.validity import full_check
 from apex_ompl.planners import APEX
 from apex_ompl.planners.apex_parameters import ApexParameters
-from apex_ompl.problems.reach import robot
+from apex_ompl.problems.suite_robot import robot
 from apex_ompl.result import PlanStatus
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Problem

@@ -85,9 +85,9 @@ def copied(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     for name in ("swap-easy.json.xz", "vertical-small.json.xz", "SHA256SUMS"):
         shutil.copy(FOLDER / name, tmp_path / name)
     monkeypatch.setattr(frozen, "FOLDER", tmp_path)
-    frozen.forget()
+    frozen.clear_cache()
     yield tmp_path
-    frozen.forget()
+    frozen.clear_cache()
 
 
 def test_what_is_saved_is_what_is_loaded(copied: Path) -> None:
@@ -99,14 +99,14 @@ def test_what_is_saved_is_what_is_loaded(copied: Path) -> None:
         frozen.save("vertical", "small", some, 3)
     for seed, item in some.items():
         again = frozen.load(ProblemId("vertical", "small", seed))
-        assert again.problem == item.problem and again.number == item.number
+        assert again.problem == item.problem and again.draw_number == item.draw_number
         assert np.array_equal(again.witness.path, item.witness.path)
 
 
 def test_a_changed_or_missing_file_is_named_and_nothing_is_drawn_instead(copied: Path) -> None:
     file = copied / "swap-easy.json.xz"
     assert problems.load("swap/easy/900003").name == "swap/easy/900003"
-    frozen.forget()
+    frozen.clear_cache()
     content = bytearray(file.read_bytes())
     content[len(content) // 2] ^= 1
     file.write_bytes(content)
@@ -126,7 +126,7 @@ def changed_file(copied: Path, change) -> None:
     content = content if isinstance(content, bytes) else lzma.compress(json.dumps(content).encode())
     file.write_bytes(content)
     (copied / "SHA256SUMS").write_text(f"{hashlib.sha256(content).hexdigest()}  swap-easy.json.xz\n")
-    frozen.forget()
+    frozen.clear_cache()
 
 
 def first_row(change) -> object:
@@ -168,7 +168,7 @@ def test_a_damaged_file_with_a_right_hash_is_one_sentence(copied: Path, change, 
 def test_a_damaged_file_of_hashes_is_named(copied: Path, line: str) -> None:
     with (copied / "SHA256SUMS").open("a") as file:
         file.write(line + "\n")
-    frozen.forget()
+    frozen.clear_cache()
     with pytest.raises(FileFormatError, match="SHA256SUMS"):
         problems.load("swap/easy/900000")
 
