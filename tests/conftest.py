@@ -66,7 +66,7 @@ def apex_cli():
     """Run the command line in a fresh process: exit code, standard output, standard error."""
 
     def run(*arguments: object, **options: object) -> subprocess.CompletedProcess[str]:
-        command = [sys.executable, "-m", "apex_ompl.cli.parser", *map(str, arguments)]
+        command = [sys.executable, "-m", "apex_ompl.cli", *map(str, arguments)]
         settings = {"capture_output": True, "text": True, "timeout": 120, "env": os.environ, **options}
         return subprocess.run(command, check=False, **settings)
 

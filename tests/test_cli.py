@@ -182,7 +182,7 @@ def test_an_output_that_cannot_be_written_is_named(apex_cli, easy: Path) -> None
 )
 def test_ctrl_c_ends_a_plan_in_good_order(planner: str, settings: list[str], tmp_path: Path) -> None:
     """Planners that would go on for long: by their nature, or made slow by a parameter."""
-    command = [sys.executable, "-m", "apex_ompl.cli.parser", "plan", "shelf_swap", "--planner", planner]
+    command = [sys.executable, "-m", "apex_ompl.cli", "plan", "shelf_swap", "--planner", planner]
     command += [word for setting in settings for word in ("--set", setting)]
     command += ["--timeout", "60", "--out", str(tmp_path / "r.npz")]
     running = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
@@ -204,7 +204,7 @@ def test_a_csv_needs_a_path_but_the_status_is_told(apex_cli, tmp_path: Path) -> 
 
 def test_a_full_or_closed_output_is_no_traceback() -> None:
     for shell in ("{} schema > /dev/full", "{} problems | true"):
-        command = shell.format(f"{sys.executable} -m apex_ompl.cli.parser")
+        command = shell.format(f"{sys.executable} -m apex_ompl.cli")
         done = subprocess.run(command, check=False, shell=True, capture_output=True, text=True, timeout=60)
         assert "Traceback" not in done.stderr and "Exception ignored" not in done.stderr
 
