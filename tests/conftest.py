@@ -48,7 +48,7 @@ def checker(robot: Robot, post: Obstacle) -> CollisionChecker:
 
 @pytest.fixture
 def problem(robot: Robot, post: Obstacle) -> Problem:
-    """Both arms turn; easy for every planner, and the straight line collides."""
+    """The left arm passes a post; easy for every planner, but the straight line collides."""
     start, goal = robot.home.copy(), robot.home.copy()
     start[[0, 1, 3]] = 0.1, 0.4, -1.6
     goal[[0, 1, 3]] = -1.3, 0.4, -1.6
@@ -63,7 +63,7 @@ def problem(robot: Robot, post: Obstacle) -> Problem:
 
 @pytest.fixture
 def apex_cli():
-    """Run the command line in a fresh process: exit code, standard output, standard error."""
+    """Run the command line in a new process; returns exit code, standard output and standard error."""
 
     def run(*arguments: object, **options: object) -> subprocess.CompletedProcess[str]:
         command = [sys.executable, "-m", "apex_ompl.cli", *map(str, arguments)]
@@ -75,9 +75,9 @@ def apex_cli():
 
 @pytest.fixture(scope="session")
 def paths() -> Paths:
-    """Paths of a few problems of every level."""
-    whole = load(ROOT / "data" / "dual_panda_softhand" / "paths.zip")
-    return whole.chosen(np.arange(0, whole.problems, 60))
+    """Paths of every 60th problem of the data set."""
+    data = load(ROOT / "data" / "dual_panda_softhand" / "paths.zip")
+    return data.chosen(np.arange(0, data.problems, 60))
 
 
 @pytest.fixture(scope="session")
@@ -94,12 +94,12 @@ def few(paths: Paths, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def quiet() -> Iterator[None]:
-    """OMPL says nothing."""
+    """OMPL's log is off."""
     with quiet_ompl():
         yield
 
 
 @pytest.fixture
 def ready() -> PlanningSetup:
-    """A hard problem, set up."""
+    """The planning setup of a hard problem."""
     return assemble(at_hand(HARD), suite_robot())

@@ -26,6 +26,7 @@ def within(seconds: float) -> ob.PlannerTerminationCondition:
 
 @cache
 def at_hand(name: str) -> Problem:
+    """The problem of a name, loaded once."""
     return problems.load(name)
 
 
@@ -33,11 +34,12 @@ def states(setup: og.SimpleSetup) -> np.ndarray:
     return path_to_array(setup.getSolutionPath(), robot().dof)
 
 
+# Parameters of apex without its other stages.
 ALONE = {"bridge": False, "fallback": False, "polish": False}
 
 
 class Plain(ob.StateValidityChecker):
-    """A checker that knows nothing of this project but its checker, as that of a user's might."""
+    """A validity checker as a user writes one: OMPL calls a function of the state, without proofs or batches."""
 
     def __init__(self, si: ob.SpaceInformation, free: Callable[[np.ndarray], bool]) -> None:
         super().__init__(si)
