@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from hypothesis import settings as hypothesis_settings
-from planning import HARD, at_hand
+from planning import HARD, cached_problem
 from support import ROOT
 
 from apex_ompl.collision import CollisionChecker
@@ -102,4 +102,4 @@ def quiet() -> Iterator[None]:
 @pytest.fixture
 def ready() -> PlanningSetup:
     """The planning setup of a hard problem."""
-    return assemble(at_hand(HARD), suite_robot())
+    return assemble(cached_problem(HARD), suite_robot())

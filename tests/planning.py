@@ -25,7 +25,7 @@ def within(seconds: float) -> ob.PlannerTerminationCondition:
 
 
 @cache
-def at_hand(name: str) -> Problem:
+def cached_problem(name: str) -> Problem:
     """The problem of a name, loaded once."""
     return problems.load(name)
 
@@ -34,11 +34,11 @@ def states(setup: og.SimpleSetup) -> np.ndarray:
     return path_to_array(setup.getSolutionPath(), robot().dof)
 
 
-# Parameters of apex without its other stages.
-ALONE = {"bridge": False, "fallback": False, "polish": False}
+# Parameters of apex that turn its other stages off.
+DIFFUSION_ONLY = {"bridge": False, "fallback": False, "polish": False}
 
 
-class Plain(ob.StateValidityChecker):
+class UserValidityChecker(ob.StateValidityChecker):
     """A validity checker as a user writes one: OMPL calls a function of the state, without proofs or batches."""
 
     def __init__(self, si: ob.SpaceInformation, free: Callable[[np.ndarray], bool]) -> None:
