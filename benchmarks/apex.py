@@ -33,7 +33,7 @@ from apex_ompl import plan, problems
 from apex_ompl.diffusion.checkpoint import SHIPPED
 from apex_ompl.ompl_adapter.setup import assemble
 from apex_ompl.ompl_adapter.validity import full_check
-from apex_ompl.problems.reach import robot
+from apex_ompl.problems.suite_robot import robot
 from apex_ompl.result import FIRST, INSIDE, PlanResult
 from apex_ompl.util.resolution import FULL_RESOLUTION
 from apex_ompl.util.scripts import run_command

@@ -29,7 +29,7 @@ from apex_ompl.ompl_adapter.setup import PlanningSetup, assemble
 from apex_ompl.planners import apex_parameters
 from apex_ompl.planners.apex import APEX
 from apex_ompl.planners.apex_parameters import ApexParameters
-from apex_ompl.problems.reach import robot
+from apex_ompl.problems.suite_robot import robot
 from apex_ompl.trajopt.optimizer import Optimizer, Settings
 from apex_ompl.util.scripts import run_command
 from apex_ompl.util.validation import one_or_more

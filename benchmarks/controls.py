@@ -24,7 +24,7 @@ from apex_ompl.ompl_adapter.setup import assemble
 from apex_ompl.planners.apex import APEX
 from apex_ompl.planners.apex_parameters import ApexParameters
 from apex_ompl.planners.registry import register
-from apex_ompl.problems.reach import robot
+from apex_ompl.problems.suite_robot import robot
 from apex_ompl.trajopt.optimizer import Optimizer
 
 

@@ -24,7 +24,7 @@ from store import RunStore
 from apex_ompl import plan, problems
 from apex_ompl.ompl_adapter.setup import assemble
 from apex_ompl.ompl_adapter.validity import full_check
-from apex_ompl.problems.reach import robot
+from apex_ompl.problems.suite_robot import robot
 from apex_ompl.trajopt.candidates import first_valid
 from apex_ompl.trajopt.optimizer import Optimizer
 from apex_ompl.trajopt.path import path_length

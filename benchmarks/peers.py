@@ -34,7 +34,7 @@ from apex_ompl.ompl_adapter.process import quiet_ompl
 from apex_ompl.ompl_adapter.repair import repair
 from apex_ompl.ompl_adapter.setup import PlanningSetup, assemble
 from apex_ompl.ompl_adapter.validity import full_check
-from apex_ompl.problems.reach import robot
+from apex_ompl.problems.suite_robot import robot
 from apex_ompl.robot import Robot
 from apex_ompl.robot.model import link_of
 from apex_ompl.scene.bodies import Body, pose_matrix

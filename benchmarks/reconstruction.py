@@ -24,7 +24,7 @@ from apex_ompl.diffusion.checkpoint import shipped
 from apex_ompl.diffusion.data import split
 from apex_ompl.ompl_adapter.setup import assemble
 from apex_ompl.ompl_adapter.validity import full_check
-from apex_ompl.problems.reach import robot
+from apex_ompl.problems.suite_robot import robot
 from apex_ompl.util.scripts import run_command
 from apex_ompl.util.validation import one_or_more
 

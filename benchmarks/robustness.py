@@ -28,7 +28,7 @@ from apex_ompl.ompl_adapter.setup import assemble
 from apex_ompl.ompl_adapter.space import to_state
 from apex_ompl.planners.apex import APEX
 from apex_ompl.planners.apex_parameters import ApexParameters
-from apex_ompl.problems.reach import robot
+from apex_ompl.problems.suite_robot import robot
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Goal, Problem
 from apex_ompl.util.scripts import run_command

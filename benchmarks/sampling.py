@@ -1,4 +1,4 @@
-"""How many problems of each suite and level are drawn in a second on one core, start and goal included.
+"""Rate at which problems of each suite and level are drawn on one core, start and goal included [1/s].
 
 Usage: python benchmarks/sampling.py [-n 200] [SUITE[/LEVEL] ...]
 """
@@ -28,14 +28,14 @@ def main() -> None:
     figures, rows = [], [["suite/level", "problems/s", "ms p50", "p95"], ["---", *["---:"] * 3]]
     for level in (v for v in every if not args.levels or v in args.levels or v.split("/")[0] in args.levels):
         suite, name = level.split("/")
-        problems.sample(suite, level=name, seed=0)  # loads the robot, the kernel and what the hands hold
+        problems.sample(suite, level=name, seed=0)  # loads robot and held objects, compiles the kernel
         for seed in range(20):
             problems.sample(suite, level=name, seed=seed)
         spent = []
         for seed in range(FIRST, FIRST + args.n):
-            begin = time.perf_counter()
+            started = time.perf_counter()
             problems.sample(suite, level=name, seed=seed)
-            spent.append(time.perf_counter() - begin)
+            spent.append(time.perf_counter() - started)
         rate, (middle, slow) = 1.0 / float(np.mean(spent)), record.percentiles(spent, 50, 95)
         figures.append({"level": level, "problems_per_s": rate, "s_p50": middle, "s_p95": slow})
         rows.append([level, f"{rate:.0f}", f"{middle * 1e3:.1f}", f"{slow * 1e3:.1f}"])

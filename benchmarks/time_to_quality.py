@@ -32,7 +32,7 @@ from apex_ompl.ompl_adapter.setup import PlanningSetup, assemble
 from apex_ompl.ompl_adapter.simplify import simplify
 from apex_ompl.ompl_adapter.space import path_to_array
 from apex_ompl.ompl_adapter.validity import full_check
-from apex_ompl.problems.reach import robot
+from apex_ompl.problems.suite_robot import robot
 from apex_ompl.trajopt.path import path_length
 from apex_ompl.util.files import write_atomically
 from apex_ompl.util.scripts import run_command

@@ -36,7 +36,7 @@ from apex_ompl import plan, problems
 from apex_ompl.kernel.reachability import farthest, fastest
 from apex_ompl.ompl_adapter.setup import assemble
 from apex_ompl.ompl_adapter.validity import full_check
-from apex_ompl.problems.reach import robot
+from apex_ompl.problems.suite_robot import robot
 from apex_ompl.result import PlanResult, PlanStatus
 from apex_ompl.trajectory import Timing, Trajectory, time_path
 from apex_ompl.trajectory.curve import Curve, Polyline

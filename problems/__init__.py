@@ -1,7 +1,12 @@
-"""Ready-made problems by name, and the suites that planners are judged on.
+"""Ready-made problems by name, and benchmark suites of generated problems.
 
-A problem of a suite goes by ``suite/level/seed``, for example ``shelf/hard/900012``. Seeds 0 to 799 999 are for
+The id of a problem of a suite is ``suite/level/seed``, for example ``shelf/hard/900012``. Seeds 0 to 799 999 are for
 training, 800 000 to 899 999 for validation, 900 000 to 999 999 for tests.
+
+- ``catalogue``: suites, levels, splits and ids; ``generator`` draws a problem by its id.
+- ``scenes``, ``alignment``, ``broad``: the generators of the suites; ``obstacles`` and ``objects``: what they put into
+  scenes and hands.
+- ``frozen``: the stored problems of validation and test, with their witnesses.
 """
 
 from __future__ import annotations
@@ -39,16 +44,16 @@ def load(name: str) -> Problem:
 
     Raises:
         UnknownNameError: No such problem; the message lists the known ones.
-        ParameterError: No such seed.
+        ParameterError: The seed is not from 0 to 999 999.
         SuiteError: No problem can be drawn for that seed.
         MissingFileError: The file of a frozen problem cannot be read.
-        FileFormatError: The file of a frozen problem is not the one that was frozen.
+        FileFormatError: The hash or the content of the file of a frozen problem is wrong.
     """
     from apex_ompl.problems.catalogue import ProblemId
 
-    which = ProblemId.parse(name)
-    if which is not None:
-        return sample(which.suite, level=which.level, seed=which.seed)
+    problem_id = ProblemId.parse(name)
+    if problem_id is not None:
+        return sample(problem_id.suite, level=problem_id.level, seed=problem_id.seed)
     if name not in names():
         raise UnknownNameError("problem", name, names())
     return Problem.load(DATA / f"{name}.yaml")
@@ -64,10 +69,10 @@ def is_id(text: str) -> bool:
 def sample(suite: str, *, level: str, seed: int) -> Problem:
     """Return a problem of a suite; the same seed gives the same problem.
 
-    Start and goal are free by a margin of 1 cm; held objects may be closer to each other at the goal, where they meet.
-    A moving obstacle leaves the start free at time 0, and the goal when the straight line gets there at a quarter of
-    the velocity limits; earlier it may be in the place of the goal. Frozen problems, the first ones of validation and
-    test, are read and have a witness; others are drawn now, and may be impossible to solve.
+    Start and goal are free by a margin of 1 cm; two held objects that are aligned at the goal may be closer there.
+    A moving obstacle keeps clear of the start at time 0, and of the goal at the time when the straight line ends there
+    at a quarter of the velocity limits; at earlier times it may overlap the goal. Frozen problems, the first ones of
+    validation and test, are read from files and have a witness; others are drawn, and may have no solution.
 
     Args:
         suite: See :func:`suites`.
@@ -76,16 +81,17 @@ def sample(suite: str, *, level: str, seed: int) -> Problem:
 
     Raises:
         UnknownNameError: No such suite or level.
-        ParameterError: No such seed.
+        ParameterError: The seed is not from 0 to 999 999.
         SuiteError: No problem can be drawn for that seed.
         MissingFileError: The file of a frozen problem cannot be read.
-        FileFormatError: The file of a frozen problem is not the one that was frozen.
+        FileFormatError: The hash or the content of the file of a frozen problem is wrong.
     """
     from apex_ompl.problems import frozen
-    from apex_ompl.problems.catalogue import ProblemId, first_draw
+    from apex_ompl.problems.catalogue import ProblemId
+    from apex_ompl.problems.generator import first_draw
 
-    which = ProblemId(suite, level, seed)
-    return frozen.load(which).problem if frozen.is_frozen(which) else first_draw(which)[1]
+    problem_id = ProblemId(suite, level, seed)
+    return frozen.load(problem_id).problem if frozen.is_frozen(problem_id) else first_draw(problem_id)[1]
 
 
 def frozen_names(suite: str, level: str, split: str = "test") -> tuple[str, ...]:
@@ -109,15 +115,15 @@ def witness(name: str) -> Witness:
     Raises:
         ParameterError: The problem is not a frozen one.
         MissingFileError: Its file cannot be read.
-        FileFormatError: Its file is not the one that was frozen.
+        FileFormatError: The hash or the content of its file is wrong.
     """
     from apex_ompl.problems import frozen
     from apex_ompl.problems.catalogue import ProblemId
 
-    which = ProblemId.parse(name)
-    if which is None or not frozen.is_frozen(which):
+    problem_id = ProblemId.parse(name)
+    if problem_id is None or not frozen.is_frozen(problem_id):
         raise ParameterError("problem", name, "a frozen problem of a suite")
-    return frozen.load(which).witness
+    return frozen.load(problem_id).witness
 
 
 __all__ = ["frozen_names", "is_id", "load", "names", "sample", "suites", "witness"]

@@ -1,129 +1,85 @@
-"""The paper's tasks: objects in both hands are brought together, vertically (stacking) or horizontally (insertion).
+"""The suites ``vertical`` (stacking) and ``horizontal`` (insertion): the paper's tasks with objects in both hands.
 
-Starts are home + N(0, 0.35^2), with the objects 8 cm above the tables and 0.4 m apart; goals come of descents from
-home + N(0, 0.6^2). Both are free by 1 cm, except that at the goal the two objects are where the task wants them. A
-moving cube is 3 cm off the start at time 0, and off the goal when the straight line gets there; before that it may
-be in the place of the goal. Obstacles are cubes, centred where a held object passes on the straight line, in its
-middle half, + N(0, 0.1^2) m: spread evenly over the workspace they would hardly ever be in the way.
+Starts are home + N(0, 0.35^2), the objects at least 8 cm above the tables and 0.4 m apart. Goals are found by inverse
+kinematics from home + N(0, 0.6^2). Both are free by 1 cm, except that the two objects are in contact at the goal.
+
+Obstacles are cubes. Their centres are those of a held object at a random state in the middle half of the straight line
+from start to goal, + N(0, 0.1^2) m; cubes drawn evenly over the workspace would rarely block a motion. A static cube
+keeps 3 cm to start and goal. A moving cube keeps 3 cm to the start at time 0, and to the goal at the time when the
+straight line ends there; at earlier times it may overlap the goal.
 """
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable
-from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
-from numpy.typing import NDArray
 
-from apex_ompl.collision import CollisionChecker
-from apex_ompl.collision.shapes import coal_geometry
-from apex_ompl.kernel import Inverse, Kernel, RobotTables
-from apex_ompl.problems.objects import Held, block_and_peg, boxes, cup_and_ball, put_in_hands
-from apex_ompl.problems.outline import Outline
-from apex_ompl.problems.reach import keeps_clear, robot, scene_kernel
-from apex_ompl.scene.bodies import AttachedObject, Obstacle
+from apex_ompl.problems.drawn_problem import MARGIN, DrawnProblem
+from apex_ompl.problems.objects import block_and_peg, boxes, cup_and_ball
+from apex_ompl.problems.suite_robot import robot
+from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Alignment
-from apex_ompl.tasks.alignment import RESTART_SPREAD, AlignmentGoal
-from apex_ompl.tasks.inverse_kinematics import Links
+from apex_ompl.tasks.alignment_sampling import AlignmentSampler
+from apex_ompl.tasks.cover_clearance import scene_kernel
+from apex_ompl.tasks.grasp import HandObjects
 from apex_ompl.types import Array
 
 SIZES = {"small": 0.06, "medium": 0.10, "large": 0.15, "xlarge": 0.20, "huge": 0.30}  # edges of the cubes [m]
 STATIC = ("small", "medium", "large")
-MOST_CUBES = 3
 SPEEDS = (0.1, 0.2, 0.4)  # [m/s]
-START_SPREAD = 0.35  # [rad]
-ABOVE_TABLE, APART, CUBE_MARGIN, ASIDE = 0.08, 0.4, 0.03, 0.1  # [m]
-PACE = 0.25  # of the velocity limits, at which straight lines are followed
-BATCH = 32  # states drawn at once
-TRIES = 20  # places tried for a cube
+MAX_CUBES = 3
+START_SPREAD = 0.35  # standard deviation of starts around home [rad]
+START_HEIGHT, START_SEPARATION = 0.08, 0.4  # of the objects above the tables, and of their centres [m]
+CUBE_MARGIN = 0.03  # of cubes to start and goal [m]
+CUBE_SPREAD = 0.1  # standard deviation of the centres of cubes around those of held objects [m]
+CUBE_ATTEMPTS = 20  # positions tried for a cube
+VELOCITY_SCALE = 0.25  # of the velocity limits, at which straight lines are followed
 
 
-@dataclass(frozen=True, eq=False)
-class Holding:
-    """Objects in both hands, and how they are to meet.
-
-    Attributes:
-        attached: The objects.
-        home: The home state with the synergies that hold them, shape (dof,).
-        goal: The alignment.
-        inverse: Its inverse kinematics, for the arms.
-        tables: The robot with the objects; they are not judged against each other, as they end up close together.
-        checker: Judges the robot with the objects among its tables, the objects against each other too.
-        corners: Corners of a box around each object in the frame of a joint: its number, and shape (8, 3) [m].
-    """
-
-    attached: tuple[AttachedObject, ...]
-    home: Array
-    goal: AlignmentGoal
-    inverse: Inverse
-    tables: RobotTables
-    checker: CollisionChecker
-    corners: tuple[tuple[int, Array], ...]
-
-    @classmethod
-    def of(cls, held: Held, alignment: Alignment) -> Holding:
-        """Close the hands of the robot on objects."""
-        some = robot()
-        attached, home, _ = put_in_hands(some, held)
-        checker, links = CollisionChecker(some, (), attached), Links.of(some)
-        goal = AlignmentGoal(some, alignment, attached, home)
-        corners = []
-        for body in attached:
-            shape = coal_geometry(body)
-            shape.computeLocalAABB()
-            low, high = shape.aabb_local.min_, shape.aabb_local.max_
-            local = np.array(list(itertools.product(*zip(low, high, strict=True))))
-            fixed = [links.point(body.link, body.pose[:3, :3] @ corner + body.pose[:3, 3]) for corner in local]
-            corners.append((fixed[0].joint, np.array([f.vector for f in fixed])))
-        names = [body.name for body in attached]
-        tables = checker.kernel.robot.without_pair(names[0], names[1])
-        inverse = links.inverse(goal.targets(), some.groups["hands"])
-        return cls(attached, home, goal, inverse, tables, checker, tuple(corners))
-
-    def placed(self, kernel: Kernel, states: Array) -> Array:
-        """Return the corners of the boxes around the objects at states (N, dof); shape (N, objects, 8, 3) [m]."""
-        turn, origin = kernel.joint_frames(states)
-        boxes_of = [local @ np.swapaxes(turn[:, j], 1, 2) + origin[:, j, None] for j, local in self.corners]
-        return np.stack(boxes_of, axis=1)
+def _stacking(thick: float, tall: float) -> AlignmentSampler:
+    alignment = Alignment(kind="vertical", first="lower", second="upper")
+    return AlignmentSampler(robot(), boxes(thick, tall), alignment, MARGIN)
 
 
-def _stack() -> Alignment:
-    return Alignment(kind="vertical", first="lower", second="upper")
+def _insertion(objects: Callable[[], HandObjects], first: str, second: str) -> AlignmentSampler:
+    alignment = Alignment(kind="horizontal", first=first, second=second)
+    return AlignmentSampler(robot(), objects(), alignment, MARGIN)
 
 
-HOLDINGS: dict[str, tuple[Callable[[], Holding], ...]] = {
+SAMPLERS: dict[str, tuple[Callable[[], AlignmentSampler], ...]] = {
     "vertical": tuple(
-        cache(lambda thick=thick, tall=tall: Holding.of(boxes(thick, tall), _stack()))
-        for thick, tall in ((0.06, 0.12), (0.07, 0.14), (0.06, 0.16))
+        cache(partial(_stacking, thick, tall)) for thick, tall in ((0.06, 0.12), (0.07, 0.14), (0.06, 0.16))
     ),
     "horizontal": (
-        cache(lambda: Holding.of(cup_and_ball(), Alignment(kind="horizontal", first="cup", second="ball"))),
-        cache(lambda: Holding.of(block_and_peg(), Alignment(kind="horizontal", first="block", second="peg"))),
+        cache(partial(_insertion, cup_and_ball, "cup", "ball")),
+        cache(partial(_insertion, block_and_peg, "block", "peg")),
     ),
 }
+"""Suite -> samplers of its pairs of objects, each made at its first call."""
 
 
-def draw(rng: np.random.Generator, suite: str, level: str) -> Outline | None:
-    """Draw a problem of a suite and level, or None when this draw does not work out."""
-    holding = HOLDINGS[suite][int(rng.integers(len(HOLDINGS[suite])))]()
-    kernel = scene_kernel(holding.tables, ())
-    start, goal = _start(rng, holding, kernel), _goal(rng, holding, kernel)
+def draw(rng: np.random.Generator, suite: str, level: str) -> DrawnProblem | None:
+    """Draw a problem of a suite and level; None when this draw has no start, no goal or no position of a cube."""
+    sampler = SAMPLERS[suite][int(rng.integers(len(SAMPLERS[suite])))]()
+    start = sampler.sample_start(rng, START_SPREAD, START_HEIGHT, START_SEPARATION)
+    goal = sampler.sample_goal(rng)
     if start is None or goal is None:
         return None
-    size, speed = level_of(level)
+    size, speed = cube_size_and_speed(level)
+    count = int(rng.integers(1, MAX_CUBES + 1)) if speed == 0.0 else 1
     cubes: list[Obstacle] = []
-    for k in range(int(rng.integers(1, MOST_CUBES + 1)) if speed == 0.0 else 1):
-        cube = _cube(rng, holding, np.stack([start, goal]), (size, speed), k) if size > 0.0 else None
-        if cube is None and size > 0.0:
+    for k in range(count if size > 0.0 else 0):
+        cube = _draw_cube(rng, sampler, np.stack([start, goal]), size, speed)
+        if cube is None:
             return None
-        cubes += [cube] if cube is not None else []
-    return Outline(tuple(cubes), start, goal, holding.attached)
+        cubes.append(cube.model_copy(update={"name": f"cube_{k}"}))
+    return DrawnProblem(tuple(cubes), start, goal, sampler.attached)
 
 
-def level_of(level: str) -> tuple[float, float]:
-    """Return the size [m] and the speed [m/s] of a level's cubes; 0 where there are none, or they stand still."""
+def cube_size_and_speed(level: str) -> tuple[float, float]:
+    """Return the edge [m] and the speed [m/s] of a level's cubes; size 0 without cubes, speed 0 for static ones."""
     if level == "free":
         return 0.0, 0.0
     moving, _, rest = level.partition("-")
@@ -133,64 +89,48 @@ def level_of(level: str) -> tuple[float, float]:
     return SIZES[size], float(speed)
 
 
-def duration(start: Array, goal: Array) -> float:
-    """Return how long a straight line takes at ``PACE`` [s]."""
-    return float(np.max(np.abs(goal - start) / robot().limits.velocity)) / PACE
+def straight_line_duration(start: Array, goal: Array) -> float:
+    """Return how long a straight line takes at ``VELOCITY_SCALE`` of the velocity limits [s]."""
+    return float(np.max(np.abs(goal - start) / robot().limits.velocity)) / VELOCITY_SCALE
 
 
-def _inside(states: Array) -> NDArray[np.bool_]:
-    limits = robot().limits
-    return np.asarray(((states >= limits.lower) & (states <= limits.upper)).all(axis=1), bool)
-
-
-def _start(rng: np.random.Generator, holding: Holding, kernel: Kernel) -> Array | None:
-    some = robot()
-    states = np.round(holding.home + rng.normal(0.0, START_SPREAD, (BATCH, some.dof)), 6)
-    states[:, some.groups["hands"]] = holding.home[some.groups["hands"]]
-    boxes_of = holding.placed(kernel, states)
-    centres = boxes_of.mean(axis=2)
-    apart = np.linalg.norm(centres[:, 0] - centres[:, 1], axis=1)
-    good = _inside(states) & (boxes_of[..., 2].min(axis=(1, 2)) >= ABOVE_TABLE) & (apart >= APART)
-    return next((q for q in states[good] if keeps_clear(kernel, q)[0] and holding.checker.is_free(q)), None)
-
-
-def _goal(rng: np.random.Generator, holding: Holding, kernel: Kernel) -> Array | None:
-    some = robot()
-    states = holding.home + rng.normal(0.0, RESTART_SPREAD, (BATCH, some.dof))
-    states[:, some.groups["hands"]] = holding.home[some.groups["hands"]]
-    states = np.clip(states, some.limits.lower, some.limits.upper)
-    ends = holding.inverse.descend(states, max_steps=40)
-    found = np.round(ends.states[ends.errors < 1e-3], 6)
-    found = found[_inside(found)]
-    good = (q for q in found[keeps_clear(kernel, found)] if holding.goal.is_satisfied(q))
-    return next((q for q in good if holding.checker.is_free(q)), None)
-
-
-def _cube(
-    rng: np.random.Generator, holding: Holding, ends: Array, motion: tuple[float, float], number: int
+def _draw_cube(
+    rng: np.random.Generator, sampler: AlignmentSampler, ends: Array, size: float, speed: float
 ) -> Obstacle | None:
-    """Return a cube of a size [m] and speed [m/s] where a held object passes, or None when no place was found."""
-    (size, speed), lasts = motion, duration(ends[0], ends[1])
-    bare = scene_kernel(holding.tables, ())
-    for _ in range(TRIES):
-        share, which = rng.uniform(0.25, 0.75), int(rng.integers(len(holding.attached)))
-        middle = ends[0] + share * (ends[1] - ends[0])
-        centre = holding.placed(bare, middle[None])[0, which].mean(axis=0) + rng.normal(0.0, ASIDE, 3)
-        turn = rng.uniform(0.0, 2.0 * np.pi)
-        velocity = np.round(speed * np.array([np.cos(turn), np.sin(turn), 0.0]), 4)
-        centre[2] = max(centre[2], size / 2)  # not in the table
-        begin = np.round(centre - velocity * share * lasts, 4)
-        places = (begin, begin + velocity * lasts)
+    """Return a cube near the straight line of a held object, or None when no position was found.
+
+    Args:
+        rng: Source of positions and directions.
+        sampler: The held objects.
+        ends: Start and goal, shape (2, dof).
+        size: Edge of the cube [m].
+        speed: Of the cube, in a random horizontal direction [m/s].
+    """
+    duration = straight_line_duration(ends[0], ends[1])
+    for _ in range(CUBE_ATTEMPTS):
+        fraction, held = rng.uniform(0.25, 0.75), int(rng.integers(len(sampler.attached)))
+        state = ends[0] + fraction * (ends[1] - ends[0])
+        centre = sampler.box_corners(state[None])[0, held].mean(axis=0) + rng.normal(0.0, CUBE_SPREAD, 3)
+        heading = rng.uniform(0.0, 2.0 * np.pi)
+        velocity = np.round(speed * np.array([np.cos(heading), np.sin(heading), 0.0]), 4)
+        centre[2] = max(centre[2], size / 2)  # above the table
+        initial = np.round(centre - velocity * fraction * duration, 4)
+        final = initial + velocity * duration
         if all(
-            scene_kernel(holding.tables, [_cube_at(size, place)]).clearance(q, CUBE_MARGIN)[0, 0] >= CUBE_MARGIN
-            for q, place in zip(ends, places, strict=True)
+            _cube_distance(sampler, q, _cube(size, position)) >= CUBE_MARGIN
+            for q, position in zip(ends, (initial, final), strict=True)
         ):
-            cube = _cube_at(size, begin, f"cube_{number}")
-            moving = {"velocity": tuple(velocity.tolist())} if speed > 0.0 else {}
-            return cube.model_copy(update=moving)
+            cube = _cube(size, initial)
+            return cube if speed == 0.0 else cube.model_copy(update={"velocity": tuple(velocity.tolist())})
     return None
 
 
-def _cube_at(size: float, centre: Array, name: str = "cube") -> Obstacle:
+def _cube(size: float, centre: Array) -> Obstacle:
     x, y, z = (float(v) for v in centre)
-    return Obstacle(name=name, box=(size, size, size), position=(x, y, z))
+    return Obstacle(name="cube", box=(size, size, size), position=(x, y, z))
+
+
+def _cube_distance(sampler: AlignmentSampler, q: Array, cube: Obstacle) -> float:
+    """Return the distance of the robot with its objects to a cube and to fixtures, ``CUBE_MARGIN`` at most [m]."""
+    kernel = scene_kernel(robot(), sampler.tables, [cube])
+    return float(kernel.clearance(q, CUBE_MARGIN)[0, 0])

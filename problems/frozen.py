@@ -1,9 +1,8 @@
 """The frozen problems: the first validation and test problems of every suite and level, each with a witness.
 
-They lie in ``problems/frozen``, a file per suite and level (JSON, compressed by LZMA), and are what counts: nothing
-draws them again. ``SHA256SUMS`` holds the hashes of the files. A witness is a path that passed the full check; for
-levels with moving obstacles it is a timed one. Its states between start and goal are stored in ten-thousandths of a
-radian.
+They are stored in ``problems/frozen``, a file per suite and level (JSON, compressed by LZMA), and are read, never drawn
+again. ``SHA256SUMS`` holds the hashes of the files. A witness is a path that passed the full check; it has times where
+obstacles move. Its states between start and goal are stored as multiples of 1e-4 rad.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ from numpy.typing import NDArray
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError
 from apex_ompl.problems.catalogue import LEVELS, SPLITS, ProblemId
 from apex_ompl.problems.objects import DATA
-from apex_ompl.problems.reach import ROBOT, robot
+from apex_ompl.problems.suite_robot import ROBOT, robot
 from apex_ompl.scene.bodies import located
 from apex_ompl.scene.problem import Problem
 from apex_ompl.types import Array
@@ -34,8 +33,8 @@ from apex_ompl.util.schema import validate
 FOLDER = Path(__file__).parent / "frozen"
 SUMS = "SHA256SUMS"
 SCHEMA = "apex-ompl/frozen/1"
-COUNTS = {"validation": (30, 10), "test": (100, 20)}  # of static levels, and of moving ones
-GRAIN, TICK = 1e-4, 1e-3  # of the states of witnesses [rad], and of their times [s]
+COUNTS = {"validation": (30, 10), "test": (100, 20)}  # problems of a static level, and of one with moving obstacles
+STATE_STEP, TIME_STEP = 1e-4, 1e-3  # quantization of the states of witnesses [rad] and of their times [s]
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,33 +43,33 @@ class Witness:
 
     Attributes:
         path: States from start to goal, shape (N, dof).
-        times: When they are passed, shape (N,) [s]; None where nothing moves.
+        times: Times of the states, shape (N,) [s]; None where no obstacle moves.
     """
 
     path: Array
     times: Array | None = None
 
     def rounded(self) -> Witness:
-        """Return the witness as its file will hold it."""
+        """Return the witness quantized as in its file."""
         path = self.path.copy()
-        path[1:-1] = _counts(path[1:-1], GRAIN) * GRAIN
-        return Witness(path, None if self.times is None else _ticks(self.times))
+        path[1:-1] = _quantized(path[1:-1], STATE_STEP) * STATE_STEP
+        times = None if self.times is None else np.asarray(_quantized(self.times, TIME_STEP) * TIME_STEP, np.float64)
+        return Witness(path, times)
 
 
 @dataclass(frozen=True, eq=False)
-class Frozen:
-    """A frozen problem.
+class FrozenProblem:
+    """A problem with its witness.
 
     Attributes:
         problem: The problem.
         witness: Its witness.
-        number: Which draw of its seed it is.
-        digest: The first 16 digits of the SHA-256 of the problem.
+        draw_number: Number of the draw, see :func:`apex_ompl.problems.generator.draw`.
     """
 
     problem: Problem
     witness: Witness
-    number: int
+    draw_number: int
 
     @property
     def digest(self) -> str:
@@ -78,9 +77,10 @@ class Frozen:
         return digest(self.problem)
 
 
-def is_frozen(which: ProblemId) -> bool:
+def is_frozen(problem_id: ProblemId) -> bool:
     """Whether a problem is among the frozen ones."""
-    return which.suite in LEVELS and any(which.seed in frozen_seeds(which.level, split) for split in COUNTS)
+    seeds = (frozen_seeds(problem_id.level, split) for split in COUNTS)
+    return problem_id.suite in LEVELS and any(problem_id.seed in some for some in seeds)
 
 
 def frozen_seeds(level: str, split: str) -> range:
@@ -89,34 +89,34 @@ def frozen_seeds(level: str, split: str) -> range:
     return range(first, first + count)
 
 
-def load(which: ProblemId) -> Frozen:
+def load(problem_id: ProblemId) -> FrozenProblem:
     """Return a frozen problem.
 
     Raises:
         MissingFileError: Its file cannot be read.
-        FileFormatError: Its file is not the one that was frozen, or holds something else.
+        FileFormatError: The hash of its file is another one, or the file holds something else.
     """
-    path = FOLDER / _name(which.suite, which.level)
-    head, rows = _file(path, which.suite, which.level)
-    if which.seed not in rows:
-        raise FileFormatError(str(path), "problems", f"none with seed {which.seed}", "expected the frozen seeds")
-    row, joints = rows[which.seed], head["joints"]
+    path = FOLDER / _name(problem_id.suite, problem_id.level)
+    head, rows = _file(path, problem_id.suite, problem_id.level)
+    if problem_id.seed not in rows:
+        raise FileFormatError(str(path), "problems", f"none with seed {problem_id.seed}", "expected the frozen seeds")
+    row, joints = rows[problem_id.seed], head["joints"]
     try:
         start, goal = (dict(zip(joints, row[key], strict=True)) for key in ("start", "goal"))
         fields = {
-            "schema": "apex-ompl/problem/1", "name": str(which), "robot": head["robot"], "scene": row["scene"],
+            "schema": "apex-ompl/problem/1", "name": str(problem_id), "robot": head["robot"], "scene": row["scene"],
             "attached": head["held"][row["held"]], "start": start, "goal": {"joints": goal},
         }  # fmt: skip
-        inner = np.array(row["path"], float).reshape(-1, len(joints)) * GRAIN
+        inner = np.array(row["path"], float).reshape(-1, len(joints)) * STATE_STEP
         states = np.concatenate([[row["start"]], inner, [row["goal"]]])
-        times = np.array(row["times"], float) * TICK if "times" in row else None
+        times = np.array(row["times"], float) * TIME_STEP if "times" in row else None
         number = int(row["draw"])
     except (KeyError, IndexError, TypeError, ValueError) as error:
-        seed = f"problems, seed {which.seed}"
+        seed = f"problems, seed {problem_id.seed}"
         raise FileFormatError(str(path), seed, repr(error), "expected a problem and its witness") from error
-    problem = validate(Problem, fields, f"{path}, {which}")
+    problem = validate(Problem, fields, f"{path}, {problem_id}")
     problem = problem.model_copy(update={"attached": tuple(located(body, DATA) for body in problem.attached)})
-    return Frozen(problem, Witness(states, times), number)
+    return FrozenProblem(problem, Witness(states, times), number)
 
 
 def exists(suite: str, level: str) -> bool:
@@ -124,41 +124,42 @@ def exists(suite: str, level: str) -> bool:
     return (FOLDER / _name(suite, level)).is_file()
 
 
-def save(suite: str, level: str, frozen: Mapping[int, Frozen], dropped: int, *, replace: bool = False) -> int:
+def save(suite: str, level: str, frozen: Mapping[int, FrozenProblem], dropped: int, *, replace: bool = False) -> int:
     """Write the frozen problems of a suite and level, by seed, and the hash of their file.
 
     Args:
         suite: The suite.
         level: Its level.
-        frozen: The problems.
-        dropped: How many draws were left out because no witness was found.
-        replace: Whether a file that exists may be replaced; results refer to what it holds.
+        frozen: The problems by seed.
+        dropped: Number of draws without a witness, which were left out.
+        replace: Whether to replace a file that exists; published results refer to its problems.
 
     Returns:
         The size of the file in bytes.
 
     Raises:
-        ParameterError: The file exists, and is not to be replaced.
+        ParameterError: The file exists and ``replace`` is False.
     """
     if exists(suite, level) and not replace:
         raise ParameterError("replace", replace, f"True, since {_name(suite, level)} exists")
-    some = robot()
+    joints = robot().joint_names
     held: list[Any] = []
     rows = []
     for seed, item in sorted(frozen.items()):
         data = item.problem.as_dict()
-        mine = [_with_short_mesh(body) for body in data.get("attached", [])]
-        if mine not in held:
-            held.append(mine)
-        start, goal = item.problem.start_state(some.joint_names), item.problem.goal_states(some.joint_names)[0]
+        attached = [_with_mesh_name(body) for body in data.get("attached", [])]
+        if attached not in held:
+            held.append(attached)
+        start, goal = item.problem.start_state(joints), item.problem.goal_states(joints)[0]
         row: dict[str, Any] = {
-            "seed": seed, "draw": item.number, "held": held.index(mine), "scene": data.get("scene", []),
-            "start": start.tolist(), "goal": goal.tolist(), "path": _counts(item.witness.path[1:-1], GRAIN).tolist(),
+            "seed": seed, "draw": item.draw_number, "held": held.index(attached), "scene": data.get("scene", []),
+            "start": start.tolist(), "goal": goal.tolist(),
+            "path": _quantized(item.witness.path[1:-1], STATE_STEP).tolist(),
         }  # fmt: skip
         if item.witness.times is not None:
-            row["times"] = _counts(item.witness.times, TICK).tolist()
+            row["times"] = _quantized(item.witness.times, TIME_STEP).tolist()
         rows.append(row)
-    head = {"schema": SCHEMA, "suite": suite, "level": level, "robot": ROBOT, "joints": list(some.joint_names)}
+    head = {"schema": SCHEMA, "suite": suite, "level": level, "robot": ROBOT, "joints": list(joints)}
     text = json.dumps({**head, "dropped": dropped, "held": held, "problems": rows}, separators=(",", ":"))
     content = lzma.compress(text.encode(), preset=9 | lzma.PRESET_EXTREME)
     FOLDER.mkdir(exist_ok=True)
@@ -166,30 +167,27 @@ def save(suite: str, level: str, frozen: Mapping[int, Frozen], dropped: int, *, 
     sums = {**_sums(), _name(suite, level): hashlib.sha256(content).hexdigest()}
     lines = [f"{sums[name]}  {name}\n" for name in sorted(sums)]
     write_atomically(FOLDER / SUMS, "".join(lines).encode())
-    forget()
+    clear_cache()
     return len(content)
 
 
 def digest(problem: Problem) -> str:
-    """Return the first 16 digits of the SHA-256 of a problem, its meshes by their names alone."""
+    """Return the first 16 digits of the SHA-256 of a problem; of meshes only the file names enter."""
     data = problem.as_dict()
-    data["attached"] = [_with_short_mesh(body) for body in data.get("attached", [])]
+    data["attached"] = [_with_mesh_name(body) for body in data.get("attached", [])]
     return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()[:16]
 
 
-def _with_short_mesh(body: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a held object whose mesh, if it has one, is named from the folder of the ready-made problems."""
+def _with_mesh_name(body: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a held object with the file name of its mesh, if it has one, in place of the path."""
     if "mesh" not in body:
         return dict(body)
     return {**body, "mesh": {**body["mesh"], "file": Path(body["mesh"]["file"]).name}}
 
 
-def _counts(values: Array, unit: float) -> NDArray[np.int64]:
-    return np.rint(np.asarray(values) / unit).astype(np.int64)
-
-
-def _ticks(times: Array) -> Array:
-    return np.asarray(_counts(times, TICK) * TICK, dtype=np.float64)
+def _quantized(values: Array, step: float) -> NDArray[np.int64]:
+    """Return the integers round(values / step)."""
+    return np.rint(np.asarray(values) / step).astype(np.int64)
 
 
 def _name(suite: str, level: str) -> str:
@@ -197,11 +195,11 @@ def _name(suite: str, level: str) -> str:
 
 
 def _sums() -> dict[str, str]:
-    """Return the hashes by name of file; the form is that of ``sha256sum``.
+    """Return the hashes of ``SHA256SUMS`` by file name; the format is that of ``sha256sum``.
 
     Raises:
-        MissingFileError: The file of hashes is there and cannot be read.
-        FileFormatError: It holds something else.
+        MissingFileError: The file exists and cannot be read.
+        FileFormatError: A line has another format, or a name occurs twice.
     """
     path = FOLDER / SUMS
     found: dict[str, str] = {}
@@ -241,11 +239,11 @@ def _file(path: Path, suite: str, level: str) -> tuple[dict[str, Any], dict[int,
     return data, rows
 
 
-def forget() -> None:
-    """Forget the files that were read."""
+def clear_cache() -> None:
+    """Drop the cache of the files that were read."""
     _file.cache_clear()
 
 
-def files() -> Sequence[tuple[str, str]]:
-    """Return every suite and level."""
+def suite_levels() -> Sequence[tuple[str, str]]:
+    """Return every suite with each of its levels; each pair has a file."""
     return [(suite, level) for suite, levels in LEVELS.items() for level in levels]

@@ -1,36 +1,36 @@
-"""What the hands of the ready-made problems and of the suites hold, and how it is grasped."""
+"""Objects that the hands hold in the ready-made problems and in the suites; poses are in the frame of the palm."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import AttachedObject
-from apex_ompl.tasks.grasp import Grasp, grasp
-
-Held = Sequence[tuple[str, AttachedObject]]
+from apex_ompl.tasks.grasp import HandObjects
 
 DATA = Path(__file__).parent / "data"
-PALM = -0.009  # height of an object's surface over the palm, in the palm's frame [m]
+PALM = -0.009  # z of the surface of an object that lies on the palm, in the palm's frame [m]
 ALONG_X = (0.0, float(np.sqrt(0.5)), 0.0, float(np.sqrt(0.5)))  # turns z to the palm's x
 
 
-def _made(**fields: Any) -> AttachedObject:
+def _attached(**fields: Any) -> AttachedObject:
     return AttachedObject.model_validate(fields)
 
 
-def boxes(thick: float = 0.07, tall: float = 0.14) -> Held:
-    """Return a box for each hand, faces to be stacked on the side of the little finger [m]."""
+def boxes(thick: float = 0.07, tall: float = 0.14) -> HandObjects:
+    """Return a box for each hand, its contact face on the side of the little finger.
+
+    Args:
+        thick: Edge of the square cross-section [m].
+        tall: Length [m].
+    """
     height = PALM - thick / 2
     base = {"link": "palm", "box": (thick, thick, tall), "position": (0.0, 0.02, height), "orientation": ALONG_X}
     faces = {"lower": (-tall / 2, -1), "upper": (tall / 2, 1)}
     return [
-        (f"{side}_hand", _made(name=name, contact={"point": (0, 0, z), "axis": (0, 0, axis)}, **base))
+        (f"{side}_hand", _attached(name=name, contact={"point": (0, 0, z), "axis": (0, 0, axis)}, **base))
         for side, (name, (z, axis)) in zip(("left", "right"), faces.items(), strict=True)
     ]
 
@@ -41,68 +41,53 @@ def cup(name: str, side: int, **contact: object) -> AttachedObject:
     Args:
         name: Name of the object.
         side: -1 for the left hand, 1 for the right one.
-        **contact: Parts of its contact face that are not the middle of the opening.
+        **contact: Fields of its contact face that differ from the middle of the opening.
     """
     turn = ALONG_X if side > 0 else (0.0, -ALONG_X[1], 0.0, ALONG_X[3])
-    return _made(
+    return _attached(
         name=name, link="palm", mesh={"file": str(DATA / "cup.obj")}, position=(0.0, 0.02, PALM - 0.04),
         orientation=turn, contact={"point": (0, 0, 0.065), "axis": (0, 0, 1), **contact},
     )  # fmt: skip
 
 
-def cup_and_ball() -> Held:
+def cup_and_ball() -> HandObjects:
     """Return a cup for the left hand, and a ball between the outer fingers of the right one."""
-    ball = _made(
+    ball = _attached(
         name="ball", link="palm", sphere={"radius": 0.032}, position=(0.035, 0.03, PALM - 0.032),
         contact={"point": (0.032, 0, 0), "axis": (1, 0, 0)},
     )  # fmt: skip
     return [("left_hand", cup("cup", -1)), ("right_hand", ball)]
 
 
-def block_and_peg() -> Held:
+def block_and_peg() -> HandObjects:
     """Return a block with a square hole for the left hand, and a round peg for the right one."""
-    block = _made(
+    block = _attached(
         name="block", link="palm", mesh={"file": str(DATA / "block.obj")}, position=(-0.03, 0.03, PALM - 0.04),
         orientation=(0.0, -ALONG_X[1], 0.0, ALONG_X[3]), contact={"point": (0, 0, 0.035), "axis": (0, 0, 1)},
     )  # fmt: skip
-    peg = _made(
+    peg = _attached(
         name="peg", link="palm", cylinder={"radius": 0.016, "length": 0.18}, position=(0.02, 0.03, PALM - 0.016),
         orientation=ALONG_X, contact={"point": (0, 0, 0.09), "axis": (0, 0, 1)},
     )  # fmt: skip
     return [("left_hand", block), ("right_hand", peg)]
 
 
-def two_cups() -> Held:
+def two_cups() -> HandObjects:
     """Return a full cup for the right hand, its lip away from the palm, and an empty one for the left hand."""
-    # Of the turned cup, -x of the mesh looks along +z of the palm, so +x is the side away from the palm.
+    # In the turned cup the -x axis of the mesh points along +z of the palm: +x is the side away from the palm.
     return [("left_hand", cup("empty", -1)), ("right_hand", cup("full", 1, point=(0.04, 0, 0.065)))]
 
 
-def bar() -> Held:
-    """Return a bar for the left hand that sticks out beyond the little finger, where the right hand is to take it."""
-    held = _made(
+def bar() -> HandObjects:
+    """Return a bar for the left hand; it extends beyond the little finger, where the right hand is to grasp it."""
+    held = _attached(
         name="bar", link="palm", cylinder={"radius": 0.015, "length": 0.36}, position=(-0.1, 0.03, PALM - 0.015),
         orientation=ALONG_X, contact={"point": (0.015, 0, -0.13), "axis": (1, 0, 0)},
     )  # fmt: skip
     return [("left_hand", held)]
 
 
-def parcels() -> Held:
+def parcels() -> HandObjects:
     """Return a parcel for each hand, along the fingers."""
     base = {"link": "palm", "box": (0.07, 0.12, 0.06), "position": (0.0, 0.06, PALM - 0.03)}
-    return [(f"{side}_hand", _made(name=f"{side}_parcel", **base)) for side in ("left", "right")]
-
-
-def put_in_hands(robot: Robot, held: Held) -> tuple[tuple[AttachedObject, ...], NDArray[np.float64], list[Grasp]]:
-    """Close the hands on what they hold.
-
-    Returns:
-        The objects, the home state with the synergies that hold them, shape (dof,), and the grasps.
-    """
-    home, grasps = robot.home.copy(), [grasp(robot, hand, item) for hand, item in held]
-    for closed in grasps:
-        if closed.synergy_joint:
-            home[robot.joint_names.index(closed.synergy_joint)] = np.floor(closed.synergy * 1e3) / 1e3
-    # The default touch links, those of the hand, are the same and keep the files short.
-    objects = tuple(closed.held.model_copy(update={"touch_links": None}) for closed in grasps)
-    return objects, home, grasps
+    return [(f"{side}_hand", _attached(name=f"{side}_parcel", **base)) for side in ("left", "right")]

@@ -15,8 +15,9 @@ from apex_ompl.live.moving import timed_check
 from apex_ompl.ompl_adapter.setup import assemble
 from apex_ompl.ompl_adapter.validity import full_check
 from apex_ompl.problems import frozen
-from apex_ompl.problems.catalogue import ProblemId, first_draw
-from apex_ompl.problems.reach import robot
+from apex_ompl.problems.catalogue import ProblemId
+from apex_ompl.problems.generator import first_draw
+from apex_ompl.problems.suite_robot import robot
 from apex_ompl.util.scripts import run_command
 from apex_ompl.util.validation import whole_number
 
@@ -46,12 +47,12 @@ def main() -> None:
         "--redraw", type=whole_number, default=0, metavar="N", help="draw N of each level anew, and compare"
     )
     args = parser.parse_args()
-    every = [f"{suite}/{level}" for suite, level in frozen.files()]
+    every = [f"{suite}/{level}" for suite, level in frozen.suite_levels()]
     for name in args.levels:
         if name not in every and name not in problems.suites():
             raise SystemExit(f"unknown suite or level {name!r}; known: {', '.join(every)}")
     faults = count = same = redrawn = 0
-    for suite, level in frozen.files():
+    for suite, level in frozen.suite_levels():
         if args.levels and suite not in args.levels and f"{suite}/{level}" not in args.levels:
             continue
         names = [name for split in frozen.COUNTS for name in problems.frozen_names(suite, level, split)]
@@ -62,7 +63,7 @@ def main() -> None:
             which = ProblemId(suite, level, int(name.rsplit("/", 1)[1]))
             kept = frozen.load(which)
             redrawn += 1
-            same += frozen.digest(first_draw(which, kept.number - 1)[1]) == kept.digest
+            same += frozen.digest(first_draw(which, kept.draw_number - 1)[1]) == kept.digest
         faults, count = faults + len(found), count + len(names)
         print(f"{suite}/{level}: {len(names) - len(found)} of {len(names)} sound", flush=True)
     print(f"{count - faults} of {count} frozen problems sound; {same} of {redrawn} redrawn the same")

@@ -18,7 +18,7 @@ from apex_ompl.datasets.records import SOURCES, DatasetError, Paths
 from apex_ompl.datasets.store import Store, load
 from apex_ompl.ompl_adapter.setup import assemble
 from apex_ompl.ompl_adapter.validity import full_check
-from apex_ompl.problems.reach import robot
+from apex_ompl.problems.suite_robot import robot
 from apex_ompl.util.files import check_writable, is_file, write_atomically
 from apex_ompl.util.scripts import run_command
 from apex_ompl.util.validation import one_or_more, whole_number
@@ -87,14 +87,14 @@ def draw(paths: Paths, which: np.ndarray, file: Path) -> list[str]:
     """Draw some motions, a row each, and return what they are."""
     import imageio.v3 as iio
 
-    from apex_ompl.viz.render import Stage
+    from apex_ompl.viz.scene_renderer import SceneRenderer
 
     rows, captions, spline = [], [], paths.spline
     for k, points in zip(which, paths.control(which), strict=True):
         name = paths.problem_name(int(paths.arrays["problem"][k]))
-        stage = Stage(assemble(problems.load(name), robot()), SIZE)
+        renderer = SceneRenderer(assemble(problems.load(name), robot()), SIZE)
         at = np.linspace(0, spline.states - 1, SHOTS).astype(int)
-        rows.append(np.concatenate([stage.shoot(q) for q in spline.path(points)[at]], axis=1))
+        rows.append(np.concatenate([renderer.screenshot(q) for q in spline.path(points)[at]], axis=1))
         length = f"{float(paths.arrays['length'][k]):.1f} rad"
         captions.append(f"{name}, {SOURCES[paths.arrays['source'][k]]}, {length}")
     write_atomically(file, iio.imwrite("<bytes>", np.concatenate(rows), extension=".jpg", quality=80))

@@ -24,7 +24,7 @@ from apex_ompl.kernel import Kernel
 from apex_ompl.kernel.tables import BOX, HALF_SPACE, SPHERE
 from apex_ompl.ompl_adapter.setup import PlanningSetup, assemble
 from apex_ompl.ompl_adapter.validity import full_check
-from apex_ompl.problems.reach import robot
+from apex_ompl.problems.suite_robot import robot
 from apex_ompl.trajopt.candidates import first_valid
 from apex_ompl.trajopt.optimizer import Optimizer
 from apex_ompl.util.files import make_folder

@@ -24,18 +24,17 @@ from apex_ompl.ompl_adapter.setup import assemble
 from apex_ompl.ompl_adapter.validity import full_check
 from apex_ompl.problems.objects import (
     DATA,
-    Held,
     bar,
     block_and_peg,
     boxes,
     cup_and_ball,
     parcels,
-    put_in_hands,
     two_cups,
 )
 from apex_ompl.robot import Robot, load_robot
 from apex_ompl.scene.bodies import AttachedObject, Obstacle
 from apex_ompl.scene.problem import Alignment, Goal, Problem
+from apex_ompl.tasks.grasp import HandObjects, close_hands
 from apex_ompl.tasks.inverse_kinematics import Links, in_world
 from apex_ompl.util.scripts import run_command
 
@@ -61,7 +60,7 @@ class Reach:
     scene: Callable[[], Sequence[Obstacle]]
     start: tuple[HandPose, HandPose]
     goal: tuple[HandPose, HandPose]
-    held: Callable[[], Held] = tuple
+    held: Callable[[], HandObjects] = tuple
     synergies: tuple[float, ...] = ()
 
 
@@ -71,7 +70,7 @@ class Align:
 
     file: str
     scene: Callable[[], Sequence[Obstacle]]
-    held: Callable[[], Held]
+    held: Callable[[], HandObjects]
     alignment: Alignment
     seed: int = 0
 
@@ -232,9 +231,9 @@ def block_obj(edge: float = 0.08, hole: float = 0.042, depth: float = 0.07, floo
     return "\n".join(lines) + "\n"
 
 
-def hold(robot: Robot, held: Held) -> tuple[tuple[AttachedObject, ...], np.ndarray]:
+def hold(robot: Robot, held: HandObjects) -> tuple[tuple[AttachedObject, ...], np.ndarray]:
     """Return what the hands hold and a home state that holds it, and say how it is held."""
-    objects, home, grasps = put_in_hands(robot, held)
+    objects, home, grasps = close_hands(robot, held)
     for closed in grasps:
         print(f"  {closed.held.name}: synergy {closed.synergy:.3f}, first touch {closed.touched or 'none'}")
     return objects, home

@@ -22,10 +22,11 @@ from apex_ompl.live.moving import at_time, even_times, timed_check
 from apex_ompl.ompl_adapter.setup import assemble
 from apex_ompl.ompl_adapter.validity import full_check
 from apex_ompl.problems import frozen
-from apex_ompl.problems.alignment import PACE, duration
-from apex_ompl.problems.catalogue import ProblemId, first_draw
-from apex_ompl.problems.frozen import Frozen, Witness
-from apex_ompl.problems.reach import robot
+from apex_ompl.problems.alignment import VELOCITY_SCALE, straight_line_duration
+from apex_ompl.problems.catalogue import ProblemId
+from apex_ompl.problems.frozen import FrozenProblem, Witness
+from apex_ompl.problems.generator import first_draw
+from apex_ompl.problems.suite_robot import robot
 from apex_ompl.scene.problem import Problem
 from apex_ompl.types import Array
 from apex_ompl.util.resolution import SEARCH_RESOLUTION
@@ -34,7 +35,7 @@ from apex_ompl.util.validation import one_or_more
 
 LIMITS = ((0, 10.0), (1, 20.0))  # seeds and time limits of rrtconnect [s]
 QUICK = 1.0  # time limit among obstacles that were stopped [s]
-PACES = (PACE, 2.0 * PACE, PACE / 2.0)  # shares of the velocity limits
+PACES = (VELOCITY_SCALE, 2.0 * VELOCITY_SCALE, VELOCITY_SCALE / 2.0)  # shares of the velocity limits
 WAITS = (1.0, 2.0, 4.0, 8.0)  # [s]
 ASIDE, HURRY = 60, 0.8  # random states to wait at, and the pace to get there
 
@@ -72,7 +73,7 @@ def _timed_paths(problem: Problem) -> Iterator[tuple[Array, Array]]:
     line = np.stack([problem.start_state(names), problem.goal_states(names)[0]])
     for pace in PACES:
         yield line, even_times(robot(), line, pace)
-    lasts = duration(line[0], line[1])
+    lasts = straight_line_duration(line[0], line[1])
     for shares in ((0.5,), (0.25, 0.5, 0.75), (0.0, 0.25, 0.5, 0.75, 1.0), (0.0,), (1.0,), ()):
         stopped = [
             at_time(obstacle, share * lasts).model_copy(update={"name": f"{obstacle.name}_{k}", "velocity": None})
@@ -86,7 +87,7 @@ def _timed_paths(problem: Problem) -> Iterator[tuple[Array, Array]]:
             for pace in PACES:
                 yield result.path.states, even_times(robot(), result.path.states, pace)
             for wait in WAITS:
-                times = even_times(robot(), result.path.states, PACE)
+                times = even_times(robot(), result.path.states, VELOCITY_SCALE)
                 yield np.concatenate([line[:1], result.path.states]), np.concatenate([[0.0], wait + times])
     yield from _ways_aside(problem, line)
 
@@ -105,13 +106,13 @@ def _ways_aside(problem: Problem, line: Array) -> Iterator[tuple[Array, Array]]:
         away, on = np.stack([line[0], via]), np.stack([via, line[1]])
         for wait in (0.01, *WAITS):
             first = even_times(some, away, HURRY)
-            second = first[-1] + wait + even_times(some, on, 2.0 * PACE)
+            second = first[-1] + wait + even_times(some, on, 2.0 * VELOCITY_SCALE)
             yield np.concatenate([away, on]), np.concatenate([first, second])
 
 
-def freeze(level: tuple[str, str]) -> tuple[dict[int, Frozen], int, float]:
+def freeze(level: tuple[str, str]) -> tuple[dict[int, FrozenProblem], int, float]:
     """Return the frozen problems of a suite and level by seed, how many draws had no witness, and the time taken."""
-    found: dict[int, Frozen] = {}
+    found: dict[int, FrozenProblem] = {}
     dropped, begin = 0, time.perf_counter()
     for split in frozen.COUNTS:
         for seed in frozen.frozen_seeds(level[1], split):
@@ -122,7 +123,7 @@ def freeze(level: tuple[str, str]) -> tuple[dict[int, Frozen], int, float]:
                 if proof is None:
                     dropped += 1
                 else:
-                    found[seed] = Frozen(problem, proof, number)
+                    found[seed] = FrozenProblem(problem, proof, number)
     return found, dropped, time.perf_counter() - begin
 
 
@@ -133,7 +134,7 @@ def main() -> None:
     parser.add_argument("--replace", action="store_true", help="draw levels again whose files exist")
     parser.add_argument("--jobs", type=one_or_more, default=2)
     args = parser.parse_args()
-    every = {f"{suite}/{level}": (suite, level) for suite, level in frozen.files()}
+    every = {f"{suite}/{level}": (suite, level) for suite, level in frozen.suite_levels()}
     for name in args.levels:
         if name not in every:
             raise SystemExit(f"unknown level {name!r}; known: {', '.join(every)}")

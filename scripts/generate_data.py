@@ -126,7 +126,7 @@ def _drawn(args: argparse.Namespace) -> tuple[Work, dict[str, Any], dict[str, An
     """Return what works, units to draw, what the manifest says of the robot, and its tables with empty hands."""
     from apex_ompl.collision import CollisionChecker
     from apex_ompl.generation.worker import plan_units, work
-    from apex_ompl.problems.reach import robot
+    from apex_ompl.problems.suite_robot import robot
 
     units = {unit.name: unit for unit in plan_units(args.problems, args.levels)}
     sizes = {unit.size for unit in units.values()}

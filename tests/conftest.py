@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from hypothesis import settings as hypothesis_settings
-from planning import HARD, at_hand
+from planning import HARD, cached_problem
 from support import DATA
 
 from apex_ompl.collision import CollisionChecker
@@ -17,7 +17,7 @@ from apex_ompl.datasets.records import Paths
 from apex_ompl.datasets.store import load, save
 from apex_ompl.ompl_adapter.process import quiet_ompl
 from apex_ompl.ompl_adapter.setup import PlanningSetup, assemble
-from apex_ompl.problems import reach
+from apex_ompl.problems.suite_robot import robot as suite_robot
 from apex_ompl.robot import Robot, load_robot
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Goal, Problem
@@ -48,7 +48,7 @@ def checker(robot: Robot, post: Obstacle) -> CollisionChecker:
 
 @pytest.fixture
 def problem(robot: Robot, post: Obstacle) -> Problem:
-    """Both arms turn; easy for every planner, and the straight line collides."""
+    """The left arm passes a post; easy for every planner, but the straight line collides."""
     start, goal = robot.home.copy(), robot.home.copy()
     start[[0, 1, 3]] = 0.1, 0.4, -1.6
     goal[[0, 1, 3]] = -1.3, 0.4, -1.6
@@ -63,10 +63,10 @@ def problem(robot: Robot, post: Obstacle) -> Problem:
 
 @pytest.fixture
 def apex_cli():
-    """Run the command line in a fresh process: exit code, standard output, standard error."""
+    """Run the command line in a new process; returns exit code, standard output and standard error."""
 
     def run(*arguments: object, **options: object) -> subprocess.CompletedProcess[str]:
-        command = [sys.executable, "-m", "apex_ompl.cli.parser", *map(str, arguments)]
+        command = [sys.executable, "-m", "apex_ompl.cli", *map(str, arguments)]
         settings = {"capture_output": True, "text": True, "timeout": 120, "env": os.environ, **options}
         return subprocess.run(command, check=False, **settings)
 
@@ -93,12 +93,12 @@ def few(paths: Paths, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def quiet() -> Iterator[None]:
-    """OMPL says nothing."""
+    """OMPL's log is off."""
     with quiet_ompl():
         yield
 
 
 @pytest.fixture
 def ready() -> PlanningSetup:
-    """A hard problem, set up."""
-    return assemble(at_hand(HARD), reach.robot())
+    """The planning setup of a hard problem."""
+    return assemble(cached_problem(HARD), suite_robot())

@@ -12,7 +12,7 @@ from ompl import geometric as og
 
 from apex_ompl import problems
 from apex_ompl.ompl_adapter.space import path_to_array
-from apex_ompl.problems.reach import robot
+from apex_ompl.problems.suite_robot import robot
 from apex_ompl.scene.problem import Problem
 
 EXACT, TIMEOUT = ob.PlannerStatus.EXACT_SOLUTION, ob.PlannerStatus.TIMEOUT
@@ -25,7 +25,8 @@ def within(seconds: float) -> ob.PlannerTerminationCondition:
 
 
 @cache
-def at_hand(name: str) -> Problem:
+def cached_problem(name: str) -> Problem:
+    """The problem of a name, loaded once."""
     return problems.load(name)
 
 
@@ -33,11 +34,12 @@ def states(setup: og.SimpleSetup) -> np.ndarray:
     return path_to_array(setup.getSolutionPath(), robot().dof)
 
 
-ALONE = {"bridge": False, "fallback": False, "polish": False}
+# Parameters of apex that turn its other stages off.
+DIFFUSION_ONLY = {"bridge": False, "fallback": False, "polish": False}
 
 
-class Plain(ob.StateValidityChecker):
-    """A checker that knows nothing of this project but its checker, as that of a user's might."""
+class UserValidityChecker(ob.StateValidityChecker):
+    """A validity checker as a user writes one: OMPL calls a function of the state, without proofs or batches."""
 
     def __init__(self, si: ob.SpaceInformation, free: Callable[[np.ndarray], bool]) -> None:
         super().__init__(si)

@@ -1,4 +1,4 @@
-"""Robots of random joints and spheres, and where their bodies are."""
+"""Robots of random joints and spheres, and their forward kinematics."""
 
 from __future__ import annotations
 
@@ -15,14 +15,15 @@ def unit(rng: np.random.Generator) -> np.ndarray:
 
 
 def pose(rng: np.random.Generator, spread: float = 0.5) -> np.ndarray:
-    at = np.eye(4)
-    at[:3, :3] = pin.exp3(unit(rng) * rng.uniform(0.0, np.pi))
-    at[:3, 3] = rng.normal(0.0, spread, 3)
-    return at
+    """A random homogeneous transformation, shape (4, 4)."""
+    transform = np.eye(4)
+    transform[:3, :3] = pin.exp3(unit(rng) * rng.uniform(0.0, np.pi))
+    transform[:3, 3] = rng.normal(0.0, spread, 3)
+    return transform
 
 
 def balls(rng: np.random.Generator, leaves: int) -> dict[str, np.ndarray]:
-    """A root around some leaves, as a cover has them."""
+    """A tree of spheres as covers have them: leaves, and a root that contains them."""
     centres, radii = rng.normal(0.0, 0.05, (leaves, 3)), rng.uniform(0.01, 0.06, leaves)
     root = float((np.linalg.norm(centres, axis=1) + radii).max())
     return {
@@ -32,7 +33,7 @@ def balls(rng: np.random.Generator, leaves: int) -> dict[str, np.ndarray]:
 
 
 def random_robot(seed: int, joints: int = 9, dof: int = 4) -> tuple[RobotTables, list, list, list]:
-    """A random tree of revolute, prismatic, fixed and mimic joints with a body on each, and the parts it is of."""
+    """Tables, joints, bodies and pairs of a random tree of revolute, prismatic, fixed and mimic joints."""
     rng = np.random.default_rng(seed)
     specs = [robot_builder.JointSpec(0)]
     for k in range(1, joints):
@@ -52,8 +53,8 @@ def random_robot(seed: int, joints: int = 9, dof: int = 4) -> tuple[RobotTables,
 
 
 def frames(specs: list, q: np.ndarray) -> list[np.ndarray]:
-    """Forward kinematics from the book: placement, then rotation about or translation along the axis."""
-    found = [np.eye(4)]
+    """Poses of the joints in the world: T = T_parent * placement * exp(axis * value), by definition."""
+    poses = [np.eye(4)]
     for joint in specs[1:]:
         motion = np.eye(4)
         value = joint.ratio * q[joint.source] + joint.shift
@@ -61,5 +62,5 @@ def frames(specs: list, q: np.ndarray) -> list[np.ndarray]:
             motion[:3, :3] = pin.exp3(joint.axis * value)
         elif joint.kind == PRISMATIC:
             motion[:3, 3] = joint.axis * value
-        found.append(found[joint.parent] @ joint.placement @ motion)
-    return found
+        poses.append(poses[joint.parent] @ joint.placement @ motion)
+    return poses

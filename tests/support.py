@@ -1,4 +1,4 @@
-"""What several tests share."""
+"""Constants and functions that several tests share."""
 
 from __future__ import annotations
 
@@ -36,6 +36,7 @@ f 4 5 8
 
 
 def states_around_home(robot: Robot, rng: np.random.Generator, count: int, spread: float = 0.4) -> np.ndarray:
+    """States home + N(0, spread^2), hands uniform, clipped to the limits; shape (count, dof)."""
     states = robot.home + rng.normal(0.0, spread, (count, robot.dof))
     hands = robot.groups.get("hands", [])
     states[:, hands] = rng.uniform(0.0, 1.0, (count, len(hands)))
@@ -43,11 +44,11 @@ def states_around_home(robot: Robot, rng: np.random.Generator, count: int, sprea
 
 
 def distance(points: np.ndarray, path: np.ndarray) -> float:
-    """The largest distance of points from a polyline, by all of its sides."""
-    sides = np.diff(path, axis=0)
-    squares = np.maximum(np.sum(sides**2, axis=1), 1e-300)
-    share = np.clip(np.einsum("nkd,kd->nk", points[:, None] - path[:-1], sides) / squares, 0.0, 1.0)
-    return float(np.linalg.norm(points[:, None] - path[:-1] - share[..., None] * sides, axis=2).min(axis=1).max())
+    """Largest distance of points, shape (N, dof), from a polyline, shape (M, dof)."""
+    segments = np.diff(path, axis=0)
+    squares = np.maximum(np.sum(segments**2, axis=1), 1e-300)
+    fraction = np.clip(np.einsum("nkd,kd->nk", points[:, None] - path[:-1], segments) / squares, 0.0, 1.0)
+    return float(np.linalg.norm(points[:, None] - path[:-1] - fraction[..., None] * segments, axis=2).min(axis=1).max())
 
 
 def needs(path: str) -> pytest.MarkDecorator:

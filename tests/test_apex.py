@@ -11,7 +11,7 @@ import pytest
 from ompl import base as ob
 from ompl import geometric as og
 from ompl import tools as ot
-from planning import EASY, EXACT, HARD, Plain, at_hand, states, within
+from planning import EASY, EXACT, HARD, UserValidityChecker, cached_problem, states, within
 from support import ROOT
 
 from apex_ompl import plan, planners
@@ -21,7 +21,7 @@ from apex_ompl.ompl_adapter.space import path_to_array, state_space, to_state
 from apex_ompl.ompl_adapter.validity import StateValidityChecker, full_check
 from apex_ompl.planners import APEX
 from apex_ompl.planners.apex_parameters import ApexParameters
-from apex_ompl.problems.reach import robot
+from apex_ompl.problems.suite_robot import robot
 from apex_ompl.result import INSIDE
 from apex_ompl.trajopt.path import path_length
 
@@ -29,15 +29,15 @@ pytestmark = pytest.mark.usefixtures("quiet")
 
 
 def test_it_is_the_default_and_proves_what_it_finds() -> None:
-    result = plan(at_hand(HARD), timeout=20.0)
+    result = plan(cached_problem(HARD), timeout=20.0)
     assert result and result.planner == "apex", result.reason
-    checker = assemble(at_hand(HARD), robot()).checker
+    checker = assemble(cached_problem(HARD), robot()).checker
     assert full_check(checker, result.path, result.path[0], [result.path[-1]], resolution=0.0005)
     inside = {name.removeprefix(INSIDE): seconds for name, seconds in result.times.items() if name.startswith(INSIDE)}
     assert 0.0 < inside.pop("first") < result.times["solve"]
     assert {"query", "known", "polish"} <= inside.keys()
     assert sum(inside.values()) <= result.times["solve"]
-    tree = plan(at_hand(HARD), "rrtconnect", timeout=20.0)
+    tree = plan(cached_problem(HARD), "rrtconnect", timeout=20.0)
     assert result.length < tree.length
 
 
@@ -181,10 +181,10 @@ def test_alignment_goals_are_proposed_for_in_one_batch(monkeypatch: pytest.Monke
 
 
 def foreign(name: str) -> tuple[PlanningSetup, og.SimpleSetup]:
-    ready = assemble(at_hand(name), robot())
+    ready = assemble(cached_problem(name), robot())
     setup = og.SimpleSetup(state_space(robot()))
     si = setup.getSpaceInformation()
-    setup.setStateValidityChecker(Plain(si, ready.checker.is_free))
+    setup.setStateValidityChecker(UserValidityChecker(si, ready.checker.is_free))
     setup.setStartAndGoalStates(to_state(si, ready.start), to_state(si, ready.goals[0]))
     return ready, setup
 
@@ -226,7 +226,7 @@ def test_the_checkers_of_the_moment_judge(ready: PlanningSetup) -> None:
     path = setup.getSolutionPath()
     assert all(wary.isValid(path.getState(k)) for k in range(path.getStateCount()))
     setup.clear()
-    setup.setStateValidityChecker(Plain(si, lambda q: False))
+    setup.setStateValidityChecker(UserValidityChecker(si, lambda q: False))
     assert setup.solve(within(0.5)).getStatus() == ob.PlannerStatus.INVALID_START
 
 
@@ -234,7 +234,7 @@ def test_paths_of_trees_pass_the_full_check_too() -> None:
     """RRTConnect and OMPL's shortcuts look less closely."""
     alone = {"line": False, "first": 0, "second": 0, "third": 0, "bridge": False}
     for number in range(800_000, 800_004):
-        ready = assemble(at_hand(f"bins/hard/{number}"), robot())
+        ready = assemble(cached_problem(f"bins/hard/{number}"), robot())
         setup = ready.simple_setup
         setup.setPlanner(planners.make("apex", setup.getSpaceInformation(), seed=3, **alone))
         if setup.solve(within(8.0)).getStatus() == EXACT:

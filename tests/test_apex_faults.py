@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from ompl import base as ob
 from ompl import geometric as og
-from planning import ALONE, EXACT, HARD, TIMEOUT, Plain, at_hand, states, within
+from planning import DIFFUSION_ONLY, EXACT, HARD, TIMEOUT, UserValidityChecker, cached_problem, states, within
 from support import ROOT
 
 import apex_ompl
@@ -21,7 +21,7 @@ from apex_ompl.ompl_adapter.space import state_space, to_state
 from apex_ompl.ompl_adapter.validity import full_check
 from apex_ompl.planners import APEX
 from apex_ompl.planners.apex_parameters import ApexParameters
-from apex_ompl.problems.reach import robot
+from apex_ompl.problems.suite_robot import robot
 from apex_ompl.result import PlanStatus
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Problem
@@ -40,12 +40,12 @@ def test_faulty_parameters_are_named(tmp_path: Path) -> None:
         with pytest.raises(error, match=said):
             ApexParameters(**values)
     with pytest.raises(UnknownNameError, match="unknown checkpoint 'nope'"):
-        plan(at_hand(HARD), params={"model": "nope"})
+        plan(cached_problem(HARD), params={"model": "nope"})
     with pytest.raises(ParameterError, match="'denoising_steps'.*at most 256"):
-        plan(at_hand(HARD), params={"denoising_steps": 500})
+        plan(cached_problem(HARD), params={"denoising_steps": 500})
     (tmp_path / "empty").mkdir()
     with pytest.raises(MissingFileError, match="config.json"):
-        plan(at_hand(HARD), params={"model": str(tmp_path / "empty")})
+        plan(cached_problem(HARD), params={"model": str(tmp_path / "empty")})
     with pytest.raises(ApexError, match="expected 'baxter'"):
         setup = apex_ompl.setup(Problem.load(ROOT / "examples" / "baxter_table.yaml"))
         APEX(setup.getSpaceInformation())
@@ -98,7 +98,7 @@ def test_faulty_starts_and_goals_get_a_status_and_a_reason(ready: PlanningSetup)
 
 def test_behind_a_wall_there_is_no_way(ready: PlanningSetup) -> None:
     """The wall begins 12 cm from the first axis of the left arm, whose first link cannot pass, and must."""
-    checker = assemble(at_hand(HARD).model_copy(update={"scene": ()}), robot())
+    checker = assemble(cached_problem(HARD).model_copy(update={"scene": ()}), robot())
     start, goal = robot().home.copy(), robot().home.copy()
     start[0], goal[0] = 0.6, 2.12
     checker.checker.add(Obstacle(name="wall", box=(2.0, 0.04, 3.0), position=(1.12, 0.5, 1.5)))
@@ -113,7 +113,7 @@ def test_without_a_way_there_is_none_in_time() -> None:
     """The first joint may not cross zero, and the goal is on the other side."""
     panda, setup = robot(), og.SimpleSetup(state_space(robot()))
     si = setup.getSpaceInformation()
-    setup.setStateValidityChecker(Plain(si, lambda q: bool(abs(q[0]) > 0.05)))
+    setup.setStateValidityChecker(UserValidityChecker(si, lambda q: bool(abs(q[0]) > 0.05)))
     start, goal = panda.home.copy(), panda.home.copy()
     start[0], goal[0] = -0.5, 0.5
     setup.setStartAndGoalStates(to_state(si, start), to_state(si, goal))
@@ -129,7 +129,7 @@ def test_without_a_way_there_is_none_in_time() -> None:
 def test_approximate_solutions_come_with_their_difference(ready: PlanningSetup) -> None:
     setup = ready.simple_setup
     si = setup.getSpaceInformation()
-    nothing = {"line": True, "first": 1, "second": 0, "third": 0, "repair": False, "resample": 0, **ALONE}
+    nothing = {"line": True, "first": 1, "second": 0, "third": 0, "repair": False, "resample": 0, **DIFFUSION_ONLY}
     setup.setPlanner(planners.make("apex", si, approximate=True, seed=0, **nothing))
     setup.setup()
     status = setup.solve(within(1.0)).getStatus()
@@ -162,7 +162,7 @@ def test_no_exception_leaves_solve(
 
 @pytest.mark.parametrize("count", [0, 300])
 def test_no_obstacles_and_very_many(count: int) -> None:
-    base = at_hand(HARD)
+    base = cached_problem(HARD)
     rng = np.random.default_rng(0)
     scene = []
     for k in range(count):

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import torch
 from ompl import base as ob
-from planning import ALONE, EXACT, HARD, TIMEOUT, at_hand, states, within
+from planning import DIFFUSION_ONLY, EXACT, HARD, TIMEOUT, cached_problem, states, within
 
 from apex_ompl import plan, planners
 from apex_ompl.apex.path_validator import PathValidator
@@ -40,7 +40,7 @@ pytestmark = pytest.mark.usefixtures("quiet")
     ],
 )
 def test_stages_can_be_left_out(changes: dict[str, Any], by: tuple[str, ...]) -> None:
-    result = plan(at_hand("swap/hard/800000"), timeout=4.0, params={**ALONE, **changes})
+    result = plan(cached_problem("swap/hard/800000"), timeout=4.0, params={**DIFFUSION_ONLY, **changes})
     assert result.solved_by in by and bool(result) == bool(result.solved_by), (result.solved_by, result.reason)
     names = {name.removeprefix(INSIDE) for name in result.times if name.startswith(INSIDE)}
     assert "polish" not in names
@@ -49,7 +49,7 @@ def test_stages_can_be_left_out(changes: dict[str, Any], by: tuple[str, ...]) ->
 
 
 def test_open_scenes_take_a_sprint_of_a_tree() -> None:
-    problem = at_hand("vertical/small/800000")
+    problem = cached_problem("vertical/small/800000")
     quick = plan(problem, timeout=10.0)
     assert quick.solved_by == "sprint" and not {INSIDE + "propose", INSIDE + "rrtconnect"} & quick.times.keys()
     for params in ({"sprint": 0}, {"fallback": False}, {"lambda_obs": 0.001}):
@@ -61,7 +61,7 @@ def test_a_sprint_that_is_not_enough_is_the_beginning_of_the_fallback() -> None:
     unaided = {"line": False, "first": 0, "second": 0, "third": 0, "repair": False, "bridge": False, "polish": False}
     lengths = []
     for sprint in (0, 1):
-        result = plan(at_hand("swap/hard/800000"), timeout=20.0, seed=1, params={**unaided, "sprint": sprint})
+        result = plan(cached_problem("swap/hard/800000"), timeout=20.0, seed=1, params={**unaided, "sprint": sprint})
         assert result.solved_by == "rrtconnect" and (INSIDE + "sprint" in result.times) == bool(sprint)
         lengths.append(result.length)
     assert lengths[0] == lengths[1], "one iteration more or less in the sprint changes nothing about the tree"
@@ -71,7 +71,7 @@ def test_the_algorithm_of_the_paper_alone_runs(ready: PlanningSetup) -> None:
     """Guided ancestral sampling in all steps, resampling on collision or nearness, nothing else."""
     paper = {
         "sampler": "ddpm", "denoising_steps": 64, "guidance": True, "gamma": 1.0, "lambda_obs": 0.02, "line": False,
-        "repair": False, "first": 8, "second": 0, "third": 0, "resample": 2, **ALONE,
+        "repair": False, "first": 8, "second": 0, "third": 0, "resample": 2, **DIFFUSION_ONLY,
     }  # fmt: skip
     setup = ready.simple_setup
     planner = planners.make("apex", setup.getSpaceInformation(), **paper)
@@ -87,8 +87,8 @@ def test_the_algorithm_of_the_paper_alone_runs(ready: PlanningSetup) -> None:
 
 def test_valid_paths_that_pass_too_near_are_resampled(ready: PlanningSetup) -> None:
     validator = PathValidator(ready.simple_setup.getSpaceInformation(), "")
-    plain = plan(at_hand(HARD), timeout=20.0, params={"polish": False})
-    wary = plan(at_hand(HARD), timeout=20.0, params={"polish": False, "lambda_obs": 0.5})
+    plain = plan(cached_problem(HARD), timeout=20.0, params={"polish": False})
+    wary = plan(cached_problem(HARD), timeout=20.0, params={"polish": False, "lambda_obs": 0.5})
     assert plain and wary
     gaps = [validator.obstacle_distance(result.path.states) for result in (plain, wary)]
     assert gaps[1] >= gaps[0] - 1e-9, "nothing is half a metre off, so the one that keeps most distance stands"
@@ -99,7 +99,7 @@ def test_valid_paths_that_pass_too_near_are_resampled(ready: PlanningSetup) -> N
 
 def test_the_same_seed_gives_the_same_path_also_in_threads() -> None:
     def length(_: int) -> list[float]:
-        result = plan(at_hand(HARD), timeout=60.0, params={"seed": 5})
+        result = plan(cached_problem(HARD), timeout=60.0, params={"seed": 5})
         return [result.length, *result.path[100]]
 
     threads = torch.get_num_threads()
@@ -107,7 +107,7 @@ def test_the_same_seed_gives_the_same_path_also_in_threads() -> None:
     with ThreadPoolExecutor(2) as pool:
         assert all(found == alone for found in pool.map(length, range(2)))
     assert torch.get_num_threads() == threads
-    assert plan(at_hand(HARD), timeout=60.0, params={"seed": 6}).length != alone[0]
+    assert plan(cached_problem(HARD), timeout=60.0, params={"seed": 6}).length != alone[0]
 
 
 def test_with_time_left_paths_only_get_shorter(ready: PlanningSetup) -> None:
@@ -120,7 +120,7 @@ def test_with_time_left_paths_only_get_shorter(ready: PlanningSetup) -> None:
     assert setup.solve(within(3.0)).getStatus() == EXACT
     found = setup.getProblemDefinition().getSolutionCount()
     assert "improve" in planner.report.times
-    once = plan(at_hand(HARD), timeout=20.0, params={"seed": 0})
+    once = plan(cached_problem(HARD), timeout=20.0, params={"seed": 0})
     assert found >= 1 + planner.report.improved
     assert path_length(states(setup)) <= once.length + 1e-9
     assert full_check(ready.checker, states(setup), ready.start, ready.goals)

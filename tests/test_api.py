@@ -144,7 +144,7 @@ def test_several_goals_never_hang(planner: str, problem: Problem, tmp_path: Path
     """In a process of its own: OMPL's threaded planners deadlock over several goals."""
     other = dict(problem.goal.joints[0], right_joint1=0.3)
     problem.model_copy(update={"goal": Goal(joints=(*problem.goal.joints, other))}).save(tmp_path / "p.yaml")
-    command = [sys.executable, "-m", "apex_ompl.cli.parser", "plan", tmp_path / "p.yaml", "--planner", planner]
+    command = [sys.executable, "-m", "apex_ompl.cli", "plan", tmp_path / "p.yaml", "--planner", planner]
     done = subprocess.run([*command, "--timeout", "2"], check=False, capture_output=True, text=True, timeout=30)
     assert done.returncode in (0, 1, 4), done.stderr
     if planner.startswith("prm"):

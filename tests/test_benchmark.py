@@ -167,7 +167,7 @@ def test_processes_are_renewed(results: Results, tmp_path: Path, monkeypatch: py
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
 def test_a_stopped_command_goes_on(results: Results, tmp_path: Path, how: signal.Signals) -> None:
     folder, file = tmp_path / "stopped", tmp_path / "stopped" / "runs.jsonl"
-    command = [sys.executable, "-m", "apex_ompl.cli.parser", "bench", LEVEL, "--planners", ROWS[1], "--runs", str(RUNS)]
+    command = [sys.executable, "-m", "apex_ompl.cli", "bench", LEVEL, "--planners", ROWS[1], "--runs", str(RUNS)]
     command += ["--timeout", "10", "--split", "validation", "-o", str(folder)]
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # what a shell starts behind it ignores Ctrl-C
     try:

@@ -18,7 +18,7 @@ from apex_ompl.generation.worker import Unit, written
 from apex_ompl.kernel import RobotTables
 from apex_ompl.ompl_adapter.setup import assemble
 from apex_ompl.ompl_adapter.validity import full_check
-from apex_ompl.problems.reach import robot
+from apex_ompl.problems.suite_robot import robot
 from apex_ompl.trajopt.spline import Spline
 
 WITHOUT = """

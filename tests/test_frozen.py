@@ -1,4 +1,4 @@
-"""The frozen problems: all there, unchanged, and each with a witness that solves it."""
+"""The frozen problems: complete, unchanged, and each with a witness that is a valid path."""
 
 from __future__ import annotations
 
@@ -24,23 +24,23 @@ from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.trajopt.path import resample
 
 FOLDER = ROOT / "problems" / "frozen"
-EVERY = [(suite, level) for suite, levels in problems.suites().items() for level in levels]
-# Results refer to these problems: whoever freezes others says so here, and measures again.
+SUITE_LEVELS = [(suite, level) for suite, levels in problems.suites().items() for level in levels]
+# Published results refer to these problems. With other frozen problems they have to be measured again.
 FROZEN = "48f3f7dbde31d4285e45257a56fcf80297579264372cb278739e8266420f92c1"
-MOVING = [pair for pair in EVERY if pair[1].startswith("moving-")]
-STATIC = [pair for pair in EVERY if pair not in MOVING]
+MOVING = [pair for pair in SUITE_LEVELS if pair[1].startswith("moving-")]
+STATIC = [pair for pair in SUITE_LEVELS if pair not in MOVING]
 
 
 def test_the_files_match_their_hashes_and_are_small() -> None:
     assert hashlib.sha256((FOLDER / "SHA256SUMS").read_bytes()).hexdigest() == FROZEN
     lines = [line.split() for line in (FOLDER / "SHA256SUMS").read_text().splitlines()]
-    assert {name for _, name in lines} == {f"{suite}-{level}.json.xz" for suite, level in EVERY}
+    assert {name for _, name in lines} == {f"{suite}-{level}.json.xz" for suite, level in SUITE_LEVELS}
     for wanted, name in lines:
         assert hashlib.sha256((FOLDER / name).read_bytes()).hexdigest() == wanted
     assert sum(path.stat().st_size for path in FOLDER.iterdir()) < 10 * 2**20
 
 
-@pytest.mark.parametrize(("suite", "level"), EVERY)
+@pytest.mark.parametrize(("suite", "level"), SUITE_LEVELS)
 def test_the_first_problems_of_validation_and_test_are_frozen(robot: Robot, suite: str, level: str) -> None:
     counts = (20, 10) if level.startswith("moving-") else (100, 30)
     names = [problems.frozen_names(suite, level, split) for split in ("test", "validation")]
@@ -59,16 +59,16 @@ def test_the_first_problems_of_validation_and_test_are_frozen(robot: Robot, suit
 
 @pytest.mark.parametrize(("suite", "level"), STATIC)
 def test_witnesses_pass_the_full_check(robot: Robot, suite: str, level: str) -> None:
-    """Some of each level; scripts/check_frozen.py looks at all."""
+    """Some of each level; scripts/check_frozen.py checks all."""
     for name in problems.frozen_names(suite, level)[::20]:
         problem, witness = problems.load(name), problems.witness(name)
         checker = CollisionChecker(robot, problem.scene, problem.attached)
         check = full_check(checker, witness.path, witness.path[0], problem.goal_states(robot.joint_names))
         assert check, check.reason
-        # An obstacle in the way of the right palm, in the middle of the path, is met.
-        at = robot.link_pose(resample(witness.path, 3)[1], "right_hand_palm")[:3, 3]
-        checker.add(Obstacle(name="in_the_way", sphere={"radius": 0.03}, position=tuple(at)))
-        assert "in_the_way" in full_check(checker, witness.path, witness.path[0], [witness.path[-1]]).reason
+        # An obstacle at the right palm in the middle of the path is reported.
+        palm = robot.link_pose(resample(witness.path, 3)[1], "right_hand_palm")[:3, 3]
+        checker.add(Obstacle(name="at_the_palm", sphere={"radius": 0.03}, position=tuple(palm)))
+        assert "at_the_palm" in full_check(checker, witness.path, witness.path[0], [witness.path[-1]]).reason
 
 
 @pytest.mark.parametrize(("suite", "level"), MOVING)
@@ -80,33 +80,33 @@ def test_timed_witnesses_pass_their_check(robot: Robot, suite: str, level: str) 
 
 
 @pytest.fixture
-def copied(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Two files of frozen problems in another folder."""
+def folder_copy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with copies of two files of frozen problems, in place of the real one."""
     for name in ("swap-easy.json.xz", "vertical-small.json.xz", "SHA256SUMS"):
         shutil.copy(FOLDER / name, tmp_path / name)
     monkeypatch.setattr(frozen, "FOLDER", tmp_path)
-    frozen.forget()
+    frozen.clear_cache()
     yield tmp_path
-    frozen.forget()
+    frozen.clear_cache()
 
 
-def test_what_is_saved_is_what_is_loaded(copied: Path) -> None:
+def test_saving_and_loading_are_inverse(folder_copy: Path) -> None:
     seeds = (900_000, 900_007, 800_003)
     some = {seed: frozen.load(ProblemId("vertical", "small", seed)) for seed in seeds}
-    (copied / "vertical-small.json.xz").unlink()
+    (folder_copy / "vertical-small.json.xz").unlink()
     frozen.save("vertical", "small", some, 3)
     with pytest.raises(ParameterError, match="vertical-small.json.xz exists"):
         frozen.save("vertical", "small", some, 3)
     for seed, item in some.items():
         again = frozen.load(ProblemId("vertical", "small", seed))
-        assert again.problem == item.problem and again.number == item.number
+        assert again.problem == item.problem and again.draw_number == item.draw_number
         assert np.array_equal(again.witness.path, item.witness.path)
 
 
-def test_a_changed_or_missing_file_is_named_and_nothing_is_drawn_instead(copied: Path) -> None:
-    file = copied / "swap-easy.json.xz"
+def test_a_changed_or_missing_file_is_reported_and_no_problem_is_drawn(folder_copy: Path) -> None:
+    file = folder_copy / "swap-easy.json.xz"
     assert problems.load("swap/easy/900003").name == "swap/easy/900003"
-    frozen.forget()
+    frozen.clear_cache()
     content = bytearray(file.read_bytes())
     content[len(content) // 2] ^= 1
     file.write_bytes(content)
@@ -115,18 +115,18 @@ def test_a_changed_or_missing_file_is_named_and_nothing_is_drawn_instead(copied:
     file.unlink()
     with pytest.raises(MissingFileError, match="swap-easy.json.xz"):
         problems.sample("swap", level="easy", seed=900_003)
-    assert problems.load("swap/easy/900100").name == "swap/easy/900100"  # behind the frozen ones it is drawn
+    assert problems.load("swap/easy/900100").name == "swap/easy/900100"  # after the last frozen problem
 
 
-def changed_file(copied: Path, change) -> None:
-    """Put something else into a file of frozen problems, and its hash among the others."""
-    file = copied / "swap-easy.json.xz"
+def changed_file(folder_copy: Path, change) -> None:
+    """Change the content of a file of frozen problems, and its hash in ``SHA256SUMS``."""
+    file = folder_copy / "swap-easy.json.xz"
     data = json.loads(lzma.decompress(file.read_bytes()))
     content = change(data)
     content = content if isinstance(content, bytes) else lzma.compress(json.dumps(content).encode())
     file.write_bytes(content)
-    (copied / "SHA256SUMS").write_text(f"{hashlib.sha256(content).hexdigest()}  swap-easy.json.xz\n")
-    frozen.forget()
+    (folder_copy / "SHA256SUMS").write_text(f"{hashlib.sha256(content).hexdigest()}  swap-easy.json.xz\n")
+    frozen.clear_cache()
 
 
 def first_row(change) -> object:
@@ -138,7 +138,7 @@ def first_row(change) -> object:
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         (lambda data: b"not xz", "LZMA"),
         (lambda data: lzma.compress(b"{"), "JSON"),
@@ -157,18 +157,18 @@ def first_row(change) -> object:
         (first_row(lambda row: row.update(scene=[{"name": "x"}])), "scene"),
     ],
 )
-def test_a_damaged_file_with_a_right_hash_is_one_sentence(copied: Path, change, said: str) -> None:
-    changed_file(copied, change)
-    with pytest.raises(FileFormatError, match=said) as caught:
+def test_invalid_content_with_a_valid_hash_is_reported_in_one_sentence(folder_copy: Path, change, message: str) -> None:
+    changed_file(folder_copy, change)
+    with pytest.raises(FileFormatError, match=message) as caught:
         problems.load("swap/easy/900000")
     assert "swap-easy.json.xz" in str(caught.value) and "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("line", ["one", "a b c", f"{'0' * 64}  swap-easy.json.xz"])
-def test_a_damaged_file_of_hashes_is_named(copied: Path, line: str) -> None:
-    with (copied / "SHA256SUMS").open("a") as file:
+def test_an_invalid_file_of_hashes_is_reported(folder_copy: Path, line: str) -> None:
+    with (folder_copy / "SHA256SUMS").open("a") as file:
         file.write(line + "\n")
-    frozen.forget()
+    frozen.clear_cache()
     with pytest.raises(FileFormatError, match="SHA256SUMS"):
         problems.load("swap/easy/900000")
 

@@ -20,7 +20,7 @@ from apex_ompl.errors import ParameterError, UnknownNameError
 from apex_ompl.generation.worker import Unit, plan_units, static_levels, work
 from apex_ompl.ompl_adapter.setup import assemble
 from apex_ompl.ompl_adapter.validity import full_check
-from apex_ompl.problems.reach import robot
+from apex_ompl.problems.suite_robot import robot
 from apex_ompl.trajopt.path import path_length
 from apex_ompl.trajopt.spline import Spline
 from apex_ompl.util.cluster import ClusterError, spread

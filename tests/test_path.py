@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from planning import HARD, at_hand
+from planning import HARD, cached_problem
 from scipy.interpolate import BSpline
 
 from apex_ompl import PlanResult, plan
@@ -67,10 +67,10 @@ def test_faulty_paths_and_parameters_are_named() -> None:
 
 
 def test_the_spline_of_the_planner_comes_out_of_plan_and_out_of_files(tmp_path: pathlib.Path) -> None:
-    result = plan(at_hand(HARD), timeout=20.0)
+    result = plan(cached_problem(HARD), timeout=20.0)
     assert result and result.path is not None and result.path.spline is not None
     np.testing.assert_array_equal(result.path.spline.path(result.path.control), result.path.states)
-    tree = plan(at_hand(HARD), "rrtconnect", timeout=20.0)
+    tree = plan(cached_problem(HARD), "rrtconnect", timeout=20.0)
     assert tree and tree.path is not None and tree.path.spline is None
     for one in (result, tree):
         for suffix in (".npz", ".json", ".yaml"):
@@ -83,7 +83,7 @@ def test_the_spline_of_the_planner_comes_out_of_plan_and_out_of_files(tmp_path: 
 
 def test_the_straight_line_is_tried_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Before ``solve`` in a plan, inside of it for users of OMPL."""
-    ready = assemble(at_hand(HARD))
+    ready = assemble(cached_problem(HARD))
     line, lines = np.stack([ready.start, ready.goals[0]]), 0
     checked = CollisionChecker.first_collision
 
@@ -96,6 +96,6 @@ def test_the_straight_line_is_tried_once(monkeypatch: pytest.MonkeyPatch) -> Non
     run = PlanRun(ready, "apex", ApexParameters(sprint=0), 0)
     assert straight_line(run) is None and lines == 1
     assert solve(run, 20.0, True) and lines == 1
-    setup = assemble(at_hand(HARD)).simple_setup
+    setup = assemble(cached_problem(HARD)).simple_setup
     setup.setPlanner(APEX(setup.getSpaceInformation(), ApexParameters(sprint=0, seed=0)))
     assert setup.solve(20.0) and lines == 2

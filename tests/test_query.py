@@ -12,7 +12,7 @@ from apex_ompl.collision import CollisionChecker
 from apex_ompl.diffusion.conditions import ObstacleSet, distances
 from apex_ompl.generation.worker import row_of
 from apex_ompl.ompl_adapter.setup import assemble
-from apex_ompl.problems.reach import robot
+from apex_ompl.problems.suite_robot import robot
 from apex_ompl.scene.bodies import HalfSpace, Obstacle
 
 

@@ -11,7 +11,8 @@ from apex_ompl import plan
 from apex_ompl.errors import MissingFileError, ParameterError
 from apex_ompl.ompl_adapter.setup import assemble
 from apex_ompl.scene.problem import Problem
-from apex_ompl.viz.render import Stage, render
+from apex_ompl.viz.render import render
+from apex_ompl.viz.scene_renderer import SceneRenderer
 
 SMALL = (320, 240)
 
@@ -28,10 +29,10 @@ def test_a_problem_becomes_a_picture_with_start_goal_and_obstacles(problem: Prob
 
 def test_the_robot_is_drawn_where_it_is(problem: Problem) -> None:
     ready = assemble(problem)
-    stage = Stage(ready, SMALL)
-    first, second = stage.shoot(ready.start).astype(int), stage.shoot(ready.goals[0]).astype(int)
+    renderer = SceneRenderer(ready, SMALL)
+    first, second = renderer.screenshot(ready.start).astype(int), renderer.screenshot(ready.goals[0]).astype(int)
     assert (np.abs(first - second).max(axis=2) > 20).sum() > 500
-    assert np.abs(first - stage.shoot(ready.start)).mean() < 1.0
+    assert np.abs(first - renderer.screenshot(ready.start)).mean() < 1.0
 
 
 def test_a_result_becomes_a_strip_and_a_film(problem: Problem, tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from apex_ompl.diffusion.checkpoint import SHIPPED, shipped
 from apex_ompl.diffusion.proposals import Sampling
 from apex_ompl.diffusion.validation import query_of_case
 from apex_ompl.kernel import Kernel
-from apex_ompl.problems.reach import robot
+from apex_ompl.problems.suite_robot import robot
 from apex_ompl.trajopt.candidates import first_valid
 from apex_ompl.trajopt.optimizer import Optimizer
 from apex_ompl.util.resolution import FULL_RESOLUTION

@@ -1,4 +1,4 @@
-"""The suites: drawn by seed alone, with starts and goals that are what they are said to be."""
+"""The suites: problems are drawn by seed alone; starts and goals have the documented margins."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from apex_ompl.robot import Robot
 from apex_ompl.scene.problem import Alignment, Problem
 from apex_ompl.tasks.alignment import AlignmentGoal
 
-EVERY = [(suite, level) for suite, levels in problems.suites().items() for level in levels]
+SUITE_LEVELS = [(suite, level) for suite, levels in problems.suites().items() for level in levels]
 HARD = ("shelf", "bins", "cage", "posts", "wall", "swap", "clutter")
 LEVELS = ["free", "small", "large", "moving-medium-0.2", "moving-huge-0.4"]
 FACES = {"vertical": [("lower", "upper")], "horizontal": [("cup", "ball"), ("block", "peg")]}
@@ -36,11 +36,11 @@ def ends(problem: Problem, robot: Robot) -> np.ndarray:
 def box_corners(robot: Robot, problem: Problem, q: np.ndarray) -> list[np.ndarray]:
     """Corners of the held boxes at a state, by Pinocchio, each of shape (8, 3)."""
     signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T / 2.0
-    found = []
+    corners = []
     for body in problem.attached:
         pose = robot.link_pose(q, body.link) @ body.pose
-        found.append(signs * body.box @ pose[:3, :3].T + pose[:3, 3])
-    return found
+        corners.append(signs * body.box @ pose[:3, :3].T + pose[:3, 3])
+    return corners
 
 
 def test_the_suites_and_levels_are_those_of_the_contract() -> None:
@@ -53,11 +53,11 @@ def test_the_suites_and_levels_are_those_of_the_contract() -> None:
 
 
 @settings(max_examples=150)
-@given(which=st.sampled_from(EVERY), seed=st.integers(0, 799_999), other=st.integers(0, 799_999))
+@given(which=st.sampled_from(SUITE_LEVELS), seed=st.integers(0, 799_999), other=st.integers(0, 799_999))
 def test_the_same_seed_gives_the_same_problem(which: tuple[str, str], seed: int, other: int) -> None:
     suite, level = which
     first = problems.sample(suite, level=level, seed=seed)
-    problems.sample(suite, level=level, seed=other)  # nothing is carried over
+    problems.sample(suite, level=level, seed=other)  # has no influence on the next draw
     again = problems.load(f"{suite}/{level}/{seed}")
     assert again == first and digest(again) == digest(first) and first.name == f"{suite}/{level}/{seed}"
     if other != seed:
@@ -75,17 +75,19 @@ def test_another_process_draws_the_same() -> None:
 @pytest.mark.parametrize("level", ["easy", "medium", "hard"])
 @pytest.mark.parametrize("suite", HARD)
 def test_every_scene_can_be_built(suite: str, level: str) -> None:
-    """Whatever the numbers drawn: no board without thickness, no name twice."""
+    """For any random numbers: every body has a positive thickness, and names are unique."""
     for seed in range(150):
-        draft = scenes.SUITES[suite](np.random.default_rng([9, seed]), level)
-        assert len({body.name for body in draft.scene}) == len(draft.scene)
-        for region in (*draft.start, *draft.goal):
+        task = scenes.SUITES[suite](np.random.default_rng([9, seed]), level)
+        assert len({body.name for body in task.scene}) == len(task.scene)
+        for region in (*task.start, *task.goal):
             assert all(low <= high for low, high in (region.x, region.y, region.z)) and region.fingers
 
 
 @pytest.mark.parametrize("level", ["easy", "medium", "hard"])
 @pytest.mark.parametrize("suite", HARD)
-def test_starts_and_goals_of_the_hard_suites_keep_a_centimetre(robot: Robot, suite: str, level: str) -> None:
+def test_starts_and_goals_of_the_hard_suites_have_a_clearance_of_a_centimetre(
+    robot: Robot, suite: str, level: str
+) -> None:
     """By Coal's distances, the links against each other included; the hands hold nothing."""
     for seed in range(3):
         problem = problems.sample(suite, level=level, seed=seed)
@@ -99,7 +101,7 @@ def test_starts_and_goals_of_the_hard_suites_keep_a_centimetre(robot: Robot, sui
 
 @pytest.mark.parametrize("level", LEVELS)
 @pytest.mark.parametrize("suite", ["vertical", "horizontal"])
-def test_alignment_problems_are_as_the_paper_has_them(robot: Robot, suite: str, level: str) -> None:
+def test_alignment_problems_satisfy_the_definition_of_the_paper(robot: Robot, suite: str, level: str) -> None:
     held = set()
     for seed in range(8):
         problem = problems.sample(suite, level=level, seed=seed)
@@ -113,7 +115,7 @@ def test_alignment_problems_are_as_the_paper_has_them(robot: Robot, suite: str, 
         bare = CollisionChecker(robot, (), problem.attached, proofs=False)
         assert bare.is_free(start) and bare.is_free(goal)
         assert min(bare.distance(q, fixtures=True).value for q in (start, goal)) >= 0.01
-        assert bare.clearance(start) >= 0.01  # of every pair; at the goal the objects are where they are wanted
+        assert bare.clearance(start) >= 0.01  # of every pair of bodies; at the goal the two objects may be closer
         if suite == "vertical":
             corners = box_corners(robot, problem, start)
             assert min(c[:, 2].min() for c in corners) >= 0.08
@@ -122,21 +124,21 @@ def test_alignment_problems_are_as_the_paper_has_them(robot: Robot, suite: str, 
 
 
 @pytest.mark.parametrize("level", LEVELS[1:])
-def test_cubes_have_their_size_and_speed_and_keep_off_start_and_goal(robot: Robot, level: str) -> None:
+def test_cubes_have_their_size_and_speed_and_are_clear_of_start_and_goal(robot: Robot, level: str) -> None:
     moving, _, rest = level.rpartition("moving-")
     size, _, speed = rest.partition("-")
     counts = set()
     for seed in range(12):
         problem = problems.sample("vertical", level=level, seed=seed)
         start, goal = ends(problem, robot)
-        lasts = float(np.max(np.abs(goal - start) / robot.limits.velocity)) / 0.25
+        duration = float(np.max(np.abs(goal - start) / robot.limits.velocity)) / 0.25
         counts.add(len(problem.scene))
         for cube in problem.scene:
             edge = {"small": 0.06, "medium": 0.10, "large": 0.15, "xlarge": 0.20, "huge": 0.30}[size or level]
             assert cube.box == (edge, edge, edge) and cube.moving == bool(speed)
             if speed:
                 assert np.linalg.norm(cube.velocity) == pytest.approx(float(speed), abs=1e-4)
-        for q, time in ((start, 0.0), (goal, lasts)):
+        for q, time in ((start, 0.0), (goal, duration)):
             scene = [at_time(cube, time) for cube in problem.scene]
             assert CollisionChecker(robot, scene, problem.attached).distance(q).value >= 0.03
     assert counts == {1} if speed else 1 < len(counts) and counts <= {1, 2, 3}
@@ -150,7 +152,7 @@ def test_splits_are_by_seed() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "error", "said"),
+    ("name", "error", "message"),
     [
         ("shelv/hard/12", UnknownNameError, "did you mean 'shelf'"),
         ("shelf/hart/12", UnknownNameError, "did you mean 'hard'"),
@@ -165,8 +167,8 @@ def test_splits_are_by_seed() -> None:
         ("there/is/none", ApexError, "no such file"),
     ],
 )
-def test_wrong_ids_are_named(name: str, error: type[ApexError], said: str) -> None:
-    with pytest.raises(error, match=said):
+def test_invalid_ids_are_reported(name: str, error: type[ApexError], message: str) -> None:
+    with pytest.raises(error, match=message):
         load_problem(name)
 
 
@@ -178,7 +180,7 @@ def test_an_id_goes_before_a_file_of_that_name(tmp_path, monkeypatch: pytest.Mon
 
 
 @pytest.mark.parametrize("seed", [-1, 1_000_000, 1.5, True, "7"])
-def test_wrong_seeds_are_named(seed: object) -> None:
+def test_invalid_seeds_are_reported(seed: object) -> None:
     with pytest.raises(ParameterError, match="seed"):
         problems.sample("shelf", level="hard", seed=seed)  # type: ignore[arg-type]
 
@@ -186,7 +188,7 @@ def test_wrong_seeds_are_named(seed: object) -> None:
 def test_ids_work_at_the_command_line(apex_cli) -> None:
     done = apex_cli("check", "posts/easy/7")
     assert done.returncode == 0 and "posts/easy/7" in done.stdout and done.stdout.count("free") == 2
-    done = apex_cli("check", "vertical/moving-huge-0.1/0")  # the cube begins where the goal is
+    done = apex_cli("check", "vertical/moving-huge-0.1/0")  # at time 0 the cube overlaps the goal
     assert done.returncode == 0 and "goal       free (without cube_0)" in done.stdout
     done = apex_cli("plan", "vertical/moving-huge-0.1/0", "--snapshot")
     assert done.returncode == 3 and "cube_0" in done.stdout

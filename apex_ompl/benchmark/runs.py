@@ -23,7 +23,7 @@ from apex_ompl.ompl_adapter.report import SolveReport, report_of
 from apex_ompl.ompl_adapter.setup import assemble
 from apex_ompl.ompl_adapter.validity import full_check
 from apex_ompl.planning import PlanRun, finish, query_fault, solve, solving_time, with_exact_ends
-from apex_ompl.problems.catalogue import SuiteError
+from apex_ompl.problems.generator import SuiteError
 from apex_ompl.result import FIRST, PlanResult, PlanStatus
 from apex_ompl.robot import Robot, load_robot
 from apex_ompl.trajectory.smoothness import jerk

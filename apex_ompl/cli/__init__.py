@@ -1,4 +1,4 @@
-"""The command line ``apex-ompl``."""
+"""The command line ``apex-ompl``: ``parser`` has the entry point, the other modules a command or a few each."""
 
 from apex_ompl.cli.parser import main
 

@@ -24,8 +24,9 @@ from apex_ompl.ompl_adapter.simplify import simplify
 from apex_ompl.ompl_adapter.space import path_to_array
 from apex_ompl.ompl_adapter.validity import full_check
 from apex_ompl.problems import scenes
-from apex_ompl.problems.catalogue import KNOWN, SPLITS, SuiteError
-from apex_ompl.problems.reach import robot
+from apex_ompl.problems.catalogue import KNOWN, SPLITS
+from apex_ompl.problems.generator import SuiteError
+from apex_ompl.problems.suite_robot import robot
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Problem
 from apex_ompl.trajopt.optimizer import Optimizer

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import coal
@@ -14,6 +15,10 @@ from apex_ompl.errors import SceneError, UnknownNameError
 from apex_ompl.robot import Robot
 from apex_ompl.robot.model import link_of
 from apex_ompl.scene.bodies import AttachedObject
+from apex_ompl.types import Array
+
+HandObjects = Sequence[tuple[str, AttachedObject]]
+"""Objects by the name of the hand that is to hold each."""
 
 SCAN = 200  # synergies tried from open to closed before bisection
 TOLERANCE = 1e-4
@@ -75,6 +80,21 @@ def grasp(robot: Robot, hand: str, held: AttachedObject) -> Grasp:
         found = closing.touched(middle)
         low, high, touched = (low, middle, found) if found else (middle, high, touched)
     return Grasp(held, hand, record.synergy, low, touched)
+
+
+def close_hands(robot: Robot, objects: HandObjects) -> tuple[tuple[AttachedObject, ...], Array, list[Grasp]]:
+    """Close hands on objects, see :func:`grasp`; synergies are rounded down to a thousandth.
+
+    Returns:
+        The held objects, the home state with the synergies that hold them, shape (dof,), and the grasps.
+    """
+    home, grasps = robot.home.copy(), [grasp(robot, hand, held) for hand, held in objects]
+    for closed in grasps:
+        if closed.synergy_joint:
+            home[robot.joint_names.index(closed.synergy_joint)] = np.floor(closed.synergy * 1e3) / 1e3
+    # The default touch links, those of the hand, are the same and keep problem files short.
+    attached = tuple(closed.held.model_copy(update={"touch_links": None}) for closed in grasps)
+    return attached, home, grasps
 
 
 class _Closing:

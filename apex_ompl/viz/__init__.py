@@ -1,1 +1,1 @@
-"""Pictures: rendered scenes, films, plots."""
+"""Rendered scenes, films and plots."""

@@ -1,4 +1,4 @@
-"""Pictures of timed motions."""
+"""Plots of timed motions."""
 
 from __future__ import annotations
 
@@ -16,25 +16,25 @@ from apex_ompl.robot import load_robot
 from apex_ompl.util.files import suffix_of, write_atomically
 
 FORMATS = (".png", ".pdf", ".svg")
-SPACING = 0.002  # between two moments of a curve [s]
-MOST = 4000  # moments of a curve
-MOMENTS = 128  # at which clearance is drawn
+TIME_STEP, MAX_SAMPLES = 0.002, 4000  # of a curve [s]
+CLEARANCE_SAMPLES = 128
 ROWS = ("position", "velocity", "acceleration", "jerk")
 
 
 def plot_motion(result: PlanResult, out: str | os.PathLike[str]) -> None:
-    """Draw a timed motion: positions, velocities, accelerations and jerks as shares of their limits, and clearance.
+    """Draw positions, velocities, accelerations and jerks of a timed motion over time, and its clearance.
 
-    A column shows the joints of a group; a position is 1 at its upper limit and -1 at its lower one.
+    Each curve is scaled by the joint's limits: 1 is the upper limit, -1 the lower one. A column shows the joints of a
+    group.
 
     Args:
         result: A result with a trajectory.
         out: Picture to write, .png, .pdf or .svg.
 
     Raises:
-        ParameterError: The result has no trajectory, or one of other joints, or ``out`` another suffix.
+        ParameterError: The result has no trajectory, or one of other joints, or ``out`` has another suffix.
         MissingFileError: The file cannot be written.
-        ApexError: The robot or the problem of the result cannot be made.
+        ApexError: The robot or the problem of the result cannot be loaded.
     """
     path = Path(out)
     suffix = suffix_of(path, FORMATS)
@@ -43,22 +43,22 @@ def plot_motion(result: PlanResult, out: str | os.PathLike[str]) -> None:
         raise ParameterError("result", str(result.status), "one with a timed motion")
     robot = load_robot(result.robot)
     checker, limits = assemble(result.problem, robot).checker, robot.limits
-    middle, half = (limits.upper + limits.lower) / 2.0, (limits.upper - limits.lower) / 2.0
+    centre, half_range = (limits.upper + limits.lower) / 2.0, (limits.upper - limits.lower) / 2.0
     if result.joint_names != robot.joint_names:
         raise ParameterError("result", ", ".join(result.joint_names), f"the joints of {robot.name}")
-    times = motion.sample(max(SPACING, motion.duration / MOST)).time
-    shares = [(motion(times) - middle) / half]
+    times = motion.sample(max(TIME_STEP, motion.duration / MAX_SAMPLES)).time
+    scaled = [(motion(times) - centre) / half_range]
     bounds = (limits.velocity, limits.acceleration, limits.jerk)
-    shares += [motion(times, order) / bound for order, bound in enumerate(bounds, 1)]
+    scaled += [motion(times, order) / bound for order, bound in enumerate(bounds, 1)]
     groups = robot.groups or {"joints": np.arange(robot.dof)}
 
     figure = Figure(figsize=(4.2 * len(groups), 11), layout="constrained")
     grid = figure.add_gridspec(len(ROWS) + 1, len(groups))
     for column, (group, joints) in enumerate(groups.items()):
-        for row, (name, share) in enumerate(zip(ROWS, shares, strict=True)):
+        for row, (name, values) in enumerate(zip(ROWS, scaled, strict=True)):
             axis = figure.add_subplot(grid[row, column])
             for joint in joints:
-                axis.plot(times, share[:, joint], linewidth=1.2, label=robot.joint_names[joint])
+                axis.plot(times, values[:, joint], linewidth=1.2, label=robot.joint_names[joint])
             for bound in (-1.0, 1.0):
                 axis.axhline(bound, color="black", linewidth=0.8, linestyle="--")
             axis.set_ylim(-1.15, 1.15)
@@ -70,9 +70,9 @@ def plot_motion(result: PlanResult, out: str | os.PathLike[str]) -> None:
                 axis.legend(fontsize=6, ncols=2, loc="lower right")
             if column == 0:
                 axis.set_ylabel(f"{name}\nshare of limit", fontsize=9)
-    moments = np.linspace(0.0, motion.duration, MOMENTS)
+    clearance_times = np.linspace(0.0, motion.duration, CLEARANCE_SAMPLES)
     axis = figure.add_subplot(grid[len(ROWS), :])
-    axis.plot(moments, [1e3 * checker.clearance(q) for q in motion(moments)], color="#0b6e4f")
+    axis.plot(clearance_times, [1e3 * checker.clearance(q) for q in motion(clearance_times)], color="#0b6e4f")
     axis.set_ylim(bottom=0.0)
     axis.grid(alpha=0.25)
     axis.set_ylabel("clearance mm", fontsize=9)

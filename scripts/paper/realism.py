@@ -25,7 +25,7 @@ from apex_ompl.diffusion.proposals import Sampling
 from apex_ompl.generation.worker import plan_units, work
 from apex_ompl.ompl_adapter.process import quiet_ompl
 from apex_ompl.ompl_adapter.setup import assemble
-from apex_ompl.problems.reach import robot
+from apex_ompl.problems.suite_robot import robot
 from apex_ompl.trajopt.spline import Spline
 from apex_ompl.types import Array
 from apex_ompl.util.cluster import spread

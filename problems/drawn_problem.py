@@ -1,4 +1,4 @@
-"""What a suite draws: a problem in arrays, and the problem made of it."""
+"""A problem as the generators of the suites draw it."""
 
 from __future__ import annotations
 
@@ -9,10 +9,12 @@ from apex_ompl.scene.bodies import AttachedObject, Obstacle
 from apex_ompl.scene.problem import Goal, Problem
 from apex_ompl.types import Array
 
+MARGIN = 0.01  # clearance of every start and goal [m]
+
 
 @dataclass(frozen=True, eq=False)
-class Outline:
-    """A scene, held objects, and the states to go between.
+class DrawnProblem:
+    """Obstacles, held objects, and a start and a goal in the order of the robot's joints.
 
     Attributes:
         scene: Obstacles.
@@ -26,8 +28,8 @@ class Outline:
     goal: Array
     attached: tuple[AttachedObject, ...] = ()
 
-    def problem(self, name: str, robot: Robot) -> Problem:
-        """Return the problem by a name, for the robot that it was drawn for."""
+    def to_problem(self, name: str, robot: Robot) -> Problem:
+        """Return the problem under a name, for the robot that it was drawn for."""
         start, goal = (dict(zip(robot.joint_names, q.tolist(), strict=True)) for q in (self.start, self.goal))
         return Problem(
             name=name, robot=robot.name, scene=self.scene, attached=self.attached, start=start,

@@ -1,0 +1,44 @@
+"""Helpers that several commands share."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from importlib import import_module
+from types import ModuleType
+
+from apex_ompl.errors import MissingFileError, ParameterError
+
+PROBLEM_HELP = "name of a problem, an id as shelf/hard/900012, or a YAML file"
+
+
+def name_value_pairs(option: str, pairs: Sequence[str]) -> dict[str, str]:
+    """Return the values of a repeated option NAME=VALUE by name.
+
+    Raises:
+        ParameterError: A name, a value or the equals sign is missing.
+    """
+    found = {}
+    for pair in pairs:
+        name, equals, value = pair.partition("=")
+        if not equals or not name or not value:
+            raise ParameterError(option, pair, "NAME=VALUE")
+        found[name.strip()] = value.strip()
+    return found
+
+
+def import_extra(module: str, purpose: str, extra: str) -> ModuleType:
+    """Return a module that needs an optional extra of the package.
+
+    Args:
+        module: Its name.
+        purpose: What it is for, for the message.
+        extra: Name of the extra.
+
+    Raises:
+        MissingFileError: A package is not installed.
+    """
+    try:
+        return import_module(module)
+    except ImportError as error:
+        name = error.name or "a package"
+        raise MissingFileError(name, f"package for {purpose}", f"install the extra: apex-ompl[{extra}]") from error

@@ -1,0 +1,22 @@
+"""The robot of the suites, made once."""
+
+from __future__ import annotations
+
+from functools import cache
+
+from apex_ompl.robot import Robot, load_robot
+from apex_ompl.tasks.hand_poses import DualArmTables
+
+ROBOT = "dual_panda_softhand"
+
+
+@cache
+def robot() -> Robot:
+    """Return the robot of the suites."""
+    return load_robot(ROBOT)
+
+
+@cache
+def empty_hand_tables() -> DualArmTables:
+    """Return the kernel's tables of the robot with empty hands."""
+    return DualArmTables.of(robot())
