@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
-from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,13 +15,13 @@ from apex_ompl.ompl_adapter.repair import repair
 from apex_ompl.ompl_adapter.setup import PlanningSetup, set_goals
 from apex_ompl.ompl_adapter.simplify import simplify as shorten
 from apex_ompl.ompl_adapter.space import path_to_array
-from apex_ompl.ompl_adapter.validity import full_check
+from apex_ompl.ompl_adapter.validity import FullCheck, full_check
 from apex_ompl.result import FIRST, INSIDE, PlanResult, PlanStatus
 from apex_ompl.trajectory import Timing, Trajectory, time_path
-from apex_ompl.trajectory.motion import ROUNDING
+from apex_ompl.trajectory.trajectory import ROUNDING
 from apex_ompl.trajopt.path import path_length, resample
 from apex_ompl.types import Array
-from apex_ompl.util.resolution import FULL_RESOLUTION
+from apex_ompl.util.resolution import FULL_RESOLUTION, MOTION_RESOLUTION
 from apex_ompl.util.stopwatch import timed
 
 if TYPE_CHECKING:
@@ -31,8 +30,8 @@ if TYPE_CHECKING:
 
 
 CLEARANCE_SAMPLES = 32
-CHORD = 1e-5  # that a timed motion is off the straight line between two states that are proved, at most [rad]
-MOST_STATES = 100_000  # that are proved of a timed motion
+CHORD = 1e-5  # largest distance of a timed motion from the straight line between two states that are checked [rad]
+MOST_STATES = 100_000  # of a timed motion that are checked
 STRAIGHT_LINE = "straight line"
 PROOF_SHARE, LONGEST_PROOF = 0.1, 0.5  # time kept from planners that stop at the timeout only, for repair [1, s]
 LONGEST_TIMEOUT = 1e8  # OMPL counts nanoseconds in 64 bits [s]
@@ -147,38 +146,53 @@ class Planning:
             raise fault
 
     def with_timing(self, result: PlanResult, timing: Timing) -> PlanResult:
-        """Return a result with its path timed and the motion proved, or with the status TIMING_FAILED."""
-        ready, path, began = self.ready, result.path, time.perf_counter()
+        """Return a result with its path timed, or with the status TIMING_FAILED.
+
+        Stretches of the path that fail the full check at MOTION_RESOLUTION are planned anew, since motions along them
+        would fail it too. The motion is valid when it keeps the limits and passes that check.
+        """
+        path, proof = result.path, dict[str, float]()
         if path is None or not result:
             return result
-        robot, proof = ready.robot, dict[str, float]()
-        limits = robot.limits
+        ready, limits, names = self.ready, self.ready.robot.limits, self.ready.robot.joint_names
 
-        def fault(motion: Trajectory, resolution: float) -> str:
-            with timed(proof, "proof"):
+        def fault(motion: Trajectory) -> str:
+            with timed(proof, "motion"):
                 shares = motion.use(timing.limits(limits))
                 over = [f"{name} {share:.4f}" for name, share in shares.items() if share > 1.0 + ROUNDING]
                 if over:
                     return f"the share of a limit that it uses is over 1: {', '.join(over)}"
-                bend = max(float(np.abs(motion.accelerations).max()), 1e-9)
-                states = motion.sample(max(np.sqrt(8.0 * CHORD / bend), motion.duration / MOST_STATES, 1e-6)).position
-                states = np.clip(states, limits.lower, limits.upper)  # of rounding, as was seen
-                return full_check(ready.checker, states, ready.start, ready.goals, resolution).reason
+                acceleration = max(float(np.abs(motion.accelerations).max()), 1e-9)
+                spacing = max(np.sqrt(8.0 * CHORD / acceleration), motion.duration / MOST_STATES, 1e-6)
+                states = np.clip(motion.sample(spacing).position, limits.lower, limits.upper)  # without rounding
+                return full_check(ready.checker, states, ready.start, ready.goals, MOTION_RESOLUTION).reason
 
+        with timed(proof, "path"):
+            check = full_check(ready.checker, path, ready.start, ready.goals, MOTION_RESOLUTION)
+        if not check:
+            with timed(self.times, "repair"):
+                repaired = self._repaired_finely(path, check)
+            if repaired is not None:
+                path, solved_by = repaired, f"{result.solved_by.removesuffix('+repair')}+repair"
+                result = replace(result, path=path, solved_by=solved_by)
         try:
-            try:  # twice as densely as the path, which may itself only just pass
-                made = time_path(
-                    path, limits, robot.joint_names, timing, partial(fault, resolution=FULL_RESOLUTION / 2.0)
-                )
-            except TimingError:
-                made = time_path(path, limits, robot.joint_names, timing, partial(fault, resolution=FULL_RESOLUTION))
+            with timed(self.times, "timing"):
+                made = time_path(path, limits, names, timing, fault)
         except TimingError as error:
             return replace(result, status=PlanStatus.TIMING_FAILED, reason=f"the path cannot be timed, {error}")
         finally:
-            self.times["timing proof"] = proof.get("proof", 0.0)
-            self.times["timing"] = time.perf_counter() - began - self.times["timing proof"]
+            self.times["timing"] -= proof.get("motion", 0.0)
+            self.times["timing proof"] = sum(proof.values())
         motion = made.trajectory
-        return replace(result, trajectory=motion, limit_use=motion.use(limits), deviation=made.deviation)
+        return replace(
+            result, trajectory=motion, limit_use=motion.use(limits), deviation=made.deviation,
+            timing_resolution=MOTION_RESOLUTION,
+        )  # fmt: skip
+
+    def _repaired_finely(self, path: Array, check: FullCheck) -> Array | None:
+        """Return a path that passes the full check at MOTION_RESOLUTION, or None; ``check`` is the one it failed."""
+        deadline = time.perf_counter() + LONGEST_PROOF
+        return repair(self.ready, path, check, deadline, self.interrupt, resolution=MOTION_RESOLUTION)
 
     def finish(self, started: float, result: PlanResult) -> PlanResult:
         """Add clearance, length, counts and times."""

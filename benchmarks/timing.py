@@ -40,7 +40,7 @@ from apex_ompl.problems.reach import robot
 from apex_ompl.result import PlanResult, PlanStatus
 from apex_ompl.trajectory import Timing, Trajectory, time_path
 from apex_ompl.trajectory.curve import Curve, Polyline
-from apex_ompl.trajectory.motion import joined
+from apex_ompl.trajectory.trajectory import joined
 from apex_ompl.trajectory.point_to_point import calculate, knots, stops
 from apex_ompl.trajectory.timing import PER_PIECE, SPACING, least_spacing, spline
 from apex_ompl.util.scripts import run_command

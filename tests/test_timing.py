@@ -80,7 +80,7 @@ def test_ten_thousand_points_keep_the_limits() -> None:
     t = np.linspace(0.0, 1.0, 10_000)[:, None]
     path = np.cos(7.0 * t * np.array([1.0, 1.3, 0.7])) + np.random.default_rng(0).normal(0.0, 1e-4, (10_000, 3))
     made = timed(path)
-    assert made.way == "blended" and keeps_limits(made.trajectory) and made.deviation < 0.05
+    assert made.method == "blended" and keeps_limits(made.trajectory) and made.deviation < 0.05
 
 
 @pytest.mark.parametrize("length", [1e-4, 0.01, 0.6, 4.0])
@@ -96,7 +96,7 @@ def test_a_straight_line_takes_the_least_time_there_is(length: float) -> None:
     else:
         least = 4.0 * np.cbrt(length / (2.0 * j))
     made = timed(path)
-    assert made.way == "line" and made.deviation == 0.0
+    assert made.method == "line" and made.deviation == 0.0
     assert made.trajectory.duration == pytest.approx(least, rel=1e-5)
     assert keeps_limits(made.trajectory)
 
@@ -158,7 +158,7 @@ def test_motions_begin_with_a_velocity(path: np.ndarray, seed: int, share: float
         assert np.any(np.abs(velocity) + acceleration**2 / (2.0 * LIMITS.jerk) > LIMITS.velocity)
         return
     motion = made.trajectory
-    assert made.way.startswith("moving start")
+    assert made.method.startswith("moving start")
     np.testing.assert_allclose(motion(0.0, 1), velocity, atol=1e-9)
     np.testing.assert_allclose(motion(0.0, 2), acceleration, atol=1e-9)
     np.testing.assert_array_equal(motion.positions[[0, -1]], path[[0, -1]])
@@ -187,7 +187,7 @@ def test_where_a_motion_is_at_fault_it_stays_closer_and_stops_at_last() -> None:
         return "it leaves the path" if tried[-1] > 1e-4 else ""
 
     made = timed(path, fault=leaves)
-    assert made.way == "stops" and tried[-1] < 1e-9 and keeps_limits(made.trajectory)
+    assert made.method == "stops" and tried[-1] < 1e-9 and keeps_limits(made.trajectory)
     assert all(later < 0.8 * earlier for earlier, later in zip(tried[:-1], tried[1:], strict=True))
     for corner in path[1:-1]:
         near = int(np.argmin(np.linalg.norm(made.trajectory.positions - corner, axis=1)))
@@ -240,7 +240,7 @@ def test_joints_that_stay_at_their_limits_do_not_stop_the_motion() -> None:
         over = (motion.positions < LIMITS.lower) | (motion.positions > LIMITS.upper)
         return "outside" if over.any() else ""
 
-    assert timed(path, fault=outside).way == "blended"
+    assert timed(path, fault=outside).method == "blended"
     ready = assemble(api.load_problem("reach_past_post"))
     robot = ready.robot
     states = np.repeat(ready.start[None], 256, axis=0)
