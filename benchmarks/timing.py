@@ -1,14 +1,14 @@
-"""Timing of paths: limits, deviation, proof, duration beside TOPP-RA's optimum, computing time; and other ways.
+"""Timing of paths: limits, deviation, proof, duration beside TOPP-RA's optimum, computing time; and other methods.
 
 The paths are those that apex finds for the first test problems of each static level; those of rrtconnect, simplified,
 whose corners are sharp, are timed as well. TOPP-RA's optimum is that of the cubic spline through the states of apex's
 paths under the same limits of velocity and acceleration, without any of jerk (package ``toppra``, extra ``peers``).
 
-The other ways, on the first problems of each level:
+The other methods, on the first problems of each level:
 ``Ruckig along the arc``: one number moves along the same curve by Ruckig, in stretches with limits from the curve's
 derivatives and with speeds between them that can be reached; the best of 1 to 32 stretches.
 ``TOPP-RA, then Ruckig``: TOPP-RA's states every 50 ms, Ruckig in all joints from one to the next.
-``Ruckig from waypoint to waypoint``: points of the curve every 0.2 rad with the velocities of the fastest way and no
+``Ruckig from waypoint to waypoint``: points of the curve every 0.2 rad with the velocities of the fastest motion and no
 acceleration, Ruckig in all joints.
 ``Ruckig from corner to corner``: at rest at each, without leaving the path; of rrtconnect's paths.
 
@@ -40,21 +40,26 @@ from apex_ompl.problems.reach import robot
 from apex_ompl.result import PlanResult, PlanStatus
 from apex_ompl.trajectory import Timing, Trajectory, time_path
 from apex_ompl.trajectory.curve import Curve, Polyline
-from apex_ompl.trajectory.trajectory import joined
-from apex_ompl.trajectory.point_to_point import calculate, knots, stops
-from apex_ompl.trajectory.timing import PER_PIECE, SPACING, least_spacing, spline
+from apex_ompl.trajectory.methods.ruckig import calculate, knots, stops
+from apex_ompl.trajectory.methods.spline import (
+    CONTROL_POINT_SPACING,
+    GRID_POINTS_PER_SPAN,
+    least_knot_spacing,
+    spline_in_time,
+)
+from apex_ompl.trajectory.trajectory import concatenate
 from apex_ompl.util.scripts import run_command
 from apex_ompl.util.validation import one_or_more, whole_number
 
 LIMITS, NAMES = robot().limits, robot().joint_names
-APART_ON_PATH = SPACING * Timing().deviation  # of control points, as the first that time_path tries [rad]
+APART_ON_PATH = CONTROL_POINT_SPACING * Timing().deviation  # of control points, as the first that time_path tries [rad]
 EACH, APART, POINTS = 0.004, 0.05, 500  # of samples [s], of TOPP-RA's states [s], of its grid
 DERIVATIVES = ("position", "velocity", "acceleration", "jerk")
 
 
 @dataclass
 class Figures:
-    """What came of a way of timing."""
+    """Figures of a method of time parameterization."""
 
     ratios: list[float] = field(default_factory=list)
     durations: list[float] = field(default_factory=list)
@@ -114,7 +119,7 @@ def in_all_joints(states: list[tuple[np.ndarray, np.ndarray, np.ndarray]], least
         except ruckig.RuckigError:
             return None
         parts.append(Trajectory(*knots(made), NAMES))
-    return joined(parts)
+    return concatenate(parts)
 
 
 def after_toppra(path: np.ndarray) -> Trajectory | None:
@@ -135,13 +140,13 @@ def after_toppra(path: np.ndarray) -> Trajectory | None:
 def curve_of(path: np.ndarray) -> tuple[Curve, np.ndarray, np.ndarray]:
     """Return the curve along a path and its derivatives."""
     curve = Curve.along(Polyline.through(path), APART_ON_PATH)
-    return curve, *curve.derivatives(PER_PIECE)
+    return curve, *curve.derivatives(GRID_POINTS_PER_SPAN)
 
 
 def by_waypoints(path: np.ndarray) -> Trajectory | None:
     """Return the motion by Ruckig from waypoint to waypoint."""
     curve, first, second = curve_of(path)
-    step, x = curve.spacing / PER_PIECE, np.empty(len(first))
+    step, x = curve.spacing / GRID_POINTS_PER_SPAN, np.empty(len(first))
     fastest(first, second, LIMITS.velocity, LIMITS.acceleration, step, x)
     chosen = np.unique(np.linspace(0, len(x) - 1, max(2, math.ceil(step * len(x) / 0.2))).astype(int))
     points, still = curve.points(chosen * step), np.zeros(len(NAMES))
@@ -167,20 +172,20 @@ def in_stretches(curve: Curve, first: np.ndarray, second: np.ndarray, count: int
             min(np.min(LIMITS.velocity / abs(first[p])), math.sqrt(np.min(0.5 * LIMITS.acceleration / abs(second[p]))))
             for p in parts
         ]
-        push = [float(np.min(0.5 * LIMITS.acceleration / abs(first[p]))) for p in parts]
-        jolt = [float(np.min(0.5 * LIMITS.jerk / abs(first[p]))) for p in parts]
+        acceleration = [float(np.min(0.5 * LIMITS.acceleration / abs(first[p]))) for p in parts]
+        jerk = [float(np.min(0.5 * LIMITS.jerk / abs(first[p]))) for p in parts]
     ends = edges / (n - 1) * length
     between = [0.0, *(min(pair) for pair in zip(speed[:-1], speed[1:], strict=True)), 0.0]
     for order in (range(count), reversed(range(count))):  # forwards, then backwards
         for k in order:
             slow, fast = (k, k + 1) if between[k] < between[k + 1] else (k + 1, k)
-            between[fast] = within_reach(between[slow], between[fast], push[k], jolt[k], ends[k + 1] - ends[k])
+            between[fast] = within_reach(between[slow], between[fast], acceleration[k], jerk[k], ends[k + 1] - ends[k])
     solver, task = ruckig.Ruckig(1), ruckig.InputParameter(1)
     pieces, took = [], 0.0
     for k in range(count):
         task.current_position, task.target_position = [float(ends[k])], [float(ends[k + 1])]
         task.current_velocity, task.target_velocity = [between[k]], [between[k + 1]]
-        task.max_velocity, task.max_acceleration, task.max_jerk = [float(speed[k])], [push[k]], [jolt[k]]
+        task.max_velocity, task.max_acceleration, task.max_jerk = [float(speed[k])], [acceleration[k]], [jerk[k]]
         made = ruckig.Trajectory(1)
         try:
             solver.calculate(task, made)
@@ -191,19 +196,21 @@ def in_stretches(curve: Curve, first: np.ndarray, second: np.ndarray, count: int
     times = np.linspace(0.0, took, max(2, math.ceil(took / EACH)))
     place = np.empty(len(times))
     for k, time_ in enumerate(times):
-        begin, made = next(piece for piece in reversed(pieces) if piece[0] <= time_)
-        place[k] = made.at_time(float(time_ - begin))[0][0]
+        start, made = next(piece for piece in reversed(pieces) if piece[0] <= time_)
+        place[k] = made.at_time(float(time_ - start))[0][0]
     points = curve.points(np.clip(place, 0.0, length))
     control = np.concatenate([points[[0, 0]], points, points[[-1, -1]]])
-    return spline(control, least_spacing(control, LIMITS), NAMES)
+    return spline_in_time(control, least_knot_spacing(control, LIMITS), NAMES)
 
 
-def within_reach(slow: float, fast: float, push: float, jolt: float, distance: float) -> float:
+def within_reach(slow: float, fast: float, acceleration: float, jerk: float, distance: float) -> float:
     """Return the greatest speed up to ``fast`` that a jerk-limited ramp reaches from ``slow`` over a distance."""
 
     def needs(speed: float) -> float:
         gain = speed - slow
-        took = gain / push + push / jolt if gain > push**2 / jolt else 2.0 * math.sqrt(gain / jolt)
+        took = (
+            gain / acceleration + acceleration / jerk if gain > acceleration**2 / jerk else 2.0 * math.sqrt(gain / jerk)
+        )
         return 0.5 * (slow + speed) * took
 
     if needs(fast) <= distance:
@@ -217,7 +224,7 @@ def within_reach(slow: float, fast: float, push: float, jolt: float, distance: f
 
 def from_corner_to_corner(path: np.ndarray) -> Trajectory:
     """Return the motion by Ruckig that stops at each corner."""
-    return stops(Polyline.through(path).corners().states, LIMITS, NAMES)
+    return stops(Polyline.through(path), LIMITS, NAMES)[0]
 
 
 def deviation_of(motion: Trajectory, path: np.ndarray) -> float:
@@ -227,7 +234,7 @@ def deviation_of(motion: Trajectory, path: np.ndarray) -> float:
     return float(farthest(states, arc * line.length / max(arc[-1], 1e-12), line.states, line.arc, 1.5))
 
 
-def judge(figures: Figures, motion: Trajectory | None, path: np.ndarray, checker: Any, best: float | None) -> None:
+def measure(figures: Figures, motion: Trajectory | None, path: np.ndarray, checker: Any, best: float | None) -> None:
     """Add the figures of a motion."""
     if motion is None:
         figures.none += 1
@@ -243,11 +250,13 @@ def judge(figures: Figures, motion: Trajectory | None, path: np.ndarray, checker
         figures.ratios.append(motion.duration / best)
 
 
-def timed_way(way: Callable[[np.ndarray], Trajectory | None], path: np.ndarray) -> tuple[Trajectory | None, float]:
-    """Return the motion of a way, and the seconds it took."""
-    begin = time.perf_counter()
-    motion = way(path)
-    return motion, time.perf_counter() - begin
+def timed_method(
+    method: Callable[[np.ndarray], Trajectory | None], path: np.ndarray
+) -> tuple[Trajectory | None, float]:
+    """Return the motion of a method, and its computing time [s]."""
+    started = time.perf_counter()
+    motion = method(path)
+    return motion, time.perf_counter() - started
 
 
 def ours(path: np.ndarray) -> Trajectory | None:
@@ -255,7 +264,7 @@ def ours(path: np.ndarray) -> Trajectory | None:
     return time_path(path, LIMITS, NAMES).trajectory
 
 
-WAYS: dict[str, Callable[[np.ndarray], Trajectory | None]] = {
+METHODS: dict[str, Callable[[np.ndarray], Trajectory | None]] = {
     "time_path": ours,
     "Ruckig along the arc": along_arc,
     "TOPP-RA, then Ruckig": after_toppra,
@@ -269,7 +278,7 @@ def main() -> None:
     parser.add_argument("levels", nargs="*", metavar="SUITE[/LEVEL]")
     parser.add_argument("-n", type=one_or_more, default=18, help="problems of a level (default: %(default)s)")
     parser.add_argument(
-        "--ways", type=whole_number, default=3, help="of them for the other ways (default: %(default)s)"
+        "--ways", type=whole_number, default=3, help="of them for the other methods (default: %(default)s)"
     )
     args = parser.parse_args()
     toppra.setup_logging("ERROR")
@@ -278,12 +287,12 @@ def main() -> None:
         for level in record.static_levels(args.levels)
         for k, name in enumerate(problems.frozen_names(*level.split("/"), "test")[: args.n])
     ]
-    whole = {planner: Figures() for planner in ("apex", "rrtconnect")}
-    ways = {**{name: Figures() for name in WAYS}, "Ruckig from corner to corner": Figures()}
+    planned = {planner: Figures() for planner in ("apex", "rrtconnect")}
+    methods = {**{name: Figures() for name in METHODS}, "Ruckig from corner to corner": Figures()}
     stages: dict[str, list[float]] = {}
     for name, k in tqdm(names, unit="problem"):
         checker = assemble(problems.load(name), robot()).checker
-        for planner, figures in whole.items():
+        for planner, figures in planned.items():
             result: PlanResult = plan(name, planner, timeout=10.0, seed=k)
             if result.status is PlanStatus.TIMING_FAILED:
                 figures.none += 1
@@ -292,7 +301,7 @@ def main() -> None:
             path, motion = result.path, result.trajectory
             found = optimum(path) if planner == "apex" and len(path) > 2 else None
             best = None if found is None else found[1]
-            judge(figures, motion, path, checker, best)
+            measure(figures, motion, path, checker, best)
             figures.seconds.append(result.times["timing"])
             for stage in ("setup", "solve", "verify", "timing", "timing proof", "clearance", "total"):
                 if planner == "apex":
@@ -300,22 +309,22 @@ def main() -> None:
             if k >= args.ways:
                 continue
             if planner == "rrtconnect":
-                made, took = timed_way(from_corner_to_corner, path)
-                judge(ways["Ruckig from corner to corner"], made, path, checker, None)
-                ways["Ruckig from corner to corner"].seconds.append(took)
+                made, took = timed_method(from_corner_to_corner, path)
+                measure(methods["Ruckig from corner to corner"], made, path, checker, None)
+                methods["Ruckig from corner to corner"].seconds.append(took)
             elif len(path) > 2:
-                for label, way in WAYS.items():
-                    made, took = timed_way(way, path)
-                    judge(ways[label], made, path, checker, best)
-                    ways[label].seconds.append(took)
+                for label, method in METHODS.items():
+                    made, took = timed_method(method, path)
+                    measure(methods[label], made, path, checker, best)
+                    methods[label].seconds.append(took)
     rows = [record.row(["paths", *HEAD]), record.row(["---", *["---:"] * len(HEAD)])]
-    rows += [record.row([planner, *figures.cells()]) for planner, figures in whole.items()]
-    rows += ["", record.row(["way", *HEAD]), record.row(["---", *["---:"] * len(HEAD)])]
-    rows += [record.row([label, *figures.cells()]) for label, figures in ways.items()]
+    rows += [record.row([planner, *figures.cells()]) for planner, figures in planned.items()]
+    rows += ["", record.row(["method", *HEAD]), record.row(["---", *["---:"] * len(HEAD)])]
+    rows += [record.row([label, *figures.cells()]) for label, figures in methods.items()]
     rows += ["", record.row(["stage of plan, apex", "ms p50", "p95"]), record.row(["---", "---:", "---:"])]
     for stage, seconds in stages.items():
         rows.append(record.row([stage, *(f"{1e3 * v:.1f}" for v in record.percentiles(seconds, 50, 95))]))
-    figures = {label: f.__dict__ for label, f in {**whole, **ways}.items()}
+    figures = {label: f.__dict__ for label, f in {**planned, **methods}.items()}
     about = {"split": "test", "seed": "number of the problem in its level", "toppra": metadata.version("toppra")}
     record.write("timing", {"figures": figures}, "\n".join(rows), **about, ruckig=metadata.version("ruckig"))
 

@@ -1,19 +1,13 @@
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support import distance
 
-from apex_ompl import api, cli, plan, planning
 from apex_ompl.errors import ParameterError, TimingError
 from apex_ompl.kernel.reachability import fastest, moments
-from apex_ompl.ompl_adapter.setup import assemble
-from apex_ompl.ompl_adapter.validity import full_check
-from apex_ompl.result import PlanResult, PlanStatus
 from apex_ompl.robot import Limits
 from apex_ompl.trajectory import TimedPath, Timing, Trajectory, time_path
 from apex_ompl.trajectory.curve import Curve, Polyline
@@ -241,15 +235,6 @@ def test_joints_that_stay_at_their_limits_do_not_stop_the_motion() -> None:
         return "outside" if over.any() else ""
 
     assert timed(path, fault=outside).method == "blended"
-    ready = assemble(api.load_problem("reach_past_post"))
-    robot = ready.robot
-    states = np.repeat(ready.start[None], 256, axis=0)
-    states[:, 6], states[:, 13] = robot.limits.upper[6], robot.limits.lower[13]
-    states[:, 5] += 0.2 * np.sin(5.0 * t)
-    ready = replace(ready, start=states[0], goals=states[-1:])
-    result = planning.Planning(ready, "rrtconnect", 0, 0.0, ())
-    exact = result._exact(states, "test")
-    assert result.with_timing(exact, Timing()).trajectory.duration < 5.0
 
 
 def test_extreme_options_take_no_extreme_time() -> None:
@@ -262,81 +247,3 @@ def test_extreme_options_take_no_extreme_time() -> None:
         assert motion.spectral_arc_length < 0.0
     late = timed(path, Timing(start_velocity=(0.1, 0.1, 0.0), minimum_duration=3600.0)).trajectory
     assert late.duration >= 3600.0 - 1e-6 and max(late.use(LIMITS).values()) <= 1.0 + 1e-9
-
-
-def test_plans_are_timed_and_proved() -> None:
-    result = plan("ball_in_cup", timeout=20.0)
-    motion = result.trajectory
-    assert result and motion is not None and motion.dof == 16 and 0.3 < motion.duration < 10.0
-    assert set(result.limit_use) == {"position", "velocity", "acceleration", "jerk"}
-    assert 0.9 < max(result.limit_use.values()) <= 1.0 + 1e-9 and result.deviation <= Timing().deviation
-    ready = assemble(result.problem)
-    states = motion.sample(0.001).position
-    assert full_check(ready.checker, states, ready.start, ready.goals)
-    assert result.times["timing"] > 0.0 and result.times["timing proof"] > 0.0
-    assert result.as_dict()["duration"] == motion.duration
-
-
-def test_a_path_that_cannot_be_timed_is_no_success(monkeypatch: pytest.MonkeyPatch) -> None:
-    def fails(*args: object) -> None:
-        raise TimingError("the motion collides")
-
-    monkeypatch.setattr(planning, "time_path", fails)
-    result = plan("ball_in_cup", timeout=20.0)
-    assert result.status is PlanStatus.TIMING_FAILED and not result and result.path is not None
-    assert result.reason == "the path cannot be timed, the motion collides" and result.trajectory is None
-    assert plan("ball_in_cup", timeout=20.0, timing=False)
-
-
-def test_collisions_of_the_timed_motion_are_seen(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Blending that cuts a corner by up to half a radian runs into what the path goes around."""
-    tight = plan("reach_past_post", "rrtconnect", timeout=20.0, seed=3)
-    wide = plan("reach_past_post", "rrtconnect", timeout=20.0, seed=3, timing=Timing(deviation=0.5))
-    ready = assemble(tight.problem)
-    for result in (tight, wide):
-        assert result and result.trajectory is not None
-        assert full_check(ready.checker, result.trajectory.sample(0.002).position, ready.start, ready.goals)
-    blind = time_path(wide.path, ready.robot.limits, ready.robot.joint_names, Timing(deviation=0.5))  # type: ignore[arg-type]
-    assert not full_check(ready.checker, blind.trajectory.sample(0.002).position), "or the test shows nothing"
-
-
-def test_what_is_no_timing_is_refused() -> None:
-    with pytest.raises(ParameterError, match="timing"):
-        api.plan("ball_in_cup", timing=0.5)  # type: ignore[arg-type]
-    with pytest.raises(ParameterError, match="start_velocity"):
-        api.plan("ball_in_cup", timing=Timing(start_velocity=(1.0, 2.0)))
-
-
-def test_the_command_writes_motions_and_draws_them(tmp_path, capsys: pytest.CaptureFixture[str]) -> None:  # type: ignore[no-untyped-def]
-    out = tmp_path / "m.traj.yaml"
-    assert cli.main(["plan", "ball_in_cup", "--timeout", "20", "--velocity-scale", "0.5", "--out", str(out)]) == 0
-    said = capsys.readouterr().out
-    motion = Trajectory.load(out)
-    assert f"motion     {motion.duration:.3f} s" in said and "jerk" in said and "timing proof" in said
-    out = tmp_path / "c.traj.json"
-    assert cli.main(["plan", "ball_in_cup", "--timeout", "20", "--out", str(out), "--controllers"]) == 0
-    assert Trajectory.load(out).dof == 16 and "left_arm_controller" in out.read_text()
-    out = tmp_path / "r.npz"
-    assert cli.main(["plan", "ball_in_cup", "--timeout", "20", "--out", str(out)]) == 0
-    saved = PlanResult.load(out)
-    assert saved.trajectory is not None and saved.limit_use["jerk"] > 0.0
-    for name in ("p.png", "p.svg"):
-        assert cli.main(["plot", str(out), "-o", str(tmp_path / name)]) == 0
-    assert (tmp_path / "p.png").read_bytes()[:4] == b"\x89PNG" and "<svg" in (tmp_path / "p.svg").read_text()
-    capsys.readouterr()
-    untimed = tmp_path / "n.npz"
-    assert cli.main(["plan", "ball_in_cup", "--timeout", "20", "--no-timing", "--out", str(untimed)]) == 0
-    assert PlanResult.load(untimed).trajectory is None
-    for arguments, words in (
-        (["plot", str(untimed), "-o", str(tmp_path / "q.png")], "timed motion"),
-        (["plot", str(out), "-o", str(tmp_path / "q.txt")], "ending in"),
-        (["plot", str(tmp_path / "none.npz"), "-o", str(tmp_path / "q.png")], "none.npz"),
-        (["plan", "ball_in_cup", "--jerk-scale", "2"], "jerk_scale"),
-        (["plan", "ball_in_cup", "--controllers"], "--controllers"),
-        (["plan", "ball_in_cup", "--no-timing", "--out", str(tmp_path / "q.traj.yaml")], "--no-timing"),
-    ):
-        capsys.readouterr()
-        assert cli.main(arguments) == 2
-        said = capsys.readouterr().err
-        assert words in said and said.count("\n") == 1
-    assert not list(tmp_path.glob("q*"))
