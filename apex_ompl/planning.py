@@ -33,6 +33,7 @@ CLEARANCE_SAMPLES = 32
 CHORD = 1e-5  # largest distance of a timed motion from the straight line between two states that are checked [rad]
 MOST_STATES = 100_000  # of a timed motion that are checked
 STRAIGHT_LINE = "straight line"
+LONGEST_FINE_REPAIR = 3.0  # of a path that fails the check at MOTION_RESOLUTION, on top of the timeout [s]
 PROOF_SHARE, LONGEST_PROOF = 0.1, 0.5  # time kept from planners that stop at the timeout only, for repair [1, s]
 LONGEST_TIMEOUT = 1e8  # OMPL counts nanoseconds in 64 bits [s]
 
@@ -191,7 +192,7 @@ class Planning:
 
     def _repaired_finely(self, path: Array, check: FullCheck) -> Array | None:
         """Return a path that passes the full check at MOTION_RESOLUTION, or None; ``check`` is the one it failed."""
-        deadline = time.perf_counter() + LONGEST_PROOF
+        deadline = time.perf_counter() + LONGEST_FINE_REPAIR
         return repair(self.ready, path, check, deadline, self.interrupt, resolution=MOTION_RESOLUTION)
 
     def finish(self, started: float, result: PlanResult) -> PlanResult:
