@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,13 +17,13 @@ from apex_ompl.ompl_adapter.report import LineAwarePlanner, SolveReport, report_
 from apex_ompl.ompl_adapter.setup import PlanningSetup, set_goals
 from apex_ompl.ompl_adapter.simplify import simplify as shorten
 from apex_ompl.ompl_adapter.space import path_to_array
-from apex_ompl.ompl_adapter.validity import full_check
+from apex_ompl.ompl_adapter.validity import FullCheck, full_check
 from apex_ompl.result import FIRST, INSIDE, PlanResult, PlanStatus
 from apex_ompl.trajectory import Timing, Trajectory, time_path
-from apex_ompl.trajectory.motion import ROUNDING
+from apex_ompl.trajectory.trajectory import ROUNDING
 from apex_ompl.trajopt.path import Path, resample
 from apex_ompl.types import Array
-from apex_ompl.util.resolution import FULL_RESOLUTION
+from apex_ompl.util.resolution import FULL_RESOLUTION, MOTION_RESOLUTION
 from apex_ompl.util.stopwatch import timed
 
 if TYPE_CHECKING:
@@ -33,6 +32,7 @@ if TYPE_CHECKING:
 CLEARANCE_SAMPLES = 32
 CHORD = 1e-5  # largest distance of a timed motion from the straight line between two states that are checked [rad]
 MAX_STATES = 100_000  # that are checked of a timed motion
+MAX_FINE_REPAIR = 3.0  # of a path that fails the check at MOTION_RESOLUTION, on top of the timeout [s]
 STRAIGHT_LINE = "straight line"
 PROOF_SHARE, MAX_PROOF = 0.1, 0.5  # time kept from planners that stop at the timeout only, for repair [1, s]
 MAX_TIMEOUT = 1e8  # OMPL counts nanoseconds in 64 bits [s]
@@ -199,38 +199,58 @@ def verify(run: PlanRun, path: Path, deadline: float, simplify: bool, solved_by:
 
 
 def parameterize(run: PlanRun, result: PlanResult, timing: Timing) -> PlanResult:
-    """Return a result with its path timed and the motion proved, or with the status TIMING_FAILED."""
-    setup, path, began = run.setup, result.path, time.perf_counter()
-    if path is None or not result:
-        return result
-    robot, proof = setup.robot, dict[str, float]()
-    limits = robot.limits
+    """Return a result with its path timed, or with the status TIMING_FAILED.
 
-    def fault(motion: Trajectory, resolution: float) -> str:
-        with timed(proof, "proof"):
+    Stretches of the path that fail the full check at MOTION_RESOLUTION are planned anew, since motions along them would
+    fail it too. The motion is valid when it keeps the limits and passes that check.
+    """
+    if result.path is None or not result:
+        return result
+    setup, limits, proof = run.setup, run.setup.robot.limits, dict[str, float]()
+
+    def fault(motion: Trajectory) -> str:
+        with timed(proof, "motion"):
             shares = motion.use(timing.limits(limits))
             over = [f"{name} {share:.4f}" for name, share in shares.items() if share > 1.0 + ROUNDING]
             if over:
                 return f"the share of a limit that it uses is over 1: {', '.join(over)}"
-            bend = max(float(np.abs(motion.accelerations).max()), 1e-9)
-            states = motion.sample(max(np.sqrt(8.0 * CHORD / bend), motion.duration / MAX_STATES, 1e-6)).position
-            states = np.clip(states, limits.lower, limits.upper)  # of rounding, as was seen
-            return full_check(setup.checker, states, setup.start, setup.goals, resolution).reason
+            acceleration = max(float(np.abs(motion.accelerations).max()), 1e-9)
+            spacing = max(np.sqrt(8.0 * CHORD / acceleration), motion.duration / MAX_STATES, 1e-6)
+            states = np.clip(motion.sample(spacing).position, limits.lower, limits.upper)  # without rounding
+            return full_check(setup.checker, states, setup.start, setup.goals, MOTION_RESOLUTION).reason
 
+    with timed(proof, "path"):
+        check = full_check(setup.checker, result.path.states, setup.start, setup.goals, MOTION_RESOLUTION)
     try:
-        try:  # twice as densely as the path, which may itself only just pass
-            made = time_path(
-                path.states, limits, robot.joint_names, timing, partial(fault, resolution=FULL_RESOLUTION / 2.0)
-            )
-        except TimingError:
-            made = time_path(path.states, limits, robot.joint_names, timing, partial(fault, resolution=FULL_RESOLUTION))
+        if not check:
+            result = _repaired_finely(run, result, result.path.states, check)
+        assert result.path is not None
+        with timed(run.times, "timing"):
+            made = time_path(result.path.states, limits, setup.robot.joint_names, timing, fault)
     except TimingError as error:
         return replace(result, status=PlanStatus.TIMING_FAILED, reason=f"the path cannot be timed, {error}")
     finally:
-        run.times["timing proof"] = proof.get("proof", 0.0)
-        run.times["timing"] = time.perf_counter() - began - run.times["timing proof"]
+        run.times["timing"] = run.times.get("timing", 0.0) - proof.get("motion", 0.0)
+        run.times["timing proof"] = sum(proof.values())
     motion = made.trajectory
-    return replace(result, trajectory=motion, limit_use=motion.use(limits), deviation=made.deviation)
+    return replace(
+        result, trajectory=motion, limit_use=motion.use(limits), deviation=made.deviation,
+        timing_resolution=MOTION_RESOLUTION,
+    )  # fmt: skip
+
+
+def _repaired_finely(run: PlanRun, result: PlanResult, states: Array, check: FullCheck) -> PlanResult:
+    """Return a result whose path passes the full check at MOTION_RESOLUTION.
+
+    Raises:
+        TimingError: No such path is found.
+    """
+    with timed(run.times, "repair"):
+        deadline = time.perf_counter() + MAX_FINE_REPAIR
+        repaired = repair(run.setup, states, check, deadline, run.interrupt, resolution=MOTION_RESOLUTION)
+    if repaired is None:
+        raise TimingError(f"it fails the full check at {MOTION_RESOLUTION:g} rad, {check.reason}")
+    return replace(result, path=Path(repaired), solved_by=f"{result.solved_by.removesuffix('+repair')}+repair")
 
 
 def finish(run: PlanRun, result: PlanResult, started: float) -> PlanResult:

@@ -27,7 +27,7 @@ from apex_ompl.util.schema import dump_yaml, read_yaml, validate
 SCHEMA = "apex-ompl/result/2"
 SUFFIXES = (*MESSAGES, ".npz", ".csv", ".json", ".yaml")
 KNOTS = ("times", *STATES)
-NUMBERS = ("length", "clearance", "deviation")
+NUMBERS = ("length", "clearance", "deviation", "timing_resolution")
 
 INSIDE = "solve: "
 """Stands before the names of a planner's own stages in ``PlanResult.times``."""
@@ -74,6 +74,7 @@ class PlanResult:
         limit_use: Largest share of each limit that ``trajectory`` uses, by ``position``, ``velocity``,
             ``acceleration`` and ``jerk``; empty without one.
         deviation: Largest distance of ``trajectory`` from ``path`` [rad], NaN without one.
+        timing_resolution: Spacing of the full check that ``trajectory`` passed [rad, max-norm], NaN without one.
         times: Seconds per stage, and ``total``; those of a planner's own stages, as ``solve: repair``, are part of
             ``solve``.
         length: Sum of Euclidean joint-space steps [rad], NaN without a path.
@@ -97,6 +98,7 @@ class PlanResult:
     trajectory: Trajectory | None = None
     limit_use: Mapping[str, float] = field(default_factory=dict)
     deviation: float = float("nan")
+    timing_resolution: float = float("nan")
     times: Mapping[str, float] = field(default_factory=dict)
     length: float = float("nan")
     clearance: float = float("nan")
@@ -131,6 +133,7 @@ class PlanResult:
             "duration": None if motion is None else motion.duration,
             "limit_use": dict(self.limit_use),
             "deviation": None if np.isnan(self.deviation) else self.deviation,
+            "timing_resolution": None if np.isnan(self.timing_resolution) else self.timing_resolution,
             "jerk": None if motion is None else motion.jerk,
             "spectral_arc_length": None if motion is None else motion.spectral_arc_length,
             "trajectory": None if motion is None else {key: getattr(motion, key).tolist() for key in KNOTS},
@@ -171,6 +174,7 @@ class PlanResult:
         data = read_yaml(path, "result file") if path.suffix != ".npz" else _read_npz(path)
         if data.get("schema") != SCHEMA:
             raise FileFormatError(str(path), "schema", data.get("schema"), f"expected {SCHEMA!r}")
+        data.setdefault("timing_resolution", None)  # older files lack it
         try:
             states = None if data["path"] is None else np.array(data["path"], dtype=float)
             number = {k: float("nan") if data[k] is None else float(data[k]) for k in NUMBERS}

@@ -22,7 +22,7 @@ import record
 from store import RunStore
 
 from apex_ompl import plan, problems
-from apex_ompl.live.moving import even_times, timed_check
+from apex_ompl.live.moving import check_timed_path, constant_velocity_times
 from apex_ompl.problems.alignment import VELOCITY_SCALE
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.util.scripts import run_command
@@ -44,9 +44,9 @@ def run(job: tuple[str, str]) -> dict[str, Any]:
     result = plan(problem, planner, timeout=TIMEOUT, seed=int(name.rsplit("/", 1)[1]) % 1000, snapshot=True)
     solved, reason = bool(result), result.reason
     if solved and problem.moving:
-        check = timed_check(
-            robot(), problem, result.path.states, even_times(robot(), result.path.states, VELOCITY_SCALE)
-        )
+        states = result.path.states
+        times = constant_velocity_times(robot(), states, VELOCITY_SCALE)
+        check = check_timed_path(robot(), problem, states, times)
         solved, reason = bool(check), check.reason
     return {
         "problem": name, "planner": planner, "solved": solved, "by": result.solved_by, "status": str(result.status),
@@ -59,7 +59,7 @@ def _line(name: str) -> bool:
     """Whether the straight line solves a problem, at a quarter of the velocity limits where obstacles move."""
     problem, names = problems.load(name), robot().joint_names
     line = np.stack([problem.start_state(names), problem.goal_states(names)[0]])
-    return bool(timed_check(robot(), problem, line, even_times(robot(), line, VELOCITY_SCALE)))
+    return bool(check_timed_path(robot(), problem, line, constant_velocity_times(robot(), line, VELOCITY_SCALE)))
 
 
 def warm_up() -> None:

@@ -11,7 +11,7 @@ import numpy as np
 
 from apex_ompl import problems
 from apex_ompl.errors import ApexError
-from apex_ompl.live.moving import timed_check
+from apex_ompl.live.moving import check_timed_path
 from apex_ompl.ompl_adapter.setup import assemble
 from apex_ompl.ompl_adapter.validity import full_check
 from apex_ompl.problems import frozen
@@ -33,7 +33,7 @@ def fault(name: str) -> str:
         ends = [problem.start_state(names), problem.goal_states(names)[0]]
         if not np.array_equal(witness.path[[0, -1]], ends):
             return "the witness does not go from start to goal"
-        return timed_check(robot(), problem, witness.path, witness.times).reason
+        return check_timed_path(robot(), problem, witness.path, witness.times).reason
     ready = assemble(problem)
     faults = (ready.start_fault, *ready.goal_faults)
     return "".join(faults) or full_check(ready.checker, witness.path, ready.start, ready.goals).reason

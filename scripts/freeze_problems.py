@@ -18,7 +18,7 @@ import numpy as np
 
 from apex_ompl.api import plan
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.live.moving import at_time, even_times, timed_check
+from apex_ompl.live.moving import check_timed_path, constant_velocity_times, obstacle_at
 from apex_ompl.ompl_adapter.setup import assemble
 from apex_ompl.ompl_adapter.validity import full_check
 from apex_ompl.problems import frozen
@@ -62,7 +62,7 @@ def _timed_witness(problem: Problem) -> Witness | None:
     for path, times in _timed_paths(problem):
         found = Witness(path, times).rounded()
         assert found.times is not None
-        if timed_check(robot(), problem, found.path, found.times):
+        if check_timed_path(robot(), problem, found.path, found.times):
             return found
     return None
 
@@ -72,11 +72,11 @@ def _timed_paths(problem: Problem) -> Iterator[tuple[Array, Array]]:
     names = robot().joint_names
     line = np.stack([problem.start_state(names), problem.goal_states(names)[0]])
     for pace in PACES:
-        yield line, even_times(robot(), line, pace)
+        yield line, constant_velocity_times(robot(), line, pace)
     lasts = straight_line_duration(line[0], line[1])
     for shares in ((0.5,), (0.25, 0.5, 0.75), (0.0, 0.25, 0.5, 0.75, 1.0), (0.0,), (1.0,), ()):
         stopped = [
-            at_time(obstacle, share * lasts).model_copy(update={"name": f"{obstacle.name}_{k}", "velocity": None})
+            obstacle_at(obstacle, share * lasts).model_copy(update={"name": f"{obstacle.name}_{k}", "velocity": None})
             for obstacle in problem.scene
             for k, share in enumerate(shares)
         ]
@@ -85,9 +85,9 @@ def _timed_paths(problem: Problem) -> Iterator[tuple[Array, Array]]:
             if not result or result.path is None:
                 break
             for pace in PACES:
-                yield result.path.states, even_times(robot(), result.path.states, pace)
+                yield result.path.states, constant_velocity_times(robot(), result.path.states, pace)
             for wait in WAITS:
-                times = even_times(robot(), result.path.states, VELOCITY_SCALE)
+                times = constant_velocity_times(robot(), result.path.states, VELOCITY_SCALE)
                 yield np.concatenate([line[:1], result.path.states]), np.concatenate([[0.0], wait + times])
     yield from _ways_aside(problem, line)
 
@@ -105,8 +105,8 @@ def _ways_aside(problem: Problem, line: Array) -> Iterator[tuple[Array, Array]]:
             continue
         away, on = np.stack([line[0], via]), np.stack([via, line[1]])
         for wait in (0.01, *WAITS):
-            first = even_times(some, away, HURRY)
-            second = first[-1] + wait + even_times(some, on, 2.0 * VELOCITY_SCALE)
+            first = constant_velocity_times(some, away, HURRY)
+            second = first[-1] + wait + constant_velocity_times(some, on, 2.0 * VELOCITY_SCALE)
             yield np.concatenate([away, on]), np.concatenate([first, second])
 
 

@@ -15,7 +15,7 @@ from support import ROOT
 from apex_ompl import problems
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError, UnknownNameError
-from apex_ompl.live.moving import timed_check
+from apex_ompl.live.moving import check_timed_path
 from apex_ompl.ompl_adapter.validity import full_check
 from apex_ompl.problems import frozen
 from apex_ompl.problems.catalogue import ProblemId
@@ -75,7 +75,7 @@ def test_witnesses_pass_the_full_check(robot: Robot, suite: str, level: str) -> 
 def test_timed_witnesses_pass_their_check(robot: Robot, suite: str, level: str) -> None:
     for name in problems.frozen_names(suite, level)[3::16]:
         witness = problems.witness(name)
-        check = timed_check(robot, problems.load(name), witness.path, witness.times)
+        check = check_timed_path(robot, problems.load(name), witness.path, witness.times)
         assert check, check.reason
 
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ParameterError
-from apex_ompl.live.moving import at_time, even_times, grown, timed_check
+from apex_ompl.live.moving import check_timed_path, constant_velocity_times, inflated, obstacle_at
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Goal, Problem
@@ -28,12 +28,12 @@ def problem_with(robot: Robot, *scene: Obstacle) -> Problem:
 def path_from_home(robot: Robot, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     path = robot.home + np.cumsum(rng.normal(0.0, 0.12, (4, robot.dof)), axis=0)
     path = np.clip(path, robot.limits.lower, robot.limits.upper)
-    return path, even_times(robot, path, 0.5)
+    return path, constant_velocity_times(robot, path, 0.5)
 
 
 @settings(max_examples=40)
 @given(seed=st.integers(0, 2**32 - 1))
-def test_what_passes_is_free_at_all_times_and_what_fails_nearly_touches(robot: Robot, seed: int) -> None:
+def test_valid_paths_are_free_at_all_times_and_invalid_ones_nearly_touch(robot: Robot, seed: int) -> None:
     rng = np.random.default_rng(seed)
     path, times = path_from_home(robot, rng)
     hand = robot.link_pose(path[2], "left_hand_palm")[:3, 3]
@@ -42,28 +42,28 @@ def test_what_passes_is_free_at_all_times_and_what_fails_nearly_touches(robot: R
     mover = Obstacle.model_validate(
         {"name": "mover", "position": at.tolist(), "velocity": velocity.tolist(), **SHAPES[seed % len(SHAPES)]}
     )
-    check = timed_check(robot, problem_with(robot, mover), path, times)
+    check = check_timed_path(robot, problem_with(robot, mover), path, times)
     checker = CollisionChecker(robot, [mover], proofs=False)
     nearest = np.inf
     for time in np.linspace(0.0, times[-1], 150):
         q = np.array([np.interp(time, times, column) for column in path.T])
-        checker.move("mover", at_time(mover, time).position)
+        checker.move("mover", obstacle_at(mover, time).position)
         if check:
             assert checker.is_free(q), time
         elif checker.is_free(q):
             nearest = min(nearest, checker.clearance(q))
         else:
             nearest = 0.0
-    assert check or nearest < 0.02  # the grown obstacle was 2.5 mm larger, samples are some 10 mm apart
+    assert check or nearest < 0.02  # the inflated obstacle was 2.5 mm larger, samples are some 10 mm apart
 
 
 def test_without_movers_it_is_the_full_check(robot: Robot, post: Obstacle) -> None:
     start, goal = robot.home.copy(), robot.home.copy()
     start[[0, 1, 3]], goal[[0, 1, 3]] = (0.1, 0.4, -1.6), (-1.3, 0.4, -1.6)
     path = np.stack([start, goal])
-    blocked = timed_check(robot, problem_with(robot, post), path, [0.0, 5.0])
+    blocked = check_timed_path(robot, problem_with(robot, post), path, [0.0, 5.0])
     assert not blocked and "post" in blocked.reason and blocked.time == 5.0
-    assert timed_check(robot, problem_with(robot), path, [0.0, 5.0])
+    assert check_timed_path(robot, problem_with(robot), path, [0.0, 5.0])
 
 
 def test_waiting_lets_an_obstacle_pass(robot: Robot) -> None:
@@ -73,20 +73,20 @@ def test_waiting_lets_an_obstacle_pass(robot: Robot) -> None:
     velocity = np.array([0.8, 0.0, 0.0])
     box = Obstacle(name="box", box=(0.1, 0.1, 0.1), position=tuple(hand - velocity), velocity=tuple(velocity))
     moving = problem_with(robot, box)
-    met = timed_check(robot, moving, path, [0.0, 1.0])
+    met = check_timed_path(robot, moving, path, [0.0, 1.0])
     assert not met and "box" in met.reason
     waited = np.stack([path[0], path[0], path[1]])
-    assert timed_check(robot, moving, waited, [0.0, 3.0, 4.0])
+    assert check_timed_path(robot, moving, waited, [0.0, 3.0, 4.0])
 
 
 @pytest.mark.parametrize("kind", SHAPES)
-def test_grown_obstacles_hold_all_within_reach(kind: dict[str, object]) -> None:
+def test_inflated_obstacles_contain_all_points_within_the_distance(kind: dict[str, object]) -> None:
     import coal
 
     from apex_ompl.collision.shapes import world_geometry
 
     body = Obstacle.model_validate({"name": "body", "position": (0.1, -0.2, 0.3), **kind})
-    (inner, pose), (outer, same) = world_geometry(body), world_geometry(grown(body, 0.02))
+    (inner, pose), (outer, same) = world_geometry(body), world_geometry(inflated(body, 0.02))
     assert np.array_equal(pose, same)
     rng, probe = np.random.default_rng(0), coal.Sphere(1e-6)
     where = coal.Transform3s(pose[:3, :3], pose[:3, 3])
@@ -99,43 +99,43 @@ def test_grown_obstacles_hold_all_within_reach(kind: dict[str, object]) -> None:
             assert apart[1] <= 1e-5
 
 
-def test_even_times_keep_the_pace(robot: Robot) -> None:
+def test_constant_velocity_times_keep_the_velocity_scale(robot: Robot) -> None:
     path, _ = path_from_home(robot, np.random.default_rng(3))
-    times = even_times(robot, path, 0.25)
+    times = constant_velocity_times(robot, path, 0.25)
     speeds = np.abs(np.diff(path, axis=0)) / np.diff(times)[:, None] / robot.limits.velocity
     assert times[0] == 0.0 and np.allclose(speeds.max(axis=1), 0.25)
-    assert timed_check(robot, problem_with(robot), path, times * 0.26)
-    fast = timed_check(robot, problem_with(robot), path, times * 0.24)
+    assert check_timed_path(robot, problem_with(robot), path, times * 0.26)
+    fast = check_timed_path(robot, problem_with(robot), path, times * 0.24)
     assert not fast and "its limit is" in fast.reason
 
 
 @pytest.mark.parametrize(
-    ("path", "times", "said"),
+    ("path", "times", "name"),
     [
         (np.zeros((2, 3)), [0, 1], "path"), (np.zeros((1, 16)), [0], "path"), (np.zeros((2, 16)), [0, 0], "times"),
         (np.zeros((2, 16)), [1, 2], "times"), (np.zeros((2, 16)), [0, np.nan], "times"),
         (np.zeros((2, 16)), [0], "times"),
     ],
 )  # fmt: skip
-def test_wrong_arguments_are_named(robot: Robot, path: np.ndarray, times: list[float], said: str) -> None:
-    with pytest.raises(ParameterError, match=said):
-        timed_check(robot, problem_with(robot), path, times)
+def test_wrong_arguments_are_named(robot: Robot, path: np.ndarray, times: list[float], name: str) -> None:
+    with pytest.raises(ParameterError, match=name):
+        check_timed_path(robot, problem_with(robot), path, times)
 
 
-def test_what_takes_too_long_and_paces_that_are_none_are_named(robot: Robot) -> None:
+def test_long_durations_and_wrong_velocity_scales_are_named(robot: Robot) -> None:
     ball = Obstacle(name="ball", sphere={"radius": 0.1}, position=(2.0, 0.0, 0.5), velocity=(0.1, 0.0, 0.0))
     with pytest.raises(ParameterError, match="times"):
-        timed_check(robot, problem_with(robot, ball), np.stack([robot.home, robot.home]), [0.0, 1e10])
-    for pace in (0.0, -1.0, np.nan, 1.5):
-        with pytest.raises(ParameterError, match="pace"):
-            even_times(robot, np.stack([robot.home, robot.home]), pace)
+        check_timed_path(robot, problem_with(robot, ball), np.stack([robot.home, robot.home]), [0.0, 1e10])
+    for scale in (0.0, -1.0, np.nan, 1.5):
+        with pytest.raises(ParameterError, match="velocity_scale"):
+            constant_velocity_times(robot, np.stack([robot.home, robot.home]), scale)
 
 
-def test_limits_and_shapes_that_cannot_be_grown_are_named(robot: Robot) -> None:
+def test_limits_and_shapes_that_cannot_be_inflated_are_named(robot: Robot) -> None:
     path = np.stack([robot.home, robot.home])
     path[1, 3] = 0.5
-    beyond = timed_check(robot, problem_with(robot), path, [0.0, 9.0])
+    beyond = check_timed_path(robot, problem_with(robot), path, [0.0, 9.0])
     assert not beyond and "left_joint4" in beyond.reason
     floor = Obstacle(name="floor", half_space={"normal": (0, 0, 1)}, position=(0, 0, -2), velocity=(0, 0, 0.1))
     with pytest.raises(ParameterError, match="floor"):
-        timed_check(robot, problem_with(robot, floor), np.stack([robot.home, robot.home]), [0.0, 1.0])
+        check_timed_path(robot, problem_with(robot, floor), np.stack([robot.home, robot.home]), [0.0, 1.0])

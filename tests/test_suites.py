@@ -14,7 +14,7 @@ from apex_ompl import problems
 from apex_ompl.api import load_problem
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ApexError, ParameterError, UnknownNameError
-from apex_ompl.live.moving import at_time
+from apex_ompl.live.moving import obstacle_at
 from apex_ompl.problems import alignment, scenes
 from apex_ompl.problems.catalogue import SPLITS, ProblemId
 from apex_ompl.problems.frozen import digest
@@ -139,7 +139,7 @@ def test_cubes_have_their_size_and_speed_and_are_clear_of_start_and_goal(robot: 
             if speed:
                 assert np.linalg.norm(cube.velocity) == pytest.approx(float(speed), abs=1e-4)
         for q, time in ((start, 0.0), (goal, duration)):
-            scene = [at_time(cube, time) for cube in problem.scene]
+            scene = [obstacle_at(cube, time) for cube in problem.scene]
             assert CollisionChecker(robot, scene, problem.attached).distance(q).value >= 0.03
     assert counts == {1} if speed else 1 < len(counts) and counts <= {1, 2, 3}
 

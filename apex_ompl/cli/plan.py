@@ -120,7 +120,8 @@ def _summary(result: PlanResult) -> str:
     if result.trajectory is not None:
         uses = ", ".join(f"{name} {share:.3f}" for name, share in result.limit_use.items() if name != "position")
         lines.append(
-            f"  motion     {result.trajectory.duration:.3f} s, off the path by {result.deviation:.4f} rad at most"
+            f"  motion     {result.trajectory.duration:.3f} s, at most {result.deviation:.4f} rad off the path, "
+            f"checked every {result.timing_resolution:.2g} rad"
         )
         lines.append(f"  limits     {uses} used")
     lines.append(f"  checks     {result.checks} states judged, planner {result.planner}, seed {result.seed}")

@@ -1,6 +1,6 @@
-"""Obstacles that move: where they are, and whether a timed path keeps clear of them.
+"""Moving obstacles: their poses over time, and the collision check of timed paths among them.
 
-Obstacles move at constant velocity from time 0, when the path begins.
+Obstacles move at constant velocity v from time 0, when the path starts: p(t) = p(0) + v t.
 """
 
 from __future__ import annotations
@@ -18,19 +18,19 @@ from apex_ompl.scene.problem import Problem
 from apex_ompl.types import Array
 from apex_ompl.util.resolution import FULL_RESOLUTION
 
-SHORTEST = 0.01  # time of a step of a path [s]
-MOST_PIECES = 1_000_000
-STEP = 0.005  # that obstacles move on while one place, grown by half of it, stands for them [m]
+SHORTEST_STEP = 0.01  # time between two states of a path [s]
+MAX_INTERVALS = 1_000_000
+OBSTACLE_STEP = 0.005  # largest motion of an obstacle during one time interval of the check [m]
 
 
 @dataclass(frozen=True)
-class TimedCheck:
+class TimedPathCheck:
     """Outcome of the check of a timed path.
 
     Attributes:
-        ok: Whether the path is inside the limits of positions and velocities, and free.
-        reason: One sentence about the first fault found, empty when there is none: limits are looked at first.
-        time: By when it is met [s], or None.
+        ok: Whether the path is inside the limits of positions and velocities, and collision-free.
+        reason: One sentence about the first fault found, empty without one; limits are checked first.
+        time: Time by which the fault occurs [s], or None.
     """
 
     ok: bool
@@ -38,23 +38,23 @@ class TimedCheck:
     time: float | None = None
 
     def __bool__(self) -> bool:
-        """Whether the path is inside the limits and free."""
+        """Whether the path is inside the limits and collision-free."""
         return self.ok
 
 
-def at_time(obstacle: Obstacle, time: float) -> Obstacle:
-    """Return an obstacle as it stands at a time [s]."""
+def obstacle_at(obstacle: Obstacle, time: float) -> Obstacle:
+    """Return an obstacle at its position at a time [s]."""
     if not obstacle.moving:
         return obstacle
     x, y, z = (float(v) for v in np.add(obstacle.position, np.multiply(obstacle.velocity or (0, 0, 0), time)))
     return obstacle.model_copy(update={"position": (x, y, z)})
 
 
-def grown(obstacle: Obstacle, by: float) -> Obstacle:
-    """Return an obstacle that holds all points within ``by`` of it [m].
+def inflated(obstacle: Obstacle, by: float) -> Obstacle:
+    """Return an obstacle that contains all points within a distance ``by`` of it [m].
 
     Raises:
-        ParameterError: It is a mesh or a half-space.
+        ParameterError: The obstacle is a mesh or a half-space.
     """
     if obstacle.box is not None:
         x, y, z = (edge + 2.0 * by for edge in obstacle.box)
@@ -70,79 +70,82 @@ def grown(obstacle: Obstacle, by: float) -> Obstacle:
     raise ParameterError("scene", obstacle.name, "moving obstacles that are boxes, spheres, cylinders or capsules")
 
 
-def timed_check(
+def check_timed_path(
     robot: Robot,
     problem: Problem,
     path: ArrayLike,
     times: ArrayLike,
     resolution: float = FULL_RESOLUTION,
-) -> TimedCheck:
-    """Decide whether a path that passes its states at given times is free of obstacles, moving ones among them.
+) -> TimedPathCheck:
+    """Check whether a timed path is inside the limits and free of collisions with still and moving obstacles.
 
-    Between states the path goes straight at an even pace. It is cut into pieces during which no obstacle moves more
-    than ``STEP``; each piece is judged among obstacles grown by half of that, at the places of the middle of its time,
-    so that obstacles miss nothing between samples. Along the path states are judged as in the full check.
+    Between states the path is straight and its velocity constant. Time is divided into intervals in which no obstacle
+    moves more than ``OBSTACLE_STEP``. In each, the obstacles stand where they are in its middle, inflated by half of
+    ``OBSTACLE_STEP``, and so contain all that they sweep; the states are those of the full check.
 
     Args:
         robot: The robot.
-        problem: Its obstacles, where they are at time 0, and its held objects count.
+        problem: The problem, with obstacles where they are at time 0, and held objects.
         path: States, shape (N, dof).
-        times: When they are passed, shape (N,), from 0 on and growing [s].
-        resolution: Spacing of the states judged [rad, max-norm].
+        times: Times of the states, increasing from 0, shape (N,) [s].
+        resolution: Spacing of the states that are checked [rad, max-norm].
 
     Raises:
-        ParameterError: Another shape, times that do not grow from 0, or a moving obstacle that cannot be grown.
+        ParameterError: Another shape, times that do not increase from 0, or a moving obstacle that cannot be inflated.
     """
     path, times = np.asarray(path, dtype=np.float64), np.asarray(times, dtype=np.float64)
     if path.ndim != 2 or path.shape[1] != robot.dof or len(path) < 2:
         raise ParameterError("path", path.shape, f"an array of shape (N, {robot.dof}) with 2 states or more")
     if times.shape != (len(path),) or times[0] != 0.0 or not (np.diff(times) > 0.0).all() or not np.isfinite(times[-1]):
-        raise ParameterError("times", times.shape, f"{len(path)} times that grow from 0")
+        raise ParameterError("times", times.shape, f"{len(path)} times that increase from 0")
     for k, q in enumerate(path):
         if fault := robot.limit_fault(q):
-            return TimedCheck(False, f"state {k}: {fault}", float(times[k]))
+            return TimedPathCheck(False, f"state {k}: {fault}", float(times[k]))
     speeds = np.abs(np.diff(path, axis=0)) / np.diff(times)[:, None]
     excess = speeds / robot.limits.velocity
     if excess.max() > 1.0 + 1e-9:
         worst, joint = divmod(int(excess.argmax()), robot.dof)
         name, limit = robot.joint_names[joint], robot.limits.velocity[joint]
-        return TimedCheck(
+        return TimedPathCheck(
             False, f"{name} at {speeds[worst, joint]:.3g}, its limit is {limit:.3g} rad/s", float(times[worst])
         )
     movers = [o for o in problem.scene if o.moving]
     fastest = max((float(np.linalg.norm(o.velocity or (0, 0, 0))) for o in movers), default=0.0)
-    if fastest * times[-1] / STEP > MOST_PIECES:
-        raise ParameterError("times", float(times[-1]), f"an end at which no obstacle moved {MOST_PIECES * STEP:g} m")
-    pieces = max(1, int(np.ceil(fastest * times[-1] / STEP)))
-    cuts = np.linspace(0.0, times[-1], pieces + 1)
-    scene = [grown(o, STEP / 2.0) if o.moving else o for o in problem.scene]
+    if fastest * times[-1] / OBSTACLE_STEP > MAX_INTERVALS:
+        farthest = MAX_INTERVALS * OBSTACLE_STEP
+        raise ParameterError("times", float(times[-1]), f"an end before an obstacle has moved {farthest:g} m")
+    intervals = max(1, int(np.ceil(fastest * times[-1] / OBSTACLE_STEP)))
+    bounds = np.linspace(0.0, times[-1], intervals + 1)
+    scene = [inflated(o, OBSTACLE_STEP / 2.0) if o.moving else o for o in problem.scene]
     checker = CollisionChecker(robot, scene, problem.attached)
-    for begin, end in zip(cuts[:-1], cuts[1:], strict=True):
+    for begin, end in zip(bounds[:-1], bounds[1:], strict=True):
         for mover in movers:
-            checker.move(mover.name, at_time(mover, (begin + end) / 2.0).position)
+            checker.move(mover.name, obstacle_at(mover, (begin + end) / 2.0).position)
         knots = np.concatenate([[begin], times[(times > begin) & (times < end)], [end]])
         states = np.stack([np.interp(knots, times, column) for column in path.T], axis=1)
         hit = checker.first_collision(states, resolution)
         if hit is not None:
             contacts = checker.contacts(hit.state)
             what = str(contacts[0]) if contacts else "in collision"
-            return TimedCheck(False, f"between {begin:.3f} and {end:.3f} s: {what}", float(end))
-    return TimedCheck(True)
+            return TimedPathCheck(False, f"between {begin:.3f} and {end:.3f} s: {what}", float(end))
+    return TimedPathCheck(True)
 
 
-def even_times(robot: Robot, path: Array, pace: float) -> Array:
-    """Return times for the states of a path, shape (N,) [s], so that each step takes its slowest joint's time.
+def constant_velocity_times(robot: Robot, path: Array, velocity_scale: float) -> Array:
+    """Return times of the states of a path, shape (N,) [s], between which the velocity is constant.
+
+    A step takes max_j |dq_j| / (velocity_scale * limit_j), and at least 0.01 s.
 
     Args:
         robot: The robot.
         path: States, shape (N, dof).
-        pace: Share of the velocity limits, in (0, 1].
+        velocity_scale: Share of the velocity limits, in (0, 1].
 
     Raises:
-        ParameterError: ``pace`` is not.
+        ParameterError: ``velocity_scale`` is outside its range.
     """
-    if not 0.0 < pace <= 1.0:
-        raise ParameterError("pace", pace, "a share of the velocity limits, above 0 and at most 1")
-    steps = (np.abs(np.diff(path, axis=0)) / robot.limits.velocity).max(axis=1) / pace
-    times: Array = np.concatenate([[0.0], np.cumsum(np.maximum(steps, SHORTEST))])
+    if not 0.0 < velocity_scale <= 1.0:
+        raise ParameterError("velocity_scale", velocity_scale, "a share of the velocity limits, above 0 and at most 1")
+    steps = (np.abs(np.diff(path, axis=0)) / robot.limits.velocity).max(axis=1) / velocity_scale
+    times: Array = np.concatenate([[0.0], np.cumsum(np.maximum(steps, SHORTEST_STEP))])
     return times

@@ -19,8 +19,9 @@ MAX_BRIDGES = 20
 
 
 def repair(
-    ready: PlanningSetup, path: Array, fault: FullCheck, deadline: float, interrupt: Interrupt | None = None
-) -> Array | None:
+    ready: PlanningSetup, path: Array, fault: FullCheck, deadline: float, interrupt: Interrupt | None = None,
+    *, resolution: float = FULL_RESOLUTION,
+) -> Array | None:  # fmt: skip
     """Plan stretches that fail the full check anew, at the resolution of the full check.
 
     Args:
@@ -29,6 +30,7 @@ def repair(
         fault: Outcome of the full check of ``path``.
         deadline: Value of ``time.perf_counter`` at which to give up [s].
         interrupt: Ends the work in good order when it was pressed.
+        resolution: Spacing of the full check [rad, max-norm].
 
     Returns:
         A path that passes the full check, or None.
@@ -39,11 +41,11 @@ def repair(
         if left <= 0.0 or fault.segment is None or interrupt.pressed:
             return None
         first, last = _free_ends(ready, path, fault.segment)
-        bridge = _bridge(ready, path[first], path[last], left, interrupt)
+        bridge = _bridge(ready, path[first], path[last], left, interrupt, resolution=resolution)
         if bridge is None:
             return None
         path = np.concatenate([path[:first], bridge, path[last + 1 :]])
-        fault = full_check(ready.checker, path, ready.start, ready.goals)
+        fault = full_check(ready.checker, path, ready.start, ready.goals, resolution)
         if fault:
             return path
     return None
@@ -62,13 +64,15 @@ def _free_ends(ready: PlanningSetup, path: Array, segment: int) -> tuple[int, in
     return first, last
 
 
-def _bridge(ready: PlanningSetup, a: Array, b: Array, timeout: float, interrupt: Interrupt) -> Array | None:
+def _bridge(
+    ready: PlanningSetup, a: Array, b: Array, timeout: float, interrupt: Interrupt, *, resolution: float
+) -> Array | None:
     """Return a path between two free states, checked at the resolution of the full check, or None."""
     space = state_space(ready.robot)
     setup = og.SimpleSetup(space)
     si = setup.getSpaceInformation()
     validity_checker = StateValidityChecker(si, ready.checker)
-    motions = MotionValidator(si, MotionCheck(ready.checker, FULL_RESOLUTION))
+    motions = MotionValidator(si, MotionCheck(ready.checker, resolution))
     setup.setStateValidityChecker(validity_checker)
     si.setMotionValidator(motions)
     setup.setStartAndGoalStates(to_state(si, a), to_state(si, b))

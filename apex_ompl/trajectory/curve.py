@@ -1,4 +1,4 @@
-"""Paths as smooth curves: polylines whose corners are blended."""
+"""Polylines, and smooth curves along them that round their corners."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from numpy.typing import ArrayLike
 
 from apex_ompl.types import Array
 
-SAME = 1e-9  # distance of states that count as one [rad]
-STRAIGHT = 1e-7  # change of direction that is none
+SAME_STATE = 1e-9  # distance below which states count as one [rad]
+SAME_DIRECTION = 1e-7  # norm of the difference of unit directions below which they count as one
 
 
 @dataclass(frozen=True, eq=False)
 class Polyline:
-    """States joined by straight lines, without repeated ones.
+    """States joined by straight lines, no two neighbours the same.
 
     Attributes:
-        states: Shape (N, dof).
-        arc: Arc lengths of the states, the first one 0, shape (N,) [rad].
+        states: Shape (N, dof) [rad; synergies 0..1].
+        arc: Arc length up to each state, from 0, shape (N,) [rad].
     """
 
     states: Array
@@ -28,18 +28,18 @@ class Polyline:
 
     @classmethod
     def through(cls, path: ArrayLike) -> Polyline:
-        """Return the polyline through the states of a path, shape (N, dof); the ends stay as they are.
+        """Return the polyline through the states of a path, shape (N, dof), with the same ends bit for bit.
 
-        Where all states count as one, it has the first and the last of them, or one if they are the same.
+        Where all states count as one, it has the first and the last of them, or one if these are equal.
         """
         states = np.array(path, dtype=float)
         kept, rows = [0], states.tolist()
         for k, row in enumerate(rows):
-            if math.dist(row, rows[kept[-1]]) > SAME:
+            if math.dist(row, rows[kept[-1]]) > SAME_STATE:
                 kept.append(k)
         last = len(states) - 1
         if kept[-1] != last and len(kept) > 1:
-            kept[-1] = last  # which is next to it
+            kept[-1] = last  # they count as one
         elif kept[-1] != last and not np.array_equal(states[0], states[last]):
             kept.append(last)
         states = states[kept]
@@ -47,18 +47,18 @@ class Polyline:
 
     @property
     def length(self) -> float:
-        """Its length [rad]."""
+        """Arc length [rad]."""
         return float(self.arc[-1])
 
-    def at(self, places: Array) -> Array:
-        """Return the states at arc lengths, shape (n, dof)."""
-        found: Array = np.stack([np.interp(places, self.arc, column) for column in self.states.T], axis=1)
-        return found
+    def at(self, arc: Array) -> Array:
+        """Return the states at arc lengths of shape (n,) [rad], shape (n, dof)."""
+        states: Array = np.stack([np.interp(arc, self.arc, column) for column in self.states.T], axis=1)
+        return states
 
     def corners(self) -> Polyline:
-        """Return the polyline through the ends and the states at which the direction changes; arc lengths stay."""
+        """Return the polyline through the ends and the states at which the direction changes; arc lengths are kept."""
         directions = np.diff(self.states, axis=0) / np.diff(self.arc)[:, None]
-        turns = np.linalg.norm(np.diff(directions, axis=0), axis=1) > STRAIGHT
+        turns = np.linalg.norm(np.diff(directions, axis=0), axis=1) > SAME_DIRECTION
         kept = np.concatenate([[True], turns, [True]])
         return Polyline(self.states[kept], self.arc[kept])
 
@@ -67,11 +67,12 @@ class Polyline:
 class Curve:
     """A uniform cubic B-spline whose control points lie on a polyline at even arc lengths.
 
-    It has continuous curvature, follows straight stretches at unit speed, begins and ends with the polyline, and stays
-    within any box that the polyline stays in. A corner is cut by at most a third of the distance of control points.
+    It is q(s) = sum_i B_i(s) P_i over the arc length s of the polyline. It has continuous curvature, follows straight
+    stretches at unit speed, starts and ends with the polyline, and stays within any axis-aligned box that the polyline
+    stays in. A corner is cut by at most a third of the spacing of control points.
 
     Attributes:
-        control: Control points, one beyond each end, shape (spans + 3, dof).
+        control: Control points P_i, one beyond each end, shape (spans + 3, dof).
         spacing: Distance of control points along the polyline [rad].
     """
 
@@ -89,26 +90,26 @@ class Curve:
 
     @property
     def spans(self) -> int:
-        """Of how many pieces it is."""
+        """Number of polynomial pieces."""
         return len(self.control) - 3
 
-    def derivatives(self, per: int) -> tuple[Array, Array]:
-        """Return first and second derivatives at ``per`` places a piece, and at the end, shape (places, dof)."""
-        u = np.arange(per)[:, None] / per
+    def derivatives(self, per_span: int) -> tuple[Array, Array]:
+        """Return q'(s) and q''(s) at ``per_span`` arc lengths a span and at the end, shape (K, dof)."""
+        u = np.arange(per_span)[:, None] / per_span
         slopes = np.hstack([-((1 - u) ** 2), 3 * u**2 - 4 * u, 1 + 2 * u - 3 * u**2, u**2]) / 2.0
-        bends = np.hstack([1 - u, 3 * u - 2, 1 - 3 * u, u])
+        curvatures = np.hstack([1 - u, 3 * u - 2, 1 - 3 * u, u])
         windows = np.lib.stride_tricks.sliding_window_view(self.control, 4, axis=0)[: self.spans]  # (spans, dof, 4)
-        made = []
-        for weights, power in ((slopes, 1), (bends, 2)):
+        derivatives = []
+        for weights, order in ((slopes, 1), (curvatures, 2)):
             inner = (windows @ weights.T).transpose(0, 2, 1).reshape(-1, self.control.shape[1])
-            last = self.control[-3:].T @ ((-0.5, 0.0, 0.5) if power == 1 else (1.0, -2.0, 1.0))
-            made.append(np.ascontiguousarray(np.vstack([inner, last]) / self.spacing**power))
-        return made[0], made[1]
+            last = self.control[-3:].T @ ((-0.5, 0.0, 0.5) if order == 1 else (1.0, -2.0, 1.0))
+            derivatives.append(np.ascontiguousarray(np.vstack([inner, last]) / self.spacing**order))
+        return derivatives[0], derivatives[1]
 
-    def points(self, places: Array) -> Array:
-        """Return the points at arc lengths of the polyline, shape (n, dof)."""
-        piece = np.clip((places / self.spacing).astype(int), 0, self.spans - 1)
-        u = (places / self.spacing - piece)[:, None]
+    def points(self, arc: Array) -> Array:
+        """Return q(s) at arc lengths of the polyline of shape (n,) [rad], shape (n, dof)."""
+        span = np.clip((arc / self.spacing).astype(int), 0, self.spans - 1)
+        u = (arc / self.spacing - span)[:, None]
         weights = np.hstack([(1 - u) ** 3, 3 * u**3 - 6 * u**2 + 4, 1 + 3 * u + 3 * u**2 - 3 * u**3, u**3]) / 6.0
-        found: Array = np.einsum("nk,nkd->nd", weights, self.control[piece[:, None] + np.arange(4)])
-        return found
+        points: Array = np.einsum("nk,nkd->nd", weights, self.control[span[:, None] + np.arange(4)])
+        return points

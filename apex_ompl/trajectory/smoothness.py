@@ -1,6 +1,6 @@
-"""Smoothness of paths and motions: jerk, spectral arc length.
+"""Smoothness of paths and motions: root mean square jerk, and spectral arc length.
 
-S_r of the paper, the sum of joint-space steps, is :func:`apex_ompl.trajopt.path.path_length`.
+The smoothness S_r of the paper, the sum of joint-space steps, is :func:`apex_ompl.trajopt.path.path_length`.
 """
 
 from __future__ import annotations
@@ -12,21 +12,21 @@ from apex_ompl.errors import ParameterError
 from apex_ompl.trajopt.path import resample
 from apex_ompl.types import Array
 
-STEPS = 128  # into which a path is cut for its jerk
+STEPS = 128  # of even length that a path is resampled to for its jerk
 
 
 def jerk(path: ArrayLike, duration: float = 1.0) -> float:
-    """Return the root mean square of the jerk of a path that is run through at even speed [rad/s^3].
+    """Return the root mean square jerk of a path that is followed at constant speed [rad/s^3].
 
-    It is that of third differences of states at even distances, 129 of them, so that the corners of a polyline count as
-    if they were rounded over about a hundredth of its length.
+    The jerk is the third difference of 129 states at even distances, d3q (128 / duration)^3, so that a corner of a
+    polyline counts as if it were rounded over about a hundredth of the path's length.
 
     Args:
         path: States, shape (N, dof).
-        duration: Time in which it is run through [s].
+        duration: Duration of the motion [s].
 
     Raises:
-        ParameterError: ``path`` has not two states or more, or ``duration`` is not positive.
+        ParameterError: ``path`` has fewer than two states, or ``duration`` is not positive.
     """
     states = _states(path)
     if not duration > 0.0:
@@ -38,17 +38,17 @@ def jerk(path: ArrayLike, duration: float = 1.0) -> float:
 def spectral_arc_length(
     speed: ArrayLike, spacing: float, *, cutoff: float = 10.0, threshold: float = 0.05, padding: int = 4
 ) -> float:
-    """Return the spectral arc length of a profile of speed, 0 or less; smoother motions have one nearer to 0.
+    """Return the spectral arc length of a speed profile (SPARC), at most 0 and nearer to 0 for smoother motions.
 
-    The negative length of the normalised amplitude spectrum up to ``cutoff`` or to the last frequency at which it
-    reaches ``threshold`` (SPARC, Balasubramanian et al. 2015).
+    It is -sum_k sqrt((df_k / f_c)^2 + (dV_k)^2) over the normalised amplitude spectrum V(f), up to f_c: ``cutoff``, or
+    the last frequency below it at which V reaches ``threshold`` (Balasubramanian et al. 2015).
 
     Args:
         speed: Speeds at even times, shape (N,).
         spacing: Time between them [s].
         cutoff: Highest frequency [Hz].
-        threshold: Amplitude, as a share of that at 0 Hz.
-        padding: Zeros are added up to two to the power of this, times the next power of two of N.
+        threshold: Least amplitude, as a share of the largest.
+        padding: The profile is padded with zeros to 2^padding times the next power of two of N.
 
     Raises:
         ParameterError: There is no movement, or ``spacing`` is not positive.

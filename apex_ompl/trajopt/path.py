@@ -14,7 +14,7 @@ from apex_ompl.trajopt.spline import Spline
 from apex_ompl.types import Array
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Path:
     """Path in joint space, from planner to time parameterization.
 
@@ -56,6 +56,10 @@ class Path:
     def length(self) -> float:
         """Sum of Euclidean joint-space steps between the states [rad]; S_r of the paper."""
         return path_length(self.states)
+
+    def __repr__(self) -> str:
+        """Return the numbers of states and joints, and what the path is."""
+        return f"Path({len(self)} states, {self.dof} joints, {'polyline' if self.spline is None else 'B-spline'})"
 
     def __len__(self) -> int:
         """Number of states."""

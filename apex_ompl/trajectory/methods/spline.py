@@ -1,0 +1,116 @@
+"""Blended motions: cubic B-splines in time along a curve that rounds the corners of a polyline."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from apex_ompl.kernel.reachability import farthest, fastest, moments
+from apex_ompl.robot.model import Limits
+from apex_ompl.trajectory.curve import Curve, Polyline
+from apex_ompl.trajectory.deviation import deviation_bound
+from apex_ompl.trajectory.trajectory import Trajectory
+from apex_ompl.types import Array
+
+GRID_POINTS_PER_SPAN = 10
+MAX_SPANS = 20_000
+CONTROL_POINT_SPACING = 3.0  # of the curve, as a multiple of the deviation: a corner is cut by a third of the spacing
+KNOT_SPACINGS = tuple(0.001 * k * 2**n for n in range(2, 13) for k in (1, 1.5))  # in time, from 0.004 to 6.144 [s]
+FIRST_SPACING = 4  # index of the knot spacing that is tried first
+SAME_DURATION = 1.0005  # ratio of durations below which the motion with fewer knots is preferred
+NANOSECOND = 1e-9
+
+
+def blended(
+    line: Polyline, limits: Limits, joint_names: tuple[str, ...], deviation: float
+) -> tuple[Trajectory, float] | None:
+    """Return the fastest motion along a curve that rounds the corners of a polyline.
+
+    1. A uniform cubic B-spline q(s) along the polyline rounds its corners (:class:`apex_ompl.trajectory.curve.Curve`).
+    2. Reachability analysis gives the largest speeds along q(s) within the limits of velocity and acceleration
+       (:mod:`apex_ompl.kernel.reachability`; Pham and Pham 2018).
+    3. States at times h apart on that motion are the control points of a uniform cubic B-spline in time. Averages of
+       states within the limits are within the limits, and the jerk is at most 2 a_max / h. In step 2 the limit of
+       acceleration is min(a_max, j_max h); what is still over a limit is removed by stretching h.
+    4. The h with the shortest motion is chosen, or the next smaller one that keeps the deviation.
+
+    Args:
+        line: The polyline, of positive length.
+        limits: Limits of the joints.
+        joint_names: Names of the joints, in the order of the columns.
+        deviation: Largest distance of the motion from the polyline [rad].
+
+    Returns:
+        The motion and a bound on its distance from the polyline [rad], or None where none keeps ``deviation``.
+    """
+    if line.length > MAX_SPANS * CONTROL_POINT_SPACING * deviation:
+        return None
+    curve = Curve.along(line, CONTROL_POINT_SPACING * deviation)
+    first, second = curve.derivatives(GRID_POINTS_PER_SPAN)
+    step, window = curve.spacing / GRID_POINTS_PER_SPAN, 2.0 * curve.spacing
+    grid = np.linspace(0.0, line.length, len(first))
+    if farthest(curve.points(grid), grid, line.states, line.arc, window) > deviation:
+        return None
+    squared_speed = np.empty(len(first))
+    tried: dict[int, tuple[float, Array, Array]] = {}  # least knot spacing [s], control points, their arc lengths
+
+    def duration_with(index: int) -> float:
+        """Return the duration of the motion with a knot spacing by its index, and keep the motion in ``tried``."""
+        if index not in tried:
+            spacing = KNOT_SPACINGS[index]
+            acceleration = np.minimum(limits.acceleration, limits.jerk * spacing)
+            fastest(first, second, limits.velocity, acceleration, step, squared_speed)
+            duration = moments(squared_speed, step, 0.0, np.empty(0))
+            count = max(1, int(duration / spacing))
+            arc = np.empty(count + 1)
+            moments(squared_speed, step, duration / count, arc)
+            arc[-1] = line.length
+            points = curve.points(arc)
+            points[0], points[-1] = line.states[0], line.states[-1]
+            control = np.concatenate([points[:1], points[:1], points, points[-1:], points[-1:]])
+            tried[index] = (least_knot_spacing(control, limits), control, arc)
+        least, control, _ = tried[index]
+        return float(least * (len(control) - 3))
+
+    best = FIRST_SPACING
+    while best + 1 < len(KNOT_SPACINGS) and duration_with(best + 1) < SAME_DURATION * duration_with(best):
+        best += 1
+    while best > 0 and duration_with(best - 1) * SAME_DURATION < duration_with(best):
+        best -= 1
+    for index in range(best, -1, -1):  # knots far apart in time cut corners of the curve
+        duration_with(index)
+        spacing, control, arc = tried[index]
+        motion = spline_in_time(control, spacing, joint_names)
+        low, high = line.states.min(axis=0), line.states.max(axis=0)  # the spline is inside, except for rounding
+        motion = replace(motion, positions=motion.positions.clip(low, high))
+        arc = np.concatenate([[0.0], arc, [line.length]])
+        bound = deviation_bound(motion, line, (motion.times, arc), window, deviation)
+        if bound <= deviation:
+            return motion, bound
+    return None
+
+
+def least_knot_spacing(control: Array, limits: Limits) -> float:
+    """Return the least knot spacing h at which a uniform cubic B-spline in time keeps the limits [s].
+
+    With control points P_i, velocities are convex combinations of the first differences dP / h; accelerations at the
+    knots are d2P / h^2, and jerks between them d3P / h^3. So h = max_k max |dkP / limit_k|^(1/k).
+    """
+    least = []
+    difference = control
+    for order, limit in enumerate((limits.velocity, limits.acceleration, limits.jerk), 1):
+        difference = np.diff(difference, axis=0)
+        least.append(float(np.abs(difference / limit).max(initial=0.0)) ** (1.0 / order))
+    return NANOSECOND * float(math.ceil(max(least) * (1.0 + 1e-9) / NANOSECOND))
+
+
+def spline_in_time(control: Array, spacing: float, joint_names: tuple[str, ...]) -> Trajectory:
+    """Return the uniform cubic B-spline in time with control points of shape (K + 2, dof) and a knot spacing [s]."""
+    before, at, after = control[:-2], control[1:-1], control[2:]
+    positions = (before + 4.0 * at + after) / 6.0
+    positions[0], positions[-1] = control[0], control[-1]
+    velocities, accelerations = (after - before) / (2.0 * spacing), (after - 2.0 * at + before) / spacing**2
+    times = np.arange(len(positions), dtype=float) * spacing
+    return Trajectory(times, positions, velocities, accelerations, joint_names)

@@ -1,0 +1,152 @@
+"""Plans with timing: the motion in the result, its check, and the command line."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from apex_ompl import api, cli, plan, planners, planning
+from apex_ompl.errors import ParameterError, TimingError
+from apex_ompl.ompl_adapter.setup import assemble
+from apex_ompl.ompl_adapter.validity import full_check
+from apex_ompl.result import PlanResult, PlanStatus
+from apex_ompl.trajectory import Timing, Trajectory, time_path
+from apex_ompl.trajopt.path import Path as JointPath
+from apex_ompl.util.resolution import MOTION_RESOLUTION
+
+
+def test_plans_are_timed_and_checked() -> None:
+    result = plan("ball_in_cup", timeout=20.0)
+    motion = result.trajectory
+    assert result and motion is not None and motion.dof == 16 and 0.3 < motion.duration < 10.0
+    assert set(result.limit_use) == {"position", "velocity", "acceleration", "jerk"}
+    assert 0.9 < max(result.limit_use.values()) <= 1.0 + 1e-9 and result.deviation <= Timing().deviation
+    ready = assemble(result.problem)
+    states = motion.sample(0.001).position
+    assert full_check(ready.checker, states, ready.start, ready.goals)
+    assert result.times["timing"] > 0.0 and result.times["timing proof"] > 0.0
+    assert result.as_dict()["duration"] == motion.duration
+    assert result.timing_resolution == MOTION_RESOLUTION
+
+
+def test_paths_that_graze_an_obstacle_between_samples_are_repaired() -> None:
+    """This one is 0.03 mm inside an obstacle between the samples of its own full check."""
+    name = "clutter/medium/900014"
+    untimed, result = (plan(name, "rrtconnect", timeout=20.0, seed=14, timing=timing) for timing in (False, True))
+    assert untimed and result and result.trajectory is not None and result.solved_by == "rrtconnect+repair"
+    ready, finer = assemble(result.problem), MOTION_RESOLUTION / 2.0
+    assert not full_check(ready.checker, untimed.path, resolution=finer), "or the test shows nothing"  # type: ignore[arg-type]
+    assert full_check(ready.checker, result.path, ready.start, ready.goals, finer)  # type: ignore[arg-type]
+    assert full_check(ready.checker, result.trajectory.sample(0.001).position, ready.start, ready.goals, finer)
+
+
+def test_a_grazing_path_that_can_be_neither_repaired_nor_timed_is_no_success(monkeypatch: pytest.MonkeyPatch) -> None:
+    resolutions: list[float] = []
+
+    def fails(*args: object, resolution: float) -> None:
+        resolutions.append(resolution)
+
+    def check(checker: object, path: np.ndarray, *args: object, **options: object) -> object:
+        found = full_check(checker, path, *args, **options)  # type: ignore[arg-type]
+        finely = len(args) == 3 and args[2] == MOTION_RESOLUTION
+        return replace(found, ok=False, reason="it grazes", segment=0) if finely else found
+
+    monkeypatch.setattr(planning, "repair", fails)
+    monkeypatch.setattr(planning, "full_check", check)
+    result = plan("ball_in_cup", timeout=20.0)
+    assert resolutions == [MOTION_RESOLUTION] and result.status is PlanStatus.TIMING_FAILED
+    assert result.reason == "the path cannot be timed, it fails the full check at 0.00031 rad, it grazes" and np.isnan(
+        result.timing_resolution
+    )
+
+
+def test_results_without_a_timing_resolution_are_read(tmp_path: Path) -> None:
+    plan("ball_in_cup", timeout=20.0).save(tmp_path / "new.json")
+    data = json.loads((tmp_path / "new.json").read_text())
+    del data["timing_resolution"]
+    (tmp_path / "old.json").write_text(json.dumps(data))
+    assert np.isnan(PlanResult.load(tmp_path / "old.json").timing_resolution)
+
+
+def test_joints_at_their_limits_do_not_stop_a_plan() -> None:
+    ready = assemble(api.load_problem("reach_past_post"))
+    robot = ready.robot
+    states = np.repeat(ready.start[None], 256, axis=0)
+    states[:, 6], states[:, 13] = robot.limits.upper[6], robot.limits.lower[13]
+    states[:, 5] += 0.2 * np.sin(5.0 * np.linspace(0.0, 1.0, 256))
+    ready = replace(ready, start=states[0], goals=states[-1:])
+    run = planning.PlanRun(ready, "rrtconnect", planners.parameters("rrtconnect"), 0)
+    exact = run.result(PlanStatus.EXACT_SOLUTION, path=JointPath(states))
+    assert planning.parameterize(run, exact, Timing()).trajectory.duration < 5.0
+
+
+def test_a_path_that_cannot_be_timed_is_no_success(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(*args: object) -> None:
+        raise TimingError("the motion collides")
+
+    monkeypatch.setattr(planning, "time_path", fails)
+    result = plan("ball_in_cup", timeout=20.0)
+    assert result.status is PlanStatus.TIMING_FAILED and not result and result.path is not None
+    assert result.reason == "the path cannot be timed, the motion collides" and result.trajectory is None
+    assert plan("ball_in_cup", timeout=20.0, timing=False)
+
+
+def test_collisions_of_the_timed_motion_are_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Blending that cuts a corner by up to half a radian runs into what the path goes around."""
+    tight = plan("reach_past_post", "rrtconnect", timeout=20.0, seed=3)
+    wide = plan("reach_past_post", "rrtconnect", timeout=20.0, seed=3, timing=Timing(deviation=0.5))
+    ready = assemble(tight.problem)
+    for result in (tight, wide):
+        assert result and result.trajectory is not None
+        assert full_check(ready.checker, result.trajectory.sample(0.002).position, ready.start, ready.goals)
+    blind = time_path(wide.path, ready.robot.limits, ready.robot.joint_names, Timing(deviation=0.5))  # type: ignore[arg-type]
+    assert not full_check(ready.checker, blind.trajectory.sample(0.002).position), "or the test shows nothing"
+
+
+def test_what_is_no_timing_is_refused() -> None:
+    with pytest.raises(ParameterError, match="timing"):
+        api.plan("ball_in_cup", timing=0.5)  # type: ignore[arg-type]
+    with pytest.raises(ParameterError, match="start_velocity"):
+        api.plan("ball_in_cup", timing=Timing(start_velocity=(1.0, 2.0)))
+
+
+def test_the_command_writes_motions_and_draws_them(tmp_path, capsys: pytest.CaptureFixture[str]) -> None:  # type: ignore[no-untyped-def]
+    out = tmp_path / "m.traj.yaml"
+    assert cli.main(["plan", "ball_in_cup", "--timeout", "20", "--velocity-scale", "0.5", "--out", str(out)]) == 0
+    printed = capsys.readouterr().out
+    motion = Trajectory.load(out)
+    assert f"motion     {motion.duration:.3f} s" in printed and "jerk" in printed and "timing proof" in printed
+    assert "checked every 0.00031 rad" in printed
+    out = tmp_path / "c.traj.json"
+    assert cli.main(["plan", "ball_in_cup", "--timeout", "20", "--out", str(out), "--controllers"]) == 0
+    assert Trajectory.load(out).dof == 16 and "left_arm_controller" in out.read_text()
+    out = tmp_path / "r.npz"
+    assert cli.main(["plan", "ball_in_cup", "--timeout", "20", "--out", str(out)]) == 0
+    saved = PlanResult.load(out)
+    assert saved.trajectory is not None and saved.limit_use["jerk"] > 0.0
+    assert saved.timing_resolution == MOTION_RESOLUTION
+    for name in ("p.png", "p.svg"):
+        assert cli.main(["plot", str(out), "-o", str(tmp_path / name)]) == 0
+    assert (tmp_path / "p.png").read_bytes()[:4] == b"\x89PNG" and "<svg" in (tmp_path / "p.svg").read_text()
+    capsys.readouterr()
+    untimed = tmp_path / "n.npz"
+    assert cli.main(["plan", "ball_in_cup", "--timeout", "20", "--no-timing", "--out", str(untimed)]) == 0
+    without = PlanResult.load(untimed)
+    assert without.trajectory is None and np.isnan(without.timing_resolution)
+    for arguments, words in (
+        (["plot", str(untimed), "-o", str(tmp_path / "q.png")], "timed motion"),
+        (["plot", str(out), "-o", str(tmp_path / "q.txt")], "ending in"),
+        (["plot", str(tmp_path / "none.npz"), "-o", str(tmp_path / "q.png")], "none.npz"),
+        (["plan", "ball_in_cup", "--jerk-scale", "2"], "jerk_scale"),
+        (["plan", "ball_in_cup", "--controllers"], "--controllers"),
+        (["plan", "ball_in_cup", "--no-timing", "--out", str(tmp_path / "q.traj.yaml")], "--no-timing"),
+    ):
+        capsys.readouterr()
+        assert cli.main(arguments) == 2
+        printed = capsys.readouterr().err
+        assert words in printed and printed.count("\n") == 1
+    assert not list(tmp_path.glob("q*"))
