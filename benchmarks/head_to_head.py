@@ -26,7 +26,7 @@ import record
 from apex_ompl.benchmark import Row, Workers, bench, report, write_database, write_logs
 from apex_ompl.benchmark.metrics import share_interval
 from apex_ompl.benchmark.rows import PAPER
-from apex_ompl.benchmark.summary import MOMENTS, Figures, Table, figures, tables, warnings
+from apex_ompl.benchmark.summary import SHARE_TIMES, Statistics, Table, statistics, tables, warnings
 from apex_ompl.util.scripts import run_command
 from apex_ompl.util.validation import one_or_more
 
@@ -61,7 +61,7 @@ ROWS = (
 )
 
 
-def together(found: Sequence[Figures]) -> Table:
+def together(found: Sequence[Statistics]) -> Table:
     """Return what came of each row on levels of a kind, its paths beside those of apex for the same problems."""
     rows = []
     for group, levels in GROUPS.items():
@@ -71,10 +71,10 @@ def together(found: Sequence[Figures]) -> Table:
             parts = [f for f in mine if f.label == row.label]
             if not parts or (row.levels and group == "all"):
                 continue
-            f = Figures(group, row.label, [run for part in parts for run in part.runs])
+            f = Statistics(group, row.label, [run for part in parts for run in part.runs])
             low, high = share_interval(len(f.solved), len(f.runs))
             both = [math.log(run["length"] / best[run["problem"]]) for run in f.solved if best.get(run["problem"])]
-            shares = [f"{f.share_within(t):.3f}" if t <= f.limit else "-" for t in MOMENTS]
+            shares = [f"{f.share_within(t):.3f}" if t <= f.limit else "-" for t in SHARE_TIMES]
             times = [f.percentile(which, p) for which, p in TIMES]
             rows.append([
                 group, row.label, str(len(f.runs)),
@@ -82,7 +82,7 @@ def together(found: Sequence[Figures]) -> Table:
                 *(f"{1e3 * t:.0f}" if math.isfinite(t) else "-" for t in times),
                 f"{math.exp(np.mean(both)):.2f} ({len(both)})" if both else "-",
             ])  # fmt: skip
-    head = ["levels", "planner", "N", "solved (95 %, Wilson)", *(f"in {t:g} s" for t in MOMENTS), "first path p50 ms",
+    head = ["levels", "planner", "N", "solved (95 %, Wilson)", *(f"in {t:g} s" for t in SHARE_TIMES), "first path p50 ms",
             "p95", "p99", "end p50 ms", "length / apex's (problems that both solved)"]  # fmt: skip
     return Table("Levels together", head, rows)
 
@@ -101,7 +101,7 @@ def main() -> None:
     results = replace(results, runs=[run for run in results.runs if run["seed"] < seeds.get(run["label"], 0)])
     write_database(results, write_logs(results))
     report(folder, folder)
-    found = [table for table in (together(figures(results)), *tables(results)) if table.rows]
+    found = [table for table in (together(statistics(results)), *tables(results)) if table.rows]
     text = "\n\n".join([*warnings(results), *(table.markdown() for table in found)])
     said = {"tables": [{"title": t.title, "head": list(t.head), "rows": [list(r) for r in t.rows]} for t in found]}
     about = {"timeout": f"{TIMEOUT:g} s but for rows that say otherwise", "seeds": "0 to N - 1"}

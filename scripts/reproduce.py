@@ -25,7 +25,7 @@ import numpy as np
 
 from apex_ompl.benchmark import Results, Row, Workers, bench, metrics
 from apex_ompl.benchmark.rows import PAPER
-from apex_ompl.benchmark.summary import Figures, Table, about, figures, warnings
+from apex_ompl.benchmark.summary import Statistics, Table, about, statistics, warnings
 from apex_ompl.util.files import make_folder, write_atomically
 from apex_ompl.util.provenance import hardware, versions
 from apex_ompl.util.scripts import run_command
@@ -72,7 +72,7 @@ def runs(args: argparse.Namespace) -> Results:
 def failure(args: argparse.Namespace) -> tuple[dict[str, Any], list[Table], Figure, list[tuple[str, Any]]]:
     """Return R_f, S_r and time of each planner on each task, over all sizes of cubes."""
     results = runs(args)
-    per_level = [f for f in figures(results) if f.experiment.split("/")[1] in SIZES]
+    per_level = [f for f in statistics(results) if f.experiment.split("/")[1] in SIZES]
     found: dict[str, Any] = {}
     rows = []
     picture = blank(11, 4)
@@ -80,7 +80,7 @@ def failure(args: argparse.Namespace) -> tuple[dict[str, Any], list[Table], Figu
     for t, task in enumerate(TASKS):
         for k, row in enumerate(ROWS):
             mine = [f for f in per_level if f.experiment.startswith(f"{task}/") and f.label == row.label]
-            f = Figures(task, row.label, [run for one in mine for run in one.runs])
+            f = Statistics(task, row.label, [run for one in mine for run in one.runs])
             ratio = metrics.failure_ratio([run["solved"] for run in f.runs])
             low, high = (100.0 * (1.0 - v) for v in metrics.share_interval(len(f.solved), len(f.runs)))
             length, raw, took = f.median("length"), f.median("raw_length"), f.percentile("total", 50)
@@ -109,7 +109,7 @@ def failure(args: argparse.Namespace) -> tuple[dict[str, Any], list[Table], Figu
 def size(args: argparse.Namespace) -> tuple[dict[str, Any], list[Table], Figure, list[tuple[str, Any]]]:
     """Return the failure ratio over the size of the cubes, guided and not."""
     results = runs(args)
-    by = {(f.experiment, f.label): f for f in figures(results)}
+    by = {(f.experiment, f.label): f for f in statistics(results)}
     found: dict[str, Any] = {}
     rows = []
     picture = blank(9, 4.4)

@@ -18,7 +18,7 @@ from ompl import tools as ot
 from apex_ompl import benchmark, problems
 from apex_ompl.benchmark import Results, Row, Workers, bench, workers
 from apex_ompl.benchmark.rows import experiments, jobs
-from apex_ompl.benchmark.summary import Figures, figures
+from apex_ompl.benchmark.summary import Statistics, statistics
 from apex_ompl.cli.parser import main
 from apex_ompl.errors import ApexError, FileFormatError, MissingFileError, ParameterError, UnknownNameError
 
@@ -78,7 +78,7 @@ def test_runs_take_problems_and_seeds_in_turn() -> None:
         jobs(["wall/hard"], [Row("c", "no_such")], **options)
 
 
-def test_runs_tell_what_came_of_them(results: Results) -> None:
+def test_runs_record_their_outcome(results: Results) -> None:
     assert len(results.runs) == len(ROWS) * RUNS and {run["label"] for run in results.runs} == set(ROWS)
     for run in results.runs:
         assert run["solved"] and run["status"] == "EXACT_SOLUTION" and run["problem"] in problems.frozen_names(
@@ -124,7 +124,7 @@ def test_the_log_is_ompls_own(results: Results) -> None:
 
 
 def outcome(results: Results) -> list[tuple]:
-    """What a table says of runs, but for the times."""
+    """Columns of runs that do not depend on time."""
     found = [(r["problem"], r["label"], r["solved"], r["by"], r["length"], r["raw_length"]) for r in results.runs]
     return sorted(found)
 
@@ -157,7 +157,7 @@ def test_a_last_line_that_is_whole_is_kept(results: Results, tmp_path: Path) -> 
 
 def test_processes_are_renewed(results: Results, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     begun = []
-    monkeypatch.setattr(workers, "RENEWED", 2)
+    monkeypatch.setattr(workers, "RUNS_PER_PROCESS", 2)
     pool = Workers._pool
     monkeypatch.setattr(Workers, "_pool", lambda self, *given: (begun.append(given[1]), pool(self, *given))[1])
     found = bench([LEVEL], ROWS[1:], tmp_path, runs=RUNS, timeout=10.0, split="validation", quiet=True)
@@ -193,13 +193,13 @@ def test_a_stopped_command_goes_on(results: Results, tmp_path: Path, how: signal
         assert outcome(found) == [one for one in outcome(results) if one[1] == ROWS[1]]
 
 
-def made_up(firsts: list[float | None], timeout: float = 2.0) -> Figures:
+def made_up(firsts: list[float | None], timeout: float = 2.0) -> Statistics:
     made = [
         {"solved": t is not None, "first": t, "total": None if t is None else t + 0.1, "by": "apex", "timeout": timeout,
          "length": 3.0 if t is not None else None}
         for t in firsts
     ]  # fmt: skip
-    return Figures("a/b", "apex", made)
+    return Statistics("a/b", "apex", made)
 
 
 def test_figures_count_what_is_not_solved_as_endless() -> None:
@@ -212,21 +212,21 @@ def test_the_report_opens_without_a_network(results: Results, tmp_path: Path) ->
     page, text = benchmark.report(results.folder, tmp_path / "report")
     html, found = page.read_text(), text.read_text()
     assert not re.findall(r"""(?:src|href)=["'](?!data:)""", html) and html.count("data:image/png;base64") >= 3
-    for f in figures(results):
+    for f in statistics(results):
         length = f"{f.median('length'):.3g}"
         assert f.label in html and f"<td>{length}</td>" in html and f" {length} " in found
     assert "EPYC" in html or "cores" in html
     assert "at the same time" not in found
 
 
-def test_load_beyond_the_runs_is_said(results: Results) -> None:
+def test_load_beyond_the_runs_is_reported(results: Results) -> None:
     assert all(run["load"] >= 0.0 for run in results.runs)
     for load, said in ((1.4, False), (1.6, True)):
         loaded = Results(results.folder, results.about, [{**run, "load": load} for run in results.runs])
         assert ("The load was over 1.5 in 6 of 6 runs" in benchmark.markdown(loaded)) is said
 
 
-def test_planners_that_end_early_are_said(results: Results) -> None:
+def test_planners_that_end_early_are_reported(results: Results) -> None:
     refused = {"status ENUM": str(ob.PlannerStatus.PlannerStatusType.INVALID_GOAL.value)}
     made = [{**run, "solved": False, "properties": refused} for run in results.runs[:2]]
     text = benchmark.markdown(Results(results.folder, results.about, made))
@@ -236,7 +236,7 @@ def test_planners_that_end_early_are_said(results: Results) -> None:
     assert "Ended early" not in benchmark.markdown(results)
 
 
-def test_runs_at_the_same_time_are_said(results: Results, tmp_path: Path) -> None:
+def test_runs_at_the_same_time_are_reported(results: Results, tmp_path: Path) -> None:
     options: dict = {"runs": 2, "timeout": 10.0, "split": "validation", "quiet": True}
     found = bench([LEVEL], ROWS[1:], tmp_path, workers=Workers(2), **options)
     assert outcome(found) == [one for one in outcome(results) if one[1] == ROWS[1]][:2]

@@ -25,14 +25,14 @@ def test_the_first_path_counts_where_the_shortened_one_is_repaired(robot: Robot)
     line = np.stack([ready.start, ready.goals[0]])
     planning = runs.Benchmarked(ready, "rrtconnect", 0, 0.0, ())
     planning.times |= {"verify": 0.25}
-    assert planning.proof_of_first() == 0.25
+    assert planning.first_path_proof() == 0.25
     planning.times |= {"repair": 30.0}
-    assert planning.proof_of_first() == 0.25, "of a planner whose first path is not known"
+    assert planning.first_path_proof() == 0.25, "the first path is not known"
     planning.raw = witness
-    assert 0.0 < planning.proof_of_first() < 30.0
+    assert 0.0 < planning.first_path_proof() < 30.0
     assert not full_check(ready.checker, line, ready.start, ready.goals)
     planning.raw = line
-    assert planning.proof_of_first() == 30.25
+    assert planning.first_path_proof() == 30.25
 
 
 def test_another_robot_warms_up_on_its_own_problem(tmp_path: Path) -> None:
