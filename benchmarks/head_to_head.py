@@ -62,7 +62,7 @@ ROWS = (
 
 
 def together(found: Sequence[Statistics]) -> Table:
-    """Return what came of each row on levels of a kind, its paths beside those of apex for the same problems."""
+    """Return the statistics of each row over levels of a kind, with its lengths over those of apex."""
     rows = []
     for group, levels in GROUPS.items():
         mine = [f for f in found if f.experiment.split("/")[1] in levels]
@@ -82,8 +82,8 @@ def together(found: Sequence[Statistics]) -> Table:
                 *(f"{1e3 * t:.0f}" if math.isfinite(t) else "-" for t in times),
                 f"{math.exp(np.mean(both)):.2f} ({len(both)})" if both else "-",
             ])  # fmt: skip
-    head = ["levels", "planner", "N", "solved (95 %, Wilson)", *(f"in {t:g} s" for t in SHARE_TIMES), "first path p50 ms",
-            "p95", "p99", "end p50 ms", "length / apex's (problems that both solved)"]  # fmt: skip
+    within = [f"in {t:g} s" for t in SHARE_TIMES]
+    head = ["levels", "planner", "N", "solved (95 %, Wilson)", *within, "first path p50 ms", "p95", "p99", "end p50 ms", "length / apex's (problems that both solved)"]  # fmt: skip
     return Table("Levels together", head, rows)
 
 

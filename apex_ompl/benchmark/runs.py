@@ -180,10 +180,8 @@ def _by_runner(job: Job) -> Run:
     with quiet_ompl(), one_torch_thread():
         seed_ompl(job.seed)
         found = dict(load_runner(job.runner)(job))
-    status = PlanStatus.EXACT_SOLUTION if found["solved"] else PlanStatus.TIMEOUT
-    return (
-        unsolved(str(status), "") | {"by": job.planner if found["solved"] else "", "load": os.getloadavg()[0]} | found
-    )
+    status, by = (PlanStatus.EXACT_SOLUTION, job.planner) if found["solved"] else (PlanStatus.TIMEOUT, "")
+    return unsolved(str(status), "") | {"by": by, "load": os.getloadavg()[0]} | found
 
 
 def planned(job: Job) -> tuple[Benchmarked, PlanResult]:
@@ -217,8 +215,8 @@ def columns(planning: Benchmarked, result: PlanResult) -> Run:
         "jerk": jerk(path) if path is not None and path_length(path) > 0.0 else None,
         "raw_jerk": jerk(raw) if found and raw is not None and path_length(raw) > 0.0 else None,
         "clearance": result.clearance if path is not None and np.isfinite(result.clearance) else None,
-        "checks": result.checks - planning.experiment_checks, "properties": planning.properties, "common": planning.common,
-        "load": os.getloadavg()[0],
+        "checks": result.checks - planning.experiment_checks,
+        "properties": planning.properties, "common": planning.common, "load": os.getloadavg()[0],
         "counts": {} if report is None else {
             "candidates": report.candidates, "proposals": report.proposed, "resamples": report.resampled,
             "repair steps": report.steps, "improvements": report.improved,
