@@ -34,6 +34,7 @@ from apex_ompl.trajopt.optimizer import Optimizer, Settings
 from apex_ompl.util.scripts import run_command
 from apex_ompl.util.validation import one_or_more
 
+DEPENDS = ("@planning",)
 LIMIT, SEED = 5.0, 1  # [s]
 TREELESS = {"fallback": False, "bridge": False}
 HARD = ("shelf", "bins", "cage", "posts", "wall", "swap", "clutter")

@@ -46,6 +46,7 @@ from apex_ompl.trajectory.timing import PER_PIECE, SPACING, least_spacing, splin
 from apex_ompl.util.scripts import run_command
 from apex_ompl.util.validation import one_or_more, whole_number
 
+DEPENDS = ("@planning", "apex_ompl/trajectory")
 LIMITS, NAMES = robot().limits, robot().joint_names
 APART_ON_PATH = SPACING * Timing().deviation  # of control points, as the first that time_path tries [rad]
 EACH, APART, POINTS = 0.004, 0.05, 500  # of samples [s], of TOPP-RA's states [s], of its grid
