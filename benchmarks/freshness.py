@@ -109,7 +109,7 @@ def freshness(root: Path, result: Path) -> Freshness:
         script = script_of(root, result, about["command"])
         if script is None:
             return Freshness(result.stem, STALE, f"no script makes it any more; it was: {about['command']}")
-        depends = record.dependencies(script)
+        depends = record.dependencies(script, root)
     commits = dict.fromkeys([about["commit"], *about.get("run_commits", about["commit"]).split("; ")])
     for commit in commits:
         if commit == "unknown":

@@ -35,7 +35,7 @@ GROUPS = {
 """Names of groups of paths in ``DEPENDS``."""
 
 
-def dependencies(script: Path) -> list[str]:
+def dependencies(script: Path, root: Path = ROOT) -> list[str]:
     """Return the paths that the results of a script depend on: the script, and its ``DEPENDS`` with groups resolved.
 
     The script is read, not run: some need packages that are not installed.
@@ -47,7 +47,7 @@ def dependencies(script: Path) -> list[str]:
         if isinstance(node, ast.Assign) and [ast.unparse(target) for target in node.targets] == ["DEPENDS"]:
             declared = ast.literal_eval(node.value)
             paths = [path for name in declared for path in GROUPS.get(name, (name,))]
-            return [script.resolve().relative_to(ROOT).as_posix(), *dict.fromkeys(paths)]
+            return [script.resolve().relative_to(root).as_posix(), *dict.fromkeys(paths)]
     raise SystemExit(f"{script}: expected DEPENDS, the paths that its results depend on")
 
 

@@ -1,3 +1,5 @@
+"""Results of a benchmark: runs, logs, resumption, reports."""
+
 from __future__ import annotations
 
 import json
@@ -17,10 +19,8 @@ from ompl import tools as ot
 
 from apex_ompl import benchmark, problems
 from apex_ompl.benchmark import Results, Row, Workers, bench, workers
-from apex_ompl.benchmark.rows import experiments, jobs
 from apex_ompl.benchmark.summary import Statistics, statistics
-from apex_ompl.cli.parser import main
-from apex_ompl.errors import ApexError, FileFormatError, MissingFileError, ParameterError, UnknownNameError
+from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError
 
 LEVEL, RUNS = "swap/easy", 3
 ROWS = ("apex[seed=1]", "rrtconnect")
@@ -30,52 +30,6 @@ ROWS = ("apex[seed=1]", "rrtconnect")
 def results(tmp_path_factory: pytest.TempPathFactory) -> Results:
     folder = tmp_path_factory.mktemp("bench") / "results"
     return bench([LEVEL], ROWS, folder, runs=RUNS, timeout=10.0, split="validation", quiet=True)
-
-
-def test_rows_are_read_and_checked() -> None:
-    row = Row.parse(" apex[fallback=false; lambda-obs=0.1] ")
-    assert row.planner == "apex" and dict(row.params) == {"fallback": "false", "lambda_obs": "0.1"}
-    assert row.parameters().fallback is False and row.settings()["lambda_obs"] == 0.1
-    assert Row.parse("rrtconnect+polish").planner == "rrtconnect+polish"
-    for text in ("", "apex[", "apex[gamma]", "apex[=1]", "a[b=1]c"):
-        with pytest.raises(ParameterError, match="planner"):
-            Row.parse(text)
-    for arguments in ({"timeout": 0.0}, {"runs": -1}):
-        with pytest.raises(ParameterError):
-            Row("a", "apex", **arguments)
-    assert Row("a", "apex", levels=("/hard", "cage", "wall/easy")).levels
-
-
-def test_suites_stand_for_their_static_levels() -> None:
-    assert list(experiments(["vertical"])) == [f"vertical/{v}" for v in ("free", "small", "medium", "large")]
-    assert experiments(["shelf/hard", "shelf_swap", "cage/easy/800001"]) == {
-        "shelf/hard": True, "shelf_swap": False, "cage/easy/800001": False,
-    }  # fmt: skip
-    for names in ([], ["no_such"], ["shelf/none"], ["vertical/moving-small-0.1"], ["vertical/moving-small-0.1/800001"]):
-        with pytest.raises(ApexError):
-            experiments(names)
-
-
-def test_runs_take_problems_and_seeds_in_turn() -> None:
-    rows = [Row("a", "rrtconnect"), Row("b", "rrt", runs=2, timeout=1.0, levels=("/hard",))]
-    options: dict = {"runs": 3, "timeout": 5.0, "seed": 7, "split": "test", "simplify": True}
-    found = jobs(["wall/hard", "wall/easy"], rows, **options)
-    assert [(j.problem, j.label, j.seed, j.timeout) for j in found[:3]] == [
-        ("wall/hard/900000", "a", 7, 5.0), ("wall/hard/900000", "b", 7, 1.0), ("wall/easy/900000", "a", 7, 5.0),
-    ]  # fmt: skip
-    assert len(found) == 3 + 2 + 3 and len({j.key for j in found}) == len(found)
-    assert [(j.problem, j.seed) for j in jobs(["shelf_swap"], rows[:1], **options)] == [
-        ("shelf_swap", 7), ("shelf_swap", 8), ("shelf_swap", 9),
-    ]  # fmt: skip
-    with pytest.raises(ParameterError, match="each once"):
-        jobs(["wall/hard"], [rows[0], rows[0]], **options)
-    for more in ({"runs": 100_001}, {"seed": 2**31 - 2}):
-        with pytest.raises(ParameterError, match="runs: expected at most"):
-            jobs(["wall/hard"], rows, **{**options, **more})
-    with pytest.raises(UnknownNameError, match="split"):
-        jobs(["wall/hard"], rows, **{**options, "split": "none"})
-    with pytest.raises(UnknownNameError, match="planner"):
-        jobs(["wall/hard"], [Row("c", "no_such")], **options)
 
 
 def test_runs_record_their_outcome(results: Results) -> None:
@@ -281,44 +235,3 @@ def test_faulty_results_are_named(results: Results, tmp_path: Path) -> None:
     (tmp_path / "about.json").unlink()
     with pytest.raises(FileFormatError, match="expected results of bench"):
         bench([LEVEL], ROWS, tmp_path, quiet=True)
-
-
-def test_a_faulty_checkpoint_ends_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    arguments = [
-        "bench",
-        LEVEL,
-        "--planners",
-        "apex[model=no_such]",
-        "--runs",
-        "1",
-        "-o",
-        str(tmp_path / "x"),
-        "--quiet",
-    ]
-    assert main(arguments) == 2
-    assert "no_such" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["bench", "no_such", "-o", "x"], "no_such"),
-        (["bench", "shelf/hard", "-o", "x", "--planners", "apex,none"], "unknown planner 'none'"),
-        (["bench", "shelf/hard", "-o", "x", "--planners", "apex[gama=1]"], "did you mean 'gamma'"),
-        (["bench", "shelf/hard", "-o", "x", "--runs", "0"], "runs"),
-        (["bench", "shelf/hard", "-o", "x", "--jobs", "0"], "jobs"),
-        (["bench", "shelf/hard", "-o", "x", "--timeout", "nan"], "timeout"),
-        (["bench", "shelf/hard", "-o", "x", "--split", "none"], "split"),
-        (["bench", "shelf/hard", "-o", "x", "--planners", ","], "planners"),
-        (["bench", "vertical/moving-small-0.1", "-o", "x"], "moving"),
-        (["report", "nowhere", "-o", "x"], "nowhere"),
-    ],
-)
-def test_faulty_commands_get_a_sentence(
-    arguments: list[str], words: str, capsys: pytest.CaptureFixture[str], tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
-    monkeypatch.chdir(tmp_path)
-    assert main(arguments) == 2
-    said = capsys.readouterr().err
-    assert words in said and said.count("\n") == 1 and not list(tmp_path.iterdir())
