@@ -24,6 +24,7 @@ from apex_ompl.tasks.alignment import alignment_goal
 from apex_ompl.util.scripts import run_command
 from apex_ompl.util.validation import one_or_more, whole_number
 
+DEPENDS = ("@checking", "apex_ompl/tasks", "problems")
 PROBLEMS = ("stack_boxes", "ball_in_cup", "peg_in_hole", "pour", "handover")
 
 

@@ -1,10 +1,11 @@
-"""Where the time of apex goes on hard problems, and what was tried to make it less.
+"""Where the time of apex goes on hard problems, and variants of its stages that were tried.
 
-Every run is one call of ``APEX.solve`` without trees (``fallback=false``, ``bridge=false``) on a validation problem of
-a hard level, in a warm process, with a limit of 5 s; one that finds nothing counts as endless. The first table holds
-the stages of the planner as it is, shortening included; the second holds variants of it, without shortening: what was
-taken is the first row. The third tells what the first sprint, RRTConnect's iterations before proposals, costs where it
-does not help, and how often it is enough in open scenes; later sprints are left out there.
+Every run is one of apex without trees (``fallback=false``, ``bridge=false``) on a validation problem of a hard level,
+with a limit of 5 s; a run without a path has infinite times. The first table holds the stages of the planner as it is,
+shortening included; the second holds variants of it, without shortening, the first row being apex as it is. The third
+shows the cost of the first sprint, RRTConnect's iterations before proposals, where it does not help, and how often it
+is enough in open scenes; later sprints are left out there.
+Each run is stored in benchmarks/runs/apex_profile when it ends; the command resumes where it was stopped.
 
 Usage: python benchmarks/apex_profile.py [-n 30]
 """
@@ -12,33 +13,33 @@ Usage: python benchmarks/apex_profile.py [-n 30]
 from __future__ import annotations
 
 import argparse
-import math
-import time
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
+from unittest import mock
 
-import numpy as np
 import record
-import torch
 from ompl import base as ob
 
-from apex_ompl import problems
-from apex_ompl.ompl_adapter.process import quiet_ompl, seed_ompl
-from apex_ompl.ompl_adapter.setup import PlanningSetup, assemble
-from apex_ompl.planners import apex_parameters
-from apex_ompl.planners.apex import APEX
+from apex_ompl.benchmark import Row, Workers, bench, runs
+from apex_ompl.benchmark.rows import Job
+from apex_ompl.benchmark.runs import NO_PROBLEM, Run
+from apex_ompl.benchmark.summary import Statistics
 from apex_ompl.planners.apex_parameters import ApexParameters
-from apex_ompl.problems.suite_robot import robot
+from apex_ompl.result import FIRST, INSIDE
 from apex_ompl.trajopt.optimizer import Optimizer, Settings
 from apex_ompl.util.scripts import run_command
 from apex_ompl.util.validation import one_or_more
 
-LIMIT, SEED = 5.0, 1  # [s]
+DEPENDS = ("@benchmark",)
+FOLDER = record.RESULTS.parent / "runs" / "apex_profile"
+TIMEOUT, SEED = 5.0, 1  # [s]
 TREELESS = {"fallback": False, "bridge": False}
-HARD = ("shelf", "bins", "cage", "posts", "wall", "swap", "clutter")
+HARD = tuple(f"{suite}/hard" for suite in ("shelf", "bins", "cage", "posts", "wall", "swap", "clutter"))
 OPEN = ("vertical/free", "vertical/small", "horizontal/small", "bins/easy", "wall/easy")
 SPRINTS = (0, 20, 40, 80, 160)  # iterations
+RUNNER = "apex_profile:run_variant"
 VARIANTS: dict[str, tuple[dict[str, Any], int | None]] = {
     "as it is": ({}, None),
     "1, 7, 24 proposals": ({"first": 1, "second": 7}, None),
@@ -55,122 +56,122 @@ VARIANTS: dict[str, tuple[dict[str, Any], int | None]] = {
     "2 resamplings a round": ({"resample": 2}, None),
     "no straight line": ({"line": False}, None),
 }
+STAGES = Row("stages", "apex", {"seed": SEED, **TREELESS}, levels=HARD)
 
 
-def run(ready: PlanningSetup, samples: int | None = None, **params: Any) -> tuple[float, float, APEX]:
-    """Return the time to a first path, that to the end, both endless without one, and the planner [s]."""
-    setup = ready.simple_setup
-    setup.clear()
-    seed_ompl(SEED)
-    planner = APEX(setup.getSpaceInformation(), ApexParameters(seed=SEED, **params))
-    if samples is not None:
-        planner.optimizer = Optimizer(planner.model.spline, Settings(samples=samples))
-    setup.setPlanner(planner)
-    setup.setup()
-    begin = time.perf_counter()
-    status = setup.solve(ob.timedPlannerTerminationCondition(LIMIT)).getStatus()
-    took = time.perf_counter() - begin
-    solved = status == ob.PlannerStatus.EXACT_SOLUTION
-    return (planner.report.first if solved else math.inf), (took if solved else math.inf), planner
+def run_variant(job: Job) -> Run:
+    """Return the columns of a run with other samples of the optimiser in repair, or without later sprints."""
+    params = dict(job.params)
+    samples, later_sprints = params.pop("samples", None), params.pop("later_sprints", True)
+    build = ApexParameters.build
+
+    def build_variant(self: ApexParameters, si: ob.SpaceInformation) -> ob.Planner:
+        planner = build(self, si)
+        if samples is not None:
+            planner.optimizer = Optimizer(planner.model.spline, Settings(samples=samples))
+        return planner
+
+    longer = solver.LONGER if later_sprints else (1, 0, 0)
+    with mock.patch.object(ApexParameters, "build", build_variant), mock.patch.object(solver, "LONGER", longer):
+        return runs.columns(*runs.planned(replace(job, params=params, runner="")))
 
 
-def times(values: Sequence[float]) -> list[str]:
-    """Return percentiles of times in ms."""
-    found = [record.reached(values, p) for p in (50, 80, 95)]
-    return ["-" if v is None else f"{1e3 * v:.1f}" for v in found]
+def variant_rows() -> list[Row]:
+    """Return a row of each variant."""
+    common = {"seed": SEED, "polish": False, **TREELESS}
+    return [
+        Row(name, "apex", {**common, **params, "samples": samples}, levels=HARD, runner=RUNNER)
+        for name, (params, samples) in VARIANTS.items()
+    ]
 
 
-def stages(ready: Sequence[PlanningSetup]) -> tuple[dict[str, Any], list[str]]:
-    """Return seconds by stage of the planner as it is, and a table."""
-    told, took = list[dict[str, float]](), list[float]()
-    for one in ready:
-        _, total, planner = run(one, **TREELESS)
-        if math.isfinite(total):
-            took.append(total)
-            told.append(planner.report.times)
-    whole = sum(took)
-    rows = [record.row(["stage", "share of the time", "mean ms", "p95 ms"]), record.row(["---", *["---:"] * 3])]
-    figures = {}
-    spent = {stage: [times.get(stage, 0.0) for times in told] for stage in {name for times in told for name in times}}
+def sprint_rows() -> list[Row]:
+    """Return a row of each length of the first sprint."""
+    common = {"seed": SEED, "polish": False, "later_sprints": False}
+    return [Row(f"sprint {k}", "apex", {**common, "sprint": k}, runner=RUNNER) for k in SPRINTS]
+
+
+def statistics(made: Sequence[Run], label: str, levels: Sequence[str]) -> Statistics:
+    """Return the statistics of a row on some levels."""
+    return Statistics("", label, [run for run in made if run["label"] == label and run["experiment"] in levels])
+
+
+def first_times(found: Statistics) -> list[float | None]:
+    """Return percentiles of the time to a first path [s]."""
+    return [record.reached(found.times("first"), p) for p in (50, 80, 95)]
+
+
+def ms(values: Sequence[float | None]) -> list[str]:
+    """Return times as text [ms]."""
+    return ["-" if value is None else f"{1e3 * value:.1f}" for value in values]
+
+
+def stages(made: Sequence[Run]) -> tuple[dict[str, Any], list[str]]:
+    """Return the time of each stage of the planner as it is [s], and a table."""
+    times = [run["times"] for run in statistics(made, STAGES.label, HARD).solved]
+    lines = [record.row(["stage", "share of the time", "mean ms", "p95 ms"]), record.row(["---", *["---:"] * 3])]
+    total, found = sum(one["solve"] for one in times), {}
+    names = {name for one in times for name in one if name.startswith(INSIDE) and name != FIRST}
+    spent = {name.removeprefix(INSIDE): [one.get(name, 0.0) for one in times] for name in names}
     for stage, values in sorted(spent.items(), key=lambda pair: -sum(pair[1])):
-        share, mean, high = sum(values) / whole, sum(values) / len(took), record.reached(values, 95) or 0.0
-        figures[stage] = {"share": share, "mean_s": mean, "p95_s": high}
-        rows.append(record.row([stage, f"{share:.2f}", f"{1e3 * mean:.1f}", f"{1e3 * high:.1f}"]))
-    rest = 1.0 - sum(f["share"] for f in figures.values())
-    rows.append(record.row(["all else", f"{rest:.2f}", f"{1e3 * rest * whole / len(took):.1f}", ""]))
-    return figures, rows
+        share, mean, high = sum(values) / total, sum(values) / len(times), record.reached(values, 95) or 0.0
+        found[stage] = {"share": share, "mean_s": mean, "p95_s": high}
+        lines.append(record.row([stage, f"{share:.2f}", f"{1e3 * mean:.1f}", f"{1e3 * high:.1f}"]))
+    if times:
+        rest = 1.0 - sum(f["share"] for f in found.values())
+        lines.append(record.row(["all else", f"{rest:.2f}", f"{1e3 * rest * total / len(times):.1f}", ""]))
+    return found, lines
 
 
-def variants(ready: Sequence[PlanningSetup]) -> tuple[dict[str, Any], list[str]]:
-    """Return what comes of variants, and a table."""
-    rows = [record.row(["variant", "solved", "first path ms p50", "p80", "p95", "by proposals as they are"])]
-    rows.append(record.row(["---", *["---:"] * 5]))
-    figures = {}
-    for name, (params, samples) in VARIANTS.items():
-        firsts, by = list[float](), Counter[str]()
-        for one in ready:
-            first, _, planner = run(one, samples, polish=False, **TREELESS, **params)
-            firsts.append(first)
-            by[planner.report.solved_by] += 1
-        solved = float(np.mean(np.isfinite(firsts)))
-        figures[name] = {"solved": solved, "first_s": [record.reached(firsts, p) for p in (50, 80, 95)], "by": dict(by)}
-        rows.append(record.row([name, f"{solved:.3f}", *times(firsts), f"{by['apex'] / len(ready):.2f}"]))
-        print(rows[-1], flush=True)
-    return figures, rows
+def variants(made: Sequence[Run]) -> tuple[dict[str, Any], list[str]]:
+    """Return the statistics of variants, and a table."""
+    lines = [record.row(["variant", "solved", "first path ms p50", "p80", "p95", "by proposals as they are"])]
+    lines.append(record.row(["---", *["---:"] * 5]))
+    found = {}
+    for name in VARIANTS:
+        f = statistics(made, name, HARD)
+        solved, by = len(f.solved) / len(f.runs), Counter(f.by)
+        found[name] = {"solved": solved, "first_s": first_times(f), "by": dict(by)}
+        lines.append(record.row([name, f"{solved:.3f}", *ms(first_times(f)), f"{by['apex'] / len(f.runs):.2f}"]))
+    return found, lines
 
 
-def sprints(hard: Sequence[PlanningSetup], scenes: Sequence[PlanningSetup]) -> tuple[dict[str, Any], list[str]]:
-    """Return what comes of sprints of several lengths, and a table."""
+def sprints(made: Sequence[Run]) -> tuple[dict[str, Any], list[str]]:
+    """Return the statistics of sprints of several lengths, and a table."""
     head = ["iterations", "open: enough for", "open: first path ms p50", "p80", "p95"]
     head += ["hard: enough for", "hard: sprint ms p50", "hard: first path ms p50", "p80", "p95"]
-    rows = [record.row(head), record.row(["---:"] * len(head))]
-    figures = {}
+    lines = [record.row(head), record.row(["---:"] * len(head))]
+    found = {}
     for sprint in SPRINTS:
         cells: list[str] = [str(sprint)]
-        for name, ready in (("open", scenes), ("hard", hard)):
-            firsts, spent, enough = list[float](), list[float](), 0
-            for one in ready:
-                first, _, planner = run(one, polish=False, sprint=sprint)
-                firsts.append(first)
-                spent.append(planner.report.times.get("sprint", 0.0))
-                enough += planner.report.solved_by == "sprint"
-            figures[f"{sprint}, {name}"] = {
-                "enough": enough / len(ready), "first_s": [record.reached(firsts, p) for p in (50, 80, 95)],
-                "sprint_s": record.reached(spent, 50),
-            }  # fmt: skip
-            cells.append(f"{enough / len(ready):.2f}")
-            cells += [times(spent)[0]] if name == "hard" else []
-            cells += times(firsts)
-        rows.append(record.row(cells))
-        print(rows[-1], flush=True)
-    return figures, rows
+        for name, levels in (("open", OPEN), ("hard", HARD)):
+            f = statistics(made, f"sprint {sprint}", levels)
+            spent = record.reached([run["times"].get(f"{INSIDE}sprint", 0.0) for run in f.runs], 50)
+            enough = f.by["sprint"] / len(f.runs)
+            found[f"{sprint}, {name}"] = {"enough": enough, "first_s": first_times(f), "sprint_s": spent}
+            cells += [f"{enough:.2f}", *(ms([spent]) if name == "hard" else []), *ms(first_times(f))]
+        lines.append(record.row(cells))
+    return found, lines
 
 
 def main() -> None:
-    """Measure and write the results."""
+    """Run what is missing, and write the results."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument(
         "-n", type=one_or_more, default=30, help="validation problems of a level (default: %(default)s)"
     )
     args = parser.parse_args()
-    torch.set_num_threads(1)
-
-    def drawn(level: str) -> list[PlanningSetup]:
-        names = problems.frozen_names(*level.split("/"), "validation")[: args.n]
-        return [assemble(problems.load(name), robot()) for name in names]
-
-    with quiet_ompl():
-        hard = [one for suite in HARD for one in drawn(f"{suite}/hard")]
-        scenes = [one for level in OPEN for one in drawn(level)]
-        run(hard[0], **TREELESS)
-        by_stage, first = stages(hard)
-        by_variant, second = variants(hard)
-        apex_parameters.SPRINT_FACTORS = (1, 0, 0)
-        by_sprint, third = sprints(hard, scenes)
-    text = "\n".join([*first, "", *second, "", *third])
-    figures = {"stages": by_stage, "variants": by_variant, "sprints": by_sprint}
+    results = bench(
+        [*HARD, *OPEN], [STAGES, *variant_rows(), *sprint_rows()], FOLDER, runs=args.n, timeout=TIMEOUT,
+        split="validation", workers=Workers(), provenance=record.session(),
+    )  # fmt: skip
+    made = [run for run in results.runs if run["seed"] < args.n and run["status"] != NO_PROBLEM]
+    (by_stage, first), (by_variant, second), (by_sprint, third) = stages(made), variants(made), sprints(made)
+    data = {"stages": by_stage, "variants": by_variant, "sprints": by_sprint}
+    counts = f"{args.n * len(HARD)} hard, {args.n * len(OPEN)} open"
     record.write(
-        "apex_profile", figures, text, split="validation", N=f"{len(hard)} hard, {len(scenes)} open", seed=SEED,
+        "apex_profile", data, "\n".join([*first, "", *second, "", *third]), split="validation", N=counts, seed=SEED,
+        **record.made_with(replace(results, runs=made)),
     )  # fmt: skip
 
 

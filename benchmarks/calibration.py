@@ -1,84 +1,90 @@
-"""How hard the suites are: what the straight line, rrtconnect and rrt make of the first test problems.
+"""How hard the suites are: the straight line on all levels, and rrtconnect and rrt among moving obstacles.
 
-Runs are kept in a store as they end (JSON lines), so that the command goes on where it was stopped; the results are
-made of all runs in the store. On levels with moving obstacles planners see the scene of time 0, and what they find is
-followed at a quarter of the velocity limits among the moving obstacles: a run counts when nothing is hit. Of those
-levels 20 test problems are frozen; more are drawn, and may have no solution. A cube may be where the goal is at time
-0; such runs fail, and are counted as ``goal_blocked``.
+Planners on levels without moving obstacles are compared by head_to_head.py. On levels with moving obstacles planners
+see the scene of time 0, and their path is followed at a quarter of the velocity limits among the moving obstacles: a
+run is solved when nothing is hit. Of those levels 20 test problems are frozen; more are sampled, and may have no
+solution. A cube may be where the goal is at time 0; such runs fail, and are counted as ``goal_blocked``.
+Each run is stored in benchmarks/runs/calibration when it ends; the command resumes where it was stopped.
 
-Usage: python benchmarks/calibration.py [-n 50] [--rrt 20] [--jobs 2] [--store FILE] [--report] [SUITE[/LEVEL] ...]
+Usage: python benchmarks/calibration.py [-n 50] [--rrt 20] [--jobs 2] [--store FOLDER] [--report] [SUITE[/LEVEL] ...]
 """
 
 from __future__ import annotations
 
 import argparse
-import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import record
-from store import RunStore
 
-from apex_ompl import plan, problems
+from apex_ompl import problems
+from apex_ompl.benchmark import Results, Row, Workers, bench, runs
+from apex_ompl.benchmark.rows import Job
+from apex_ompl.benchmark.runs import Run
+from apex_ompl.benchmark.summary import Statistics
 from apex_ompl.live.moving import check_timed_path, constant_velocity_times
 from apex_ompl.problems.alignment import VELOCITY_SCALE
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.util.scripts import run_command
 from apex_ompl.util.validation import one_or_more, whole_number
 
-FIRST = 900_000  # seed of the first test problem
+DEPENDS = ("@benchmark", "apex_ompl/live/moving.py")
+FOLDER = record.RESULTS.parent / "runs" / "calibration"
 TIMEOUT, LIMITS = 10.0, (0.5, 2.0, 10.0)  # [s]
-STORE = record.RESULTS.parent / "runs" / "calibration.jsonl"
-FINDING = ("line", "solve", "verify", "repair")  # stages that count as finding a path
-LINE = "straight line"
+LINE, PLANNERS = "straight line", ("rrtconnect", "rrt")
+LINE_ROW = Row(LINE, LINE, runner="calibration:straight_line")
 
 
-def run(job: tuple[str, str]) -> dict[str, Any]:
-    """Return one run of a planner, or of the straight line alone, on a problem."""
-    name, planner = job
-    problem = problems.load(name)
-    if planner == LINE:
-        return {"problem": name, "planner": planner, "solved": _line(name)}
-    result = plan(problem, planner, timeout=TIMEOUT, seed=int(name.rsplit("/", 1)[1]) % 1000, snapshot=True)
-    solved, reason = bool(result), result.reason
-    if solved and problem.moving:
-        states = result.path.states
-        times = constant_velocity_times(robot(), states, VELOCITY_SCALE)
-        check = check_timed_path(robot(), problem, states, times)
-        solved, reason = bool(check), check.reason
-    return {
-        "problem": name, "planner": planner, "solved": solved, "by": result.solved_by, "status": str(result.status),
-        "reason": reason, "found_s": sum(result.times.get(k, 0.0) for k in FINDING),
-        "simplify_s": result.times.get("simplify", 0.0), "length": result.length if solved else None,
-    }  # fmt: skip
-
-
-def _line(name: str) -> bool:
-    """Whether the straight line solves a problem, at a quarter of the velocity limits where obstacles move."""
-    problem, names = problems.load(name), robot().joint_names
+def straight_line(job: Job) -> Run:
+    """Return whether the straight line is a solution, at a quarter of the velocity limits where obstacles move."""
+    problem, names = problems.load(job.problem), robot().joint_names
     line = np.stack([problem.start_state(names), problem.goal_states(names)[0]])
-    return bool(check_timed_path(robot(), problem, line, constant_velocity_times(robot(), line, VELOCITY_SCALE)))
-
-
-def warm_up() -> None:
-    """Load the kernel and the robot, so that no run pays for it."""
-    plan(problems.frozen_names("shelf", "hard")[0], timeout=0.1, simplify=False)
-
-
-def summary(runs: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return success at the time limits, and percentiles of times [s] and lengths [rad]; failures count as endless."""
-    runs = list(runs)
-    found = np.array([r["found_s"] if r["solved"] else math.inf for r in runs])
-    simplified = np.array([r["found_s"] + r["simplify_s"] if r["solved"] else math.inf for r in runs])
-    lengths = [r["length"] for r in runs if r["solved"]]
     return {
-        "n": len(runs),
-        "goal_blocked": sum(r["status"] == "INVALID_GOAL" for r in runs),
-        "success": {str(limit): float((found <= limit).mean()) for limit in LIMITS},
-        "found_s": [record.reached(found, p) for p in (50, 95)],
-        "simplified_s": [record.reached(simplified, p) for p in (50, 95)],
+        "solved": bool(check_timed_path(robot(), problem, line, constant_velocity_times(robot(), line, VELOCITY_SCALE)))
+    }
+
+
+def among_moving(job: Job) -> Run:
+    """Return the columns of a run of a planner whose path is followed among the moving obstacles."""
+    planning, experiment, result = runs.planned(replace(job, runner=""))
+    found = runs.columns(planning, experiment, result)
+    if result.path is None or not found["solved"]:
+        return found
+    problem = problems.load(job.problem)
+    times = constant_velocity_times(robot(), result.path.states, VELOCITY_SCALE)
+    check = check_timed_path(robot(), problem, result.path.states, times)
+    return {**found, "solved": bool(check), "reason": check.reason}
+
+
+def levels_of(wanted: Sequence[str]) -> list[str]:
+    """Return all levels, or those that are wanted: SUITE or SUITE/LEVEL.
+
+    Raises:
+        SystemExit: No such suite or level.
+    """
+    every = [f"{suite}/{level}" for suite, levels in problems.suites().items() for level in levels]
+    for name in wanted:
+        if name not in every and name not in problems.suites():
+            raise SystemExit(f"unknown suite or level {name!r}; known: {', '.join(every)}")
+    return [level for level in every if not wanted or level in wanted or level.split("/")[0] in wanted]
+
+
+def summary(some: Sequence[Run]) -> dict[str, Any]:
+    """Return success at the time limits, and percentiles of times [s] and lengths [rad]; failures have infinite times.
+
+    ``found_s`` is the time to the first path, ``simplified_s`` that to the end.
+    """
+    found = Statistics("", "", some)
+    lengths = [run["length"] for run in found.solved]
+    return {
+        "n": len(some),
+        "goal_blocked": sum(run["status"] == "INVALID_GOAL" for run in some),
+        "success": {str(limit): found.share_within(limit) for limit in LIMITS},
+        "found_s": [record.reached(found.times("first"), p) for p in (50, 95)],
+        "simplified_s": [record.reached(found.times("total"), p) for p in (50, 95)],
         "length_rad": record.percentiles(lengths, 50, 95) if lengths else [None, None],
     }
 
@@ -89,62 +95,60 @@ def _cell(value: float | None) -> str:
     return f"{value:.3f}" if value < 1.0 else f"{value:.1f}"
 
 
-def table(figures: list[dict[str, Any]]) -> str:
-    """Return the Markdown table of the figures."""
+def table(levels: Sequence[dict[str, Any]]) -> str:
+    """Return the Markdown table of the statistics of levels."""
     head = ["suite/level", "line", "planner", "N", *(f"solved in {limit:g} s" for limit in LIMITS)]
     head += ["found s p50", "p95", "simplified s p50", "p95", "length rad p50", "p95"]
     rows = [head, ["---", "---:", "---", *["---:"] * (len(head) - 3)]]
-    for figure in figures:
-        for planner, s in figure["planners"].items():
+    for level in levels:
+        name = [level["level"], f"{level['line']:.2f}"]
+        for planner, s in level["planners"].items():
             rows.append(
-                [*((figure["level"], f"{figure['line']:.2f}") if planner == "rrtconnect" else ("", "")), planner,
-                 s["n"], *(f"{v:.2f}" for v in s["success"].values()), *map(_cell, s["found_s"]),
+                [*name, planner, s["n"], *(f"{v:.2f}" for v in s["success"].values()), *map(_cell, s["found_s"]),
                  *map(_cell, s["simplified_s"]), *("-" if v is None else f"{v:.1f}" for v in s["length_rad"])]
             )  # fmt: skip
+            name = ["", ""]
+        if not level["planners"]:
+            rows.append([*name, *["-"] * (len(head) - 2)])
     return "\n".join(record.row(row) for row in rows)
 
 
 def main() -> None:
-    """Run what is missing, and write the results of all."""
+    """Run what is missing, and write the results."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("levels", nargs="*", metavar="SUITE[/LEVEL]")
     parser.add_argument("-n", type=one_or_more, default=50, help="problems for rrtconnect (default: %(default)s)")
     parser.add_argument("--rrt", type=whole_number, default=20, help="problems for rrt (default: %(default)s)")
-    parser.add_argument("--jobs", type=one_or_more, default=2, help="processes (default: %(default)s)")
-    parser.add_argument("--store", type=Path, default=STORE)
-    parser.add_argument("--report", action="store_true", help="run nothing; write the results of what the store holds")
+    parser.add_argument("--lines", type=one_or_more, default=100, help="problems for the line (default: %(default)s)")
+    parser.add_argument("--jobs", type=one_or_more, default=2, help="runs at a time (default: %(default)s)")
+    parser.add_argument("--store", type=Path, default=FOLDER, help="folder of the runs")
+    parser.add_argument("--report", action="store_true", help="run nothing; write the results of the stored runs")
     args = parser.parse_args()
-    every = [f"{suite}/{level}" for suite, levels in problems.suites().items() for level in levels]
-    for name in args.levels:
-        if name not in every and name not in problems.suites():
-            raise SystemExit(f"unknown suite or level {name!r}; known: {', '.join(every)}")
-    levels = [v for v in every if not args.levels or v in args.levels or v.split("/")[0] in args.levels]
-    store = RunStore(args.store, ("problem", "planner"))
-    done = store.read()
-    todo: list[tuple[str, str]] = []
-    for level in levels:
-        frozen = len(problems.frozen_names(*level.split("/")))
-        for planner, count in ((LINE, max(frozen, args.n)), ("rrtconnect", args.n), ("rrt", args.rrt)):
-            names = [f"{level}/{FIRST + k}" for k in range(count)]
-            todo += [(name, planner) for name in names if (name, planner) not in done]
-    todo.sort(key=lambda job: (job[1] == "rrt", "moving" in job[0]))  # rrt, which takes most of the time, last
-    todo = [] if args.report else todo
-    store.complete(run, todo, args.jobs, warm_up)
-    figures: list[dict[str, Any]] = []
-    by_level: dict[str, list[dict[str, Any]]] = {}
-    runs = store.read()
-    for (name, _), one in runs.items():
-        by_level.setdefault(name.rsplit("/", 1)[0], []).append(one)
-    for level in every:
-        mine = by_level.get(level, [])
-        of = {p: [r for r in mine if r["planner"] == p] for p in (LINE, "rrtconnect", "rrt")}
-        if of[LINE]:
-            line = float(np.mean([r["solved"] for r in of[LINE]]))
-            planners = {p: summary(of[p]) for p in ("rrtconnect", "rrt") if of[p]}
-            figures.append({"level": level, "line": line, "line_n": len(of[LINE]), "planners": planners})
+    levels = levels_of(args.levels)
+    most = dict(zip(PLANNERS, (args.n, args.rrt), strict=True))
+    rows = [Row(name, name, runs=k, runner="calibration:among_moving") for name, k in most.items() if k]
+    moving = [level for level in levels if "/moving-" in level]
+    if not args.report:
+        workers = Workers(args.jobs)
+        for some, wanted, count in ((levels, [LINE_ROW], args.lines), (moving, rows, max(args.n, args.rrt))):
+            if some:
+                bench(
+                    some, wanted, args.store, runs=count, timeout=TIMEOUT, workers=workers, provenance=record.session()
+                )
+    results = Results.load(args.store)
+    made = [run for run in results.runs if run["experiment"] in levels and run["status"] != runs.NO_PROBLEM]
+    by = {(level, label): list[Run]() for level in levels for label in (LINE, *PLANNERS)}
+    for run in made:
+        by[run["experiment"], run["label"]].append(run)
+    found = [
+        {"level": level, "line": float(np.mean([run["solved"] for run in by[level, LINE]])),
+         "line_n": len(by[level, LINE]),
+         "planners": {name: summary(by[level, name]) for name in PLANNERS if by[level, name]}}
+        for level in levels if by[level, LINE]
+    ]  # fmt: skip
     record.write(
-        "calibration", {"levels": figures}, table(figures), split="test", timeout=TIMEOUT,
-        seeds="number of the problem modulo 1000", **record.made_with(runs.values()),
+        "calibration", {"levels": found}, table(found), split="test", timeout=TIMEOUT,
+        seeds="number of the problem modulo 1000", **record.made_with(replace(results, runs=made)),
     )  # fmt: skip
 
 

@@ -29,6 +29,7 @@ from apex_ompl.util.resolution import FULL_RESOLUTION
 from apex_ompl.util.scripts import run_command
 from apex_ompl.util.validation import one_or_more, whole_number
 
+DEPENDS = ("@checking", "apex_ompl/ompl_adapter", "problems")
 SCENES = (3, 10, 30, 100, 300)
 CROWDED = 30  # obstacles; more are made smaller, so that some room is left
 LIMIT = 0.1  # clearances over this are not looked for, as by an optimiser [m]

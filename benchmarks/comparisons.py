@@ -1,7 +1,7 @@
-"""All comparisons with other planners, one command after the other; each goes on where it was stopped.
+"""All comparisons with other planners, one command after the other; each resumes where it was stopped.
 
 benchmarks/head_to_head.py, time_to_quality.py and peers.py, then the paper's figures by scripts/reproduce.py. The
-lengths that time_to_quality.py goes by are made again only where they are missing.
+reference lengths of time_to_quality.py are made only where they are missing.
 
 Usage: python benchmarks/comparisons.py [--jobs 1]    (needs the extras "bench", "data" and "peers")
 """
@@ -35,7 +35,7 @@ def main() -> None:
     parser.add_argument("--jobs", type=one_or_more, default=1, help="runs at a time (default: one, as they are timed)")
     args = parser.parse_args()
     missing = [name for name in NEEDED if importlib.util.find_spec(name) is None]
-    if missing:  # said now, not after hours
+    if missing:  # reported now, not after hours
         parser.error(f"no {', '.join(missing)}, expected: pip install 'apex-ompl[bench,data,peers]'")
     for command in COMMANDS:
         given = [*command, "--jobs", str(args.jobs)]

@@ -1,15 +1,14 @@
 """What stands in the place of the model in comparisons: random bumps, random weights, another problem's conditions.
 
-Importing this module registers APEX with each of them as a planner.
+Importing this module registers the planner ``bumps``: APEX with random bumps.
 """
 
 from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -98,31 +97,13 @@ def next_query(name: str) -> Query:
     return make_query(setup.checker, setup.start, setup.goals[0])
 
 
-@cache
-def control(kind: str, trained: TrajectoryModel) -> TrajectoryModel:
-    """Return what takes the place of the model."""
-    if kind == "random weights":
-        return TrajectoryModel(drawn(trained.network), {})
-    return (Bumps if kind == "bumps" else Shuffled)(trained.network, {})
-
-
-OTHER: list[Query] = []  # of the problem at hand
-
-
+@register("bumps")
 @dataclass(frozen=True)
-class Control(ApexParameters):
-    """APEX with another model."""
-
-    kind: ClassVar[str]
+class BumpsParameters(ApexParameters):
+    """APEX with random bumps instead of proposals."""
 
     def build(self, si: ob.SpaceInformation) -> ob.Planner:
         """Return the planner."""
         planner = APEX(si, self)
-        planner.model = control(self.kind, planner.model)
-        if isinstance(planner.model, Shuffled):
-            planner.model.other = OTHER[0]
+        planner.model = Bumps(planner.model.network, {})
         return planner
-
-
-for _kind in ("random weights", "shuffled conditions", "bumps"):
-    register(_kind)(type("Control", (Control,), {"kind": _kind}))

@@ -28,6 +28,7 @@ from apex_ompl.util.resolution import FULL_RESOLUTION, SEARCH_RESOLUTION
 from apex_ompl.util.scripts import run_command
 from apex_ompl.util.validation import one_or_more
 
+DEPENDS = ("@checking", "apex_ompl/ompl_adapter", "problems", "benchmarks/collision_checker.py")
 PROBLEMS = ("shelf_swap", "reach_past_post")
 
 

@@ -31,6 +31,7 @@ from apex_ompl.trajopt.spline import Spline
 from apex_ompl.util.scripts import run_command
 from apex_ompl.util.validation import one_or_more, whole_number
 
+DEPENDS = ("@planning", "apex_ompl/datasets", "apex_ompl/generation")
 SCRIPT = Path(__file__).resolve().parent.parent / "scripts" / "generate_data.py"
 WANTED, CORES = 500_000, (2, 16, 64)
 SCALED = ("vertical", "horizontal", "wall/easy", "swap/medium")  # what is made with one and with several workers

@@ -1,11 +1,11 @@
 """Planners head to head on all static levels of the test split, through ``apex_ompl.benchmark``.
 
-Rows: apex; without the trees behind its proposals; with guidance; the paper's algorithm alone (``apex-paper``, on 20
-problems of a level); the straight line and its repair, which ends by itself; rounds of eight random bumps in the place
-of proposals, with the same repair, for 2 s; rrtconnect+polish; rrtconnect; rrt on 20 problems of a level; and planners
-that use all the time they get, 5 s, on 20 problems of the hard and large levels.
-Runs are kept in benchmarks/runs/head_to_head as they end, with OMPL's logs and the database for Planner Arena; the
-command goes on where it was stopped.
+Rows: apex; apex without trees after its proposals; apex with guidance; the paper's algorithm alone (``apex-paper``, on
+20 problems of a level); the straight line and its repair, which ends by itself; rounds of eight random bumps instead of
+proposals, with the same repair, for 2 s; rrtconnect+polish; rrtconnect; rrt on 20 problems of a level; and planners
+that use their whole time limit, 5 s, on 20 problems of the hard and large levels.
+Each run is stored in benchmarks/runs/head_to_head when it ends, with OMPL's logs and the database for Planner Arena;
+the command resumes where it was stopped.
 
 scripts/reproduce.py takes its runs from there, and adds some.
 
@@ -26,10 +26,11 @@ import record
 from apex_ompl.benchmark import Row, Workers, bench, report, write_database, write_logs
 from apex_ompl.benchmark.metrics import share_interval
 from apex_ompl.benchmark.rows import PAPER
-from apex_ompl.benchmark.summary import MOMENTS, Figures, Table, figures, tables, warnings
+from apex_ompl.benchmark.summary import SHARE_TIMES, Statistics, Table, statistics, tables, warnings
 from apex_ompl.util.scripts import run_command
 from apex_ompl.util.validation import one_or_more
 
+DEPENDS = ("@benchmark", "benchmarks/controls.py")
 TIMEOUT = 10.0  # [s]
 TIMES = (("first", 50), ("first", 95), ("first", 99), ("total", 50))
 GROUPS = {
@@ -61,8 +62,8 @@ ROWS = (
 )
 
 
-def together(found: Sequence[Figures]) -> Table:
-    """Return what came of each row on levels of a kind, its paths beside those of apex for the same problems."""
+def together(found: Sequence[Statistics]) -> Table:
+    """Return the statistics of each row over levels of a kind, with its lengths over those of apex."""
     rows = []
     for group, levels in GROUPS.items():
         mine = [f for f in found if f.experiment.split("/")[1] in levels]
@@ -71,10 +72,10 @@ def together(found: Sequence[Figures]) -> Table:
             parts = [f for f in mine if f.label == row.label]
             if not parts or (row.levels and group == "all"):
                 continue
-            f = Figures(group, row.label, [run for part in parts for run in part.runs])
+            f = Statistics(group, row.label, [run for part in parts for run in part.runs])
             low, high = share_interval(len(f.solved), len(f.runs))
             both = [math.log(run["length"] / best[run["problem"]]) for run in f.solved if best.get(run["problem"])]
-            shares = [f"{f.share_within(t):.3f}" if t <= f.limit else "-" for t in MOMENTS]
+            shares = [f"{f.share_within(t):.3f}" if t <= f.limit else "-" for t in SHARE_TIMES]
             times = [f.percentile(which, p) for which, p in TIMES]
             rows.append([
                 group, row.label, str(len(f.runs)),
@@ -82,8 +83,9 @@ def together(found: Sequence[Figures]) -> Table:
                 *(f"{1e3 * t:.0f}" if math.isfinite(t) else "-" for t in times),
                 f"{math.exp(np.mean(both)):.2f} ({len(both)})" if both else "-",
             ])  # fmt: skip
-    head = ["levels", "planner", "N", "solved (95 %, Wilson)", *(f"in {t:g} s" for t in MOMENTS), "first path p50 ms",
-            "p95", "p99", "end p50 ms", "length / apex's (problems that both solved)"]  # fmt: skip
+    within = [f"in {t:g} s" for t in SHARE_TIMES]
+    head = ["levels", "planner", "N", "solved (95 %, Wilson)", *within, "first path p50 ms", "p95", "p99", "end p50 ms"]
+    head += ["length / apex's (problems that both solved)"]
     return Table("Levels together", head, rows)
 
 
@@ -97,16 +99,15 @@ def main() -> None:
     folder = Path(__file__).parent / "runs" / "head_to_head"
     workers = Workers(args.jobs, modules=("controls",))
     levels, seeds = record.static_levels(args.levels), {row.label: min(args.n, row.runs or args.n) for row in ROWS}
-    results = bench(levels, ROWS, folder, runs=args.n, timeout=TIMEOUT, workers=workers)
+    results = bench(levels, ROWS, folder, runs=args.n, timeout=TIMEOUT, workers=workers, provenance=record.session())
     results = replace(results, runs=[run for run in results.runs if run["seed"] < seeds.get(run["label"], 0)])
     write_database(results, write_logs(results))
     report(folder, folder)
-    found = [table for table in (together(figures(results)), *tables(results)) if table.rows]
+    found = [table for table in (together(statistics(results)), *tables(results)) if table.rows]
     text = "\n\n".join([*warnings(results), *(table.markdown() for table in found)])
-    said = {"tables": [{"title": t.title, "head": list(t.head), "rows": [list(r) for r in t.rows]} for t in found]}
-    about = {"timeout": f"{TIMEOUT:g} s but for rows that say otherwise", "seeds": "0 to N - 1"}
-    about |= record.made_with(results.about["sessions"])
-    record.write("head_to_head", said, text, split="test", **about)
+    data = {"tables": [{"title": t.title, "head": list(t.head), "rows": [list(r) for r in t.rows]} for t in found]}
+    about = {"timeout": f"{TIMEOUT:g} s but for rows with their own", "seeds": "0 to N - 1"}
+    record.write("head_to_head", data, text, split="test", **about, **record.made_with(results))
 
 
 if __name__ == "__main__":

@@ -21,6 +21,7 @@ import record
 from apex_ompl.util.scripts import run_command
 from apex_ompl.util.validation import one_or_more
 
+DEPENDS = ("@checking", "apex_ompl/api.py")
 CODE = """
 import json, time
 marks = [time.perf_counter()]

@@ -27,6 +27,7 @@ from apex_ompl.diffusion.validation import judged
 from apex_ompl.util.scripts import run_command
 from apex_ompl.util.validation import one_or_more
 
+DEPENDS = ("apex_ompl/diffusion", "apex_ompl/datasets", "scripts/train.py", "scripts/configs")
 LOSSES = ("loss", "held_out")
 ROOT = record.RESULTS.parent.parent
 VARIANTS: dict[str, dict[str, Any]] = {

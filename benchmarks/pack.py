@@ -1,8 +1,8 @@
-"""Pack the runs behind committed tables, or unpack them, so that a clone can make a table again, or a longer one.
+"""Pack the runs of committed tables, or unpack them, so that a clone can remake or extend a table.
 
-``pack`` puts what lies in benchmarks/runs under a name (a folder, or a file of JSON lines) into
-benchmarks/packed/NAME.tar.xz; ``unpack`` puts it back, where the command that made it goes on from. Pictures, pages,
-OMPL's logs and databases are left out: they are made of the runs.
+``pack`` puts the runs in the folder benchmarks/runs/NAME into benchmarks/packed/NAME.tar.xz; ``unpack`` puts them back,
+where the command that made them resumes. Pictures, pages, OMPL's logs and databases are left out: they are made from
+the runs.
 
 Usage: python benchmarks/pack.py pack|unpack NAME [NAME ...]    (as: pack head_to_head peers)
 """
@@ -24,15 +24,14 @@ KINDS = (".json", ".jsonl")
 
 
 def pack(name: str) -> Path:
-    """Pack the runs of a name, the same runs to the same bytes.
+    """Pack the runs of a benchmark; the same runs give the same bytes.
 
     Raises:
         MissingFileError: There are none.
     """
-    files = [file for file in (RUNS / f"{name}.jsonl", *sorted((RUNS / name).glob("*"))) if file.suffix in KINDS]
-    files = [file for file in files if file.is_file()]
+    files = [file for file in sorted((RUNS / name).glob("*")) if file.suffix in KINDS and file.is_file()]
     if not files:
-        raise MissingFileError(str(RUNS / name), "runs", "expected a folder or JSON lines, as the benchmarks keep them")
+        raise MissingFileError(str(RUNS / name), "runs", "expected a folder, as the benchmarks store them")
     archive = io.BytesIO()
     with tarfile.open(fileobj=archive, mode="w") as tar:
         for file in files:
@@ -45,11 +44,11 @@ def pack(name: str) -> Path:
 
 
 def unpack(name: str) -> list[Path]:
-    """Unpack the runs of a name.
+    """Unpack the runs of a benchmark.
 
     Raises:
-        MissingFileError: They are not packed, or not as ``pack`` does it.
-        ParameterError: Others of that name are there.
+        MissingFileError: There is no archive, or not one of ``pack``.
+        ParameterError: The folder holds other runs.
     """
     path = PACKED / f"{name}.tar.xz"
     try:

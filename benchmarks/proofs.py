@@ -28,6 +28,7 @@ from apex_ompl.util.resolution import FULL_RESOLUTION, SEARCH_RESOLUTION
 from apex_ompl.util.scripts import run_command
 from apex_ompl.util.validation import one_or_more, whole_number
 
+DEPENDS = ("@checking", "benchmarks/collision_checker.py")
 SCENES = 20
 INSIDE_SCENES = 100
 DENSER = 100

@@ -1,10 +1,11 @@
-"""What proposals are worth: B = 1, 8 and 32 of them judged, repaired, judged again and shortened, on test problems.
+"""What proposals are worth: B = 1, 8 and 32 of them checked, repaired, checked again and shortened, on test problems.
 
 The models, unguided and guided, stand beside the straight line, random bumps, the nearest training paths, a regression
 network of the same size, conditions and training, the same network with random weights, and with the conditions of
-another problem of the level. All are repaired by the same steps of the same optimiser, shortened, and judged by the
-same full check; beside them rrtconnect+polish. Times leave out the setup of the problem. Runs are kept in a store as
-they end (JSON lines), so that the command goes on where it was stopped.
+another problem of the level. All are repaired by the same steps of the same optimiser, shortened, and pass the same
+full check; beside them rrtconnect+polish. Times leave out the setup of the problem. Each run is stored in
+benchmarks/runs/proposals when it ends; the command resumes where it was stopped. Runs with other models or data need
+another folder.
 
 The regression network is trained by ``python scripts/train.py scripts/configs/apex.yaml --set
 denoiser.kind=regression --out benchmarks/runs/regression``, with the same --set as the model.
@@ -18,19 +19,22 @@ import argparse
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import record
 import torch
 from controls import Shuffled, checkpoint_digest, digest, drawn, next_query
 from neighbours import Neighbours
-from store import RunStore
 
-from apex_ompl import load_model, plan, problems
+from apex_ompl import load_model
 from apex_ompl.apex.query import make_query
+from apex_ompl.benchmark import Results, Row, Workers, bench
+from apex_ompl.benchmark.rows import Job
+from apex_ompl.benchmark.runs import NO_PROBLEM, Run
 from apex_ompl.diffusion.checkpoint import SHIPPED, read_config
 from apex_ompl.diffusion.data import Mirror, window_paths
 from apex_ompl.diffusion.guidance import Guidance
@@ -39,16 +43,17 @@ from apex_ompl.kernel import Kernel, RobotTables
 from apex_ompl.kernel.scene_builder import scene_tables
 from apex_ompl.ompl_adapter.setup import PlanningSetup, assemble
 from apex_ompl.ompl_adapter.validity import full_check
+from apex_ompl.problems import load
 from apex_ompl.problems.suite_robot import robot
-from apex_ompl.result import INSIDE
 from apex_ompl.trajopt.candidates import first_valid
 from apex_ompl.trajopt.optimizer import Optimizer
 from apex_ompl.trajopt.path import path_length
 from apex_ompl.util.scripts import run_command
 from apex_ompl.util.validation import one_or_more, whole_number
 
-ROOT = record.RESULTS.parent.parent
-STORE = record.RESULTS.parent / "runs" / "proposals.jsonl"
+ROOT = record.ROOT
+FOLDER = record.RESULTS.parent / "runs" / "proposals"
+DEPENDS = ("@benchmark", "benchmarks/controls.py", "benchmarks/neighbours.py")
 COUNTS = (1, 8, 32)
 GUIDED = Guidance(gamma=1.0)
 PAPER = Sampling("ddpm", 256)
@@ -92,26 +97,6 @@ def neighbours(data: str) -> Neighbours:
     return Neighbours([paths, *images], tables)
 
 
-class Job(NamedTuple):
-    """A run: a problem, a method with so many proposals, and what the method is made of."""
-
-    problem: str
-    method: str
-    count: int
-    made_of: str
-    data: str
-    regression: str
-
-    @property
-    def key(self) -> tuple[str, str, int, str]:
-        """The job's entries of ``KEYS``."""
-        return self.problem, self.method, self.count, self.made_of
-
-
-KEYS = ("problem", "method", "count", "made_of")
-"""What tells runs apart."""
-
-
 def made_of(method: str, args: argparse.Namespace) -> str:
     """Return a digest of the models that a method uses, so that runs of others are not taken for its own.
 
@@ -136,50 +121,64 @@ def made_of(method: str, args: argparse.Namespace) -> str:
 ALIKE = ("latent", "condition", "denoiser", "steps", "batch", "rate", "weights", "mirror")
 
 
-def run(job: Job) -> dict[str, Any]:
-    """Return one run of a method on a problem with so many proposals."""
-    name, method, count = job.problem, job.method, job.count
-    seed = int(name.rsplit("/", 1)[1]) % 1000
-    about = {"problem": name, "method": method, "count": count, "made_of": job.made_of}
-    if method == "rrtconnect+polish":
-        result = plan(problems.load(name), method, timeout=TIME_LIMIT, seed=seed)
-        took = sum(result.times.get(k, 0.0) for k in ("line", "solve", "simplify", "verify", "repair"))
-        found = took - sum(result.times.get(f"{INSIDE}{k}", 0.0) for k in ("simplify", "polish"))
-        length = result.length if result else None
-        return {**about, "sampled": False, "solved": bool(result), "found_s": found, "total_s": took, "length": length}
-    ready, optimizer = assemble(problems.load(name), robot()), Optimizer()
-    make = proposer(ready, optimizer, job, seed)
+def label(method: str, count: int) -> str:
+    """Return the label of a row."""
+    return f"{method}, {count}" if len(METHODS[method]) > 1 else method
+
+
+def rows(args: argparse.Namespace) -> list[Row]:
+    """Return a row of each method and number of proposals."""
+    found = []
+    for method in args.methods:
+        if method == "rrtconnect+polish":
+            found.append(Row(method, method))
+            continue
+        most = args.paper if method.startswith("apex-paper") else None
+        if most == 0:
+            continue
+        about = {"made_of": made_of(method, args), "data": args.data, "regression": args.regression}
+        found += [
+            Row(label(method, count), method, {"count": count, **about}, runs=most, runner="proposals:propose")
+            for count in METHODS[method]
+        ]
+    return found
+
+
+def propose(job: Job) -> Run:
+    """Return the columns of a run of a method; ``sampled`` is whether a proposal was valid as it was."""
+    ready, optimizer = assemble(load(job.problem), robot()), Optimizer()
+    make = proposer(ready, optimizer, job)
 
     def is_valid(path: np.ndarray) -> bool:
         return bool(full_check(ready.checker, path, ready.start, [ready.goals[0]]))
 
     begin = time.perf_counter()
-    control = make(count)
+    control = make(job.params["count"])
     proposed = time.perf_counter()
     valid = next((c for c in control if is_valid(optimizer.spline.path(c))), None)
-    judged = time.perf_counter()
+    checked = time.perf_counter()
     found = valid if valid is not None else first_valid(optimizer, ready.checker.kernel, control, is_valid)
-    found_s = time.perf_counter() - begin
+    first = time.perf_counter() - begin
     best = None if found is None else optimizer.shorten(ready.checker.kernel, found, is_valid)
     best = found if best is None else best
-    took = time.perf_counter() - begin
-    length = None if best is None else path_length(optimizer.spline.path(best))
+    total = time.perf_counter() - begin
     return {
-        **about, "sampled": valid is not None, "solved": best is not None, "propose_s": proposed - begin,
-        "judge_s": judged - proposed, "found_s": found_s, "total_s": took, "length": length,
+        "solved": best is not None, "sampled": valid is not None, "first": None if best is None else first,
+        "total": total, "times": {"propose": proposed - begin, "check": checked - proposed},
+        "length": None if best is None else path_length(optimizer.spline.path(best)),
     }  # fmt: skip
 
 
-def proposer(ready: PlanningSetup, optimizer: Optimizer, job: Job, seed: int) -> Callable[[int], np.ndarray]:
-    """Return what makes proposals; what needs no problem is made ready."""
-    method = job.method
+def proposer(ready: PlanningSetup, optimizer: Optimizer, job: Job) -> Callable[[int], np.ndarray]:
+    """Return the function that makes proposals; what does not depend on the problem is loaded before."""
+    method, seed = job.planner, job.seed
     kernel, start, goal = ready.checker.kernel, ready.start, ready.goals[0]
     if method in ("line", "bumps"):
         return lambda count: optimizer.starts(start, goal, count, np.random.default_rng(seed))
     if method == "nearest paths":
-        near = neighbours(job.data)
+        near = neighbours(job.params["data"])
         return lambda count: near.refitted(make_query(ready.checker, start, goal, point=False), kernel, count)
-    kinds = {"regression": job.regression, "random weights": method, "shuffled conditions": method}
+    kinds = {"regression": job.params["regression"], "random weights": method, "shuffled conditions": method}
     network = model(kinds.get(method, "apex-paper" if method.startswith("apex-paper") else "apex"))
     if isinstance(network, Shuffled):
         network.other = next_query(job.problem)
@@ -194,51 +193,30 @@ def proposer(ready: PlanningSetup, optimizer: Optimizer, job: Job, seed: int) ->
     return made
 
 
-def warm_up(jobs: Sequence[Job]) -> None:
-    """Load kernel, robot and models, so that no run pays for it: one run of each method on an easy problem."""
-    for job in jobs:
-        run(job._replace(problem="wall/easy/800000"))
+def summaries(runs: Sequence[Run]) -> dict[str, Any]:
+    """Return the statistics of every method and count on a level."""
+    polished = {run["problem"]: run for run in runs if run["label"] == "rrtconnect+polish" and run["solved"]}
+    labels = [label(method, count) for method, counts in METHODS.items() for count in counts]
+    by_label = {name: [run for run in runs if run["label"] == name] for name in labels}
+    return {name: _summary(some, polished) for name, some in by_label.items() if some}
 
 
-def attempted(job: Job) -> dict[str, Any]:
-    """Return a run; one that raises counts as not solved, and says why."""
-    try:
-        return run(job)
-    except Exception as error:
-        about = {"problem": job.problem, "method": job.method, "count": job.count, "made_of": job.made_of}
-        return {**about, "sampled": False, "solved": False, "error": repr(error)}
-
-
-def figures(runs: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Return what came of every method and count on a level."""
-    polished = {r["problem"]: r for r in runs if r["method"] == "rrtconnect+polish" and r["solved"]}
-    found: dict[str, Any] = {}
-    for method, counts in METHODS.items():
-        for count in counts:
-            some = [r for r in runs if (r["method"], r["count"]) == (method, count)]
-            if some:
-                found[f"{method}, {count}" if len(counts) > 1 else method] = _of_runs(some, polished)
-    return found
-
-
-def _of_runs(some: Sequence[dict[str, Any]], polished: dict[str, dict[str, Any]]) -> dict[str, Any]:
-    took = np.sort([r["total_s"] if r["solved"] else math.inf for r in some])
-    found = np.sort([r["found_s"] if r["solved"] else math.inf for r in some])
-    both = [(r, polished[r["problem"]]) for r in some if r["solved"] and r["problem"] in polished]
-    total, first = (float(times[(len(times) - 1) // 2]) for times in (took, found))
+def _summary(some: Sequence[Run], polished: dict[str, Run]) -> dict[str, Any]:
+    total, first = ([run[key] if run["solved"] else math.inf for run in some] for key in ("total", "first"))
+    both = [(run, polished[run["problem"]]) for run in some if run["solved"] and run["problem"] in polished]
     return {
-        "n": len(some), "sampled": float(np.mean([r["sampled"] for r in some])),
-        "solved": float(np.mean([r["solved"] for r in some])),
-        "propose_s_p50": float(np.median([r.get("propose_s", math.nan) for r in some])),
-        "found_s_p50": first if math.isfinite(first) else None,
-        "total_s_p50": total if math.isfinite(total) else None,
-        "both": len(both),
-        "length_p50": float(np.median([r["length"] for r in some if r["solved"]] or [math.nan])),
-        "length_over_polished": float(np.exp(np.mean([math.log(a["length"] / b["length"]) for a, b in both])))
-        if both else None,
-        "time_over_polished": float(np.exp(np.mean([math.log(a["total_s"] / b["total_s"]) for a, b in both])))
-        if both else None,
+        "n": len(some), "sampled": float(np.mean([run.get("sampled", False) for run in some])),
+        "solved": float(np.mean([run["solved"] for run in some])),
+        "propose_s_p50": float(np.median([run["times"].get("propose", math.nan) for run in some])),
+        "found_s_p50": record.reached(first, 50), "total_s_p50": record.reached(total, 50), "both": len(both),
+        "length_p50": float(np.median([run["length"] for run in some if run["solved"]] or [math.nan])),
+        "length_over_polished": _mean_ratio(both, "length"), "time_over_polished": _mean_ratio(both, "total"),
     }  # fmt: skip
+
+
+def _mean_ratio(pairs: Sequence[tuple[Run, Run]], key: str) -> float | None:
+    """Return the geometric mean of the ratios of a column."""
+    return float(np.exp(np.mean([math.log(a[key] / b[key]) for a, b in pairs]))) if pairs else None
 
 
 def table(levels: Sequence[dict[str, Any]]) -> str:
@@ -283,35 +261,33 @@ def main() -> None:
     parser.add_argument("--split", choices=("validation", "test"), default="test")
     parser.add_argument("--methods", nargs="*", choices=list(METHODS), default=list(METHODS), metavar="NAME")
     parser.add_argument("--regression", default=str(ROOT / "benchmarks" / "runs" / "regression" / "checkpoint"))
-    parser.add_argument("--store", type=Path, default=STORE)
-    parser.add_argument("--report", action="store_true", help="run nothing; write the results of what the store holds")
+    parser.add_argument("--store", type=Path, default=FOLDER, help="folder of the runs")
+    parser.add_argument("--report", action="store_true", help="run nothing; write the results of the stored runs")
     args = parser.parse_args()
-    chosen = record.static_levels(args.levels)
-    kinds = {method: made_of(method, args) for method in args.methods}
-    jobs: list[Job] = []
-    for level in chosen:
-        most = args.hard if level.endswith("/hard") else args.n
-        names = problems.frozen_names(*level.split("/"), args.split)[:most]
-        for method in args.methods:
-            few = names[: args.paper] if method.startswith("apex-paper") else names
-            rest = kinds[method], args.data, args.regression
-            jobs += [Job(name, method, count, *rest) for count in METHODS[method] for name in few]
-    store = RunStore(args.store, KEYS)
-    done = store.read()
-    todo = [] if args.report else [job for job in jobs if job.key not in done]
-    todo.sort(key=lambda job: (job.method.startswith("apex-paper"), int(job.problem.rsplit("/", 1)[1]) % 1000))
-    first = {job.method: job for job in reversed(todo)}
-    store.complete(attempted, todo, args.jobs, warm_up, list(first.values()))
-    done = store.read()
-    runs = [done[job.key] for job in jobs if job.key in done]
-    levels = [{"level": v, "methods": figures([r for r in runs if r["problem"].startswith(f"{v}/")])} for v in chosen]
+    chosen, wanted = record.static_levels(args.levels), rows(args)
+    if not args.report:
+        for count, levels in ((args.n, [v for v in chosen if not v.endswith("/hard")]),
+                              (args.hard, [v for v in chosen if v.endswith("/hard")])):  # fmt: skip
+            if count and levels:
+                bench(levels, wanted, args.store, runs=count, timeout=TIME_LIMIT, split=args.split,
+                      workers=Workers(args.jobs), provenance=record.session())  # fmt: skip
+    results = Results.load(args.store)
+    most = {level: args.hard if level.endswith("/hard") else args.n for level in chosen}
+    labels = {row.label: row.runs or math.inf for row in wanted}
+    runs = [
+        run for run in results.runs
+        if run["seed"] < min(most.get(run["experiment"], 0), labels.get(run["label"], 0))
+        and run["status"] != NO_PROBLEM
+    ]  # fmt: skip
+    levels = [{"level": v, "methods": summaries([r for r in runs if r["experiment"] == v])} for v in chosen]
     levels = [level for level in levels if level["methods"]]
-    hard = [r for r in runs if "/hard/" in r["problem"]]
+    hard = [run for run in runs if run["experiment"].endswith("/hard")]
     if hard:
-        levels.insert(0, {"level": "all hard levels", "methods": figures(hard)})
+        levels.insert(0, {"level": "all hard levels", "methods": summaries(hard)})
+    kinds = {row.planner: row.params.get("made_of", "") for row in wanted}
     record.write(
-        "proposals", {"levels": levels, "made_of": kinds}, table(levels), split=args.split,
-        time_limit=TIME_LIMIT, seeds="number of the problem modulo 1000", **record.made_with(runs),
+        "proposals", {"levels": levels, "made_of": kinds}, table(levels), split=args.split, time_limit=TIME_LIMIT,
+        seeds="number of the problem modulo 1000", **record.made_with(replace(results, runs=runs)),
     )  # fmt: skip
 
 

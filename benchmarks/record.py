@@ -1,11 +1,11 @@
-"""What every committed measurement says besides its figures: command, versions, hardware, commit, date."""
+"""Results of measurements, with their provenance: command, versions, hardware, commit, date, dependencies."""
 
 from __future__ import annotations
 
+import ast
 import json
 import math
 import platform
-import subprocess
 import sys
 from collections.abc import Iterable
 from datetime import UTC, datetime
@@ -15,56 +15,82 @@ from typing import Any
 import numpy as np
 
 from apex_ompl import problems
+from apex_ompl.benchmark import Results
 from apex_ompl.benchmark.metrics import next_percentile
+from apex_ompl.util import provenance
 from apex_ompl.util.files import write_atomically
-from apex_ompl.util.provenance import hardware, versions
 
-RESULTS = Path(__file__).parent / "results"
-
-
-def commit() -> str:
-    """Return the commit of the tree, with a mark when it has changes."""
-    root = Path(__file__).parent
-    try:
-        head = subprocess.run(
-            ["git", "rev-parse", "--short", "HEAD"], cwd=root, capture_output=True, text=True, check=True
-        )
-        dirty = subprocess.run(["git", "status", "--porcelain"], cwd=root, capture_output=True, text=True, check=True)
-    except (OSError, subprocess.CalledProcessError):
-        return "unknown"
-    return head.stdout.strip() + ("+changes" if dirty.stdout.strip() else "")
+ROOT = Path(__file__).resolve().parents[1]
+RESULTS = ROOT / "benchmarks" / "results"
+CHECKING = ("apex_ompl/scene", "apex_ompl/robot", "apex_ompl/kernel", "apex_ompl/collision", "apex_ompl/util")
+PLANNING = (
+    *CHECKING, "apex_ompl/apex", "apex_ompl/api.py", "apex_ompl/diffusion", "apex_ompl/ompl_adapter",
+    "apex_ompl/planning.py", "apex_ompl/tasks", "apex_ompl/trajopt", "planners", "problems",
+)  # fmt: skip
+GROUPS = {
+    "@checking": CHECKING,
+    "@planning": PLANNING,
+    "@benchmark": (*PLANNING, "apex_ompl/benchmark", "apex_ompl/trajectory/smoothness.py"),
+}
+"""Names of groups of paths in ``DEPENDS``."""
 
 
-def write(name: str, figures: dict[str, Any], table: str, **settings: Any) -> None:
-    """Write ``results/NAME.json`` and ``results/NAME.md``, and print the table.
+def dependencies(script: Path, root: Path = ROOT) -> list[str]:
+    """Return the paths that the results of a script depend on: the script, and its ``DEPENDS`` with groups resolved.
+
+    The script is read, not run: some need packages that are not installed.
+
+    Raises:
+        SystemExit: It has no ``DEPENDS``, a tuple of texts.
+    """
+    for node in ast.parse(script.read_text(encoding="utf-8")).body:
+        if isinstance(node, ast.Assign) and [ast.unparse(target) for target in node.targets] == ["DEPENDS"]:
+            declared = ast.literal_eval(node.value)
+            paths = [path for name in declared for path in GROUPS.get(name, (name,))]
+            return [script.resolve().relative_to(root).as_posix(), *dict.fromkeys(paths)]
+    raise SystemExit(f"{script}: expected DEPENDS, the paths that its results depend on")
+
+
+def script() -> Path:
+    """Return the script that this process runs."""
+    return Path(sys.argv[0]).resolve()
+
+
+def session() -> dict[str, str]:
+    """Return what a session of ``bench`` records besides its own provenance: the commit of what it depends on."""
+    return {"commit": provenance.commit(ROOT, dependencies(script()))}
+
+
+def write(
+    name: str, data: dict[str, Any], table: str, folder: Path = RESULTS, **settings: Any
+) -> None:  # fmt: skip
+    """Write ``NAME.json`` and ``NAME.md``, and print the table.
 
     Args:
         name: Name of the measurement.
-        figures: The figures, ready for JSON.
-        table: A Markdown table of them.
+        data: The measured values, ready for JSON.
+        table: Markdown tables of them.
+        folder: Folder of the results.
         **settings: Seed, N and other settings; ``hardware`` where it is not that of this process.
     """
+    depends = dependencies(script())
     about = {
-        "command": " ".join(
-            [
-                "python",
-                *(str(a) for a in [Path(sys.argv[0]).name and f"benchmarks/{Path(sys.argv[0]).name}", *sys.argv[1:]]),
-            ]
-        ),
+        "command": " ".join(["python", script().relative_to(ROOT).as_posix(), *sys.argv[1:]]),
         "date": datetime.now(UTC).strftime("%Y-%m-%d"),
-        "commit": commit(),
-        "hardware": hardware(),
+        "commit": provenance.commit(ROOT, depends),
+        "hardware": provenance.hardware(),
         "python": platform.python_version(),
-        "versions": versions(),
+        "versions": provenance.versions(),
+        "depends": depends,
         **settings,
     }
-    RESULTS.mkdir(exist_ok=True)
-    write_atomically(RESULTS / f"{name}.json", (json.dumps({"about": about, **figures}, indent=1) + "\n").encode())
-    made_with = ", ".join(f"{k} {v}" for k, v in about["versions"].items())
+    folder.mkdir(exist_ok=True, parents=True)
+    write_atomically(folder / f"{name}.json", (json.dumps({"about": about, **data}, indent=1) + "\n").encode())
+    libraries = ", ".join(f"{k} {v}" for k, v in about["versions"].items())
     rest = ", ".join(f"{k} {v}" for k, v in settings.items() if k != "hardware")
     head = f"`{about['command']}` on {about['hardware']}; {about['date']}, commit {about['commit']}, "
-    head += f"Python {about['python']}, {made_with}; {rest}."
-    write_atomically(RESULTS / f"{name}.md", f"# {name}\n\n{head}\n\n{table}\n".encode())
+    head += f"Python {about['python']}, {libraries}{'; ' if rest else ''}{rest}."
+    write_atomically(folder / f"{name}.md", f"# {name}\n\n{head}\n\n{table}\n".encode())
     print(table)
 
 
@@ -74,17 +100,22 @@ def row(cells: list[Any]) -> str:
 
 
 def reached(values: list[float] | np.ndarray, p: float) -> float | None:
-    """Return a percentile of times, the next larger value; None without any, or where it is endless."""
+    """Return a percentile of times, the next larger value; None without any, or where it is infinite."""
     if not len(values):
         return None
     value = next_percentile(values, p)
     return value if math.isfinite(value) else None
 
 
-def made_with(runs: Iterable[dict[str, Any]]) -> dict[str, str]:
-    """Return on what hardware runs of a store were made, and how many at a time."""
-    runs = list(runs)
-    return {name: "; ".join(sorted({str(run[name]) for run in runs})) for name in ("jobs", "hardware")}
+def made_with(results: Results) -> dict[str, str]:
+    """Return how the runs of results were made: number at a time, hardware, commits of the code."""
+    sessions = results.sessions()
+    names = {"jobs": "jobs", "hardware": "hardware", "run_commits": "commit"}
+    return {name: _distinct(one.get(key, "unknown") for one in sessions) for name, key in names.items()}
+
+
+def _distinct(values: Iterable[Any]) -> str:
+    return "; ".join(sorted({str(value) for value in values}))
 
 
 def static_levels(wanted: list[str]) -> list[str]:

@@ -34,6 +34,7 @@ from apex_ompl.scene.problem import Goal, Problem
 from apex_ompl.util.scripts import run_command
 from apex_ompl.util.validation import one_or_more
 
+DEPENDS = ("@planning",)
 HARD = "shelf/hard/800012"
 MIB = 2**20
 OVERRUN = 0.02  # that is aimed at [s]

@@ -15,6 +15,7 @@ from apex_ompl import problems
 from apex_ompl.util.scripts import run_command
 from apex_ompl.util.validation import one_or_more
 
+DEPENDS = ("@checking", "problems")
 FIRST = 100_000  # seed of the first problem, of the training split
 
 

@@ -1,10 +1,10 @@
-"""How long planners take to a short path: one within 10 % of the length that aorrtc has after 30 s.
+"""Time of planners to a short path: one within 10 % of the length that aorrtc has after 30 s.
 
-The lengths to come up to are made once (``--reference``), on the first 20 test problems of each hard level, and kept in
-benchmarks/reference_lengths.json. Then each planner has 10 s: apex, improving its path all the time (``anytime``);
-rrtconnect and OMPL's simplification, and rrtconnect+polish, begun anew with other random numbers as long as there is
-time, their best path kept; aorrtc. Paths count from when they are found, if they pass the full check, which is part of
-the time only where the planner makes it itself.
+The reference lengths are made once (``--reference``), on the first 20 test problems of each hard level, and kept in
+benchmarks/reference_lengths.json. Then each planner has 10 s: apex, which improves its path all the time (``anytime``);
+rrtconnect with OMPL's simplification, and rrtconnect+polish, restarted with other random numbers as long as there is
+time; aorrtc. A path counts from when it has passed the full check, as first paths do in apex_ompl.benchmark.
+Each run is stored in benchmarks/runs/time_to_quality when it ends; the command resumes where it was stopped.
 
 Usage: python benchmarks/time_to_quality.py [--reference] [SUITE/hard ...] [-n 20] [--jobs 1]
 """
@@ -16,22 +16,24 @@ import json
 import math
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import record
-import torch
 from ompl import base as ob
 from ompl import geometric as og
-from store import RunStore
 
-from apex_ompl import planners, problems
-from apex_ompl.ompl_adapter.process import quiet_ompl, seed_ompl
+from apex_ompl import planners
+from apex_ompl.benchmark import Row, Workers, bench
+from apex_ompl.benchmark.rows import Job
+from apex_ompl.benchmark.runs import NO_PROBLEM, Run
 from apex_ompl.ompl_adapter.setup import PlanningSetup, assemble
 from apex_ompl.ompl_adapter.simplify import simplify
 from apex_ompl.ompl_adapter.space import path_to_array
 from apex_ompl.ompl_adapter.validity import full_check
+from apex_ompl.problems import load
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.trajopt.path import path_length
 from apex_ompl.util.files import write_atomically
@@ -39,13 +41,17 @@ from apex_ompl.util.scripts import run_command
 from apex_ompl.util.validation import one_or_more
 
 REFERENCE = Path(__file__).parent / "reference_lengths.json"
-STORE = Path(__file__).parent / "runs" / "time_to_quality.jsonl"
-LONG, LIMIT, WITHIN = 30.0, 10.0, 1.1  # [s], [s], factor on the length
+FOLDER = Path(__file__).parent / "runs" / "time_to_quality"
+DEPENDS = ("@benchmark", "benchmarks/reference_lengths.json")
+REFERENCE_TIMEOUT, TIMEOUT, WITHIN = 30.0, 10.0, 1.1  # [s], [s], factor on the length
 ALL_HARD = "all"
-LOOK = 0.005  # between two looks at a planner's best path [s]
+PERIOD = 0.005  # at which a planner's best path is read [s]
+RUNNER = "time_to_quality:improve"
 METHODS = ("apex", "rrtconnect", "rrtconnect+polish", "aorrtc")
+ROWS = tuple(Row(name, name, {"anytime": True} if name == "apex" else {}, runner=RUNNER) for name in METHODS)
+REFERENCE_ROW = Row("reference", "aorrtc", timeout=REFERENCE_TIMEOUT, runner=RUNNER)
 Lengths = list[tuple[float, float]]
-"""Seconds, and the length of a path that passed the full check [rad]; each shorter than those before."""
+"""Time at which a path had passed the full check [s], and its length [rad]; each shorter than those before."""
 
 
 def proven(ready: PlanningSetup, path: np.ndarray) -> bool:
@@ -54,14 +60,14 @@ def proven(ready: PlanningSetup, path: np.ndarray) -> bool:
     return bool(full_check(ready.checker, states, ready.start, ready.goals))
 
 
-def watched(ready: PlanningSetup, planner: ob.Planner, limit: float) -> Lengths:
-    """Let a planner run, look at its best path all the time, and return what it came to."""
+def observed(ready: PlanningSetup, planner: ob.Planner, limit: float) -> Lengths:
+    """Run a planner, read its best path periodically, and return the lengths; each path is checked afterwards."""
     setup, found = ready.simple_setup, list[tuple[float, np.ndarray]]()
     pdef, begin, last = setup.getProblemDefinition(), time.perf_counter(), [0.0]
 
     def over() -> bool:
         now = time.perf_counter() - begin
-        if now - last[0] > LOOK or now > limit:
+        if now - last[0] > PERIOD or now > limit:
             last[0] = now
             if pdef.hasExactSolution():
                 path = path_to_array(pdef.getSolutionPath(), ready.robot.dof)
@@ -74,7 +80,12 @@ def watched(ready: PlanningSetup, planner: ob.Planner, limit: float) -> Lengths:
     begin = time.perf_counter()
     setup.solve(ob.PlannerTerminationCondition(over))
     over()
-    return shorter([(took, path_length(path)) for took, path in found if proven(ready, path)])
+    lengths: Lengths = []
+    for took, path in found:
+        check = time.perf_counter()
+        if proven(ready, path):
+            lengths.append((took + time.perf_counter() - check, path_length(path)))
+    return shorter(lengths)
 
 
 def shorter(lengths: Lengths) -> Lengths:
@@ -86,30 +97,29 @@ def shorter(lengths: Lengths) -> Lengths:
     return found
 
 
-def apex(ready: PlanningSetup, seed: int) -> Lengths:
-    """Let apex improve its path until time is up."""
+def apex(ready: PlanningSetup, job: Job) -> Lengths:
+    """Run apex, which improves its path until time is up."""
     setup = ready.simple_setup
-    planner = planners.parameters("apex", seed=seed, anytime=True).build(setup.getSpaceInformation())
+    planner = planners.parameters("apex", seed=job.seed, **job.params).build(setup.getSpaceInformation())
     setup.setPlanner(planner)
     setup.setup()
-    setup.solve(ob.timedPlannerTerminationCondition(LIMIT))
+    setup.solve(ob.timedPlannerTerminationCondition(job.timeout))
     return shorter(planner.report.lengths)
 
 
-def again(attempt: Callable[[float], np.ndarray | None], ready: PlanningSetup) -> Lengths:
-    """Make attempts until time is up."""
+def repeated(attempt: Callable[[float], np.ndarray | None], ready: PlanningSetup, limit: float) -> Lengths:
+    """Make attempts until time is up, and return the lengths."""
     begin, found = time.perf_counter(), list[tuple[float, float]]()
-    while (left := LIMIT - (time.perf_counter() - begin)) > 0.0:
+    while (left := limit - (time.perf_counter() - begin)) > 0.0:
         path = attempt(left)
-        took = time.perf_counter() - begin
-        if path is not None and took <= LIMIT and proven(ready, path):
+        if path is not None and proven(ready, path) and (took := time.perf_counter() - begin) <= limit:
             found.append((took, path_length(path)))
     return shorter(found)
 
 
-def attempts(ready: PlanningSetup, name: str) -> Lengths:
-    """Run a planner again and again, and simplify what it finds unless that is smooth."""
-    setup, parameters = ready.simple_setup, planners.parameters(name)
+def attempts(ready: PlanningSetup, job: Job) -> Lengths:
+    """Run a planner repeatedly, and simplify its paths unless they are smooth."""
+    setup, parameters = ready.simple_setup, planners.parameters(job.planner)
     si = setup.getSpaceInformation()
 
     def attempt(left: float) -> np.ndarray | None:
@@ -122,37 +132,25 @@ def attempts(ready: PlanningSetup, name: str) -> Lengths:
         path = path_to_array(setup.getSolutionPath(), ready.robot.dof)
         return path if parameters.smooth else simplify(og.PathSimplifier(si), si, path)
 
-    return again(attempt, ready)
+    return repeated(attempt, ready, job.timeout)
 
 
-def run(job: tuple[str, str]) -> dict[str, Any]:
-    """Return what a planner came to on a problem."""
-    name, method = job
-    seed = int(name.rsplit("/", 1)[1]) % 1000
-    with quiet_ompl():
-        seed_ompl(seed)
-        ready = assemble(problems.load(name), robot())
-        if method == "apex":
-            found = apex(ready, seed)
-        elif method in ("aorrtc", "reference"):
-            setup = ready.simple_setup
-            si = setup.getSpaceInformation()
-            setup.setOptimizationObjective(ob.PathLengthOptimizationObjective(si))
-            planner = planners.parameters("aorrtc").build(si)
-            found = watched(ready, planner, LONG if method == "reference" else LIMIT)
-        else:
-            found = attempts(ready, method)
-    return {"problem": name, "method": method, "lengths": found}
-
-
-def warm_up() -> None:
-    """Load the kernel, the robot, the model."""
-    torch.set_num_threads(1)
-    ready = assemble(problems.load("wall/easy/800000"), robot())
-    with quiet_ompl():
-        planner = planners.parameters("apex", seed=0).build(ready.simple_setup.getSpaceInformation())
-        ready.simple_setup.setPlanner(planner)
-        ready.simple_setup.solve(ob.timedPlannerTerminationCondition(1.0))
+def improve(job: Job) -> Run:
+    """Return the columns of a run; ``lengths`` are those of its paths, ``total`` is the time of the last of them."""
+    ready = assemble(load(job.problem), robot())
+    if job.planner == "apex":
+        found = apex(ready, job)
+    elif job.planner == "aorrtc":
+        setup = ready.simple_setup
+        si = setup.getSpaceInformation()
+        setup.setOptimizationObjective(ob.PathLengthOptimizationObjective(si))
+        found = observed(ready, planners.parameters("aorrtc").build(si), job.timeout)
+    else:
+        found = attempts(ready, job)
+    if not found:
+        return {"solved": False, "lengths": found}
+    (first, _), (total, length) = found[0], found[-1]
+    return {"solved": True, "first": first, "total": total, "length": length, "lengths": found}
 
 
 def reached(lengths: Lengths, wanted: float) -> float:
@@ -161,10 +159,10 @@ def reached(lengths: Lengths, wanted: float) -> float:
 
 
 def quality(done: dict[Any, Any], names: list[str], method: str, kept: dict[str, float]) -> dict[str, Any]:
-    """Return how many of some problems a planner reached the wanted lengths on, and when."""
-    lengths = [done[name, method]["lengths"] for name in names]
+    """Return the share of problems on which a planner reached the wanted lengths, and the times."""
+    lengths = [done[name, method].get("lengths", []) for name in names]
     ratios = [one[-1][1] / kept[name] for name, one in zip(names, lengths, strict=True) if one]
-    known = [min([kept[n]] + [one[-1][1] for m in METHODS if (one := done[n, m]["lengths"])]) for n in names]
+    known = [min([kept[n]] + [one[-1][1] for m in METHODS if (one := done[n, m].get("lengths"))]) for n in names]
     found: dict[str, Any] = {
         "n": len(names), "ratio": float(np.exp(np.mean(np.log(ratios)))) if ratios else None,
         "no_path": len(names) - len(ratios),
@@ -181,21 +179,21 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("levels", nargs="*", metavar="SUITE/hard")
     parser.add_argument("-n", type=one_or_more, default=20, help="test problems of a level (default: %(default)s)")
-    parser.add_argument(
-        "--reference", action="store_true", help="make the lengths to come up to, 30 s for each problem"
-    )
+    parser.add_argument("--reference", action="store_true", help="make the reference lengths, 30 s for each problem")
     parser.add_argument("--jobs", type=one_or_more, default=1, help="runs at a time (default: one, as they are timed)")
     args = parser.parse_args()
     levels = [level for level in record.static_levels(args.levels) if level.endswith("/hard")]
-    names = [name for level in levels for name in problems.frozen_names(*level.split("/"), "test")[: args.n]]
-    jobs = [(name, method) for name in names for method in (("reference",) if args.reference else METHODS)]
-    store = RunStore(STORE, ("problem", "method"))
-    done = store.read()
-    store.complete(run, [job for job in jobs if job not in done], args.jobs, warm_up)
-    done = store.read()
+    results = bench(
+        levels, [REFERENCE_ROW] if args.reference else ROWS, FOLDER, runs=args.n, timeout=TIMEOUT,
+        workers=Workers(args.jobs), provenance=record.session(),
+    )  # fmt: skip
+    wanted = [run for run in results.runs if run["experiment"] in levels and run["seed"] < args.n]
+    results = replace(results, runs=[r for r in wanted if (r["label"] == REFERENCE_ROW.label) is args.reference])
+    done = {(run["problem"], run["label"]): run for run in results.runs if run["status"] != NO_PROBLEM}
+    names = sorted({name for name, _ in done})
     kept = json.loads(REFERENCE.read_text()) if REFERENCE.is_file() else {}
     if args.reference:
-        made = {name: lengths[-1][1] for name, _ in jobs if (lengths := done[name, "reference"]["lengths"])}
+        made = {name: run["length"] for (name, _), run in done.items() if run["solved"]}
         write_atomically(REFERENCE, (json.dumps({**kept, **made}, indent=1, sort_keys=True) + "\n").encode())
         print(f"{REFERENCE.name}: {len(kept | made)} lengths")
         return
@@ -214,9 +212,9 @@ def main() -> None:
             cells = [level if k == 0 else "", method, f["n"], shares[0], *slow[0], ratio, f["no_path"], shares[1]]
             rows.append(record.row([*cells, *slow[1]]))
     without = sum(name not in kept for name in names)
-    text = f"\n\n{without} of {len(names)} problems, for which aorrtc has no path after {LONG:g} s, are left out."
-    limits = f"{LIMIT:g} s, within {WITHIN:g} of aorrtc's length after {LONG:g} s"
-    about = {"limit": limits, **record.made_with(done[job] for job in jobs)}
+    text = f"\n\n{without} of {len(names)} problems are left out: aorrtc has no path after {REFERENCE_TIMEOUT:g} s."
+    limits = f"{TIMEOUT:g} s, within {WITHIN:g} of aorrtc's length after {REFERENCE_TIMEOUT:g} s"
+    about = {"limit": limits, **record.made_with(results)}
     record.write("time_to_quality", {"levels": figures}, "\n".join(rows) + text, split="test", **about)
 
 

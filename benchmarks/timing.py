@@ -50,6 +50,7 @@ from apex_ompl.trajectory.curve import Polyline
 from apex_ompl.util.scripts import run_command
 from apex_ompl.util.validation import one_or_more, whole_number
 
+DEPENDS = ("@planning", "apex_ompl/trajectory")
 Method = Callable[[np.ndarray], Trajectory | None]
 DERIVATIVES = ("position", "velocity", "acceleration", "jerk")
 

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import ruckig
 import toppra
-from apex_ompl.problems.reach import robot
 from toppra import algorithm, constraint
 
 from apex_ompl.kernel.reachability import fastest
+from apex_ompl.problems.suite_robot import robot
 from apex_ompl.trajectory import Timing, Trajectory
 from apex_ompl.trajectory.curve import Curve, Polyline
 from apex_ompl.trajectory.methods.ruckig import calculate, knots, stops

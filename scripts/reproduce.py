@@ -1,13 +1,13 @@
-"""Make a figure of the paper anew, for static scenes: its numbers, a table, and a picture.
+"""Reproduce a figure of the paper for static scenes: its numbers, a table, and a picture.
 
-``failure``: failure ratio R_f, smoothness S_r and time of planning, vertical and horizontal tasks among cubes.
-``size``: failure ratio over the size of the cubes, guided and not.
+``failure``: failure ratio R_f, smoothness S_r and planning time, vertical and horizontal tasks among cubes.
+``size``: failure ratio over the size of the cubes, guided and unguided.
 ``fid``: FID and KID of guided and unguided paths against solutions of the same problems, in the features of the
 variational autoencoder of ``apex-paper`` and in principal components.
 
-The runs of ``failure`` and ``size`` are the same, and are kept as they end, beside those of benchmarks/head_to_head.py,
-some of which they are; so are the solutions of ``fid``. All planners have the same problems. The command goes on where
-it was stopped.
+``failure`` and ``size`` have the same runs. Each is stored when it ends, beside those of benchmarks/head_to_head.py,
+with which they share some; so are the solutions of ``fid``. All planners have the same problems. The command resumes
+where it was stopped.
 
 Usage: python scripts/reproduce.py failure|size|fid [-n 40] [--jobs 1] [--keep FOLDER] [-o FOLDER]
 """
@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import argparse
 import io
-import json
+import sys
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,7 +25,7 @@ import numpy as np
 
 from apex_ompl.benchmark import Results, Row, Workers, bench, metrics
 from apex_ompl.benchmark.rows import PAPER
-from apex_ompl.benchmark.summary import Figures, Table, about, figures, warnings
+from apex_ompl.benchmark.summary import Statistics, Table, about, statistics, warnings
 from apex_ompl.util.files import make_folder, write_atomically
 from apex_ompl.util.provenance import hardware, versions
 from apex_ompl.util.scripts import run_command
@@ -35,6 +35,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 ROOT = Path(__file__).resolve().parents[1]
+DEPENDS = ("@benchmark", "apex_ompl/datasets", "apex_ompl/generation", "scripts/paper")
+COMMITS = "Commits of the runs"
 TASKS, SIZES = ("vertical", "horizontal"), ("small", "medium", "large")
 EDGES = {"free": 0.0, "small": 0.06, "medium": 0.10, "large": 0.15}  # of the cubes [m]
 TIMEOUT = 10.0  # [s]
@@ -61,10 +63,12 @@ def blank(width: float, height: float) -> Figure:
 
 
 def runs(args: argparse.Namespace) -> Results:
-    """Return the runs of the planners on the paper's tasks, each on the same problems."""
+    """Return the runs of the planners on the paper's tasks, all on the same problems."""
     levels, labels = [f"{task}/{size}" for task in TASKS for size in EDGES], {row.label for row in ROWS}
     folder, workers = args.keep / "head_to_head", Workers(args.jobs)
-    found = bench(levels, ROWS, folder, runs=args.n, timeout=TIMEOUT, workers=workers)
+    import record
+
+    found = bench(levels, ROWS, folder, runs=args.n, timeout=TIMEOUT, workers=workers, provenance=record.session())
     mine = [r for r in found.runs if r["experiment"] in levels and r["label"] in labels and r["seed"] < args.n]
     return replace(found, runs=mine)
 
@@ -72,7 +76,7 @@ def runs(args: argparse.Namespace) -> Results:
 def failure(args: argparse.Namespace) -> tuple[dict[str, Any], list[Table], Figure, list[tuple[str, Any]]]:
     """Return R_f, S_r and time of each planner on each task, over all sizes of cubes."""
     results = runs(args)
-    per_level = [f for f in figures(results) if f.experiment.split("/")[1] in SIZES]
+    per_level = [f for f in statistics(results) if f.experiment.split("/")[1] in SIZES]
     found: dict[str, Any] = {}
     rows = []
     picture = blank(11, 4)
@@ -80,7 +84,7 @@ def failure(args: argparse.Namespace) -> tuple[dict[str, Any], list[Table], Figu
     for t, task in enumerate(TASKS):
         for k, row in enumerate(ROWS):
             mine = [f for f in per_level if f.experiment.startswith(f"{task}/") and f.label == row.label]
-            f = Figures(task, row.label, [run for one in mine for run in one.runs])
+            f = Statistics(task, row.label, [run for one in mine for run in one.runs])
             ratio = metrics.failure_ratio([run["solved"] for run in f.runs])
             low, high = (100.0 * (1.0 - v) for v in metrics.share_interval(len(f.solved), len(f.runs)))
             length, raw, took = f.median("length"), f.median("raw_length"), f.percentile("total", 50)
@@ -103,13 +107,13 @@ def failure(args: argparse.Namespace) -> tuple[dict[str, Any], list[Table], Figu
     axes[2].set_yscale("log")
     picture.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=8)
     head = ["task", "planner", "N", "R_f %", "95 %", "S_r rad (median of solved)", "as found", "time s (median of all)"]
-    return found, [Table("Failure ratio, smoothness, time", head, rows)], picture, said_of(results)
+    return found, [Table("Failure ratio, smoothness, time", head, rows)], picture, provenance(results)
 
 
 def size(args: argparse.Namespace) -> tuple[dict[str, Any], list[Table], Figure, list[tuple[str, Any]]]:
     """Return the failure ratio over the size of the cubes, guided and not."""
     results = runs(args)
-    by = {(f.experiment, f.label): f for f in figures(results)}
+    by = {(f.experiment, f.label): f for f in statistics(results)}
     found: dict[str, Any] = {}
     rows = []
     picture = blank(9, 4.4)
@@ -137,12 +141,15 @@ def size(args: argparse.Namespace) -> tuple[dict[str, Any], list[Table], Figure,
     picture.axes[0].set_ylabel("R_f %")
     picture.legend(*picture.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=8)
     head = ["task", "planner", "edge m", "N", "R_f %", "95 %"]
-    return found, [Table("Failure ratio over the size of obstacles", head, rows)], picture, said_of(results)
+    return found, [Table("Failure ratio over the size of obstacles", head, rows)], picture, provenance(results)
 
 
-def said_of(results: Results) -> list[tuple[str, Any]]:
-    """Return how the runs were made, and what a reader of times must know."""
-    return [*about(results), *(("Note", said) for said in warnings(results))]
+def provenance(results: Results) -> list[tuple[str, Any]]:
+    """Return the provenance of the runs, and warnings for a reader of the times."""
+    import record
+
+    commits = (COMMITS, record.made_with(results)["run_commits"])
+    return [*about(results), commits, *(("Note", warning) for warning in warnings(results))]
 
 
 def fid(args: argparse.Namespace) -> tuple[dict[str, Any], list[Table], Figure, list[tuple[str, Any]]]:
@@ -168,14 +175,14 @@ def fid(args: argparse.Namespace) -> tuple[dict[str, Any], list[Table], Figure, 
         axis.set_title(f"FID, {name} features (dots: floor)")
         axis.set_xticks(range(len(made)), list(made), rotation=15, fontsize=8)
     head = ["features", "paths", "N", "d", "FID", "95 %", "floor", "KID", "CPU ms a path"]
-    says = [
+    notes = [
         ("Real", f"solutions of {len(real)} validation problems, one each, of {', '.join(FID_LEVELS)}"),
         ("Made", f"one path for each of them; apex by its own sampling, apex-paper by {realism.STEPS} steps of DDIM"),
         ("Seeds", f"the number of the first of {realism.PART} problems at a time, 0 to {len(real) - 1}"),
         ("Floor", "FID between two halves of the real set, of other problems each: larger than it would be for all"),
         ("Made with", f"{hardware()}, {args.jobs} processes; {', '.join(f'{k} {v}' for k, v in versions().items())}"),
     ]
-    return found_all, [Table("FID and KID", head, rows)], picture, says
+    return found_all, [Table("FID and KID", head, rows)], picture, notes
 
 
 FIGURES = {"failure": (failure, 40), "size": (size, 40), "fid": (fid, 10_000)}
@@ -190,23 +197,25 @@ def main() -> None:
     parser.add_argument("--keep", type=Path, default=ROOT / "benchmarks" / "runs", metavar="FOLDER", help="for runs")
     parser.add_argument("-o", "--out", type=Path, default=ROOT / "benchmarks" / "results", metavar="FOLDER")
     args = parser.parse_args()
-    blank(1.0, 1.0)  # says now that matplotlib is missing, not after hours
+    blank(1.0, 1.0)  # a missing matplotlib is reported now, not after hours
     make, usual = FIGURES[args.figure]
     args.n = usual if args.n is None else args.n
     if args.n < 4:
         parser.error("-n is 4 or more")
     make_folder(args.keep)
     make_folder(args.out)
-    found, tables, picture, says = make(args)
+    sys.path.append(str(ROOT / "benchmarks"))
+    import record
+
+    found, tables, picture, notes = make(args)
     name = f"paper_{args.figure}"
-    text = [f"# {name}", f"`python scripts/reproduce.py {args.figure} -n {args.n}`"]
-    text += [*(table.markdown() for table in tables), "\n".join(f"- {key}: {value}" for key, value in says)]
-    write_atomically(args.out / f"{name}.json", (json.dumps({"about": says, **found}, indent=1) + "\n").encode())
-    write_atomically(args.out / f"{name}.md", ("\n\n".join(text) + "\n").encode())
+    text = [*(table.markdown() for table in tables), "\n".join(f"- {key}: {value}" for key, value in notes)]
+    commits = [value for key, value in notes if key == COMMITS]
+    about = {"run_commits": commits[0]} if commits else {}
+    record.write(name, {"notes": notes, **found}, "\n\n".join(text), args.out, N=args.n, **about)
     drawn = io.BytesIO()
     picture.savefig(drawn, format="png", dpi=120)
     write_atomically(args.out / f"{name}.png", drawn.getvalue())
-    print("\n\n".join(table.markdown() for table in tables))
 
 
 if __name__ == "__main__":

@@ -1,3 +1,5 @@
+"""Results of a benchmark: runs, logs, resumption, reports."""
+
 from __future__ import annotations
 
 import json
@@ -17,10 +19,8 @@ from ompl import tools as ot
 
 from apex_ompl import benchmark, problems
 from apex_ompl.benchmark import Results, Row, Workers, bench, workers
-from apex_ompl.benchmark.rows import experiments, jobs
-from apex_ompl.benchmark.summary import Figures, figures
-from apex_ompl.cli.parser import main
-from apex_ompl.errors import ApexError, FileFormatError, MissingFileError, ParameterError, UnknownNameError
+from apex_ompl.benchmark.summary import Statistics, statistics
+from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError
 
 LEVEL, RUNS = "swap/easy", 3
 ROWS = ("apex[seed=1]", "rrtconnect")
@@ -32,53 +32,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Results:
     return bench([LEVEL], ROWS, folder, runs=RUNS, timeout=10.0, split="validation", quiet=True)
 
 
-def test_rows_are_read_and_checked() -> None:
-    row = Row.parse(" apex[fallback=false; lambda-obs=0.1] ")
-    assert row.planner == "apex" and dict(row.params) == {"fallback": "false", "lambda_obs": "0.1"}
-    assert row.parameters().fallback is False and row.settings()["lambda_obs"] == 0.1
-    assert Row.parse("rrtconnect+polish").planner == "rrtconnect+polish"
-    for text in ("", "apex[", "apex[gamma]", "apex[=1]", "a[b=1]c"):
-        with pytest.raises(ParameterError, match="planner"):
-            Row.parse(text)
-    for arguments in ({"timeout": 0.0}, {"runs": -1}):
-        with pytest.raises(ParameterError):
-            Row("a", "apex", **arguments)
-    assert Row("a", "apex", levels=("/hard", "cage", "wall/easy")).levels
-
-
-def test_suites_stand_for_their_static_levels() -> None:
-    assert list(experiments(["vertical"])) == [f"vertical/{v}" for v in ("free", "small", "medium", "large")]
-    assert experiments(["shelf/hard", "shelf_swap", "cage/easy/800001"]) == {
-        "shelf/hard": True, "shelf_swap": False, "cage/easy/800001": False,
-    }  # fmt: skip
-    for names in ([], ["no_such"], ["shelf/none"], ["vertical/moving-small-0.1"], ["vertical/moving-small-0.1/800001"]):
-        with pytest.raises(ApexError):
-            experiments(names)
-
-
-def test_runs_take_problems_and_seeds_in_turn() -> None:
-    rows = [Row("a", "rrtconnect"), Row("b", "rrt", runs=2, timeout=1.0, levels=("/hard",))]
-    options: dict = {"runs": 3, "timeout": 5.0, "seed": 7, "split": "test", "simplify": True}
-    found = jobs(["wall/hard", "wall/easy"], rows, **options)
-    assert [(j.problem, j.label, j.seed, j.timeout) for j in found[:3]] == [
-        ("wall/hard/900000", "a", 7, 5.0), ("wall/hard/900000", "b", 7, 1.0), ("wall/easy/900000", "a", 7, 5.0),
-    ]  # fmt: skip
-    assert len(found) == 3 + 2 + 3 and len({j.key for j in found}) == len(found)
-    assert [(j.problem, j.seed) for j in jobs(["shelf_swap"], rows[:1], **options)] == [
-        ("shelf_swap", 7), ("shelf_swap", 8), ("shelf_swap", 9),
-    ]  # fmt: skip
-    with pytest.raises(ParameterError, match="each once"):
-        jobs(["wall/hard"], [rows[0], rows[0]], **options)
-    for more in ({"runs": 100_001}, {"seed": 2**31 - 2}):
-        with pytest.raises(ParameterError, match="runs: expected at most"):
-            jobs(["wall/hard"], rows, **{**options, **more})
-    with pytest.raises(UnknownNameError, match="split"):
-        jobs(["wall/hard"], rows, **{**options, "split": "none"})
-    with pytest.raises(UnknownNameError, match="planner"):
-        jobs(["wall/hard"], [Row("c", "no_such")], **options)
-
-
-def test_runs_tell_what_came_of_them(results: Results) -> None:
+def test_runs_record_their_outcome(results: Results) -> None:
     assert len(results.runs) == len(ROWS) * RUNS and {run["label"] for run in results.runs} == set(ROWS)
     for run in results.runs:
         assert run["solved"] and run["status"] == "EXACT_SOLUTION" and run["problem"] in problems.frozen_names(
@@ -124,7 +78,7 @@ def test_the_log_is_ompls_own(results: Results) -> None:
 
 
 def outcome(results: Results) -> list[tuple]:
-    """What a table says of runs, but for the times."""
+    """Columns of runs that do not depend on time."""
     found = [(r["problem"], r["label"], r["solved"], r["by"], r["length"], r["raw_length"]) for r in results.runs]
     return sorted(found)
 
@@ -157,7 +111,7 @@ def test_a_last_line_that_is_whole_is_kept(results: Results, tmp_path: Path) -> 
 
 def test_processes_are_renewed(results: Results, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     begun = []
-    monkeypatch.setattr(workers, "RENEWED", 2)
+    monkeypatch.setattr(workers, "RUNS_PER_PROCESS", 2)
     pool = Workers._pool
     monkeypatch.setattr(Workers, "_pool", lambda self, *given: (begun.append(given[1]), pool(self, *given))[1])
     found = bench([LEVEL], ROWS[1:], tmp_path, runs=RUNS, timeout=10.0, split="validation", quiet=True)
@@ -193,13 +147,13 @@ def test_a_stopped_command_goes_on(results: Results, tmp_path: Path, how: signal
         assert outcome(found) == [one for one in outcome(results) if one[1] == ROWS[1]]
 
 
-def made_up(firsts: list[float | None], timeout: float = 2.0) -> Figures:
+def made_up(firsts: list[float | None], timeout: float = 2.0) -> Statistics:
     made = [
         {"solved": t is not None, "first": t, "total": None if t is None else t + 0.1, "by": "apex", "timeout": timeout,
          "length": 3.0 if t is not None else None}
         for t in firsts
     ]  # fmt: skip
-    return Figures("a/b", "apex", made)
+    return Statistics("a/b", "apex", made)
 
 
 def test_figures_count_what_is_not_solved_as_endless() -> None:
@@ -212,21 +166,21 @@ def test_the_report_opens_without_a_network(results: Results, tmp_path: Path) ->
     page, text = benchmark.report(results.folder, tmp_path / "report")
     html, found = page.read_text(), text.read_text()
     assert not re.findall(r"""(?:src|href)=["'](?!data:)""", html) and html.count("data:image/png;base64") >= 3
-    for f in figures(results):
+    for f in statistics(results):
         length = f"{f.median('length'):.3g}"
         assert f.label in html and f"<td>{length}</td>" in html and f" {length} " in found
     assert "EPYC" in html or "cores" in html
     assert "at the same time" not in found
 
 
-def test_load_beyond_the_runs_is_said(results: Results) -> None:
+def test_load_beyond_the_runs_is_reported(results: Results) -> None:
     assert all(run["load"] >= 0.0 for run in results.runs)
     for load, said in ((1.4, False), (1.6, True)):
         loaded = Results(results.folder, results.about, [{**run, "load": load} for run in results.runs])
         assert ("The load was over 1.5 in 6 of 6 runs" in benchmark.markdown(loaded)) is said
 
 
-def test_planners_that_end_early_are_said(results: Results) -> None:
+def test_planners_that_end_early_are_reported(results: Results) -> None:
     refused = {"status ENUM": str(ob.PlannerStatus.PlannerStatusType.INVALID_GOAL.value)}
     made = [{**run, "solved": False, "properties": refused} for run in results.runs[:2]]
     text = benchmark.markdown(Results(results.folder, results.about, made))
@@ -236,7 +190,7 @@ def test_planners_that_end_early_are_said(results: Results) -> None:
     assert "Ended early" not in benchmark.markdown(results)
 
 
-def test_runs_at_the_same_time_are_said(results: Results, tmp_path: Path) -> None:
+def test_runs_at_the_same_time_are_reported(results: Results, tmp_path: Path) -> None:
     options: dict = {"runs": 2, "timeout": 10.0, "split": "validation", "quiet": True}
     found = bench([LEVEL], ROWS[1:], tmp_path, workers=Workers(2), **options)
     assert outcome(found) == [one for one in outcome(results) if one[1] == ROWS[1]][:2]
@@ -281,44 +235,3 @@ def test_faulty_results_are_named(results: Results, tmp_path: Path) -> None:
     (tmp_path / "about.json").unlink()
     with pytest.raises(FileFormatError, match="expected results of bench"):
         bench([LEVEL], ROWS, tmp_path, quiet=True)
-
-
-def test_a_faulty_checkpoint_ends_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    arguments = [
-        "bench",
-        LEVEL,
-        "--planners",
-        "apex[model=no_such]",
-        "--runs",
-        "1",
-        "-o",
-        str(tmp_path / "x"),
-        "--quiet",
-    ]
-    assert main(arguments) == 2
-    assert "no_such" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["bench", "no_such", "-o", "x"], "no_such"),
-        (["bench", "shelf/hard", "-o", "x", "--planners", "apex,none"], "unknown planner 'none'"),
-        (["bench", "shelf/hard", "-o", "x", "--planners", "apex[gama=1]"], "did you mean 'gamma'"),
-        (["bench", "shelf/hard", "-o", "x", "--runs", "0"], "runs"),
-        (["bench", "shelf/hard", "-o", "x", "--jobs", "0"], "jobs"),
-        (["bench", "shelf/hard", "-o", "x", "--timeout", "nan"], "timeout"),
-        (["bench", "shelf/hard", "-o", "x", "--split", "none"], "split"),
-        (["bench", "shelf/hard", "-o", "x", "--planners", ","], "planners"),
-        (["bench", "vertical/moving-small-0.1", "-o", "x"], "moving"),
-        (["report", "nowhere", "-o", "x"], "nowhere"),
-    ],
-)
-def test_faulty_commands_get_a_sentence(
-    arguments: list[str], words: str, capsys: pytest.CaptureFixture[str], tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
-    monkeypatch.chdir(tmp_path)
-    assert main(arguments) == 2
-    said = capsys.readouterr().err
-    assert words in said and said.count("\n") == 1 and not list(tmp_path.iterdir())

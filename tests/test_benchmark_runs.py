@@ -9,15 +9,14 @@ import numpy as np
 import pytest
 from support import ROOT
 
-from apex_ompl import benchmark, planners, problems
+from apex_ompl import benchmark, problems
 from apex_ompl.benchmark import Row, Workers, bench, runs
+from apex_ompl.benchmark.accounting import first_path_proof
 from apex_ompl.benchmark.rows import Job
 from apex_ompl.errors import ParameterError
 from apex_ompl.ompl_adapter.setup import assemble
 from apex_ompl.ompl_adapter.validity import full_check
-from apex_ompl.planning import PlanRun
 from apex_ompl.robot import Robot
-from apex_ompl.trajopt.path import Path as JointPath
 
 
 def test_the_first_path_counts_where_the_shortened_one_is_repaired(robot: Robot) -> None:
@@ -25,16 +24,17 @@ def test_the_first_path_counts_where_the_shortened_one_is_repaired(robot: Robot)
     ready = assemble(problem, robot)
     witness = problems.witness("wall/easy/800000").path
     line = np.stack([ready.start, ready.goals[0]])
-    planning = PlanRun(ready, "rrtconnect", planners.parameters("rrtconnect"), 0)
-    planning.times |= {"verify": 0.25}
-    assert runs.proof_of_first(planning) == 0.25
-    planning.times |= {"repair": 30.0}
-    assert runs.proof_of_first(planning) == 0.25, "of a planner whose first path is not known"
-    planning.first_path = JointPath(witness)
-    assert 0.0 < runs.proof_of_first(planning) < 30.0
+
+    def proof(raw: np.ndarray | None) -> float:
+        return first_path_proof(ready.checker, raw, ready.start, ready.goals, times)
+
+    times = {"verify": 0.25}
+    assert proof(witness) == 0.25
+    times["repair"] = 30.0
+    assert proof(None) == 0.25, "the first path is not known"
+    assert 0.0 < proof(witness) < 30.0
     assert not full_check(ready.checker, line, ready.start, ready.goals)
-    planning.first_path = JointPath(line)
-    assert runs.proof_of_first(planning) == 30.25
+    assert proof(line) == 30.25
 
 
 def test_another_robot_warms_up_on_its_own_problem(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Planners compared on suites of problems through OMPL's Benchmark, and reports of what came of it."""
+"""Comparison of planners on suites of problems through OMPL's Benchmark, and its reports."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A benchmark: runs kept as they end, so that it goes on where it was stopped."""
+"""Driver of a benchmark: each run is stored when it ends, so that a benchmark resumes where it was stopped."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import os
 import platform
 import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -28,31 +28,32 @@ from apex_ompl.util.resolution import FULL_RESOLUTION, SEARCH_RESOLUTION
 def bench(
     suites: Sequence[str], rows: Sequence[Row | str], out: str | os.PathLike[str], *, runs: int = 100,
     timeout: float = 5.0, seed: int = 0, split: str = "test", simplify: bool = True, workers: Workers | None = None,
-    quiet: bool = False,
+    quiet: bool = False, provenance: Mapping[str, Any] | None = None,
 ) -> Results:  # fmt: skip
-    """Run planners on problems through OMPL's Benchmark, in the same space, by the same checker and resolution.
+    """Run planners on problems through OMPL's Benchmark, with the same space, checker and resolution.
 
-    A run is solved when its path passed the full check. What was run before with the same settings is not run again.
-    Every process has run each row once before its first run.
+    A run is solved when its path passed the full check. Runs that the folder has with the same settings are not made
+    again. Each process makes one run of each row to warm up.
 
     Args:
         suites: Suites, levels, problems or files.
         rows: Planners.
-        out: Folder for the results; it is made, or goes on.
-        runs: Of each row on a level, each on another problem; or on a single problem.
-        timeout: Of a run [s].
-        seed: Of the first run; the next ones follow.
-        split: Whose problems.
-        simplify: Whether paths are shortened; those of smooth planners are not.
+        out: Folder of the results, which is made or resumed.
+        runs: Number of runs of each row on a level, each on another problem, or on a single problem.
+        timeout: Time limit of a run [s].
+        seed: Seed of the first run; the k-th run has ``seed + k``.
+        split: Split of the problems.
+        simplify: Whether paths are simplified; those of smooth planners are not.
         workers: Where runs are made; by default one at a time, in a process of this machine.
         quiet: Whether to show no progress.
+        provenance: Further entries of the session, as the commit of the code.
 
     Returns:
         The results in the folder.
 
     Raises:
         ApexError: An argument is unknown or out of range, the folder is of something else, or the cluster fails.
-        KeyboardInterrupt: Ctrl-C was pressed; what had ended is kept.
+        KeyboardInterrupt: Ctrl-C was pressed; runs that had ended are kept.
     """
     workers = workers or Workers()
     check_arguments(timeout, seed)
@@ -60,8 +61,8 @@ def bench(
         raise ParameterError("runs", runs, "a whole number, 1 or more")
     for module in workers.modules:
         importlib.import_module(module)
-    given = [row if isinstance(row, Row) else Row.parse(row) for row in rows]
-    wanted = jobs(suites, given, runs=runs, timeout=timeout, seed=seed, split=split, simplify=simplify)
+    parsed = [row if isinstance(row, Row) else Row.parse(row) for row in rows]
+    wanted = jobs(suites, parsed, runs=runs, timeout=timeout, seed=seed, split=split, simplify=simplify)
     folder = make_folder(out)
     with locked(folder):
         if (folder / RUNS).exists() and not (folder / ABOUT).exists():
@@ -70,23 +71,24 @@ def bench(
             )
         before = Results.load(folder) if (folder / ABOUT).exists() else Results(folder, {})
         settings = {"timeout": float(timeout), "seed": seed, "split": split, "simplify": simplify}
-        about = _about(before.about, given, settings, folder)
-        there = {one["key"] for one in before.runs}
-        left = [job for job in wanted if job.key not in there]
+        about = _about(before.about, parsed, settings, folder)
+        stored = {run["key"] for run in before.runs}
+        left = [job for job in wanted if job.key not in stored]
         if not left:
             return before
-        about["sessions"] = [*about["sessions"], _session(workers, split=split, seed=seed)]
+        session = _session(workers, split=split, seed=seed, **(provenance or {}))
+        about["sessions"] = [*about["sessions"], session]
         results = Results(folder, about, before.runs)
-        results.note()
+        results.save_about()
         try:
             _complete(results, left, len(wanted), workers, quiet)
         finally:
-            results.note()
+            results.save_about()
     return Results.load(folder)
 
 
 def _session(workers: Workers, **more: Any) -> dict[str, Any]:
-    """Return what is noted of one call."""
+    """Return the provenance of one call of ``bench``."""
     return {
         "command": shlex.join([Path(sys.argv[0]).name or "python", *sys.argv[1:]]),
         "date": datetime.now(UTC).isoformat(timespec="seconds"), "hardware": hardware(), "jobs": workers.at_once,
@@ -98,18 +100,19 @@ def _session(workers: Workers, **more: Any) -> dict[str, Any]:
 def _about(
     before: dict[str, Any], rows: Sequence[Row], settings: dict[str, Any], folder: Path
 ) -> dict[str, Any]:  # fmt: skip
-    """Return what is noted of all calls.
+    """Return the provenance of all calls.
 
     Raises:
-        ParameterError: What is there was made otherwise.
+        ParameterError: The results in the folder have other settings.
     """
     for name, value in settings.items():
-        there = before.get("settings", settings)[name]
-        if there != value:
-            raise ParameterError(name, value, f"{there!r}, as in {folder}; or another folder")
+        stored = before.get("settings", settings)[name]
+        if stored != value:
+            raise ParameterError(name, value, f"{stored!r}, as in {folder}; or another folder")
     known = {**before.get("rows", {})}
     for row in rows:
         now = {"planner": row.planner, "all": row.settings(), "timeout": row.timeout}
+        now |= {"runner": row.runner} if row.runner else {}
         if known.setdefault(row.label, now) != now:
             raise ParameterError("planner", row.label, f"the parameters that it has in {folder}; or another folder")
     return {
@@ -119,15 +122,15 @@ def _about(
 
 
 def _complete(results: Results, left: Sequence[Job], of: int, workers: Workers, quiet: bool) -> None:
-    """Make the runs that are left, and write each as it ends."""
+    """Make the runs that are left, and write each when it ends."""
     file = results.folder / RUNS
-    if file.is_file() and not file.read_bytes().endswith(b"\n"):  # the process ended while it wrote
-        write_atomically(file, "".join(json.dumps(one) + "\n" for one in results.runs).encode())
-    solved = 0
+    if file.is_file() and not file.read_bytes().endswith(b"\n"):  # a killed process left an incomplete line
+        write_atomically(file, "".join(json.dumps(run) + "\n" for run in results.runs).encode())
+    solved, session = 0, len(results.about["sessions"]) - 1
     with file.open("a") as out, tqdm(total=of, initial=of - len(left), unit="run", disable=quiet) as bar:
-        for done, one in enumerate(workers.made(left, results.about["warm_up"]), 1):
-            out.write(json.dumps(one) + "\n")
+        for done, run in enumerate(workers.runs_of(left, results.about["warm_up"]), 1):
+            out.write(json.dumps({**run, "session": session}) + "\n")
             out.flush()
-            solved += one["solved"]
-            bar.set_postfix_str(f"{solved} of {done} solved, {one['experiment']} {one['label']}")
+            solved += run["solved"]
+            bar.set_postfix_str(f"{solved} of {done} solved, {run['experiment']} {run['label']}")
             bar.update()

@@ -1,4 +1,4 @@
-"""OMPL's own log of a benchmark, and the database of it that Planner Arena reads."""
+"""OMPL's log of a benchmark, and the database for Planner Arena that is made of it."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from apex_ompl.result import INSIDE
 from apex_ompl.util.files import check_writable
 
 DATABASE, LOGS = "benchmark.db", "logs"
-OWN = {
+PROPERTIES = {
     "first solution time REAL": "first", "total time REAL": "total", "path length REAL": "length",
     "raw path length REAL": "raw_length", "jerk REAL": "jerk", "raw jerk REAL": "raw_jerk",
     "clearance REAL": "clearance", "checker calls INTEGER": "checks",
 }  # fmt: skip
-"""Names of properties in the log, and in runs."""
-BEHIND = ("simplify", "verify", "repair")  # the planner, in a plan
+"""Properties of the log that are columns of a run."""
+AFTER_PLANNER = ("simplify", "verify", "repair")  # stages of a plan
 
 
 def write_logs(results: Results) -> list[Path]:
@@ -47,7 +47,9 @@ def write_logs(results: Results) -> list[Path]:
             by_experiment.setdefault(one["experiment"], []).append(one)
     names: dict[str, str] = {}
     for experiment in sorted(by_experiment):
-        name = "_".join(short(experiment).replace("/", " ").split())  # OMPL's reader takes a line's last word for it
+        name = "_".join(
+            short(experiment).replace("/", " ").split()
+        )  # OMPL's reader takes a line's last word as the name
         again = sum(other == name or other.startswith(f"{name}-") for other in names.values())
         names[experiment] = f"{name}-{again + 1}" if again else name
     return [_write(results, name, by_experiment[experiment], folder) for experiment, name in names.items()]
@@ -87,10 +89,10 @@ def _write(results: Results, name: str, runs: list[Run], folder: Path) -> Path:
 def _planner(results: Results, label: str, runs: list[Run]) -> ot.PlannerExperiment:
     made = ot.PlannerExperiment()
     made.name = label
-    own = results.about["rows"].get(label, {}).get("all", {})
-    theirs: dict[str, str] = next((one["common"] for one in runs if one["common"]), {})
-    own = own | {"timeout": max(one["timeout"] for one in runs)}
-    made.common = _properties({**{name: _line(str(value)) for name, value in own.items()}, **theirs})
+    settings = results.about["rows"].get(label, {}).get("all", {})
+    from_ompl: dict[str, str] = next((one["common"] for one in runs if one["common"]), {})
+    settings = settings | {"timeout": max(one["timeout"] for one in runs)}
+    made.common = _properties({**{name: _line(str(value)) for name, value in settings.items()}, **from_ompl})
     made.runs = [_properties(properties(one)) for one in sorted(runs, key=lambda one: int(one["seed"]))]
     return made
 
@@ -103,16 +105,16 @@ def _properties(values: Mapping[str, str]) -> ot.RunProperties:
 
 
 def properties(run: Run) -> dict[str, str]:
-    """Return a run's properties as OMPL's log has them: OMPL's own, and ours beside them."""
+    """Return the properties of a run for OMPL's log: OMPL's own and this project's."""
     found = dict(run["properties"])
     found["solved BOOLEAN"] = found["passed full check BOOLEAN"] = str(int(run["solved"]))
     found["problem TEXT"] = _line(short(run["problem"]))
     found["seed INTEGER"] = str(run["seed"])
     found["solved by TEXT"] = run["by"]
-    found |= {name: _text(run[key]) for name, key in OWN.items()}
+    found |= {name: _text(run[key]) for name, key in PROPERTIES.items()}
     found |= {f"{name} INTEGER": str(value) for name, value in run["counts"].items()}
-    # What Planner Arena adds to the planner's time.
-    found["simplification time REAL"] = _text(sum(run["times"].get(stage, 0.0) for stage in BEHIND))
+    # Planner Arena adds this to the planner's time.
+    found["simplification time REAL"] = _text(sum(run["times"].get(stage, 0.0) for stage in AFTER_PLANNER))
     for stage, seconds in run["times"].items():
         words = stage.removeprefix(INSIDE) if stage.startswith(INSIDE) else f"plan {stage}"
         found[f"stage {words} REAL"] = _text(seconds)
@@ -120,7 +122,7 @@ def properties(run: Run) -> dict[str, str]:
 
 
 def _line(text: str) -> str:
-    """Return a text that does not break OMPL's log."""
+    """Return a text on one line, without the separator of OMPL's log."""
     return " ".join(text.split()).replace("; ", ", ")
 
 

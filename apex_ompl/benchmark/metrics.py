@@ -13,7 +13,7 @@ from apex_ompl.errors import ParameterError
 from apex_ompl.trajopt.path import resample
 from apex_ompl.types import Array
 
-STEPS = 128  # into which a path is cut for its jerk, and for distances between paths
+STEPS = 128  # segments of a path that is resampled for distances between paths
 BLOCK = 2048  # rows of a kernel matrix at a time
 RESAMPLINGS = 200
 
@@ -167,7 +167,7 @@ class Realism:
 
 
 def realism(real: ArrayLike, made: ArrayLike, seed: int = 0) -> Realism:
-    """Return FID and KID of a set of features, with what is needed to judge them.
+    """Return FID and KID of a set of features, with an interval and a floor to compare them with.
 
     Args:
         real: Features, shape (N, d).

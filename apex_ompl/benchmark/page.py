@@ -1,4 +1,4 @@
-"""The report of a benchmark: one HTML page that needs nothing else, and Markdown."""
+"""Report of a benchmark: one self-contained HTML page, and Markdown."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from matplotlib.lines import Line2D
 
 from apex_ompl.benchmark.log import short
 from apex_ompl.benchmark.results import Results
-from apex_ompl.benchmark.summary import Figures, about, figures, tables, warnings
+from apex_ompl.benchmark.summary import Statistics, about, statistics, tables, warnings
 from apex_ompl.errors import FileFormatError
 from apex_ompl.util.files import make_folder, write_atomically
 
-COLUMNS = 4  # of small pictures
+COLUMNS = 4  # of subplots
 COLOURS = (
     "#0b6e4f",
     "#c8553d",
@@ -88,7 +88,7 @@ def report(results: str | os.PathLike[str], out: str | os.PathLike[str]) -> tupl
         FileFormatError: The results are damaged, or hold no run.
     """
     read = Results.load(results)
-    found = figures(read)
+    found = statistics(read)
     if not found:
         raise FileFormatError(str(read.folder), "", "none", "expected results with one run or more")
     folder = make_folder(out)
@@ -106,7 +106,7 @@ def markdown(results: Results) -> str:
     return "\n\n".join(parts) + "\n"
 
 
-def html(results: Results, found: Sequence[Figures]) -> str:
+def html(results: Results, found: Sequence[Statistics]) -> str:
     """Return the page."""
     labels, experiments = (list(dict.fromkeys(getattr(f, name) for f in found)) for name in ("label", "experiment"))
     template = jinja2.Environment(autoescape=True, trim_blocks=True).from_string(PAGE)
@@ -117,7 +117,7 @@ def html(results: Results, found: Sequence[Figures]) -> str:
     )  # fmt: skip
 
 
-def pictures(found: Sequence[Figures]) -> dict[str, str]:
+def pictures(found: Sequence[Statistics]) -> dict[str, str]:
     """Return PNG pictures in base 64, by the names of :data:`TITLES`."""
     labels = list(dict.fromkeys(f.label for f in found))
     colours = {label: COLOURS[k % len(COLOURS)] for k, label in enumerate(labels)}
@@ -132,16 +132,16 @@ def pictures(found: Sequence[Figures]) -> dict[str, str]:
 
 
 def _grid(
-    found: Sequence[Figures], draw: Callable[..., None], colours: dict[str, str], unit: str, *, log: bool = False,
+    found: Sequence[Statistics], draw: Callable[..., None], colours: dict[str, str], unit: str, *, log: bool = False,
     legend: bool = True,
 ) -> str:  # fmt: skip
-    """Return a picture with a small one for each level."""
+    """Return a picture with a subplot for each level."""
     levels = list(dict.fromkeys(f.experiment for f in found))
     columns = min(COLUMNS, len(levels))
-    lines = math.ceil(len(levels) / columns)
+    rows = math.ceil(len(levels) / columns)
     height = 2.4 if legend else 0.6 + 0.28 * len(colours)
-    figure = Figure(figsize=(3.2 * columns, height * lines + 0.7), layout="constrained")
-    axes = figure.subplots(lines, columns, squeeze=False).ravel()
+    figure = Figure(figsize=(3.2 * columns, height * rows + 0.7), layout="constrained")
+    axes = figure.subplots(rows, columns, squeeze=False).ravel()
     for axis, level in zip(axes, levels, strict=False):
         mine = [f for f in found if f.experiment == level]
         draw(axis, mine, colours)
@@ -160,7 +160,7 @@ def _grid(
     return _png(figure)
 
 
-def _curve(axis: Any, mine: Sequence[Figures], colours: dict[str, str]) -> None:
+def _curve(axis: Any, mine: Sequence[Statistics], colours: dict[str, str]) -> None:
     for f in mine:
         times = f.times()
         there = times[np.isfinite(times)]
@@ -171,7 +171,7 @@ def _curve(axis: Any, mine: Sequence[Figures], colours: dict[str, str]) -> None:
 
 
 def _box(key: str) -> Callable[..., None]:
-    def draw(axis: Any, mine: Sequence[Figures], colours: dict[str, str]) -> None:
+    def draw(axis: Any, mine: Sequence[Statistics], colours: dict[str, str]) -> None:
         values = [[max(run[key], 1e-4) for run in f.solved if run[key] is not None] for f in mine]
         shown = axis.boxplot(values, orientation="horizontal", patch_artist=True, showfliers=False, whis=(5, 95))
         for patch, f in zip(shown["boxes"], mine, strict=True):
@@ -185,7 +185,7 @@ def _box(key: str) -> Callable[..., None]:
     return draw
 
 
-def _bars(found: Sequence[Figures]) -> str:
+def _bars(found: Sequence[Statistics]) -> str:
     names = sorted({name for f in found for name in f.by})
     figure = Figure(figsize=(10, 0.8 + 0.22 * len(found)), layout="constrained")
     axis, left = figure.subplots(), np.zeros(len(found))

@@ -22,8 +22,8 @@ class Results:
 
     Attributes:
         folder: The folder.
-        about: How they were made: schema, commands, hardware, versions, rows, warm-up.
-        runs: The runs, in no order.
+        about: Provenance: schema, settings, sessions (command, hardware, versions), rows, warm-up times.
+        runs: The runs, in no order; ``session`` is the index of the session in which one was made.
     """
 
     folder: Path
@@ -51,15 +51,20 @@ class Results:
         runs: dict[str, Run] = {}
         for number, line in enumerate(lines):
             try:
-                made = json.loads(line)
-                runs[made["key"]] = made
+                run = json.loads(line)
+                runs[run["key"]] = run
             except (ValueError, KeyError, TypeError) as error:
-                if number < len(lines) - 1:  # the process may have ended while it wrote the last one
+                if number < len(lines) - 1:  # a process that was killed may have left the last one incomplete
                     raise FileFormatError(str(folder / RUNS), f"line {number + 1}", line, "expected a run") from error
         return cls(folder, about, list(runs.values()))
 
-    def note(self) -> None:
-        """Write down how the results were made.
+    def sessions(self) -> list[dict[str, Any]]:
+        """Return the sessions in which the runs were made, in their order; all where a run does not name its own."""
+        found = {run.get("session") for run in self.runs} or {None}
+        return [one for k, one in enumerate(self.about["sessions"]) if k in found or None in found]
+
+    def save_about(self) -> None:
+        """Write the provenance.
 
         Raises:
             MissingFileError: The file cannot be written.

@@ -1,13 +1,14 @@
-"""What a benchmark runs: rows, which are planners with parameters, and experiments, which are levels of problems."""
+"""Rows (planners with parameters), experiments (levels of problems) and jobs (single runs) of a benchmark."""
 
 from __future__ import annotations
 
 import hashlib
+import importlib
 import json
 import math
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -17,27 +18,33 @@ from apex_ompl.api import load_problem
 from apex_ompl.errors import ParameterError, UnknownNameError
 from apex_ompl.problems.catalogue import SPLITS
 
-WRITTEN = re.compile(r"(?P<planner>[^\[\]]+?)(\[(?P<params>[^\[\]]*)\])?")
+RUNNER = re.compile(r"[\w.]+:\w+")
+ROW = re.compile(r"(?P<planner>[^\[\]]+?)(\[(?P<params>[^\[\]]*)\])?")
 
 PAPER = {
     "model": "apex-paper", "line": False, "repair": False, "bridge": False, "fallback": False, "polish": False,
     "first": 8, "second": 8, "third": 16, "resample": 2,
 }  # fmt: skip
-"""Parameters of apex that leave the paper's algorithm alone, without guidance: ancestral sampling in all steps, and
-resampling of what collides."""
+"""Parameters of apex that leave only the paper's algorithm, without guidance: ancestral sampling with all steps, and
+collision-triggered resampling."""
+
+RunnerFunction = Callable[["Job"], Mapping[str, Any]]
 
 
 @dataclass(frozen=True)
 class Row:
-    """A planner as it is benchmarked.
+    """A planner with parameters, as it is benchmarked.
 
     Attributes:
-        label: Its name in tables.
-        planner: Its name.
-        params: Its parameters that are not the defaults.
-        timeout: Of its runs [s]; None takes the benchmark's.
-        runs: Most of them on a level; None takes the benchmark's.
-        levels: Where it runs: suites, levels as ``shelf/hard``, or ends of their names as ``/hard``; all by default.
+        label: Name in tables.
+        planner: Name of the planner.
+        params: Parameters that differ from the defaults.
+        timeout: Time limit of a run [s]; None takes the benchmark's.
+        runs: Largest number of runs on a level; None takes the benchmark's.
+        levels: Suites, levels as ``shelf/hard``, or suffixes of their names as ``/hard``; all by default.
+        runner: Function that makes a run instead of OMPL's Benchmark, as ``module:function``. It takes a :class:`Job`
+            and returns columns of the run, among them ``solved``, and further ones of its own. Names of planners and
+            parameters are then the function's own.
     """
 
     label: str
@@ -46,6 +53,7 @@ class Row:
     timeout: float | None = None
     runs: int | None = None
     levels: tuple[str, ...] = ()
+    runner: str = ""
 
     def __post_init__(self) -> None:
         """Check the numbers.
@@ -58,6 +66,8 @@ class Row:
         for name, value in (("timeout", self.timeout), ("runs", self.runs)):
             if value is not None and not 0 < value < math.inf:
                 raise ParameterError(f"{name} of {self.label}", value, "a positive number")
+        if self.runner and not RUNNER.fullmatch(self.runner):
+            raise ParameterError(f"runner of {self.label}", self.runner, "MODULE:FUNCTION")
 
     @classmethod
     def parse(cls, text: str) -> Row:
@@ -66,7 +76,7 @@ class Row:
         Raises:
             ParameterError: The text has another form.
         """
-        match = WRITTEN.fullmatch(text.strip())
+        match = ROW.fullmatch(text.strip())
         pairs = [pair.partition("=") for pair in ((match and match["params"]) or "").split(";") if pair.strip()]
         if match is None or not all(equals and name.strip() and value.strip() for name, equals, value in pairs):
             raise ParameterError("planner", text, "NAME or NAME[PARAMETER=VALUE;...]")
@@ -83,11 +93,16 @@ class Row:
         return planners.parameters(self.planner, **self.params)
 
     def settings(self) -> dict[str, Any]:
-        """Return all parameters by name, as plain values."""
-        return asdict(self.parameters())
+        """Return all parameters by name, as plain values.
+
+        Raises:
+            UnknownNameError: No such planner or parameter.
+            ParameterError: A value of the wrong type or out of range.
+        """
+        return dict(self.params) if self.runner else asdict(self.parameters())
 
     def runs_on(self, experiment: str) -> bool:
-        """Whether the row is for an experiment."""
+        """Whether the row runs on an experiment."""
         named = any(experiment == level or experiment.startswith(f"{level}/") for level in self.levels)
         ends = tuple(level for level in self.levels if level.startswith("/"))
         return not self.levels or named or experiment.endswith(ends)
@@ -95,17 +110,18 @@ class Row:
 
 @dataclass(frozen=True)
 class Job:
-    """One run to be made.
+    """A run to be made.
 
     Attributes:
         experiment: Name of the level or problem.
         problem: Name or file of the problem.
-        label: Of the row.
+        label: Label of the row.
         planner: Name of the planner.
-        params: Its parameters.
-        seed: Of all random numbers.
-        timeout: Of the run [s].
-        simplify: Whether the path is shortened, unless the planner's are smooth.
+        params: Parameters of the planner that differ from the defaults.
+        seed: Seed of all random numbers.
+        timeout: Time limit [s].
+        simplify: Whether the path is simplified, unless the planner's paths are smooth.
+        runner: Function that makes the run, as in :class:`Row`.
     """
 
     experiment: str
@@ -116,25 +132,42 @@ class Job:
     seed: int
     timeout: float
     simplify: bool
+    runner: str = ""
 
     @property
     def key(self) -> str:
-        """What tells the run apart from all others."""
-        settings = asdict(planners.parameters(self.planner, **self.params))
-        made_of = json.dumps([self.planner, settings, float(self.timeout), self.simplify], sort_keys=True)
-        digest = hashlib.sha256(made_of.encode()).hexdigest()[:12]
+        """Unique name of the run: problem, seed, label and a digest of its settings."""
+        settings = dict(self.params) if self.runner else asdict(planners.parameters(self.planner, **self.params))
+        made_of = [self.planner, settings, float(self.timeout), self.simplify]
+        made_of += [self.runner] if self.runner else []
+        digest = hashlib.sha256(json.dumps(made_of, sort_keys=True).encode()).hexdigest()[:12]
         return f"{self.experiment} {self.problem} {self.seed} {self.label} {digest}"
 
 
-def experiments(suites: Sequence[str]) -> dict[str, bool]:
-    """Return what some names stand for: experiments, and whether they are levels of problems, or single problems.
+def load_runner(name: str) -> RunnerFunction:
+    """Return the function that makes the runs of a row, by its name ``module:function``.
+
+    Raises:
+        ParameterError: There is no such module or function.
+    """
+    module, _, function = name.partition(":")
+    try:
+        found: RunnerFunction = getattr(importlib.import_module(module), function)
+    except (ImportError, AttributeError) as error:
+        raise ParameterError("runner", name, f"MODULE:FUNCTION that can be imported ({error})") from error
+    return found
+
+
+def experiments(suites: Sequence[str], moving: bool = False) -> dict[str, bool]:
+    """Return the experiments that names stand for; True for a level of problems, False for a single problem.
 
     Args:
         suites: Suites, levels as ``shelf/hard``, problems by name or id, or files. A suite stands for its levels
             without moving obstacles.
+        moving: Whether levels and problems with moving obstacles are taken.
 
     Raises:
-        ApexError: No such suite, level or problem; one with moving obstacles; or none is given.
+        ApexError: No such suite, level or problem; one with moving obstacles that is not taken; or none is given.
     """
     if not suites:
         raise ParameterError("suites", "nothing", "a suite, a level as shelf/hard, or a problem")
@@ -146,11 +179,11 @@ def experiments(suites: Sequence[str]) -> dict[str, bool]:
             static = [v for v in known[name] if not v.startswith("moving-")]
             found |= {f"{name}/{v}": True for v in static}
         elif suite in known and level in known[suite]:
-            if level.startswith("moving-"):
+            if level.startswith("moving-") and not moving:
                 raise ParameterError("suite", name, "a level without moving obstacles: plans hold for one moment only")
             found[name] = True
         else:
-            if load_problem(name).moving:
+            if load_problem(name).moving and not moving:
                 raise ParameterError("problem", name, "one without moving obstacles: plans hold for one moment only")
             found[os.fspath(Path(name).resolve()) if name.endswith((".yaml", ".yml")) else name] = False
     return found
@@ -159,10 +192,10 @@ def experiments(suites: Sequence[str]) -> dict[str, bool]:
 def jobs(
     suites: Sequence[str], rows: Sequence[Row], *, runs: int, timeout: float, seed: int, split: str, simplify: bool
 ) -> list[Job]:
-    """Return the runs of a benchmark: all rows on a problem in turn, and the first problems of all levels first.
+    """Return the runs of a benchmark in their order: all rows on a problem, the first problems of all levels first.
 
-    The k-th run on a level is on the k-th problem of the split; on a single problem all runs are. The k-th run has the
-    seed ``seed + k``.
+    The k-th run on a level is on the k-th problem of the split, with the seed ``seed + k``; a single problem is that of
+    all its runs. Levels with moving obstacles are taken where each row has a runner of its own.
 
     Raises:
         ApexError: A suite, planner, parameter or split is unknown, or two rows have the same label.
@@ -176,13 +209,16 @@ def jobs(
     if len(set(labels)) < len(labels) or not labels:
         raise ParameterError("planners", ", ".join(labels) or "none", "one or more, each once")
     for row in rows:
-        row.parameters()
+        row.settings()
+        if row.runner:
+            load_runner(row.runner)
     found = []
-    for experiment, is_level in experiments(suites).items():
+    for experiment, is_level in experiments(suites, moving=all(row.runner for row in rows)).items():
         for row in rows:
             for k in range(min(runs, row.runs or runs) if row.runs_on(experiment) else 0):
                 problem = f"{experiment}/{SPLITS[split].start + k}" if is_level else experiment
                 limit = row.timeout or timeout
-                job = Job(experiment, problem, row.label, row.planner, row.params, seed + k, limit, simplify)
+                about = (experiment, problem, row.label, row.planner, row.params, seed + k, limit, simplify)
+                job = Job(*about, row.runner)
                 found.append((k, job))
     return [job for _, job in sorted(found, key=lambda pair: pair[0])]

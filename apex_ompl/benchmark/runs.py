@@ -1,4 +1,4 @@
-"""One run of a benchmark: ``plan`` whose call of OMPL goes through OMPL's own Benchmark."""
+"""Single runs of a benchmark: ``plan`` with OMPL's solve inside of OMPL's Benchmark, or a row's own function."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ import math
 import os
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
-from typing import TYPE_CHECKING, Any
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from ompl import base as ob
@@ -16,12 +16,12 @@ from ompl import tools as ot
 
 from apex_ompl import planners
 from apex_ompl.api import load_problem
-from apex_ompl.benchmark.rows import Job
+from apex_ompl.benchmark.accounting import PROOF, first_path_proof
+from apex_ompl.benchmark.rows import Job, load_runner
 from apex_ompl.errors import ApexError
 from apex_ompl.ompl_adapter.process import quiet_ompl, seed_ompl
 from apex_ompl.ompl_adapter.report import SolveReport, report_of
 from apex_ompl.ompl_adapter.setup import assemble
-from apex_ompl.ompl_adapter.validity import full_check
 from apex_ompl.planning import PlanRun, finish, query_fault, solve, solving_time, with_exact_ends
 from apex_ompl.problems.generator import SuiteError
 from apex_ompl.result import FIRST, PlanResult, PlanStatus
@@ -31,17 +31,13 @@ from apex_ompl.trajopt.path import path_length
 from apex_ompl.types import Array
 from apex_ompl.util.threads import one_torch_thread
 
-if TYPE_CHECKING:
-    pass
-
 Run = dict[str, Any]
 """A run as it is stored, ready for JSON."""
 
-MEMORY = 16_384.0  # that OMPL grants a run [MB]
-UPDATES = 0.05  # between two looks at a planner's progress [s]
+MEMORY = 16_384.0  # limit of a run [MB]
+UPDATES = 0.05  # period at which a planner's progress is read [s]
 NO_PROBLEM, CRASH = "NO_PROBLEM", str(PlanStatus.CRASH)
 WARM_UP = "wall/easy/800000"
-PROOF = ("verify", "repair")
 
 _robots: dict[str, Robot] = {}
 
@@ -51,12 +47,12 @@ class Experiment:
     """Runs a planner in an experiment of ``ompl.tools.Benchmark``, in the place of :func:`apex_ompl.planning.execute`.
 
     Attributes:
-        checked_aside: Number of states that the experiment checked for itself.
+        checks: Number of states that OMPL's experiment itself checked.
         properties: OMPL's properties of the run.
         common: OMPL's parameters of the planner.
     """
 
-    checked_aside: int = 0
+    checks: int = 0
     properties: dict[str, str] = field(default_factory=dict)
     common: dict[str, str] = field(default_factory=dict)
 
@@ -65,56 +61,41 @@ class Experiment:
         check_counts, reports = run.setup.checker.check_counts, list[SolveReport | None]()
         states = [check_counts.states]
 
-        def begin(_: ob.Planner) -> None:
+        def before_run(_: ob.Planner) -> None:
             seed_ompl(run.seed)  # the experiment itself has drawn and checked states by then
             states.append(check_counts.states)
 
-        def end(*_: object) -> None:  # after it the experiment checks the path, and clears the planner
+        def after_run(*_: object) -> None:  # after it the experiment checks the path, and clears the planner
             states.append(check_counts.states)
             reports.append(report_of(planner))
 
-        moments, validator = list[float](), run.setup.motion_validator
+        observed, validator = list[float](), run.setup.motion_validator
         original = validator.check
         if run.parameters.optimizing:
-            validator.check = _watched(run, moments)
+            validator.check = _watched(run, observed)
         experiment = ot.Benchmark(run.setup.simple_setup, "run")
         experiment.addPlanner(planner)
-        experiment.setPreRunEvent(begin)
-        experiment.setPostRunEvent(end)
+        experiment.setPreRunEvent(before_run)
+        experiment.setPostRunEvent(after_run)
         request = ot.Request(solving_time(run.parameters, timeout), MEMORY, 1, UPDATES, False, False, False)
         try:
             experiment.benchmark(request)
         finally:
-            validator.check = original  # or it and OMPL's objects would keep each other, and all that was planned
+            validator.check = original  # or a reference cycle would keep the whole problem alive
         run.setup.raise_faults()
-        self.checked_aside = states[1] - states[0] + check_counts.states - states[2]
+        self.checks = states[1] - states[0] + check_counts.states - states[2]
         if reports[0] is not None:
             planner.report = reports[0]
         recorded = experiment.getRecordedExperimentData().planners[0]
         self.properties, self.common = recorded.runs[0].to_dict(), recorded.common.to_dict()
         run.times["solve"] = float(self.properties["time REAL"])
-        moments += [moment for data in recorded.runsProgressData for moment in _solved_at(data)]
-        if moments:
-            run.times[FIRST] = min(moments)
+        observed += [moment for data in recorded.runsProgressData for moment in _solved_at(data)]
+        if observed:
+            run.times[FIRST] = min(observed)
         return ompl_status(self.properties)
 
 
-def proof_of_first(run: PlanRun) -> float:
-    """Return how long the full check of the first path takes, or the check and repair of the final one [s].
-
-    The shortened path may need a repair where the path as it was found does not. Of planners that use all their time
-    the first path is not known: the check of the last one stands for its check.
-    """
-    proof = {stage: run.times.get(stage, 0.0) for stage in PROOF}
-    if "repair" not in run.times or run.parameters.optimizing or run.first_path is None:
-        return proof["verify"]
-    begin = time.perf_counter()
-    path = with_exact_ends(run.setup, run.first_path)
-    check = full_check(run.setup.checker, path.states, run.setup.start, run.setup.goals)
-    return time.perf_counter() - begin if check else sum(proof.values())
-
-
-def _watched(run: PlanRun, moments: list[float]) -> Callable[[Array, Array], bool]:
+def _watched(run: PlanRun, observed: list[float]) -> Callable[[Array, Array], bool]:
     """Return a motion check whose first call after a path was found notes the time since its first call [s]."""
     check, definition = run.setup.motion_validator.check, run.setup.simple_setup.getProblemDefinition()
     begin = 0.0
@@ -122,20 +103,20 @@ def _watched(run: PlanRun, moments: list[float]) -> Callable[[Array, Array], boo
     def watched(first: Array, second: Array) -> bool:
         nonlocal begin
         begin = begin or time.perf_counter()
-        if not moments and definition.hasExactSolution():
-            moments.append(time.perf_counter() - begin)
+        if not observed and definition.hasExactSolution():
+            observed.append(time.perf_counter() - begin)
         return check(first, second)
 
     return watched
 
 
 def ompl_status(properties: Mapping[str, str]) -> PlanStatus:
-    """Return what a planner itself said in the end, of OMPL's properties of a run."""
+    """Return the status that the planner itself returned, from OMPL's properties of a run."""
     return PlanStatus(ob.PlannerStatus.PlannerStatusType(int(properties["status ENUM"])).name)
 
 
 def _solved_at(progress: Iterable[Mapping[str, str]]) -> Iterator[float]:
-    """Yield the moments of a run at which the planner said that it had a path [s]."""
+    """Yield the times of a run at which the planner reported a path of finite cost [s]."""
     for moment in progress:
         costs = (float(value) for name, value in moment.items() if name.startswith("best cost"))
         if any(math.isfinite(cost) for cost in costs):
@@ -143,14 +124,14 @@ def _solved_at(progress: Iterable[Mapping[str, str]]) -> Iterator[float]:
 
 
 def run(job: Job) -> Run:
-    """Return one run; one that fails in an unforeseen way is not solved, and says why.
+    """Return one run; one that fails in an unforeseen way is not solved and gives the reason.
 
     Raises:
         ApexError: A file, a parameter or a checkpoint is at fault.
     """
-    about = told_of(job)
+    about = job_columns(job)
     try:
-        return about | _outcome(job)
+        return about | (_by_runner(job) if job.runner else columns(*planned(job)))
     except SuiteError as error:
         return about | unsolved(NO_PROBLEM, str(error))
     except ApexError:
@@ -159,19 +140,32 @@ def run(job: Job) -> Run:
         return about | unsolved(CRASH, repr(error))
 
 
-def told_of(job: Job) -> Run:
-    """Return what is stored of a run before it is made."""
-    return {**asdict(job), "params": dict(job.params), "key": job.key}
+def job_columns(job: Job) -> Run:
+    """Return the columns of a run that are known before it is made."""
+    known = {**asdict(job), "params": dict(job.params), "key": job.key}
+    if not job.runner:
+        del known["runner"]
+    return known
 
 
 def unsolved(status: str, reason: str) -> Run:
-    """Return what is said of a run without a result."""
+    """Return the columns of a run without a result."""
     return {"status": status, "reason": reason, "solved": False, "by": "", "first": None, "total": None, "setup": None,
             "times": {}, "length": None, "raw_length": None, "jerk": None, "raw_jerk": None, "clearance": None,
             "checks": 0, "counts": {}, "properties": {}, "common": {}, "load": None}  # fmt: skip
 
 
-def _outcome(job: Job) -> Run:
+def _by_runner(job: Job) -> Run:
+    """Return the columns of a run that a row's own function makes; ``status`` follows ``solved`` if it has none."""
+    with quiet_ompl(), one_torch_thread():
+        seed_ompl(job.seed)
+        found = dict(load_runner(job.runner)(job))
+    status, by = (PlanStatus.EXACT_SOLUTION, job.planner) if found["solved"] else (PlanStatus.TIMEOUT, "")
+    return unsolved(str(status), "") | {"by": by, "load": os.getloadavg()[0]} | found
+
+
+def planned(job: Job) -> tuple[PlanRun, Experiment, PlanResult]:
+    """Return the call of ``plan`` of a run, OMPL's experiment, and the result."""
     started = time.perf_counter()
     parameters = planners.parameters(job.planner, **job.params)
     problem = load_problem(job.problem)
@@ -185,21 +179,23 @@ def _outcome(job: Job) -> Run:
         result = query_fault(planning)  # the planner runs even where the straight line is a solution
         if result is None:
             result = solve(planning, job.timeout, job.simplify, experiment)
-        result = finish(planning, result, started)
-    return told(planning, experiment, result)
+        return planning, experiment, finish(planning, result, started)
 
 
-def told(planning: PlanRun, experiment: Experiment, result: PlanResult) -> Run:
-    """Return what is stored of a run."""
+def columns(planning: PlanRun, experiment: Experiment, result: PlanResult) -> Run:
+    """Return the columns of a run that was planned."""
     times, report = result.times, planning.report
     path = result.path.states if result and result.path is not None else None
-    first_path = None if planning.parameters.optimizing else planning.first_path  # others go on after their first path
+    # Optimizing planners go on after their first path, which is not kept.
+    first_path = None if planning.parameters.optimizing else planning.first_path
     raw = None if first_path is None else first_path.states
     found = path is not None
     total = sum(times.get(stage, 0.0) for stage in ("solve", "simplify", *PROOF))
     first = times.get(FIRST, times.get("solve", 0.0))
-    if report is None or not report.first_verified:  # what the planner found had still to be proved
-        first += proof_of_first(planning)
+    if report is None or not report.first_verified:  # the planner itself had not made the full check
+        setup = planning.setup
+        exact = None if first_path is None else with_exact_ends(setup, first_path).states
+        first += first_path_proof(setup.checker, exact, setup.start, setup.goals, times)
     return {
         "status": str(result.status), "reason": result.reason, "solved": found, "by": result.solved_by,
         "first": first if found else None, "total": total, "setup": times.get("setup"), "times": dict(times),
@@ -208,9 +204,8 @@ def told(planning: PlanRun, experiment: Experiment, result: PlanResult) -> Run:
         "jerk": jerk(path) if path is not None and path_length(path) > 0.0 else None,
         "raw_jerk": jerk(raw) if found and raw is not None and path_length(raw) > 0.0 else None,
         "clearance": result.clearance if path is not None and np.isfinite(result.clearance) else None,
-        "checks": result.checks - experiment.checked_aside,
-        "properties": experiment.properties, "common": experiment.common,
-        "load": os.getloadavg()[0],
+        "checks": result.checks - experiment.checks,
+        "properties": experiment.properties, "common": experiment.common, "load": os.getloadavg()[0],
         "counts": {} if report is None else {
             "candidates": report.candidates, "proposals": report.proposed, "resamples": report.resampled,
             "repair steps": report.steps, "improvements": report.improved,
@@ -219,7 +214,7 @@ def told(planning: PlanRun, experiment: Experiment, result: PlanResult) -> Run:
 
 
 def _robot_of(problem: str) -> str:
-    """Return the robot of a problem; that of the suites where no problem can be drawn."""
+    """Return the robot of a problem; that of the suites where no problem can be sampled."""
     try:
         return load_problem(problem).robot
     except SuiteError:
@@ -227,18 +222,18 @@ def _robot_of(problem: str) -> str:
 
 
 def warm_up(jobs: Sequence[Job], modules: Sequence[str] = ()) -> dict[str, float]:
-    """Load what runs of some rows need, and return the seconds that the first run of each took.
+    """Load what the runs of some rows need, and return the time of each row's first run [s].
 
     Args:
-        jobs: One of each row. Those on problems of another robot than ``WARM_UP`` are made as they are.
-        modules: That are imported first, and register planners.
+        jobs: One job of each row. It is made on the problem ``WARM_UP`` where that has the same robot.
+        modules: Modules to import first, which register planners.
     """
     for module in modules:
         importlib.import_module(module)
     seconds = {}
     for job in jobs:
-        begin = time.perf_counter()
+        started = time.perf_counter()
         problem = WARM_UP if _robot_of(job.problem) == _robot_of(WARM_UP) else job.problem
-        run(Job("warm-up", problem, job.label, job.planner, job.params, 0, job.timeout, job.simplify))
-        seconds[job.label] = time.perf_counter() - begin
+        run(replace(job, experiment="warm-up", problem=problem, seed=0))
+        seconds[job.label] = time.perf_counter() - started
     return seconds

@@ -1,4 +1,4 @@
-"""What came of a benchmark: figures of each row on each level, and tables of them."""
+"""Statistics of a benchmark, for each row on each level, and tables of them."""
 
 from __future__ import annotations
 
@@ -15,34 +15,34 @@ from apex_ompl.benchmark.results import Results
 from apex_ompl.benchmark.runs import NO_PROBLEM, Run, ompl_status
 from apex_ompl.result import PlanStatus
 
-BESIDE = 0.5  # load average above that of the runs that is let pass
-MOMENTS = (0.1, 0.5, 2.0, 10.0)  # at which shares of solved runs are given [s]
+TOLERATED_LOAD = 0.5  # load average above that of the runs themselves
+SHARE_TIMES = (0.1, 0.5, 2.0, 10.0)  # at which the share of runs with a first path is given [s]
 FULL_TIME = (PlanStatus.TIMEOUT, PlanStatus.APPROXIMATE_SOLUTION, PlanStatus.EXACT_SOLUTION)
-TREES = ("rrtconnect", "sprint")  # what of apex is a tree's work alone
+TREES = ("rrtconnect", "sprint")  # stages of apex that are tree search alone
 
 
 @dataclass(frozen=True)
 class Table:
-    """A table: a title, heads of the columns, and rows of text."""
+    """A table: title, column heads, rows of text."""
 
     title: str
     head: Sequence[str]
     rows: Sequence[Sequence[str]]
 
     def markdown(self) -> str:
-        """Return it as Markdown."""
+        """Return the table as Markdown."""
         lines = [self.head, ["---", "---", *["---:"] * (len(self.head) - 2)], *self.rows]
         return f"### {self.title}\n\n" + "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
 @dataclass(frozen=True)
-class Figures:
-    """What came of a row on a level.
+class Statistics:
+    """Statistics of a row on a level.
 
     Attributes:
-        experiment: The level.
-        label: The row.
-        runs: Its runs.
+        experiment: Name of the level.
+        label: Label of the row.
+        runs: The runs.
     """
 
     experiment: str
@@ -51,17 +51,17 @@ class Figures:
 
     @property
     def solved(self) -> list[Run]:
-        """Those that found a path which passed the full check."""
+        """Runs whose path passed the full check."""
         return [run for run in self.runs if run["solved"]]
 
     @property
     def planner(self) -> str:
-        """The name of its planner."""
+        """Name of the planner."""
         return str(self.runs[0]["planner"])
 
     @property
     def limit(self) -> float:
-        """The longest time that a run was given [s]."""
+        """Longest time limit of a run [s]."""
         return max(float(run["timeout"]) for run in self.runs)
 
     def times(self, which: str = "first") -> np.ndarray:
@@ -77,39 +77,39 @@ class Figures:
         return next_percentile(self.times(which), p)
 
     def median(self, key: str) -> float:
-        """Return the median of what solved runs have, NaN where none has it."""
+        """Return the median of a column over solved runs that have it, NaN without any."""
         values = [run[key] for run in self.solved if run[key] is not None]
         return float(np.median(values)) if values else math.nan
 
     @property
     def by(self) -> Counter[str]:
-        """What solved how many runs."""
+        """Number of runs that each planner or stage solved."""
         return Counter(run["by"] for run in self.solved)
 
 
-def figures(results: Results) -> list[Figures]:
-    """Return the figures of all rows on all levels, in the order of the runs."""
+def statistics(results: Results) -> list[Statistics]:
+    """Return the statistics of all rows on all levels: levels by name, rows in the order of the results."""
     runs: dict[tuple[str, str], list[Run]] = {}
     for run in sorted(results.runs, key=lambda run: int(run["seed"])):
         if run["status"] != NO_PROBLEM:
             runs.setdefault((run["experiment"], run["label"]), []).append(run)
     labels = list(results.about["rows"])
     order = sorted(runs, key=lambda key: (key[0], labels.index(key[1]) if key[1] in labels else len(labels)))
-    return [Figures(*key, runs[key]) for key in order]
+    return [Statistics(*key, runs[key]) for key in order]
 
 
 def tables(results: Results) -> list[Table]:
     """Return the tables of a report."""
-    found = figures(results)
+    found = statistics(results)
     return [successes(found), times(found), paths(found), stages(found)]
 
 
-def successes(found: Iterable[Figures]) -> Table:
-    """Return how many runs were solved in how much time."""
+def successes(found: Iterable[Statistics]) -> Table:
+    """Return the table of shares solved, in all and within some times."""
     rows, last = [], ""
     for f in found:
         low, high = share_interval(len(f.solved), len(f.runs))
-        within = [_share(f.share_within(t)) if t <= f.limit else "-" for t in MOMENTS]
+        within = [_share(f.share_within(t)) if t <= f.limit else "-" for t in SHARE_TIMES]
         share = f"{_share(len(f.solved) / len(f.runs))} ({_share(low)} to {_share(high)})"
         trees = sum(f.by[name] for name in TREES if f.planner != name) / len(f.runs)
         rows.append(
@@ -122,14 +122,14 @@ def successes(found: Iterable[Figures]) -> Table:
         "N",
         "limit s",
         "solved (95 %, Wilson)",
-        *(f"in {t:g} s" for t in MOMENTS),
+        *(f"in {t:g} s" for t in SHARE_TIMES),
         "by its trees alone",
     ]
     return Table("Success", head, rows)
 
 
-def times(found: Iterable[Figures]) -> Table:
-    """Return times to a first path and to the end."""
+def times(found: Iterable[Statistics]) -> Table:
+    """Return the table of times to the first path and to the end."""
     rows, last = [], ""
     for f in found:
         low, high = percentile_interval(f.times(), 50.0)
@@ -144,8 +144,8 @@ def times(found: Iterable[Figures]) -> Table:
     return Table("Time", [*head, "setup ms"], rows)
 
 
-def paths(found: Iterable[Figures]) -> Table:
-    """Return lengths, jerks and clearances."""
+def paths(found: Iterable[Statistics]) -> Table:
+    """Return the table of lengths, jerks and clearances."""
     rows, last = [], ""
     for f in found:
         numbers = [_number(f.median(key)) for key in ("raw_length", "length", "raw_jerk", "jerk")]
@@ -157,8 +157,8 @@ def paths(found: Iterable[Figures]) -> Table:
     return Table("Paths (medians of solved runs; jerk of a run in 1 s at even speed)", head, rows)
 
 
-def stages(found: Iterable[Figures]) -> Table:
-    """Return who solved what."""
+def stages(found: Iterable[Statistics]) -> Table:
+    """Return the table of shares solved by each stage."""
     chosen = [f for f in found if len(f.by) > 1 or set(f.by) - {f.planner}]
     names = sorted({name for f in chosen for name in f.by})
     rows, last = [], ""
@@ -170,49 +170,51 @@ def stages(found: Iterable[Figures]) -> Table:
 
 
 def warnings(results: Results) -> list[str]:
-    """Return what a reader of times must know."""
-    sessions, said = results.about["sessions"], []
+    """Return warnings for a reader of the times."""
+    sessions, found = results.sessions(), list[str]()
     if any(session["address"] for session in sessions):
-        said.append("Runs were made on a cluster, whose machines are not said.")
+        found.append("Runs were made on a cluster, whose machines are not recorded.")
     if any(session["jobs"] > 1 for session in sessions):
-        said.append("Several runs went at the same time, so that times are longer than those of runs alone.")
-    most = max(session["jobs"] for session in sessions) + BESIDE
-    beside = sum(run["load"] is not None and run["load"] > most for run in results.runs)
-    if beside:
+        found.append("Several runs went at the same time, so that times are longer than those of runs alone.")
+    most = max(session["jobs"] for session in sessions) + TOLERATED_LOAD
+    loaded = sum(run["load"] is not None and run["load"] > most for run in results.runs)
+    if loaded:
         of = len(results.runs)
-        said.append(f"The load was over {most:g} in {beside} of {of} runs: other processes, or many threads that wake.")
+        found.append(
+            f"The load was over {most:g} in {loaded} of {of} runs: other processes, or many threads that wake."
+        )
     if len({session["hardware"] for session in sessions}) > 1:
-        said.append("The runs were made on different machines.")
+        found.append("The runs were made on different machines.")
     if len({str(session["versions"]) for session in sessions}) > 1:
-        said.append("The runs were made with different versions of libraries.")
+        found.append("The runs were made with different versions of libraries.")
     crashed = [run for run in results.runs if run["status"] == "CRASH"]
     if crashed:
         reasons = Counter(f"{run['label']}: {run['reason']}" for run in crashed)
-        said.append("Crashed: " + "; ".join(f"{n} x {reason}" for reason, n in reasons.most_common(5)) + ".")
+        found.append("Crashed: " + "; ".join(f"{n} x {reason}" for reason, n in reasons.most_common(5)) + ".")
     ended = ((run["label"], ompl_status(run["properties"])) for run in results.runs if run["properties"])
     refused = Counter(f"{label}, {status}" for label, status in ended if status not in FULL_TIME)
     if refused:
-        said.append("Ended early, unsolved: " + "; ".join(f"{n} x {name}" for name, n in refused.most_common(5)) + ".")
+        found.append("Ended early, unsolved: " + "; ".join(f"{n} x {name}" for name, n in refused.most_common(5)) + ".")
     faulty = Counter(
         f"{run['problem']}: {run['reason']}" for run in results.runs if run["status"].startswith("INVALID")
     )
     if faulty:
-        said.append("Faulty problems: " + "; ".join(list(faulty)[:5]) + ".")
+        found.append("Faulty problems: " + "; ".join(list(faulty)[:5]) + ".")
     skipped = len({run["problem"] for run in results.runs if run["status"] == NO_PROBLEM})
     if skipped:
-        said.append(f"{skipped} seeds gave no problem and do not count.")
+        found.append(f"{skipped} seeds gave no problem and do not count.")
     if any(not run["raw_length"] for run in results.runs if run["solved"]):
-        said.append(
-            "First paths of planners that use all their time are noticed up to 0.05 s late, without their length, and "
+        found.append(
+            "First paths of planners that use all their time are observed up to 0.05 s late, without their length, and "
             "are not checked; the full check of the last path counts in their place, no repair of it."
         )
-    said.append("OMPL's Benchmark looks at the clock every 0.1 s: runs may take so much longer than their limit.")
-    return said
+    found.append("OMPL's Benchmark reads the clock every 0.1 s: runs may exceed their limit by that much.")
+    return found
 
 
 def about(results: Results) -> list[tuple[str, Any]]:
-    """Return how the results were made, as pairs of a name and a text."""
-    sessions = results.about["sessions"]
+    """Return the provenance of results, as pairs of a name and a text."""
+    sessions = results.sessions()
     last = sessions[-1]
     pairs = [("Command", f"{one['command']} ({one['date']}, {one['jobs']} at a time)") for one in sessions]
     versions = ", ".join(f"{name} {version}" for name, version in last["versions"].items())

@@ -12,12 +12,12 @@ from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 
 from apex_ompl.benchmark.rows import Job
-from apex_ompl.benchmark.runs import CRASH, Run, run, told_of, unsolved, warm_up
+from apex_ompl.benchmark.runs import CRASH, Run, job_columns, run, unsolved, warm_up
 from apex_ompl.errors import ApexError, ParameterError
 from apex_ompl.util.cluster import spread
 
 DIED = "the process died"
-RENEWED = 500  # runs of a process, about, until another takes its place: OMPL's BIT* keeps 20 MB for each second
+RUNS_PER_PROCESS = 500  # about, until a new process takes its place: OMPL's BIT* leaks 20 MB for each second
 
 
 @dataclass(frozen=True)
@@ -25,9 +25,9 @@ class Workers:
     """Where runs are made.
 
     Attributes:
-        at_once: Runs at the same time; their times are comparable with one.
-        address: Of a Ray cluster; by default processes of this machine.
-        modules: That are imported first, and register planners.
+        at_once: Number of runs at the same time; with one, times are those of runs alone.
+        address: Address of a Ray cluster; by default processes of this machine.
+        modules: Modules to import first, which register planners.
     """
 
     at_once: int = 1
@@ -43,12 +43,12 @@ class Workers:
         if isinstance(self.at_once, bool) or not isinstance(self.at_once, int) or self.at_once < 1:
             raise ParameterError("jobs", self.at_once, "a whole number, 1 or more")
 
-    def made(self, jobs: Sequence[Job], warm: dict[str, float]) -> Iterator[Run]:
-        """Make runs, and yield them as they end; a process that dies is a run that crashed.
+    def runs_of(self, jobs: Sequence[Job], warm: dict[str, float]) -> Iterator[Run]:
+        """Make runs, and yield them as they end; a run whose process dies has crashed.
 
         Args:
             jobs: The runs to be made, in this order.
-            warm: Is told how many seconds the first run of each row took, on this machine.
+            warm: Filled with the time of the first run of each row on this machine [s].
 
         Raises:
             ApexError: A planner kills the process while it warms up; a file, a parameter or a checkpoint is at
@@ -59,13 +59,13 @@ class Workers:
             named = {job.key: (job, first, self.modules) for job in jobs}
 
             def lost(key: str) -> Run:
-                return told_of(named[key][0]) | unsolved(CRASH, DIED)
+                return job_columns(named[key][0]) | unsolved(CRASH, DIED)
 
             found = spread(_remote, named, workers=self.at_once, address=self.address, ahead=1, lost=lost)
             yield from (one for _, one in found)
             return
         waiting, suspects, blamed = list(jobs[::-1]), list[Job](), set[str]()
-        while waiting or suspects:  # those under way when a process died are made again, one by one
+        while waiting or suspects:  # runs under way when a process died are made again, one by one
             under_way: dict[Future[Run], Job] = {}
             before = len(waiting) + len(suspects)
             pool = self._pool(first, 1 if suspects else self.at_once)
@@ -78,9 +78,9 @@ class Workers:
                     raise ParameterError(
                         "planners", ", ".join(job.label for job in first), "planners that do not end the process"
                     ) from None
-                for job in died:  # the first time it may have been the doing of a run before
+                for job in died:  # the first time another run may have been the cause
                     if job.key in blamed:
-                        yield told_of(job) | unsolved(CRASH, DIED)
+                        yield job_columns(job) | unsolved(CRASH, DIED)
                     else:
                         blamed.add(job.key)
                         suspects.append(job)
@@ -95,8 +95,8 @@ class Workers:
     def _pooled(
         pool: ProcessPoolExecutor, queue: list[Job], at_once: int, under_way: dict[Future[Run], Job]
     ) -> Iterator[Run]:
-        """Make runs of a queue, its end first, and take off what is under way, as long as processes last."""
-        left = RENEWED * at_once
+        """Make runs from the end of a queue until the processes are due for renewal; those started leave the queue."""
+        left = RUNS_PER_PROCESS * at_once
         while (queue and left) or under_way:
             while queue and left and len(under_way) < at_once:
                 left -= 1
@@ -104,9 +104,9 @@ class Workers:
                 queue.pop()
             done, _ = wait(under_way, return_when=FIRST_COMPLETED)
             for future in done:
-                one = future.result()
+                made = future.result()
                 del under_way[future]
-                yield one
+                yield made
 
 
 _warm_up: dict[str, float] = {}  # of this process
@@ -114,16 +114,16 @@ _faults: list[ApexError] = []
 
 
 def _prepare(first: Sequence[Job], modules: Sequence[str]) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the process that waits for runs goes by it
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent process handles it
     threading.Thread(target=_end_with_parent, daemon=True).start()
     try:
         _warm_up.update(warm_up(first, modules))
-    except ApexError as error:  # said when there is somebody to hear it
+    except ApexError as error:  # raised by the first call, for the parent to catch
         _faults.append(error)
 
 
 def _end_with_parent() -> None:
-    """End this process when the one that started it is gone, were it killed."""
+    """End this process when its parent has ended, were it by SIGKILL."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()

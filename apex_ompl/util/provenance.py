@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import platform
+import subprocess
 from collections.abc import Sequence
 from importlib import metadata
 from pathlib import Path
@@ -22,6 +23,19 @@ def versions(libraries: Sequence[str] = FIGURES) -> dict[str, str]:
         except metadata.PackageNotFoundError:
             continue
     return found
+
+
+def commit(root: Path, paths: Sequence[str] = (".",)) -> str:
+    """Return the commit of a git repository, with ``+changes`` where some paths of it differ; or ``unknown``."""
+    commands = (["rev-parse", "--short", "HEAD"], ["status", "--porcelain", "--", *paths])
+    try:
+        head, changes = (
+            subprocess.run(["git", *command], cwd=root, capture_output=True, text=True, check=True).stdout.strip()
+            for command in commands
+        )
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+    return head + ("+changes" if changes else "")
 
 
 def hardware() -> str:
