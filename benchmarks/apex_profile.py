@@ -71,8 +71,11 @@ def run_variant(job: Job) -> Run:
             planner.optimizer = Optimizer(planner.model.spline, Settings(samples=samples))
         return planner
 
-    longer = solver.LONGER if later_sprints else (1, 0, 0)
-    with mock.patch.object(ApexParameters, "build", build_variant), mock.patch.object(solver, "LONGER", longer):
+    factors = apex_parameters.SPRINT_FACTORS if later_sprints else (1, 0, 0)
+    with (
+        mock.patch.object(ApexParameters, "build", build_variant),
+        mock.patch.object(apex_parameters, "SPRINT_FACTORS", factors),
+    ):
         return runs.columns(*runs.planned(replace(job, params=params, runner="")))
 
 
