@@ -26,6 +26,7 @@ from apex_ompl.benchmark import Row, Workers, bench, runs
 from apex_ompl.benchmark.rows import Job
 from apex_ompl.benchmark.runs import NO_PROBLEM, Run
 from apex_ompl.benchmark.summary import Statistics
+from apex_ompl.planners import apex_parameters
 from apex_ompl.planners.apex_parameters import ApexParameters
 from apex_ompl.result import FIRST, INSIDE
 from apex_ompl.trajopt.optimizer import Optimizer, Settings
