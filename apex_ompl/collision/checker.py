@@ -25,6 +25,7 @@ from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import AttachedObject, Body, Obstacle
 from apex_ompl.types import Array
 from apex_ompl.util.schema import validate
+from apex_ompl.util.validation import check_states, shape_error
 
 
 @dataclass(frozen=True)
@@ -193,8 +194,7 @@ class CollisionChecker:
         """Whether the state ``q``, shape (dof,), collides with nothing."""
         q = np.asarray(q, float)
         if q.shape != (self.robot.dof,):
-            self.robot.to_pinocchio(q)  # says what is wrong
-            raise ParameterError("state", q.shape, f"an array of shape ({self.robot.dof},)")
+            raise shape_error(q, (self.robot.dof,), "state")
         if not self._prove:
             return self._free_by_meshes(q)
         left = self._proved().unproved_at(q, self.check_counts)
@@ -207,8 +207,7 @@ class CollisionChecker:
             ParameterError: Another shape.
         """
         states = np.asarray(states, float)
-        if states.ndim != 2 or states.shape[1] != self.robot.dof:
-            raise ParameterError("states", states.shape, f"an array of shape (N, {self.robot.dof})")
+        check_states(states, self.robot.dof)
         if not self._prove:
             return np.array([self._free_by_meshes(q) for q in states], bool)
         free = np.ones(len(states), bool)
@@ -234,7 +233,7 @@ class CollisionChecker:
         if not (math.isfinite(resolution) and resolution > 0.0):
             raise ParameterError("resolution", resolution, "a positive number of radians")
         if path.ndim != 2 or path.shape[1] != self.robot.dof or len(path) == 0:
-            raise ParameterError("path", path.shape, f"an array of shape (N, {self.robot.dof})")
+            raise shape_error(path, ("N", self.robot.dof), "path", least=1)
         if len(path) == 1:
             free = not start or self.is_free(path[0])
             return None if free else Collision(path[0].copy(), 0)

@@ -14,13 +14,14 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from apex_ompl.errors import FileFormatError, ParameterError, RobotError, UnknownNameError
+from apex_ompl.errors import FileFormatError, RobotError, UnknownNameError
 from apex_ompl.robot.assets import DATA, resolve
 from apex_ompl.robot.compose import compose
 from apex_ompl.robot.config import Hand, RobotConfig, read_config, read_disabled_pairs
 from apex_ompl.scene.bodies import Body
 from apex_ompl.scene.meshes import extent_fault
 from apex_ompl.types import Array
+from apex_ompl.util.validation import shape_error
 
 
 @dataclass(frozen=True)
@@ -93,7 +94,7 @@ class Robot:
         """
         q = np.asarray(q, dtype=float)
         if q.ndim == 0 or q.shape[-1] != len(self._order):
-            raise ParameterError("state", q.shape, f"{len(self._order)} joint values")
+            raise shape_error(q, ("...", len(self._order)), "state")
         return q[..., self._order]
 
     def link_frame(self, link: str) -> int:
