@@ -17,7 +17,7 @@ from apex_ompl.trajectory.curve import SAME, Curve, Polyline
 from apex_ompl.trajectory.motion import Trajectory
 from apex_ompl.trajectory.point_to_point import from_motion, stops
 from apex_ompl.types import Array
-from apex_ompl.util.validation import is_number, numbers
+from apex_ompl.util.validation import check_array, check_number, check_states, numbers
 
 PER_PIECE = 10  # points of the grid a piece of the curve
 SPACINGS = tuple(0.001 * k * 2**n for n in range(2, 13) for k in (1, 1.5))  # of knots, from 0.004 to 6.144 [s]
@@ -66,9 +66,7 @@ class Timing:
             ParameterError: One is out of its range.
         """
         for name, (low, high) in RANGES.items():
-            value = getattr(self, name)
-            if not is_number(value) or not low <= value <= high:
-                raise ParameterError(name, value, f"a number from {low:g} to {high:g}")
+            check_number(getattr(self, name), name, low, high)
         for name in ("start_velocity", "start_acceleration"):
             object.__setattr__(self, name, tuple(np.atleast_1d(numbers(getattr(self, name), name)).ravel().tolist()))
 
@@ -90,8 +88,7 @@ class Timing:
             given = np.array(getattr(self, f"start_{name}"), dtype=float)
             if not given.size:
                 given = np.zeros(len(limit))
-            if given.shape != limit.shape:
-                raise ParameterError(f"start_{name}", given.shape, f"{len(limit)} finite numbers, one a joint")
+            check_array(given, limit.shape, f"start_{name}")
             if np.any(np.abs(given) > limit):
                 k = int(np.argmax(np.abs(given) / limit))
                 raise ParameterError(f"start_{name}", given[k], f"at most {limit[k]:g} for joint {k + 1}, as scaled")
@@ -160,8 +157,7 @@ def time_path(
 
 def _check(states: Array, limits: Limits, joint_names: Sequence[str]) -> None:
     dof = len(limits.velocity)
-    if states.ndim != 2 or states.shape[1] != dof or not len(states):
-        raise ParameterError("path", states.shape, f"states of shape (N, {dof})")
+    check_states(states, dof, "path", least=1)
     if len(joint_names) != dof:
         raise ParameterError("joint_names", len(joint_names), f"{dof}, as there are joints")
     over = (states < limits.lower - OUTSIDE) | (states > limits.upper + OUTSIDE)
