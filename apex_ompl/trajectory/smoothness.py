@@ -10,7 +10,6 @@ from numpy.typing import ArrayLike
 
 from apex_ompl.errors import ParameterError
 from apex_ompl.trajopt.path import resample
-from apex_ompl.types import Array
 from apex_ompl.util.validation import check_array, check_path, check_positive
 
 STEPS = 128  # into which a path is cut for its jerk

@@ -6,11 +6,10 @@ All number and shape checks of the package are made here, so that their messages
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Iterable, Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from apex_ompl.errors import ParameterError
 from apex_ompl.types import Array
@@ -110,7 +109,7 @@ def check_not_negative(values: ArrayLike, name: str) -> None:
         raise ParameterError(name, values, "a number, 0 or more")
 
 
-def check_numbered(chosen: Sequence[int], count: int, name: str, what: str) -> None:
+def check_numbered(chosen: Iterable[int] | NDArray[np.intp], count: int, name: str, what: str) -> None:
     """Check that integers number some of ``count`` items, such as ``planned joints``.
 
     Raises:
@@ -120,9 +119,7 @@ def check_numbered(chosen: Sequence[int], count: int, name: str, what: str) -> N
         raise ParameterError(name, list(chosen), f"numbers of {what}, 0 to {count - 1}")
 
 
-def check_array(
-    array: Array, shape: Sequence[int | str], name: str, *, finite: bool = False, least: int = 0
-) -> None:
+def check_array(array: Array, shape: Sequence[int | str], name: str, *, finite: bool = False, least: int = 0) -> None:
     """Check the shape of an array and, with ``finite``, that all its numbers are finite.
 
     Args:
