@@ -8,11 +8,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from apex_ompl.errors import ApexError, ParameterError, UnknownNameError
+from apex_ompl.errors import ApexError, UnknownNameError
 from apex_ompl.problems import alignment, broad, scenes
 from apex_ompl.problems.outline import Outline
 from apex_ompl.problems.reach import HandPoses, robot
 from apex_ompl.scene.problem import Problem
+from apex_ompl.util.validation import check_whole
 
 SPLITS = {"train": range(800_000), "validation": range(800_000, 900_000), "test": range(900_000, 1_000_000)}
 SYNERGIES = (0.0, 0.4)  # range of the hands where they hold nothing
@@ -62,9 +63,7 @@ class ProblemId:
             raise UnknownNameError("suite", str(self.suite), KNOWN)
         if not isinstance(self.level, str) or self.level not in KNOWN[self.suite]:
             raise UnknownNameError(f"level of {self.suite}", str(self.level), KNOWN[self.suite])
-        whole = isinstance(self.seed, (int, np.integer)) and not isinstance(self.seed, bool)
-        if not whole or not 0 <= self.seed < SPLITS["test"].stop:
-            raise ParameterError("seed", self.seed, f"a whole number from 0 to {SPLITS['test'].stop - 1}")
+        check_whole(self.seed, "seed", 0, SPLITS["test"].stop - 1)
 
     def __str__(self) -> str:
         """Return the name of the problem, ``suite/level/seed``."""
