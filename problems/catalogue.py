@@ -13,7 +13,7 @@ from apex_ompl.problems import alignment, broad, scenes
 from apex_ompl.problems.outline import Outline
 from apex_ompl.problems.reach import HandPoses, robot
 from apex_ompl.scene.problem import Problem
-from apex_ompl.util.validation import check_whole
+from apex_ompl.util.validation import check_integer
 
 SPLITS = {"train": range(800_000), "validation": range(800_000, 900_000), "test": range(900_000, 1_000_000)}
 SYNERGIES = (0.0, 0.4)  # range of the hands where they hold nothing
@@ -63,7 +63,7 @@ class ProblemId:
             raise UnknownNameError("suite", str(self.suite), KNOWN)
         if not isinstance(self.level, str) or self.level not in KNOWN[self.suite]:
             raise UnknownNameError(f"level of {self.suite}", str(self.level), KNOWN[self.suite])
-        check_whole(self.seed, "seed", 0, SPLITS["test"].stop - 1)
+        check_integer(self.seed, "seed", 0, SPLITS["test"].stop - 1)
 
     def __str__(self) -> str:
         """Return the name of the problem, ``suite/level/seed``."""

@@ -23,7 +23,7 @@ from apex_ompl.errors import FileFormatError, ParameterError
 from apex_ompl.util.files import locked, make_folder, write_atomically
 from apex_ompl.util.provenance import hardware, versions
 from apex_ompl.util.resolution import FULL_RESOLUTION, SEARCH_RESOLUTION
-from apex_ompl.util.validation import check_whole
+from apex_ompl.util.validation import check_integer
 
 
 def bench(
@@ -57,7 +57,7 @@ def bench(
     """
     workers = workers or Workers()
     check_arguments(timeout, seed)
-    runs = check_whole(runs, "runs", 1)
+    runs = check_integer(runs, "runs", 1)
     for module in workers.modules:
         importlib.import_module(module)
     given = [row if isinstance(row, Row) else Row.parse(row) for row in rows]

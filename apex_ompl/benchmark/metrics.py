@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from apex_ompl.errors import ParameterError
 from apex_ompl.trajopt.path import resample
 from apex_ompl.types import Array
-from apex_ompl.util.validation import check_array, check_path, check_whole
+from apex_ompl.util.validation import check_array, check_integer, check_path
 
 STEPS = 128  # into which a path is cut for its jerk, and for distances between paths
 BLOCK = 2048  # rows of a kernel matrix at a time
@@ -37,7 +37,7 @@ def share_interval(count: int, of: int, confidence: float = 0.95) -> tuple[float
     Raises:
         ParameterError: ``count`` is not from 0 to ``of``, or ``of`` is 0.
     """
-    check_whole(count, "count", 0, check_whole(of, "tasks", 1))
+    check_integer(count, "count", 0, check_integer(of, "tasks", 1))
     from scipy import stats
 
     interval = stats.binomtest(count, of).proportion_ci(confidence, method="wilson")

@@ -15,7 +15,7 @@ from apex_ompl.benchmark.rows import Job
 from apex_ompl.benchmark.runs import CRASH, Run, run, told_of, unsolved, warm_up
 from apex_ompl.errors import ApexError, ParameterError
 from apex_ompl.util.cluster import spread
-from apex_ompl.util.validation import check_whole
+from apex_ompl.util.validation import check_integer
 
 DIED = "the process died"
 RENEWED = 500  # runs of a process, about, until another takes its place: OMPL's BIT* keeps 20 MB for each second
@@ -41,7 +41,7 @@ class Workers:
         Raises:
             ParameterError: It is not a whole number, 1 or more.
         """
-        check_whole(self.at_once, "jobs", 1)
+        check_integer(self.at_once, "jobs", 1)
 
     def made(self, jobs: Sequence[Job], warm: dict[str, float]) -> Iterator[Run]:
         """Make runs, and yield them as they end; a process that dies is a run that crashed.

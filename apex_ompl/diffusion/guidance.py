@@ -16,7 +16,7 @@ from apex_ompl.diffusion.schedule import Estimate, NoiseSchedule
 from apex_ompl.errors import UnknownNameError
 from apex_ompl.kernel import Kernel
 from apex_ompl.types import Array
-from apex_ompl.util.validation import check_number, check_positive, check_whole
+from apex_ompl.util.validation import check_integer, check_number, check_positive
 
 SCALINGS = ("noise", "clean")
 
@@ -55,7 +55,7 @@ class Guidance:
         for name, value in (("gamma", self.gamma), ("clip", self.clip), ("begin", self.begin)):
             check_number(value, name, 0.0)
         check_positive(self.margin, "margin")
-        check_whole(self.samples, "samples", 2)
+        check_integer(self.samples, "samples", 2)
 
 
 def collision_cost(kernel: Kernel, paths: Array, margin: float) -> tuple[Array, Array]:

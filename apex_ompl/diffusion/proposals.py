@@ -20,7 +20,7 @@ from apex_ompl.errors import ParameterError, UnknownNameError
 from apex_ompl.kernel import Kernel
 from apex_ompl.trajopt.spline import Spline
 from apex_ompl.types import Array
-from apex_ompl.util.validation import check_array, check_number, check_whole
+from apex_ompl.util.validation import check_array, check_integer, check_number
 
 PLAIN = Guidance(gamma=0.0)
 
@@ -50,7 +50,7 @@ class Sampling:
         """
         if self.sampler not in SAMPLERS:
             raise UnknownNameError("sampler", self.sampler, SAMPLERS)
-        check_whole(self.steps, "number of denoising steps", 1)
+        check_integer(self.steps, "number of denoising steps", 1)
         check_number(self.temperature, "temperature", 0.0)
 
 
@@ -116,7 +116,7 @@ class TrajectoryModel:
             ParameterError: A query has states of another robot, or there are no paths to propose.
         """
         sampling, queries = sampling or self.sampling, [query] if isinstance(query, Query) else list(query)
-        check_whole(count, "count", 1)
+        check_integer(count, "count", 1)
         shape = torch.zeros(len(queries) * count, *self.network.latent, device=self.device)
         generator = generator or torch.Generator().manual_seed(0)
         first = sampling.temperature * noise_like(shape, generator)
@@ -144,7 +144,7 @@ class TrajectoryModel:
         sampling, control = sampling or self.sampling, np.asarray(control, float)
         shape = ("B", self.spline.points, len(self.network.config.joints))
         check_array(control, shape, "control points", finite=True)
-        check_whole(step, "step", 0, self.network.schedule.steps - 1)
+        check_integer(step, "step", 0, self.network.schedule.steps - 1)
         generator = generator or torch.Generator().manual_seed(0)
         with torch.no_grad():
             clean = self.network.autoencoder.encode(torch.tensor(control, dtype=torch.float32, device=self.device))

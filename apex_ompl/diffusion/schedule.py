@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from apex_ompl.errors import UnknownNameError
-from apex_ompl.util.validation import check_whole
+from apex_ompl.util.validation import check_integer
 
 SCHEDULES = ("cosine", "linear")
 PREDICTIONS = ("noise", "velocity", "clean")
@@ -52,7 +52,7 @@ class NoiseSchedule:
             ParameterError: There are no steps.
             UnknownNameError: No such schedule.
         """
-        check_whole(self.steps, "steps", 1)
+        check_integer(self.steps, "steps", 1)
         if self.kind not in SCHEDULES:
             raise UnknownNameError("noise schedule", self.kind, SCHEDULES)
 
@@ -130,6 +130,6 @@ class NoiseSchedule:
             ParameterError: There are not as many, or no such step.
         """
         top = self.steps - 1 if first is None else first
-        check_whole(top, "first step", 0, self.steps - 1)
-        check_whole(count, "number of denoising steps", 1, top + 1)
+        check_integer(top, "first step", 0, self.steps - 1)
+        check_integer(count, "number of denoising steps", 1, top + 1)
         return [round((top + 1) * (1.0 - k / count)) - 1 for k in range(count)]

@@ -14,7 +14,7 @@ from apex_ompl.kernel.ik_solver import FACING, GAP, PARTS, SLOPE, descend, resid
 from apex_ompl.kernel.tables import RobotTables
 from apex_ompl.kernel.views import room
 from apex_ompl.types import Array
-from apex_ompl.util.validation import check_numbered, is_whole, shape_error
+from apex_ompl.util.validation import check_indices, is_integer, shape_error
 
 
 class Fixed(NamedTuple):
@@ -44,7 +44,7 @@ class Target:
         """
         if len(self.whole) != 4 or self.whole[0] not in (GAP, FACING, SLOPE):
             raise ParameterError("target", self.whole, "a kind and three joints")
-        if not all(is_whole(j) for j in self.whole):
+        if not all(is_integer(j) for j in self.whole):
             raise ParameterError("target", self.whole, "whole numbers of joints")
         if len(self.parts) != PARTS:
             raise ParameterError("target", self.parts, f"{PARTS} parts")
@@ -105,7 +105,7 @@ class Inverse:
         joints = sorted({j for target in targets for j in target.whole[1:]})
         if not joints or joints[0] < 0 or joints[-1] >= len(arrays.joint_parent):
             raise ParameterError("targets", joints, f"targets on joints 0 to {len(arrays.joint_parent) - 1}")
-        check_numbered(fixed, robot.dof, "fixed", "planned joints")
+        check_indices(fixed, robot.dof, "fixed", "planned joints")
         self.robot = robot
         self.targets = tuple(targets)
         self.rows = sum(target.rows for target in targets)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from apex_ompl.errors import FileFormatError, MissingFileError, UnknownNameError
 from apex_ompl.util.files import is_file, write_atomically
-from apex_ompl.util.validation import check_numbered
+from apex_ompl.util.validation import check_indices
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -169,7 +169,7 @@ class RobotTables:
         Raises:
             ParameterError: There is no such joint.
         """
-        check_numbered(joints, self.dof, "joints", "planned joints")
+        check_indices(joints, self.dof, "joints", "planned joints")
         a, mine = self.arrays, {int(k) for k in joints}
         movers: list[set[int]] = []  # of each joint; parents come first
         for parent, source in zip(a.joint_parent, a.joint_source, strict=True):

@@ -18,7 +18,7 @@ from apex_ompl.trajectory.files import STATES, SUFFIXES, decoded, encoded
 from apex_ompl.trajectory.smoothness import spectral_arc_length
 from apex_ompl.types import Array
 from apex_ompl.util.files import suffix_of, write_atomically
-from apex_ompl.util.validation import check_array, check_positive, check_times, check_whole, numbers
+from apex_ompl.util.validation import check_array, check_integer, check_positive, check_times, finite_array
 
 ROUNDING = 1e-9  # of shares of limits
 JOINED = 1e-6  # share by which a knot may be off what the one before it leads to; files of ROS round times
@@ -74,7 +74,7 @@ class Trajectory:
                 knots that no motion of constant jerk joins.
         """
         for name in ("times", *STATES):
-            object.__setattr__(self, name, numbers(getattr(self, name), name))
+            object.__setattr__(self, name, finite_array(getattr(self, name), name))
         names = tuple(self.joint_names)
         object.__setattr__(self, "joint_names", names)
         if not names or len(set(names)) < len(names):
@@ -118,8 +118,8 @@ class Trajectory:
         Raises:
             ParameterError: ``order`` is none of these, or a time is no number.
         """
-        check_whole(order, "order", 0, len(STATES))
-        given = numbers(time, "time")
+        check_integer(order, "order", 0, len(STATES))
+        given = finite_array(time, "time")
         if given.ndim > 1:
             raise ParameterError("time", given.shape, "one moment, or several of shape (N,)")
         moments = np.atleast_1d(given)
@@ -246,7 +246,7 @@ class Trajectory:
         Raises:
             ParameterError: ``time`` is no number.
         """
-        numbers(time, "time")
+        finite_array(time, "time")
         later = self.times > time + 1e-9
         if not later.any():
             return Trajectory(

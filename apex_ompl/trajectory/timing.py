@@ -17,7 +17,7 @@ from apex_ompl.trajectory.curve import SAME, Curve, Polyline
 from apex_ompl.trajectory.motion import Trajectory
 from apex_ompl.trajectory.point_to_point import from_motion, stops
 from apex_ompl.types import Array
-from apex_ompl.util.validation import check_array, check_number, check_states, numbers
+from apex_ompl.util.validation import check_array, check_number, check_states, finite_array
 
 PER_PIECE = 10  # points of the grid a piece of the curve
 SPACINGS = tuple(0.001 * k * 2**n for n in range(2, 13) for k in (1, 1.5))  # of knots, from 0.004 to 6.144 [s]
@@ -68,7 +68,9 @@ class Timing:
         for name, (low, high) in RANGES.items():
             check_number(getattr(self, name), name, low, high)
         for name in ("start_velocity", "start_acceleration"):
-            object.__setattr__(self, name, tuple(np.atleast_1d(numbers(getattr(self, name), name)).ravel().tolist()))
+            object.__setattr__(
+                self, name, tuple(np.atleast_1d(finite_array(getattr(self, name), name)).ravel().tolist())
+            )
 
     def limits(self, limits: Limits) -> Limits:
         """Return the scaled limits."""
@@ -141,7 +143,7 @@ def time_path(
     timing = timing or Timing()
     if not isinstance(timing, Timing):
         raise ParameterError("timing", timing, "a Timing")
-    states = numbers(path, "path")
+    states = finite_array(path, "path")
     _check(states, limits, joint_names)
     scaled = timing.limits(limits)
     start = timing.start(scaled)

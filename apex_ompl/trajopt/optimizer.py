@@ -18,7 +18,7 @@ from apex_ompl.kernel import optimization
 from apex_ompl.kernel.interface import Kernel
 from apex_ompl.trajopt.spline import Spline
 from apex_ompl.types import Array
-from apex_ompl.util.validation import check_array, check_not_negative, check_number, check_positive, check_whole
+from apex_ompl.util.validation import check_array, check_integer, check_nonnegative, check_number, check_positive
 
 Check = Callable[[Array], bool]
 """Whether a path, shape (states, dof), is valid."""
@@ -59,8 +59,8 @@ class Settings:
         Raises:
             ParameterError: One is out of range.
         """
-        check_whole(self.samples, "samples", 1)
-        check_whole(self.steps, "steps")
+        check_integer(self.samples, "samples", 1)
+        check_integer(self.steps, "steps")
         for name in ("scene_margin", "own_margin", "stiffness"):
             check_positive(getattr(self, name), name)
         for name in ("damping", "tolerance"):
@@ -118,7 +118,7 @@ class Optimizer:
         Raises:
             ParameterError: ``count`` is not positive.
         """
-        check_whole(count, "count", 1)
+        check_integer(count, "count", 1)
         line = self.spline.line(start, goal)
         bumps = _bumps(self.spline) @ rng.normal(size=(count, self.spline.free, line.shape[1]))
         bumps[0] = 0.0
@@ -184,7 +184,7 @@ class Optimizer:
             return self._bent(control, about)
         for name, number in (("steps", steps), ("stiffness", stiffness), ("damping", damping)):
             if number is not None:
-                check_not_negative(number, name)
+                check_nonnegative(number, name)
         grid = _grid(self.spline, self.settings.samples)
         numbers = self._numbers()
         numbers[optimization.STEPS] = self.settings.steps if steps is None else steps

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from apex_ompl.errors import ParameterError
 from apex_ompl.types import Array
-from apex_ompl.util.validation import check_path, check_whole
+from apex_ompl.util.validation import check_integer, check_path
 
 FIT_SAMPLES = 1025
 ROUGHNESS = 1e-9  # of the third derivative, where a fit would leave control points open
@@ -43,8 +43,8 @@ class Spline:
             ParameterError: There are too few points, states or pinned points, or nothing is left free.
         """
         for name, low in (("degree", 1), ("pinned", 1), ("states", 2)):
-            object.__setattr__(self, name, check_whole(getattr(self, name), name, low))
-        object.__setattr__(self, "points", check_whole(self.points, "points", self.degree + 1))
+            object.__setattr__(self, name, check_integer(getattr(self, name), name, low))
+        object.__setattr__(self, "points", check_integer(self.points, "points", self.degree + 1))
         if self.free < 1:
             raise ParameterError("pinned", self.pinned, f"less than half of the {self.points} points")
 

@@ -23,7 +23,7 @@ def is_number(value: object) -> bool:
     return isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
 
 
-def is_whole(value: object) -> bool:
+def is_integer(value: object) -> bool:
     """Whether a value is an integer of Python or NumPy; True and False are not."""
     return isinstance(value, (int, np.integer)) and not isinstance(value, bool)
 
@@ -53,13 +53,13 @@ def check_positive(value: float, name: str, expected: str = "a positive number")
         raise ParameterError(name, value, expected)
 
 
-def check_whole(value: int, name: str, low: int = 0, high: int | None = None) -> int:
+def check_integer(value: int, name: str, low: int = 0, high: int | None = None) -> int:
     """Return an integer as an ``int`` after checking that it lies in [low, high].
 
     Raises:
         ParameterError: It does not, or the value is no integer.
     """
-    if not is_whole(value) or value < low or (high is not None and value > high):
+    if not is_integer(value) or value < low or (high is not None and value > high):
         raise ParameterError(name, value, _in_range("a whole number", low, high))
     return int(value)
 
@@ -70,7 +70,7 @@ def check_seed(seed: int) -> int:
     Raises:
         ParameterError: It does not, or the value is no integer.
     """
-    return check_whole(seed, "seed", 0, LARGEST_INT)
+    return check_integer(seed, "seed", 0, LARGEST_INT)
 
 
 def _in_range(what: str, low: float, high: float | None) -> str:
@@ -84,7 +84,7 @@ def _shown(bound: float) -> str:
     return str(bound) if isinstance(bound, int) else f"{bound:g}"
 
 
-def numbers(given: ArrayLike, name: str) -> Array:
+def finite_array(given: ArrayLike, name: str) -> Array:
     """Return a copy of finite numbers as an array.
 
     Raises:
@@ -99,7 +99,7 @@ def numbers(given: ArrayLike, name: str) -> Array:
     return found
 
 
-def check_not_negative(values: ArrayLike, name: str) -> None:
+def check_nonnegative(values: ArrayLike, name: str) -> None:
     """Check that each of some numbers is 0 or more; infinity is allowed.
 
     Raises:
@@ -109,7 +109,7 @@ def check_not_negative(values: ArrayLike, name: str) -> None:
         raise ParameterError(name, values, "a number, 0 or more")
 
 
-def check_numbered(chosen: Iterable[int] | NDArray[np.intp], count: int, name: str, what: str) -> None:
+def check_indices(chosen: Iterable[int] | NDArray[np.intp], count: int, name: str, what: str) -> None:
     """Check that integers number some of ``count`` items, such as ``planned joints``.
 
     Raises:
