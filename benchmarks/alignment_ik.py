@@ -21,7 +21,7 @@ from apex_ompl.robot.config import Part, read_config
 from apex_ompl.robot.model import build_robot
 from apex_ompl.scene.bodies import Body
 from apex_ompl.tasks.alignment import alignment_goal
-from apex_ompl.util.scripts import run_command
+from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import one_or_more, whole_number
 
 PROBLEMS = ("stack_boxes", "ball_in_cup", "peg_in_hole", "pour", "handover")
@@ -80,4 +80,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    run_command(main)
+    run_script(main)

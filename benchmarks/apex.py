@@ -35,8 +35,8 @@ from apex_ompl.ompl_adapter.setup import assemble
 from apex_ompl.ompl_adapter.validity import full_check
 from apex_ompl.problems.reach import robot
 from apex_ompl.result import FIRST, INSIDE, PlanResult
+from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.resolution import FULL_RESOLUTION
-from apex_ompl.util.scripts import run_command
 from apex_ompl.util.validation import one_or_more, whole_number
 
 STORE = record.RESULTS.parent / "runs" / "apex.jsonl"
@@ -268,4 +268,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    run_command(main)
+    run_script(main)

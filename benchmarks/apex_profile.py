@@ -31,7 +31,7 @@ from apex_ompl.planners.apex import APEX
 from apex_ompl.planners.apex_parameters import ApexParameters
 from apex_ompl.problems.reach import robot
 from apex_ompl.trajopt.optimizer import Optimizer, Settings
-from apex_ompl.util.scripts import run_command
+from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import one_or_more
 
 LIMIT, SEED = 5.0, 1  # [s]
@@ -175,4 +175,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    run_command(main)
+    run_script(main)

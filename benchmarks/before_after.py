@@ -20,7 +20,7 @@ from shipped_problems import BAXTER
 from apex_ompl import PlanResult, plan, problems
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.ompl_adapter import setup
-from apex_ompl.util.scripts import run_command
+from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import one_or_more
 
 WORK = ("line", "solve", "simplify", "verify", "repair")
@@ -81,4 +81,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    run_command(main)
+    run_script(main)

@@ -25,7 +25,7 @@ from apex_ompl import plan, problems
 from apex_ompl.live.moving import even_times, timed_check
 from apex_ompl.problems.alignment import PACE
 from apex_ompl.problems.reach import robot
-from apex_ompl.util.scripts import run_command
+from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import one_or_more, whole_number
 
 FIRST = 900_000  # seed of the first test problem
@@ -147,4 +147,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    run_command(main)
+    run_script(main)

@@ -25,8 +25,8 @@ from apex_ompl.ompl_adapter.validity import full_check
 from apex_ompl.robot import Robot, load_robot
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.trajopt.path import resample
+from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.resolution import FULL_RESOLUTION
-from apex_ompl.util.scripts import run_command
 from apex_ompl.util.validation import one_or_more, whole_number
 
 SCENES = (3, 10, 30, 100, 300)
@@ -229,4 +229,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    run_command(main)
+    run_script(main)

@@ -24,8 +24,8 @@ from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.cover.spheres import quality, read_covers, shape_key
 from apex_ompl.ompl_adapter import setup
 from apex_ompl.robot import load_robot
+from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.resolution import FULL_RESOLUTION, SEARCH_RESOLUTION
-from apex_ompl.util.scripts import run_command
 from apex_ompl.util.validation import one_or_more
 
 PROBLEMS = ("shelf_swap", "reach_past_post")
@@ -86,4 +86,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    run_command(main)
+    run_script(main)

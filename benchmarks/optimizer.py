@@ -28,7 +28,7 @@ from apex_ompl.problems.reach import robot
 from apex_ompl.trajopt.candidates import first_valid
 from apex_ompl.trajopt.optimizer import Optimizer
 from apex_ompl.trajopt.path import path_length
-from apex_ompl.util.scripts import run_command
+from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import one_or_more, whole_number
 
 STORE = record.RESULTS.parent / "runs" / "optimizer.jsonl"
@@ -145,4 +145,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    run_command(main)
+    run_script(main)

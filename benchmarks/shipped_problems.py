@@ -12,7 +12,7 @@ import record
 
 from apex_ompl import PlanResult, plan, problems
 from apex_ompl.planning import STRAIGHT_LINE
-from apex_ompl.util.scripts import run_command
+from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import one_or_more
 
 BAXTER = Path(__file__).resolve().parent.parent / "examples" / "baxter_table.yaml"
@@ -68,4 +68,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    run_command(main)
+    run_script(main)

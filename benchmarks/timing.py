@@ -43,7 +43,7 @@ from apex_ompl.trajectory.curve import Curve, Polyline
 from apex_ompl.trajectory.motion import joined
 from apex_ompl.trajectory.point_to_point import calculate, knots, stops
 from apex_ompl.trajectory.timing import PER_PIECE, SPACING, least_spacing, spline
-from apex_ompl.util.scripts import run_command
+from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import one_or_more, whole_number
 
 LIMITS, NAMES = robot().limits, robot().joint_names
@@ -321,4 +321,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    run_command(main)
+    run_script(main)

@@ -17,7 +17,7 @@ from apex_ompl.ompl_adapter.validity import full_check
 from apex_ompl.problems import frozen
 from apex_ompl.problems.catalogue import ProblemId, first_draw
 from apex_ompl.problems.reach import robot
-from apex_ompl.util.scripts import run_command
+from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import whole_number
 
 
@@ -70,4 +70,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    run_command(main)
+    run_script(main)

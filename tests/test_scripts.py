@@ -6,7 +6,7 @@ from collections.abc import Callable
 import pytest
 
 from apex_ompl.errors import ParameterError
-from apex_ompl.util.scripts import run_command
+from apex_ompl.util.entry_point import run_script
 
 
 def raises(error: BaseException) -> Callable[[], None]:
@@ -29,7 +29,7 @@ def test_faults_end_a_script_with_one_sentence(
 ) -> None:
     monkeypatch.setattr(sys, "argv", ["folder/some_script.py", "-n", "0"])
     with pytest.raises(SystemExit) as ended:
-        run_command(raises(error), "bench")
+        run_script(raises(error), "bench")
     shown = capsys.readouterr()
     assert ended.value.code == code and shown.out == ""
     assert shown.err.startswith(f"some_script: {said}") and shown.err.count("\n") == 1
@@ -38,5 +38,5 @@ def test_faults_end_a_script_with_one_sentence(
 def test_faults_of_the_code_are_not_hidden() -> None:
     for error in (ValueError("a defect"), ImportError("a defect")):
         with pytest.raises(type(error), match="a defect"):
-            run_command(raises(error))
-    run_command(lambda: None)
+            run_script(raises(error))
+    run_script(lambda: None)

@@ -9,7 +9,7 @@ from pathlib import Path
 from apex_ompl.errors import ApexError
 
 
-def run_command(main: Callable[[], None], extra: str = "") -> None:
+def run_script(main: Callable[[], None], extra: str = "") -> None:
     """Run a script; what it cannot go by ends it with one sentence on standard error.
 
     Args:
