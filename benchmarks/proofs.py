@@ -21,7 +21,7 @@ from collision_checker import around_home, boxes, near_contact
 
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.conservative import CheckCounts
-from apex_ompl.collision.path_grid import sample_path
+from apex_ompl.collision.discretization import sample_path
 from apex_ompl.robot import Robot, load_robot
 from apex_ompl.scene.bodies import AttachedObject, MeshFile, Obstacle
 from apex_ompl.util.entry_point import run_script

@@ -13,7 +13,7 @@ import coal
 import numpy as np
 import pinocchio as pin
 
-from apex_ompl.collision.containment import ANCHOR_RADIUS, Host, anchor_points, may_contain
+from apex_ompl.collision.containment import ANCHOR_RADIUS, EnclosingMesh, anchor_points, may_contain
 from apex_ompl.collision.distance import HullDistances
 from apex_ompl.collision.shapes import is_shell
 from apex_ompl.robot import Robot
@@ -58,7 +58,7 @@ def exact_requests(data: pin.GeometryData) -> pin.GeometryData:
     return data
 
 
-_links_as_hosts: WeakKeyDictionary[Robot, dict[int, Host]] = WeakKeyDictionary()  # what was analysed before
+_links_as_hosts: WeakKeyDictionary[Robot, dict[int, EnclosingMesh]] = WeakKeyDictionary()  # what was analysed before
 
 
 class CompiledScene:
@@ -103,7 +103,7 @@ class CompiledScene:
         self.pairs = [(p.first, p.second) for p in self.geometry.collisionPairs]
         self.same = list(range(self.geometry.ngeoms))  # geometry -> the geometry it stands for
         self.offsets: dict[int, pin.SE3] = {}  # geometry that stands for another -> where in the other's frame
-        self.hollow: list[tuple[int, int, Host, pin.SE3]] = []
+        self.hollow: list[tuple[int, int, EnclosingMesh, pin.SE3]] = []
         self._add_containment()
         self.geometry_data, self.manager = self._broadphase(self.geometry)
         self.second = self._second_stage()
@@ -151,7 +151,7 @@ class CompiledScene:
                 if not is_shell(items[h].geometry) or not may_contain(items[h].geometry, items[g].geometry):
                     continue
                 if h not in hosts:
-                    hosts[h] = Host.of(items[h].geometry)
+                    hosts[h] = EnclosingMesh.of(items[h].geometry)
                     if h < self.links:
                         links[h] = hosts[h]
                 points = [pin.SE3(np.eye(3), point) for point in anchor_points(items[g].geometry)]

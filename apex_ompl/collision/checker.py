@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from apex_ompl.collision.broadphase import CompiledScene, Contact
 from apex_ompl.collision.conservative import CheckCounts, ConservativeChecker, NoGridError, UnprovedPairs
+from apex_ompl.collision.discretization import bit_reversed, sample_path
 from apex_ompl.collision.distance import Distance
-from apex_ompl.collision.path_grid import bit_reversed, sample_path
 from apex_ompl.collision.shapes import coal_geometry, world_geometry
 from apex_ompl.errors import ParameterError, SceneError
 from apex_ompl.kernel import Kernel
@@ -218,7 +218,7 @@ class CollisionChecker:
     def first_collision(self, path: Array, resolution: float, start: bool = True) -> Collision | None:
         """Return a colliding state along a path, or None when it is free.
 
-        States at most ``resolution`` apart are checked, those of ``apex_ompl.collision.path_grid.sample_path``,
+        States at most ``resolution`` apart are checked, those of ``apex_ompl.collision.discretization.sample_path``,
         in bit-reversed order; those inside a stretch that the spheres prove to be free count as judged.
 
         Args:

@@ -22,7 +22,7 @@ CONVEX_TOLERANCE = 5e-4  # a mesh is convex when its triangles' centres are no d
 
 
 @dataclass(frozen=True)
-class Host:
+class EnclosingMesh:
     """A mesh that may contain others: its hull, whether the hull stands for the solid, and its triangles.
 
     Holes are closed by fans of triangles (``apex_ompl.scene.meshes.capped``). The hull stands for the solid where no
@@ -35,7 +35,7 @@ class Host:
     corners: NDArray[np.float64]
 
     @classmethod
-    def of(cls, mesh: coal.BVHModelBase) -> Host:
+    def of(cls, mesh: coal.BVHModelBase) -> EnclosingMesh:
         """Analyse a mesh."""
         hull = convex_hull(mesh)
         vertices, faces = triangles(mesh)
@@ -53,7 +53,7 @@ class Host:
         return cls(hull, is_closed(vertices, faces) and float(depth.max()) <= CONVEX_TOLERANCE, capped(vertices, faces))
 
     @property
-    def outline(self) -> NDArray[np.float64]:
+    def boundary(self) -> NDArray[np.float64]:
         """Corners of the triangles of what stands for the solid, shape (T, 3, 3) [m]."""
         return hull_corners(self.hull) if self.convex else self.corners
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import coal
 import numpy as np
 
-from apex_ompl.collision.containment import Host
+from apex_ompl.collision.containment import EnclosingMesh
 from apex_ompl.collision.cover.proof import PAD, Cover
 from apex_ompl.scene.meshes import bounding_boxes
 from apex_ompl.types import Array
@@ -24,7 +24,7 @@ def rough_cover(geometry: coal.CollisionGeometry) -> Cover:
     if geometry.getNodeType() == coal.GEOM_BOX:
         boxes, most = np.array([[-geometry.halfSide, geometry.halfSide]]), LEAVES
     else:
-        boxes, most = bounding_boxes(Host.of(geometry).outline, COLUMNS), LEAVES_IN_MESH
+        boxes, most = bounding_boxes(EnclosingMesh.of(geometry).boundary, COLUMNS), LEAVES_IN_MESH
     sides = boxes[:, 1] - boxes[:, 0]
     longest = float(sides.max())
     while len(boxes) < most and _leaves(sides, longest / 1.1) <= most:

@@ -18,7 +18,7 @@ import coal
 import numpy as np
 from numpy.typing import NDArray
 
-from apex_ompl.collision.containment import Host
+from apex_ompl.collision.containment import EnclosingMesh
 from apex_ompl.collision.shapes import convex_hull, is_shell
 from apex_ompl.errors import ParameterError
 from apex_ompl.scene.meshes import capped, triangles, winding_number
@@ -284,7 +284,7 @@ def solid_of(geometry: coal.CollisionGeometry) -> Solid:
         return Solid((Polytope.around(np.array(geometry.points())),))
     if not is_shell(geometry):
         raise ParameterError("geometry", kind, "a box, sphere, cylinder, capsule, convex body or mesh")
-    if Host.of(geometry).convex:
+    if EnclosingMesh.of(geometry).convex:
         return Solid((Polytope.around(np.array(convex_hull(geometry).points())),))
     return _cells(capped(*triangles(geometry)))
 
