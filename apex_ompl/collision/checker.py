@@ -89,8 +89,7 @@ class CollisionChecker:
 
         Raises:
             SceneError: The name is taken already.
-            MissingFileError: Its mesh file is missing.
-            FileFormatError: Its mesh file holds no triangles.
+            MissingFileError, FileFormatError: Its mesh file is missing, or holds no triangles.
         """
         self._claim(obstacle.name)
         self._placed[obstacle.name] = world_geometry(obstacle)
