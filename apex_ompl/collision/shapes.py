@@ -1,4 +1,4 @@
-"""From the shapes of a problem to Coal geometry, exact and convex."""
+"""Coal geometry of the shapes of a problem, exact or as convex hulls."""
 
 from __future__ import annotations
 
@@ -41,8 +41,8 @@ def coal_geometry(body: Body) -> coal.CollisionGeometry:
 def world_geometry(body: Body) -> tuple[coal.CollisionGeometry, NDArray[np.float64]]:
     """Return the Coal geometry of a body and its placement in the world, shape (4, 4).
 
-    A half-space is given in world coordinates with the identity as placement: Coal's bounding box of a rotated
-    one overflows, and the broadphase then misses collisions.
+    A half-space is returned in world coordinates with the identity as placement, because Coal's bounding box of a
+    rotated half-space overflows and the broadphase then misses collisions.
 
     Raises:
         MissingFileError: The mesh file cannot be read.
@@ -62,7 +62,7 @@ def _half_space(normal: NDArray[np.float64], offset: float) -> coal.Halfspace:
 
 
 def is_shell(geometry: coal.CollisionGeometry) -> bool:
-    """Whether collision with the geometry only sees its surface (a triangle mesh), not its inside."""
+    """Whether the geometry is a triangle mesh, which collides by its surface and not by its inside."""
     return bool(geometry.getObjectType() == coal.OT_BVH)
 
 

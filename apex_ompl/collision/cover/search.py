@@ -114,7 +114,7 @@ class _Search:
         return _Level(centres, needs.argmin(axis=0), gap) if gap < best_gap else best
 
     def _recentre(self, centre: Array, own: Array, reach: float, steps: int) -> tuple[Array, float]:
-        """Return the centre with the smallest gap around the ball's own points, by random search, and the next reach."""
+        """Return the centre with the smallest gap around the ball's points, by random search, and the next reach."""
         count = 12 if self.effort == 1 else 24
         if len(own) > 80:  # the extreme points alone determine the radius
             own = own[np.unique((own @ DIRECTIONS.T).argmax(axis=0))]

@@ -38,7 +38,7 @@ class Field:
 
     @classmethod
     def over(cls, low: Array, high: Array, skin: Array, contains: Callable[[Array], Flags], count: int) -> Field:
-        """Sample depths at about ``count`` grid points, as distances to points of the surface ``skin``, shape (N, 3)."""
+        """Sample depths at about ``count`` grid points, by distances to points of the surface ``skin``, (N, 3)."""
         spacing = float(np.prod(high - low) / count) ** (1 / 3)
         numbers = np.maximum(np.ceil((high - low) / spacing).astype(int), 2)
         lines = [np.linspace(a, b, n + 1) for a, b, n in zip(low, high, numbers, strict=True)]
@@ -110,7 +110,7 @@ class Solid:
         return np.concatenate([part.surface(spacing) for part in self.parts])
 
     def inside(self, count: int) -> Array:
-        """Return the points inside the solid of a grid with about ``count`` points in its bounding box, shape (N, 3)."""
+        """Return the points inside the solid of a grid of about ``count`` points over its bounding box, (N, 3)."""
         low, high = self.low, self.high
         size = np.maximum(high - low, 1e-9)
         spacing = float(np.prod(size) / count) ** (1 / 3)
