@@ -25,7 +25,7 @@ from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import Body
 from apex_ompl.scene.meshes import triangles
 from apex_ompl.scene.problem import Problem
-from apex_ompl.tasks.alignment import Face
+from apex_ompl.tasks.link_faces import LinkFace
 from apex_ompl.trajopt.path import resample
 from apex_ompl.types import Array
 from apex_ompl.util.files import check_writable, write_atomically
@@ -132,7 +132,7 @@ class Stage:
             look = {"color": HELD_COLOURS[k % len(HELD_COLOURS)], "specular": 0.2}
             placement = frame.placement * pin.SE3(held.pose)
             parts.append((frame.parentJoint, placement, self._mesh(coal_geometry(held)), look))
-        faces: list[Face] = []
+        faces: list[LinkFace] = []
         if ready.alignment is not None:
             faces = [ready.alignment.first, ready.alignment.second]
         for face, colour in zip(faces, ARROWS, strict=False):
