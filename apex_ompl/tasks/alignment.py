@@ -1,21 +1,21 @@
 """Alignment goals: the task as two vectors to be aligned (section III-A of the paper).
 
-Each object has a contact face: a centre p and an outward unit axis a, fixed to the link that holds it. With
-e = p2 - p1, an alignment asks for
+Each object has a contact face with the centre p and the outward unit axis a, fixed to the link that holds it. With
+e = p2 - p1 and the wanted distance d, the error terms of an alignment are
 
-- opposition, ``angle``: the angle between a1 and -a2 (not for pouring),
-- ``lateral``: the length of e across a1, that is of (I - a1 a1^T) e,
-- ``axial``: how far a1 . e is from the wanted distance,
+- ``angle``: the angle between a1 and -a2 (not for pouring),
+- ``lateral``: |(I - a1 a1^T) e|,
+- ``axial``: |a1 . e - d|,
 
-and by its kind for
+and, depending on its kind,
 
-- ``vertical``, ``gravity``: the angle between a1 and up,
-- ``horizontal``, ``gravity``: the angle between a1 and the horizontal plane,
-- ``pour``: the first face is the lip of a vessel whose axis points out of its opening. ``lateral`` and ``axial`` are
-  then measured along the upward direction from the second face (the opening to pour into) to the lip, ``angle``
-  is that between a2 and up, ``tilt`` how far the vessel's angle from upright lies outside the wanted range, and
-  ``roll`` the angle that the lip is away from the lowest point of the rim,
-- ``handover``: nothing more; the second face is a hand's grasp point with the outward normal of its palm.
+- ``vertical``: ``gravity``, the angle between a1 and up,
+- ``horizontal``: ``gravity``, the angle between a1 and the horizontal plane,
+- ``pour``: the first face is the lip of a vessel, and its axis points out of the opening. ``lateral`` and ``axial``
+  are measured along the upward direction from the second face, the opening to pour into, to the lip. ``angle`` is
+  the angle between a2 and up, ``tilt`` the violation of the range of the angle between a1 and up, and ``roll`` the
+  angle between the lip and the lowest point of the rim,
+- ``handover``: no further term. The second face is the grasp point of a hand with the outward normal of its palm.
 
 Angles are in radians, lengths in metres.
 """
@@ -41,24 +41,24 @@ from apex_ompl.tasks.link_faces import LinkFace, lip_direction
 from apex_ompl.types import Array
 
 DEFAULT_TILT = (1.75, 2.36)  # 100 to 135 degrees from upright
-RESTART_SPREAD = 0.6  # standard deviation of restarts around home [rad]
-POSITION_WEIGHT = 4.0  # how much a metre counts against a radian in the descent
+RESTART_SPREAD = 0.6  # standard deviation of initial states around home [rad]
+POSITION_WEIGHT = 4.0  # weight of a position error against an angle in inverse kinematics [rad/m]
 
 
 class AlignmentGoal:
-    """An alignment for one robot, whose held objects and start are known."""
+    """An alignment of the held objects of a robot."""
 
     def __init__(self, robot: Robot, alignment: Alignment, attached: Sequence[AttachedObject], start: Array) -> None:
-        """Look the two faces up.
+        """Find the two faces and prepare inverse kinematics.
 
         Args:
             robot: The robot.
-            alignment: What is asked for.
+            alignment: The alignment.
             attached: The held objects.
-            start: State at which vectors in the world are seen and whose hands stay as they are, shape (dof,).
+            start: State at which vectors in the world are given, shape (dof,); its hand synergies are kept.
 
         Raises:
-            FileFormatError: A face names no held object with a contact, or both hang on the same link.
+            FileFormatError: A face names no held object with a contact, or both faces move together.
             UnknownNameError: A vector names an unknown link, or a handover an unknown hand.
         """
         self.robot = robot
@@ -95,7 +95,7 @@ class AlignmentGoal:
         return LinkFace.of_object(held[named])
 
     def faces(self, q: Array) -> tuple[Array, Array, Array, Array]:
-        """Return p1, a1, p2, a2 in the world at a state, each of shape (3,)."""
+        """Return p1, a1, p2 and a2 in the world at a state, each of shape (3,) [m]."""
         found: list[Array] = []
         for face, pose in zip((self.first, self.second), self._poses(q), strict=True):
             found += [pose[:3, :3] @ face.point + pose[:3, 3], pose[:3, :3] @ face.axis]
@@ -108,7 +108,7 @@ class AlignmentGoal:
             return [np.array(self._data.oMf[frame].homogeneous) for frame in self._frames]
 
     def errors(self, q: Array) -> dict[str, float]:
-        """Return the error terms at a state, shape (dof,): lengths [m] and angles [rad], none negative."""
+        """Return the error terms at a state, shape (dof,): lengths [m] and angles [rad], all 0 or more."""
         p1, a1, p2, a2 = self.faces(q)
         e = p2 - p1
         if self.alignment.kind == "pour":
@@ -137,12 +137,12 @@ class AlignmentGoal:
         return errors
 
     def is_satisfied(self, q: Array) -> bool:
-        """Whether every error at a state is within its tolerance, the bound included."""
+        """Whether every error at a state is at most its tolerance."""
         return within(self.errors(q), self.bounds)
 
     @property
     def bounds(self) -> dict[str, float]:
-        """Largest allowed value of each error term."""
+        """Tolerance of each error term: lengths [m] and angles [rad]."""
         t = self.tolerance
         return {
             "lateral": t.lateral,
@@ -154,7 +154,7 @@ class AlignmentGoal:
         }
 
     def targets(self) -> list[Target]:
-        """Return what inverse kinematics brings to zero; lengths count ``POSITION_WEIGHT`` times against angles."""
+        """Return the residuals of inverse kinematics; lengths are weighted by ``POSITION_WEIGHT``."""
         links, up, w, d = Links.of(self.robot), in_world(UP), POSITION_WEIGHT, self.distance
         p1, p2 = (links.point(face.link, face.point) for face in (self.first, self.second))
         a1, a2 = (links.direction(face.link, face.axis) for face in (self.first, self.second))
@@ -162,7 +162,7 @@ class AlignmentGoal:
             middle = float(np.cos((self.tilt[0] + self.tilt[1]) / 2))
             targets = [gap(p2, p1, up, d, w), facing(a2, up, -1.0), slope(a1, up, middle)]
             if self._radial is not None:
-                deepest = -float(np.sqrt(1.0 - middle**2))  # height of the lowest direction square to the axis
+                deepest = -float(np.sqrt(1.0 - middle**2))  # z of the lowest unit vector orthogonal to the axis
                 targets.append(slope(links.direction(self.first.link, self._radial), up, deepest))
             return targets
         targets = [gap(p1, p2, a1, d, w), facing(a1, a2)]
@@ -173,7 +173,10 @@ class AlignmentGoal:
         return targets
 
     def attempt(self, rng: np.random.Generator) -> Array:
-        """Return the end of one descent from a random state around home, hands as at the start, shape (dof,)."""
+        """Return the result of inverse kinematics from a random state around home, shape (dof,).
+
+        The hand synergies are those of the start.
+        """
         q0 = self.robot.home + rng.normal(0.0, RESTART_SPREAD, self.robot.dof)
         hands = self._hand_joints()
         q0[hands] = self.start[hands]
@@ -184,13 +187,13 @@ class AlignmentGoal:
     def sample(
         self, checker: CollisionChecker, rng: np.random.Generator, count: int = 8, max_attempts: int = 200
     ) -> AlignmentSamples:
-        """Sample free states that satisfy the alignment, by descents from random restarts.
+        """Sample free states that satisfy the alignment, by inverse kinematics from random states.
 
         Args:
-            checker: Judges the states.
-            rng: Source of the restarts.
-            count: How many states to look for.
-            max_attempts: Most descents to make.
+            checker: Checks the states for collision.
+            rng: Source of the initial states.
+            count: Number of states to find.
+            max_attempts: Largest number of attempts.
         """
         states: list[Array] = []
         best: dict[str, float] = {}
@@ -224,7 +227,8 @@ def alignment_goal(robot: Robot, problem: Problem) -> AlignmentGoal | None:
     """Return the alignment goal of a problem, or None when its goal is joint configurations.
 
     Raises:
-        ApexError: A face, a link or a hand is unknown.
+        UnknownNameError: A held object, a link or a hand is unknown.
+        FileFormatError: The alignment does not fit the held objects.
     """
     if problem.goal.alignment is None:
         return None

@@ -15,14 +15,14 @@ UP = np.array([0.0, 0.0, 1.0])
 
 @dataclass(frozen=True)
 class AlignmentSamples:
-    """What sampling an alignment gave.
+    """States sampled for an alignment.
 
     Attributes:
-        states: Free states that satisfy it, shape (found, dof).
-        attempts: Descents made.
-        converged: Descents that satisfied it, free or not.
-        best: The errors of the best attempt.
-        blocked: Why the last state that satisfied it was not free; empty when one was free, or none satisfied it.
+        states: Free states that satisfy the alignment, shape (found, dof).
+        attempts: Number of attempts of inverse kinematics.
+        converged: Number of attempts that satisfied the alignment, free or in collision.
+        best: Error terms of the best attempt.
+        blocked: A collision of the last state that satisfied the alignment; empty if one was free or none satisfied it.
     """
 
     states: Array
@@ -33,7 +33,7 @@ class AlignmentSamples:
 
     @property
     def fault(self) -> str:
-        """Why there is no state, in one sentence; empty when there is one."""
+        """Reason for which there is no state, in one sentence; empty when there is one."""
         if len(self.states):
             return ""
         if self.converged:
@@ -43,12 +43,12 @@ class AlignmentSamples:
 
 
 def angle(a: Array, b: Array) -> float:
-    """Return the angle between two vectors, 0..pi [rad], exact also where they are nearly parallel."""
+    """Return the angle between two vectors, atan2(|a x b|, a . b) [rad], accurate for nearly parallel vectors too."""
     return float(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b))
 
 
 def within(errors: Mapping[str, float], bounds: Mapping[str, float]) -> bool:
-    """Whether every error is at most its bound, give or take rounding."""
+    """Whether every error is at most its bound, up to rounding."""
     return all(value <= bounds[name] + 1e-12 for name, value in errors.items())
 
 
@@ -58,12 +58,12 @@ def unit_of(name: str) -> str:
 
 
 def relative_error(errors: Mapping[str, float], bounds: Mapping[str, float]) -> float:
-    """Return the largest error in multiples of its bound; terms without slack count in hundredths of a radian."""
+    """Return the largest ratio of an error to its bound, where a bound of zero counts as 0.01."""
     return max(value / max(bounds[name], 0.01) for name, value in errors.items())
 
 
 def lowest_direction(axis: Array) -> Array:
-    """Return the unit direction square to an axis that points down most."""
+    """Return the lowest unit vector orthogonal to a unit axis, shape (3,); down itself for a vertical axis."""
     down = -UP + (UP @ axis) * axis
     length = float(np.linalg.norm(down))
     return down / length if length > 1e-9 else -UP

@@ -38,7 +38,7 @@ class LinkFace:
 
     @classmethod
     def of_vector(cls, robot: Robot, vector: WorldVector, start: Array) -> LinkFace:
-        """Return the face that a vector in the world has in the frame of the link that holds it at ``start``.
+        """Return the face given by a vector in the world, fixed to its link at the state ``start``.
 
         Raises:
             UnknownNameError: No such link.
