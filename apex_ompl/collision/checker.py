@@ -10,7 +10,6 @@ from typing import Any
 import coal
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
 from apex_ompl.collision.broadphase import CompiledScene, Contact
 from apex_ompl.collision.conservative import CheckCounts, ConservativeChecker, NoGridError, UnprovedPairs
@@ -21,7 +20,7 @@ from apex_ompl.errors import ParameterError, SceneError
 from apex_ompl.kernel import Kernel
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import AttachedObject, Body, Obstacle
-from apex_ompl.types import Array
+from apex_ompl.types import Array, Flags
 from apex_ompl.util.schema import validate
 from apex_ompl.util.validation import check_states, shape_error
 
@@ -155,7 +154,7 @@ class CollisionChecker:
         self._invalidate()
 
     @property
-    def movable(self) -> NDArray[np.bool_]:
+    def movable(self) -> Flags:
         """Which of the kernel's obstacles are not fixtures of the robot, shape (obstacles,)."""
         numbers = self._scene().scene
         owners = [numbers[name] for name in self.obstacle_names]
@@ -184,7 +183,7 @@ class CollisionChecker:
         left = self._first_stage().unproved_at(q, self.check_counts)
         return left is None or self._free_by_meshes(q, left)
 
-    def are_free(self, states: Array) -> NDArray[np.bool_]:
+    def are_free(self, states: Array) -> Flags:
         """Whether each of the states, shape (N, dof), collides with nothing; shape (N,).
 
         Raises:

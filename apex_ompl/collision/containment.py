@@ -12,10 +12,10 @@ from dataclasses import dataclass
 
 import coal
 import numpy as np
-from numpy.typing import NDArray
 
 from apex_ompl.collision.shapes import convex_hull, is_shell
 from apex_ompl.scene.meshes import capped, is_closed, piece_points, triangles, winding_number
+from apex_ompl.types import Array
 
 ANCHOR_RADIUS = 1e-6  # [m]
 CONVEX_TOLERANCE = 5e-4  # a mesh is convex when its triangles' centres are no deeper than this below its hull [m]
@@ -38,7 +38,7 @@ class EnclosingMesh:
 
     hull: coal.CollisionGeometry
     convex: bool
-    corners: NDArray[np.float64]
+    corners: Array
 
     @classmethod
     def of(cls, mesh: coal.BVHModelBase) -> EnclosingMesh:
@@ -59,20 +59,20 @@ class EnclosingMesh:
         return cls(hull, is_closed(vertices, faces) and float(depth.max()) <= CONVEX_TOLERANCE, capped(vertices, faces))
 
     @property
-    def boundary(self) -> NDArray[np.float64]:
+    def boundary(self) -> Array:
         """Corners of the triangles of the hull if the mesh is convex, else of the mesh, shape (T, 3, 3) [m]."""
         return hull_corners(self.hull) if self.convex else self.corners
 
-    def contains(self, point: NDArray[np.float64]) -> bool:
+    def contains(self, point: Array) -> bool:
         """Whether a point in the mesh's frame, not on its surface, lies in the solid."""
         return abs(winding_number(point, self.corners)) > 0.5
 
 
-def hull_corners(hull: coal.ConvexBase32) -> NDArray[np.float64]:
+def hull_corners(hull: coal.ConvexBase32) -> Array:
     """Return the corners of the triangles of a convex hull, shape (T, 3, 3) [m]."""
     points = np.array(hull.points())
     rows = [hull.polygons(k) for k in range(hull.num_polygons)]
-    corners: NDArray[np.float64] = points[np.array([[row[0], row[1], row[2]] for row in rows])]
+    corners: Array = points[np.array([[row[0], row[1], row[2]] for row in rows])]
     return corners
 
 
@@ -88,7 +88,7 @@ def may_contain(outer: coal.BVHModelBase, inner: coal.CollisionGeometry) -> bool
     return _inscribed_radius(inner) <= widest_ball and (is_shell(inner) or volume <= hull.computeVolume())
 
 
-def anchor_points(geometry: coal.CollisionGeometry) -> NDArray[np.float64]:
+def anchor_points(geometry: coal.CollisionGeometry) -> Array:
     """Return one point of each connected piece of a solid, in its own frame, shape (pieces, 3) [m]."""
     return piece_points(*triangles(geometry)) if is_shell(geometry) else np.zeros((1, 3))
 

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
 from apex_ompl.collision.shapes import convex_hull
+from apex_ompl.types import Array
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class Distance:
     value: float
     first: str
     second: str
-    points: NDArray[np.float64]
+    points: Array
 
 
 NO_PAIR = Distance(float("inf"), "", "", np.full((2, 3), np.nan))
@@ -64,16 +64,16 @@ class HullDistances:
         self._hull_data = self._hulls.createData()
         self._lock = threading.Lock()
 
-    def values(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
+    def values(self, q: Array) -> Array:
         """Return the signed distance of every pair at a state in Pinocchio's order, shape (pairs,) [m]."""
         with self._lock:
             return self._values(q)
 
-    def _values(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _values(self, q: Array) -> Array:
         pin.computeDistances(self._model, self._data, self._hulls, self._hull_data, q)
         return np.array([result.min_distance for result in self._hull_data.distanceResults])
 
-    def closest(self, q: NDArray[np.float64]) -> Distance:
+    def closest(self, q: Array) -> Distance:
         """Return the closest pair at a state in Pinocchio's order."""
         if not self._pairs:
             return NO_PAIR

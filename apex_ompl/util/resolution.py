@@ -1,7 +1,7 @@
-"""Spacings at which paths are judged."""
+"""Resolutions of collision checking along paths."""
 
 SEARCH_RESOLUTION = 0.031
-"""Spacing of states that planners check along a motion [rad, max-norm]."""
+"""Largest spacing of the states that planners check along a motion [rad, max-norm]."""
 
 FULL_RESOLUTION = 0.0031
-"""Spacing of states of the full check, which decides whether a path is a solution [rad, max-norm]."""
+"""Largest spacing of the states of the full check, which decides whether a path is a solution [rad, max-norm]."""
