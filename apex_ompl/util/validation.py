@@ -34,7 +34,7 @@ def check_number(value: float, name: str, low: float = -np.inf, high: float = np
     Raises:
         ParameterError: It does not, or the value is no finite number.
     """
-    if not is_number(value) or not np.isfinite(value) or not low <= value <= high:
+    if not is_number(value) or not -np.inf < value < np.inf or not low <= value <= high:
         raise ParameterError(name, value, _in_range("a number", low, high))
 
 
@@ -95,7 +95,7 @@ def finite_array(given: ArrayLike, name: str) -> Array:
     except (TypeError, ValueError, OverflowError) as error:
         raise ParameterError(name, given, "finite numbers") from error
     if not np.isfinite(found).all():
-        raise ParameterError(name, found[~np.isfinite(found)].flat[0], "finite numbers")
+        raise ParameterError(name, float(found[~np.isfinite(found)].flat[0]), "finite numbers")
     return found
 
 
@@ -139,7 +139,7 @@ def check_array(array: Array, shape: Sequence[int | str], name: str, *, finite: 
         raise shape_error(array, shape, name, finite=finite, least=least)
     if finite and not np.isfinite(array).all():
         error = shape_error(array, shape, name, finite=True, least=least)
-        raise ParameterError(name, array[~np.isfinite(array)].flat[0], error.expected)
+        raise ParameterError(name, float(array[~np.isfinite(array)].flat[0]), error.expected)
 
 
 def shape_error(
