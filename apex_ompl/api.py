@@ -8,7 +8,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from ompl import geometric as og
 
 from apex_ompl import planners, problems
@@ -23,6 +22,7 @@ from apex_ompl.robot import load_robot
 from apex_ompl.scene.problem import Problem
 from apex_ompl.trajectory import Timing, warm_up
 from apex_ompl.util.files import is_file
+from apex_ompl.util.validation import check_positive, check_seed
 
 
 def load_problem(name_or_path: str | os.PathLike[str]) -> Problem:
@@ -137,8 +137,5 @@ def check_arguments(timeout: float, seed: int) -> None:
     Raises:
         ParameterError: ``timeout`` is not a positive number of seconds, or ``seed`` not a whole number from 0.
     """
-    number = isinstance(timeout, (int, float)) and not isinstance(timeout, bool)
-    if not number or not 0.0 < timeout < float("inf"):
-        raise ParameterError("timeout", timeout, "a positive number of seconds")
-    if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or not 0 <= seed < 2**31:
-        raise ParameterError("seed", seed, "a whole number from 0 to 2147483647")
+    check_positive(timeout, "timeout", "a positive number of seconds")
+    check_seed(seed)

@@ -1,8 +1,7 @@
-"""Faults that a caller can mend, each said in one sentence.
+"""Errors that a caller can correct, each described in one sentence.
 
-A planning failure is not among them: that is a status of the result. Every class here descends from
-:class:`ApexError`, carries the data of the fault as attributes, and prints one sentence that names the
-thing, the value found and what was expected.
+A planning failure is not an error but a status of the result. Every class descends from :class:`ApexError`, carries
+its data as attributes, and prints one sentence that names the parameter or file, the value and what was expected.
 """
 
 from __future__ import annotations
@@ -13,10 +12,10 @@ from typing import Any
 
 
 class ApexError(Exception):
-    """Root of all errors raised on purpose by this package; it can be sent between processes."""
+    """Base class of all errors raised by this package; it can be sent between processes."""
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Return what pickling needs: the sentence and the attributes, as the constructors take other arguments."""
+        """Return the message and the attributes for pickling, since the constructors take other arguments."""
         return _rebuilt, (type(self), self.args, self.__dict__)
 
 
@@ -36,13 +35,13 @@ class UnknownNameError(ApexError):
     """A name that is not registered.
 
     Attributes:
-        kind: What was looked up, for example ``planner``.
-        name: The name given.
-        known: The names that exist.
+        kind: Kind of name, such as ``planner``.
+        name: The unknown name.
+        known: The known names.
     """
 
     def __init__(self, kind: str, name: str, known: Iterable[str]) -> None:
-        """Compose the sentence from what was asked for and what exists."""
+        """Compose the message ``unknown KIND NAME; known: ...``."""
         self.kind = kind
         self.name = name
         self.known = tuple(sorted(known))
@@ -57,14 +56,14 @@ class FileFormatError(ApexError):
     """A file whose content does not follow its schema.
 
     Attributes:
-        file: Where the content came from.
-        field: Dotted path of the field at fault, or an empty string for the file as a whole.
-        value: The offending value.
-        expected: What the field should hold.
+        file: The file.
+        field: Dotted path of the faulty field, or an empty string for the file itself.
+        value: The faulty value.
+        expected: Description of valid values.
     """
 
     def __init__(self, file: str, field: str, value: object, expected: str) -> None:
-        """Compose the sentence ``file: field: expected ..., got ...``."""
+        """Compose the message ``file: field: expected ..., got ...``."""
         self.file = file
         self.field = field
         self.value = value
@@ -78,11 +77,11 @@ class MissingFileError(ApexError):
 
     Attributes:
         file: The path.
-        role: What the file was wanted for.
+        role: Description of the file.
     """
 
     def __init__(self, file: str, role: str, why: str = "no such file") -> None:
-        """Compose the sentence from the file, its role and why it cannot be had."""
+        """Compose the message ``ROLE FILE: why``."""
         self.file = file
         self.role = role
         super().__init__(f"{role} {file!r}: {why}")
@@ -93,12 +92,12 @@ class ParameterError(ApexError):
 
     Attributes:
         name: The parameter.
-        value: The value given.
-        expected: What it should be.
+        value: The faulty value.
+        expected: Description of valid values.
     """
 
     def __init__(self, name: str, value: object, expected: str) -> None:
-        """Compose the sentence ``name: expected ..., got ...``."""
+        """Compose the message ``name: expected ..., got ...``."""
         self.name = name
         self.value = value
         self.expected = expected
@@ -113,21 +112,21 @@ class FolderInUseError(ApexError):
     """
 
     def __init__(self, folder: str) -> None:
-        """Compose the sentence."""
+        """Compose the message."""
         self.folder = folder
         super().__init__(f"{folder}: another process writes here, expected one at a time")
 
 
 class TimingError(ApexError):
-    """A path for which no motion was found."""
+    """A path without a time parameterization."""
 
 
 class RobotError(ApexError):
-    """A robot description that cannot be made into a robot."""
+    """A robot description that is not valid."""
 
 
 class SceneError(ApexError):
-    """A scene change that makes no sense, such as removing an obstacle that is not there."""
+    """A scene change that is not possible, such as removing an obstacle that does not exist."""
 
 
 def _short(value: object, limit: int = 80) -> str:

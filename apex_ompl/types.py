@@ -1,4 +1,4 @@
-"""Array types shared by all packages."""
+"""Array types shared by all packages; docstrings give shapes and units."""
 
 from __future__ import annotations
 
@@ -6,4 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-"""Floating-point array; docstrings give its shape and unit."""
+"""Real numbers."""
+
+Flags = NDArray[np.bool_]
+"""One answer, yes or no, for each row of another array."""
+
+Indices = NDArray[np.int64]
+"""Integers that number rows of other arrays."""

@@ -21,25 +21,25 @@ from apex_ompl.robot.config import Part, read_config
 from apex_ompl.robot.model import build_robot
 from apex_ompl.scene.bodies import Body
 from apex_ompl.tasks.alignment import alignment_goal
-from apex_ompl.util.scripts import run_command
+from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import one_or_more, whole_number
 
 DEPENDS = ("@checking", "apex_ompl/tasks", "problems")
 PROBLEMS = ("stack_boxes", "ball_in_cup", "peg_in_hole", "pour", "handover")
 
 
-def robot_with_gap(gap: float) -> Robot:
-    """Return the dual Panda with its bases and tables ``gap`` metres apart."""
+def robot_with_bases_apart(distance: float) -> Robot:
+    """Return the dual Panda with its bases and tables ``distance`` metres apart."""
     path = DATA / "dual_panda_softhand.robot.yaml"
     config = read_config(path)
 
     def spread(part: Part) -> Part:
         x, y, z = part.position
-        return part.model_copy(update={"position": (x, y * gap, z)}) if part.parent == "world" else part
+        return part.model_copy(update={"position": (x, y * distance, z)}) if part.parent == "world" else part
 
     def shifted(table: Body) -> Body:
         x, y, z = table.position
-        return table.model_copy(update={"position": (x, y + float(np.sign(y)) * (gap - 1.0) / 2, z)})
+        return table.model_copy(update={"position": (x, y + float(np.sign(y)) * (distance - 1.0) / 2, z)})
 
     parts, fixtures = tuple(map(spread, config.parts)), tuple(map(shifted, config.fixtures))
     return build_robot(config.model_copy(update={"parts": parts, "fixtures": fixtures}), path)
@@ -52,20 +52,20 @@ def main() -> None:
     parser.add_argument("--seed", type=whole_number, default=0)
     args = parser.parse_args()
     rows, figures = [], []
-    for gap in (1.0, 0.7):
-        robot = robot_with_gap(gap)
+    for distance in (1.0, 0.7):
+        robot = robot_with_bases_apart(distance)
         for name in PROBLEMS:
             problem = load_problem(name)
             goal = alignment_goal(robot, problem)
             assert goal is not None
             checker = CollisionChecker(robot, (), problem.attached)
             checker.is_free(robot.home)
-            begin = time.perf_counter()
+            start = time.perf_counter()
             found = goal.sample(checker, np.random.default_rng(args.seed), args.attempts, args.attempts)
-            spent = (time.perf_counter() - begin) * 1e3
+            spent = (time.perf_counter() - start) * 1e3
             figure = {
                 "problem": name,
-                "gap_m": gap,
+                "gap_m": distance,
                 "converged": found.converged / found.attempts,
                 "free": len(found.states) / found.attempts,
                 "ms_per_attempt": spent / found.attempts,
@@ -74,11 +74,11 @@ def main() -> None:
             figures.append(figure)
             shares = [f"{figure[key]:.2f}" for key in ("converged", "free")]
             costs = [f"{figure[key]:.1f}" for key in ("ms_per_attempt", "ms_per_free_goal")]
-            rows.append([goal.alignment.kind, name, f"{gap:.1f}", *shares, *costs])
+            rows.append([goal.alignment.kind, name, f"{distance:.1f}", *shares, *costs])
     head = ["kind", "objects of", "bases apart m", "converged", "converged and free", "ms an attempt", "ms a free goal"]
     table = "\n".join(record.row(r) for r in [head, ["---", "---", *["---:"] * 5], *rows])
     record.write("alignment_ik", {"rows": figures}, table, seed=args.seed, N=args.attempts)
 
 
 if __name__ == "__main__":
-    run_command(main)
+    run_script(main)

@@ -30,7 +30,7 @@ from apex_ompl.planners import apex_parameters
 from apex_ompl.planners.apex_parameters import ApexParameters
 from apex_ompl.result import FIRST, INSIDE
 from apex_ompl.trajopt.optimizer import Optimizer, Settings
-from apex_ompl.util.scripts import run_command
+from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import one_or_more
 
 DEPENDS = ("@benchmark",)
@@ -180,4 +180,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    run_command(main)
+    run_script(main)

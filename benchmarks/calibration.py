@@ -28,7 +28,7 @@ from apex_ompl.benchmark.summary import Statistics
 from apex_ompl.live.moving import check_timed_path, constant_velocity_times
 from apex_ompl.problems.alignment import VELOCITY_SCALE
 from apex_ompl.problems.suite_robot import robot
-from apex_ompl.util.scripts import run_command
+from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import one_or_more, whole_number
 
 DEPENDS = ("@benchmark", "apex_ompl/live/moving.py")
@@ -153,4 +153,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    run_command(main)
+    run_script(main)

@@ -1,11 +1,11 @@
 """Cost of the checker: of states with 3 to 300 obstacles, and of free paths, two stages against the meshes alone.
 
-For each scene the same states are judged by the two stages, by the meshes alone (Pinocchio's AABB tree) and by a plain
+For each scene the same states are checked by the two stages, by the meshes alone (Pinocchio's AABB tree) and by a plain
 loop over all pairs; every disagreement is counted, with half of the states near the border of collision. The kernel's
 clearance and gradient are timed beside them. Then free paths of 256 states, straight lines in these scenes and what
-rrtconnect found on the ready-made problems, are judged state by state and by the full check.
+rrtconnect found on the ready-made problems, are checked state by state and by the full check.
 
-Usage: python benchmarks/checker.py [--states 50000] [--paths 200]
+Usage: python benchmarks/collision_checker.py [--states 50000] [--paths 200]
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from apex_ompl.ompl_adapter.validity import full_check
 from apex_ompl.robot import Robot, load_robot
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.trajopt.path import resample
+from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.resolution import FULL_RESOLUTION
-from apex_ompl.util.scripts import run_command
 from apex_ompl.util.validation import one_or_more, whole_number
 
 DEPENDS = ("@checking", "apex_ompl/ompl_adapter", "problems")
@@ -65,7 +65,7 @@ def around_home(robot: Robot, rng: np.random.Generator, count: int) -> np.ndarra
 
 
 class PlainLoop:
-    """The same geometry judged pair by pair, without a broadphase."""
+    """The same geometry checked pair by pair, without a broadphase."""
 
     def __init__(self, checker: CollisionChecker) -> None:
         """Take the compiled scene of ``checker``."""
@@ -79,14 +79,14 @@ class PlainLoop:
         return not pin.computeCollisions(model, self.data, self.scene.geometry, self.geometry_data, state, True)
 
 
-def microseconds(judge: Callable[[np.ndarray], object], states: np.ndarray, repeats: int = 3) -> float:
+def microseconds(check: Callable[[np.ndarray], object], states: np.ndarray, repeats: int = 3) -> float:
     """Return the best mean of several passes over ``states``, one call each [us a state]."""
     best = np.inf
     for _ in range(repeats):
-        begin = time.perf_counter()
+        start = time.perf_counter()
         for q in states:
-            judge(q)
-        best = min(best, (time.perf_counter() - begin) / len(states))
+            check(q)
+        best = min(best, (time.perf_counter() - start) / len(states))
     return best * 1e6
 
 
@@ -94,9 +94,9 @@ def of_batch(work: Callable[[np.ndarray], object], states: np.ndarray, repeats: 
     """Return the best of several calls with all ``states`` [us a state]."""
     best = np.inf
     for _ in range(repeats):
-        begin = time.perf_counter()
+        start = time.perf_counter()
         work(states)
-        best = min(best, (time.perf_counter() - begin) / len(states))
+        best = min(best, (time.perf_counter() - start) / len(states))
     return best * 1e6
 
 
@@ -116,7 +116,7 @@ def near_contact(
     return np.array(found).reshape(-1, states.shape[1])
 
 
-def judge_states(robot: Robot, count: int, share: int, rng: np.random.Generator) -> dict[str, float]:
+def check_states(robot: Robot, count: int, share: int, rng: np.random.Generator) -> dict[str, float]:
     """Return the figures of a scene."""
     scene = boxes(count, rng)
     both, meshes = CollisionChecker(robot, scene), CollisionChecker(robot, scene, proofs=False)
@@ -157,7 +157,7 @@ def straight_paths(robot: Robot, count: int, wanted: int, rng: np.random.Generat
     return scene, found
 
 
-def judge_paths(checkers: tuple[CollisionChecker, CollisionChecker], paths: list[np.ndarray]) -> dict[str, list[float]]:
+def check_paths(checkers: tuple[CollisionChecker, CollisionChecker], paths: list[np.ndarray]) -> dict[str, list[float]]:
     """Return milliseconds of each path: its states, and its full check, by two stages and by the meshes alone.
 
     ``batched`` is Pinocchio's own call for a batch of states, on one thread.
@@ -171,9 +171,9 @@ def judge_paths(checkers: tuple[CollisionChecker, CollisionChecker], paths: list
     times: dict[str, list[float]] = {}
 
     def timed(name: str, work: Callable[[], object]) -> None:
-        begin = time.perf_counter()
+        start = time.perf_counter()
         good = work()
-        times.setdefault(name, []).append((time.perf_counter() - begin) * 1e3)
+        times.setdefault(name, []).append((time.perf_counter() - start) * 1e3)
         assert good, name
 
     for path in paths:
@@ -188,17 +188,17 @@ def judge_paths(checkers: tuple[CollisionChecker, CollisionChecker], paths: list
 def main() -> None:
     """Measure and write."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--states", type=one_or_more, default=50_000, help="states judged, over all scenes")
+    parser.add_argument("--states", type=one_or_more, default=50_000, help="states checked, over all scenes")
     parser.add_argument("--paths", type=one_or_more, default=200, help="straight paths a scene")
     parser.add_argument("--seed", type=whole_number, default=0)
     args = parser.parse_args()
     rng = np.random.default_rng(args.seed)
     robot = load_robot("dual_panda_softhand")
-    figures = [judge_states(robot, count, args.states // len(SCENES), rng) for count in SCENES]
+    figures = [check_states(robot, count, args.states // len(SCENES), rng) for count in SCENES]
     paths = {}
     for count in SCENES[:3]:
         scene, found = straight_paths(robot, count, args.paths, rng)
-        paths[f"straight, {count} obstacles"] = judge_paths(
+        paths[f"straight, {count} obstacles"] = check_paths(
             (CollisionChecker(robot, scene), CollisionChecker(robot, scene, proofs=False)), found
         )
     solved: dict[str, list[float]] = {}
@@ -209,7 +209,7 @@ def main() -> None:
         results = [plan(problem, "rrtconnect", timeout=10.0, seed=seed) for seed in range(5)]
         done = [resample(r.path.states, 256) for r in results if r]
         done = [p for p in done if full_check(pair[1], p)]  # resampling cuts corners
-        for key, values in judge_paths(pair, done).items():  # type: ignore[arg-type]
+        for key, values in check_paths(pair, done).items():  # type: ignore[arg-type]
             solved.setdefault(key, []).extend(values)
     paths["rrtconnect's, ready-made problems"] = solved
     columns = list(figures[0])
@@ -230,4 +230,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    run_command(main)
+    run_script(main)

@@ -14,7 +14,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from apex_ompl.util.scripts import run_command
+from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import one_or_more
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -46,4 +46,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    run_command(main)
+    run_script(main)

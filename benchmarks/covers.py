@@ -24,8 +24,8 @@ from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.cover.spheres import quality, read_covers, shape_key
 from apex_ompl.ompl_adapter import setup
 from apex_ompl.robot import load_robot
+from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.resolution import FULL_RESOLUTION, SEARCH_RESOLUTION
-from apex_ompl.util.scripts import run_command
 from apex_ompl.util.validation import one_or_more
 
 DEPENDS = ("@checking", "apex_ompl/ompl_adapter", "problems", "benchmarks/collision_checker.py")
@@ -57,10 +57,10 @@ def measure(path: Path, states: int, seeds: int) -> dict[str, float]:
         free_us.append(microseconds(checker.is_free, free))
         for a, b in zip(free[:150], free[150:300], strict=False):
             for resolution, times in ((SEARCH_RESOLUTION, search_ms), (FULL_RESOLUTION, full_ms)):
-                begin = time.perf_counter()
+                start = time.perf_counter()
                 clear = checker.first_collision(np.stack([a, b]), resolution) is None
                 if clear:
-                    times.append((time.perf_counter() - begin) * 1e3)
+                    times.append((time.perf_counter() - start) * 1e3)
     found |= {"proved_of_free": float(np.mean(proved)), "proof_us": float(np.mean(kernel_us))}
     found |= {"two_stages_free_us": float(np.mean(free_us))}
     found |= {"free_motion_search_ms": float(np.median(search_ms)), "free_motion_full_ms": float(np.median(full_ms))}
@@ -87,4 +87,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    run_command(main)
+    run_script(main)

@@ -28,7 +28,7 @@ from apex_ompl.datasets.records import SOURCES
 from apex_ompl.generation.worker import SHARES, UNIT, Unit, static_levels, work
 from apex_ompl.problems import scenes
 from apex_ompl.trajopt.spline import Spline
-from apex_ompl.util.scripts import run_command
+from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import one_or_more, whole_number
 
 DEPENDS = ("@planning", "apex_ompl/datasets", "apex_ompl/generation")
@@ -159,4 +159,4 @@ def _table(rows: list[dict[str, Any]]) -> str:
 
 
 if __name__ == "__main__":
-    run_command(main)
+    run_script(main)

@@ -22,7 +22,7 @@ from pathlib import Path
 
 import record
 
-from apex_ompl.util.scripts import run_command
+from apex_ompl.util.entry_point import run_script
 
 CHANGES = "+changes"
 FIELDS = ("command", "date", "commit", "hardware", "python", "versions")
@@ -148,4 +148,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    run_command(main)
+    run_script(main)

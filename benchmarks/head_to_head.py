@@ -27,7 +27,7 @@ from apex_ompl.benchmark import Row, Workers, bench, report, write_database, wri
 from apex_ompl.benchmark.metrics import share_interval
 from apex_ompl.benchmark.rows import PAPER
 from apex_ompl.benchmark.summary import SHARE_TIMES, Statistics, Table, statistics, tables, warnings
-from apex_ompl.util.scripts import run_command
+from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import one_or_more
 
 DEPENDS = ("@benchmark", "benchmarks/controls.py")
@@ -111,4 +111,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    run_command(main)
+    run_script(main)

@@ -24,7 +24,7 @@ from apex_ompl.diffusion.guidance import Guidance
 from apex_ompl.diffusion.proposals import Sampling
 from apex_ompl.ompl_adapter.setup import assemble
 from apex_ompl.problems.suite_robot import robot
-from apex_ompl.util.scripts import run_command
+from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import one_or_more
 
 DEPENDS = ("apex_ompl/diffusion", "apex_ompl/apex/query.py", "apex_ompl/kernel")
@@ -87,4 +87,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    run_command(main)
+    run_script(main)

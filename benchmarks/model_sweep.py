@@ -24,7 +24,7 @@ from apex_ompl.datasets.cases import load_cases
 from apex_ompl.diffusion.checkpoint import load_model
 from apex_ompl.diffusion.runlog import read_log
 from apex_ompl.diffusion.validation import judged
-from apex_ompl.util.scripts import run_command
+from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import one_or_more
 
 DEPENDS = ("apex_ompl/diffusion", "apex_ompl/datasets", "scripts/train.py", "scripts/configs")
@@ -121,4 +121,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    run_command(main)
+    run_script(main)

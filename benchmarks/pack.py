@@ -16,8 +16,8 @@ import tarfile
 from pathlib import Path
 
 from apex_ompl.errors import MissingFileError, ParameterError
+from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.files import make_folder, write_atomically
-from apex_ompl.util.scripts import run_command
 
 RUNS, PACKED = Path(__file__).parent / "runs", Path(__file__).parent / "packed"
 KINDS = (".json", ".jsonl")
@@ -77,4 +77,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    run_command(main)
+    run_script(main)

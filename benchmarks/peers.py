@@ -42,8 +42,8 @@ from apex_ompl.scene.bodies import Body, pose_matrix
 from apex_ompl.scene.problem import Problem
 from apex_ompl.trajopt.path import path_length
 from apex_ompl.types import Array
+from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.resolution import SEARCH_RESOLUTION
-from apex_ompl.util.scripts import run_command
 from apex_ompl.util.stopwatch import timed
 from apex_ompl.util.validation import one_or_more
 
@@ -270,4 +270,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    run_command(main)
+    run_script(main)

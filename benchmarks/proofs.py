@@ -21,11 +21,11 @@ from collision_checker import around_home, boxes, near_contact
 
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.conservative import CheckCounts
-from apex_ompl.collision.path_grid import sample_path
+from apex_ompl.collision.discretization import sample_path
 from apex_ompl.robot import Robot, load_robot
 from apex_ompl.scene.bodies import AttachedObject, MeshFile, Obstacle
+from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.resolution import FULL_RESOLUTION, SEARCH_RESOLUTION
-from apex_ompl.util.scripts import run_command
 from apex_ompl.util.validation import one_or_more, whole_number
 
 DEPENDS = ("@checking", "benchmarks/collision_checker.py")
@@ -194,4 +194,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    run_command(main)
+    run_script(main)

@@ -28,7 +28,7 @@ from apex_ompl.benchmark.rows import Job
 from apex_ompl.benchmark.runs import Run
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.ompl_adapter import setup
-from apex_ompl.util.scripts import run_command
+from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import one_or_more
 
 DEPENDS = ("@benchmark", "examples/baxter_table.yaml")
@@ -122,4 +122,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    run_command(main)
+    run_script(main)

@@ -36,8 +36,8 @@ from apex_ompl.ompl_adapter.validity import full_check
 from apex_ompl.problems import load
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.trajopt.path import path_length
+from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.files import write_atomically
-from apex_ompl.util.scripts import run_command
 from apex_ompl.util.validation import one_or_more
 
 REFERENCE = Path(__file__).parent / "reference_lengths.json"
@@ -219,4 +219,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    run_command(main)
+    run_script(main)

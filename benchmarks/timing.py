@@ -47,7 +47,7 @@ from apex_ompl.problems.suite_robot import robot
 from apex_ompl.result import PlanResult, PlanStatus
 from apex_ompl.trajectory import Trajectory, time_path
 from apex_ompl.trajectory.curve import Polyline
-from apex_ompl.util.scripts import run_command
+from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import one_or_more, whole_number
 
 DEPENDS = ("@planning", "apex_ompl/trajectory")
@@ -190,4 +190,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    run_command(main)
+    run_script(main)

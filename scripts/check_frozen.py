@@ -18,7 +18,7 @@ from apex_ompl.problems import frozen
 from apex_ompl.problems.catalogue import ProblemId
 from apex_ompl.problems.generator import first_draw
 from apex_ompl.problems.suite_robot import robot
-from apex_ompl.util.scripts import run_command
+from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import whole_number
 
 
@@ -71,4 +71,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    run_command(main)
+    run_script(main)

@@ -15,8 +15,8 @@ import numpy as np
 
 from apex_ompl.datasets.records import PATH_FIELDS, SOURCES, DatasetError, Paths
 from apex_ompl.datasets.store import Store, save
+from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.files import check_writable, write_atomically
-from apex_ompl.util.scripts import run_command
 from apex_ompl.util.validation import whole_number
 
 CLOSE = 200  # how closely the limit is met: to one part in this
@@ -80,4 +80,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    run_command(main, "data")
+    run_script(main, "data")

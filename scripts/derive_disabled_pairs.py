@@ -26,8 +26,8 @@ from apex_ompl.robot import Robot
 from apex_ompl.robot.assets import DATA
 from apex_ompl.robot.config import PAIRS_SCHEMA, RobotConfig, read_config
 from apex_ompl.robot.model import build_robot, link_of
+from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.files import write_atomically
-from apex_ompl.util.scripts import run_command
 from apex_ompl.util.validation import one_or_more, whole_number
 
 
@@ -162,4 +162,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    run_command(main)
+    run_script(main)

@@ -19,8 +19,8 @@ from apex_ompl.datasets.store import Store, load
 from apex_ompl.ompl_adapter.setup import assemble
 from apex_ompl.ompl_adapter.validity import full_check
 from apex_ompl.problems.suite_robot import robot
+from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.files import check_writable, is_file, write_atomically
-from apex_ompl.util.scripts import run_command
 from apex_ompl.util.validation import one_or_more, whole_number
 
 SHOTS, MOTIONS, SIZE = 5, 10, (320, 240)
@@ -138,4 +138,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    run_command(main, "data")
+    run_script(main, "data")

@@ -27,8 +27,8 @@ from apex_ompl.ompl_adapter.validity import full_check
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.trajopt.candidates import first_valid
 from apex_ompl.trajopt.optimizer import Optimizer
+from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.files import make_folder
-from apex_ompl.util.scripts import run_command
 from apex_ompl.util.validation import whole_number
 
 MOMENTS = (0.0, 0.25, 0.5, 1.0)  # as shares of the reverse process
@@ -151,4 +151,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    run_command(main, "data")
+    run_script(main, "data")

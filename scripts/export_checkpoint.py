@@ -9,7 +9,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from apex_ompl.util.scripts import run_command
+from apex_ompl.util.entry_point import run_script
 
 LARGEST = 24.0  # of all that ship together [MiB]
 
@@ -37,4 +37,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    run_command(main)
+    run_script(main)

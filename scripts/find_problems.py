@@ -36,7 +36,7 @@ from apex_ompl.scene.bodies import AttachedObject, Obstacle
 from apex_ompl.scene.problem import Alignment, Goal, Problem
 from apex_ompl.tasks.grasp import HandObjects, close_hands
 from apex_ompl.tasks.inverse_kinematics import Links, in_world
-from apex_ompl.util.scripts import run_command
+from apex_ompl.util.entry_point import run_script
 
 ROOT = Path(__file__).resolve().parent.parent
 MARGIN = 0.01  # [m]
@@ -360,4 +360,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    run_command(main)
+    run_script(main)

@@ -29,8 +29,8 @@ from apex_ompl.problems.generator import first_draw
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.scene.problem import Problem
 from apex_ompl.types import Array
+from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.resolution import SEARCH_RESOLUTION
-from apex_ompl.util.scripts import run_command
 from apex_ompl.util.validation import one_or_more
 
 LIMITS = ((0, 10.0), (1, 20.0))  # seeds and time limits of rrtconnect [s]
@@ -160,4 +160,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    run_command(main)
+    run_script(main)

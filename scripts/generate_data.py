@@ -27,9 +27,9 @@ from apex_ompl.errors import ParameterError
 from apex_ompl.kernel import RobotTables
 from apex_ompl.trajopt.spline import Spline
 from apex_ompl.util.cluster import spread
+from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.files import check_writable, make_folder
 from apex_ompl.util.provenance import versions
-from apex_ompl.util.scripts import run_command
 from apex_ompl.util.validation import one_or_more, whole_number
 
 # Pinocchio, Coal and OMPL are imported where problems are drawn: --cases needs none of them.
@@ -214,4 +214,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    run_command(main, "data")
+    run_script(main, "data")

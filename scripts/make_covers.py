@@ -19,8 +19,8 @@ import numpy as np
 from apex_ompl.collision.cover.spheres import GAPS, Cover, make_cover, quality, shape_key, unproved, write_covers
 from apex_ompl.robot import load_robot
 from apex_ompl.robot.assets import DATA
+from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.files import check_writable
-from apex_ompl.util.scripts import run_command
 
 
 def shapes_of(robot: str) -> dict[str, tuple[list[str], coal.CollisionGeometry]]:
@@ -75,4 +75,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    run_command(main)
+    run_script(main)

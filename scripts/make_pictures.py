@@ -9,7 +9,7 @@ import argparse
 from pathlib import Path
 
 from apex_ompl import load_problem, plan, problems
-from apex_ompl.util.scripts import run_command
+from apex_ompl.util.entry_point import run_script
 from apex_ompl.viz.plots import plot_motion
 from apex_ompl.viz.render import render
 
@@ -33,4 +33,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    run_command(main, "viz")
+    run_script(main, "viz")

@@ -20,7 +20,7 @@ import numpy as np
 import pinocchio as pin
 from scipy.spatial.transform import Rotation
 
-from apex_ompl.util.scripts import run_command
+from apex_ompl.util.entry_point import run_script
 
 RADIUS = 0.007
 HALF_GAP = 0.0065  # half the distance between the two rolling halves of a joint [m]
@@ -193,4 +193,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    run_command(main)
+    run_script(main)

@@ -14,8 +14,8 @@ import numpy as np
 
 from apex_ompl.datasets.cases import load_cases, save_cases
 from apex_ompl.datasets.store import load, save
+from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.files import make_folder, write_atomically
-from apex_ompl.util.scripts import run_command
 
 PROBLEM_STRIDE, CASE_STRIDE = 60, 4
 EASY_SUITE = "bins"  # most of its problems are solved by repairing the straight line, so they tell models apart badly
@@ -51,4 +51,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    run_command(main, "data")
+    run_script(main, "data")

@@ -26,9 +26,9 @@ import numpy as np
 from apex_ompl.benchmark import Results, Row, Workers, bench, metrics
 from apex_ompl.benchmark.rows import PAPER
 from apex_ompl.benchmark.summary import Statistics, Table, about, statistics, warnings
+from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.files import make_folder, write_atomically
 from apex_ompl.util.provenance import hardware, versions
-from apex_ompl.util.scripts import run_command
 from apex_ompl.util.validation import one_or_more
 
 if TYPE_CHECKING:
@@ -219,4 +219,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    run_command(main, "bench,data")
+    run_script(main, "bench,data")

@@ -16,8 +16,8 @@ from typing import Any
 
 import yaml
 
+from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.files import locked, make_folder
-from apex_ompl.util.scripts import run_command
 
 
 def train(args: argparse.Namespace) -> None:
@@ -91,4 +91,4 @@ def _minutes(text: str) -> float:
 
 
 if __name__ == "__main__":
-    run_command(main, "train")
+    run_script(main, "train")

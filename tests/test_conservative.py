@@ -12,7 +12,7 @@ import pytest
 from support import states_around_home
 
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.collision.path_grid import sample_path
+from apex_ompl.collision.discretization import sample_path
 from apex_ompl.errors import ParameterError
 from apex_ompl.ompl_adapter.validity import full_check
 from apex_ompl.robot import Robot

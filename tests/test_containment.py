@@ -31,8 +31,8 @@ def test_an_obstacle_wholly_inside_a_link_is_a_collision(robot: Robot, shape: di
         vertices, _ = triangles(item.geometry)
         centre = robot.link_pose(robot.home, link) @ item.placement.homogeneous @ [*vertices.mean(axis=0), 1.0]
         checker = CollisionChecker(robot, [Obstacle(name="seed", position=tuple(centre[:3]), **shape)])
-        # Nothing touches the shell ...
-        assert shell_contacts(checker, robot.home) == []
+        # Nothing touches the surface ...
+        assert surface_contacts(checker, robot.home) == []
         # ... and still the state is not free, also after the obstacle was moved away and back.
         assert not checker.is_free(robot.home)
         assert "seed" in (c.second for c in checker.contacts(robot.home))
@@ -42,7 +42,7 @@ def test_an_obstacle_wholly_inside_a_link_is_a_collision(robot: Robot, shape: di
         assert not checker.is_free(robot.home)
 
 
-def shell_contacts(checker: CollisionChecker, q: np.ndarray) -> list[tuple[str, str]]:
+def surface_contacts(checker: CollisionChecker, q: np.ndarray) -> list[tuple[str, str]]:
     """The pairs that overlap by meshes and primitives alone, without the cases of containment."""
     scene = checker._scene()
     model, geometry = checker.robot.model, scene.geometry
@@ -74,11 +74,11 @@ def test_a_link_inside_a_hollow_mesh_obstacle_is_a_collision_and_its_notch_is_no
     file.write_text(u_shape_obj(4.0))
     u = Obstacle(name="u", mesh={"file": str(file)}, position=(-6.0, -2.0, -6.0))
     checker = CollisionChecker(robot, [u])  # all of the robot in the solid bottom of the U
-    assert not shell_contacts(checker, robot.home)
+    assert not surface_contacts(checker, robot.home)
     assert not checker.is_free(robot.home)
     assert {c.second for c in checker.contacts(robot.home)} == {"u"}
     checker.move("u", (-6.0, -8.0, -6.0))  # all of it in the notch, inside the mesh's convex hull
-    assert not shell_contacts(checker, robot.home)
+    assert not surface_contacts(checker, robot.home)
     assert checker.is_free(robot.home)
     assert checker.contacts(robot.home) == []
 
@@ -98,7 +98,7 @@ def test_links_never_hide_in_each_other(robot: Robot) -> None:
     """The reason why links are no guests of each other: where one is inside another, the checker knows."""
     checker = CollisionChecker(robot)
     items = list(robot.geometry.geometryObjects)
-    shells = {
+    meshes = {
         i: np.array(triangles(g.geometry)[0])[triangles(g.geometry)[1]]
         for i, g in enumerate(items)
         if g.meshPath.endswith("stl")
@@ -110,10 +110,10 @@ def test_links_never_hide_in_each_other(robot: Robot) -> None:
         poses = [data.oMi[g.parentJoint] * g.placement for g in items]
         inside = False
         for pair in robot.geometry.collisionPairs:
-            for host, guest in ((pair.first, pair.second), (pair.second, pair.first)):
-                if host in shells and guest not in shells:
-                    point = poses[host].actInv(poses[guest].translation)
-                    inside |= abs(winding_number(point, shells[host])) > 0.5
+            for outer, inner in ((pair.first, pair.second), (pair.second, pair.first)):
+                if outer in meshes and inner not in meshes:
+                    point = poses[outer].actInv(poses[inner].translation)
+                    inside |= abs(winding_number(point, meshes[outer])) > 0.5
         assert not (inside and checker.is_free(q))
 
 
@@ -181,7 +181,7 @@ def test_each_piece_of_a_mesh_is_looked_for_inside_links(robot: Robot, tmp_path,
     file = tmp_path / "two.obj"
     file.write_text("\n".join([*(x for p in pieces for x in p[0]), *(x for p in pieces for x in p[1])]) + "\n")
     checker = CollisionChecker(robot, [Obstacle(name="two", mesh={"file": str(file)})])
-    assert shell_contacts(checker, robot.home) == []
+    assert surface_contacts(checker, robot.home) == []
     assert not checker.is_free(robot.home)
 
 
@@ -210,7 +210,7 @@ def test_meshes_that_bound_no_solid_are_refused(robot: Robot, tmp_path, text: st
         CollisionChecker(robot, [Obstacle(name="m", mesh={"file": str(file)})])
 
 
-def test_a_mesh_with_a_hole_is_judged_by_the_winding_number(robot: Robot, tmp_path) -> None:
+def test_a_mesh_with_a_hole_is_checked_by_the_winding_number(robot: Robot, tmp_path) -> None:
     file = tmp_path / "open.obj"
     file.write_text(CUBE_OBJ.replace("f 5 6 7\n", ""))
     for position, free in (((-3.0, -3.0, -3.0), False), ((20.0, 0.0, 0.0), True)):

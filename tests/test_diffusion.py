@@ -95,7 +95,9 @@ def test_the_variational_network_learns_to_give_paths_back() -> None:
 def test_states_that_cannot_be_halved_are_refused() -> None:
     with pytest.raises(ParameterError, match="states, width: expected 16 times a whole number of states"):
         VariationalLatent(Spline(states=250), DOF)
-    with pytest.raises(ParameterError, match="dimension of the latent space: expected 1 to 192, got 193"):
+    with pytest.raises(
+        ParameterError, match="dimension of the latent space: expected a whole number from 1 to 192, got 193"
+    ):
         LinearLatent(Spline(), DOF, 193)
 
 
@@ -241,7 +243,7 @@ def test_noise_up_to_a_step_leaves_paths_near() -> None:
         return float(np.abs(found.control - control).mean())
 
     assert strayed(0) < 0.2 * strayed(255)
-    with pytest.raises(ParameterError, match="step: expected 0 to 255, got 256"):
+    with pytest.raises(ParameterError, match="step: expected a whole number from 0 to 255, got 256"):
         strayed(256)
     with pytest.raises(ParameterError, match=r"control points: expected finite numbers of shape \(B, 14, 16\)"):
         model.renoise(ends, kernel(), control[:, :5], 3)
@@ -251,7 +253,7 @@ def test_noise_up_to_a_step_leaves_paths_near() -> None:
 
 def test_a_query_of_another_robot_is_refused() -> None:
     model = TrajectoryModel(network(), {})
-    with pytest.raises(ParameterError, match=r"start: expected a finite state of shape \(16,\)"):
+    with pytest.raises(ParameterError, match=r"start: expected finite numbers of shape \(16,\)"):
         model.propose(Query(np.zeros(7), np.zeros(7), np.zeros(3), ObstacleSet.of([])), kernel(), 1)
     tables = kernel().robot
     other = Kernel(dataclasses.replace(tables, name="baxter"), kernel().scene)
@@ -259,11 +261,11 @@ def test_a_query_of_another_robot_is_refused() -> None:
         model.propose(query(), other, 1)
     nan = query()
     nan.goal[3] = np.nan
-    with pytest.raises(ParameterError, match="goal: expected a finite state"):
+    with pytest.raises(ParameterError, match="goal: expected finite numbers"):
         model.propose(nan, kernel(), 1)
     lost = query()
     lost.things.position[0, 1] = np.nan
     with pytest.raises(ParameterError, match="obstacles: expected finite positions"):
         model.propose(lost, kernel(), 1)
-    with pytest.raises(ParameterError, match="count: expected a positive number of paths, got 0"):
+    with pytest.raises(ParameterError, match="count: expected a whole number, 1 or more, got 0"):
         model.propose(query(), kernel(), 0)

@@ -217,7 +217,7 @@ def test_workers_of_ray_make_the_same_paths_and_may_die(made: list[Paths]) -> No
             return unit
 
         done = []
-        with pytest.raises(ClusterError, match=r"b: its worker died twice .*the same command goes on"):
+        with pytest.raises(ClusterError, match=r"b: its worker died twice .*the same command continues"):
             for name, _ in spread(fails, {"a": (0,), "b": (1,)}, **options):
                 done.append(name)
         assert done == ["a"]

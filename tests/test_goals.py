@@ -13,7 +13,8 @@ from apex_ompl.ompl_adapter.setup import assemble
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import AttachedObject, ContactFace
 from apex_ompl.scene.problem import Alignment, Goal, Tolerance, WorldVector
-from apex_ompl.tasks.alignment import AlignmentGoal, alignment_goal, angle
+from apex_ompl.tasks.alignment import AlignmentGoal, alignment_goal
+from apex_ompl.tasks.alignment_errors import angle
 from apex_ompl.tasks.inverse_kinematics import Links
 
 KINDS = ("vertical", "horizontal", "pour", "handover")
@@ -215,8 +216,8 @@ def test_contact_faces_turn_with_their_object() -> None:
         name="x", link="l", sphere={"radius": 0.1}, position=(1.0, 0.0, 0.0),
         orientation=(0.0, np.sqrt(0.5), 0.0, np.sqrt(0.5)), contact=face,
     )  # fmt: skip
-    from apex_ompl.tasks.alignment import Face
+    from apex_ompl.tasks.link_faces import LinkFace
 
-    found = Face.of_object(turned)
+    found = LinkFace.of_object(turned)
     np.testing.assert_allclose(found.point, [1.1, 0.0, 0.0], atol=1e-12)
     np.testing.assert_allclose(found.axis, [1.0, 0.0, 0.0], atol=1e-12)

@@ -6,7 +6,7 @@ from collections.abc import Callable
 import pytest
 
 from apex_ompl.errors import ParameterError
-from apex_ompl.util.scripts import run_command
+from apex_ompl.util.entry_point import run_script
 
 
 def raises(error: BaseException) -> Callable[[], None]:
@@ -17,7 +17,7 @@ def raises(error: BaseException) -> Callable[[], None]:
 
 
 @pytest.mark.parametrize(
-    "error, code, said",
+    "error, code, message",
     [
         (ParameterError("-n", 0, "1 or more"), 2, "error: -n"),
         (ModuleNotFoundError("No module named 'ray'", name="ray"), 2, "error: no ray, expected: pip install"),
@@ -25,18 +25,18 @@ def raises(error: BaseException) -> Callable[[], None]:
     ],
 )
 def test_faults_end_a_script_with_one_sentence(
-    error: BaseException, code: int, said: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    error: BaseException, code: int, message: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sys, "argv", ["folder/some_script.py", "-n", "0"])
     with pytest.raises(SystemExit) as ended:
-        run_command(raises(error), "bench")
+        run_script(raises(error), "bench")
     shown = capsys.readouterr()
     assert ended.value.code == code and shown.out == ""
-    assert shown.err.startswith(f"some_script: {said}") and shown.err.count("\n") == 1
+    assert shown.err.startswith(f"some_script: {message}") and shown.err.count("\n") == 1
 
 
 def test_faults_of_the_code_are_not_hidden() -> None:
     for error in (ValueError("a defect"), ImportError("a defect")):
         with pytest.raises(type(error), match="a defect"):
-            run_command(raises(error))
-    run_command(lambda: None)
+            run_script(raises(error))
+    run_script(lambda: None)

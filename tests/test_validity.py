@@ -11,7 +11,7 @@ from ompl import geometric as og
 from support import states_around_home
 
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.collision.path_grid import bit_reversed, sample_path, states_between
+from apex_ompl.collision.discretization import bit_reversed, sample_path, states_between
 from apex_ompl.errors import ParameterError
 from apex_ompl.ompl_adapter.setup import assemble
 from apex_ompl.ompl_adapter.space import array_to_path, path_to_array, state_space, to_array, to_state

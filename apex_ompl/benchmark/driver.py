@@ -23,6 +23,7 @@ from apex_ompl.errors import FileFormatError, ParameterError
 from apex_ompl.util.files import locked, make_folder, write_atomically
 from apex_ompl.util.provenance import hardware, versions
 from apex_ompl.util.resolution import FULL_RESOLUTION, SEARCH_RESOLUTION
+from apex_ompl.util.validation import check_integer
 
 
 def bench(
@@ -57,8 +58,7 @@ def bench(
     """
     workers = workers or Workers()
     check_arguments(timeout, seed)
-    if isinstance(runs, bool) or not isinstance(runs, int) or runs < 1:
-        raise ParameterError("runs", runs, "a whole number, 1 or more")
+    runs = check_integer(runs, "runs", 1)
     for module in workers.modules:
         importlib.import_module(module)
     parsed = [row if isinstance(row, Row) else Row.parse(row) for row in rows]

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from apex_ompl.errors import ParameterError
 from apex_ompl.trajopt.path import resample
 from apex_ompl.types import Array
+from apex_ompl.util.validation import check_array, check_integer, check_path
 
 STEPS = 128  # segments of a path that is resampled for distances between paths
 BLOCK = 2048  # rows of a kernel matrix at a time
@@ -36,8 +37,7 @@ def share_interval(count: int, of: int, confidence: float = 0.95) -> tuple[float
     Raises:
         ParameterError: ``count`` is not from 0 to ``of``, or ``of`` is 0.
     """
-    if not 0 <= count <= of or of == 0:
-        raise ParameterError("count", count, f"0 to {of}, of one or more")
+    check_integer(count, "count", 0, check_integer(of, "tasks", 1))
     from scipy import stats
 
     interval = stats.binomtest(count, of).proportion_ci(confidence, method="wilson")
@@ -92,7 +92,7 @@ def diversity(paths: Sequence[ArrayLike]) -> float:
     """
     if not len(paths):
         raise ParameterError("paths", 0, "one or more")
-    even = [resample(_states(path), STEPS + 1) for path in paths]
+    even = [resample(check_path(path), STEPS + 1) for path in paths]
     apart = [np.sqrt(((a - b) ** 2).sum(axis=1).mean()) for a, b in combinations(even, 2)]
     return float(np.mean(apart)) if apart else 0.0
 
@@ -193,18 +193,10 @@ def realism(real: ArrayLike, made: ArrayLike, seed: int = 0) -> Realism:
     return Realism(fid, (float(low), float(high)), floor, kid, len(a), len(b), a.shape[1])
 
 
-def _states(path: ArrayLike) -> Array:
-    states = np.asarray(path, dtype=float)
-    if states.ndim != 2 or len(states) < 2 or not np.isfinite(states).all():
-        raise ParameterError("path", states.shape, "two or more finite states, shape (N, dof)")
-    return states
-
-
 def _features(real: ArrayLike, made: ArrayLike) -> tuple[Array, Array]:
     a, b = np.asarray(real, dtype=float), np.asarray(made, dtype=float)
-    good = a.ndim == b.ndim == 2 and a.shape[1] == b.shape[1] and min(len(a), len(b)) > 1
-    if not good or not (np.isfinite(a).all() and np.isfinite(b).all()):
-        raise ParameterError("features", (a.shape, b.shape), "two sets of finite features of one length, (N, d), N > 1")
+    check_array(a, ("N", "d"), "features", finite=True, least=2)
+    check_array(b, ("N", a.shape[1]), "features", finite=True, least=2)
     return a, b
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import importlib
 import json
-import math
 import os
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -17,6 +16,7 @@ from apex_ompl import planners, problems
 from apex_ompl.api import load_problem
 from apex_ompl.errors import ParameterError, UnknownNameError
 from apex_ompl.problems.catalogue import SPLITS
+from apex_ompl.util.validation import check_positive
 
 RUNNER = re.compile(r"[\w.]+:\w+")
 ROW = re.compile(r"(?P<planner>[^\[\]]+?)(\[(?P<params>[^\[\]]*)\])?")
@@ -64,8 +64,8 @@ class Row:
         if not self.label.strip() or not self.label.isprintable():
             raise ParameterError("label of a planner", self.label, "one line of text")
         for name, value in (("timeout", self.timeout), ("runs", self.runs)):
-            if value is not None and not 0 < value < math.inf:
-                raise ParameterError(f"{name} of {self.label}", value, "a positive number")
+            if value is not None:
+                check_positive(value, f"{name} of {self.label}")
         if self.runner and not RUNNER.fullmatch(self.runner):
             raise ParameterError(f"runner of {self.label}", self.runner, "MODULE:FUNCTION")
 

@@ -15,6 +15,7 @@ from apex_ompl.benchmark.rows import Job
 from apex_ompl.benchmark.runs import CRASH, Run, job_columns, run, unsolved, warm_up
 from apex_ompl.errors import ApexError, ParameterError
 from apex_ompl.util.cluster import spread
+from apex_ompl.util.validation import check_integer
 
 DIED = "the process died"
 RUNS_PER_PROCESS = 500  # about, until a new process takes its place: OMPL's BIT* leaks 20 MB for each second
@@ -40,8 +41,7 @@ class Workers:
         Raises:
             ParameterError: It is not a whole number, 1 or more.
         """
-        if isinstance(self.at_once, bool) or not isinstance(self.at_once, int) or self.at_once < 1:
-            raise ParameterError("jobs", self.at_once, "a whole number, 1 or more")
+        check_integer(self.at_once, "jobs", 1)
 
     def runs_of(self, jobs: Sequence[Job], warm: dict[str, float]) -> Iterator[Run]:
         """Make runs, and yield them as they end; a run whose process dies has crashed.

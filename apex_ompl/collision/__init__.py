@@ -1,4 +1,4 @@
-"""Collision: the checker over Coal's meshes, distances by GJK, shapes, containment."""
+"""Collision checking and distances of a robot in a scene."""
 
 from apex_ompl.collision.broadphase import Contact
 from apex_ompl.collision.checker import CollisionChecker

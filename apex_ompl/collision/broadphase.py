@@ -1,4 +1,4 @@
-"""A scene compiled for Pinocchio: geometry, pairs, data and broadphase; objects are moved, not added."""
+"""A scene compiled for Pinocchio: geometry, collision pairs, data and broadphase manager."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import coal
 import numpy as np
 import pinocchio as pin
 
-from apex_ompl.collision.containment import ANCHOR_RADIUS, Host, anchor_points, may_contain
+from apex_ompl.collision.containment import ANCHOR_RADIUS, EnclosingMesh, anchor_points, may_contain
 from apex_ompl.collision.distance import HullDistances
 from apex_ompl.collision.shapes import is_shell
 from apex_ompl.robot import Robot
@@ -29,9 +29,9 @@ class Contact:
     """Two solids that overlap.
 
     Attributes:
-        first: Link or held object.
-        second: Link, held object, obstacle or fixture.
-        depth: How deep they overlap [m], between convex hulls.
+        first: Name of a link or a held object.
+        second: Name of a link, a held object, an obstacle or a fixture.
+        depth: Penetration depth of the convex hulls [m].
     """
 
     first: str
@@ -44,13 +44,13 @@ class Contact:
 
 
 def exact_requests(data: pin.GeometryData) -> pin.GeometryData:
-    """Return ``data`` with requests whose answer is as exact as it gets, and depends on the state alone.
+    """Return ``data`` with collision requests that are as exact as possible and depend on the state alone.
 
-    Without contacts asked for, GJK stops early and overlaps of 0.04 mm are missed; with a cached first guess, on
-    the border of contact the answer depends on the states judged before.
+    Without contacts requested, GJK stops early and misses overlaps of 0.04 mm. With a cached initial guess, the result
+    at the border of contact depends on the states checked before.
     """
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)  # the flag wins over its successor, so it is set
+        warnings.simplefilter("ignore", DeprecationWarning)  # the deprecated flag overrides its successor
         for request in data.collisionRequests:
             request.enable_contact = True
             request.enable_cached_gjk_guess = False
@@ -58,13 +58,14 @@ def exact_requests(data: pin.GeometryData) -> pin.GeometryData:
     return data
 
 
-_links_as_hosts: WeakKeyDictionary[Robot, dict[int, Host]] = WeakKeyDictionary()  # what was analysed before
+_enclosing_links: WeakKeyDictionary[Robot, dict[int, EnclosingMesh]] = WeakKeyDictionary()
+"""Robot -> geometry of a link -> its analysed mesh, kept between scenes."""
 
 
 class CompiledScene:
-    """The robot, the obstacles and the held objects of one moment as one Pinocchio geometry model.
+    """The robot, the obstacles and the held objects of a scene as one Pinocchio geometry model.
 
-    States are in Pinocchio's order here.
+    Obstacles can be moved; any other change needs a new compilation. States are in Pinocchio's order.
     """
 
     def __init__(
@@ -74,9 +75,13 @@ class CompiledScene:
         attached: Mapping[str, AttachedObject],
         placed: Mapping[str, tuple[coal.CollisionGeometry, Array]],
     ) -> None:
-        """Compile ``obstacles`` (fixtures among them) and ``attached``.
+        """Compile a scene.
 
-        Their geometry and pose, in the world or in the link that holds them, are in ``placed``.
+        Args:
+            robot: The robot.
+            obstacles: Obstacles by name, the robot's fixtures included.
+            attached: Held objects by name.
+            placed: Geometry and pose of each of them, in the world or in the frame of the link that holds it.
         """
         self._robot = robot
         self.model = robot.model
@@ -101,9 +106,9 @@ class CompiledScene:
             self.touch[name] = frozenset(default if held.touch_links is None else held.touch_links)
         self._pair_up()
         self.pairs = [(p.first, p.second) for p in self.geometry.collisionPairs]
-        self.same = list(range(self.geometry.ngeoms))  # geometry -> the geometry it stands for
-        self.offsets: dict[int, pin.SE3] = {}  # geometry that stands for another -> where in the other's frame
-        self.hollow: list[tuple[int, int, Host, pin.SE3]] = []
+        self.same = list(range(self.geometry.ngeoms))  # geometry -> the geometry that it is a proxy of, or itself
+        self.offsets: dict[int, pin.SE3] = {}  # proxy geometry -> its pose in the frame of the original
+        self.hollow: list[tuple[int, int, EnclosingMesh, pin.SE3]] = []
         self._add_containment()
         self.geometry_data, self.manager = self._broadphase(self.geometry)
         self.second = self._second_stage()
@@ -123,7 +128,7 @@ class CompiledScene:
         return int(self.geometry.addGeometryObject(pin.GeometryObject(name, joint, frame, placement, shape)))
 
     def _pair_up(self) -> None:
-        """Pair obstacles with what moves, and held objects with everything they may not touch."""
+        """Add collision pairs: obstacles with moving bodies, and held objects with all that they may not touch."""
         items = self.geometry.geometryObjects
         moving = [i for i in range(self.links) if items[i].parentJoint > 0]
         held = list(self.held.values())
@@ -138,10 +143,14 @@ class CompiledScene:
             self.geometry.addCollisionPair(pin.CollisionPair(i, j))
 
     def _add_containment(self) -> None:
-        """For every pair in which one may be wholly inside the mesh of the other, pair hull and points."""
+        """Add containment tests for every pair in which one solid may lie inside the mesh of the other.
+
+        A convex mesh is tested by collision of its hull with anchor points of the inner solid. A mesh that is not
+        convex is added to ``hollow``, to be tested by winding numbers.
+        """
         items = self.geometry.geometryObjects
-        links = _links_as_hosts.setdefault(self._robot, {})
-        hosts = dict(links)
+        links = _enclosing_links.setdefault(self._robot, {})
+        enclosing = dict(links)
         hulls: dict[int, int] = {}
         anchors: dict[int, list[int]] = {}
         for a, b in self.pairs:
@@ -150,22 +159,22 @@ class CompiledScene:
             for h, g in ((a, b), (b, a)):
                 if not is_shell(items[h].geometry) or not may_contain(items[h].geometry, items[g].geometry):
                     continue
-                if h not in hosts:
-                    hosts[h] = Host.of(items[h].geometry)
+                if h not in enclosing:
+                    enclosing[h] = EnclosingMesh.of(items[h].geometry)
                     if h < self.links:
-                        links[h] = hosts[h]
+                        links[h] = enclosing[h]
                 points = [pin.SE3(np.eye(3), point) for point in anchor_points(items[g].geometry)]
-                if not hosts[h].convex:
-                    self.hollow += [(h, g, hosts[h], point) for point in points]
+                if not enclosing[h].convex:
+                    self.hollow += [(h, g, enclosing[h], point) for point in points]
                     continue
                 if h not in hulls:
-                    hulls[h] = self._stand_in(h, pin.SE3.Identity(), hosts[h].hull)
+                    hulls[h] = self._add_proxy(h, pin.SE3.Identity(), enclosing[h].hull)
                 if g not in anchors:
-                    anchors[g] = [self._stand_in(g, point, coal.Sphere(ANCHOR_RADIUS)) for point in points]
+                    anchors[g] = [self._add_proxy(g, point, coal.Sphere(ANCHOR_RADIUS)) for point in points]
                 for anchor in anchors[g]:
                     self.geometry.addCollisionPair(pin.CollisionPair(hulls[h], anchor))
 
-    def _stand_in(self, index: int, offset: pin.SE3, shape: coal.CollisionGeometry) -> int:
+    def _add_proxy(self, index: int, offset: pin.SE3, shape: coal.CollisionGeometry) -> int:
         item = self.geometry.geometryObjects[index]
         number = self._add(
             f"{item.name}#{len(self.same)}", item.parentJoint, item.parentFrame, item.placement * offset, shape
@@ -180,17 +189,17 @@ class CompiledScene:
         return data, Manager(self.model, geometry, data)
 
     def _second_stage(self) -> Any:
-        """Broadphase over hulls of hollow meshes and points: what it reports must be looked at exactly."""
+        """Return a broadphase over the hulls of hollow meshes and anchor points; its hits need an exact test."""
         if not self.hollow:
             return None
         geometry = pin.GeometryModel()
         items = self.geometry.geometryObjects
-        for k, (h, g, host, offset) in enumerate(self.hollow):
+        for k, (h, g, mesh, offset) in enumerate(self.hollow):
             a, b = items[h], items[g]
             point = coal.Sphere(ANCHOR_RADIUS)
-            hull = pin.GeometryObject(f"hull{k}", a.parentJoint, a.parentFrame, a.placement, host.hull)
-            guest = pin.GeometryObject(f"point{k}", b.parentJoint, b.parentFrame, b.placement * offset, point)
-            pair = [geometry.addGeometryObject(item) for item in (hull, guest)]
+            hull = pin.GeometryObject(f"hull{k}", a.parentJoint, a.parentFrame, a.placement, mesh.hull)
+            anchor = pin.GeometryObject(f"point{k}", b.parentJoint, b.parentFrame, b.placement * offset, point)
+            pair = [geometry.addGeometryObject(item) for item in (hull, anchor)]
             geometry.addCollisionPair(pin.CollisionPair(*pair))
         return geometry, *self._broadphase(geometry)
 
@@ -230,16 +239,16 @@ class CompiledScene:
         return hollow and bool(self._contained(q))
 
     def _contained(self, q: Array) -> list[tuple[int, int]]:
-        """Return the pairs (host, guest) of hollow meshes with something wholly inside."""
+        """Return the pairs of a hollow mesh and a geometry entirely inside it."""
         geometry, data, manager = self.second
         with self.lock:
             if not pin.computeCollisions(self.model, self.data, manager, q, True):
                 return []
             found = []
-            for k, (h, g, host, _) in enumerate(self.hollow):
+            for k, (h, g, mesh, _) in enumerate(self.hollow):
                 if pin.computeCollision(geometry, data, k):
                     point = data.oMg[2 * k].actInv(data.oMg[2 * k + 1].translation)
-                    if host.contains(point):
+                    if mesh.contains(point):
                         found.append((h, g))
             return found
 
@@ -264,7 +273,12 @@ class CompiledScene:
         return sorted(found, key=lambda c: (-c.depth, c.first, c.second))
 
     def distances(self, which: str) -> HullDistances:
-        """Return the distances of a set of pairs: ``scene``, ``all`` (with fixtures) or ``pairs``."""
+        """Return the distances of a set of pairs.
+
+        Args:
+            which: ``scene`` for robot and held objects against obstacles, ``all`` for the same with fixtures, or
+                ``pairs`` for all collision pairs.
+        """
         if which not in self._distances:
             if which == "pairs":
                 chosen = self.pairs

@@ -8,36 +8,36 @@ from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
 from apex_ompl.collision.shapes import convex_hull
+from apex_ompl.types import Array
 
 
 @dataclass(frozen=True)
 class Distance:
-    """The closest pair at a state.
+    """Minimum distance at a state, and the pair that has it.
 
     Attributes:
-        value: Signed distance [m]; negative is the depth of overlap; ``inf`` when there is no pair.
-        first: Link or held object.
-        second: Obstacle, fixture or link.
-        points: Nearest points on ``first`` and ``second`` in the world, shape (2, 3) [m].
+        value: Signed distance [m]; the negative penetration depth where they overlap; ``inf`` without any pair.
+        first: Name of a link or a held object.
+        second: Name of an obstacle, a fixture or a link.
+        points: Nearest points of ``first`` and ``second`` in the world, shape (2, 3) [m].
     """
 
     value: float
     first: str
     second: str
-    points: NDArray[np.float64]
+    points: Array
 
 
 NO_PAIR = Distance(float("inf"), "", "", np.full((2, 3), np.nan))
 
 
 class HullDistances:
-    """Distances of chosen pairs of geometries, each replaced by its convex hull.
+    """Signed distances of pairs of geometries, each replaced by its convex hull.
 
-    A hull contains its mesh, so that the distance is never more than the true one; for boxes, spheres,
-    cylinders, capsules and convex meshes it is the true one.
+    A hull contains its mesh, so the distance is a lower bound. It is exact for boxes, spheres, cylinders, capsules and
+    convex meshes.
     """
 
     def __init__(
@@ -47,7 +47,7 @@ class HullDistances:
         pairs: Sequence[tuple[int, int]],
         labels: Sequence[str],
     ) -> None:
-        """Prepare the hulls of the geometries that ``pairs`` name; ``labels`` name every geometry."""
+        """Prepare the hulls of the geometries in ``pairs``; ``labels`` are the names of all geometries."""
         self._model = model
         self._data = model.createData()
         self._hulls = pin.GeometryModel()
@@ -64,16 +64,16 @@ class HullDistances:
         self._hull_data = self._hulls.createData()
         self._lock = threading.Lock()
 
-    def values(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
+    def values(self, q: Array) -> Array:
         """Return the signed distance of every pair at a state in Pinocchio's order, shape (pairs,) [m]."""
         with self._lock:
             return self._values(q)
 
-    def _values(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _values(self, q: Array) -> Array:
         pin.computeDistances(self._model, self._data, self._hulls, self._hull_data, q)
         return np.array([result.min_distance for result in self._hull_data.distanceResults])
 
-    def closest(self, q: NDArray[np.float64]) -> Distance:
+    def closest(self, q: Array) -> Distance:
         """Return the closest pair at a state in Pinocchio's order."""
         if not self._pairs:
             return NO_PAIR

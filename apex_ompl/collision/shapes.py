@@ -1,4 +1,4 @@
-"""From the shapes of a problem to Coal geometry, exact and convex."""
+"""Coal geometry of the shapes of a problem, exact or as convex hulls."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ from pathlib import Path
 
 import coal
 import numpy as np
-from numpy.typing import NDArray
 
 from apex_ompl.errors import FileFormatError, MissingFileError
 from apex_ompl.scene.bodies import Body
 from apex_ompl.scene.meshes import extent_fault, orientation_fault, triangles
+from apex_ompl.types import Array
 from apex_ompl.util.files import is_file
 
 
@@ -38,11 +38,11 @@ def coal_geometry(body: Body) -> coal.CollisionGeometry:
     return _load_mesh(body.name, body.mesh.file, np.asarray(body.mesh.scale, float))
 
 
-def world_geometry(body: Body) -> tuple[coal.CollisionGeometry, NDArray[np.float64]]:
+def world_geometry(body: Body) -> tuple[coal.CollisionGeometry, Array]:
     """Return the Coal geometry of a body and its placement in the world, shape (4, 4).
 
-    A half-space is given in world coordinates with the identity as placement: Coal's bounding box of a rotated
-    one overflows, and the broadphase then misses collisions.
+    A half-space is returned in world coordinates with the identity as placement, because Coal's bounding box of a
+    rotated half-space overflows and the broadphase then misses collisions.
 
     Raises:
         MissingFileError: The mesh file cannot be read.
@@ -56,13 +56,13 @@ def world_geometry(body: Body) -> tuple[coal.CollisionGeometry, NDArray[np.float
     return _half_space(normal / length, offset), np.eye(4)
 
 
-def _half_space(normal: NDArray[np.float64], offset: float) -> coal.Halfspace:
+def _half_space(normal: Array, offset: float) -> coal.Halfspace:
     length = float(np.linalg.norm(normal))
     return coal.Halfspace(normal / length, offset / length)
 
 
 def is_shell(geometry: coal.CollisionGeometry) -> bool:
-    """Whether collision with the geometry only sees its surface (a triangle mesh), not its inside."""
+    """Whether the geometry is a triangle mesh, which collides by its surface and not by its inside."""
     return bool(geometry.getObjectType() == coal.OT_BVH)
 
 
@@ -75,7 +75,7 @@ def convex_hull(geometry: coal.CollisionGeometry) -> coal.CollisionGeometry:
     return geometry.convex
 
 
-def _load_mesh(name: str, file: str, scale: NDArray[np.float64]) -> coal.CollisionGeometry:
+def _load_mesh(name: str, file: str, scale: Array) -> coal.CollisionGeometry:
     role = f"mesh of {name!r}"
     if not is_file(Path(file)):
         raise MissingFileError(file, role)

@@ -8,7 +8,7 @@ import coal
 import numpy as np
 import pinocchio as pin
 
-from apex_ompl.collision.containment import Host
+from apex_ompl.collision.containment import EnclosingMesh
 from apex_ompl.collision.cover.proof import Cover
 from apex_ompl.errors import RobotError
 from apex_ompl.kernel.robot_builder import BodySpec, JointSpec, robot_tables
@@ -140,4 +140,4 @@ def primitives(shape: coal.CollisionGeometry, pose: Array, boxes: Array | None =
 
 def mesh_boxes(mesh: coal.BVHModelBase) -> Array:
     """Return boxes in the mesh's frame that together contain its solid, shape (boxes, 2, 3) [m]."""
-    return bounding_boxes(Host.of(mesh).outline)
+    return bounding_boxes(EnclosingMesh.of(mesh).boundary)

@@ -16,6 +16,7 @@ from torch.nn import functional
 
 from apex_ompl.errors import ParameterError
 from apex_ompl.trajopt.spline import Spline
+from apex_ompl.util.validation import check_integer
 
 MOST_GROUPS = 8  # of channels that are normalised together
 FLAT = 1e-3  # deviations below this share of the largest are not blown up to one
@@ -95,8 +96,7 @@ class LinearLatent(Autoencoder):
             ParameterError: There are not as many.
         """
         super().__init__(spline, dof)
-        if not 1 <= dim <= spline.free * dof:
-            raise ParameterError("dimension of the latent space", dim, f"1 to {spline.free * dof}")
+        check_integer(dim, "dimension of the latent space", 1, spline.free * dof)
         self.latent = (dim,)
         self.register_buffer("mean", torch.zeros(spline.free * dof))
         self.register_buffer("components", torch.eye(spline.free * dof)[:, :dim].clone())

@@ -13,9 +13,10 @@ from torch import Tensor
 from apex_ompl.diffusion.autoencoder import Autoencoder
 from apex_ompl.diffusion.sampler import Predict
 from apex_ompl.diffusion.schedule import Estimate, NoiseSchedule
-from apex_ompl.errors import ParameterError, UnknownNameError
+from apex_ompl.errors import UnknownNameError
 from apex_ompl.kernel import Kernel
 from apex_ompl.types import Array
+from apex_ompl.util.validation import check_integer, check_number, check_positive
 
 SCALINGS = ("noise", "clean")
 
@@ -52,12 +53,9 @@ class Guidance:
         if self.scaling not in SCALINGS:
             raise UnknownNameError("scaling of guidance", self.scaling, SCALINGS)
         for name, value in (("gamma", self.gamma), ("clip", self.clip), ("begin", self.begin)):
-            if not 0.0 <= value < np.inf:
-                raise ParameterError(name, value, "a number, 0 or more")
-        if not 0.0 < self.margin < np.inf:
-            raise ParameterError("margin", self.margin, "a number, more than 0")
-        if self.samples < 2:
-            raise ParameterError("samples", self.samples, "a whole number, 2 or more")
+            check_number(value, name, 0.0)
+        check_positive(self.margin, "margin")
+        check_integer(self.samples, "samples", 2)
 
 
 def collision_cost(kernel: Kernel, paths: Array, margin: float) -> tuple[Array, Array]:

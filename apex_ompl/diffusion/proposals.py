@@ -20,6 +20,7 @@ from apex_ompl.errors import ParameterError, UnknownNameError
 from apex_ompl.kernel import Kernel
 from apex_ompl.trajopt.spline import Spline
 from apex_ompl.types import Array
+from apex_ompl.util.validation import check_array, check_integer, check_number
 
 PLAIN = Guidance(gamma=0.0)
 
@@ -49,10 +50,8 @@ class Sampling:
         """
         if self.sampler not in SAMPLERS:
             raise UnknownNameError("sampler", self.sampler, SAMPLERS)
-        if self.steps < 1:
-            raise ParameterError("number of denoising steps", self.steps, "1 or more")
-        if not 0.0 <= self.temperature < np.inf:
-            raise ParameterError("temperature", self.temperature, "a number, 0 or more")
+        check_integer(self.steps, "number of denoising steps", 1)
+        check_number(self.temperature, "temperature", 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,8 +116,7 @@ class TrajectoryModel:
             ParameterError: A query has states of another robot, or there are no paths to propose.
         """
         sampling, queries = sampling or self.sampling, [query] if isinstance(query, Query) else list(query)
-        if not isinstance(count, int) or count < 1:
-            raise ParameterError("count", count, "a positive number of paths")
+        check_integer(count, "count", 1)
         shape = torch.zeros(len(queries) * count, *self.network.latent, device=self.device)
         generator = generator or torch.Generator().manual_seed(0)
         first = sampling.temperature * noise_like(shape, generator)
@@ -144,13 +142,9 @@ class TrajectoryModel:
             ParameterError: Control points of another shape, or no such step.
         """
         sampling, control = sampling or self.sampling, np.asarray(control, float)
-        shape = (self.spline.points, len(self.network.config.joints))
-        if control.ndim != 3 or control.shape[1:] != shape or not np.isfinite(control).all():
-            raise ParameterError(
-                "control points", control.shape, f"finite numbers of shape (B, {shape[0]}, {shape[1]})"
-            )
-        if not isinstance(step, int) or not 0 <= step < self.network.schedule.steps:
-            raise ParameterError("step", step, f"0 to {self.network.schedule.steps - 1}")
+        shape = ("B", self.spline.points, len(self.network.config.joints))
+        check_array(control, shape, "control points", finite=True)
+        check_integer(step, "step", 0, self.network.schedule.steps - 1)
         generator = generator or torch.Generator().manual_seed(0)
         with torch.no_grad():
             clean = self.network.autoencoder.encode(torch.tensor(control, dtype=torch.float32, device=self.device))
@@ -169,8 +163,7 @@ class TrajectoryModel:
             raise ParameterError("robot", kernel.robot.name, f"{config.robot}, which the model was trained for")
         for query in queries:
             for name, state in (("start", query.start), ("goal", query.goal)):
-                if np.shape(state) != (len(config.joints),) or not np.isfinite(state).all():
-                    raise ParameterError(name, state, f"a finite state of shape ({len(config.joints)},)")
+                check_array(np.asarray(state, float), (len(config.joints),), name, finite=True)
             things = query.things
             numbers = (query.point, things.position, things.turn, things.size)
             if not all(np.isfinite(values).all() for values in numbers):

@@ -10,7 +10,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from apex_ompl.errors import ParameterError, UnknownNameError
+from apex_ompl.errors import UnknownNameError
+from apex_ompl.util.validation import check_integer
 
 SCHEDULES = ("cosine", "linear")
 PREDICTIONS = ("noise", "velocity", "clean")
@@ -51,8 +52,7 @@ class NoiseSchedule:
             ParameterError: There are no steps.
             UnknownNameError: No such schedule.
         """
-        if self.steps < 1:
-            raise ParameterError("steps", self.steps, "a whole number, 1 or more")
+        check_integer(self.steps, "steps", 1)
         if self.kind not in SCHEDULES:
             raise UnknownNameError("noise schedule", self.kind, SCHEDULES)
 
@@ -130,8 +130,6 @@ class NoiseSchedule:
             ParameterError: There are not as many, or no such step.
         """
         top = self.steps - 1 if first is None else first
-        if not 0 <= top < self.steps:
-            raise ParameterError("first step", first, f"0 to {self.steps - 1}")
-        if not 1 <= count <= top + 1:
-            raise ParameterError("number of denoising steps", count, f"1 to {top + 1}")
+        check_integer(top, "first step", 0, self.steps - 1)
+        check_integer(count, "number of denoising steps", 1, top + 1)
         return [round((top + 1) * (1.0 - k / count)) - 1 for k in range(count)]

@@ -12,6 +12,7 @@ from apex_ompl.kernel import entries
 from apex_ompl.kernel.tables import RobotTables, SceneTables
 from apex_ompl.kernel.views import room
 from apex_ompl.types import Array
+from apex_ompl.util.validation import shape_error
 
 MOST_PAIRS = 16  # that are told apart for one state
 
@@ -38,7 +39,7 @@ class Kernel:
         """
         states = np.require(np.atleast_2d(np.asarray(q, dtype=float)), requirements=["C", "W"])
         if states.ndim != 2 or states.shape[1] != self.robot.dof:
-            raise ParameterError("states", states.shape, f"an array of shape (N, {self.robot.dof})")
+            raise shape_error(states, ("N", self.robot.dof), "states")
         return states
 
     def unproved(self, q: ArrayLike) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -102,8 +103,10 @@ class Kernel:
             ParameterError: Another shape, or a spacing that is not positive.
         """
         states = self.states(path)
-        if len(states) < 2 or not resolution > 0.0:
-            raise ParameterError("path", (states.shape, resolution), "two states or more, and a positive resolution")
+        if len(states) < 2:
+            raise shape_error(states, ("N", self.robot.dof), "path", least=2)
+        if not resolution > 0.0:
+            raise ParameterError("resolution", resolution, "a positive number of radians")
         found, counts = self.unproved(states[[0, -1]])
         if counts.any():
             return False

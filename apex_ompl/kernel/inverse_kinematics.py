@@ -14,6 +14,7 @@ from apex_ompl.kernel.ik_solver import FACING, GAP, PARTS, SLOPE, descend, resid
 from apex_ompl.kernel.tables import RobotTables
 from apex_ompl.kernel.views import room
 from apex_ompl.types import Array
+from apex_ompl.util.validation import check_indices, is_integer, shape_error
 
 
 class Fixed(NamedTuple):
@@ -43,7 +44,7 @@ class Target:
         """
         if len(self.whole) != 4 or self.whole[0] not in (GAP, FACING, SLOPE):
             raise ParameterError("target", self.whole, "a kind and three joints")
-        if any(isinstance(j, bool) or not isinstance(j, (int, np.integer)) for j in self.whole):
+        if not all(is_integer(j) for j in self.whole):
             raise ParameterError("target", self.whole, "whole numbers of joints")
         if len(self.parts) != PARTS:
             raise ParameterError("target", self.parts, f"{PARTS} parts")
@@ -104,8 +105,7 @@ class Inverse:
         joints = sorted({j for target in targets for j in target.whole[1:]})
         if not joints or joints[0] < 0 or joints[-1] >= len(arrays.joint_parent):
             raise ParameterError("targets", joints, f"targets on joints 0 to {len(arrays.joint_parent) - 1}")
-        if any(k not in range(robot.dof) for k in fixed):
-            raise ParameterError("fixed", list(fixed), f"numbers of planned joints, 0 to {robot.dof - 1}")
+        check_indices(fixed, robot.dof, "fixed", "planned joints")
         self.robot = robot
         self.targets = tuple(targets)
         self.rows = sum(target.rows for target in targets)
@@ -133,7 +133,7 @@ class Inverse:
         """
         q = np.require(q, float, ["C", "W"])
         if q.shape != (self.robot.dof,):
-            raise ParameterError("state", q.shape, f"an array of shape ({self.robot.dof},)")
+            raise shape_error(q, (self.robot.dof,), "state")
         values, rows = np.empty(self.rows), np.empty((self.rows, len(q)))
         work = np.empty((4, max(len(q), 3)))
         residual(
@@ -168,7 +168,7 @@ class Inverse:
         """
         ends = np.array(states, float, order="C", ndmin=2)
         if ends.ndim != 2 or ends.shape[1] != self.robot.dof:
-            raise ParameterError("states", ends.shape, f"an array of shape (N, {self.robot.dof})")
+            raise shape_error(ends, ("N", self.robot.dof), "states")
         errors, counts = np.empty(len(ends)), np.empty(len(ends), np.int64)
         n, dof = len(self._free), ends.shape[1]
         scratch = np.empty(3 + 4 * dof + 3 * n * n + 3 * n)

@@ -18,8 +18,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError, UnknownNameError
+from apex_ompl.errors import FileFormatError, MissingFileError, UnknownNameError
 from apex_ompl.util.files import is_file, write_atomically
+from apex_ompl.util.validation import check_indices
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -168,8 +169,7 @@ class RobotTables:
         Raises:
             ParameterError: There is no such joint.
         """
-        if any(k not in range(self.dof) for k in joints):
-            raise ParameterError("joints", list(joints), f"numbers of planned joints, 0 to {self.dof - 1}")
+        check_indices(joints, self.dof, "joints", "planned joints")
         a, mine = self.arrays, {int(k) for k in joints}
         movers: list[set[int]] = []  # of each joint; parents come first
         for parent, source in zip(a.joint_parent, a.joint_source, strict=True):

@@ -17,6 +17,7 @@ from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Problem
 from apex_ompl.types import Array
 from apex_ompl.util.resolution import FULL_RESOLUTION
+from apex_ompl.util.validation import check_states, check_times
 
 SHORTEST_STEP = 0.01  # time between two states of a path [s]
 MAX_INTERVALS = 1_000_000
@@ -94,10 +95,8 @@ def check_timed_path(
         ParameterError: Another shape, times that do not increase from 0, or a moving obstacle that cannot be inflated.
     """
     path, times = np.asarray(path, dtype=np.float64), np.asarray(times, dtype=np.float64)
-    if path.ndim != 2 or path.shape[1] != robot.dof or len(path) < 2:
-        raise ParameterError("path", path.shape, f"an array of shape (N, {robot.dof}) with 2 states or more")
-    if times.shape != (len(path),) or times[0] != 0.0 or not (np.diff(times) > 0.0).all() or not np.isfinite(times[-1]):
-        raise ParameterError("times", times.shape, f"{len(path)} times that increase from 0")
+    check_states(path, robot.dof, "path", least=2)
+    check_times(times, len(path))
     for k, q in enumerate(path):
         if fault := robot.limit_fault(q):
             return TimedPathCheck(False, f"state {k}: {fault}", float(times[k]))

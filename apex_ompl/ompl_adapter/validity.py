@@ -11,9 +11,9 @@ from numpy.typing import ArrayLike
 from ompl import base as ob
 
 from apex_ompl.collision.checker import CollisionChecker
-from apex_ompl.errors import ParameterError
 from apex_ompl.types import Array
 from apex_ompl.util.resolution import FULL_RESOLUTION, SEARCH_RESOLUTION
+from apex_ompl.util.validation import check_states
 
 
 class MotionCheck:
@@ -125,8 +125,7 @@ def full_check(
     """
     robot = checker.robot
     path = np.asarray(path, dtype=float)
-    if path.ndim != 2 or path.shape[1] != robot.dof or len(path) == 0:
-        raise ParameterError("path", path.shape, f"an array of shape (N, {robot.dof})")
+    check_states(path, robot.dof, "path", least=1)
     for k, q in enumerate(path):
         fault = robot.limit_fault(q)
         if fault:

@@ -1,4 +1,4 @@
-"""Robots: loading, composition, limits, links."""
+"""Robots: loading, composition, limits and links."""
 
 from apex_ompl.robot.model import Limits, Robot, load_robot, robot_names
 

@@ -1,4 +1,4 @@
-"""Where the files of robots lie: this package's own data and the packages of installed robot data."""
+"""Files of robots: data of this package and of installed packages of robot descriptions."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def resolve(uri: str, relative_to: Path, role: str) -> Path:
         uri: ``package://NAME/path``, ``file:///path``, an absolute path, or a path relative to
             ``relative_to``.
         relative_to: Folder for relative paths.
-        role: What the file is wanted for; it is named in the error.
+        role: Description of the file for the error.
 
     Raises:
         MissingFileError: No such file.

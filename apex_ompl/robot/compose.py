@@ -1,4 +1,4 @@
-"""One URDF out of several: renaming, pruning, locking, mounting, absolute mesh paths."""
+"""Composition of several URDFs into one: renaming, pruning, locking, mounting, absolute mesh paths."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from apex_ompl.errors import MissingFileError, RobotError
 from apex_ompl.robot.assets import resolve
 from apex_ompl.robot.config import Part, RobotConfig
 from apex_ompl.scene.bodies import pose_matrix
+from apex_ompl.types import Array
 
 
 @dataclass(frozen=True)
@@ -40,7 +41,7 @@ def compose(config: RobotConfig, folder: Path) -> Composition:
 
     Raises:
         MissingFileError: A URDF, SRDF or collision mesh is missing.
-        RobotError: A part cannot be composed; the message says which and why.
+        RobotError: A part cannot be composed; the message names the part and the reason.
     """
     # Version 1.2 is the first in which URDF has capsules.
     root = ET.Element("robot", name=config.name, version="1.2")
@@ -101,23 +102,23 @@ def _renamer(part: Part) -> Callable[[str], str]:
 
 
 def _prune(tree: ET.Element, part: Part) -> None:
-    """Remove the links of ``part.remove`` and everything below them."""
+    """Remove the links of ``part.remove`` and their descendants."""
     known = {link.get("name") for link in tree.findall("link")}
-    doomed = set(part.remove)
-    if doomed - known:
-        raise RobotError(f"part {part.name!r}: no link {min(doomed - known)!r} to remove")
+    removed = set(part.remove)
+    if removed - known:
+        raise RobotError(f"part {part.name!r}: no link {min(removed - known)!r} to remove")
     edges = [(j, j.find("parent"), j.find("child")) for j in tree.findall("joint")]
     arcs = [(j, p.get("link"), c.get("link")) for j, p, c in edges if p is not None and c is not None]
     grown = True
     while grown:
-        below = {str(child) for _, parent, child in arcs if parent in doomed}
-        grown = not below <= doomed
-        doomed |= below
+        below = {str(child) for _, parent, child in arcs if parent in removed}
+        grown = not below <= removed
+        removed |= below
     for joint, _, child in arcs:
-        if child in doomed:
+        if child in removed:
             tree.remove(joint)
     for link in tree.findall("link"):
-        if link.get("name") in doomed:
+        if link.get("name") in removed:
             tree.remove(link)
 
 
@@ -178,7 +179,7 @@ def _lock(root: ET.Element, name: str, value: float) -> None:
     _set_origin(joint, placement @ motion)
 
 
-def _floats(text: str, joint: str) -> np.ndarray:
+def _floats(text: str, joint: str) -> Array:
     try:
         values = np.array([float(v) for v in text.split()])
     except ValueError:
@@ -188,7 +189,7 @@ def _floats(text: str, joint: str) -> np.ndarray:
     return values
 
 
-def _set_origin(joint: ET.Element, pose: np.ndarray) -> None:
+def _set_origin(joint: ET.Element, pose: Array) -> None:
     xyz, rpy = pose[:3, 3], pin.rpy.matrixToRpy(pose[:3, :3])
     text = {"xyz": " ".join(f"{v:.17g}" for v in xyz), "rpy": " ".join(f"{v:.17g}" for v in rpy)}
     joint.insert(0, ET.Element("origin", text))

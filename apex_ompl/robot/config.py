@@ -1,4 +1,4 @@
-"""The file that describes a robot: URDF parts, state order, limits, fixtures, disabled pairs."""
+"""Robot files: URDF parts, planned joints, limits, fixtures and disabled collision pairs."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ class Part(StrictModel):
     Attributes:
         name: Name of the part.
         urdf: URDF file, as a ``package://`` URI or a path relative to the robot file.
-        srdf: SRDF file whose ``disable_collisions`` are taken over.
-        prefix: Put before the names of all links and joints.
-        rename: Text replaced at the start of names, before ``prefix`` is added.
-        remove: Links removed together with everything below them.
+        srdf: SRDF file whose ``disable_collisions`` are used.
+        prefix: Prefix of the names of all links and joints.
+        rename: Old -> new beginning of names, replaced before ``prefix`` is added.
+        remove: Links that are removed together with their descendants.
         parent: ``world``, or the link of an earlier part that carries this one.
         position: Placement of the part's root link in ``parent`` [m].
         orientation: The same, quaternion xyzw.
@@ -42,7 +42,7 @@ class Part(StrictModel):
 
 
 class Joint(StrictModel):
-    """A planned joint: limits [rad, rad/s, rad/s^2, rad/s^3]; a URDF's where it has them."""
+    """A planned joint and its limits [rad, rad/s, rad/s^2, rad/s^3]; by default those of the URDF."""
 
     home: float = 0.0
     lower: float | None = None
@@ -53,14 +53,14 @@ class Joint(StrictModel):
 
 
 class Hand(StrictModel):
-    """A hand that can hold things.
+    """A hand that can hold objects.
 
     Attributes:
-        synergy: The planned joint that closes it from 0 to 1, or None for a hand that stays as it is.
+        synergy: The planned joint that closes the hand from 0 (open) to 1 (closed), or None for a rigid hand.
         palm: The link that held objects are fixed to.
-        point: Where an object is held, in the palm's frame [m].
-        axis: Outward normal of the palm on its closing side, unit, in the palm's frame.
-        fingers: Where the open fingers point, unit, in the palm's frame.
+        point: Grasp point in the palm's frame [m].
+        axis: Outward unit normal of the palm on its closing side, in the palm's frame.
+        fingers: Unit direction of the open fingers, in the palm's frame.
     """
 
     synergy: str | None = None
@@ -71,19 +71,19 @@ class Hand(StrictModel):
 
 
 class RobotConfig(StrictModel):
-    """A whole robot file.
+    """The content of a robot file.
 
     Attributes:
         name: Name of the robot.
         description: One line about it.
-        parts: The URDFs it is composed of.
-        fixtures: Solids that belong to the robot's place, such as the tables it stands on.
+        parts: The URDFs that the robot is composed of.
+        fixtures: Solids that are fixed beside the robot, such as the tables that it stands on.
         joints: The planned joints in state order.
-        locked: Joints held at a value; they become fixed joints.
+        locked: Joint name -> value of joints that become fixed joints.
         groups: Named groups of planned joints.
         hands: Hands by name.
-        disabled_pairs: File of further link pairs that are never checked.
-        covers: File of sphere covers of the links; without it coarser ones are made at run time.
+        disabled_pairs: File of further link pairs that are not checked for collision.
+        covers: File of sphere covers of the links; without it coarser covers are made at run time.
     """
 
     schema_id: Literal["apex-ompl/robot/1"] = Field(alias="schema")
@@ -111,7 +111,7 @@ class RobotConfig(StrictModel):
 
 
 class DisabledPair(StrictModel):
-    """Two links that are not checked against each other, and why."""
+    """Two links that are not checked for collision, with the reason."""
 
     links: tuple[str, str]
     reason: str

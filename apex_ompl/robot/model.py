@@ -1,4 +1,4 @@
-"""The robot: a Pinocchio model with a state order, limits, links and disabled pairs."""
+"""The robot: a Pinocchio model with an order of its joints in states, limits, links and collision pairs."""
 
 from __future__ import annotations
 
@@ -14,13 +14,14 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from apex_ompl.errors import FileFormatError, ParameterError, RobotError, UnknownNameError
+from apex_ompl.errors import FileFormatError, RobotError, UnknownNameError
 from apex_ompl.robot.assets import DATA, resolve
 from apex_ompl.robot.compose import compose
 from apex_ompl.robot.config import Hand, RobotConfig, read_config, read_disabled_pairs
 from apex_ompl.scene.bodies import Body
 from apex_ompl.scene.meshes import extent_fault
 from apex_ompl.types import Array
+from apex_ompl.util.validation import shape_error
 
 
 @dataclass(frozen=True)
@@ -44,18 +45,18 @@ class Limits:
 
 @dataclass(frozen=True, eq=False)
 class Robot:
-    """A robot ready to be planned for.
+    """A robot to plan for.
 
     Attributes:
         name: Name of the robot.
         joint_names: Planned joints in state order, the order of every state outside this module.
         limits: Limits in state order.
-        home: A comfortable free state, shape (dof,).
+        home: A collision-free resting state, shape (dof,).
         groups: Group name -> indices into a state.
-        hands: Hand name -> where and how it holds.
-        model: Pinocchio model; its q has its own order, see :meth:`to_pinocchio`.
-        geometry: Collision geometry of the links with the pairs to check, without any scene.
-        fixtures: Solids of the robot's place, such as its tables.
+        hands: Hand name -> palm, grasp point and synergy.
+        model: Pinocchio model; the order of its q differs from that of states, see :meth:`to_pinocchio`.
+        geometry: Collision geometry of the links with the self-collision pairs, without a scene.
+        fixtures: Solids that are fixed beside the robot, such as its tables.
         part_links: Part name -> names of its links.
         urdf: The composed URDF with absolute mesh paths.
         covers: File of the links' sphere covers, or None.
@@ -89,11 +90,11 @@ class Robot:
         """Return a state, shape (dof,), or states, shape (N, dof), in Pinocchio's order, as a new array.
 
         Raises:
-            ParameterError: Another number of joint values.
+            ParameterError: The number of joint values differs from ``dof``.
         """
         q = np.asarray(q, dtype=float)
         if q.ndim == 0 or q.shape[-1] != len(self._order):
-            raise ParameterError("state", q.shape, f"{len(self._order)} joint values")
+            raise shape_error(q, ("...", len(self._order)), "state")
         return q[..., self._order]
 
     def link_frame(self, link: str) -> int:
@@ -125,10 +126,10 @@ class Robot:
         raise UnknownNameError("link", link, self.link_names)
 
     def hand_of(self, link: str) -> tuple[str, ...]:
-        """Return the links that hang together with a link beyond the last planned joint: its hand.
+        """Return the links of the hand that a link belongs to.
 
-        They are the links below the nearest joint above ``link`` that does not mimic another one; for a palm or a
-        finger those of the wrist and of the whole hand.
+        They are all links below the nearest ancestor joint of ``link`` that does not mimic another joint. For a palm
+        or a finger these are the links of the wrist and of the hand.
 
         Raises:
             UnknownNameError: No such link.
@@ -137,7 +138,7 @@ class Robot:
         joint = model.frames[self.link_frame(link)].parentJoint
         while joint > 0 and model.joints[joint].nq == 0:
             joint = model.parents[joint]
-        if joint == 0:  # fixed to the world: nothing moves it, and nothing else hangs on it
+        if joint == 0:  # fixed to the world
             return tuple(f.name for f in model.frames if f.type == pin.FrameType.BODY and f.parentJoint == 0)
         below = {joint}
         for k in range(1, model.njoints):  # parents come before their children
@@ -147,7 +148,7 @@ class Robot:
         return tuple(f.name for f in bodies if f.parentJoint in below)
 
     def limit_fault(self, q: Array) -> str | None:
-        """Return a sentence about the first joint of ``q`` outside its limits, or None when all hold."""
+        """Return a sentence on the first joint of ``q`` outside its limits, or None when all are inside."""
         q = np.asarray(q, dtype=float)
         if q.shape != (self.dof,):
             return f"the state has shape {q.shape}, expected ({self.dof},)"
@@ -180,7 +181,7 @@ def load_robot(name_or_path: str | Path, relative_to: Path | None = None) -> Rob
         UnknownNameError: No robot of that name ships with the package.
         MissingFileError: The robot file, a URDF, an SRDF or a collision mesh is missing.
         FileFormatError: A file does not follow its schema.
-        RobotError: The description cannot be made into a robot.
+        RobotError: The description is not valid.
     """
     text = str(name_or_path)
     if text in robot_names():
@@ -193,7 +194,7 @@ def load_robot(name_or_path: str | Path, relative_to: Path | None = None) -> Rob
 
 
 def build_robot(config: RobotConfig, path: Path) -> Robot:
-    """Make a robot out of a robot file that was read from ``path``.
+    """Build a robot from a robot file that was read from ``path``.
 
     Raises:
         MissingFileError: A URDF, an SRDF or a collision mesh is missing.
@@ -239,7 +240,7 @@ def link_of(model: pin.Model, item: pin.GeometryObject) -> str:
 
 
 def _check_geometry(model: pin.Model, geometry: pin.GeometryModel, urdf: str, path: Path) -> None:
-    """Refuse links whose collision geometry Pinocchio dropped, or that is no solid."""
+    """Raise a RobotError if Pinocchio has dropped collision geometry, or if a collision mesh is not a solid."""
     found = Counter(link_of(model, item) for item in geometry.geometryObjects)
     for link in ET.fromstring(urdf).findall("link"):
         name, wanted = str(link.get("name")), len(link.findall("collision"))
@@ -253,7 +254,7 @@ def _check_geometry(model: pin.Model, geometry: pin.GeometryModel, urdf: str, pa
 
 
 def _state_order(config: RobotConfig, model: pin.Model, path: Path) -> NDArray[np.intp]:
-    """Return ``order`` with ``q_pinocchio = q_state[order]``."""
+    """Return the indices ``order``, shape (nq,), with ``q_pinocchio = q_state[order]``."""
     order = np.full(model.nq, -1, dtype=np.intp)
     for k, name in enumerate(config.joints):
         if not model.existJointName(name):
@@ -284,7 +285,7 @@ def _limits(config: RobotConfig, model: pin.Model, path: Path) -> Limits:
 
 
 def _pair_up(model: pin.Model, geometry: pin.GeometryModel, disabled: Sequence[tuple[str, str]]) -> None:
-    """Pair all geometry that can move against each other and is not disabled."""
+    """Add a collision pair for any two geometries that move relative to each other and are not disabled."""
     skip = {frozenset(pair) for pair in disabled}
     items = list(geometry.geometryObjects)
     for i, j in combinations(range(len(items)), 2):

@@ -1,1 +1,1 @@
-"""Problem files: bodies, meshes, planning problems."""
+"""Planning problems and their files: bodies, meshes, start and goal."""

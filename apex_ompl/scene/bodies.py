@@ -1,4 +1,4 @@
-"""Solids as files name them: shapes, poses, obstacles and held objects.
+"""Solids of problem and robot files: shapes, poses, obstacles and held objects.
 
 Lengths are in metres, the world has z up, quaternions are ordered xyzw.
 """
@@ -10,13 +10,14 @@ from pathlib import Path
 from typing import Annotated, Self, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydantic import AfterValidator, Field, field_validator, model_validator
 
+from apex_ompl.types import Array
 from apex_ompl.util.schema import StrictModel
 
 MESH_SUFFIXES = (".stl", ".obj")
-LARGEST = 1e4  # lengths beyond are taken for a fault [m]
+LARGEST = 1e4  # longer lengths are errors [m]
 
 
 def _unit_quaternion(q: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
@@ -53,7 +54,7 @@ class RoundBar(StrictModel):
 
 
 class MeshFile(StrictModel):
-    """A closed triangle mesh from an STL or OBJ file; a relative path starts at the problem file."""
+    """A closed triangle mesh from an STL or OBJ file; a relative path is relative to the problem file."""
 
     file: str
     scale: Vector = (1.0, 1.0, 1.0)
@@ -81,7 +82,7 @@ class HalfSpace(StrictModel):
 
 
 class Body(StrictModel):
-    """A named solid: exactly one shape, and its pose."""
+    """A named solid with exactly one shape and a pose."""
 
     name: Name
     box: tuple[Size, Size, Size] | None = None
@@ -107,7 +108,7 @@ class Body(StrictModel):
         return next(k for k in SHAPES if getattr(self, k) is not None)
 
     @property
-    def pose(self) -> NDArray[np.float64]:
+    def pose(self) -> Array:
         """Homogeneous transform, shape (4, 4) [m]."""
         return pose_matrix(self.position, self.orientation)
 
@@ -117,7 +118,7 @@ SHAPES = ("box", "sphere", "cylinder", "capsule", "mesh", "half_space")
 
 
 class Obstacle(Body):
-    """A solid of the scene, in the world frame; ``velocity`` [m/s] makes it a moving one."""
+    """A solid in the world frame; it moves if it has a ``velocity`` [m/s]."""
 
     velocity: Vector | None = None
 
@@ -128,16 +129,16 @@ class Obstacle(Body):
 
 
 class ContactFace(StrictModel):
-    """Where a held object meets another: face centre [m] and outward axis, in the object's frame."""
+    """The face of a held object that is brought into contact: centre [m] and outward axis, in the object's frame."""
 
     point: Vector = (0.0, 0.0, 0.0)
     axis: Direction = (0.0, 0.0, 1.0)
 
 
 class AttachedObject(Body):
-    """A held solid, posed in the frame of the link that holds it.
+    """A held solid, with its pose in the frame of the link that holds it.
 
-    ``touch_links`` are links it may touch; None means all links of the hand that holds it.
+    ``touch_links`` are the links that it may touch; None means all links of the hand that holds it.
     """
 
     link: Name
@@ -152,14 +153,14 @@ class AttachedObject(Body):
 
 
 def located(body: BodyT, folder: Path) -> BodyT:
-    """Return a body whose mesh, if it has one, is named by its absolute path; a relative one starts at ``folder``."""
+    """Return a body whose mesh file, if any, has an absolute path; a relative path is relative to ``folder``."""
     if body.mesh is None:
         return body
     file = os.path.abspath(folder / body.mesh.file)
     return body.model_copy(update={"mesh": body.mesh.model_copy(update={"file": file})})
 
 
-def pose_matrix(position: ArrayLike, orientation: ArrayLike) -> NDArray[np.float64]:
+def pose_matrix(position: ArrayLike, orientation: ArrayLike) -> Array:
     """Return the homogeneous transform of a position [m] and a quaternion xyzw, shape (4, 4)."""
     x, y, z, w = np.asarray(orientation, float) / np.linalg.norm(orientation)
     pose = np.eye(4)

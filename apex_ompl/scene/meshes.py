@@ -1,4 +1,4 @@
-"""Triangle meshes as arrays: faults, pieces, closedness, inside and outside."""
+"""Triangle meshes as arrays: validity, connected pieces, bounding boxes and winding numbers."""
 
 from __future__ import annotations
 
@@ -6,21 +6,23 @@ import coal
 import numpy as np
 from numpy.typing import NDArray
 
-BOX_PAD = 1e-6  # boxes are larger than what they must hold by this, to stand above rounding [m]
-MOST_TRIANGLES = 200_000  # after which large ones are taken as they are
-LARGEST = 1e4  # coordinates beyond are taken for a fault [m]
+from apex_ompl.types import Array
+
+BOX_PAD = 1e-6  # margin of bounding boxes, which exceeds rounding errors [m]
+MOST_TRIANGLES = 200_000  # number at which large triangles are subdivided no further
+LARGEST = 1e4  # larger coordinates are errors [m]
 
 
-def triangles(mesh: coal.BVHModelBase) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def triangles(mesh: coal.BVHModelBase) -> tuple[Array, NDArray[np.int64]]:
     """Return the vertices, shape (V, 3) [m], and the vertex indices of the triangles, shape (T, 3)."""
     faces = [mesh.tri_indices(k) for k in range(mesh.num_tris)]
     return np.array(mesh.vertices()), np.array([[t[0], t[1], t[2]] for t in faces])
 
 
-def extent_fault(vertices: NDArray[np.float64]) -> str:
-    """Return why vertices, shape (V, 3) [m], cannot be those of a solid, or an empty text.
+def extent_fault(vertices: Array) -> str:
+    """Return the reason for which vertices, shape (V, 3) [m], are not those of a solid, or an empty string.
 
-    They must be finite, of sane size, and not all in one plane; Coal ends the process over others.
+    Vertices must be finite, at most ``LARGEST``, and not all in one plane; Coal aborts the process for others.
     """
     if not (np.isfinite(vertices).all() and np.abs(vertices).max() < LARGEST):
         return "vertices that are not finite or too far away"
@@ -30,10 +32,10 @@ def extent_fault(vertices: NDArray[np.float64]) -> str:
     return ""
 
 
-def orientation_fault(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> str:
-    """Return that neighbouring triangles are not oriented alike, or an empty text.
+def orientation_fault(vertices: Array, faces: NDArray[np.int64]) -> str:
+    """Return an error message if neighbouring triangles are oriented inconsistently, or an empty string.
 
-    Holes are let pass: what is inside is then decided by the generalised winding number.
+    Holes are allowed: the inside is then defined by the generalised winding number.
 
     Args:
         vertices: Shape (V, 3) [m].
@@ -48,26 +50,26 @@ def orientation_fault(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -
     return ""
 
 
-def is_closed(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> bool:
+def is_closed(vertices: Array, faces: NDArray[np.int64]) -> bool:
     """Whether every edge of a mesh belongs to more than one triangle."""
     edges = np.sort(_edges(vertices, faces), axis=1)
     return bool((np.unique(edges, axis=0, return_counts=True)[1] > 1).all())
 
 
-def _edges(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the directed edges of all triangles as numbers of places, shape (E, 2), without those of slivers."""
+def _edges(vertices: Array, faces: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the directed edges of all triangles but slivers, as indices of welded vertices, shape (E, 2)."""
     corners = weld(vertices)[faces]
     corners = corners[(corners != np.roll(corners, 1, axis=1)).all(axis=1)]
     return np.concatenate([corners[:, [k, (k + 1) % 3]] for k in range(3)])
 
 
-def weld(vertices: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return for every vertex, shape (V, 3), the number of its place; vertices at one place share it."""
+def weld(vertices: Array) -> NDArray[np.int64]:
+    """Return the index of the position of every vertex, shape (V,); vertices at the same position share one."""
     scale = max(float(np.abs(vertices).max()), 1e-9)
     return np.unique(np.round(vertices / scale, 9), axis=0, return_inverse=True)[1].ravel()
 
 
-def piece_points(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.float64]:
+def piece_points(vertices: Array, faces: NDArray[np.int64]) -> Array:
     """Return one vertex of every connected piece of a mesh, shape (pieces, 3)."""
     corners = weld(vertices)[faces]
     label = np.arange(int(corners.max()) + 1)
@@ -80,21 +82,21 @@ def piece_points(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDA
             break
         label = new
     _, first = np.unique(label[corners[:, 0]], return_index=True)
-    points: NDArray[np.float64] = vertices[faces[first, 0]]
+    points: Array = vertices[faces[first, 0]]
     return points
 
 
-def bounding_boxes(corners: NDArray[np.float64], columns: int = 8) -> NDArray[np.float64]:
-    """Return boxes that together contain the solid of a mesh, cavities left open, shape (boxes, 2, 3) [m].
+def bounding_boxes(corners: Array, columns: int = 8) -> Array:
+    """Return boxes whose union contains the solid of a mesh, shape (boxes, 2, 3) [m].
 
     The mesh is cut into columns along one axis. A line along that axis through a point of the solid leaves the solid
-    at both ends through the surface, inside the same column; so the box around what the column has of the surface
-    contains what it has of the solid. The axis is the one with the least volume of boxes. A surface that is not
-    closed gets one box around all of it, as points with a winding number over a half lie in its convex hull.
+    at both ends through the surface, inside the same column. The box around the part of the surface in a column
+    therefore contains the part of the solid in it. The axis with the smallest volume of boxes is chosen. A surface
+    that is not closed gets a single box, as points with a winding number above 1/2 lie in its convex hull.
 
     Args:
         corners: Corners of the triangles, holes capped (see :func:`capped`), shape (T, 3, 3) [m].
-        columns: How many along each of the two other axes.
+        columns: Number of columns along each of the two other axes.
     """
     if not _is_cycle(corners):
         columns = 1
@@ -104,16 +106,19 @@ def bounding_boxes(corners: NDArray[np.float64], columns: int = 8) -> NDArray[np
     return min(found, key=lambda boxes: float(np.prod(boxes[:, 1] - boxes[:, 0], axis=1).sum()))
 
 
-def _is_cycle(corners: NDArray[np.float64]) -> bool:
-    """Whether every edge is run through as often one way as the other, so that winding numbers are whole."""
+def _is_cycle(corners: Array) -> bool:
+    """Whether every edge occurs equally often in both directions, so that winding numbers are integers."""
     edges = _edges(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3))
     turned = np.where(edges[:, 0] > edges[:, 1], -1.0, 1.0)
     place = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True)[1].ravel()
     return not np.bincount(place, weights=turned).any()
 
 
-def _halved(corners: NDArray[np.float64], longest: float) -> NDArray[np.float64]:
-    """Halve triangles, shape (T, 3, 3), along their longest edges until all edges are short, or there are many."""
+def _halved(corners: Array, longest: float) -> Array:
+    """Bisect triangles, shape (T, 3, 3), at their longest edges until no edge is longer than ``longest`` [m].
+
+    Subdivision ends early at ``MOST_TRIANGLES``.
+    """
     while len(corners) < MOST_TRIANGLES:
         edges = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2)
         large = edges.max(axis=1) > longest
@@ -126,8 +131,8 @@ def _halved(corners: NDArray[np.float64], longest: float) -> NDArray[np.float64]
     return corners
 
 
-def _columns(corners: NDArray[np.float64], cut: NDArray[np.intp], columns: int) -> NDArray[np.float64]:
-    """Return the boxes around triangles, shape (T, 3, 3), column by column; ``cut`` are the axes that are cut."""
+def _columns(corners: Array, cut: NDArray[np.intp], columns: int) -> Array:
+    """Return the bounding boxes of triangles, shape (T, 3, 3), in each column; ``cut`` are the axes that are cut."""
     low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
     width = np.maximum((high - low)[cut] / columns, 1e-12)
     least, most = corners.min(axis=1), corners.max(axis=1)
@@ -147,11 +152,11 @@ def _columns(corners: NDArray[np.float64], cut: NDArray[np.intp], columns: int) 
         np.minimum.at(boxes[:, :, 0], (x, y), floor)
         np.maximum.at(boxes[:, :, 1], (x, y), roof)
     found = boxes[np.isfinite(boxes).all(axis=(2, 3))]
-    wide: NDArray[np.float64] = found + np.array([-BOX_PAD, BOX_PAD])[:, None]
+    wide: Array = found + np.array([-BOX_PAD, BOX_PAD])[:, None]
     return wide
 
 
-def capped(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.float64]:
+def capped(vertices: Array, faces: NDArray[np.int64]) -> Array:
     """Return the corners of the triangles of a mesh, shape (T, 3, 3), with a fan of triangles over every hole.
 
     Args:
@@ -189,14 +194,14 @@ def capped(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[n
     return np.concatenate([corners, *fans])
 
 
-def winding_number(point: NDArray[np.float64], corners: NDArray[np.float64]) -> float:
-    """Return how often a closed triangle mesh winds around a point: about 1 inside, 0 outside.
+def winding_number(point: Array, corners: Array) -> float:
+    """Return the winding number of a triangle mesh around a point: 1 inside a closed mesh, 0 outside.
 
     Args:
         point: Shape (3,), not on the surface.
         corners: Corners of the triangles, shape (T, 3, 3), counter-clockwise from outside.
 
-    The solid angle of each triangle is taken by the formula of van Oosterom and Strackee (1983).
+    It is the sum of the solid angles of the triangles (van Oosterom, Strackee 1983) over 4 pi.
     """
     a, b, c = np.moveaxis(corners - point, 1, 0)
     la, lb, lc = (np.linalg.norm(v, axis=1) for v in (a, b, c))

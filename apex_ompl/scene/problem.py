@@ -1,4 +1,4 @@
-"""Planning problems: the robot's name, a scene, held objects, a start and a goal; as records and as YAML.
+"""Planning problems: the robot, a scene, held objects, a start and a goal, as records and as YAML files.
 
 The file format is ``schema: apex-ompl/problem/1``. Joints go by name [rad; hand synergies 0 open to 1
 closed]; lengths are in metres, the world has z up, quaternions are ordered xyzw.
@@ -12,11 +12,11 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field, PositiveFloat, Strict, field_validator, model_validator
 
 from apex_ompl.errors import FileFormatError, nearest_name
 from apex_ompl.scene.bodies import AttachedObject, Name, Obstacle, Vector, located
+from apex_ompl.types import Array
 from apex_ompl.util.files import write_atomically
 from apex_ompl.util.schema import StrictModel, dump_yaml, read_yaml, validate
 
@@ -31,10 +31,9 @@ def _one_or_many(value: Any) -> Any:
 
 
 class WorldVector(StrictModel):
-    """A vector seen in the world at the start state, fixed to the link that holds what it was drawn along.
+    """A vector given in the world at the start state and fixed to a link, as in section III-A of the paper.
 
-    This is how the paper states a task (its section III-A): ``tip`` is the point of contact [m], and the direction
-    from ``tail`` to ``tip`` the outward axis.
+    ``tip`` is the point of contact [m], and the direction from ``tail`` to ``tip`` is the outward axis.
     """
 
     link: Name
@@ -49,7 +48,7 @@ class WorldVector(StrictModel):
 
 
 class Tolerance(StrictModel):
-    """How far an alignment may be off: across and along the axis [m], and in angle [rad]."""
+    """Tolerance of an alignment: across and along the axis [m], and of the angle [rad]."""
 
     lateral: PositiveFloat
     axial: PositiveFloat
@@ -62,19 +61,19 @@ ALIGNMENT_DEFAULTS: dict[str, tuple[float, Tolerance]] = {
     "pour": (0.05, Tolerance(lateral=0.015, axial=0.02, angle=float(np.radians(10)))),
     "handover": (0.01, Tolerance(lateral=0.015, axial=0.01, angle=float(np.radians(12)))),
 }
-"""Kind -> distance [m] and tolerance where an alignment does not say."""
+"""Kind of alignment -> default distance [m] and tolerance."""
 
 
 class Alignment(StrictModel):
-    """Two contact faces brought together (section III-A of the paper), as ``apex_ompl.tasks.alignment`` defines it.
+    """An alignment of two contact faces (section III-A of the paper), defined in ``apex_ompl.tasks.alignment``.
 
     Attributes:
         kind: ``vertical`` (stacking), ``horizontal`` (insertion), ``pour`` or ``handover``.
         first: Name of a held object that has a contact face, or a vector in the world.
-        second: The same; for a handover the name of the hand that receives.
-        distance: Gap between the faces along the axis; for ``pour`` the height of the lip above the opening [m].
-        tolerance: How far off is still good; the kind's own by default.
-        tilt: Least and largest angle between the axis of ``first`` and up, for ``pour`` [rad].
+        second: The same; for a handover the name of the receiving hand.
+        distance: Distance of the faces along the axis; for ``pour`` the height of the lip above the opening [m].
+        tolerance: Tolerance; that of the kind by default.
+        tilt: Smallest and largest angle between the axis of ``first`` and up, for ``pour`` [rad].
     """
 
     kind: Literal["vertical", "horizontal", "pour", "handover"]
@@ -96,7 +95,7 @@ class Alignment(StrictModel):
 
 
 class Goal(StrictModel):
-    """What is to be reached: one of several complete joint configurations, or an alignment of held objects."""
+    """A goal: one or several joint configurations of which one is to be reached, or an alignment of held objects."""
 
     joints: (
         Annotated[
@@ -125,7 +124,7 @@ class Problem(StrictModel):
         scene: Obstacles in the world frame, besides the robot's own fixtures.
         attached: Held objects.
         start: Joint name -> value of the start state.
-        goal: What is to be reached.
+        goal: The goal.
     """
 
     schema_id: Literal["apex-ompl/problem/1"] = Field(default="apex-ompl/problem/1", alias="schema")
@@ -154,7 +153,7 @@ class Problem(StrictModel):
         """Names of the obstacles that move."""
         return tuple(o.name for o in self.scene if o.moving)
 
-    def start_state(self, joint_names: Sequence[str]) -> NDArray[np.float64]:
+    def start_state(self, joint_names: Sequence[str]) -> Array:
         """Return the start in the order of ``joint_names``, shape (dof,).
 
         Raises:
@@ -162,7 +161,7 @@ class Problem(StrictModel):
         """
         return _in_order(self.start, joint_names, self.name, "start")
 
-    def goal_states(self, joint_names: Sequence[str]) -> NDArray[np.float64]:
+    def goal_states(self, joint_names: Sequence[str]) -> Array:
         """Return the goals in the order of ``joint_names``, shape (goals, dof); none for an alignment.
 
         Raises:
@@ -221,7 +220,7 @@ class Problem(StrictModel):
         return self.model_copy(update=update)
 
 
-def _in_order(values: Mapping[str, float], joint_names: Sequence[str], source: str, field: str) -> NDArray[np.float64]:
+def _in_order(values: Mapping[str, float], joint_names: Sequence[str], source: str, field: str) -> Array:
     unknown = [name for name in values if name not in joint_names]
     if unknown:
         near = nearest_name(unknown[0], joint_names)

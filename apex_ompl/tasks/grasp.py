@@ -1,4 +1,4 @@
-"""Grasps: a held object, the hand synergy that holds it, and the links that may touch it, as one thing."""
+"""Grasps: a held object with the hand synergy that closes on it and the links that may touch it."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from apex_ompl.types import Array
 HandObjects = Sequence[tuple[str, AttachedObject]]
 """Objects by the name of the hand that is to hold each."""
 
-SCAN = 200  # synergies tried from open to closed before bisection
-TOLERANCE = 1e-4
+SCAN = 200  # number of steps from open to closed before bisection
+TOLERANCE = 1e-4  # of the synergy at first contact
 
 
 @dataclass(frozen=True)
@@ -32,8 +32,8 @@ class Grasp:
         held: The object, fixed to the palm; it may touch the links of the hand.
         hand: Name of the hand.
         synergy_joint: The joint that closes the hand, or None for a hand without one.
-        synergy: Its value at first contact, just short of touching.
-        touched: The finger link that would touch first, or an empty text when none does.
+        synergy: Largest synergy found without contact.
+        touched: The finger link that makes contact first, or an empty string when none does.
     """
 
     held: AttachedObject
@@ -44,7 +44,7 @@ class Grasp:
 
 
 def grasp(robot: Robot, hand: str, held: AttachedObject) -> Grasp:
-    """Close a hand on an object until the first finger link would touch it.
+    """Close a hand on an object until just before a finger link makes contact.
 
     Args:
         robot: The robot.
@@ -53,7 +53,7 @@ def grasp(robot: Robot, hand: str, held: AttachedObject) -> Grasp:
 
     Raises:
         UnknownNameError: No such hand.
-        SceneError: A finger of the open hand is inside the object already.
+        SceneError: A finger of the open hand is in contact already.
     """
     if hand not in robot.hands:
         raise UnknownNameError("hand", hand, robot.hands)
@@ -121,7 +121,7 @@ class _Closing:
         self.data, self.geometry_data = robot.model.createData(), exact_requests(self.geometry.createData())
 
     def touched(self, synergy: float) -> str:
-        """Return the first finger link that overlaps the object at a synergy, or an empty text."""
+        """Return a finger link that overlaps the object at a synergy, or an empty string."""
         q = self.robot.home.copy()
         q[self.index] = synergy
         order = self.robot.to_pinocchio(q)

@@ -1,4 +1,4 @@
-"""Inverse kinematics by links: points and directions of links for the kernel's descents."""
+"""Inverse kinematics in terms of links: their points and directions as residuals of the kernel's solver."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ from apex_ompl.robot import Robot
 
 
 def in_world(vector: ArrayLike) -> Fixed:
-    """Return a point [m] or a unit direction of the world, shape (3,), as a part of targets."""
+    """Return a point [m] or a unit direction in the world frame, shape (3,), for the targets of the solver."""
     return Fixed(0, vector)
 
 
 class Links:
-    """A robot's links as parts of targets; safe to use from several threads."""
+    """Points and directions fixed to the links of a robot, for the targets of the solver; safe for several threads."""
 
     def __init__(self, robot: Robot) -> None:
         """Tabulate the joints of ``robot``.
 
         Raises:
-            RobotError: A joint moves in a way that the kernel does not know.
+            RobotError: The kernel does not support the type of a joint.
         """
-        # The robot itself is not kept: `of` would keep it alive for good.
+        # No reference to the robot, so that the cache of `of` can release it.
         specs = joint_specs(robot)
         frames = (f for f in robot.model.frames if f.type == pin.FrameType.BODY)
         self._placements = {f.name: (int(f.parentJoint), f.placement.copy()) for f in frames}
@@ -44,14 +44,14 @@ class Links:
 
     @classmethod
     def of(cls, robot: Robot) -> Links:
-        """Return the links of a robot, made once."""
+        """Return the links of a robot, made once per robot."""
         with _lock:
             if robot not in _known:
                 _known[robot] = cls(robot)
             return _known[robot]
 
     def point(self, link: str, point: ArrayLike) -> Fixed:
-        """Return a point in a link's frame, shape (3,) [m].
+        """Return a point given in the frame of a link, shape (3,) [m].
 
         Raises:
             UnknownNameError: No such link.
@@ -60,7 +60,7 @@ class Links:
         return Fixed(joint, self._turns[joint].T @ placement.act(np.asarray(point, float)))
 
     def direction(self, link: str, direction: ArrayLike) -> Fixed:
-        """Return a unit direction in a link's frame, shape (3,).
+        """Return a unit direction given in the frame of a link, shape (3,).
 
         Raises:
             UnknownNameError: No such link.
@@ -69,7 +69,7 @@ class Links:
         return Fixed(joint, self._turns[joint].T @ placement.rotation @ np.asarray(direction, float))
 
     def inverse(self, targets: Sequence[Target], fixed: Sequence[int] | NDArray[np.intp] = ()) -> Inverse:
-        """Return the inverse kinematics for targets; the planned joints whose numbers are ``fixed`` stay."""
+        """Return the inverse kinematics of targets; the planned joints with indices ``fixed`` are not moved."""
         return Inverse(self.tables, targets, fixed)
 
     def _placement(self, link: str) -> tuple[int, pin.SE3]:

@@ -1,10 +1,10 @@
-"""Problems out of MoveIt and MotionBenchMaker files: a planning scene and a motion plan request, both as YAML.
+"""Import of MoveIt and MotionBenchMaker files: a planning scene and a motion plan request, both as YAML.
 
-Read are ``moveit_msgs/PlanningScene`` (or its ``world`` alone) and ``moveit_msgs/MotionPlanRequest`` in the two
-spellings that are about: poses as lists or as x/y/z(/w) mappings, primitive types by name or by number.
-A primitive's pose is composed with that of its object and of the frame the object is given in; every primitive of
-an object becomes an obstacle. What would change the problem and cannot be read is an error that names it; what is
-left out without harm is listed in the notes.
+The messages are ``moveit_msgs/PlanningScene`` (or its ``world`` alone) and ``moveit_msgs/MotionPlanRequest``, in either
+of two spellings: poses as lists or as x/y/z(/w) mappings, primitive types by name or by number. The pose of a primitive
+is composed with that of its object and of the object's frame; every primitive of an object becomes an obstacle. Content
+that would change the problem and is not supported is an error that names it. Content that is left out without effect
+is listed in the notes.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ HARMLESS = ("workspace_parameters", "planner_id", "num_planning_attempts", "allo
 
 @dataclass
 class Conversion:
-    """A problem, and what was not taken over into it."""
+    """A converted problem, with notes on the content of the files that was left out."""
 
     problem: Problem
     notes: list[str] = field(default_factory=list)
@@ -51,7 +51,7 @@ class _Reader:
         return FileFormatError(str(self.file), where, value, expected)
 
     def joint(self, name: str, where: str) -> str | None:
-        """Return our name of a joint, or None for one that this robot does not plan."""
+        """Return the name of a planned joint of this robot, or None if the robot does not plan the joint."""
         mapped = self.joint_map.get(name, name)
         if mapped in self.robot.joint_names:
             return mapped
@@ -73,7 +73,7 @@ class _Reader:
         raise self.fail(f"{where}.header.frame_id", name, expected)
 
     def pose(self, data: Any, where: str) -> Array:
-        """Return a pose message as a matrix; a missing one is the identity."""
+        """Return a pose message as a matrix, shape (4, 4) [m]; the identity when the message is empty."""
         if not data:
             return np.eye(4)
         position = self.numbers(data.get("position"), "xyz", (0.0, 0.0, 0.0), f"{where}.position")
@@ -159,18 +159,18 @@ def convert(
     joint_map: Mapping[str, str] | None = None,
     frame_map: Mapping[str, str] | None = None,
 ) -> Conversion:
-    """Read a scene and a request as a problem for one of our robots.
+    """Return the problem of a planning scene and a motion plan request.
 
     Args:
         scene: YAML of a ``moveit_msgs/PlanningScene`` or its world.
         request: YAML of a ``moveit_msgs/MotionPlanRequest``.
         robot: The robot.
-        joint_map: Their joint name -> ours.
-        frame_map: Their frame -> ``world`` or a link of ours.
+        joint_map: Joint name in the files -> planned joint of ``robot``.
+        frame_map: Frame in the files -> ``world`` or a link of ``robot``.
 
     Raises:
         MissingFileError: A file or a mesh cannot be read.
-        FileFormatError: Something that matters cannot be read; the message names it.
+        FileFormatError: Content is faulty or not supported; the message names it.
         UnknownNameError: The joint map names an unknown joint.
     """
     scene_data, request_data = read_yaml(scene, "scene file"), read_yaml(request, "request file")

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from apex_ompl.errors import ParameterError
 from apex_ompl.trajopt.path import resample
-from apex_ompl.types import Array
+from apex_ompl.util.validation import check_array, check_path, check_positive
 
 STEPS = 128  # of even length that a path is resampled to for its jerk
 
@@ -28,9 +28,8 @@ def jerk(path: ArrayLike, duration: float = 1.0) -> float:
     Raises:
         ParameterError: ``path`` has fewer than two states, or ``duration`` is not positive.
     """
-    states = _states(path)
-    if not duration > 0.0:
-        raise ParameterError("duration", duration, "a positive number of seconds")
+    states = check_path(path)
+    check_positive(duration, "duration", "a positive number of seconds")
     third = np.diff(resample(states, STEPS + 1), 3, axis=0) * (STEPS / duration) ** 3
     return float(np.sqrt((third**2).sum(axis=1).mean()))
 
@@ -54,10 +53,10 @@ def spectral_arc_length(
         ParameterError: There is no movement, or ``spacing`` is not positive.
     """
     speeds = np.asarray(speed, dtype=float)
-    if speeds.ndim != 1 or len(speeds) < 2 or not speeds.any() or not np.isfinite(speeds).all():
-        raise ParameterError("speed", speeds.shape, "two or more finite speeds, not all 0")
-    if not spacing > 0.0:
-        raise ParameterError("spacing", spacing, "a positive number of seconds")
+    check_array(speeds, ("N",), "speed", finite=True, least=2)
+    if not speeds.any():
+        raise ParameterError("speed", 0.0, "speeds that are not all 0")
+    check_positive(spacing, "spacing", "a positive number of seconds")
     count = 2 ** (int(np.ceil(np.log2(len(speeds)))) + padding)
     amplitude = np.abs(np.fft.rfft(speeds, count))
     frequency = np.fft.rfftfreq(count, spacing)
@@ -68,10 +67,3 @@ def spectral_arc_length(
     amplitude, frequency = amplitude[: last + 1], frequency[: last + 1]
     steps = np.diff(frequency) / (frequency[-1] - frequency[0])
     return float(-np.hypot(steps, np.diff(amplitude)).sum())
-
-
-def _states(path: ArrayLike) -> Array:
-    states = np.asarray(path, dtype=float)
-    if states.ndim != 2 or len(states) < 2 or not np.isfinite(states).all():
-        raise ParameterError("path", states.shape, "two or more finite states, shape (N, dof)")
-    return states

@@ -18,7 +18,7 @@ from apex_ompl.trajectory.methods.ruckig import from_moving_start, stops
 from apex_ompl.trajectory.methods.spline import blended
 from apex_ompl.trajectory.trajectory import Trajectory
 from apex_ompl.types import Array
-from apex_ompl.util.validation import is_number, numbers
+from apex_ompl.util.validation import check_array, check_number, check_states, finite_array
 
 SHORTEST_DURATION = 1e-3  # of a motion between states that count as one [s]
 BLENDS = 6  # deviations that are tried, each half of the one before, until the motion stops at corners
@@ -59,11 +59,11 @@ class Timing:
             ParameterError: One is out of its range.
         """
         for name, (low, high) in RANGES.items():
-            value = getattr(self, name)
-            if not is_number(value) or not low <= value <= high:
-                raise ParameterError(name, value, f"a number from {low:g} to {high:g}")
+            check_number(getattr(self, name), name, low, high)
         for name in ("start_velocity", "start_acceleration"):
-            object.__setattr__(self, name, tuple(np.atleast_1d(numbers(getattr(self, name), name)).ravel().tolist()))
+            object.__setattr__(
+                self, name, tuple(np.atleast_1d(finite_array(getattr(self, name), name)).ravel().tolist())
+            )
 
     def limits(self, limits: Limits) -> Limits:
         """Return the scaled limits."""
@@ -86,8 +86,7 @@ class Timing:
             given = np.array(getattr(self, f"start_{name}"), dtype=float)
             if not given.size:
                 given = np.zeros(len(limit))
-            if given.shape != limit.shape:
-                raise ParameterError(f"start_{name}", given.shape, f"{len(limit)} finite numbers, one a joint")
+            check_array(given, limit.shape, f"start_{name}")
             if np.any(np.abs(given) > limit):
                 k = int(np.argmax(np.abs(given) / limit))
                 raise ParameterError(f"start_{name}", given[k], f"at most {limit[k]:g} for joint {k + 1}, as scaled")
@@ -138,7 +137,7 @@ def time_path(
     timing = timing or Timing()
     if not isinstance(timing, Timing):
         raise ParameterError("timing", timing, "a Timing")
-    states = numbers(path, "path")
+    states = finite_array(path, "path")
     _check(states, limits, joint_names)
     scaled = timing.limits(limits)
     start = timing.start(scaled)
@@ -154,8 +153,7 @@ def time_path(
 
 def _check(states: Array, limits: Limits, joint_names: Sequence[str]) -> None:
     dof = len(limits.velocity)
-    if states.ndim != 2 or states.shape[1] != dof or not len(states):
-        raise ParameterError("path", states.shape, f"states of shape (N, {dof})")
+    check_states(states, dof, "path", least=1)
     if len(joint_names) != dof:
         raise ParameterError("joint_names", len(joint_names), f"{dof}, as there are joints")
     over = (states < limits.lower - LIMIT_TOLERANCE) | (states > limits.upper + LIMIT_TOLERANCE)

@@ -18,7 +18,7 @@ from apex_ompl.trajectory.files import STATES, SUFFIXES, decode, encode
 from apex_ompl.trajectory.smoothness import spectral_arc_length
 from apex_ompl.types import Array
 from apex_ompl.util.files import suffix_of, write_atomically
-from apex_ompl.util.validation import check_positive, numbers
+from apex_ompl.util.validation import check_array, check_integer, check_positive, check_times, finite_array
 
 ROUNDING = 1e-9  # of shares of limits
 CONTINUITY_TOLERANCE = 1e-6  # relative error of a knot integrated from the one before; files of ROS round times
@@ -76,17 +76,14 @@ class Trajectory:
                 twice, or knots that no motion of constant jerk joins.
         """
         for name in ("times", *STATES):
-            object.__setattr__(self, name, numbers(getattr(self, name), name))
+            object.__setattr__(self, name, finite_array(getattr(self, name), name))
         names = tuple(self.joint_names)
         object.__setattr__(self, "joint_names", names)
         if not names or len(set(names)) < len(names):
             raise ParameterError("joint_names", names, "one name or more, each once")
-        if self.times.ndim != 1 or not len(self.times) or self.times[0] != 0.0 or not np.all(np.diff(self.times) > 0.0):
-            raise ParameterError("times", self.times.shape, "one time or more, rising from 0")
-        shape = (len(self.times), len(names))
+        check_times(self.times)
         for name in STATES:
-            if getattr(self, name).shape != shape:
-                raise ParameterError(name, getattr(self, name).shape, f"numbers of shape {shape}")
+            check_array(getattr(self, name), (len(self.times), len(names)), name)
         q, v, a, t = self.positions, self.velocities, self.accelerations, np.diff(self.times)[:, None]
         reached = q[:-1] + t * (v[:-1] + t * (2.0 * a[:-1] + a[1:]) / 6.0), v[:-1] + t * (a[:-1] + a[1:]) / 2.0
         for name, integrated, given in zip(STATES, reached, (q[1:], v[1:]), strict=False):
@@ -123,9 +120,8 @@ class Trajectory:
         Raises:
             ParameterError: ``order`` is none of these, or a time is not a finite number.
         """
-        if isinstance(order, bool) or not isinstance(order, int) or not 0 <= order <= len(STATES):
-            raise ParameterError("order", order, "0, 1, 2 or 3")
-        given = numbers(time, "time")
+        check_integer(order, "order", 0, len(STATES))
+        given = finite_array(time, "time")
         if given.ndim > 1:
             raise ParameterError("time", given.shape, "one time, or several of shape (N,)")
         times = np.atleast_1d(given)
@@ -248,7 +244,7 @@ class Trajectory:
         Raises:
             ParameterError: ``time`` is not a finite number.
         """
-        numbers(time, "time")
+        finite_array(time, "time")
         knots = (self.positions, self.velocities, self.accelerations)
         later = self.times > time + 1e-9
         if not later.any():

@@ -7,7 +7,7 @@ check is handed in.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -18,6 +18,7 @@ from apex_ompl.kernel import optimization
 from apex_ompl.kernel.interface import Kernel
 from apex_ompl.trajopt.spline import Spline
 from apex_ompl.types import Array
+from apex_ompl.util.validation import check_array, check_integer, check_nonnegative, check_number, check_positive
 
 Check = Callable[[Array], bool]
 """Whether a path, shape (states, dof), is valid."""
@@ -58,14 +59,12 @@ class Settings:
         Raises:
             ParameterError: One is out of range.
         """
-        for field in fields(self):
-            value, whole = getattr(self, field.name), field.name in ("samples", "steps")
-            kinds = (int, np.integer) if whole else (int, float, np.integer, np.floating)
-            low = 1 if field.name == "samples" else 0
-            good = isinstance(value, kinds) and not isinstance(value, bool) and low <= value < np.inf
-            if not good or (value == 0 and field.name in ("scene_margin", "own_margin", "stiffness")):
-                least = f"{low} or more" if whole or field.name in ("damping", "tolerance") else "more than 0"
-                raise ParameterError(field.name, value, f"{'a whole' if whole else 'a'} number, {least}")
+        check_integer(self.samples, "samples", 1)
+        check_integer(self.steps, "steps")
+        for name in ("scene_margin", "own_margin", "stiffness"):
+            check_positive(getattr(self, name), name)
+        for name in ("damping", "tolerance"):
+            check_number(getattr(self, name), name, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,8 +118,7 @@ class Optimizer:
         Raises:
             ParameterError: ``count`` is not positive.
         """
-        if count < 1:
-            raise ParameterError("count", count, "a positive number of paths")
+        check_integer(count, "count", 1)
         line = self.spline.line(start, goal)
         bumps = _bumps(self.spline) @ rng.normal(size=(count, self.spline.free, line.shape[1]))
         bumps[0] = 0.0
@@ -185,8 +183,8 @@ class Optimizer:
         if not len(control):
             return self._bent(control, about)
         for name, number in (("steps", steps), ("stiffness", stiffness), ("damping", damping)):
-            if number is not None and not (np.asarray(number) >= 0.0).all():
-                raise ParameterError(name, number, "a number, 0 or more")
+            if number is not None:
+                check_nonnegative(number, name)
         grid = _grid(self.spline, self.settings.samples)
         numbers = self._numbers()
         numbers[optimization.STEPS] = self.settings.steps if steps is None else steps
@@ -252,11 +250,7 @@ class Optimizer:
         points = np.require(control, float, ["C", "W"])
         if points.ndim == 2:
             points = points[None]
-        wanted = (self.spline.points, kernel.robot.dof)
-        if points.ndim != 3 or points.shape[1:] != wanted or not np.isfinite(points).all():
-            raise ParameterError(
-                "control points", points.shape, f"finite numbers of shape (B, {wanted[0]}, {wanted[1]})"
-            )
+        check_array(points, ("B", self.spline.points, kernel.robot.dof), "control points", finite=True)
         return points
 
     def _numbers(self) -> Array:

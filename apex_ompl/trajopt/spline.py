@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from apex_ompl.errors import ParameterError
 from apex_ompl.types import Array
+from apex_ompl.util.validation import check_integer, check_path
 
 FIT_SAMPLES = 1025
 ROUGHNESS = 1e-9  # of the third derivative, where a fit would leave control points open
@@ -41,12 +42,9 @@ class Spline:
         Raises:
             ParameterError: There are too few points, states or pinned points, or nothing is left free.
         """
-        for name in ("degree", "points", "pinned", "states"):
-            value = getattr(self, name)
-            whole = isinstance(value, int) and not isinstance(value, bool)
-            low = {"points": self.degree + 1, "states": 2}.get(name, 1) if name != "degree" else 1
-            if not whole or value < low:
-                raise ParameterError(name, value, f"a whole number, {low} or more")
+        for name, low in (("degree", 1), ("pinned", 1), ("states", 2)):
+            object.__setattr__(self, name, check_integer(getattr(self, name), name, low))
+        object.__setattr__(self, "points", check_integer(self.points, "points", self.degree + 1))
         if self.free < 1:
             raise ParameterError("pinned", self.pinned, f"less than half of the {self.points} points")
 
@@ -153,9 +151,7 @@ class Spline:
         Raises:
             ParameterError: The polyline has another shape, or numbers that are not finite.
         """
-        line = np.asarray(polyline, float)
-        if line.ndim != 2 or len(line) < 2 or not np.isfinite(line).all():
-            raise ParameterError("polyline", line.shape, "finite states of shape (N, dof), N > 1")
+        line = check_path(polyline, "polyline")
         steps = np.linalg.norm(np.diff(line, axis=0), axis=1)
         along = np.concatenate([[0.0], np.cumsum(steps)])
         even = self.line(line[0], line[-1])

@@ -1,1 +1,1 @@
-"""Files, argument checks, provenance, threads, and other things without geometry."""
+"""Files, argument checks, provenance, threads and other utilities."""

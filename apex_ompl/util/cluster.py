@@ -1,4 +1,4 @@
-"""Work spread by Ray, over the cores of this machine or over a cluster."""
+"""Parallel work by Ray, on the cores of this machine or on a cluster."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 from apex_ompl.errors import ApexError
 
-OBJECT_STORE = 256 << 20  # of Ray [bytes]
+OBJECT_STORE = 256 << 20  # size of Ray's object store [bytes]
 
 
 class ClusterError(ApexError):
@@ -25,26 +25,26 @@ def spread(
     ahead: int = 2,
     lost: Callable[[str], Any] | None = None,
 ) -> Iterator[tuple[str, Any]]:
-    """Call a function once for each job, and yield names and what came of them as they are done.
+    """Call a function once for each job, and yield the name and the result of each job as it ends.
 
-    A job whose worker died is tried once more.
+    A job whose worker died is run once more.
 
     Args:
-        work: The function; it can be imported or pickled.
-        jobs: Its arguments, by names.
-        workers: How many jobs run at once.
-        ahead: How many jobs for each worker are under way or wait at Ray.
-        lost: What comes of a job whose worker died twice, by its name; by default that ends the work.
-        address: Of a running cluster; by default Ray is started on this machine, and stopped again.
+        work: The function, which can be imported or pickled.
+        jobs: Name of a job -> arguments of the function.
+        workers: Number of jobs that run at once.
+        address: Address of a running cluster; by default Ray is started on this machine, and stopped at the end.
+        ahead: Number of jobs per worker that are running or queued at Ray.
+        lost: Returns the result of a job, by its name, whose worker died twice; by default that is an error.
 
     Raises:
-        ClusterError: Ray is not there, a job raised, or a worker died twice over one.
+        ClusterError: Ray is not installed or cannot be reached, a job raised, or its worker died twice.
     """
     try:
         import ray
     except ImportError as error:
         raise ClusterError("no Ray, expected: pip install 'apex-ompl[data]'; or one worker and no address") from error
-    mine = not ray.is_initialized()  # who has started Ray goes on with it
+    mine = not ray.is_initialized()  # otherwise the caller owns Ray, and it is left running
     if mine:
         _start(ray, workers, address)
     try:
@@ -62,8 +62,8 @@ def spread(
             except ray.exceptions.RayError as error:
                 if lost is None or not isinstance(error, ray.exceptions.WorkerCrashedError):
                     raise ClusterError(
-                        f"{name}: its worker died twice ({type(error).__name__}); what is written is whole, and "
-                        "the same command goes on from there"
+                        f"{name}: its worker died twice ({type(error).__name__}); finished jobs are kept, and "
+                        "the same command continues from there"
                     ) from error
                 found = lost(name)
             following = next(waiting, None)
@@ -79,7 +79,7 @@ def _start(ray: Any, workers: int, address: str | None) -> None:
     """Start Ray on this machine, or join a cluster.
 
     Raises:
-        ClusterError: There is none.
+        ClusterError: Ray cannot be started, or there is no cluster at ``address``.
     """
     if address and ":" in address.removeprefix("ray://"):
         _reach(address.removeprefix("ray://"))
@@ -87,9 +87,8 @@ def _start(ray: Any, workers: int, address: str | None) -> None:
     try:
         ray.init(address=address, include_dashboard=False, log_to_driver=False, logging_level="error", **local)
     except Exception as error:  # ConnectionError, ValueError, RuntimeError
-        said = _first_line(error)
         expected = f"expected a cluster at {address or 'this machine'}, and RAY_AUTH_MODE=token if it asks for tokens"
-        raise ClusterError(f"Ray: {said}, {expected}") from error
+        raise ClusterError(f"Ray: {_first_line(error)}, {expected}") from error
 
 
 def _first_line(error: BaseException) -> str:
@@ -97,10 +96,10 @@ def _first_line(error: BaseException) -> str:
 
 
 def _reach(address: str) -> None:
-    """Look whether somebody listens at HOST:PORT: Ray itself tries for minutes.
+    """Check that HOST:PORT accepts connections, since Ray itself retries for minutes.
 
     Raises:
-        ClusterError: Nobody does.
+        ClusterError: It does not.
     """
     host, _, port = address.rpartition(":")
     try:

@@ -1,4 +1,4 @@
-"""Files written whole or not at all."""
+"""Files: atomic writes, checks of paths, folders and locks."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ BROKEN = (
     KeyError, TypeError, ValueError, EOFError, OverflowError, NotImplementedError, RuntimeError, MemoryError,
     tokenize.TokenError, zipfile.BadZipFile, zlib.error,
 )  # fmt: skip
-"""What reading an archive of NumPy that is damaged raises, and a file that holds something else."""
+"""Exceptions raised on reading a NumPy archive that is damaged or holds other content."""
 
 
 def is_file(path: Path) -> bool:
-    """Whether a path is that of a file; False also for names that no file can have."""
+    """Whether a path is an existing file; False also for names that no file can have."""
     try:
         return path.is_file()
     except (OSError, ValueError):
@@ -32,10 +32,10 @@ def is_file(path: Path) -> bool:
 
 
 def suffix_of(path: Path, known: Sequence[str]) -> str:
-    """Return which of some suffixes, such as ``.traj.yaml``, the name of an output file ends in.
+    """Return the suffix, such as ``.traj.yaml``, of an output file out of the known ones.
 
     Raises:
-        ParameterError: None of them.
+        ParameterError: The file has another suffix.
     """
     found = next((suffix for suffix in known if path.name.endswith(suffix) and path.name != suffix), None)
     if found is None:
@@ -44,7 +44,7 @@ def suffix_of(path: Path, known: Sequence[str]) -> str:
 
 
 def check_writable(path: Path) -> None:
-    """Check that a file can be written, before the work that makes its content.
+    """Check that a file can be written, before its content is computed.
 
     Raises:
         MissingFileError: The folder does not exist or cannot be written, or the path is a folder.
@@ -63,11 +63,11 @@ def check_writable(path: Path) -> None:
 
 
 def make_folder(folder: str | os.PathLike[str], role: str = "output folder") -> Path:
-    """Make a folder and those above it, if they are not there, and return its path.
+    """Make a folder and its parents, if they do not exist, and return its path.
 
     Args:
         folder: The folder.
-        role: What it is for, as errors name it.
+        role: Description of the folder for errors.
 
     Raises:
         MissingFileError: It cannot be made.
@@ -83,11 +83,11 @@ def make_folder(folder: str | os.PathLike[str], role: str = "output folder") -> 
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Keep other processes from writing into a folder.
+    """Lock a folder against other processes inside the block.
 
     Raises:
         MissingFileError: The folder cannot be written.
-        FolderInUseError: Another process writes there.
+        FolderInUseError: Another process has locked it.
     """
     try:
         file = open(folder / ".lock", "w")
@@ -102,7 +102,7 @@ def locked(folder: Path) -> Iterator[None]:
 
 
 def write_atomically(path: Path, content: bytes) -> None:
-    """Write a file under a temporary name beside it, then rename it.
+    """Write a file under a temporary name in the same folder, then rename it.
 
     Raises:
         MissingFileError: The folder does not exist or cannot be written.

@@ -1,4 +1,4 @@
-"""What a measurement or a data set was made with: versions and hardware."""
+"""Provenance of measurements and data sets: versions of libraries, and hardware."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from importlib import metadata
 from pathlib import Path
 
 FIGURES = ("apex-ompl", "ompl", "pin", "coal", "numba", "numpy", "torch")
-"""Libraries that measured figures depend on."""
+"""Libraries that affect measurements."""
 LIBRARIES = (*FIGURES, "ruckig", "scipy", "pydantic", "example-robot-data")
 
 
 def versions(libraries: Sequence[str] = FIGURES) -> dict[str, str]:
-    """Return the versions of libraries by name, of those that are installed."""
+    """Return name -> version of those libraries that are installed."""
     found = {}
     for name in libraries:
         try:
@@ -39,7 +39,7 @@ def commit(root: Path, paths: Sequence[str] = (".",)) -> str:
 
 
 def hardware() -> str:
-    """Return the name of the processor and the number of cores that this process may use."""
+    """Return the name of the processor and the number of cores available to this process."""
     name, info = platform.processor() or platform.machine(), Path("/proc/cpuinfo")
     if info.exists():
         names = [line.split(":", 1)[1].strip() for line in info.read_text().splitlines() if "model name" in line]

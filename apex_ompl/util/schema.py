@@ -1,4 +1,4 @@
-"""YAML files checked by pydantic: reading, faults in one sentence, and writing without half files."""
+"""YAML files validated by pydantic: reading, errors in one sentence, and serialisation."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ ModelT = TypeVar("ModelT", bound="StrictModel")
 
 
 class StrictModel(BaseModel):
-    """A frozen record that refuses unknown keys and numbers that are not finite."""
+    """A frozen record without unknown keys and with finite numbers only."""
 
     model_config = ConfigDict(
         extra="forbid", frozen=True, allow_inf_nan=False, populate_by_name=True, validate_default=True
@@ -24,15 +24,15 @@ class StrictModel(BaseModel):
 
 
 class _Loader(yaml.SafeLoader):
-    """SafeLoader that refuses a key given twice."""
+    """SafeLoader that refuses duplicate keys."""
 
 
 class _FastLoader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
-    """The same over libyaml, ten times faster; deep nesting ends the process."""
+    """The same by libyaml, ten times faster; deep nesting crashes the process."""
 
 
 def _shallow(text: str) -> bool:
-    """Whether the nesting of YAML text is surely at most some hundred levels deep."""
+    """Whether a bound on the nesting depth of YAML text is at most about a hundred levels."""
     text = re.sub(r"(?m)^\s*#.*$", "", text)
     text = re.sub(r"""(?<=[:,] )("[^"\\\n]*"|'[^'\n]*')""", "", text)  # values that are quoted on one line
     quoted = "'" in text or '"' in text  # closing brackets may be part of text then
@@ -52,7 +52,7 @@ def _mapping(loader: _Loader | _FastLoader, node: yaml.MappingNode) -> dict[Hash
         if key in seen:
             raise yaml.constructor.ConstructorError(None, None, f"key {key!r} is given twice", key_node.start_mark)
         seen.add(key)
-    mapping: dict[Hashable, Any] = loader.construct_mapping(node, deep=True)  # which takes merge keys in
+    mapping: dict[Hashable, Any] = loader.construct_mapping(node, deep=True)  # merge keys are resolved
     return mapping
 
 
@@ -95,7 +95,7 @@ def parse_yaml(text: str, source: str) -> dict[str, Any]:
         place = f"line {mark.line + 1}, column {mark.column + 1}" if mark else ""
         problem = str(error.problem or error.context).strip()
         raise FileFormatError(source, place, problem, "expected valid YAML") from error
-    except Exception as error:  # PyYAML lets many kinds through, and deep nesting ends the recursion
+    except Exception as error:  # PyYAML raises many kinds, deep nesting a RecursionError
         what = str(error) or type(error).__name__
         raise FileFormatError(source, "", what, "expected valid YAML") from error
     if not isinstance(data, dict):
@@ -104,7 +104,7 @@ def parse_yaml(text: str, source: str) -> dict[str, Any]:
 
 
 def validate(model: type[ModelT], data: dict[str, Any], source: str) -> ModelT:
-    """Make a record from ``data``, or say in one sentence what is wrong with the first fault.
+    """Return a record made from ``data``; the error describes the first fault in one sentence.
 
     Raises:
         FileFormatError: ``data`` does not fit ``model``.
@@ -113,7 +113,7 @@ def validate(model: type[ModelT], data: dict[str, Any], source: str) -> ModelT:
         return model.model_validate(data)
     except ValidationError as error:
         faults = error.errors()
-        # A misspelt key shows up as a missing one too; the misspelling says more.
+        # A misspelt key is reported as a missing key too; the misspelling is more informative.
         first = next((f for f in faults if f["type"] == "extra_forbidden"), faults[0])
         location = [str(part) for part in first["loc"]]
         expected = first["msg"][0].lower() + first["msg"][1:]
@@ -159,7 +159,7 @@ def _model_in(annotation: Any) -> type[BaseModel] | None:
 
 
 class _Dumper(yaml.SafeDumper):
-    """Block style for mappings, flow style for plain vectors of numbers."""
+    """Block style for mappings, flow style for vectors of numbers."""
 
 
 def _represent_sequence(dumper: _Dumper, data: Any) -> yaml.SequenceNode:

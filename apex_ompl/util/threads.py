@@ -1,4 +1,4 @@
-"""One thread for small networks: with more, and a busy core, an evaluation takes many times longer."""
+"""Thread count of torch: small networks are evaluated by one thread, as several wait for each other on busy cores."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from contextlib import contextmanager
 import torch
 
 _lock = threading.Lock()
-_before: list[int] = []  # thread counts to go back to, one for each block at work
+_before: list[int] = []  # thread count to restore, one entry for each active block
 
 
 @contextmanager
 def one_torch_thread() -> Iterator[None]:
-    """Let torch compute on one thread inside of the block, and on as many as before behind it.
+    """Let torch compute by one thread inside the block, and restore the thread count afterwards.
 
-    Blocks may overlap in several threads; the last to end goes back.
+    Blocks may overlap in several threads; the last one to end restores the count.
     """
     with _lock:
         _before.append(_before[0] if _before else torch.get_num_threads())

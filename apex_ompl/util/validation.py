@@ -1,13 +1,21 @@
-"""Checks of the numbers that callers give, in Python or on a command line."""
+"""Checks of numbers and arrays that callers give, in Python or on a command line.
+
+All number and shape checks of the package are made here, so that their messages are worded alike.
+"""
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from apex_ompl.errors import ParameterError
+from apex_ompl.types import Array
+
+LARGEST_INT = 2**31 - 1
+"""Largest seed or count, the largest signed integer of 32 bits."""
 
 
 def is_number(value: object) -> bool:
@@ -15,44 +23,179 @@ def is_number(value: object) -> bool:
     return isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
 
 
-def check_positive(value: float, name: str, expected: str) -> None:
-    """Check a number.
+def is_integer(value: object) -> bool:
+    """Whether a value is an integer of Python or NumPy; True and False are not."""
+    return isinstance(value, (int, np.integer)) and not isinstance(value, bool)
+
+
+def check_number(value: float, name: str, low: float = -np.inf, high: float = np.inf) -> None:
+    """Check that a finite number lies in the closed interval [low, high].
 
     Raises:
-        ParameterError: It is none, or not positive and finite.
+        ParameterError: It does not, or the value is no finite number.
+    """
+    if not is_number(value) or not -np.inf < value < np.inf or not low <= value <= high:
+        raise ParameterError(name, value, _in_range("a number", low, high))
+
+
+def check_positive(value: float, name: str, expected: str = "a positive number") -> None:
+    """Check that a number is positive and finite.
+
+    Args:
+        value: The number.
+        name: Its name in the error.
+        expected: What the error asks for, such as ``a positive number of seconds``.
+
+    Raises:
+        ParameterError: The value is no number, not positive, or not finite.
     """
     if not is_number(value) or not 0.0 < value < np.inf:
         raise ParameterError(name, value, expected)
 
 
-def numbers(given: ArrayLike, name: str) -> NDArray[np.float64]:
-    """Return finite numbers as an array.
+def check_integer(value: int, name: str, low: int = 0, high: int | None = None) -> int:
+    """Return an integer as an ``int`` after checking that it lies in [low, high].
 
     Raises:
-        ParameterError: They are none.
+        ParameterError: It does not, or the value is no integer.
+    """
+    if not is_integer(value) or value < low or (high is not None and value > high):
+        raise ParameterError(name, value, _in_range("a whole number", low, high))
+    return int(value)
+
+
+def check_seed(seed: int) -> int:
+    """Return a seed as an ``int`` after checking that it lies in [0, 2147483647].
+
+    Raises:
+        ParameterError: It does not, or the value is no integer.
+    """
+    return check_integer(seed, "seed", 0, LARGEST_INT)
+
+
+def _in_range(what: str, low: float, high: float | None) -> str:
+    """Return the words for a range, such as ``a number, 0 or more`` or ``a number from 0 to 1``."""
+    if high is not None and high < np.inf:
+        return f"{what} from {_shown(low)} to {_shown(high)}"
+    return what if low == -np.inf else f"{what}, {_shown(low)} or more"
+
+
+def _shown(bound: float) -> str:
+    return str(bound) if isinstance(bound, int) else f"{bound:g}"
+
+
+def finite_array(given: ArrayLike, name: str) -> Array:
+    """Return a copy of finite numbers as an array.
+
+    Raises:
+        ParameterError: One is no finite number.
     """
     try:
         found = np.array(given, dtype=float)
     except (TypeError, ValueError, OverflowError) as error:
         raise ParameterError(name, given, "finite numbers") from error
     if not np.isfinite(found).all():
-        raise ParameterError(name, found[~np.isfinite(found)].flat[0], "finite numbers")
+        raise ParameterError(name, float(found[~np.isfinite(found)].flat[0]), "finite numbers")
     return found
 
 
-def whole_number(text: str) -> int:
-    """Return a whole number, for ``argparse``.
+def check_nonnegative(values: ArrayLike, name: str) -> None:
+    """Check that each of some numbers is 0 or more; infinity is allowed.
 
     Raises:
-        ArgumentTypeError: It is not one from 0 to 2147483647.
+        ParameterError: One is negative or NaN.
     """
-    if not text.isdecimal() or not int(text) < 2**31:
-        raise argparse.ArgumentTypeError(f"{text!r}, expected a whole number from 0 to 2147483647")
+    if not (np.asarray(values) >= 0.0).all():
+        raise ParameterError(name, values, "a number, 0 or more")
+
+
+def check_indices(chosen: Iterable[int] | NDArray[np.intp], count: int, name: str, what: str) -> None:
+    """Check that integers number some of ``count`` items, such as ``planned joints``.
+
+    Raises:
+        ParameterError: One is not in [0, count - 1].
+    """
+    if any(k not in range(count) for k in chosen):
+        raise ParameterError(name, list(chosen), f"numbers of {what}, 0 to {count - 1}")
+
+
+def check_array(array: Array, shape: Sequence[int | str], name: str, *, finite: bool = False, least: int = 0) -> None:
+    """Check the shape of an array and, with ``finite``, that all its numbers are finite.
+
+    Args:
+        array: The array.
+        shape: The size of each axis: a number, or a letter such as ``N`` where any size is good.
+        name: Its name in the error.
+        finite: Whether NaN and infinity are refused.
+        least: Smallest size of the first axis.
+
+    Raises:
+        ParameterError: The array has another shape, or a number that is not finite.
+    """
+    fits = array.ndim == len(shape) and all(
+        isinstance(wanted, str) or size == wanted for size, wanted in zip(array.shape, shape, strict=True)
+    )
+    if not fits or len(array) < least:
+        raise shape_error(array, shape, name, finite=finite, least=least)
+    if finite and not np.isfinite(array).all():
+        error = shape_error(array, shape, name, finite=True, least=least)
+        raise ParameterError(name, float(array[~np.isfinite(array)].flat[0]), error.expected)
+
+
+def shape_error(
+    array: Array, shape: Sequence[int | str], name: str, *, finite: bool = False, least: int = 0
+) -> ParameterError:
+    """Return the error of :func:`check_array`, for functions called so often that they compare shapes themselves."""
+    sizes = ", ".join(map(str, shape)) + ("," if len(shape) == 1 else "")
+    what = "finite numbers" if finite else "an array"
+    rows = f", {shape[0]} at least {least}" if least > 0 else ""
+    return ParameterError(name, array.shape, f"{what} of shape ({sizes}){rows}")
+
+
+def check_states(states: Array, dof: int, name: str = "states", *, least: int = 0) -> None:
+    """Check that an array holds states, one a row: shape (N, dof) with N at least ``least``.
+
+    Raises:
+        ParameterError: Another shape, or fewer rows.
+    """
+    check_array(states, ("N", dof), name, least=least)
+
+
+def check_path(path: ArrayLike, name: str = "path") -> Array:
+    """Return a path as an array, shape (N, dof), after checking that it has two finite states or more.
+
+    Raises:
+        ParameterError: Another shape, fewer states, or a number that is not finite.
+    """
+    states = np.asarray(path, dtype=float)
+    check_array(states, ("N", "dof"), name, finite=True, least=2)
+    return states
+
+
+def check_times(times: Array, count: int | None = None) -> None:
+    """Check that times, shape (N,) or (count,), are finite, begin with 0 and increase strictly.
+
+    Raises:
+        ParameterError: They do not.
+    """
+    check_array(times, ("N" if count is None else count,), "times", finite=True, least=1)
+    if times[0] != 0.0 or not (np.diff(times) > 0.0).all():
+        raise ParameterError("times", times, "times that start at 0 and increase")
+
+
+def whole_number(text: str) -> int:
+    """Return the integer that a text gives; a type of ``argparse``.
+
+    Raises:
+        ArgumentTypeError: It is not a whole number from 0 to 2147483647.
+    """
+    if not text.isdecimal() or not int(text) <= LARGEST_INT:
+        raise argparse.ArgumentTypeError(f"{text!r}, expected a whole number from 0 to {LARGEST_INT}")
     return int(text)
 
 
 def one_or_more(text: str) -> int:
-    """Return a number of things, for ``argparse``.
+    """Return the positive integer that a text gives; a type of ``argparse``.
 
     Raises:
         ArgumentTypeError: It is not a whole number from 1 to 2147483647.

@@ -20,7 +20,7 @@ from apex_ompl.ompl_adapter.setup import PlanningSetup
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import Body
 from apex_ompl.scene.meshes import triangles
-from apex_ompl.tasks.alignment import Face
+from apex_ompl.tasks.link_faces import LinkFace
 from apex_ompl.types import Array
 
 SIZE = (1280, 960)
@@ -75,7 +75,7 @@ class SceneRenderer:
             style = {"color": HELD_COLOURS[k % len(HELD_COLOURS)], "specular": 0.2}
             placement = frame.placement * pin.SE3(held.pose)
             meshes.append((frame.parentJoint, placement, self._mesh(coal_geometry(held)), style))
-        faces: list[Face] = []
+        faces: list[LinkFace] = []
         if setup.alignment is not None:
             faces = [setup.alignment.first, setup.alignment.second]
         for face, colour in zip(faces, ARROW_COLOURS, strict=False):

@@ -1,1 +1,1 @@
-"""Sphere covers: made offline, and proved to contain their solids."""
+"""Sphere covers of solids: search, proof and files, made offline or when a scene is compiled."""

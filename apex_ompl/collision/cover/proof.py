@@ -1,7 +1,7 @@
 """The proof that a tree of balls contains a solid.
 
-Boxes over the solid are halved until each misses the solid or lies in a leaf and in all balls above that leaf. So a
-walk down the tree that drops a ball as soon as it is far enough from the others loses nothing of the solid.
+Boxes over the solid are subdivided until each misses the solid or lies in a leaf and in all ancestors of that leaf.
+A traversal may therefore prune a ball, with all balls below it, as soon as the ball is far enough from an obstacle.
 """
 
 from __future__ import annotations
@@ -10,18 +10,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from apex_ompl.collision.cover.solids import Flags, Indices, Round, Solid
-from apex_ompl.types import Array
+from apex_ompl.collision.cover.convex_parts import RoundBody
+from apex_ompl.collision.cover.solids import Solid
+from apex_ompl.types import Array, Flags, Indices
 
-PAD = 1e-6  # the radii are larger than what is proved by this, to stand above all rounding [m]
-FINEST = 3e-4  # sides of the smallest boxes of the proof [m], or a share of the solid if that is larger
-FINEST_SHARE = 1 / 400
-TOO_MANY = 2_000_000  # boxes at once
+PAD = 1e-6  # margin of the radii over the proved ones, which exceeds all rounding errors [m]
+FINEST = 3e-4  # side of the smallest boxes of the proof [m] ...
+FINEST_SHARE = 1 / 400  # ... or this share of the size of the solid where that is larger
+TOO_MANY = 2_000_000  # boxes at once at which the proof is given up
 
 
 @dataclass(frozen=True, eq=False)
 class Cover:
-    """A tree of balls in the frame of a geometry; the leaves together contain the solid.
+    """A tree of balls in the frame of a geometry; the union of the leaves contains the solid.
 
     Attributes:
         centres: Shape (n, 3) [m].
@@ -37,7 +38,7 @@ class Cover:
 
     @property
     def parents(self) -> Indices:
-        """The ball above each ball, shape (n,); -1 for the root."""
+        """Index of the parent of each ball, shape (n,); -1 for the root."""
         parents = np.full(len(self.radii), -1, dtype=np.int64)
         for k in np.flatnonzero(self.count):
             parents[self.first[k] : self.first[k] + self.count[k]] = k
@@ -50,23 +51,23 @@ class Cover:
 
     @property
     def levels(self) -> Indices:
-        """How many balls are above each ball, shape (n,)."""
+        """Depth of each ball in the tree, shape (n,); 0 for the root."""
         levels = np.zeros(len(self.radii), dtype=np.int64)
         for k, parent in enumerate(self.parents):
             levels[k] = levels[parent] + 1 if parent >= 0 else 0
         return levels
 
 
-def boxes_left(solid: Solid, cover: Cover) -> Array:
-    """Return the centres of the boxes that could not be proved to be covered, shape (N, 3) [m]; none: proved."""
+def uncovered_boxes(solid: Solid, cover: Cover) -> Array:
+    """Return the centres of boxes that are not proved to be covered, shape (N, 3) [m]; a proved cover has none."""
     part = solid.parts[0]
-    if isinstance(part, Round) and part.capped:
-        return _discs_left(part, cover)
+    if isinstance(part, RoundBody) and part.capped:
+        return _uncovered_discs(part, cover)
     return _Proof(solid, cover).run(grow=False)
 
 
-def grown(solid: Solid, cover: Cover, coarser: float) -> Cover:
-    """Return a cover with balls as much larger as the proof needs, by boxes ``coarser`` times the smallest."""
+def grow_to_cover(solid: Solid, cover: Cover, coarser: float) -> Cover:
+    """Return a cover whose radii are enlarged until the proof succeeds with boxes ``coarser`` times the smallest."""
     proof = _Proof(solid, cover)
     proof.finest *= coarser
     proof.run(grow=True)
@@ -81,8 +82,14 @@ def distances(points: Array, centres: Array) -> Array:
     return np.asarray(np.sqrt(square))
 
 
-def _farthest(centres: Array, halves: Array, balls: Array) -> Array:
-    """Return the distances from centres of balls, shape (n, 3), to the farthest points of boxes: shape (N, n)."""
+def _farthest_distances(centres: Array, halves: Array, balls: Array) -> Array:
+    """Return the distance of the farthest point of each box to each centre of a ball: shape (N, n) [m].
+
+    Args:
+        centres: Centres of the boxes, shape (N, 3) [m].
+        halves: Half sides of the boxes, shape (N, 3) [m].
+        balls: Centres of the balls, shape (n, 3) [m].
+    """
     square = np.zeros((len(centres), len(balls)))
     for axis in range(3):
         side = np.abs(centres[:, None, axis] - balls[None, :, axis])
@@ -91,16 +98,20 @@ def _farthest(centres: Array, halves: Array, balls: Array) -> Array:
     return np.asarray(np.sqrt(square, out=square))
 
 
-def needs_of(far: Array, radii: Array, parents: Indices) -> Array:
-    """Return by how much the worst of each ball and those above it falls short, of far and radii: shape (N, n)."""
-    needs = far - radii
-    for k in range(1, len(radii)):  # parents come first
-        np.maximum(needs[:, k], needs[:, parents[k]], out=needs[:, k])
-    return needs
+def worst_excess(far: Array, radii: Array, parents: Indices) -> Array:
+    """Return max(far - radius) over each ball and its ancestors: shape (N, n) [m].
+
+    A box whose farthest point is ``far`` from a centre, shape (N, n), lies in the ball and in all its ancestors where
+    the result is not positive.
+    """
+    excess = far - radii
+    for k in range(1, len(radii)):  # parents precede their children
+        np.maximum(excess[:, k], excess[:, parents[k]], out=excess[:, k])
+    return excess
 
 
 class _Proof:
-    """The halving of boxes over a solid, with the balls that may grow on the way."""
+    """Subdivision of boxes over a solid, with radii that may grow meanwhile."""
 
     def __init__(self, solid: Solid, cover: Cover) -> None:
         self.solid = solid
@@ -109,23 +120,23 @@ class _Proof:
         self.finest = max(FINEST, float((solid.high - solid.low).max()) * FINEST_SHARE)
 
     def run(self, grow: bool) -> Array:
-        """Return the centres of the boxes left over, shape (N, 3); with ``grow`` none, the radii grow instead."""
+        """Return the centres of the boxes not covered, shape (N, 3); with ``grow`` none, as the radii are enlarged."""
         which, centres, halves = self._start()
         while len(centres):
             keep = self._touching(which, centres, halves)
             which, centres, halves = which[keep], centres[keep], halves[keep]
             last = bool(len(halves)) and float(halves.max()) * 2.0 <= self.finest
-            open_ = self._open(centres, halves)
+            uncovered = self._uncovered(centres, halves)
             if grow and last:
-                self._grow(centres[open_], halves[open_])
+                self._grow(centres[uncovered], halves[uncovered])
                 return np.zeros((0, 3))
-            which, centres, halves = which[open_], centres[open_], halves[open_]
+            which, centres, halves = which[uncovered], centres[uncovered], halves[uncovered]
             if last or len(centres) > TOO_MANY:
                 return centres
             if grow:
-                self._grow_points(which, centres)
-            elif len(wrong := self._wrong(which, centres)):
-                return wrong
+                self._grow_over_points(which, centres)
+            elif len(found := self._counterexamples(which, centres)):
+                return found
             which, centres, halves = _halved(which, centres, halves)
         return np.zeros((0, 3))
 
@@ -142,7 +153,7 @@ class _Proof:
         return np.concatenate(which), np.concatenate(centres), np.concatenate(halves)
 
     def _by_part(self, which: Indices) -> list[tuple[int, slice]]:
-        """Return the parts of boxes that are sorted by part, and where theirs are."""
+        """Return each part with the slice of its boxes, which are sorted by part."""
         if not len(which):
             return []
         edges = np.flatnonzero(np.diff(which)) + 1
@@ -155,38 +166,40 @@ class _Proof:
             keep[rows] = ~self.solid.parts[k].outside(centres[rows], halves[rows])
         return keep
 
-    def _open(self, centres: Array, halves: Array) -> Flags:
-        """Which boxes lie in no leaf, or not in all balls above it."""
+    def _uncovered(self, centres: Array, halves: Array) -> Flags:
+        """Which boxes lie in no leaf together with all its ancestors."""
         result = np.ones(len(centres), bool)
         for rows in self._chunks(len(centres)):
-            needs = needs_of(_farthest(centres[rows], halves[rows], self.centres), self.radii, self.parents)
-            result[rows] = ~(needs[:, self.leaves] <= 0.0).any(axis=1)
+            excess = worst_excess(
+                _farthest_distances(centres[rows], halves[rows], self.centres), self.radii, self.parents
+            )
+            result[rows] = ~(excess[:, self.leaves] <= 0.0).any(axis=1)
         return result
 
     def _chunks(self, count: int) -> list[slice]:
         step = max(1, 200_000 // len(self.radii))
         return [slice(a, a + step) for a in range(0, count, step)]
 
-    def _wrong(self, which: Indices, centres: Array) -> Array:
-        """Return which centres are in the solid and in no leaf."""
+    def _counterexamples(self, which: Indices, centres: Array) -> Array:
+        """Return the centres that lie in the solid and in no leaf: counterexamples to the cover."""
         inside = self._touching(which, centres, np.zeros_like(centres))
         points = centres[inside]
-        return points[self._open(points, np.zeros_like(points))]
+        return points[self._uncovered(points, np.zeros_like(points))]
 
-    def _grow_points(self, which: Indices, centres: Array) -> None:
-        points = self._wrong(which, centres)
+    def _grow_over_points(self, which: Indices, centres: Array) -> None:
+        points = self._counterexamples(which, centres)
         self._grow(points, np.zeros_like(points))
 
     def _grow(self, centres: Array, halves: Array) -> None:
-        """Widen, for each box, the leaf that needs the least and the balls above it."""
+        """Enlarge, for each box, the leaf with the smallest excess, and its ancestors."""
         while len(centres):
             rows = self._chunks(len(centres))[0]
-            far = _farthest(centres[rows], halves[rows], self.centres)
-            needs = needs_of(far, self.radii, self.parents)[:, self.leaves]
-            least = needs.min(axis=1)
-            # The worst half first: what they widen often serves the others.
+            far = _farthest_distances(centres[rows], halves[rows], self.centres)
+            excess = worst_excess(far, self.radii, self.parents)[:, self.leaves]
+            least = excess.min(axis=1)
+            # The worst half first: the balls that they enlarge often contain the other boxes too.
             worst = least >= max(float(np.median(least)), 0.0)
-            for k, row in zip(self.leaves[needs[worst].argmin(axis=1)], far[worst], strict=True):
+            for k, row in zip(self.leaves[excess[worst].argmin(axis=1)], far[worst], strict=True):
                 ball = int(k)
                 while ball >= 0:
                     self.radii[ball] = max(self.radii[ball], row[ball] + 1e-9)
@@ -197,30 +210,31 @@ class _Proof:
 
 
 def _halved(which: Indices, centres: Array, halves: Array) -> tuple[Indices, Array, Array]:
-    """Return the eight parts of each box; boxes of one part stay together."""
+    """Return the eight octants of each box; boxes of one part stay together."""
     signs = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
     parts = (centres[:, None] + halves[:, None] * signs).reshape(-1, 3)
     return np.repeat(which, 8), parts, np.repeat(0.5 * halves, 8, axis=0)
 
 
-def _discs_left(part: Round, cover: Cover) -> Array:
-    """Prove a cover of a capsule by halving its axis: between two discs in a ball, the capsule is in the ball.
+def _uncovered_discs(part: RoundBody, cover: Cover) -> Array:
+    """Return points of the axis of a capsule whose surroundings are not proved to be covered, shape (N, 3) [m].
 
-    Boxes would need to be small all over, since a tight ball touches the capsule all around.
+    The axis is bisected. A ball is convex, so it contains the capsule between two discs that it contains. Boxes would
+    have to be small everywhere, since a tight ball touches the capsule along a whole circle.
     """
     radii, parents, leaves = cover.radii - PAD, cover.parents, cover.leaves
     across = np.hypot(cover.centres[:, 0], cover.centres[:, 1]) + part.radius
     ends = np.array([[0.0, 0.0, sign * part.half_length] for sign in (-1.0, 1.0)])
-    caps = needs_of(distances(ends, cover.centres) + part.radius, radii, parents)[:, leaves]
+    caps = worst_excess(distances(ends, cover.centres) + part.radius, radii, parents)[:, leaves]
     left = ends[(caps > 0.0).all(axis=1)]
     if part.half_length == 0.0:
         return left
     low, high = np.array([-part.half_length]), np.array([part.half_length])
     for _ in range(24):
         far = [np.hypot(z[:, None] - cover.centres[:, 2], across) for z in (low, high)]
-        needs = needs_of(np.maximum(*far), radii, parents)[:, leaves]
-        open_ = (needs > 0.0).all(axis=1)
-        low, high = low[open_], high[open_]
+        excess = worst_excess(np.maximum(*far), radii, parents)[:, leaves]
+        uncovered = (excess > 0.0).all(axis=1)
+        low, high = low[uncovered], high[uncovered]
         if not len(low):
             return left
         if len(low) > 1000:

@@ -1,30 +1,30 @@
-"""A cover of a box or of any closed mesh in milliseconds, for shapes that nobody made a better one of."""
+"""Covers of boxes and closed meshes made in milliseconds, for shapes without a cover made offline."""
 
 from __future__ import annotations
 
 import coal
 import numpy as np
 
-from apex_ompl.collision.containment import Host
+from apex_ompl.collision.containment import EnclosingMesh
 from apex_ompl.collision.cover.proof import PAD, Cover
 from apex_ompl.scene.meshes import bounding_boxes
 from apex_ompl.types import Array
 
-COLUMNS = 6
-LEAVES = 64  # at most, of a box
-LEAVES_IN_MESH = 200
+COLUMNS = 6  # columns of boxes along each axis of a mesh
+LEAVES = 64  # most leaves of a box ...
+LEAVES_IN_MESH = 200  # ... and of a mesh
 
 
 def rough_cover(geometry: coal.CollisionGeometry) -> Cover:
-    """Return a cover of a box or of the solid of a mesh: balls around boxes that contain it, halved again and again.
+    """Return a cover of a box or of the solid of a mesh: balls around boxes that are halved recursively.
 
-    The boxes of a mesh are those of ``apex_ompl.scene.meshes.bounding_boxes``. Nothing is left to prove: a ball around
-    all corners of a box contains the box.
+    The boxes of a mesh are those of :func:`apex_ompl.scene.meshes.bounding_boxes`, which contain the solid. No proof
+    is needed, as a ball around all corners of a box contains the box.
     """
     if geometry.getNodeType() == coal.GEOM_BOX:
         boxes, most = np.array([[-geometry.halfSide, geometry.halfSide]]), LEAVES
     else:
-        boxes, most = bounding_boxes(Host.of(geometry).outline, COLUMNS), LEAVES_IN_MESH
+        boxes, most = bounding_boxes(EnclosingMesh.of(geometry).boundary, COLUMNS), LEAVES_IN_MESH
     sides = boxes[:, 1] - boxes[:, 0]
     longest = float(sides.max())
     while len(boxes) < most and _leaves(sides, longest / 1.1) <= most:
@@ -43,12 +43,12 @@ def rough_cover(geometry: coal.CollisionGeometry) -> Cover:
 
 
 def _leaves(sides: Array, longest: float) -> float:
-    """Return how many parts boxes, shape (boxes, 3), fall into when sides are halved until none is too long."""
+    """Return the number of boxes after halving sides, shape (boxes, 3), until none is longer than ``longest``."""
     return float(np.prod(2.0 ** np.ceil(np.log2(np.maximum(sides / longest, 1.0))), axis=1).sum())
 
 
 def _halves(box: Array, longest: float) -> list[Array]:
-    """Return the halves of a box along its longest side, shape (2, 3) each, or nothing when that is short enough."""
+    """Return the halves of a box across its longest side, shape (2, 3) each; none when the side is short enough."""
     sides = box[1] - box[0]
     axis = int(np.argmax(sides))
     if sides[axis] <= longest:

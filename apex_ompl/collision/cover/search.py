@@ -1,9 +1,10 @@
-"""The search for few balls that cover a solid closely; what it finds is proved afterwards, so it may err.
+"""Search for few balls that cover a solid closely; the result is proved afterwards, so the search may be heuristic.
 
-The leaves come first: for a ball around c that holds the points P, the gap is max |p - c| - depth(c), what the ball
-stands out of the solid. Greedy set cover picks balls within the tolerance; then points go to the ball whose gap they
-widen least, each ball moves to where its gap is smallest, in turns; and balls are taken out as long as the others
-can take over. Inner balls cover leaves in the same way, with the points of a leaf taken together.
+The leaves come first. A ball around c that contains the points P protrudes from the solid by the gap
+max |p - c| - depth(c), p in P. Greedy set cover selects balls whose gaps are within the tolerance. Then two steps
+alternate as in Lloyd's algorithm: each point goes to the ball whose gap it increases least, and each ball moves to
+where its gap is smallest. Balls are removed as long as the others can contain their points. Inner balls cover leaves
+in the same way, with all points of a leaf as one group.
 """
 
 from __future__ import annotations
@@ -15,17 +16,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apex_ompl.collision.cover.proof import Cover
-from apex_ompl.collision.cover.solids import Flags, Indices, Solid
-from apex_ompl.types import Array
+from apex_ompl.collision.cover.solids import Solid
+from apex_ompl.types import Array, Flags, Indices
 
-RELAX = 1.25  # how much a tolerance gives way at a time
-COARSER = 2.5  # gap of a level relative to the one below, at least
-FLAT_BELOW = 6  # so few leaves hang on the root
+RELAX = 1.25  # factor by which a tolerance is enlarged until enough candidates fit
+COARSER = 2.5  # smallest ratio of the gaps of a level and the level below
+FLAT_BELOW = 6  # up to so many leaves are children of the root
 
 
 @dataclass
 class _Level:
-    """Balls, and the ball of each group of points below."""
+    """A level of the tree: balls, and for each group of points the ball that contains it."""
 
     centres: Array
     owner: Indices
@@ -34,7 +35,7 @@ class _Level:
 
 
 class _Search:
-    """The points to cover, sorted by group, and the moves of balls."""
+    """A search over points to be covered, sorted by group."""
 
     def __init__(self, solid: Solid, points: Array, groups: Indices, candidates: Array, effort: int) -> None:
         order = np.argsort(groups, kind="stable")
@@ -46,7 +47,7 @@ class _Search:
         self.rng = np.random.default_rng(0)
 
     def gaps(self, centres: Array, depth: Array | None = None) -> Array:
-        """Return the gap that each ball would need for each group alone, shape (balls, groups) [m]."""
+        """Return the gap of each ball if it contained one group alone, shape (balls, groups) [m]."""
         if depth is None:
             depth = self.solid.depth(centres)
         square = np.einsum("ij,ij->i", self.points, self.points) - 2.0 * centres @ self.points.T
@@ -58,9 +59,9 @@ class _Search:
         return np.asarray(far)
 
     def greedy(self, gap: float, most: int) -> _Level:
-        """Return a greedy choice of candidates; the gap gives way until at most ``most`` are enough."""
+        """Return a greedy selection of candidates; the gap is enlarged until at most ``most`` of them suffice."""
         needs = self.gaps(self.candidates)
-        least = needs.min(axis=0)  # in a sharp corner even the best candidate may stand out further
+        least = needs.min(axis=0)  # in a sharp corner even the best candidate may protrude further
         while True:
             chosen = self._pick_best(needs <= np.maximum(gap, least), most)
             if chosen is not None:
@@ -91,8 +92,8 @@ class _Search:
             left &= ~new
         return chosen
 
-    def settle(self, level: _Level, turns: int, steps: int) -> _Level:
-        """Let points and balls find each other; the level returned is the best met."""
+    def refine(self, level: _Level, turns: int, steps: int) -> _Level:
+        """Alternate between assigning points and moving balls, and return the best level found."""
         centres = level.centres.copy()
         best = level
         best_gap = np.inf
@@ -107,15 +108,15 @@ class _Search:
             for k in range(len(centres)):
                 own = self.points[point_owner == k]
                 if len(own):
-                    centres[k], reach[k] = self._move(centres[k], own, reach[k], steps)
+                    centres[k], reach[k] = self._recentre(centres[k], own, reach[k], steps)
         needs = self.gaps(centres)
         gap = float(needs.min(axis=0).max())
         return _Level(centres, needs.argmin(axis=0), gap) if gap < best_gap else best
 
-    def _move(self, centre: Array, own: Array, reach: float, steps: int) -> tuple[Array, float]:
-        """Return where the gap of a ball around its own points is smallest, by steps that shrink."""
+    def _recentre(self, centre: Array, own: Array, reach: float, steps: int) -> tuple[Array, float]:
+        """Return the centre with the smallest gap around the ball's points, by random search, and the next reach."""
         count = 12 if self.effort == 1 else 24
-        if len(own) > 80:  # the extreme points of the cloud decide
+        if len(own) > 80:  # the extreme points alone determine the radius
             own = own[np.unique((own @ DIRECTIONS.T).argmax(axis=0))]
         moved = 0.0
         step = min(reach, float(np.ptp(own, axis=0).max()) * 0.5 + 1e-4)
@@ -132,17 +133,17 @@ class _Search:
                 step *= 0.5
         return centre, max(2.0 * moved, 1e-3)
 
-    def thin_out(self, level: _Level, gap: float) -> _Level:
-        """Take out balls as long as the others can cover within the gap."""
+    def remove_balls(self, level: _Level, gap: float) -> _Level:
+        """Remove balls as long as the others can cover the points within the gap."""
         tries = (0, 3, 8)[self.effort - 1]
         while len(level.centres) > 1:
             needs = self.gaps(level.centres)
             needs[level.owner, np.arange(self.number)] = np.inf
-            missed = np.zeros(len(level.centres))  # the gap where another ball would have to take over
+            missed = np.zeros(len(level.centres))  # gap that results if other balls contain these points
             np.maximum.at(missed, level.owner, needs.min(axis=0))
             for k in np.argsort(missed, kind="stable")[:tries]:
                 fewer = np.delete(level.centres, k, axis=0)
-                found = self.settle(_Level(fewer, level.owner, np.inf), 8, 4)
+                found = self.refine(_Level(fewer, level.owner, np.inf), 8, 4)
                 if found.gap <= gap:
                     level = found
                     break
@@ -151,21 +152,21 @@ class _Search:
         return level
 
     def cover(self, gap: float, most: int) -> _Level:
-        """Return balls within the gap, or about the least gap that ``most`` allow."""
+        """Return balls within the gap, or at most ``most`` balls with about the smallest possible gap."""
         turns, steps = ((3, 3), (8, 5), (12, 6))[self.effort - 1]
-        level = self.settle(self.greedy(gap, most * 3 // 2), turns, steps)
+        level = self.refine(self.greedy(gap, most * 3 // 2), turns, steps)
         if self.effort > 1 and level.gap <= 1.3 * gap:  # a sharp corner may keep the gap from being met
-            level = self.thin_out(level, max(level.gap, gap))
+            level = self.remove_balls(level, max(level.gap, gap))
         if len(level.centres) <= most:
             return level
         level = self.greedy(gap, most)
         wanted = max(level.gap, gap)
-        level = self.settle(level, turns, steps)
-        return level if wanted > gap else self.thin_out(level, gap)
+        level = self.refine(level, turns, steps)
+        return level if wanted > gap else self.remove_balls(level, gap)
 
 
 def _directions(count: int) -> Array:
-    """Return directions spread evenly over the sphere by the golden angle, shape (count, 3)."""
+    """Return unit vectors spread evenly over the sphere (golden spiral), shape (count, 3)."""
     k = np.arange(count) + 0.5
     z = 1.0 - 2.0 * k / count
     turn = np.pi * (1.0 + 5.0**0.5) * k
@@ -177,7 +178,10 @@ DIRECTIONS = _directions(150)
 
 
 def search(solid: Solid, gaps: Sequence[float], most: int, effort: int) -> Cover:
-    """Return a tree of balls around a solid that is close to a cover, for the proof to complete."""
+    """Return a tree of balls that nearly covers a solid; its radii are enlarged by the proof.
+
+    The arguments are those of :func:`apex_ompl.collision.cover.spheres.make_cover`.
+    """
     rng = np.random.default_rng(0)
     surface, inner, centres = ((350, 120, 350), (1200, 700, 1500), (3500, 1500, 4000))[effort - 1]
     candidates = solid.inside(centres)
@@ -186,18 +190,18 @@ def search(solid: Solid, gaps: Sequence[float], most: int, effort: int) -> Cover
     if effort > 1:
         run.candidates = np.concatenate([candidates, _towards(run, candidates, rng.permutation(len(points))[:centres])])
     leaves = run.cover(0.9 * gaps[-1], most)
-    if effort > 1:  # see to what the coarse points have missed
+    if effort > 1:  # cover also what lies between the coarse points
         points = _points(solid, 6 * surface, 2 * inner, rng)
         run = _Search(solid, points, np.arange(len(points)), candidates[:1], effort)
-        leaves = run.settle(leaves, 6, 5)
-    levels = [_finished(run, leaves)]
+        leaves = run.refine(leaves, 6, 5)
+    levels = [_tightened(run, leaves)]
     owner = levels[0].owner
     for wanted in reversed(gaps[:-1]):
         if len(levels[-1].centres) <= FLAT_BELOW:
             break
-        points, owner = _outermost(points, owner)
+        points, owner = _extreme_points(points, owner)
         run = _Search(solid, points, owner, candidates[:: max(1, len(candidates) // 1500)], effort)
-        level = _finished(run, run.cover(max(wanted, COARSER * levels[-1].gap), len(levels[-1].centres)))
+        level = _tightened(run, run.cover(max(wanted, COARSER * levels[-1].gap), len(levels[-1].centres)))
         if len(level.centres) < 0.6 * len(levels[-1].centres):
             levels.append(level)
             points, owner = run.points, level.owner[run.groups]
@@ -213,15 +217,15 @@ def _points(solid: Solid, surface: int, inner: int, rng: np.random.Generator) ->
 
 
 def _towards(run: _Search, candidates: Array, chosen: Indices) -> Array:
-    """Return centres between points and the candidates that suit them best: for corners that the grid is coarse for."""
+    """Return centres between points and their best candidates, for corners finer than the grid of candidates."""
     best = candidates[run.gaps(candidates)[:, chosen].argmin(axis=0)]
     points = run.points[chosen]
     between = points + np.array([0.2, 0.4, 0.6, 0.8])[np.arange(len(points)) % 4, None] * (best - points)
     return np.asarray(between[run.solid.depth(between) > 0.0])
 
 
-def _outermost(points: Array, owner: Indices) -> tuple[Array, Indices]:
-    """Return of each group of points those farthest out in many directions: they decide what ball it needs."""
+def _extreme_points(points: Array, owner: Indices) -> tuple[Array, Indices]:
+    """Return the extreme points of each group in many directions, which determine the ball that contains it."""
     keep = []
     for k in range(int(owner.max()) + 1):
         own = np.flatnonzero(owner == k)
@@ -236,8 +240,8 @@ def _spacing(solid: Solid, count: int) -> float:
     return float(np.sqrt(area / count))
 
 
-def _finished(run: _Search, level: _Level) -> _Level:
-    """Return a level without balls that hold nothing, each ball as small as what it holds allows."""
+def _tightened(run: _Search, level: _Level) -> _Level:
+    """Return a level without empty balls, each radius as small as the ball's points allow."""
     used, owner = np.unique(level.owner, return_inverse=True)
     radii = np.zeros(len(used))
     far = np.linalg.norm(run.points - level.centres[level.owner[run.groups]], axis=1)
@@ -246,8 +250,10 @@ def _finished(run: _Search, level: _Level) -> _Level:
 
 
 def _tree(points: Array, levels: list[_Level]) -> Cover:
-    """Return the tree of levels, finest first, below a ball around points, with no ball that has one child only."""
-    # Nodes as (level, ball); level -1 stands for no ball, len(levels) for the root.
+    """Return the tree of levels, finest first, under a root around all points; no ball has a single child.
+
+    A node is (level, ball), and the level of the root is len(levels).
+    """
     top = len(levels)
     children: dict[tuple[int, int], list[tuple[int, int]]] = {}
     for height in range(top - 1, -1, -1):
@@ -276,7 +282,7 @@ def _tree(points: Array, levels: list[_Level]) -> Cover:
         order += found
         k += 1
     centres, radii = [], []
-    middle = _middle(points)
+    middle = _enclosing_centre(points)
     for height, ball in order:
         centres.append(middle if height == top else levels[height].centres[ball])
         whole = height == top
@@ -284,8 +290,8 @@ def _tree(points: Array, levels: list[_Level]) -> Cover:
     return Cover(np.array(centres), np.array(radii), np.array(first, np.int64), np.array(count, np.int64))
 
 
-def _middle(points: Array) -> Array:
-    """Return the centre of about the smallest ball around points, shape (N, 3); after Badoiu and Clarkson (2003)."""
+def _enclosing_centre(points: Array) -> Array:
+    """Return the approximate centre of the smallest enclosing ball of points, shape (N, 3) (Badoiu, Clarkson 2003)."""
     centre = 0.5 * (points.min(axis=0) + points.max(axis=0))
     for k in range(1, 300):
         far = points[np.argmax(((points - centre) ** 2).sum(axis=1))]

@@ -1,6 +1,7 @@
-"""Covers: trees of balls that provably contain a solid, to prove two solids apart before their meshes are asked.
+"""Sphere covers: trees of balls that provably contain a solid, made, measured, written and read.
 
-:func:`make_cover` builds one (``sphere_search``), :func:`unproved` proves it (``sphere_proof``).
+Two solids are apart where their covers are, which is far cheaper to check than their meshes. :func:`make_cover`
+searches for a cover (``search``) and proves it (``proof``); :func:`unproved` repeats the proof.
 """
 
 from __future__ import annotations
@@ -14,9 +15,10 @@ from typing import Any
 import coal
 import numpy as np
 
-from apex_ompl.collision.cover.proof import PAD, Cover, boxes_left, distances, grown
+from apex_ompl.collision.cover.convex_parts import RoundBody
+from apex_ompl.collision.cover.proof import PAD, Cover, distances, grow_to_cover, uncovered_boxes
 from apex_ompl.collision.cover.search import search
-from apex_ompl.collision.cover.solids import Round, solid_of
+from apex_ompl.collision.cover.solids import solid_of
 from apex_ompl.collision.shapes import is_shell
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError
 from apex_ompl.scene.meshes import triangles
@@ -28,16 +30,16 @@ __all__ = ["GAPS", "Cover", "make_cover", "quality", "read_covers", "shape_key",
 SCHEMA = "apex-ompl/spheres/1"
 COLUMNS = ["x", "y", "z", "radius", "first child", "children"]
 LARGEST = 1e6  # numbers of a file beyond are a fault [m]
-GAPS = (0.02, 0.007, 0.0025)  # [m]
-MOST = (64, 96, 256)  # leaves of a cover: of a quick one, of others, of a mesh that is not convex; the gap gives way
-QUICK = 4.0  # a quick cover grows by boxes so much larger, which takes less time and leaves more to spare
+GAPS = (0.02, 0.007, 0.0025)  # how far the balls of each level may protrude from the solid [m]
+MOST = (64, 96, 256)  # most leaves of a quick cover, of other covers, and of a mesh that is not convex
+QUICK = 4.0  # size of the boxes in which a quick cover is grown, relative to those of its proof
 
 
 def shape_key(geometry: coal.CollisionGeometry) -> str:
-    """Return 16 hexadecimal digits that tell a shape from others: of its kind and sizes, or of its triangles.
+    """Return the identifier of a shape, 16 hexadecimal digits of a hash of its kind and sizes or of its triangles.
 
     Raises:
-        ParameterError: A kind of geometry that has no cover.
+        ParameterError: The kind of geometry has no cover.
     """
     kind = geometry.getNodeType()
     names = {coal.GEOM_BOX: "box", coal.GEOM_SPHERE: "sphere", coal.GEOM_CYLINDER: "cylinder"}
@@ -69,14 +71,14 @@ def make_cover(
 
     Args:
         geometry: Box, sphere, cylinder, capsule, convex body or mesh.
-        gaps: How far the balls of each level below the root may stand out of the solid [m], descending. Sides that
-            would need more than ``most`` leaves get a larger gap.
+        gaps: How far the balls of each level below the root may protrude from the solid [m], descending. The gap is
+            enlarged where it would need more than ``most`` leaves.
         most: Largest number of leaves, by default 64 with effort 1, 96 with more, 256 for a mesh that is not convex.
-        effort: How thorough the search is, 1 (tens of milliseconds) to 3 (seconds); by default 1 for simple shapes
-            and 3 for meshes.
+        effort: Effort of the search, 1 (tens of milliseconds) to 3 (seconds); by default 1 for simple shapes and 3
+            for meshes.
 
     Raises:
-        ParameterError: Gaps that are not positive and descending, or a geometry without a cover.
+        ParameterError: The gaps are not positive and descending, or the kind of geometry has no cover.
     """
     if not gaps or min(gaps) <= 0.0 or sorted(gaps, reverse=True) != list(gaps):
         raise ParameterError("gaps", gaps, "positive numbers, descending")
@@ -86,28 +88,28 @@ def make_cover(
     if most is None:
         most = MOST[2] if len(solid.parts) > 1 else MOST[min(effort, 2) - 1]
     part = solid.parts[0]
-    if isinstance(part, Round) and part.capped:
+    if isinstance(part, RoundBody) and part.capped:
         return _capsule(part, gaps[-1], most)
     cover = search(solid, gaps, most, effort)
-    made = _rounded(grown(solid, cover, QUICK if effort == 1 else 1.0))
-    if len(boxes_left(solid, made)):
-        raise AssertionError("a cover that has grown to its proof is not proved")
+    made = _rounded(grow_to_cover(solid, cover, QUICK if effort == 1 else 1.0))
+    if len(uncovered_boxes(solid, made)):
+        raise AssertionError("a cover that has grow_to_cover to its proof is not proved")
     return made
 
 
 def unproved(geometry: coal.CollisionGeometry, cover: Cover) -> Array:
-    """Return the centres of the boxes that could not be proved to be covered, shape (N, 3) [m]; none: proved."""
-    return boxes_left(solid_of(geometry), cover)
+    """Return the centres of boxes that are not proved to be covered, shape (N, 3) [m]; a proved cover has none."""
+    return uncovered_boxes(solid_of(geometry), cover)
 
 
 def quality(
     geometry: coal.CollisionGeometry, cover: Cover, rng: np.random.Generator, samples: int = 20_000
 ) -> tuple[float, float, float]:
-    """Return how tight the leaves are: volume relative to the solid, mean and largest gap [m].
+    """Return the tightness of the leaves: their volume relative to the solid, mean and largest gap [m].
 
-    The gaps are distances to the solid from ``samples`` / 10 points on the surface of the union of the leaves, the
-    volumes come from ``samples`` points each. Meshes that are not convex are measured against the parts that stand
-    for them, the gaps against their triangles.
+    The gaps are distances to the solid from ``samples`` / 10 points on the surface of the union of the leaves. Each
+    volume is a Monte Carlo estimate from ``samples`` points. The volume of a mesh that is not convex is that of the
+    convex parts that represent it; its gaps are distances to its triangles.
     """
     solid = solid_of(geometry)
     centres, radii = cover.centres[cover.leaves], cover.radii[cover.leaves]
@@ -134,7 +136,7 @@ def quality(
 
 
 def write_covers(path: Path | str, covers: Mapping[str, Cover]) -> None:
-    """Write covers by the keys of their shapes, in micrometres rounded so that the proof holds for what is written.
+    """Write covers by the keys of their shapes, rounded outward to micrometres so that they stay proved.
 
     Raises:
         MissingFileError: The file cannot be written.
@@ -180,7 +182,11 @@ def _is_number(value: Any) -> bool:
 
 
 def _cover_of(rows: Any, file: str, field: str) -> Cover:
-    """Return the cover that rows of a file describe, or say what is wrong with them."""
+    """Return the cover in the rows of a file.
+
+    Raises:
+        FileFormatError: The rows do not describe a tree of balls.
+    """
     if not isinstance(rows, list) or not rows:
         raise FileFormatError(file, field, rows, "expected a list of balls")
     following = 1
@@ -204,12 +210,12 @@ def _cover_of(rows: Any, file: str, field: str) -> Cover:
     return Cover(table[:, :3].copy(), table[:, 3].copy(), links[:, 0].copy(), links[:, 1].copy())
 
 
-def _capsule(part: Round, gap: float, most: int) -> Cover:
-    """Return balls along the axis of a capsule, all of one size.
+def _capsule(part: RoundBody, gap: float, most: int) -> Cover:
+    """Return balls of equal size along the axis of a capsule of radius r and half length h.
 
-    A ball at the end stands out by e, so its radius is r + e, and its centre is e before the end of the axis. It
-    holds the capsule for a length s = sqrt(2 r e + e^2) to either side of its centre, so n balls reach from the
-    middle to the end of the axis when e + (n - 1) s is the half length.
+    A ball that protrudes by e has the radius r + e, and the centre of the last one is e before the end of the axis.
+    A ball contains the cylinder up to s = sqrt(2 r e + e^2) on either side of its centre, so n balls cover the
+    capsule when e + (n - 1) s = h, which is solved for e by bisection.
     """
     gap = min(gap, max(0.5 * part.radius, 1e-3))
     number = 1
@@ -236,7 +242,7 @@ def _capsule(part: Round, gap: float, most: int) -> Cover:
 
 
 def _rounded(cover: Cover) -> Cover:
-    """Return a cover in whole micrometres whose balls contain those given."""
+    """Return a cover rounded to micrometres whose balls contain the given ones."""
     centres = np.round(cover.centres, 6)
     shift = np.linalg.norm(centres - cover.centres, axis=1)
     radii = np.round(np.ceil((cover.radii + shift) * 1e6 - 1e-4) / 1e6, 6)

@@ -1,0 +1,63 @@
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from apex_ompl.errors import ParameterError
+from apex_ompl.util import validation as v
+
+
+@pytest.mark.parametrize(
+    ("check", "message"),
+    [
+        (lambda: v.check_number(-1.0, "x", 0.0), "x: expected a number, 0 or more, got -1.0"),
+        (lambda: v.check_number(2, "x", 0.0, 1.0), "x: expected a number from 0 to 1, got 2"),
+        (lambda: v.check_number(float("inf"), "x"), "x: expected a number, got inf"),
+        (lambda: v.check_number(10**400, "x", 0.0, 1.0), "x: expected a number from 0 to 1, got 1000"),
+        (lambda: v.check_positive(0.0, "x"), "x: expected a positive number, got 0.0"),
+        (
+            lambda: v.check_positive("1", "x", "a positive number of seconds"),
+            "x: expected a positive number of seconds",
+        ),
+        (lambda: v.check_integer(True, "n"), "n: expected a whole number, 0 or more, got True"),
+        (lambda: v.check_integer(4, "n", 1, 3), "n: expected a whole number from 1 to 3, got 4"),
+        (lambda: v.check_seed(2**31), "seed: expected a whole number from 0 to 2147483647, got 2147483648"),
+        (lambda: v.finite_array([1.0, np.nan], "q"), "q: expected finite numbers, got nan"),
+        (lambda: v.finite_array("abc", "q"), "q: expected finite numbers, got 'abc'"),
+        (lambda: v.check_nonnegative([0.0, -1.0], "d"), "d: expected a number, 0 or more, got"),
+        (lambda: v.check_indices([0, 3], 3, "fixed", "joints"), "fixed: expected numbers of joints, 0 to 2, got"),
+        (lambda: v.check_array(np.zeros(2), (3,), "q"), "q: expected an array of shape (3,), got (2,)"),
+        (lambda: v.check_states(np.zeros((2, 3)), 4), "states: expected an array of shape (N, 4), got (2, 3)"),
+        (lambda: v.check_states(np.zeros((0, 4)), 4, "path", least=1), "shape (N, 4), N at least 1, got (0, 4)"),
+        (lambda: v.check_path(np.zeros((1, 4))), "finite numbers of shape (N, dof), N at least 2, got (1, 4)"),
+        (lambda: v.check_path([[0.0], [np.inf]]), "finite numbers of shape (N, dof), N at least 2, got inf"),
+        (lambda: v.check_times(np.array([0.0, 1.0, 1.0])), "times: expected times that start at 0 and increase"),
+        (lambda: v.check_times(np.array([0.0, 1.0]), 3), "times: expected finite numbers of shape (3,)"),
+    ],
+)
+def test_the_error_names_the_value_and_what_was_expected(check: Callable[[], object], message: str) -> None:
+    with pytest.raises(ParameterError) as error:
+        check()
+    assert message in str(error.value)
+
+
+def test_good_values_pass() -> None:
+    v.check_number(np.float32(0.5), "x", 0.0, 1.0)
+    v.check_positive(np.int64(3), "x")
+    assert type(v.check_integer(np.int64(3), "n", 3, 3)) is int
+    v.check_nonnegative([0.0, np.inf], "d")
+    v.check_indices(np.array([0, 2]), 3, "fixed", "joints")
+    v.check_array(np.zeros((5, 14, 16)), ("B", 14, 16), "control points", finite=True)
+    v.check_times(np.array([0.0, 0.1]), 2)
+    assert v.check_path([[0, 1], [2, 3]]).dtype == float
+
+
+@pytest.mark.parametrize("text", ["-1", "1.5", "2147483648", "x", ""])
+def test_integers_on_a_command_line(text: str) -> None:
+    for read in (v.whole_number, v.one_or_more):
+        with pytest.raises(argparse.ArgumentTypeError, match="expected a whole number"):
+            read(text)
+    assert v.whole_number("0") == 0 and v.one_or_more("7") == 7
