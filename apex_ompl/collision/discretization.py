@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel.entries import MOST_STEPS
+from apex_ompl.trajopt.path import states_between
 from apex_ompl.types import Array
 
 
@@ -43,21 +43,6 @@ def bit_reversed(n: int) -> NDArray[np.intp]:
     order = turned[turned < n].astype(np.intp)
     order.flags.writeable = False
     return order
-
-
-def states_between(a: Array, b: Array, resolution: float) -> Array:
-    """Return evenly spaced states strictly between two, at most ``resolution`` apart [rad, max-norm].
-
-    Args:
-        a: First state, shape (dof,).
-        b: Last state, shape (dof,).
-        resolution: Largest spacing, also of the first state from ``a`` and of the last from ``b``.
-
-    Returns:
-        States, shape (M, dof); M is 0 when ``a`` and ``b`` are at most ``resolution`` apart.
-    """
-    n = max(1, math.ceil(float(np.abs(b - a).max()) / resolution))
-    return a + (np.arange(1, n) / n)[:, None] * (b - a)
 
 
 def sample_path(path: Array, resolution: float) -> tuple[Array, NDArray[np.intp]]:
