@@ -33,7 +33,8 @@ from toppra import algorithm, constraint
 from tqdm import tqdm
 
 from apex_ompl import plan, problems
-from apex_ompl.kernel.reachability import farthest, fastest
+from apex_ompl.kernel.compiled.polyline_distance import max_distance
+from apex_ompl.kernel.compiled.time_parameterization import max_path_speeds
 from apex_ompl.ompl_adapter.setup import assemble
 from apex_ompl.ompl_adapter.validity import full_check
 from apex_ompl.problems.reach import robot
@@ -142,7 +143,7 @@ def by_waypoints(path: np.ndarray) -> Trajectory | None:
     """Return the motion by Ruckig from waypoint to waypoint."""
     curve, first, second = curve_of(path)
     step, x = curve.spacing / PER_PIECE, np.empty(len(first))
-    fastest(first, second, LIMITS.velocity, LIMITS.acceleration, step, x)
+    max_path_speeds(first, second, LIMITS.velocity, LIMITS.acceleration, step, x)
     chosen = np.unique(np.linspace(0, len(x) - 1, max(2, math.ceil(step * len(x) / 0.2))).astype(int))
     points, still = curve.points(chosen * step), np.zeros(len(NAMES))
     states = [(q, 0.999 * first[k] * math.sqrt(x[k]), still) for q, k in zip(points, chosen, strict=True)]
@@ -224,7 +225,7 @@ def deviation_of(motion: Trajectory, path: np.ndarray) -> float:
     """Return the largest distance of samples from a path [rad]."""
     line, states = Polyline.through(path), motion.sample(EACH).position
     arc = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(states, axis=0), axis=1)))
-    return float(farthest(states, arc * line.length / max(arc[-1], 1e-12), line.states, line.arc, 1.5))
+    return float(max_distance(states, arc * line.length / max(arc[-1], 1e-12), line.states, line.arc, 1.5))
 
 
 def judge(figures: Figures, motion: Trajectory | None, path: np.ndarray, checker: Any, best: float | None) -> None:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.shapes import coal_geometry
-from apex_ompl.kernel import Inverse, Kernel, RobotTables
+from apex_ompl.kernel import IKSolver, Kernel, RobotTables
 from apex_ompl.problems.objects import Held, block_and_peg, boxes, cup_and_ball, put_in_hands
 from apex_ompl.problems.outline import Outline
 from apex_ompl.problems.reach import keeps_clear, robot, scene_kernel
@@ -57,7 +57,7 @@ class Holding:
     attached: tuple[AttachedObject, ...]
     home: Array
     goal: AlignmentGoal
-    inverse: Inverse
+    inverse: IKSolver
     tables: RobotTables
     checker: CollisionChecker
     corners: tuple[tuple[int, Array], ...]

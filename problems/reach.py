@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.shapes import world_geometry
 from apex_ompl.collision.tabulate import primitives, tabulate_scene
-from apex_ompl.kernel import Kernel, RobotTables, facing, gap
+from apex_ompl.kernel import Kernel, RobotTables, offset_target, opposition_target
 from apex_ompl.robot import Robot, load_robot
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.tasks.inverse_kinematics import Links, in_world
@@ -50,7 +50,7 @@ def bare_tables() -> RobotTables:
 @cache
 def arm_tables() -> tuple[RobotTables, ...]:
     """Return tables that judge one arm each, with its hand."""
-    return tuple(bare_tables().judging(joints) for joints in sides())
+    return tuple(bare_tables().restricted_to(joints) for joints in sides())
 
 
 def scene_kernel(tables: RobotTables, scene: Sequence[Obstacle]) -> Kernel:
@@ -121,8 +121,8 @@ class HandPoses:
         links, hand = Links.of(self.robot), list(self.robot.hands.values())[arm]
         point, fingers = region.draw(rng)
         targets = [
-            gap(in_world(point), links.point(hand.palm, hand.point)),
-            facing(links.direction(hand.palm, hand.fingers), in_world(fingers), -1.0),
+            offset_target(in_world(point), links.point(hand.palm, hand.point)),
+            opposition_target(links.direction(hand.palm, hand.fingers), in_world(fingers), -1.0),
         ]
         states = self.robot.home + rng.normal(0.0, SPREAD, (DESCENTS, self.robot.dof))
         states[:, self._hands] = rng.uniform(*hands, (DESCENTS, len(self._hands)))

@@ -6,7 +6,8 @@ import numpy as np
 import pinocchio as pin
 
 from apex_ompl.kernel import robot_builder
-from apex_ompl.kernel.tables import FIXED, PRISMATIC, REVOLUTE, RobotTables
+from apex_ompl.kernel.compiled.arrays import FIXED, PRISMATIC, REVOLUTE
+from apex_ompl.kernel.tables import RobotTables
 
 
 def unit(rng: np.random.Generator) -> np.ndarray:

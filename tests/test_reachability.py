@@ -7,7 +7,8 @@ import pytest
 from scipy.optimize import linprog
 from support import distance
 
-from apex_ompl.kernel.reachability import farthest, fastest, moments
+from apex_ompl.kernel.compiled.polyline_distance import max_distance
+from apex_ompl.kernel.compiled.time_parameterization import max_path_speeds, sample_times
 from apex_ompl.trajectory.curve import Curve, Polyline
 
 VELOCITY, ACCELERATION = np.array([2.0, 2.5, 1.5]), np.array([10.0, 15.0, 8.0])
@@ -22,7 +23,7 @@ def test_the_greatest_speeds_are_those_of_a_linear_program(seed: int) -> None:
     first, second = curve.derivatives(12)
     n, step = len(first), curve.spacing / 12
     x = np.empty(n)
-    fastest(first, second, VELOCITY, ACCELERATION, step, x)
+    max_path_speeds(first, second, VELOCITY, ACCELERATION, step, x)
     rows, bounds = [], []
     for i in range(n - 1):  # |q' u + q'' x| <= a with u = (x[i + 1] - x[i]) / (2 step)
         for j in range(3):
@@ -36,7 +37,7 @@ def test_the_greatest_speeds_are_those_of_a_linear_program(seed: int) -> None:
     found = linprog(-np.ones(n), np.array(rows), np.array(bounds), bounds=np.stack([np.zeros(n), most], 1))
     assert found.success
     duration, least = (np.sum(2.0 * step / (np.sqrt(y[1:]) + np.sqrt(y[:-1]))) for y in (x, np.maximum(found.x, 0.0)))
-    assert moments(x, step, 0.0, np.empty(0)) == pytest.approx(duration) and duration < 1.01 * least
+    assert sample_times(x, step, 0.0, np.empty(0)) == pytest.approx(duration) and duration < 1.01 * least
     if seed == 2:  # without such a place
         np.testing.assert_allclose(x, found.x, atol=1e-6)
 
@@ -44,9 +45,9 @@ def test_the_greatest_speeds_are_those_of_a_linear_program(seed: int) -> None:
 def test_places_at_even_times_follow_the_speeds() -> None:
     x = np.append(np.linspace(0.0, 4.0, 50), np.linspace(4.0, 0.0, 50)[1:])  # even acceleration, then the opposite
     step = 0.02
-    duration = moments(x, step, 0.0, np.empty(0))
+    duration = sample_times(x, step, 0.0, np.empty(0))
     place = np.empty(101)
-    assert moments(x, step, duration / 100, place) == duration
+    assert sample_times(x, step, duration / 100, place) == duration
     push, half = 4.0 / (2 * 49 * step), duration / 2
     times = np.linspace(0.0, duration, 101)
     rising = 0.5 * push * times**2
@@ -77,5 +78,5 @@ def test_distances_from_a_polyline_are_those_from_all_its_sides() -> None:
     line = Polyline.through(path)
     places = np.sort(rng.uniform(0.0, line.length, 50))
     points = line.at(places) + rng.normal(0.0, 0.01, (50, 3))
-    assert farthest(points, places, line.states, line.arc, 99.0) == pytest.approx(distance(points, path), rel=1e-12)
-    assert farthest(points, places, line.states, line.arc, 0.1) >= distance(points, path) - 1e-12
+    assert max_distance(points, places, line.states, line.arc, 99.0) == pytest.approx(distance(points, path), rel=1e-12)
+    assert max_distance(points, places, line.states, line.arc, 0.1) >= distance(points, path) - 1e-12

@@ -20,7 +20,7 @@ from apex_ompl.collision.path_grid import bit_reversed, sample_path
 from apex_ompl.collision.shapes import coal_geometry, world_geometry
 from apex_ompl.errors import ParameterError, SceneError
 from apex_ompl.kernel import Kernel
-from apex_ompl.kernel.entries import MOST_STEPS
+from apex_ompl.kernel.compiled.motion_proof import MOST_STEPS
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import AttachedObject, Body, Obstacle
 from apex_ompl.types import Array

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from apex_ompl.kernel.tables import FIXED, PRISMATIC, REVOLUTE, RobotArrays, RobotTables
+from apex_ompl.kernel.compiled.arrays import FIXED, PRISMATIC, REVOLUTE, RobotArrays
+from apex_ompl.kernel.tables import RobotTables
 from apex_ompl.types import Array
 
 SAMPLES = 65  # of a cluster's inner joint, when its ball is made

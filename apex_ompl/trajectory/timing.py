@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from apex_ompl.errors import ParameterError, TimingError
-from apex_ompl.kernel.reachability import farthest, fastest, moments
+from apex_ompl.kernel.compiled.polyline_distance import max_distance
+from apex_ompl.kernel.compiled.time_parameterization import max_path_speeds, sample_times
 from apex_ompl.robot.model import Limits
 from apex_ompl.trajectory.curve import SAME, Curve, Polyline
 from apex_ompl.trajectory.motion import Trajectory
@@ -123,7 +124,7 @@ def time_path(
 
     A straight line is run along by a jerk-limited profile of Ruckig's (Berscheid and Kroeger 2021), which is the
     fastest. Any other path is made a curve that blends corners; reachability analysis gives the fastest way along it
-    within the limits of velocity and acceleration (:mod:`apex_ompl.kernel.reachability`). States at even times there
+    within the limits of velocity and acceleration (``kernel.compiled.time_parameterization``). States at even times there
     are control points of a uniform cubic B-spline in time: averages of what is within the limits are, and its jerk, the
     change of acceleration from one knot to the next, is bounded by the distance of the knots, which is chosen so that
     the motion is shortest. What is left over a limit is taken away by stretching time. Where ``fault`` finds one, the
@@ -194,7 +195,7 @@ def blended(line: Polyline, limits: Limits, names: tuple[str, ...], within: floa
     first, second = curve.derivatives(PER_PIECE)
     step, window = curve.spacing / PER_PIECE, 2.0 * curve.spacing
     grid = np.linspace(0.0, line.length, len(first))
-    if farthest(curve.points(grid), grid, line.states, line.arc, window) > within:
+    if max_distance(curve.points(grid), grid, line.states, line.arc, window) > within:
         return None
     x = np.empty(len(first))
     tried: dict[int, tuple[float, Array, Array]] = {}  # the spacing that the limits let, control points, their places
@@ -203,11 +204,13 @@ def blended(line: Polyline, limits: Limits, names: tuple[str, ...], within: floa
         """Return the duration with a spacing of knots; what it takes is kept."""
         if which not in tried:
             apart = SPACINGS[which]
-            fastest(first, second, limits.velocity, np.minimum(limits.acceleration, limits.jerk * apart), step, x)
-            took = moments(x, step, 0.0, np.empty(0))
+            max_path_speeds(
+                first, second, limits.velocity, np.minimum(limits.acceleration, limits.jerk * apart), step, x
+            )
+            took = sample_times(x, step, 0.0, np.empty(0))
             count = max(1, int(took / apart))
             place = np.empty(count + 1)
-            moments(x, step, took / count, place)
+            sample_times(x, step, took / count, place)
             place[-1] = line.length
             points = curve.points(place)
             points[0], points[-1] = line.states[0], line.states[-1]
@@ -290,7 +293,7 @@ def _deviation(motion: Trajectory, line: Polyline, places: tuple[Array, Array], 
     if len(line.states) == 1:
         off = float(np.linalg.norm(points - line.states[0], axis=1).max())
     else:
-        off = float(farthest(points, np.interp(times, *places), line.states, line.arc, window))
+        off = float(max_distance(points, np.interp(times, *places), line.states, line.arc, window))
     between = float(np.linalg.norm(np.diff(points, axis=0), axis=1).max(initial=0.0)) / 2.0
     return off + between
 
@@ -315,6 +318,6 @@ def _lasting(motion: Trajectory, duration: float) -> Trajectory:
 def warm_up() -> None:
     """Load the compiled code, which takes a hundredth of a second in each process, or a few seconds when it is new."""
     x = np.empty(3)
-    fastest(np.ones((3, 1)), np.zeros((3, 1)), np.ones(1), np.ones(1), 1.0, x)
-    moments(x, 1.0, 1.0, np.empty(1))
-    farthest(np.zeros((1, 1)), np.zeros(1), np.array([[0.0], [1.0]]), np.array([0.0, 1.0]), 1.0)
+    max_path_speeds(np.ones((3, 1)), np.zeros((3, 1)), np.ones(1), np.ones(1), 1.0, x)
+    sample_times(x, 1.0, 1.0, np.empty(1))
+    max_distance(np.zeros((1, 1)), np.zeros(1), np.array([[0.0], [1.0]]), np.array([0.0, 1.0]), 1.0)
