@@ -124,7 +124,7 @@ def time_path(
 
     A straight line is run along by a jerk-limited profile of Ruckig's (Berscheid and Kroeger 2021), which is the
     fastest. Any other path is made a curve that blends corners; reachability analysis gives the fastest way along it
-    within the limits of velocity and acceleration (``kernel.compiled.time_parameterization``). States at even times there
+    within the limits of velocity and acceleration (``compiled.time_parameterization``). States at even times there
     are control points of a uniform cubic B-spline in time: averages of what is within the limits are, and its jerk, the
     change of acceleration from one knot to the next, is bounded by the distance of the knots, which is chosen so that
     the motion is shortest. What is left over a limit is taken away by stretching time. Where ``fault`` finds one, the

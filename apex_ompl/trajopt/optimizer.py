@@ -15,7 +15,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel import Kernel
-from apex_ompl.kernel.compiled.path_cost import CostSettings, PathCost, optimization_buffer_sizes, path_cost
+from apex_ompl.kernel.compiled.path_cost import (
+    CostSettings,
+    PathReport,
+    Report,
+    optimization_buffer_sizes,
+    path_cost,
+)
 from apex_ompl.kernel.compiled.path_optimization import optimize_path
 from apex_ompl.trajopt.spline import Spline
 from apex_ompl.types import Array
@@ -137,15 +143,22 @@ class Optimizer:
         """
         control = self._control(kernel, control)
         grid, sizes = _grid(self.spline, self.settings.samples), (self.spline.free, control.shape[2])
-        buffers, settings = self._buffers(kernel), self._cost_settings()
+        buffers, numbers = self._buffers(kernel), tuple(self._cost_settings())
         gradients = np.empty((len(control), sizes[0] * sizes[1]))
-        costs = [
+        reports = [
             path_cost(
-                *kernel.packed, *kernel.workspace(), *grid, self.spline.pinned, points, settings, *buffers, gradient
+                *kernel.packed,
+                *kernel.workspace(),
+                *grid,
+                self.spline.pinned,
+                points,
+                tuple(settings),
+                *buffers,
+                gradient,
             )
             for points, gradient in zip(control, gradients, strict=True)
         ]
-        result = self._result(control, [(cost, 0, settings.damping) for cost in costs])
+        result = self._result(control, reports)
         return result, gradients.reshape(-1, *sizes)
 
     def improve(
@@ -186,7 +199,7 @@ class Optimizer:
         reports = [
             optimize_path(
                 *kernel.packed, *kernel.workspace(), *grid, self.spline.pinned, points,
-                settings._replace(damping=float(first)), *buffers,
+                tuple(settings._replace(damping=first)), *buffers,
             )
             for kernel, points, first in zip(each, control, dampings, strict=True)
         ]  # fmt: skip
@@ -270,12 +283,10 @@ class Optimizer:
         return np.empty(integers, np.int64), np.empty(floats)
 
     @staticmethod
-    def _result(control: Array, reports: Sequence[tuple[PathCost, int, float]]) -> OptimizationResult:
-        """Return control points with the cost, steps and damping of each path."""
-        costs = np.array([cost for cost, _, _ in reports]).reshape(-1, len(PathCost._fields))
-        steps = np.array([taken for _, taken, _ in reports], np.int64)
-        damping = np.array([damping for _, _, damping in reports], float)
-        return OptimizationResult(control, costs[:, 0], costs[:, 1], costs[:, 2:], steps, damping)
+    def _result(control: Array, reports: Sequence[Report]) -> OptimizationResult:
+        r = PathReport(*np.array(reports, float).reshape(-1, len(PathReport._fields)).T)
+        clearance = np.stack([r.scene_clearance, r.own_clearance], axis=1)
+        return OptimizationResult(control, r.cost, r.clearance_cost, clearance, r.steps.astype(np.int64), r.damping)
 
 
 @lru_cache(maxsize=32)

@@ -59,6 +59,24 @@ class PathCost(NamedTuple):
     own_clearance: float
 
 
+class PathReport(NamedTuple):
+    """Result of the compiled functions: the fields of :class:`PathCost`, steps taken, and the damping to go on with.
+
+    They return, and take, plain tuples, since numba unpickles the class of a named tuple at every call from Python.
+    """
+
+    cost: float
+    clearance_cost: float
+    scene_clearance: float
+    own_clearance: float
+    steps: int
+    damping: float
+
+
+Numbers = tuple[float, float, float, float, float, float, int]  # of CostSettings
+Report = tuple[float, float, float, float, int, float]  # of PathReport
+
+
 class Buffers(NamedTuple):
     """Memory for the steps of one path; the unknowns are the free control points, joint by joint.
 
@@ -187,12 +205,13 @@ def evaluate(
 @entry_point
 def path_cost(
     ri: Integers, rf: Floats, si: Integers, sf: Floats, wi: Integers, wf: Floats, weights: Floats, first: Integers,
-    speed_gram: Floats, pinned: int, control: Floats, settings: CostSettings, bi: Integers, bf: Floats,
-    gradient: Floats,
-) -> PathCost:  # fmt: skip
+    speed_gram: Floats, pinned: int, control: Floats, numbers: Numbers, bi: Integers, bf: Floats, gradient: Floats,
+) -> Report:  # fmt: skip
     """Return the cost of a path, put its gradient (n,) into place; see ``optimize_path`` for the arguments."""
     t, s = robot_view(ri, rf), scene_view(si, sf)
     w = workspace_view(t, wi, wf)
     points, dof = control.shape
     b = buffers_view(bi, bf, (points - 2 * pinned) * dof, points, dof)
-    return evaluate(t, s, w, weights, first, speed_gram, pinned, control, settings, b, gradient, b.gram[0])
+    settings = CostSettings(*numbers)
+    c = evaluate(t, s, w, weights, first, speed_gram, pinned, control, settings, b, gradient, b.gram[0])
+    return c.cost, c.clearance_cost, c.scene_clearance, c.own_clearance, 0, settings.damping

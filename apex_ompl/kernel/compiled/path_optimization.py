@@ -16,7 +16,7 @@ import math
 from apex_ompl.kernel.compiled.arrays import RobotArrays, robot_view, scene_view
 from apex_ompl.kernel.compiled.compilation import entry_point, inlined
 from apex_ompl.kernel.compiled.layout import Floats, Integers
-from apex_ompl.kernel.compiled.path_cost import CostSettings, PathCost, buffers_view, evaluate
+from apex_ompl.kernel.compiled.path_cost import CostSettings, Numbers, Report, buffers_view, evaluate
 from apex_ompl.kernel.compiled.workspace import workspace_view
 
 LEAST_DAMPING, MOST_DAMPING = 1e-9, 1e9
@@ -95,8 +95,8 @@ def _add_step(t: RobotArrays, control: Floats, pinned: int, step: Floats, trial:
 @entry_point
 def optimize_path(
     ri: Integers, rf: Floats, si: Integers, sf: Floats, wi: Integers, wf: Floats, weights: Floats, first: Integers,
-    speed_gram: Floats, pinned: int, control: Floats, settings: CostSettings, bi: Integers, bf: Floats,
-) -> tuple[PathCost, int, float]:  # fmt: skip
+    speed_gram: Floats, pinned: int, control: Floats, numbers: Numbers, bi: Integers, bf: Floats,
+) -> Report:  # fmt: skip
     """Improve a path in place; its control points (P, dof) are put inside the limits.
 
     Args:
@@ -111,18 +111,19 @@ def optimize_path(
         speed_gram: Gram matrix A of the speed, shape (P, P).
         pinned: Number of control points at each end that stay.
         control: Control points.
-        settings: The settings.
+        numbers: The fields of :class:`apex_ompl.kernel.compiled.path_cost.CostSettings`.
         bi: Buffers, see :func:`apex_ompl.kernel.compiled.path_cost.optimization_buffer_sizes`.
         bf: Buffers.
 
     Returns:
-        Cost of the path, steps taken, and the damping to go on with.
+        The fields of :class:`apex_ompl.kernel.compiled.path_cost.PathReport`.
     """
     t, s = robot_view(ri, rf), scene_view(si, sf)
     w = workspace_view(t, wi, wf)
     points, dof = control.shape
     n = (points - 2 * pinned) * dof
     b = buffers_view(bi, bf, n, points, dof)
+    settings = CostSettings(*numbers)
     for i in range(points):
         for d in range(dof):
             if pinned <= i < points - pinned:
@@ -156,4 +157,4 @@ def optimize_path(
                 control[i, d] = b.trial[i, d]
         if gain < settings.tolerance * cost.cost:
             break
-    return cost, taken, damping
+    return cost.cost, cost.clearance_cost, cost.scene_clearance, cost.own_clearance, taken, damping
