@@ -12,7 +12,8 @@ from apex_ompl.collision.containment import Host
 from apex_ompl.collision.cover.proof import Cover
 from apex_ompl.errors import RobotError
 from apex_ompl.kernel.compiled.arrays import BOX, CAPSULE, CYLINDER, HALF_SPACE, PRISMATIC, REVOLUTE, SPHERE
-from apex_ompl.kernel.robot_builder import BodySpec, JointSpec, robot_tables
+from apex_ompl.kernel.robot_builder import robot_tables
+from apex_ompl.kernel.robot_specs import BodySpec, JointSpec
 from apex_ompl.kernel.scene_builder import Primitive, scene_tables
 from apex_ompl.kernel.tables import RobotTables, SceneTables
 from apex_ompl.robot import Robot

@@ -147,19 +147,11 @@ class Optimizer:
         gradients = np.empty((len(control), sizes[0] * sizes[1]))
         reports = [
             path_cost(
-                *kernel.packed,
-                *kernel.workspace(),
-                *grid,
-                self.spline.pinned,
-                points,
-                tuple(settings),
-                *buffers,
-                gradient,
+                *kernel.packed, *kernel.workspace(), *grid, self.spline.pinned, points, numbers, *buffers, gradient
             )
             for points, gradient in zip(control, gradients, strict=True)
         ]
-        result = self._result(control, reports)
-        return result, gradients.reshape(-1, *sizes)
+        return self._result(control, reports), gradients.reshape(-1, *sizes)
 
     def improve(
         self,
@@ -194,12 +186,12 @@ class Optimizer:
                 raise ParameterError(name, number, "a number, 0 or more")
         grid = _grid(self.spline, self.settings.samples)
         settings = self._cost_settings(steps, stiffness, enough)
-        dampings = np.broadcast_to(self.settings.damping if damping is None else damping, len(control)).tolist()
+        dampings = np.broadcast_to(self.settings.damping if damping is None else damping, len(control))
         buffers = self._buffers(each[0]) if each else ()
         reports = [
             optimize_path(
                 *kernel.packed, *kernel.workspace(), *grid, self.spline.pinned, points,
-                tuple(settings._replace(damping=first)), *buffers,
+                tuple(settings._replace(damping=float(first))), *buffers,
             )
             for kernel, points, first in zip(each, control, dampings, strict=True)
         ]  # fmt: skip
@@ -284,9 +276,15 @@ class Optimizer:
 
     @staticmethod
     def _result(control: Array, reports: Sequence[Report]) -> OptimizationResult:
-        r = PathReport(*np.array(reports, float).reshape(-1, len(PathReport._fields)).T)
-        clearance = np.stack([r.scene_clearance, r.own_clearance], axis=1)
-        return OptimizationResult(control, r.cost, r.clearance_cost, clearance, r.steps.astype(np.int64), r.damping)
+        named = [PathReport(*report) for report in reports]
+        return OptimizationResult(
+            control,
+            cost=np.array([r.cost for r in named], float),
+            clearance_cost=np.array([r.clearance_cost for r in named], float),
+            clearance=np.array([(r.scene_clearance, r.own_clearance) for r in named], float).reshape(-1, 2),
+            steps=np.array([r.steps for r in named], np.int64),
+            damping=np.array([r.damping for r in named], float),
+        )
 
 
 @lru_cache(maxsize=32)
