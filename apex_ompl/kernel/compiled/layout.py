@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import cache
 from typing import Annotated, Any, NamedTuple, get_args, get_origin, get_type_hints
 
 import numpy as np
@@ -43,6 +44,7 @@ class Field(NamedTuple):
         return tuple(dimensions[n] if isinstance(n, str) else n for n in self.shape)
 
 
+@cache
 def layout(cls: type[Any]) -> tuple[Field, ...]:
     """Return the fields of a named tuple of arrays."""
     found = []
@@ -90,6 +92,7 @@ def buffer_view(cls: type[Any], dimensions: Sequence[str]) -> Callable[..., Any]
     return _generated(cls, ["integers", "floats", *dimensions], lines, slices)
 
 
+@cache
 def buffer_sizes(cls: type[Any], **dimensions: int) -> tuple[int, int]:
     """Return how many integers and floats the arrays of a ``cls`` have together."""
     sizes = {True: 0, False: 0}
