@@ -129,7 +129,7 @@ def test_mimic_ratios_are_read_as_they_are(ratio: float, driver: str) -> None:
 
 @settings(max_examples=60)
 @given(seed=st.integers(0, 2**32 - 1))
-def test_tables_for_one_side_judge_that_side_alone(robot: Robot, seed: int) -> None:
+def test_tables_for_one_side_check_that_side_alone(robot: Robot, seed: int) -> None:
     rng = np.random.default_rng(seed)
     ball = Obstacle(name="ball", sphere={"radius": 0.1}, position=tuple(rng.uniform([0.2, -0.6, 0.1], [0.7, 0.6, 0.8])))
     whole = CollisionChecker(robot, [ball]).kernel

@@ -1,4 +1,4 @@
-"""The curve along a path, and the fastest way along it."""
+"""The curve along a path, and its time-optimal parameterization."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ VELOCITY, ACCELERATION = np.array([2.0, 2.5, 1.5]), np.array([10.0, 15.0, 8.0])
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2, 5])
-def test_the_greatest_speeds_are_those_of_a_linear_program(seed: int) -> None:
+def test_path_speeds_are_those_of_a_linear_program(seed: int) -> None:
     """On a grid the greedy passes may be a little slower where all joints that turn stand still for a moment."""
     rng = np.random.default_rng(seed)
     path = np.cumsum(rng.normal(0.0, 0.3, (8, 3)), axis=0)
@@ -64,15 +64,15 @@ def test_curves_have_their_derivatives_and_keep_to_straight_lines() -> None:
     h = 1e-5
     inside = places[1:-1]
     np.testing.assert_allclose(first[1:-1], (curve.points(inside + h) - curve.points(inside - h)) / (2 * h), atol=1e-6)
-    bends = (curve.points(inside + h) - 2 * curve.points(inside) + curve.points(inside - h)) / h**2
-    np.testing.assert_allclose(second[1:-1], bends, atol=2e-3)
+    curvature = (curve.points(inside + h) - 2 * curve.points(inside) + curve.points(inside - h)) / h**2
+    np.testing.assert_allclose(second[1:-1], curvature, atol=2e-3)
     np.testing.assert_allclose(curve.points(places[[0, -1]]), path[[0, -1]], atol=1e-12)
     straight = (places > 0.7) & (places < 0.8)
     np.testing.assert_allclose(curve.points(places[straight]), line.at(places[straight]), atol=1e-12)
     np.testing.assert_allclose(np.linalg.norm(first[straight], axis=1), 1.0)
 
 
-def test_distances_from_a_polyline_are_those_from_all_its_sides() -> None:
+def test_distances_from_a_polyline_are_those_from_all_segments() -> None:
     rng = np.random.default_rng(2)
     path = np.cumsum(rng.normal(0.0, 0.2, (30, 3)), axis=0)
     line = Polyline.through(path)

@@ -45,7 +45,7 @@ class Field(NamedTuple):
 
 
 @cache
-def layout(cls: type[Any]) -> tuple[Field, ...]:
+def layout(cls: Any) -> tuple[Field, ...]:
     """Return the fields of a named tuple of arrays."""
     found = []
     for name, hint in get_type_hints(cls, include_extras=True).items():
@@ -93,7 +93,7 @@ def buffer_view(cls: type[Any], dimensions: Sequence[str]) -> Callable[..., Any]
 
 
 @cache
-def buffer_sizes(cls: type[Any], **dimensions: int) -> tuple[int, int]:
+def buffer_sizes(cls: Any, **dimensions: int) -> tuple[int, int]:
     """Return how many integers and floats the arrays of a ``cls`` have together."""
     sizes = {True: 0, False: 0}
     for field in layout(cls):
