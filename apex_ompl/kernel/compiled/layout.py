@@ -59,7 +59,7 @@ def pack(arrays: Any) -> tuple[Integers, Floats]:
 
     The integers begin with the first and last place of every field, see :func:`table_view`.
     """
-    fields = layout(type(arrays))
+    fields = layout(arrays.__class__)
     places: list[int] = []
     parts: dict[bool, list[NDArray[Any]]] = {True: [], False: []}
     ends = {True: 2 * len(fields), False: 0}
@@ -70,7 +70,7 @@ def pack(arrays: Any) -> tuple[Integers, Floats]:
     return np.concatenate([np.array(places, np.int64), *parts[True]]), np.concatenate(parts[False])
 
 
-def table_view(cls: type[Any]) -> Callable[[Integers, Floats], Any]:
+def table_view(cls: Any) -> Callable[[Integers, Floats], Any]:
     """Return the compiled inverse of :func:`pack`: ``view(integers, floats)`` gives a ``cls`` of slices."""
     slices = []
     for k, field in enumerate(layout(cls)):
@@ -80,7 +80,7 @@ def table_view(cls: type[Any]) -> Callable[[Integers, Floats], Any]:
     return _generated(cls, ["integers", "floats"], [], slices)
 
 
-def buffer_view(cls: type[Any], dimensions: Sequence[str]) -> Callable[..., Any]:
+def buffer_view(cls: Any, dimensions: Sequence[str]) -> Callable[..., Any]:
     """Return the compiled ``view(integers, floats, *dimensions)`` that gives a ``cls`` of slices of buffers."""
     ends, lines, slices = {"integers": "0", "floats": "0"}, [], []
     for k, field in enumerate(layout(cls)):
@@ -101,7 +101,7 @@ def buffer_sizes(cls: Any, **dimensions: int) -> tuple[int, int]:
     return sizes[True], sizes[False]
 
 
-def _generated(cls: type[Any], arguments: list[str], lines: list[str], values: list[str]) -> Callable[..., Any]:
+def _generated(cls: Any, arguments: list[str], lines: list[str], values: list[str]) -> Callable[..., Any]:
     """Return the compiled function that computes ``lines`` and returns a ``cls`` of ``values``."""
     body = "".join(f"    {line}\n" for line in lines)
     source = f"def view({', '.join(arguments)}):\n{body}    return {cls.__name__}({', '.join(values)})\n"
