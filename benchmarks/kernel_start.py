@@ -1,7 +1,7 @@
 """How long the compiled kernel takes to be ready: compiled for the first time, and loaded from the cache.
 
 Runs fresh processes, the first with an empty cache folder, and times import, robot, ``CollisionChecker.prepare``, the
-first state and motion judged, and the first plan by the default planner.
+first state and motion checked, and the first plan by the default planner.
 
 Usage: python benchmarks/kernel_start.py [--runs 5]
 """

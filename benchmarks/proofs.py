@@ -1,7 +1,7 @@
-"""Soundness and reach of the sphere proofs: they must never call free what the meshes call colliding.
+"""Soundness and completeness of the sphere proofs: a proved state must never collide by the meshes.
 
 For each robot, over scenes of all kinds of obstacles, with and without held objects: states drawn widely, states
-pushed to within a thousandth of the border of collision, and states with a small obstacle inside a link. The checker
+bisected to within a thousandth of a contact, and states with a small obstacle inside a link. The checker
 with proofs is compared with that of the meshes alone. Motions that were proved without the meshes are sampled a
 hundred times as densely as planners sample. Then the share of states and of motion length that the spheres prove.
 
@@ -65,7 +65,7 @@ def pair(
 
 
 class Count:
-    """States judged, of them free and proved free; and what may not be."""
+    """Numbers of states checked, free, proved free, and of errors, which must be 0."""
 
     def __init__(self, kind: str) -> None:
         """Count states of a kind."""
@@ -184,9 +184,9 @@ def main() -> None:
     head = ["robot", "states", "N", "free by meshes", "proved, of the free", "proved free but colliding",
             "two stages differ from meshes"]  # fmt: skip
     table = "\n".join(record.row(r) for r in [head, ["---"] * 2 + ["---:"] * 5, *rows])
-    head = ["robot", "motions proved whole", f"samples on them, {DENSER} times denser", "of these colliding",
-            "search: length inside proved stretches", "judged states proved", "states to meshes, per step",
-            "full check: length inside proved stretches", "judged states proved",
+    head = ["robot", "motions proved", f"samples on them, {DENSER} times denser", "of these colliding",
+            "search: length inside proved intervals", "checked states proved", "states to meshes, per step",
+            "full check: length inside proved intervals", "checked states proved",
             "states to meshes, per step"]  # fmt: skip
     table += "\n\nFree motions of all lengths, half of them beginning near a contact:\n\n"
     table += "\n".join(record.row(r) for r in [head, ["---"] + ["---:"] * 9, *motion_rows])

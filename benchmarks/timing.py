@@ -40,7 +40,7 @@ from timing_methods import (
 from tqdm import tqdm
 
 from apex_ompl import plan, problems
-from apex_ompl.kernel.reachability import farthest
+from apex_ompl.kernel.compiled.polyline_distance import max_distance
 from apex_ompl.ompl_adapter.setup import assemble
 from apex_ompl.ompl_adapter.validity import full_check
 from apex_ompl.problems.suite_robot import robot
@@ -91,7 +91,7 @@ def deviation_of(motion: Trajectory, path: np.ndarray) -> float:
     """Return the largest distance of samples from a path [rad]."""
     line, states = Polyline.through(path), motion.sample(EACH).position
     arc = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(states, axis=0), axis=1)))
-    return float(farthest(states, arc * line.length / max(arc[-1], 1e-12), line.states, line.arc, 1.5))
+    return float(max_distance(states, arc * line.length / max(arc[-1], 1e-12), line.states, line.arc, 1.5))
 
 
 def measure(figures: Figures, motion: Trajectory | None, path: np.ndarray, checker: Any, best: float | None) -> None:

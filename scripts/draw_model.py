@@ -21,7 +21,7 @@ from apex_ompl.apex.query import make_query
 from apex_ompl.diffusion.guidance import Guidance
 from apex_ompl.diffusion.proposals import Sampling
 from apex_ompl.kernel import Kernel
-from apex_ompl.kernel.tables import BOX, HALF_SPACE, SPHERE
+from apex_ompl.kernel.compiled.arrays import BOX, HALF_SPACE, SPHERE
 from apex_ompl.ompl_adapter.setup import PlanningSetup, assemble
 from apex_ompl.ompl_adapter.validity import full_check
 from apex_ompl.problems.suite_robot import robot

@@ -19,7 +19,7 @@ import numpy as np
 
 from apex_ompl.api import plan
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.kernel import facing, gap
+from apex_ompl.kernel import offset_target, opposition_target
 from apex_ompl.ompl_adapter.setup import assemble
 from apex_ompl.ompl_adapter.validity import full_check
 from apex_ompl.problems.objects import (
@@ -253,8 +253,8 @@ def hand_states(
     targets = []
     fixed = [robot.joint_names.index(h.synergy) for h in robot.hands.values() if h.synergy]
     for hand, pose in zip(robot.hands.values(), poses, strict=True):
-        targets.append(gap(in_world(pose.point), links.point(hand.palm, hand.point)))
-        targets.append(facing(links.direction(hand.palm, hand.fingers), in_world(pose.fingers), -1.0))
+        targets.append(offset_target(in_world(pose.point), links.point(hand.palm, hand.point)))
+        targets.append(opposition_target(links.direction(hand.palm, hand.fingers), in_world(pose.fingers), -1.0))
     inverse = links.inverse(targets, fixed)
     found: list[np.ndarray] = []
     for _ in range(4000):

@@ -21,8 +21,8 @@ from apex_ompl.diffusion.model import (
     NoiseConfig,
 )
 from apex_ompl.kernel import Kernel, RobotTables
+from apex_ompl.kernel.compiled.arrays import BOX, CAPSULE, CYLINDER, SPHERE
 from apex_ompl.kernel.scene_builder import Primitive, scene_tables
-from apex_ompl.kernel.tables import BOX, CAPSULE, CYLINDER, SPHERE
 
 DOF = 16
 KINDS = {"box": BOX, "sphere": SPHERE, "cylinder": CYLINDER, "capsule": CAPSULE}

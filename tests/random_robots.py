@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pinocchio as pin
 
-from apex_ompl.kernel import robot_builder
-from apex_ompl.kernel.tables import FIXED, PRISMATIC, REVOLUTE, RobotTables
+from apex_ompl.kernel import robot_builder, robot_specs
+from apex_ompl.kernel.compiled.arrays import FIXED, PRISMATIC, REVOLUTE
+from apex_ompl.kernel.tables import RobotTables
 
 
 def unit(rng: np.random.Generator) -> np.ndarray:
@@ -35,16 +36,16 @@ def balls(rng: np.random.Generator, leaves: int) -> dict[str, np.ndarray]:
 def random_robot(seed: int, joints: int = 9, dof: int = 4) -> tuple[RobotTables, list, list, list]:
     """Tables, joints, bodies and pairs of a random tree of revolute, prismatic, fixed and mimic joints."""
     rng = np.random.default_rng(seed)
-    specs = [robot_builder.JointSpec(0)]
+    specs = [robot_specs.JointSpec(0)]
     for k in range(1, joints):
         kind = int(rng.choice([REVOLUTE, REVOLUTE, PRISMATIC, FIXED]))
         specs.append(
-            robot_builder.JointSpec(
+            robot_specs.JointSpec(
                 int(rng.integers(0, k)), kind, pose(rng, 0.2), unit(rng), -1 if kind == FIXED else k % dof,
                 float(rng.uniform(-1.5, 1.5)), float(rng.normal(0.0, 0.3)),
             )
         )  # fmt: skip
-    bodies = [robot_builder.BodySpec(f"b{k}", k, pose(rng, 0.05), **balls(rng, 3)) for k in range(joints)]
+    bodies = [robot_specs.BodySpec(f"b{k}", k, pose(rng, 0.05), **balls(rng, 3)) for k in range(joints)]
     pairs = [(a, b) for a in range(joints) for b in range(a) if rng.random() < 0.5]
     names = [f"q{k}" for k in range(dof)]
     box = np.ones(dof)

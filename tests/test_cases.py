@@ -114,7 +114,7 @@ def test_damaged_files_are_named(cases: list[WrittenCase], tmp_path: Path) -> No
         with pytest.raises(FileFormatError, match=words):
             load_cases(tmp_path)
     file.write_bytes(whole)
-    other = RobotTables.load(tmp_path / "tables-0.npz").judging(range(4))
+    other = RobotTables.load(tmp_path / "tables-0.npz").restricted_to(range(4))
     kept = (tmp_path / "tables-0.npz").read_bytes()
     other.save(tmp_path / "tables-0.npz")
     with pytest.raises(FileFormatError, match="another file"):

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from apex_ompl.errors import ParameterError, UnknownNameError
-from apex_ompl.kernel import Target, facing, gap, slope
+from apex_ompl.kernel import FixedVector, Target, angle_target, offset_target, opposition_target
 from apex_ompl.robot import Robot, load_robot
 from apex_ompl.tasks.inverse_kinematics import Links, in_world
 
@@ -31,23 +31,23 @@ def targets_and_residual(robot: Robot, kind: str):
     """Targets, and their residual from the links' poses."""
     links, (a, b) = Links.of(robot), LINKS[robot.name]
     if kind == "gap":
-        target = gap(links.point(a, LOCAL), links.point(b, OTHER), links.direction(a, AXIS), 0.3, 2.0)
+        target = offset_target(links.point(a, LOCAL), links.point(b, OTHER), links.direction(a, AXIS), 0.3, 2.0)
 
         def residual(q: np.ndarray) -> np.ndarray:
             first, second = placed(robot, q, a, LOCAL, True), placed(robot, q, b, OTHER, True)
             return 2.0 * (second - first - 0.3 * placed(robot, q, a, AXIS, False))
     elif kind == "facing":
-        target = facing(links.direction(a, AXIS), links.direction(b, OTHER), -1.0, 0.5)
+        target = opposition_target(links.direction(a, AXIS), links.direction(b, OTHER), -1.0, 0.5)
 
         def residual(q: np.ndarray) -> np.ndarray:
             return 0.5 * (placed(robot, q, a, AXIS, False) - placed(robot, q, b, OTHER, False))
     elif kind == "slope":
-        target = slope(links.direction(a, AXIS), links.direction(b, OTHER), 0.25, 3.0)
+        target = angle_target(links.direction(a, AXIS), links.direction(b, OTHER), 0.25, 3.0)
 
         def residual(q: np.ndarray) -> np.ndarray:
             return 3.0 * np.array([placed(robot, q, a, AXIS, False) @ placed(robot, q, b, OTHER, False) - 0.25])
     else:
-        target = gap(in_world(POINT), links.point(b, LOCAL))
+        target = offset_target(in_world(POINT), links.point(b, LOCAL))
 
         def residual(q: np.ndarray) -> np.ndarray:
             return placed(robot, q, b, LOCAL, True) - POINT
@@ -75,8 +75,8 @@ def pose_targets(robot: Robot, link: str, pose: np.ndarray) -> list[Target]:
     links = Links.of(robot)
     point, axis = pose[:3, :3] @ LOCAL + pose[:3, 3], pose[:3, :3] @ AXIS
     return [
-        gap(in_world(point), links.point(link, LOCAL)),
-        facing(links.direction(link, AXIS), in_world(axis), -1.0),
+        offset_target(in_world(point), links.point(link, LOCAL)),
+        opposition_target(links.direction(link, AXIS), in_world(axis), -1.0),
     ]
 
 
@@ -114,7 +114,7 @@ def test_a_descent_never_gets_worse_and_leaves_the_rest_alone(robot: Robot, seed
 
 
 def test_an_unreachable_point_gives_the_nearest_error(robot: Robot) -> None:
-    target = gap(in_world((3.0, 0.5, 0.5)), Links.of(robot).point("left_hand_palm", (0, 0, 0)))
+    target = offset_target(in_world((3.0, 0.5, 0.5)), Links.of(robot).point("left_hand_palm", (0, 0, 0)))
     found = Links.of(robot).inverse([target]).descend(robot.home, max_steps=200)
     assert 1.7 < found.errors[0] < 2.2  # the palm reaches about 1.1 m from the shoulder
 
@@ -133,9 +133,12 @@ def test_bad_input_is_named(robot: Robot) -> None:
             inverse.residual(wrong)
     with pytest.raises(ParameterError, match="fixed"):
         links.inverse([targets_and_residual(robot, "gap")[0]], fixed=[16])
-    for whole, parts in (((0, 0, 1), (0.0,) * 11), ((3, 0, 1, 0), (0.0,) * 11), ((0, 0, 1, 0), (0.0,) * 3)):
+    good, strange = FixedVector(0, (0.0, 0.0, 1.0)), FixedVector(0.5, (0.0, 0.0, 1.0))
+    for kind, vectors in ((3, (good,) * 3), (0, (good,) * 2), (0, (good, good, strange))):
         with pytest.raises(ParameterError, match="target"):
-            Target(whole, parts)
+            Target(kind, vectors, 0.0, 1.0)
+    with pytest.raises(ParameterError, match="target"):
+        offset_target(good, FixedVector(1, (0.0, 0.0)))
     bad = robot.home.copy()
     bad[0] = np.nan
     target = pose_targets(robot, "left_hand_palm", robot.link_pose(robot.home, "left_hand_palm"))

@@ -19,10 +19,11 @@ from support import ROOT, states_around_home
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.tabulate import primitives
 from apex_ompl.errors import ParameterError
-from apex_ompl.kernel import entries, robot_builder
-from apex_ompl.kernel.interface import Kernel
+from apex_ompl.kernel import Kernel, robot_builder, robot_specs
+from apex_ompl.kernel.compiled import motion_proof, queries
+from apex_ompl.kernel.compiled.arrays import PRISMATIC
 from apex_ompl.kernel.scene_builder import scene_tables
-from apex_ompl.kernel.tables import PRISMATIC, RobotTables
+from apex_ompl.kernel.tables import RobotTables
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import Obstacle
 
@@ -83,15 +84,15 @@ def test_clearance_of_random_trees_is_that_of_all_spheres(seed: int) -> None:
 
 def single_ball() -> RobotTables:
     """A ball of 1 cm on three sliders: its state is where it is."""
-    specs = [robot_builder.JointSpec(0)]
-    specs += [robot_builder.JointSpec(k, PRISMATIC, np.eye(4), np.eye(3)[k], k) for k in range(3)]
+    specs = [robot_specs.JointSpec(0)]
+    specs += [robot_specs.JointSpec(k, PRISMATIC, np.eye(4), np.eye(3)[k], k) for k in range(3)]
     cover = {
         "centres": np.zeros((1, 3)),
         "radii": np.array([0.01]),
         "first": np.zeros(1, int),
         "count": np.zeros(1, int),
     }
-    body = robot_builder.BodySpec("ball", 3, np.eye(4), **cover)
+    body = robot_specs.BodySpec("ball", 3, np.eye(4), **cover)
     box = 10.0 * np.ones(3)
     return robot_builder.robot_tables("ball", "xyz", lower=-box, upper=box, joints=specs, bodies=[body], pairs=[])
 
@@ -177,12 +178,16 @@ def test_frames_and_gradients_of_real_robots(which: str, request: pytest.Fixture
 def test_read_only_arrays_are_not_compiled_for_anew(robot: Robot) -> None:
     checker = CollisionChecker(robot)
     checker.prepare()
-    before = [len(f.dispatcher.signatures) for f in (entries.judge_states, entries.advance, entries.lay_grid)]
+    before = [
+        len(f.dispatcher.signatures) for f in (queries.check_states, motion_proof.prove_path, motion_proof.lay_grid)
+    ]
     path = np.tile(robot.home, (3, 1))
     path.flags.writeable = False
     assert checker.first_collision(path, 0.031) is None and checker.is_free(robot.home)
     checker.kernel.unproved(robot.home)
-    after = [len(f.dispatcher.signatures) for f in (entries.judge_states, entries.advance, entries.lay_grid)]
+    after = [
+        len(f.dispatcher.signatures) for f in (queries.check_states, motion_proof.prove_path, motion_proof.lay_grid)
+    ]
     assert before == after == [1, 1, 1]
 
 
@@ -190,10 +195,10 @@ def test_read_only_arrays_are_not_compiled_for_anew(robot: Robot) -> None:
 def test_grids_hold_no_more_steps_than_they_can_count(step: float) -> None:
     starts = np.empty(2, np.int64)
     path = np.array([[0.0], [step]])
-    assert entries.lay_grid(path, 0.03, starts) == (1 if step < 0.03 else -1)
+    assert motion_proof.lay_grid(path, 0.03, starts) == (1 if step < 0.03 else -1)
     for resolution in (0.0, 1e-320, np.nan):
-        assert entries.lay_grid(np.array([[0.0], [1.0]]), resolution, starts) == -1
-    assert entries.lay_grid(np.array([[0.0], [1.0]]), 0.03, starts) == 34
+        assert motion_proof.lay_grid(np.array([[0.0], [1.0]]), resolution, starts) == -1
+    assert motion_proof.lay_grid(np.array([[0.0], [1.0]]), 0.03, starts) == 34
 
 
 def test_clearance_of_what_is_no_number_is_none(robot: Robot) -> None:
@@ -246,14 +251,14 @@ def test_threads_do_not_disturb_each_other(robot: Robot, post: Obstacle) -> None
 
 CALL = """
 import numpy as np
-from apex_ompl.kernel import compiled
+from apex_ompl.kernel.compiled import compilation
 
 def plus(a):
     return a[0] + 1.0
 
-f = compiled.entry(plus)
+f = compilation.entry_point(plus)
 assert f(np.ones(1)) == f(np.ones(1)) == 2.0
-print(compiled.cache_folder())
+print(compilation.cache_folder())
 """
 
 

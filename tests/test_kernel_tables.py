@@ -6,7 +6,6 @@ import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
-from unittest import mock
 
 import coal
 import numpy as np
@@ -20,11 +19,10 @@ from support import ROOT, states_around_home
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.tabulate import joint_specs, primitives
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError, UnknownNameError
-from apex_ompl.kernel import views
-from apex_ompl.kernel.interface import Kernel
+from apex_ompl.kernel import Kernel
+from apex_ompl.kernel.compiled.arrays import robot_view, scene_view
 from apex_ompl.kernel.scene_builder import scene_tables
 from apex_ompl.kernel.tables import RobotTables
-from apex_ompl.kernel.views import robot_view, scene_view
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import Obstacle
 
@@ -38,9 +36,10 @@ def test_tables_are_saved_and_loaded_without_pinocchio(robot: Robot, post: Obsta
 import sys, numpy as np
 for name in ("pinocchio", "coal", "ompl"):
     sys.modules[name] = None
-from apex_ompl.kernel.interface import Kernel
+from apex_ompl.kernel import Kernel
 from apex_ompl.kernel.scene_builder import Primitive, scene_tables
-from apex_ompl.kernel.tables import BOX, RobotTables
+from apex_ompl.kernel.compiled.arrays import BOX
+from apex_ompl.kernel.tables import RobotTables
 at = np.eye(4)
 at[:3, 3] = {list(post.position)}
 box = Primitive(BOX, at, {tuple(e / 2 for e in post.box)})
@@ -103,8 +102,7 @@ def test_damaged_tables_are_faults_and_no_crash(tmp_path: Path) -> None:
 def test_arrays_come_out_of_a_pack_as_they_went_in(robot: Robot, post: Obstacle) -> None:
     kernel = CollisionChecker(robot, [post]).kernel
     for tables, view in ((kernel.robot, robot_view), (kernel.scene, scene_view)):
-        with mock.patch.multiple(views, _ints=views._ints.py_func, _floats=views._floats.py_func):
-            seen = view.py_func(*tables.packed)
+        seen = view.py_func(*tables.packed)
         for name, array in tables.arrays._asdict().items():
             assert np.array_equal(getattr(seen, name), array), name
 
@@ -131,12 +129,12 @@ def test_mimic_ratios_are_read_as_they_are(ratio: float, driver: str) -> None:
 
 @settings(max_examples=60)
 @given(seed=st.integers(0, 2**32 - 1))
-def test_tables_for_one_side_judge_that_side_alone(robot: Robot, seed: int) -> None:
+def test_tables_for_one_side_check_that_side_alone(robot: Robot, seed: int) -> None:
     rng = np.random.default_rng(seed)
     ball = Obstacle(name="ball", sphere={"radius": 0.1}, position=tuple(rng.uniform([0.2, -0.6, 0.1], [0.7, 0.6, 0.8])))
     whole = CollisionChecker(robot, [ball]).kernel
     sides = [[k for k, name in enumerate(robot.joint_names) if name.startswith(side)] for side in ("left", "right")]
-    kernels = [Kernel(whole.robot.judging(joints), whole.scene) for joints in sides]
+    kernels = [Kernel(whole.robot.restricted_to(joints), whole.scene) for joints in sides]
     q, other = states_around_home(robot, rng, 2)
     everything, parts = whole.clearance(q)[0], [kernel.clearance(q)[0] for kernel in kernels]
     assert everything[0] == min(parts[0][0], parts[1][0])  # all that moves is moved by one side or the other
@@ -150,7 +148,7 @@ def test_tables_for_one_side_judge_that_side_alone(robot: Robot, seed: int) -> N
 def test_pairs_between_the_sides_are_left_to_the_whole(robot: Robot) -> None:
     whole = CollisionChecker(robot).kernel
     sides = [[k for k, name in enumerate(robot.joint_names) if name.startswith(side)] for side in ("left", "right")]
-    kernels = [Kernel(whole.robot.judging(joints), whole.scene) for joints in sides]
+    kernels = [Kernel(whole.robot.restricted_to(joints), whole.scene) for joints in sides]
     q = robot.home.copy()
     q[[0, 1, 7, 8]] = -1.2, 0.3, 1.2, 0.3  # the hands meet in the middle
     assert whole.clearance(q)[0, 1] < 0.0 < min(kernel.clearance(q)[0, 1] for kernel in kernels)
@@ -168,15 +166,12 @@ def test_a_pair_can_be_left_out(robot: Robot) -> None:
     for other in states_around_home(robot, np.random.default_rng(5), 50):  # elsewhere nothing changes
         assert np.array_equal(smaller.clearance(other), whole.clearance(other))
     right = [k for k, name in enumerate(robot.joint_names) if name.startswith("right")]
-    one, other_order = whole.robot.judging(right).without_pair(a, b), whole.robot.without_pair(a, b).judging(right)
+    side = whole.robot.restricted_to(right)
+    tables = side, side.without_pair(a, b), whole.robot.without_pair(a, b).restricted_to(right)
     for state in states_around_home(robot, np.random.default_rng(6), 50, 1.0):
-        values = [
-            Kernel(tables, whole.scene).clearance(state) for tables in (one, other_order, whole.robot.judging(right))
-        ]
-        assert np.array_equal(values[0], values[1]) and np.array_equal(
-            values[0], values[2]
-        )  # the pair is not of one side
+        values = [Kernel(some, whole.scene).clearance(state) for some in tables]  # the pair is not of one side
+        assert np.array_equal(values[0], values[1]) and np.array_equal(values[0], values[2])
     with pytest.raises(UnknownNameError, match="body"):
         whole.robot.without_pair("no_such_body", a)
     with pytest.raises(ParameterError, match="joints"):
-        whole.robot.judging([99])
+        whole.robot.restricted_to([99])

@@ -1,4 +1,4 @@
-"""The curve along a path, and the fastest way along it."""
+"""The curve along a path, and its time-optimal parameterization."""
 
 from __future__ import annotations
 
@@ -7,14 +7,15 @@ import pytest
 from scipy.optimize import linprog
 from support import distance
 
-from apex_ompl.kernel.reachability import farthest, fastest, moments
+from apex_ompl.kernel.compiled.polyline_distance import max_distance
+from apex_ompl.kernel.compiled.time_parameterization import max_path_speeds, sample_times
 from apex_ompl.trajectory.curve import Curve, Polyline
 
 VELOCITY, ACCELERATION = np.array([2.0, 2.5, 1.5]), np.array([10.0, 15.0, 8.0])
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2, 5])
-def test_the_greatest_speeds_are_those_of_a_linear_program(seed: int) -> None:
+def test_path_speeds_are_those_of_a_linear_program(seed: int) -> None:
     """On a grid the greedy passes may be a little slower where all joints that turn stand still for a moment."""
     rng = np.random.default_rng(seed)
     path = np.cumsum(rng.normal(0.0, 0.3, (8, 3)), axis=0)
@@ -22,7 +23,7 @@ def test_the_greatest_speeds_are_those_of_a_linear_program(seed: int) -> None:
     first, second = curve.derivatives(12)
     n, step = len(first), curve.spacing / 12
     x = np.empty(n)
-    fastest(first, second, VELOCITY, ACCELERATION, step, x)
+    max_path_speeds(first, second, VELOCITY, ACCELERATION, step, x)
     rows, bounds = [], []
     for i in range(n - 1):  # |q' u + q'' x| <= a with u = (x[i + 1] - x[i]) / (2 step)
         for j in range(3):
@@ -36,7 +37,7 @@ def test_the_greatest_speeds_are_those_of_a_linear_program(seed: int) -> None:
     found = linprog(-np.ones(n), np.array(rows), np.array(bounds), bounds=np.stack([np.zeros(n), most], 1))
     assert found.success
     duration, least = (np.sum(2.0 * step / (np.sqrt(y[1:]) + np.sqrt(y[:-1]))) for y in (x, np.maximum(found.x, 0.0)))
-    assert moments(x, step, 0.0, np.empty(0)) == pytest.approx(duration) and duration < 1.01 * least
+    assert sample_times(x, step, 0.0, np.empty(0)) == pytest.approx(duration) and duration < 1.01 * least
     if seed == 2:  # without such a place
         np.testing.assert_allclose(x, found.x, atol=1e-6)
 
@@ -44,9 +45,9 @@ def test_the_greatest_speeds_are_those_of_a_linear_program(seed: int) -> None:
 def test_places_at_even_times_follow_the_speeds() -> None:
     x = np.append(np.linspace(0.0, 4.0, 50), np.linspace(4.0, 0.0, 50)[1:])  # even acceleration, then the opposite
     step = 0.02
-    duration = moments(x, step, 0.0, np.empty(0))
+    duration = sample_times(x, step, 0.0, np.empty(0))
     place = np.empty(101)
-    assert moments(x, step, duration / 100, place) == duration
+    assert sample_times(x, step, duration / 100, place) == duration
     push, half = 4.0 / (2 * 49 * step), duration / 2
     times = np.linspace(0.0, duration, 101)
     rising = 0.5 * push * times**2
@@ -63,19 +64,19 @@ def test_curves_have_their_derivatives_and_keep_to_straight_lines() -> None:
     h = 1e-5
     inside = places[1:-1]
     np.testing.assert_allclose(first[1:-1], (curve.points(inside + h) - curve.points(inside - h)) / (2 * h), atol=1e-6)
-    bends = (curve.points(inside + h) - 2 * curve.points(inside) + curve.points(inside - h)) / h**2
-    np.testing.assert_allclose(second[1:-1], bends, atol=2e-3)
+    curvature = (curve.points(inside + h) - 2 * curve.points(inside) + curve.points(inside - h)) / h**2
+    np.testing.assert_allclose(second[1:-1], curvature, atol=2e-3)
     np.testing.assert_allclose(curve.points(places[[0, -1]]), path[[0, -1]], atol=1e-12)
     straight = (places > 0.7) & (places < 0.8)
     np.testing.assert_allclose(curve.points(places[straight]), line.at(places[straight]), atol=1e-12)
     np.testing.assert_allclose(np.linalg.norm(first[straight], axis=1), 1.0)
 
 
-def test_distances_from_a_polyline_are_those_from_all_its_sides() -> None:
+def test_distances_from_a_polyline_are_those_from_all_segments() -> None:
     rng = np.random.default_rng(2)
     path = np.cumsum(rng.normal(0.0, 0.2, (30, 3)), axis=0)
     line = Polyline.through(path)
     places = np.sort(rng.uniform(0.0, line.length, 50))
     points = line.at(places) + rng.normal(0.0, 0.01, (50, 3))
-    assert farthest(points, places, line.states, line.arc, 99.0) == pytest.approx(distance(points, path), rel=1e-12)
-    assert farthest(points, places, line.states, line.arc, 0.1) >= distance(points, path) - 1e-12
+    assert max_distance(points, places, line.states, line.arc, 99.0) == pytest.approx(distance(points, path), rel=1e-12)
+    assert max_distance(points, places, line.states, line.arc, 0.1) >= distance(points, path) - 1e-12

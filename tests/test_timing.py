@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from support import distance
 
 from apex_ompl.errors import ParameterError, TimingError
-from apex_ompl.kernel.reachability import fastest, moments
+from apex_ompl.kernel.compiled.time_parameterization import max_path_speeds, sample_times
 from apex_ompl.robot import Limits
 from apex_ompl.trajectory import TimedPath, Timing, Trajectory, time_path
 from apex_ompl.trajectory.curve import Curve, Polyline
@@ -102,8 +102,8 @@ def test_a_gentle_curve_takes_little_more_than_the_least_time() -> None:
     first, second = Curve.along(Polyline.through(path), 0.01).derivatives(10)
     x = np.empty(len(first))
     step = Polyline.through(path).length / (len(first) - 1)
-    fastest(first, second, stiff.velocity, stiff.acceleration, step, x)
-    least = moments(x, step, 0.0, np.empty(0))
+    max_path_speeds(first, second, stiff.velocity, stiff.acceleration, step, x)
+    least = sample_times(x, step, 0.0, np.empty(0))
     made = timed(path, limits=stiff)
     assert 0.995 * least < made.trajectory.duration < 1.05 * least
 

@@ -17,8 +17,8 @@ from apex_ompl.diffusion.data import Mirror, held_out, split, window_paths
 from apex_ompl.diffusion.training import Trainer
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel import Kernel, RobotTables
+from apex_ompl.kernel.compiled.arrays import BOX
 from apex_ompl.kernel.scene_builder import Primitive, scene_tables
-from apex_ompl.kernel.tables import BOX
 
 
 def test_mirror_images_are_valid_where_paths_are(paths: Paths) -> None:

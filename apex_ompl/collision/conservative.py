@@ -1,4 +1,4 @@
-"""The first stage of the checker: what the sphere covers prove, and what they leave for the meshes."""
+"""First stage of the collision checker: proofs by sphere covers that states and motions are free."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from apex_ompl.collision.cover.rough import rough_cover
 from apex_ompl.collision.cover.spheres import make_cover, read_covers, shape_key
 from apex_ompl.collision.shapes import is_shell
 from apex_ompl.collision.tabulate import mesh_boxes, primitives, tabulate, tabulate_scene
-from apex_ompl.kernel import entries
-from apex_ompl.kernel.interface import MOST_PAIRS, Kernel
+from apex_ompl.kernel.compiled import motion_proof, queries
+from apex_ompl.kernel.kernel import MOST_PAIRS, Kernel
 from apex_ompl.kernel.tables import RobotTables, SceneTables
 from apex_ompl.robot import Robot
 from apex_ompl.types import Array
 
 
 class UnprovedPairs(NamedTuple):
-    """What the meshes must judge at a state.
+    """Pairs that the meshes must check at a state.
 
     Attributes:
         pairs: Pairs of geometries that are not proved to be apart.
@@ -40,7 +40,7 @@ class UnprovedPairs(NamedTuple):
 QUICK_GAPS, LEAVES = (0.02, 0.005), 32  # of covers made at run time
 SLENDER = 0.05  # cylinders thinner or flatter than this are covered like boxes
 
-MOST_TABLES = 64  # that are kept of a robot with different things in its hands
+MOST_TABLES = 64  # kept for each robot: one for each set of held objects
 
 _robots: WeakKeyDictionary[Robot, dict[Hashable, RobotTables]] = WeakKeyDictionary()
 _quick: dict[str, Cover] = {}  # by shape key
@@ -48,35 +48,35 @@ _quick: dict[str, Cover] = {}  # by shape key
 
 @dataclass
 class CheckCounts:
-    """What the two stages of a checker did.
+    """Numbers of checks by the two stages of a checker.
 
     Attributes:
         proved: States that the spheres proved free.
-        meshes: States that the meshes judged.
-        boxes: Stretches of motions that the spheres tried to prove at once.
-        proved_boxes: Those that they proved.
-        steps: Steps between states to judge along motions.
-        proved_steps: Those inside proved stretches.
+        meshes: States that the meshes checked.
+        intervals: Intervals of motions that the spheres tried to prove as a whole.
+        proved_intervals: Those that they proved.
+        steps: Steps between the states of motions.
+        proved_steps: Those inside proved intervals.
     """
 
     proved: int = 0
     meshes: int = 0
-    boxes: int = 0
-    proved_boxes: int = 0
+    intervals: int = 0
+    proved_intervals: int = 0
     steps: int = 0
     proved_steps: int = 0
 
     @property
     def states(self) -> int:
-        """States that were judged one by one."""
+        """States that were checked one by one."""
         return self.proved + self.meshes
 
 
 def covers_of(robot: Robot, shapes: Sequence[coal.CollisionGeometry]) -> list[Cover]:
-    """Return a cover of each shape: one that the robot's file brings, or a quick one made now.
+    """Return a cover of each shape: one from the robot's file, or a rough one made now.
 
-    What a file brings is taken on trust; ``scripts/make_covers.py`` writes only covers that are proved, and for those
-    that ship the tests prove it again.
+    Covers in files are not checked here: ``scripts/make_covers.py`` writes only proved covers, and the tests prove
+    again those that ship.
 
     Raises:
         MissingFileError: The robot names a file of covers that cannot be read.
@@ -107,7 +107,7 @@ class ConservativeChecker:
     """Conservative checks of one compiled scene; safe to use from several threads."""
 
     def __init__(self, robot: Robot, scene: CompiledScene) -> None:
-        """Make the kernel's tables of ``robot``, and of what ``scene`` holds besides.
+        """Make the kernel's tables of ``robot`` with its held objects and of the obstacles of ``scene``.
 
         Raises:
             MissingFileError: The robot names a file of covers that cannot be read.
@@ -149,22 +149,24 @@ class ConservativeChecker:
         return tabulate_scene(solids)
 
     def obstacles_moved(self) -> None:
-        """Take over the poses of the scene's obstacles."""
+        """Make the tables of the obstacles again after they moved."""
         self.kernel = Kernel(self.kernel.robot, self._obstacles())
 
     def unproved_at(self, q: Array, check_counts: CheckCounts) -> UnprovedPairs | None:
-        """Return what is left to be judged at a state, shape (dof,); None where it is proved free."""
-        mine = self._mine()
-        mine.state[0] = q
-        entries.judge_states(*self.kernel.packed, *mine.room, mine.state, mine.found[None], mine.ends[:1])
-        count = int(mine.ends[0])
+        """Return the pairs left to the meshes at a state, shape (dof,); None where it is proved free."""
+        buffers = self._buffers()
+        buffers.state[0] = q
+        queries.check_states(
+            *self.kernel.packed, *buffers.workspace, buffers.state, buffers.found[None], buffers.ends[:1]
+        )
+        count = int(buffers.ends[0])
         if count == 0:
             check_counts.proved += 1
             return None
-        return self._left(mine.found, count)
+        return self._left(buffers.found, count)
 
     def unproved_among(self, states: Array, check_counts: CheckCounts) -> list[tuple[int, UnprovedPairs]]:
-        """Return the states, shape (N, dof), that are not proved free: their numbers and what is left to be judged."""
+        """Return the states, shape (N, dof), that are not proved free, by number, and the pairs left."""
         found, counts = self.kernel.unproved(states)
         opened = np.flatnonzero(counts)
         check_counts.proved += len(states) - len(opened)
@@ -183,67 +185,67 @@ class ConservativeChecker:
         check_counts: CheckCounts,
         is_free: Callable[[Array, UnprovedPairs], bool],
     ) -> tuple[Array, int] | None:
-        """Prove a path, state by state where it must be.
+        """Return the first collision found on a path, whose intervals are proved as a whole where possible.
 
         Args:
-            path: States, shape (N, dof), N > 1, in a row of memory.
+            path: States, shape (N, dof), N > 1, contiguous.
             resolution: Largest spacing of states [rad, max-norm].
-            start: Whether the first state is judged too.
-            check_counts: Is kept up to date.
-            is_free: Judges a state that is not proved, given what is left to be judged of it.
+            start: Whether the first state is checked too.
+            check_counts: Counts to add to.
+            is_free: Checks a state that is not proved by the meshes, given the pairs left to them.
 
         Returns:
-            A state that is not free and the segment that it lies on, or None.
+            A state in collision and the segment that it lies on, or None.
 
         Raises:
             NoGridError: The path has numbers that are not finite, or is too long for its resolution.
         """
-        mine = self._mine()
-        starts = mine.starts if len(path) == 2 else np.empty(len(path), np.int64)
-        last = entries.lay_grid(path, resolution, starts)
+        buffers = self._buffers()
+        starts = buffers.starts if len(path) == 2 else np.empty(len(path), np.int64)
+        last = motion_proof.lay_grid(path, resolution, starts)
         if last < 0:
             raise NoGridError
-        queue, ends, state = mine.queue, mine.ends, mine.state[0]
+        queue, ends, state = buffers.queue, buffers.ends, buffers.state[0]
         if len(queue) < 2 * last + 4:
             queue = np.empty((2 * last + 4, 2), np.int64)
         entered = [(0, 0), (last, last), (0, last)][0 if start else 1 :]
         queue[: len(entered)] = entered
         ends[:2] = 0, len(entered)
-        mine.counts[:] = 0
+        buffers.counts[:] = 0
         hit = None
         while hit is None:
-            number = entries.advance(
-                *self.kernel.packed, *mine.room, path, starts, queue, ends, state, mine.found, mine.counts
+            number = motion_proof.prove_path(
+                *self.kernel.packed, *buffers.workspace, path, starts, queue, ends, state, buffers.found, buffers.counts
             )
-            if number == entries.DONE:
+            if number == motion_proof.DONE:
                 break
-            if not is_free(state, self._left(mine.found, int(ends[2]))):
+            if not is_free(state, self._left(buffers.found, int(ends[2]))):
                 hit = state.copy(), max(int(np.searchsorted(starts, number)) - 1, 0)
-        proved, _, proved_boxes, boxes, proved_steps = mine.counts.tolist()
+        proved, _, proved_intervals, intervals, proved_steps = buffers.counts.tolist()
         check_counts.proved += proved
-        check_counts.boxes += boxes
-        check_counts.proved_boxes += proved_boxes
+        check_counts.intervals += intervals
+        check_counts.proved_intervals += proved_intervals
         check_counts.proved_steps += proved_steps
         check_counts.steps += last
         return hit
 
-    def _mine(self) -> _Room:
-        """Return this thread's room to work in."""
-        room: _Room | None = getattr(self._local, "room", None)
-        if room is None:
-            room = self._local.room = _Room(self.kernel)
-        return room
+    def _buffers(self) -> _Buffers:
+        """Return this thread's buffers."""
+        buffers: _Buffers | None = getattr(self._local, "buffers", None)
+        if buffers is None:
+            buffers = self._local.buffers = _Buffers(self.kernel)
+        return buffers
 
 
 class NoGridError(Exception):
     """A path that no grid can be laid over."""
 
 
-class _Room:
-    """Arrays that calls of one thread work in."""
+class _Buffers:
+    """Arrays that one thread passes to compiled code."""
 
     def __init__(self, kernel: Kernel) -> None:
-        self.room = kernel.room()
+        self.workspace = kernel.workspace()
         self.state = np.empty((1, kernel.robot.dof))
         self.found = np.empty((MOST_PAIRS, 2), np.int64)
         self.starts = np.empty(2, np.int64)

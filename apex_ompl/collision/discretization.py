@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apex_ompl.errors import ParameterError
-from apex_ompl.kernel.entries import MOST_STEPS
+from apex_ompl.kernel.compiled.motion_proof import MOST_STEPS
 from apex_ompl.trajopt.path import states_between
 from apex_ompl.types import Array
 

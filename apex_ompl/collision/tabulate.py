@@ -1,4 +1,4 @@
-"""From Pinocchio's and Coal's objects to the kernel's tables."""
+"""The kernel's tables from Pinocchio models and Coal shapes."""
 
 from __future__ import annotations
 
@@ -11,35 +11,27 @@ import pinocchio as pin
 from apex_ompl.collision.containment import EnclosingMesh
 from apex_ompl.collision.cover.proof import Cover
 from apex_ompl.errors import RobotError
-from apex_ompl.kernel.robot_builder import BodySpec, JointSpec, robot_tables
+from apex_ompl.kernel.compiled.arrays import BOX, CAPSULE, CYLINDER, HALF_SPACE, PRISMATIC, REVOLUTE, SPHERE
+from apex_ompl.kernel.robot_builder import robot_tables
+from apex_ompl.kernel.robot_specs import BodySpec, JointSpec
 from apex_ompl.kernel.scene_builder import Primitive, scene_tables
-from apex_ompl.kernel.tables import (
-    BOX,
-    CAPSULE,
-    CYLINDER,
-    HALF_SPACE,
-    PRISMATIC,
-    REVOLUTE,
-    SPHERE,
-    RobotTables,
-    SceneTables,
-)  # fmt: skip
+from apex_ompl.kernel.tables import RobotTables, SceneTables
 from apex_ompl.robot import Robot
 from apex_ompl.scene.meshes import bounding_boxes
 from apex_ompl.types import Array
 
-PROBE = 1e-3  # value of a planned joint at which the motion of the others is read off: less than half a turn of any
-CHECKS = (0.37, -1.13, 2.71)  # where it is looked at again, besides the limits
+PROBE = 1e-3  # value of a planned joint at which axes and ratios are measured: no joint turns by half a turn or more
+CHECKS = (0.37, -1.13, 2.71)  # values at which they are checked, besides the limits
 
 
 def joint_specs(robot: Robot) -> list[JointSpec]:
     """Return the joints of a robot's Pinocchio model, which keep their numbers.
 
-    Axes and mimic ratios are read off the motion of each joint, so that every kind of revolute, prismatic or mimic
-    joint is known.
+    Axes and mimic ratios are measured: they are the twist of each joint, log(T(0)^-1 T(q)) / q, which holds for every
+    kind of revolute, prismatic or mimic joint.
 
     Raises:
-        RobotError: A joint moves in another way.
+        RobotError: The motion of a joint is not that of a constant twist about or along an axis.
     """
     model, data = robot.model, robot.model.createData()
     source = [int(k) for k in robot.to_pinocchio(np.arange(float(robot.dof)))]  # by place in Pinocchio's order
@@ -81,15 +73,15 @@ def tabulate(
     meets_scene: Sequence[bool],
     pairs: Iterable[tuple[int, int]],
 ) -> RobotTables:
-    """Return the tables of a robot with all that hangs on it.
+    """Return the tables of a robot with its links and held objects.
 
     Args:
         robot: The robot.
         items: Its geometries and those of what it holds.
-        numbers: What each goes by outside of the tables.
+        numbers: Number of each outside of the tables.
         covers: The cover of each.
-        meets_scene: Whether each is judged against obstacles.
-        pairs: Those that may not touch, by their places in ``items``.
+        meets_scene: Whether each is checked against obstacles.
+        pairs: Pairs that are checked for self-collision, by their places in ``items``.
     """
     bodies = [
         BodySpec(
@@ -106,17 +98,17 @@ def tabulate(
 
 
 def tabulate_scene(solids: Mapping[int, Sequence[Primitive]]) -> SceneTables:
-    """Return the tables of obstacles by number, each the solids that :func:`primitives` returns."""
+    """Return the tables of obstacles, given by number and the solids that :func:`primitives` returns."""
     return scene_tables([(number, solid) for number, parts in solids.items() for solid in parts])
 
 
 def primitives(shape: coal.CollisionGeometry, pose: Array, boxes: Array | None = None) -> list[Primitive]:
-    """Return solids that the kernel knows and that contain a geometry: itself, or boxes around a mesh.
+    """Return primitives that together contain a geometry: itself, or boxes around a mesh.
 
     Args:
         shape: The geometry.
         pose: Its pose in the world, shape (4, 4) [m].
-        boxes: What :func:`mesh_boxes` returned for it before.
+        boxes: Result of :func:`mesh_boxes` for it, if known.
     """
     kind = shape.getNodeType()
     if kind == coal.GEOM_BOX:

@@ -23,8 +23,9 @@ from apex_ompl.datasets.engine import RECIPES, Case, Engine, Options, Row
 from apex_ompl.datasets.records import SHAPES, Paths
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError
 from apex_ompl.kernel import Kernel, RobotTables
+from apex_ompl.kernel.compiled.arrays import SceneArrays
 from apex_ompl.kernel.table_checks import scene_fault
-from apex_ompl.kernel.tables import SceneArrays, SceneTables
+from apex_ompl.kernel.tables import SceneTables
 from apex_ompl.trajopt.spline import Spline
 from apex_ompl.types import Array
 from apex_ompl.util.files import is_file, make_folder, write_atomically

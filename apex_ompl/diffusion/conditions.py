@@ -12,7 +12,7 @@ from torch import Tensor
 
 from apex_ompl.datasets.records import SHAPES, Paths
 from apex_ompl.kernel import Kernel, RobotTables
-from apex_ompl.kernel.tables import BOX, HALF_SPACE, SceneArrays
+from apex_ompl.kernel.compiled.arrays import BOX, HALF_SPACE, SceneArrays
 from apex_ompl.types import Array
 
 HALVES = np.array([[0.5, 0.5, 0.5], [1.0, 0.5, 0.5], [1.0, 0.5, 0.5], [1.0, 0.5, 0.5]], np.float32)
@@ -258,7 +258,7 @@ class Table:
 def distances(shape: Tensor, position: Tensor, turn: Tensor, size: Tensor, points: Tensor) -> Tensor:
     """Return signed distances [m] of points to obstacles, each with points of its own: shape (T, K).
 
-    The formulas are those of the kernel, see :mod:`apex_ompl.kernel.primitives`.
+    The formulas are those of the kernel, see :mod:`apex_ompl.kernel.compiled.signed_distance`.
 
     Args:
         shape: Numbers of shapes, shape (T,).

@@ -1,20 +1,27 @@
-"""The compiled kernel over flat arrays, without Pinocchio or Coal: clearance, gradients, proofs, inverse kinematics."""
+"""Compiled code over flat arrays, without Pinocchio or Coal: clearance, gradients, proofs, inverse kinematics."""
 
-from apex_ompl.kernel.interface import Kernel
-from apex_ompl.kernel.inverse_kinematics import Fixed, Inverse, Target, facing, gap, slope
+from apex_ompl.kernel.inverse_kinematics import (
+    FixedVector,
+    IKSolver,
+    Target,
+    angle_target,
+    offset_target,
+    opposition_target,
+)
+from apex_ompl.kernel.kernel import Kernel
 from apex_ompl.kernel.scene_builder import Primitive, scene_tables
 from apex_ompl.kernel.tables import RobotTables, SceneTables
 
 __all__ = [
-    "Fixed",
-    "Inverse",
+    "FixedVector",
+    "IKSolver",
     "Kernel",
     "Primitive",
     "RobotTables",
     "SceneTables",
     "Target",
-    "facing",
-    "gap",
+    "angle_target",
+    "offset_target",
+    "opposition_target",
     "scene_tables",
-    "slope",
 ]

@@ -1,4 +1,4 @@
-"""Inverse kinematics on the kernel's tables: targets, residuals and descents; numpy alone."""
+"""Inverse kinematics on the kernel's tables: targets, residuals and descents."""
 
 from __future__ import annotations
 
@@ -10,14 +10,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from apex_ompl.errors import ParameterError
-from apex_ompl.kernel.ik_solver import FACING, GAP, PARTS, SLOPE, descend, residual
+from apex_ompl.kernel.compiled.ik_solver import descend, ik_buffer_sizes, residual_and_jacobian
+from apex_ompl.kernel.compiled.ik_targets import ANGLE, OFFSET, OPPOSITION, TargetArrays
+from apex_ompl.kernel.compiled.layout import Floats, Integers, pack
+from apex_ompl.kernel.compiled.workspace import workspace_sizes
 from apex_ompl.kernel.tables import RobotTables
-from apex_ompl.kernel.views import room
 from apex_ompl.types import Array
-from apex_ompl.util.validation import check_indices, is_integer, shape_error
+from apex_ompl.util.validation import check_indices, shape_error
 
 
-class Fixed(NamedTuple):
+class FixedVector(NamedTuple):
     """A point or a direction that is fixed to the frame of a joint; joint 0 is the world.
 
     Attributes:
@@ -29,56 +31,77 @@ class Fixed(NamedTuple):
     vector: ArrayLike
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Target:
-    """Something to bring to zero; made by :func:`gap`, :func:`facing` or :func:`slope`."""
+    """A residual to bring to zero: see :func:`offset_target`, :func:`opposition_target` and :func:`angle_target`.
 
-    whole: tuple[int, int, int, int]
-    parts: tuple[float, ...]
+    Attributes:
+        kind: Which of the three.
+        vectors: Points or directions a, b and c.
+        value: Distance, sign or cosine.
+        weight: Factor on the residual.
+    """
+
+    kind: int
+    vectors: tuple[FixedVector, FixedVector, FixedVector]
+    value: float
+    weight: float
 
     def __post_init__(self) -> None:
         """Check what the compiled code trusts.
 
         Raises:
-            ParameterError: Not four whole numbers, the kind first, or not eleven parts.
+            ParameterError: Another kind, or not three vectors on joints with numbers.
         """
-        if len(self.whole) != 4 or self.whole[0] not in (GAP, FACING, SLOPE):
-            raise ParameterError("target", self.whole, "a kind and three joints")
-        if not all(is_integer(j) for j in self.whole):
-            raise ParameterError("target", self.whole, "whole numbers of joints")
-        if len(self.parts) != PARTS:
-            raise ParameterError("target", self.parts, f"{PARTS} parts")
+        if self.kind not in (OFFSET, OPPOSITION, ANGLE) or len(self.vectors) != 3:
+            raise ParameterError("target", (self.kind, self.vectors), "a kind and three vectors")
+        for joint, vector in self.vectors:
+            if isinstance(joint, bool) or not isinstance(joint, (int, np.integer)):
+                raise ParameterError("target", joint, "the number of a joint")
+            if np.shape(vector) != (3,):
+                raise ParameterError("target", vector, "a vector of shape (3,)")
+
+    @property
+    def joints(self) -> tuple[int, ...]:
+        """Joints of the three vectors."""
+        return tuple(int(v.joint) for v in self.vectors)
 
     @property
     def rows(self) -> int:
         """How many numbers its residual has."""
-        return 1 if self.whole[0] == SLOPE else 3
+        return 1 if self.kind == ANGLE else 3
 
 
-NOTHING = Fixed(0, (0.0, 0.0, 0.0))
+NOTHING = FixedVector(0, (0.0, 0.0, 0.0))
 
 
-def gap(first: Fixed, second: Fixed, along: Fixed = NOTHING, distance: float = 0.0, weight: float = 1.0) -> Target:
-    """Bring a point to where it is ``distance`` from another along a direction: weight (second - first - d along)."""
-    return _target(GAP, first, second, along, distance, weight)
+def offset_target(
+    first: FixedVector, second: FixedVector, along: FixedVector = NOTHING, distance: float = 0.0, weight: float = 1.0
+) -> Target:
+    """Return a target for two points: ``distance`` apart along a unit direction, or at one place.
+
+    The residual is weight (second - first - distance along), shape (3,) [m].
+    """
+    return Target(OFFSET, (first, second, along), float(distance), float(weight))
 
 
-def facing(first: Fixed, second: Fixed, sign: float = 1.0, weight: float = 1.0) -> Target:
-    """Bring two unit directions to face each other, or with sign -1 to agree: weight (first + sign second)."""
-    return _target(FACING, first, second, NOTHING, sign, weight)
+def opposition_target(first: FixedVector, second: FixedVector, sign: float = 1.0, weight: float = 1.0) -> Target:
+    """Return a target for two unit directions: opposite, or with sign -1 equal.
+
+    The residual is weight (first + sign second), shape (3,).
+    """
+    return Target(OPPOSITION, (first, second, NOTHING), float(sign), float(weight))
 
 
-def slope(first: Fixed, second: Fixed, cosine: float = 0.0, weight: float = 1.0) -> Target:
-    """Bring the angle of two unit directions to one whose cosine is given: weight (first . second - cosine)."""
-    return _target(SLOPE, first, second, NOTHING, cosine, weight)
+def angle_target(first: FixedVector, second: FixedVector, cosine: float = 0.0, weight: float = 1.0) -> Target:
+    """Return a target for the angle between two unit directions, by its cosine.
+
+    The residual is weight (first . second - cosine), shape (1,).
+    """
+    return Target(ANGLE, (first, second, NOTHING), float(cosine), float(weight))
 
 
-def _target(kind: int, a: Fixed, b: Fixed, c: Fixed, number: float, weight: float) -> Target:
-    vectors = [np.asarray(v.vector, float).reshape(3) for v in (a, b, c)]
-    return Target((kind, a.joint, b.joint, c.joint), (*np.concatenate(vectors).tolist(), float(number), float(weight)))
-
-
-class Descents(NamedTuple):
+class IKDescents(NamedTuple):
     """Ends of descents.
 
     Attributes:
@@ -92,7 +115,7 @@ class Descents(NamedTuple):
     steps: NDArray[np.int64]
 
 
-class Inverse:
+class IKSolver:
     """Inverse kinematics of a robot for some targets; serial, and safe to use from several threads."""
 
     def __init__(self, robot: RobotTables, targets: Sequence[Target], fixed: Sequence[int] | NDArray[np.intp] = ()):
@@ -102,15 +125,21 @@ class Inverse:
             ParameterError: There is no target, or one hangs on a joint that the robot does not have.
         """
         arrays = robot.arrays
-        joints = sorted({j for target in targets for j in target.whole[1:]})
+        joints = sorted({j for target in targets for j in target.joints})
         if not joints or joints[0] < 0 or joints[-1] >= len(arrays.joint_parent):
             raise ParameterError("targets", joints, f"targets on joints 0 to {len(arrays.joint_parent) - 1}")
         check_indices(fixed, robot.dof, "fixed", "planned joints")
         self.robot = robot
         self.targets = tuple(targets)
         self.rows = sum(target.rows for target in targets)
-        self._whole = np.array([target.whole for target in targets], np.int64)
-        self._parts = np.array([target.parts for target in targets])
+        arrays_of_targets = TargetArrays(
+            kind=np.array([target.kind for target in targets], np.int64),
+            joints=np.array([target.joints for target in targets], np.int64),
+            vectors=np.array([[v.vector for v in target.vectors] for target in targets], float),
+            value=np.array([target.value for target in targets]),
+            weight=np.array([target.weight for target in targets]),
+        )
+        self._targets = pack(arrays_of_targets)
         above: set[int] = set()
         for joint in joints:
             k = joint
@@ -120,10 +149,11 @@ class Inverse:
         self._chain = np.array(sorted(above), np.int64)
         moved = {int(arrays.joint_source[j]) for j in above} - {-1}
         self._free = np.array(sorted(moved - {int(k) for k in fixed}), np.int64)
-        self._room = room(arrays)
+        self._workspace_sizes = workspace_sizes(arrays)
+        self._buffer_sizes = ik_buffer_sizes(robot.dof, len(self._free))
 
-    def _working(self) -> tuple[NDArray[np.int64], Array]:
-        return np.empty(self._room[0], np.int64), np.empty(self._room[1])
+    def _memory(self, sizes: tuple[int, int]) -> tuple[Integers, Floats]:
+        return np.empty(sizes[0], np.int64), np.empty(sizes[1])
 
     def residual(self, q: Array) -> tuple[Array, Array]:
         """Return the residual at a state, shape (m,), and its Jacobian, shape (m, dof), of all planned joints.
@@ -133,25 +163,17 @@ class Inverse:
         """
         q = np.require(q, float, ["C", "W"])
         if q.shape != (self.robot.dof,):
-            raise shape_error(q, (self.robot.dof,), "state")
-        values, rows = np.empty(self.rows), np.empty((self.rows, len(q)))
-        work = np.empty((4, max(len(q), 3)))
-        residual(
-            *self.robot.packed,
-            *self._working(),
-            self._chain,
-            self._whole,
-            self._parts,
-            q,
-            values,
-            rows,
-            work[:, : len(q)],
-        )
-        return values, rows
+            raise ParameterError("state", q.shape, f"an array of shape ({self.robot.dof},)")
+        values, jacobian = np.empty(self.rows), np.empty((self.rows, len(q)))
+        residual_and_jacobian(
+            *self.robot.packed, *self._memory(self._workspace_sizes), self._chain, *self._targets, q, values, jacobian,
+            *self._memory(self._buffer_sizes),
+        )  # fmt: skip
+        return values, jacobian
 
     def descend(
         self, states: ArrayLike, *, tolerance: float = 1e-4, max_steps: int = 100, damping: float = 1e-2
-    ) -> Descents:
+    ) -> IKDescents:
         """Descend from states by damped least squares (Levenberg-Marquardt), clipped to the limits.
 
         A state that is not finite in a joint that the targets depend on gets an error that is not finite; other joints
@@ -170,10 +192,8 @@ class Inverse:
         if ends.ndim != 2 or ends.shape[1] != self.robot.dof:
             raise shape_error(ends, ("N", self.robot.dof), "states")
         errors, counts = np.empty(len(ends)), np.empty(len(ends), np.int64)
-        n, dof = len(self._free), ends.shape[1]
-        scratch = np.empty(3 + 4 * dof + 3 * n * n + 3 * n)
         descend(
-            *self.robot.packed, *self._working(), self._chain, self._free, self._whole, self._parts, ends, errors,
-            counts, np.array([tolerance, max_steps, damping], float), scratch,
+            *self.robot.packed, *self._memory(self._workspace_sizes), self._chain, self._free, *self._targets, ends,
+            errors, counts, float(tolerance), int(max_steps), float(damping), *self._memory(self._buffer_sizes),
         )  # fmt: skip
-        return Descents(ends, errors, counts)
+        return IKDescents(ends, errors, counts)

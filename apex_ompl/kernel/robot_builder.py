@@ -1,65 +1,17 @@
-"""From joints, covered bodies and pairs to the arrays of a robot; numpy alone."""
+"""Tables of a robot from its joints, covered bodies and pairs of bodies."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apex_ompl.kernel.tables import FIXED, PRISMATIC, REVOLUTE, RobotArrays, RobotTables
+from apex_ompl.kernel.cluster_balls import ClusterBall, Member, cluster_ball, leaf_radii, transformed
+from apex_ompl.kernel.compiled.arrays import FIXED, RobotArrays
+from apex_ompl.kernel.robot_specs import BodySpec, JointSpec
+from apex_ompl.kernel.tables import RobotTables
 from apex_ompl.types import Array
-
-SAMPLES = 65  # of a cluster's inner joint, when its ball is made
-
-
-@dataclass(frozen=True)
-class JointSpec:
-    """A joint of a tree; number 0 is the world, and parents come before their children.
-
-    Attributes:
-        parent: Number of the parent.
-        kind: FIXED, REVOLUTE or PRISMATIC.
-        placement: Pose in the parent's frame at value 0, shape (4, 4) [m].
-        axis: Unit vector in the joint's own frame, shape (3,).
-        source: Planned joint that drives it.
-        ratio: Value of the joint is ``ratio * q[source] + shift``; mimic joints share a source.
-        shift: See ``ratio``.
-    """
-
-    parent: int
-    kind: int = FIXED
-    placement: Array | None = None
-    axis: Array | None = None
-    source: int = -1
-    ratio: float = 1.0
-    shift: float = 0.0
-
-
-@dataclass(frozen=True)
-class BodySpec:
-    """A solid fixed to a joint, and the tree of spheres that contains it.
-
-    Attributes:
-        name: Name of the body.
-        joint: Number of its joint.
-        placement: Pose of the spheres' frame in the joint's, shape (4, 4) [m].
-        centres: Shape (n, 3) [m]; node 0 is the root.
-        radii: Shape (n,) [m].
-        first: First child of each node, shape (n,).
-        count: Number of children of each node, 0 for leaves, shape (n,).
-        meets_scene: Whether it is judged against obstacles.
-    """
-
-    name: str
-    joint: int
-    placement: Array
-    centres: Array
-    radii: Array
-    first: NDArray[np.int64]
-    count: NDArray[np.int64]
-    meets_scene: bool = True
 
 
 def robot_tables(
@@ -82,8 +34,8 @@ def robot_tables(
         upper: Their highest values, shape (dof,).
         joints: The tree, the world first.
         bodies: The solids.
-        pairs: Places of the bodies that may not touch each other.
-        numbers: What the bodies go by outside of the tables; by default their places.
+        pairs: Places of the bodies that are checked against each other.
+        numbers: Numbers of the bodies outside of the tables; by default their places.
     """
     given = range(len(bodies)) if numbers is None else numbers
     return _Builder(joints, bodies, lower, upper).tables(name, tuple(joint_names), pairs, given)
@@ -121,13 +73,13 @@ class _Builder:
         self.bodies = [bodies[b] for b in order]
         self.cluster_of = [self.clusters.index(keys[b]) for b in order]
         self.centres = [
-            _transform(turns[b.joint].T @ np.asarray(b.placement, float), np.asarray(b.centres, float))
+            transformed(turns[b.joint].T @ np.asarray(b.placement, float), np.asarray(b.centres, float))
             for b in self.bodies
         ]
         self.lazy = [self._inner(j) for j, _ in self.clusters]
 
     def _cluster_joint(self, k: int) -> int:
-        """Return the joint that a joint's bodies are looked at with: its own, or the one that carries the hand.
+        """Return the joint of the cluster of a joint's bodies: the joint itself, or the one that carries the hand.
 
         Joints of which several follow one planned joint are taken for fingers, as long as one planned joint drives
         all of what hangs there.
@@ -161,7 +113,7 @@ class _Builder:
         return all(self._is_finger(x) for x in chain[: chain.index(top)])
 
     def _key(self, body: BodySpec, number: int) -> tuple[int, int]:
-        """Return what tells clusters apart: the joint, and what a body meets; fixed bodies stand each alone."""
+        """Return the key of a body's cluster: the joint, and whether it meets the scene; each fixed body is its own."""
         home = self.home[body.joint]
         return (home, number if home == 0 else int(body.meets_scene))
 
@@ -176,7 +128,7 @@ class _Builder:
         inner = {k for ks in self.lazy for k in ks}
         trees = [np.asarray(b.radii, float) for b in bodies]
         starts = np.cumsum([0, *(len(t) for t in trees)])
-        outer = [_outer(c, r, b) for c, r, b in zip(self.centres, trees, bodies, strict=True)]
+        outer = [leaf_radii(c, r, b) for c, r, b in zip(self.centres, trees, bodies, strict=True)]
         balls = [self._ball(c, outer) for c in range(len(self.clusters))]
         pair_rows = self._pairs(pairs)
         arrays = RobotArrays(
@@ -204,10 +156,10 @@ class _Builder:
             joint_shift=np.array([j.shift for j in joints], float),
             lower=np.array(self.lower, float),
             upper=np.array(self.upper, float),
-            cluster_ball=np.array([[*ball[0], ball[1]] for ball in balls]).reshape(-1, 4),
-            cluster_outer=np.array([ball[2] for ball in balls]),
-            cluster_spread=np.array([ball[3] for ball in balls]),
-            cluster_speed=np.array([ball[4] for ball in balls]),
+            cluster_ball=np.array([[*ball.centre, ball.radius] for ball in balls]).reshape(-1, 4),
+            cluster_outer=np.array([ball.outer for ball in balls]),
+            cluster_spread=np.array([ball.spread for ball in balls]),
+            cluster_speed=np.array([ball.speed for ball in balls]),
             node_centre=np.concatenate([np.empty((0, 3)), *self.centres]),
             node_radius=np.concatenate([np.empty(0), *trees]),
             node_outer=np.concatenate([np.empty(0), *outer]),
@@ -231,101 +183,17 @@ class _Builder:
             found.append(((c, d), common, sorted(members)))
         return found
 
-    def _ball(self, cluster: int, outer: Sequence[Array]) -> tuple[Array, float, float, float, float]:
-        """Return centre, radius around the solids and around the leaves, spread, and speed of a cluster.
-
-        Inner joints are sampled over their range; between two samples a centre moves by at most its speed times half
-        the spacing.
-        """
-        members = [k for k, c in enumerate(self.cluster_of) if c == cluster]
+    def _ball(self, cluster: int, outer: Sequence[Array]) -> ClusterBall:
+        members = [
+            Member(b.joint, self.centres[k], np.asarray(b.radii, float), outer[k])
+            for k, b in enumerate(self.bodies)
+            if self.cluster_of[k] == cluster
+        ]
         dof = self._dof(cluster)
-        values = np.zeros(1) if dof < 0 else np.linspace(self.lower[dof], self.upper[dof], SAMPLES)
-        top = self.clusters[cluster][0]
-        poses = {top: np.tile(np.eye(4), (len(values), 1, 1))}
-        for k in self.lazy[cluster]:
-            joint = self.joints[k]
-            poses[k] = poses[joint.parent] @ self.placements[k] @ _motions(joint, values)
-        points = np.concatenate([_transform(poses[self.bodies[m].joint], self.centres[m]) for m in members], axis=1)
-        radii = np.concatenate([np.asarray(self.bodies[m].radii, float) for m in members])
-        roots = np.concatenate([np.arange(len(self.bodies[m].radii)) == 0 for m in members])
-        speeds = np.concatenate([self._speed(m, top) for m in members])
-        slack = 0.0 if dof < 0 else speeds * (self.upper[dof] - self.lower[dof]) / (SAMPLES - 1) / 2.0
-        centre = _middle(points[:, roots], (radii + slack)[roots])
-        away = np.linalg.norm(points - centre, axis=2).max(axis=0) + slack
-        leaves = np.concatenate([outer[m] for m in members])
-        # The roots contain the solids; the leaves and inner nodes are what moves.
-        return (
-            centre, float((away + radii)[roots].max()) + 1e-9, float((away + leaves)[roots].max()) + 1e-9,
-            float(away.max()) + 1e-9, float(speeds.max()),
-        )  # fmt: skip
-
-    def _speed(self, body: int, top: int) -> Array:
-        """Bound the speed of a body's spheres relative to the cluster's joint, per unit of the planned joint."""
-        reach = np.linalg.norm(self.centres[body], axis=1)
-        speed = np.zeros(len(reach))
-        k = self.bodies[body].joint
-        while k != top:
-            joint = self.joints[k]
-            if joint.kind == REVOLUTE:
-                speed += abs(joint.ratio) * reach
-            elif joint.kind == PRISMATIC:
-                speed += abs(joint.ratio)
-                widest = max(abs(joint.ratio * v + joint.shift) for v in self._range(joint.source))
-                reach = reach + widest
-            reach = reach + np.linalg.norm(self.placements[k][:3, 3])
-            k = joint.parent
-        return speed
-
-    def _range(self, dof: int) -> tuple[float, float]:
-        return float(self.lower[dof]), float(self.upper[dof])
-
-
-def _motions(joint: JointSpec, q: Array) -> Array:
-    """Return the motion of a joint at values of its planned joint, shape (N, 4, 4)."""
-    poses = np.tile(np.eye(4), (len(q), 1, 1))
-    values = joint.ratio * q + joint.shift
-    if joint.kind == REVOLUTE:
-        c, s = np.cos(values), np.sin(values)
-        poses[:, 0, 0], poses[:, 0, 1], poses[:, 1, 0], poses[:, 1, 1] = c, -s, s, c
-    elif joint.kind == PRISMATIC:
-        poses[:, 2, 3] = values
-    return poses
-
-
-def _outer(centres: Array, radii: Array, body: BodySpec) -> Array:
-    """Return for each node a radius around all leaves below it."""
-    above = np.full(len(radii), -1)
-    for k in np.flatnonzero(body.count):
-        above[body.first[k] : body.first[k] + body.count[k]] = k
-    leaves = np.flatnonzero(np.asarray(body.count) == 0)
-    outer, at = np.zeros(len(radii)), leaves
-    while len(leaves):
-        np.maximum.at(outer, at, np.linalg.norm(centres[leaves] - centres[at], axis=1) + radii[leaves])
-        at = above[at]
-        leaves, at = leaves[at >= 0], at[at >= 0]
-    return outer + 1e-12
-
-
-def _middle(points: Array, radii: Array) -> Array:
-    """Return about the centre of the smallest ball around balls: points (..., n, 3), radii (n,).
-
-    By steps towards the farthest (Badoiu and Clarkson 2003).
-    """
-    flat = points.reshape(-1, 3)
-    wide = np.broadcast_to(radii, points.shape[:-1]).ravel()
-    centre: Array = flat.mean(axis=0)
-    for step in range(1, 100):
-        offsets = flat - centre
-        k = int(np.argmax(np.linalg.norm(offsets, axis=1) + wide))
-        long = float(np.linalg.norm(offsets[k]))
-        if long == 0.0:
-            break
-        centre = centre + offsets[k] / long * (long + wide[k]) / (step + 1) * 0.5
-    return centre
-
-
-def _transform(pose: Array, points: Array) -> Array:
-    return points @ np.swapaxes(pose[..., :3, :3], -1, -2) + pose[..., None, :3, 3]
+        limits = None if dof < 0 else (float(self.lower[dof]), float(self.upper[dof]))
+        return cluster_ball(
+            members, self.clusters[cluster][0], self.lazy[cluster], self.joints, self.placements, limits
+        )
 
 
 def _ints(values: object) -> NDArray[np.int64]:

@@ -8,7 +8,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from apex_ompl.kernel.tables import BOX, CAPSULE, HALF_SPACE, SPHERE, Floats, SceneArrays, SceneTables
+from apex_ompl.kernel.compiled.arrays import BOX, CAPSULE, HALF_SPACE, SPHERE, SceneArrays
+from apex_ompl.kernel.compiled.layout import Floats
+from apex_ompl.kernel.tables import SceneTables
 
 
 class Primitive(NamedTuple):

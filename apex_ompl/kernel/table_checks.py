@@ -1,4 +1,4 @@
-"""What may be wrong with tables that were read from a file; the kernel itself trusts its tables."""
+"""Checks of arrays that were read from a file; compiled code trusts its arrays."""
 
 from __future__ import annotations
 
@@ -6,11 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from apex_ompl.kernel.tables import BOX, FIXED, HALF_SPACE, PRISMATIC, ROWS, RobotArrays, RobotTables, SceneArrays
+from apex_ompl.kernel.compiled.arrays import BOX, FIXED, HALF_SPACE, PRISMATIC, RobotArrays, SceneArrays
+from apex_ompl.kernel.compiled.layout import layout
 
 
 def head_fault(head: dict[str, Any]) -> str:
-    """Return the key of a file's head that is missing or of another type, or nothing."""
+    """Return the key of a file's head that is missing or of another type, or an empty string."""
     for key, kind in (("joints", str), ("bodies", str), ("numbers", int)):
         values = head.get(key)
         if not isinstance(values, list) or not all(type(v) is kind for v in values):
@@ -19,19 +20,19 @@ def head_fault(head: dict[str, Any]) -> str:
 
 
 def scene_fault(s: SceneArrays) -> str:
-    """Return the name of a scene's array that does not fit, or whose numbers point out of the scene; else nothing."""
-    things, boxes = len(s.kind), len(s.tree_skip)
-    for name, array in s._asdict().items():
-        whole = name in SceneArrays._fields[: SceneArrays._fields.index("rotation")]
-        if array.dtype != (np.int64 if whole else np.float64) or array.shape[1:] != ROWS.get(name, ()):
+    """Return the name of an array with another type or length, or with numbers out of range; else an empty string."""
+    obstacles, boxes = len(s.kind), len(s.tree_skip)
+    for field, array in zip(layout(SceneArrays), s, strict=True):
+        name = field.name
+        if array.dtype != field.dtype or array.shape[1:] != field.shape:
             return name
-        size = 1 if name == "open" else boxes if name.startswith("tree") else things
+        size = 1 if name == "open" else boxes if name.startswith("tree") else obstacles
         if len(array) != size or not np.isfinite(array).all():
             return name
-    if things and not BOX <= s.kind.min() <= s.kind.max() <= HALF_SPACE:
+    if obstacles and not BOX <= s.kind.min() <= s.kind.max() <= HALF_SPACE:
         return "kind"
-    closed = things - int(s.open[0])
-    if not 0 <= closed <= things or (s.kind[:closed] == HALF_SPACE).any() or (s.kind[closed:] != HALF_SPACE).any():
+    closed = obstacles - int(s.open[0])
+    if not 0 <= closed <= obstacles or (s.kind[:closed] == HALF_SPACE).any() or (s.kind[closed:] != HALF_SPACE).any():
         return "open"
     if ((s.tree_skip <= np.arange(boxes)) | (s.tree_skip > boxes)).any():
         return "tree_skip"
@@ -41,11 +42,8 @@ def scene_fault(s: SceneArrays) -> str:
     return ""
 
 
-def table_fault(tables: RobotTables) -> str:
-    """Return the name of an array with a wrong length, or with numbers that point out of the tables; else nothing."""
-    t, dof, bodies = tables.arrays, tables.dof, len(tables.body_names)
-    if len(tables.numbers) != bodies:
-        return "numbers"
+def robot_fault(t: RobotArrays, dof: int, bodies: int) -> str:
+    """Return the name of an array with a wrong length, or with numbers out of range; else an empty string."""
     return _length_fault(t, dof, bodies) or _range_fault(t, dof, bodies) or _tree_fault(t) or _order_fault(t)
 
 

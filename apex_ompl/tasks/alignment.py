@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import FileFormatError, UnknownNameError
-from apex_ompl.kernel import Target, facing, gap, slope
+from apex_ompl.kernel import Target, angle_target, offset_target, opposition_target
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import AttachedObject
 from apex_ompl.scene.problem import ALIGNMENT_DEFAULTS, Alignment, Problem, WorldVector
@@ -160,16 +160,16 @@ class AlignmentGoal:
         a1, a2 = (links.direction(face.link, face.axis) for face in (self.first, self.second))
         if self.alignment.kind == "pour":
             middle = float(np.cos((self.tilt[0] + self.tilt[1]) / 2))
-            targets = [gap(p2, p1, up, d, w), facing(a2, up, -1.0), slope(a1, up, middle)]
+            targets = [offset_target(p2, p1, up, d, w), opposition_target(a2, up, -1.0), angle_target(a1, up, middle)]
             if self._radial is not None:
                 deepest = -float(np.sqrt(1.0 - middle**2))  # z of the lowest unit vector orthogonal to the axis
-                targets.append(slope(links.direction(self.first.link, self._radial), up, deepest))
+                targets.append(angle_target(links.direction(self.first.link, self._radial), up, deepest))
             return targets
-        targets = [gap(p1, p2, a1, d, w), facing(a1, a2)]
+        targets = [offset_target(p1, p2, a1, d, w), opposition_target(a1, a2)]
         if self.alignment.kind == "vertical":
-            targets.append(facing(a1, up, -1.0))
+            targets.append(opposition_target(a1, up, -1.0))
         elif self.alignment.kind == "horizontal":
-            targets.append(slope(a1, up))
+            targets.append(angle_target(a1, up))
         return targets
 
     def attempt(self, rng: np.random.Generator) -> Array:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.kernel import Kernel, RobotTables, facing, gap
+from apex_ompl.kernel import Kernel, RobotTables, offset_target, opposition_target
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.tasks.cover_clearance import has_clearance, scene_kernel
@@ -70,7 +70,7 @@ class DualArmTables:
             for side in ("left_", "right_")
         )
         both = CollisionChecker(robot).kernel.robot
-        return cls(robot, both, (both.judging(left), both.judging(right)), (left, right))
+        return cls(robot, both, (both.restricted_to(left), both.restricted_to(right)), (left, right))
 
 
 class HandPoseSampler:
@@ -125,8 +125,8 @@ class HandPoseSampler:
         links, hand = Links.of(self.robot), list(self.robot.hands.values())[arm]
         point, fingers = region.sample(rng)
         targets = [
-            gap(in_world(point), links.point(hand.palm, hand.point)),
-            facing(links.direction(hand.palm, hand.fingers), in_world(fingers), -1.0),
+            offset_target(in_world(point), links.point(hand.palm, hand.point)),
+            opposition_target(links.direction(hand.palm, hand.fingers), in_world(fingers), -1.0),
         ]
         seeds = self.robot.home + rng.normal(0.0, SEED_SPREAD, (SEEDS, self.robot.dof))
         seeds[:, self._hands] = rng.uniform(*synergies, (SEEDS, len(self._hands)))

@@ -1,4 +1,4 @@
-"""Inverse kinematics in terms of links: their points and directions as residuals of the kernel's solver."""
+"""IKSolver kinematics in terms of links: their points and directions as residuals of the kernel's solver."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from apex_ompl.collision.tabulate import joint_specs
 from apex_ompl.errors import UnknownNameError
-from apex_ompl.kernel import Fixed, Inverse, RobotTables, Target
+from apex_ompl.kernel import FixedVector, IKSolver, Target
+from apex_ompl.kernel.compiled.arrays import FIXED
 from apex_ompl.kernel.robot_builder import robot_tables, turn_to
-from apex_ompl.kernel.tables import FIXED
 from apex_ompl.robot import Robot
 
 
-def in_world(vector: ArrayLike) -> Fixed:
+def in_world(vector: ArrayLike) -> FixedVector:
     """Return a point [m] or a unit direction in the world frame, shape (3,), for the targets of the solver."""
-    return Fixed(0, vector)
+    return FixedVector(0, vector)
 
 
 class Links:
@@ -50,27 +50,27 @@ class Links:
                 _known[robot] = cls(robot)
             return _known[robot]
 
-    def point(self, link: str, point: ArrayLike) -> Fixed:
+    def point(self, link: str, point: ArrayLike) -> FixedVector:
         """Return a point given in the frame of a link, shape (3,) [m].
 
         Raises:
             UnknownNameError: No such link.
         """
         joint, placement = self._placement(link)
-        return Fixed(joint, self._turns[joint].T @ placement.act(np.asarray(point, float)))
+        return FixedVector(joint, self._turns[joint].T @ placement.act(np.asarray(point, float)))
 
-    def direction(self, link: str, direction: ArrayLike) -> Fixed:
+    def direction(self, link: str, direction: ArrayLike) -> FixedVector:
         """Return a unit direction given in the frame of a link, shape (3,).
 
         Raises:
             UnknownNameError: No such link.
         """
         joint, placement = self._placement(link)
-        return Fixed(joint, self._turns[joint].T @ placement.rotation @ np.asarray(direction, float))
+        return FixedVector(joint, self._turns[joint].T @ placement.rotation @ np.asarray(direction, float))
 
-    def inverse(self, targets: Sequence[Target], fixed: Sequence[int] | NDArray[np.intp] = ()) -> Inverse:
+    def inverse(self, targets: Sequence[Target], fixed: Sequence[int] | NDArray[np.intp] = ()) -> IKSolver:
         """Return the inverse kinematics of targets; the planned joints with indices ``fixed`` are not moved."""
-        return Inverse(self.tables, targets, fixed)
+        return IKSolver(self.tables, targets, fixed)
 
     def _placement(self, link: str) -> tuple[int, pin.SE3]:
         if link not in self._placements:

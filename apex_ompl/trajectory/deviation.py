@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from apex_ompl.kernel.reachability import farthest
+from apex_ompl.kernel.compiled.polyline_distance import max_distance
 from apex_ompl.trajectory.curve import Polyline
 from apex_ompl.trajectory.trajectory import Trajectory
 from apex_ompl.types import Array
@@ -39,6 +39,6 @@ def deviation_bound(
     if len(line.states) == 1:
         distance = float(np.linalg.norm(points - line.states[0], axis=1).max())
     else:
-        distance = float(farthest(points, np.interp(times, *arc_at), line.states, line.arc, window))
+        distance = float(max_distance(points, np.interp(times, *arc_at), line.states, line.arc, window))
     half_step = float(np.linalg.norm(np.diff(points, axis=0), axis=1).max(initial=0.0)) / 2.0
     return distance + half_step

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from apex_ompl.errors import ParameterError, TimingError
-from apex_ompl.kernel.reachability import farthest, fastest, moments
+from apex_ompl.kernel.compiled.polyline_distance import max_distance
+from apex_ompl.kernel.compiled.time_parameterization import max_path_speeds, sample_times
 from apex_ompl.robot.model import Limits
 from apex_ompl.trajectory.curve import SAME_STATE, Polyline
 from apex_ompl.trajectory.deviation import deviation_bound
@@ -218,6 +219,6 @@ def _lasting(motion: Trajectory, duration: float) -> Trajectory:
 def warm_up() -> None:
     """Load the compiled code: about 10 ms in each process, or a few seconds when it must be compiled first."""
     x = np.empty(3)
-    fastest(np.ones((3, 1)), np.zeros((3, 1)), np.ones(1), np.ones(1), 1.0, x)
-    moments(x, 1.0, 1.0, np.empty(1))
-    farthest(np.zeros((1, 1)), np.zeros(1), np.array([[0.0], [1.0]]), np.array([0.0, 1.0]), 1.0)
+    max_path_speeds(np.ones((3, 1)), np.zeros((3, 1)), np.ones(1), np.ones(1), 1.0, x)
+    sample_times(x, 1.0, 1.0, np.empty(1))
+    max_distance(np.zeros((1, 1)), np.zeros(1), np.array([[0.0], [1.0]]), np.array([0.0, 1.0]), 1.0)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from numpy.typing import ArrayLike
 
-from apex_ompl.kernel.interface import Kernel
+from apex_ompl.kernel import Kernel
 from apex_ompl.trajopt.optimizer import LAST_RESORT, Check, Optimizer
 from apex_ompl.types import Array
 

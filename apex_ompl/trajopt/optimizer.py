@@ -14,8 +14,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from apex_ompl.errors import ParameterError
-from apex_ompl.kernel import optimization
-from apex_ompl.kernel.interface import Kernel
+from apex_ompl.kernel import Kernel
+from apex_ompl.kernel.compiled.path_cost import (
+    CostSettings,
+    PathReport,
+    Report,
+    optimization_buffer_sizes,
+    path_cost,
+)
+from apex_ompl.kernel.compiled.path_optimization import optimize_path
 from apex_ompl.trajopt.spline import Spline
 from apex_ompl.types import Array
 from apex_ompl.util.validation import check_array, check_integer, check_nonnegative, check_number, check_positive
@@ -92,8 +99,8 @@ class OptimizationResult:
 class Optimizer:
     """Levenberg-Marquardt on control points of batches of paths; thread-safe, without random numbers of its own.
 
-    The cost is the squared speed and the squared violations of the margins, see :mod:`apex_ompl.kernel.optimization`.
-    Limits are kept by the control points.
+    The cost is the squared speed and the squared violations of the margins, see
+    :mod:`apex_ompl.kernel.compiled.path_cost`. Limits are kept by the control points.
     """
 
     def __init__(self, spline: Spline | None = None, settings: Settings | None = None) -> None:
@@ -134,22 +141,15 @@ class Optimizer:
         """
         control = self._control(kernel, control)
         grid, sizes = _grid(self.spline, self.settings.samples), (self.spline.free, control.shape[2])
-        scratch, about = self._scratch(kernel), np.empty((len(control), 6))
-        slopes = np.empty((len(control), sizes[0] * sizes[1]))
-        for points, row, slope in zip(control, about, slopes, strict=True):
-            optimization.path_cost(
-                *kernel.packed,
-                *kernel.room(),
-                *grid,
-                self.spline.pinned,
-                points,
-                self._numbers(),
-                scratch,
-                row[:5],
-                slope,
+        buffers, numbers = self._buffers(kernel), tuple(self._cost_settings())
+        gradients = np.empty((len(control), sizes[0] * sizes[1]))
+        reports = [
+            path_cost(
+                *kernel.packed, *kernel.workspace(), *grid, self.spline.pinned, points, numbers, *buffers, gradient
             )
-        about[:, 5] = self.settings.damping
-        return self._bent(control, about), slopes.reshape(-1, *sizes)
+            for points, gradient in zip(control, gradients, strict=True)
+        ]
+        return self._result(control, reports), gradients.reshape(-1, *sizes)
 
     def improve(
         self,
@@ -179,25 +179,21 @@ class Optimizer:
         each = several * len(control) if isinstance(kernels, Kernel) else several
         if len(each) != len(control) or any(k.robot.dof != control.shape[2] for k in each):
             raise ParameterError("kernels", len(each), f"{len(control)}, one for each path, or one alone")
-        about = np.empty((len(control), 6))
-        if not len(control):
-            return self._bent(control, about)
         for name, number in (("steps", steps), ("stiffness", stiffness), ("damping", damping)):
-            if number is not None:
+            if len(control) and number is not None:
                 check_nonnegative(number, name)
         grid = _grid(self.spline, self.settings.samples)
-        numbers = self._numbers()
-        numbers[optimization.STEPS] = self.settings.steps if steps is None else steps
-        numbers[optimization.STIFFNESS] = self.settings.stiffness if stiffness is None else stiffness
-        numbers[optimization.ENOUGH_SCENE] = numbers[optimization.ENOUGH_OWN] = enough
+        settings = self._cost_settings(steps, stiffness, enough)
         dampings = np.broadcast_to(self.settings.damping if damping is None else damping, len(control))
-        scratch, held = self._scratch(each[0]), np.empty(self.spline.free * control.shape[2], np.int64)
-        for kernel, points, row, first in zip(each, control, about, dampings, strict=True):
-            numbers[optimization.DAMPING] = first
-            optimization.bend(
-                *kernel.packed, *kernel.room(), *grid, self.spline.pinned, points, numbers, scratch, held, row
+        buffers = self._buffers(each[0]) if each else ()
+        reports = [
+            optimize_path(
+                *kernel.packed, *kernel.workspace(), *grid, self.spline.pinned, points,
+                tuple(settings._replace(damping=float(first))), *buffers,
             )
-        return self._bent(control, about)
+            for kernel, points, first in zip(each, control, dampings, strict=True)
+        ]  # fmt: skip
+        return self._result(control, reports)
 
     def shorten(
         self, kernel: Kernel, control: ArrayLike, is_valid: Check, stop: Callable[[], bool] = lambda: False
@@ -253,25 +249,35 @@ class Optimizer:
         check_array(points, ("B", self.spline.points, kernel.robot.dof), "control points", finite=True)
         return points
 
-    def _numbers(self) -> Array:
+    def _cost_settings(
+        self, steps: int | None = None, stiffness: float | None = None, enough: float = np.inf
+    ) -> CostSettings:
         s = self.settings
-        return np.array(
-            [s.scene_margin, s.own_margin, s.stiffness, s.damping, np.inf, np.inf, s.tolerance, s.steps], float
+        return CostSettings(
+            scene_margin=float(s.scene_margin),
+            own_margin=float(s.own_margin),
+            stiffness=float(s.stiffness if stiffness is None else stiffness),
+            damping=float(s.damping),
+            enough=float(enough),
+            tolerance=float(s.tolerance),
+            steps=int(s.steps if steps is None else steps),
         )
 
-    def _scratch(self, kernel: Kernel) -> Array:
+    def _buffers(self, kernel: Kernel) -> tuple[NDArray[np.int64], Array]:
         dof = kernel.robot.dof
-        return np.empty(optimization.room_for(self.spline.free * dof, self.spline.points, dof))
+        integers, floats = optimization_buffer_sizes(self.spline.free * dof, self.spline.points, dof)
+        return np.empty(integers, np.int64), np.empty(floats)
 
     @staticmethod
-    def _bent(control: Array, about: Array) -> OptimizationResult:
-        cost, clearance_cost, clearance = (
-            about[:, optimization.COST],
-            about[:, optimization.CLEARANCE_COST],
-            about[:, optimization.SCENE :][:, :2],
-        )
+    def _result(control: Array, reports: Sequence[Report]) -> OptimizationResult:
+        named = [PathReport(*report) for report in reports]
         return OptimizationResult(
-            control, cost, clearance_cost, clearance, about[:, optimization.TAKEN].astype(np.int64), about[:, -1]
+            control,
+            cost=np.array([r.cost for r in named], float),
+            clearance_cost=np.array([r.clearance_cost for r in named], float),
+            clearance=np.array([(r.scene_clearance, r.own_clearance) for r in named], float).reshape(-1, 2),
+            steps=np.array([r.steps for r in named], np.int64),
+            damping=np.array([r.damping for r in named], float),
         )
 
 

@@ -7,7 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from apex_ompl.kernel.reachability import farthest, fastest, moments
+from apex_ompl.kernel.compiled.polyline_distance import max_distance
+from apex_ompl.kernel.compiled.time_parameterization import max_path_speeds, sample_times
 from apex_ompl.robot.model import Limits
 from apex_ompl.trajectory.curve import Curve, Polyline
 from apex_ompl.trajectory.deviation import deviation_bound
@@ -51,7 +52,7 @@ def blended(
     first, second = curve.derivatives(GRID_POINTS_PER_SPAN)
     step, window = curve.spacing / GRID_POINTS_PER_SPAN, 2.0 * curve.spacing
     grid = np.linspace(0.0, line.length, len(first))
-    if farthest(curve.points(grid), grid, line.states, line.arc, window) > deviation:
+    if max_distance(curve.points(grid), grid, line.states, line.arc, window) > deviation:
         return None
     squared_speed = np.empty(len(first))
     tried: dict[int, tuple[float, Array, Array]] = {}  # least knot spacing [s], control points, their arc lengths
@@ -61,11 +62,11 @@ def blended(
         if index not in tried:
             spacing = KNOT_SPACINGS[index]
             acceleration = np.minimum(limits.acceleration, limits.jerk * spacing)
-            fastest(first, second, limits.velocity, acceleration, step, squared_speed)
-            duration = moments(squared_speed, step, 0.0, np.empty(0))
+            max_path_speeds(first, second, limits.velocity, acceleration, step, squared_speed)
+            duration = sample_times(squared_speed, step, 0.0, np.empty(0))
             count = max(1, int(duration / spacing))
             arc = np.empty(count + 1)
-            moments(squared_speed, step, duration / count, arc)
+            sample_times(squared_speed, step, duration / count, arc)
             arc[-1] = line.length
             points = curve.points(arc)
             points[0], points[-1] = line.states[0], line.states[-1]

@@ -1,4 +1,4 @@
-"""The kernel as Python objects use it: a robot among obstacles."""
+"""Clearances, gradients and proofs for a robot in a scene, in terms of NumPy arrays."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from apex_ompl.errors import ParameterError
-from apex_ompl.kernel import entries
+from apex_ompl.kernel.compiled import motion_proof, queries
+from apex_ompl.kernel.compiled.workspace import workspace_sizes
 from apex_ompl.kernel.tables import RobotTables, SceneTables
-from apex_ompl.kernel.views import room
 from apex_ompl.types import Array
 from apex_ompl.util.validation import shape_error
 
-MOST_PAIRS = 16  # that are told apart for one state
+MOST_PAIRS = 16  # pairs that are listed for one state
 
 
 class Kernel:
@@ -25,14 +25,14 @@ class Kernel:
         self.robot = robot
         self.scene = scene
         self.packed: tuple[Any, ...] = (*robot.packed, *scene.packed)
-        self._room = room(robot.arrays)
+        self._workspace_sizes = workspace_sizes(robot.arrays)
 
-    def room(self) -> tuple[NDArray[np.int64], Array]:
-        """Return new arrays for one call to work in, so that several threads may call."""
-        return np.empty(self._room[0], np.int64), np.empty(self._room[1])
+    def workspace(self) -> tuple[NDArray[np.int64], Array]:
+        """Return new buffers for one call, so that several threads may call."""
+        return np.empty(self._workspace_sizes[0], np.int64), np.empty(self._workspace_sizes[1])
 
     def states(self, q: ArrayLike) -> Array:
-        """Return states as an array of shape (N, dof), in a row of memory.
+        """Return states as a contiguous array of shape (N, dof).
 
         Raises:
             ParameterError: Another shape.
@@ -43,16 +43,16 @@ class Kernel:
         return states
 
     def unproved(self, q: ArrayLike) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return what the spheres cannot prove for states, shape (N, dof).
+        """Return the pairs that the spheres do not prove to be apart at states, shape (N, dof).
 
         Returns:
             Pairs, shape (N, K, 2): two bodies, or a body and -1 - obstacle; and their number, shape (N,): 0 where
-            the state is proved free, K where there may be more than K, -1 where the spheres say nothing.
+            the state is proved free, K where there may be more than K, -1 where the tables do not hold for the state.
         """
         states = self.states(q)
         found = np.empty((len(states), MOST_PAIRS, 2), np.int64)
         counts = np.empty(len(states), np.int64)
-        entries.judge_states(*self.packed, *self.room(), states, found, counts)
+        queries.check_states(*self.packed, *self.workspace(), states, found, counts)
         return found, counts
 
     def clearance(self, q: ArrayLike, limit: float = np.inf) -> Array:
@@ -60,7 +60,7 @@ class Kernel:
 
         Args:
             q: States.
-            limit: Larger clearances are not looked for, and given as this [m].
+            limit: Larger clearances are given as this [m]; a small one is faster.
 
         Returns:
             Shape (N, 2) [m]: to the obstacles, and between bodies that may touch. The true clearances are at least as
@@ -68,7 +68,9 @@ class Kernel:
         """
         states = self.states(q)
         values = np.empty((len(states), 2))
-        entries.clearances(*self.packed, *self.room(), states, float(limit), values, np.empty((0, 2, states.shape[1])))
+        queries.clearances(
+            *self.packed, *self.workspace(), states, float(limit), values, np.empty((0, 2, states.shape[1]))
+        )
         return values
 
     def clearance_gradient(self, q: ArrayLike, limit: float = np.inf) -> tuple[Array, Array]:
@@ -80,24 +82,24 @@ class Kernel:
         """
         states = self.states(q)
         values = np.empty((len(states), 2))
-        slopes = np.empty((len(states), 2, states.shape[1]))
-        entries.clearances(*self.packed, *self.room(), states, float(limit), values, slopes)
-        return values, slopes
+        gradients = np.empty((len(states), 2, states.shape[1]))
+        queries.clearances(*self.packed, *self.workspace(), states, float(limit), values, gradients)
+        return values, gradients
 
     def joint_frames(self, q: ArrayLike) -> tuple[Array, Array]:
         """Return rotations, shape (N, J, 3, 3), and origins, shape (N, J, 3) [m], of all joints, their axes along z."""
         states = self.states(q)
         joints = len(self.robot.arrays.joint_parent)
-        turn, origin = np.empty((len(states), joints, 3, 3)), np.empty((len(states), joints, 3))
-        entries.joint_frames(*self.robot.packed, *self.room(), states, turn, origin)
-        return turn, origin
+        rotation, origin = np.empty((len(states), joints, 3, 3)), np.empty((len(states), joints, 3))
+        queries.joint_frames(*self.robot.packed, *self.workspace(), states, rotation, origin)
+        return rotation, origin
 
     def proves(self, path: ArrayLike, resolution: float) -> bool:
-        """Whether the spheres alone prove all of a path free, its states at most ``resolution`` apart [rad, max-norm].
+        """Whether the spheres alone prove a path free, its states at most ``resolution`` apart [rad, max-norm].
 
         Args:
             path: States, shape (N, dof), N > 1.
-            resolution: Spacing; whole stretches are proved at once where that works.
+            resolution: Spacing; intervals are proved as a whole where the bounds on motion suffice.
 
         Raises:
             ParameterError: Another shape, or a spacing that is not positive.
@@ -111,11 +113,11 @@ class Kernel:
         if counts.any():
             return False
         starts = np.empty(len(states), np.int64)
-        last = entries.lay_grid(states, float(resolution), starts)
+        last = motion_proof.lay_grid(states, float(resolution), starts)
         if last < 0:
             return False
         queue, ends, check_counts = np.empty((2 * last + 4, 2), np.int64), np.array([0, 1, 0]), np.zeros(5, np.int64)
         queue[0] = 0, last
         state = np.empty(self.robot.dof)
         arrays = (states, starts, queue, ends, state, found[0], check_counts)
-        return bool(entries.advance(*self.packed, *self.room(), *arrays) == entries.DONE)
+        return bool(motion_proof.prove_path(*self.packed, *self.workspace(), *arrays) == motion_proof.DONE)

@@ -1,11 +1,11 @@
-"""Inside the kernel: signed distances of points to boxes, spheres, cylinders, capsules and half-spaces."""
+"""Signed distances of points to boxes, spheres, cylinders, capsules and half-spaces, and their gradients."""
 
 from __future__ import annotations
 
 import math
 
-from apex_ompl.kernel.compiled import inlined
-from apex_ompl.kernel.tables import BOX, CAPSULE, CYLINDER, HALF_SPACE, SPHERE, SceneArrays
+from apex_ompl.kernel.compiled.arrays import BOX, CAPSULE, CYLINDER, HALF_SPACE, SPHERE, SceneArrays
+from apex_ompl.kernel.compiled.compilation import inlined
 
 
 @inlined
@@ -73,10 +73,10 @@ def direction(s: SceneArrays, o: int, x: float, y: float, z: float) -> tuple[flo
             a, b, c = across, 0.0, math.copysign(along, c)
     elif kind == CAPSULE:
         c -= min(max(c, -size[1]), size[1])
-    long = math.sqrt(a * a + b * b + c * c)
-    if not long > 0.0:
+    length = math.sqrt(a * a + b * b + c * c)
+    if not length > 0.0:
         return s.rotation[o, 0, 0], s.rotation[o, 1, 0], s.rotation[o, 2, 0]
-    a, b, c = a / long, b / long, c / long
+    a, b, c = a / length, b / length, c / length
     r = s.rotation[o]
     return (
         r[0, 0] * a + r[0, 1] * b + r[0, 2] * c,

@@ -1,9 +1,9 @@
 """Compilation of the kernel by numba, cached on disk where there is a writable place.
 
-numba keeps compiled code beside the source and renews it when that one file changes; the kernel is spread over several
-files that are compiled into each other, so the cache is a folder of our own, named after a digest of all of them and
-of the versions of Python, numba and the kernel's processor. It is ``$NUMBA_CACHE_DIR`` when that is set, or the
-user's cache folder; where neither can be written, the code is compiled anew in every process, and a warning says so.
+numba renews cached code when the one file that it was written in changes. The functions of this folder are compiled
+into each other, so their cache is a folder named after a digest of all its files, of the versions of Python and numba,
+and of the processor. It lies in ``$NUMBA_CACHE_DIR`` when that is set, or in the user's cache folder; where neither can
+be written, the code is compiled anew in every process, and a warning says so.
 """
 
 from __future__ import annotations
@@ -28,17 +28,10 @@ from numba.core import config
 F = TypeVar("F", bound=Callable[..., Any])
 
 LOG = logging.getLogger("apex_ompl")
-NOT_COMPILED = (
-    "__init__.py",
-    "robot_builder.py",
-    "interface.py",
-    "table_checks.py",
-    "inverse_kinematics.py",
-    "scene_builder.py",
-)
 TYPICAL_SECONDS = 45
 
-# Without numba's runtime no array is counted, which costs most of the time otherwise; nothing may be allocated.
+# Without numba's runtime (_nrt) references to arrays are not counted, which would take most of the time; in return
+# compiled code may allocate nothing.
 OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "_nrt": False}
 
 _lock = threading.RLock()
@@ -48,8 +41,7 @@ _lock = threading.RLock()
 def _digest() -> str:
     digest = hashlib.sha256()
     for path in sorted(Path(__file__).parent.glob("*.py")):
-        if path.name not in NOT_COMPILED:
-            digest.update(path.read_bytes())
+        digest.update(path.read_bytes())
     processor = f"{platform.machine()} {llvm.get_host_cpu_name()}"
     digest.update(f"{sys.version_info[:3]} {numba.__version__} {processor}".encode())
     return digest.hexdigest()[:16]
@@ -66,43 +58,46 @@ def cache_folder() -> Path | None:
             folder = home.expanduser() / "apex_ompl" / f"kernel-{_digest()}"
             folder.mkdir(parents=True, exist_ok=True)
             tempfile.TemporaryFile(dir=folder).close()
-        except (OSError, RuntimeError):  # RuntimeError: nobody's home
+        except (OSError, RuntimeError):  # RuntimeError: the user has no home folder
             continue
         return folder
     return None
 
 
 def inlined(function: F) -> F:
-    """Compile a function that is only called by other compiled ones."""
+    """Compile a function that only other compiled ones call; LLVM inlines it."""
     compiled: F = numba.njit(**OPTIONS, forceinline=True)(function)
     return compiled
 
 
-def pasted(function: F) -> F:
-    """Paste a function into those that call it, as what returns arrays must be without numba's runtime."""
+def ir_inlined(function: F) -> F:
+    """Compile a function that only other compiled ones call; numba inlines it, which functions that return arrays need.
+
+    Without numba's runtime no array can be returned from a function that is left standing.
+    """
     compiled: F = numba.njit(**OPTIONS, inline="always")(function)
     return compiled
 
 
-def entry(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile a function that Python calls; its code is kept on disk, and its first compilation is announced.
+def entry_point(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Compile a function that Python calls; its code is cached on disk, and its first compilation is announced.
 
-    Calls release Python's lock, and run on the calling thread alone.
+    Calls release the global interpreter lock, and run on the calling thread alone.
     """
     folder = cache_folder()
     with _lock:
-        kept, config.CACHE_DIR = config.CACHE_DIR, str(folder or "")
+        before, config.CACHE_DIR = config.CACHE_DIR, str(folder or "")
         try:
             dispatcher = numba.njit(**OPTIONS, cache=folder is not None)(function)
         finally:
-            config.CACHE_DIR = kept
+            config.CACHE_DIR = before
     return _Announced(dispatcher, function.__name__)
 
 
 class _Announced:
-    """A compiled function whose first call, when nothing was kept from an earlier process, says that it compiles."""
+    """A compiled function whose first call warns that it compiles, unless an earlier process left its code."""
 
-    _said = False
+    _announced = False
 
     def __init__(self, dispatcher: Any, name: str) -> None:
         self.dispatcher = dispatcher
@@ -118,9 +113,9 @@ class _Announced:
             folder = cache_folder()
             if folder is None or not any(folder.rglob(f"*.{self.name}-*.nbi")):
                 self._announce(folder)
-                begin = time.perf_counter()
+                start = time.perf_counter()
                 result = self.dispatcher(*arguments)
-                LOG.warning("apex_ompl compiled %s in %.1f s", self.name, time.perf_counter() - begin)
+                LOG.warning("apex_ompl compiled %s in %.1f s", self.name, time.perf_counter() - start)
             else:
                 result = self.dispatcher(*arguments)
             self._ready = True
@@ -128,8 +123,8 @@ class _Announced:
 
     @staticmethod
     def _announce(folder: Path | None) -> None:
-        if _Announced._said:
+        if _Announced._announced:
             return
-        _Announced._said = True
+        _Announced._announced = True
         where = f"kept in {folder}" if folder else "in every process anew, since no cache folder can be written"
         LOG.warning("apex_ompl compiles its collision kernel (about %d s, %s)", TYPICAL_SECONDS, where)

@@ -1,0 +1,97 @@
+"""Robot and scene as flat arrays: all that compiled code knows of them, without Pinocchio.
+
+A robot is a tree of joints. Bodies are fixed to joints and covered by trees of spheres (:mod:`apex_ompl.collision`
+makes them and proves that they contain the solids). Bodies that move together, or nearly so (a hand with its fingers),
+form a cluster inside one ball, which is tested first. Every joint frame is rotated so that its axis is z.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, NamedTuple
+
+from apex_ompl.kernel.compiled.layout import Floats, Integers, table_view
+
+FIXED, REVOLUTE, PRISMATIC = 0, 1, 2
+BOX, SPHERE, CYLINDER, CAPSULE, HALF_SPACE = range(5)
+
+Pairs = Annotated[Integers, 2]
+Spans = Annotated[Integers, 2]  # first and number
+Vectors = Annotated[Floats, 3]
+Rotations = Annotated[Floats, 3, 3]
+Balls = Annotated[Floats, 4]  # centre and radius
+
+
+class RobotArrays(NamedTuple):
+    """Arrays of a robot: J joints (0 is the world), C clusters, B bodies, N spheres, P pairs of clusters.
+
+    Joints come after their parents. ``joint_rotation`` and ``joint_offset`` place a joint in its parent; its value is
+    ``joint_ratio * q[joint_source] + joint_shift`` (mimic joints share a source), about or along z. ``eager`` joints
+    are placed at every state, ``lazy`` ones, which are inner joints of clusters, only where a cluster's ball is not
+    enough.
+
+    ``cluster_ball`` holds centre and radius of a ball around all of a cluster's solids in the frame of
+    ``cluster_joint``, for all values of its inner joints; ``cluster_outer`` is the radius around its leaf spheres,
+    ``cluster_spread`` the largest distance of a sphere's centre from the ball's, ``cluster_speed`` the largest speed
+    of such a centre in that frame, per unit of ``q[cluster_dof]``.
+
+    A node is a sphere (``node_centre`` in the frame of its body's joint, ``node_radius``) around the part of the solid
+    that the leaves below cover; ``node_outer`` is a radius around the leaves themselves.
+    """
+
+    joint_parent: Integers
+    joint_kind: Integers
+    joint_source: Integers
+    eager: Integers
+    lazy: Integers
+    cluster_joint: Integers
+    cluster_lazy: Spans
+    cluster_dof: Integers
+    cluster_bodies: Spans
+    cluster_meets_scene: Integers
+    body_joint: Integers
+    body_root: Integers
+    node_first: Integers
+    node_count: Integers
+    pair_clusters: Pairs
+    pair_common: Integers
+    pair_bodies: Spans
+    bodies: Pairs
+    joint_rotation: Rotations
+    joint_offset: Vectors
+    joint_ratio: Floats
+    joint_shift: Floats
+    lower: Floats
+    upper: Floats
+    cluster_ball: Balls
+    cluster_outer: Floats
+    cluster_spread: Floats
+    cluster_speed: Floats
+    node_centre: Vectors
+    node_radius: Floats
+    node_outer: Floats
+
+
+class SceneArrays(NamedTuple):
+    """Arrays of a scene: obstacles, sorted so that each leaf of a tree of boxes holds a range of them.
+
+    ``kind`` is one of BOX ... HALF_SPACE, ``owner`` the number of the obstacle that a solid is part of. ``size`` holds
+    half edges, or radius and half length; a half-space has its unit normal in ``offset`` and its distance in ``size``.
+    Nodes of the tree are in depth-first order: ``tree_skip`` is the next node outside of a node's subtree,
+    ``tree_range`` first obstacle and number of them (0 for inner nodes). The last ``open`` (1,) obstacles are
+    half-spaces, which no box holds.
+    """
+
+    kind: Integers
+    owner: Integers
+    tree_skip: Integers
+    tree_range: Spans
+    open: Integers
+    rotation: Rotations
+    offset: Vectors
+    size: Vectors
+    tree_low: Vectors
+    tree_high: Vectors
+
+
+robot_view = table_view(RobotArrays)
+scene_view = table_view(SceneArrays)

@@ -1,0 +1,118 @@
+"""Clearance cost of a state, its gradient and its Gauss-Newton matrix.
+
+With the clearance d_k of every cluster to every obstacle, of every pair of clusters, and the margin m, the violations
+and the cost are
+
+    r_k = max(0, (m - d_k) / m),   c = 1/2 sum_k r_k^2,   dc/dq = -sum_k r_k u_k,   G = sum_k u_k u_k^T,
+
+where u_k = (dd_k/dq) / m. There is one margin for the scene and one for self-collision.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from apex_ompl.kernel.compiled.arrays import RobotArrays, SceneArrays
+from apex_ompl.kernel.compiled.clearance import (
+    Nearest,
+    gradient_between_bodies,
+    gradient_to_obstacle,
+    nearest_leaves,
+    nearest_to_obstacle,
+)
+from apex_ompl.kernel.compiled.compilation import inlined
+from apex_ompl.kernel.compiled.kinematics import place_cluster, place_robot
+from apex_ompl.kernel.compiled.layout import Floats
+from apex_ompl.kernel.compiled.scene_tree import next_obstacles
+from apex_ompl.kernel.compiled.workspace import Workspace
+
+
+class StateCost(NamedTuple):
+    """Clearance cost of a state.
+
+    Attributes:
+        cost: The cost.
+        scene: Clearance to the scene, at most the one it was compared with [m].
+        own: Clearance between links, at most the one it was compared with [m].
+    """
+
+    cost: float
+    scene: float
+    own: float
+
+
+@inlined
+def _add_violation(clearance: float, margin: float, row: Floats, gradient: Floats, gram: Floats) -> float:
+    """Add the square of a violation whose clearance has the gradient ``row``, which is scaled; return its cost."""
+    for i in range(len(row)):
+        row[i] /= margin
+    violation = (margin - clearance) / margin
+    for i in range(len(row)):
+        u = row[i]
+        if u != 0.0:
+            gradient[i] -= violation * u
+            for k in range(i + 1):
+                gram[i, k] += u * row[k]
+    return 0.5 * violation * violation
+
+
+@inlined
+def _nearest_of_pair(t: RobotArrays, w: Workspace, q: Floats, p: int, margin: float) -> Nearest:
+    """Return the nearest leaves of pair ``p`` of clusters, if they are less than ``margin`` apart."""
+    near: Nearest = (margin, -1, -1, -1, -1)
+    a, b = t.pair_clusters[p, 0], t.pair_clusters[p, 1]
+    u, v = w.ball[a], w.ball[b]
+    apart = math.sqrt((u[0] - v[0]) ** 2 + (u[1] - v[1]) ** 2 + (u[2] - v[2]) ** 2)
+    if a != b and apart - t.cluster_outer[a] - t.cluster_outer[b] >= margin:
+        return near
+    place_cluster(t, w, q, a)
+    place_cluster(t, w, q, b)
+    first = t.pair_bodies[p, 0]
+    for k in range(first, first + t.pair_bodies[p, 1]):
+        near = nearest_leaves(t, w, t.bodies[k, 0], t.bodies[k, 1], near)
+    return near
+
+
+@inlined
+def state_cost(
+    t: RobotArrays, s: SceneArrays, w: Workspace, q: Floats, scene_margin: float, own_margin: float, row: Floats,
+    gradient: Floats, gram: Floats, scene: float, own: float,
+) -> StateCost:  # fmt: skip
+    """Return the clearance cost of a state; put its gradient (dof,) and the lower half of G (dof, dof) into place.
+
+    ``row`` (dof,) is memory to work in; ``scene`` and ``own`` are the smallest clearances so far.
+    """
+    for i in range(len(gradient)):
+        gradient[i] = 0.0
+        for k in range(i + 1):
+            gram[i, k] = 0.0
+    place_robot(t, w, q)
+    cost = 0.0
+    for c in range(len(t.cluster_joint)):
+        if not t.cluster_meets_scene[c]:
+            continue
+        x, y, z = w.ball[c, 0], w.ball[c, 1], w.ball[c, 2]
+        radius = t.cluster_outer[c] + scene_margin
+        n = 0
+        while True:
+            n, first, end = next_obstacles(s, x, y, z, radius, n)
+            if first == end:
+                break
+            for o in range(first, end):
+                near = nearest_to_obstacle(t, s, w, q, c, o, (scene_margin, -1, -1, -1, -1))
+                if near[1] >= 0:
+                    scene = min(scene, near[0])
+                    for i in range(len(row)):
+                        row[i] = 0.0
+                    gradient_to_obstacle(t, s, w, near, row)
+                    cost += _add_violation(near[0], scene_margin, row, gradient, gram)
+    for p in range(len(t.pair_common)):
+        near = _nearest_of_pair(t, w, q, p, own_margin)
+        if near[1] >= 0:
+            own = min(own, near[0])
+            for i in range(len(row)):
+                row[i] = 0.0
+            gradient_between_bodies(t, w, near, row)
+            cost += _add_violation(near[0], own_margin, row, gradient, gram)
+    return StateCost(cost, scene, own)

@@ -1,0 +1,71 @@
+"""Forward kinematics of joints, clusters and spheres."""
+
+from __future__ import annotations
+
+import math
+
+from apex_ompl.kernel.compiled.arrays import FIXED, REVOLUTE, RobotArrays
+from apex_ompl.kernel.compiled.compilation import inlined
+from apex_ompl.kernel.compiled.layout import Floats
+from apex_ompl.kernel.compiled.workspace import Workspace
+
+
+@inlined
+def place_joint(t: RobotArrays, w: Workspace, q: Floats, j: int) -> None:
+    """Place one joint in the world: rotation R_parent R_j Rz(value), or Rz left out and the origin moved along z."""
+    up, kind = t.joint_parent[j], t.joint_kind[j]
+    a, b, r = w.rotation[up], t.joint_rotation[j], w.rotation[j]
+    o = t.joint_offset[j]
+    for i in range(3):
+        w.origin[j, i] = w.origin[up, i] + a[i, 0] * o[0] + a[i, 1] * o[1] + a[i, 2] * o[2]
+        for k in range(3):
+            r[i, k] = a[i, 0] * b[0, k] + a[i, 1] * b[1, k] + a[i, 2] * b[2, k]
+    if kind == FIXED:
+        return
+    value = t.joint_ratio[j] * q[t.joint_source[j]] + t.joint_shift[j]
+    if kind == REVOLUTE:
+        c, s = math.cos(value), math.sin(value)
+        for i in range(3):
+            x, y = r[i, 0], r[i, 1]
+            r[i, 0], r[i, 1] = c * x + s * y, c * y - s * x
+    else:
+        for i in range(3):
+            w.origin[j, i] += r[i, 2] * value
+
+
+@inlined
+def place_robot(t: RobotArrays, w: Workspace, q: Floats) -> None:
+    """Place all joints but the clusters' inner ones, and the clusters' balls; no cluster is opened yet."""
+    for j in t.eager:
+        place_joint(t, w, q, j)
+    for c in range(len(t.cluster_joint)):
+        j = t.cluster_joint[c]
+        r, ball = w.rotation[j], t.cluster_ball[c]
+        for i in range(3):
+            w.ball[c, i] = w.origin[j, i] + r[i, 0] * ball[0] + r[i, 1] * ball[1] + r[i, 2] * ball[2]
+        w.opened[c] = 0
+
+
+@inlined
+def node_position(t: RobotArrays, w: Workspace, j: int, n: int) -> tuple[float, float, float]:
+    """Return the centre of node ``n``, fixed to joint ``j``, in the world [m]."""
+    r, o, c = w.rotation[j], w.origin[j], t.node_centre[n]
+    return (
+        o[0] + r[0, 0] * c[0] + r[0, 1] * c[1] + r[0, 2] * c[2],
+        o[1] + r[1, 0] * c[0] + r[1, 1] * c[1] + r[1, 2] * c[2],
+        o[2] + r[2, 0] * c[0] + r[2, 1] * c[1] + r[2, 2] * c[2],
+    )
+
+
+@inlined
+def place_cluster(t: RobotArrays, w: Workspace, q: Floats, c: int) -> None:
+    """Place a cluster's inner joints and the root spheres of its bodies, unless that was done at this state."""
+    if w.opened[c]:
+        return
+    w.opened[c] = 1
+    first = t.cluster_lazy[c, 0]
+    for k in range(first, first + t.cluster_lazy[c, 1]):
+        place_joint(t, w, q, t.lazy[k])
+    first = t.cluster_bodies[c, 0]
+    for b in range(first, first + t.cluster_bodies[c, 1]):
+        w.root[b, 0], w.root[b, 1], w.root[b, 2] = node_position(t, w, t.body_joint[b], t.body_root[b])

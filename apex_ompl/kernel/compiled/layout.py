@@ -1,0 +1,110 @@
+"""Named tuples of arrays in two flat buffers, one of integers and one of floats.
+
+Passing two arrays to compiled code costs a tenth of passing thirty. A layout is the list of fields of a named tuple:
+each is annotated ``Integers`` or ``Floats``, or with these and a shape, ``Annotated[Floats, "joints", 3]``. From it
+come the sizes of the buffers and the source of the compiled function that slices them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from functools import cache
+from typing import Annotated, Any, NamedTuple, get_args, get_origin, get_type_hints
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apex_ompl.kernel.compiled.compilation import ir_inlined
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+
+class Field(NamedTuple):
+    """A field of a layout.
+
+    Attributes:
+        name: Name of the field.
+        integer: Whether its numbers are integers.
+        shape: Declared shape: of one row for tables, else of the whole array; names stand for dimensions.
+    """
+
+    name: str
+    integer: bool
+    shape: tuple[int | str, ...]
+
+    @property
+    def dtype(self) -> type[np.int64] | type[np.float64]:
+        """Type of its numbers."""
+        return np.int64 if self.integer else np.float64
+
+    def sized(self, dimensions: dict[str, int]) -> tuple[int, ...]:
+        """Return the shape with numbers for the names."""
+        return tuple(dimensions[n] if isinstance(n, str) else n for n in self.shape)
+
+
+@cache
+def layout(cls: Any) -> tuple[Field, ...]:
+    """Return the fields of a named tuple of arrays."""
+    found = []
+    for name, hint in get_type_hints(cls, include_extras=True).items():
+        array, *shape = get_args(hint) if get_origin(hint) is Annotated else (hint,)
+        found.append(Field(name, array == Integers, tuple(shape)))
+    return tuple(found)
+
+
+def pack(arrays: Any) -> tuple[Integers, Floats]:
+    """Return the arrays of a table one behind the other: integers and floats.
+
+    The integers begin with the first and last place of every field, see :func:`table_view`.
+    """
+    fields = layout(arrays.__class__)
+    places: list[int] = []
+    parts: dict[bool, list[NDArray[Any]]] = {True: [], False: []}
+    ends = {True: 2 * len(fields), False: 0}
+    for field, array in zip(fields, arrays, strict=True):
+        places += [ends[field.integer], ends[field.integer] + array.size]
+        ends[field.integer] += array.size
+        parts[field.integer].append(array.ravel())
+    return np.concatenate([np.array(places, np.int64), *parts[True]]), np.concatenate(parts[False])
+
+
+def table_view(cls: Any) -> Callable[[Integers, Floats], Any]:
+    """Return the compiled inverse of :func:`pack`: ``view(integers, floats)`` gives a ``cls`` of slices."""
+    slices = []
+    for k, field in enumerate(layout(cls)):
+        rows = f".reshape(-1, {', '.join(map(str, field.shape))})" if field.shape else ""
+        buffer = "integers" if field.integer else "floats"
+        slices.append(f"{buffer}[integers[{2 * k}] : integers[{2 * k + 1}]]{rows}")
+    return _generated(cls, ["integers", "floats"], [], slices)
+
+
+def buffer_view(cls: Any, dimensions: Sequence[str]) -> Callable[..., Any]:
+    """Return the compiled ``view(integers, floats, *dimensions)`` that gives a ``cls`` of slices of buffers."""
+    ends, lines, slices = {"integers": "0", "floats": "0"}, [], []
+    for k, field in enumerate(layout(cls)):
+        buffer = "integers" if field.integer else "floats"
+        lines.append(f"end{k} = {ends[buffer]} + {' * '.join(map(str, field.shape))}")
+        rows = f".reshape({', '.join(map(str, field.shape))})" if len(field.shape) > 1 else ""
+        slices.append(f"{buffer}[{ends[buffer]} : end{k}]{rows}")
+        ends[buffer] = f"end{k}"
+    return _generated(cls, ["integers", "floats", *dimensions], lines, slices)
+
+
+@cache
+def buffer_sizes(cls: Any, **dimensions: int) -> tuple[int, int]:
+    """Return how many integers and floats the arrays of a ``cls`` have together."""
+    sizes = {True: 0, False: 0}
+    for field in layout(cls):
+        sizes[field.integer] += math.prod(field.sized(dimensions))
+    return sizes[True], sizes[False]
+
+
+def _generated(cls: Any, arguments: list[str], lines: list[str], values: list[str]) -> Callable[..., Any]:
+    """Return the compiled function that computes ``lines`` and returns a ``cls`` of ``values``."""
+    body = "".join(f"    {line}\n" for line in lines)
+    source = f"def view({', '.join(arguments)}):\n{body}    return {cls.__name__}({', '.join(values)})\n"
+    names: dict[str, Any] = {cls.__name__: cls, "__name__": cls.__module__}
+    exec(compile(source, f"<layout of {cls.__name__}>", "exec"), names)
+    return ir_inlined(names["view"])  # type: ignore[no-any-return]

@@ -1,0 +1,217 @@
+"""Cost of a path that is to be clear and short, with its gradient and Gauss-Newton matrix.
+
+The cost of the path q(u) = sum_i B_i(u) P_i with control points P is
+
+    J(P) = stiffness / 2 int |q'(u)|^2 du + 1/N sum_k c(q(u_k)),
+
+with the clearance cost c of :mod:`apex_ompl.kernel.compiled.clearance_cost` at N samples u_k. The first term is
+stiffness / 2 P^T A P with the Gram matrix A of the derivatives B_i'.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, NamedTuple
+
+from apex_ompl.kernel.compiled.arrays import RobotArrays, SceneArrays, robot_view, scene_view
+from apex_ompl.kernel.compiled.clearance_cost import state_cost
+from apex_ompl.kernel.compiled.compilation import entry_point, inlined
+from apex_ompl.kernel.compiled.layout import Floats, Integers, buffer_sizes, buffer_view
+from apex_ompl.kernel.compiled.separation import tables_hold
+from apex_ompl.kernel.compiled.workspace import Workspace, workspace_view
+
+
+class CostSettings(NamedTuple):
+    """Settings of the cost and of the steps.
+
+    Attributes:
+        scene_margin: Clearance to obstacles below which a state costs [m].
+        own_margin: Clearance between links below which a state costs [m].
+        stiffness: Weight of half the integral of the squared speed [1/rad^2].
+        damping: Damping of the first step.
+        enough: The steps end when both clearances reach this [m].
+        tolerance: A step that lowers the cost by less than this share is the last.
+        steps: Most steps, rejected ones among them.
+    """
+
+    scene_margin: float
+    own_margin: float
+    stiffness: float
+    damping: float
+    enough: float
+    tolerance: float
+    steps: int
+
+
+class PathCost(NamedTuple):
+    """Cost of a path; infinite where the tables do not hold for one of its samples.
+
+    Attributes:
+        cost: The cost J.
+        clearance_cost: The part of it that is due to clearance.
+        scene_clearance: Smallest clearance to the scene at the samples, at most its margin [m].
+        own_clearance: Smallest clearance between links at the samples, at most its margin [m].
+    """
+
+    cost: float
+    clearance_cost: float
+    scene_clearance: float
+    own_clearance: float
+
+
+class PathReport(NamedTuple):
+    """Result of the compiled functions: the fields of :class:`PathCost`, steps taken, and the damping to go on with.
+
+    They return, and take, plain tuples, since numba unpickles the class of a named tuple at every call from Python.
+    """
+
+    cost: float
+    clearance_cost: float
+    scene_clearance: float
+    own_clearance: float
+    steps: int
+    damping: float
+
+
+Numbers = tuple[float, float, float, float, float, float, int]  # of CostSettings
+Report = tuple[float, float, float, float, int, float]  # of PathReport
+
+
+class Buffers(NamedTuple):
+    """Memory for the steps of one path; the unknowns are the free control points, joint by joint.
+
+    Attributes:
+        gram: Upper halves of the Gauss-Newton matrices, of the path and of the trial.
+        factor: Upper Cholesky factor.
+        gradient: Gradients of the path and of the trial.
+        step: Right-hand side, then step.
+        trial: Control points of the trial.
+        state: A sample.
+        row: Gradient of one clearance at a sample.
+        state_gradient: Gradient of the clearance cost of a sample.
+        state_gram: Lower half of its Gauss-Newton matrix.
+        held: Whether an unknown stays at its limit.
+    """
+
+    gram: Annotated[Floats, 2, "unknowns", "unknowns"]
+    factor: Annotated[Floats, "unknowns", "unknowns"]
+    gradient: Annotated[Floats, 2, "unknowns"]
+    step: Annotated[Floats, "unknowns"]
+    trial: Annotated[Floats, "points", "dof"]
+    state: Annotated[Floats, "dof"]
+    row: Annotated[Floats, "dof"]
+    state_gradient: Annotated[Floats, "dof"]
+    state_gram: Annotated[Floats, "dof", "dof"]
+    held: Annotated[Integers, "unknowns"]
+
+
+buffers_view = buffer_view(Buffers, ("unknowns", "points", "dof"))
+
+
+def optimization_buffer_sizes(unknowns: int, points: int, dof: int) -> tuple[int, int]:
+    """Return how many integers and floats one call needs as buffers."""
+    return buffer_sizes(Buffers, unknowns=unknowns, points=points, dof=dof)
+
+
+@inlined
+def _sample(weights: Floats, first: Integers, k: int, control: Floats, lower: Floats, upper: Floats, q: Floats) -> None:
+    """Put sample ``k`` of a path into ``q``, inside the limits in spite of rounding."""
+    for i in range(len(q)):
+        total = 0.0
+        for m in range(weights.shape[1]):
+            total += weights[k, m] * control[first[k] + m, i]
+        q[i] = min(max(total, lower[i]), upper[i])
+
+
+@inlined
+def _add_sample(
+    share: float, weights: Floats, first: int, pinned: int, free: int, here: Floats, matrix: Floats, gradient: Floats,
+    gram: Floats,
+) -> None:  # fmt: skip
+    """Add the gradient ``here`` of a sample's cost and its ``matrix`` (lower half), mapped to the control points."""
+    dof = len(here)
+    for m in range(len(weights)):
+        i = first + m - pinned
+        if i < 0 or i >= free:
+            continue
+        f = share * weights[m]
+        for d in range(dof):
+            gradient[i * dof + d] += f * here[d]
+        for k in range(m, min(len(weights), free + pinned - first)):
+            g, at = f * weights[k], (first + k - pinned) * dof
+            for d in range(dof):
+                target = gram[i * dof + d]
+                for e in range(d + 1):
+                    target[at + e] += g * matrix[d, e]
+                for e in range(d + 1, dof):
+                    target[at + e] += g * matrix[e, d]
+
+
+@inlined
+def _add_speed(
+    stiffness: float, speed_gram: Floats, pinned: int, control: Floats, gradient: Floats, gram: Floats
+) -> float:
+    """Add gradient and matrix of stiffness / 2 P^T A P; return the term."""
+    points, dof = control.shape
+    free, total = points - 2 * pinned, 0.0
+    for i in range(points):
+        a = i - pinned
+        inside = 0 <= a < free
+        for k in range(points):
+            b, f = k - pinned, stiffness * speed_gram[i, k]
+            if f == 0.0:
+                continue
+            for d in range(dof):
+                total += 0.5 * f * control[i, d] * control[k, d]
+                if inside:
+                    gradient[a * dof + d] += f * control[k, d]
+            if inside and a <= b < free:
+                for d in range(dof):
+                    gram[a * dof + d, b * dof + d] += f
+    return total
+
+
+@inlined
+def evaluate(
+    t: RobotArrays, s: SceneArrays, w: Workspace, weights: Floats, first: Integers, speed_gram: Floats, pinned: int,
+    control: Floats, settings: CostSettings, b: Buffers, gradient: Floats, gram: Floats,
+) -> PathCost:  # fmt: skip
+    """Return the cost of a path; put its gradient (n,) and the upper half of its matrix (n, n) into place.
+
+    The unknowns are the free control points: number i * dof + d for joint d of free point i.
+    """
+    dof = control.shape[1]
+    free = len(control) - 2 * pinned
+    for i in range(free * dof):
+        gradient[i] = 0.0
+        for k in range(i, free * dof):
+            gram[i, k] = 0.0
+    scene, own = settings.scene_margin, settings.own_margin
+    total, share, q = 0.0, 1.0 / len(weights), b.state
+    for k in range(len(weights)):
+        _sample(weights, first, k, control, t.lower, t.upper, q)
+        if not tables_hold(t, q, w.half_width):
+            return PathCost(math.inf, math.inf, -math.inf, -math.inf)
+        cost, scene, own = state_cost(
+            t, s, w, q, settings.scene_margin, settings.own_margin, b.row, b.state_gradient, b.state_gram, scene, own,
+        )  # fmt: skip
+        if cost > 0.0:
+            total += share * cost
+            _add_sample(share, weights[k], first[k], pinned, free, b.state_gradient, b.state_gram, gradient, gram)
+    speed = _add_speed(settings.stiffness, speed_gram, pinned, control, gradient, gram)
+    return PathCost(total + speed, total, scene, own)
+
+
+@entry_point
+def path_cost(
+    ri: Integers, rf: Floats, si: Integers, sf: Floats, wi: Integers, wf: Floats, weights: Floats, first: Integers,
+    speed_gram: Floats, pinned: int, control: Floats, numbers: Numbers, bi: Integers, bf: Floats, gradient: Floats,
+) -> Report:  # fmt: skip
+    """Return the cost of a path, put its gradient (n,) into place; see ``optimize_path`` for the arguments."""
+    t, s = robot_view(ri, rf), scene_view(si, sf)
+    w = workspace_view(t, wi, wf)
+    points, dof = control.shape
+    b = buffers_view(bi, bf, (points - 2 * pinned) * dof, points, dof)
+    settings = CostSettings(*numbers)
+    c = evaluate(t, s, w, weights, first, speed_gram, pinned, control, settings, b, gradient, b.gram[0])
+    return c.cost, c.clearance_cost, c.scene_clearance, c.own_clearance, 0, settings.damping

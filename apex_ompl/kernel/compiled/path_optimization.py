@@ -1,0 +1,160 @@
+"""Levenberg-Marquardt steps on the control points of a path, on the cost of :mod:`apex_ompl.kernel.compiled.path_cost`.
+
+A step solves
+
+    (stiffness A + H + damping A) dP = -dJ/dP,
+
+where H sums the Gauss-Newton matrices of the samples, mapped to the control points. Damping in the metric A spreads a
+step smoothly over the path (a covariant descent as CHOMP's, Zucker et al. 2013, on the least squares of GPMP2, Mukadam
+et al. 2018).
+"""
+
+from __future__ import annotations
+
+import math
+
+from apex_ompl.kernel.compiled.arrays import RobotArrays, robot_view, scene_view
+from apex_ompl.kernel.compiled.compilation import entry_point, inlined
+from apex_ompl.kernel.compiled.layout import Floats, Integers
+from apex_ompl.kernel.compiled.path_cost import CostSettings, Numbers, Report, buffers_view, evaluate
+from apex_ompl.kernel.compiled.workspace import workspace_view
+
+LEAST_DAMPING, MOST_DAMPING = 1e-9, 1e9
+
+
+@inlined
+def _factorise(factor: Floats, band: int) -> bool:
+    """Replace a matrix by its upper Cholesky factor; both are zero beyond ``band`` from the diagonal."""
+    n = len(factor)
+    for k in range(n):
+        end, source = min(n, k + band), factor[k]
+        if not source[k] > 0.0:
+            return False
+        root = 1.0 / math.sqrt(source[k])
+        for j in range(k, end):
+            source[j] *= root
+        for i in range(k + 1, end):
+            f = source[i]
+            if f != 0.0:
+                target = factor[i]
+                for j in range(i, end):
+                    target[j] -= f * source[j]
+    return True
+
+
+@inlined
+def _newton_step(
+    gram: Floats, speed_gram: Floats, damping: float, pinned: int, dof: int, held: Integers, band: int, factor: Floats,
+    step: Floats,
+) -> bool:  # fmt: skip
+    """Solve (gram + damping A) x = step in place, with x = 0 for ``held`` unknowns; False if not positive definite."""
+    n = len(step)
+    for i in range(n):
+        for k in range(i, min(n, i + band)):
+            factor[i, k] = 0.0 if held[i] or held[k] else gram[i, k]
+        a, d = i // dof, i % dof
+        for k in range(i, min(n, i + band), dof):
+            if not held[i] and not held[k]:
+                factor[i, k] += damping * speed_gram[a + pinned, (k - d) // dof + pinned]
+        if held[i]:
+            factor[i, i], step[i] = 1.0, 0.0
+    if not _factorise(factor, band):
+        return False
+    for i in range(n):
+        step[i] /= factor[i, i]
+        for j in range(i + 1, min(n, i + band)):
+            step[j] -= step[i] * factor[i, j]
+    for i in range(n - 1, -1, -1):
+        total = step[i]
+        for j in range(i + 1, min(n, i + band)):
+            total -= factor[i, j] * step[j]
+        step[i] = total / factor[i, i]
+    return True
+
+
+@inlined
+def _hold(t: RobotArrays, control: Floats, pinned: int, gradient: Floats, held: Integers, step: Floats) -> None:
+    """List the unknowns that the gradient would push beyond their limits, and begin a step with -gradient."""
+    dof = control.shape[1]
+    for i in range(len(step)):
+        d = i % dof
+        value, g = control[pinned + i // dof, d], gradient[i]
+        held[i] = (value <= t.lower[d] and g > 0.0) or (value >= t.upper[d] and g < 0.0)
+        step[i] = -g
+
+
+@inlined
+def _add_step(t: RobotArrays, control: Floats, pinned: int, step: Floats, trial: Floats) -> None:
+    """Put the control points after a step, clipped to the limits, into ``trial``."""
+    dof = control.shape[1]
+    for i in range(len(step)):
+        a, d = pinned + i // dof, i % dof
+        trial[a, d] = min(max(control[a, d] + step[i], t.lower[d]), t.upper[d])
+
+
+@entry_point
+def optimize_path(
+    ri: Integers, rf: Floats, si: Integers, sf: Floats, wi: Integers, wf: Floats, weights: Floats, first: Integers,
+    speed_gram: Floats, pinned: int, control: Floats, numbers: Numbers, bi: Integers, bf: Floats,
+) -> Report:  # fmt: skip
+    """Improve a path in place; its control points (P, dof) are put inside the limits.
+
+    Args:
+        ri: Robot, packed; see :func:`apex_ompl.kernel.compiled.layout.pack`.
+        rf: Robot.
+        si: Scene, packed.
+        sf: Scene.
+        wi: Workspace, see :func:`apex_ompl.kernel.compiled.workspace.workspace_sizes`.
+        wf: Workspace.
+        weights: Weights of control points at the samples, shape (N, degree + 1).
+        first: The first control point that they belong to, shape (N,).
+        speed_gram: Gram matrix A of the speed, shape (P, P).
+        pinned: Number of control points at each end that stay.
+        control: Control points.
+        numbers: The fields of :class:`apex_ompl.kernel.compiled.path_cost.CostSettings`.
+        bi: Buffers, see :func:`apex_ompl.kernel.compiled.path_cost.optimization_buffer_sizes`.
+        bf: Buffers.
+
+    Returns:
+        The fields of :class:`apex_ompl.kernel.compiled.path_cost.PathReport`.
+    """
+    t, s = robot_view(ri, rf), scene_view(si, sf)
+    w = workspace_view(t, wi, wf)
+    points, dof = control.shape
+    n = (points - 2 * pinned) * dof
+    b = buffers_view(bi, bf, n, points, dof)
+    settings = CostSettings(*numbers)
+    for i in range(points):
+        for d in range(dof):
+            if pinned <= i < points - pinned:
+                control[i, d] = min(max(control[i, d], t.lower[d]), t.upper[d])
+            b.trial[i, d] = control[i, d]
+    now, taken, damping, band = 0, 0, settings.damping, min(n, weights.shape[1] * dof)
+    cost = evaluate(t, s, w, weights, first, speed_gram, pinned, control, settings, b, b.gradient[now], b.gram[now])
+    while taken < settings.steps and math.isfinite(cost.cost):
+        if cost.scene_clearance >= settings.enough and cost.own_clearance >= settings.enough:
+            break
+        taken += 1
+        new = cost
+        _hold(t, control, pinned, b.gradient[now], b.held, b.step)
+        better = _newton_step(b.gram[now], speed_gram, damping, pinned, dof, b.held, band, b.factor, b.step)
+        if better:
+            _add_step(t, control, pinned, b.step, b.trial)
+            new = evaluate(
+                t, s, w, weights, first, speed_gram, pinned, b.trial, settings, b, b.gradient[1 - now], b.gram[1 - now]
+            )
+            better = new.cost < cost.cost
+        if not better:
+            damping = max(4.0 * damping, LEAST_DAMPING)
+            if damping > MOST_DAMPING:
+                break
+            continue
+        gain = cost.cost - new.cost
+        cost, now = new, 1 - now
+        damping = max(damping / 3.0, LEAST_DAMPING)
+        for i in range(points):
+            for d in range(dof):
+                control[i, d] = b.trial[i, d]
+        if gain < settings.tolerance * cost.cost:
+            break
+    return cost.cost, cost.clearance_cost, cost.scene_clearance, cost.own_clearance, taken, damping

@@ -1,0 +1,183 @@
+"""Proofs by the sphere cover that pairs of bodies are apart, at a state or during a motion around it.
+
+A pair is proved apart when the distance of all spheres that still have to be looked at exceeds their radii plus a bound
+on their displacement (:mod:`apex_ompl.kernel.compiled.motion_bound`). The cover contains the solids, so that a proved
+pair is free of collision; a pair that is not proved may be either.
+"""
+
+from __future__ import annotations
+
+import math
+
+from apex_ompl.kernel.compiled.arrays import RobotArrays, SceneArrays
+from apex_ompl.kernel.compiled.compilation import inlined
+from apex_ompl.kernel.compiled.kinematics import node_position, place_cluster, place_robot
+from apex_ompl.kernel.compiled.layout import Floats, Integers
+from apex_ompl.kernel.compiled.motion_bound import cluster_displacement, relative_displacement
+from apex_ompl.kernel.compiled.scene_tree import next_obstacles
+from apex_ompl.kernel.compiled.signed_distance import distance
+from apex_ompl.kernel.compiled.workspace import Workspace
+
+# Every comparison is of the form "distance > bound", which is false for NaN: such a state is never proved free.
+
+
+@inlined
+def body_clear(t: RobotArrays, s: SceneArrays, w: Workspace, b: int, o: int, shift: float) -> bool:
+    """Whether a body whose spheres move by at most ``shift`` [m] is proved apart from an obstacle."""
+    j, top = t.body_joint[b], 1
+    w.stack[0] = t.body_root[b]
+    while top > 0:
+        top -= 1
+        n = w.stack[top]
+        x, y, z = node_position(t, w, j, n)
+        if distance(s, o, x, y, z) > t.node_radius[n] + shift:
+            continue
+        if t.node_count[n] == 0:
+            return False
+        for k in range(t.node_first[n], t.node_first[n] + t.node_count[n]):
+            w.stack[top] = k
+            top += 1
+    return True
+
+
+@inlined
+def bodies_clear(t: RobotArrays, w: Workspace, a: int, b: int, shift: float) -> bool:
+    """Whether two bodies that move by at most ``shift`` [m] relative to each other are proved apart."""
+    ja, jb, top = t.body_joint[a], t.body_joint[b], 1
+    w.stack[0], w.stack[1] = t.body_root[a], t.body_root[b]
+    while top > 0:
+        top -= 1
+        m, n = w.stack[2 * top], w.stack[2 * top + 1]
+        x, y, z = node_position(t, w, ja, m)
+        u, v, r = node_position(t, w, jb, n)
+        apart = t.node_radius[m] + t.node_radius[n] + shift
+        if (x - u) ** 2 + (y - v) ** 2 + (z - r) ** 2 > apart * apart:
+            continue
+        first = t.node_count[m] > 0 and (t.node_count[n] == 0 or t.node_radius[m] >= t.node_radius[n])
+        if first:
+            for k in range(t.node_first[m], t.node_first[m] + t.node_count[m]):
+                w.stack[2 * top], w.stack[2 * top + 1] = k, n
+                top += 1
+        elif t.node_count[n] > 0:
+            for k in range(t.node_first[n], t.node_first[n] + t.node_count[n]):
+                w.stack[2 * top], w.stack[2 * top + 1] = m, k
+                top += 1
+        else:
+            return False
+    return True
+
+
+@inlined
+def cluster_against(
+    t: RobotArrays, s: SceneArrays, w: Workspace, q: Floats, c: int, o: int, found: Integers, count: int
+) -> int:
+    """Add to ``found`` a cluster's bodies that are not proved apart from an obstacle; return the number of pairs."""
+    shift = cluster_displacement(w, c)
+    if distance(s, o, w.ball[c, 0], w.ball[c, 1], w.ball[c, 2]) > t.cluster_ball[c, 3] + shift:
+        return count
+    place_cluster(t, w, q, c)
+    first = t.cluster_bodies[c, 0]
+    for b in range(first, first + t.cluster_bodies[c, 1]):
+        if distance(s, o, w.root[b, 0], w.root[b, 1], w.root[b, 2]) > t.node_radius[t.body_root[b]] + shift:
+            continue
+        if not body_clear(t, s, w, b, o, shift):
+            found[count, 0], found[count, 1] = b, -1 - s.owner[o]
+            count += 1
+            if count == len(found):
+                break
+    return count
+
+
+@inlined
+def unproved_with_obstacles(
+    t: RobotArrays, s: SceneArrays, w: Workspace, q: Floats, found: Integers, count: int
+) -> int:
+    """Add to ``found`` the bodies and obstacles that are not proved apart; return the number of pairs."""
+    for c in range(len(t.cluster_joint)):
+        if not t.cluster_meets_scene[c]:
+            continue
+        radius = t.cluster_ball[c, 3] + cluster_displacement(w, c)
+        x, y, z = w.ball[c, 0], w.ball[c, 1], w.ball[c, 2]
+        k = 0
+        while True:
+            k, first, end = next_obstacles(s, x, y, z, radius, k)
+            if first == end:
+                break
+            for o in range(first, end):
+                count = cluster_against(t, s, w, q, c, o, found, count)
+                if count == len(found):
+                    return count
+    return count
+
+
+@inlined
+def unproved_between_bodies(t: RobotArrays, w: Workspace, q: Floats, found: Integers, count: int) -> int:
+    """Add to ``found`` the bodies that are not proved apart from each other; return the number of pairs."""
+    for p in range(len(t.pair_common)):
+        a, b = t.pair_clusters[p, 0], t.pair_clusters[p, 1]
+        common = t.pair_common[p]
+        shift = relative_displacement(w, a, b, common)
+        if a != b:
+            apart = t.cluster_ball[a, 3] + t.cluster_ball[b, 3] + shift
+            u, v = w.ball[a], w.ball[b]
+            if (u[0] - v[0]) ** 2 + (u[1] - v[1]) ** 2 + (u[2] - v[2]) ** 2 > apart * apart:
+                continue
+        place_cluster(t, w, q, a)
+        place_cluster(t, w, q, b)
+        first = t.pair_bodies[p, 0]
+        for k in range(first, first + t.pair_bodies[p, 1]):
+            m, n = t.bodies[k, 0], t.bodies[k, 1]
+            u, v = w.root[m], w.root[n]
+            apart = t.node_radius[t.body_root[m]] + t.node_radius[t.body_root[n]] + shift
+            if (u[0] - v[0]) ** 2 + (u[1] - v[1]) ** 2 + (u[2] - v[2]) ** 2 > apart * apart:
+                continue
+            if not bodies_clear(t, w, m, n, shift):
+                found[count, 0], found[count, 1] = m, n
+                count += 1
+                if count == len(found):
+                    return count
+    return count
+
+
+@inlined
+def tables_hold(t: RobotArrays, q: Floats, half_width: Floats) -> bool:
+    """Whether a box of states is finite, and inside the limits for which the clusters' balls were made."""
+    for k in range(len(q)):
+        if not math.isfinite(q[k]):
+            return False
+    for c in range(len(t.cluster_dof)):
+        k = t.cluster_dof[c]
+        if k >= 0 and not (q[k] - half_width[k] >= t.lower[k] and q[k] + half_width[k] <= t.upper[k]):
+            return False
+    return True
+
+
+@inlined
+def unproved(t: RobotArrays, s: SceneArrays, w: Workspace, q: Floats, found: Integers) -> int:
+    """Put the pairs that are not proved apart into ``found`` (K, 2), at the state and during the motion of ``w``.
+
+    A pair is two bodies, or a body and -1 - obstacle; the search ends when ``found`` is full.
+
+    Returns:
+        The number of pairs.
+    """
+    count = unproved_with_obstacles(t, s, w, q, found, 0)
+    if count == len(found):
+        return count
+    return unproved_between_bodies(t, w, q, found, count)
+
+
+@inlined
+def unproved_at_state(t: RobotArrays, s: SceneArrays, w: Workspace, q: Floats, found: Integers) -> int:
+    """Place the robot at a state and put the pairs that are not proved apart into ``found``, see :func:`unproved`.
+
+    Returns:
+        The number of pairs, or -1 where the tables do not hold for the state.
+    """
+    for k in range(len(q)):
+        w.half_width[k] = 0.0
+    if not tables_hold(t, q, w.half_width):
+        return -1
+    place_robot(t, w, q)
+    w.moving[0] = 0
+    return unproved(t, s, w, q, found)
