@@ -20,10 +20,10 @@ from typing import Any
 import record
 import torch
 
-from apex_ompl.datasets.cases import load_cases
+from apex_ompl.datasets.kernel_problems import load_kernel_problems
 from apex_ompl.diffusion.checkpoint import load_model
 from apex_ompl.diffusion.runlog import read_log
-from apex_ompl.diffusion.validation import judged
+from apex_ompl.diffusion.validation import success_rates
 from apex_ompl.util.scripts import run_command
 from apex_ompl.util.validation import one_or_more
 
@@ -67,7 +67,7 @@ def figures(folder: Path | None, cases: list[Any]) -> dict[str, Any]:
         "weights": sum(p.numel() for p in model.network.parameters()),
     }  # fmt: skip
     for count in (1, 8):
-        said = judged(model, cases, count)
+        said = success_rates(model, cases, count)
         hard = [value for name, value in said.items() if name.endswith("/hard")]
         found[f"B{count}"] = {**said, "hard": sum(hard) / len(hard)}
     return found
@@ -110,7 +110,7 @@ def main() -> None:
     args = parser.parse_args()
     with ThreadPoolExecutor(args.jobs) as pool:
         folders = dict(zip(args.only, pool.map(lambda name: trained(name, args), args.only), strict=True))
-    cases = load_cases(ROOT / "data" / "dual_panda_softhand" / "validation")
+    cases = load_kernel_problems(ROOT / "data" / "dual_panda_softhand" / "validation")
     torch.set_num_threads(1)
     rows = {name: figures(folder, cases) for name, folder in (*folders.items(), ("apex as it ships", None))}
     record.write(

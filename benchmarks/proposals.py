@@ -32,7 +32,7 @@ from store import RunStore
 from apex_ompl import load_model, plan, problems
 from apex_ompl.apex.query import make_query
 from apex_ompl.diffusion.checkpoint import SHIPPED, read_config
-from apex_ompl.diffusion.data import Mirror, window_paths
+from apex_ompl.diffusion.data import Mirror, shard_paths
 from apex_ompl.diffusion.guidance import Guidance
 from apex_ompl.diffusion.proposals import Sampling, TrajectoryModel
 from apex_ompl.kernel import Kernel, RobotTables
@@ -52,7 +52,7 @@ STORE = record.RESULTS.parent / "runs" / "proposals.jsonl"
 COUNTS = (1, 8, 32)
 GUIDED = Guidance(gamma=1.0)
 PAPER = Sampling("ddpm", 256)
-GUIDED_PAPER = Sampling("ddpm", 256, guidance=Guidance(1.0, "noise", begin=0.25))
+GUIDED_PAPER = Sampling("ddpm", 256, guidance=Guidance(1.0, "noise", active_below=0.25))
 METHODS: dict[str, tuple[int, ...]] = {
     "line": (1,),
     "bumps": (8, 32),
@@ -86,7 +86,7 @@ def model(name: str) -> TrajectoryModel:
 def neighbours(data: str) -> Neighbours:
     """Return the training paths to look for neighbours in, with the mirror images that the model saw."""
     tables = RobotTables.load(ROOT / "data" / "dual_panda_softhand" / "robot.npz")
-    paths, _ = window_paths(data.split(","), 0, 10**9, 0)
+    paths, _ = shard_paths(data.split(","), 0, 10**9, 0)
     mirror = load_model("apex").about["config"]["mirror"]
     images = [] if mirror is None else [Mirror(**mirror).paths(paths, Kernel(tables, scene_tables([])))]
     return Neighbours([paths, *images], tables)

@@ -34,7 +34,7 @@ def some(paths: Paths, count: int, seed: int) -> Paths:
 def compact(args: argparse.Namespace) -> None:
     """Write as many paths as fit."""
     check_writable(args.file)
-    every, limit = Paths.joined(Store(args.folder)), args.mib * 2**20
+    every, limit = Paths.concatenate(Store(args.folder)), args.mib * 2**20
     with tempfile.TemporaryDirectory() as folder:
         trial = Path(folder) / "trial.zip"
         fits, too_many, count = -1, len(every) + 1, len(every)

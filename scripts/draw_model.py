@@ -33,7 +33,7 @@ from apex_ompl.util.validation import whole_number
 
 MOMENTS = (0.0, 0.25, 0.5, 1.0)  # as shares of the reverse process
 HANDS = {"left_hand_palm_0": "tab:blue", "right_hand_palm_0": "tab:orange"}
-GUIDED = Guidance(1.0, "noise", begin=0.25)
+GUIDED = Guidance(1.0, "noise", active_below=0.25)
 
 
 def places(kernel: Kernel, path: np.ndarray) -> dict[str, np.ndarray]:

@@ -77,7 +77,7 @@ def apex_cli():
 def paths() -> Paths:
     """Paths of a few problems of every level."""
     whole = load(ROOT / "data" / "dual_panda_softhand" / "paths.zip")
-    return whole.chosen(np.arange(0, whole.problems, 60))
+    return whole.subset(np.arange(0, whole.problems, 60))
 
 
 @pytest.fixture(scope="session")

@@ -33,7 +33,7 @@ KINDS = {"box": BOX, "sphere": SPHERE, "cylinder": CYLINDER, "capsule": CAPSULE}
 def some_paths() -> Paths:
     """Paths of a few problems of every level."""
     paths = load(DATA / "paths.zip")
-    return paths.chosen(np.arange(0, paths.problems, 100))
+    return paths.subset(np.arange(0, paths.problems, 100))
 
 
 @cache
@@ -49,7 +49,7 @@ def kernel(*things: tuple[str, tuple[float, ...], tuple[float, ...]]) -> Kernel:
 
 def config(**parts: object) -> ModelConfig:
     robot = kernel().robot
-    count = len(Probes.of(robot, 3).joint)
+    count = len(Probes.from_robot(robot, 3).joint)
     small = {
         "latent": LatentConfig(dim=24, width=16), "condition": ConditionConfig(width=16, out=32, along=3),
         "denoiser": DenoiserConfig(width=32, blocks=2), "noise": NoiseConfig(),
@@ -61,7 +61,7 @@ def network(seed: int = 0, **parts: object) -> LatentDiffusion:
     """A small model, its last layer not zero as at the beginning of a training."""
     torch.manual_seed(seed)
     model = LatentDiffusion(config(**parts))
-    probes = Probes.of(kernel().robot, 3)
+    probes = Probes.from_robot(kernel().robot, 3)
     model.probe_joint.copy_(torch.from_numpy(probes.joint))
     model.probe_offset.copy_(torch.from_numpy(probes.offset))
     if isinstance(model.autoencoder, LinearLatent):
@@ -88,4 +88,4 @@ def query(seed: int = 0) -> Query:
     middle, span = (limits.lower + limits.upper) / 2, limits.upper - limits.lower
     ends = middle + 0.3 * span * rng.uniform(-0.5, 0.5, (2, DOF))
     rows = [(0, WALL[1], (0, 0, 0, 1), (0.1, 0.8, 0.6)), (2, POST[1], (0, 0, 0, 1), (0.05, 0.6, 0.0))]
-    return Query(ends[0], ends[1], np.array([0.4, 0.0, 0.5]), ObstacleSet.of(rows))
+    return Query(ends[0], ends[1], np.array([0.4, 0.0, 0.5]), ObstacleSet.from_rows(rows))

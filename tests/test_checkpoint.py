@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
-from trainings import DATA, HERE, config, query_of_path
+from trainings import DATA, HERE, config, query_from_path
 
 import apex_ompl
 from apex_ompl.datasets.store import load
@@ -55,7 +55,7 @@ def test_a_checkpoint_gives_the_model_back(saved: Path, few: Path, tmp_path: Pat
     assert "denoiser, step 12, 0 min, 32 paths in memory" in (saved / "README.md").read_text()
     assert model.about["config"]["steps"] == 12
     kernel = Kernel(RobotTables.load(DATA / "robot.npz"), scene_tables([]))
-    query = query_of_path(load(few), 0)
+    query = query_from_path(load(few), 0)
     first, second = (
         m.propose(query, kernel, 3, generator=torch.Generator().manual_seed(1)).control
         for m in (model, load_model(str(tmp_path / "again")))

@@ -8,10 +8,10 @@ import torch
 from support import ROOT
 
 from apex_ompl import load_model
-from apex_ompl.datasets.cases import load_cases
+from apex_ompl.datasets.kernel_problems import load_kernel_problems
 from apex_ompl.diffusion.checkpoint import SHIPPED, shipped
 from apex_ompl.diffusion.proposals import Sampling
-from apex_ompl.diffusion.validation import query_of_case
+from apex_ompl.diffusion.validation import query_from_problem
 from apex_ompl.kernel import Kernel
 from apex_ompl.problems.reach import robot
 from apex_ompl.trajopt.candidates import first_valid
@@ -19,7 +19,7 @@ from apex_ompl.trajopt.optimizer import Optimizer
 from apex_ompl.util.resolution import FULL_RESOLUTION
 from apex_ompl.util.threads import one_torch_thread
 
-CASES = load_cases(ROOT / "data" / "dual_panda_softhand" / "validation")
+CASES = load_kernel_problems(ROOT / "data" / "dual_panda_softhand" / "validation")
 
 
 def test_what_ships_is_small_and_named() -> None:
@@ -42,7 +42,7 @@ def test_a_sample_of_the_model_is_shorter_to_repair_than_the_line(name: str) -> 
         kernel = Kernel(case.robot, case.scene)
         generator = torch.Generator().manual_seed(1)
         with one_torch_thread():
-            proposed = model.propose(query_of_case(case), kernel, 1, sampling=quick, generator=generator)
+            proposed = model.propose(query_from_problem(case), kernel, 1, sampling=quick, generator=generator)
         starts = {
             "model": proposed.control,
             "line": model.spline.line(case.start, case.goal)[None],

@@ -15,14 +15,15 @@ from tqdm import tqdm
 
 from apex_ompl import problems
 from apex_ompl.apex.query import make_query
-from apex_ompl.datasets.engine import Options
+from apex_ompl.datasets.engine import EngineOptions
 from apex_ompl.datasets.records import SOURCES, Paths
 from apex_ompl.datasets.store import Store
 from apex_ompl.diffusion.autoencoder import Autoencoder
 from apex_ompl.diffusion.checkpoint import load_model
 from apex_ompl.diffusion.guidance import Guidance
 from apex_ompl.diffusion.proposals import Sampling
-from apex_ompl.generation.worker import plan_units, work
+from apex_ompl.generation.solving import solve_unit
+from apex_ompl.generation.units import plan_units
 from apex_ompl.ompl_adapter.process import quiet_ompl
 from apex_ompl.ompl_adapter.setup import assemble
 from apex_ompl.problems.reach import robot
@@ -50,14 +51,14 @@ def variants() -> dict[str, tuple[str, Sampling]]:
 def solutions(folder: Path, count: int, levels: Sequence[str], workers: int) -> list[Paths]:
     """Return solutions of validation problems, at least ``count`` where as many can be had, kept in a folder."""
     units = {unit.name: unit for unit in plan_units(int(1.2 * count), levels, "validation")}
-    options, spline = Options(copies=1, parts=0), Spline()
+    options, spline = EngineOptions(copies=1, parts=0), Spline()
     settings = {"problems": count, "levels": list(levels), **asdict(spline)}
     store = Store.create(folder, settings, ("problems", "levels"))
     with store.locked():
         there = set(store.units())
         jobs = {name: (unit, options, spline) for name, unit in units.items() if name not in there}
         if jobs:
-            made = spread(work, jobs, workers=workers, address=None)
+            made = spread(solve_unit, jobs, workers=workers, address=None)
             for name, (paths, _) in tqdm(made, total=len(jobs), unit="unit"):
                 store.write(name, paths)
         return list(store)
