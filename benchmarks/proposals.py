@@ -1,10 +1,10 @@
-"""What proposals are worth: B = 1, 8 and 32 of them judged, repaired, judged again and shortened, on test problems.
+"""Quality of proposals: B = 1, 8 and 32 of them checked, optimized, checked again and shortened, on test problems.
 
 The models, unguided and guided, stand beside the straight line, random bumps, the nearest training paths, a regression
 network of the same size, conditions and training, the same network with random weights, and with the conditions of
-another problem of the level. All are repaired by the same steps of the same optimiser, shortened, and judged by the
-same full check; beside them rrtconnect+polish. Times leave out the setup of the problem. Runs are kept in a store as
-they end (JSON lines), so that the command goes on where it was stopped.
+another problem of the level. All are optimized by the same steps of the same optimizer, shortened, and checked by
+the same full check; beside them rrtconnect+polish. Times leave out the setup of the problem. Runs are kept in a store
+as they end (JSON lines); the same command resumes an interrupted run.
 
 The regression network is trained by ``python scripts/train.py scripts/configs/apex.yaml --set
 denoiser.kind=regression --out benchmarks/runs/regression``, with the same --set as the model.
@@ -15,9 +15,8 @@ Usage: python benchmarks/proposals.py [SUITE[/LEVEL] ...] [-n 10] [--hard 30] [-
 from __future__ import annotations
 
 import argparse
-import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -27,13 +26,15 @@ import record
 import torch
 from controls import Shuffled, checkpoint_digest, digest, drawn, next_query
 from neighbours import Neighbours
+from proposal_tables import figures, table
 from store import RunStore
 
 from apex_ompl import load_model, plan, problems
 from apex_ompl.apex.query import make_query
 from apex_ompl.diffusion.checkpoint import SHIPPED, read_config
-from apex_ompl.diffusion.data import Mirror, shard_paths
+from apex_ompl.diffusion.data import shard_paths
 from apex_ompl.diffusion.guidance import Guidance
+from apex_ompl.diffusion.mirror import Mirror
 from apex_ompl.diffusion.proposals import Sampling, TrajectoryModel
 from apex_ompl.kernel import Kernel, RobotTables
 from apex_ompl.kernel.scene_builder import scene_tables
@@ -157,7 +158,7 @@ def run(job: Job) -> dict[str, Any]:
     control = make(count)
     proposed = time.perf_counter()
     valid = next((c for c in control if is_valid(optimizer.spline.path(c))), None)
-    judged = time.perf_counter()
+    checked = time.perf_counter()
     found = valid if valid is not None else first_valid(optimizer, ready.checker.kernel, control, is_valid)
     found_s = time.perf_counter() - begin
     best = None if found is None else optimizer.shorten(ready.checker.kernel, found, is_valid)
@@ -166,7 +167,7 @@ def run(job: Job) -> dict[str, Any]:
     length = None if best is None else path_length(optimizer.spline.path(best))
     return {
         **about, "sampled": valid is not None, "solved": best is not None, "propose_s": proposed - begin,
-        "judge_s": judged - proposed, "found_s": found_s, "total_s": took, "length": length,
+        "judge_s": checked - proposed, "found_s": found_s, "total_s": took, "length": length,
     }  # fmt: skip
 
 
@@ -209,64 +210,6 @@ def attempted(job: Job) -> dict[str, Any]:
         return {**about, "sampled": False, "solved": False, "error": repr(error)}
 
 
-def figures(runs: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Return what came of every method and count on a level."""
-    polished = {r["problem"]: r for r in runs if r["method"] == "rrtconnect+polish" and r["solved"]}
-    found: dict[str, Any] = {}
-    for method, counts in METHODS.items():
-        for count in counts:
-            some = [r for r in runs if (r["method"], r["count"]) == (method, count)]
-            if some:
-                found[f"{method}, {count}" if len(counts) > 1 else method] = _of_runs(some, polished)
-    return found
-
-
-def _of_runs(some: Sequence[dict[str, Any]], polished: dict[str, dict[str, Any]]) -> dict[str, Any]:
-    took = np.sort([r["total_s"] if r["solved"] else math.inf for r in some])
-    found = np.sort([r["found_s"] if r["solved"] else math.inf for r in some])
-    both = [(r, polished[r["problem"]]) for r in some if r["solved"] and r["problem"] in polished]
-    total, first = (float(times[(len(times) - 1) // 2]) for times in (took, found))
-    return {
-        "n": len(some), "sampled": float(np.mean([r["sampled"] for r in some])),
-        "solved": float(np.mean([r["solved"] for r in some])),
-        "propose_s_p50": float(np.median([r.get("propose_s", math.nan) for r in some])),
-        "found_s_p50": first if math.isfinite(first) else None,
-        "total_s_p50": total if math.isfinite(total) else None,
-        "both": len(both),
-        "length_p50": float(np.median([r["length"] for r in some if r["solved"]] or [math.nan])),
-        "length_over_polished": float(np.exp(np.mean([math.log(a["length"] / b["length"]) for a, b in both])))
-        if both else None,
-        "time_over_polished": float(np.exp(np.mean([math.log(a["total_s"] / b["total_s"]) for a, b in both])))
-        if both else None,
-    }  # fmt: skip
-
-
-def table(levels: Sequence[dict[str, Any]]) -> str:
-    """Return the Markdown table."""
-    head = ["suite/level", "proposals", "N", "valid", "repaired", "propose ms", "found ms p50", "shortened ms p50"]
-    head += ["length rad", "length / rrtconnect+polish", "time / rrtconnect+polish", "on"]
-    rows = [head, ["---", "---", *["---:"] * (len(head) - 2)]]
-    for level in levels:
-        for k, (method, f) in enumerate(level["methods"].items()):
-            cells = [level["level"] if k == 0 else "", method, f["n"], f"{f['sampled']:.2f}", f"{f['solved']:.2f}"]
-            cells += list(_cells(f))
-            rows.append(cells)
-    return "\n".join(record.row(row) for row in rows)
-
-
-def _cells(f: dict[str, Any]) -> Iterator[str]:
-    def ms(value: float | None, otherwise: str) -> str:
-        return otherwise if value is None or math.isnan(value) else f"{1e3 * value:.0f}"
-
-    yield ms(f["propose_s_p50"], "-")
-    yield ms(f["found_s_p50"], "not found")
-    yield ms(f["total_s_p50"], "not found")
-    yield "-" if math.isnan(f["length_p50"]) else f"{f['length_p50']:.1f}"
-    for name in ("length_over_polished", "time_over_polished"):
-        yield "-" if f[name] is None else f"{f[name]:.2f}"
-    yield str(f["both"])
-
-
 def main() -> None:
     """Run what is missing, and write the results of all."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -304,11 +247,12 @@ def main() -> None:
     store.complete(attempted, todo, args.jobs, warm_up, list(first.values()))
     done = store.read()
     runs = [done[job.key] for job in jobs if job.key in done]
-    levels = [{"level": v, "methods": figures([r for r in runs if r["problem"].startswith(f"{v}/")])} for v in chosen]
+    by_level = {v: [r for r in runs if r["problem"].startswith(f"{v}/")] for v in chosen}
+    levels = [{"level": v, "methods": figures(by_level[v], METHODS)} for v in chosen]
     levels = [level for level in levels if level["methods"]]
     hard = [r for r in runs if "/hard/" in r["problem"]]
     if hard:
-        levels.insert(0, {"level": "all hard levels", "methods": figures(hard)})
+        levels.insert(0, {"level": "all hard levels", "methods": figures(hard, METHODS)})
     record.write(
         "proposals", {"levels": levels, "made_of": kinds}, table(levels), split=args.split,
         time_limit=TIME_LIMIT, seeds="number of the problem modulo 1000", **record.made_with(runs),

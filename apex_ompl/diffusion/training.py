@@ -188,14 +188,11 @@ class Trainer:
             "paths": len(self.data.shard), "config": config,
         }  # fmt: skip
 
-    def _trained_modules(self) -> list[nn.Module]:
-        if self.phase == "autoencoder":
-            return [self.network.autoencoder]
-        return [self.network.encoder, self.network.denoiser]
-
     def _start_phase(self) -> None:
         """Make the optimizer and the averaged weights of the phase."""
-        chosen = {id(p) for module in self._trained_modules() for p in module.parameters()}
+        network = self.network
+        modules = [network.autoencoder] if self.phase == "autoencoder" else [network.encoder, network.denoiser]
+        chosen = {id(p) for module in modules for p in module.parameters()}
         named = [(name, p) for name, p in self.network.named_parameters() if id(p) in chosen]
         self._names, self._parameters = [name for name, _ in named], [p for _, p in named]
         self.averaged = {name: p.detach().clone() for name, p in self.network.named_parameters()}
