@@ -1,4 +1,4 @@
-"""What stands in the place of the model in comparisons: random bumps, random weights, another problem's conditions.
+"""Controls of the model in comparisons: random bumps, random weights, another problem's conditions.
 
 Importing this module registers APEX with each of them as a planner.
 """
@@ -29,7 +29,7 @@ from apex_ompl.trajopt.optimizer import Optimizer
 
 
 class Bumps(TrajectoryModel):
-    """Random bumps in the place of proposals."""
+    """Random bumps instead of proposals."""
 
     def propose(self, query: Any, kernel: Any, count: int, **options: Any) -> Proposals:
         """Return bumps on the straight lines of queries."""
@@ -82,7 +82,7 @@ def drawn(trained: LatentDiffusion) -> LatentDiffusion:
 
 
 def digest(*files: Path) -> str:
-    """Return what tells the contents of files apart from others."""
+    """Return a digest of the contents of files."""
     return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:12]
 
 
@@ -100,7 +100,7 @@ def next_query(name: str) -> Query:
 
 @cache
 def control(kind: str, trained: TrajectoryModel) -> TrajectoryModel:
-    """Return what takes the place of the model."""
+    """Return the control that replaces the model."""
     if kind == "random weights":
         return TrajectoryModel(drawn(trained.network), {})
     return (Bumps if kind == "bumps" else Shuffled)(trained.network, {})

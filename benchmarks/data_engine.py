@@ -34,13 +34,13 @@ from apex_ompl.util.validation import one_or_more, whole_number
 
 SCRIPT = Path(__file__).resolve().parent.parent / "scripts" / "generate_data.py"
 WANTED, CORES = 500_000, (2, 16, 64)
-SCALED = ("vertical", "horizontal", "wall/easy", "swap/medium")  # what is made with one and with several workers
+SCALED = ("vertical", "horizontal", "wall/easy", "swap/medium")  # levels solved with one and with several workers
 PROBLEMS = 240
 MOST_DEEP = 3  # columns of stages
 
 
 def one(unit: Unit) -> dict[str, Any]:
-    """Return what a unit yields, and what it costs."""
+    """Return yield and cost of a unit."""
     begin = time.perf_counter()
     paths, times = solve_unit(unit, EngineOptions(), Spline())
     seconds = time.perf_counter() - begin

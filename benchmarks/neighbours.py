@@ -1,4 +1,4 @@
-"""The nearest training paths, moved to the ends of a query: what a model has to be better than."""
+"""Nearest training paths, moved to the ends of a query: the baseline of a model."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from apex_ompl.kernel.scene_builder import scene_tables
 from apex_ompl.types import Array
 
 ALONG = 7  # states of the straight line at which clearances are compared
-NEAR = 0.3  # clearances are told apart up to here [m]
-PER_METRE = 3.0  # rad that a metre of clearance counts as much as
+NEAR = 0.3  # clearances are clipped here [m]
+PER_METRE = 3.0  # weight of clearances beside joint angles [rad/m]
 
 
 class Neighbours:
@@ -36,7 +36,7 @@ class Neighbours:
         self._features, self._residual = np.concatenate(rows), np.concatenate(rests)
 
     def refitted(self, query: Query, kernel: Kernel, count: int) -> Array:
-        """Return what the nearest paths differ in from their straight lines, put on that of a query.
+        """Return the nearest paths' residuals from their straight lines, added to the straight line of a query.
 
         Args:
             query: The problem.
@@ -61,7 +61,7 @@ class Neighbours:
 
 
 def features(conditions: Conditions) -> NDArray[np.float32]:
-    """Return what neighbours are compared by, shape (B, features) [rad]."""
+    """Return the features by which neighbours are compared, shape (B, features) [rad]."""
     least = pad_obstacles(conditions.probe_distances().clamp(-NEAR, NEAR), conditions.mask, NEAR).amin(dim=1)
     rows = torch.cat([conditions.start, conditions.goal, PER_METRE * least / least.shape[1] ** 0.5], dim=1)
     return np.asarray(rows.numpy(), np.float32)

@@ -94,7 +94,7 @@ def neighbours(data: str) -> Neighbours:
 
 
 class Job(NamedTuple):
-    """A run: a problem, a method with so many proposals, and what the method is made of."""
+    """A run: a problem, a method, its number of proposals, and the digest of its models."""
 
     problem: str
     method: str
@@ -172,7 +172,7 @@ def run(job: Job) -> dict[str, Any]:
 
 
 def proposer(ready: PlanningSetup, optimizer: Optimizer, job: Job, seed: int) -> Callable[[int], np.ndarray]:
-    """Return what makes proposals; what needs no problem is made ready."""
+    """Return the function from a count to proposals; what does not depend on the problem is loaded here."""
     method = job.method
     kernel, start, goal = ready.checker.kernel, ready.start, ready.goals[0]
     if method in ("line", "bumps"):
@@ -202,7 +202,7 @@ def warm_up(jobs: Sequence[Job]) -> None:
 
 
 def attempted(job: Job) -> dict[str, Any]:
-    """Return a run; one that raises counts as not solved, and says why."""
+    """Return a run; one that raises counts as not solved, with its error."""
     try:
         return run(job)
     except Exception as error:

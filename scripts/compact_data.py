@@ -1,6 +1,6 @@
 """Make the compact set of a data set: one file of all problems with as many of their paths as fit.
 
-Whole paths come first, then reversals, then random parts. The robot's tables go beside it.
+Complete paths come first, then reversals, then random parts. The robot's tables go beside it.
 
 Usage: python scripts/compact_data.py FOLDER FILE.zip [--mib 24] [--seed 0]
 """
@@ -19,7 +19,7 @@ from apex_ompl.util.files import check_writable, write_atomically
 from apex_ompl.util.scripts import run_command
 from apex_ompl.util.validation import whole_number
 
-CLOSE = 200  # how closely the limit is met: to one part in this
+CLOSE = 200  # the limit on the size is met to one part in this
 
 
 def some(paths: Paths, count: int, seed: int) -> Paths:

@@ -1,4 +1,4 @@
-"""Print and plot what a data set holds: a folder that generate_data made, or a file of paths.
+"""Print and plot the statistics of a data set: a folder that generate_data made, or a file of paths.
 
 Writes description.md, figures.png and motions.jpg (some random ones) into a folder.
 
@@ -39,7 +39,7 @@ def table(figures: list[description.LevelStatistics]) -> str:
 
 
 def checked(paths: Paths, which: np.ndarray) -> str:
-    """Return what the full check says of some paths as they are stored."""
+    """Return a sentence on how many of some stored paths pass the full check."""
     control, spline, good = paths.control(which), paths.spline, 0
     for k, points in zip(which, control, strict=True):
         ready = assemble(problems.load(paths.problem_name(int(paths.arrays["problem"][k]))), robot())
@@ -84,7 +84,7 @@ def plot(paths: Paths, figures: list[description.LevelStatistics], file: Path) -
 
 
 def draw(paths: Paths, which: np.ndarray, file: Path) -> list[str]:
-    """Draw some motions, a row each, and return what they are."""
+    """Draw some motions, a row each, and return their captions."""
     import imageio.v3 as iio
 
     from apex_ompl.viz.render import Stage

@@ -34,7 +34,7 @@ MARGIN = 0.01  # [m]
 
 
 def hold(robot: Robot, held: Held) -> tuple[tuple[AttachedObject, ...], np.ndarray]:
-    """Return what the hands hold and a home state that holds it, and say how it is held."""
+    """Return the held objects and a home state whose hands hold them; print the grasps."""
     objects, home, grasps = put_in_hands(robot, held)
     for closed in grasps:
         print(f"  {closed.held.name}: synergy {closed.synergy:.3f}, first touch {closed.touched or 'none'}")

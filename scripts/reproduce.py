@@ -6,8 +6,8 @@
 variational autoencoder of ``apex-paper`` and in principal components.
 
 The runs of ``failure`` and ``size`` are the same, and are kept as they end, beside those of benchmarks/head_to_head.py,
-some of which they are; so are the solutions of ``fid``. All planners have the same problems. The command goes on where
-it was stopped.
+some of which they are; so are the solutions of ``fid``. All planners have the same problems. The same command
+resumes an interrupted run.
 
 Usage: python scripts/reproduce.py failure|size|fid [-n 40] [--jobs 1] [--keep FOLDER] [-o FOLDER]
 """
@@ -103,7 +103,7 @@ def failure(args: argparse.Namespace) -> tuple[dict[str, Any], list[Table], Figu
     axes[2].set_yscale("log")
     picture.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=8)
     head = ["task", "planner", "N", "R_f %", "95 %", "S_r rad (median of solved)", "as found", "time s (median of all)"]
-    return found, [Table("Failure ratio, smoothness, time", head, rows)], picture, said_of(results)
+    return found, [Table("Failure ratio, smoothness, time", head, rows)], picture, provenance_of(results)
 
 
 def size(args: argparse.Namespace) -> tuple[dict[str, Any], list[Table], Figure, list[tuple[str, Any]]]:
@@ -137,12 +137,12 @@ def size(args: argparse.Namespace) -> tuple[dict[str, Any], list[Table], Figure,
     picture.axes[0].set_ylabel("R_f %")
     picture.legend(*picture.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=8)
     head = ["task", "planner", "edge m", "N", "R_f %", "95 %"]
-    return found, [Table("Failure ratio over the size of obstacles", head, rows)], picture, said_of(results)
+    return found, [Table("Failure ratio over the size of obstacles", head, rows)], picture, provenance_of(results)
 
 
-def said_of(results: Results) -> list[tuple[str, Any]]:
-    """Return how the runs were made, and what a reader of times must know."""
-    return [*about(results), *(("Note", said) for said in warnings(results))]
+def provenance_of(results: Results) -> list[tuple[str, Any]]:
+    """Return how the runs were made, and warnings about their times."""
+    return [*about(results), *(("Note", text) for text in warnings(results))]
 
 
 def fid(args: argparse.Namespace) -> tuple[dict[str, Any], list[Table], Figure, list[tuple[str, Any]]]:
@@ -168,14 +168,14 @@ def fid(args: argparse.Namespace) -> tuple[dict[str, Any], list[Table], Figure, 
         axis.set_title(f"FID, {name} features (dots: floor)")
         axis.set_xticks(range(len(made)), list(made), rotation=15, fontsize=8)
     head = ["features", "paths", "N", "d", "FID", "95 %", "floor", "KID", "CPU ms a path"]
-    says = [
+    notes = [
         ("Real", f"solutions of {len(real)} validation problems, one each, of {', '.join(FID_LEVELS)}"),
         ("Made", f"one path for each of them; apex by its own sampling, apex-paper by {realism.STEPS} steps of DDIM"),
-        ("Seeds", f"the number of the first of {realism.PART} problems at a time, 0 to {len(real) - 1}"),
+        ("Seeds", f"the number of the first of {realism.BATCH} problems at a time, 0 to {len(real) - 1}"),
         ("Floor", "FID between two halves of the real set, of other problems each: larger than it would be for all"),
         ("Made with", f"{hardware()}, {args.jobs} processes; {', '.join(f'{k} {v}' for k, v in versions().items())}"),
     ]
-    return found_all, [Table("FID and KID", head, rows)], picture, says
+    return found_all, [Table("FID and KID", head, rows)], picture, notes
 
 
 FIGURES = {"failure": (failure, 40), "size": (size, 40), "fid": (fid, 10_000)}
@@ -190,18 +190,18 @@ def main() -> None:
     parser.add_argument("--keep", type=Path, default=ROOT / "benchmarks" / "runs", metavar="FOLDER", help="for runs")
     parser.add_argument("-o", "--out", type=Path, default=ROOT / "benchmarks" / "results", metavar="FOLDER")
     args = parser.parse_args()
-    blank(1.0, 1.0)  # says now that matplotlib is missing, not after hours
+    blank(1.0, 1.0)  # fails here where matplotlib is missing, and not after hours
     make, usual = FIGURES[args.figure]
     args.n = usual if args.n is None else args.n
     if args.n < 4:
         parser.error("-n is 4 or more")
     make_folder(args.keep)
     make_folder(args.out)
-    found, tables, picture, says = make(args)
+    found, tables, picture, notes = make(args)
     name = f"paper_{args.figure}"
     text = [f"# {name}", f"`python scripts/reproduce.py {args.figure} -n {args.n}`"]
-    text += [*(table.markdown() for table in tables), "\n".join(f"- {key}: {value}" for key, value in says)]
-    write_atomically(args.out / f"{name}.json", (json.dumps({"about": says, **found}, indent=1) + "\n").encode())
+    text += [*(table.markdown() for table in tables), "\n".join(f"- {key}: {value}" for key, value in notes)]
+    write_atomically(args.out / f"{name}.json", (json.dumps({"about": notes, **found}, indent=1) + "\n").encode())
     write_atomically(args.out / f"{name}.md", ("\n\n".join(text) + "\n").encode())
     drawn = io.BytesIO()
     picture.savefig(drawn, format="png", dpi=120)

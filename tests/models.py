@@ -37,10 +37,10 @@ def some_paths() -> Paths:
 
 
 @cache
-def kernel(*things: tuple[str, tuple[float, ...], tuple[float, ...]]) -> Kernel:
+def kernel(*obstacles: tuple[str, tuple[float, ...], tuple[float, ...]]) -> Kernel:
     """The robot among obstacles that are given by shape, position and size; kernels keep radii and half lengths."""
     solids = []
-    for k, (shape, position, size) in enumerate(things):
+    for k, (shape, position, size) in enumerate(obstacles):
         pose = np.eye(4)
         pose[:3, 3] = position
         solids.append((k, Primitive(KINDS[shape], pose, size)))

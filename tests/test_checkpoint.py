@@ -102,7 +102,7 @@ def test_faulty_checkpoints_are_named(saved: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("what", "said"),
+    ("what", "message"),
     [
         ("missing", "denoiser.leave.bias: expected weights that fit config.json"),
         ("shape", "denoiser.leave.bias: expected weights that fit config.json"),
@@ -110,7 +110,7 @@ def test_faulty_checkpoints_are_named(saved: Path, tmp_path: Path) -> None:
         ("text", "model.safetensors: expected safetensors"),
     ],
 )
-def test_weights_that_do_not_fit_are_named(what: str, said: str, saved: Path, tmp_path: Path) -> None:
+def test_weights_that_do_not_fit_are_named(what: str, message: str, saved: Path, tmp_path: Path) -> None:
     import hashlib
 
     folder = _changed(saved, tmp_path / what)
@@ -129,7 +129,7 @@ def test_weights_that_do_not_fit_are_named(what: str, said: str, saved: Path, tm
     fitting = _changed(folder, tmp_path / "fitting", digest=digest)
     with pytest.raises(FileFormatError) as caught:
         load_model(fitting)
-    assert said in str(caught.value)
+    assert message in str(caught.value)
 
 
 def test_a_checkpoint_is_written_whole_or_not_at_all(saved: Path, tmp_path: Path, monkeypatch: Any) -> None:

@@ -89,8 +89,8 @@ def test_the_variational_network_learns_to_give_paths_back() -> None:
         assert latent.std(dim=(0, 2)) == pytest.approx(np.ones(8), abs=0.05)
         found = model.control(latent, control[:, 0], control[:, -1])
         path = model.path(control)
-        apart = (model.path(found) - path).square().mean()
-        assert apart < 0.2 * (model.path(model.line(control[:, 0], control[:, -1])) - path).square().mean()
+        error = (model.path(found) - path).square().mean()
+        assert error < 0.2 * (model.path(model.line(control[:, 0], control[:, -1])) - path).square().mean()
 
 
 def test_states_that_cannot_be_halved_are_refused() -> None:
@@ -231,19 +231,19 @@ def test_the_same_seed_gives_the_same_paths(parts: dict[str, object]) -> None:
 
 
 def test_noise_up_to_a_step_leaves_paths_near() -> None:
-    """One step of noise, and of denoising by whatever network, strays less than all of it."""
+    """One step of noise, and of denoising by whatever network, changes a path less than all of it."""
     model = TrajectoryModel(network(), {})
     control = some_paths().control(slice(0, 1)).repeat(6, axis=0)
     ends = Query(control[0, 0], control[0, -1], np.zeros(3), ObstacleSet.from_rows([]))
 
-    def strayed(step: int) -> float:
+    def change(step: int) -> float:
         generator = torch.Generator().manual_seed(0)
         found = model.renoise(ends, kernel(), control, step, sampling=Sampling(steps=3), generator=generator)
         return float(np.abs(found.control - control).mean())
 
-    assert strayed(0) < 0.2 * strayed(255)
+    assert change(0) < 0.2 * change(255)
     with pytest.raises(ParameterError, match="step: expected 0 to 255, got 256"):
-        strayed(256)
+        change(256)
     with pytest.raises(ParameterError, match=r"control points: expected finite numbers of shape \(B, 14, 16\)"):
         model.renoise(ends, kernel(), control[:, :5], 3)
     with pytest.raises(ParameterError, match="control points: expected finite numbers"):

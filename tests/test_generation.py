@@ -39,12 +39,12 @@ def same(a: Paths, b: Paths) -> bool:
     return all(np.array_equal(a.arrays[k], b.arrays[k]) for k in FIELDS) and a.counts == b.counts
 
 
-def test_every_path_is_proven_and_described_truly(made: list[Paths]) -> None:
+def test_every_path_passes_the_full_check_and_its_record_is_true(made: list[Paths]) -> None:
     spline, sources = Spline(), set()
     for paths in made:
         assert len(paths) > 10
         control, a = paths.control(), paths.arrays
-        things = np.concatenate([[0], np.cumsum(a["things"])]).astype(int)
+        bounds = np.concatenate([[0], np.cumsum(a["things"])]).astype(int)
         for k in range(len(paths)):
             owner = int(a["problem"][k])
             problem = problems.load(paths.problem_name(owner))
@@ -52,7 +52,7 @@ def test_every_path_is_proven_and_described_truly(made: list[Paths]) -> None:
             path = spline.path(control[k])
             assert full_check(ready.checker, path, paths.start[k], [paths.goal[k]])
             assert a["length"][k] == pytest.approx(path_length(path), rel=1e-5)
-            # No sphere of the cover is nearer than it says, at the states that were looked at.
+            # The stored clearance is that of the sphere cover at every other state.
             assert ready.checker.kernel.clearance(path[::2], 0.2).min() == pytest.approx(a["clearance"][k], abs=1e-6)
             source = SOURCES[a["source"][k]]
             sources.add(source)
@@ -68,12 +68,12 @@ def test_every_path_is_proven_and_described_truly(made: list[Paths]) -> None:
             nearest = ready.checker.distance(path[0])
             point = nearest.points[1] if problem.scene else NO_POINT
             np.testing.assert_allclose(a["point"][k], point, atol=1e-3)
-            mine = slice(things[owner], things[owner + 1])
+            mine = slice(bounds[owner], bounds[owner + 1])
             np.testing.assert_allclose(
                 a["position"][mine], [o.position for o in problem.scene] or np.zeros((0, 3)), atol=1e-6
             )
-            for number, thing in zip(a["shape"][mine], problem.scene, strict=True):
-                assert getattr(thing, SHAPES[number]) is not None
+            for number, obstacle in zip(a["shape"][mine], problem.scene, strict=True):
+                assert getattr(obstacle, SHAPES[number]) is not None
     assert {"bumps", "rrtconnect", "reversed", "part"} <= sources
 
 
@@ -230,7 +230,7 @@ def test_workers_of_ray_make_the_same_paths_and_may_die(made: list[Paths]) -> No
         ray.shutdown()
 
 
-def test_proposals_of_a_model_are_proven_like_all_else() -> None:
+def test_paths_from_a_models_proposals_pass_the_full_check() -> None:
     unit, options = Unit("posts", "hard", 3, 3), EngineOptions(copies=2, parts=0, model="apex")
     paths, times = solve_unit(unit, options, Spline())
     assert "model" in {SOURCES[k] for k in paths.arrays["source"]} and times["model"] > 0.0

@@ -40,16 +40,16 @@ def test_guidance_of_nothing_is_the_plain_model_bit_for_bit(parts: dict[str, obj
         np.testing.assert_array_equal(found[0], found[2])
 
 
-def test_the_cost_has_the_gradient_that_it_says() -> None:
+def test_the_gradient_of_the_cost_is_that_of_finite_differences() -> None:
     rng, among = np.random.default_rng(0), kernel(WALL, POST)
     paths = Spline(states=16).path(some_paths().control(slice(0, 6)))
     cost, slope = collision_cost(among, paths, 0.1)
     assert (cost > 0).any() and slope.shape == paths.shape
     for _ in range(10):
-        way = rng.normal(size=paths.shape)
+        direction = rng.normal(size=paths.shape)
         step = 1e-6
-        up, down = (collision_cost(among, paths + s * way, 0.1)[0] for s in (step, -step))
-        np.testing.assert_allclose((up - down) / (2 * step), (slope * way).sum(axis=(1, 2)), rtol=2e-3, atol=2e-4)
+        up, down = (collision_cost(among, paths + s * direction, 0.1)[0] for s in (step, -step))
+        np.testing.assert_allclose((up - down) / (2 * step), (slope * direction).sum(axis=(1, 2)), rtol=2e-3, atol=2e-4)
 
 
 @pytest.mark.parametrize("parts", [{}, VARIATIONAL], ids=["linear", "variational"])
@@ -59,9 +59,9 @@ def test_the_gradient_goes_through_decoder_and_kernel(parts: dict[str, object]) 
     latent = 0.5 * torch.randn(3, *model.latent, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     function = partial(_likely, model.double(), among, ends, guidance)
     slope = gradient(function, latent)
-    way = torch.randn(latent.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    difference = (function(latent + 1e-6 * way) - function(latent - 1e-6 * way)) / 2e-6
-    torch.testing.assert_close((slope * way).flatten(1).sum(dim=1), difference, rtol=5e-3, atol=5e-4)
+    direction = torch.randn(latent.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    difference = (function(latent + 1e-6 * direction) - function(latent - 1e-6 * direction)) / 2e-6
+    torch.testing.assert_close((slope * direction).flatten(1).sum(dim=1), difference, rtol=5e-3, atol=5e-4)
 
 
 def _likely(model: LatentDiffusion, among: Kernel, ends: tuple, guidance: Guidance, z: torch.Tensor) -> torch.Tensor:

@@ -215,7 +215,7 @@ def test_success_rates_are_those_of_repair_and_proof(few: Path, tmp_path: Path) 
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         ({"schema": "apex-ompl/training/2"}, "schema: expected 'apex-ompl/training/1', got 'apex-ompl/training/2'"),
         ({"stepz": 3}, "stepz: unknown key, did you mean 'steps'?"),
@@ -225,16 +225,16 @@ def test_success_rates_are_those_of_repair_and_proof(few: Path, tmp_path: Path) 
         ({"mirror": {"order": [0, 0], "sign": [1, 1], "shift": [0, 0]}}, "mirror: expected every joint's number once"),
     ],
 )
-def test_faulty_configurations_are_named(change: dict[str, Any], said: str, few: Path, tmp_path: Path) -> None:
+def test_faulty_configurations_are_named(change: dict[str, Any], message: str, few: Path, tmp_path: Path) -> None:
     file = tmp_path / "faulty.yaml"
     file.write_text(yaml.safe_dump({**SMALL, "data": str(few), **change}))
     with pytest.raises(FileFormatError, match="faulty.yaml") as caught:
         TrainingConfig.read(file)
-    assert said in str(caught.value)
+    assert message in str(caught.value)
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         ({"data": "/no/such"}, "manifest of a data set '/no/such/manifest.json': no such file"),
         ({"robot": "/no/such.npz"}, "file of kernel tables '/no/such.npz': no such file"),
@@ -242,10 +242,10 @@ def test_faulty_configurations_are_named(change: dict[str, Any], said: str, few:
         ({"mirror": {"order": [0], "sign": [1], "shift": [0]}}, "mirror: expected 16 joints, got 1"),
     ],
 )
-def test_what_does_not_fit_is_named(change: dict[str, Any], said: str, few: Path, tmp_path: Path) -> None:
+def test_what_does_not_fit_is_named(change: dict[str, Any], message: str, few: Path, tmp_path: Path) -> None:
     with pytest.raises(ApexError) as caught:
         Trainer(config(**{"data": few, **change}), tmp_path, HERE)
-    assert str(caught.value) == said
+    assert str(caught.value) == message
 
 
 def test_dotted_keys_change_a_configuration() -> None:

@@ -33,13 +33,13 @@ from apex_ompl.util.cluster import spread
 
 MODELS = ("apex", "apex-paper")
 STEPS = 8  # of DDIM, for apex-paper, whose own 256 would take hours
-PART = 50  # problems that a worker takes at once
+BATCH = 50  # problems of a job
 
 load = cache(load_model)  # once in a process
 
 
 def variants() -> dict[str, tuple[str, Sampling]]:
-    """Return what makes paths: a model and how it is sampled, guided and not."""
+    """Return the variants by label: a model and its sampling, guided and unguided."""
     own = {"apex": load("apex").sampling, "apex-paper": Sampling("ddim", STEPS)}
     return {
         f"{name}{'' if guided else ', unguided'}": (name, replace(own[name], guidance=Guidance(gamma=float(guided))))
@@ -67,7 +67,7 @@ def solutions(folder: Path, count: int, levels: Sequence[str], workers: int) -> 
 def made_for(
     units: Sequence[Paths], count: int, workers: int
 ) -> tuple[list[Array], dict[str, list[Array]], dict[str, float]]:
-    """Return the first solution of each of ``count`` problems, and what each variant makes of the same problems.
+    """Return the first solution of each of ``count`` problems, and the paths of each variant for the same problems.
 
     Returns:
         The solutions, those of all levels in turn; by variant, paths in the same order, as control points; and the CPU
@@ -80,7 +80,7 @@ def made_for(
             by_level.setdefault(name.rsplit("/", 1)[0], []).append((name, unit.control(slice(k, k + 1))[0]))
     in_turn = (one for some in zip_longest(*by_level.values()) for one in some if one is not None)
     picked = list(islice(in_turn, count))
-    jobs = {str(k): (picked[k : k + PART], k) for k in range(0, len(picked), PART)}
+    jobs = {str(k): (picked[k : k + BATCH], k) for k in range(0, len(picked), BATCH)}
     found = dict(tqdm(spread(propose, jobs, workers=workers, address=None), total=len(jobs), unit="part"))
     paths: dict[str, list[Array]] = {label: [] for label in variants()}
     seconds = dict.fromkeys(paths, 0.0)
