@@ -1,4 +1,4 @@
-"""What stands in the place of the model in comparisons: random bumps, random weights, another problem's conditions.
+"""Controls of the model in comparisons: random bumps, random weights, another problem's conditions.
 
 Importing this module registers the planner ``bumps``: APEX with random bumps.
 """
@@ -28,7 +28,7 @@ from apex_ompl.trajopt.optimizer import Optimizer
 
 
 class Bumps(TrajectoryModel):
-    """Random bumps in the place of proposals."""
+    """Random bumps instead of proposals."""
 
     def propose(self, query: Any, kernel: Any, count: int, **options: Any) -> Proposals:
         """Return bumps on the straight lines of queries."""
@@ -81,7 +81,7 @@ def drawn(trained: LatentDiffusion) -> LatentDiffusion:
 
 
 def digest(*files: Path) -> str:
-    """Return what tells the contents of files apart from others."""
+    """Return a digest of the contents of files."""
     return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:12]
 
 

@@ -23,9 +23,10 @@ from typing import Any
 import numpy as np
 import record
 
-from apex_ompl.datasets.engine import Options
+from apex_ompl.datasets.engine import EngineOptions
 from apex_ompl.datasets.records import SOURCES
-from apex_ompl.generation.worker import SHARES, UNIT, Unit, static_levels, work
+from apex_ompl.generation.solving import solve_unit
+from apex_ompl.generation.units import LEVEL_WEIGHTS, UNIT_SIZE, Unit, static_levels
 from apex_ompl.problems import scenes
 from apex_ompl.trajopt.spline import Spline
 from apex_ompl.util.entry_point import run_script
@@ -34,15 +35,15 @@ from apex_ompl.util.validation import one_or_more, whole_number
 DEPENDS = ("@planning", "apex_ompl/datasets", "apex_ompl/generation")
 SCRIPT = Path(__file__).resolve().parent.parent / "scripts" / "generate_data.py"
 WANTED, CORES = 500_000, (2, 16, 64)
-SCALED = ("vertical", "horizontal", "wall/easy", "swap/medium")  # what is made with one and with several workers
+SCALED = ("vertical", "horizontal", "wall/easy", "swap/medium")  # levels solved with one and with several workers
 PROBLEMS = 240
 MOST_DEEP = 3  # columns of stages
 
 
 def one(unit: Unit) -> dict[str, Any]:
-    """Return what a unit yields, and what it costs."""
+    """Return yield and cost of a unit."""
     begin = time.perf_counter()
-    paths, times = work(unit, Options(), Spline())
+    paths, times = solve_unit(unit, EngineOptions(), Spline())
     seconds = time.perf_counter() - begin
     a = paths.arrays
     straight = set(a["problem"][a["source"] == SOURCES.index("line")].tolist())
@@ -57,7 +58,7 @@ def one(unit: Unit) -> dict[str, Any]:
 def warm_up() -> None:
     """Load the kernel and the robot, so that no unit pays for it."""
     for level in ("easy", "hard"):
-        work(Unit("wall", level, 1, 1), Options(), Spline())
+        solve_unit(Unit("wall", level, 1, 1), EngineOptions(), Spline())
 
 
 def scaled(workers: int) -> dict[str, float]:
@@ -78,7 +79,7 @@ def main() -> None:
         choices=range(1, 100),
         metavar="N",
         default=2,
-        help=f"of {UNIT} problems, a level (default: %(default)s)",
+        help=f"of {UNIT_SIZE} problems, a level (default: %(default)s)",
     )
     parser.add_argument("--workers", type=one_or_more, default=2, help="processes at once (default: %(default)s)")
     parser.add_argument(
@@ -111,8 +112,8 @@ def main() -> None:
         f"({s['seconds']:.0f} s)" for s in scaling) + "."]  # fmt: skip
     record.write(
         "data_engine", {"levels": levels, "totals": totals, "mixed_rate": mix, "hours": hours, "scaling": scaling,
-                        "memory_mb": memory}, "\n".join(text), units=args.units, problems_per_unit=UNIT,
-        workers=args.workers, first_seed=args.first * UNIT, seed=0,
+                        "memory_mb": memory}, "\n".join(text), units=args.units, problems_per_unit=UNIT_SIZE,
+        workers=args.workers, first_seed=args.first * UNIT_SIZE, seed=0,
     )  # fmt: skip
 
 
@@ -127,7 +128,7 @@ def _totals(name: str, rows: list[dict[str, Any]], workers: int) -> dict[str, An
     rates = {s: workers * n / seconds for s, n in sources.items()}
     shares = {stage: value / seconds for stage, value in times.most_common()}
     return {"level": name, "rate": sum(rates.values()), "rates": rates, "tried": tried, "solved": solved,
-            "seconds_per_problem": seconds / max(1, UNIT * len(rows)), "time": shares}  # fmt: skip
+            "seconds_per_problem": seconds / max(1, UNIT_SIZE * len(rows)), "time": shares}  # fmt: skip
 
 
 def _summary(level: str, made: list[dict[str, Any]], workers: int) -> dict[str, Any]:
@@ -139,7 +140,7 @@ def _mixed(levels: list[dict[str, Any]]) -> float:
     paths = seconds = 0.0
     for f in levels:
         suite, level = f["level"].split("/")
-        share = SHARES[suite if suite in SHARES else level]
+        share = LEVEL_WEIGHTS[suite if suite in LEVEL_WEIGHTS else level]
         seconds += share * f["seconds_per_problem"]
         paths += share * f["seconds_per_problem"] * f["rate"]
     return paths / seconds

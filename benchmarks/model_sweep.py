@@ -1,8 +1,8 @@
-"""What matters in the model: short trainings that differ in one thing each, judged on validation problems.
+"""Ablation of the model: short trainings that differ in one setting each, evaluated on validation problems.
 
 Every variant is trained by scripts/train.py for as many steps, on one thread, two at a time; what is trained already
 is not trained again. Beside them stands the checkpoint that ships, which had more steps and more data. Then B = 1 and 8
-proposals in two deterministic steps are repaired by the optimiser and judged by the kernel.
+proposals in two deterministic steps are repaired by the optimizer and checked by the kernel.
 
 Usage: python benchmarks/model_sweep.py [--steps 3000] [--data FOLDER] [--runs FOLDER] [--only NAME ...]
 """
@@ -20,10 +20,10 @@ from typing import Any
 import record
 import torch
 
-from apex_ompl.datasets.cases import load_cases
+from apex_ompl.datasets.kernel_problems import load_kernel_problems
 from apex_ompl.diffusion.checkpoint import load_model
 from apex_ompl.diffusion.runlog import read_log
-from apex_ompl.diffusion.validation import judged
+from apex_ompl.diffusion.validation import success_rates
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import one_or_more
 
@@ -59,7 +59,7 @@ def trained(name: str, args: argparse.Namespace) -> Path:
 
 
 def figures(folder: Path | None, cases: list[Any]) -> dict[str, Any]:
-    """Return what a variant came to; without a folder, the checkpoint that ships."""
+    """Return the success rates of a variant; without a folder, of the checkpoint that ships."""
     model = load_model("apex" if folder is None else folder / "checkpoint")
     last = {} if folder is None else read_log(folder)[-1]
     found: dict[str, Any] = {
@@ -68,9 +68,9 @@ def figures(folder: Path | None, cases: list[Any]) -> dict[str, Any]:
         "weights": sum(p.numel() for p in model.network.parameters()),
     }  # fmt: skip
     for count in (1, 8):
-        said = judged(model, cases, count)
-        hard = [value for name, value in said.items() if name.endswith("/hard")]
-        found[f"B{count}"] = {**said, "hard": sum(hard) / len(hard)}
+        rates = success_rates(model, cases, count)
+        hard = [value for name, value in rates.items() if name.endswith("/hard")]
+        found[f"B{count}"] = {**rates, "hard": sum(hard) / len(hard)}
     return found
 
 
@@ -100,7 +100,7 @@ def table(rows: dict[str, dict[str, Any]]) -> str:
 
 
 def main() -> None:
-    """Train, judge, and write the results."""
+    """Train, evaluate, and write the results."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--steps", type=one_or_more, default=3000, help="of each (default: %(default)s)")
     parser.add_argument("--threads", type=one_or_more, default=1, help="of each (default: %(default)s)")
@@ -111,7 +111,7 @@ def main() -> None:
     args = parser.parse_args()
     with ThreadPoolExecutor(args.jobs) as pool:
         folders = dict(zip(args.only, pool.map(lambda name: trained(name, args), args.only), strict=True))
-    cases = load_cases(ROOT / "data" / "dual_panda_softhand" / "validation")
+    cases = load_kernel_problems(ROOT / "data" / "dual_panda_softhand" / "validation")
     torch.set_num_threads(1)
     rows = {name: figures(folder, cases) for name, folder in (*folders.items(), ("apex as it ships", None))}
     record.write(

@@ -1,4 +1,4 @@
-"""The nearest training paths, moved to the ends of a query: what a model has to be better than."""
+"""Nearest training paths, moved to the ends of a query: the baseline of a model."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ import torch
 from numpy.typing import NDArray
 
 from apex_ompl.datasets.records import Paths
-from apex_ompl.diffusion.conditions import Conditions, Probes, Query, Table, batched, pooled
+from apex_ompl.diffusion.conditions import Conditions, ConditionTable, Probes, Query, batch_queries, pad_obstacles
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel import Kernel, RobotTables
 from apex_ompl.kernel.scene_builder import scene_tables
 from apex_ompl.types import Array
 
 ALONG = 7  # states of the straight line at which clearances are compared
-NEAR = 0.3  # clearances are told apart up to here [m]
-PER_METRE = 3.0  # rad that a metre of clearance counts as much as
+NEAR = 0.3  # clearances are clipped here [m]
+PER_METRE = 3.0  # weight of clearances beside joint angles [rad/m]
 
 
 class Neighbours:
@@ -25,10 +25,10 @@ class Neighbours:
 
     def __init__(self, several: Sequence[Paths], robot: RobotTables) -> None:
         """Look for neighbours among paths of ``robot``, all of the same spline."""
-        self._probes, self.spline = Probes.of(robot, ALONG), several[0].spline
+        self._probes, self.spline = Probes.from_robot(robot, ALONG), several[0].spline
         kernel, rows, rests = Kernel(robot, scene_tables([])), [], []
         for paths in several:
-            table = Table(paths, self._probes, kernel)
+            table = ConditionTable(paths, self._probes, kernel)
             parts = (torch.arange(k, min(k + 2048, len(paths))) for k in range(0, len(paths), 2048))
             rows += [features(table.batch(part)) for part in parts]
             control = paths.control()
@@ -36,7 +36,7 @@ class Neighbours:
         self._features, self._residual = np.concatenate(rows), np.concatenate(rests)
 
     def refitted(self, query: Query, kernel: Kernel, count: int) -> Array:
-        """Return what the nearest paths differ in from their straight lines, put on that of a query.
+        """Return the nearest paths' residuals from their straight lines, added to the straight line of a query.
 
         Args:
             query: The problem.
@@ -51,7 +51,7 @@ class Neighbours:
         """
         if not 1 <= count <= len(self._residual):
             raise ParameterError("count", count, f"1 to {len(self._residual)}, as many as there are paths")
-        mine = features(batched([query], self._probes, kernel))
+        mine = features(batch_queries([query], self._probes, kernel))
         apart = ((self._features - mine) ** 2).sum(axis=1)
         nearest = np.argpartition(apart, count - 1)[:count]
         nearest = nearest[np.argsort(apart[nearest], kind="stable")]
@@ -60,8 +60,8 @@ class Neighbours:
         return self.spline.with_ends(np.clip(control, limits.lower, limits.upper), query.start, query.goal)
 
 
-def features(given: Conditions) -> NDArray[np.float32]:
-    """Return what neighbours are compared by, shape (B, features) [rad]."""
-    least = pooled(given.apart().clamp(-NEAR, NEAR), given.there, NEAR).amin(dim=1)
-    rows = torch.cat([given.start, given.goal, PER_METRE * least / least.shape[1] ** 0.5], dim=1)
+def features(conditions: Conditions) -> NDArray[np.float32]:
+    """Return the features by which neighbours are compared, shape (B, features) [rad]."""
+    least = pad_obstacles(conditions.probe_distances().clamp(-NEAR, NEAR), conditions.mask, NEAR).amin(dim=1)
+    rows = torch.cat([conditions.start, conditions.goal, PER_METRE * least / least.shape[1] ** 0.5], dim=1)
     return np.asarray(rows.numpy(), np.float32)

@@ -36,8 +36,9 @@ from apex_ompl.benchmark import Results, Row, Workers, bench
 from apex_ompl.benchmark.rows import Job
 from apex_ompl.benchmark.runs import NO_PROBLEM, Run
 from apex_ompl.diffusion.checkpoint import SHIPPED, read_config
-from apex_ompl.diffusion.data import Mirror, window_paths
+from apex_ompl.diffusion.data import shard_paths
 from apex_ompl.diffusion.guidance import Guidance
+from apex_ompl.diffusion.mirror import Mirror
 from apex_ompl.diffusion.proposals import Sampling, TrajectoryModel
 from apex_ompl.kernel import Kernel, RobotTables
 from apex_ompl.kernel.scene_builder import scene_tables
@@ -57,7 +58,7 @@ DEPENDS = ("@benchmark", "benchmarks/controls.py", "benchmarks/neighbours.py")
 COUNTS = (1, 8, 32)
 GUIDED = Guidance(gamma=1.0)
 PAPER = Sampling("ddpm", 256)
-GUIDED_PAPER = Sampling("ddpm", 256, guidance=Guidance(1.0, "noise", begin=0.25))
+GUIDED_PAPER = Sampling("ddpm", 256, guidance=Guidance(1.0, "noise", active_below=0.25))
 METHODS: dict[str, tuple[int, ...]] = {
     "line": (1,),
     "bumps": (8, 32),
@@ -91,7 +92,7 @@ def model(name: str) -> TrajectoryModel:
 def neighbours(data: str) -> Neighbours:
     """Return the training paths to look for neighbours in, with the mirror images that the model saw."""
     tables = RobotTables.load(ROOT / "data" / "dual_panda_softhand" / "robot.npz")
-    paths, _ = window_paths(data.split(","), 0, 10**9, 0)
+    paths, _ = shard_paths(data.split(","), 0, 10**9, 0)
     mirror = load_model("apex").about["config"]["mirror"]
     images = [] if mirror is None else [Mirror(**mirror).paths(paths, Kernel(tables, scene_tables([])))]
     return Neighbours([paths, *images], tables)

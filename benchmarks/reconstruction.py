@@ -1,4 +1,4 @@
-"""What the latent spaces lose: paths of problems that no model was trained on, encoded, decoded, and judged again.
+"""Reconstruction error of the latent spaces: held-out paths, encoded, decoded, and checked again.
 
 Both latent spaces take the states of a path and give states back. Valid paths are those of the training split's
 problems that were held out, which pass the full check before.

@@ -23,7 +23,7 @@ from apex_ompl.util.validation import whole_number
 
 
 def fault(name: str) -> str:
-    """Return what is wrong with a frozen problem or its witness, or an empty text."""
+    """Return the fault of a frozen problem or its witness, or an empty text."""
     try:
         problem, witness = problems.load(name), problems.witness(name)
     except ApexError as error:
@@ -56,9 +56,9 @@ def main() -> None:
         if args.levels and suite not in args.levels and f"{suite}/{level}" not in args.levels:
             continue
         names = [name for split in frozen.COUNTS for name in problems.frozen_names(suite, level, split)]
-        found = [(name, said) for name in names if (said := fault(name))]
-        for name, said in found:
-            print(f"{name}: {said}", flush=True)
+        found = [(name, reason) for name in names if (reason := fault(name))]
+        for name, reason in found:
+            print(f"{name}: {reason}", flush=True)
         for name in names[: args.redraw]:
             which = ProblemId(suite, level, int(name.rsplit("/", 1)[1]))
             kept = frozen.load(which)

@@ -1,6 +1,6 @@
 """Make the compact set of a data set: one file of all problems with as many of their paths as fit.
 
-Whole paths come first, then reversals, then random parts. The robot's tables go beside it.
+Complete paths come first, then reversals, then random parts. The robot's tables go beside it.
 
 Usage: python scripts/compact_data.py FOLDER FILE.zip [--mib 24] [--seed 0]
 """
@@ -19,7 +19,7 @@ from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.files import check_writable, write_atomically
 from apex_ompl.util.validation import whole_number
 
-CLOSE = 200  # how closely the limit is met: to one part in this
+CLOSE = 200  # the limit on the size is met to one part in this
 
 
 def some(paths: Paths, count: int, seed: int) -> Paths:
@@ -34,7 +34,7 @@ def some(paths: Paths, count: int, seed: int) -> Paths:
 def compact(args: argparse.Namespace) -> None:
     """Write as many paths as fit."""
     check_writable(args.file)
-    every, limit = Paths.joined(Store(args.folder)), args.mib * 2**20
+    every, limit = Paths.concatenate(Store(args.folder)), args.mib * 2**20
     with tempfile.TemporaryDirectory() as folder:
         trial = Path(folder) / "trial.zip"
         fits, too_many, count = -1, len(every) + 1, len(every)

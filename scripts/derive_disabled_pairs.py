@@ -1,6 +1,6 @@
 """Derive the link pairs of a robot that need no collision check, and write them to its pairs file.
 
-The pairs looked at are those that an SRDF says nothing about and that stand on one root part (a hand
+The pairs considered are those that no SRDF lists and whose links stand on the same root part (a hand
 against itself and its own arm), never one arm against the other. Three findings disable a pair:
 
 - ``by design``: both links belong to a part named with ``--soft``, a hand whose fingers touch each other

@@ -1,4 +1,4 @@
-"""Print and plot what a data set holds: a folder that generate_data made, or a file of paths.
+"""Print and plot the statistics of a data set: a folder that generate_data made, or a file of paths.
 
 Writes description.md, figures.png and motions.jpg (some random ones) into a folder.
 
@@ -26,7 +26,7 @@ from apex_ompl.util.validation import one_or_more, whole_number
 SHOTS, MOTIONS, SIZE = 5, 10, (320, 240)
 
 
-def table(figures: list[description.Figures]) -> str:
+def table(figures: list[description.LevelStatistics]) -> str:
     """Return the table of the levels in Markdown."""
     head = ["level", "problems", "paths", *SOURCES, "straight", "homotopies", "several", "duplicates"]
     head += ["length rad p5", "p50", "p95", "clearance mm p5", "p50", "p95"]
@@ -39,7 +39,7 @@ def table(figures: list[description.Figures]) -> str:
 
 
 def checked(paths: Paths, which: np.ndarray) -> str:
-    """Return what the full check says of some paths as they are stored."""
+    """Return a sentence on how many of some stored paths pass the full check."""
     control, spline, good = paths.control(which), paths.spline, 0
     for k, points in zip(which, control, strict=True):
         ready = assemble(problems.load(paths.problem_name(int(paths.arrays["problem"][k]))), robot())
@@ -47,7 +47,7 @@ def checked(paths: Paths, which: np.ndarray) -> str:
     return f"{good} of {len(which)} random paths pass the full check as they are stored."
 
 
-def plot(paths: Paths, figures: list[description.Figures], file: Path) -> None:
+def plot(paths: Paths, figures: list[description.LevelStatistics], file: Path) -> None:
     """Draw lengths, clearances, sources and the coverage of joints."""
     from io import BytesIO
 
@@ -84,7 +84,7 @@ def plot(paths: Paths, figures: list[description.Figures], file: Path) -> None:
 
 
 def draw(paths: Paths, which: np.ndarray, file: Path) -> list[str]:
-    """Draw some motions, a row each, and return what they are."""
+    """Draw some motions, a row each, and return their captions."""
     import imageio.v3 as iio
 
     from apex_ompl.viz.scene_renderer import SceneRenderer
@@ -105,10 +105,10 @@ def describe(args: argparse.Namespace) -> None:
     """Describe the data set."""
     for name in ("description.md", "figures.png", "motions.jpg"):
         check_writable(args.out / name)
-    paths = load(args.data) if is_file(args.data) else Paths.joined(Store(args.data))
+    paths = load(args.data) if is_file(args.data) else Paths.concatenate(Store(args.data))
     if not len(paths):
         raise DatasetError(f"{args.data}: there are no paths, expected some")
-    figures = description.levels(paths)
+    figures = description.level_statistics(paths)
     rng = np.random.default_rng(args.seed)
     text = [f"# {args.data.name}", "", f"{len(paths)} paths of {paths.problems} problems.", "", table(figures), ""]
     if args.check:

@@ -33,11 +33,11 @@ from apex_ompl.util.validation import whole_number
 
 MOMENTS = (0.0, 0.25, 0.5, 1.0)  # as shares of the reverse process
 HANDS = {"left_hand_palm_0": "tab:blue", "right_hand_palm_0": "tab:orange"}
-GUIDED = Guidance(1.0, "noise", begin=0.25)
+GUIDED = Guidance(1.0, "noise", active_below=0.25)
 
 
-def places(kernel: Kernel, path: np.ndarray) -> dict[str, np.ndarray]:
-    """Return where the palms are along a path, shape (N, 3) [m], by body."""
+def palm_positions(kernel: Kernel, path: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the positions of the palms along a path, shape (N, 3) [m], by body."""
     tables = kernel.robot
     _, origin = kernel.joint_frames(path)
     return {name: origin[:, tables.arrays.body_joint[tables.body_names.index(name)]] for name in HANDS}
@@ -59,7 +59,7 @@ def outlines(axes: Any, ready: PlanningSetup, first: int, second: int) -> None:
 
 
 def denoising(name: str, ready: PlanningSetup, seed: int, file: Path) -> None:
-    """Draw what the reverse process is at some moments."""
+    """Draw the decoded samples at some steps of the reverse process."""
     import matplotlib.pyplot as plt
 
     model, kernel = load_model(name), ready.checker.kernel
@@ -82,7 +82,7 @@ def denoising(name: str, ready: PlanningSetup, seed: int, file: Path) -> None:
         for row, (first, second) in enumerate(((0, 1), (0, 2))):
             at = axes[row, column]
             outlines(at, ready, first, second)
-            for body, line in places(kernel, snapshots[moment]).items():
+            for body, line in palm_positions(kernel, snapshots[moment]).items():
                 at.plot(line[:, first], line[:, second], color=HANDS[body], lw=1.2)
                 at.plot(*line[0, [first, second]], "P", color=HANDS[body], ms=7)
                 at.plot(*line[-1, [first, second]], "v", color=HANDS[body], ms=7)
@@ -118,7 +118,7 @@ def diversity(name: str, ready: PlanningSetup, seed: int, file: Path, wanted: in
     figure, axes = plt.subplots(2, 2, figsize=(9, 5.5), sharex=True, layout="constrained")
     share = np.linspace(0.0, 1.0, optimizer.spline.states)
     for path in found:
-        for column, line in enumerate(places(kernel, path).values()):
+        for column, line in enumerate(palm_positions(kernel, path).values()):
             for row in range(2):
                 axes[row, column].plot(share, line[:, row], lw=1.0, alpha=0.8)
                 axes[row, column].plot(0.0, line[0, row], "kP", ms=8)

@@ -1,4 +1,4 @@
-"""Take a training run's checkpoint into the package, where ``apex_ompl.load_model(NAME)`` finds it.
+"""Copy a training run's checkpoint into the package, where ``apex_ompl.load_model(NAME)`` finds it.
 
 Usage: python scripts/export_checkpoint.py RUN NAME
 """
@@ -15,7 +15,7 @@ LARGEST = 24.0  # of all that ship together [MiB]
 
 
 def export(run: Path, name: str) -> None:
-    """Read the checkpoint of a run, which proves it, and write it in half precision."""
+    """Read and check the checkpoint of a run, and write it in half precision."""
     from apex_ompl.diffusion.checkpoint import SHIPPED, load_model, save_model
 
     folder = run / "checkpoint" if (run / "checkpoint").is_dir() else run

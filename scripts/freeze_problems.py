@@ -68,7 +68,7 @@ def _timed_witness(problem: Problem) -> Witness | None:
 
 
 def _timed_paths(problem: Problem) -> Iterator[tuple[Array, Array]]:
-    """Yield timed paths that may do: straight lines, ways around places of the obstacles, waits, and ways aside."""
+    """Yield timed paths to try: straight lines, paths around stopped obstacles, waits, and detours."""
     names = robot().joint_names
     line = np.stack([problem.start_state(names), problem.goal_states(names)[0]])
     for pace in PACES:
@@ -140,7 +140,7 @@ def main() -> None:
             raise SystemExit(f"unknown level {name!r}; known: {', '.join(every)}")
     wanted = [every[name] for name in args.levels or every]
     todo = [pair for pair in wanted if args.replace or not frozen.exists(*pair)]
-    todo.sort(key=lambda pair: pair[1] not in ("hard", "medium"))  # what takes longest first
+    todo.sort(key=lambda pair: pair[1] not in ("hard", "medium"))  # the slowest levels first
     failed = 0
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(args.jobs, mp_context=context) as pool:
@@ -154,8 +154,8 @@ def main() -> None:
                 failed += 1
                 print(f"{name}: {error!r}", flush=True)
                 continue
-            said = f"{len(found)} problems, {dropped} draws without a witness, {size} bytes, {spent:.0f} s"
-            print(f"{name}: {said}", flush=True)
+            summary = f"{len(found)} problems, {dropped} draws without a witness, {size} bytes, {spent:.0f} s"
+            print(f"{name}: {summary}", flush=True)
     raise SystemExit(1 if failed else 0)
 
 

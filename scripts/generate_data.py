@@ -1,10 +1,10 @@
-"""Make a data set of proven paths: problems of the training split are drawn, solved, and what was proved is kept.
+"""Make a data set of verified paths: problems of the training split are drawn and solved, and valid paths are kept.
 
-The same options give the same paths. What was stopped goes on when the command is given again; at most the units under
-way are lost. With one worker everything runs in this process; more are run by Ray, on this machine or on a cluster.
+The same options give the same paths. The same command resumes an interrupted run; at most the units in progress are
+lost. With one worker everything runs in this process; more are run by Ray, on this machine or on a cluster.
 
-With --write-cases problems are drawn only, and written for machines without Pinocchio, Coal and OMPL; there --cases
-solves them from the straight line and from bumps, and keeps what the spheres prove.
+With --write-cases problems are only drawn, and written for machines without Pinocchio, Coal and OMPL; there --cases
+solves them from the straight line and from random bumps, and keeps the paths that the sphere cover proves free.
 
 Usage: python scripts/generate_data.py FOLDER [--problems 10000] [--workers 2] [--address HOST:PORT] [SUITE[/LEVEL] ...]
 """
@@ -19,8 +19,8 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from apex_ompl.datasets.cases import load_cases, save_cases, work_cases
-from apex_ompl.datasets.engine import Options
+from apex_ompl.datasets.engine import EngineOptions
+from apex_ompl.datasets.kernel_problems import load_kernel_problems, save_kernel_problems, solve_kernel_problems
 from apex_ompl.datasets.records import Paths
 from apex_ompl.datasets.store import Store
 from apex_ompl.errors import ParameterError
@@ -35,35 +35,35 @@ from apex_ompl.util.validation import one_or_more, whole_number
 # Pinocchio, Coal and OMPL are imported where problems are drawn: --cases needs none of them.
 
 LIBRARIES = ("apex-ompl", "ompl", "pin", "coal", "numba", "numpy", "zarr")
-Work = Callable[[Any, Options, Spline], tuple[Paths, dict[str, float]]]
-Done = tuple[str, Paths, dict[str, float]]
+Solve = Callable[[Any, EngineOptions, Spline], tuple[Paths, dict[str, float]]]
+Solved = tuple[str, Paths, dict[str, float]]
 
 
-def worked(
-    work: Work, units: dict[str, Any], options: Options, spline: Spline, *, workers: int, address: str | None
-) -> Iterator[Done]:
-    """Work on units by their names: in this process, or where there are several workers or a cluster by Ray.
+def solve_all(
+    solve: Solve, units: dict[str, Any], options: EngineOptions, spline: Spline, *, workers: int, address: str | None
+) -> Iterator[Solved]:
+    """Yield name, paths and times of units as they are solved: in this process, or by Ray with workers or a cluster.
 
     Raises:
-        ClusterError: Ray is not there, or a worker failed.
+        ClusterError: Ray is missing, or a worker failed.
     """
     if not units or (workers == 1 and address is None):
         for name, unit in units.items():
-            yield name, *work(unit, options, spline)
+            yield name, *solve(unit, options, spline)
         return
     jobs = {name: (unit, options, spline) for name, unit in units.items()}
-    for name, (paths, times) in spread(work, jobs, workers=workers, address=address):
+    for name, (paths, times) in spread(solve, jobs, workers=workers, address=address):
         yield name, paths, times
 
 
 def generate(args: argparse.Namespace) -> None:
-    """Make what is missing of the data set."""
-    import tqdm  # noqa: F401 - said now if it is missing, and not behind the first unit
+    """Solve the units that the data set lacks."""
+    import tqdm  # noqa: F401 - fails here where it is missing, and not after the first unit
     import zarr  # noqa: F401
 
     spline = Spline(args.control_points, args.pinned)
-    work, units, about, tables = _given(args) if args.cases else _drawn(args)
-    options = Options(args.seed, args.copies, 0 if args.cases else args.parts, args.model)
+    solve, units, about, tables = _read_units(args) if args.cases else _planned_units(args)
+    options = EngineOptions(args.seed, args.copies, 0 if args.cases else args.parts, args.model)
     manifest = {
         **about, "seed": args.seed, "copies": args.copies,
         "parts": options.parts, "model": args.model, "control_points": args.control_points, "pinned": args.pinned,
@@ -89,19 +89,21 @@ def generate(args: argparse.Namespace) -> None:
             tables.save(store.folder / "robot.npz")
         there = set(store.units())
         left = {name: unit for name, unit in units.items() if name not in there}
-        source = worked(work, left, options, spline, workers=args.workers, address=args.address)
-        paths, seconds = _make(store, source, len(units), len(left), args)
+        source = solve_all(solve, left, options, spline, workers=args.workers, address=args.address)
+        paths, seconds = _write_units(store, source, len(units), len(left), args)
         total = summary(store)
         store.note(counts=total)
     print(f"{args.folder}: {total['paths']} paths of {total['solved']} problems in {total['units']} units", end="")
     print(f"; {paths} of them now, {paths / seconds:.1f} a second" if left else "; nothing was left to do")
 
 
-def _make(store: Store, source: Iterator[Done], units: int, left: int, args: argparse.Namespace) -> tuple[int, float]:
-    """Write what is made, and note the run; return how many paths it made, and in how many seconds."""
+def _write_units(
+    store: Store, source: Iterator[Solved], units: int, left: int, args: argparse.Namespace
+) -> tuple[int, float]:
+    """Write the units, and note the run in the manifest; return the number of paths, and the time [s]."""
     from tqdm import tqdm
 
-    begin, done, paths, times = time.perf_counter(), 0, 0, Counter[str]()
+    started, done, paths, times = time.perf_counter(), 0, 0, Counter[str]()
     seconds = 0.0
     try:
         with tqdm(total=units, initial=units - left, unit="unit", disable=args.quiet) as bar:
@@ -109,12 +111,12 @@ def _make(store: Store, source: Iterator[Done], units: int, left: int, args: arg
                 store.write(name, found)
                 done, paths = done + 1, paths + len(found)
                 times.update(spent)
-                rate = paths / (time.perf_counter() - begin)
+                rate = paths / (time.perf_counter() - started)
                 bar.set_postfix_str(f"{rate:.1f} paths/s, {name}")
                 bar.update()
     finally:
         source.close()
-        seconds = time.perf_counter() - begin
+        seconds = time.perf_counter() - started
         if done:
             run = {"workers": args.workers, "seconds": round(seconds, 1), "units": done, "paths": paths}
             run["worker_seconds"] = {stage: round(value, 1) for stage, value in sorted(times.items())}
@@ -122,34 +124,35 @@ def _make(store: Store, source: Iterator[Done], units: int, left: int, args: arg
     return paths, max(seconds, 1e-9)
 
 
-def _drawn(args: argparse.Namespace) -> tuple[Work, dict[str, Any], dict[str, Any], RobotTables]:
-    """Return what works, units to draw, what the manifest says of the robot, and its tables with empty hands."""
+def _planned_units(args: argparse.Namespace) -> tuple[Solve, dict[str, Any], dict[str, Any], RobotTables]:
+    """Return the solving function, units to draw, the robot for the manifest, and its tables with empty hands."""
     from apex_ompl.collision import CollisionChecker
-    from apex_ompl.generation.worker import plan_units, work
+    from apex_ompl.generation.solving import solve_unit
+    from apex_ompl.generation.units import plan_units
     from apex_ompl.problems.suite_robot import robot
 
     units = {unit.name: unit for unit in plan_units(args.problems, args.levels)}
     sizes = {unit.size for unit in units.values()}
     about = {"robot": robot().name, "joints": list(robot().joint_names), "problems_per_unit": max(sizes)}
-    return work, units, about, CollisionChecker(robot()).kernel.robot
+    return solve_unit, units, about, CollisionChecker(robot()).kernel.robot
 
 
-def _given(args: argparse.Namespace) -> tuple[Work, dict[str, Any], dict[str, Any], RobotTables | None]:
-    """Return what works, units that were written, what the manifest says of the robot, and its tables if known.
+def _read_units(args: argparse.Namespace) -> tuple[Solve, dict[str, Any], dict[str, Any], RobotTables | None]:
+    """Return the solving function, the units of --cases, the robot for the manifest, and its tables where known.
 
     Raises:
-        ParameterError: Suites are named beside.
+        ParameterError: Suites are named as well.
     """
     if args.levels:
         raise ParameterError("SUITE[/LEVEL]", " ".join(args.levels), "none beside --cases")
     units: dict[str, Any] = {}
-    cases = load_cases(args.cases)
-    for case in cases:
-        units.setdefault(case.unit, []).append(case)
-    first, tables = cases[0], next((case.robot for case in cases if json.loads(case.row.held) == []), None)
+    problems = load_kernel_problems(args.cases)
+    for problem in problems:
+        units.setdefault(problem.unit, []).append(problem)
+    first, tables = problems[0], next((p.robot for p in problems if json.loads(p.record.held) == []), None)
     sizes = {len(unit) for unit in units.values()}
     about = {"robot": first.robot.name, "joints": list(first.robot.joint_names), "problems_per_unit": max(sizes)}
-    return work_cases, units, about, tables
+    return solve_kernel_problems, units, about, tables
 
 
 def write_cases(args: argparse.Namespace) -> None:
@@ -158,17 +161,18 @@ def write_cases(args: argparse.Namespace) -> None:
     Raises:
         MissingFileError: The folder cannot be made.
     """
-    from apex_ompl.generation.worker import plan_units, written
+    from apex_ompl.generation.records import kernel_problems
+    from apex_ompl.generation.units import plan_units
 
     check_writable(make_folder(args.folder, "folder for problems") / "cases.npz")
     units = plan_units(args.problems, args.levels, args.split)
-    cases = [case for unit in units for case in written(unit)]
-    save_cases(args.folder, cases)
-    print(f"{args.folder}: {len(cases)} problems in {len({case.unit for case in cases})} units")
+    problems = [problem for unit in units for problem in kernel_problems(unit)]
+    save_kernel_problems(args.folder, problems)
+    print(f"{args.folder}: {len(problems)} problems in {len({problem.unit for problem in problems})} units")
 
 
 def summary(store: Store) -> dict[str, Any]:
-    """Return what a data set holds, by counting."""
+    """Return the number of units, paths and problems of a data set, and the sums of its statistics."""
     total: Counter[str] = Counter(units=0, paths=0, solved=0)
     for paths in store:
         total.update({"units": 1, "paths": len(paths)})
@@ -187,10 +191,10 @@ def main() -> None:
     )
     parser.add_argument("--seed", type=whole_number, default=0, help="of the random choices (default: %(default)s)")
     parser.add_argument(
-        "--copies", type=one_or_more, default=Options.copies, help="paths sought (default: %(default)s)"
+        "--copies", type=one_or_more, default=EngineOptions.copies, help="paths sought (default: %(default)s)"
     )
     parser.add_argument(
-        "--parts", type=whole_number, default=Options.parts, help="parts of each path (default: %(default)s)"
+        "--parts", type=whole_number, default=EngineOptions.parts, help="parts of each path (default: %(default)s)"
     )
     parser.add_argument("--model", default="", help="whose proposals are tried first, for example apex (default: none)")
     parser.add_argument("--control-points", type=one_or_more, default=Spline.points, help="(default: %(default)s)")

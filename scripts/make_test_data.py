@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from apex_ompl.datasets.cases import load_cases, save_cases
+from apex_ompl.datasets.kernel_problems import load_kernel_problems, save_kernel_problems
 from apex_ompl.datasets.store import load, save
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.files import make_folder, write_atomically
@@ -29,11 +29,15 @@ def make(source: Path, out: Path) -> None:
     """
     make_folder(out, "folder for the data of the tests")
     full = load(source / "paths.zip")
-    paths = full.chosen(np.arange(0, full.problems, PROBLEM_STRIDE))
+    paths = full.subset(np.arange(0, full.problems, PROBLEM_STRIDE))
     save(out / "paths.zip", paths)
-    hard = [case for case in load_cases(source / "validation") if case.level == "hard" and case.suite != EASY_SUITE]
+    hard = [
+        case
+        for case in load_kernel_problems(source / "validation")
+        if case.level == "hard" and case.suite != EASY_SUITE
+    ]
     cases = hard[::CASE_STRIDE]
-    save_cases(out / "validation", cases)
+    save_kernel_problems(out / "validation", cases)
     write_atomically(out / "robot.npz", (source / "robot.npz").read_bytes())
     size = sum(file.stat().st_size for file in out.rglob("*.*") if file.is_file())
     print(f"{out}: {len(paths)} paths of {paths.problems} problems, {len(cases)} cases, {size / 2**10:.0f} KiB")

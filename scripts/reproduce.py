@@ -178,7 +178,7 @@ def fid(args: argparse.Namespace) -> tuple[dict[str, Any], list[Table], Figure, 
     notes = [
         ("Real", f"solutions of {len(real)} validation problems, one each, of {', '.join(FID_LEVELS)}"),
         ("Made", f"one path for each of them; apex by its own sampling, apex-paper by {realism.STEPS} steps of DDIM"),
-        ("Seeds", f"the number of the first of {realism.PART} problems at a time, 0 to {len(real) - 1}"),
+        ("Seeds", f"the number of the first of {realism.BATCH} problems at a time, 0 to {len(real) - 1}"),
         ("Floor", "FID between two halves of the real set, of other problems each: larger than it would be for all"),
         ("Made with", f"{hardware()}, {args.jobs} processes; {', '.join(f'{k} {v}' for k, v in versions().items())}"),
     ]

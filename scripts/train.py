@@ -1,7 +1,7 @@
-"""Train a latent diffusion model; the same command goes on where it was interrupted.
+"""Train a latent diffusion model; the same command resumes an interrupted run.
 
-The run's folder gets ``checkpoint`` (read it by ``apex_ompl.load_model``), ``log.csv``, TensorBoard's files, and
-``state.pt``, from which it goes on. Several GPUs, or processes, train together by
+The run's folder receives ``checkpoint`` (read it by ``apex_ompl.load_model``), ``log.csv``, TensorBoard event files,
+and ``state.pt``, from which the run is resumed. Several GPUs, or processes, train together by
 ``torchrun --nproc-per-node N scripts/train.py CONFIG.yaml``. Neither Pinocchio nor OMPL is needed.
 
 Usage: python scripts/train.py CONFIG.yaml [--out FOLDER] [--set KEY=VALUE ...] [--minutes M]
@@ -21,38 +21,38 @@ from apex_ompl.util.files import locked, make_folder
 
 
 def train(args: argparse.Namespace) -> None:
-    """Train until the end, or until the time is up."""
+    """Train to the end, or to the time limit."""
     from tqdm import tqdm
 
-    from apex_ompl.datasets.cases import load_cases
+    from apex_ompl.datasets.kernel_problems import load_kernel_problems
     from apex_ompl.diffusion.config import TrainingConfig
-    from apex_ompl.diffusion.objective import Place
+    from apex_ompl.diffusion.distributed import DistributedProcess
     from apex_ompl.diffusion.training import Trainer
 
     config = TrainingConfig.read(args.config, dict(args.set))
     folder = make_folder(args.out or Path("runs") / Path(args.config).stem, "folder of a training run")
-    cases = load_cases(config.cases) if config.cases is not None else []
-    place = Place.here()
+    validation = load_kernel_problems(config.cases) if config.cases is not None else []
+    process = DistributedProcess.current()
     bars: dict[str, Any] = {}
 
     def watch(at: Trainer, loss: float) -> None:
         if at.phase not in bars:  # a phase has a speed of its own
             for bar in bars.values():
                 bar.close()
-            quiet = args.quiet or place.rank != 0
+            quiet = args.quiet or process.rank != 0
             bars[at.phase] = tqdm(total=at.steps, initial=at.step - 1, unit="step", desc=at.phase, disable=quiet)
         bars[at.phase].set_postfix_str(f"loss {loss:.4f}", refresh=False)
         bars[at.phase].update()
 
     try:
-        with locked(folder) if place.rank == 0 else nullcontext():
-            trainer = Trainer(config, folder, place, cases, tqdm.write)
+        with locked(folder) if process.rank == 0 else nullcontext():
+            trainer = Trainer(config, folder, process, validation, tqdm.write)
             trainer.run(60.0 * args.minutes, watch)
     finally:
         for bar in bars.values():
             bar.close()
-        place.leave()
-    if place.rank == 0:
+        process.close()
+    if process.rank == 0:
         print(f"{folder / 'checkpoint'}: {trainer.phase}, step {trainer.step} of {trainer.steps}")
 
 
@@ -64,7 +64,9 @@ def main() -> None:
     parser.add_argument(
         "--set", type=_setting, action="append", default=[], metavar="KEY=VALUE", help="for example latent.dim=96"
     )
-    parser.add_argument("--minutes", type=_minutes, default=float("inf"), help="end after these, to go on another time")
+    parser.add_argument(
+        "--minutes", type=_minutes, default=float("inf"), help="time limit; the same command resumes the run"
+    )
     parser.add_argument("--quiet", action="store_true", help="show no progress")
     args = parser.parse_args()
     train(args)

@@ -35,10 +35,10 @@ def some_paths() -> Paths:
 
 
 @cache
-def kernel(*things: tuple[str, tuple[float, ...], tuple[float, ...]]) -> Kernel:
+def kernel(*obstacles: tuple[str, tuple[float, ...], tuple[float, ...]]) -> Kernel:
     """The robot among obstacles that are given by shape, position and size; kernels keep radii and half lengths."""
     solids = []
-    for k, (shape, position, size) in enumerate(things):
+    for k, (shape, position, size) in enumerate(obstacles):
         pose = np.eye(4)
         pose[:3, 3] = position
         solids.append((k, Primitive(KINDS[shape], pose, size)))
@@ -47,7 +47,7 @@ def kernel(*things: tuple[str, tuple[float, ...], tuple[float, ...]]) -> Kernel:
 
 def config(**parts: object) -> ModelConfig:
     robot = kernel().robot
-    count = len(Probes.of(robot, 3).joint)
+    count = len(Probes.from_robot(robot, 3).joint)
     small = {
         "latent": LatentConfig(dim=24, width=16), "condition": ConditionConfig(width=16, out=32, along=3),
         "denoiser": DenoiserConfig(width=32, blocks=2), "noise": NoiseConfig(),
@@ -59,7 +59,7 @@ def network(seed: int = 0, **parts: object) -> LatentDiffusion:
     """A small model, its last layer not zero as at the beginning of a training."""
     torch.manual_seed(seed)
     model = LatentDiffusion(config(**parts))
-    probes = Probes.of(kernel().robot, 3)
+    probes = Probes.from_robot(kernel().robot, 3)
     model.probe_joint.copy_(torch.from_numpy(probes.joint))
     model.probe_offset.copy_(torch.from_numpy(probes.offset))
     if isinstance(model.autoencoder, LinearLatent):
@@ -86,4 +86,4 @@ def query(seed: int = 0) -> Query:
     middle, span = (limits.lower + limits.upper) / 2, limits.upper - limits.lower
     ends = middle + 0.3 * span * rng.uniform(-0.5, 0.5, (2, DOF))
     rows = [(0, WALL[1], (0, 0, 0, 1), (0.1, 0.8, 0.6)), (2, POST[1], (0, 0, 0, 1), (0.05, 0.6, 0.0))]
-    return Query(ends[0], ends[1], np.array([0.4, 0.0, 0.5]), ObstacleSet.of(rows))
+    return Query(ends[0], ends[1], np.array([0.4, 0.0, 0.5]), ObstacleSet.from_rows(rows))

@@ -10,11 +10,12 @@ import pytest
 from support import ROOT
 
 from apex_ompl import problems
-from apex_ompl.datasets.cases import WrittenCase, load_cases, save_cases
+from apex_ompl.datasets.kernel_problems import KernelProblem, load_kernel_problems, save_kernel_problems
 from apex_ompl.datasets.records import SOURCES
 from apex_ompl.datasets.store import Store
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError
-from apex_ompl.generation.worker import Unit, written
+from apex_ompl.generation.records import kernel_problems
+from apex_ompl.generation.units import Unit
 from apex_ompl.kernel import RobotTables
 from apex_ompl.ompl_adapter.setup import assemble
 from apex_ompl.ompl_adapter.validity import full_check
@@ -34,18 +35,18 @@ runpy.run_path(sys.argv[0], run_name="__main__")
 
 
 @pytest.fixture(scope="module")
-def cases() -> list[WrittenCase]:
-    return [*written(Unit("broad", "free", 5, 4)), *written(Unit("horizontal", "small", 5, 3))]
+def cases() -> list[KernelProblem]:
+    return [*kernel_problems(Unit("broad", "free", 5, 4)), *kernel_problems(Unit("horizontal", "small", 5, 3))]
 
 
-def test_what_is_written_is_read(cases: list[WrittenCase], tmp_path: Path) -> None:
-    save_cases(tmp_path, cases)
-    again = load_cases(tmp_path)
+def test_what_is_written_is_read(cases: list[KernelProblem], tmp_path: Path) -> None:
+    save_kernel_problems(tmp_path, cases)
+    again = load_kernel_problems(tmp_path)
     assert len(again) == len(cases) == 7
     for old, new in zip(cases, again, strict=True):
-        assert (new.unit, new.suite, new.level, new.recipe) == (old.unit, old.suite, old.level, old.recipe)
-        assert new.row.seed == old.row.seed and new.row.held == old.row.held
-        assert len(new.row.things) == len(old.row.things)
+        assert (new.unit, new.suite, new.level, new.strategy) == (old.unit, old.suite, old.level, old.strategy)
+        assert new.record.seed == old.record.seed and new.record.held == old.record.held
+        assert len(new.record.obstacles) == len(old.record.obstacles)
         for mine, theirs in ((new.start, old.start), (new.goal, old.goal), (new.points, old.points)):
             assert np.array_equal(mine, theirs)
         packed = [(*case.scene.packed, *case.robot.packed) for case in (new, old)]
@@ -53,9 +54,9 @@ def test_what_is_written_is_read(cases: list[WrittenCase], tmp_path: Path) -> No
             assert np.array_equal(mine, theirs)
 
 
-def test_they_are_solved_without_pinocchio_coal_and_ompl(cases: list[WrittenCase], tmp_path: Path) -> None:
+def test_they_are_solved_without_pinocchio_coal_and_ompl(cases: list[KernelProblem], tmp_path: Path) -> None:
     """What the spheres proved there passes the full check here, meshes and all."""
-    save_cases(tmp_path / "cases", cases)
+    save_kernel_problems(tmp_path / "cases", cases)
     command = [sys.executable, "-c", WITHOUT, str(ROOT / "scripts" / "generate_data.py"), str(tmp_path / "data")]
     command += ["--cases", str(tmp_path / "cases"), "--quiet"]
     result = subprocess.run(command, check=False, capture_output=True, text=True, timeout=300)
@@ -72,18 +73,18 @@ def test_they_are_solved_without_pinocchio_coal_and_ompl(cases: list[WrittenCase
     assert seen >= 8
 
 
-def test_damaged_files_are_named(cases: list[WrittenCase], tmp_path: Path) -> None:
+def test_damaged_files_are_named(cases: list[KernelProblem], tmp_path: Path) -> None:
     with pytest.raises(ParameterError, match="cases"):
-        save_cases(tmp_path, [])
+        save_kernel_problems(tmp_path, [])
     with pytest.raises(MissingFileError, match=r"cases\.npz"):
-        load_cases(tmp_path / "nowhere")
-    save_cases(tmp_path, cases[:2])
+        load_kernel_problems(tmp_path / "nowhere")
+    save_kernel_problems(tmp_path, cases[:2])
     file = tmp_path / "cases.npz"
     whole = file.read_bytes()
     for content in (b"", whole[: len(whole) // 2], b"PK" + whole[2:300]):
         file.write_bytes(content)
         with pytest.raises(FileFormatError, match=r"cases\.npz"):
-            load_cases(tmp_path)
+            load_kernel_problems(tmp_path)
     file.write_bytes(whole)
     with np.load(file) as data:
         arrays = dict(data)
@@ -96,7 +97,7 @@ def test_damaged_files_are_named(cases: list[WrittenCase], tmp_path: Path) -> No
     for name, value in wrong.items():
         np.savez(file, **{**arrays, name: value})
         with pytest.raises(FileFormatError, match=r"cases\.npz"):
-            load_cases(tmp_path)
+            load_kernel_problems(tmp_path)
     about = json.loads(str(arrays["about"]))
     for key, value in (
         ("unit", "../../evil"),
@@ -108,19 +109,19 @@ def test_damaged_files_are_named(cases: list[WrittenCase], tmp_path: Path) -> No
         first = {**about["cases"][0], key: value}
         np.savez(file, **{**arrays, "about": json.dumps({**about, "cases": [first, *about["cases"][1:]]})})
         with pytest.raises(FileFormatError, match=r"cases\.npz"):
-            load_cases(tmp_path)
+            load_kernel_problems(tmp_path)
     for other, words in (({**about, "schema": "apex-ompl/cases/0"}, "cases/0"), ({**about, "cases": []}, "cases")):
         np.savez(file, **{**arrays, "about": json.dumps(other)})
         with pytest.raises(FileFormatError, match=words):
-            load_cases(tmp_path)
+            load_kernel_problems(tmp_path)
     file.write_bytes(whole)
     other = RobotTables.load(tmp_path / "tables-0.npz").restricted_to(range(4))
     kept = (tmp_path / "tables-0.npz").read_bytes()
     other.save(tmp_path / "tables-0.npz")
     with pytest.raises(FileFormatError, match="another file"):
-        load_cases(tmp_path)
+        load_kernel_problems(tmp_path)
     (tmp_path / "tables-0.npz").write_bytes(kept)
-    assert len(load_cases(tmp_path)) == 2
+    assert len(load_kernel_problems(tmp_path)) == 2
     (tmp_path / "tables-0.npz").unlink()
     with pytest.raises(MissingFileError, match="tables-0"):
-        load_cases(tmp_path)
+        load_kernel_problems(tmp_path)

@@ -14,7 +14,7 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 from support import DATA
-from trainings import HERE, config, query_of_path
+from trainings import HERE, config, query_from_path
 
 import apex_ompl
 from apex_ompl.datasets.store import load
@@ -56,7 +56,7 @@ def test_a_checkpoint_gives_the_model_back(saved: Path, few: Path, tmp_path: Pat
     assert "denoiser, step 12, 0 min, 32 paths in memory" in (saved / "README.md").read_text()
     assert model.about["config"]["steps"] == 12
     kernel = Kernel(RobotTables.load(DATA / "robot.npz"), scene_tables([]))
-    query = query_of_path(load(few), 0)
+    query = query_from_path(load(few), 0)
     first, second = (
         m.propose(query, kernel, 3, generator=torch.Generator().manual_seed(1)).control
         for m in (model, load_model(str(tmp_path / "again")))
@@ -103,7 +103,7 @@ def test_faulty_checkpoints_are_named(saved: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("what", "said"),
+    ("what", "message"),
     [
         ("missing", "denoiser.leave.bias: expected weights that fit config.json"),
         ("shape", "denoiser.leave.bias: expected weights that fit config.json"),
@@ -111,7 +111,7 @@ def test_faulty_checkpoints_are_named(saved: Path, tmp_path: Path) -> None:
         ("text", "model.safetensors: expected safetensors"),
     ],
 )
-def test_weights_that_do_not_fit_are_named(what: str, said: str, saved: Path, tmp_path: Path) -> None:
+def test_weights_that_do_not_fit_are_named(what: str, message: str, saved: Path, tmp_path: Path) -> None:
     import hashlib
 
     folder = _changed(saved, tmp_path / what)
@@ -130,7 +130,7 @@ def test_weights_that_do_not_fit_are_named(what: str, said: str, saved: Path, tm
     fitting = _changed(folder, tmp_path / "fitting", digest=digest)
     with pytest.raises(FileFormatError) as caught:
         load_model(fitting)
-    assert said in str(caught.value)
+    assert message in str(caught.value)
 
 
 def test_a_checkpoint_is_written_whole_or_not_at_all(saved: Path, tmp_path: Path, monkeypatch: Any) -> None:

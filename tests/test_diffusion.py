@@ -13,9 +13,10 @@ from models import DOF, VARIATIONAL, WALL, kernel, network, query, some_paths
 
 from apex_ompl.datasets.records import SHAPES
 from apex_ompl.diffusion.autoencoder import LinearLatent, VariationalLatent
-from apex_ompl.diffusion.conditions import ObstacleSet, Probes, Query, Table, batched, distances, rotations
+from apex_ompl.diffusion.conditions import ConditionTable, ObstacleSet, Probes, Query, batch_queries
 from apex_ompl.diffusion.denoisers import UNetDenoiser
 from apex_ompl.diffusion.encoders import ConditionEncoder
+from apex_ompl.diffusion.geometry import rotation_matrices, signed_distances
 from apex_ompl.diffusion.model import (
     DenoiserConfig,
 )
@@ -71,7 +72,7 @@ def test_the_variational_network_learns_to_give_paths_back() -> None:
     torch.manual_seed(0)
     control = torch.tensor(some_paths().control()[::10][:64], dtype=torch.float32)
     model = VariationalLatent(Spline(), DOF, 8, 32)
-    model.measure(control)
+    model.fit_scale(control)
     optimizer = torch.optim.Adam(model.parameters(), 2e-3)
     errors = []
     for k in range(120):
@@ -82,14 +83,14 @@ def test_the_variational_network_learns_to_give_paths_back() -> None:
         optimizer.step()
         errors.append(float(error.detach()))
     assert errors[-1] < 0.1 * errors[0]
-    model.measure(control)
+    model.fit_scale(control)
     with torch.no_grad():
         latent = model.encode(control)
         assert latent.std(dim=(0, 2)) == pytest.approx(np.ones(8), abs=0.05)
         found = model.control(latent, control[:, 0], control[:, -1])
         path = model.path(control)
-        apart = (model.path(found) - path).square().mean()
-        assert apart < 0.2 * (model.path(model.line(control[:, 0], control[:, -1])) - path).square().mean()
+        error = (model.path(found) - path).square().mean()
+        assert error < 0.2 * (model.path(model.line(control[:, 0], control[:, -1])) - path).square().mean()
 
 
 def test_states_that_cannot_be_halved_are_refused() -> None:
@@ -110,7 +111,7 @@ def test_quaternions_become_the_rotations_of_scipy(seed: int) -> None:
     from scipy.spatial.transform import Rotation
 
     quaternions = np.random.default_rng(seed).normal(size=(7, 4))
-    np.testing.assert_allclose(rotations(quaternions), Rotation.from_quat(quaternions).as_matrix(), atol=1e-6)
+    np.testing.assert_allclose(rotation_matrices(quaternions), Rotation.from_quat(quaternions).as_matrix(), atol=1e-6)
 
 
 @pytest.mark.parametrize("shape", SHAPES)
@@ -124,14 +125,14 @@ def test_distances_are_those_of_the_meshes_library(shape: str) -> None:
         "capsule": coal.Capsule(0.15, 0.4),
     }[shape]  # fmt: skip
     quaternion = rng.normal(size=4)
-    things = ObstacleSet.of([(SHAPES.index(shape), (0.1, -0.2, 0.3), quaternion, size)])
+    obstacles = ObstacleSet.from_rows([(SHAPES.index(shape), (0.1, -0.2, 0.3), quaternion, size)])
     ends = np.zeros(DOF)
-    given_ = batched([Query(ends, ends, np.zeros(3), things)], Probes.of(kernel().robot, 2), kernel())
+    given_ = batch_queries([Query(ends, ends, np.zeros(3), obstacles)], Probes.from_robot(kernel().robot, 2), kernel())
     points = rng.uniform(-0.8, 0.8, (60, 3))
-    mine = distances(
-        given_.shape[0], given_.position[0], given_.turn[0], given_.size[0], torch.tensor(points[None]).float()
+    mine = signed_distances(
+        given_.shape[0], given_.position[0], given_.rotation[0], given_.size[0], torch.tensor(points[None]).float()
     )[0].numpy()  # fmt: skip
-    pose = coal.Transform3s(rotations(quaternion).astype(float), np.array([0.1, -0.2, 0.3]))
+    pose = coal.Transform3s(rotation_matrices(quaternion).astype(float), np.array([0.1, -0.2, 0.3]))
     for point, value in zip(points, mine, strict=True):
         result = coal.DistanceResult()
         dot = coal.Transform3s(np.eye(3), point)
@@ -143,19 +144,19 @@ def test_distances_are_those_of_the_meshes_library(shape: str) -> None:
 
 
 def test_probes_are_where_the_joints_take_them() -> None:
-    probes, q = Probes.of(kernel().robot, 5), query()
-    places = probes.places(kernel(), q.start[None], q.goal[None])
-    assert places.shape == (1, 5, len(probes.joint), 3)
+    probes, q = Probes.from_robot(kernel().robot, 5), query()
+    positions = probes.positions(kernel(), q.start[None], q.goal[None])
+    assert positions.shape == (1, 5, len(probes.joint), 3)
     turn, origin = kernel().joint_frames(np.stack([q.start, (q.start + q.goal) / 2, q.goal]))
     for k, along in enumerate((0, 2, 4)):
         wanted = [turn[k, j] @ p + origin[k, j] for j, p in zip(probes.joint, probes.offset, strict=True)]
-        np.testing.assert_allclose(places[0, along], wanted, atol=1e-6)
+        np.testing.assert_allclose(positions[0, along], wanted, atol=1e-6)
 
 
 @pytest.mark.parametrize("scene", ["none", "set", "distances"])
 def test_the_order_of_obstacles_does_not_matter(scene: str) -> None:
     torch.manual_seed(0)
-    probes, rng = Probes.of(kernel().robot, 3), np.random.default_rng(5)
+    probes, rng = Probes.from_robot(kernel().robot, 3), np.random.default_rng(5)
     sizes = {"probes": len(probes.joint), "along": 3, "out": 20, "width": 16}
     encoder = ConditionEncoder(DOF, scene=scene, point=True, **sizes)
     rows = [
@@ -165,9 +166,9 @@ def test_the_order_of_obstacles_does_not_matter(scene: str) -> None:
 
     def encoded(chosen: list[int], beside: int = 0) -> torch.Tensor:
         """The code of a query, in a batch with another one of ``beside`` obstacles."""
-        mine = Query(q.start, q.goal, q.point, ObstacleSet.of([rows[k] for k in chosen]))
-        other = Query(q.goal, q.start, q.point, ObstacleSet.of(rows[:beside]))
-        return encoder(batched([mine, other], probes, kernel()))[0]
+        mine = Query(q.start, q.goal, q.point, ObstacleSet.from_rows([rows[k] for k in chosen]))
+        other = Query(q.goal, q.start, q.point, ObstacleSet.from_rows(rows[:beside]))
+        return encoder(batch_queries([mine, other], probes, kernel()))[0]
 
     first = encoded(list(range(9)))
     for _ in range(5):
@@ -180,9 +181,9 @@ def test_the_order_of_obstacles_does_not_matter(scene: str) -> None:
 
 def test_conditions_of_stored_paths_are_those_of_their_problems() -> None:
     paths = some_paths()
-    probes = Probes.of(kernel().robot, 3)
+    probes = Probes.from_robot(kernel().robot, 3)
     which = np.arange(0, len(paths), 37)
-    found = Table(paths, probes, kernel()).batch(torch.from_numpy(which))
+    found = ConditionTable(paths, probes, kernel()).batch(torch.from_numpy(which))
     a = paths.arrays
     first = np.concatenate([[0], np.cumsum(a["things"])])
     queries = []
@@ -190,9 +191,9 @@ def test_conditions_of_stored_paths_are_those_of_their_problems() -> None:
         p = a["problem"][k]
         span = slice(int(first[p]), int(first[p + 1]))
         columns = (a[name][span] for name in ("shape", "position", "orientation", "size"))
-        things = ObstacleSet.of(list(zip(*columns, strict=True)))
-        queries.append(Query(paths.start[k], paths.goal[k], a["point"][k], things))
-    wanted = batched(queries, probes, kernel())
+        obstacles = ObstacleSet.from_rows(list(zip(*columns, strict=True)))
+        queries.append(Query(paths.start[k], paths.goal[k], a["point"][k], obstacles))
+    wanted = batch_queries(queries, probes, kernel())
     torch.manual_seed(0)
     sizes = {"probes": len(probes.joint), "along": 3, "out": 20, "width": 16}
     encoder = ConditionEncoder(DOF, scene="distances", point=True, **sizes)
@@ -226,25 +227,25 @@ def test_the_same_seed_gives_the_same_paths(parts: dict[str, object]) -> None:
 
     first, limits = proposed(1), kernel().robot.arrays
     np.testing.assert_array_equal(first, proposed(1))
-    assert np.array_equal(first, proposed(2)) == model.network.regresses
+    assert np.array_equal(first, proposed(2)) == model.network.is_regression
     assert (first[:, 0] == query().start).all() and (first[:, -1] == query().goal).all()
     assert ((first >= limits.lower) & (first <= limits.upper)).all()
 
 
 def test_noise_up_to_a_step_leaves_paths_near() -> None:
-    """One step of noise, and of denoising by whatever network, strays less than all of it."""
+    """One step of noise, and of denoising by whatever network, changes a path less than all of it."""
     model = TrajectoryModel(network(), {})
     control = some_paths().control(slice(0, 1)).repeat(6, axis=0)
-    ends = Query(control[0, 0], control[0, -1], np.zeros(3), ObstacleSet.of([]))
+    ends = Query(control[0, 0], control[0, -1], np.zeros(3), ObstacleSet.from_rows([]))
 
-    def strayed(step: int) -> float:
+    def change(step: int) -> float:
         generator = torch.Generator().manual_seed(0)
         found = model.renoise(ends, kernel(), control, step, sampling=Sampling(steps=3), generator=generator)
         return float(np.abs(found.control - control).mean())
 
-    assert strayed(0) < 0.2 * strayed(255)
+    assert change(0) < 0.2 * change(255)
     with pytest.raises(ParameterError, match="step: expected a whole number from 0 to 255, got 256"):
-        strayed(256)
+        change(256)
     with pytest.raises(ParameterError, match=r"control points: expected finite numbers of shape \(B, 14, 16\)"):
         model.renoise(ends, kernel(), control[:, :5], 3)
     with pytest.raises(ParameterError, match="control points: expected finite numbers"):
@@ -254,7 +255,7 @@ def test_noise_up_to_a_step_leaves_paths_near() -> None:
 def test_a_query_of_another_robot_is_refused() -> None:
     model = TrajectoryModel(network(), {})
     with pytest.raises(ParameterError, match=r"start: expected finite numbers of shape \(16,\)"):
-        model.propose(Query(np.zeros(7), np.zeros(7), np.zeros(3), ObstacleSet.of([])), kernel(), 1)
+        model.propose(Query(np.zeros(7), np.zeros(7), np.zeros(3), ObstacleSet.from_rows([])), kernel(), 1)
     tables = kernel().robot
     other = Kernel(dataclasses.replace(tables, name="baxter"), kernel().scene)
     with pytest.raises(ParameterError, match="robot: expected dual_panda_softhand, which .* got 'baxter'"):
@@ -264,7 +265,7 @@ def test_a_query_of_another_robot_is_refused() -> None:
     with pytest.raises(ParameterError, match="goal: expected finite numbers"):
         model.propose(nan, kernel(), 1)
     lost = query()
-    lost.things.position[0, 1] = np.nan
+    lost.obstacles.position[0, 1] = np.nan
     with pytest.raises(ParameterError, match="obstacles: expected finite positions"):
         model.propose(lost, kernel(), 1)
     with pytest.raises(ParameterError, match="count: expected a whole number, 1 or more, got 0"):

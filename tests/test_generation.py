@@ -13,11 +13,12 @@ from support import ROOT
 
 from apex_ompl import problems
 from apex_ompl.collision.checker import NO_POINT
-from apex_ompl.datasets.engine import STRAIGHT_SHARE, Options
-from apex_ompl.datasets.records import FIELDS, SHAPES, SOURCES, Paths, rounded
+from apex_ompl.datasets.engine import STRAIGHT_SHARE, EngineOptions
+from apex_ompl.datasets.records import FIELDS, SHAPES, SOURCES, Paths, to_half
 from apex_ompl.datasets.store import Store, load
 from apex_ompl.errors import ParameterError, UnknownNameError
-from apex_ompl.generation.worker import Unit, plan_units, static_levels, work
+from apex_ompl.generation.solving import solve_unit
+from apex_ompl.generation.units import Unit, plan_units, static_levels
 from apex_ompl.ompl_adapter.setup import assemble
 from apex_ompl.ompl_adapter.validity import full_check
 from apex_ompl.problems.suite_robot import robot
@@ -31,19 +32,19 @@ UNITS = [Unit("vertical", "medium", 3, 4), Unit("wall", "easy", 3, 3), Unit("bro
 
 @pytest.fixture(scope="module")
 def made() -> list[Paths]:
-    return [work(unit, Options(), Spline())[0] for unit in UNITS]
+    return [solve_unit(unit, EngineOptions(), Spline())[0] for unit in UNITS]
 
 
 def same(a: Paths, b: Paths) -> bool:
     return all(np.array_equal(a.arrays[k], b.arrays[k]) for k in FIELDS) and a.counts == b.counts
 
 
-def test_every_path_is_proven_and_described_truly(made: list[Paths]) -> None:
+def test_every_path_passes_the_full_check_and_its_record_is_true(made: list[Paths]) -> None:
     spline, sources = Spline(), set()
     for paths in made:
         assert len(paths) > 10
         control, a = paths.control(), paths.arrays
-        things = np.concatenate([[0], np.cumsum(a["things"])]).astype(int)
+        bounds = np.concatenate([[0], np.cumsum(a["things"])]).astype(int)
         for k in range(len(paths)):
             owner = int(a["problem"][k])
             problem = problems.load(paths.problem_name(owner))
@@ -51,7 +52,7 @@ def test_every_path_is_proven_and_described_truly(made: list[Paths]) -> None:
             path = spline.path(control[k])
             assert full_check(ready.checker, path, paths.start[k], [paths.goal[k]])
             assert a["length"][k] == pytest.approx(path_length(path), rel=1e-5)
-            # No sphere of the cover is nearer than it says, at the states that were looked at.
+            # The stored clearance is that of the sphere cover at every other state.
             assert ready.checker.kernel.clearance(path[::2], 0.2).min() == pytest.approx(a["clearance"][k], abs=1e-6)
             source = SOURCES[a["source"][k]]
             sources.add(source)
@@ -67,22 +68,22 @@ def test_every_path_is_proven_and_described_truly(made: list[Paths]) -> None:
             nearest = ready.checker.distance(path[0])
             point = nearest.points[1] if problem.scene else NO_POINT
             np.testing.assert_allclose(a["point"][k], point, atol=1e-3)
-            mine = slice(things[owner], things[owner + 1])
+            mine = slice(bounds[owner], bounds[owner + 1])
             np.testing.assert_allclose(
                 a["position"][mine], [o.position for o in problem.scene] or np.zeros((0, 3)), atol=1e-6
             )
-            for number, thing in zip(a["shape"][mine], problem.scene, strict=True):
-                assert getattr(thing, SHAPES[number]) is not None
+            for number, obstacle in zip(a["shape"][mine], problem.scene, strict=True):
+                assert getattr(obstacle, SHAPES[number]) is not None
     assert {"bumps", "rrtconnect", "reversed", "part"} <= sources
 
 
 def test_the_same_seed_gives_the_same_paths_and_another_one_others(made: list[Paths]) -> None:
-    assert same(work(UNITS[1], Options(), Spline())[0], made[1])
-    assert not same(work(UNITS[1], Options(seed=1), Spline())[0], made[1])
+    assert same(solve_unit(UNITS[1], EngineOptions(), Spline())[0], made[1])
+    assert not same(solve_unit(UNITS[1], EngineOptions(seed=1), Spline())[0], made[1])
 
 
 def test_problems_that_a_line_solves_are_few() -> None:
-    paths, _ = work(Unit("vertical", "free", 1, 10), Options(copies=1, parts=0), Spline())
+    paths, _ = solve_unit(Unit("vertical", "free", 1, 10), EngineOptions(copies=1, parts=0), Spline())
     lines = int((paths.arrays["source"] == SOURCES.index("line")).sum())
     assert paths.counts["straight, left out"] > 0
     assert lines <= STRAIGHT_SHARE * paths.problems
@@ -107,7 +108,7 @@ def test_units_cover_all_static_levels_with_training_seeds() -> None:
 def test_half_precision_stays_inside_the_limits() -> None:
     lower, upper = robot().limits.lower, robot().limits.upper
     control = np.stack([lower, upper, np.nextafter(upper, -np.inf)])
-    half = rounded(control, lower, upper)
+    half = to_half(control, lower, upper)
     assert (half >= lower).all() and (half <= upper).all()
     assert np.array_equal(half, half.astype(np.float16)) and np.abs(half - control).max() < 4e-3
 
@@ -154,7 +155,7 @@ def test_a_set_is_described_and_made_compact(made: list[Paths], tmp_path: Path) 
     assert len(load(tmp_path / "c.zip")) == sum(map(len, made))
     done = subprocess.run([*command, "--mib", str(size / 2**20)], check=False, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    few, all_of_them = load(tmp_path / "c.zip"), Paths.joined(store)
+    few, all_of_them = load(tmp_path / "c.zip"), Paths.concatenate(store)
     assert (tmp_path / "c.zip").stat().st_size <= size
     assert few.problems == all_of_them.problems and 10 < len(few) < len(all_of_them)
     parts = SOURCES.index("part")
@@ -205,8 +206,8 @@ def test_workers_of_ray_make_the_same_paths_and_may_die(made: list[Paths]) -> No
     except Exception as error:  # sandboxes without sockets or shared memory
         pytest.skip(f"Ray does not start here: {error}")
     try:
-        units = {unit.name: (unit, Options(), Spline()) for unit in UNITS}
-        found = {name: paths for name, (paths, _) in spread(work, units, **options)}
+        units = {unit.name: (unit, EngineOptions(), Spline()) for unit in UNITS}
+        found = {name: paths for name, (paths, _) in spread(solve_unit, units, **options)}
         assert all(same(found[unit.name], paths) for unit, paths in zip(UNITS, made, strict=True))
 
         def fails(unit: int) -> int:
@@ -229,13 +230,13 @@ def test_workers_of_ray_make_the_same_paths_and_may_die(made: list[Paths]) -> No
         ray.shutdown()
 
 
-def test_proposals_of_a_model_are_proven_like_all_else() -> None:
-    unit, options = Unit("posts", "hard", 3, 3), Options(copies=2, parts=0, model="apex")
-    paths, times = work(unit, options, Spline())
+def test_paths_from_a_models_proposals_pass_the_full_check() -> None:
+    unit, options = Unit("posts", "hard", 3, 3), EngineOptions(copies=2, parts=0, model="apex")
+    paths, times = solve_unit(unit, options, Spline())
     assert "model" in {SOURCES[k] for k in paths.arrays["source"]} and times["model"] > 0.0
-    assert same(paths, work(unit, options, Spline())[0])
+    assert same(paths, solve_unit(unit, options, Spline())[0])
     for k in range(len(paths)):
         ready = assemble(problems.load(paths.problem_name(paths.arrays["problem"][k])), robot())
         assert full_check(ready.checker, paths.spline.path(paths.control(slice(k, k + 1))[0]))
     with pytest.raises(ParameterError, match="model: expected one of paths by"):
-        work(unit, options, Spline(16))
+        solve_unit(unit, options, Spline(16))

@@ -34,22 +34,22 @@ def test_guidance_of_nothing_is_the_plain_model_bit_for_bit(parts: dict[str, obj
                 query(), kernel(WALL, POST), 4, sampling=Sampling(name, 5, 1.0, guidance),
                 generator=torch.Generator().manual_seed(4),
             ).control
-            for guidance in (Guidance(gamma=0.0, scaling=scaling), Guidance(gamma=0.0), Guidance(1.0, begin=0.0))
+            for guidance in (Guidance(gamma=0.0, scaling=scaling), Guidance(gamma=0.0), Guidance(1.0, active_below=0.0))
         ]  # fmt: skip
         np.testing.assert_array_equal(found[0], found[1])
         np.testing.assert_array_equal(found[0], found[2])
 
 
-def test_the_cost_has_the_gradient_that_it_says() -> None:
+def test_the_gradient_of_the_cost_is_that_of_finite_differences() -> None:
     rng, among = np.random.default_rng(0), kernel(WALL, POST)
     paths = Spline(states=16).path(some_paths().control(slice(0, 6)))
     cost, slope = collision_cost(among, paths, 0.1)
     assert (cost > 0).any() and slope.shape == paths.shape
     for _ in range(10):
-        way = rng.normal(size=paths.shape)
+        direction = rng.normal(size=paths.shape)
         step = 1e-6
-        up, down = (collision_cost(among, paths + s * way, 0.1)[0] for s in (step, -step))
-        np.testing.assert_allclose((up - down) / (2 * step), (slope * way).sum(axis=(1, 2)), rtol=2e-3, atol=2e-4)
+        up, down = (collision_cost(among, paths + s * direction, 0.1)[0] for s in (step, -step))
+        np.testing.assert_allclose((up - down) / (2 * step), (slope * direction).sum(axis=(1, 2)), rtol=2e-3, atol=2e-4)
 
 
 @pytest.mark.parametrize("parts", [{}, VARIATIONAL], ids=["linear", "variational"])
@@ -59,9 +59,9 @@ def test_the_gradient_goes_through_decoder_and_kernel(parts: dict[str, object]) 
     latent = 0.5 * torch.randn(3, *model.latent, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     function = partial(_likely, model.double(), among, ends, guidance)
     slope = gradient(function, latent)
-    way = torch.randn(latent.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    difference = (function(latent + 1e-6 * way) - function(latent - 1e-6 * way)) / 2e-6
-    torch.testing.assert_close((slope * way).flatten(1).sum(dim=1), difference, rtol=5e-3, atol=5e-4)
+    direction = torch.randn(latent.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    difference = (function(latent + 1e-6 * direction) - function(latent - 1e-6 * direction)) / 2e-6
+    torch.testing.assert_close((slope * direction).flatten(1).sum(dim=1), difference, rtol=5e-3, atol=5e-4)
 
 
 def _likely(model: LatentDiffusion, among: Kernel, ends: tuple, guidance: Guidance, z: torch.Tensor) -> torch.Tensor:
@@ -72,13 +72,13 @@ def test_guided_paths_stay_near_where_little_is_left_of_the_sample() -> None:
     """At the first steps almost all is noise, and whatever is divided by what is left of the sample grows large."""
     model, sizes = TrajectoryModel(network(noise=NoiseConfig(most=4.0)), {}), []
     for gamma in (0.0, 1.0):
-        guidance = Guidance(gamma, "noise", begin=1.0)
+        guidance = Guidance(gamma, "noise", active_below=1.0)
         for steps in (1, 2, 8):
             found = model.propose(query(), kernel(WALL, POST), 4, sampling=Sampling("ddim", steps, 1.0, guidance))
             sizes.append(float(found.latent.abs().max()))
     assert max(sizes) <= 4.0
     control = some_paths().control(slice(0, 4))
-    ends = Query(control[0, 0], control[0, -1], np.zeros(3), ObstacleSet.of([]))
+    ends = Query(control[0, 0], control[0, -1], np.zeros(3), ObstacleSet.from_rows([]))
     sampling = Sampling("ddim", 4, 1.0, Guidance(1.0, "noise"))
     again = model.renoise(ends, kernel(WALL, POST), control, 100, sampling=sampling)
     assert np.isfinite(again.control).all() and float(again.latent.abs().max()) <= 4.0
@@ -107,7 +107,7 @@ def test_guidance_lowers_the_collision_cost_on_average(name: str, scaling: str) 
     model, among = TrajectoryModel(network(), {}), kernel(WALL, POST)
     costs = []
     for gamma in (0.0, 3.0):
-        guidance, total = Guidance(gamma, scaling, clip=1.0, begin=0.6), 0.0
+        guidance, total = Guidance(gamma, scaling, clip=1.0, active_below=0.6), 0.0
         for seed in range(3):
             found = model.propose(
                 query(seed), among, 8, sampling=Sampling(name, 8, 1.0, guidance),

@@ -9,16 +9,17 @@ import torch
 from apex_ompl import load_problem
 from apex_ompl.apex.query import make_query
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.diffusion.conditions import ObstacleSet, distances
-from apex_ompl.generation.worker import row_of
+from apex_ompl.diffusion.conditions import ObstacleSet
+from apex_ompl.diffusion.geometry import signed_distances
+from apex_ompl.generation.records import problem_record
 from apex_ompl.ompl_adapter.setup import assemble
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.scene.bodies import HalfSpace, Obstacle
 
 
-def sorted_rows(things: ObstacleSet) -> np.ndarray:
+def sorted_rows(obstacles: ObstacleSet) -> np.ndarray:
     """Shape, position, half sizes of boxes in the world, and so on, in an order of their own."""
-    rows = np.column_stack([things.shape, things.position, things.size, things.turn.reshape(-1, 9)])
+    rows = np.column_stack([obstacles.shape, obstacles.position, obstacles.size, obstacles.rotation.reshape(-1, 9)])
     return rows[np.lexsort(np.round(rows[:, ::-1], 5).T)]
 
 
@@ -26,25 +27,25 @@ def sorted_rows(things: ObstacleSet) -> np.ndarray:
 def test_queries_are_what_data_sets_hold(name: str) -> None:
     ready = assemble(load_problem(name), robot())
     query = make_query(ready.checker, ready.start, ready.goals[0])
-    stored = ObstacleSet.of(row_of(ready.problem, 0).things)
-    assert len(query.things) == len(stored) > 0
-    np.testing.assert_allclose(sorted_rows(query.things), sorted_rows(stored), atol=1e-5)
+    stored = ObstacleSet.from_rows(problem_record(ready.problem, 0).obstacles)
+    assert len(query.obstacles) == len(stored) > 0
+    np.testing.assert_allclose(sorted_rows(query.obstacles), sorted_rows(stored), atol=1e-5)
     assert (query.start == ready.start).all() and (query.goal == ready.goals[0]).all()
     nearest = ready.checker.distance(ready.start)
     near = [abs(_distance(stored, query.point)[k]) for k in range(len(stored))]
     assert min(near) < 1e-3 and nearest.value > 0
 
 
-def _distance(things: ObstacleSet, point: np.ndarray) -> np.ndarray:
-    arrays = [torch.tensor(v).float() for v in (things.position, things.turn, things.size)]
-    points = torch.tensor(point).float().expand(len(things), 1, 3)
-    return distances(torch.tensor(things.shape), *arrays, points)[:, 0].numpy()
+def _distance(obstacles: ObstacleSet, point: np.ndarray) -> np.ndarray:
+    arrays = [torch.tensor(v).float() for v in (obstacles.position, obstacles.rotation, obstacles.size)]
+    points = torch.tensor(point).float().expand(len(obstacles), 1, 3)
+    return signed_distances(torch.tensor(obstacles.shape), *arrays, points)[:, 0].numpy()
 
 
 def test_without_obstacles_nothing_is_seen() -> None:
     checker = CollisionChecker(robot())
     query = make_query(checker, robot().home, robot().home)
-    assert len(query.things) == 0 and query.point.tolist() == [0.0, 0.0, -1.0]
+    assert len(query.obstacles) == 0 and query.point.tolist() == [0.0, 0.0, -1.0]
 
 
 def test_half_spaces_are_seen_as_large_boxes() -> None:
@@ -54,4 +55,4 @@ def test_half_spaces_are_seen_as_large_boxes() -> None:
     query = make_query(checker, robot().home, robot().home)
     points = np.random.default_rng(0).uniform([-0.3, -0.8, 0.0], [1.2, 0.8, 1.2], (50, 3))
     for point in points:
-        assert _distance(query.things, point)[0] == pytest.approx(normal @ point + 0.7, abs=1e-4)
+        assert _distance(query.obstacles, point)[0] == pytest.approx(normal @ point + 0.7, abs=1e-4)

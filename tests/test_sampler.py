@@ -29,7 +29,7 @@ def test_noise_grows_from_almost_none_to_almost_all(kind: str, steps: int) -> No
 def test_what_a_perfect_network_says_gives_sample_and_noise_back(kind: str, name: str, t: int, seed: int) -> None:
     schedule, g = NoiseSchedule(256, name), torch.Generator().manual_seed(seed)
     clean, noise = (torch.randn(3, 5, generator=g, dtype=torch.float64) for _ in range(2))
-    sample = schedule.noisy(clean, noise, t)
+    sample = schedule.add_noise(clean, noise, t)
     found = schedule.estimate(kind, sample, schedule.target(kind, clean, noise, torch.full((3,), t)), t)
     torch.testing.assert_close(found.clean, clean, atol=1e-4, rtol=1e-4)
     torch.testing.assert_close(found.noise, noise, atol=1e-4, rtol=1e-4)
@@ -38,7 +38,7 @@ def test_what_a_perfect_network_says_gives_sample_and_noise_back(kind: str, name
 @given(st.integers(0, 255), st.data())
 def test_steps_fall_from_the_first(first: int, data: st.DataObject) -> None:
     count = data.draw(st.integers(1, first + 1))
-    times = NoiseSchedule(256).times(count, first)
+    times = NoiseSchedule(256).timesteps(count, first)
     assert len(times) == count and times[0] == first and times[-1] >= 0
     assert all(a > b for a, b in pairwise(times))
     if count == first + 1:
@@ -49,7 +49,7 @@ def test_bad_schedules_are_named() -> None:
     with pytest.raises(UnknownNameError, match="noise schedule 'cosin', did you mean 'cosine'"):
         NoiseSchedule(256, "cosin")
     with pytest.raises(ParameterError, match="number of denoising steps: expected 1 to 256, got 257"):
-        NoiseSchedule(256).times(257)
+        NoiseSchedule(256).timesteps(257)
     with pytest.raises(ParameterError, match="times"):
         ddim(lambda z, t: Estimate(z, z), torch.zeros(1, 2), NoiseSchedule(8), [1, 3])
 
@@ -86,7 +86,7 @@ def test_deterministic_samplers_are_those_of_diffusers(name: str, steps: int, ki
     theirs.set_timesteps(steps)
     predict = blurred(schedule)
     start = torch.randn(4, 7, generator=torch.Generator().manual_seed(steps))
-    times = schedule.times(steps)
+    times = schedule.timesteps(steps)
     assert times == theirs.timesteps.tolist()
     mine = SAMPLERS[name](predict, start, schedule, times)
     sample = start
@@ -103,7 +103,7 @@ def test_ancestral_sampling_is_that_of_diffusers(kind: str) -> None:
     theirs.set_timesteps(64)
     predict = blurred(schedule)
     start = torch.randn(4, 7, generator=torch.Generator().manual_seed(1))
-    mine = ddpm(predict, start, schedule, schedule.times(64), generator=torch.Generator().manual_seed(2))
+    mine = ddpm(predict, start, schedule, schedule.timesteps(64), generator=torch.Generator().manual_seed(2))
     sample, g = start, torch.Generator().manual_seed(2)
     for t in theirs.timesteps:
         sample = theirs.step(predict(sample, int(t)).noise, t, sample, generator=g).prev_sample
@@ -122,11 +122,12 @@ def test_samplers_find_the_only_point_there_is(name: str) -> None:
     g = torch.Generator().manual_seed(0)
     seen: list[int] = []
     found = SAMPLERS[name](
-        predict, torch.randn(5, 3, generator=g), schedule, schedule.times(6), callback=lambda t, z, e: seen.append(t),
+        predict, torch.randn(5, 3, generator=g), schedule, schedule.timesteps(6),
+        callback=lambda t, z, e: seen.append(t),
         **({"generator": g} if name == "ddpm" else {}),
     )  # fmt: skip
     torch.testing.assert_close(found, point.expand(5, 3))
-    assert seen == schedule.times(6)
+    assert seen == schedule.timesteps(6)
 
 
 def test_samples_of_a_normal_distribution_are_normal() -> None:
@@ -141,9 +142,9 @@ def test_samples_of_a_normal_distribution_are_normal() -> None:
     g = torch.Generator().manual_seed(0)
     first = torch.randn(20_000, 1, generator=g, dtype=torch.float64)
     for found in (
-        ddpm(predict, first, schedule, schedule.times(256), generator=g),
-        ddim(predict, first, schedule, schedule.times(128)),
-        dpm_solver(predict, first, schedule, schedule.times(32)),
+        ddpm(predict, first, schedule, schedule.timesteps(256), generator=g),
+        ddim(predict, first, schedule, schedule.timesteps(128)),
+        dpm_solver(predict, first, schedule, schedule.timesteps(32)),
     ):
         assert float(found.mean()) == pytest.approx(mean, abs=0.02)
         assert float(found.std()) == pytest.approx(spread, abs=0.02)
@@ -158,7 +159,7 @@ def test_two_orders_are_better_than_one() -> None:
         return schedule.estimate("clean", sample, clean, t)
 
     first = torch.randn(50, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    wanted = ddim(predict, first, schedule, schedule.times(256))
-    one = ddim(predict, first, schedule, schedule.times(32))
-    two = dpm_solver(predict, first, schedule, schedule.times(32))
+    wanted = ddim(predict, first, schedule, schedule.timesteps(256))
+    one = ddim(predict, first, schedule, schedule.timesteps(32))
+    two = dpm_solver(predict, first, schedule, schedule.timesteps(32))
     assert (two - wanted).norm() < 0.8 * (one - wanted).norm()

@@ -8,11 +8,10 @@ import torch
 from support import DATA, ROOT, needs
 
 from apex_ompl import load_model
-from apex_ompl.datasets.cases import load_cases
 from apex_ompl.datasets.store import load
 from apex_ompl.diffusion.checkpoint import SHIPPED, shipped
 from apex_ompl.diffusion.proposals import Sampling
-from apex_ompl.diffusion.validation import query_of_case
+from apex_ompl.diffusion.validation import query_from_problem
 from apex_ompl.kernel import Kernel
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.trajopt.candidates import first_valid
@@ -38,11 +37,11 @@ def test_a_sample_of_the_model_is_shorter_to_repair_than_the_line(name: str) -> 
     """One proposal for each of some hard problems that no training saw, and the straight line, both repaired alike."""
     model, solved = load_model(name), {"model": 0, "line": 0}
     quick = Sampling("ddim", 8) if model.sampling.steps > 8 else None
-    for case in load_cases(DATA / "validation"):
+    for case in load_kernel_problems(DATA / "validation"):
         kernel = Kernel(case.robot, case.scene)
         generator = torch.Generator().manual_seed(1)
         with one_torch_thread():
-            proposed = model.propose(query_of_case(case), kernel, 1, sampling=quick, generator=generator)
+            proposed = model.propose(query_from_problem(case), kernel, 1, sampling=quick, generator=generator)
         starts = {
             "model": proposed.control,
             "line": model.spline.line(case.start, case.goal)[None],
@@ -61,5 +60,5 @@ def test_the_data_of_the_tests_are_drawn_from_the_set_in_the_repository() -> Non
     full, few = load(FULL / "paths.zip"), load(DATA / "paths.zip")
     every = {full.problem_name(k) for k in range(full.problems)}
     assert 0 < few.problems < full.problems and all(few.problem_name(k) in every for k in range(few.problems))
-    assert len(load_cases(FULL / "validation")) > len(load_cases(DATA / "validation"))
+    assert len(load_kernel_problems(FULL / "validation")) > len(load_kernel_problems(DATA / "validation"))
     assert (FULL / "robot.npz").read_bytes() == (DATA / "robot.npz").read_bytes()

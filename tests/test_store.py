@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import errno
 import json
+import os
 import subprocess
 import sys
 import zipfile
@@ -11,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from apex_ompl.datasets.description import duplicates, levels
+from apex_ompl.datasets.description import duplicates, level_statistics
 from apex_ompl.datasets.records import FIELDS, DatasetError, Paths, from_micro, to_micro
 from apex_ompl.datasets.store import Store, load, save
 from apex_ompl.errors import ApexError, FileFormatError, FolderInUseError, MissingFileError
@@ -65,7 +66,7 @@ def test_states_are_exact_to_six_decimals() -> None:
 
 def test_joined_sets_keep_what_belongs_together(tmp_path: Path) -> None:
     parts = [random_paths(1), random_paths(2, suite="bins"), random_paths(3)]
-    joined = Paths.joined(parts)
+    joined = Paths.concatenate(parts)
     assert len(joined) == 21 and joined.problems == 9
     seen = 0
     for part, first in zip(parts, (0, 3, 6), strict=True):
@@ -75,7 +76,7 @@ def test_joined_sets_keep_what_belongs_together(tmp_path: Path) -> None:
             assert joined.problem_name(owner) == part.problem_name(int(part.arrays["problem"][k]))
             assert np.array_equal(joined.arrays["control"][seen], part.arrays["control"][k])
             seen += 1
-    chosen = joined.chosen([4, 7])
+    chosen = joined.subset([4, 7])
     assert chosen.problems == 2 and set(chosen.arrays["problem"]) <= {0, 1}
     for k, old in enumerate((4, 7)):
         assert chosen.problem_name(k) == joined.problem_name(old)
@@ -86,12 +87,12 @@ def test_joined_sets_keep_what_belongs_together(tmp_path: Path) -> None:
     assert np.array_equal(chosen.arrays["size"][:count], joined.arrays["size"][first : first + count])
     other = Paths(parts[0].arrays, parts[0].names, {**ABOUT, "robot": "another"})
     with pytest.raises(DatasetError, match="different robots"):
-        Paths.joined([parts[0], other])
+        Paths.concatenate([parts[0], other])
     assert joined.spline == Spline()
     control = joined.control()
     assert np.array_equal(control[:, 0], joined.start) and np.array_equal(control[:, -1], joined.goal)
     with pytest.raises(DatasetError, match="no paths"):
-        Paths.joined([])
+        Paths.concatenate([])
 
 
 def test_a_set_made_otherwise_is_not_gone_on_with(tmp_path: Path) -> None:
@@ -126,7 +127,7 @@ def test_a_full_disk_leaves_nothing_behind(tmp_path: Path, monkeypatch: pytest.M
     def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(store.os, "fsync", full)
+    monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(DatasetError, match="unit-0.zip: cannot be written, no space left on device"):
         store.write("unit-0", random_paths(0))
     assert not list((tmp_path / "units").iterdir())
@@ -215,7 +216,7 @@ def test_duplicates_and_figures_are_counted() -> None:
     arrays["homotopy"][:] = [0, 1, 0, 1, 0, 0]
     twins = Paths(arrays, paths.names, ABOUT)
     assert duplicates(twins).tolist() == [False, False, False, True, False, False]
-    first, all_of_them = levels(twins)
+    first, all_of_them = level_statistics(twins)
     assert (first.name, all_of_them.name) == ("shelf/easy", "all")
     assert all_of_them.sources == {"line": 1, "bumps": 1, "rrtconnect": 2, "reversed": 1, "part": 1, "model": 0}
     assert (all_of_them.straight, all_of_them.homotopies, all_of_them.several) == (0.5, 2.0, 1.0)

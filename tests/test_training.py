@@ -17,18 +17,18 @@ import pytest
 import torch
 import yaml
 from support import DATA, ROOT
-from trainings import HERE, SCRIPT, SMALL, VARIATIONAL, assert_same, config, query_of_path, weights
+from trainings import HERE, SCRIPT, SMALL, VARIATIONAL, assert_same, config, query_from_path, weights
 
-from apex_ompl.datasets.cases import load_cases, save_cases
+from apex_ompl.datasets.kernel_problems import load_kernel_problems, save_kernel_problems
 from apex_ompl.datasets.records import Paths
 from apex_ompl.datasets.store import Store, load, save
 from apex_ompl.diffusion.checkpoint import load_model
 from apex_ompl.diffusion.config import TrainingConfig
-from apex_ompl.diffusion.objective import Place
+from apex_ompl.diffusion.distributed import DistributedProcess
 from apex_ompl.diffusion.proposals import Sampling, TrajectoryModel
 from apex_ompl.diffusion.runlog import read_log
 from apex_ompl.diffusion.training import Trainer, TrainingError
-from apex_ompl.diffusion.validation import judged, query_of_case
+from apex_ompl.diffusion.validation import query_from_problem, success_rates
 from apex_ompl.errors import ApexError, FileFormatError, MissingFileError
 from apex_ompl.kernel import Kernel, RobotTables
 from apex_ompl.kernel.scene_builder import scene_tables
@@ -44,7 +44,7 @@ def _one_thread() -> Iterator[None]:
         yield
 
 
-def test_32_trajectories_are_learnt_by_heart(few: Path, tmp_path: Path) -> None:
+def test_32_trajectories_are_memorized(few: Path, tmp_path: Path) -> None:
     sizes = {
         "latent": {"dim": 20},
         "denoiser": {"width": 192, "blocks": 2},
@@ -54,27 +54,25 @@ def test_32_trajectories_are_learnt_by_heart(few: Path, tmp_path: Path) -> None:
     trainer.run()
     model, paths = TrajectoryModel(trainer.averaged_network(), {}), load(few)
     kernel = Kernel(RobotTables.load(DATA / "robot.npz"), scene_tables([]))
-    control, apart, from_line = paths.control(), [], []
+    control, errors, from_line = paths.control(), [], []
     for k in range(len(paths)):
         generator = torch.Generator().manual_seed(k)
-        query = query_of_path(paths, k)
+        query = query_from_path(paths, k)
         found = model.propose(query, kernel, 4, sampling=Sampling("ddim", 8), generator=generator).control
-        apart.append(np.abs(found - control[k]).mean())
+        errors.append(np.abs(found - control[k]).mean())
         from_line.append(np.abs(model.spline.line(query.start, query.goal) - control[k]).mean())
-    assert np.mean(apart) < 0.35 * np.mean(from_line)
+    assert np.mean(errors) < 0.35 * np.mean(from_line)
 
 
-@pytest.mark.parametrize("kind", ["linear", "variational", "several windows"])
-def test_a_run_that_is_interrupted_comes_to_the_same_weights(
-    kind: str, few: Path, paths: Paths, tmp_path: Path
-) -> None:
+@pytest.mark.parametrize("kind", ["linear", "variational", "several shards"])
+def test_an_interrupted_run_ends_with_the_same_weights(kind: str, few: Path, paths: Paths, tmp_path: Path) -> None:
     data, changes = few, VARIATIONAL if kind == "variational" else {}
-    if kind == "several windows":
+    if kind == "several shards":
         data, changes = tmp_path / "store", {"units": 2, "batch": 64}
         store = Store.create(data, {"robot": "x"}, [])
         for k in range(5):
-            store.write(f"unit-{k}", paths.chosen(np.arange(20 * k, 20 * k + 7)))
-    cut = {"linear": [5], "variational": [3, 7], "several windows": [6, 9]}[kind]
+            store.write(f"unit-{k}", paths.subset(np.arange(20 * k, 20 * k + 7)))
+    cut = {"linear": [5], "variational": [3, 7], "several shards": [6, 9]}[kind]
     (tmp_path / "whole").mkdir()
     whole = Trainer(config(data, **changes), tmp_path / "whole", HERE)
     whole.run()
@@ -93,7 +91,7 @@ def test_a_run_that_is_interrupted_comes_to_the_same_weights(
     assert_same(weights(part), weights(whole))
 
 
-def test_what_was_logged_behind_the_last_save_is_forgotten(paths: Paths, tmp_path: Path) -> None:
+def test_rows_logged_after_the_last_save_are_removed(paths: Paths, tmp_path: Path) -> None:
     def trainer() -> Trainer:
         return Trainer(config(data, log_every=1, held_out=0.2), tmp_path, HERE)
 
@@ -119,7 +117,7 @@ def test_what_was_logged_behind_the_last_save_is_forgotten(paths: Paths, tmp_pat
         trainer()
 
 
-def test_a_killed_command_goes_on(few: Path, tmp_path: Path) -> None:
+def test_a_killed_command_is_resumed(few: Path, tmp_path: Path) -> None:
     file = tmp_path / "small.yaml"
     file.write_text(yaml.safe_dump({**SMALL, "data": str(few), "steps": 3000, "save_every": 0.05, "log_every": 500}))
     command = [sys.executable, str(SCRIPT), str(file), "--out", str(tmp_path / "run"), "--quiet"]
@@ -143,7 +141,7 @@ def test_a_killed_command_goes_on(few: Path, tmp_path: Path) -> None:
     assert torch.load(state, weights_only=True)["step"] > step
     assert [path.name for path in (tmp_path / "run").glob(".*")] == [".lock"]
     same = subprocess.run([*command, "--set", "log_every=7", "--minutes", "0.001"], check=False, **how)
-    assert same.returncode == 0, same.stderr  # it decides nothing
+    assert same.returncode == 0, same.stderr  # it does not determine the weights
 
 
 def test_two_processes_train_one_model(few: Path, tmp_path: Path) -> None:
@@ -164,10 +162,10 @@ def test_two_processes_train_one_model(few: Path, tmp_path: Path) -> None:
     for _ in range(4):
         gradients = []
         for rank in range(2):
-            single.place = Place(rank, 2, torch.device("cpu"))
+            single.process = DistributedProcess(rank, 2, torch.device("cpu"))
             loss = single._loss()  # noqa: SLF001
             gradients.append(torch.autograd.grad(loss, single._parameters, allow_unused=True))  # noqa: SLF001
-        single.place = HERE
+        single.process = HERE
         mean = [None if a is None else (a + b) / 2 for a, b in zip(*gradients, strict=True)]
         single._loss = lambda mean=mean: _Given(single, mean)  # type: ignore[assignment,method-assign]  # noqa: SLF001
         single.advance()
@@ -196,27 +194,28 @@ class _Given:
 # Validation
 
 
-def test_proposals_are_judged_by_repair_and_proof(few: Path, tmp_path: Path) -> None:
-    cases = load_cases(DATA / "validation")[::4]
+def test_success_rates_are_those_of_repair_and_proof(few: Path, tmp_path: Path) -> None:
+    problems = load_kernel_problems(DATA / "validation")[::4]
     model = TrajectoryModel(Trainer(config(few), tmp_path, HERE).averaged_network(), {})
-    said = judged(model, cases, 3)
+    rates = success_rates(model, problems, 3)
     wanted = []
-    for case in cases:
-        kernel = Kernel(case.robot, case.scene)
-        control = model.propose(query_of_case(case), kernel, 3, generator=torch.Generator().manual_seed(0)).control
+    for problem in problems:
+        kernel = Kernel(problem.robot, problem.scene)
+        control = model.propose(
+            query_from_problem(problem), kernel, 3, generator=torch.Generator().manual_seed(0)
+        ).control
         found = first_valid(Optimizer(model.spline), kernel, control, lambda p, k=kernel: k.proves(p, FULL_RESOLUTION))
         wanted.append(found is not None)
-    assert said["repaired"] == pytest.approx(np.mean(wanted))
-    assert 0.0 <= said["sampled"] <= said["repaired"]
-    levels = {f"{case.suite}/{case.level}" for case in cases}
-    assert levels <= said.keys()
+    assert rates["repaired"] == pytest.approx(np.mean(wanted))
+    assert 0.0 <= rates["sampled"] <= rates["repaired"]
+    assert {f"{problem.suite}/{problem.level}" for problem in problems} <= rates.keys()
 
 
 # Configurations
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         ({"schema": "apex-ompl/training/2"}, "schema: expected 'apex-ompl/training/1', got 'apex-ompl/training/2'"),
         ({"stepz": 3}, "stepz: unknown key, did you mean 'steps'?"),
@@ -226,16 +225,16 @@ def test_proposals_are_judged_by_repair_and_proof(few: Path, tmp_path: Path) -> 
         ({"mirror": {"order": [0, 0], "sign": [1, 1], "shift": [0, 0]}}, "mirror: expected every joint's number once"),
     ],
 )
-def test_faulty_configurations_are_named(change: dict[str, Any], said: str, few: Path, tmp_path: Path) -> None:
+def test_faulty_configurations_are_named(change: dict[str, Any], message: str, few: Path, tmp_path: Path) -> None:
     file = tmp_path / "faulty.yaml"
     file.write_text(yaml.safe_dump({**SMALL, "data": str(few), **change}))
     with pytest.raises(FileFormatError, match="faulty.yaml") as caught:
         TrainingConfig.read(file)
-    assert said in str(caught.value)
+    assert message in str(caught.value)
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         ({"data": "/no/such"}, "manifest of a data set '/no/such/manifest.json': no such file"),
         ({"robot": "/no/such.npz"}, "file of kernel tables '/no/such.npz': no such file"),
@@ -243,10 +242,10 @@ def test_faulty_configurations_are_named(change: dict[str, Any], said: str, few:
         ({"mirror": {"order": [0], "sign": [1], "shift": [0]}}, "mirror: expected 16 joints, got 1"),
     ],
 )
-def test_what_does_not_fit_is_named(change: dict[str, Any], said: str, few: Path, tmp_path: Path) -> None:
+def test_what_does_not_fit_is_named(change: dict[str, Any], message: str, few: Path, tmp_path: Path) -> None:
     with pytest.raises(ApexError) as caught:
         Trainer(config(**{"data": few, **change}), tmp_path, HERE)
-    assert str(caught.value) == said
+    assert str(caught.value) == message
 
 
 def test_dotted_keys_change_a_configuration() -> None:
@@ -280,7 +279,7 @@ def test_steps_without_a_finite_gradient_change_nothing(few: Path, tmp_path: Pat
     trainer = Trainer(config(few, steps=100), tmp_path, HERE)
     trainer.advance()
     before = {name: tensor.clone() for name, tensor in weights(trainer).items()}
-    trainer.supply.window.control.fill_(torch.nan)
+    trainer.data.shard.control.fill_(torch.nan)
     trainer.advance()
     assert_same(before, weights(trainer))
     with pytest.raises(TrainingError, match="20 gradients in a row are not finite"):
@@ -291,7 +290,7 @@ def test_steps_without_a_finite_gradient_change_nothing(few: Path, tmp_path: Pat
 
 def test_training_needs_no_ompl_and_no_pinocchio(few: Path, tmp_path: Path) -> None:
     file = tmp_path / "small.yaml"
-    save_cases(tmp_path / "cases", load_cases(DATA / "validation")[::8])
+    save_kernel_problems(tmp_path / "cases", load_kernel_problems(DATA / "validation")[::8])
     file.write_text(yaml.safe_dump({**SMALL, "data": str(few), "steps": 2, "cases": str(tmp_path / "cases")}))
     code = "import sys\nfor name in ('ompl', 'pinocchio', 'coal', 'ruckig'):\n    sys.modules[name] = None\n"
     code += f"sys.argv = ['train.py', {str(file)!r}, '--out', {str(tmp_path / 'run')!r}, '--quiet']\n"

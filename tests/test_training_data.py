@@ -1,4 +1,4 @@
-"""What is trained on: mirror images, problems held out, windows, weights."""
+"""Training data: mirror images, held-out problems, shards, weights."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ import pytest
 import torch
 import yaml
 from support import DATA, ROOT
-from trainings import HERE, config, query_of_path
+from trainings import HERE, config, query_from_path
 
 from apex_ompl.datasets.records import Paths
 from apex_ompl.datasets.store import Store, save
-from apex_ompl.diffusion.data import Mirror, held_out, split, window_paths
+from apex_ompl.diffusion.data import is_held_out, shard_paths, split
+from apex_ompl.diffusion.mirror import Mirror
 from apex_ompl.diffusion.training import Trainer
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel import Kernel, RobotTables
@@ -32,14 +33,15 @@ def test_mirror_images_are_valid_where_paths_are(paths: Paths) -> None:
     np.testing.assert_allclose(mirror.states(mirror.states(paths.control())), paths.control(), atol=1e-12)
     proven, near = [], []
     for k in range(0, len(image), 4):
-        query = query_of_path(image, k)
-        things = query.things
+        query = query_from_path(image, k)
+        obstacles = query.obstacles
         solids = []
-        for shape, place, turn, size in zip(things.shape, things.position, things.turn, things.size, strict=True):
+        columns = (obstacles.shape, obstacles.position, obstacles.rotation, obstacles.size)
+        for shape, position, rotation, size in zip(*columns, strict=True):
             if shape != 0:
                 break
             pose = np.eye(4)
-            pose[:3, :3], pose[:3, 3] = turn, place
+            pose[:3, :3], pose[:3, 3] = rotation, position
             solids.append((len(solids), Primitive(BOX, pose, tuple(size))))
         else:
             states = image.spline.path(image.control(slice(k, k + 1))[0])
@@ -54,16 +56,16 @@ def test_problems_are_held_out_whole(paths: Paths) -> None:
     names = [{part.problem_name(k) for k in range(part.problems)} for part in (train, out)]
     assert not names[0] & names[1] and len(train) + len(out) == len(paths)
     assert 0.15 < len(names[1]) / paths.problems < 0.45
-    assert all(held_out(name, 0.3) for name in names[1]) and not any(held_out(name, 0.3) for name in names[0])
+    assert all(is_held_out(name, 0.3) for name in names[1]) and not any(is_held_out(name, 0.3) for name in names[0])
 
 
 def test_every_pass_goes_through_all_units_once(paths: Paths, tmp_path: Path) -> None:
     store = Store.create(tmp_path, {"robot": "x"}, [])
     for k in range(5):
-        store.write(f"unit-{k}", paths.chosen([k]))
-    found = [window_paths([str(tmp_path)], 3, 2, number) for number in range(9)]
-    assert all(windows == 3 for _, windows in found)
-    both, _ = window_paths([str(tmp_path), str(tmp_path)], 0, 100, 0)
+        store.write(f"unit-{k}", paths.subset([k]))
+    found = [shard_paths([str(tmp_path)], 3, 2, number) for number in range(9)]
+    assert all(shards == 3 for _, shards in found)
+    both, _ = shard_paths([str(tmp_path), str(tmp_path)], 0, 100, 0)
     assert both.problems == 10
     names = [[p.problem_name(k) for k in range(p.problems)] for p, _ in found]
     passes = [sum(names[k : k + 3], []) for k in (0, 3, 6)]
@@ -75,8 +77,8 @@ def test_weights_say_how_often_paths_are_drawn(paths: Paths, few: Path, tmp_path
     file = tmp_path / "data.zip"
     save(file, paths)
     trainer = Trainer(config(file, weights={"shelf/*": 0.0, "*/hard": 5.0}), tmp_path, HERE)
-    window = trainer.supply.window
-    drawn = window.drawn(100_000, torch.Generator().manual_seed(0))
+    shard = trainer.data.shard
+    drawn = shard.sample(100_000, torch.Generator().manual_seed(0))
     assert (np.diff(drawn) >= 0).all()
     a = paths.arrays
     levels = [

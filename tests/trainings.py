@@ -11,11 +11,11 @@ from support import DATA, ROOT
 from apex_ompl.datasets.records import Paths
 from apex_ompl.diffusion.conditions import ObstacleSet, Query
 from apex_ompl.diffusion.config import TrainingConfig
-from apex_ompl.diffusion.objective import Place
+from apex_ompl.diffusion.distributed import DistributedProcess
 from apex_ompl.diffusion.training import Trainer
 
 SCRIPT = ROOT / "scripts" / "train.py"
-HERE = Place(0, 1, torch.device("cpu"))
+HERE = DistributedProcess(0, 1, torch.device("cpu"))
 SMALL = {
     "schema": "apex-ompl/training/1", "robot": str(DATA / "robot.npz"), "latent": {"dim": 32},
     "condition": {"width": 32, "out": 64, "along": 3}, "denoiser": {"width": 64, "blocks": 2}, "steps": 12, "batch": 32,
@@ -42,10 +42,10 @@ def assert_same(first: dict[str, torch.Tensor], second: dict[str, torch.Tensor])
         assert torch.equal(tensor, second[name]), name
 
 
-def query_of_path(paths: Paths, k: int) -> Query:
+def query_from_path(paths: Paths, k: int) -> Query:
     a, p = paths.arrays, paths.arrays["problem"][k]
     first = int(a["things"][:p].sum())
     span = slice(first, first + int(a["things"][p]))
     columns = (a[name][span] for name in ("shape", "position", "orientation", "size"))
-    things = ObstacleSet.of(list(zip(*columns, strict=True)))
-    return Query(paths.start[k], paths.goal[k], a["point"][k], things)
+    obstacles = ObstacleSet.from_rows(list(zip(*columns, strict=True)))
+    return Query(paths.start[k], paths.goal[k], a["point"][k], obstacles)

@@ -21,6 +21,6 @@ def make_query(checker: CollisionChecker, start: Array, goal: Array, *, point: b
         goal: Shape (dof,) [rad].
         point: Whether the obstacle point is looked for; models that do not see it can do without.
     """
-    obstacles = ObstacleSet.among(checker.kernel.scene.arrays, checker.movable)
-    place = checker.obstacle_point(start) if point else np.array(NO_POINT)
-    return Query(np.asarray(start, float), np.asarray(goal, float), place, obstacles)
+    obstacles = ObstacleSet.from_scene(checker.kernel.scene.arrays, checker.movable)
+    nearest = checker.obstacle_point(start) if point else np.array(NO_POINT)
+    return Query(np.asarray(start, float), np.asarray(goal, float), nearest, obstacles)

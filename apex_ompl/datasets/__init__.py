@@ -1,1 +1,1 @@
-"""Data sets of proven paths: records, store, engine, description."""
+"""Data sets of verified paths: records, store, generation by the kernel alone, statistics."""

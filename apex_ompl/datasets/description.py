@@ -1,4 +1,4 @@
-"""What a data set holds, in numbers."""
+"""Statistics of a data set."""
 
 from __future__ import annotations
 
@@ -12,24 +12,24 @@ from numpy.typing import NDArray
 from apex_ompl.datasets.records import SOURCES, Paths
 from apex_ompl.types import Array
 
-SAME = 0.1  # control points nearer than this make a duplicate [rad, max-norm]
+DUPLICATE_DISTANCE = 0.1  # control points nearer than this make a duplicate [rad, max-norm]
 
 
 @dataclass(frozen=True)
-class Figures:
-    """Numbers of a level, or of all.
+class LevelStatistics:
+    """Statistics of a level, or of all levels together.
 
     Attributes:
         name: ``suite/level``, or ``all``.
         problems: Number of problems.
         paths: Number of paths.
-        sources: How many paths come from where.
-        straight: Share of the problems kept that the straight line solves; the engine keeps few of those.
-        homotopies: Mean number of homotopies found of a problem that the straight line does not solve.
-        several: Share of those problems with more than one.
-        duplicates: Paths that are nearly the same as an earlier one with the same ends.
-        length: 5th, 50th and 95th percentile [rad].
-        clearance: The same of the clearance of the sphere cover [m].
+        sources: Number of paths by source.
+        straight: Share of the problems that the straight line solves, of which the engine keeps few.
+        homotopies: Mean number of homotopy classes found of a problem that the straight line does not solve.
+        several: Share of those problems with more than one class.
+        duplicates: Number of paths nearly equal to an earlier one with the same ends.
+        length: 5th, 50th and 95th percentile of the length [rad].
+        clearance: 5th, 50th and 95th percentile of the sphere cover's clearance [m].
     """
 
     name: str
@@ -44,22 +44,25 @@ class Figures:
     clearance: tuple[float, ...]
 
 
-def levels(paths: Paths) -> list[Figures]:
-    """Return the numbers of every level of a set, and those of all as the last."""
+def level_statistics(paths: Paths) -> list[LevelStatistics]:
+    """Return the statistics of each level of a set, and of all levels together as the last."""
     names = np.array([paths.problem_name(k).rsplit("/", 1)[0] for k in range(paths.problems)])
     twins = duplicates(paths)
-    found = [_figures(paths, str(name), np.flatnonzero(names == name), twins) for name in sorted(set(names))]
-    return [*found, _figures(paths, "all", np.arange(paths.problems), twins)]
+    found = [_statistics(paths, str(name), np.flatnonzero(names == name), twins) for name in sorted(set(names))]
+    return [*found, _statistics(paths, "all", np.arange(paths.problems), twins)]
 
 
-def _figures(paths: Paths, name: str, problems: NDArray[np.intp], twins: NDArray[np.bool_]) -> Figures:
+def _statistics(paths: Paths, name: str, problems: NDArray[np.intp], twins: NDArray[np.bool_]) -> LevelStatistics:
+    """Return the statistics of some problems, given by their indices."""
     a = paths.arrays
     mine = np.isin(a["problem"], problems)
     source, owner = a["source"][mine], a["problem"][mine]
     straight = set(owner[source == SOURCES.index("line")].tolist())
-    whole = np.isin(source, [SOURCES.index(s) for s in ("bumps", "rrtconnect", "model")])
-    classes = Counter(k for k, _ in set(zip(owner[whole].tolist(), a["homotopy"][mine][whole].tolist(), strict=True)))
-    return Figures(
+    from_start = np.isin(source, [SOURCES.index(s) for s in ("bumps", "rrtconnect", "model")])
+    classes = Counter(
+        k for k, _ in set(zip(owner[from_start].tolist(), a["homotopy"][mine][from_start].tolist(), strict=True))
+    )
+    return LevelStatistics(
         name=name, problems=len(problems), paths=int(mine.sum()),
         sources={s: int((source == k).sum()) for k, s in enumerate(SOURCES)},
         straight=len(straight) / max(1, len(problems)),
@@ -79,15 +82,19 @@ def duplicates(paths: Paths) -> NDArray[np.bool_]:
         key = int(a["problem"][k]), a["start"][k].tobytes(), a["goal"][k].tobytes()
         others = groups.setdefault(key, [])
         mine = a["control"][k].astype(float)
-        twins[k] = any(float(np.abs(mine - a["control"][o].astype(float)).max()) < SAME for o in others)
+        twins[k] = any(float(np.abs(mine - a["control"][o].astype(float)).max()) < DUPLICATE_DISTANCE for o in others)
         others.append(k)
     return twins
 
 
 def coverage(paths: Paths, lower: Array, upper: Array, most: int = 2000) -> Array:
-    """Return how much of each joint's range paths use: 1st, 50th and 99th percentile of their states, (3, dof) in 0..1.
+    """Return the 1st, 50th and 99th percentile of the states in each joint's range, shape (3, dof) in 0..1.
 
-    Of at most ``most`` paths, evenly spread over the set.
+    Args:
+        paths: The paths.
+        lower: Lower limits, shape (dof,) [rad].
+        upper: Upper limits, shape (dof,) [rad].
+        most: Largest number of paths looked at, evenly spread over the set.
     """
     which = np.unique(np.linspace(0, len(paths) - 1, most).astype(int))
     states = paths.spline.path(paths.control(which)).reshape(-1, len(lower))

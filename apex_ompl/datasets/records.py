@@ -1,8 +1,8 @@
-"""Proven paths, and the problems that they solve, as arrays: what a data set holds."""
+"""Records of a data set: verified paths, and the problems that they solve, as arrays."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -13,19 +13,22 @@ from apex_ompl.errors import ApexError
 from apex_ompl.trajopt.spline import Spline
 from apex_ompl.types import Array
 
-MICRO = 1e-6  # states are kept in millionths of a radian, in which the suites draw them
+MICRO = 1e-6  # states are stored in whole microradians; the suites draw states of six decimals
 SOURCES = ("line", "bumps", "rrtconnect", "reversed", "part", "model")
-"""Where a path comes from: the straight line, optimisation from bumps, rrtconnect and optimisation, another path
-backwards, the rest of another path from a state on it, or optimisation from what a model proposed."""
+"""Origin of a path: straight line; optimization from random bumps; rrtconnect and optimization; the reversal of another
+path; the rest of another path from one of its states; optimization from a model's proposal."""
 
 SHAPES = ("box", "sphere", "cylinder", "capsule")
-"""Kinds of obstacles. Sizes are edges; radius; or radius and length along z [m]."""
+"""Shapes of obstacles. Sizes are edges; radius; or radius and length along z [m]."""
+
+ObstacleRecord = tuple[int, Sequence[float], Sequence[float], Sequence[float]]
+"""An obstacle: index of its shape in :data:`SHAPES`, position [m], orientation (xyzw), size [m]."""
 
 PROBLEM_FIELDS: dict[str, tuple[Any, tuple[int, ...]]] = {
     "seed": (np.int32, ()), "suite": (np.uint8, ()), "level": (np.uint8, ()), "held": (np.uint8, ()),
     "things": (np.uint16, ()),
 }  # fmt: skip
-THING_FIELDS: dict[str, tuple[Any, tuple[int, ...]]] = {
+OBSTACLE_FIELDS: dict[str, tuple[Any, tuple[int, ...]]] = {
     "shape": (np.uint8, ()), "position": (np.float32, (3,)), "orientation": (np.float32, (4,)),
     "size": (np.float32, (3,)),
 }  # fmt: skip
@@ -34,29 +37,29 @@ PATH_FIELDS: dict[str, tuple[Any, tuple[int, ...]]] = {
     "control": (np.float16, (-1, -1)), "point": (np.float32, (3,)), "clearance": (np.float32, ()),
     "length": (np.float32, ()), "source": (np.uint8, ()), "homotopy": (np.uint8, ()),
 }  # fmt: skip
-FIELDS = {**PROBLEM_FIELDS, **THING_FIELDS, **PATH_FIELDS}
+FIELDS = {**PROBLEM_FIELDS, **OBSTACLE_FIELDS, **PATH_FIELDS}
 SPLINE = ("points", "pinned", "states", "degree")
 
 
 class DatasetError(ApexError):
-    """A data set that cannot be read or written as asked."""
+    """A data set cannot be read or written as asked."""
 
 
 @dataclass(frozen=True, eq=False)
 class Paths:
-    """Proven paths, and the problems that they solve, as arrays.
+    """Verified paths, and the problems that they solve, as arrays.
 
     Attributes:
-        arrays: Of each problem, ``suite`` and ``level`` (numbers in ``names``), ``seed``, ``held`` (a number in
-            ``names``, what the hands hold), and how many ``things`` stand around. Of each thing, in the order of the
-            problems, ``shape`` (a number in :data:`SHAPES`), ``position`` [m], ``orientation`` (xyzw) and ``size`` [m].
-            Of each path, the number of its ``problem``, ``start`` and ``goal`` [1e-6 rad], free ``control`` points
-            [rad], the obstacle ``point`` nearest to the robot at the start [m], ``clearance`` [m] and ``length``
-            [rad], ``source`` (a number in :data:`SOURCES`), and ``homotopy``, which tells paths of a problem apart that
-            could not be deformed into each other along straight lines.
-        names: What numbers stand for: ``suite``, ``level``, ``held``.
-        about: Whose paths these are: ``robot``, ``joints``, and the fields of their :class:`Spline`.
-        counts: What was tried, and what came of it.
+        arrays: For each problem, ``suite`` and ``level`` (indices into ``names``), ``seed``, ``held`` (an index into
+            ``names``: the held objects), and ``things``, the number of obstacles. For each obstacle, in the order of
+            the problems, ``shape`` (an index into :data:`SHAPES`), ``position`` [m], ``orientation`` (xyzw) and
+            ``size`` [m]. For each path, the index of its ``problem``, ``start`` and ``goal`` [1e-6 rad], free
+            ``control`` points [rad], the obstacle ``point`` nearest to the robot at the start [m], ``clearance`` [m]
+            and ``length`` [rad], ``source`` (an index into :data:`SOURCES`), and ``homotopy``, the class of the path
+            among those of its problem: paths of one class can be deformed into each other along straight lines.
+        names: Texts that indices stand for: ``suite``, ``level``, ``held`` (JSON).
+        about: Robot and spline of the paths: ``robot``, ``joints``, and the fields of their :class:`Spline`.
+        counts: Statistics of the generation, by name.
     """
 
     arrays: Mapping[str, NDArray[Any]]
@@ -65,7 +68,7 @@ class Paths:
     counts: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Check that the arrays belong together.
+        """Check that the arrays fit each other.
 
         Raises:
             DatasetError: They do not.
@@ -80,7 +83,7 @@ class Paths:
 
     @property
     def problems(self) -> int:
-        """The number of problems."""
+        """Number of problems."""
         return len(self.arrays["seed"])
 
     @property
@@ -95,11 +98,11 @@ class Paths:
 
     @property
     def spline(self) -> Spline:
-        """What the control points belong to."""
+        """Spline of the control points."""
         return Spline(**{key: self.about[key] for key in SPLINE})
 
     def control(self, which: Any = slice(None)) -> Array:
-        """Return all control points of paths, shape (n, points, dof) [rad]."""
+        """Return the control points of paths, fixed ones included, shape (n, points, dof) [rad]."""
         spline = self.spline
         free = np.asarray(self.arrays["control"][which], float)
         points = np.zeros((len(free), spline.points, free.shape[2]))
@@ -111,27 +114,27 @@ class Paths:
         a = self.arrays
         return f"{self.names['suite'][a['suite'][k]]}/{self.names['level'][a['level'][k]]}/{a['seed'][k]}"
 
-    def chosen(self, problems: ArrayLike) -> Paths:
-        """Return the paths of some problems, whose numbers are given."""
+    def subset(self, problems: ArrayLike) -> Paths:
+        """Return the paths of some problems, given by their indices."""
         wanted = np.sort(np.asarray(problems, int))
         a = self.arrays
         first = np.concatenate([[0], np.cumsum(a["things"])]).astype(int)
-        things = np.concatenate([np.arange(first[k], first[k + 1]) for k in wanted] or [np.zeros(0, int)])
-        place = np.full(self.problems, -1)
-        place[wanted] = np.arange(len(wanted))
-        kept = place[a["problem"]] >= 0
+        obstacles = np.concatenate([np.arange(first[k], first[k + 1]) for k in wanted] or [np.zeros(0, int)])
+        new_index = np.full(self.problems, -1)
+        new_index[wanted] = np.arange(len(wanted))
+        kept = new_index[a["problem"]] >= 0
         arrays = {name: a[name][wanted] for name in PROBLEM_FIELDS}
-        arrays |= {name: a[name][things] for name in THING_FIELDS}
+        arrays |= {name: a[name][obstacles] for name in OBSTACLE_FIELDS}
         arrays |= {name: a[name][kept] for name in PATH_FIELDS}
-        arrays["problem"] = place[a["problem"][kept]].astype(np.int32)
+        arrays["problem"] = new_index[a["problem"][kept]].astype(np.int32)
         return Paths(arrays, self.names, self.about)
 
     @classmethod
-    def joined(cls, several: Iterable[Paths]) -> Paths:
-        """Return all paths of several sets as one.
+    def concatenate(cls, several: Iterable[Paths]) -> Paths:
+        """Return the paths of several sets as one set.
 
         Raises:
-            DatasetError: There is none, or their states have not the same number of joints.
+            DatasetError: There is none, or they are of different robots or splines.
         """
         parts = list(several)
         if not parts:
@@ -145,15 +148,15 @@ class Paths:
             for name in FIELDS:
                 column = part.arrays[name]
                 if name in names:
-                    column = _renumbered(column, part.names[name], names[name])
+                    column = _reindexed(column, part.names[name], names[name])
                 columns[name].append(column + np.int32(before) if name == "problem" else column)
             before += part.problems
         arrays = {name: np.concatenate(column) for name, column in columns.items()}
         return cls(arrays, {key: tuple(values) for key, values in names.items()}, parts[0].about)
 
 
-def rounded(control: Array, lower: Array, upper: Array) -> Array:
-    """Return control points as half-precision numbers inside the limits, shape (..., dof)."""
+def to_half(control: Array, lower: Array, upper: Array) -> Array:
+    """Return control points rounded to half precision, inside the limits, shape (..., dof) [rad]."""
     half = control.astype(np.float16)
     half = np.where(half.astype(float) > upper, np.nextafter(half, np.float16(-np.inf)), half)
     half = np.where(half.astype(float) < lower, np.nextafter(half, np.float16(np.inf)), half)
@@ -161,27 +164,27 @@ def rounded(control: Array, lower: Array, upper: Array) -> Array:
 
 
 def to_micro(states: ArrayLike) -> NDArray[np.int32]:
-    """Return states [rad] in whole millionths."""
+    """Return states [rad] in whole microradians."""
     return np.rint(np.asarray(states, float) / MICRO).astype(np.int32)
 
 
 def from_micro(states: NDArray[np.int32]) -> Array:
-    """Return states [rad] from whole millionths; the states nearest to six decimals, bit for bit."""
+    """Return states [rad] from whole microradians: those nearest to six decimals, bit for bit."""
     return np.asarray(states, float) / 1e6
 
 
-def _renumbered(numbers: NDArray[Any], names: Iterable[str], known: list[str]) -> NDArray[Any]:
-    """Return numbers of ``names`` as numbers of ``known``, to which new names are added."""
+def _reindexed(indices: NDArray[Any], names: Iterable[str], known: list[str]) -> NDArray[Any]:
+    """Return indices into ``names`` as indices into ``known``, to which new names are appended."""
     table = []
     for name in names:
         if name not in known:
             known.append(name)
         table.append(known.index(name))
-    return np.array(table, np.uint8)[numbers] if len(numbers) else numbers
+    return np.array(table, np.uint8)[indices] if len(indices) else indices
 
 
 def arrays_fault(arrays: Mapping[str, NDArray[Any]]) -> str:
-    """Return what is wrong with arrays, or nothing."""
+    """Return the name of the field that is faulty or does not fit the others, or an empty text."""
     if set(arrays) != set(FIELDS):
         return "fields"
     for name, (kind, shape) in FIELDS.items():
@@ -189,7 +192,7 @@ def arrays_fault(arrays: Mapping[str, NDArray[Any]]) -> str:
         fits = array.ndim == 1 + len(shape) and all(b in (-1, a) for a, b in zip(array.shape[1:], shape, strict=True))
         if array.dtype != kind or not fits:
             return name
-    for names in (PROBLEM_FIELDS, THING_FIELDS, PATH_FIELDS):
+    for names in (PROBLEM_FIELDS, OBSTACLE_FIELDS, PATH_FIELDS):
         if len({len(arrays[name]) for name in names}) > 1:
             return "lengths"
     if int(arrays["things"].sum()) != len(arrays["shape"]):
@@ -205,7 +208,7 @@ def arrays_fault(arrays: Mapping[str, NDArray[Any]]) -> str:
 
 
 def about_fault(about: Any, arrays: Mapping[str, NDArray[Any]]) -> str:
-    """Return what is wrong with what is said about arrays, or nothing."""
+    """Return ``about`` where robot, joints or spline do not fit the arrays, or an empty text."""
     try:
         spline, joints = Spline(**{key: about[key] for key in SPLINE}), about["joints"]
         fits = isinstance(about["robot"], str) and all(isinstance(name, str) for name in joints)
@@ -215,5 +218,5 @@ def about_fault(about: Any, arrays: Mapping[str, NDArray[Any]]) -> str:
 
 
 def names_fault(arrays: Mapping[str, NDArray[Any]], names: Mapping[str, tuple[str, ...]]) -> str:
-    """Return what is wrong with the names that numbers stand for, or nothing."""
+    """Return the field with an index beyond its names, or an empty text."""
     return next((k for k, v in names.items() if len(arrays[k]) and arrays[k].max() >= len(v)), "")

@@ -1,7 +1,7 @@
-"""The store of proven paths that the model learns from.
+"""Store of verified paths on disk, from which the model is trained.
 
-A data set is a folder: ``manifest.json``, and ``units/NAME.zip``, each a Zarr group in one file. A unit is written
-under a temporary name and renamed when it is complete, so that whatever ends the process leaves whole units only. The
+A data set is a folder with ``manifest.json`` and ``units/NAME.zip``, each a Zarr group in one file. A unit is written
+under a temporary name and renamed when it is complete, so that a process that is killed leaves complete units only. The
 compact set is one such file with paths of many units.
 """
 
@@ -51,17 +51,17 @@ class Store:
 
     @classmethod
     def create(cls, folder: str | os.PathLike[str], manifest: Mapping[str, Any], same: Iterable[str]) -> Store:
-        """Make a data set, or open the one that is there to go on with it.
+        """Make a data set, or open an existing one to add to it.
 
         Args:
-            folder: Where.
-            manifest: What to write down.
-            same: Keys of the manifest in which a data set that is there must agree.
+            folder: Folder of the data set.
+            manifest: Entries of a new manifest.
+            same: Keys of the manifest in which an existing data set must agree.
 
         Raises:
             MissingFileError: The folder cannot be written.
-            FileFormatError: What is there is of another version.
-            DatasetError: What is there was made otherwise.
+            FileFormatError: The existing data set is of another version.
+            DatasetError: The existing data set was made with other options.
         """
         path = Path(folder) / "manifest.json"
         make_folder(path.parent / "units", "folder for a data set")
@@ -78,7 +78,7 @@ class Store:
 
     @contextmanager
     def locked(self) -> Iterator[None]:
-        """Keep other processes from writing, and clear away what an ended one left half-written.
+        """Keep other processes from writing, and remove incomplete files of a process that was killed.
 
         Raises:
             FolderInUseError: Another process writes here.

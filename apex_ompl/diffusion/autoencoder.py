@@ -1,7 +1,7 @@
-"""Trajectories as latent vectors: whitened principal components of a spline's free points, or a variational network.
+"""Latent spaces of paths: whitened principal components of the free control points, or a variational autoencoder.
 
-Both describe a path by what it differs in from the straight line between its ends, so that the ends are exact whatever
-the latent vector is.
+Both encode the residual of a path from the straight line between its ends, so that decoded paths meet start and goal
+exactly for every latent vector.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ from apex_ompl.errors import ParameterError
 from apex_ompl.trajopt.spline import Spline
 from apex_ompl.util.validation import check_integer
 
-MOST_GROUPS = 8  # of channels that are normalised together
-FLAT = 1e-3  # deviations below this share of the largest are not blown up to one
+GROUPS = 8  # groups of the group normalization
+MIN_DEVIATION = 1e-3  # smallest standard deviation that is whitened to one, relative to the largest
 
 
 class Autoencoder(nn.Module, ABC):
-    """What encodes residuals from the straight line.
+    """Encoder and decoder of a path's residual from the straight line.
 
     Attributes:
-        spline: The spline of the control points.
+        spline: Spline of the control points.
         dof: Number of joints.
         latent: Shape of a latent vector.
     """
@@ -37,7 +37,7 @@ class Autoencoder(nn.Module, ABC):
     fit_matrix: Tensor
 
     def __init__(self, spline: Spline, dof: int) -> None:
-        """Work on paths of ``dof`` joints."""
+        """Encode paths of ``dof`` joints."""
         super().__init__()
         self.spline, self.dof = spline, dof
         shares = spline.line(np.zeros(1), np.ones(1))[:, 0]
@@ -56,7 +56,7 @@ class Autoencoder(nn.Module, ABC):
         """Return control points (B, points, dof) of latent vectors, between ends of shape (B, dof)."""
 
     def decode(self, latent: Tensor, start: Tensor, goal: Tensor) -> Tensor:
-        """Return paths (B, states, dof) of latent vectors, between ends of shape (B, dof), which are exact."""
+        """Return paths (B, states, dof) of latent vectors; their first and last states are the given ends, (B, dof)."""
         return self.path(self.control(latent, start, goal))
 
     def path(self, control: Tensor) -> Tensor:
@@ -72,18 +72,22 @@ class Autoencoder(nn.Module, ABC):
         return torch.cat([start[:, None].expand(-1, pinned, -1), inner, goal[:, None].expand(-1, pinned, -1)], dim=1)
 
     def with_inner(self, inner: Tensor, start: Tensor, goal: Tensor) -> Tensor:
-        """Return control points whose free ones are the straight line's and ``inner``, (B, free, dof), added."""
+        """Return the straight line's control points with ``inner``, (B, free, dof), added to the free ones."""
         line = self.line(start, goal)
         pinned = self.spline.pinned
         return torch.cat([line[:, :pinned], line[:, self.spline.inner] + inner, line[:, -pinned:]], dim=1)
 
     def residual(self, control: Tensor) -> Tensor:
-        """Return what free control points differ in from those of the straight line, shape (B, free, dof)."""
+        """Return the free control points minus those of the straight line, shape (B, free, dof)."""
         return (control - self.line(control[:, 0], control[:, -1]))[:, self.spline.inner]
 
 
 class LinearLatent(Autoencoder):
-    """Whitened principal components of the free control points' residuals."""
+    """Whitened principal components of the free control points' residuals r.
+
+    z = S^-1 V^T (r - mean) and r = mean + V S z, with the leading eigenvectors V of the data's covariance and the
+    diagonal matrix S of their standard deviations, so that the data's latent vectors have unit covariance.
+    """
 
     mean: Tensor
     components: Tensor
@@ -93,7 +97,7 @@ class LinearLatent(Autoencoder):
         """Keep ``dim`` components.
 
         Raises:
-            ParameterError: There are not as many.
+            ParameterError: There are fewer.
         """
         super().__init__(spline, dof)
         check_integer(dim, "dimension of the latent space", 1, spline.free * dof)
@@ -103,16 +107,18 @@ class LinearLatent(Autoencoder):
         self.register_buffer("deviations", torch.ones(dim))
 
     def fit(self, control: Tensor) -> None:
-        """Take mean, components and deviations from data, control points of shape (N, points, dof)."""
+        """Compute mean, components and deviations of data, control points of shape (N, points, dof)."""
         rows = self.residual(control).flatten(1).double()
         mean = rows.mean(dim=0)
         values, vectors = torch.linalg.eigh((rows - mean).T @ (rows - mean) / len(rows))
         order = torch.argsort(values, descending=True)[: self.latent[0]]
         vectors = vectors[:, order]
-        signs = torch.sign(vectors[vectors.abs().argmax(dim=0), torch.arange(len(order))])  # the same everywhere
+        signs = torch.sign(
+            vectors[vectors.abs().argmax(dim=0), torch.arange(len(order))]
+        )  # eigenvectors are unique up to sign
         self.mean.copy_(mean)
         self.components.copy_(vectors * signs)
-        self.deviations.copy_(values[order].clamp(min=float(FLAT**2 * values.max().clamp(min=1e-12))).sqrt())
+        self.deviations.copy_(values[order].clamp(min=float(MIN_DEVIATION**2 * values.max().clamp(min=1e-12))).sqrt())
 
     def encode(self, control: Tensor) -> Tensor:
         """Return latent vectors (B, dim) of control points (B, points, dof)."""
@@ -125,93 +131,106 @@ class LinearLatent(Autoencoder):
 
 
 class Moments(NamedTuple):
-    """The distribution of latent vectors that an encoder gives: mean and logarithm of the variance, (B, *latent)."""
+    """Normal distribution q(z | x) of an encoder: mean and logarithm of the variance, each (B, *latent)."""
 
     mean: Tensor
     log_variance: Tensor
 
 
 class VariationalLatent(Autoencoder):
-    """A convolutional variational autoencoder of all states of a path (section III-B of the paper).
+    """Convolutional variational autoencoder of all states of a path (section III-B of the paper).
 
-    It takes and emits the residuals of all states from the straight line; a window that vanishes at both ends makes
-    them exact. Latent vectors are scaled to unit variance, as Rombach et al. (2022) do it.
+    Input and output are the residuals of all states from the straight line. The output is multiplied by a window
+    that vanishes at both ends, so that start and goal are exact. Latent vectors are shifted and scaled to zero mean
+    and unit variance by channel, as in Rombach et al. (2022).
     """
 
     scale: Tensor
     shift: Tensor
     window: Tensor
-    even: Tensor
+    fractions: Tensor
 
     def __init__(self, spline: Spline, dof: int, channels: int = 8, width: int = 64, halvings: int = 4) -> None:
         """Make an encoder and a decoder.
 
         Args:
-            spline: What paths are fitted by; its number of states is what the network sees.
+            spline: Spline of the control points; its number of states is the length of the network's input.
             dof: Number of joints.
             channels: Channels of a latent vector.
-            width: Channels inside.
-            halvings: How often the length is halved.
+            width: Channels of the hidden layers.
+            halvings: Number of layers that halve the length.
 
         Raises:
-            ParameterError: The number of states cannot be halved as often.
+            ParameterError: The number of states is not divisible by 2**halvings, or the width by the groups.
         """
         super().__init__(spline, dof)
-        if spline.states % 2**halvings or width % MOST_GROUPS:
-            expected = f"{2**halvings} times a whole number of states, and a width of {MOST_GROUPS} times one"
+        if spline.states % 2**halvings or width % GROUPS:
+            expected = f"{2**halvings} times a whole number of states, and a width of {GROUPS} times one"
             raise ParameterError("states, width", (spline.states, width), expected)
         self.latent = (channels, spline.states // 2**halvings)
         u = torch.linspace(0.0, 1.0, spline.states)
         self.register_buffer("window", (8.0 * torch.minimum(u, 1.0 - u)).clamp(max=1.0)[:, None], persistent=False)
-        self.register_buffer("even", u[:, None], persistent=False)
+        self.register_buffer("fractions", u[:, None], persistent=False)
         self.register_buffer("scale", torch.ones(channels, 1))
         self.register_buffer("shift", torch.zeros(channels, 1))
         down: list[nn.Module] = [nn.Conv1d(dof, width, 5, padding=2)]
-        up: list[nn.Module] = [nn.Conv1d(channels, width, 3, padding=1), Mix(width)]
+        up: list[nn.Module] = [nn.Conv1d(channels, width, 3, padding=1), ResidualBlock(width)]
         for _ in range(halvings):
-            down += [Mix(width), nn.Conv1d(width, width, 4, stride=2, padding=1)]
-            up += [nn.Upsample(scale_factor=2.0), nn.Conv1d(width, width, 3, padding=1), Mix(width)]
-        self.encoder = nn.Sequential(*down, Mix(width), nn.SiLU(), nn.Conv1d(width, 2 * channels, 3, padding=1))
+            down += [ResidualBlock(width), nn.Conv1d(width, width, 4, stride=2, padding=1)]
+            up += [nn.Upsample(scale_factor=2.0), nn.Conv1d(width, width, 3, padding=1), ResidualBlock(width)]
+        self.encoder = nn.Sequential(
+            *down, ResidualBlock(width), nn.SiLU(), nn.Conv1d(width, 2 * channels, 3, padding=1)
+        )
         self.decoder = nn.Sequential(*up, nn.SiLU(), nn.Conv1d(width, dof, 5, padding=2))
 
     def moments(self, control: Tensor) -> Moments:
-        """Return the distribution of the encoder, before it is scaled; control points (B, points, dof)."""
-        return self._moments(self._rest(control))
+        """Return q(z | x), before shift and scale, of control points (B, points, dof)."""
+        return self._encode(self._path_residual(control))
 
-    def _rest(self, control: Tensor) -> Tensor:
+    def _path_residual(self, control: Tensor) -> Tensor:
         path = self.path(control)
-        return path - self._even_line(path[:, 0], path[:, -1])
+        return path - self._uniform_line(path[:, 0], path[:, -1])
 
-    def _moments(self, rest: Tensor) -> Moments:
-        mean, log_variance = self.encoder(rest.transpose(1, 2)).chunk(2, dim=1)
+    def _encode(self, residual: Tensor) -> Moments:
+        mean, log_variance = self.encoder(residual.transpose(1, 2)).chunk(2, dim=1)
         return Moments(mean, log_variance.clamp(-20.0, 10.0))
 
     def residuals(self, raw: Tensor) -> Tensor:
-        """Return residuals from the straight line, (B, states, dof), of latent vectors that are not scaled."""
-        found: Tensor = self.decoder(raw)
-        return self.window * found.transpose(1, 2)
+        """Return residuals from the straight line, (B, states, dof), of latent vectors before shift and scale."""
+        output: Tensor = self.decoder(raw)
+        return self.window * output.transpose(1, 2)
 
     def loss(self, control: Tensor, noise: Tensor, weight: float) -> tuple[Tensor, Tensor]:
-        """Return the loss, and the error of reconstruction in it.
+        """Return the negative evidence lower bound (Kingma and Welling 2014), and its reconstruction error.
 
-        The loss is the negative evidence lower bound (Kingma and Welling 2014): the mean square error of the states
-        [rad^2], and ``weight`` times the divergence from the standard normal distribution, per number of the latent.
+        With mu and sigma of q(z | x) and z = mu + sigma noise, as means over all entries:
+
+        loss = mean((decode(z) - x)^2) + weight * mean((mu^2 + sigma^2 - 1 - log sigma^2) / 2)
+
+        The second mean is the Kullback-Leibler divergence of q(z | x) from N(0, I).
 
         Args:
             control: Control points, shape (B, points, dof).
             noise: Standard normal, shape (B, *latent).
             weight: Weight of the divergence.
-        """
-        with torch.autocast(control.device.type, enabled=False):  # half precision would blur the path
-            rest = self._rest(control)
-        mean, log_variance = self._moments(rest)
-        found = self.residuals(mean + (0.5 * log_variance).exp() * noise)
-        error = functional.mse_loss(found.float(), rest)
-        apart = 0.5 * (mean**2 + log_variance.exp() - 1.0 - log_variance)
-        return error + weight * apart.mean(), error
 
-    def measure(self, control: Tensor) -> None:
-        """Take scale and shift of latent vectors from data, control points (N, points, dof)."""
+        Returns:
+            Loss, and mean square error of the states [rad^2].
+        """
+        with torch.autocast(control.device.type, enabled=False):  # half precision is too coarse for joint angles
+            residual = self._path_residual(control)
+        mean, log_variance = self._encode(residual)
+        decoded = self.residuals(mean + (0.5 * log_variance).exp() * noise)
+        error = functional.mse_loss(decoded.float(), residual)
+        divergence = 0.5 * (mean**2 + log_variance.exp() - 1.0 - log_variance)
+        return error + weight * divergence.mean(), error
+
+    def fit_scale(self, control: Tensor) -> None:
+        """Set shift and scale to mean and standard deviation of the data's latent vectors, by channel.
+
+        Args:
+            control: Control points, shape (N, points, dof).
+        """
         with torch.no_grad():
             means = torch.cat([self.moments(control[k : k + 4096]).mean for k in range(0, len(control), 4096)])
             self.shift.copy_(means.mean(dim=(0, 2))[:, None])
@@ -223,27 +242,27 @@ class VariationalLatent(Autoencoder):
 
     def decode(self, latent: Tensor, start: Tensor, goal: Tensor) -> Tensor:
         """Return paths (B, states, dof)."""
-        path = self._even_line(start, goal) + self.residuals(latent * self.scale + self.shift)
+        path = self._uniform_line(start, goal) + self.residuals(latent * self.scale + self.shift)
         return torch.cat([start[:, None], path[:, 1:-1], goal[:, None]], dim=1)
 
     def control(self, latent: Tensor, start: Tensor, goal: Tensor) -> Tensor:
-        """Return the control points (B, points, dof) of the splines nearest to the paths."""
+        """Return the control points (B, points, dof) of the least-squares fits to the decoded paths."""
         line = self.line(start, goal)
-        rest = self.decode(latent, start, goal) - self.path(line)
-        return self.with_inner(self.fit_matrix @ rest, start, goal)
+        residual = self.decode(latent, start, goal) - self.path(line)
+        return self.with_inner(self.fit_matrix @ residual, start, goal)
 
-    def _even_line(self, start: Tensor, goal: Tensor) -> Tensor:
-        line: Tensor = start[:, None] + self.even * (goal - start)[:, None]
+    def _uniform_line(self, start: Tensor, goal: Tensor) -> Tensor:
+        line: Tensor = start[:, None] + self.fractions * (goal - start)[:, None]
         return line
 
 
-class Mix(nn.Module):
-    """A residual block of one convolution."""
+class ResidualBlock(nn.Module):
+    """Residual block of one convolution."""
 
     def __init__(self, width: int) -> None:
         """Work on ``width`` channels."""
         super().__init__()
-        self.norm = nn.GroupNorm(MOST_GROUPS, width)
+        self.norm = nn.GroupNorm(GROUPS, width)
         self.conv = nn.Conv1d(width, width, 3, padding=1)
 
     def forward(self, x: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Checkpoints: a folder of ``config.json``, ``model.safetensors`` and a model card; nothing in it is executed."""
+"""Checkpoints: folders of ``config.json``, ``model.safetensors`` and a model card; nothing in them is executed."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ PICKLES = (".pt", ".pth", ".ckpt", ".bin", ".pkl", ".pickle")
 
 
 class CheckpointConfig(StrictModel):
-    """What ``config.json`` holds.
+    """Content of ``config.json``.
 
     Attributes:
         schema_: Version of the format.
-        model: What the model is made of.
+        model: Configuration of the model.
         digest: SHA-256 of the file of weights.
-        trained: What is known of the training.
+        trained: Record of the training.
     """
 
     schema_: Literal["apex-ompl/model/1"] = Field(alias="schema")
@@ -51,16 +51,16 @@ class CheckpointConfig(StrictModel):
 def save_model(
     folder: str | os.PathLike[str], network: LatentDiffusion, trained: Mapping[str, Any], *, half: bool = True
 ) -> None:
-    """Write a checkpoint with its model card, whole or not at all; one that is there is replaced.
+    """Write a checkpoint with its model card, completely or not at all; an existing one is replaced.
 
     Args:
-        folder: Where.
+        folder: Folder of the checkpoint.
         network: The model.
-        trained: What is known of its training, ready for JSON.
+        trained: Record of its training, ready for JSON.
         half: Whether weights are stored in half precision.
 
     Raises:
-        MissingFileError: The folder cannot be written, or something else is there.
+        MissingFileError: The folder cannot be written, or is not a checkpoint's.
     """
     folder = Path(folder)
     if folder.exists() and not is_file(folder / CONFIG):
@@ -78,7 +78,7 @@ def save_model(
     content = {WEIGHTS: weights, CARD: card.encode(), CONFIG: (json.dumps(config, indent=1) + "\n").encode()}
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
-        for left in folder.parent.glob(f".{folder.name}.*{PART}"):  # of a process that was killed
+        for left in folder.parent.glob(f".{folder.name}.*{PART}"):  # left by a process that was killed
             shutil.rmtree(left, ignore_errors=True)
         temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", suffix=PART, dir=folder.parent))
     except (OSError, ValueError) as error:
@@ -104,9 +104,9 @@ def model_card(config: ModelConfig, trained: Mapping[str, Any], weights: int) ->
     """Return a model card, Markdown.
 
     Args:
-        config: What the model is made of.
-        trained: What is known of its training.
-        weights: Their number.
+        config: Configuration of the model.
+        trained: Record of its training.
+        weights: Number of weights.
     """
     latent, condition, noise = config.latent, config.condition, config.noise
     size = f"{latent.dim} components" if latent.kind == "linear" else f"{latent.channels} channels"
@@ -132,14 +132,14 @@ def load_model(
     """Return a trained model.
 
     Args:
-        name: One that ships, ``apex`` or ``apex-paper``, or a folder.
-        device: Where it runs.
-        robot: Name of the robot it must be for; by default any.
+        name: Name of a checkpoint that ships, ``apex`` or ``apex-paper``, or a folder.
+        device: Device that it computes on.
+        robot: Name of the robot that the model must be for; by default any.
 
     Raises:
-        UnknownNameError: Nothing of that name ships, and there is no such folder.
+        UnknownNameError: No checkpoint of that name ships, and there is no such folder.
         MissingFileError: A file of the checkpoint is missing.
-        FileFormatError: It is damaged, a pickle, of another version, or for another robot.
+        FileFormatError: The checkpoint is damaged, a pickle, of another version, or for another robot.
         ParameterError: There is no such device.
     """
     folder = _folder(name)
@@ -178,13 +178,13 @@ def load_model(
 
 
 def shared_model(name: str | os.PathLike[str], *, device: str = "cpu", robot: str | None = None) -> TrajectoryModel:
-    """Return a trained model, the same object as before as long as its files have not changed.
+    """Return a trained model from a cache; it is read again when its files change.
 
     Raises:
         ApexError: As :func:`load_model` does.
     """
     folder = _folder(name)
-    files = [folder / name for name in (CONFIG, WEIGHTS)]
+    files = [folder / file for file in (CONFIG, WEIGHTS)]
     stamp = tuple(file.stat().st_mtime_ns for file in files if is_file(file))
     with _loading:
         return _shared(str(folder.absolute()), stamp, device, robot)
@@ -203,7 +203,7 @@ def read_config(folder: Path) -> CheckpointConfig:
     """Read the configuration of a checkpoint.
 
     Raises:
-        FileFormatError: It is not one.
+        FileFormatError: The file is not one.
     """
     path = folder / CONFIG
     try:

@@ -1,4 +1,4 @@
-"""What a training run is made of, as a YAML file."""
+"""Configuration of a training run, a YAML file."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Positive = Annotated[float, Field(gt=0.0)]
 
 
 class MirrorConfig(StrictModel):
-    """A symmetry of the robot, see ``apex_ompl.diffusion.data.Mirror``; one number for each joint."""
+    """Mirror symmetry of a robot, see ``apex_ompl.diffusion.mirror.Mirror``; one number for each joint."""
 
     order: tuple[Annotated[int, Field(ge=0)], ...]
     sign: tuple[Literal[-1, 1], ...]
@@ -34,12 +34,12 @@ class MirrorConfig(StrictModel):
 
 
 class AutoencoderTraining(StrictModel):
-    """How a variational latent space is trained, before the denoiser.
+    """Training of a variational latent space, which comes before that of the denoiser.
 
     Attributes:
         steps: Number of steps.
-        rate: Learning rate at first; it falls to nothing.
-        divergence: Weight of the divergence from the normal distribution.
+        rate: Largest learning rate; its schedule is that of the denoiser.
+        divergence: Weight of the Kullback-Leibler divergence in the loss.
     """
 
     steps: Count = 5000
@@ -48,7 +48,7 @@ class AutoencoderTraining(StrictModel):
 
 
 class TrainingConfig(StrictModel):
-    """What ``scripts/train.py`` reads.
+    """Configuration of ``scripts/train.py``; attributes are keys of the file, except ``validation_sampling``.
 
     Attributes:
         schema_: Version of the format.
@@ -57,28 +57,29 @@ class TrainingConfig(StrictModel):
         cases: Folder of validation problems, as ``generate_data.py --write-cases`` writes them; none by default.
         latent: Latent space.
         condition: Encoder of conditions.
-        denoiser: Network.
-        noise: Diffusion.
-        autoencoder: How a variational latent space is trained.
+        denoiser: Denoising network.
+        noise: Diffusion process.
+        autoencoder: Training of a variational latent space.
         steps: Number of steps.
         batch: Paths in a step, over all processes.
-        rate: Largest learning rate; it rises over ``warmup`` steps and falls to nothing by half a cosine.
-        warmup: See ``rate``.
+        rate: Largest learning rate; it rises linearly over ``warmup`` steps and falls to 0 by half a cosine.
+        warmup: Number of steps of the rise.
         decay: Weight decay.
-        clip: Longest gradient.
-        ema: Share of the averaged weights that a step keeps.
+        clip: Largest norm of the gradient.
+        ema: Decay of the exponential moving average of the weights.
         precision: ``float32`` or ``bfloat16`` (mixed).
-        seed: Of all random choices.
-        weights: How often paths are drawn, by patterns of ``suite/level``; the first that fits counts, 1 by default.
-        mirror: Symmetry of the robot that doubles the data.
-        held_out: Share of the problems that only the validation loss sees.
-        units: Units of a data set in memory at once; all by default.
+        seed: Seed of all random choices.
+        weights: Relative frequency of paths in training, by patterns of ``suite/level``; the first that matches
+            counts, 1 where none does.
+        mirror: Mirror symmetry of the robot, by which the data are augmented.
+        held_out: Share of the problems kept for the validation loss.
+        units: Number of units of a data set in memory at the same time; all by default.
         log_every: Steps between two lines of the log.
         save_every: Seconds between two saves.
         validate_every: Steps between two validations by proposals.
-        proposals: Proposals for each problem of a validation.
-        judged: How they are denoised.
-        sampling: How the trained model denoises unless something else is said.
+        proposals: Number of proposals for each problem of a validation.
+        validation_sampling: Sampling of a validation; its key in the file is ``judged``.
+        sampling: Default sampling of the trained model.
     """
 
     schema_: Literal["apex-ompl/training/1"] = Field(alias="schema")
@@ -107,27 +108,27 @@ class TrainingConfig(StrictModel):
     save_every: Positive = 120.0
     validate_every: Count = 2000
     proposals: Count = 8
-    judged: SamplingConfig = SamplingConfig()
+    validation_sampling: SamplingConfig = Field(SamplingConfig(), alias="judged")
     sampling: SamplingConfig = SamplingConfig()
 
     @property
     def sources(self) -> tuple[str, ...]:
-        """All data sets."""
+        """Data sets as a tuple."""
         return (self.data,) if isinstance(self.data, str) else self.data
 
     @property
-    def essence(self) -> str:
-        """What decides the weights, as text: all but how often things are logged, saved and judged, and from where."""
+    def determining(self) -> str:
+        """Settings that determine the trained weights, as JSON: all but paths, logging, saving and validation."""
         return self.model_dump_json(
             exclude={
-                "data", "robot", "cases", "log_every", "save_every", "validate_every", "proposals", "judged",
-                "sampling",
+                "data", "robot", "cases", "log_every", "save_every", "validate_every", "proposals",
+                "validation_sampling", "sampling",
             }
         )  # fmt: skip
 
     @classmethod
     def read(cls, path: str | os.PathLike[str], changes: Mapping[str, Any] | None = None) -> TrainingConfig:
-        """Read a configuration; ``changes`` are put over it, by dotted keys.
+        """Read a configuration, with some keys replaced: ``changes`` maps dotted keys to values.
 
         Raises:
             MissingFileError: The file cannot be read.
@@ -138,10 +139,10 @@ class TrainingConfig(StrictModel):
             raise FileFormatError(str(path), "schema", data.get("schema"), f"expected {SCHEMA!r}")
         for key, value in (changes or {}).items():
             *above, last = key.split(".")
-            place = data
+            section = data
             for name in above:
-                place = place.setdefault(name, {})
-                if not isinstance(place, dict):
+                section = section.setdefault(name, {})
+                if not isinstance(section, dict):
                     raise FileFormatError(str(path), key, value, f"expected {name!r} to hold keys")
-            place[last] = value
+            section[last] = value
         return validate(cls, data, str(path))

@@ -1,4 +1,7 @@
-"""Encoders of conditions: the MLP phi of the paper, and one that sees the obstacles."""
+"""Encoder of conditions: the MLP phi of the paper, with or without features of all obstacles.
+
+Names of layers are keys of the checkpoints' weights.
+"""
 
 from __future__ import annotations
 
@@ -6,25 +9,25 @@ import torch
 from torch import Tensor, nn
 
 from apex_ompl.datasets.records import SHAPES
-from apex_ompl.diffusion.conditions import Conditions, pooled
+from apex_ompl.diffusion.conditions import Conditions, pad_obstacles
 
-MIDDLE = (0.4, 0.0, 0.6)  # about where the robot works, from which points are counted [m]
-NEAR = 0.4  # distances are told apart up to here [m]
-LARGE = 1e4
+WORKSPACE_CENTRE = (0.4, 0.0, 0.6)  # origin of all points that the encoder sees [m]
+MAX_DISTANCE = 0.4  # distances are clipped here [m]
+PADDING = -1e4  # below every feature, for the maximum over obstacles
 
 
 class ConditionEncoder(nn.Module):
-    """Turns conditions into one vector.
+    """Encoder of start, goal and obstacles into one vector.
 
     With ``scene="none"`` it is the paper's phi: an MLP over the vector g of start, goal and obstacle point. ``set``
     adds the obstacles, each through an MLP and then pooled by mean and maximum, so that their order does not matter
-    (Zaheer et al. 2017). ``distances`` adds what the obstacles mean to the robot: where its probes are along the
-    straight line, and how far they are from each obstacle, and from the nearest one.
+    (Zaheer et al. 2017). ``distances`` adds the positions of the robot's probe points along the straight line
+    from start to goal, and their signed distances to each obstacle and to the nearest one.
     """
 
     lower: Tensor
     upper: Tensor
-    middle: Tensor
+    centre: Tensor
 
     def __init__(self, dof: int, *, out: int, width: int, scene: str, point: bool, probes: int, along: int) -> None:
         """Make an encoder.
@@ -32,22 +35,22 @@ class ConditionEncoder(nn.Module):
         Args:
             dof: Number of joints.
             out: Size of the vector.
-            width: Width inside.
+            width: Width of the hidden layers.
             scene: ``none``, ``set`` or ``distances``.
-            point: Whether it sees the obstacle point.
-            probes: Number of probes.
-            along: Number of states of the straight line at which they are.
+            point: Whether the obstacle point is an input.
+            probes: Number P of probe points.
+            along: Number L of states of the straight line at which they are placed.
         """
         super().__init__()
         self.scene, self.point, self.along = scene, point, along
         self.register_buffer("lower", torch.full((dof,), -1.0))
         self.register_buffer("upper", torch.full((dof,), 1.0))
-        self.register_buffer("middle", torch.tensor(MIDDLE), persistent=False)
+        self.register_buffer("centre", torch.tensor(WORKSPACE_CENTRE), persistent=False)
         size = 2 * dof + 3 * point
         if scene != "none":
-            seen = len(SHAPES) + 15 + (3 * probes if scene == "distances" else 0)
+            features = len(SHAPES) + 15 + (3 * probes if scene == "distances" else 0)
             self.thing = nn.Sequential(
-                nn.Linear(seen, width), nn.SiLU(), nn.Linear(width, width), nn.SiLU(), nn.Linear(width, width)
+                nn.Linear(features, width), nn.SiLU(), nn.Linear(width, width), nn.SiLU(), nn.Linear(width, width)
             )
             size += 2 * width
         if scene == "distances":
@@ -55,34 +58,34 @@ class ConditionEncoder(nn.Module):
         self.phi = nn.Sequential(nn.Linear(size, 2 * width), nn.SiLU(), nn.Linear(2 * width, out))
 
     def set_limits(self, lower: Tensor, upper: Tensor) -> None:
-        """Scale states by the robot's limits, shape (dof,) [rad]."""
+        """Set the robot's limits, shape (dof,) [rad], by which states are scaled to -1..1."""
         self.lower.copy_(lower)
         self.upper.copy_(upper)
 
-    def forward(self, given: Conditions) -> Tensor:
-        """Return vectors, shape (B, out)."""
+    def forward(self, conditions: Conditions) -> Tensor:
+        """Return encoded conditions, shape (B, out)."""
         span = self.upper - self.lower
-        parts = [2.0 * (q - self.lower) / span - 1.0 for q in (given.start, given.goal)]
+        parts = [2.0 * (q - self.lower) / span - 1.0 for q in (conditions.start, conditions.goal)]
         if self.point:
-            parts.append(given.point - self.middle)
+            parts.append(conditions.point - self.centre)
         if self.scene != "none":
-            parts += self._seen(given)
+            parts += self._obstacle_features(conditions)
         encoded: Tensor = self.phi(torch.cat(parts, dim=1))
         return encoded
 
-    def _seen(self, given: Conditions) -> list[Tensor]:
-        """Return what is seen of the obstacles, tensors of shape (B, ...)."""
-        there = given.there
-        shape, position, turn, size = given.things()
+    def _obstacle_features(self, conditions: Conditions) -> list[Tensor]:
+        """Return features of the obstacles, tensors of shape (B, features)."""
+        mask = conditions.mask
+        shape, position, rotation, size = conditions.obstacles()
         kinds = nn.functional.one_hot(shape, len(SHAPES)).to(position)
-        things = [kinds, position - self.middle, turn.flatten(1), size]
+        inputs = [kinds, position - self.centre, rotation.flatten(1), size]
         parts: list[Tensor] = []
         if self.scene == "distances":
-            along, probes = given.probes.shape[1:3]
-            with torch.autocast(there.device.type, enabled=False):  # half precision is some millimetres off
-                apart = given.apart().clamp(-NEAR, NEAR) / NEAR
-            parts += [(given.probes - self.middle).flatten(1), pooled(apart, there, 1.0).amin(dim=1)]
-            things.append(apart.reshape(-1, along, probes)[:, [0, along // 2, -1]].flatten(1))
-        tokens = self.thing(torch.cat(things, dim=1))
-        mean = pooled(tokens, there, 0.0).sum(dim=1) / there.sum(dim=1, keepdim=True).clamp(min=1)
-        return [*parts, mean, pooled(tokens, there, -LARGE).amax(dim=1).clamp(min=0.0)]
+            along, probes = conditions.probes.shape[1:3]
+            with torch.autocast(mask.device.type, enabled=False):  # half precision is some millimetres off
+                distances = conditions.probe_distances().clamp(-MAX_DISTANCE, MAX_DISTANCE) / MAX_DISTANCE
+            parts += [(conditions.probes - self.centre).flatten(1), pad_obstacles(distances, mask, 1.0).amin(dim=1)]
+            inputs.append(distances.reshape(-1, along, probes)[:, [0, along // 2, -1]].flatten(1))
+        tokens = self.thing(torch.cat(inputs, dim=1))
+        mean = pad_obstacles(tokens, mask, 0.0).sum(dim=1) / mask.sum(dim=1, keepdim=True).clamp(min=1)
+        return [*parts, mean, pad_obstacles(tokens, mask, PADDING).amax(dim=1).clamp(min=0.0)]

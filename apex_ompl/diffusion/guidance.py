@@ -1,4 +1,8 @@
-"""Obstacle guidance: denoising improved by the collision cost of the decoded path (section III-C of the paper)."""
+"""Obstacle guidance: denoising along the gradient of the decoded path's collision cost (section III-C of the paper).
+
+By Bayes, grad log p(z | g) = grad log p(z) + gamma grad log p(g | z) (equation 6), where log p(g | z) is minus the
+collision cost of the decoded path.
+"""
 
 from __future__ import annotations
 
@@ -23,23 +27,23 @@ SCALINGS = ("noise", "clean")
 
 @dataclass(frozen=True)
 class Guidance:
-    """How strongly, and when.
+    """Parameters of obstacle guidance.
 
     Attributes:
-        gamma: Scale of the guidance; 0 gives the plain model, bit for bit.
-        scaling: ``noise`` adds to the noise as in equation 7, in proportion to the noise that is left; ``clean`` adds
-            the gradient to the clean sample, not scaled with the noise.
-        clip: Longest gradient, in standard deviations of the latent space.
-        begin: It acts at steps below this share of the schedule; 1 means all. Two deterministic steps over 256 are
-            those at 255 and 127.
-        margin: Clearance below which a state costs [m].
-        samples: How many states of a path are looked at.
+        gamma: Guidance scale; 0 gives the unguided model, bit for bit.
+        scaling: ``noise`` subtracts gamma sqrt(1 - abar_t) times the gradient from the noise (equation 7); ``clean``
+            adds gamma times the gradient to the clean sample at every noise level.
+        clip: Largest norm of the gradient, in standard deviations of the latent space.
+        active_below: Guidance acts at steps t < active_below * T; 1 means all. Two deterministic steps over T = 256
+            are t = 255 and 127, of which the default guides the second.
+        margin: Clearance below which a state has a cost [m].
+        samples: Number of states of a path at which the cost is taken.
     """
 
     gamma: float = 1.0
     scaling: str = "clean"
     clip: float = 1.0
-    begin: float = 0.6
+    active_below: float = 0.6
     margin: float = 0.03
     samples: int = 64
 
@@ -47,115 +51,127 @@ class Guidance:
         """Check the numbers.
 
         Raises:
-            ParameterError: One is out of range.
-            UnknownNameError: No such scaling.
+            ParameterError: A number is out of range.
+            UnknownNameError: There is no such scaling.
         """
         if self.scaling not in SCALINGS:
             raise UnknownNameError("scaling of guidance", self.scaling, SCALINGS)
-        for name, value in (("gamma", self.gamma), ("clip", self.clip), ("begin", self.begin)):
+        for name, value in (("gamma", self.gamma), ("clip", self.clip), ("active_below", self.active_below)):
             check_number(value, name, 0.0)
         check_positive(self.margin, "margin")
         check_integer(self.samples, "samples", 2)
 
 
 def collision_cost(kernel: Kernel, paths: Array, margin: float) -> tuple[Array, Array]:
-    """Return what paths, shape (B, N, dof), cost, shape (B,), and its gradient, shape (B, N, dof) [1/rad].
+    """Return the collision cost of paths, shape (B,), and its gradient, shape (B, N, dof) [1/rad].
 
-    The cost is the sum over states, divided by their number, of half the squared shortfall of the least clearance
-    from ``margin``, to the obstacles and of the robot to itself, in margins. It is minus log p(g given x) in equation 6
-    of the paper.
+    cost = 1 / (2 N) sum_i sum_k max(0, 1 - d_k(q_i) / margin)^2
+
+    d_0 is the smallest distance of the robot to the obstacles, d_1 that between its own links. The cost is
+    -log p(g | x) of equation 6 of the paper, up to a constant.
+
+    Args:
+        kernel: The robot among its obstacles.
+        paths: Shape (B, N, dof) [rad].
+        margin: Clearance below which a state has a cost [m].
     """
     count, states, dof = paths.shape
     lower, upper = kernel.robot.arrays.lower, kernel.robot.arrays.upper
     inside = np.clip(paths.reshape(-1, dof), lower, upper)
-    clearance, slope = kernel.clearance_gradient(inside, margin)
-    short = np.where(np.isfinite(clearance), np.maximum(margin - clearance, 0.0), 0.0) / margin
-    cost = 0.5 * (short**2).sum(axis=1).reshape(count, states).mean(axis=1)
-    rows = -(short[:, :, None] * np.nan_to_num(slope)).sum(axis=1) / margin
+    clearance, jacobian = kernel.clearance_gradient(inside, margin)
+    violation = np.where(np.isfinite(clearance), np.maximum(margin - clearance, 0.0), 0.0) / margin
+    cost = 0.5 * (violation**2).sum(axis=1).reshape(count, states).mean(axis=1)
+    rows = -(violation[:, :, None] * np.nan_to_num(jacobian)).sum(axis=1) / margin
     return cost, rows.reshape(count, states, dof) / states
 
 
-class _Cost(torch.autograd.Function):
-    """The kernel's cost inside of torch."""
+class _CollisionCost(torch.autograd.Function):
+    """:func:`collision_cost` as a differentiable function of torch."""
 
     @staticmethod
     def forward(context: Any, paths: Tensor, kernel: Kernel, margin: float) -> Tensor:
-        cost, slope = collision_cost(kernel, paths.detach().cpu().double().numpy(), margin)
-        context.save_for_backward(torch.from_numpy(slope).to(paths))
+        cost, slopes = collision_cost(kernel, paths.detach().cpu().double().numpy(), margin)
+        context.save_for_backward(torch.from_numpy(slopes).to(paths))
         return torch.from_numpy(cost).to(paths)
 
     @staticmethod
     def backward(context: Any, *grads: Tensor) -> tuple[Tensor, None, None]:
-        (slope,) = context.saved_tensors
-        return grads[0][:, None, None] * slope, None, None
+        (slopes,) = context.saved_tensors
+        return grads[0][:, None, None] * slopes, None, None
 
 
 def log_likelihood(
     autoencoder: Autoencoder, kernel: Kernel, latent: Tensor, ends: tuple[Tensor, Tensor], guidance: Guidance
 ) -> Tensor:
-    """Return log p(g given x) of latent vectors, shape (B,), but for a constant: minus the collision cost.
+    """Return log p(g | z) of latent vectors up to a constant, shape (B,): minus the collision cost of their paths.
 
     Args:
-        autoencoder: Decodes them.
+        autoencoder: Decoder of the latent vectors.
         kernel: The robot among its obstacles.
-        latent: Shape (B, *latent).
+        latent: Latent vectors z, shape (B, *latent).
         ends: Starts and goals, each of shape (B, dof) [rad].
-        guidance: Says what costs.
+        guidance: Margin of the cost, and number of states.
     """
     which = torch.linspace(0, autoencoder.spline.states - 1, guidance.samples).round().long()
     paths = autoencoder.decode(latent, *ends)[:, which]
-    cost: Tensor = _Cost.apply(paths, kernel, guidance.margin)  # type: ignore[no-untyped-call]
+    cost: Tensor = _CollisionCost.apply(paths, kernel, guidance.margin)  # type: ignore[no-untyped-call]
     return -cost
 
 
 def guided(
-    predict: Predict, slope: Callable[[Tensor], Tensor], schedule: NoiseSchedule, guidance: Guidance,
+    predict: Predict, score: Callable[[Tensor], Tensor], schedule: NoiseSchedule, guidance: Guidance,
     most: float | None = None,
 ) -> Predict:  # fmt: skip
-    """Return a denoiser that is drawn to what is likely.
+    """Return a guided denoiser.
 
-    With ``scaling="noise"`` this is equation 7 of the paper with alpha_bar under the root, as Dhariwal and Nichol
-    (2021) have it: noise - gamma * sqrt(1 - alpha_bar) * grad log p. The gradient is taken at the estimate of the clean
-    sample and goes through decoder and kernel, not through the denoiser, of whose derivative the factor
-    1 / sqrt(alpha_bar) is kept.
+    With ``scaling="noise"``, equation 7 of the paper, with abar_t under the root as in Dhariwal and Nichol (2021):
+
+    epsilon_guided = epsilon - gamma sqrt(1 - abar_t) grad_{z_t} log p(g | z_0(z_t))
+
+    The gradient is taken at the estimated clean sample z_0. It goes through decoder and kernel but not through the
+    denoiser: of d z_0 / d z_t only the factor 1 / sqrt(abar_t) is kept. With ``scaling="clean"``,
+
+    z_0_guided = z_0 + gamma grad_{z_0} log p(g | z_0)
+
+    Both clip the gradient's norm at ``guidance.clip``, and recompute the other half of the estimate.
 
     Args:
-        predict: The plain denoiser.
-        slope: Gives the gradient of log p(g given x) at clean samples, of their shape.
+        predict: The unguided denoiser.
+        score: Returns grad log p(g | z_0) at clean samples, of their shape.
         schedule: The noise schedule.
-        guidance: How strongly, and when.
-        most: Clean samples are clipped at this, as those of the plain denoiser are.
+        guidance: Scale of the guidance, and steps at which it acts.
+        most: Limit at which clean samples are clipped, as those of the unguided denoiser; None for no clipping.
     """
     if guidance.gamma == 0.0:
         return predict
 
-    def improved(sample: Tensor, t: int) -> Estimate:
-        found = predict(sample, t)
-        if t >= guidance.begin * schedule.steps:
-            return found
+    def predict_guided(sample: Tensor, t: int) -> Estimate:
+        estimate = predict(sample, t)
+        if t >= guidance.active_below * schedule.steps:
+            return estimate
         signal, sigma = schedule.scale(t)
-        way = slope(found.clean)
+        direction = score(estimate.clean)
         if guidance.scaling == "noise":
-            noise = found.noise - guidance.gamma * sigma * shortened(way / signal, guidance.clip)
+            noise = estimate.noise - guidance.gamma * sigma * clip_norm(direction / signal, guidance.clip)
             clean = (sample - sigma * noise) / signal
         else:
-            clean = found.clean + guidance.gamma * shortened(way, guidance.clip)
+            clean = estimate.clean + guidance.gamma * clip_norm(direction, guidance.clip)
             noise = (sample - signal * clean) / sigma
         return schedule.clipped(Estimate(noise, clean), sample, t, most)
 
-    return improved
+    return predict_guided
 
 
 def gradient(function: Callable[[Tensor], Tensor], at: Tensor) -> Tensor:
-    """Return the gradient of a function that gives one number for each row."""
+    """Return the gradient, of the shape of ``at``, of a function from (B, ...) to one number a row, (B,)."""
     with torch.enable_grad():
         inside = at.detach().requires_grad_()
         found: Tensor = torch.autograd.grad(function(inside).sum(), inside)[0]
     return found
 
 
-def shortened(slope: Tensor, most: float) -> Tensor:
-    """Return gradients (B, ...) that are at most so long."""
-    length = slope.flatten(1).norm(dim=1).clamp(min=1e-12)
-    share: Tensor = (most / length).clamp(max=1.0)
-    return slope * share.reshape(-1, *[1] * (slope.ndim - 1))
+def clip_norm(gradients: Tensor, most: float) -> Tensor:
+    """Return gradients (B, ...) scaled down to norm ``most`` where they exceed it."""
+    norm = gradients.flatten(1).norm(dim=1).clamp(min=1e-12)
+    share: Tensor = (most / norm).clamp(max=1.0)
+    return gradients * share.reshape(-1, *[1] * (gradients.ndim - 1))

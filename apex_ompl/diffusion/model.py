@@ -1,4 +1,4 @@
-"""The latent diffusion model: an autoencoder, an encoder of conditions, and a denoiser between them."""
+"""The latent diffusion model: autoencoder, encoder of conditions, and denoiser, with their configurations."""
 
 from __future__ import annotations
 
@@ -36,10 +36,10 @@ class LatentConfig(StrictModel):
     Attributes:
         kind: ``linear`` for whitened principal components of the free control points, ``variational`` for a network
             over all states.
-        dim: Number of components.
-        channels: Channels of the variational latent.
-        width: Channels inside its networks.
-        halvings: How often the length is halved.
+        dim: Number of components of the linear latent space.
+        channels: Channels of the variational latent space.
+        width: Channels of its hidden layers.
+        halvings: Number of its layers that halve the length.
     """
 
     kind: Literal["linear", "variational"] = "linear"
@@ -50,14 +50,14 @@ class LatentConfig(StrictModel):
 
 
 class ConditionConfig(StrictModel):
-    """What the model sees, see ``apex_ompl.diffusion.encoders.ConditionEncoder``.
+    """Encoder of conditions, see ``apex_ompl.diffusion.encoders.ConditionEncoder``.
 
     Attributes:
         scene: ``none``, ``set`` or ``distances``.
-        point: Whether it sees the obstacle point of the paper.
-        width: Width inside the encoder.
-        out: Size of what comes out of it.
-        along: Number of states of the straight line at which probes are looked at.
+        point: Whether the obstacle point of the paper is an input.
+        width: Width of the hidden layers.
+        out: Size of the encoded condition.
+        along: Number of states of the straight line at which the probe points are placed.
     """
 
     scene: Literal["none", "set", "distances"] = "distances"
@@ -68,10 +68,10 @@ class ConditionConfig(StrictModel):
 
 
 class DenoiserConfig(StrictModel):
-    """The network.
+    """Denoising network.
 
     Attributes:
-        kind: ``mlp``, ``unet``, or ``regression``: the MLP, which is asked once for the latent vector itself.
+        kind: ``mlp``, ``unet``, or ``regression``: the MLP, evaluated once to predict the latent vector itself.
         width: Width of the MLP, or channels of the U-Net's first resolution.
         blocks: Blocks of the MLP.
         multipliers: Channels of the U-Net's resolutions, in widths.
@@ -84,14 +84,14 @@ class DenoiserConfig(StrictModel):
 
 
 class NoiseConfig(StrictModel):
-    """The diffusion, see ``apex_ompl.diffusion.schedule.NoiseSchedule``.
+    """Diffusion process, see ``apex_ompl.diffusion.schedule.NoiseSchedule``.
 
     Attributes:
         steps: Number of steps T.
         schedule: ``cosine`` or ``linear``.
-        prediction: What the network says: ``noise``, ``velocity`` or ``clean``.
-        most: Clean samples are clipped at this many standard deviations; not at all by default, as paths among many
-            obstacles have components far out.
+        prediction: Quantity that the network predicts: ``noise``, ``velocity`` or ``clean``.
+        most: Number of standard deviations at which clean samples are clipped; not at all by default, as paths among
+            many obstacles have large components.
     """
 
     steps: Count = 256
@@ -101,25 +101,25 @@ class NoiseConfig(StrictModel):
 
 
 class SamplingConfig(StrictModel):
-    """How paths are denoised unless something else is said, see ``apex_ompl.diffusion.proposals.Sampling``."""
+    """Default sampling of the model, see ``apex_ompl.diffusion.proposals.Sampling``."""
 
     sampler: Literal["ddpm", "ddim", "dpm_solver"] = "ddim"
     steps: Count = 2
 
 
 class ModelConfig(StrictModel):
-    """All that makes a model, its weights left out.
+    """Configuration of a model: all but its weights.
 
     Attributes:
         robot: Name of the robot.
         joints: Its planned joints in state order.
-        probes: Number of points of the robot that the model looks at.
+        probes: Number of probe points on the robot.
         spline: Spline of the control points.
         latent: Latent space.
         condition: Encoder of conditions.
-        denoiser: Network.
-        noise: Diffusion.
-        sampling: How paths are denoised unless something else is said.
+        denoiser: Denoising network.
+        noise: Diffusion process.
+        sampling: Default sampling.
     """
 
     robot: str
@@ -134,16 +134,18 @@ class ModelConfig(StrictModel):
 
 
 class LatentDiffusion(nn.Module):
-    """Paths by diffusion in a latent space (section III-B of the paper; Rombach et al. 2022).
+    """Latent diffusion model of paths (section III-B of the paper; Rombach et al. 2022).
+
+    Names of modules and buffers are keys of the checkpoints' weights.
 
     Attributes:
-        config: What it was made of.
-        autoencoder: Between control points and latent vectors.
-        encoder: Of conditions.
-        denoiser: The network.
-        schedule: The noise schedule.
-        probe_joint: Joints of the points of the robot that the model looks at, shape (P,).
-        probe_offset: Their places in the joints' frames, shape (P, 3) [m].
+        config: Configuration.
+        autoencoder: Latent space of control points.
+        encoder: Encoder of conditions.
+        denoiser: Denoising network.
+        schedule: Noise schedule.
+        probe_joint: Joints that carry the probe points, shape (P,).
+        probe_offset: Positions of the probe points in the joints' frames, shape (P, 3) [m].
     """
 
     probe_joint: Tensor
@@ -180,12 +182,18 @@ class LatentDiffusion(nn.Module):
         return self.autoencoder.latent
 
     @property
-    def regresses(self) -> bool:
-        """Whether the network gives latent vectors at once, and no diffusion is run."""
+    def is_regression(self) -> bool:
+        """Whether the network predicts latent vectors directly, without diffusion."""
         return self.config.denoiser.kind == "regression"
 
-    def said(self, latent: Tensor, t: Tensor, encoded: Tensor) -> Tensor:
-        """Return what the network says of noisy latent vectors (B, *latent) at steps (B,) or, all alike, (1,)."""
+    def denoise(self, latent: Tensor, t: Tensor, encoded: Tensor) -> Tensor:
+        """Return the denoiser's output for noisy latent vectors (B, *latent), of their shape.
+
+        Args:
+            latent: Noisy latent vectors.
+            t: Steps, shape (B,), or (1,) for one step for all.
+            encoded: Encoded conditions, shape (B, out), or (1, out) for one condition for all.
+        """
         if isinstance(self.denoiser, MLPDenoiser):
             out: Tensor = self.denoiser(latent.flatten(1), t, encoded)
             return out.reshape(latent.shape)
@@ -195,29 +203,32 @@ class LatentDiffusion(nn.Module):
         out = self.denoiser(latent, t, encoded)
         return out
 
-    def loss(self, clean: Tensor, noise: Tensor, t: Tensor, given: Conditions) -> Tensor:
-        """Return the mean square error of what the network says (equation 5 of the paper).
+    def loss(self, clean: Tensor, noise: Tensor, t: Tensor, conditions: Conditions) -> Tensor:
+        """Return the mean square error of the denoiser (equation 5 of the paper).
+
+        loss = mean((f(sqrt(abar_t) z_0 + sqrt(1 - abar_t) epsilon, t, g) - target)^2), where the target is epsilon,
+        the velocity or z_0, see :meth:`NoiseSchedule.target`.
 
         Args:
-            clean: Latent vectors of data, shape (B, *latent).
-            noise: Standard normal, of the same shape.
+            clean: Latent vectors z_0 of data, shape (B, *latent).
+            noise: Standard normal epsilon, of the same shape.
             t: Steps, shape (B,).
-            given: Conditions.
+            conditions: Conditions g.
         """
-        encoded = self.encoder(given)
-        if self.regresses:
-            return nn.functional.mse_loss(self.said(torch.zeros_like(clean), torch.zeros_like(t), encoded), clean)
-        said = self.said(self.schedule.noisy(clean, noise, t), t, encoded)
-        wanted = self.schedule.target(self.config.noise.prediction, clean, noise, t)
-        return nn.functional.mse_loss(said.float(), wanted)
+        encoded = self.encoder(conditions)
+        if self.is_regression:
+            return nn.functional.mse_loss(self.denoise(torch.zeros_like(clean), torch.zeros_like(t), encoded), clean)
+        output = self.denoise(self.schedule.add_noise(clean, noise, t), t, encoded)
+        target = self.schedule.target(self.config.noise.prediction, clean, noise, t)
+        return nn.functional.mse_loss(output.float(), target)
 
     def predict(self, encoded: Tensor) -> Predict:
-        """Return the function that samplers ask, for one encoded condition of shape (1, out), or (B, out)."""
+        """Return the denoiser as samplers call it, for one encoded condition, (1, out), or one each, (B, out)."""
         noise = self.config.noise
 
         def predict(sample: Tensor, t: int) -> Estimate:
             steps = torch.full((1,), t, device=sample.device)
-            found = self.schedule.estimate(noise.prediction, sample, self.said(sample, steps, encoded), t)
-            return self.schedule.clipped(found, sample, t, noise.most)
+            estimate = self.schedule.estimate(noise.prediction, sample, self.denoise(sample, steps, encoded), t)
+            return self.schedule.clipped(estimate, sample, t, noise.most)
 
         return predict

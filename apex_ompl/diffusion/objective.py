@@ -1,64 +1,37 @@
-"""What is minimised, and the processes that do it together."""
+"""Loss of a training phase as a module, as ``DistributedDataParallel`` wants it."""
 
 from __future__ import annotations
 
-import os
-from dataclasses import dataclass
-
 import torch
-from torch import Tensor, distributed, nn
+from torch import Tensor, nn
 
 from apex_ompl.diffusion.autoencoder import VariationalLatent
 from apex_ompl.diffusion.conditions import Conditions
 from apex_ompl.diffusion.model import LatentDiffusion
 
 
-@dataclass(frozen=True)
-class Place:
-    """One of the processes that train together.
-
-    Attributes:
-        rank: Its number.
-        world: How many there are.
-        device: Where it computes.
-    """
-
-    rank: int
-    world: int
-    device: torch.device
-
-    @classmethod
-    def here(cls) -> Place:
-        """Return this process, joined to the others that ``torchrun`` started if it did."""
-        rank, world, local = (int(os.environ.get(k, d)) for k, d in (("RANK", 0), ("WORLD_SIZE", 1), ("LOCAL_RANK", 0)))
-        cuda = torch.cuda.is_available()
-        device = torch.device("cuda", local) if cuda else torch.device("cpu")
-        if cuda:
-            torch.cuda.set_device(device)
-        if world > 1 and not distributed.is_initialized():
-            distributed.init_process_group("nccl" if cuda else "gloo")
-        return cls(rank, world, device)
-
-    def leave(self) -> None:
-        """Part from the others."""
-        if self.world > 1 and distributed.is_initialized():
-            distributed.destroy_process_group()
-
-
 class Objective(nn.Module):
-    """The loss of a phase as a module, which is what several processes share gradients of."""
+    """Loss of a phase: the negative ELBO of the autoencoder, or the mean square error of the denoiser."""
 
     def __init__(self, network: LatentDiffusion, divergence: float) -> None:
-        """Train ``network``."""
+        """Train ``network``; ``divergence`` is the weight of the autoencoder's Kullback-Leibler divergence."""
         super().__init__()
         self.network, self.divergence = network, divergence
 
-    def forward(self, phase: str, control: Tensor, given: Conditions, noise: Tensor, t: Tensor) -> Tensor:
-        """Return the loss of paths, control points (B, points, dof)."""
+    def forward(self, phase: str, control: Tensor, conditions: Conditions, noise: Tensor, t: Tensor) -> Tensor:
+        """Return the loss of a batch of paths.
+
+        Args:
+            phase: ``autoencoder`` or ``denoiser``.
+            control: Control points, shape (B, points, dof) [rad].
+            conditions: Conditions of the paths.
+            noise: Standard normal, shape (B, *latent).
+            t: Diffusion steps, shape (B,).
+        """
         autoencoder = self.network.autoencoder
         if phase == "autoencoder":
             assert isinstance(autoencoder, VariationalLatent)
             return autoencoder.loss(control, noise, self.divergence)[0]
         with torch.no_grad():
             clean = autoencoder.encode(control)
-        return self.network.loss(clean, noise, t, given)
+        return self.network.loss(clean, noise, t, conditions)

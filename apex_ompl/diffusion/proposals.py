@@ -1,4 +1,4 @@
-"""A trained model as planners use it: paths proposed for a query."""
+"""A trained model as planners use it: candidate paths for a query."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from apex_ompl.diffusion.conditions import Conditions, Probes, Query, batched
+from apex_ompl.diffusion.conditions import Conditions, Probes, Query, batch_queries
 from apex_ompl.diffusion.guidance import Guidance, gradient, guided, log_likelihood
 from apex_ompl.diffusion.model import LatentDiffusion
 from apex_ompl.diffusion.sampler import SAMPLERS, Callback, ddpm, noise_like
@@ -22,31 +22,31 @@ from apex_ompl.trajopt.spline import Spline
 from apex_ompl.types import Array
 from apex_ompl.util.validation import check_array, check_integer, check_number
 
-PLAIN = Guidance(gamma=0.0)
+UNGUIDED = Guidance(gamma=0.0)
 
 
 @dataclass(frozen=True)
 class Sampling:
-    """How a path is denoised.
+    """Parameters of sampling.
 
     Attributes:
         sampler: ``ddim``, ``dpm_solver`` or ``ddpm``.
         steps: Number of denoising steps; the paper takes all 256 by ``ddpm``.
-        temperature: Standard deviation of the noise to begin with; less gives likelier and less diverse paths.
-        guidance: How paths are drawn away from obstacles; not at all by default.
+        temperature: Standard deviation of the initial noise; below 1, paths are more likely and less diverse.
+        guidance: Obstacle guidance; none by default.
     """
 
     sampler: str = "ddim"
     steps: int = 2
     temperature: float = 1.0
-    guidance: Guidance = PLAIN
+    guidance: Guidance = UNGUIDED
 
     def __post_init__(self) -> None:
         """Check the numbers.
 
         Raises:
-            UnknownNameError: No such sampler.
-            ParameterError: A number out of range.
+            UnknownNameError: There is no such sampler.
+            ParameterError: A number is out of range.
         """
         if self.sampler not in SAMPLERS:
             raise UnknownNameError("sampler", self.sampler, SAMPLERS)
@@ -56,12 +56,12 @@ class Sampling:
 
 @dataclass(frozen=True, eq=False)
 class Proposals:
-    """Paths that were proposed; they need not be valid.
+    """Proposed paths, not checked for collisions.
 
     Attributes:
-        control: Control points, shape (B, points, dof) [rad], inside the limits, their ends exact.
+        control: Control points, shape (B, points, dof) [rad], inside the limits; ends are start and goal bit for bit.
         latent: Latent vectors, shape (B, *latent).
-        seconds: Where the time went: ``condition``, ``network``, ``guidance``, ``decode`` [s].
+        seconds: Time by stage: ``condition``, ``network``, ``guidance``, ``decode`` [s].
     """
 
     control: Array
@@ -70,17 +70,17 @@ class Proposals:
 
 
 class TrajectoryModel:
-    """Proposes paths; safe to use from several threads.
+    """Trained model that proposes paths; safe to use from several threads.
 
     Attributes:
-        network: The model.
-        about: What is known of its training.
-        spline: The spline of the control points.
-        sampling: How paths are denoised unless something else is said.
+        network: The networks.
+        about: Record of the training.
+        spline: Spline of the control points.
+        sampling: Default sampling.
     """
 
     def __init__(self, network: LatentDiffusion, about: Mapping[str, Any]) -> None:
-        """Use a model as it is now."""
+        """Use a network with its present weights; they are frozen."""
         self.network = network.eval().requires_grad_(False)
         self.about = dict(about)
         self.spline: Spline = network.autoencoder.spline
@@ -105,15 +105,15 @@ class TrajectoryModel:
         """Return paths from noise (Algorithm 1 of the paper, generate_traj).
 
         Args:
-            query: The problem, or several of one scene.
-            kernel: The robot among its obstacles, which guidance asks.
-            count: How many paths for each query; those of the first query come first.
-            sampling: How they are denoised; by default as the model's configuration says.
+            query: A query, or several in one scene.
+            kernel: The robot among its obstacles, for the guidance.
+            count: Number of paths for each query; those of the first query come first.
+            sampling: Parameters of sampling; by default the model's own.
             generator: Source of all noise; the same state gives the same paths. By default one with seed 0.
             callback: Called at every step.
 
         Raises:
-            ParameterError: A query has states of another robot, or there are no paths to propose.
+            ParameterError: A query has states of another robot, or ``count`` is not positive.
         """
         sampling, queries = sampling or self.sampling, [query] if isinstance(query, Query) else list(query)
         check_integer(count, "count", 1)
@@ -127,19 +127,19 @@ class TrajectoryModel:
         self, query: Query, kernel: Kernel, control: Array, step: int, *, sampling: Sampling | None = None,
         generator: torch.Generator | None = None, callback: Callback | None = None,
     ) -> Proposals:  # fmt: skip
-        """Return paths near given ones: noised up to a step, and denoised again.
+        """Return variations of given paths: noise of a step is added to their latent vectors, and removed again.
 
         Args:
-            query: The problem.
+            query: The query.
             kernel: The robot among its obstacles.
-            control: Control points, shape (B, points, dof).
-            step: How noisy they become, 0 to T - 1.
-            sampling: How they are denoised; its number of steps is cut to those there are.
+            control: Control points, shape (B, points, dof) [rad].
+            step: Step t of the noise that is added, 0 to T - 1.
+            sampling: Parameters of sampling; the number of steps is at most ``step + 1``.
             generator: Source of all noise; by default one with seed 0.
             callback: Called at every step.
 
         Raises:
-            ParameterError: Control points of another shape, or no such step.
+            ParameterError: Control points have another shape, or there is no such step.
         """
         sampling, control = sampling or self.sampling, np.asarray(control, float)
         shape = ("B", self.spline.points, len(self.network.config.joints))
@@ -148,15 +148,15 @@ class TrajectoryModel:
         generator = generator or torch.Generator().manual_seed(0)
         with torch.no_grad():
             clean = self.network.autoencoder.encode(torch.tensor(control, dtype=torch.float32, device=self.device))
-            first = self.network.schedule.noisy(clean, noise_like(clean, generator), step)
+            first = self.network.schedule.add_noise(clean, noise_like(clean, generator), step)
         sampling = replace(sampling, steps=min(sampling.steps, step + 1))
         return self._denoised([query], kernel, first, step, sampling=sampling, generator=generator, callback=callback)
 
     def conditions(self, queries: Sequence[Query], kernel: Kernel) -> Conditions:
-        """Return queries as a batch.
+        """Return queries as a batch on the model's device.
 
         Raises:
-            ParameterError: The robot is another one, or numbers are not finite.
+            ParameterError: The robot is not the model's, or numbers are not finite.
         """
         config = self.network.config
         if (kernel.robot.name, kernel.robot.joint_names) != (config.robot, config.joints):
@@ -164,71 +164,72 @@ class TrajectoryModel:
         for query in queries:
             for name, state in (("start", query.start), ("goal", query.goal)):
                 check_array(np.asarray(state, float), (len(config.joints),), name, finite=True)
-            things = query.things
-            numbers = (query.point, things.position, things.turn, things.size)
+            obstacles = query.obstacles
+            numbers = (query.point, obstacles.position, obstacles.rotation, obstacles.size)
             if not all(np.isfinite(values).all() for values in numbers):
                 raise ParameterError("obstacles", "NaN or infinity", "finite positions, rotations and sizes")
-        return batched(queries, self.probes, kernel).to(self.device)
+        return batch_queries(queries, self.probes, kernel).to(self.device)
 
     def _denoised(
         self, queries: Sequence[Query], kernel: Kernel, first: Tensor, top: int, *, sampling: Sampling,
         generator: torch.Generator, callback: Callback | None,
     ) -> Proposals:  # fmt: skip
-        network, clock = self.network, _Clock()
+        """Return the paths that the reverse process makes of noisy latent vectors ``first`` at step ``top``."""
+        network, clock = self.network, _StageClock()
         with torch.no_grad():
-            given, each = self.conditions(queries, kernel), len(first) // len(queries)
-            encoded = network.encoder(given)
+            conditions, each = self.conditions(queries, kernel), len(first) // len(queries)
+            encoded = network.encoder(conditions)
             if len(queries) > 1:
                 encoded = encoded.repeat_interleave(each, dim=0)
-            start, goal = (ends.repeat_interleave(each, dim=0) for ends in (given.start, given.goal))
+            start, goal = (ends.repeat_interleave(each, dim=0) for ends in (conditions.start, conditions.goal))
             clock.lap("condition")
-            if network.regresses:
+            if network.is_regression:
                 zero = torch.zeros_like(first)
-                latent = network.said(zero, torch.zeros(1, dtype=torch.int64, device=zero.device), encoded)
+                latent = network.denoise(zero, torch.zeros(1, dtype=torch.int64, device=zero.device), encoded)
             else:
 
-                def likely(clean: Tensor) -> Tensor:
+                def log_p(clean: Tensor) -> Tensor:
                     return log_likelihood(network.autoencoder, kernel, clean, (start, goal), sampling.guidance)
 
-                def slope(clean: Tensor) -> Tensor:
+                def score(clean: Tensor) -> Tensor:
                     with clock.within("guidance"):
-                        return gradient(likely, clean)
+                        return gradient(log_p, clean)
 
                 most = network.config.noise.most
-                predict = guided(network.predict(encoded), slope, network.schedule, sampling.guidance, most)
-                times = network.schedule.times(sampling.steps, top)
+                predict = guided(network.predict(encoded), score, network.schedule, sampling.guidance, most)
+                times = network.schedule.timesteps(sampling.steps, top)
                 extra: dict[str, Any] = {} if callback is None else {"callback": callback}
                 if sampling.sampler == "ddpm":
                     latent = ddpm(predict, first, network.schedule, times, generator=generator, **extra)
                 else:
                     latent = SAMPLERS[sampling.sampler](predict, first, network.schedule, times, **extra)
             clock.lap("network")
-            found = network.autoencoder.control(latent, start, goal).cpu().double().numpy()
+            control = network.autoencoder.control(latent, start, goal).cpu().double().numpy()
             limits = kernel.robot.arrays
             ends = (np.repeat([getattr(q, name) for q in queries], each, axis=0) for name in ("start", "goal"))
-            found = self.spline.with_ends(np.clip(found, limits.lower, limits.upper), *ends)
+            control = self.spline.with_ends(np.clip(control, limits.lower, limits.upper), *ends)
             clock.lap("decode")
-        return Proposals(found, latent, clock.seconds)
+        return Proposals(control, latent, clock.seconds)
 
 
-class _Clock:
-    """Counts the seconds of stages."""
+class _StageClock:
+    """Seconds by stage."""
 
     def __init__(self) -> None:
         self.seconds = {"condition": 0.0, "network": 0.0, "guidance": 0.0, "decode": 0.0}
         self._last, self._inside = time.perf_counter(), 0.0
 
     def lap(self, stage: str) -> None:
-        """Count what has passed since the last lap to a stage, but for what was counted within."""
+        """Add the time since the last lap to a stage, less what :meth:`within` added to others."""
         now = time.perf_counter()
         self.seconds[stage] += now - self._last - self._inside
         self._last, self._inside = now, 0.0
 
     @contextmanager
     def within(self, stage: str) -> Iterator[None]:
-        """Count the time of a block to a stage inside of the one that the next lap ends."""
-        begin = time.perf_counter()
+        """Add the time of a block to a stage, and not to the one that the next lap ends."""
+        started = time.perf_counter()
         yield
-        passed = time.perf_counter() - begin
+        passed = time.perf_counter() - started
         self.seconds[stage] += passed
         self._inside += passed

@@ -1,4 +1,4 @@
-"""The log of a training run: a CSV file, and TensorBoard's where that is installed."""
+"""Log of a training run: a CSV file, and TensorBoard event files where TensorBoard is installed."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def read_log(folder: Path) -> list[dict[str, str]]:
     """Return the rows of a run's log.
 
     Raises:
-        FileFormatError: It is none.
+        FileFormatError: The file is not a log.
     """
     path = folder / FILE
     if not is_file(path):
@@ -36,10 +36,14 @@ class RunLog:
     """Rows of numbers by phase and step."""
 
     def __init__(self, folder: Path, progress: Mapping[str, int]) -> None:
-        """Go on with the log in a folder, behind the last step of each phase; later rows are forgotten.
+        """Append to the log in a folder; rows beyond the progress of a phase are removed.
+
+        Args:
+            folder: Folder of the run.
+            progress: Last step of each phase.
 
         Raises:
-            FileFormatError: What is there is no log.
+            FileFormatError: The existing file is not a log.
             MissingFileError: It cannot be written.
         """
         self._path = folder / FILE

@@ -1,4 +1,8 @@
-"""Reverse processes: from noise to samples, as plain functions that call back at every step."""
+"""Reverse processes: from noise to samples, as plain functions with a callback at each step.
+
+Notation: z_t is the noisy sample at step t, z_0 and epsilon its clean sample and noise as the network estimates them,
+abar_t the schedule's ``alpha_bar``, s the step that follows t (abar = 1 behind the last one).
+"""
 
 from __future__ import annotations
 
@@ -12,49 +16,56 @@ from apex_ompl.diffusion.schedule import Estimate, NoiseSchedule
 from apex_ompl.errors import ParameterError
 
 Predict = Callable[[Tensor, int], Estimate]
-"""Says of samples of shape (B, ...) at a step what they are made of."""
+"""Denoiser: return the estimated noise and clean samples of noisy samples, shape (B, ...), at a step."""
 
 Callback = Callable[[int, Tensor, Estimate], None]
-"""Called at each step with its number, the noisy samples and what they are made of."""
+"""Called at each step with its number, the noisy samples and the denoiser's estimate."""
 
 
-def _silent(t: int, sample: Tensor, estimate: Estimate) -> None:
+def _no_callback(t: int, sample: Tensor, estimate: Estimate) -> None:
     del t, sample, estimate
 
 
 def ddpm(
     predict: Predict, sample: Tensor, schedule: NoiseSchedule, times: Sequence[int], *,
-    generator: torch.Generator | None = None, callback: Callback = _silent,
+    generator: torch.Generator | None = None, callback: Callback = _no_callback,
 ) -> Tensor:  # fmt: skip
-    """Denoise step by step, with fresh noise at each (ancestral sampling, equation 3; Ho et al. 2020).
+    """Return samples of ancestral sampling, with fresh noise at each step (equation 3 of the paper; Ho et al. 2020).
 
-    The mean is the posterior's, given the clean sample that the network sees; the variance is the posterior's too.
+    The next sample is drawn from the posterior q(z_s | z_t, z_0) = N(mean, variance), with alpha = abar_t / abar_s:
+
+    - mean = (sqrt(abar_s) (1 - alpha) z_0 + sqrt(alpha) (1 - abar_s) z_t) / (1 - abar_t)
+    - variance = (1 - abar_s) / (1 - abar_t) (1 - alpha)
 
     Args:
-        predict: The network.
-        sample: Noisy samples, shape (B, ...).
+        predict: The denoiser.
+        sample: Noisy samples at the first step, shape (B, ...).
         schedule: The noise schedule.
-        times: Steps, falling; all of them in the paper.
+        times: Steps, descending; all of them in the paper.
         generator: Source of the noise.
-        callback: Called at every step.
+        callback: Called at each step.
     """
-    left = schedule.alpha_bar
+    alpha_bars = schedule.alpha_bar
     for t, following in _pairs(times):
         estimate = predict(sample, t)
         callback(t, sample, estimate)
-        now = float(left[t])
-        before = float(left[following]) if following >= 0 else 1.0
-        kept = now / before
-        mean = (before**0.5 * (1.0 - kept) * estimate.clean + kept**0.5 * (1.0 - before) * sample) / (1.0 - now)
-        spread = ((1.0 - before) / (1.0 - now) * (1.0 - kept)) ** 0.5
-        sample = mean + spread * noise_like(sample, generator) if following >= 0 else mean
+        here = float(alpha_bars[t])
+        after = float(alpha_bars[following]) if following >= 0 else 1.0
+        alpha = here / after
+        mean = (after**0.5 * (1.0 - alpha) * estimate.clean + alpha**0.5 * (1.0 - after) * sample) / (1.0 - here)
+        deviation = ((1.0 - after) / (1.0 - here) * (1.0 - alpha)) ** 0.5
+        sample = mean + deviation * noise_like(sample, generator) if following >= 0 else mean
     return sample
 
 
 def ddim(
-    predict: Predict, sample: Tensor, schedule: NoiseSchedule, times: Sequence[int], *, callback: Callback = _silent
-) -> Tensor:
-    """Denoise without fresh noise (Song, Meng and Ermon 2021); arguments as in :func:`ddpm`."""
+    predict: Predict, sample: Tensor, schedule: NoiseSchedule, times: Sequence[int], *,
+    callback: Callback = _no_callback,
+) -> Tensor:  # fmt: skip
+    """Return samples of the deterministic sampler DDIM (Song, Meng and Ermon 2021); arguments as in :func:`ddpm`.
+
+    z_s = sqrt(abar_s) z_0 + sqrt(1 - abar_s) epsilon
+    """
     for t, following in _pairs(times):
         estimate = predict(sample, t)
         callback(t, sample, estimate)
@@ -66,36 +77,43 @@ def ddim(
 
 
 def dpm_solver(
-    predict: Predict, sample: Tensor, schedule: NoiseSchedule, times: Sequence[int], *, callback: Callback = _silent
-) -> Tensor:
-    """Denoise by the second-order multistep solver DPM-Solver++(2M) (Lu et al. 2022); arguments as in :func:`ddpm`.
+    predict: Predict, sample: Tensor, schedule: NoiseSchedule, times: Sequence[int], *,
+    callback: Callback = _no_callback,
+) -> Tensor:  # fmt: skip
+    """Return samples of the second-order multistep solver DPM-Solver++(2M) (Lu et al. 2022).
 
-    The first step, and the last one to the clean sample, are of first order.
+    Arguments are those of :func:`ddpm`. With lambda = log(sqrt(abar) / sqrt(1 - abar)), h = lambda_s - lambda_t, and
+    h' and z_0' those of the step before:
+
+    - D = z_0 + h / (2 h') (z_0 - z_0')
+    - z_s = sigma_s / sigma_t z_t - sqrt(abar_s) (exp(-h) - 1) D
+
+    The first step, and the last one to the clean sample, are of first order (D = z_0).
     """
-    left = schedule.alpha_bar
-    half_logs = (0.5 * (left.log() - (1.0 - left).log())).tolist()
-    last: tuple[float, Tensor] | None = None
+    alpha_bars = schedule.alpha_bar
+    lambdas = (0.5 * (alpha_bars.log() - (1.0 - alpha_bars).log())).tolist()
+    previous: tuple[float, Tensor] | None = None
     for t, following in _pairs(times):
         estimate = predict(sample, t)
         callback(t, sample, estimate)
         if following < 0:
             return estimate.clean
-        step = half_logs[following] - half_logs[t]
+        step = lambdas[following] - lambdas[t]
         clean = estimate.clean
-        if last is not None:
-            clean = clean + step / (2.0 * last[0]) * (clean - last[1])
-        last = step, estimate.clean
+        if previous is not None:
+            clean = clean + step / (2.0 * previous[0]) * (clean - previous[1])
+        previous = step, estimate.clean
         signal, sigma = schedule.scale(following)
         sample = sigma / schedule.scale(t)[1] * sample - signal * math.expm1(-step) * clean
     return sample
 
 
 SAMPLERS = {"ddpm": ddpm, "ddim": ddim, "dpm_solver": dpm_solver}
-"""By name."""
+"""Samplers by name."""
 
 
 def noise_like(sample: Tensor, generator: torch.Generator | None) -> Tensor:
-    """Return standard normal numbers of a sample's shape; drawn on the generator's device, so that they repeat."""
+    """Return standard normal noise of a sample's shape; drawn on the generator's device, so that it is reproducible."""
     device = generator.device if generator is not None else sample.device
     return torch.randn(sample.shape, generator=generator, device=device, dtype=sample.dtype).to(sample.device)
 
@@ -104,9 +122,9 @@ def _pairs(times: Sequence[int]) -> list[tuple[int, int]]:
     """Return each step with the one that follows, -1 behind the last.
 
     Raises:
-        ParameterError: They do not fall.
+        ParameterError: The steps do not descend.
     """
     chain = [*times, -1]
     if any(a <= b for a, b in zip(chain, chain[1:], strict=False)):
-        raise ParameterError("times", list(times), "steps that fall, none below 0")
+        raise ParameterError("times", list(times), "descending steps, none below 0")
     return list(zip(chain[:-1], chain[1:], strict=True))

@@ -1,4 +1,7 @@
-"""The noise schedule of Gaussian diffusion (equation 2 of the paper), and what a network predicts."""
+"""Noise schedule of Gaussian diffusion (equation 2 of the paper), and the quantity that a network predicts.
+
+q(z_t | z_0) = N(sqrt(abar_t) z_0, (1 - abar_t) I), so z_t = sqrt(abar_t) z_0 + sqrt(1 - abar_t) epsilon.
+"""
 
 from __future__ import annotations
 
@@ -15,15 +18,15 @@ from apex_ompl.util.validation import check_integer
 
 SCHEDULES = ("cosine", "linear")
 PREDICTIONS = ("noise", "velocity", "clean")
-MOST_NOISE = 0.999  # of a step of the cosine schedule, as its authors cap it
+MAX_BETA = 0.999  # largest variance of a step, as Nichol and Dhariwal (2021) cap it
 
 
 class Estimate(NamedTuple):
-    """What a noisy sample is made of, as the network sees it.
+    """Noise and clean sample of a noisy sample, as a network estimates them.
 
     Attributes:
-        noise: The noise in it, of the sample's shape.
-        clean: The sample without it.
+        noise: Noise epsilon, of the sample's shape.
+        clean: Clean sample z_0, of the sample's shape.
     """
 
     noise: Tensor
@@ -32,10 +35,11 @@ class Estimate(NamedTuple):
 
 @dataclass(frozen=True)
 class NoiseSchedule:
-    """How much of a sample is left at each of T steps of noising, t = 0 ... T - 1.
+    """Noise schedule of T steps, t = 0 ... T - 1.
 
-    ``linear`` is that of Ho et al. (2020), its variances scaled so that T steps reach what their 1000 reach; ``cosine``
-    that of Nichol and Dhariwal (2021).
+    ``linear`` is that of Ho et al. (2020): beta from 1e-4 to 0.02, times 1000 / T, so that T steps add the noise of
+    their 1000. ``cosine`` is that of Nichol and Dhariwal (2021): abar(u) proportional to
+    cos^2((u + 0.008) / 1.008 * pi / 2), u = t / T.
 
     Attributes:
         steps: Number of steps T.
@@ -58,42 +62,43 @@ class NoiseSchedule:
 
     @cached_property
     def betas(self) -> Tensor:
-        """Variance of the noise that each step adds, shape (steps,), float64."""
+        """Variances beta_t of the noise that each step adds, shape (steps,), float64."""
         if self.kind == "linear":
             scale = 1000.0 / self.steps
-            return torch.linspace(1e-4 * scale, 0.02 * scale, self.steps, dtype=torch.float64).clamp(max=MOST_NOISE)
+            return torch.linspace(1e-4 * scale, 0.02 * scale, self.steps, dtype=torch.float64).clamp(max=MAX_BETA)
         at = torch.arange(self.steps + 1, dtype=torch.float64) / self.steps
-        left = torch.cos((at + 0.008) / 1.008 * math.pi / 2) ** 2
-        return (1.0 - left[1:] / left[:-1]).clamp(max=MOST_NOISE)
+        alpha_bar = torch.cos((at + 0.008) / 1.008 * math.pi / 2) ** 2
+        return (1.0 - alpha_bar[1:] / alpha_bar[:-1]).clamp(max=MAX_BETA)
 
     @cached_property
     def alpha_bar(self) -> Tensor:
-        """Share of the sample's variance that is left at each step, shape (steps,), float64."""
+        """Products abar_t of 1 - beta up to each step, shape (steps,), float64."""
         return torch.cumprod(1.0 - self.betas, dim=0)
 
     def scales(self, t: Tensor, like: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the factors of sample and noise at steps (B,), to be multiplied with tensors like ``like``."""
-        left = self.alpha_bar[t.to(self.alpha_bar.device)]
-        left = left.reshape(*left.shape, *[1] * (like.ndim - left.ndim))
-        return left.sqrt().to(like), (1.0 - left).sqrt().to(like)
+        """Return sqrt(abar_t) and sqrt(1 - abar_t) at steps (B,), in a shape that multiplies tensors like ``like``."""
+        alpha_bar = self.alpha_bar[t.to(self.alpha_bar.device)]
+        alpha_bar = alpha_bar.reshape(*alpha_bar.shape, *[1] * (like.ndim - alpha_bar.ndim))
+        return alpha_bar.sqrt().to(like), (1.0 - alpha_bar).sqrt().to(like)
 
     def scale(self, t: int) -> tuple[float, float]:
-        """Return the factors of sample and noise at one step."""
+        """Return sqrt(abar_t) and sqrt(1 - abar_t) at one step."""
         return self._scales[t]
 
     @cached_property
     def _scales(self) -> list[tuple[float, float]]:
         return list(zip(self.alpha_bar.sqrt().tolist(), (1.0 - self.alpha_bar).sqrt().tolist(), strict=True))
 
-    def noisy(self, clean: Tensor, noise: Tensor, t: Tensor | int) -> Tensor:
-        """Return samples with noise in them (equation 2): one step for all, or shape (B,) for one each."""
+    def add_noise(self, clean: Tensor, noise: Tensor, t: Tensor | int) -> Tensor:
+        """Return noisy samples sqrt(abar_t) z_0 + sqrt(1 - abar_t) epsilon (equation 2) at one step, or at (B,)."""
         signal, sigma = self.scale(t) if isinstance(t, int) else self.scales(t, clean)
         return signal * clean + sigma * noise
 
     def target(self, prediction: str, clean: Tensor, noise: Tensor, t: Tensor) -> Tensor:
-        """Return what a network learns to say of noisy samples: the noise (equation 5), the velocity or the sample.
+        """Return what a network is trained to predict of noisy samples.
 
-        The velocity is that of Salimans and Ho (2022).
+        ``noise`` is epsilon (equation 5), ``clean`` is z_0, and ``velocity`` is v = sqrt(abar_t) epsilon -
+        sqrt(1 - abar_t) z_0 (Salimans and Ho 2022).
         """
         if prediction == "noise":
             return noise
@@ -102,32 +107,32 @@ class NoiseSchedule:
         signal, sigma = self.scales(t, clean)
         return signal * noise - sigma * clean
 
-    def estimate(self, prediction: str, sample: Tensor, said: Tensor, t: int) -> Estimate:
-        """Return noise and clean sample from what a network says of a noisy one."""
+    def estimate(self, prediction: str, sample: Tensor, output: Tensor, t: int) -> Estimate:
+        """Return noise and clean sample from a network's output for a noisy sample; inverts :meth:`target`."""
         signal, sigma = self.scale(t)
         if prediction == "noise":
-            return Estimate(said, (sample - sigma * said) / signal)
+            return Estimate(output, (sample - sigma * output) / signal)
         if prediction == "clean":
-            return Estimate((sample - signal * said) / sigma, said)
-        return Estimate(sigma * sample + signal * said, signal * sample - sigma * said)
+            return Estimate((sample - signal * output) / sigma, output)
+        return Estimate(sigma * sample + signal * output, signal * sample - sigma * output)
 
-    def clipped(self, found: Estimate, sample: Tensor, t: int, most: float | None) -> Estimate:
-        """Return an estimate whose clean sample is at most ``most``, and whose noise fits it where that changed it."""
+    def clipped(self, estimate: Estimate, sample: Tensor, t: int, most: float | None) -> Estimate:
+        """Return an estimate with its clean sample clipped to [-most, most], and the noise recomputed where it was."""
         if most is None:
-            return found
+            return estimate
         signal, sigma = self.scale(t)
-        clean = found.clean.clamp(-most, most)
-        return Estimate(torch.where(clean == found.clean, found.noise, (sample - signal * clean) / sigma), clean)
+        clean = estimate.clean.clamp(-most, most)
+        return Estimate(torch.where(clean == estimate.clean, estimate.noise, (sample - signal * clean) / sigma), clean)
 
-    def times(self, count: int, first: int | None = None) -> list[int]:
-        """Return ``count`` steps at which to denoise, evenly from ``first`` down ("trailing", Lin et al. 2024).
+    def timesteps(self, count: int, first: int | None = None) -> list[int]:
+        """Return ``count`` denoising steps, evenly spaced from ``first`` down ("trailing" spacing, Lin et al. 2024).
 
         Args:
-            count: How many, at most first + 1.
-            first: The noisiest; by default the last of the schedule.
+            count: Number of steps, at most ``first`` + 1.
+            first: The noisiest step; by default T - 1.
 
         Raises:
-            ParameterError: There are not as many, or no such step.
+            ParameterError: There are fewer steps, or no such step.
         """
         top = self.steps - 1 if first is None else first
         check_integer(top, "first step", 0, self.steps - 1)

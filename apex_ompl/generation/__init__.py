@@ -1,1 +1,1 @@
-"""Training data made from drawn problems."""
+"""Generation of training data: units of work, their problems, and the solving of those with OMPL and meshes."""

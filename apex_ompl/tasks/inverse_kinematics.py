@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from apex_ompl.collision.tabulate import joint_specs
 from apex_ompl.errors import UnknownNameError
-from apex_ompl.kernel import FixedVector, IKSolver, Target
+from apex_ompl.kernel import FixedVector, IKSolver, RobotTables, Target
 from apex_ompl.kernel.compiled.arrays import FIXED
 from apex_ompl.kernel.robot_builder import robot_tables, turn_to
 from apex_ompl.robot import Robot

@@ -15,14 +15,15 @@ from tqdm import tqdm
 
 from apex_ompl import problems
 from apex_ompl.apex.query import make_query
-from apex_ompl.datasets.engine import Options
+from apex_ompl.datasets.engine import EngineOptions
 from apex_ompl.datasets.records import SOURCES, Paths
 from apex_ompl.datasets.store import Store
 from apex_ompl.diffusion.autoencoder import Autoencoder
 from apex_ompl.diffusion.checkpoint import load_model
 from apex_ompl.diffusion.guidance import Guidance
 from apex_ompl.diffusion.proposals import Sampling
-from apex_ompl.generation.worker import plan_units, work
+from apex_ompl.generation.solving import solve_unit
+from apex_ompl.generation.units import plan_units
 from apex_ompl.ompl_adapter.process import quiet_ompl
 from apex_ompl.ompl_adapter.setup import assemble
 from apex_ompl.problems.suite_robot import robot
@@ -32,13 +33,13 @@ from apex_ompl.util.cluster import spread
 
 MODELS = ("apex", "apex-paper")
 STEPS = 8  # of DDIM, for apex-paper, whose own 256 would take hours
-PART = 50  # problems that a worker takes at once
+BATCH = 50  # problems of a job
 
 load = cache(load_model)  # once in a process
 
 
 def variants() -> dict[str, tuple[str, Sampling]]:
-    """Return what makes paths: a model and how it is sampled, guided and not."""
+    """Return the variants by label: a model and its sampling, guided and unguided."""
     own = {"apex": load("apex").sampling, "apex-paper": Sampling("ddim", STEPS)}
     return {
         f"{name}{'' if guided else ', unguided'}": (name, replace(own[name], guidance=Guidance(gamma=float(guided))))
@@ -50,14 +51,14 @@ def variants() -> dict[str, tuple[str, Sampling]]:
 def solutions(folder: Path, count: int, levels: Sequence[str], workers: int) -> list[Paths]:
     """Return solutions of validation problems, at least ``count`` where as many can be had, kept in a folder."""
     units = {unit.name: unit for unit in plan_units(int(1.2 * count), levels, "validation")}
-    options, spline = Options(copies=1, parts=0), Spline()
+    options, spline = EngineOptions(copies=1, parts=0), Spline()
     settings = {"problems": count, "levels": list(levels), **asdict(spline)}
     store = Store.create(folder, settings, ("problems", "levels"))
     with store.locked():
         there = set(store.units())
         jobs = {name: (unit, options, spline) for name, unit in units.items() if name not in there}
         if jobs:
-            made = spread(work, jobs, workers=workers, address=None)
+            made = spread(solve_unit, jobs, workers=workers, address=None)
             for name, (paths, _) in tqdm(made, total=len(jobs), unit="unit"):
                 store.write(name, paths)
         return list(store)
@@ -66,7 +67,7 @@ def solutions(folder: Path, count: int, levels: Sequence[str], workers: int) -> 
 def made_for(
     units: Sequence[Paths], count: int, workers: int
 ) -> tuple[list[Array], dict[str, list[Array]], dict[str, float]]:
-    """Return the first solution of each of ``count`` problems, and what each variant makes of the same problems.
+    """Return the first solution of each of ``count`` problems, and the paths of each variant for the same problems.
 
     Returns:
         The solutions, those of all levels in turn; by variant, paths in the same order, as control points; and the CPU
@@ -79,7 +80,7 @@ def made_for(
             by_level.setdefault(name.rsplit("/", 1)[0], []).append((name, unit.control(slice(k, k + 1))[0]))
     in_turn = (one for some in zip_longest(*by_level.values()) for one in some if one is not None)
     picked = list(islice(in_turn, count))
-    jobs = {str(k): (picked[k : k + PART], k) for k in range(0, len(picked), PART)}
+    jobs = {str(k): (picked[k : k + BATCH], k) for k in range(0, len(picked), BATCH)}
     found = dict(tqdm(spread(propose, jobs, workers=workers, address=None), total=len(jobs), unit="part"))
     paths: dict[str, list[Array]] = {label: [] for label in variants()}
     seconds = dict.fromkeys(paths, 0.0)

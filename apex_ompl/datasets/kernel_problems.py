@@ -1,7 +1,8 @@
-"""Problems as the kernel knows them, for machines without Pinocchio, Coal and OMPL.
+"""Problems as tables of the kernel, to be solved on machines without Pinocchio, Coal and OMPL.
 
-They are written where those are, and solved anywhere from the straight line and from bumps; what the spheres prove is
-kept. Parts of paths need Coal for the obstacle point at their start, and are left out.
+They are written on a machine that has those (:mod:`apex_ompl.generation.records`), and solved from the straight line
+and from random bumps; paths that the sphere cover proves free are kept. Rests of paths are left out: the obstacle point
+at their start needs Coal.
 """
 
 from __future__ import annotations
@@ -19,8 +20,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apex_ompl.datasets.engine import RECIPES, Case, Engine, Options, Row
-from apex_ompl.datasets.records import SHAPES, Paths
+from apex_ompl.datasets.engine import STRATEGIES, Engine, EngineOptions, ProblemRecord
+from apex_ompl.datasets.path_finder import PathFinder
+from apex_ompl.datasets.records import SHAPES, ObstacleRecord, Paths
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError
 from apex_ompl.kernel import Kernel, RobotTables
 from apex_ompl.kernel.compiled.arrays import SceneArrays
@@ -34,17 +36,17 @@ SCHEMA = "apex-ompl/cases/1"
 
 
 @dataclass(frozen=True, eq=False)
-class WrittenCase:
-    """A problem to be solved elsewhere.
+class KernelProblem:
+    """A problem as tables of the kernel.
 
     Attributes:
-        unit: Name of the unit of work that it belongs to.
+        unit: Name of its unit of work.
         suite: Its suite.
         level: Its level.
-        recipe: How it is solved, see ``apex_ompl.datasets.engine.RECIPES``.
-        row: What is written of it.
-        robot: The robot, with what it holds.
-        scene: The obstacles, fixtures among them.
+        strategy: How it is solved, a key of ``apex_ompl.datasets.engine.STRATEGIES``.
+        record: Its record in a data set.
+        robot: The robot with the held objects.
+        scene: The obstacles, fixtures included.
         start: Shape (dof,) [rad].
         goal: Shape (dof,) [rad].
         points: Obstacle points nearest to the robot at start and goal, shape (2, 3) [m].
@@ -53,8 +55,8 @@ class WrittenCase:
     unit: str
     suite: str
     level: str
-    recipe: str
-    row: Row
+    strategy: str
+    record: ProblemRecord
     robot: RobotTables
     scene: SceneTables
     start: Array
@@ -62,36 +64,37 @@ class WrittenCase:
     points: Array
 
 
-def save_cases(folder: str | os.PathLike[str], cases: Sequence[WrittenCase]) -> None:
-    """Write problems into a folder: ``tables-K.npz``, and last ``cases.npz``.
+def save_kernel_problems(folder: str | os.PathLike[str], problems: Sequence[KernelProblem]) -> None:
+    """Write problems into a folder: ``tables-K.npz`` with robots, then ``cases.npz``.
 
     Raises:
         MissingFileError: The folder cannot be written.
         ParameterError: There are no problems.
     """
     folder = Path(folder)
-    if not cases:
+    if not problems:
         raise ParameterError("cases", 0, "one problem or more")
     make_folder(folder, "folder for problems")
     tables: list[RobotTables] = []
     head: list[dict[str, object]] = []
-    for case in cases:
-        if not any(case.robot is known for known in tables):
-            tables.append(case.robot)
-        number = next(k for k, known in enumerate(tables) if known is case.robot)
-        things = [[shape, *map(list, numbers)] for shape, *numbers in case.row.things]
-        names = {"unit": case.unit, "suite": case.suite, "level": case.level, "recipe": case.recipe}
-        head.append({**names, "seed": case.row.seed, "held": case.row.held, "things": things, "tables": number})
+    for problem in problems:
+        if not any(problem.robot is known for known in tables):
+            tables.append(problem.robot)
+        number = next(k for k, known in enumerate(tables) if known is problem.robot)
+        record = problem.record
+        things = [[shape, *map(list, numbers)] for shape, *numbers in record.obstacles]
+        names = {"unit": problem.unit, "suite": problem.suite, "level": problem.level, "recipe": problem.strategy}
+        head.append({**names, "seed": record.seed, "held": record.held, "things": things, "tables": number})
     digests = []
     for k, known in enumerate(tables):
         known.save(folder / f"tables-{k}.npz")
         digests.append(hashlib.sha256((folder / f"tables-{k}.npz").read_bytes()).hexdigest())
     arrays: dict[str, Any] = {
-        "start": np.stack([c.start for c in cases]), "goal": np.stack([c.goal for c in cases]),
-        "points": np.stack([c.points for c in cases]),
+        "start": np.stack([p.start for p in problems]), "goal": np.stack([p.goal for p in problems]),
+        "points": np.stack([p.points for p in problems]),
     }  # fmt: skip
     for name in SceneArrays._fields:
-        columns = [getattr(c.scene.arrays, name) for c in cases]
+        columns = [getattr(p.scene.arrays, name) for p in problems]
         arrays[name], arrays[f"{name}_count"] = np.concatenate(columns), np.array([len(c) for c in columns])
     stream = io.BytesIO()
     np.savez_compressed(
@@ -100,8 +103,8 @@ def save_cases(folder: str | os.PathLike[str], cases: Sequence[WrittenCase]) -> 
     write_atomically(folder / "cases.npz", stream.getvalue())
 
 
-def load_cases(folder: str | os.PathLike[str]) -> list[WrittenCase]:
-    """Read problems that :func:`save_cases` wrote; needs NumPy and numba alone.
+def load_kernel_problems(folder: str | os.PathLike[str]) -> list[KernelProblem]:
+    """Read problems that :func:`save_kernel_problems` wrote; needs only NumPy and numba.
 
     Raises:
         MissingFileError: A file cannot be read.
@@ -123,10 +126,10 @@ def load_cases(folder: str | os.PathLike[str]) -> list[WrittenCase]:
     try:
         head = about["cases"]
         scenes = _scenes(arrays, len(head))
-        rows = [Row(int(h["seed"]), str(h["held"]), [_thing(t) for t in h["things"]]) for h in head]
+        records = [ProblemRecord(int(h["seed"]), str(h["held"]), [_obstacle(t) for t in h["things"]]) for h in head]
         names = [(str(h["unit"]), str(h["suite"]), str(h["level"]), str(h["recipe"])) for h in head]
         numbers = [int(h["tables"]) for h in head]
-        if not head or not all(_sound(name) for name in names) or min(numbers) < 0 or max(numbers) >= len(head):
+        if not head or not all(_is_sound(name) for name in names) or min(numbers) < 0 or max(numbers) >= len(head):
             raise ValueError
         digests = about["tables"]
         tables = [_tables(path.parent / f"tables-{k}.npz", digests[k]) for k in range(max(numbers) + 1)]
@@ -140,14 +143,19 @@ def load_cases(folder: str | os.PathLike[str]) -> list[WrittenCase]:
     except (AttributeError, IndexError, KeyError, OverflowError, TypeError, ValueError) as error:
         expected = "expected problems that fit each other"
         raise FileFormatError(str(path), str(error), "values that do not fit", expected) from error
-    places = zip(start, goal, points, strict=True)
+    states = zip(start, goal, points, strict=True)
     return [
-        WrittenCase(*name, row, tables[number], scene, *place)
-        for name, row, number, scene, place in zip(names, rows, numbers, scenes, places, strict=True)
+        KernelProblem(*name, record, tables[number], scene, *ends)
+        for name, record, number, scene, ends in zip(names, records, numbers, scenes, states, strict=True)
     ]
 
 
 def _scenes(arrays: dict[str, NDArray[Any]], count: int) -> list[SceneTables]:
+    """Return the scenes whose concatenated arrays a file holds.
+
+    Raises:
+        ValueError: They do not fit each other.
+    """
     columns = {}
     for name in SceneArrays._fields:
         counts = arrays[f"{name}_count"]
@@ -164,20 +172,30 @@ def _scenes(arrays: dict[str, NDArray[Any]], count: int) -> list[SceneTables]:
     return [SceneTables(scene) for scene in made]
 
 
-def _sound(name: Sequence[str]) -> bool:
-    """Whether names can be those of a unit of work, which become names of files, and its recipe is known."""
-    return all(re.fullmatch(r"[A-Za-z0-9_-]{1,80}", part) for part in name) and name[3] in RECIPES
+def _is_sound(name: Sequence[str]) -> bool:
+    """Whether unit, suite and level can be part of a file's name, and the strategy is known."""
+    return all(re.fullmatch(r"[A-Za-z0-9_-]{1,80}", part) for part in name) and name[3] in STRATEGIES
 
 
-def _thing(numbers: Sequence[Any]) -> tuple[int, list[float], list[float], list[float]]:
-    shape, place, turn, size = numbers
-    found = int(shape), [float(v) for v in place], [float(v) for v in turn], [float(v) for v in size]
+def _obstacle(numbers: Sequence[Any]) -> ObstacleRecord:
+    """Return an obstacle from the lists of a file.
+
+    Raises:
+        ValueError: They are not those of an obstacle.
+    """
+    shape, position, orientation, size = numbers
+    found = int(shape), [float(v) for v in position], [float(v) for v in orientation], [float(v) for v in size]
     if not 0 <= found[0] < len(SHAPES) or [len(v) for v in found[1:]] != [3, 4, 3]:
         raise ValueError("things")
     return found
 
 
 def _tables(path: Path, digest: str) -> RobotTables:
+    """Return the robot of a file.
+
+    Raises:
+        FileFormatError: The file is not the one that the problems were written with.
+    """
     tables = RobotTables.load(path)
     if hashlib.sha256(path.read_bytes()).hexdigest() != digest:
         raise FileFormatError(
@@ -186,16 +204,19 @@ def _tables(path: Path, digest: str) -> RobotTables:
     return tables
 
 
-def work_cases(cases: Sequence[WrittenCase], options: Options, spline: Spline) -> tuple[Paths, dict[str, float]]:
+def solve_kernel_problems(
+    problems: Sequence[KernelProblem], options: EngineOptions, spline: Spline
+) -> tuple[Paths, dict[str, float]]:
     """Solve the problems of one unit of work; the same arguments give the same paths.
 
     Returns:
-        The paths, and where the time went [s].
+        The paths, and the time by stage [s].
     """
-    first = cases[0]
-    engine = Engine(first.unit, (first.suite, first.level), first.recipe, options, spline)
-    for case in cases:
-        task = Case(Kernel(case.robot, case.scene), case.start, case.goal, engine.optimizer)
-        task.points = {q.tobytes(): p for q, p in zip((case.start, case.goal), case.points, strict=True)}
-        engine.solve(task, case.row)
+    first = problems[0]
+    engine = Engine(first.unit, (first.suite, first.level), first.strategy, options, spline)
+    for problem in problems:
+        start, goal = problem.start, problem.goal
+        finder = PathFinder(Kernel(problem.robot, problem.scene), start, goal, engine.optimizer)
+        finder.points = {q.tobytes(): p for q, p in zip((start, goal), problem.points, strict=True)}
+        engine.solve(finder, problem.record)
     return engine.paths(first.robot.name, first.robot.joint_names), engine.times

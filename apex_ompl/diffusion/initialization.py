@@ -1,0 +1,37 @@
+"""Model at the start of a training run."""
+
+from __future__ import annotations
+
+import torch
+
+from apex_ompl.diffusion.autoencoder import LinearLatent
+from apex_ompl.diffusion.config import TrainingConfig
+from apex_ompl.diffusion.data import TrainingData
+from apex_ompl.diffusion.model import LatentDiffusion, ModelConfig, SplineConfig
+from apex_ompl.kernel import RobotTables
+
+
+def initial_network(config: TrainingConfig, data: TrainingData, robot: RobotTables) -> LatentDiffusion:
+    """Return a model with random weights, with the robot's limits and probe points, and a fitted linear latent space.
+
+    Args:
+        config: Configuration of the run; the same seed gives the same weights.
+        data: Training data.
+        robot: Kernel tables of the robot.
+    """
+    probes = data.probes
+    model = ModelConfig(
+        robot=robot.name, joints=robot.joint_names, probes=len(probes.joint), spline=SplineConfig(**data.spline),
+        latent=config.latent, condition=config.condition, denoiser=config.denoiser, noise=config.noise,
+        sampling=config.sampling,
+    )  # fmt: skip
+    with torch.random.fork_rng(devices=[]):  # torch's layers initialize their weights from the global generator
+        torch.manual_seed(config.seed)
+        network = LatentDiffusion(model)
+    network.probe_joint.copy_(torch.from_numpy(probes.joint))
+    network.probe_offset.copy_(torch.from_numpy(probes.offset))
+    limits = (torch.tensor(v, dtype=torch.float32) for v in (robot.arrays.lower, robot.arrays.upper))
+    network.encoder.set_limits(*limits)
+    if isinstance(network.autoencoder, LinearLatent):
+        network.autoencoder.fit(data.statistics_sample())
+    return network

@@ -1,0 +1,69 @@
+"""Records of problems: as data sets hold them, and as tables of the kernel."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from apex_ompl import problems
+from apex_ompl.datasets.engine import ProblemRecord
+from apex_ompl.datasets.kernel_problems import KernelProblem
+from apex_ompl.datasets.records import SHAPES, ObstacleRecord
+from apex_ompl.errors import UnknownNameError
+from apex_ompl.generation.units import Unit
+from apex_ompl.ompl_adapter.process import quiet_ompl
+from apex_ompl.ompl_adapter.setup import assemble
+from apex_ompl.problems.generator import SuiteError
+from apex_ompl.problems.suite_robot import robot
+from apex_ompl.scene.bodies import Obstacle
+from apex_ompl.scene.problem import Problem
+
+
+def kernel_problems(unit: Unit) -> list[KernelProblem]:
+    """Return the problems of a unit as tables of the kernel, for machines without Pinocchio, Coal and OMPL."""
+    found = []
+    with quiet_ompl():
+        for seed in unit.seeds:
+            try:
+                problem = problems.load(f"{unit.suite}/{unit.level}/{seed}")
+            except SuiteError:
+                continue
+            setup = assemble(problem, robot())
+            kernel, start, goal = setup.checker.kernel, setup.start, setup.goals[0]
+            points = np.stack([setup.checker.obstacle_point(start), setup.checker.obstacle_point(goal)])
+            names, record = (unit.name, unit.suite, unit.level, unit.strategy), problem_record(problem, seed)
+            found.append(KernelProblem(*names, record, kernel.robot, kernel.scene, start, goal, points))
+    return found
+
+
+def problem_record(problem: Problem, seed: int) -> ProblemRecord:
+    """Return the record of a problem in a data set; held meshes are named by their files, without folders."""
+    bodies = [h.model_dump(mode="json", exclude_defaults=True) for h in problem.attached]
+    for body in bodies:
+        if "mesh" in body:
+            body["mesh"]["file"] = Path(body["mesh"]["file"]).name
+    held = json.dumps(bodies)
+    return ProblemRecord(seed, held, [_obstacle_record(obstacle) for obstacle in problem.scene])
+
+
+def _obstacle_record(obstacle: Obstacle) -> ObstacleRecord:
+    """Return shape index, position, orientation and size of an obstacle.
+
+    Raises:
+        UnknownNameError: The obstacle is a mesh or a half-space.
+    """
+    if obstacle.box is not None:
+        size: Sequence[float] = obstacle.box
+        kind = "box"
+    elif obstacle.sphere is not None:
+        size, kind = (obstacle.sphere.radius, 0.0, 0.0), "sphere"
+    elif obstacle.cylinder is not None:
+        size, kind = (obstacle.cylinder.radius, obstacle.cylinder.length, 0.0), "cylinder"
+    elif obstacle.capsule is not None:
+        size, kind = (obstacle.capsule.radius, obstacle.capsule.length, 0.0), "capsule"
+    else:
+        raise UnknownNameError("shape of an obstacle in a data set", "mesh or half_space", SHAPES)
+    return SHAPES.index(kind), obstacle.position, obstacle.orientation, size
