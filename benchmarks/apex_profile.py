@@ -29,7 +29,8 @@ from apex_ompl.benchmark.summary import Statistics
 from apex_ompl.planners import apex_parameters
 from apex_ompl.planners.apex_parameters import ApexParameters
 from apex_ompl.result import FIRST, INSIDE
-from apex_ompl.trajopt.optimizer import Optimizer, Settings
+from apex_ompl.trajopt.optimizer import Optimizer
+from apex_ompl.trajopt.settings import OptimizerSettings
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import one_or_more
 
@@ -69,7 +70,7 @@ def run_variant(job: Job) -> Run:
     def build_variant(self: ApexParameters, si: ob.SpaceInformation) -> ob.Planner:
         planner = build(self, si)
         if samples is not None:
-            planner.optimizer = Optimizer(planner.model.spline, Settings(samples=samples))
+            planner.optimizer = Optimizer(planner.model.spline, OptimizerSettings(samples=samples))
         return planner
 
     factors = apex_parameters.SPRINT_FACTORS if later_sprints else (1, 0, 0)

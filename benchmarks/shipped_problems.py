@@ -43,9 +43,12 @@ def plan_with_checker(job: Job) -> Run:
     """Return the columns of a run with one of the checkers; ``path`` is a digest of the path."""
     checker = partial(CollisionChecker, proofs=job.params["proofs"])
     with mock.patch.object(setup, "CollisionChecker", checker):
-        planning, result = runs.planned(replace(job, params={}, runner=""))
-        found = runs.columns(planning, result)
-    return {**found, "path": "" if result.path is None else hashlib.sha256(result.path.tobytes()).hexdigest()[:16]}
+        planning, experiment, result = runs.planned(replace(job, params={}, runner=""))
+        found = runs.columns(planning, experiment, result)
+    return {
+        **found,
+        "path": "" if result.path is None else hashlib.sha256(result.path.states.tobytes()).hexdigest()[:16],
+    }
 
 
 def label(planner: str, checker: str) -> str:

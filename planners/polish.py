@@ -18,8 +18,9 @@ from apex_ompl.ompl_adapter.simplify import simplify
 from apex_ompl.ompl_adapter.space import array_to_path, path_to_array
 from apex_ompl.ompl_adapter.validity import StateValidityChecker
 from apex_ompl.planners.registry import Parameters, bounded, register
-from apex_ompl.trajopt.optimizer import Optimizer, Settings
+from apex_ompl.trajopt.optimizer import Optimizer
 from apex_ompl.trajopt.path import Path
+from apex_ompl.trajopt.settings import OptimizerSettings
 from apex_ompl.trajopt.spline import Spline
 from apex_ompl.types import Array
 from apex_ompl.util.resolution import FULL_RESOLUTION
@@ -151,7 +152,9 @@ class RRTConnectPolish(Parameters):
         if not isinstance(validity_checker, StateValidityChecker):
             expected = "apex_ompl's StateValidityChecker, as apex_ompl.setup sets it"
             raise ParameterError(f"state validity checker for {NAME}", type(validity_checker).__name__, expected)
-        settings = Settings(scene_margin=self.scene_margin, own_margin=self.own_margin, stiffness=self.stiffness)
+        settings = OptimizerSettings(
+            scene_margin=self.scene_margin, own_margin=self.own_margin, stiffness=self.stiffness
+        )
         optimizer = Optimizer(Spline(self.control_points, self.pinned), settings)
         optimizer.prepare(validity_checker.checker.kernel)
         inner = og.RRTConnect(si)

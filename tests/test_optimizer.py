@@ -10,8 +10,9 @@ from apex_ompl.ompl_adapter.setup import PlanningSetup, assemble
 from apex_ompl.ompl_adapter.validity import full_check
 from apex_ompl.robot import Robot
 from apex_ompl.trajopt.candidates import CandidatePool, first_valid
-from apex_ompl.trajopt.optimizer import Optimizer, Settings
+from apex_ompl.trajopt.optimizer import Optimizer
 from apex_ompl.trajopt.path import path_length
+from apex_ompl.trajopt.settings import OptimizerSettings
 from apex_ompl.trajopt.spline import Spline
 from apex_ompl.util.resolution import FULL_RESOLUTION
 
@@ -31,7 +32,7 @@ def random_paths(ready: PlanningSetup, spline: Spline, count: int, size: float =
 @pytest.mark.parametrize("name", ["wall/easy/5", "vertical/large/3"])
 def test_the_gradient_is_that_of_finite_differences(robot: Robot, spline: Spline, name: str) -> None:
     ready = assemble(problems.load(name), robot)
-    optimizer = Optimizer(spline, Settings(samples=40, stiffness=2e-3))
+    optimizer = Optimizer(spline, OptimizerSettings(samples=40, stiffness=2e-3))
     kernel = ready.checker.kernel
     for control in random_paths(ready, spline, 2):
         about, gradient = optimizer.evaluate(kernel, control)
@@ -50,11 +51,11 @@ def test_the_cost_is_what_it_says(robot: Robot) -> None:
     spline = Spline()
     free = assemble(problems.load("broad/free/3"), robot)
     line = spline.line(free.start, free.goals[0])
-    tight = Optimizer(spline, Settings(scene_margin=1e-6, own_margin=1e-6, stiffness=1.0))
+    tight = Optimizer(spline, OptimizerSettings(scene_margin=1e-6, own_margin=1e-6, stiffness=1.0))
     about, _ = tight.evaluate(free.checker.kernel, line)
     length = path_length(spline.path(line))
     assert about.cost[0] - about.clearance_cost[0] == pytest.approx(0.5 * length**2, rel=1e-6)
-    wide = Optimizer(spline, Settings(samples=50, scene_margin=5.0, own_margin=5.0))
+    wide = Optimizer(spline, OptimizerSettings(samples=50, scene_margin=5.0, own_margin=5.0))
     about, _ = wide.evaluate(free.checker.kernel, line)
     states = spline.basis((np.arange(50) + 0.5) / 50) @ line
     np.testing.assert_allclose(about.clearance[0], free.checker.kernel.clearance(states, 5.0).min(axis=0), atol=1e-9)
@@ -183,7 +184,7 @@ def test_starts_begin_with_the_line_and_stray_as_asked(ready: PlanningSetup) -> 
 )  # fmt: skip
 def test_settings_out_of_range_are_named(name: str, value: object) -> None:
     with pytest.raises(ParameterError, match=name):
-        Settings(**{name: value})
+        OptimizerSettings(**{name: value})
 
 
 def test_faults_of_control_points_are_named(ready: PlanningSetup) -> None:

@@ -8,6 +8,7 @@ import torch
 from support import DATA, ROOT, needs
 
 from apex_ompl import load_model
+from apex_ompl.datasets.kernel_problems import load_kernel_problems
 from apex_ompl.datasets.store import load
 from apex_ompl.diffusion.checkpoint import SHIPPED, shipped
 from apex_ompl.diffusion.proposals import Sampling

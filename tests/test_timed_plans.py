@@ -55,8 +55,8 @@ def test_a_grazing_path_that_can_be_neither_repaired_nor_timed_is_no_success(mon
         finely = len(args) == 3 and args[2] == MOTION_RESOLUTION
         return replace(found, ok=False, reason="it grazes", segment=0) if finely else found
 
-    monkeypatch.setattr(planning, "repair", fails)
-    monkeypatch.setattr(planning, "full_check", check)
+    monkeypatch.setattr(planning.timing, "repair", fails)
+    monkeypatch.setattr(planning.timing, "full_check", check)
     result = plan("ball_in_cup", timeout=20.0)
     assert resolutions == [MOTION_RESOLUTION] and result.status is PlanStatus.TIMING_FAILED
     assert result.reason == "the path cannot be timed, it fails the full check at 0.00031 rad, it grazes" and np.isnan(
@@ -88,7 +88,7 @@ def test_a_path_that_cannot_be_timed_is_no_success(monkeypatch: pytest.MonkeyPat
     def fails(*args: object) -> None:
         raise TimingError("the motion collides")
 
-    monkeypatch.setattr(planning, "time_path", fails)
+    monkeypatch.setattr(planning.timing, "time_path", fails)
     result = plan("ball_in_cup", timeout=20.0)
     assert result.status is PlanStatus.TIMING_FAILED and not result and result.path is not None
     assert result.reason == "the path cannot be timed, the motion collides" and result.trajectory is None

@@ -44,7 +44,7 @@ _robots: dict[str, Robot] = {}
 
 @dataclass(eq=False)
 class Experiment:
-    """Runs a planner in an experiment of ``ompl.tools.Benchmark``, in the place of :func:`apex_ompl.planning.execute`.
+    """Runs a planner in an experiment of ``ompl.tools.Benchmark``, in the place of ``planning.solving.execute``.
 
     Attributes:
         checks: Number of states that OMPL's experiment itself checked.

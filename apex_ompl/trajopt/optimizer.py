@@ -23,9 +23,10 @@ from apex_ompl.kernel.compiled.path_cost import (
     path_cost,
 )
 from apex_ompl.kernel.compiled.path_optimization import optimize_path
+from apex_ompl.trajopt.settings import OptimizerSettings
 from apex_ompl.trajopt.spline import Spline
 from apex_ompl.types import Array
-from apex_ompl.util.validation import check_array, check_integer, check_nonnegative, check_number, check_positive
+from apex_ompl.util.validation import check_array, check_integer, check_nonnegative
 
 Check = Callable[[Array], bool]
 """Whether a path, shape (states, dof), is valid."""
@@ -34,44 +35,6 @@ STIFFER, SHORTENINGS = 5.0, 4  # factor from one round of shortening to the next
 PART = 8  # steps between two looks at the clock
 FINER = 2  # factor on the number of samples for paths that are clear at them and yet not valid
 LAST_RESORT = 0.1  # factor on the stiffness where nothing came out valid
-
-
-@dataclass(frozen=True)
-class Settings:
-    """Cost of a path, and when its optimisation ends.
-
-    Attributes:
-        samples: Number of states whose clearance counts: the middles of as many even intervals of the parameter, as
-            dense as every fourth state of a path of 256.
-        scene_margin: Clearance to obstacles below which a state costs [m].
-        own_margin: Clearance between the robot's own links, its arms among them, below which a state costs [m].
-        stiffness: Weight of half the integral of the speed squared, [1/rad^2]; for an even speed this is half the
-            length squared. A clearance of 0 all along the path costs 1/2.
-        damping: Weight of the speed of the change at the first step.
-        steps: Largest number of steps of one call.
-        tolerance: A step that lowers the cost by less than this share is the last.
-    """
-
-    samples: int = 64
-    scene_margin: float = 0.04
-    own_margin: float = 0.02
-    stiffness: float = 1e-3
-    damping: float = 1e-2
-    steps: int = 30
-    tolerance: float = 2e-3
-
-    def __post_init__(self) -> None:
-        """Check the numbers.
-
-        Raises:
-            ParameterError: One is out of range.
-        """
-        check_integer(self.samples, "samples", 1)
-        check_integer(self.steps, "steps")
-        for name in ("scene_margin", "own_margin", "stiffness"):
-            check_positive(getattr(self, name), name)
-        for name in ("damping", "tolerance"):
-            check_number(getattr(self, name), name, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,10 +66,10 @@ class Optimizer:
     :mod:`apex_ompl.kernel.compiled.path_cost`. Limits are kept by the control points.
     """
 
-    def __init__(self, spline: Spline | None = None, settings: Settings | None = None) -> None:
+    def __init__(self, spline: Spline | None = None, settings: OptimizerSettings | None = None) -> None:
         """Work on control points of ``spline``."""
         self.spline = spline or Spline()
-        self.settings = settings or Settings()
+        self.settings = settings or OptimizerSettings()
 
     def prepare(self, kernel: Kernel) -> None:
         """Load or compile now what the first steps need."""

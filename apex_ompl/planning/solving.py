@@ -1,79 +1,33 @@
-"""Steps of ``plan``: query, straight line, solve, verify, repair, time; the benchmark composes the same steps."""
+"""Path of a problem: straight line, planner, full check, repair."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 from ompl import base as ob
 
-from apex_ompl.errors import ApexError, TimingError
-from apex_ompl.ompl_adapter.interrupt import Interrupt
+from apex_ompl.errors import ApexError
 from apex_ompl.ompl_adapter.repair import repair
-from apex_ompl.ompl_adapter.report import LineAwarePlanner, SolveReport, report_of
+from apex_ompl.ompl_adapter.report import LineAwarePlanner, report_of
 from apex_ompl.ompl_adapter.setup import PlanningSetup, set_goals
 from apex_ompl.ompl_adapter.simplify import simplify as shorten
 from apex_ompl.ompl_adapter.space import path_to_array
-from apex_ompl.ompl_adapter.validity import FullCheck, full_check
+from apex_ompl.ompl_adapter.validity import full_check
+from apex_ompl.planning.run import PlanRun
 from apex_ompl.result import FIRST, INSIDE, PlanResult, PlanStatus
-from apex_ompl.trajectory import Timing, Trajectory, time_path
-from apex_ompl.trajectory.trajectory import ROUNDING
-from apex_ompl.trajopt.path import Path, resample
-from apex_ompl.types import Array
-from apex_ompl.util.resolution import FULL_RESOLUTION, MOTION_RESOLUTION
+from apex_ompl.trajopt.path import Path
+from apex_ompl.util.resolution import FULL_RESOLUTION
 from apex_ompl.util.stopwatch import timed
 
 if TYPE_CHECKING:
     from apex_ompl.planners import Parameters
 
-CLEARANCE_SAMPLES = 32
-CHORD = 1e-5  # largest distance of a timed motion from the straight line between two states that are checked [rad]
-MAX_STATES = 100_000  # that are checked of a timed motion
-MAX_FINE_REPAIR = 3.0  # of a path that fails the check at MOTION_RESOLUTION, on top of the timeout [s]
 STRAIGHT_LINE = "straight line"
 PROOF_SHARE, MAX_PROOF = 0.1, 0.5  # time kept from planners that stop at the timeout only, for repair [1, s]
 MAX_TIMEOUT = 1e8  # OMPL counts nanoseconds in 64 bits [s]
-
-
-@dataclass(eq=False)
-class PlanRun:
-    """One call of ``plan`` on a problem that is set up.
-
-    Attributes:
-        setup: The problem.
-        planner: Name of the planner.
-        parameters: Its parameters.
-        seed: The seed used.
-        times: Seconds by stage so far.
-        notes: What a user should know about this run.
-        interrupt: Holds Ctrl-C back.
-        rejected_lines: Straight lines to goals that failed the full check, each of shape (2, dof).
-        first_path: First path that the planner found, or None.
-        report: Report of the planner, of planners that make one.
-    """
-
-    setup: PlanningSetup
-    planner: str
-    parameters: Parameters
-    seed: int
-    times: dict[str, float] = field(default_factory=dict)
-    notes: list[str] = field(default_factory=list)
-    interrupt: Interrupt = field(default_factory=Interrupt)
-    rejected_lines: list[Array] = field(default_factory=list)
-    first_path: Path | None = None
-    report: SolveReport | None = None
-
-    def result(self, status: PlanStatus, reason: str = "", path: Path | None = None, solved_by: str = "") -> PlanResult:
-        """Return a result without what :func:`finish` adds."""
-        robot = self.setup.robot
-        return PlanResult(
-            status=status, reason=reason, problem=self.setup.problem, robot=robot.name, joint_names=robot.joint_names,
-            planner=self.planner, seed=self.seed, path=path, solved_by=solved_by, notes=tuple(self.notes),
-        )  # fmt: skip
-
 
 Execute = Callable[[PlanRun, ob.Planner, float], PlanStatus]
 """Runs a planner that is set, for a time [s], and returns its status."""
@@ -196,79 +150,6 @@ def verify(run: PlanRun, path: Path, deadline: float, simplify: bool, solved_by:
             path = Path(repaired)
             return run.result(PlanStatus.EXACT_SOLUTION, path=path, solved_by=f"{solved_by}+repair")
     return run.result(PlanStatus.TIMEOUT, f"the path found failed the full check and repair, {reason}")
-
-
-def parameterize(run: PlanRun, result: PlanResult, timing: Timing) -> PlanResult:
-    """Return a result with its path timed, or with the status TIMING_FAILED.
-
-    Stretches of the path that fail the full check at MOTION_RESOLUTION are planned anew, since motions along them would
-    fail it too. The motion is valid when it keeps the limits and passes that check.
-    """
-    if result.path is None or not result:
-        return result
-    setup, limits, proof = run.setup, run.setup.robot.limits, dict[str, float]()
-
-    def fault(motion: Trajectory) -> str:
-        with timed(proof, "motion"):
-            shares = motion.use(timing.limits(limits))
-            over = [f"{name} {share:.4f}" for name, share in shares.items() if share > 1.0 + ROUNDING]
-            if over:
-                return f"the share of a limit that it uses is over 1: {', '.join(over)}"
-            acceleration = max(float(np.abs(motion.accelerations).max()), 1e-9)
-            spacing = max(np.sqrt(8.0 * CHORD / acceleration), motion.duration / MAX_STATES, 1e-6)
-            states = np.clip(motion.sample(spacing).position, limits.lower, limits.upper)  # without rounding
-            return full_check(setup.checker, states, setup.start, setup.goals, MOTION_RESOLUTION).reason
-
-    with timed(proof, "path"):
-        check = full_check(setup.checker, result.path.states, setup.start, setup.goals, MOTION_RESOLUTION)
-    try:
-        if not check:
-            result = _repaired_finely(run, result, result.path.states, check)
-        assert result.path is not None
-        with timed(run.times, "timing"):
-            made = time_path(result.path.states, limits, setup.robot.joint_names, timing, fault)
-    except TimingError as error:
-        return replace(result, status=PlanStatus.TIMING_FAILED, reason=f"the path cannot be timed, {error}")
-    finally:
-        run.times["timing"] = run.times.get("timing", 0.0) - proof.get("motion", 0.0)
-        run.times["timing proof"] = sum(proof.values())
-    motion = made.trajectory
-    return replace(
-        result, trajectory=motion, limit_use=motion.use(limits), deviation=made.deviation,
-        timing_resolution=MOTION_RESOLUTION,
-    )  # fmt: skip
-
-
-def _repaired_finely(run: PlanRun, result: PlanResult, states: Array, check: FullCheck) -> PlanResult:
-    """Return a result whose path passes the full check at MOTION_RESOLUTION.
-
-    Raises:
-        TimingError: No such path is found.
-    """
-    with timed(run.times, "repair"):
-        deadline = time.perf_counter() + MAX_FINE_REPAIR
-        repaired = repair(run.setup, states, check, deadline, run.interrupt, resolution=MOTION_RESOLUTION)
-    if repaired is None:
-        raise TimingError(f"it fails the full check at {MOTION_RESOLUTION:g} rad, {check.reason}")
-    return replace(result, path=Path(repaired), solved_by=f"{result.solved_by.removesuffix('+repair')}+repair")
-
-
-def finish(run: PlanRun, result: PlanResult, started: float) -> PlanResult:
-    """Add clearance, length, counts and times.
-
-    Args:
-        run: The call of ``plan``.
-        result: What came of it.
-        started: Value of ``time.perf_counter`` when the call began [s].
-    """
-    checks = run.setup.checker.check_counts.states
-    if result.path is not None:
-        with timed(run.times, "clearance"):
-            states = resample(result.path.states, CLEARANCE_SAMPLES)
-            clearance = min(run.setup.checker.clearance(q) for q in states)
-        result = replace(result, length=result.path.length, clearance=clearance)
-    run.times["total"] = time.perf_counter() - started
-    return replace(result, checks=checks, times=dict(run.times))
 
 
 def with_exact_ends(setup: PlanningSetup, path: Path) -> Path:

@@ -1,0 +1,28 @@
+"""Steps of ``plan``: query, straight line, solve, verify, repair, time; the benchmark composes the same steps."""
+
+from apex_ompl.planning.run import PlanRun
+from apex_ompl.planning.solving import (
+    STRAIGHT_LINE,
+    find_path,
+    query_fault,
+    solve,
+    solving_time,
+    straight_line,
+    verify,
+    with_exact_ends,
+)
+from apex_ompl.planning.timing import finish, parameterize
+
+__all__ = [
+    "STRAIGHT_LINE",
+    "PlanRun",
+    "find_path",
+    "finish",
+    "parameterize",
+    "query_fault",
+    "solve",
+    "solving_time",
+    "straight_line",
+    "verify",
+    "with_exact_ends",
+]

@@ -1,0 +1,53 @@
+"""One call of ``plan`` on a problem that is set up."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from apex_ompl.ompl_adapter.interrupt import Interrupt
+from apex_ompl.ompl_adapter.report import SolveReport
+from apex_ompl.ompl_adapter.setup import PlanningSetup
+from apex_ompl.result import PlanResult, PlanStatus
+from apex_ompl.trajopt.path import Path
+from apex_ompl.types import Array
+
+if TYPE_CHECKING:
+    from apex_ompl.planners import Parameters
+
+
+@dataclass(eq=False)
+class PlanRun:
+    """One call of ``plan`` on a problem that is set up.
+
+    Attributes:
+        setup: The problem.
+        planner: Name of the planner.
+        parameters: Its parameters.
+        seed: The seed used.
+        times: Seconds by stage so far.
+        notes: What a user should know about this run.
+        interrupt: Holds Ctrl-C back.
+        rejected_lines: Straight lines to goals that failed the full check, each of shape (2, dof).
+        first_path: First path that the planner found, or None.
+        report: Report of the planner, of planners that make one.
+    """
+
+    setup: PlanningSetup
+    planner: str
+    parameters: Parameters
+    seed: int
+    times: dict[str, float] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+    interrupt: Interrupt = field(default_factory=Interrupt)
+    rejected_lines: list[Array] = field(default_factory=list)
+    first_path: Path | None = None
+    report: SolveReport | None = None
+
+    def result(self, status: PlanStatus, reason: str = "", path: Path | None = None, solved_by: str = "") -> PlanResult:
+        """Return a result without what :func:`finish` adds."""
+        robot = self.setup.robot
+        return PlanResult(
+            status=status, reason=reason, problem=self.setup.problem, robot=robot.name, joint_names=robot.joint_names,
+            planner=self.planner, seed=self.seed, path=path, solved_by=solved_by, notes=tuple(self.notes),
+        )  # fmt: skip
