@@ -9,7 +9,7 @@ the command resumes where it was stopped.
 
 scripts/reproduce.py takes its runs from there, and adds some.
 
-Usage: python benchmarks/head_to_head.py [SUITE[/LEVEL] ...] [-n 30] [--jobs 1]
+Usage: python benchmarks/head_to_head.py [SUITE[/LEVEL] ...] [-n 30] [--slow 20] [--jobs 1]
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ from apex_ompl.util.validation import one_or_more
 
 DEPENDS = ("@benchmark", "benchmarks/controls.py")
 TIMEOUT = 10.0  # [s]
+SLOW = 20  # problems of a level for rows that take long
 TIMES = (("first", 50), ("first", 95), ("first", 99), ("total", 50))
 GROUPS = {
     "free, easy, small": ("free", "easy", "small"),
@@ -44,7 +45,7 @@ ROWS = (
     Row("apex", "apex"),
     Row("apex without trees", "apex", TREELESS),
     Row("apex guided", "apex", {"guidance": True}),
-    Row("apex-paper", "apex", {**PAPER, "guidance": True}, runs=20),
+    Row("apex-paper", "apex", {**PAPER, "guidance": True}, runs=SLOW),
     Row("straight line + repair", "apex", {**TREELESS, "first": 0, "second": 0, "third": 0, "resample": 0}, 2.0),
     Row(
         "8 bumps + repair",
@@ -54,9 +55,9 @@ ROWS = (
     ),
     Row("rrtconnect+polish", "rrtconnect+polish"),
     Row("rrtconnect", "rrtconnect"),
-    Row("rrt", "rrt", runs=20),
+    Row("rrt", "rrt", runs=SLOW),
     *(
-        Row(name, name, timeout=5.0, runs=20, levels=("/hard", "/large"))
+        Row(name, name, timeout=5.0, runs=SLOW, levels=("/hard", "/large"))
         for name in ("aorrtc", "informedrrtstar", "bitstar")
     ),
 )
@@ -94,12 +95,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("levels", nargs="*", metavar="SUITE[/LEVEL]")
     parser.add_argument("-n", type=one_or_more, default=30, help="problems of a level (default: %(default)s)")
+    parser.add_argument(
+        "--slow", type=one_or_more, default=SLOW, help="of them for rows that take long (default: %(default)s)"
+    )
     parser.add_argument("--jobs", type=one_or_more, default=1, help="runs at a time (default: one, as they are timed)")
     args = parser.parse_args()
     folder = Path(__file__).parent / "runs" / "head_to_head"
     workers = Workers(args.jobs, modules=("controls",))
-    levels, seeds = record.static_levels(args.levels), {row.label: min(args.n, row.runs or args.n) for row in ROWS}
-    results = bench(levels, ROWS, folder, runs=args.n, timeout=TIMEOUT, workers=workers, provenance=record.session())
+    rows = [row if row.runs is None else replace(row, runs=args.slow) for row in ROWS]
+    levels, seeds = record.static_levels(args.levels), {row.label: min(args.n, row.runs or args.n) for row in rows}
+    results = bench(levels, rows, folder, runs=args.n, timeout=TIMEOUT, workers=workers, provenance=record.session())
     results = replace(results, runs=[run for run in results.runs if run["seed"] < seeds.get(run["label"], 0)])
     write_database(results, write_logs(results))
     report(folder, folder)

@@ -25,7 +25,7 @@ RESULTS = ROOT / "benchmarks" / "results"
 CHECKING = ("apex_ompl/scene", "apex_ompl/robot", "apex_ompl/kernel", "apex_ompl/collision", "apex_ompl/util")
 PLANNING = (
     *CHECKING, "apex_ompl/apex", "apex_ompl/api.py", "apex_ompl/diffusion", "apex_ompl/ompl_adapter",
-    "apex_ompl/planning", "apex_ompl/tasks", "apex_ompl/trajopt", "planners", "problems",
+    "apex_ompl/planning", "apex_ompl/result.py", "apex_ompl/tasks", "apex_ompl/trajopt", "planners", "problems",
 )  # fmt: skip
 GROUPS = {
     "@checking": CHECKING,

@@ -38,7 +38,7 @@ def test_shipped_problems_are_solved_and_proved(name: str | Path) -> None:
     assert result.path is not None and result.path.dof == robot.dof
     start, goals = problem.start_state(robot.joint_names), problem.goal_states(robot.joint_names)
     assert np.array_equal(result.path[0], start) and np.array_equal(result.path[-1], goals[0])
-    # Judged anew by a fresh checker, on a grid that the planner did not use.
+    # Checked anew by a fresh checker, on a grid that the planner did not use.
     check = full_check(
         CollisionChecker(robot, problem.scene, problem.attached), result.path, start, goals, resolution=0.0047
     )
@@ -151,15 +151,15 @@ def test_several_goals_never_hang(planner: str, problem: Problem, tmp_path: Path
 
 @pytest.mark.parametrize("stage", ["shorten", "repair"])
 def test_ctrl_c_after_the_search_is_not_lost(stage: str, problem: Problem, monkeypatch: pytest.MonkeyPatch) -> None:
-    honest = getattr(planning, stage)
+    honest = getattr(planning.solving, stage)
 
     def pressed(*args: object) -> object:
         signal.raise_signal(signal.SIGINT)
         return honest(*args)
 
-    monkeypatch.setattr(planning, stage, pressed)
+    monkeypatch.setattr(planning.solving, stage, pressed)
     if stage == "repair":
-        monkeypatch.setattr(planning.timing, "full_check", lambda *_: FullCheck(False, "on purpose", 0, 1))
+        monkeypatch.setattr(planning.solving, "full_check", lambda *_: FullCheck(False, "on purpose", 0, 1))
     before = signal.getsignal(signal.SIGINT)
     with pytest.raises(KeyboardInterrupt):
         plan(problem, "rrtconnect", timeout=20.0)

@@ -270,5 +270,5 @@ def test_the_kernel_alone_proves_what_the_spheres_prove(checker: CollisionChecke
     assert 0.5 * free <= proved < 60
     assert not checker.kernel.proves(np.full((2, robot.dof), np.nan), FULL_RESOLUTION)
     for path, resolution in ((robot.home[None], 0.01), (np.stack([robot.home] * 2), 0.0)):
-        with pytest.raises(ParameterError, match="path"):
+        with pytest.raises(ParameterError, match="path|resolution"):
             checker.kernel.proves(path, resolution)

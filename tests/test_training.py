@@ -238,7 +238,7 @@ def test_faulty_configurations_are_named(change: dict[str, Any], message: str, f
     [
         ({"data": "/no/such"}, "manifest of a data set '/no/such/manifest.json': no such file"),
         ({"robot": "/no/such.npz"}, "file of kernel tables '/no/such.npz': no such file"),
-        ({"latent": {"dim": 500}}, "dimension of the latent space: expected 1 to 192, got 500"),
+        ({"latent": {"dim": 500}}, "dimension of the latent space: expected a whole number from 1 to 192, got 500"),
         ({"mirror": {"order": [0], "sign": [1], "shift": [0]}}, "mirror: expected 16 joints, got 1"),
     ],
 )

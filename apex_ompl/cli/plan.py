@@ -124,6 +124,6 @@ def _summary(result: PlanResult) -> str:
             f"checked every {result.timing_resolution:.2g} rad"
         )
         lines.append(f"  limits     {uses} used")
-    lines.append(f"  checks     {result.checks} states judged, planner {result.planner}, seed {result.seed}")
+    lines.append(f"  checks     {result.checks} states checked, planner {result.planner}, seed {result.seed}")
     lines += [f"  note       {note}" for note in result.notes]
     return "\n".join(lines)

@@ -53,6 +53,11 @@ class Path:
         return int(self.states.shape[1])
 
     @property
+    def shape(self) -> tuple[int, int]:
+        """Shape of the states, (N, dof)."""
+        return len(self.states), self.dof
+
+    @property
     def length(self) -> float:
         """Sum of Euclidean joint-space steps between the states [rad]; S_r of the paper."""
         return path_length(self.states)
