@@ -89,7 +89,8 @@ def plan(
         simplify: Whether to shorten the path that was found.
         params: Parameters of the planner by name.
         snapshot: Plan among moving obstacles as they stand at time 0.
-        timing: How the path is timed, or whether; the timed motion is proved by the full check too.
+        timing: How the path is timed, or whether; the timed motion is checked along its own states too. A path that
+            grazes an obstacle between the states of its own check is repaired first, within 3 s.
 
     Returns:
         The result; it is true only for an exact path that passed the full check and, unless timing is off, is timed.

@@ -12,7 +12,6 @@ from enum import StrEnum
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from ompl import base as ob
 
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError
@@ -21,6 +20,7 @@ from apex_ompl.trajectory import Trajectory
 from apex_ompl.trajectory.files import MESSAGES, STATES
 from apex_ompl.trajopt.path import Path
 from apex_ompl.trajopt.spline import Spline
+from apex_ompl.types import Array
 from apex_ompl.util.files import BROKEN, suffix_of, write_atomically
 from apex_ompl.util.schema import dump_yaml, read_yaml, validate
 
@@ -224,7 +224,7 @@ def _spline_fields(path: Path) -> dict[str, Any] | None:
     return {"control": path.control.tolist(), "degree": path.spline.degree, "pinned": path.spline.pinned}
 
 
-def _path(states: NDArray[np.float64], spline: dict[str, Any] | None) -> Path:
+def _path(states: Array, spline: dict[str, Any] | None) -> Path:
     """Return a path as it was saved."""
     if spline is None:
         return Path(states)

@@ -19,10 +19,9 @@ import numpy as np
 import record
 from collision_checker import around_home, boxes, microseconds, of_batch
 
-from apex_ompl import plan
+from apex_ompl import api, plan
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.cover.spheres import quality, read_covers, shape_key
-from apex_ompl.ompl_adapter import setup
 from apex_ompl.robot import load_robot
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.resolution import FULL_RESOLUTION, SEARCH_RESOLUTION
@@ -64,7 +63,7 @@ def measure(path: Path, states: int, seeds: int) -> dict[str, float]:
     found |= {"proved_of_free": float(np.mean(proved)), "proof_us": float(np.mean(kernel_us))}
     found |= {"two_stages_free_us": float(np.mean(free_us))}
     found |= {"free_motion_search_ms": float(np.median(search_ms)), "free_motion_full_ms": float(np.median(full_ms))}
-    with mock.patch.object(setup, "load_robot", lambda *_: robot):
+    with mock.patch.object(api, "load_robot", lambda *_: robot):
         for name in PROBLEMS:
             runs = [plan(name, "rrtconnect", timeout=10.0, seed=seed) for seed in range(seeds)]
             found[f"{name}_solve_ms"] = float(np.median([r.times["solve"] for r in runs])) * 1e3

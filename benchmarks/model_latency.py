@@ -27,7 +27,7 @@ from apex_ompl.problems.suite_robot import robot
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import one_or_more
 
-DEPENDS = ("apex_ompl/diffusion", "apex_ompl/apex/query.py", "apex_ompl/kernel")
+DEPENDS = ("apex_ompl/diffusion", "apex_ompl/apex/query.py", "apex_ompl/kernel", "apex_ompl/ompl_adapter", "problems")
 PROBLEM = "shelf/hard/800003"
 COUNTS = (1, 8, 32)
 STEPS = (1, 2, 8)

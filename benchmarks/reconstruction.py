@@ -28,7 +28,7 @@ from apex_ompl.problems.suite_robot import robot
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import one_or_more
 
-DEPENDS = ("apex_ompl/diffusion", "apex_ompl/trajopt", "data/dual_panda_softhand")
+DEPENDS = ("apex_ompl/diffusion", "apex_ompl/trajopt", "apex_ompl/datasets", "data/dual_panda_softhand")
 DATA = record.RESULTS.parent.parent / "data" / "dual_panda_softhand" / "paths.zip"
 
 

@@ -22,7 +22,10 @@ from apex_ompl.util.files import write_atomically
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
-CHECKING = ("apex_ompl/scene", "apex_ompl/robot", "apex_ompl/kernel", "apex_ompl/collision", "apex_ompl/util")
+CHECKING = (
+    "apex_ompl/scene", "apex_ompl/robot", "apex_ompl/kernel", "apex_ompl/collision", "apex_ompl/util",
+    "apex_ompl/trajopt/path.py",
+)  # fmt: skip
 PLANNING = (
     *CHECKING, "apex_ompl/apex", "apex_ompl/api.py", "apex_ompl/diffusion", "apex_ompl/ompl_adapter",
     "apex_ompl/planning", "apex_ompl/result.py", "apex_ompl/tasks", "apex_ompl/trajopt", "planners", "problems",

@@ -81,8 +81,8 @@ def many(count: int) -> tuple[str, bool]:
             gc.collect()
             marks.append(resident())
     took = time.perf_counter() - begin
-    said = f"{solved} solved in {took:.0f} s, MiB at quarters: {', '.join(f'{m:.0f}' for m in marks)}"
-    return said, solved == count and marks[-1] - marks[1] < GROWTH
+    outcome = f"{solved} solved in {took:.0f} s, MiB at quarters: {', '.join(f'{m:.0f}' for m in marks)}"
+    return outcome, solved == count and marks[-1] - marks[1] < GROWTH
 
 
 def overruns() -> tuple[str, bool]:
@@ -102,8 +102,8 @@ def overruns() -> tuple[str, bool]:
                 late.append(max(0.0, time.perf_counter() - begin - limit))
                 assert planner_status.getStatus() != ob.PlannerStatus.CRASH
     found = np.array(late)
-    said = f"N = {len(found)}, ms p50 {1e3 * np.median(found):.1f}, p95 {1e3 * np.percentile(found, 95):.1f}, "
-    return said + f"most {1e3 * found.max():.1f}", bool(found.max() < OVERRUN)
+    outcome = f"N = {len(found)}, ms p50 {1e3 * np.median(found):.1f}, p95 {1e3 * np.percentile(found, 95):.1f}, "
+    return outcome + f"most {1e3 * found.max():.1f}", bool(found.max() < OVERRUN)
 
 
 def walled() -> Problem:
@@ -155,8 +155,8 @@ def in_a_millisecond() -> tuple[str, bool]:
     """Next to no time."""
     result = plan(HARD, timeout=0.001)
     late = result.times["solve"] - 0.001
-    said = f"{result.status} after {1e3 * result.times['solve']:.1f} ms"
-    return said, str(result.status) == "TIMEOUT" and late < OVERRUN
+    outcome = f"{result.status} after {1e3 * result.times['solve']:.1f} ms"
+    return outcome, str(result.status) == "TIMEOUT" and late < OVERRUN
 
 
 def nan_in_a_state() -> tuple[str, bool]:
@@ -214,12 +214,12 @@ def main() -> None:
     with quiet_ompl():
         plan(HARD)
         for name, check in checks.items():
-            said, good = check()
-            print(f"{name}: {said} {'' if good else '<-- not as expected'}", flush=True)
-            rows.append(record.row([name, said, "yes" if good else "no"]))
-            found[name] = {"said": said, "as_expected": good}
+            outcome, good = check()
+            print(f"{name}: {outcome} {'' if good else '<-- not as expected'}", flush=True)
+            rows.append(record.row([name, outcome, "yes" if good else "no"]))
+            found[name] = {"outcome": outcome, "as_expected": good}
             failed += [] if good else [name]
-    record.write("robustness", {"checks": found}, "\n".join(rows), seed="0 or as said")
+    record.write("robustness", {"checks": found}, "\n".join(rows), seed="0 or as stated")
     if failed:
         sys.exit(f"not as expected: {', '.join(failed)}")
 

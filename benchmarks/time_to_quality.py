@@ -54,7 +54,7 @@ Lengths = list[tuple[float, float]]
 """Time at which a path had passed the full check [s], and its length [rad]; each shorter than those before."""
 
 
-def proven(ready: PlanningSetup, path: np.ndarray) -> bool:
+def passes_full_check(ready: PlanningSetup, path: np.ndarray) -> bool:
     """Whether a path passes the full check between the given ends, as they are bit for bit."""
     states = np.concatenate([ready.start[None], path[1:-1], ready.goals[0][None]])
     return bool(full_check(ready.checker, states, ready.start, ready.goals))
@@ -83,7 +83,7 @@ def observed(ready: PlanningSetup, planner: ob.Planner, limit: float) -> Lengths
     lengths: Lengths = []
     for took, path in found:
         check = time.perf_counter()
-        if proven(ready, path):
+        if passes_full_check(ready, path):
             lengths.append((took + time.perf_counter() - check, path_length(path)))
     return shorter(lengths)
 
@@ -112,7 +112,7 @@ def repeated(attempt: Callable[[float], np.ndarray | None], ready: PlanningSetup
     begin, found = time.perf_counter(), list[tuple[float, float]]()
     while (left := limit - (time.perf_counter() - begin)) > 0.0:
         path = attempt(left)
-        if path is not None and proven(ready, path) and (took := time.perf_counter() - begin) <= limit:
+        if path is not None and passes_full_check(ready, path) and (took := time.perf_counter() - begin) <= limit:
             found.append((took, path_length(path)))
     return shorter(found)
 

@@ -12,7 +12,7 @@ derivatives and with speeds between them that can be reached; the best of 1 to 3
 acceleration, Ruckig in all joints.
 ``Ruckig from corner to corner``: at rest at each, without leaving the path; of rrtconnect's paths.
 
-Usage: python benchmarks/timing.py [SUITE[/LEVEL] ...] [-n 18] [--ways 3]
+Usage: python benchmarks/timing.py [SUITE[/LEVEL] ...] [-n 18] [--others 3]
 """
 
 from __future__ import annotations
@@ -138,7 +138,7 @@ def main() -> None:
     parser.add_argument("levels", nargs="*", metavar="SUITE[/LEVEL]")
     parser.add_argument("-n", type=one_or_more, default=18, help="problems of a level (default: %(default)s)")
     parser.add_argument(
-        "--ways", type=whole_number, default=3, help="of them for the other methods (default: %(default)s)"
+        "--others", type=whole_number, default=3, help="of them for the other methods (default: %(default)s)"
     )
     args = parser.parse_args()
     toppra.setup_logging("ERROR")
@@ -166,7 +166,7 @@ def main() -> None:
             for stage in ("setup", "solve", "verify", "timing", "timing proof", "clearance", "total"):
                 if planner == "apex":
                     stages.setdefault(stage, []).append(result.times.get(stage, 0.0))
-            if k >= args.ways:
+            if k >= args.others:
                 continue
             if planner == "rrtconnect":
                 made, took = timed_method(from_corner_to_corner, path)

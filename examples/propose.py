@@ -20,7 +20,7 @@ from apex_ompl.trajopt.path import path_length
 
 
 def main() -> None:
-    """Propose, judge, repair, and judge again."""
+    """Propose, check, repair, and check again."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("problem", nargs="?", default="shelf/hard/900012")
     parser.add_argument("--count", type=int, default=8, help="paths to propose (default: %(default)s)")

@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 from ompl import base as ob
 
 from apex_ompl.errors import ParameterError, UnknownNameError
+from apex_ompl.util.validation import LARGEST_INT
 
 
 @dataclass(frozen=True)
@@ -66,8 +67,6 @@ def one_of(default: str, *others: str) -> Any:
     """Return a dataclass field that is one of some words."""
     return dataclasses.field(default=default, metadata={"words": (default, *others)})
 
-
-LARGEST_INT = 2**31 - 1
 
 _REGISTRY: dict[str, type[Parameters]] = {}
 

@@ -30,12 +30,12 @@ HEIGHT = {name: height for height, names in enumerate(LAYERS) for name in names}
 FILES = sorted(p for p in (ROOT / "apex_ompl").rglob("*.py") if p.name != "__init__.py" or p.parent.name != "apex_ompl")
 
 
-def room(path: Path) -> str:
+def package(path: Path) -> str:
     return path.relative_to(ROOT / "apex_ompl").parts[0].removesuffix(".py")
 
 
 def imports(path: Path) -> set[str]:
-    """Rooms of this package that a module imports, at the top or inside functions."""
+    """Packages of apex_ompl that a module imports, at the top or inside functions."""
     found = set()
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.ImportFrom) and node.module:
@@ -60,13 +60,13 @@ def outside(path: Path) -> set[str]:
 
 @pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(ROOT / "apex_ompl")))
 def test_imports_go_down(path: Path) -> None:
-    here = room(path)
+    here = package(path)
     assert here in HEIGHT, f"{here} has no layer yet"
     for other in imports(path) - {here}:
         assert HEIGHT[other] < HEIGHT[here], f"{here} imports {other}"
 
 
-def test_every_room_is_in_the_package_list() -> None:
+def test_every_package_is_in_the_package_list() -> None:
     import tomllib
 
     listed = set(tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["packages"])
@@ -75,7 +75,7 @@ def test_every_room_is_in_the_package_list() -> None:
     assert listed == {".".join(f.relative_to(ROOT).parts) for f in folders}
 
 
-def test_low_rooms_know_no_ompl() -> None:
+def test_low_packages_know_no_ompl() -> None:
     for path in FILES:
-        if HEIGHT[room(path)] < HEIGHT["ompl_adapter"]:
+        if HEIGHT[package(path)] < HEIGHT["ompl_adapter"]:
             assert "ompl" not in outside(path), path

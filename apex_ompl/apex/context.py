@@ -93,7 +93,7 @@ class SolveContext:
 
     def new_pool(self) -> CandidatePool:
         """Return an empty pool of candidates."""
-        return CandidatePool(self.optimizer, self.kernel, self.is_valid, self.keeps_distance)
+        return CandidatePool(self.optimizer, self.kernel, self.is_valid, self.accepts_distance)
 
     def path_of(self, candidate: Candidate) -> Path:
         """Return the path of a candidate's control points."""
@@ -104,7 +104,7 @@ class SolveContext:
         limits = self.kernel.robot.arrays
         return self.optimizer.spline.fit(states, limits.lower, limits.upper).control
 
-    def keeps_distance(self, candidate: Candidate, states: Array) -> bool:
+    def accepts_distance(self, candidate: Candidate, states: Array) -> bool:
         """Whether a valid path keeps ``lambda_obs`` from obstacles; one that does not is set aside."""
         if self.lambda_obs <= 0.0:
             return True

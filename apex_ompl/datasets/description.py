@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from apex_ompl.datasets.records import SOURCES, Paths
 from apex_ompl.types import Array
 
-DUPLICATE_DISTANCE = 0.1  # control points nearer than this make a duplicate [rad, max-norm]
+DUPLICATE_CONTROL_DISTANCE = 0.1  # control points nearer than this make a duplicate [rad, max-norm]
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,9 @@ def duplicates(paths: Paths) -> NDArray[np.bool_]:
         key = int(a["problem"][k]), a["start"][k].tobytes(), a["goal"][k].tobytes()
         others = groups.setdefault(key, [])
         mine = a["control"][k].astype(float)
-        twins[k] = any(float(np.abs(mine - a["control"][o].astype(float)).max()) < DUPLICATE_DISTANCE for o in others)
+        twins[k] = any(
+            float(np.abs(mine - a["control"][o].astype(float)).max()) < DUPLICATE_CONTROL_DISTANCE for o in others
+        )
         others.append(k)
     return twins
 

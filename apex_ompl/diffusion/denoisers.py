@@ -109,9 +109,12 @@ class UNetDenoiser(nn.Module):
         """
         super().__init__()
         self.step = StepEmbedding(step_size)
-        size_out = 4 * width
+        embedding_size = 4 * width
         self.mood = nn.Sequential(
-            nn.Linear(step_size + condition, size_out), nn.SiLU(), nn.Linear(size_out, size_out), nn.SiLU()
+            nn.Linear(step_size + condition, embedding_size),
+            nn.SiLU(),
+            nn.Linear(embedding_size, embedding_size),
+            nn.SiLU(),
         )
         sizes = [width * m for m in multipliers]
         self.divisor = 2 ** (len(sizes) - 1)
@@ -119,15 +122,15 @@ class UNetDenoiser(nn.Module):
         self.down, self.up = nn.ModuleList(), nn.ModuleList()
         now, skips = width, [width]
         for k, size in enumerate(sizes):
-            self.down += [ConvBlock(now, size, size_out), ConvBlock(size, size, size_out)]
+            self.down += [ConvBlock(now, size, embedding_size), ConvBlock(size, size, embedding_size)]
             skips += [size, size]
             now = size
             if k + 1 < len(sizes):
                 self.down.append(nn.Conv1d(size, size, 3, stride=2, padding=1))
                 skips.append(size)
-        self.middle = nn.ModuleList([ConvBlock(now, now, size_out), ConvBlock(now, now, size_out)])
+        self.middle = nn.ModuleList([ConvBlock(now, now, embedding_size), ConvBlock(now, now, embedding_size)])
         for k, size in reversed(list(enumerate(sizes))):
-            self.up += [ConvBlock(n + skips.pop(), size, size_out) for n in (now, size, size)]
+            self.up += [ConvBlock(n + skips.pop(), size, embedding_size) for n in (now, size, size)]
             now = size
             if k > 0:
                 self.up.append(nn.ConvTranspose1d(size, size, 4, stride=2, padding=1))

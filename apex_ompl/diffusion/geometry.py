@@ -24,7 +24,7 @@ def rotation_matrices(orientation: NDArray[np.floating]) -> NDArray[np.float32]:
 def signed_distances(shape: Tensor, position: Tensor, rotation: Tensor, size: Tensor, points: Tensor) -> Tensor:
     """Return signed distances [m] of points to obstacles, each with points of its own: shape (T, K).
 
-    The formulas are those of the kernel, see :mod:`apex_ompl.kernel.primitives`.
+    The formulas are those of the kernel, see :mod:`apex_ompl.kernel.compiled.signed_distance`.
 
     Args:
         shape: Indices of shapes, shape (T,).

@@ -19,13 +19,13 @@ MAX_BRIDGES = 20
 
 
 def repair(
-    ready: PlanningSetup, path: Array, fault: FullCheck, deadline: float, interrupt: Interrupt | None = None,
+    problem: PlanningSetup, path: Array, fault: FullCheck, deadline: float, interrupt: Interrupt | None = None,
     *, resolution: float = FULL_RESOLUTION,
 ) -> Array | None:  # fmt: skip
     """Plan stretches that fail the full check anew, at the resolution of the full check.
 
     Args:
-        ready: The problem.
+        problem: Planning setup of the problem.
         path: States, shape (N, dof), the first and the last of them free.
         fault: Outcome of the full check of ``path``.
         deadline: Value of ``time.perf_counter`` at which to give up [s].
@@ -40,39 +40,39 @@ def repair(
         left = deadline - time.perf_counter()
         if left <= 0.0 or fault.segment is None or interrupt.pressed:
             return None
-        first, last = _free_ends(ready, path, fault.segment)
-        bridge = _bridge(ready, path[first], path[last], left, interrupt, resolution=resolution)
+        first, last = _free_ends(problem, path, fault.segment)
+        bridge = _bridge(problem, path[first], path[last], left, interrupt, resolution=resolution)
         if bridge is None:
             return None
         path = np.concatenate([path[:first], bridge, path[last + 1 :]])
-        fault = full_check(ready.checker, path, ready.start, ready.goals, resolution)
+        fault = full_check(problem.checker, path, problem.start, problem.goals, resolution)
         if fault:
             return path
     return None
 
 
-def _free_ends(ready: PlanningSetup, path: Array, segment: int) -> tuple[int, int]:
+def _free_ends(problem: PlanningSetup, path: Array, segment: int) -> tuple[int, int]:
     """Return the states nearest to a segment, before and after it, that are free.
 
     Shortcuts may put a state between those that were checked, so that a state of the path itself collides.
     """
     first, last = segment, segment + 1
-    while first > 0 and not ready.checker.is_free(path[first]):
+    while first > 0 and not problem.checker.is_free(path[first]):
         first -= 1
-    while last < len(path) - 1 and not ready.checker.is_free(path[last]):
+    while last < len(path) - 1 and not problem.checker.is_free(path[last]):
         last += 1
     return first, last
 
 
 def _bridge(
-    ready: PlanningSetup, a: Array, b: Array, timeout: float, interrupt: Interrupt, *, resolution: float
+    problem: PlanningSetup, a: Array, b: Array, timeout: float, interrupt: Interrupt, *, resolution: float
 ) -> Array | None:
     """Return a path between two free states, checked at the resolution of the full check, or None."""
-    space = state_space(ready.robot)
+    space = state_space(problem.robot)
     setup = og.SimpleSetup(space)
     si = setup.getSpaceInformation()
-    validity_checker = StateValidityChecker(si, ready.checker)
-    motions = MotionValidator(si, MotionCheck(ready.checker, resolution))
+    validity_checker = StateValidityChecker(si, problem.checker)
+    motions = MotionValidator(si, MotionCheck(problem.checker, resolution))
     setup.setStateValidityChecker(validity_checker)
     si.setMotionValidator(motions)
     setup.setStartAndGoalStates(to_state(si, a), to_state(si, b))
@@ -84,5 +84,5 @@ def _bridge(
         raise fault
     if status.getStatus() != ob.PlannerStatus.EXACT_SOLUTION:
         return None
-    bridge = path_to_array(setup.getSolutionPath(), ready.robot.dof)
+    bridge = path_to_array(setup.getSolutionPath(), problem.robot.dof)
     return np.stack([a, b]) if len(bridge) < 2 else np.concatenate([a[None], bridge[1:-1], b[None]])

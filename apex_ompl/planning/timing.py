@@ -53,7 +53,7 @@ def parameterize(run: PlanRun, result: PlanResult, timing: Timing) -> PlanResult
             result = _repaired_finely(run, result, result.path.states, check)
         assert result.path is not None
         with timed(run.times, "timing"):
-            made = time_path(result.path.states, limits, setup.robot.joint_names, timing, fault)
+            made = time_path(result.path, limits, setup.robot.joint_names, timing, fault)
     except TimingError as error:
         return replace(result, status=PlanStatus.TIMING_FAILED, reason=f"the path cannot be timed, {error}")
     finally:

@@ -18,6 +18,7 @@ from apex_ompl.trajectory.deviation import deviation_bound
 from apex_ompl.trajectory.methods.ruckig import from_moving_start, stops
 from apex_ompl.trajectory.methods.spline import blended
 from apex_ompl.trajectory.trajectory import Trajectory
+from apex_ompl.trajopt.path import Path
 from apex_ompl.types import Array
 from apex_ompl.util.validation import check_array, check_number, check_states, finite_array
 
@@ -113,7 +114,7 @@ class TimedPath:
 
 
 def time_path(
-    path: ArrayLike, limits: Limits, joint_names: Sequence[str], timing: Timing | None = None,
+    path: Path | ArrayLike, limits: Limits, joint_names: Sequence[str], timing: Timing | None = None,
     fault: Callable[[Trajectory], str] = lambda trajectory: "",
 ) -> TimedPath:  # fmt: skip
     """Time a path.
@@ -124,7 +125,8 @@ def time_path(
     last a motion that stops at every corner.
 
     Args:
-        path: States to be joined by straight lines, shape (N, dof).
+        path: Path, or states of shape (N, dof). The motion follows the straight lines between its states, also where
+            it has a spline, because these are what passed the full check.
         limits: Limits of the joints.
         joint_names: Names of the joints, in the order of the columns.
         timing: How the path is timed.
@@ -138,7 +140,7 @@ def time_path(
     timing = timing or Timing()
     if not isinstance(timing, Timing):
         raise ParameterError("timing", timing, "a Timing")
-    states = finite_array(path, "path")
+    states = finite_array(path.states if isinstance(path, Path) else path, "path")
     _check(states, limits, joint_names)
     scaled = timing.limits(limits)
     start = timing.start(scaled)

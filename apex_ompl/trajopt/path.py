@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from apex_ompl.errors import ParameterError
 from apex_ompl.trajopt.spline import Spline
 from apex_ompl.types import Array
+from apex_ompl.util.validation import check_integer, check_positive
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -96,8 +97,7 @@ class Path:
         at = np.atleast_1d(given)
         if at.ndim != 1 or not ((at >= 0.0) & (at <= 1.0)).all():
             raise ParameterError("s", s, "parameters in [0, 1]")
-        if isinstance(order, bool) or not isinstance(order, int) or order < 0:
-            raise ParameterError("order", order, "a whole number, 0 or more")
+        check_integer(order, "order", 0)
         if self.spline is None or self.control is None:
             found = self._polyline(at, order)
         else:
@@ -126,8 +126,7 @@ class Path:
         Raises:
             ParameterError: ``spacing`` is not positive.
         """
-        if not spacing > 0.0:
-            raise ParameterError("spacing", spacing, "a positive number of radians")
+        check_positive(spacing, "spacing", "a positive number of radians")
         pieces = [self.states[:1]]
         for a, b in pairwise(self.states):
             pieces += [states_between(a, b, spacing), b[None]]

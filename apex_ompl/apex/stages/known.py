@@ -35,7 +35,7 @@ class KnownCandidates:
                     candidate = Candidate(control, origin, np.inf, np.inf, 0.0)
                     if self._may_be_valid(context, origin, start, goal):
                         states = context.optimizer.spline.path(control)
-                        if context.is_valid(states) and context.keeps_distance(candidate, states):
+                        if context.is_valid(states) and context.accepts_distance(candidate, states):
                             return solution_of(candidate, context)
                     context.unchecked.append((origin, control))
         return None

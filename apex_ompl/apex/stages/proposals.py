@@ -68,18 +68,18 @@ class Repair:
     """Optimiser steps on the candidates, the most promising one first.
 
     Attributes:
-        least: Least number of steps.
-        steps: Number of steps for each pair of start and goal.
+        min_steps: Budget of steps in all, at least.
+        steps: Budget of steps for each pair of start and goal.
     """
 
-    least: int
+    min_steps: int
     steps: int
 
     def run(self, context: SolveContext) -> Solution | None:
         """Return the first candidate that becomes valid, or None."""
         if context.stop():
             return None
-        steps, before = max(self.least, self.steps * len(context.queries)), context.pool.steps
+        steps, before = max(self.min_steps, self.steps * len(context.queries)), context.pool.steps
         with context.report.timed("repair"):
             found = context.pool.improve(steps, context.stop)
         context.report.steps += context.pool.steps - before

@@ -31,7 +31,7 @@ def blended(
 
     1. A uniform cubic B-spline q(s) along the polyline rounds its corners (:class:`apex_ompl.trajectory.curve.Curve`).
     2. Reachability analysis gives the largest speeds along q(s) within the limits of velocity and acceleration
-       (:mod:`apex_ompl.kernel.reachability`; Pham and Pham 2018).
+       (:mod:`apex_ompl.kernel.compiled.time_parameterization`; Pham and Pham 2018).
     3. States at times h apart on that motion are the control points of a uniform cubic B-spline in time. Averages of
        states within the limits are within the limits, and the jerk is at most 2 a_max / h. In step 2 the limit of
        acceleration is min(a_max, j_max h); what is still over a limit is removed by stretching h.
