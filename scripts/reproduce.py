@@ -5,9 +5,8 @@
 ``fid``: FID and KID of guided and unguided paths against solutions of the same problems, in the features of the
 variational autoencoder of ``apex-paper`` and in principal components.
 
-``failure`` and ``size`` have the same runs. Each is stored when it ends, beside those of benchmarks/head_to_head.py,
-with which they share some; so are the solutions of ``fid``. All planners have the same problems. The command resumes
-where it was stopped.
+``failure`` and ``size`` have the same runs. Each is stored in benchmarks/runs/paper_figures when it ends; so
+are the solutions of ``fid``. All planners have the same problems. The command resumes where it was stopped.
 
 Usage: python scripts/reproduce.py failure|size|fid [-n 40] [--jobs 1] [--keep FOLDER] [-o FOLDER]
 """
@@ -65,7 +64,7 @@ def blank(width: float, height: float) -> Figure:
 def runs(args: argparse.Namespace) -> Results:
     """Return the runs of the planners on the paper's tasks, all on the same problems."""
     levels, labels = [f"{task}/{size}" for task in TASKS for size in EDGES], {row.label for row in ROWS}
-    folder, workers = args.keep / "head_to_head", Workers(args.jobs)
+    folder, workers = args.keep / "paper_figures", Workers(args.jobs)
     import record
 
     found = bench(levels, ROWS, folder, runs=args.n, timeout=TIMEOUT, workers=workers, provenance=record.session())
