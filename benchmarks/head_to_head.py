@@ -7,7 +7,7 @@ that use their whole time limit, 5 s, on 20 problems of the hard and large level
 Each run is stored in benchmarks/runs/head_to_head when it ends, with OMPL's logs and the database for Planner Arena;
 the command resumes where it was stopped.
 
-scripts/reproduce.py takes its runs from there, and adds some.
+scripts/reproduce.py keeps runs of its own, in benchmarks/runs/paper_figures.
 
 Usage: python benchmarks/head_to_head.py [SUITE[/LEVEL] ...] [-n 30] [--slow 20] [--jobs 1]
 """
