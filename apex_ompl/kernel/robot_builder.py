@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apex_ompl.kernel.cluster_balls import ClusterBall, Member, cluster_ball, leaf_radii, transformed
-from apex_ompl.kernel.compiled.arrays import FIXED, RobotArrays
+from apex_ompl.kernel.compiled.arrays import FIXED, LIMIT_SLACK, RobotArrays
 from apex_ompl.kernel.robot_specs import BodySpec, JointSpec
 from apex_ompl.kernel.tables import RobotTables
 from apex_ompl.types import Array
@@ -190,7 +190,7 @@ class _Builder:
             if self.cluster_of[k] == cluster
         ]
         dof = self._dof(cluster)
-        limits = None if dof < 0 else (float(self.lower[dof]), float(self.upper[dof]))
+        limits = None if dof < 0 else (float(self.lower[dof]) - LIMIT_SLACK, float(self.upper[dof]) + LIMIT_SLACK)
         return cluster_ball(
             members, self.clusters[cluster][0], self.lazy[cluster], self.joints, self.placements, limits
         )

@@ -13,6 +13,7 @@ from apex_ompl.kernel.compiled.layout import Floats, Integers, table_view
 
 FIXED, REVOLUTE, PRISMATIC = 0, 1, 2
 BOX, SPHERE, CYLINDER, CAPSULE, HALF_SPACE = range(5)
+LIMIT_SLACK = 1e-9  # by which clusters' balls hold beyond the limits: motions are bounded with rounding [rad]
 
 Pairs = Annotated[Integers, 2]
 Spans = Annotated[Integers, 2]  # first and number

@@ -70,6 +70,12 @@ def inlined(function: F) -> F:
     return compiled
 
 
+def outlined(function: F) -> F:
+    """Compile a function that only other compiled ones call, once for all of them."""
+    compiled: F = numba.njit(**OPTIONS)(function)
+    return compiled
+
+
 def ir_inlined(function: F) -> F:
     """Compile a function that only other compiled ones call; numba inlines it, which functions that return arrays need.
 

@@ -101,6 +101,18 @@ def buffer_sizes(cls: Any, **dimensions: int) -> tuple[int, int]:
     return sizes[True], sizes[False]
 
 
+def new_buffers(cls: Any, **dimensions: int) -> tuple[Integers, Floats, Any]:
+    """Return new buffers, of zeros, for the arrays of a ``cls``, and the ``cls`` of views of them for Python."""
+    integers, floats = (np.zeros(n, t) for n, t in zip(buffer_sizes(cls, **dimensions), (np.int64, float), strict=True))
+    views, ends = [], {True: 0, False: 0}
+    for field in layout(cls):
+        begin = ends[field.integer]
+        ends[field.integer] += math.prod(field.sized(dimensions))
+        buffer = integers if field.integer else floats
+        views.append(buffer[begin : ends[field.integer]].reshape(field.sized(dimensions)))
+    return integers, floats, cls(*views)
+
+
 def _generated(cls: Any, arguments: list[str], lines: list[str], values: list[str]) -> Callable[..., Any]:
     """Return the compiled function that computes ``lines`` and returns a ``cls`` of ``values``."""
     body = "".join(f"    {line}\n" for line in lines)

@@ -76,16 +76,16 @@ def bound_displacements(t: RobotArrays, w: Workspace) -> None:
 
 @inlined
 def cluster_displacement(w: Workspace, c: int) -> float:
-    """Return a bound on the displacement of a cluster's spheres in the world [m]."""
+    """Return a bound on the displacement of a cluster's spheres in the world, plus the margin [m]."""
     if w.moving[0] == 0:
         return 0.0
     x, y, z = w.linear[c, 0, 0], w.linear[c, 0, 1], w.linear[c, 0, 2]
-    return float(min(w.arc_bound[c, 0], math.sqrt(x * x + y * y + z * z) + w.remainder[c, 0]))
+    return float(min(w.arc_bound[c, 0], math.sqrt(x * x + y * y + z * z) + w.remainder[c, 0])) + w.margin[0]
 
 
 @inlined
 def relative_displacement(w: Workspace, a: int, b: int, common: int) -> float:
-    """Return a bound on the displacement of two clusters' spheres relative to each other [m].
+    """Return a bound on the displacement of two clusters' spheres relative to each other, plus the margin [m].
 
     Both displacements are taken in the frame of ``common``, a joint above both.
     """
@@ -94,4 +94,4 @@ def relative_displacement(w: Workspace, a: int, b: int, common: int) -> float:
     u, v = w.linear[a, common], w.linear[b, common]
     x, y, z = u[0] - v[0], u[1] - v[1], u[2] - v[2]
     straight = math.sqrt(x * x + y * y + z * z) + w.remainder[a, common] + w.remainder[b, common]
-    return float(min(w.arc_bound[a, common] + w.arc_bound[b, common], straight))
+    return float(min(w.arc_bound[a, common] + w.arc_bound[b, common], straight)) + w.margin[0]

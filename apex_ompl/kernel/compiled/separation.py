@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 
-from apex_ompl.kernel.compiled.arrays import RobotArrays, SceneArrays
+from apex_ompl.kernel.compiled.arrays import LIMIT_SLACK, RobotArrays, SceneArrays
 from apex_ompl.kernel.compiled.compilation import inlined
 from apex_ompl.kernel.compiled.kinematics import node_position, place_cluster, place_robot
 from apex_ompl.kernel.compiled.layout import Floats, Integers
@@ -141,13 +141,14 @@ def unproved_between_bodies(t: RobotArrays, w: Workspace, q: Floats, found: Inte
 
 @inlined
 def tables_hold(t: RobotArrays, q: Floats, half_width: Floats) -> bool:
-    """Whether a box of states is finite, and inside the limits for which the clusters' balls were made."""
+    """Whether a box of states is finite, and inside the limits for which the clusters' balls were made, rounded."""
     for k in range(len(q)):
         if not math.isfinite(q[k]):
             return False
     for c in range(len(t.cluster_dof)):
         k = t.cluster_dof[c]
-        if k >= 0 and not (q[k] - half_width[k] >= t.lower[k] and q[k] + half_width[k] <= t.upper[k]):
+        low, high = t.lower[k] - LIMIT_SLACK, t.upper[k] + LIMIT_SLACK
+        if k >= 0 and not (q[k] - half_width[k] >= low and q[k] + half_width[k] <= high):
             return False
     return True
 

@@ -20,6 +20,7 @@ class Workspace(NamedTuple):
         root: Centres of the bodies' root spheres in the world [m].
         stack: Nodes that wait in a traversal of trees of spheres.
         moving: Whether clusters move: else the bounds below are not looked at.
+        margin: Distance by which pairs that move must be apart [m].
         arc_bound: Bound by lengths of arcs on the displacement of a cluster's spheres, relative to the frames of the
             joints above it [m]; for this and the next two see :mod:`apex_ompl.kernel.compiled.motion_bound`.
         linear: Displacement of a cluster's ball to first order, relative to the same frames, in the world's axes [m].
@@ -38,6 +39,7 @@ class Workspace(NamedTuple):
     root: Annotated[Floats, "bodies", 3]
     stack: Annotated[Integers, "stack"]
     moving: Annotated[Integers, 1]
+    margin: Annotated[Floats, 1]
     arc_bound: Annotated[Floats, "clusters", "joints"]
     linear: Annotated[Floats, "clusters", "joints", 3]
     remainder: Annotated[Floats, "clusters", "joints"]
@@ -76,4 +78,5 @@ def workspace_view(t: RobotArrays, integers: Integers, floats: Floats) -> Worksp
     for k in range(len(t.lower)):
         w.half_width[k] = 0.0
     w.moving[0] = 0
+    w.margin[0] = 0.0
     return w  # type: ignore[no-any-return]

@@ -1,0 +1,220 @@
+"""Exact shapes of bodies and obstacles as the kernel's flat arrays: primitives, hulls, and trees over triangles."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import coal
+import numpy as np
+from numpy.typing import NDArray
+
+from apex_ompl.collision.containment import hull_corners
+from apex_ompl.collision.cover.spheres import shape_key
+from apex_ompl.collision.shapes import convex_hull, is_shell
+from apex_ompl.kernel.compiled.arrays import BOX, CAPSULE, CYLINDER, HALF_SPACE, SPHERE
+from apex_ompl.kernel.compiled.layout import Floats, Integers, pack
+from apex_ompl.kernel.compiled.shapes import HULL, ShapeArrays
+from apex_ompl.scene.meshes import triangles
+from apex_ompl.types import Array
+
+CONVEX_TOLERANCE = 1e-7  # a mesh is its hull when its triangles' centres are no deeper than this below it [m]
+MOST_MESHES = 256  # that are kept
+CELLS = 1 << 10  # along each axis, by which triangles are sorted
+
+_meshes: OrderedDict[str, Mesh] = OrderedDict()  # by shape key
+
+
+class Mesh(NamedTuple):
+    """A mesh for the kernel.
+
+    Attributes:
+        points: Corners of its convex hull, shape (P, 3) [m].
+        corners: Corners of its triangles in the tree's order, shape (T, 3, 3) [m]; none for a mesh that is its hull.
+        balls: Centre and radius around the triangles below each node of the tree, shape (2 T - 1, 4) [m].
+        child: First child of each node, -1 for leaves, shape (2 T - 1,).
+        leaf: Triangle of each leaf, -1 for inner nodes, shape (2 T - 1,).
+    """
+
+    points: Array
+    corners: Array
+    balls: Array
+    child: NDArray[np.int64]
+    leaf: NDArray[np.int64]
+
+
+class PlacedShape(NamedTuple):
+    """A shape that is fixed to a joint.
+
+    Attributes:
+        geometry: The shape.
+        joint: Joint of the kernel.
+        pose: Pose in the joint's frame, shape (4, 4) [m].
+    """
+
+    geometry: coal.CollisionGeometry
+    joint: int
+    pose: Array
+
+
+def mesh_of(geometry: coal.CollisionGeometry) -> Mesh:
+    """Return the hull of a mesh or of a convex body, with a tree over its triangles where it is not convex."""
+    key = shape_key(geometry)
+    if key in _meshes:
+        _meshes.move_to_end(key)
+        return _meshes[key]
+    hull = convex_hull(geometry)
+    mesh = Mesh(np.array(hull.points()), np.empty((0, 3, 3)), np.empty((0, 4)), *(np.empty(0, np.int64),) * 2)
+    if is_shell(geometry):
+        vertices, faces = triangles(geometry)
+        corners = vertices[faces]
+        if _depth(hull, corners) > CONVEX_TOLERANCE:
+            corners = corners[_morton_order(corners.mean(axis=1))]
+            mesh = Mesh(mesh.points, corners, *ball_tree(corners))
+    while len(_meshes) >= MOST_MESHES:
+        _meshes.popitem(last=False)
+    _meshes[key] = mesh
+    return mesh
+
+
+def _depth(hull: coal.CollisionGeometry, corners: Array) -> float:
+    """Return the largest depth of a triangle's centre below the faces of a hull [m]."""
+    outside, depth = hull_corners(hull), 0.0
+    normals = np.cross(outside[:, 1] - outside[:, 0], outside[:, 2] - outside[:, 0])
+    long = np.linalg.norm(normals, axis=1)
+    sound = long > 1e-14
+    normals = normals[sound] / long[sound, None]
+    offsets = np.einsum("ij,ij->i", normals, outside[sound, 0])
+    turned = np.sign(offsets - normals @ outside.mean(axis=(0, 1)))
+    normals, offsets = normals * turned[:, None], offsets * turned
+    for first in range(0, len(corners), 1000):
+        centres = corners[first : first + 1000].mean(axis=1)
+        depth = max(depth, float((offsets - centres @ normals.T).min(axis=1).max()))
+    return depth
+
+
+def _morton_order(centres: Array) -> NDArray[np.intp]:
+    """Return points in the order of a space-filling curve, so that neighbours in it are near."""
+    low = centres.min(axis=0)
+    cells = np.minimum((centres - low) / max(float(np.ptp(centres, axis=0).max()), 1e-12) * CELLS, CELLS - 1)
+    code = np.zeros(len(centres), np.int64)
+    for bit in range(CELLS.bit_length() - 1):
+        for axis in range(3):
+            code |= ((cells[:, axis].astype(np.int64) >> bit) & 1) << (3 * bit + axis)
+    return np.argsort(code, kind="stable")
+
+
+def ball_tree(corners: Array) -> tuple[Array, NDArray[np.int64], NDArray[np.int64]]:
+    """Return a binary tree over triangles in their order, shape (T, 3, 3) [m]: balls, children and leaves.
+
+    Each node holds a range of triangles, its children the two halves; nodes stand level by level. The ball of a node
+    has the centre of its bounding box.
+    """
+    low, high = corners.min(axis=1), corners.max(axis=1)
+    first, last = np.zeros(1, np.int64), np.array([len(corners)])
+    balls, child, leaf, count = [], [], [], 1
+    while len(first):
+        edges = np.stack([first, last], axis=1).ravel()
+        box_low, box_high = (_over_ranges(f, v, edges) for f, v in ((np.minimum, low), (np.maximum, high)))
+        centre = (box_low + box_high) / 2.0
+        owner = np.repeat(np.arange(len(first)), last - first)
+        inside = np.concatenate([np.arange(a, b) for a, b in zip(first, last, strict=True)])
+        far = np.linalg.norm(corners[inside] - centre[owner][:, None], axis=2).max(axis=1)
+        radius = np.maximum.reduceat(far, np.cumsum([0, *(last - first)])[:-1]) + 1e-12
+        balls.append(np.concatenate([centre, radius[:, None]], axis=1))
+        inner = last - first > 1
+        number = np.full(len(first), -1, np.int64)
+        number[inner] = count + 2 * np.arange(int(inner.sum()))
+        child.append(number)
+        leaf.append(np.where(inner, -1, first))
+        count += 2 * int(inner.sum())
+        middle = (first + last)[inner] // 2
+        first = np.stack([first[inner], middle], axis=1).ravel()
+        last = np.stack([middle, last[inner]], axis=1).ravel()
+    return np.concatenate(balls), np.concatenate(child), np.concatenate(leaf)
+
+
+def _over_ranges(function: np.ufunc, values: Array, edges: NDArray[np.int64]) -> Array:
+    """Return ``function`` over rows of values between each even edge and the odd one behind it."""
+    padded = np.concatenate([values, values[-1:]])  # the last edge may be one behind the end
+    reduced: Array = function.reduceat(padded, edges, axis=0)[::2]
+    return reduced
+
+
+def pack_shapes(shapes: Mapping[int, PlacedShape]) -> tuple[Integers, Floats]:
+    """Return the packed arrays of shapes by their numbers."""
+    numbers = list(shapes)
+    row = np.full(max(numbers, default=-1) + 1, -1, np.int64)
+    row[numbers] = np.arange(len(numbers))
+    placed, points, nodes, point_count = list(shapes.values()), [np.empty((0, 3))], [], 0
+    roots, spans, child, corner = [], [], [np.empty(0, np.int64)], [np.empty(0, np.int64)]
+    node_count = 0
+    for shape in placed:
+        if _kind(shape.geometry) != HULL:
+            roots.append(-1)
+            spans.append((0, 0))
+            continue
+        mesh = mesh_of(shape.geometry)
+        spans.append((point_count, len(mesh.points)))
+        point_count += len(mesh.points)
+        roots.append(node_count if len(mesh.leaf) else -1)
+        child.append(np.where(mesh.child >= 0, mesh.child + node_count, -1))
+        corner.append(np.where(mesh.leaf >= 0, point_count + 3 * mesh.leaf, -1))
+        nodes.append(mesh.balls)
+        points += [mesh.points, mesh.corners.reshape(-1, 3)]
+        point_count += 3 * len(mesh.corners)
+        node_count += len(mesh.leaf)
+    poses = [_pose(shape) for shape in placed]
+    arrays = ShapeArrays(
+        kind=np.array([_kind(s.geometry) for s in placed], np.int64),
+        joint=np.array([s.joint for s in placed], np.int64),
+        points_of=np.array(spans, np.int64).reshape(-1, 2),
+        root=np.array(roots, np.int64),
+        child=np.concatenate(child),
+        corner=np.concatenate(corner),
+        row=row,
+        rotation=np.array([pose[0] for pose in poses]).reshape(-1, 3, 3),
+        offset=np.array([pose[1] for pose in poses]).reshape(-1, 3),
+        size=np.array([pose[2] for pose in poses]).reshape(-1, 3),
+        ball=np.array([_ball(shape) for shape in placed]).reshape(-1, 4),
+        node_ball=np.concatenate([np.empty((0, 4)), *nodes]),
+        points=np.concatenate(points),
+    )
+    return pack(arrays)
+
+
+def _kind(shape: coal.CollisionGeometry) -> int:
+    kinds = {coal.GEOM_BOX: BOX, coal.GEOM_SPHERE: SPHERE, coal.GEOM_CYLINDER: CYLINDER}
+    kinds |= {coal.GEOM_CAPSULE: CAPSULE, coal.GEOM_HALFSPACE: HALF_SPACE}
+    return kinds.get(shape.getNodeType(), HULL)
+
+
+def _size(shape: coal.CollisionGeometry) -> tuple[float, ...]:
+    kind = _kind(shape)
+    if kind == BOX:
+        return tuple(shape.halfSide)
+    if kind == SPHERE:
+        return (shape.radius, 0.0, 0.0)
+    return (shape.radius, shape.halfLength, 0.0) if kind in (CYLINDER, CAPSULE) else (0.0, 0.0, 0.0)
+
+
+def _pose(placed: PlacedShape) -> tuple[Array, Sequence[float] | Array, Sequence[float]]:
+    """Return rotation, offset and size; a half-space has its normal as offset and its distance as size."""
+    shape, pose = placed.geometry, placed.pose
+    if _kind(shape) != HALF_SPACE:
+        return pose[:3, :3], pose[:3, 3], _size(shape)
+    normal = pose[:3, :3] @ shape.n
+    return np.eye(3), normal, (shape.d + float(normal @ pose[:3, 3]), 0.0, 0.0)
+
+
+def _ball(placed: PlacedShape) -> Array:
+    """Return centre and radius of a ball around a solid in the joint's frame, shape (4,) [m]; 0 for half-spaces."""
+    shape, kind, centre = placed.geometry, _kind(placed.geometry), np.zeros(3)
+    a, b, c = _size(shape)
+    radius = {BOX: float(np.linalg.norm((a, b, c))), SPHERE: a, CYLINDER: float(np.hypot(a, b)), CAPSULE: a + b}
+    if kind == HULL:
+        points = mesh_of(shape).points
+        centre = (points.min(axis=0) + points.max(axis=0)) / 2.0
+        radius[HULL] = float(np.linalg.norm(points - centre, axis=1).max())
+    return np.append(placed.pose[:3, :3] @ centre + placed.pose[:3, 3], radius.get(kind, 0.0) + 1e-12)

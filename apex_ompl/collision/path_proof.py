@@ -1,0 +1,194 @@
+"""Proofs that whole paths and motions are free, with their least clearance; see the kernel's ``curve_proof``."""
+
+from __future__ import annotations
+
+import threading
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from apex_ompl.collision.broadphase import CompiledScene
+from apex_ompl.collision.exact_shapes import PlacedShape, pack_shapes
+from apex_ompl.collision.tabulate import joint_specs
+from apex_ompl.errors import ParameterError
+from apex_ompl.kernel.compiled import curve_proof
+from apex_ompl.kernel.compiled.arrays import FIXED
+from apex_ompl.kernel.compiled.layout import new_buffers
+from apex_ompl.kernel.compiled.shapes import PairBuffers
+from apex_ompl.kernel.kernel import Kernel
+from apex_ompl.kernel.robot_builder import turn_to
+from apex_ompl.robot import Robot
+from apex_ompl.types import Array
+
+if TYPE_CHECKING:
+    from apex_ompl.trajectory import Trajectory
+
+TOUCH = 1e-5  # distance that counts as contact [m]
+TOLERANCE = 1e-4  # of the least clearance [m]
+BUDGET = 1000  # intervals between two looks at the clock: some milliseconds
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A curve through the joint space: straight lines between states, or the cubic pieces of a motion.
+
+    Attributes:
+        knots: Increasing parameters of the states, shape (K,): lengths [rad], or times [s].
+        states: Shape (K, dof).
+        rates: Velocities and accelerations side by side, shape (K, 2 dof); (0, 2 dof) for straight lines.
+        slack: What the pieces miss each other by, by rounding, in all [rad].
+    """
+
+    knots: Array
+    states: Array
+    rates: Array
+    slack: float
+
+    @classmethod
+    def polyline(cls, states: Array) -> Curve:
+        """Return straight lines between states, shape (N, dof); their parameter is the length in the max-norm."""
+        steps = np.abs(np.diff(states, axis=0)).max(axis=1)
+        kept = np.concatenate([[True], steps > 0.0])
+        states = np.require(states[kept], float, ["C"])
+        knots = np.concatenate([[0.0], np.cumsum(steps[steps > 0.0])])
+        if len(states) == 1:
+            states, knots = np.repeat(states, 2, axis=0), np.zeros(2)
+        return cls(knots, states, np.empty((0, 2 * states.shape[1])), 0.0)
+
+    @classmethod
+    def motion(cls, trajectory: Trajectory) -> Curve:
+        """Return the cubic pieces of a motion; their parameter is the time."""
+        q, v, a, t = trajectory.positions, trajectory.velocities, trajectory.accelerations, trajectory.times
+        if len(t) == 1:
+            return cls.polyline(q)
+        dt = np.diff(t)[:, None]
+        missed = np.abs(q[:-1] + dt * (v[:-1] + dt * (2.0 * a[:-1] + a[1:]) / 6.0) - q[1:])
+        missed_speed = np.abs(v[:-1] + dt * (a[:-1] + a[1:]) / 2.0 - v[1:])
+        slack = float(missed.max(axis=1).sum() + missed_speed.max(axis=1).sum() * t[-1])
+        rates = np.require(np.concatenate([v, a], axis=1), float, ["C"])
+        return cls(np.require(t, float, ["C"]), np.require(q, float, ["C"]), rates, slack)
+
+
+@dataclass(frozen=True)
+class PathProof:
+    """Outcome of the proof of a path or a motion.
+
+    Attributes:
+        ok: Whether it is proved free.
+        reason: Why not: one sentence, empty for a proved path.
+        parameter: Where on the curve the fault is, or the least distance found.
+        state: The state there, shape (dof,).
+        clearance: Least distance of a checked pair that was found at a state [m], infinite where there is no pair.
+        clearance_bound: Least distance that is proved along the whole curve [m]; 0 without a proof.
+        pair: Names of the two bodies at the least distance found; empty where there is none.
+        by_spheres: Share of the curve's length that the sphere covers proved alone; exact shapes proved the rest.
+        intervals: Number of intervals looked at.
+        timed_out: Whether the time was over before the proof ended.
+    """
+
+    ok: bool
+    reason: str
+    parameter: float
+    state: Array
+    clearance: float
+    clearance_bound: float
+    pair: tuple[str, str]
+    by_spheres: float
+    intervals: int
+    timed_out: bool = False
+
+    def __bool__(self) -> bool:
+        """Whether the curve is proved free."""
+        return self.ok
+
+
+class PathProver:
+    """Proofs for a robot in one compiled scene; safe to use from several threads."""
+
+    def __init__(self, robot: Robot, scene: CompiledScene, kernel: Kernel) -> None:
+        """Make the tables of exact shapes of all bodies and obstacles in ``kernel``."""
+        self._scene, self._kernel, self._dof = scene, kernel, robot.dof
+        self._local = threading.local()
+        items = scene.geometry.geometryObjects
+        turns = [turn_to(j.axis if j.kind != FIXED else None).T for j in joint_specs(robot)]
+        bodies = {}
+        for row, number in enumerate(kernel.robot.numbers):
+            item = items[number]
+            joint = int(item.parentJoint)
+            bodies[row] = PlacedShape(item.geometry, joint, turns[joint] @ item.placement.homogeneous)
+        self._bodies = pack_shapes(bodies)
+        self.obstacles_moved(kernel)
+
+    def obstacles_moved(self, kernel: Kernel) -> None:
+        """Make the tables of the obstacles again after they moved."""
+        items = self._scene.geometry.geometryObjects
+        placed = {k: PlacedShape(items[k].geometry, 0, items[k].placement.homogeneous) for k in self._scene.scene.values()}
+        self._kernel, self._obstacles = kernel, pack_shapes(placed)
+
+    def prove(
+        self, curve: Curve, *, touch: float = TOUCH, tolerance: float = TOLERANCE, deadline: float | None = None
+    ) -> PathProof:
+        """Prove that a curve is free, and find its least clearance.
+
+        Args:
+            curve: The curve.
+            touch: Distance of a pair that counts as contact [m].
+            tolerance: Of the least clearance [m]: ``clearance_bound`` is at least ``clearance`` less this, or half of
+                it; 0 asks for the proof alone.
+            deadline: Value of ``time.perf_counter`` at which to give up [s].
+        """
+        if not np.isfinite(curve.states).all():
+            k = int(np.argmax(~np.isfinite(curve.states).all(axis=1)))
+            return self._unproved(f"state {k} is not finite", float(curve.knots[k]), curve.states[k])
+        buffers, knots = self._buffers(), curve.knots
+        p = buffers.proof
+        p.places[:] = 0, 1, 0
+        p.pairs[0], p.intervals[0] = curve_proof.ALL, (knots[0], knots[-1])
+        p.worst[:] = -1
+        p.figures[:] = np.inf if tolerance > 0.0 else 0.0, np.inf, knots[0], 0.0
+        arrays = (*self._kernel.packed, *self._bodies, *self._obstacles, *buffers.arrays)
+        outcome, over = curve_proof.MORE, False
+        while outcome == curve_proof.MORE and not over:
+            outcome = curve_proof.prove_curve(
+                *arrays, knots, curve.states, curve.rates, curve.slack, touch, tolerance, BUDGET
+            )
+            over = outcome == curve_proof.MORE and deadline is not None and time.perf_counter() > deadline
+        margin, least, where, by_spheres = p.figures.tolist()
+        names, ok = self._names(int(p.worst[0]), int(p.worst[1])), outcome == curve_proof.PROVED
+        reason, length = "", float(knots[-1] - knots[0])
+        if over:
+            reason = "not proved in time"
+        elif outcome == curve_proof.TOUCHING:
+            reason = f"{names[0]} <-> {names[1]} " + ("touch" if least <= 0.0 else f"are {least * 1e6:.2g} um apart")
+        elif not ok:
+            reason, where = "too close to contact to be proved", float(p.where[0])
+        share = by_spheres / length if length > 0.0 else 0.0
+        bound = margin if ok and tolerance > 0.0 else 0.0
+        return PathProof(ok, reason, where, p.state.copy(), least, bound, names, share, int(p.places[2]), over)
+
+    def _unproved(self, reason: str, parameter: float, state: Array) -> PathProof:
+        return PathProof(False, reason, parameter, state, -np.inf, 0.0, ("", ""), 0.0, 0)
+
+    def _names(self, first: int, second: int) -> tuple[str, str]:
+        if first < 0:
+            return "", ""
+        numbers, labels = self._kernel.robot.numbers, self._scene.labels
+        return labels[numbers[first]], labels[numbers[second] if second >= 0 else -1 - second]
+
+    def _buffers(self) -> _Buffers:
+        """Return this thread's buffers."""
+        buffers: _Buffers | None = getattr(self._local, "buffers", None)
+        if buffers is None:
+            buffers = self._local.buffers = _Buffers(self._kernel)
+        return buffers
+
+
+class _Buffers:
+    """Arrays that one thread passes to compiled code."""
+
+    def __init__(self, kernel: Kernel) -> None:
+        self.proof: curve_proof.ProofBuffers
+        integers, floats, self.proof = new_buffers(curve_proof.ProofBuffers, dof=kernel.robot.dof)
+        self.arrays = (*kernel.workspace(), *new_buffers(PairBuffers)[:2], integers, floats)

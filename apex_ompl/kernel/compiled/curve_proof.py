@@ -1,0 +1,210 @@
+"""Proof that a whole curve is free, and its least clearance, by branch and bound.
+
+Intervals of the curve are bisected, breadth first. On each the sphere covers are tried first, for all pairs at once.
+The few pairs that they leave are looked at by their exact shapes
+(:func:`apex_ompl.kernel.compiled.pair_distance.pair_bound`); a pair that is not decided goes on to the two halves of
+the interval, alone. Bounds are compared with a margin: 0 for a bare proof; for the least clearance c it is what was
+found so far less a tolerance, so that in the end margin <= c <= found. A pair that is nearer than ``touch`` at any state
+counts as touching.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, NamedTuple
+
+from apex_ompl.kernel.compiled.arrays import RobotArrays, SceneArrays, robot_view, scene_view
+from apex_ompl.kernel.compiled.clearance import nearest_bodies, nearest_obstacle
+from apex_ompl.kernel.compiled.compilation import entry_point, inlined, outlined
+from apex_ompl.kernel.compiled.curve import set_motion, set_state
+from apex_ompl.kernel.compiled.kinematics import place_cluster, place_robot
+from apex_ompl.kernel.compiled.layout import Floats, Integers, buffer_view
+from apex_ompl.kernel.compiled.motion_bound import bound_displacements
+from apex_ompl.kernel.compiled.pair_distance import pair_bound
+from apex_ompl.kernel.compiled.separation import tables_hold, unproved
+from apex_ompl.kernel.compiled.shapes import PairBuffers, ShapeArrays, pair_view, shapes_view
+from apex_ompl.kernel.compiled.workspace import Workspace, workspace_view
+
+PROVED, MORE, TOUCHING, UNDECIDED = range(4)  # outcomes
+QUEUE = 1 << 14  # intervals that wait
+MOST_UNPROVED = 256  # pairs that the spheres leave on one interval
+FEW = 12  # pairs that are looked at one by one also on a long interval
+SHORT = 0.01  # share of the curve below which an interval is not long
+SHORTEST = 1e-11  # share of the curve below which a pair that is still open is given up
+SEEDED = 9  # intervals whose nearest spheres show where the least clearance may be
+ALL = -1  # stands for all pairs
+
+
+class ProofBuffers(NamedTuple):
+    """State of a proof between calls.
+
+    Attributes:
+        places: First and one behind the last interval in the queue, which goes around; intervals so far.
+        pairs: Body and other body, or -1 - obstacle; ALL for all pairs; of each interval in the queue.
+        found: Pairs that the spheres leave.
+        worst: The pair with the least distance found.
+        intervals: Begin and end of each interval in the queue.
+        figures: Margin, least distance found, where on the curve, and the length that spheres alone proved.
+        where: Middle of the last interval.
+        state: State in the middle.
+    """
+
+    places: Annotated[Integers, 3]
+    pairs: Annotated[Integers, QUEUE, 2]
+    found: Annotated[Integers, MOST_UNPROVED, 2]
+    worst: Annotated[Integers, 2]
+    intervals: Annotated[Floats, QUEUE, 2]
+    figures: Annotated[Floats, 4]
+    where: Annotated[Floats, 1]
+    state: Annotated[Floats, "dof"]
+
+
+_proof_view = buffer_view(ProofBuffers, ("dof",))
+MARGIN, LEAST, WHERE, BY_SPHERES = range(4)  # of the figures
+
+
+@inlined
+def _append(p: ProofBuffers, a: float, b: float, first: int, second: int) -> None:
+    k = p.places[1] % QUEUE
+    p.intervals[k, 0], p.intervals[k, 1], p.pairs[k, 0], p.pairs[k, 1] = a, b, first, second
+    p.places[1] += 1
+
+
+@inlined
+def _record(p: ProofBuffers, distance: float, where: float, a: int, b: int, tolerance: float) -> None:
+    """Keep the least distance found, and lower the margin to it less the tolerance, at most by half."""
+    if distance < p.figures[LEAST]:
+        p.figures[LEAST], p.figures[WHERE], p.worst[0], p.worst[1] = distance, where, a, b
+        if tolerance > 0.0:
+            p.figures[MARGIN] = max(distance - tolerance, 0.5 * distance)
+
+
+@outlined
+def _bound(
+    t: RobotArrays, w: Workspace, h: ShapeArrays, k: ShapeArrays, g: PairBuffers, a: int, b: int, need: float
+) -> tuple[float, float]:
+    """Return :func:`pair_bound` of body ``a`` and body ``b``, or obstacle -1 - ``b``."""
+    if b >= 0:
+        return pair_bound(t, w, h, h.row[a], h, h.row[b], g, need)
+    return pair_bound(t, w, h, h.row[a], k, k.row[-1 - b], g, need)
+
+
+@outlined
+def _seed(
+    t: RobotArrays, s: SceneArrays, w: Workspace, h: ShapeArrays, k: ShapeArrays, g: PairBuffers, p: ProofBuffers,
+    where: float, tolerance: float,
+) -> None:  # fmt: skip
+    """Record the distance now of the two bodies, and of the body and obstacle, whose spheres are nearest."""
+    near = nearest_obstacle(t, s, w, p.state, math.inf)
+    if near[1] >= 0:
+        other = -1 - s.owner[near[3]]
+        place_cluster_of(t, w, p.state, near[1], other)
+        found = _bound(t, w, h, k, g, near[1], other, math.inf)
+        _record(p, found[1], where, near[1], other, tolerance)
+    own = nearest_bodies(t, w, p.state, p.figures[LEAST])
+    if own[1] >= 0:
+        place_cluster_of(t, w, p.state, own[1], own[3])
+        found = _bound(t, w, h, k, g, own[1], own[3], math.inf)
+        _record(p, found[1], where, own[1], own[3], tolerance)
+
+
+@inlined
+def place_cluster_of(t: RobotArrays, w: Workspace, q: Floats, a: int, b: int) -> None:
+    """Place the clusters of body ``a`` and, if it is one, of body ``b``."""
+    for c in range(len(t.cluster_bodies)):
+        first, count = t.cluster_bodies[c, 0], t.cluster_bodies[c, 1]
+        if first <= a < first + count or first <= b < first + count:
+            place_cluster(t, w, q, c)
+
+
+@entry_point
+def prove_curve(
+    ri: Integers, rf: Floats, si: Integers, sf: Floats, bi: Integers, bf: Floats, oi: Integers, of: Floats,
+    wi: Integers, wf: Floats, gi: Integers, gf: Floats, pi: Integers, pf: Floats,
+    knots: Floats, states: Floats, rates: Floats, slack: float, touch: float, tolerance: float, budget: int,
+) -> int:  # fmt: skip
+    """Prove a curve free, for at most ``budget`` intervals; another call goes on.
+
+    Robot, scene, shapes of bodies and of obstacles come packed, then the buffers of a state, of a pair and of the
+    proof, in which the whole curve is the first interval.
+
+    Args (besides):
+        knots, states, rates, slack: The curve, see :func:`apex_ompl.kernel.compiled.curve.set_motion`.
+        touch: Distance that counts as contact [m].
+        tolerance: Of the least clearance [m]; 0 for a bare proof.
+        budget: Number of intervals.
+
+    Returns:
+        PROVED, MORE, TOUCHING (the state and the pair are those of ``worst``), or UNDECIDED where an interval got too
+        short.
+    """
+    t, s, h, k = robot_view(ri, rf), scene_view(si, sf), shapes_view(bi, bf), shapes_view(oi, of)
+    w, g, p = workspace_view(t, wi, wf), pair_view(gi, gf), _proof_view(pi, pf, len(t.lower))
+    whole = knots[len(knots) - 1] - knots[0]
+    while p.places[0] < p.places[1] and budget > 0:
+        budget -= 1
+        p.places[2] += 1
+        if p.places[1] - p.places[0] < QUEUE // 2:
+            e = p.places[0] % QUEUE
+            p.places[0] += 1
+        else:  # the queue is getting full: depth first
+            p.places[1] -= 1
+            e = p.places[1] % QUEUE
+        a, b, first, second = p.intervals[e, 0], p.intervals[e, 1], p.pairs[e, 0], p.pairs[e, 1]
+        middle = p.where[0] = 0.5 * (a + b)
+        set_state(knots, states, rates, middle, p.state)
+        set_motion(knots, states, rates, slack, a, b, p.state, w)
+        for i in range(len(p.state)):  # the hands may end at their limits
+            w.end[i] = w.half_width[i]
+            w.half_width[i] = 0.0
+        count = 0
+        if not tables_hold(t, p.state, w.half_width) or p.places[1] - p.places[0] > QUEUE - 2 * MOST_UNPROVED:
+            return UNDECIDED
+        place_robot(t, w, p.state)
+        for i in range(len(p.state)):
+            w.half_width[i] = w.end[i]
+        if first == ALL:
+            w.moving[0] = 0
+            if tolerance > 0.0 and p.places[2] <= SEEDED:
+                _still(w)
+                _seed(t, s, w, h, k, g, p, middle, tolerance)
+                set_motion(knots, states, rates, slack, a, b, p.state, w)
+            bound_displacements(t, w)
+            w.margin[0] = p.figures[MARGIN]
+            count = unproved(t, s, w, p.state, p.found)
+            w.margin[0] = 0.0
+            if count == 0:
+                p.figures[BY_SPHERES] += b - a
+                continue
+            if count == MOST_UNPROVED or (count > FEW and b - a > SHORT * whole):
+                if b - a <= SHORTEST * whole:
+                    return UNDECIDED
+                _append(p, a, middle, ALL, ALL)
+                _append(p, middle, b, ALL, ALL)
+                continue
+        else:
+            count = 1
+            p.found[0, 0], p.found[0, 1] = first, second
+        for m in range(count):
+            x, y = p.found[m, 0], p.found[m, 1]
+            if m > 0 and p.found[m - 1, 0] == x and p.found[m - 1, 1] == y:
+                continue
+            place_cluster_of(t, w, p.state, x, y)
+            bound, upper = _bound(t, w, h, k, g, x, y, p.figures[MARGIN])
+            _record(p, upper, middle, x, y, tolerance)
+            if upper <= touch:
+                return TOUCHING
+            if bound > 0.0 and bound >= p.figures[MARGIN]:
+                continue
+            if b - a <= SHORTEST * whole:
+                return UNDECIDED
+            _append(p, a, middle, x, y)
+            _append(p, middle, b, x, y)
+    return PROVED if p.places[0] == p.places[1] else MORE
+
+
+@inlined
+def _still(w: Workspace) -> None:
+    """Let the motion be none, for distances now."""
+    for i in range(len(w.step)):
+        w.step[i] = w.deviation[i] = w.half_width[i] = 0.0
