@@ -23,7 +23,6 @@ from apex_ompl.trajopt.path import Path
 from apex_ompl.trajopt.settings import OptimizerSettings
 from apex_ompl.trajopt.spline import Spline
 from apex_ompl.types import Array
-from apex_ompl.util.resolution import FULL_RESOLUTION
 
 NAME = "rrtconnect+polish"
 LOG = logging.getLogger("apex_ompl")
@@ -40,7 +39,7 @@ def polished(
     control = optimizer.spline.fit(states, limits.lower, limits.upper).control
 
     def is_valid(found: Array) -> bool:
-        return checker.first_collision(found, FULL_RESOLUTION) is None
+        return bool(checker.prove(found, tolerance=0.0))
 
     best = optimizer.shorten(checker.kernel, control, is_valid, stop)
     return None if best is None else Path.on(optimizer.spline, best)

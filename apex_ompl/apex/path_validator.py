@@ -14,7 +14,6 @@ from apex_ompl.ompl_adapter.space import to_state
 from apex_ompl.ompl_adapter.validity import MotionValidator, StateValidityChecker
 from apex_ompl.robot import load_robot
 from apex_ompl.types import Array
-from apex_ompl.util.resolution import FULL_RESOLUTION
 
 Stop = Callable[[], bool]
 
@@ -80,7 +79,7 @@ class PathValidator:
 
     def is_valid(self, path: Array, stop: Stop = lambda: False) -> bool:
         """Whether a path, shape (N, dof), is valid; with another checker, not when it is told to stop meanwhile."""
-        if self.knows_obstacles and self.checker.first_collision(path, FULL_RESOLUTION) is not None:
+        if self.knows_obstacles and not self.checker.prove(path, tolerance=0.0):
             return False
         return self.exclusive or self._valid_by_ompl(path, stop)
 
@@ -93,19 +92,11 @@ class PathValidator:
         return all(not stop() and self._si.checkMotion(a, b) for a, b in zip(states, states[1:], strict=False))
 
     def obstacle_distance(self, path: Array) -> float:
-        """Return the least distance between robot and obstacles along a path, shape (N, dof), by GJK [m].
+        """Return the least distance between robot and obstacles along a path, shape (N, dof) [m].
 
-        Every fourth state is measured, fixtures are left out; infinite where the obstacles are not known.
+        Fixtures are left out; infinite where the obstacles are not known.
         """
-        if not self.knows_obstacles:
-            return np.inf
-        states = np.concatenate([path[::STRIDE], path[-1:]])
-        bound, least = self.checker.kernel.clearance(states)[:, 0], np.inf
-        for k in np.argsort(bound):  # the spheres' clearance is at most that of the meshes
-            if bound[k] >= least:
-                break
-            least = min(least, self.checker.distance(states[k]).value)
-        return float(least)
+        return self.checker.obstacle_distance(path) if self.knows_obstacles else np.inf
 
 
 def _checkers(si: ob.SpaceInformation) -> tuple[ob.StateValidityChecker, ob.MotionValidator]:

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Iterable, Sequence
-from typing import Any
+from collections.abc import Iterable
 
-import coal
 import numpy as np
 import pinocchio as pin
 
@@ -15,20 +13,20 @@ from apex_ompl.collision.broadphase import CompiledScene, Contact
 from apex_ompl.collision.conservative import CheckCounts, ConservativeChecker, NoGridError, UnprovedPairs
 from apex_ompl.collision.discretization import Collision, first_colliding_sample
 from apex_ompl.collision.distance import Distance
-from apex_ompl.collision.shapes import coal_geometry, world_geometry
-from apex_ompl.errors import ParameterError, SceneError
+from apex_ompl.collision.path_proof import TOLERANCE, Curve, PathProof, PathProver, obstacles_alone
+from apex_ompl.collision.scene_bodies import SceneBodies
+from apex_ompl.errors import ParameterError
 from apex_ompl.kernel import Kernel
 from apex_ompl.robot import Robot
-from apex_ompl.scene.bodies import AttachedObject, Body, Obstacle
+from apex_ompl.scene.bodies import AttachedObject, Obstacle
 from apex_ompl.types import Array, Flags
-from apex_ompl.util.schema import validate
 from apex_ompl.util.validation import check_states, shape_error
 
 NO_POINT = (0.0, 0.0, -1.0)
 """Obstacle point of a scene without obstacles, 1 m below the table tops, farther away than any obstacle [m]."""
 
 
-class CollisionChecker:
+class CollisionChecker(SceneBodies):
     """Checks states of a robot in a scene for collision, in two stages.
 
     The first stage is conservative: sphere covers that contain the solids prove most free states, and long stretches
@@ -63,95 +61,13 @@ class CollisionChecker:
             MissingFileError: A mesh file is missing.
             FileFormatError: A mesh file holds no triangles.
         """
-        self.robot = robot
         self.check_counts = CheckCounts()
         self._two_stages = proofs
         self._conservative: ConservativeChecker | None = None
+        self._provers: dict[bool, PathProver] = {}
         self._lock = threading.RLock()  # the first queries may come from several threads
-        self._obstacles: dict[str, Body] = {}
-        self._attached: dict[str, AttachedObject] = {}
-        self._placed: dict[str, tuple[coal.CollisionGeometry, Array]] = {}
         self._compiled: CompiledScene | None = None
-        self._fixtures = frozenset(body.name for body in robot.fixtures)
-        for body in (*robot.fixtures, *scene):
-            self.add(body)
-        for held in attached:
-            self.attach(held)
-
-    @property
-    def obstacle_names(self) -> tuple[str, ...]:
-        """Names of the obstacles, without the robot's fixtures."""
-        return tuple(name for name in self._obstacles if name not in self._fixtures)
-
-    def add(self, obstacle: Body) -> None:
-        """Add an obstacle.
-
-        Raises:
-            SceneError: The name is taken already.
-            MissingFileError, FileFormatError: Its mesh file is missing, or holds no triangles.
-        """
-        self._claim(obstacle.name)
-        self._placed[obstacle.name] = world_geometry(obstacle)
-        self._obstacles[obstacle.name] = obstacle
-        self._invalidate()
-
-    def move(self, name: str, position: Sequence[float], orientation: Sequence[float] | None = None) -> None:
-        """Move an obstacle to a pose in the world [m, quaternion xyzw]; the orientation is kept by default.
-
-        Raises:
-            SceneError: There is no such obstacle.
-            FileFormatError: The position or the orientation is not valid.
-        """
-        old = self._find(self._obstacles, name, "obstacle")
-        turn = old.orientation if orientation is None else orientation
-        fields = {**old.model_dump(), "position": tuple(position), "orientation": tuple(turn)}
-        new = validate(type(old), fields, f"obstacle {name!r}")
-        self._obstacles[name] = new
-        if new.half_space is not None:  # its pose is part of its geometry
-            self._placed[name] = world_geometry(new)
-            self._invalidate()
-            return
-        self._placed[name] = (self._placed[name][0], new.pose)
-        if self._compiled is not None:
-            self._compiled.place(name, pin.SE3(new.pose))
-            if self._conservative is not None:
-                self._conservative.obstacles_moved()
-
-    def remove(self, name: str) -> None:
-        """Remove an obstacle.
-
-        Raises:
-            SceneError: There is no such obstacle.
-        """
-        self._find(self._obstacles, name, "obstacle")
-        del self._obstacles[name], self._placed[name]
-        self._invalidate()
-
-    def attach(self, held: AttachedObject) -> None:
-        """Attach an object to the link that holds it; it then collides like a part of the robot.
-
-        Raises:
-            SceneError: The name is taken already.
-            UnknownNameError: An unknown link holds it or may touch it.
-            MissingFileError: Its mesh file is missing.
-            FileFormatError: Its mesh file holds no triangles.
-        """
-        self._claim(held.name)
-        for link in (held.link, *(held.touch_links or ())):
-            self.robot.link_frame(link)
-        self._placed[held.name] = (coal_geometry(held), held.pose)
-        self._attached[held.name] = held
-        self._invalidate()
-
-    def detach(self, name: str) -> None:
-        """Remove a held object.
-
-        Raises:
-            SceneError: There is no such held object.
-        """
-        self._find(self._attached, name, "held object")
-        del self._attached[name], self._placed[name]
-        self._invalidate()
+        super().__init__(robot, scene, attached)
 
     @property
     def movable(self) -> Flags:
@@ -228,14 +144,52 @@ class CollisionChecker:
                 pass
         return first_colliding_sample(path, resolution, start, self.is_free)
 
+    def prove(self, path: Array | Curve, *, tolerance: float = TOLERANCE, deadline: float | None = None) -> PathProof:
+        """Prove that a path is free from its first state to its last, and find its least clearance.
+
+        The first state is checked in full, solids inside of others included. Along the rest all pairs are proved to
+        stay apart: by the sphere covers, and where they do not suffice by distances of the exact shapes (meshes by
+        their triangles) against bounds on their relative motion. No stretch is taken on trust.
+
+        Args:
+            path: States joined by straight lines, shape (N, dof), or a curve.
+            tolerance: Of the least clearance [m]; 0 asks for the proof alone, which is faster.
+            deadline: Value of ``time.perf_counter`` at which to give up [s].
+
+        Raises:
+            ParameterError: ``path`` has not the shape (N, dof).
+        """
+        if not isinstance(path, Curve):
+            path = np.asarray(path, float)
+            check_states(path, self.robot.dof, "path", least=1)
+            path = Curve.polyline(path)
+        start = path.states[0]
+        if not self.is_free(start):
+            contacts = self.contacts(start) if np.isfinite(start).all() else []
+            return PathProof.refused(str(contacts[0]) if contacts else "in collision", path)
+        proof = self._prover().prove(path, tolerance=tolerance, deadline=deadline)
+        self.check_counts.intervals += proof.intervals
+        return proof
+
+    def obstacle_distance(self, path: Array) -> float:
+        """Return the least distance of robot and held objects to obstacles along a path, 0 where they touch [m].
+
+        The robot's fixtures are left out. The distance is that of the exact shapes, infinite without obstacles.
+
+        Args:
+            path: States joined by straight lines, shape (N, dof).
+        """
+        return max(0.0, self._prover(alone=True).prove(Curve.polyline(path)).clearance)
+
     def contacts(self, q: Array) -> list[Contact]:
         """Return all overlapping pairs at ``q``, shape (dof,), the deepest first."""
         return self._scene().contacts(self.robot.to_pinocchio(q))
 
     def distance(self, q: Array, fixtures: bool = False) -> Distance:
-        """Return the minimum distance of robot and held objects to obstacles, d_obs of the paper.
+        """Return the signed distance of robot and held objects to obstacles by convex hulls, and its nearest points.
 
-        It is computed by GJK between convex shapes; a mesh that is not convex is replaced by its convex hull.
+        It is computed by GJK between convex shapes; a mesh that is not convex is replaced by its convex hull, which
+        is enough for the model's condition. Distances of exact shapes are those of :meth:`obstacle_distance`.
 
         Args:
             q: State, shape (dof,).
@@ -252,8 +206,15 @@ class CollisionChecker:
         return np.asarray(nearest.points[1] if nearest.first else NO_POINT, float)
 
     def clearance(self, q: Array) -> float:
-        """Return the minimum distance of all pairs that are checked, self-collision pairs included [m]."""
-        return self._scene().distances("pairs").closest(self.robot.to_pinocchio(q)).value
+        """Return the distance of the nearest pair that is checked, self-collision pairs included [m].
+
+        It is that of the exact shapes at a free state, and minus the largest depth of :meth:`contacts` at a colliding
+        one.
+        """
+        proof = self.prove(np.asarray(q, float)[None])
+        if proof or proof.clearance > 0.0:
+            return proof.clearance
+        return -max((contact.depth for contact in self.contacts(q)), default=0.0)
 
     def _free_by_meshes(self, q: Array, unproved: UnprovedPairs | None = None) -> bool:
         """Check a state by the meshes: the pairs that are unproved first, and all pairs unless these are complete."""
@@ -269,22 +230,23 @@ class CollisionChecker:
                 return True
         return not scene.collides(order)
 
-    def _claim(self, name: str) -> None:
-        if name in self._obstacles or name in self._attached or self.robot.model.existBodyName(name):
-            raise SceneError(f"the name {name!r} is taken by an obstacle, a held object, a fixture or a link")
-
-    @staticmethod
-    def _find(bodies: dict[str, Any], name: str, kind: str) -> Any:
-        if name not in bodies:
-            raise SceneError(f"no {kind} {name!r}; there are: {', '.join(bodies) or 'none'}")
-        return bodies[name]
-
     def _first_stage(self) -> ConservativeChecker:
         checker = self._conservative
         if checker is None:
             with self._lock:
                 checker = self._conservative = self._conservative or ConservativeChecker(self.robot, self._scene())
         return checker
+
+    def _prover(self, alone: bool = False) -> PathProver:
+        """Return the prover of all pairs, or of those with obstacles alone, fixtures left out."""
+        prover = self._provers.get(alone)
+        if prover is None:
+            with self._lock:
+                kernel, scene = self.kernel, self._scene()
+                if alone:
+                    kernel = obstacles_alone(kernel, self.movable)
+                prover = self._provers[alone] = self._provers.get(alone) or PathProver(self.robot, scene, kernel)
+        return prover
 
     def _scene(self) -> CompiledScene:
         compiled = self._compiled
@@ -294,6 +256,15 @@ class CollisionChecker:
                 self._compiled = compiled
         return compiled
 
-    def _invalidate(self) -> None:
+    def _moved(self, name: str) -> None:
+        """Move an obstacle in the compiled scene, if there is one."""
+        if self._compiled is not None:
+            self._compiled.place(name, pin.SE3(self._placed[name][1]))
+            if self._conservative is not None:
+                self._conservative.obstacles_moved()
+        self._provers.clear()
+
+    def _changed(self) -> None:
         """Drop the compiled scene, after a change of its objects."""
         self._compiled = self._conservative = None
+        self._provers.clear()

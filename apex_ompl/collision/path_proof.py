@@ -4,29 +4,25 @@ from __future__ import annotations
 
 import threading
 import time
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from apex_ompl.collision.broadphase import CompiledScene
 from apex_ompl.collision.exact_shapes import PlacedShape, pack_shapes
 from apex_ompl.collision.tabulate import joint_specs
-from apex_ompl.errors import ParameterError
 from apex_ompl.kernel.compiled import curve_proof
 from apex_ompl.kernel.compiled.arrays import FIXED
 from apex_ompl.kernel.compiled.layout import new_buffers
 from apex_ompl.kernel.compiled.shapes import PairBuffers
 from apex_ompl.kernel.kernel import Kernel
 from apex_ompl.kernel.robot_builder import turn_to
+from apex_ompl.kernel.scene_builder import primitive, scene_tables
 from apex_ompl.robot import Robot
-from apex_ompl.types import Array
-
-if TYPE_CHECKING:
-    from apex_ompl.trajectory import Trajectory
+from apex_ompl.types import Array, Flags
 
 TOUCH = 1e-5  # distance that counts as contact [m]
-TOLERANCE = 1e-4  # of the least clearance [m]
+TOLERANCE = 1e-5  # of the least clearance [m]
 BUDGET = 1000  # intervals between two looks at the clock: some milliseconds
 
 
@@ -51,24 +47,27 @@ class Curve:
         """Return straight lines between states, shape (N, dof); their parameter is the length in the max-norm."""
         steps = np.abs(np.diff(states, axis=0)).max(axis=1)
         kept = np.concatenate([[True], steps > 0.0])
-        states = np.require(states[kept], float, ["C"])
+        states = np.require(states[kept], float, ["C", "W"])
         knots = np.concatenate([[0.0], np.cumsum(steps[steps > 0.0])])
         if len(states) == 1:
             states, knots = np.repeat(states, 2, axis=0), np.zeros(2)
         return cls(knots, states, np.empty((0, 2 * states.shape[1])), 0.0)
 
     @classmethod
-    def motion(cls, trajectory: Trajectory) -> Curve:
-        """Return the cubic pieces of a motion; their parameter is the time."""
-        q, v, a, t = trajectory.positions, trajectory.velocities, trajectory.accelerations, trajectory.times
+    def cubic(cls, times: Array, positions: Array, velocities: Array, accelerations: Array) -> Curve:
+        """Return the cubic pieces of a motion, given at its knots, shapes (K,) and (K, dof); the parameter is the time.
+
+        The acceleration is linear between knots.
+        """
+        q, v, a, t = positions, velocities, accelerations, times
         if len(t) == 1:
             return cls.polyline(q)
         dt = np.diff(t)[:, None]
         missed = np.abs(q[:-1] + dt * (v[:-1] + dt * (2.0 * a[:-1] + a[1:]) / 6.0) - q[1:])
         missed_speed = np.abs(v[:-1] + dt * (a[:-1] + a[1:]) / 2.0 - v[1:])
         slack = float(missed.max(axis=1).sum() + missed_speed.max(axis=1).sum() * t[-1])
-        rates = np.require(np.concatenate([v, a], axis=1), float, ["C"])
-        return cls(np.require(t, float, ["C"]), np.require(q, float, ["C"]), rates, slack)
+        rates = np.require(np.concatenate([v, a], axis=1), float, ["C", "W"])
+        return cls(np.require(t, float, ["C", "W"]), np.require(q, float, ["C", "W"]), rates, slack)
 
 
 @dataclass(frozen=True)
@@ -103,6 +102,22 @@ class PathProof:
         """Whether the curve is proved free."""
         return self.ok
 
+    @classmethod
+    def refused(cls, reason: str, curve: Curve) -> PathProof:
+        """Return the outcome for a curve whose first state is not free."""
+        return cls(False, reason, float(curve.knots[0]), curve.states[0].copy(), 0.0, 0.0, ("", ""), 0.0, 0)
+
+
+def obstacles_alone(kernel: Kernel, chosen: Flags) -> Kernel:
+    """Return a kernel that checks a robot against some obstacles, shape (obstacles,), and not against itself."""
+    bodies, scene = kernel.robot.arrays, kernel.scene.arrays
+    bodies = bodies._replace(
+        pair_clusters=bodies.pair_clusters[:0], pair_common=bodies.pair_common[:0], pair_bodies=bodies.pair_bodies[:0]
+    )
+    robot = replace(kernel.robot, arrays=bodies)
+    solids = [(int(scene.owner[k]), primitive(scene, int(k))) for k in np.flatnonzero(chosen)]
+    return Kernel(robot, scene_tables(solids))
+
 
 class PathProver:
     """Proofs for a robot in one compiled scene; safe to use from several threads."""
@@ -118,14 +133,9 @@ class PathProver:
             item = items[number]
             joint = int(item.parentJoint)
             bodies[row] = PlacedShape(item.geometry, joint, turns[joint] @ item.placement.homogeneous)
-        self._bodies = pack_shapes(bodies)
-        self.obstacles_moved(kernel)
-
-    def obstacles_moved(self, kernel: Kernel) -> None:
-        """Make the tables of the obstacles again after they moved."""
-        items = self._scene.geometry.geometryObjects
-        placed = {k: PlacedShape(items[k].geometry, 0, items[k].placement.homogeneous) for k in self._scene.scene.values()}
-        self._kernel, self._obstacles = kernel, pack_shapes(placed)
+        owners = sorted({int(k) for k in kernel.scene.arrays.owner})
+        obstacles = {k: PlacedShape(items[k].geometry, 0, items[k].placement.homogeneous) for k in owners}
+        self._bodies, self._obstacles = pack_shapes(bodies), pack_shapes(obstacles)
 
     def prove(
         self, curve: Curve, *, touch: float = TOUCH, tolerance: float = TOLERANCE, deadline: float | None = None
@@ -139,9 +149,8 @@ class PathProver:
                 it; 0 asks for the proof alone.
             deadline: Value of ``time.perf_counter`` at which to give up [s].
         """
-        if not np.isfinite(curve.states).all():
-            k = int(np.argmax(~np.isfinite(curve.states).all(axis=1)))
-            return self._unproved(f"state {k} is not finite", float(curve.knots[k]), curve.states[k])
+        if not (np.isfinite(curve.states).all() and np.isfinite(curve.rates).all()):
+            return PathProof.refused("a state that is not finite", curve)
         buffers, knots = self._buffers(), curve.knots
         p = buffers.proof
         p.places[:] = 0, 1, 0
@@ -167,9 +176,6 @@ class PathProver:
         share = by_spheres / length if length > 0.0 else 0.0
         bound = margin if ok and tolerance > 0.0 else 0.0
         return PathProof(ok, reason, where, p.state.copy(), least, bound, names, share, int(p.places[2]), over)
-
-    def _unproved(self, reason: str, parameter: float, state: Array) -> PathProof:
-        return PathProof(False, reason, parameter, state, -np.inf, 0.0, ("", ""), 0.0, 0)
 
     def _names(self, first: int, second: int) -> tuple[str, str]:
         if first < 0:

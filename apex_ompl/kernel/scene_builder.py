@@ -76,6 +76,16 @@ def scene_tables(solids: Sequence[tuple[int, Primitive]]) -> SceneTables:
     return SceneTables(arrays)
 
 
+def primitive(arrays: SceneArrays, k: int) -> Primitive:
+    """Return solid ``k`` of a scene's arrays."""
+    kind = int(arrays.kind[k])
+    if kind == HALF_SPACE:
+        return Primitive(kind, np.eye(4), (*arrays.offset[k].tolist(), float(arrays.size[k, 0])))
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = arrays.rotation[k], arrays.offset[k]
+    return Primitive(kind, pose, tuple(arrays.size[k].tolist()))
+
+
 def _row(p: Primitive) -> tuple[Floats, Floats, Floats]:
     if p.kind == HALF_SPACE:
         return np.eye(3), np.array(p.size[:3]), np.array([p.size[3], 0.0, 0.0])

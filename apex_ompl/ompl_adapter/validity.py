@@ -11,8 +11,10 @@ from numpy.typing import ArrayLike
 from ompl import base as ob
 
 from apex_ompl.collision.checker import CollisionChecker
+from apex_ompl.collision.path_proof import Curve, PathProof
+from apex_ompl.trajectory.trajectory import ROUNDING, Trajectory
 from apex_ompl.types import Array
-from apex_ompl.util.resolution import FULL_RESOLUTION, SEARCH_RESOLUTION
+from apex_ompl.util.resolution import SEARCH_RESOLUTION
 from apex_ompl.util.validation import check_states
 
 
@@ -27,6 +29,18 @@ class MotionCheck:
     def __call__(self, a: ArrayLike, b: ArrayLike) -> bool:
         """Whether the motion from ``a`` to ``b`` is free, its end first; ``a`` is taken to be free."""
         return self.checker.first_collision(np.array([a, b]), self.resolution, start=False) is None
+
+
+class MotionProof:
+    """Proof of straight motions between states; a plain callable, without OMPL."""
+
+    def __init__(self, checker: CollisionChecker) -> None:
+        """Prove by ``checker``."""
+        self.checker = checker
+
+    def __call__(self, a: ArrayLike, b: ArrayLike) -> bool:
+        """Whether the motion from ``a`` to ``b`` is proved free."""
+        return bool(self.checker.prove(np.array([a, b]), tolerance=0.0))
 
 
 class StateValidityChecker(ob.StateValidityChecker):
@@ -63,7 +77,7 @@ class StateValidityChecker(ob.StateValidityChecker):
 class MotionValidator(ob.MotionValidator):
     """OMPL motion validator over a collision checker, in bit-reversed order; no exception leaves it."""
 
-    def __init__(self, si: ob.SpaceInformation, check: MotionCheck) -> None:
+    def __init__(self, si: ob.SpaceInformation, check: MotionCheck | MotionProof) -> None:
         """Check motions of ``si`` by ``check``."""
         super().__init__(si)
         self.check: Callable[[Array, Array], bool] = check
@@ -87,13 +101,15 @@ class FullCheck:
         ok: Whether the path is a solution.
         reason: One sentence about the first fault found, empty when there is none.
         segment: Index of the segment (states k and k + 1) with the fault, or None.
-        states: Number of states that were checked one by one.
+        proof: The proof, or None where limits or ends are at fault.
+        timed_out: Whether the time was over before the path was proved.
     """
 
     ok: bool
     reason: str
     segment: int | None
-    states: int
+    proof: PathProof | None = None
+    timed_out: bool = False
 
     def __bool__(self) -> bool:
         """Whether the path is a solution."""
@@ -102,44 +118,53 @@ class FullCheck:
 
 def full_check(
     checker: CollisionChecker,
-    path: Array,
+    path: Array | Trajectory,
     start: Array | None = None,
     goals: Iterable[Array] = (),
-    resolution: float = FULL_RESOLUTION,
+    *,
+    deadline: float | None = None,
 ) -> FullCheck:
-    """Decide whether a path is a solution.
+    """Decide whether a path or a motion is a solution.
 
-    It is when every state along it is inside the limits and free at a spacing of ``resolution``, the first
-    state is ``start`` bit for bit, and the last is one of ``goals``. Stretches that the spheres prove free count as
-    sampled.
+    It is when it stays inside the limits, begins at ``start`` and ends at one of ``goals`` bit for bit, and is proved
+    free from end to end (:meth:`apex_ompl.collision.CollisionChecker.prove`).
 
     Args:
         checker: Collision checker.
-        path: States, shape (N, dof).
+        path: States joined by straight lines, shape (N, dof), or a timed motion, which is proved along its own cubic
+            pieces.
         start: The given start, shape (dof,), or None for any.
         goals: Goal states; none means any end.
-        resolution: Spacing [rad, max-norm].
+        deadline: Value of ``time.perf_counter`` at which to give up [s].
 
     Raises:
         ParameterError: ``path`` has not the shape (N, dof).
     """
-    robot = checker.robot
-    path = np.asarray(path, dtype=float)
-    check_states(path, robot.dof, "path", least=1)
-    for k, q in enumerate(path):
+    robot, goals = checker.robot, list(goals)
+    motion = path if isinstance(path, Trajectory) else None
+    states = np.asarray(path, float) if motion is None else motion.positions
+    check_states(states, robot.dof, "path", least=1)
+    last = max(len(states) - 2, 0)
+    if motion is not None and motion.use(robot.limits)["position"] > 1.0 + ROUNDING:
+        return FullCheck(False, "the motion leaves the position limits", None)
+    for k, q in enumerate(states if motion is None else states[:0]):
         fault = robot.limit_fault(q)
         if fault:
-            return FullCheck(False, f"state {k}: {fault}", min(k, max(len(path) - 2, 0)), 0)
-    if start is not None and not np.array_equal(path[0], start):
-        return FullCheck(False, "the path does not begin at the start", 0, 0)
-    ends = list(goals)
-    if ends and not any(np.array_equal(path[-1], goal) for goal in ends):
-        return FullCheck(False, "the path does not end at a goal", len(path) - 2, 0)
-    before = checker.check_counts.states
-    hit = checker.first_collision(path, resolution)
-    checked = checker.check_counts.states - before
-    if hit is None:
-        return FullCheck(True, "", None, checked)
-    contacts = checker.contacts(hit.state)
-    what = str(contacts[0]) if contacts else "in collision"
-    return FullCheck(False, f"between states {hit.segment} and {hit.segment + 1}: {what}", hit.segment, checked)
+            return FullCheck(False, f"state {k}: {fault}", min(k, last))
+    if start is not None and not np.array_equal(states[0], start):
+        return FullCheck(False, "the path does not begin at the start", 0)
+    if goals and not any(np.array_equal(states[-1], goal) for goal in goals):
+        return FullCheck(False, "the path does not end at a goal", last)
+    curve = Curve.polyline(states)
+    if motion is not None:
+        curve = Curve.cubic(motion.times, states, motion.velocities, motion.accelerations)
+    proof = checker.prove(curve, deadline=deadline)
+    if proof:
+        return FullCheck(True, "", None, proof)
+    if proof.timed_out:
+        return FullCheck(False, proof.reason, None, proof, True)
+    if motion is not None:
+        return FullCheck(False, f"at {proof.parameter:.3f} s: {proof.reason}", None, proof)
+    lengths = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(states, axis=0)).max(axis=1))])
+    segment = min(int(np.searchsorted(lengths, proof.parameter, side="right")) - 1, last)
+    return FullCheck(False, f"between states {segment} and {segment + 1}: {proof.reason}", segment, proof)

@@ -68,9 +68,7 @@ def _set_polyline(knots: Floats, states: Floats, a: float, b: float, middle: Flo
 
 
 @inlined
-def _set_cubic(
-    knots: Floats, rates: Floats, a: float, b: float, middle: float, w: Workspace
-) -> None:
+def _set_cubic(knots: Floats, rates: Floats, a: float, b: float, middle: float, w: Workspace) -> None:
     """Set step and deviation for cubic pieces: h q'(m), and h^2 / 2 max |q''| by Taylor's theorem."""
     dof, half = len(w.step), 0.5 * (b - a)
     k, first, last = piece_of(knots, middle), piece_of(knots, a), piece_of(knots, b)

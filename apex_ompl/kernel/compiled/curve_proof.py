@@ -4,8 +4,8 @@ Intervals of the curve are bisected, breadth first. On each the sphere covers ar
 The few pairs that they leave are looked at by their exact shapes
 (:func:`apex_ompl.kernel.compiled.pair_distance.pair_bound`); a pair that is not decided goes on to the two halves of
 the interval, alone. Bounds are compared with a margin: 0 for a bare proof; for the least clearance c it is what was
-found so far less a tolerance, so that in the end margin <= c <= found. A pair that is nearer than ``touch`` at any state
-counts as touching.
+found so far less a tolerance, so that in the end margin <= c <= found. A pair that is nearer than ``touch`` at a state
+in the middle of an interval counts as touching.
 """
 
 from __future__ import annotations
@@ -79,6 +79,15 @@ def _record(p: ProofBuffers, distance: float, where: float, a: int, b: int, tole
             p.figures[MARGIN] = max(distance - tolerance, 0.5 * distance)
 
 
+@inlined
+def _place_clusters(t: RobotArrays, w: Workspace, q: Floats, a: int, b: int) -> None:
+    """Place the clusters of body ``a`` and, if it is one, of body ``b``."""
+    for c in range(len(t.cluster_bodies)):
+        first, count = t.cluster_bodies[c, 0], t.cluster_bodies[c, 1]
+        if first <= a < first + count or first <= b < first + count:
+            place_cluster(t, w, q, c)
+
+
 @outlined
 def _bound(
     t: RobotArrays, w: Workspace, h: ShapeArrays, k: ShapeArrays, g: PairBuffers, a: int, b: int, need: float
@@ -95,26 +104,99 @@ def _seed(
     where: float, tolerance: float,
 ) -> None:  # fmt: skip
     """Record the distance now of the two bodies, and of the body and obstacle, whose spheres are nearest."""
+    for i in range(len(w.step)):
+        w.step[i] = w.deviation[i] = w.half_width[i] = 0.0
     near = nearest_obstacle(t, s, w, p.state, math.inf)
     if near[1] >= 0:
         other = -1 - s.owner[near[3]]
-        place_cluster_of(t, w, p.state, near[1], other)
+        _place_clusters(t, w, p.state, near[1], other)
         found = _bound(t, w, h, k, g, near[1], other, math.inf)
         _record(p, found[1], where, near[1], other, tolerance)
     own = nearest_bodies(t, w, p.state, p.figures[LEAST])
     if own[1] >= 0:
-        place_cluster_of(t, w, p.state, own[1], own[3])
+        _place_clusters(t, w, p.state, own[1], own[3])
         found = _bound(t, w, h, k, g, own[1], own[3], math.inf)
         _record(p, found[1], where, own[1], own[3], tolerance)
 
 
 @inlined
-def place_cluster_of(t: RobotArrays, w: Workspace, q: Floats, a: int, b: int) -> None:
-    """Place the clusters of body ``a`` and, if it is one, of body ``b``."""
-    for c in range(len(t.cluster_bodies)):
-        first, count = t.cluster_bodies[c, 0], t.cluster_bodies[c, 1]
-        if first <= a < first + count or first <= b < first + count:
-            place_cluster(t, w, q, c)
+def _take(p: ProofBuffers) -> int:
+    """Return the place of the next interval in the queue: the oldest, or the newest where the queue is getting full."""
+    p.places[2] += 1
+    if p.places[1] - p.places[0] < QUEUE // 2:
+        p.places[0] += 1
+        return int((p.places[0] - 1) % QUEUE)
+    p.places[1] -= 1
+    return int(p.places[1] % QUEUE)
+
+
+@inlined
+def _place(t: RobotArrays, w: Workspace, p: ProofBuffers) -> bool:
+    """Place the robot at the state in the middle; false where the tables do not hold for it."""
+    for i in range(len(p.state)):  # the bounds of exact shapes hold beyond the limits
+        w.end[i], w.half_width[i] = w.half_width[i], 0.0
+    holds = tables_hold(t, p.state, w.half_width)
+    for i in range(len(p.state)):
+        w.half_width[i] = w.end[i]
+    if holds:
+        place_robot(t, w, p.state)
+    return holds
+
+
+@inlined
+def _left_by_spheres(
+    t: RobotArrays, s: SceneArrays, w: Workspace, p: ProofBuffers, a: float, b: float, whole: float
+) -> int:
+    """Put the pairs that the spheres leave into ``found``, or append both halves of an interval that has too many.
+
+    Returns:
+        The number of pairs, or -1 where an interval got too short.
+    """
+    count = MOST_UNPROVED
+    if tables_hold(t, p.state, w.half_width):
+        bound_displacements(t, w)
+        w.margin[0] = p.figures[MARGIN]
+        count = unproved(t, s, w, p.state, p.found)
+        w.margin[0] = 0.0
+    if count == 0:
+        p.figures[BY_SPHERES] += b - a
+    elif count == MOST_UNPROVED or (count > FEW and b - a > SHORT * whole):
+        if b - a <= SHORTEST * whole:
+            return -1
+        middle = 0.5 * (a + b)
+        _append(p, a, middle, ALL, ALL)
+        _append(p, middle, b, ALL, ALL)
+        return 0
+    return count
+
+
+@inlined
+def _by_shapes(
+    t: RobotArrays, w: Workspace, h: ShapeArrays, k: ShapeArrays, g: PairBuffers, p: ProofBuffers,
+    a: float, b: float, count: int, shortest: float, touch: float, tolerance: float,
+) -> int:  # fmt: skip
+    """Look at the pairs in ``found`` by their shapes; append both halves of the interval for those that stay open.
+
+    Returns:
+        PROVED, TOUCHING or UNDECIDED.
+    """
+    middle = 0.5 * (a + b)
+    for m in range(count):
+        x, y = p.found[m, 0], p.found[m, 1]
+        if m > 0 and p.found[m - 1, 0] == x and p.found[m - 1, 1] == y:
+            continue
+        _place_clusters(t, w, p.state, x, y)
+        bound, upper = _bound(t, w, h, k, g, x, y, p.figures[MARGIN])
+        _record(p, upper, middle, x, y, tolerance)
+        if upper <= touch:
+            return TOUCHING
+        if bound > 0.0 and bound >= p.figures[MARGIN]:
+            continue
+        if b - a <= shortest:
+            return UNDECIDED
+        _append(p, a, middle, x, y)
+        _append(p, middle, b, x, y)
+    return PROVED
 
 
 @entry_point
@@ -126,85 +208,35 @@ def prove_curve(
     """Prove a curve free, for at most ``budget`` intervals; another call goes on.
 
     Robot, scene, shapes of bodies and of obstacles come packed, then the buffers of a state, of a pair and of the
-    proof, in which the whole curve is the first interval.
-
-    Args (besides):
-        knots, states, rates, slack: The curve, see :func:`apex_ompl.kernel.compiled.curve.set_motion`.
-        touch: Distance that counts as contact [m].
-        tolerance: Of the least clearance [m]; 0 for a bare proof.
-        budget: Number of intervals.
+    proof, in which the whole curve is the first interval. ``knots``, ``states``, ``rates`` and ``slack`` are the curve,
+    see :func:`apex_ompl.kernel.compiled.curve.set_motion`; ``touch`` is the distance that counts as contact [m],
+    ``tolerance`` that of the least clearance [m], 0 for a bare proof.
 
     Returns:
-        PROVED, MORE, TOUCHING (the state and the pair are those of ``worst``), or UNDECIDED where an interval got too
-        short.
+        PROVED, MORE, TOUCHING (the pair is in ``worst``), or UNDECIDED where an interval got too short.
     """
     t, s, h, k = robot_view(ri, rf), scene_view(si, sf), shapes_view(bi, bf), shapes_view(oi, of)
     w, g, p = workspace_view(t, wi, wf), pair_view(gi, gf), _proof_view(pi, pf, len(t.lower))
     whole = knots[len(knots) - 1] - knots[0]
     while p.places[0] < p.places[1] and budget > 0:
         budget -= 1
-        p.places[2] += 1
-        if p.places[1] - p.places[0] < QUEUE // 2:
-            e = p.places[0] % QUEUE
-            p.places[0] += 1
-        else:  # the queue is getting full: depth first
-            p.places[1] -= 1
-            e = p.places[1] % QUEUE
+        e = _take(p)
         a, b, first, second = p.intervals[e, 0], p.intervals[e, 1], p.pairs[e, 0], p.pairs[e, 1]
         middle = p.where[0] = 0.5 * (a + b)
         set_state(knots, states, rates, middle, p.state)
         set_motion(knots, states, rates, slack, a, b, p.state, w)
-        for i in range(len(p.state)):  # the hands may end at their limits
-            w.end[i] = w.half_width[i]
-            w.half_width[i] = 0.0
-        count = 0
-        if not tables_hold(t, p.state, w.half_width) or p.places[1] - p.places[0] > QUEUE - 2 * MOST_UNPROVED:
+        if p.places[1] - p.places[0] > QUEUE - 2 * MOST_UNPROVED or not _place(t, w, p):
             return UNDECIDED
-        place_robot(t, w, p.state)
-        for i in range(len(p.state)):
-            w.half_width[i] = w.end[i]
+        count = 1
+        p.found[0, 0], p.found[0, 1] = first, second
         if first == ALL:
-            w.moving[0] = 0
             if tolerance > 0.0 and p.places[2] <= SEEDED:
-                _still(w)
                 _seed(t, s, w, h, k, g, p, middle, tolerance)
                 set_motion(knots, states, rates, slack, a, b, p.state, w)
-            bound_displacements(t, w)
-            w.margin[0] = p.figures[MARGIN]
-            count = unproved(t, s, w, p.state, p.found)
-            w.margin[0] = 0.0
-            if count == 0:
-                p.figures[BY_SPHERES] += b - a
-                continue
-            if count == MOST_UNPROVED or (count > FEW and b - a > SHORT * whole):
-                if b - a <= SHORTEST * whole:
-                    return UNDECIDED
-                _append(p, a, middle, ALL, ALL)
-                _append(p, middle, b, ALL, ALL)
-                continue
-        else:
-            count = 1
-            p.found[0, 0], p.found[0, 1] = first, second
-        for m in range(count):
-            x, y = p.found[m, 0], p.found[m, 1]
-            if m > 0 and p.found[m - 1, 0] == x and p.found[m - 1, 1] == y:
-                continue
-            place_cluster_of(t, w, p.state, x, y)
-            bound, upper = _bound(t, w, h, k, g, x, y, p.figures[MARGIN])
-            _record(p, upper, middle, x, y, tolerance)
-            if upper <= touch:
-                return TOUCHING
-            if bound > 0.0 and bound >= p.figures[MARGIN]:
-                continue
-            if b - a <= SHORTEST * whole:
-                return UNDECIDED
-            _append(p, a, middle, x, y)
-            _append(p, middle, b, x, y)
+            count = _left_by_spheres(t, s, w, p, a, b, whole)
+        if count < 0:
+            return UNDECIDED
+        outcome = _by_shapes(t, w, h, k, g, p, a, b, count, SHORTEST * whole, touch, tolerance)
+        if outcome != PROVED:
+            return outcome
     return PROVED if p.places[0] == p.places[1] else MORE
-
-
-@inlined
-def _still(w: Workspace) -> None:
-    """Let the motion be none, for distances now."""
-    for i in range(len(w.step)):
-        w.step[i] = w.deviation[i] = w.half_width[i] = 0.0

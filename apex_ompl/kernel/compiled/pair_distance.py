@@ -57,7 +57,7 @@ def _balls_apart(h: ShapeArrays, k: ShapeArrays, g: PairBuffers, m: int, n: int)
         apart += (a - b) ** 2
     first = g.ball[0, 3] if m < 0 else h.node_ball[m, 3]
     second = g.ball[1, 3] if n < 0 else k.node_ball[n, 3]
-    return math.sqrt(apart) - first - second
+    return float(math.sqrt(apart) - first - second)
 
 
 @outlined

@@ -161,5 +161,3 @@ def convex_bound(points: Floats, others: Floats, g: PairBuffers, distance: float
     if both:
         bound = max(bound, distance_during_motion(others, points, g, 1, x, y, z, math.inf))
     return bound
-
-
