@@ -47,7 +47,7 @@ def support(points: Floats, g: PairBuffers, s: int, x: float, y: float, z: float
         c = math.copysign(size[1], c)
     else:
         best, at = -math.inf, g.first[s]
-        for k in range(g.first[s], g.first[s] + g.count[s]):
+        for k in range(g.first[s], g.first[s] + g.corners[s]):
             value = points[k, 0] * a + points[k, 1] * b + points[k, 2] * c
             if value > best:
                 best, at = value, k

@@ -132,8 +132,11 @@ def _take(p: ProofBuffers) -> int:
 
 @inlined
 def _place(t: RobotArrays, w: Workspace, p: ProofBuffers) -> bool:
-    """Place the robot at the state in the middle; false where the tables do not hold for it."""
-    for i in range(len(p.state)):  # the bounds of exact shapes hold beyond the limits
+    """Place the robot at the state in the middle; false where the tables do not hold for it.
+
+    The curve stays inside the limits, also where the box around an interval of it does not.
+    """
+    for i in range(len(p.state)):
         w.end[i], w.half_width[i] = w.half_width[i], 0.0
     holds = tables_hold(t, p.state, w.half_width)
     for i in range(len(p.state)):
@@ -152,12 +155,10 @@ def _left_by_spheres(
     Returns:
         The number of pairs, or -1 where an interval got too short.
     """
-    count = MOST_UNPROVED
-    if tables_hold(t, p.state, w.half_width):
-        bound_displacements(t, w)
-        w.margin[0] = p.figures[MARGIN]
-        count = unproved(t, s, w, p.state, p.found)
-        w.margin[0] = 0.0
+    bound_displacements(t, w)
+    w.margin[0] = p.figures[MARGIN]
+    count = unproved(t, s, w, p.state, p.found)
+    w.margin[0] = 0.0
     if count == 0:
         p.figures[BY_SPHERES] += b - a
     elif count == MOST_UNPROVED or (count > FEW and b - a > SHORT * whole):

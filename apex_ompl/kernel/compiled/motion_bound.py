@@ -80,7 +80,7 @@ def cluster_displacement(w: Workspace, c: int) -> float:
     if w.moving[0] == 0:
         return 0.0
     x, y, z = w.linear[c, 0, 0], w.linear[c, 0, 1], w.linear[c, 0, 2]
-    return float(min(w.arc_bound[c, 0], math.sqrt(x * x + y * y + z * z) + w.remainder[c, 0])) + w.margin[0]
+    return float(min(w.arc_bound[c, 0], math.sqrt(x * x + y * y + z * z) + w.remainder[c, 0]) + w.margin[0])
 
 
 @inlined
@@ -94,4 +94,4 @@ def relative_displacement(w: Workspace, a: int, b: int, common: int) -> float:
     u, v = w.linear[a, common], w.linear[b, common]
     x, y, z = u[0] - v[0], u[1] - v[1], u[2] - v[2]
     straight = math.sqrt(x * x + y * y + z * z) + w.remainder[a, common] + w.remainder[b, common]
-    return float(min(w.arc_bound[a, common] + w.arc_bound[b, common], straight)) + w.margin[0]
+    return float(min(w.arc_bound[a, common] + w.arc_bound[b, common], straight) + w.margin[0])

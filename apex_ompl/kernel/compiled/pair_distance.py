@@ -33,7 +33,7 @@ def _set_node(h: ShapeArrays, g: PairBuffers, s: int, node: int) -> None:
     """Set the piece of side ``s``: a triangle for a leaf, else the node's ball."""
     r, o, b = g.rotation[s], g.origin[s], h.node_ball[node]
     if h.child[node] < 0:
-        g.kind[s], g.first[s], g.count[s] = HULL, h.corner[node], TRIANGLE
+        g.kind[s], g.first[s], g.corners[s] = HULL, h.corner[node], TRIANGLE
         for i in range(3):
             g.centre[s, i] = o[i]
     else:
@@ -70,7 +70,7 @@ def _mesh_bound(h: ShapeArrays, k: ShapeArrays, g: PairBuffers, m: int, n: int, 
         top -= 1
         m, n = g.nodes[top, 0], g.nodes[top, 1]
         apart = _balls_apart(h, k, g, m, n) - arc
-        if apart >= need:
+        if apart >= min(need, bound):
             bound = min(bound, apart)
             continue
         inner, other = m >= 0 and h.child[m] >= 0, n >= 0 and k.child[n] >= 0
@@ -80,25 +80,27 @@ def _mesh_bound(h: ShapeArrays, k: ShapeArrays, g: PairBuffers, m: int, n: int, 
             _set_node(k, g, 1, n)
         if not (inner and other):
             _set_guess(g)
-            distance, upper = convex_distance(h.points, k.points, g, need + arc)
-            if distance - arc >= need:
+            distance, upper = convex_distance(h.points, k.points, g, min(need, bound) + arc)
+            if distance - arc >= min(need, bound):
                 bound = min(bound, distance - arc)
                 continue
             if not (inner or other):
                 bound = min(bound, convex_bound(h.points, k.points, g, distance, True))
                 least = min(least, upper)
-                if bound < need:
-                    return bound, least
                 continue
         if top + 2 > MOST_NODES:
             return -math.inf, least
         if inner and (not other or h.node_ball[m, 3] >= k.node_ball[n, 3]):
             first = h.child[m]
-            g.nodes[top, 0], g.nodes[top, 1], g.nodes[top + 1, 0], g.nodes[top + 1, 1] = first, n, first + 1, n
+            swap = _balls_apart(h, k, g, first, n) < _balls_apart(h, k, g, first + 1, n)
+            g.nodes[top, 0], g.nodes[top + 1, 0] = (first + 1, first) if swap else (first, first + 1)
+            g.nodes[top, 1] = g.nodes[top + 1, 1] = n
         else:
             first = k.child[n]
-            g.nodes[top, 0], g.nodes[top, 1], g.nodes[top + 1, 0], g.nodes[top + 1, 1] = m, first, m, first + 1
-        top += 2
+            swap = _balls_apart(h, k, g, m, first) < _balls_apart(h, k, g, m, first + 1)
+            g.nodes[top, 1], g.nodes[top + 1, 1] = (first + 1, first) if swap else (first, first + 1)
+            g.nodes[top, 0] = g.nodes[top + 1, 0] = m
+        top += 2  # the nearer one is looked at first
     return bound, least
 
 

@@ -39,7 +39,7 @@ def place_shape(w: Workspace, h: ShapeArrays, row: int, g: PairBuffers, s: int) 
         for k in range(3):
             g.rotation[s, i, k] = r[i, 0] * a[0, k] + r[i, 1] * a[1, k] + r[i, 2] * a[2, k]
     g.ball[s, 3] = ball[3]
-    g.kind[s], g.first[s], g.count[s] = h.kind[row], h.points_of[row, 0], h.points_of[row, 1]
+    g.kind[s], g.first[s], g.corners[s] = h.kind[row], h.points_of[row, 0], h.points_of[row, 1]
 
 
 @inlined
@@ -107,7 +107,7 @@ def _least(points: Floats, g: PairBuffers, s: int, x: float, y: float, z: float)
     p = support(points, g, s, -x, -y, -z)
     c = g.ball[s]
     along = x * (p[0] - c[0]) + y * (p[1] - c[1]) + z * (p[2] - c[2])
-    return along - radius(g, s) * math.sqrt(x * x + y * y + z * z)
+    return float(along - radius(g, s) * math.sqrt(x * x + y * y + z * z))
 
 
 @outlined
@@ -135,7 +135,7 @@ def distance_during_motion(
     u, p, q = y * o[2] - z * o[1], z * o[0] - x * o[2], x * o[1] - y * o[0]  # n x turn
     ahead = middle + along + _least(points, g, s, x + u, y + p, z + q)
     behind = middle - along + _least(points, g, s, x - u, y - p, z - q)
-    return min(ahead, behind) - g.remainder[s]
+    return float(min(ahead, behind) - g.remainder[s])
 
 
 @inlined
@@ -160,4 +160,4 @@ def convex_bound(points: Floats, others: Floats, g: PairBuffers, distance: float
     bound = max(distance - g.arc_bound[0], distance_during_motion(points, others, g, 0, -x, -y, -z, math.inf))
     if both:
         bound = max(bound, distance_during_motion(others, points, g, 1, x, y, z, math.inf))
-    return bound
+    return float(bound)

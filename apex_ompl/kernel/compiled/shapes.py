@@ -46,7 +46,7 @@ class PairBuffers(NamedTuple):
     Attributes:
         kind: Kind of the convex piece that is looked at on a side.
         first: First of its points.
-        count: Number of its points.
+        corners: Number of its points.
         nodes: Pairs of nodes that wait in a traversal.
         chain: Joints between the two sides.
         rotation: Rotations of the shapes in the world.
@@ -64,7 +64,7 @@ class PairBuffers(NamedTuple):
 
     kind: Annotated[Integers, 2]
     first: Annotated[Integers, 2]
-    count: Annotated[Integers, 2]
+    corners: Annotated[Integers, 2]
     nodes: Annotated[Integers, MOST_NODES, 2]
     chain: Annotated[Integers, 256]
     rotation: Annotated[Floats, 2, 3, 3]
