@@ -50,6 +50,7 @@ class SolveContext:
         best: Shortest valid path, or None.
         nearest: Path that ends near a goal and its distance from it [rad], or None.
         trees: RRTConnect that a sprint began and its problem definition, or None.
+        all_trees: RRTConnect for all starts and goals and its problem definition, or None.
     """
 
     def __init__(
@@ -72,6 +73,7 @@ class SolveContext:
         self.best: Path | None = None
         self.nearest: tuple[Path, float] | None = None
         self.trees: tuple[og.RRTConnect, ob.ProblemDefinition] | None = None
+        self.all_trees: tuple[og.RRTConnect, ob.ProblemDefinition] | None = None
         self._queries: list[Query] = []
 
     @property
@@ -109,7 +111,7 @@ class SolveContext:
         if self.lambda_obs <= 0.0:
             return True
         with self.report.timed("distance"):
-            distance = self.validator.obstacle_distance(states)
+            distance = self.validator.obstacle_distance(states, self.stop)
         if distance < self.lambda_obs:
             self.set_aside.append((distance, candidate))
         return distance >= self.lambda_obs
@@ -143,9 +145,9 @@ class SolveContext:
                 return False
             if self.lambda_obs > 0.0:
                 with self.report.timed("distance"):
-                    distance = self.validator.obstacle_distance(path.states)
+                    distance = self.validator.obstacle_distance(path.states, self.stop)
                     best = self.best.sample(CLEARANCE_SPACING)
-                    if distance < self.lambda_obs and distance < self.validator.obstacle_distance(best):
+                    if distance < self.lambda_obs and distance < self.validator.obstacle_distance(best, self.stop):
                         return False
         self.accept(path)
         return True

@@ -92,10 +92,11 @@ class PathValidator:
                 return False
         return all(not stop() and self._si.checkMotion(a, b) for a, b in zip(states, states[1:], strict=False))
 
-    def obstacle_distance(self, path: Array) -> float:
+    def obstacle_distance(self, path: Array, stop: Stop = lambda: False) -> float:
         """Return the least distance between robot and obstacles along a path, shape (N, dof), by GJK [m].
 
-        Every fourth state is measured, fixtures are left out; infinite where the obstacles are not known.
+        Every fourth state is measured, fixtures are left out; infinite where the obstacles are not known. When told to
+        stop meanwhile, a lower bound is returned, that of the spheres.
         """
         if not self.knows_obstacles:
             return np.inf
@@ -104,6 +105,8 @@ class PathValidator:
         for k in np.argsort(bound):  # the spheres' clearance is at most that of the meshes
             if bound[k] >= least:
                 break
+            if stop():
+                return float(bound[k])
             least = min(least, self.checker.distance(states[k]).value)
         return float(least)
 

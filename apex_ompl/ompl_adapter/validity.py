@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
@@ -88,12 +89,14 @@ class FullCheck:
         reason: One sentence about the first fault found, empty when there is none.
         segment: Index of the segment (states k and k + 1) with the fault, or None.
         states: Number of states that were checked one by one.
+        timed_out: Whether there was no time for the proof.
     """
 
     ok: bool
     reason: str
     segment: int | None
     states: int
+    timed_out: bool = False
 
     def __bool__(self) -> bool:
         """Whether the path is a solution."""
@@ -106,6 +109,8 @@ def full_check(
     start: Array | None = None,
     goals: Iterable[Array] = (),
     resolution: float = FULL_RESOLUTION,
+    *,
+    deadline: float | None = None,
 ) -> FullCheck:
     """Decide whether a path is a solution.
 
@@ -119,6 +124,7 @@ def full_check(
         start: The given start, shape (dof,), or None for any.
         goals: Goal states; none means any end.
         resolution: Spacing [rad, max-norm].
+        deadline: Value of ``time.perf_counter`` at which it gives up [s], or None.
 
     Raises:
         ParameterError: ``path`` has not the shape (N, dof).
@@ -135,6 +141,8 @@ def full_check(
     ends = list(goals)
     if ends and not any(np.array_equal(path[-1], goal) for goal in ends):
         return FullCheck(False, "the path does not end at a goal", len(path) - 2, 0)
+    if deadline is not None and time.perf_counter() >= deadline:
+        return FullCheck(False, "not proved in time", None, 0, timed_out=True)
     before = checker.check_counts.states
     hit = checker.first_collision(path, resolution)
     checked = checker.check_counts.states - before

@@ -11,6 +11,7 @@ from apex_ompl.ompl_adapter.setup import PlanningSetup
 from apex_ompl.result import PlanResult, PlanStatus
 from apex_ompl.trajopt.path import Path
 from apex_ompl.types import Array
+from apex_ompl.util.deadline import Deadline
 
 if TYPE_CHECKING:
     from apex_ompl.planners import Parameters
@@ -25,6 +26,7 @@ class PlanRun:
         planner: Name of the planner.
         parameters: Its parameters.
         seed: The seed used.
+        deadline: When the plan is to be ready.
         times: Seconds by stage so far.
         notes: What a user should know about this run.
         interrupt: Holds Ctrl-C back.
@@ -37,12 +39,17 @@ class PlanRun:
     planner: str
     parameters: Parameters
     seed: int
+    deadline: Deadline
     times: dict[str, float] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     interrupt: Interrupt = field(default_factory=Interrupt)
     rejected_lines: list[Array] = field(default_factory=list)
     first_path: Path | None = None
     report: SolveReport | None = None
+
+    def ends_search(self) -> bool:
+        """Whether only the reserve for the proof is left, or Ctrl-C was pressed."""
+        return self.interrupt.pressed or self.deadline.for_search <= 0.0
 
     def result(self, status: PlanStatus, reason: str = "", path: Path | None = None, solved_by: str = "") -> PlanResult:
         """Return a result without what :func:`finish` adds."""
