@@ -13,6 +13,16 @@ from ompl import base as ob
 
 from apex_ompl.ompl_adapter.validity import MotionValidator
 
+MAX_TIME = 1e8  # OMPL counts nanoseconds in 64 bits [s]
+
+
+def ends_after(seconds: float) -> ob.PlannerTerminationCondition:
+    """Return OMPL's condition that holds after a time [s], which may be negative, or longer than OMPL can count.
+
+    It is made in C++: planners that run threads deadlock with one made in Python.
+    """
+    return ob.timedPlannerTerminationCondition(min(max(seconds, 0.0), MAX_TIME))
+
 
 class Interrupt:
     """Holds SIGINT back while planning: it ends the planner at work, and is raised when planning has ended.

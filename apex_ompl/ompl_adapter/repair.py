@@ -8,7 +8,7 @@ import numpy as np
 from ompl import base as ob
 from ompl import geometric as og
 
-from apex_ompl.ompl_adapter.interrupt import Interrupt, motions_until
+from apex_ompl.ompl_adapter.interrupt import Interrupt, ends_after, motions_until
 from apex_ompl.ompl_adapter.setup import PlanningSetup
 from apex_ompl.ompl_adapter.space import path_to_array, state_space, to_state
 from apex_ompl.ompl_adapter.validity import FullCheck, MotionCheck, MotionValidator, StateValidityChecker, full_check
@@ -72,7 +72,7 @@ def _bridge(problem: PlanningSetup, a: Array, b: Array, deadline: float, interru
     si.setMotionValidator(motions)
     setup.setStartAndGoalStates(to_state(si, a), to_state(si, b))
     setup.setPlanner(og.RRTConnect(si))
-    condition = ob.timedPlannerTerminationCondition(max(0.0, deadline - time.perf_counter()))
+    condition = ends_after(deadline - time.perf_counter())
     with interrupt.ends(condition) as ptc, motions_until(motions, lambda: time.perf_counter() >= deadline):
         status = setup.solve(ptc)
     fault = validity_checker.fault or motions.fault

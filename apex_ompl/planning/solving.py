@@ -9,7 +9,7 @@ import numpy as np
 from ompl import base as ob
 
 from apex_ompl.errors import ApexError
-from apex_ompl.ompl_adapter.interrupt import motions_until
+from apex_ompl.ompl_adapter.interrupt import MAX_TIME, ends_after, motions_until
 from apex_ompl.ompl_adapter.repair import repair
 from apex_ompl.ompl_adapter.report import LineAwarePlanner, report_of
 from apex_ompl.ompl_adapter.setup import PlanningSetup, set_goals
@@ -25,7 +25,6 @@ from apex_ompl.util.stopwatch import timed
 STRAIGHT_LINE = "straight line"
 NOT_PROVED = "a path was found but not proved in time"
 REPAIR_SHARE = 0.5  # of the time left, for the repair of one path
-MAX_TIMEOUT = 1e8  # OMPL counts nanoseconds in 64 bits [s]
 
 Execute = Callable[[PlanRun, ob.Planner, float], PlanStatus]
 """Runs a planner that is set, for a time [s], and returns its status."""
@@ -78,9 +77,7 @@ def straight_line(run: PlanRun) -> PlanResult | None:
 def execute(run: PlanRun, planner: ob.Planner, timeout: float) -> PlanStatus:
     """Run a planner that is set, and return its status; faults of the checkers are raised."""
     del planner
-    # A condition made in C++: planners that run threads deadlock with one made in Python.
-    condition = ob.timedPlannerTerminationCondition(timeout)
-    with run.interrupt.ends(condition) as ptc, timed(run.times, "solve"):
+    with run.interrupt.ends(ends_after(timeout)) as ptc, timed(run.times, "solve"):
         status = PlanStatus.of(run.setup.simple_setup.solve(ptc))
     run.setup.raise_faults()
     return status
@@ -105,7 +102,7 @@ def solve(run: PlanRun, simplify: bool, execute: Execute = execute) -> PlanResul
         with timed(run.times, "setup"), run.deadline.paused():
             planner = _set_up(run)
         with motions_until(run.setup.motion_validator, run.ends_search):
-            status = execute(run, planner, min(run.deadline.for_search, MAX_TIMEOUT))
+            status = execute(run, planner, min(run.deadline.for_search, MAX_TIME))
         report = run.report = report_of(planner)
         if report is not None:
             run.times |= {INSIDE + stage: seconds for stage, seconds in report.times.items()}
