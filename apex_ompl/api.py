@@ -21,6 +21,7 @@ from apex_ompl.result import PlanResult
 from apex_ompl.robot import load_robot
 from apex_ompl.scene.problem import Problem
 from apex_ompl.trajectory import Timing, warm_up
+from apex_ompl.util.deadline import Deadline
 from apex_ompl.util.files import is_file
 from apex_ompl.util.validation import check_positive, check_seed
 
@@ -75,22 +76,22 @@ def plan(
     """Plan a path, prove it by the full check, and time it.
 
     The straight line to each goal is tried before the planner runs. What the planner finds is shortened unless it is
-    smooth, proved, and planned anew where the proof fails.
+    smooth, proved, and planned anew where the proof fails. A path that was found and not proved, or not timed, in time
+    has the status TIMEOUT and that reason.
 
     Args:
         problem: A problem, its name, or its file.
         planner: Name of a planner, see ``apex_ompl.planners.names()``; by default apex, or rrtconnect+polish for a
             robot that no model ships for.
-        timeout: Seconds for finding and repairing a path; shortening, which is capped by counts, and timing come on
-            top. Of planners that stop at the timeout only, a tenth, at most 0.5 s, is kept for repair.
+        timeout: Seconds for all that follows the set-up of problem and planner. The search ends a tenth of it before,
+            from 0.05 to 0.5 s and at most half of it, so that its path can be proved and timed.
         seed: Seed of all random numbers, 0 or more. The same seed gives the same path for planners that are
             neither stopped by the clock nor threaded, as long as no other thread plans at the same time (OMPL
             seeds one generator per process).
         simplify: Whether to shorten the path that was found.
         params: Parameters of the planner by name.
         snapshot: Plan among moving obstacles as they stand at time 0.
-        timing: How the path is timed, or whether; the timed motion is checked along its own states too. A path that
-            grazes an obstacle between the states of its own check is repaired first, within 3 s.
+        timing: How the path is timed, or whether; the timed motion is proved too.
 
     Returns:
         The result; it is true only for an exact path that passed the full check and, unless timing is off, is timed.
@@ -124,9 +125,10 @@ def plan(
         ready = assemble(loaded, robot, seed=seed)
         if how is not None:
             warm_up()
-        run = PlanRun(ready, planner, parameters, seed, {"setup": time.perf_counter() - started}, notes)
+        times = {"setup": time.perf_counter() - started}
+        run = PlanRun(ready, planner, parameters, seed, Deadline(timeout), times, notes)
         with Interrupt() as run.interrupt:
-            result = find_path(run, timeout, simplify)
+            result = find_path(run, simplify)
             if how is not None:
                 result = parameterize(run, result, how)
         return finish(run, result, started)

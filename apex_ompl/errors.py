@@ -121,6 +121,10 @@ class TimingError(ApexError):
     """A path without a time parameterization."""
 
 
+class TimingStoppedError(TimingError):
+    """A time parameterization that was told to stop before it had a valid motion."""
+
+
 class RobotError(ApexError):
     """A robot description that is not valid."""
 

@@ -27,7 +27,9 @@ from apex_ompl.util.schema import dump_yaml, read_yaml, validate
 SCHEMA = "apex-ompl/result/2"
 SUFFIXES = (*MESSAGES, ".npz", ".csv", ".json", ".yaml")
 KNOTS = ("times", *STATES)
-NUMBERS = ("length", "clearance", "deviation", "timing_resolution")
+PROOF = ("clearance", "clearance_bound", "proved_by_spheres", "motion_clearance")
+NUMBERS = ("length", "deviation", *PROOF)
+
 
 INSIDE = "solve: "
 """Stands before the names of a planner's own stages in ``PlanResult.times``."""
@@ -74,11 +76,16 @@ class PlanResult:
         limit_use: Largest share of each limit that ``trajectory`` uses, by ``position``, ``velocity``,
             ``acceleration`` and ``jerk``; empty without one.
         deviation: Largest distance of ``trajectory`` from ``path`` [rad], NaN without one.
-        timing_resolution: Spacing of the full check that ``trajectory`` passed [rad, max-norm], NaN without one.
+        motion_clearance: Least distance of a checked pair along ``trajectory`` [m], NaN without one.
         times: Seconds per stage, and ``total``; those of a planner's own stages, as ``solve: repair``, are part of
             ``solve``.
         length: Sum of Euclidean joint-space steps [rad], NaN without a path.
-        clearance: Least distance of any checked pair at 32 states spread over the path [m], NaN without a path.
+        clearance: Least distance of any checked pair along the whole path, by the exact shapes [m]; infinite without
+            any pair, NaN without a proved path.
+        clearance_bound: What of ``clearance`` is proved: no state of the path is nearer to contact [m]. It is less by
+            10 um at most, or by half where ``clearance`` is smaller than that.
+        clearance_pair: Names of the two bodies that have it.
+        proved_by_spheres: Share of the path's length that sphere covers proved; exact shapes proved the rest.
         checks: Number of states checked one by one; those inside proved stretches of motions do not count.
         solved_by: What found the path: the planner's name, or the stage of apex that did (see
             ``apex_ompl.ompl_adapter.report.SolveReport``), with ``+repair`` where a stretch of it failed the full check
@@ -98,10 +105,13 @@ class PlanResult:
     trajectory: Trajectory | None = None
     limit_use: Mapping[str, float] = field(default_factory=dict)
     deviation: float = float("nan")
-    timing_resolution: float = float("nan")
+    motion_clearance: float = float("nan")
     times: Mapping[str, float] = field(default_factory=dict)
     length: float = float("nan")
     clearance: float = float("nan")
+    clearance_bound: float = float("nan")
+    clearance_pair: tuple[str, str] = ("", "")
+    proved_by_spheres: float = float("nan")
     checks: int = 0
     solved_by: str = ""
     notes: tuple[str, ...] = ()
@@ -123,7 +133,8 @@ class PlanResult:
             "seed": self.seed,
             "solved_by": self.solved_by,
             "length": None if np.isnan(self.length) else self.length,
-            "clearance": None if not np.isfinite(self.clearance) else self.clearance,
+            **{name: _finite(getattr(self, name)) for name in PROOF},
+            "clearance_pair": list(self.clearance_pair),
             "checks": self.checks,
             "times": dict(self.times),
             "notes": list(self.notes),
@@ -133,7 +144,6 @@ class PlanResult:
             "duration": None if motion is None else motion.duration,
             "limit_use": dict(self.limit_use),
             "deviation": None if np.isnan(self.deviation) else self.deviation,
-            "timing_resolution": None if np.isnan(self.timing_resolution) else self.timing_resolution,
             "jerk": None if motion is None else motion.jerk,
             "spectral_arc_length": None if motion is None else motion.spectral_arc_length,
             "trajectory": None if motion is None else {key: getattr(motion, key).tolist() for key in KNOTS},
@@ -174,7 +184,7 @@ class PlanResult:
         data = read_yaml(path, "result file") if path.suffix != ".npz" else _read_npz(path)
         if data.get("schema") != SCHEMA:
             raise FileFormatError(str(path), "schema", data.get("schema"), f"expected {SCHEMA!r}")
-        data.setdefault("timing_resolution", None)  # older files lack it
+        data = {**dict.fromkeys(PROOF), "clearance_pair": ["", ""]} | data  # older files lack some
         try:
             states = None if data["path"] is None else np.array(data["path"], dtype=float)
             number = {k: float("nan") if data[k] is None else float(data[k]) for k in NUMBERS}
@@ -189,7 +199,7 @@ class PlanResult:
                 problem=validate(Problem, data["problem_file"], str(path)), planner=data["planner"],
                 joint_names=names, trajectory=motion, limit_use=dict(data["limit_use"]), seed=int(data["seed"]),
                 times=data["times"], checks=int(data["checks"]), solved_by=data["solved_by"],
-                notes=tuple(data["notes"]), **number,
+                notes=tuple(data["notes"]), clearance_pair=tuple(data["clearance_pair"]), **number,
             )  # fmt: skip
         except (*BROKEN, ParameterError) as error:
             raise FileFormatError(str(path), "", str(error), "expected a complete saved result") from error
@@ -215,6 +225,11 @@ class PlanResult:
         names = np.array(self.joint_names)
         np.savez(buffer, path=states, joint_names=names, result=np.array(json.dumps(data)), **arrays)
         return buffer.getvalue()
+
+
+def _finite(value: float) -> float | None:
+    """Return a number, or None for one that is not finite."""
+    return value if np.isfinite(value) else None
 
 
 def _spline_fields(path: Path) -> dict[str, Any] | None:

@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import argparse
 import sys
-import time
 from collections.abc import Sequence
 from dataclasses import replace
 from importlib.metadata import version
@@ -34,6 +33,7 @@ from apex_ompl.benchmark.summary import Statistics
 from apex_ompl.ompl_adapter.repair import repair
 from apex_ompl.ompl_adapter.setup import PlanningSetup, assemble
 from apex_ompl.ompl_adapter.validity import full_check
+from apex_ompl.planning import NOT_PROVED
 from apex_ompl.problems import load
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.robot import Robot
@@ -42,6 +42,7 @@ from apex_ompl.scene.bodies import Body, pose_matrix
 from apex_ompl.scene.problem import Problem
 from apex_ompl.trajopt.path import path_length
 from apex_ompl.types import Array
+from apex_ompl.util.deadline import Deadline
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.resolution import SEARCH_RESOLUTION
 from apex_ompl.util.stopwatch import timed
@@ -156,15 +157,17 @@ def plan_with_roboplan(job: Job) -> Run:
     scene = roboplan_scene(ready)
     same = agreement(ready, scene, np.random.default_rng(job.seed))
     names = list(scene.getJointNames())
+    deadline = Deadline(job.timeout)
     options = RRTOptions(
         max_nodes=NODES, max_connection_distance=MAX_STEP, collision_check_step_size=SEARCH_RESOLUTION,
-        max_planning_time=job.timeout, rrt_connect=True,
+        max_planning_time=deadline.for_search, rrt_connect=True,
     )  # fmt: skip
     planner = RRT(scene, options)
     planner.setRngSeed(job.seed)
     start, goal = (JointConfiguration(names, ready.robot.to_pinocchio(q)) for q in (ready.start, ready.goals[0]))
-    times, started = dict[str, float](), time.perf_counter()
+    times = dict[str, float]()
     try:
+        deadline.restart(job.timeout)
         with timed(times, "solve"):
             found = planner.plan(start, goal)
     except RuntimeError as error:
@@ -176,7 +179,7 @@ def plan_with_roboplan(job: Job) -> Run:
     candidates = [np.array(path.positions)[:, order] for path in (shortened, found)]
     for states in candidates:
         states[0], states[-1] = ready.start, ready.goals[0]
-    path, reason = prove(ready, candidates, started + job.timeout, times)
+    path, reason = prove(ready, candidates, deadline.at, times)
     total = sum(times.values())
     first = times["solve"] + first_path_proof(ready.checker, candidates[-1], ready.start, ready.goals, times)
     return {
@@ -192,9 +195,11 @@ def prove(
     reason = ""
     for states in candidates:
         with timed(times, "verify"):
-            check = full_check(ready.checker, states, ready.start, ready.goals)
+            check = full_check(ready.checker, states, ready.start, ready.goals, deadline=deadline)
         if check:
             return states, ""
+        if check.timed_out:
+            return None, NOT_PROVED
         reason = reason or f"the path found failed the full check and repair, {check.reason}"
         with timed(times, "repair"):
             repaired = repair(ready, states, check, deadline)

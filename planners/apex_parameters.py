@@ -58,8 +58,8 @@ class ApexParameters(Parameters):
             distance stands when none comes out better.
         repair: Whether candidates are improved by the optimiser.
         bridge: Whether blocked stretches of the best candidates are bridged by short trees.
-        fallback: Whether RRTConnect gets the time that is left, and sprints before; otherwise there are more rounds of
-            proposals.
+        fallback: Whether RRTConnect takes turns with more rounds of proposals in the time that is left, and sprints
+            before; otherwise there are more rounds of proposals alone.
         polish: Whether valid paths are shortened.
         approximate: Whether, without an exact solution, a path that ends near a goal is given as an approximate one.
         anytime: Whether paths are improved until the time is up, as they are with a path length objective.
@@ -116,8 +116,10 @@ class ApexParameters(Parameters):
         """Return the stages of ``solve`` up to the first valid path, in their order."""
         from apex_ompl.apex import stages
 
-        def proposal_round(count: int) -> list[Stage]:
-            return stages.proposal_round(count, repair=self.repair, resample=self.resample, noise=self.noise)
+        def proposal_round(count: int, temperature: float = 1.0) -> list[Stage]:
+            return stages.proposal_round(
+                count, repair=self.repair, resample=self.resample, noise=self.noise, temperature=temperature
+            )
 
         found: list[Stage] = [stages.KnownCandidates(self.line)]
         for number, count in enumerate(self.batches or (0,)):
@@ -131,11 +133,11 @@ class ApexParameters(Parameters):
             found.append(stages.Bridging(self.range))
         if self.approximate:
             found.append(stages.NearestToGoal())
-        if self.fallback:
-            found.append(stages.GrowTrees(self.range, self.approximate))
-        else:
-            largest = max(self.batches, default=0)
-            found.append(stages.MoreRounds(tuple(proposal_round(largest)) if largest else ()))
+        largest = max(self.batches, default=0)
+        rounds = [proposal_round(largest, temperature) for temperature in stages.TEMPERATURES if largest]
+        ends: list[Stage] = [stages.Farthest(), *([stages.Bridging(self.range)] if self.bridge else [])]
+        trees = stages.GrowTrees(self.range, self.approximate) if self.fallback else None
+        found.append(stages.TakeTurns(trees, tuple((*one, *ends) for one in rounds)))
         return found
 
     def build(self, si: ob.SpaceInformation) -> ob.Planner:

@@ -33,6 +33,24 @@ class Cheat(ob.Planner):
         return ob.PlannerStatus(ob.PlannerStatus.EXACT_SOLUTION)
 
 
+class Deaf(ob.Planner):
+    """Finds a path, and goes on until long after its time is up."""
+
+    def __init__(self, si: ob.SpaceInformation) -> None:
+        super().__init__(si, "deaf")
+        self.inner = og.RRTConnect(si)
+        self.inner.setRange(0.7)
+
+    def solve(self, ptc: Any) -> ob.PlannerStatus:
+        self.inner.setProblemDefinition(self.getProblemDefinition())
+        self.inner.setup()
+        status = self.inner.solve(ptc)
+        while not ptc():
+            time.sleep(0.01)
+        time.sleep(0.2)
+        return status
+
+
 class Dies(ob.Planner):
     """Ends the process at one of its calls of solve; the first one is the warm-up."""
 
@@ -68,6 +86,15 @@ class CheatParameters(Parameters):
 
     def build(self, si: ob.SpaceInformation) -> ob.Planner:
         return Cheat(si)
+
+
+@register("deaf")
+@dataclass(frozen=True)
+class DeafParameters(Parameters):
+    """Finds a path, and goes on until long after its time is up."""
+
+    def build(self, si: ob.SpaceInformation) -> ob.Planner:
+        return Deaf(si)
 
 
 @register("dies")

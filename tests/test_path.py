@@ -20,6 +20,7 @@ from apex_ompl.planners.apex_parameters import ApexParameters
 from apex_ompl.planning import PlanRun, solve, straight_line
 from apex_ompl.trajopt.path import Path
 from apex_ompl.trajopt.spline import Spline
+from apex_ompl.util.deadline import Deadline
 
 
 @pytest.mark.parametrize("spline", [Spline(), Spline(22, 3, 100), Spline(8, 2, 33, 3)])
@@ -93,9 +94,9 @@ def test_the_straight_line_is_tried_once(monkeypatch: pytest.MonkeyPatch) -> Non
         return checked(self, path, *rest, **more)  # type: ignore[arg-type]
 
     monkeypatch.setattr(CollisionChecker, "first_collision", counting)
-    run = PlanRun(ready, "apex", ApexParameters(sprint=0), 0)
+    run = PlanRun(ready, "apex", ApexParameters(sprint=0), 0, Deadline(20.0))
     assert straight_line(run) is None and lines == 1
-    assert solve(run, 20.0, True) and lines == 1
+    assert solve(run, True) and lines == 1
     setup = assemble(cached_problem(HARD)).simple_setup
     setup.setPlanner(APEX(setup.getSpaceInformation(), ApexParameters(sprint=0, seed=0)))
     assert setup.solve(20.0) and lines == 2

@@ -16,6 +16,7 @@ from apex_ompl.ompl_adapter.validity import full_check
 from apex_ompl.result import PlanResult, PlanStatus
 from apex_ompl.trajectory import Timing, Trajectory, time_path
 from apex_ompl.trajopt.path import Path as JointPath
+from apex_ompl.util.deadline import Deadline
 from apex_ompl.util.resolution import MOTION_RESOLUTION
 
 
@@ -33,37 +34,6 @@ def test_plans_are_timed_and_checked() -> None:
     assert result.timing_resolution == MOTION_RESOLUTION
 
 
-def test_paths_that_graze_an_obstacle_between_samples_are_repaired() -> None:
-    """This one is 0.03 mm inside an obstacle between the samples of its own full check."""
-    name = "clutter/medium/900014"
-    untimed, result = (plan(name, "rrtconnect", timeout=20.0, seed=14, timing=timing) for timing in (False, True))
-    assert untimed and result and result.trajectory is not None and result.solved_by == "rrtconnect+repair"
-    ready, finer = assemble(result.problem), MOTION_RESOLUTION / 2.0
-    assert not full_check(ready.checker, untimed.path, resolution=finer), "or the test shows nothing"  # type: ignore[arg-type]
-    assert full_check(ready.checker, result.path, ready.start, ready.goals, finer)  # type: ignore[arg-type]
-    assert full_check(ready.checker, result.trajectory.sample(0.001).position, ready.start, ready.goals, finer)
-
-
-def test_a_grazing_path_that_can_be_neither_repaired_nor_timed_is_no_success(monkeypatch: pytest.MonkeyPatch) -> None:
-    resolutions: list[float] = []
-
-    def fails(*args: object, resolution: float) -> None:
-        resolutions.append(resolution)
-
-    def check(checker: object, path: np.ndarray, *args: object, **options: object) -> object:
-        found = full_check(checker, path, *args, **options)  # type: ignore[arg-type]
-        finely = len(args) == 3 and args[2] == MOTION_RESOLUTION
-        return replace(found, ok=False, reason="it grazes", segment=0) if finely else found
-
-    monkeypatch.setattr(planning.timing, "repair", fails)
-    monkeypatch.setattr(planning.timing, "full_check", check)
-    result = plan("ball_in_cup", timeout=20.0)
-    assert resolutions == [MOTION_RESOLUTION] and result.status is PlanStatus.TIMING_FAILED
-    assert result.reason == "the path cannot be timed, it fails the full check at 0.00031 rad, it grazes" and np.isnan(
-        result.timing_resolution
-    )
-
-
 def test_results_without_a_timing_resolution_are_read(tmp_path: Path) -> None:
     plan("ball_in_cup", timeout=20.0).save(tmp_path / "new.json")
     data = json.loads((tmp_path / "new.json").read_text())
@@ -79,13 +49,13 @@ def test_joints_at_their_limits_do_not_stop_a_plan() -> None:
     states[:, 6], states[:, 13] = robot.limits.upper[6], robot.limits.lower[13]
     states[:, 5] += 0.2 * np.sin(5.0 * np.linspace(0.0, 1.0, 256))
     ready = replace(ready, start=states[0], goals=states[-1:])
-    run = planning.PlanRun(ready, "rrtconnect", planners.parameters("rrtconnect"), 0)
+    run = planning.PlanRun(ready, "rrtconnect", planners.parameters("rrtconnect"), 0, Deadline(20.0))
     exact = run.result(PlanStatus.EXACT_SOLUTION, path=JointPath(states))
     assert planning.parameterize(run, exact, Timing()).trajectory.duration < 5.0
 
 
 def test_a_path_that_cannot_be_timed_is_no_success(monkeypatch: pytest.MonkeyPatch) -> None:
-    def fails(*args: object) -> None:
+    def fails(*args: object, **options: object) -> None:
         raise TimingError("the motion collides")
 
     monkeypatch.setattr(planning.timing, "time_path", fails)

@@ -50,6 +50,7 @@ class SolveContext:
         best: Shortest valid path, or None.
         nearest: Path that ends near a goal and its distance from it [rad], or None.
         trees: RRTConnect that a sprint began and its problem definition, or None.
+        all_trees: RRTConnect for all starts and goals and its problem definition, or None.
     """
 
     def __init__(
@@ -72,6 +73,7 @@ class SolveContext:
         self.best: Path | None = None
         self.nearest: tuple[Path, float] | None = None
         self.trees: tuple[og.RRTConnect, ob.ProblemDefinition] | None = None
+        self.all_trees: tuple[og.RRTConnect, ob.ProblemDefinition] | None = None
         self._queries: list[Query] = []
 
     @property

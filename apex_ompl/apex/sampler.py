@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -46,11 +47,18 @@ class ProposalSampler:
         self.model, self.sampling = model, sampling
         self._kernel, self._generator, self._stop, self._report = kernel, generator, stop, report
 
-    def propose(self, queries: Sequence[Query], count: int) -> Array | None:
-        """Return control points of ``count`` new proposals a query, shape (B, points, dof); None when time ended."""
+    def propose(self, queries: Sequence[Query], count: int, temperature: float = 1.0) -> Array | None:
+        """Return control points of new proposals, shape (B, points, dof); None when time ended.
+
+        Args:
+            queries: What they are conditioned on.
+            count: Their number for each query.
+            temperature: Factor on the standard deviation of the initial noise.
+        """
+        sampling = replace(self.sampling, temperature=temperature * self.sampling.temperature)
         return self._sampled(
             lambda: self.model.propose(
-                queries, self._kernel, count, sampling=self.sampling, generator=self._generator, callback=self._leave
+                queries, self._kernel, count, sampling=sampling, generator=self._generator, callback=self._leave
             )
         )
 

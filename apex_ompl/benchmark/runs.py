@@ -22,20 +22,21 @@ from apex_ompl.errors import ApexError
 from apex_ompl.ompl_adapter.process import quiet_ompl, seed_ompl
 from apex_ompl.ompl_adapter.report import SolveReport, report_of
 from apex_ompl.ompl_adapter.setup import assemble
-from apex_ompl.planning import PlanRun, finish, query_fault, solve, solving_time, with_exact_ends
+from apex_ompl.planning import PlanRun, finish, query_fault, solve, with_exact_ends
 from apex_ompl.problems.generator import SuiteError
 from apex_ompl.result import FIRST, PlanResult, PlanStatus
 from apex_ompl.robot import Robot, load_robot
 from apex_ompl.trajectory.smoothness import jerk
 from apex_ompl.trajopt.path import path_length
 from apex_ompl.types import Array
+from apex_ompl.util.deadline import Deadline
 from apex_ompl.util.threads import one_torch_thread
 
 Run = dict[str, Any]
 """A run as it is stored, ready for JSON."""
 
 MEMORY = 16_384.0  # limit of a run [MB]
-UPDATES = 0.05  # period at which a planner's progress is read [s]
+UPDATES = 0.01  # period at which a planner's progress is read, and the end of its time is looked for [s]
 NO_PROBLEM, CRASH = "NO_PROBLEM", str(PlanStatus.CRASH)
 WARM_UP = "wall/easy/800000"
 
@@ -57,12 +58,17 @@ class Experiment:
     common: dict[str, str] = field(default_factory=dict)
 
     def __call__(self, run: PlanRun, planner: ob.Planner, timeout: float) -> PlanStatus:
-        """Run the planner, and return its status; faults of the checkers are raised."""
+        """Run the planner, and return its status; faults of the checkers are raised.
+
+        Of the run's time only the planner's own counts, not what the experiment measures.
+        """
+        left = run.deadline.remaining
         check_counts, reports = run.setup.checker.check_counts, list[SolveReport | None]()
         states = [check_counts.states]
 
         def before_run(_: ob.Planner) -> None:
             seed_ompl(run.seed)  # the experiment itself has drawn and checked states by then
+            run.deadline.restart(left)
             states.append(check_counts.states)
 
         def after_run(*_: object) -> None:  # after it the experiment checks the path, and clears the planner
@@ -77,7 +83,7 @@ class Experiment:
         experiment.addPlanner(planner)
         experiment.setPreRunEvent(before_run)
         experiment.setPostRunEvent(after_run)
-        request = ot.Request(solving_time(run.parameters, timeout), MEMORY, 1, UPDATES, False, False, False)
+        request = ot.Request(timeout, MEMORY, 1, UPDATES, False, False, False)
         try:
             experiment.benchmark(request)
         finally:
@@ -89,6 +95,7 @@ class Experiment:
         recorded = experiment.getRecordedExperimentData().planners[0]
         self.properties, self.common = recorded.runs[0].to_dict(), recorded.common.to_dict()
         run.times["solve"] = float(self.properties["time REAL"])
+        run.deadline.restart(left - run.times["solve"])
         observed += [moment for data in recorded.runsProgressData for moment in _solved_at(data)]
         if observed:
             run.times[FIRST] = min(observed)
@@ -174,11 +181,12 @@ def planned(job: Job) -> tuple[PlanRun, Experiment, PlanResult]:
     with quiet_ompl(), one_torch_thread():
         seed_ompl(job.seed)
         ready = assemble(problem, _robots[problem.robot], seed=job.seed)
-        planning = PlanRun(ready, job.planner, parameters, job.seed, {"setup": time.perf_counter() - started})
+        times = {"setup": time.perf_counter() - started}
+        planning = PlanRun(ready, job.planner, parameters, job.seed, Deadline(job.timeout), times)
         experiment = Experiment()
         result = query_fault(planning)  # the planner runs even where the straight line is a solution
         if result is None:
-            result = solve(planning, job.timeout, job.simplify, experiment)
+            result = solve(planning, job.simplify, experiment)
         return planning, experiment, finish(planning, result, started)
 
 
@@ -195,7 +203,7 @@ def columns(planning: PlanRun, experiment: Experiment, result: PlanResult) -> Ru
     if report is None or not report.first_verified:  # the planner itself had not made the full check
         setup = planning.setup
         exact = None if first_path is None else with_exact_ends(setup, first_path).states
-        first += first_path_proof(setup.checker, exact, setup.start, setup.goals, times)
+        first = min(first + first_path_proof(setup.checker, exact, setup.start, setup.goals, times), total)
     return {
         "status": str(result.status), "reason": result.reason, "solved": found, "by": result.solved_by,
         "first": first if found else None, "total": total, "setup": times.get("setup"), "times": dict(times),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import sys
 from pathlib import Path
 
@@ -103,6 +104,15 @@ def _save(result: PlanResult, out: Path, *, timed: bool, controllers: bool) -> N
         result.save(out)
 
 
+def _clearance(result: PlanResult) -> str:
+    """Return the words for the clearance of a path."""
+    if math.isnan(result.clearance):
+        return "not proved"
+    pair = " <-> ".join(name for name in result.clearance_pair if name)
+    spheres = f"{100.0 * result.proved_by_spheres:.0f} % of the path proved by spheres, the rest by exact shapes"
+    return f"{result.clearance * 1e3:.2f} mm" + (f" ({pair})" if pair else "") + f"; {spheres}"
+
+
 def _summary(result: PlanResult) -> str:
     """Return the lines printed about a result."""
     times = [(name, f"{seconds:.3f}") for name, seconds in result.times.items() if name != "total"]
@@ -116,12 +126,12 @@ def _summary(result: PlanResult) -> str:
         lines.append(f"  solve      {inside}")
     if result.path is not None:
         lines.append(f"  length     {result.length:.3f} rad over {len(result.path)} states")
-        lines.append(f"  clearance  {result.clearance * 1e3:.1f} mm")
+        lines.append(f"  clearance  {_clearance(result)}")
     if result.trajectory is not None:
         uses = ", ".join(f"{name} {share:.3f}" for name, share in result.limit_use.items() if name != "position")
         lines.append(
             f"  motion     {result.trajectory.duration:.3f} s, at most {result.deviation:.4f} rad off the path, "
-            f"checked every {result.timing_resolution:.2g} rad"
+            f"{result.motion_clearance * 1e3:.2f} mm clear"
         )
         lines.append(f"  limits     {uses} used")
     lines.append(f"  checks     {result.checks} states checked, planner {result.planner}, seed {result.seed}")

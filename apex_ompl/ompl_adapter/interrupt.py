@@ -1,15 +1,27 @@
-"""Ctrl-C during a plan: an exception inside OMPL's callbacks would end the process, so it waits its turn."""
+"""What ends work inside of OMPL early: Ctrl-C, which must not raise in its callbacks, and the end of time."""
 
 from __future__ import annotations
 
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import TracebackType
 from typing import Any, Self
 
 from ompl import base as ob
+
+from apex_ompl.ompl_adapter.validity import MotionValidator
+
+MAX_TIME = 1e8  # OMPL counts nanoseconds in 64 bits [s]
+
+
+def ends_after(seconds: float) -> ob.PlannerTerminationCondition:
+    """Return OMPL's condition that holds after a time [s], which may be negative, or longer than OMPL can count.
+
+    It is made in C++: planners that run threads deadlock with one made in Python.
+    """
+    return ob.timedPlannerTerminationCondition(min(max(seconds, 0.0), MAX_TIME))
 
 
 class Interrupt:
@@ -61,3 +73,18 @@ class Interrupt:
         self.pressed = True
         for condition in self._conditions:
             condition.terminate()
+
+
+@contextmanager
+def motions_until(validator: MotionValidator, stop: Callable[[], bool]) -> Iterator[None]:
+    """While the block runs, let all motions be invalid once ``stop`` holds.
+
+    OMPL looks at a termination condition between iterations and not inside of them, and simplifies paths by counts:
+    without motions to check, both soon come to their end.
+    """
+    check = validator.check
+    validator.check = lambda first, second: not stop() and check(first, second)
+    try:
+        yield
+    finally:
+        validator.check = check

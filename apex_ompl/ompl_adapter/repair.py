@@ -8,21 +8,21 @@ import numpy as np
 from ompl import base as ob
 from ompl import geometric as og
 
-from apex_ompl.ompl_adapter.interrupt import Interrupt
+from apex_ompl.collision.path_proof import PathProof
+from apex_ompl.ompl_adapter.interrupt import Interrupt, ends_after, motions_until
 from apex_ompl.ompl_adapter.setup import PlanningSetup
 from apex_ompl.ompl_adapter.space import path_to_array, state_space, to_state
-from apex_ompl.ompl_adapter.validity import FullCheck, MotionCheck, MotionValidator, StateValidityChecker, full_check
+from apex_ompl.ompl_adapter.validity import FullCheck, MotionProof, MotionValidator, StateValidityChecker, full_check
+from apex_ompl.trajopt.path import Path
 from apex_ompl.types import Array
-from apex_ompl.util.resolution import FULL_RESOLUTION
 
 MAX_BRIDGES = 20
 
 
 def repair(
-    problem: PlanningSetup, path: Array, fault: FullCheck, deadline: float, interrupt: Interrupt | None = None,
-    *, resolution: float = FULL_RESOLUTION,
-) -> Array | None:  # fmt: skip
-    """Plan stretches that fail the full check anew, at the resolution of the full check.
+    problem: PlanningSetup, path: Array, fault: FullCheck, deadline: float, interrupt: Interrupt | None = None
+) -> tuple[Path, PathProof] | None:
+    """Plan stretches that fail the full check anew; the motions there are proved one by one.
 
     Args:
         problem: Planning setup of the problem.
@@ -30,54 +30,51 @@ def repair(
         fault: Outcome of the full check of ``path``.
         deadline: Value of ``time.perf_counter`` at which to give up [s].
         interrupt: Ends the work in good order when it was pressed.
-        resolution: Spacing of the full check [rad, max-norm].
 
     Returns:
-        A path that passes the full check, or None.
+        A path that passes the full check with its proof, or None.
     """
     interrupt = interrupt or Interrupt()
     for _ in range(MAX_BRIDGES):
-        left = deadline - time.perf_counter()
-        if left <= 0.0 or fault.segment is None or interrupt.pressed:
+        if time.perf_counter() >= deadline or fault.segment is None or interrupt.pressed:
             return None
         first, last = _free_ends(problem, path, fault.segment)
-        bridge = _bridge(problem, path[first], path[last], left, interrupt, resolution=resolution)
+        bridge = _bridge(problem, path[first], path[last], deadline, interrupt)
         if bridge is None:
             return None
         path = np.concatenate([path[:first], bridge, path[last + 1 :]])
-        fault = full_check(problem.checker, path, problem.start, problem.goals, resolution)
-        if fault:
-            return path
+        fault = full_check(problem.checker, path, problem.start, problem.goals, deadline=deadline)
+        if fault.proof is not None and fault:
+            return Path(path), fault.proof
     return None
 
 
 def _free_ends(problem: PlanningSetup, path: Array, segment: int) -> tuple[int, int]:
-    """Return the states nearest to a segment, before and after it, that are free.
+    """Return the states nearest to a segment, before and after it, that are proved free.
 
     Shortcuts may put a state between those that were checked, so that a state of the path itself collides.
     """
     first, last = segment, segment + 1
-    while first > 0 and not problem.checker.is_free(path[first]):
+    while first > 0 and not problem.checker.prove(path[first, None], tolerance=0.0):
         first -= 1
-    while last < len(path) - 1 and not problem.checker.is_free(path[last]):
+    while last < len(path) - 1 and not problem.checker.prove(path[last, None], tolerance=0.0):
         last += 1
     return first, last
 
 
-def _bridge(
-    problem: PlanningSetup, a: Array, b: Array, timeout: float, interrupt: Interrupt, *, resolution: float
-) -> Array | None:
-    """Return a path between two free states, checked at the resolution of the full check, or None."""
+def _bridge(problem: PlanningSetup, a: Array, b: Array, deadline: float, interrupt: Interrupt) -> Array | None:
+    """Return a path between two free states whose motions are proved, or None."""
     space = state_space(problem.robot)
     setup = og.SimpleSetup(space)
     si = setup.getSpaceInformation()
     validity_checker = StateValidityChecker(si, problem.checker)
-    motions = MotionValidator(si, MotionCheck(problem.checker, resolution))
+    motions = MotionValidator(si, MotionProof(problem.checker))
     setup.setStateValidityChecker(validity_checker)
     si.setMotionValidator(motions)
     setup.setStartAndGoalStates(to_state(si, a), to_state(si, b))
     setup.setPlanner(og.RRTConnect(si))
-    with interrupt.ends(ob.timedPlannerTerminationCondition(timeout)) as ptc:
+    condition = ends_after(deadline - time.perf_counter())
+    with interrupt.ends(condition) as ptc, motions_until(motions, lambda: time.perf_counter() >= deadline):
         status = setup.solve(ptc)
     fault = validity_checker.fault or motions.fault
     if fault is not None:

@@ -129,11 +129,11 @@ def set_goals(simple_setup: og.SimpleSetup, goals: list[Array]) -> None:
 
 
 def state_fault(checker: CollisionChecker, q: Array) -> str:
-    """Return why a state is invalid: the first joint out of limits, or the deepest contact; else nothing."""
+    """Return why a state is invalid: the first joint out of limits, or the deepest contact; else nothing.
+
+    A pair that is nearer than the proof of paths takes for contact is a fault too: no path could leave the state.
+    """
     fault = checker.robot.limit_fault(q)
     if fault:
         return fault
-    if checker.is_free(q):
-        return ""
-    contacts = checker.contacts(q)
-    return str(contacts[0]) if contacts else "in collision"
+    return checker.prove(q[None], tolerance=0.0).reason

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import nullcontext
 
 import numpy as np
 from ompl import base as ob
 from ompl import geometric as og
 
+from apex_ompl.ompl_adapter.interrupt import motions_until
 from apex_ompl.ompl_adapter.space import array_to_path, path_to_array
+from apex_ompl.ompl_adapter.validity import MotionValidator
 from apex_ompl.trajopt.path import path_length
 from apex_ompl.types import Array
 
@@ -31,22 +34,23 @@ def simplify(
         simplifier: OMPL's simplifier for ``si``.
         si: OMPL's space information of the problem.
         path: States, shape (N, dof).
-        stop: Asked before every round whether to end.
+        stop: Asked whether to end before every round, and before every motion that this project's validator checks.
         max_attempts: Largest number of attempts to shorten the path in a round; 0 means OMPL's own number.
     """
     if len(path) < 3:
         return path
     work = array_to_path(si, path)
-    best = path
-    for _ in range(ROUNDS if not max_attempts else MAX_ROUNDS):
-        if stop():
-            break
-        simplifier.reduceVertices(work, max_attempts)
-        simplifier.partialShortcutPath(work, max_attempts)
-        states = path_to_array(work, path.shape[1])
-        gain = 1.0 - path_length(states) / max(path_length(best), 1e-12)
-        if gain > 0.0:
-            best = states
-        if gain < MIN_GAIN and not max_attempts:
-            break
+    best, validator = path, si.getMotionValidator()
+    with motions_until(validator, stop) if isinstance(validator, MotionValidator) else nullcontext():
+        for _ in range(ROUNDS if not max_attempts else MAX_ROUNDS):
+            if stop():
+                break
+            simplifier.reduceVertices(work, max_attempts)
+            simplifier.partialShortcutPath(work, max_attempts)
+            states = path_to_array(work, path.shape[1])
+            gain = 1.0 - path_length(states) / max(path_length(best), 1e-12)
+            if gain > 0.0:
+                best = states
+            if gain < MIN_GAIN and not max_attempts:
+                break
     return np.concatenate([path[:1], best[1:-1], path[-1:]])

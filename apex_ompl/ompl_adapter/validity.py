@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
@@ -155,6 +156,8 @@ def full_check(
         return FullCheck(False, "the path does not begin at the start", 0)
     if goals and not any(np.array_equal(states[-1], goal) for goal in goals):
         return FullCheck(False, "the path does not end at a goal", last)
+    if deadline is not None and time.perf_counter() >= deadline:
+        return FullCheck(False, "not proved in time", None, timed_out=True)
     curve = Curve.polyline(states)
     if motion is not None:
         curve = Curve.cubic(motion.times, states, motion.velocities, motion.accelerations)

@@ -2,11 +2,11 @@
 
 from apex_ompl.planning.run import PlanRun
 from apex_ompl.planning.solving import (
+    NOT_PROVED,
     STRAIGHT_LINE,
     find_path,
     query_fault,
     solve,
-    solving_time,
     straight_line,
     verify,
     with_exact_ends,
@@ -14,6 +14,7 @@ from apex_ompl.planning.solving import (
 from apex_ompl.planning.timing import finish, parameterize
 
 __all__ = [
+    "NOT_PROVED",
     "STRAIGHT_LINE",
     "PlanRun",
     "find_path",
@@ -21,7 +22,6 @@ __all__ = [
     "parameterize",
     "query_fault",
     "solve",
-    "solving_time",
     "straight_line",
     "verify",
     "with_exact_ends",

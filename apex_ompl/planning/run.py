@@ -5,12 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+from apex_ompl.collision.path_proof import PathProof
 from apex_ompl.ompl_adapter.interrupt import Interrupt
 from apex_ompl.ompl_adapter.report import SolveReport
 from apex_ompl.ompl_adapter.setup import PlanningSetup
 from apex_ompl.result import PlanResult, PlanStatus
 from apex_ompl.trajopt.path import Path
 from apex_ompl.types import Array
+from apex_ompl.util.deadline import Deadline
 
 if TYPE_CHECKING:
     from apex_ompl.planners import Parameters
@@ -25,6 +27,7 @@ class PlanRun:
         planner: Name of the planner.
         parameters: Its parameters.
         seed: The seed used.
+        deadline: When the plan is to be ready.
         times: Seconds by stage so far.
         notes: What a user should know about this run.
         interrupt: Holds Ctrl-C back.
@@ -37,6 +40,7 @@ class PlanRun:
     planner: str
     parameters: Parameters
     seed: int
+    deadline: Deadline
     times: dict[str, float] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     interrupt: Interrupt = field(default_factory=Interrupt)
@@ -44,10 +48,22 @@ class PlanRun:
     first_path: Path | None = None
     report: SolveReport | None = None
 
-    def result(self, status: PlanStatus, reason: str = "", path: Path | None = None, solved_by: str = "") -> PlanResult:
-        """Return a result without what :func:`finish` adds."""
+    def ends_search(self) -> bool:
+        """Whether only the reserve for the proof is left, or Ctrl-C was pressed."""
+        return self.interrupt.pressed or self.deadline.for_search <= 0.0
+
+    def result(
+        self, status: PlanStatus, reason: str = "", path: Path | None = None, solved_by: str = "",
+        proof: PathProof | None = None,
+    ) -> PlanResult:  # fmt: skip
+        """Return a result without what :func:`finish` adds; ``proof`` is that of ``path``."""
         robot = self.setup.robot
+        found = {} if proof is None else {
+            "clearance": proof.clearance, "clearance_bound": proof.clearance_bound, "clearance_pair": proof.pair,
+            "proved_by_spheres": proof.by_spheres,
+        }  # fmt: skip
         return PlanResult(
             status=status, reason=reason, problem=self.setup.problem, robot=robot.name, joint_names=robot.joint_names,
             planner=self.planner, seed=self.seed, path=path, solved_by=solved_by, notes=tuple(self.notes),
+            **found,  # type: ignore[arg-type]
         )  # fmt: skip

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 import numpy as np
 from ompl import base as ob
 
 from apex_ompl.errors import ApexError
+from apex_ompl.ompl_adapter.interrupt import MAX_TIME, ends_after, motions_until
 from apex_ompl.ompl_adapter.repair import repair
 from apex_ompl.ompl_adapter.report import LineAwarePlanner, report_of
 from apex_ompl.ompl_adapter.setup import PlanningSetup, set_goals
@@ -19,32 +19,27 @@ from apex_ompl.ompl_adapter.validity import full_check
 from apex_ompl.planning.run import PlanRun
 from apex_ompl.result import FIRST, INSIDE, PlanResult, PlanStatus
 from apex_ompl.trajopt.path import Path
-from apex_ompl.util.resolution import FULL_RESOLUTION
 from apex_ompl.util.stopwatch import timed
 
-if TYPE_CHECKING:
-    from apex_ompl.planners import Parameters
-
 STRAIGHT_LINE = "straight line"
-PROOF_SHARE, MAX_PROOF = 0.1, 0.5  # time kept from planners that stop at the timeout only, for repair [1, s]
-MAX_TIMEOUT = 1e8  # OMPL counts nanoseconds in 64 bits [s]
+NOT_PROVED = "a path was found but not proved in time"
+REPAIR_SHARE = 0.5  # of the time left, for the repair of one path
 
 Execute = Callable[[PlanRun, ob.Planner, float], PlanStatus]
 """Runs a planner that is set, for a time [s], and returns its status."""
 
 
-def find_path(run: PlanRun, timeout: float, simplify: bool) -> PlanResult:
+def find_path(run: PlanRun, simplify: bool) -> PlanResult:
     """Return a path that passes the full check, the straight line where it does, or why there is none.
 
     Args:
         run: The call of ``plan``.
-        timeout: Seconds for finding and repairing a path.
         simplify: Whether paths of planners that leave it to others are shortened.
     """
     result = query_fault(run)
     if result is None:
         result = straight_line(run)
-    return solve(run, timeout, simplify) if result is None else result
+    return solve(run, simplify) if result is None else result
 
 
 def query_fault(run: PlanRun) -> PlanResult | None:
@@ -58,17 +53,23 @@ def query_fault(run: PlanRun) -> PlanResult | None:
 
 
 def straight_line(run: PlanRun) -> PlanResult | None:
-    """Return the straight line to the nearest goal for which it is a solution, or None.
+    """Return the straight line to the nearest goal for which it is a solution, or that time is up, or else None.
 
-    Some of OMPL's planners hang, give up or raise where there is nothing to search for. Limits are convex, and start
-    and goals are inside of them, so that a line without collision passes the full check.
+    Some of OMPL's planners hang, give up or raise where there is nothing to search for.
     """
     setup = run.setup
     with timed(run.times, "line"):
         for goal in sorted(setup.valid_goals, key=lambda goal: float(np.linalg.norm(goal - setup.start))):
+            if run.deadline.expired:
+                return _out_of_time(run)
             line = np.stack([setup.start, goal])
-            if setup.checker.first_collision(line, FULL_RESOLUTION) is None:
-                return run.result(PlanStatus.EXACT_SOLUTION, path=Path(line), solved_by=STRAIGHT_LINE)
+            check = full_check(setup.checker, line, setup.start, setup.goals, deadline=run.deadline.at)
+            if check:
+                return run.result(
+                    PlanStatus.EXACT_SOLUTION, path=Path(line), solved_by=STRAIGHT_LINE, proof=check.proof
+                )
+            if check.timed_out:
+                return run.result(PlanStatus.TIMEOUT, NOT_PROVED)
             run.rejected_lines.append(line)
     return None
 
@@ -76,20 +77,19 @@ def straight_line(run: PlanRun) -> PlanResult | None:
 def execute(run: PlanRun, planner: ob.Planner, timeout: float) -> PlanStatus:
     """Run a planner that is set, and return its status; faults of the checkers are raised."""
     del planner
-    # A condition made in C++: planners that run threads deadlock with one made in Python.
-    condition = ob.timedPlannerTerminationCondition(solving_time(run.parameters, timeout))
-    with run.interrupt.ends(condition) as ptc, timed(run.times, "solve"):
+    with run.interrupt.ends(ends_after(timeout)) as ptc, timed(run.times, "solve"):
         status = PlanStatus.of(run.setup.simple_setup.solve(ptc))
     run.setup.raise_faults()
     return status
 
 
-def solve(run: PlanRun, timeout: float, simplify: bool, execute: Execute = execute) -> PlanResult:
+def solve(run: PlanRun, simplify: bool, execute: Execute = execute) -> PlanResult:
     """Run the planner, verify what it finds, and repair it where it fails the full check.
+
+    The planner has what time is left but for the reserve; its set-up does not count.
 
     Args:
         run: The call of ``plan``.
-        timeout: Seconds for finding and repairing a path.
         simplify: Whether paths of planners that leave it to others are shortened.
         execute: Runs the planner.
 
@@ -97,10 +97,12 @@ def solve(run: PlanRun, timeout: float, simplify: bool, execute: Execute = execu
         ApexError: The planner cannot be built; a checkpoint is missing, for one.
     """
     try:
-        with timed(run.times, "setup"):
+        if run.deadline.expired:
+            return _out_of_time(run)
+        with timed(run.times, "setup"), run.deadline.paused():
             planner = _set_up(run)
-        status = execute(run, planner, timeout)
-        deadline = time.perf_counter() + timeout - run.times["solve"]
+        with motions_until(run.setup.motion_validator, run.ends_search):
+            status = execute(run, planner, min(run.deadline.for_search, MAX_TIME))
         report = run.report = report_of(planner)
         if report is not None:
             run.times |= {INSIDE + stage: seconds for stage, seconds in report.times.items()}
@@ -109,47 +111,52 @@ def solve(run: PlanRun, timeout: float, simplify: bool, execute: Execute = execu
         if status is PlanStatus.APPROXIMATE_SOLUTION:
             return _approximate(run)
         if status is not PlanStatus.EXACT_SOLUTION:
-            return _unsolved(run, status, timeout)
+            return _unsolved(run, status)
         path = _found_path(run)
         run.first_path = path if report is None or report.first_path is None else report.first_path
         solved_by = run.planner if report is None else report.solved_by
-        return verify(run, path, deadline, simplify and not run.parameters.smooth, solved_by)
+        return verify(run, path, simplify and not run.parameters.smooth, solved_by)
     except ApexError:
         raise
     except Exception as error:
         return run.result(PlanStatus.CRASH, f"{run.planner} failed, {error!r}")
 
 
-def verify(run: PlanRun, path: Path, deadline: float, simplify: bool, solved_by: str) -> PlanResult:
+def verify(run: PlanRun, path: Path, simplify: bool, solved_by: str) -> PlanResult:
     """Put the exact start and goal in, shorten the path, check it in full, and repair it where it fails.
 
-    When a shortened path neither passes nor can be repaired, the path as it was found has its turn.
+    When a shortened path neither passes nor can be repaired, the path as it was found has its turn; each repair has
+    half of the time that is left.
 
     Args:
         run: The call of ``plan``.
         path: Path of the planner.
-        deadline: Value of ``time.perf_counter`` at which repair gives up [s].
         simplify: Whether the path is shortened.
         solved_by: What found the path.
     """
-    setup, reason = run.setup, ""
+    setup, reason, late = run.setup, "", False
     candidates = [with_exact_ends(setup, path)]
-    if simplify:
+    if simplify and not run.ends_search():
         with timed(run.times, "simplify"):
             candidates.insert(0, _simplified(run, candidates[0]))
         setup.raise_faults()
     for candidate in candidates:
         with timed(run.times, "verify"):
-            check = full_check(setup.checker, candidate.states, setup.start, setup.goals)
+            check = full_check(setup.checker, candidate.states, setup.start, setup.goals, deadline=run.deadline.at)
         if check:
-            return run.result(PlanStatus.EXACT_SOLUTION, path=candidate, solved_by=solved_by)
+            return run.result(PlanStatus.EXACT_SOLUTION, path=candidate, solved_by=solved_by, proof=check.proof)
+        if check.timed_out:
+            return run.result(PlanStatus.TIMEOUT, NOT_PROVED)
         reason = reason or check.reason
         with timed(run.times, "repair"):
-            repaired = repair(setup, candidate.states, check, deadline, run.interrupt)
+            end = time.perf_counter() + REPAIR_SHARE * run.deadline.remaining
+            repaired = repair(setup, candidate.states, check, end, run.interrupt)
         if repaired is not None:
-            path = Path(repaired)
-            return run.result(PlanStatus.EXACT_SOLUTION, path=path, solved_by=f"{solved_by}+repair")
-    return run.result(PlanStatus.TIMEOUT, f"the path found failed the full check and repair, {reason}")
+            path, proof = repaired
+            return run.result(PlanStatus.EXACT_SOLUTION, path=path, solved_by=f"{solved_by}+repair", proof=proof)
+        late |= time.perf_counter() >= end
+    failed = NOT_PROVED if late else "the path found failed the full check and repair"
+    return run.result(PlanStatus.TIMEOUT, f"{failed}, {reason}")
 
 
 def with_exact_ends(setup: PlanningSetup, path: Path) -> Path:
@@ -159,16 +166,6 @@ def with_exact_ends(setup: PlanningSetup, path: Path) -> Path:
     if np.array_equal(states[0], setup.start) and np.array_equal(states[-1], goal):
         return path
     return Path(np.concatenate([setup.start[None], states[1:-1], goal[None]]))
-
-
-def solving_time(parameters: Parameters, timeout: float) -> float:
-    """Return how much of a timeout is for the planner [s]; what it finds must still be proved.
-
-    Planners that stop at the timeout only leave a tenth of it, at most half a second.
-    """
-    if parameters.optimizing:
-        timeout -= min(PROOF_SHARE * timeout, MAX_PROOF)
-    return min(timeout, MAX_TIMEOUT)
 
 
 def _set_up(run: PlanRun) -> ob.Planner:
@@ -201,14 +198,18 @@ def _found_path(run: PlanRun) -> Path:
 def _simplified(run: PlanRun, path: Path) -> Path:
     simple_setup = run.setup.simple_setup
     si = simple_setup.getSpaceInformation()
-    return Path(shorten(simple_setup.getPathSimplifier(), si, path.states, lambda: run.interrupt.pressed))
+    return Path(shorten(simple_setup.getPathSimplifier(), si, path.states, run.ends_search))
 
 
-def _unsolved(run: PlanRun, status: PlanStatus, timeout: float) -> PlanResult:
+def _out_of_time(run: PlanRun) -> PlanResult:
+    return run.result(PlanStatus.TIMEOUT, f"no path in {run.deadline.timeout:g} s")
+
+
+def _unsolved(run: PlanRun, status: PlanStatus) -> PlanResult:
     report, details = run.report, "" if status is PlanStatus.TIMEOUT else f" (OMPL says {status})"
     details += f", {report.reason}" if report is not None and report.reason else ""
     ours = PlanStatus.TIMEOUT if status in (PlanStatus.INVALID_START, PlanStatus.INVALID_GOAL) else status
-    return run.result(ours, f"{run.planner} found no path in {timeout:g} s{details}")
+    return run.result(ours, f"{run.planner} found no path in {run.deadline.timeout:g} s{details}")
 
 
 def _approximate(run: PlanRun) -> PlanResult:
@@ -217,7 +218,11 @@ def _approximate(run: PlanRun) -> PlanResult:
     states[0] = setup.start
     distance = float(np.linalg.norm(setup.goals - states[-1], axis=1).min())
     reason = f"the nearest state found is {distance:.3g} rad from the goal"
-    check = full_check(setup.checker, states, setup.start)
-    if not check:
+    check = full_check(setup.checker, states, setup.start, deadline=run.deadline.at)
+    if check.timed_out:
+        reason += ", and the path was not checked in time"
+    elif not check:
         reason += f", and the path fails the full check, {check.reason}"
-    return run.result(PlanStatus.APPROXIMATE_SOLUTION, reason, Path(states), run.planner)
+    return run.result(
+        PlanStatus.APPROXIMATE_SOLUTION, reason, Path(states), run.planner, check.proof if check else None
+    )

@@ -4,36 +4,33 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
+from math import nan
 
-import numpy as np
-
-from apex_ompl.errors import TimingError
-from apex_ompl.ompl_adapter.repair import repair
+from apex_ompl.errors import TimingError, TimingStoppedError
 from apex_ompl.ompl_adapter.validity import FullCheck, full_check
 from apex_ompl.planning.run import PlanRun
 from apex_ompl.result import PlanResult, PlanStatus
 from apex_ompl.trajectory import Timing, Trajectory, time_path
 from apex_ompl.trajectory.trajectory import ROUNDING
-from apex_ompl.trajopt.path import Path, resample
-from apex_ompl.types import Array
-from apex_ompl.util.resolution import MOTION_RESOLUTION
 from apex_ompl.util.stopwatch import timed
 
-CLEARANCE_SAMPLES = 32
-CHORD = 1e-5  # largest distance of a timed motion from the straight line between two states that are checked [rad]
-MAX_STATES = 100_000  # of a timed motion that are checked
-MAX_FINE_REPAIR = 3.0  # of a path that fails the check at MOTION_RESOLUTION, on top of the timeout [s]
+NOT_TIMED = "a path was found but not timed in time"
 
 
 def parameterize(run: PlanRun, result: PlanResult, timing: Timing) -> PlanResult:
-    """Return a result with its path timed, or with the status TIMING_FAILED.
+    """Return a result with its path timed, or with the status TIMEOUT or TIMING_FAILED.
 
-    Stretches of the path that fail the full check at MOTION_RESOLUTION are planned anew, since motions along them would
-    fail it too. The motion is valid when it keeps the limits and passes that check.
+    The motion keeps the limits and is proved free along its own cubic pieces.
+
+    Args:
+        run: The call of ``plan``.
+        result: Result whose path passed the full check; without one it is returned as it is.
+        timing: How the path is timed.
     """
     if result.path is None or not result:
         return result
-    setup, limits, proof = run.setup, run.setup.robot.limits, dict[str, float]()
+    setup, limits, names = run.setup, run.setup.robot.limits, run.setup.robot.joint_names
+    proof, found = dict[str, float](), list[FullCheck]()
 
     def fault(motion: Trajectory) -> str:
         with timed(proof, "motion"):
@@ -41,47 +38,32 @@ def parameterize(run: PlanRun, result: PlanResult, timing: Timing) -> PlanResult
             over = [f"{name} {share:.4f}" for name, share in shares.items() if share > 1.0 + ROUNDING]
             if over:
                 return f"the share of a limit that it uses is over 1: {', '.join(over)}"
-            acceleration = max(float(np.abs(motion.accelerations).max()), 1e-9)
-            spacing = max(np.sqrt(8.0 * CHORD / acceleration), motion.duration / MAX_STATES, 1e-6)
-            states = np.clip(motion.sample(spacing).position, limits.lower, limits.upper)  # without rounding
-            return full_check(setup.checker, states, setup.start, setup.goals, MOTION_RESOLUTION).reason
+            check = full_check(setup.checker, motion, setup.start, setup.goals, deadline=run.deadline.at)
+            found.append(check)
+            return check.reason
 
-    with timed(proof, "path"):
-        check = full_check(setup.checker, result.path.states, setup.start, setup.goals, MOTION_RESOLUTION)
+    def stop() -> bool:
+        return run.interrupt.pressed or run.deadline.expired
+
     try:
-        if not check:
-            result = _repaired_finely(run, result, result.path.states, check)
-        assert result.path is not None
         with timed(run.times, "timing"):
-            made = time_path(result.path, limits, setup.robot.joint_names, timing, fault)
+            made = time_path(result.path, limits, names, timing, fault, stop=stop)
+    except TimingStoppedError:
+        return replace(result, status=PlanStatus.TIMEOUT, reason=NOT_TIMED)
     except TimingError as error:
         return replace(result, status=PlanStatus.TIMING_FAILED, reason=f"the path cannot be timed, {error}")
     finally:
-        run.times["timing"] = run.times.get("timing", 0.0) - proof.get("motion", 0.0)
-        run.times["timing proof"] = sum(proof.values())
+        run.times["timing"] -= proof.get("motion", 0.0)
+        run.times["timing proof"] = proof.get("motion", 0.0)
     motion = made.trajectory
     return replace(
         result, trajectory=motion, limit_use=motion.use(limits), deviation=made.deviation,
-        timing_resolution=MOTION_RESOLUTION,
+        motion_clearance=nan if found[-1].proof is None else found[-1].proof.clearance,
     )  # fmt: skip
 
 
-def _repaired_finely(run: PlanRun, result: PlanResult, states: Array, check: FullCheck) -> PlanResult:
-    """Return a result whose path passes the full check at MOTION_RESOLUTION.
-
-    Raises:
-        TimingError: No such path is found.
-    """
-    with timed(run.times, "repair"):
-        deadline = time.perf_counter() + MAX_FINE_REPAIR
-        repaired = repair(run.setup, states, check, deadline, run.interrupt, resolution=MOTION_RESOLUTION)
-    if repaired is None:
-        raise TimingError(f"it fails the full check at {MOTION_RESOLUTION:g} rad, {check.reason}")
-    return replace(result, path=Path(repaired), solved_by=f"{result.solved_by.removesuffix('+repair')}+repair")
-
-
 def finish(run: PlanRun, result: PlanResult, started: float) -> PlanResult:
-    """Add clearance, length, counts and times.
+    """Add length, counts and times.
 
     Args:
         run: The call of ``plan``.
@@ -90,9 +72,6 @@ def finish(run: PlanRun, result: PlanResult, started: float) -> PlanResult:
     """
     checks = run.setup.checker.check_counts.states
     if result.path is not None:
-        with timed(run.times, "clearance"):
-            states = resample(result.path.states, CLEARANCE_SAMPLES)
-            clearance = min(run.setup.checker.clearance(q) for q in states)
-        result = replace(result, length=result.path.length, clearance=clearance)
+        result = replace(result, length=result.path.length)
     run.times["total"] = time.perf_counter() - started
     return replace(result, checks=checks, times=dict(run.times))

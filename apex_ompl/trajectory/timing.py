@@ -9,7 +9,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import ArrayLike
 
-from apex_ompl.errors import ParameterError, TimingError
+from apex_ompl.errors import ParameterError, TimingError, TimingStoppedError
 from apex_ompl.kernel.compiled.polyline_distance import max_distance
 from apex_ompl.kernel.compiled.time_parameterization import max_path_speeds, sample_times
 from apex_ompl.robot.model import Limits
@@ -115,7 +115,7 @@ class TimedPath:
 
 def time_path(
     path: Path | ArrayLike, limits: Limits, joint_names: Sequence[str], timing: Timing | None = None,
-    fault: Callable[[Trajectory], str] = lambda trajectory: "",
+    fault: Callable[[Trajectory], str] = lambda trajectory: "", *, stop: Callable[[], bool] = lambda: False,
 ) -> TimedPath:  # fmt: skip
     """Time a path.
 
@@ -131,8 +131,10 @@ def time_path(
         joint_names: Names of the joints, in the order of the columns.
         timing: How the path is timed.
         fault: Returns why a motion is invalid, empty for a valid one.
+        stop: Asked often whether to give up.
 
     Raises:
+        TimingStoppedError: It was told to stop before it had a valid motion.
         TimingError: No valid motion was found; the message is the fault of the last one that was tried.
         ParameterError: The path has another shape, a number that is not finite, or a position outside the limits; the
             names are not those of the joints; or an option is out of its range.
@@ -145,12 +147,16 @@ def time_path(
     scaled = timing.limits(limits)
     start = timing.start(scaled)
     reason, line = "", Polyline.through(states)
-    for timed in _from_rest(line, scaled, tuple(joint_names), timing):
+    for timed in _from_rest(line, scaled, tuple(joint_names), timing, stop):
         rest = replace(timed, trajectory=_lasting(timed.trajectory, timing.minimum_duration))
-        for candidate in [rest] if start is None else _from_moving_start(start, rest, line, scaled, timing):
+        for candidate in [rest] if start is None else _from_moving_start(start, rest, line, scaled, timing, stop=stop):
             reason = fault(candidate.trajectory)
             if not reason:
                 return candidate
+            if stop():
+                break
+    if stop():
+        raise TimingStoppedError(reason or "no motion was found in time")
     raise TimingError(reason or "no motion from the velocity at the start stays within the limits")
 
 
@@ -166,23 +172,32 @@ def _check(states: Array, limits: Limits, joint_names: Sequence[str]) -> None:
         raise ParameterError("path", float(states[k, joint]), allowed)
 
 
-def _from_rest(line: Polyline, limits: Limits, joint_names: tuple[str, ...], timing: Timing) -> Iterator[TimedPath]:
-    """Yield motions from rest to rest, each closer to the path than the one before."""
+def _from_rest(
+    line: Polyline, limits: Limits, joint_names: tuple[str, ...], timing: Timing, stop: Callable[[], bool]
+) -> Iterator[TimedPath]:
+    """Yield motions from rest to rest, each closer to the path than the one before, until ``stop`` holds."""
+    if stop():
+        return
     if line.length <= SAME_STATE:
         yield TimedPath(_at_rest(line.states, joint_names), 0.0, "line")
         return
     straight = len(line.corners().states) == 2
     if not straight:
         for k in range(BLENDS):
-            motion = blended(line, limits, joint_names, timing.deviation / 2**k)
+            motion = blended(line, limits, joint_names, timing.deviation / 2**k, stop)
             if motion is not None:
                 yield TimedPath(*motion, "blended")
-    yield TimedPath(*stops(line, limits, joint_names), "line" if straight else "stops")
+            if stop():
+                return
+    motion = stops(line, limits, joint_names, stop)
+    if motion is not None:
+        yield TimedPath(*motion, "line" if straight else "stops")
 
 
 def _from_moving_start(
-    start: tuple[Array, Array], timed: TimedPath, line: Polyline, limits: Limits, timing: Timing
-) -> list[TimedPath]:
+    start: tuple[Array, Array], timed: TimedPath, line: Polyline, limits: Limits, timing: Timing,
+    *, stop: Callable[[], bool],
+) -> list[TimedPath]:  # fmt: skip
     """Return motions from a moving start: those that keep the deviation, fastest first, then the others, nearest first.
 
     Args:
@@ -191,11 +206,14 @@ def _from_moving_start(
         line: The path.
         limits: The scaled limits.
         timing: How the path is timed.
+        stop: Asked often whether to look for no more.
     """
     candidates = []
     for motion, join_time in from_moving_start(*start, timed.trajectory, limits, timing.minimum_duration):
+        if stop():
+            break
         arc_at = np.array([0.0, join_time]), np.zeros(2)  # it may be near any point of the path
-        head_deviation = deviation_bound(motion, line, arc_at, line.length, timing.deviation)
+        head_deviation = deviation_bound(motion, line, arc_at, line.length, timing.deviation, stop=stop)
         deviation = max(head_deviation, timed.deviation)
         candidates.append(TimedPath(motion, deviation, f"moving start, {timed.method}"))
     return sorted(candidates, key=lambda made: (max(made.deviation, timing.deviation), made.trajectory.duration))

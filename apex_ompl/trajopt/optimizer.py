@@ -32,7 +32,7 @@ Check = Callable[[Array], bool]
 """Whether a path, shape (states, dof), is valid."""
 
 STIFFER, SHORTENINGS = 5.0, 4  # factor from one round of shortening to the next, and how many rounds
-PART = 8  # steps between two looks at the clock
+PART = 4  # steps between two looks at the clock
 FINER = 2  # factor on the number of samples for paths that are clear at them and yet not valid
 LAST_RESORT = 0.1  # factor on the stiffness where nothing came out valid
 

@@ -5,7 +5,3 @@ SEARCH_RESOLUTION = 0.031
 
 FULL_RESOLUTION = 0.0031
 """Largest spacing of the states of the full check, which decides whether a path is a solution [rad, max-norm]."""
-
-MOTION_RESOLUTION = FULL_RESOLUTION / 10.0
-"""Largest spacing of the states of a timed motion's check [rad, max-norm]; it finds paths that touch an obstacle
-between the states of their own full check."""

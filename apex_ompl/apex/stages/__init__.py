@@ -8,19 +8,20 @@ from apex_ompl.apex.stages.anytime import Anytime
 from apex_ompl.apex.stages.bridging import Bridging
 from apex_ompl.apex.stages.known import CheckKnown, KnownCandidates
 from apex_ompl.apex.stages.nearest import NearestToGoal
-from apex_ompl.apex.stages.proposals import Farthest, MoreRounds, Propose, Repair, Resample, proposal_round
+from apex_ompl.apex.stages.proposals import Farthest, Propose, Repair, Resample, proposal_round
 from apex_ompl.apex.stages.shorten import Shorten
 from apex_ompl.apex.stages.stage import Solution, Stage
 from apex_ompl.apex.stages.trees import GrowTrees, Sprint
+from apex_ompl.apex.stages.turns import TEMPERATURES, TakeTurns
 
 __all__ = [
+    "TEMPERATURES",
     "Anytime",
     "Bridging",
     "CheckKnown",
     "Farthest",
     "GrowTrees",
     "KnownCandidates",
-    "MoreRounds",
     "NearestToGoal",
     "Propose",
     "Repair",
@@ -29,5 +30,6 @@ __all__ = [
     "Solution",
     "Sprint",
     "Stage",
+    "TakeTurns",
     "proposal_round",
 ]

@@ -17,7 +17,7 @@ MIN_REPAIR_STEPS = 48  # of repair in a round
 MAX_RESAMPLED = 4  # candidates that are resampled in a round
 
 
-def proposal_round(count: int, *, repair: bool, resample: int, noise: float) -> list[Stage]:
+def proposal_round(count: int, *, repair: bool, resample: int, noise: float, temperature: float = 1.0) -> list[Stage]:
     """Return the stages of a round of proposals.
 
     Args:
@@ -25,8 +25,9 @@ def proposal_round(count: int, *, repair: bool, resample: int, noise: float) -> 
         repair: Whether candidates are improved by the optimiser.
         resample: How often colliding candidates are resampled.
         noise: How far they are noised for that, as a share of the schedule.
+        temperature: Factor on the standard deviation of the proposals' initial noise.
     """
-    stages: list[Stage] = [Propose(count)]
+    stages: list[Stage] = [Propose(count, temperature)]
     if repair:
         stages.append(Repair(MIN_REPAIR_STEPS, STEPS_PER_PATH * count))
     for _ in range(resample):
@@ -42,9 +43,11 @@ class Propose:
 
     Attributes:
         count: Number of proposals for each pair of start and goal.
+        temperature: Factor on the standard deviation of their initial noise.
     """
 
     count: int
+    temperature: float = 1.0
 
     def run(self, context: SolveContext) -> Solution | None:
         """Return the first valid proposal, or None."""
@@ -55,7 +58,8 @@ class Propose:
             if context.stop():
                 return None
             with context.report.timed("propose"):
-                control = context.sampler.propose(context.queries, min(at_once, self.count - first))
+                some = min(at_once, self.count - first)
+                control = context.sampler.propose(context.queries, some, self.temperature)
             with context.report.timed("check"):
                 found = None if control is None else check(context, control, PROPOSED)
             if found is not None:
@@ -118,27 +122,6 @@ class Farthest:
     def run(self, context: SolveContext) -> Solution | None:
         """Return that path, or None where no valid path was set aside."""
         return solution_of(context.farthest(), context)
-
-
-@dataclass(frozen=True)
-class MoreRounds:
-    """Rounds of proposals until time is up.
-
-    Attributes:
-        stages: Stages of a round.
-    """
-
-    stages: tuple[Stage, ...]
-
-    def run(self, context: SolveContext) -> Solution | None:
-        """Return the first valid path, or else the one set aside that is farthest from obstacles, or None."""
-        while self.stages and not context.stop():
-            context.pool = context.new_pool()
-            for stage in self.stages:
-                found = stage.run(context)
-                if found is not None:
-                    return found
-        return Farthest().run(context)
 
 
 def check(context: SolveContext, control: Array, origin: str) -> Solution | None:

@@ -1,4 +1,4 @@
-"""RRTConnect inside APEX: short sprints before proposals, and the fallback that makes it complete."""
+"""RRTConnect inside APEX: short sprints before proposals, and turns of growing length that make it complete."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class Sprint:
 
 @dataclass(frozen=True)
 class GrowTrees:
-    """RRTConnect with the time that is left, for all starts and goals.
+    """RRTConnect for all starts and goals; it goes on where it stopped before.
 
     The trees of sprints go on where there is only one pair of start and goal.
 
@@ -63,25 +63,23 @@ class GrowTrees:
     tree_range: float
     approximate: bool
 
-    def run(self, context: SolveContext) -> Solution | None:
-        """Return the first path of the trees that is valid, or None."""
-        while not context.stop():
-            whole = len(context.pairs) == 1
-            tree, pdef = context.trees if context.trees is not None and whole else self._plant(context)
-            context.trees = None
-            with context.report.timed("rrtconnect"):
-                status = tree.solve(context.ptc).getStatus()
-            if status not in (EXACT, APPROXIMATE):
-                return None
-            states = path_to_array(pdef.getSolutionPath(), context.kernel.robot.dof)
-            if status == EXACT:
-                found = verified(context, states, "rrtconnect", self)
-                if found is not None:
-                    return found
-            elif self.approximate:
-                distance = pdef.getSolutionDifference()
-                if context.nearest is None or distance < context.nearest[1]:
-                    context.nearest = Path(states), distance
+    def run(self, context: SolveContext, iterations: int) -> Solution | None:
+        """Return the path of the trees after some more iterations, or None."""
+        begun = context.all_trees or (context.trees if len(context.pairs) == 1 else None)
+        context.trees, context.all_trees = None, begun or self._plant(context)
+        tree, pdef = context.all_trees
+        with context.report.timed("rrtconnect"):
+            status = tree.solve(context.counted(iterations)).getStatus()
+        if status not in (EXACT, APPROXIMATE):
+            return None
+        states = path_to_array(pdef.getSolutionPath(), context.kernel.robot.dof)
+        if status == EXACT:
+            context.all_trees = None
+            return verified(context, states, "rrtconnect", self)
+        if self.approximate:
+            distance = pdef.getSolutionDifference()
+            if context.nearest is None or distance < context.nearest[1]:
+                context.nearest = Path(states), distance
         return None
 
     def _plant(self, context: SolveContext) -> tuple[og.RRTConnect, ob.ProblemDefinition]:

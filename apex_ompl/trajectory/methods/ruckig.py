@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import ruckig
@@ -20,7 +20,9 @@ SHORTEST_PIECE = 1e-9  # [s]
 DERIVATIVES = ("velocity", "acceleration", "jerk")
 
 
-def stops(line: Polyline, limits: Limits, joint_names: tuple[str, ...]) -> tuple[Trajectory, float]:
+def stops(
+    line: Polyline, limits: Limits, joint_names: tuple[str, ...], stop: Callable[[], bool] = lambda: False
+) -> tuple[Trajectory, float] | None:
     """Return the fastest motion from corner to corner of a polyline, at rest at each.
 
     Along each straight line the arc length moves by Ruckig, within the tightest of the joints' limits divided by the
@@ -30,9 +32,10 @@ def stops(line: Polyline, limits: Limits, joint_names: tuple[str, ...]) -> tuple
         line: The polyline, of positive length.
         limits: Limits of the joints.
         joint_names: Names of the joints, in the order of the columns.
+        stop: Asked at every corner whether to give up.
 
     Returns:
-        The motion and its largest distance from the polyline [rad].
+        The motion and its largest distance from the polyline [rad], or None when told to stop meanwhile.
 
     Raises:
         TimingError: Ruckig finds no motion.
@@ -41,6 +44,8 @@ def stops(line: Polyline, limits: Limits, joint_names: tuple[str, ...]) -> tuple
     parts = []
     solver, query, solution = ruckig.Ruckig(1), ruckig.InputParameter(1), ruckig.Trajectory(1)
     for start, end in zip(corners.states[:-1], corners.states[1:], strict=True):
+        if stop():
+            return None
         length = float(np.linalg.norm(end - start))
         direction = (end - start) / length
         moves = np.abs(direction) > 1e-12

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -25,8 +26,9 @@ NANOSECOND = 1e-9
 
 
 def blended(
-    line: Polyline, limits: Limits, joint_names: tuple[str, ...], deviation: float
-) -> tuple[Trajectory, float] | None:
+    line: Polyline, limits: Limits, joint_names: tuple[str, ...], deviation: float,
+    stop: Callable[[], bool] = lambda: False,
+) -> tuple[Trajectory, float] | None:  # fmt: skip
     """Return the fastest motion along a curve that rounds the corners of a polyline.
 
     1. A uniform cubic B-spline q(s) along the polyline rounds its corners (:class:`apex_ompl.trajectory.curve.Curve`).
@@ -42,9 +44,11 @@ def blended(
         limits: Limits of the joints.
         joint_names: Names of the joints, in the order of the columns.
         deviation: Largest distance of the motion from the polyline [rad].
+        stop: Asked before every knot spacing whether to give up.
 
     Returns:
-        The motion and a bound on its distance from the polyline [rad], or None where none keeps ``deviation``.
+        The motion and a bound on its distance from the polyline [rad], or None where none keeps ``deviation``, or when
+        told to stop meanwhile.
     """
     if line.length > MAX_SPANS * CONTROL_POINT_SPACING * deviation:
         return None
@@ -76,18 +80,22 @@ def blended(
         return float(least * (len(control) - 3))
 
     best = FIRST_SPACING
-    while best + 1 < len(KNOT_SPACINGS) and duration_with(best + 1) < SAME_DURATION * duration_with(best):
+    while (
+        not stop() and best + 1 < len(KNOT_SPACINGS) and duration_with(best + 1) < SAME_DURATION * duration_with(best)
+    ):
         best += 1
-    while best > 0 and duration_with(best - 1) * SAME_DURATION < duration_with(best):
+    while not stop() and best > 0 and duration_with(best - 1) * SAME_DURATION < duration_with(best):
         best -= 1
     for index in range(best, -1, -1):  # knots far apart in time cut corners of the curve
+        if stop():
+            return None
         duration_with(index)
         spacing, control, arc = tried[index]
         motion = spline_in_time(control, spacing, joint_names)
         low, high = line.states.min(axis=0), line.states.max(axis=0)  # the spline is inside, except for rounding
         motion = replace(motion, positions=motion.positions.clip(low, high))
         arc = np.concatenate([[0.0], arc, [line.length]])
-        bound = deviation_bound(motion, line, (motion.times, arc), window, deviation)
+        bound = deviation_bound(motion, line, (motion.times, arc), window, deviation, stop=stop)
         if bound <= deviation:
             return motion, bound
     return None
