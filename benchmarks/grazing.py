@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 import coal
 import numpy as np
@@ -105,6 +106,14 @@ class PairDistances:
         return least
 
 
+class Graze(NamedTuple):
+    """Ends of a straight path, each of shape (dof,), and the pair of geometries that it grazes with."""
+
+    first: np.ndarray
+    last: np.ndarray
+    pair: tuple[int, int]
+
+
 @dataclass
 class Grazes:
     """Numbers of grazing paths.
@@ -127,11 +136,19 @@ class Grazes:
     off: int = 0
     pairs: dict[str, int] = field(default_factory=dict)
 
+    def add(self, other: Grazes) -> None:
+        """Add the numbers of others."""
+        for name, value in vars(other).items():
+            if name != "pairs":
+                setattr(self, name, getattr(self, name) + value)
+        for name, times in other.pairs.items():
+            self.pairs[name] = self.pairs.get(name, 0) + times
+
     def try_path(
-        self, both: CollisionChecker, meshes: CollisionChecker, distances: PairDistances,
-        a: np.ndarray, b: np.ndarray, pair: tuple[int, int],
-    ) -> None:  # fmt: skip
+        self, both: CollisionChecker, meshes: CollisionChecker, distances: PairDistances, graze: Graze
+    ) -> None:
         """Compare the proof of a straight path with what is true of it."""
+        a, b, pair = graze
         least = distances.least_along(a, b, pair)
         free = bool(meshes.are_free(a + np.linspace(0.0, 1.0, SAMPLES)[:, None] * (b - a)).all())
         proof = both.prove(np.stack([a, b]))
@@ -156,9 +173,7 @@ def _kind(scene: object, pair: tuple[int, int]) -> str:
     return " and ".join(sorted(names))
 
 
-def grazing_paths(
-    robot: Robot, rng: np.random.Generator, wanted: int, folder: Path, per_scene: int = 40
-) -> Grazes:
+def grazing_paths(robot: Robot, rng: np.random.Generator, wanted: int, folder: Path, per_scene: int = 40) -> Grazes:
     """Try paths that graze, of random pairs, half of them with held objects."""
     tray, count, k = folder / "tray.obj", Grazes(), 0
     write_tray(tray)
@@ -167,23 +182,24 @@ def grazing_paths(
         scene, held = obstacles(rng, tray), held_objects(robot, tray) if k % 2 else []
         both, meshes = CollisionChecker(robot, scene, held), CollisionChecker(robot, scene, held, proofs=False)
         distances = PairDistances(both)
-        states = np.clip(
-            robot.home + rng.normal(0.0, 0.4, (300, robot.dof)), robot.limits.lower, robot.limits.upper
-        )
+        states = np.clip(robot.home + rng.normal(0.0, 0.4, (300, robot.dof)), robot.limits.lower, robot.limits.upper)
         free = both.are_free(states)
         outside, inside = states[free], states[~free]
         tried = min(per_scene, len(outside), len(inside), wanted - count.paths)
         for a, b in zip(rng.permutation(outside)[:tried], rng.permutation(inside)[:tried], strict=True):
-            _graze(both, meshes, distances, rng, a, b, count)
+            graze = lay_graze(meshes, distances, rng, a, b)
+            if graze is not None:
+                name = _kind(distances.scene, graze.pair)
+                count.pairs[name] = count.pairs.get(name, 0) + 1
+                count.try_path(both, meshes, distances, graze)
     return count
 
 
-def _graze(
-    both: CollisionChecker, meshes: CollisionChecker, distances: PairDistances, rng: np.random.Generator,
-    a: np.ndarray, b: np.ndarray, count: Grazes,
-) -> None:  # fmt: skip
-    """Lay a path through the border of contact between a free state ``a`` and a colliding one ``b``."""
-    low, high, scene, robot = 0.0, 1.0, distances.scene, both.robot
+def lay_graze(
+    meshes: CollisionChecker, distances: PairDistances, rng: np.random.Generator, a: np.ndarray, b: np.ndarray
+) -> Graze | None:
+    """Return a path through the border of contact between a free state ``a`` and a colliding one ``b``, shifted."""
+    low, high, scene, robot = 0.0, 1.0, distances.scene, meshes.robot
     for _ in range(40):
         middle = (low + high) / 2
         low, high = (middle, high) if meshes.is_free(a + middle * (b - a)) else (low, middle)
@@ -191,23 +207,19 @@ def _graze(
     values = distances(state, scene.pairs)
     pair = scene.pairs[int(np.argmin(values))]
     if values.min() > 1e-5:  # a solid inside of another
-        return
+        return None
     step = 1e-6 * np.eye(robot.dof)
     outer = a + (low - 1e-3) * (b - a)  # a little clear of the contact, where distances are smooth
     slope = np.array([distances(outer + e, [pair])[0] - distances(outer - e, [pair])[0] for e in step]) / 2e-6
     norm = float(np.linalg.norm(slope))
     if norm < 1e-3:
-        return
+        return None
     tangent = rng.normal(size=robot.dof) * (rng.random(robot.dof) < rng.uniform(0.2, 1.0))
     tangent -= slope * (slope @ tangent) / norm**2
     if not np.linalg.norm(tangent) > 1e-6:
-        return
+        return None
     tangent *= rng.uniform(0.005, 0.2) / float(np.linalg.norm(tangent))
     shift = float(np.exp(rng.uniform(*np.log(SHIFTS)))) * rng.choice([-1.0, 1.0])
     middle = state + slope / norm**2 * shift
     ends = middle - tangent, middle + tangent
-    if any(robot.limit_fault(q) is not None and robot.limit_fault(q) for q in ends):
-        return
-    name = _kind(scene, pair)
-    count.pairs[name] = count.pairs.get(name, 0) + 1
-    count.try_path(both, meshes, distances, *ends, pair)
+    return None if any(robot.limit_fault(q) for q in ends) else Graze(*ends, pair)

@@ -32,7 +32,7 @@ def test_it_is_the_default_and_proves_what_it_finds() -> None:
     result = plan(cached_problem(HARD), timeout=20.0)
     assert result and result.planner == "apex", result.reason
     checker = assemble(cached_problem(HARD), robot()).checker
-    assert full_check(checker, result.path, result.path[0], [result.path[-1]], resolution=0.0005)
+    assert full_check(checker, result.path, result.path[0], [result.path[-1]])
     inside = {name.removeprefix(INSIDE): seconds for name, seconds in result.times.items() if name.startswith(INSIDE)}
     assert 0.0 < inside.pop("first") < result.times["solve"]
     assert {"query", "known", "polish"} <= inside.keys()
@@ -195,7 +195,7 @@ def test_another_checker_judges_and_is_told_of_once(caplog: pytest.LogCaptureFix
     planner = APEX(setup.getSpaceInformation())
     setup.setPlanner(planner)
     assert setup.solve(within(30.0)).getStatus() == EXACT
-    assert full_check(ready.checker, states(setup), ready.start, ready.goals, resolution=0.02)
+    assert full_check(ready.checker, states(setup), ready.start, ready.goals)
     assert setup.solve(within(30.0)).getStatus() == EXACT
     assert sum("is not apex_ompl's" in record.message for record in caplog.records) == 1
 

@@ -17,7 +17,6 @@ from apex_ompl.result import PlanResult, PlanStatus
 from apex_ompl.trajectory import Timing, Trajectory, time_path
 from apex_ompl.trajopt.path import Path as JointPath
 from apex_ompl.util.deadline import Deadline
-from apex_ompl.util.resolution import MOTION_RESOLUTION
 
 
 def test_plans_are_timed_and_checked() -> None:
@@ -31,15 +30,17 @@ def test_plans_are_timed_and_checked() -> None:
     assert full_check(ready.checker, states, ready.start, ready.goals)
     assert result.times["timing"] > 0.0 and result.times["timing proof"] > 0.0
     assert result.as_dict()["duration"] == motion.duration
-    assert result.timing_resolution == MOTION_RESOLUTION
+    assert 0.0 < result.motion_clearance and 0.0 < result.clearance_bound <= result.clearance
 
 
-def test_results_without_a_timing_resolution_are_read(tmp_path: Path) -> None:
+def test_results_without_a_proof_are_read(tmp_path: Path) -> None:
     plan("ball_in_cup", timeout=20.0).save(tmp_path / "new.json")
     data = json.loads((tmp_path / "new.json").read_text())
-    del data["timing_resolution"]
+    for name in ("clearance_bound", "clearance_pair", "proved_by_spheres", "motion_clearance"):
+        del data[name]
     (tmp_path / "old.json").write_text(json.dumps(data))
-    assert np.isnan(PlanResult.load(tmp_path / "old.json").timing_resolution)
+    old = PlanResult.load(tmp_path / "old.json")
+    assert np.isnan(old.motion_clearance) and np.isnan(old.clearance_bound) and old.clearance == data["clearance"]
 
 
 def test_joints_at_their_limits_do_not_stop_a_plan() -> None:
@@ -98,7 +99,7 @@ def test_the_command_writes_motions_and_draws_them(tmp_path, capsys: pytest.Capt
     assert cli.main(["plan", "ball_in_cup", "--timeout", "20", "--out", str(out)]) == 0
     saved = PlanResult.load(out)
     assert saved.trajectory is not None and saved.limit_use["jerk"] > 0.0
-    assert saved.timing_resolution == MOTION_RESOLUTION
+    assert saved.motion_clearance > 0.0
     for name in ("p.png", "p.svg"):
         assert cli.main(["plot", str(out), "-o", str(tmp_path / name)]) == 0
     assert (tmp_path / "p.png").read_bytes()[:4] == b"\x89PNG" and "<svg" in (tmp_path / "p.svg").read_text()
@@ -106,7 +107,7 @@ def test_the_command_writes_motions_and_draws_them(tmp_path, capsys: pytest.Capt
     untimed = tmp_path / "n.npz"
     assert cli.main(["plan", "ball_in_cup", "--timeout", "20", "--no-timing", "--out", str(untimed)]) == 0
     without = PlanResult.load(untimed)
-    assert without.trajectory is None and np.isnan(without.timing_resolution)
+    assert without.trajectory is None and np.isnan(without.motion_clearance)
     for arguments, words in (
         (["plot", str(untimed), "-o", str(tmp_path / "q.png")], "timed motion"),
         (["plot", str(out), "-o", str(tmp_path / "q.txt")], "ending in"),

@@ -262,7 +262,9 @@ class CollisionChecker(SceneBodies):
             self._compiled.place(name, pin.SE3(self._placed[name][1]))
             if self._conservative is not None:
                 self._conservative.obstacles_moved()
-        self._provers.clear()
+        self._provers.pop(True, None)
+        if False in self._provers:
+            self._provers[False].obstacles_moved(self.kernel)
 
     def _changed(self) -> None:
         """Drop the compiled scene, after a change of its objects."""

@@ -51,11 +51,18 @@ class PlacedShape(NamedTuple):
         geometry: The shape.
         joint: Joint of the kernel.
         pose: Pose in the joint's frame, shape (4, 4) [m].
+        mesh: The mesh for the kernel, None for primitives.
     """
 
     geometry: coal.CollisionGeometry
     joint: int
     pose: Array
+    mesh: Mesh | None = None
+
+
+def has_mesh(geometry: coal.CollisionGeometry) -> bool:
+    """Whether a geometry is a mesh or a hull of points, and no primitive."""
+    return _kind(geometry) == HULL
 
 
 def mesh_of(geometry: coal.CollisionGeometry) -> Mesh:
@@ -151,11 +158,11 @@ def pack_shapes(shapes: Mapping[int, PlacedShape]) -> tuple[Integers, Floats]:
     roots, spans, child, corner = [], [], [np.empty(0, np.int64)], [np.empty(0, np.int64)]
     node_count = 0
     for shape in placed:
-        if _kind(shape.geometry) != HULL:
+        mesh = shape.mesh
+        if mesh is None:
             roots.append(-1)
             spans.append((0, 0))
             continue
-        mesh = mesh_of(shape.geometry)
         spans.append((point_count, len(mesh.points)))
         point_count += len(mesh.points)
         roots.append(node_count if len(mesh.leaf) else -1)
@@ -213,8 +220,8 @@ def _ball(placed: PlacedShape) -> Array:
     shape, kind, centre = placed.geometry, _kind(placed.geometry), np.zeros(3)
     a, b, c = _size(shape)
     radius = {BOX: float(np.linalg.norm((a, b, c))), SPHERE: a, CYLINDER: float(np.hypot(a, b)), CAPSULE: a + b}
-    if kind == HULL:
-        points = mesh_of(shape).points
+    if placed.mesh is not None:
+        points = placed.mesh.points
         centre = (points.min(axis=0) + points.max(axis=0)) / 2.0
         radius[HULL] = float(np.linalg.norm(points - centre, axis=1).max())
     return np.append(placed.pose[:3, :3] @ centre + placed.pose[:3, 3], radius.get(kind, 0.0) + 1e-12)

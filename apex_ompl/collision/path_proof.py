@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import threading
 import time
+from collections import OrderedDict
 from dataclasses import dataclass, replace
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from apex_ompl.collision.broadphase import CompiledScene
-from apex_ompl.collision.exact_shapes import PlacedShape, pack_shapes
+from apex_ompl.collision.exact_shapes import Mesh, PlacedShape, has_mesh, mesh_of, pack_shapes
 from apex_ompl.collision.tabulate import joint_specs
 from apex_ompl.kernel.compiled import curve_proof
 from apex_ompl.kernel.compiled.arrays import FIXED
-from apex_ompl.kernel.compiled.layout import new_buffers
+from apex_ompl.kernel.compiled.layout import Floats, Integers, new_buffers
 from apex_ompl.kernel.compiled.shapes import PairBuffers
 from apex_ompl.kernel.kernel import Kernel
 from apex_ompl.kernel.robot_builder import turn_to
@@ -21,9 +23,13 @@ from apex_ompl.kernel.scene_builder import primitive, scene_tables
 from apex_ompl.robot import Robot
 from apex_ompl.types import Array, Flags
 
+MOST_PACKED = 64  # sets of held objects that are kept for each robot
 TOUCH = 1e-5  # distance that counts as contact [m]
 TOLERANCE = 1e-5  # of the least clearance [m]
 BUDGET = 1000  # intervals between two looks at the clock: some milliseconds
+
+
+_packed: WeakKeyDictionary[Robot, OrderedDict[int, tuple[Array, tuple[Integers, Floats]]]] = WeakKeyDictionary()
 
 
 @dataclass(frozen=True)
@@ -119,23 +125,43 @@ def obstacles_alone(kernel: Kernel, chosen: Flags) -> Kernel:
     return Kernel(robot, scene_tables(solids))
 
 
+def _packed_bodies(robot: Robot, scene: CompiledScene, kernel: Kernel) -> tuple[Integers, Floats]:
+    """Return the packed shapes of a kernel's bodies; those of the last sets of held objects are kept."""
+    known = _packed.setdefault(robot, OrderedDict())
+    key = id(kernel.robot.arrays.node_centre)  # shared by all kernels of one set of bodies
+    if key not in known:
+        turns = [turn_to(j.axis if j.kind != FIXED else None).T for j in joint_specs(robot)]
+        bodies, items = {}, scene.geometry.geometryObjects
+        for row, number in enumerate(kernel.robot.numbers):
+            shape, joint = items[number].geometry, int(items[number].parentJoint)
+            mesh = mesh_of(shape) if has_mesh(shape) else None
+            bodies[row] = PlacedShape(shape, joint, turns[joint] @ items[number].placement.homogeneous, mesh)
+        while len(known) >= MOST_PACKED:
+            known.popitem(last=False)
+        known[key] = kernel.robot.arrays.node_centre, pack_shapes(bodies)
+    return known[key][1]
+
+
 class PathProver:
     """Proofs for a robot in one compiled scene; safe to use from several threads."""
 
     def __init__(self, robot: Robot, scene: CompiledScene, kernel: Kernel) -> None:
         """Make the tables of exact shapes of all bodies and obstacles in ``kernel``."""
-        self._scene, self._kernel, self._dof = scene, kernel, robot.dof
+        self._scene = scene
         self._local = threading.local()
-        items = scene.geometry.geometryObjects
-        turns = [turn_to(j.axis if j.kind != FIXED else None).T for j in joint_specs(robot)]
-        bodies = {}
-        for row, number in enumerate(kernel.robot.numbers):
-            item = items[number]
-            joint = int(item.parentJoint)
-            bodies[row] = PlacedShape(item.geometry, joint, turns[joint] @ item.placement.homogeneous)
-        owners = sorted({int(k) for k in kernel.scene.arrays.owner})
-        obstacles = {k: PlacedShape(items[k].geometry, 0, items[k].placement.homogeneous) for k in owners}
-        self._bodies, self._obstacles = pack_shapes(bodies), pack_shapes(obstacles)
+        self._bodies = _packed_bodies(robot, scene, kernel)
+        self._meshes: dict[int, Mesh] = {}
+        self.obstacles_moved(kernel)
+
+    def obstacles_moved(self, kernel: Kernel) -> None:
+        """Make the tables of the obstacles in ``kernel`` anew, for the poses that they have in the scene now."""
+        items, self._kernel = self._scene.geometry.geometryObjects, kernel
+        placed = {}
+        for k in np.unique(kernel.scene.arrays.owner).tolist():
+            if has_mesh(items[k].geometry) and k not in self._meshes:
+                self._meshes[k] = mesh_of(items[k].geometry)
+            placed[k] = PlacedShape(items[k].geometry, 0, items[k].placement.homogeneous, self._meshes.get(k))
+        self._obstacles = pack_shapes(placed)
 
     def prove(
         self, curve: Curve, *, touch: float = TOUCH, tolerance: float = TOLERANCE, deadline: float | None = None

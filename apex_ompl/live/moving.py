@@ -16,7 +16,6 @@ from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Problem
 from apex_ompl.types import Array
-from apex_ompl.util.resolution import FULL_RESOLUTION
 from apex_ompl.util.validation import check_states, check_times
 
 SHORTEST_STEP = 0.01  # time between two states of a path [s]
@@ -76,20 +75,18 @@ def check_timed_path(
     problem: Problem,
     path: ArrayLike,
     times: ArrayLike,
-    resolution: float = FULL_RESOLUTION,
 ) -> TimedPathCheck:
     """Check whether a timed path is inside the limits and free of collisions with still and moving obstacles.
 
     Between states the path is straight and its velocity constant. Time is divided into intervals in which no obstacle
     moves more than ``OBSTACLE_STEP``. In each, the obstacles stand where they are in its middle, inflated by half of
-    ``OBSTACLE_STEP``, and so contain all that they sweep; the states are those of the full check.
+    ``OBSTACLE_STEP``, and so contain all that they sweep; the path of that time is proved free of them.
 
     Args:
         robot: The robot.
         problem: The problem, with obstacles where they are at time 0, and held objects.
         path: States, shape (N, dof).
         times: Times of the states, increasing from 0, shape (N,) [s].
-        resolution: Spacing of the states that are checked [rad, max-norm].
 
     Raises:
         ParameterError: Another shape, times that do not increase from 0, or a moving obstacle that cannot be inflated.
@@ -122,11 +119,9 @@ def check_timed_path(
             checker.move(mover.name, obstacle_at(mover, (begin + end) / 2.0).position)
         knots = np.concatenate([[begin], times[(times > begin) & (times < end)], [end]])
         states = np.stack([np.interp(knots, times, column) for column in path.T], axis=1)
-        hit = checker.first_collision(states, resolution)
-        if hit is not None:
-            contacts = checker.contacts(hit.state)
-            what = str(contacts[0]) if contacts else "in collision"
-            return TimedPathCheck(False, f"between {begin:.3f} and {end:.3f} s: {what}", float(end))
+        proof = checker.prove(states, tolerance=0.0)
+        if not proof:
+            return TimedPathCheck(False, f"between {begin:.3f} and {end:.3f} s: {proof.reason}", float(end))
     return TimedPathCheck(True)
 
 
