@@ -2,10 +2,10 @@
 
 Each planner has eight candidates, the first its default; OMPL's and RoboPlan's are theirs. Successive halving: all run
 on the first problem of each level, the best four and the default on the first two, the best two of them and the
-default on the first four; 2 s a run. Problems and seeds are the same for all. The score is the geometric mean over the
-problems of the time to the first path that passed the full check, where an unsolved one counts as 4 s; for planners
-that go on improving, times the geometric mean of the length at the end over the shortest of the planner's candidates,
-where an unsolved one counts as 2. Paths are not simplified. The candidate of the lowest score on the last problems is
+default on the first four; 2 s a run. Problems and seeds are the same for all. The score is the mean over the problems
+of the time to the first path that passed the full check, where an unsolved one counts as 4 s (PAR2); for planners that
+go on improving, times the mean of the length at the end over the shortest of the planner's candidates, where an
+unsolved one counts as 2. Paths are not simplified. The candidate of the lowest score on the last problems is
 chosen; planners/tuned.py keeps it.
 Each run is stored in benchmarks/runs/tune when it ends; the command resumes where it was stopped.
 
@@ -121,16 +121,22 @@ class Score:
 
     @property
     def time(self) -> float:
-        """Geometric mean of the times to the first path [s]."""
-        return _mean([run["first"] if run["solved"] else UNSOLVED_TIME for run in self.runs])
+        """Mean of the times to the first path [s]."""
+        return float(np.mean(self.times))
+
+    @property
+    def times(self) -> list[float]:
+        """Times to the first path [s]."""
+        return [run["first"] if run["solved"] else UNSOLVED_TIME for run in self.runs]
 
     @property
     def length(self) -> float:
-        """Geometric mean of the lengths over the shortest; 1 for planners that end with their first path."""
+        """Mean of the lengths over the shortest; 1 for planners that end with their first path."""
         if self.shortest is None:
             return 1.0
         known = [(run, self.shortest[run["problem"]]) for run in self.runs if run["problem"] in self.shortest]
-        return _mean([run["length"] / best if run["solved"] else UNSOLVED_LENGTH for run, best in known] or [1.0])
+        ratios = [run["length"] / best if run["solved"] else UNSOLVED_LENGTH for run, best in known]
+        return float(np.mean(ratios or [1.0]))
 
     @property
     def score(self) -> float:
@@ -142,13 +148,10 @@ class Score:
         found = Statistics("", self.label, self.runs)
         return {
             "n": len(self.runs), "solved": len(found.solved) / len(self.runs), "score": self.score,
-            "first_s_mean": self.time, "length_mean": None if self.shortest is None else self.length,
+            "first_s_mean": self.time, "first_s_geometric_mean": float(np.exp(np.mean(np.log(self.times)))),
+            "length_mean": None if self.shortest is None else self.length,
             "first_s": [record.reached(found.times("first"), p) for p in (50, 95)],
         }  # fmt: skip
-
-
-def _mean(values: Sequence[float]) -> float:
-    return float(np.exp(np.mean(np.log(values))))
 
 
 def levels() -> list[str]:
@@ -199,7 +202,8 @@ def chosen(planner: str, last: Sequence[Score]) -> dict[str, Any]:
 
 def table(found: dict[str, list[list[Score]]]) -> str:
     """Return the Markdown tables: the last rung of each planner, then all rungs of all candidates."""
-    head = ["planner", "N", "solved", "first path p50 ms", "p95", "mean ms", "length", "score ms"]
+    head = ["planner", "N", "solved", "first path p50 ms", "p95", "geometric mean ms", "mean ms", "length"]
+    head += ["score ms"]
     lines = [record.row(head), record.row(["---", *["---:"] * (len(head) - 1)])]
     for planner, rungs in found.items():
         default = rows_of(planner)[0].label
@@ -220,7 +224,9 @@ def table(found: dict[str, list[list[Score]]]) -> str:
 
 
 def _cells(f: dict[str, Any]) -> list[Any]:
-    times = ["-" if v is None else f"{1e3 * v:.0f}" for v in (*f["first_s"], f["first_s_mean"])]
+    times = [
+        "-" if v is None else f"{1e3 * v:.0f}" for v in (*f["first_s"], f["first_s_geometric_mean"], f["first_s_mean"])
+    ]
     length = "" if f["length_mean"] is None else f"{f['length_mean']:.2f}"
     return [f["n"], f"{f['solved']:.3f}", *times, length, f"{1e3 * f['score']:.0f}"]
 
