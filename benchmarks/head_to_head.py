@@ -3,9 +3,9 @@
 Rows: apex; apex without trees after its proposals; the straight line and its repair, which ends by itself; rounds of
 eight random bumps instead of proposals, with the same repair, for 2 s; rrtconnect+polish; rrtconnect as OMPL has it and
 tuned. On the hard and large levels alone: apex with guidance; and, on 20 problems of each, the paper's algorithm alone
-(``apex-paper``), rrt as OMPL has it and tuned, 5 s, and tuned planners that use their whole time limit, 5 s.
-Labels of tuned rows name the parameters that benchmarks/tune.py chose. apex and rrtconnect+polish have theirs as
-defaults.
+(``apex-paper``), and tuned, 5 s, rrt, lbkpiece1 and planners that use their whole time limit.
+Labels of tuned rows name the parameters that benchmarks/tune.py chose; those without any do best with OMPL's defaults.
+apex and rrtconnect+polish have theirs as defaults.
 Each run is stored in benchmarks/runs/head_to_head when it ends, with OMPL's logs and the database for Planner Arena;
 the command resumes where it was stopped.
 
@@ -61,10 +61,9 @@ ROWS = (
     Row("rrtconnect+polish", "rrtconnect+polish"),
     Row("rrtconnect", "rrtconnect"),
     Row.of("rrtconnect", TUNED["rrtconnect"]),
-    Row("rrt", "rrt", timeout=5.0, runs=SLOW, levels=HARD),
     *(
         Row.of(name, TUNED[name], timeout=5.0, runs=SLOW, levels=HARD)
-        for name in ("rrt", "aorrtc", "informedrrtstar", "bitstar")
+        for name in ("rrt", "lbkpiece1", "aorrtc", "informedrrtstar", "bitstar")
     ),
 )
 

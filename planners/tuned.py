@@ -12,15 +12,15 @@ from types import MappingProxyType
 Value = bool | int | float
 
 TUNED: Mapping[str, Mapping[str, Value]] = MappingProxyType({
-    "rrtconnect": {"range": 0.7},
-    "rrtconnect+polish": {"range": 0.7},
-    "rrt": {"range": 0.7},
-    "aorrtc": {"range": 0.7},
-    "bitstar": {},
-    "informedrrtstar": {"range": 0.7},
-    "kpiece1": {"range": 0.7},
-    "lbkpiece1": {"range": 0.7},
-    "roboplan": {"max_connection_distance": 0.7},
+    "rrtconnect": {"range": 1.0},
+    "rrtconnect+polish": {"range": 1.0},
     "apex": {"range": 0.7, "sprint": 40, "first": 4},
+    "roboplan": {"max_connection_distance": 0.7},
+    "aorrtc": {"range": 1.4},
+    "rrt": {},
+    "lbkpiece1": {"range": 0.5},
+    "kpiece1": {"range": 1.4, "goal_bias": 0.2},
+    "informedrrtstar": {},
+    "bitstar": {},
 })  # fmt: skip
-"""Parameters by planner [rad where they are steps]."""
+"""Parameters by planner, those that differ from OMPL's defaults; ranges and distances in rad."""

@@ -95,6 +95,7 @@ def test_the_best_candidates_and_the_default_go_on(
     seconds = [None, 0.7, 0.2, 0.6, 0.1, 0.5, 0.3, 0.4]
     bench = Bench(labels, seconds, tmp_path)
     monkeypatch.setattr(tune, "bench", bench)
+    monkeypatch.setattr(tune.record, "session", dict)  # it reads the script that this process runs
     rungs = tune.rungs_of(PLANNER, 1)
     assert [count for _, count in bench.calls] == [problems for _, problems in tune.RUNGS]
     by_score = sorted(labels[1:], key=lambda label: bench.seconds[label])
