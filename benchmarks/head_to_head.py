@@ -1,9 +1,11 @@
 """Planners head to head on all static levels of the test split, through ``apex_ompl.benchmark``.
 
-Rows: apex; apex without trees after its proposals; apex with guidance; the paper's algorithm alone (``apex-paper``, on
-20 problems of a level); the straight line and its repair, which ends by itself; rounds of eight random bumps instead of
-proposals, with the same repair, for 2 s; rrtconnect+polish; rrtconnect; rrt on 20 problems of a level; and planners
-that use their whole time limit, 5 s, on 20 problems of the hard and large levels.
+Rows: apex; apex without trees after its proposals; the straight line and its repair, which ends by itself; rounds of
+eight random bumps instead of proposals, with the same repair, for 2 s; rrtconnect+polish; rrtconnect as OMPL has it and
+tuned. On the hard and large levels alone: apex with guidance; and, on 20 problems of each, the paper's algorithm alone
+(``apex-paper``), and tuned, 5 s, rrt, lbkpiece1 and planners that use their whole time limit.
+Labels of tuned rows name the parameters that benchmarks/tune.py chose; those without any do best with OMPL's defaults.
+apex and rrtconnect+polish have theirs as defaults.
 Each run is stored in benchmarks/runs/head_to_head when it ends, with OMPL's logs and the database for Planner Arena;
 the command resumes where it was stopped.
 
@@ -27,6 +29,7 @@ from apex_ompl.benchmark import Row, Workers, bench, report, write_database, wri
 from apex_ompl.benchmark.metrics import share_interval
 from apex_ompl.benchmark.rows import PAPER
 from apex_ompl.benchmark.summary import SHARE_TIMES, Statistics, Table, statistics, tables, warnings
+from apex_ompl.planners.tuned import TUNED
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import one_or_more
 
@@ -38,14 +41,16 @@ GROUPS = {
     "free, easy, small": ("free", "easy", "small"),
     "medium": ("medium",),
     "hard, large": ("hard", "large"),
-    "all": ("free", "easy", "small", "medium", "hard", "large"),
+    "extreme": ("extreme",),
+    "all": ("free", "easy", "small", "medium", "hard", "large", "extreme"),
 }
+HARD = ("/hard", "/large")
 TREELESS = {"fallback": False, "bridge": False}
 ROWS = (
     Row("apex", "apex"),
     Row("apex without trees", "apex", TREELESS),
-    Row("apex guided", "apex", {"guidance": True}),
-    Row("apex-paper", "apex", {**PAPER, "guidance": True}, runs=SLOW),
+    Row("apex guided", "apex", {"guidance": True}, levels=HARD),
+    Row("apex-paper", "apex", {**PAPER, "guidance": True}, runs=SLOW, levels=HARD),
     Row("straight line + repair", "apex", {**TREELESS, "first": 0, "second": 0, "third": 0, "resample": 0}, 2.0),
     Row(
         "8 bumps + repair",
@@ -55,10 +60,10 @@ ROWS = (
     ),
     Row("rrtconnect+polish", "rrtconnect+polish"),
     Row("rrtconnect", "rrtconnect"),
-    Row("rrt", "rrt", runs=SLOW),
+    Row.of("rrtconnect", TUNED["rrtconnect"]),
     *(
-        Row(name, name, timeout=5.0, runs=SLOW, levels=("/hard", "/large"))
-        for name in ("aorrtc", "informedrrtstar", "bitstar")
+        Row.of(name, TUNED[name], timeout=5.0, runs=SLOW, levels=HARD)
+        for name in ("rrt", "lbkpiece1", "aorrtc", "informedrrtstar", "bitstar")
     ),
 )
 

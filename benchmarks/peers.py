@@ -33,6 +33,7 @@ from apex_ompl.benchmark.summary import Statistics
 from apex_ompl.ompl_adapter.repair import repair
 from apex_ompl.ompl_adapter.setup import PlanningSetup, assemble
 from apex_ompl.ompl_adapter.validity import full_check
+from apex_ompl.planners.tuned import TUNED
 from apex_ompl.planning import NOT_PROVED
 from apex_ompl.problems import load
 from apex_ompl.problems.suite_robot import robot
@@ -68,12 +69,15 @@ except ImportError as error:
 DEPENDS = ("@benchmark",)
 FOLDER = Path(__file__).parent / "runs" / "peers"
 TIMEOUT = 10.0  # [s]
+RUNNER = "peers:plan_with_roboplan"
 ROWS = (
     Row("apex", "apex"),
     Row("rrtconnect", "rrtconnect"),
-    Row("roboplan", "roboplan", runner="peers:plan_with_roboplan"),
+    Row.of("rrtconnect", TUNED["rrtconnect"]),
+    Row("roboplan", "roboplan", runner=RUNNER),
+    Row.of("roboplan", TUNED["roboplan"], runner=RUNNER),
 )
-NODES, MAX_STEP = 1_000_000, 3.0  # of RoboPlan's trees: most nodes, and longest step, its default [rad]
+NODES = 1_000_000  # most of RoboPlan's trees
 GROUPS = ("all hard", "all")
 STATES = 200  # on which the checkers are compared, for each problem
 ORIGIN = np.eye(4)
@@ -149,7 +153,10 @@ def agreement(ready: PlanningSetup, scene: Scene, rng: np.random.Generator) -> l
 
 
 def plan_with_roboplan(job: Job) -> Run:
-    """Return the columns of a run of RoboPlan; ``agreement`` as :func:`agreement` returns it."""
+    """Return the columns of a run of RoboPlan; ``agreement`` as :func:`agreement` returns it.
+
+    Parameters of the job are those of ``RRTOptions``, whose defaults hold otherwise.
+    """
     problem = load(job.problem)
     if not representable(problem):
         return {"solved": False, "status": NO_PROBLEM, "reason": "it has shapes that RoboPlan has not"}
@@ -159,8 +166,8 @@ def plan_with_roboplan(job: Job) -> Run:
     names = list(scene.getJointNames())
     deadline = Deadline(job.timeout)
     options = RRTOptions(
-        max_nodes=NODES, max_connection_distance=MAX_STEP, collision_check_step_size=SEARCH_RESOLUTION,
-        max_planning_time=deadline.for_search, rrt_connect=True,
+        max_nodes=NODES, collision_check_step_size=SEARCH_RESOLUTION, max_planning_time=deadline.for_search,
+        rrt_connect=True, **job.params,
     )  # fmt: skip
     planner = RRT(scene, options)
     planner.setRngSeed(job.seed)

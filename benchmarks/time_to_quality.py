@@ -3,10 +3,11 @@
 The reference lengths are made once (``--reference``), on the first 20 test problems of each hard level, and kept in
 benchmarks/reference_lengths.json. Then each planner has 10 s: apex, which improves its path all the time (``anytime``);
 rrtconnect with OMPL's simplification, and rrtconnect+polish, restarted with other random numbers as long as there is
-time; aorrtc. A path counts from when it has passed the full check, as first paths do in apex_ompl.benchmark.
+time; aorrtc; rrtconnect and aorrtc as OMPL has them, and with the parameters that benchmarks/tune.py chose, which their
+labels name. A path counts from when it has passed the full check, as first paths do in apex_ompl.benchmark.
 Each run is stored in benchmarks/runs/time_to_quality when it ends; the command resumes where it was stopped.
 
-Usage: python benchmarks/time_to_quality.py [--reference] [SUITE/hard ...] [-n 20] [--jobs 1]
+Usage: python benchmarks/time_to_quality.py [--reference] [SUITE/hard ...] [-n 10] [--jobs 1]
 """
 
 from __future__ import annotations
@@ -33,6 +34,7 @@ from apex_ompl.ompl_adapter.setup import PlanningSetup, assemble
 from apex_ompl.ompl_adapter.simplify import simplify
 from apex_ompl.ompl_adapter.space import path_to_array
 from apex_ompl.ompl_adapter.validity import full_check
+from apex_ompl.planners.tuned import TUNED
 from apex_ompl.problems import load
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.trajopt.path import path_length
@@ -47,8 +49,15 @@ REFERENCE_TIMEOUT, TIMEOUT, WITHIN = 30.0, 10.0, 1.1  # [s], [s], factor on the 
 ALL_HARD = "all"
 PERIOD = 0.005  # at which a planner's best path is read [s]
 RUNNER = "time_to_quality:improve"
-METHODS = ("apex", "rrtconnect", "rrtconnect+polish", "aorrtc")
-ROWS = tuple(Row(name, name, {"anytime": True} if name == "apex" else {}, runner=RUNNER) for name in METHODS)
+ROWS = (
+    Row("apex", "apex", {"anytime": True}, runner=RUNNER),
+    Row("rrtconnect", "rrtconnect", runner=RUNNER),
+    Row.of("rrtconnect", TUNED["rrtconnect"], runner=RUNNER),
+    Row("rrtconnect+polish", "rrtconnect+polish", TUNED["rrtconnect+polish"], runner=RUNNER),
+    Row("aorrtc", "aorrtc", runner=RUNNER),
+    Row.of("aorrtc", TUNED["aorrtc"], runner=RUNNER),
+)
+METHODS = tuple(row.label for row in ROWS)
 REFERENCE_ROW = Row("reference", "aorrtc", timeout=REFERENCE_TIMEOUT, runner=RUNNER)
 Lengths = list[tuple[float, float]]
 """Time at which a path had passed the full check [s], and its length [rad]; each shorter than those before."""
@@ -119,7 +128,7 @@ def repeated(attempt: Callable[[float], np.ndarray | None], ready: PlanningSetup
 
 def attempts(ready: PlanningSetup, job: Job) -> Lengths:
     """Run a planner repeatedly, and simplify its paths unless they are smooth."""
-    setup, parameters = ready.simple_setup, planners.parameters(job.planner)
+    setup, parameters = ready.simple_setup, planners.parameters(job.planner, **job.params)
     si = setup.getSpaceInformation()
 
     def attempt(left: float) -> np.ndarray | None:
@@ -144,7 +153,7 @@ def improve(job: Job) -> Run:
         setup = ready.simple_setup
         si = setup.getSpaceInformation()
         setup.setOptimizationObjective(ob.PathLengthOptimizationObjective(si))
-        found = observed(ready, planners.parameters("aorrtc").build(si), job.timeout)
+        found = observed(ready, planners.parameters("aorrtc", **job.params).build(si), job.timeout)
     else:
         found = attempts(ready, job)
     if not found:
@@ -178,7 +187,7 @@ def main() -> None:
     """Run what is missing, and write the results."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("levels", nargs="*", metavar="SUITE/hard")
-    parser.add_argument("-n", type=one_or_more, default=20, help="test problems of a level (default: %(default)s)")
+    parser.add_argument("-n", type=one_or_more, default=10, help="test problems of a level (default: %(default)s)")
     parser.add_argument("--reference", action="store_true", help="make the reference lengths, 30 s for each problem")
     parser.add_argument("--jobs", type=one_or_more, default=1, help="runs at a time (default: one, as they are timed)")
     args = parser.parse_args()

@@ -11,6 +11,7 @@ from ompl import base as ob
 
 from apex_ompl import diffusion
 from apex_ompl.planners.registry import Parameters, bounded, one_of, register
+from apex_ompl.planners.tuned import TUNED
 
 if TYPE_CHECKING:
     from apex_ompl.apex.stages import Stage
@@ -63,7 +64,8 @@ class ApexParameters(Parameters):
         polish: Whether valid paths are shortened.
         approximate: Whether, without an exact solution, a path that ends near a goal is given as an approximate one.
         anytime: Whether paths are improved until the time is up, as they are with a path length objective.
-        range: Longest step of RRTConnect's trees, in bridges and as fallback; 0 lets OMPL choose.
+        range: Longest step of RRTConnect's trees in sprints, in bridges and as fallback, by default the tuned one; 0
+            lets OMPL choose.
         seed: Of the proposals' noise; -1 takes one that follows from OMPL's.
     """
 
@@ -72,11 +74,11 @@ class ApexParameters(Parameters):
     robot: str = "dual_panda_softhand"
     device: str = "cpu"
     line: bool = True
-    sprint: int = bounded(40, 0)
+    sprint: int = bounded(TUNED[NAME]["sprint"], 0)
     sampler: str = one_of("model", "ddim", "dpm_solver", "ddpm")
     denoising_steps: int = bounded(0, 0, 1000)
     temperature: float = bounded(1.0, 0.0, 10.0)
-    first: int = bounded(4, 0, 1024)
+    first: int = bounded(TUNED[NAME]["first"], 0, 1024)
     second: int = bounded(8, 0, 1024)
     third: int = bounded(24, 0, 1024)
     guidance: bool = False
@@ -90,7 +92,7 @@ class ApexParameters(Parameters):
     polish: bool = True
     approximate: bool = False
     anytime: bool = False
-    range: float = bounded(0.0, 0.0, unit="rad")
+    range: float = bounded(TUNED[NAME]["range"], 0.0, unit="rad")
     seed: int = bounded(-1, -1)
 
     @property

@@ -18,6 +18,7 @@ from apex_ompl.ompl_adapter.simplify import simplify
 from apex_ompl.ompl_adapter.space import array_to_path, path_to_array
 from apex_ompl.ompl_adapter.validity import StateValidityChecker
 from apex_ompl.planners.registry import Parameters, bounded, register
+from apex_ompl.planners.tuned import TUNED
 from apex_ompl.trajopt.optimizer import Optimizer
 from apex_ompl.trajopt.path import Path
 from apex_ompl.trajopt.settings import OptimizerSettings
@@ -116,7 +117,7 @@ class RRTConnectPolish(Parameters):
     """RRTConnect, simplified, fitted by a B-spline and optimised on its control points.
 
     Attributes:
-        range: Longest step of RRTConnect's trees; 0 lets OMPL choose.
+        range: Longest step of RRTConnect's trees, by default the tuned one; 0 lets OMPL choose.
         control_points: Number of control points of the spline.
         pinned: How many of them coincide with each end.
         scene_margin: Clearance to obstacles that the optimiser asks for.
@@ -125,7 +126,7 @@ class RRTConnectPolish(Parameters):
     """
 
     smooth: ClassVar[bool] = True
-    range: float = bounded(0.0, 0.0, unit="rad")
+    range: float = bounded(TUNED[NAME]["range"], 0.0, unit="rad")
     control_points: int = bounded(14, 6, 200)
     pinned: int = bounded(1, 1, 90)
     scene_margin: float = bounded(0.04, 1e-4, 1.0, unit="m")

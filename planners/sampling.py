@@ -1,6 +1,7 @@
 """OMPL's sampling-based planners: every geometric planner that its Python bindings have.
 
 The defaults are OMPL's own; a range of 0 lets OMPL choose one from the size of the space (a fifth of its extent).
+``apex_ompl.planners.TUNED`` has parameters that suit the suites of problems.
 """
 
 from __future__ import annotations

@@ -189,7 +189,7 @@ def test_repair_ends_in_time(ready: PlanningSetup) -> None:
     fault = full_check(ready.checker, line, ready.start, ready.goals)
     assert not fault and repair(ready, line, fault, time.perf_counter()) is None
     mended = repair(ready, line, fault, time.perf_counter() + 1e300)
-    assert mended is not None and full_check(ready.checker, mended, ready.start, ready.goals)
+    assert mended is not None and full_check(ready.checker, mended[0].states, ready.start, ready.goals)
 
 
 def test_the_path_as_it_was_found_has_its_turn(
@@ -198,7 +198,7 @@ def test_the_path_as_it_was_found_has_its_turn(
     def check(checker: object, path: np.ndarray, *args: object, **options: object) -> FullCheck:
         if np.array_equal(path, states_of(found)):
             return full_check(checker, path, *args, **options)  # type: ignore[arg-type]
-        return FullCheck(False, "on purpose", 0, 1)
+        return FullCheck(False, "on purpose", 0)
 
     monkeypatch.setattr(planning.solving, "full_check", check)
     monkeypatch.setattr(planning.solving, "repair", lambda *_: None)
@@ -260,13 +260,13 @@ def test_a_path_that_is_not_timed_in_time(
     assert (result.status, result.reason) == (PlanStatus.TIMEOUT, NOT_TIMED)
     assert result.path is found.path and result.trajectory is None and run.times["timing"] >= 0.0
 
-    def ends(run: PlanRun, motion: object, deadline: float) -> str:
+    def ends(checker: object, motion: object, start: object, goals: object, *, deadline: float) -> FullCheck:
         assert deadline == run.deadline.at
         run.deadline.restart(0.0)
-        return "not proved in time"
+        return FullCheck(False, "not proved in time", None, timed_out=True)
 
     run = run_of(ready)
-    monkeypatch.setattr(planning.timing, "motion_fault", ends)
+    monkeypatch.setattr(planning.timing, "full_check", ends)
     result = parameterize(run, exact, Timing())
     assert (result.status, result.reason) == (PlanStatus.TIMEOUT, NOT_TIMED)
 

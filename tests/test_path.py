@@ -13,6 +13,7 @@ from scipy.interpolate import BSpline
 
 from apex_ompl import PlanResult, plan
 from apex_ompl.collision import CollisionChecker
+from apex_ompl.collision.path_proof import Curve
 from apex_ompl.errors import ParameterError
 from apex_ompl.ompl_adapter.setup import assemble
 from apex_ompl.planners import APEX
@@ -86,14 +87,14 @@ def test_the_straight_line_is_tried_once(monkeypatch: pytest.MonkeyPatch) -> Non
     """Before ``solve`` in a plan, inside of it for users of OMPL."""
     ready = assemble(cached_problem(HARD))
     line, lines = np.stack([ready.start, ready.goals[0]]), 0
-    checked = CollisionChecker.first_collision
+    prove = CollisionChecker.prove
 
-    def counting(self: CollisionChecker, path: np.ndarray, *rest: object, **more: object) -> object:
+    def counting(self: CollisionChecker, path: np.ndarray | Curve, **options: object) -> object:
         nonlocal lines
-        lines += np.array_equal(path, line)
-        return checked(self, path, *rest, **more)  # type: ignore[arg-type]
+        lines += np.array_equal(path.states if isinstance(path, Curve) else path, line)
+        return prove(self, path, **options)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(CollisionChecker, "first_collision", counting)
+    monkeypatch.setattr(CollisionChecker, "prove", counting)
     run = PlanRun(ready, "apex", ApexParameters(sprint=0), 0, Deadline(20.0))
     assert straight_line(run) is None and lines == 1
     assert solve(run, True) and lines == 1

@@ -91,7 +91,7 @@ def test_the_command_writes_motions_and_draws_them(tmp_path, capsys: pytest.Capt
     printed = capsys.readouterr().out
     motion = Trajectory.load(out)
     assert f"motion     {motion.duration:.3f} s" in printed and "jerk" in printed and "timing proof" in printed
-    assert "checked every 0.00031 rad" in printed
+    assert "mm clear" in printed and "proved by spheres" in printed
     out = tmp_path / "c.traj.json"
     assert cli.main(["plan", "ball_in_cup", "--timeout", "20", "--out", str(out), "--controllers"]) == 0
     assert Trajectory.load(out).dof == 16 and "left_arm_controller" in out.read_text()

@@ -83,6 +83,19 @@ class Row:
         params = {name.strip().replace("-", "_"): value.strip() for name, _, value in pairs}
         return cls(text.strip(), match["planner"].strip(), params)
 
+    @classmethod
+    def of(cls, planner: str, params: Mapping[str, Any] | None = None, **more: Any) -> Row:
+        """Return the row that ``parse`` reads from its label, as ``rrtconnect[range=0.7]``.
+
+        Args:
+            planner: Name of the planner.
+            params: Parameters that differ from the defaults.
+            **more: Further attributes of the row.
+        """
+        given = dict(params or {})
+        pairs = (f"{name}={str(v).lower() if isinstance(v, bool) else v}" for name, v in given.items())
+        return cls(f"{planner}[{';'.join(pairs)}]" if given else planner, planner, given, **more)
+
     def parameters(self) -> planners.Parameters:
         """Return the planner's parameters.
 

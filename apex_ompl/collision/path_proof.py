@@ -52,9 +52,9 @@ class Curve:
     def polyline(cls, states: Array) -> Curve:
         """Return straight lines between states, shape (N, dof); their parameter is the length in the max-norm."""
         steps = np.abs(np.diff(states, axis=0)).max(axis=1)
-        kept = np.concatenate([[True], steps > 0.0])
-        states = np.require(states[kept], float, ["C", "W"])
-        knots = np.concatenate([[0.0], np.cumsum(steps[steps > 0.0])])
+        moves = ~(steps <= 0.0)  # with steps that are not numbers, which are refused later
+        states = np.require(states[np.append(True, moves)], float, ["C", "W"])
+        knots = np.append(0.0, np.cumsum(steps[moves]))
         if len(states) == 1:
             states, knots = np.repeat(states, 2, axis=0), np.zeros(2)
         return cls(knots, states, np.empty((0, 2 * states.shape[1])), 0.0)
@@ -197,6 +197,8 @@ class PathProver:
             reason = "not proved in time"
         elif outcome == curve_proof.TOUCHING:
             reason = f"{names[0]} <-> {names[1]} " + ("touch" if least <= 0.0 else f"are {least * 1e6:.2g} um apart")
+        elif outcome == curve_proof.OUTSIDE:
+            reason, where = "a hand outside its limits", float(p.where[0])
         elif not ok:
             reason, where = "too close to contact to be proved", float(p.where[0])
         share = by_spheres / length if length > 0.0 else 0.0

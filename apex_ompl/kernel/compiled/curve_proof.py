@@ -25,7 +25,7 @@ from apex_ompl.kernel.compiled.separation import tables_hold, unproved
 from apex_ompl.kernel.compiled.shapes import PairBuffers, ShapeArrays, pair_view, shapes_view
 from apex_ompl.kernel.compiled.workspace import Workspace, workspace_view
 
-PROVED, MORE, TOUCHING, UNDECIDED = range(4)  # outcomes
+PROVED, MORE, TOUCHING, UNDECIDED, OUTSIDE = range(5)  # outcomes
 QUEUE = 1 << 14  # intervals that wait
 MOST_UNPROVED = 256  # pairs that the spheres leave on one interval
 FEW = 12  # pairs that are looked at one by one also on a long interval
@@ -214,7 +214,8 @@ def prove_curve(
     ``tolerance`` that of the least clearance [m], 0 for a bare proof.
 
     Returns:
-        PROVED, MORE, TOUCHING (the pair is in ``worst``), or UNDECIDED where an interval got too short.
+        PROVED, MORE, TOUCHING (the pair is in ``worst``), UNDECIDED where an
+        interval got too short, or OUTSIDE at a state for which the tables do not hold.
     """
     t, s, h, k = robot_view(ri, rf), scene_view(si, sf), shapes_view(bi, bf), shapes_view(oi, of)
     w, g, p = workspace_view(t, wi, wf), pair_view(gi, gf), _proof_view(pi, pf, len(t.lower))
@@ -226,7 +227,9 @@ def prove_curve(
         middle = p.where[0] = 0.5 * (a + b)
         set_state(knots, states, rates, middle, p.state)
         set_motion(knots, states, rates, slack, a, b, p.state, w)
-        if p.places[1] - p.places[0] > QUEUE - 2 * MOST_UNPROVED or not _place(t, w, p):
+        if not _place(t, w, p):
+            return OUTSIDE
+        if p.places[1] - p.places[0] > QUEUE - 2 * MOST_UNPROVED:
             return UNDECIDED
         count = 1
         p.found[0, 0], p.found[0, 1] = first, second

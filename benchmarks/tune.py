@@ -1,0 +1,258 @@
+"""Main parameters of the planners, tuned on hard and large validation problems with the same budget for each planner.
+
+Each planner has eight candidates, the first its default; OMPL's and RoboPlan's are theirs. Successive halving: all run
+on the first problem of each level, the best four and the default on the first two, the best two of them and the
+default on the first four; 2 s a run. Problems and seeds are the same for all. The score is the mean over the problems
+of the time to the first path that passed the full check, where an unsolved one counts as 4 s (PAR2); for planners that
+go on improving, times the mean of the length at the end over the shortest of the planner's candidates, where an
+unsolved one counts as 2. Paths are not simplified. The candidate of the lowest score on the last problems is
+chosen; planners/tuned.py keeps it.
+Each run is stored in benchmarks/runs/tune when it ends; the command resumes where it was stopped.
+
+Usage: python benchmarks/tune.py [--jobs 1]    (needs the extra "peers")
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import peers
+import record
+
+from apex_ompl import planners
+from apex_ompl.benchmark import Results, Row, Workers, bench
+from apex_ompl.benchmark.runs import NO_PROBLEM, Run
+from apex_ompl.benchmark.summary import Statistics
+from apex_ompl.util.entry_point import run_script
+from apex_ompl.util.validation import one_or_more
+
+DEPENDS = (
+    "@checking", "apex_ompl/apex", "apex_ompl/api.py", "apex_ompl/benchmark", "apex_ompl/diffusion",
+    "apex_ompl/ompl_adapter", "apex_ompl/planning", "apex_ompl/result.py", "apex_ompl/tasks", "apex_ompl/trajopt",
+    "benchmarks/peers.py", "planners/apex.py", "planners/apex_parameters.py", "planners/polish.py",
+    "planners/registry.py", "planners/sampling.py", "problems",
+)  # fmt: skip
+# All that plans but planners/tuned.py, which follows from the result: candidates name each parameter that is tuned.
+FOLDER = Path(__file__).parent / "runs" / "tune"
+ROBOPLAN = "roboplan"
+TIMEOUT = 2.0  # [s]
+UNSOLVED_TIME, UNSOLVED_LENGTH = 2.0 * TIMEOUT, 2.0  # [s], times the shortest
+RUNGS = ((8, 1), (4, 2), (2, 4))
+"""Candidates that are left besides the default, and problems of a level."""
+
+
+def ranges(*steps: float, **others: Any) -> list[dict[str, Any]]:
+    """Return a candidate for each longest step of a tree [rad]; 0 lets OMPL choose."""
+    return [{"range": step, **others} for step in steps]
+
+
+def batches(*sizes: int, **others: Any) -> list[dict[str, Any]]:
+    """Return a candidate for each number of samples in a batch of BIT*."""
+    return [{"samples_per_batch": size, "rewire_factor": 1.1, "use_k_nearest": True} | others for size in sizes]
+
+
+CANDIDATES: dict[str, list[dict[str, Any]]] = {
+    "rrtconnect": [
+        *ranges(0.0, 0.3, 0.5, 0.7, 1.0, 1.4, 2.0, intermediate_states=False),
+        *ranges(0.7, intermediate_states=True),
+    ],
+    "rrtconnect+polish": ranges(0.0, 0.3, 0.5, 0.7, 0.85, 1.0, 1.4, 2.0),
+    "apex": [
+        *ranges(0.0, 0.5, 0.7, 1.0, 1.4, sprint=40, first=4),
+        *ranges(0.7, sprint=20, first=4),
+        *ranges(0.7, sprint=160, first=4),
+        *ranges(0.7, sprint=40, first=2),
+    ],
+    ROBOPLAN: [
+        *({"max_connection_distance": step} for step in (3.0, 0.3, 0.5, 0.7, 1.0, 1.4, 2.0)),
+        {"max_connection_distance": 1.0, "collision_check_use_bisection": False},
+    ],
+    "aorrtc": ranges(0.0, 0.3, 0.5, 0.7, 1.0, 1.4, 2.0, 3.0),
+    "rrt": [
+        *ranges(0.0, 0.3, 0.7, 1.4, 2.5, goal_bias=0.05),
+        *ranges(0.7, 1.4, goal_bias=0.2),
+        *ranges(0.7, goal_bias=0.5),
+    ],
+    "lbkpiece1": [
+        *ranges(0.0, 0.3, 0.5, 0.7, 1.0, 1.4, 2.0, border_fraction=0.9),
+        *ranges(0.7, border_fraction=0.5),
+    ],
+    "kpiece1": [
+        *ranges(0.0, 0.3, 0.7, 1.4, goal_bias=0.05, border_fraction=0.9),
+        *ranges(0.7, 1.4, goal_bias=0.2, border_fraction=0.9),
+        *ranges(0.7, 1.4, goal_bias=0.05, border_fraction=0.5),
+    ],
+    "informedrrtstar": [
+        *ranges(0.0, 0.5, 1.0, 2.0, goal_bias=0.05, delay_cc=True),
+        *ranges(0.5, 1.0, 2.0, goal_bias=0.2, delay_cc=True),
+        *ranges(1.0, goal_bias=0.2, delay_cc=False),
+    ],
+    "bitstar": [
+        *batches(100, 10, 30, 300, 1000),
+        *batches(100, rewire_factor=1.5),
+        *batches(100, rewire_factor=2.0),
+        *batches(100, use_k_nearest=False),
+    ],
+}
+"""Candidates of each planner, the default first."""
+
+
+@dataclass(frozen=True)
+class Score:
+    """How a candidate did on the problems of a rung.
+
+    Attributes:
+        label: Label of the candidate.
+        runs: Its runs.
+        shortest: Length of the shortest path of the planner's candidates by problem, for planners that go on improving
+            [rad].
+    """
+
+    label: str
+    runs: Sequence[Run]
+    shortest: dict[str, float] | None
+
+    @property
+    def time(self) -> float:
+        """Mean of the times to the first path [s]."""
+        return float(np.mean(self.times))
+
+    @property
+    def times(self) -> list[float]:
+        """Times to the first path [s]."""
+        return [run["first"] if run["solved"] else UNSOLVED_TIME for run in self.runs]
+
+    @property
+    def length(self) -> float:
+        """Mean of the lengths over the shortest; 1 for planners that end with their first path."""
+        if self.shortest is None:
+            return 1.0
+        known = [(run, self.shortest[run["problem"]]) for run in self.runs if run["problem"] in self.shortest]
+        ratios = [run["length"] / best if run["solved"] else UNSOLVED_LENGTH for run, best in known]
+        return float(np.mean(ratios or [1.0]))
+
+    @property
+    def score(self) -> float:
+        """What is least for the best candidate [s]."""
+        return self.time * self.length
+
+    def figures(self) -> dict[str, Any]:
+        """Return the values of the result."""
+        found = Statistics("", self.label, self.runs)
+        return {
+            "n": len(self.runs), "solved": len(found.solved) / len(self.runs), "score": self.score,
+            "first_s_mean": self.time, "first_s_geometric_mean": float(np.exp(np.mean(np.log(self.times)))),
+            "length_mean": None if self.shortest is None else self.length,
+            "first_s": [record.reached(found.times("first"), p) for p in (50, 95)],
+        }  # fmt: skip
+
+
+def levels() -> list[str]:
+    """Return the hardest static levels of all suites."""
+    return [level for level in record.static_levels([]) if level.endswith(("/hard", "/large"))]
+
+
+def rows_of(planner: str) -> list[Row]:
+    """Return a row of each candidate."""
+    runner = peers.RUNNER if planner == ROBOPLAN else ""
+    return [Row.of(planner, params, runner=runner) for params in CANDIDATES[planner]]
+
+
+def scores(planner: str, results: Results, rows: Sequence[Row], problems: int) -> list[Score]:
+    """Return how candidates did on the first problems of each level, the best first."""
+    labels = {row.label for row in rows}
+    runs = [run for run in results.runs if run["label"] in labels and run["seed"] < problems]
+    runs = [run for run in runs if run["status"] != NO_PROBLEM]
+    shortest: dict[str, float] | None = None
+    if planner != ROBOPLAN and planners.parameters(planner).optimizing:
+        shortest = {}
+        for run in runs:
+            if run["solved"]:
+                shortest[run["problem"]] = min(run["length"], shortest.get(run["problem"], math.inf))
+    found = [Score(row.label, [run for run in runs if run["label"] == row.label], shortest) for row in rows]
+    return sorted(found, key=lambda one: one.score)
+
+
+def rungs_of(planner: str, jobs: int) -> list[list[Score]]:
+    """Run the candidates of a planner that are missing, and return their scores in each rung, the best first."""
+    rows, found = rows_of(planner), list[list[Score]]()
+    best = [row.label for row in rows]
+    for keep, problems in RUNGS:
+        left = [row for row in rows if row == rows[0] or row.label in best[:keep]]
+        results = bench(
+            levels(), left, FOLDER, runs=problems, timeout=TIMEOUT, split="validation", simplify=False,
+            workers=Workers(jobs), provenance=record.session(),
+        )  # fmt: skip
+        found.append(scores(planner, results, left, problems))
+        best = [one.label for one in found[-1]]
+    return found
+
+
+def chosen(planner: str, last: Sequence[Score]) -> dict[str, Any]:
+    """Return the parameters of the best candidate of the last rung."""
+    return next(dict(row.params) for row in rows_of(planner) if row.label == last[0].label)
+
+
+def table(found: dict[str, list[list[Score]]]) -> str:
+    """Return the Markdown tables: the last rung of each planner, then all rungs of all candidates."""
+    head = ["planner", "N", "solved", "first path p50 ms", "p95", "geometric mean ms", "mean ms", "length"]
+    head += ["score ms"]
+    lines = [record.row(head), record.row(["---", *["---:"] * (len(head) - 1)])]
+    for planner, rungs in found.items():
+        default = rows_of(planner)[0].label
+        for one in rungs[-1]:
+            name = f"**{one.label}**" if one is rungs[-1][0] else one.label
+            lines.append(record.row([f"{name}{', default' if one.label == default else ''}", *_cells(one.figures())]))
+    problems = [f"{count} of each level" for _, count in RUNGS]
+    head = ["candidate, score in ms (rank) on", *problems]
+    lines += ["", record.row(head), record.row(["---", *["---:"] * len(problems)])]
+    for planner, rungs in found.items():
+        for row in rows_of(planner):
+            ranks = [[one.label for one in rung] for rung in rungs]
+            places = [rank.index(row.label) if row.label in rank else None for rank in ranks]
+            both = zip(rungs, places, strict=True)
+            cells = ("" if k is None else f"{1e3 * rung[k].score:.0f} ({k + 1})" for rung, k in both)
+            lines.append(record.row([row.label, *cells]))
+    return "\n".join(lines)
+
+
+def _cells(f: dict[str, Any]) -> list[Any]:
+    times = [
+        "-" if v is None else f"{1e3 * v:.0f}" for v in (*f["first_s"], f["first_s_geometric_mean"], f["first_s_mean"])
+    ]
+    length = "" if f["length_mean"] is None else f"{f['length_mean']:.2f}"
+    return [f["n"], f"{f['solved']:.3f}", *times, length, f"{1e3 * f['score']:.0f}"]
+
+
+def main() -> None:
+    """Run what is missing, and write the results."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--jobs", type=one_or_more, default=1, help="runs at a time (default: one, as they are timed)")
+    args = parser.parse_args()
+    found = {planner: rungs_of(planner, args.jobs) for planner in CANDIDATES}
+    data = {
+        "planners": {
+            planner: {
+                "default": rows_of(planner)[0].label, "chosen": chosen(planner, rungs[-1]),
+                "rungs": [{one.label: one.figures() for one in rung} for rung in rungs],
+            }
+            for planner, rungs in found.items()
+        }
+    }  # fmt: skip
+    most = [f"{keep + (k > 0)} candidates on {count} problems of a level" for k, (keep, count) in enumerate(RUNGS)]
+    record.write(
+        "tune", data, table(found), split="validation", limit=f"{TIMEOUT:g} s", budget=f"at most {', '.join(most)}",
+        levels=len(levels()), seeds="number of the problem modulo 1000", roboplan=version("roboplan"),
+        **record.made_with(Results.load(FOLDER)),
+    )  # fmt: skip
+
+
+if __name__ == "__main__":
+    run_script(main)

@@ -1,0 +1,26 @@
+"""Parameters tuned on the validation split: what ``python benchmarks/tune.py`` chose, benchmarks/results/tune.json.
+
+OMPL's planners keep OMPL's defaults under their names; their tuned forms are rows of the benchmarks. The planners of
+this package have the tuned values as defaults. ``roboplan`` is RoboPlan's RRT-Connect as benchmarks/peers.py runs it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+
+Value = bool | int | float
+
+TUNED: Mapping[str, Mapping[str, Value]] = MappingProxyType({
+    "rrtconnect": {"range": 1.0},
+    "rrtconnect+polish": {"range": 1.0},
+    "apex": {"range": 0.7, "sprint": 40, "first": 4},
+    "roboplan": {"max_connection_distance": 0.7},
+    "aorrtc": {"range": 1.4},
+    "rrt": {},
+    "lbkpiece1": {"range": 0.5},
+    "kpiece1": {"range": 1.4, "goal_bias": 0.2},
+    "informedrrtstar": {},
+    "bitstar": {},
+})  # fmt: skip
+"""Parameters by planner, those that differ from OMPL's defaults; ranges and distances in rad."""
