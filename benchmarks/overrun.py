@@ -38,6 +38,7 @@ COUNTS = {0.05: 40, 0.5: 30, 5.0: 5}
 """Runs of each planner under each limit [s]."""
 ALLOWED, ALLOWED_SHARE = 0.1, 0.02  # overrun [s], and as a share of the limit
 CELLS, MESHES = 6, 3  # squares of a dented mesh along a side, and boxes of a problem that become meshes
+EVERY = 3  # problem has meshes
 DENT = 0.6  # depth of the dent, as a share of the height
 PLAN, ROW = "plan", "row"
 
@@ -102,21 +103,18 @@ def with_meshes(problem: Problem, folder: Path) -> Problem:
 
 
 def cases(folder: Path) -> Iterator[Path]:
-    """Yield files of problems of the three kinds in turn, without an end."""
+    """Yield files of problems: hard ones of all suites in turn, every third with meshes, and the one without a way."""
     names = [problems.frozen_names(suite, "hard", "validation") for suite in SUITES]
-    none = folder / "walled.yaml"
-    walled().save(none)
-    files: dict[str, Path] = {}
     for number in range(min(map(len, names))):
-        for suite in names:
-            for made in (str, "{}-dented".format):
-                name = made(suite[number])
-                files[name] = folder / f"{name.replace('/', '-')}.yaml"
-                if not files[name].exists():
-                    problem = problems.load(suite[number])
-                    (problem if made is str else with_meshes(problem, folder)).save(files[name])
-                yield files[name]
-        yield none
+        for k, some in enumerate(names):
+            problem = problems.load(some[number])
+            problem = with_meshes(problem, folder) if (number + k) % EVERY == 0 else problem
+            file = folder / f"{problem.name.replace('/', '-')}.yaml"
+            problem.save(file)
+            yield file
+        file = folder / f"walled-{number}.yaml"
+        walled().save(file)
+        yield file
 
 
 def measured(planner: str, limit: float, how: str, file: Path, seed: int) -> Measured:

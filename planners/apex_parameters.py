@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 NAME = "apex"
 WITHOUT_MODEL = "rrtconnect+polish"
+TURN_CALLS = 1_000  # of the termination condition of a bridge where rounds and trees take turns
 SPRINT_FACTORS = (1, 32, 128)  # on the iterations of the sprints before each round of proposals
 CHECKPOINTS = Path(diffusion.__path__[0]) / "checkpoints"
 
@@ -137,7 +138,7 @@ class ApexParameters(Parameters):
             found.append(stages.NearestToGoal())
         largest = max(self.batches, default=0)
         rounds = [proposal_round(largest, temperature) for temperature in stages.TEMPERATURES if largest]
-        ends: list[Stage] = [stages.Farthest(), *([stages.Bridging(self.range)] if self.bridge else [])]
+        ends: list[Stage] = [stages.Farthest(), *([stages.Bridging(self.range, TURN_CALLS)] if self.bridge else [])]
         trees = stages.GrowTrees(self.range, self.approximate) if self.fallback else None
         found.append(stages.TakeTurns(trees, tuple((*one, *ends) for one in rounds)))
         return found

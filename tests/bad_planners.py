@@ -47,7 +47,7 @@ class Deaf(ob.Planner):
         status = self.inner.solve(ptc)
         while not ptc():
             time.sleep(0.01)
-        time.sleep(0.2)
+        time.sleep(0.5)
         return status
 
 

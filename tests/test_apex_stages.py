@@ -13,6 +13,8 @@ from planning import DIFFUSION_ONLY, EXACT, HARD, TIMEOUT, cached_problem, state
 
 from apex_ompl import plan, planners
 from apex_ompl.apex.path_validator import PathValidator
+from apex_ompl.apex.stages import Propose, TakeTurns
+from apex_ompl.apex.stages.turns import ITERATIONS
 from apex_ompl.ompl_adapter.setup import PlanningSetup
 from apex_ompl.ompl_adapter.validity import full_check
 from apex_ompl.planners import APEX
@@ -131,3 +133,58 @@ def test_with_time_left_paths_only_get_shorter(ready: PlanningSetup) -> None:
     begin = time.perf_counter()
     assert setup.solve(within(30.0)).getStatus() == EXACT
     assert time.perf_counter() - begin < 20.0, "a path under the threshold is enough"
+
+
+class Told:
+    """What :class:`TakeTurns` asks of a context, for some calls of ``stop``."""
+
+    def __init__(self, calls: int) -> None:
+        self.calls, self.done, self.pool = calls, list[Any](), None
+
+    def stop(self) -> bool:
+        self.calls -= 1
+        return self.calls < 0
+
+    def new_pool(self) -> None:
+        self.done.append("pool")
+
+    def farthest(self) -> None:
+        self.done.append("farthest")
+
+
+class Noted:
+    """Stage or trees that note their turn, and find a path in one of them."""
+
+    def __init__(self, name: str, on: int = 99) -> None:
+        self.name, self.on, self.count = name, on, 0
+
+    def run(self, context: Told, *iterations: int) -> str | None:
+        self.count += 1
+        context.done.append((self.name, *iterations))
+        return self.name if self.count == self.on else None
+
+
+def test_trees_and_rounds_take_turns_by_counts() -> None:
+    trees, cold, hot = Noted("trees"), Noted("cold"), Noted("hot", on=2)
+    told = Told(100)
+    assert TakeTurns(trees, ((cold,), (hot,))).run(told) == "hot"  # type: ignore[arg-type, comparison-overlap]
+    stages = [one for one in told.done if one != "pool"]
+    assert [one[0] for one in stages] == ["trees", "cold", "trees", "hot"] * 2
+    lengths = [one[1] for one in stages if one[0] == "trees"]
+    assert lengths[0] == ITERATIONS and all(b > a for a, b in zip(lengths, lengths[1:], strict=False))
+    told = Told(100)
+    assert TakeTurns(Noted("trees", on=3), ()).run(told) == "trees"  # type: ignore[arg-type, comparison-overlap]
+    told = Told(5)
+    assert TakeTurns(None, ((Noted("x"),),)).run(told) is None and told.done[-1] == "farthest"  # type: ignore[arg-type]
+    told = Told(100)
+    assert TakeTurns(None, ()).run(told) is None and told.done == ["farthest"]  # type: ignore[arg-type]
+
+
+def test_later_rounds_are_hotter() -> None:
+    turns = ApexParameters().stages()[-1]
+    assert isinstance(turns, TakeTurns) and turns.trees is not None
+    hot = [next(stage for stage in one if isinstance(stage, Propose)).temperature for one in turns.rounds]
+    assert all(one > 1.0 for one in hot) and len(set(hot)) == len(hot)
+    first = [stage for stage in ApexParameters().stages() if isinstance(stage, Propose)]
+    assert {stage.temperature for stage in first} == {1.0}
+    assert ApexParameters(fallback=False).stages()[-1].trees is None  # type: ignore[attr-defined]

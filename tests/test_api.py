@@ -159,7 +159,7 @@ def test_ctrl_c_after_the_search_is_not_lost(stage: str, problem: Problem, monke
 
     monkeypatch.setattr(planning.solving, stage, pressed)
     if stage == "repair":
-        monkeypatch.setattr(planning.solving, "full_check", lambda *_, **__: FullCheck(False, "on purpose", 0, 1))
+        monkeypatch.setattr(planning.solving, "full_check", lambda *_, **__: FullCheck(False, "on purpose", 0))
     before = signal.getsignal(signal.SIGINT)
     with pytest.raises(KeyboardInterrupt):
         plan(problem, "rrtconnect", timeout=20.0)

@@ -30,8 +30,9 @@ def make_tree(si: ob.SpaceInformation, pdef: ob.ProblemDefinition, tree_range: f
 
 
 def bridge_blocked(
-    si: ob.SpaceInformation, validator: PathValidator, states: Array, stop: Stop, tree_range: float = 0.0
-) -> Array | None:
+    si: ob.SpaceInformation, validator: PathValidator, states: Array, stop: Stop, tree_range: float = 0.0,
+    *, calls: int = MAX_CALLS,
+) -> Array | None:  # fmt: skip
     """Return a valid path whose blocked stretches are planned anew by RRTConnect, or None.
 
     Args:
@@ -40,6 +41,7 @@ def bridge_blocked(
         states: Path with free ends, shape (N, dof).
         stop: Asked often whether to give up.
         tree_range: Longest step of the trees; 0 lets OMPL choose [rad].
+        calls: Of the termination condition of one bridge, at most.
     """
     free = np.array([not stop() and validator.is_free(q) for q in states])
     if stop() or not (free[0] and free[-1]):
@@ -50,7 +52,7 @@ def bridge_blocked(
         if following == k + 1 and validator.is_valid(states[[k, following]], stop):
             pieces.append(states[following : following + 1])
         else:
-            bridge = _bridge(si, states[k], states[following], stop, tree_range)
+            bridge = _bridge(si, states[k], states[following], stop_after(calls, stop), tree_range)
             if bridge is None:
                 return None
             pieces.append(bridge[1:])
@@ -76,11 +78,13 @@ def every_other(states: Array) -> Array:
     return np.concatenate([states[:-1:STRIDE], states[-1:]])
 
 
-def _bridge(si: ob.SpaceInformation, a: Array, b: Array, stop: Stop, tree_range: float) -> Array | None:
+def _bridge(
+    si: ob.SpaceInformation, a: Array, b: Array, ptc: ob.PlannerTerminationCondition, tree_range: float
+) -> Array | None:
     """Return RRTConnect's path between two free states, or None."""
     pdef = ob.ProblemDefinition(si)
     pdef.setStartAndGoalStates(to_state(si, a), to_state(si, b))
-    status = make_tree(si, pdef, tree_range).solve(stop_after(MAX_CALLS, stop)).getStatus()
+    status = make_tree(si, pdef, tree_range).solve(ptc).getStatus()
     if status != ob.PlannerStatus.EXACT_SOLUTION:
         return None
     inner = path_to_array(pdef.getSolutionPath(), len(a))

@@ -36,7 +36,8 @@ Run = dict[str, Any]
 """A run as it is stored, ready for JSON."""
 
 MEMORY = 16_384.0  # limit of a run [MB]
-UPDATES = 0.01  # period at which a planner's progress is read, and the end of its time is looked for [s]
+UPDATES = 0.05  # period at which a planner's progress is read [s]
+LOOK = 0.1  # period at which OMPL's Benchmark looks whether a planner's time is up [s]
 NO_PROBLEM, CRASH = "NO_PROBLEM", str(PlanStatus.CRASH)
 WARM_UP = "wall/easy/800000"
 
@@ -83,7 +84,7 @@ class Experiment:
         experiment.addPlanner(planner)
         experiment.setPreRunEvent(before_run)
         experiment.setPostRunEvent(after_run)
-        request = ot.Request(timeout, MEMORY, 1, UPDATES, False, False, False)
+        request = ot.Request(request_time(timeout), MEMORY, 1, UPDATES, False, False, False)
         try:
             experiment.benchmark(request)
         finally:
@@ -100,6 +101,16 @@ class Experiment:
         if observed:
             run.times[FIRST] = min(observed)
         return ompl_status(self.properties)
+
+
+def request_time(timeout: float) -> float:
+    """Return the time to ask OMPL's Benchmark for so that a planner ends within a time, or at the first look [s].
+
+    The Benchmark looks at the clock every 0.1 s. The time returned lies halfway before the last look that is early
+    enough, since looks come a little late.
+    """
+    looks = max(1, math.floor(timeout / LOOK + 1e-6))
+    return (looks - 0.5) * LOOK
 
 
 def _watched(run: PlanRun, observed: list[float]) -> Callable[[Array, Array], bool]:

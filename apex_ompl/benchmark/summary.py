@@ -208,7 +208,7 @@ def warnings(results: Results) -> list[str]:
             "First paths of planners that use all their time are observed up to 0.05 s late, without their length, and "
             "are not checked; the full check of the last path counts in their place, no repair of it."
         )
-    found.append("OMPL's Benchmark reads the clock every 0.1 s: runs may exceed their limit by that much.")
+    found.append("OMPL's Benchmark reads the clock every 0.1 s: planners end up to that much earlier, or at 0.1 s.")
     return found
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from apex_ompl.apex.bridge import bridge_blocked, every_other
+from apex_ompl.apex.bridge import MAX_CALLS, bridge_blocked, every_other
 from apex_ompl.apex.context import SolveContext
 from apex_ompl.apex.stages.stage import Solution
 from apex_ompl.trajopt.path import Path
@@ -18,9 +18,11 @@ class Bridging:
 
     Attributes:
         tree_range: Longest step of the trees; 0 lets OMPL choose [rad].
+        calls: Of the termination condition of one bridge, at most.
     """
 
     tree_range: float
+    calls: int = MAX_CALLS
 
     def run(self, context: SolveContext) -> Solution | None:
         """Return the first candidate whose blocked stretches are bridged, or None."""
@@ -29,7 +31,9 @@ class Bridging:
                 return None
             with context.report.timed("bridge"):
                 states = every_other(context.path_of(candidate).states)
-                found = bridge_blocked(context.si, context.validator, states, context.stop, self.tree_range)
+                found = bridge_blocked(
+                    context.si, context.validator, states, context.stop, self.tree_range, calls=self.calls
+                )
             if found is not None:
                 return Solution(Path(found), "apex+bridge")
         return None
