@@ -24,6 +24,7 @@ from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError
 from apex_ompl.scene.meshes import triangles
 from apex_ompl.types import Array
 from apex_ompl.util.files import write_atomically
+from apex_ompl.util.weak_cache import weakly_cached
 
 __all__ = ["GAPS", "Cover", "make_cover", "quality", "read_covers", "shape_key", "unproved", "write_covers"]
 
@@ -35,6 +36,7 @@ MOST = (64, 96, 256)  # most leaves of a quick cover, of other covers, and of a 
 QUICK = 4.0  # size of the boxes in which a quick cover is grown, relative to those of its proof
 
 
+@weakly_cached
 def shape_key(geometry: coal.CollisionGeometry) -> str:
     """Return the identifier of a shape, 16 hexadecimal digits of a hash of its kind and sizes or of its triangles.
 
