@@ -49,7 +49,7 @@ def check_readable(path: Path, role: str) -> None:
     except ValueError as error:
         raise MissingFileError(str(path), role, "no file can have this name") from error
     if stat.S_ISDIR(mode):
-        raise MissingFileError(str(path), role, "is a folder")
+        raise MissingFileError(str(path), role, "is a directory")
     if not stat.S_ISREG(mode):
         raise MissingFileError(str(path), role, "is a pipe or a device, expected a regular file")
     if not os.access(path, os.R_OK):
