@@ -183,7 +183,7 @@ class PlanResult:
             knots, names = data["trajectory"], tuple(data["joint_names"])
             arrays = {} if knots is None else {key: np.array(knots[key], dtype=float) for key in KNOTS}
             found = cls(
-                status=PlanStatus(data["status"]), reason=data["reason"], robot=data["robot"],
+                status=_status(data["status"]), reason=data["reason"], robot=data["robot"],
                 path=None if states is None else _path(states, data.get("spline")),
                 problem=Problem.parse(data["problem_file"], str(path)), planner=data["planner"],
                 joint_names=names, trajectory=Trajectory(**arrays, joint_names=names) if arrays else None,
@@ -222,6 +222,12 @@ class PlanResult:
         names = np.array(self.joint_names)
         np.savez(buffer, path=states, joint_names=names, result=np.array(json.dumps(data)), **arrays)
         return buffer.getvalue()
+
+
+def _status(name: object) -> PlanStatus:
+    if name not in list(PlanStatus):
+        raise ParameterError("status", name, f"one of {', '.join(PlanStatus)}")
+    return PlanStatus(str(name))
 
 
 def _numbers(given: Mapping[str, Any], name: str) -> dict[str, float]:

@@ -13,7 +13,7 @@ from support import CUBE_OBJ, states_around_home
 
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.containment import Extent
-from apex_ompl.collision.shapes import coal_geometry, convex_hull, hull_planes
+from apex_ompl.collision.shapes import coal_geometry, convex_hull, hull_planes, mesh_note
 from apex_ompl.errors import FileFormatError
 from apex_ompl.kernel.compiled.triangle_mesh import encloses
 from apex_ompl.robot import Robot
@@ -258,15 +258,34 @@ FLIPPED = CUBE_OBJ.replace("f 1 3 2", "f 1 2 3")
         (CUBE_OBJ.replace("v 1 1 1", "v nan 1 1"), "not finite"),
         (CUBE_OBJ.replace("v 1 1 1", "v 1e300 1 1"), "too far"),
         (FLIPPED, "oriented against each other"),
-        ("", "expected an STL or OBJ mesh"),
+        ("", "expected an STL or OBJ mesh .*, got 'an empty file'"),
+        ("hello\n", "expected an STL or OBJ mesh .*, got 'hello"),
     ],
 )
-def test_meshes_that_bound_no_solid_are_refused(robot: Robot, tmp_path, text: str, words: str) -> None:
+def test_meshes_that_bound_no_solid_are_refused(robot: Robot, tmp_path, capfd, text: str, words: str) -> None:
     """In Coal, flat and infinite ones end the process."""
     file = tmp_path / "m.obj"
     file.write_text(text)
     with pytest.raises(FileFormatError, match=words):
         CollisionChecker(robot, [Obstacle(name="m", mesh={"file": str(file)})])
+    assert capfd.readouterr() == ("", "")  # Coal prints lines of its own for numbers that are not finite
+
+
+def test_meshes_that_are_no_proper_solids_are_noted(robot: Robot, tmp_path) -> None:
+    def noted(text: str) -> tuple[str, bool]:
+        file = tmp_path / "m.obj"
+        file.write_text(text)
+        room = Obstacle(name="m", mesh={"file": str(file), "scale": (6, 6, 6)}, position=(-3.0, -3.0, -3.0))
+        return mesh_note(room), CollisionChecker(robot, [room]).is_free(robot.home)
+
+    lines = [line.split() for line in CUBE_OBJ.splitlines()]
+    turned = "\n".join(" ".join(row if row[0] == "v" else [row[0], *row[:0:-1]]) for row in lines)
+    assert noted(CUBE_OBJ) == ("", False)
+    note, free = noted(turned)
+    assert "'m' (m.obj) is inside out" in note and not free
+    note, free = noted(CUBE_OBJ.replace("f 5 6 7\n", ""))
+    assert "'m' (m.obj) is not closed (3 open edges)" in note and not free
+    assert mesh_note(Obstacle(name="b", box=(1.0, 1.0, 1.0))) == ""
 
 
 def test_a_mesh_with_a_hole_is_checked_by_the_winding_number(robot: Robot, tmp_path) -> None:
