@@ -123,6 +123,7 @@ def plan(
         if how is not None:
             how.start(how.limits(robot.limits))  # whether it fits the robot
         ready = assemble(loaded, robot, seed=seed)
+        notes += ready.notes
         if how is not None:
             warm_up()
         times = {"setup": time.perf_counter() - started}

@@ -14,15 +14,17 @@ from typing import Any
 import numpy as np
 from ompl import base as ob
 
-from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError
+from apex_ompl.errors import FileFormatError, ParameterError
 from apex_ompl.scene.problem import Problem
 from apex_ompl.trajectory import Trajectory
+from apex_ompl.trajectory.checks import check_plan
 from apex_ompl.trajectory.files import MESSAGES, STATES
 from apex_ompl.trajopt.path import Path
 from apex_ompl.trajopt.spline import Spline
 from apex_ompl.types import Array
-from apex_ompl.util.files import BROKEN, suffix_of, write_atomically
-from apex_ompl.util.schema import dump_yaml, read_yaml, validate
+from apex_ompl.util.files import BROKEN, read_file, suffix_of, write_atomically
+from apex_ompl.util.schema import dump_yaml, read_yaml
+from apex_ompl.util.validation import finite_array
 
 SCHEMA = "apex-ompl/result/2"
 SUFFIXES = (*MESSAGES, ".npz", ".csv", ".json", ".yaml")
@@ -186,23 +188,29 @@ class PlanResult:
             raise FileFormatError(str(path), "schema", data.get("schema"), f"expected {SCHEMA!r}")
         data = {**dict.fromkeys(PROOF), "clearance_pair": ["", ""]} | data  # older files lack some
         try:
-            states = None if data["path"] is None else np.array(data["path"], dtype=float)
-            number = {k: float("nan") if data[k] is None else float(data[k]) for k in NUMBERS}
+            states = None if data["path"] is None else finite_array(data["path"], "path")
+            number = {k: float("nan") if data[k] is None else float(finite_array(data[k], k)) for k in NUMBERS}
             knots, names = data["trajectory"], tuple(data["joint_names"])
             arrays = {} if knots is None else {key: np.array(knots[key], dtype=float) for key in KNOTS}
-            motion = Trajectory(**arrays, joint_names=names) if arrays else None
-            if states is not None and (states.ndim != 2 or states.shape[1] != len(names)):
-                raise ValueError(f"a path of shape {states.shape} for {len(names)} joints")
-            return cls(
-                status=PlanStatus(data["status"]), reason=data["reason"], robot=data["robot"],
+            found = cls(
+                status=_status(data["status"]), reason=data["reason"], robot=data["robot"],
                 path=None if states is None else _path(states, data.get("spline")),
-                problem=validate(Problem, data["problem_file"], str(path)), planner=data["planner"],
-                joint_names=names, trajectory=motion, limit_use=dict(data["limit_use"]), seed=int(data["seed"]),
-                times=data["times"], checks=int(data["checks"]), solved_by=data["solved_by"],
-                notes=tuple(data["notes"]), clearance_pair=tuple(data["clearance_pair"]), **number,
+                problem=Problem.parse(data["problem_file"], str(path)), planner=data["planner"],
+                joint_names=names, trajectory=Trajectory(**arrays, joint_names=names) if arrays else None,
+                limit_use=_numbers(data["limit_use"], "limit_use"), seed=int(data["seed"]),
+                times=_numbers(data["times"], "times"),
+                checks=int(data["checks"]), solved_by=data["solved_by"], notes=tuple(data["notes"]),
+                clearance_pair=tuple(data["clearance_pair"]), **number,
             )  # fmt: skip
-        except (*BROKEN, ParameterError) as error:
+            check_plan(
+                found.problem, robot=found.robot, joint_names=names, status=str(found.status), path=states,
+                motion=found.trajectory,
+            )  # fmt: skip
+        except ParameterError as error:
+            raise FileFormatError(str(path), error.name, error.value, f"expected {error.expected}") from error
+        except (*BROKEN, AttributeError) as error:
             raise FileFormatError(str(path), "", str(error), "expected a complete saved result") from error
+        return found
 
     def _encoded(self, suffix: str) -> bytes:
         data = self.as_dict()
@@ -232,6 +240,17 @@ def _finite(value: float) -> float | None:
     return value if np.isfinite(value) else None
 
 
+def _status(name: object) -> PlanStatus:
+    if name not in list(PlanStatus):
+        raise ParameterError("status", name, f"one of {', '.join(PlanStatus)}")
+    return PlanStatus(str(name))
+
+
+def _numbers(given: Mapping[str, Any], name: str) -> dict[str, float]:
+    """Return finite numbers by name."""
+    return {str(key): float(finite_array(value, f"{name}.{key}")) for key, value in given.items()}
+
+
 def _spline_fields(path: Path) -> dict[str, Any] | None:
     """Return the spline of a path as plain data, or None for a polyline."""
     if path.spline is None or path.control is None:
@@ -243,20 +262,18 @@ def _path(states: Array, spline: dict[str, Any] | None) -> Path:
     """Return a path as it was saved."""
     if spline is None:
         return Path(states)
-    control = np.array(spline["control"], dtype=float)
+    control = finite_array(spline["control"], "spline.control")
     basis = Spline(len(control), int(spline["pinned"]), len(states), int(spline["degree"]))
     return Path(states, basis, control)
 
 
 def _read_npz(path: pathlib.Path) -> dict[str, Any]:
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        with np.load(io.BytesIO(read_file(path, "result file")), allow_pickle=False) as archive:
             data = json.loads(str(archive["result"]))
             if not isinstance(data, dict):
                 raise ValueError("no mapping")
             knots = {key: archive[key] for key in KNOTS} if KNOTS[0] in archive else None
             return data | {"path": archive["path"] if len(archive["path"]) else None, "trajectory": knots}
-    except FileNotFoundError as error:
-        raise MissingFileError(str(path), "result file") from error
     except (OSError, *BROKEN) as error:
         raise FileFormatError(str(path), "", str(error), "expected a saved result") from error

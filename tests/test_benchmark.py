@@ -232,6 +232,19 @@ def test_faulty_results_are_named(results: Results, tmp_path: Path) -> None:
     (tmp_path / "runs.jsonl").write_text("nonsense\n{}\n")
     with pytest.raises(FileFormatError, match="line 1: expected a run"):
         Results.load(tmp_path)
+    first, *others = results.runs
+    for name, value, words in (
+        ("status", 5, "line 1: status: expected text, got 5"), ("seed", "x", "seed: expected a whole number"),
+        ("length", [], "length: expected a number"), ("times", None, "times: expected a mapping, got None"),
+        ("solved", "yes", "solved: expected true or false"), ("properties", {"status ENUM": "x"}, "status of OMPL's"),
+    ):  # fmt: skip
+        runs = [{**first, name: value}, *others]
+        (tmp_path / "runs.jsonl").write_text("".join(json.dumps(run) + "\n" for run in runs))
+        with pytest.raises(FileFormatError, match=words):
+            Results.load(tmp_path)
+    (tmp_path / "about.json").write_text(json.dumps(results.about | {"sessions": 3}))
+    with pytest.raises(FileFormatError, match="sessions: expected a list, got 3"):
+        Results.load(tmp_path)
     (tmp_path / "about.json").unlink()
     with pytest.raises(FileFormatError, match="expected results of bench"):
         bench([LEVEL], ROWS, tmp_path, quiet=True)

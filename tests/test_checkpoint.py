@@ -91,6 +91,16 @@ def test_faulty_checkpoints_are_named(saved: Path, tmp_path: Path) -> None:
     other = _changed(saved, tmp_path / "key", modle={})
     with pytest.raises(FileFormatError, match="modle: unknown key, did you mean 'model'"):
         load_model(other)
+    model = json.loads((saved / "config.json").read_text())["model"]
+    for section, key, value, words in (
+        ("denoiser", "width", 8 * 10**8, "model.denoiser.width: input should be less than"),
+        ("denoiser", "width", 16_384, "expected weights that fit config.json"),
+        ("noise", "steps", 10**9, "model.noise.steps: input should be less than"),
+    ):
+        wide = {**model, section: {**model.get(section, {}), key: value}}
+        other = _changed(saved, tmp_path / f"{section}-{value}", model=wide)
+        with pytest.raises(FileFormatError, match=words):
+            load_model(other)
     (tmp_path / "key" / "config.json").write_text("[]")
     with pytest.raises(FileFormatError, match="expected the configuration of a checkpoint"):
         load_model(tmp_path / "key")

@@ -12,8 +12,10 @@ from scipy.spatial import ConvexHull
 from support import CUBE_OBJ, states_around_home
 
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.collision.containment import may_contain
+from apex_ompl.collision.containment import Extent
+from apex_ompl.collision.shapes import coal_geometry, convex_hull, hull_planes, mesh_note
 from apex_ompl.errors import FileFormatError
+from apex_ompl.kernel.compiled.triangle_mesh import encloses
 from apex_ompl.robot import Robot
 from apex_ompl.robot.model import link_of
 from apex_ompl.scene.bodies import AttachedObject, Obstacle
@@ -132,11 +134,68 @@ def test_winding_number_tells_inside_from_outside_of_a_convex_mesh(point: list[f
     assert winding == pytest.approx(1.0 if heights.max() < 0 else 0.0, abs=1e-6)
 
 
+def parse_obj(text: str) -> np.ndarray:
+    """Corners of the triangles of OBJ text, shape (T, 3, 3)."""
+    rows = [line.split() for line in text.splitlines()]
+    vertices = np.array([row[1:] for row in rows if row[0] == "v"], float)
+    return vertices[np.array([row[1:] for row in rows if row[0] == "f"], int) - 1]
+
+
+def enclosed(corners: np.ndarray, point: np.ndarray, watertight: bool) -> bool:
+    box = np.stack([corners.min(axis=(0, 1)), corners.max(axis=(0, 1))])
+    return bool(encloses(np.ascontiguousarray(corners), box, watertight, *point.tolist()))
+
+
+@settings(max_examples=80, deadline=None)
+@given(seed=st.integers(0, 10_000), hole=st.booleans(), inside_out=st.booleans())
+def test_compiled_containment_decides_as_the_winding_number_does(seed: int, hole: bool, inside_out: bool) -> None:
+    """Rays through corners and along faces among it: half of the points have coordinates of corners."""
+    rng = np.random.default_rng(seed)
+    corners = parse_obj(u_shape_obj(1.0))
+    if rng.random() < 0.5:
+        turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        corners = corners @ (turn * np.sign(np.linalg.det(turn))).T * rng.uniform(0.01, 10.0)
+    corners = corners[:, ::-1] if inside_out else corners
+    corners = np.delete(corners, rng.integers(len(corners)), axis=0) if hole else corners
+    low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
+    points = rng.uniform(low - 0.1, high + 0.1, (60, 3))
+    exact = rng.random(points.shape) < 0.5
+    points[exact] = corners.reshape(-1, 3)[rng.integers(3 * len(corners), size=60)][exact]
+    inside, surface = 0, surface_of(corners)
+    for point in points:
+        if distance_to(surface, point) < 1e-6:
+            continue  # on the surface nothing is promised
+        turns = abs(winding_number(point, corners))
+        if abs(turns - 0.5) < 1e-9:
+            continue  # in the plane of the hole, whose border is that of the solid
+        expected = turns > 0.5
+        assert enclosed(corners, point, watertight=False) == expected
+        assert hole or enclosed(corners, point, watertight=True) == expected
+        inside += expected
+    assert inside > 0 or hole
+
+
+def distance_to(surface: coal.BVHModelBase, point: np.ndarray) -> float:
+    at, request = coal.Transform3s(np.eye(3), point), coal.DistanceRequest()
+    ball, result = coal.Sphere(1e-9), coal.DistanceResult()
+    return coal.distance(surface, coal.Transform3s.Identity(), ball, at, request, result)
+
+
+def surface_of(corners: np.ndarray) -> coal.BVHModelBase:
+    surface = coal.BVHModelOBBRSS()
+    surface.beginModel(len(corners), 3 * len(corners))
+    surface.addVertices(corners.reshape(-1, 3))
+    surface.addTriangles(np.arange(3 * len(corners)).reshape(-1, 3))
+    surface.endModel()
+    return surface
+
+
 def test_sizes_that_cannot_fit_are_not_looked_at(robot: Robot) -> None:
     link = next(g.geometry for g in robot.geometry.geometryObjects if g.name.startswith("left_link5"))
-    assert may_contain(link, coal.Box(0.05, 0.05, 0.05))
-    assert not may_contain(link, coal.Box(0.4, 0.4, 0.4))
-    assert not may_contain(link, coal.Halfspace(np.array([0.0, 0.0, 1.0]), 0.0))
+    size = Extent.of(link)
+    assert size.may_contain(Extent.of(coal.Box(0.05, 0.05, 0.05)))
+    assert not size.may_contain(Extent.of(coal.Box(0.4, 0.4, 0.4)))
+    assert not size.may_contain(Extent.of(coal.Halfspace(np.array([0.0, 0.0, 1.0]), 0.0)))
 
 
 def test_meshes_in_stl_and_obj_collide_like_the_box_they_are(robot: Robot, tmp_path) -> None:
@@ -199,15 +258,34 @@ FLIPPED = CUBE_OBJ.replace("f 1 3 2", "f 1 2 3")
         (CUBE_OBJ.replace("v 1 1 1", "v nan 1 1"), "not finite"),
         (CUBE_OBJ.replace("v 1 1 1", "v 1e300 1 1"), "too far"),
         (FLIPPED, "oriented against each other"),
-        ("", "expected an STL or OBJ mesh"),
+        ("", "expected an STL or OBJ mesh .*, got 'an empty file'"),
+        ("hello\n", "expected an STL or OBJ mesh .*, got 'hello"),
     ],
 )
-def test_meshes_that_bound_no_solid_are_refused(robot: Robot, tmp_path, text: str, words: str) -> None:
+def test_meshes_that_bound_no_solid_are_refused(robot: Robot, tmp_path, capfd, text: str, words: str) -> None:
     """In Coal, flat and infinite ones end the process."""
     file = tmp_path / "m.obj"
     file.write_text(text)
     with pytest.raises(FileFormatError, match=words):
         CollisionChecker(robot, [Obstacle(name="m", mesh={"file": str(file)})])
+    assert capfd.readouterr() == ("", "")  # Coal prints lines of its own for numbers that are not finite
+
+
+def test_meshes_that_are_no_proper_solids_are_noted(robot: Robot, tmp_path) -> None:
+    def noted(text: str) -> tuple[str, bool]:
+        file = tmp_path / "m.obj"
+        file.write_text(text)
+        room = Obstacle(name="m", mesh={"file": str(file), "scale": (6, 6, 6)}, position=(-3.0, -3.0, -3.0))
+        return mesh_note(room), CollisionChecker(robot, [room]).is_free(robot.home)
+
+    lines = [line.split() for line in CUBE_OBJ.splitlines()]
+    turned = "\n".join(" ".join(row if row[0] == "v" else [row[0], *row[:0:-1]]) for row in lines)
+    assert noted(CUBE_OBJ) == ("", False)
+    note, free = noted(turned)
+    assert "'m' (m.obj) is inside out" in note and not free
+    note, free = noted(CUBE_OBJ.replace("f 5 6 7\n", ""))
+    assert "'m' (m.obj) is not closed (3 open edges)" in note and not free
+    assert mesh_note(Obstacle(name="b", box=(1.0, 1.0, 1.0))) == ""
 
 
 def test_a_mesh_with_a_hole_is_checked_by_the_winding_number(robot: Robot, tmp_path) -> None:
@@ -216,3 +294,27 @@ def test_a_mesh_with_a_hole_is_checked_by_the_winding_number(robot: Robot, tmp_p
     for position, free in (((-3.0, -3.0, -3.0), False), ((20.0, 0.0, 0.0), True)):
         room = Obstacle(name="room", mesh={"file": str(file), "scale": (6, 6, 6)}, position=position)
         assert CollisionChecker(robot, [room]).is_free(robot.home) == free
+
+
+def test_a_hull_of_too_many_neighbours_is_replaced_by_a_little_larger_one(robot: Robot, tmp_path) -> None:
+    """Two cones of 600 triangles at one base: Coal takes no vertex of a hull with more than 255 neighbours."""
+    count, file = 600, tmp_path / "cones.obj"
+    turn = 2.0 * np.pi * np.arange(count) / count
+    rim = np.stack([0.3 * np.cos(turn), 0.3 * np.sin(turn), 0.0 * turn], axis=1)
+    vertices = np.concatenate([rim, [[0.0, 0.0, 0.2], [0.0, 0.0, -0.2]]])
+    k = np.arange(count)
+    up = np.stack([k, (k + 1) % count, np.full(count, count)], axis=1)
+    down = np.stack([(k + 1) % count, k, np.full(count, count + 1)], axis=1)
+    lines = [f"v {x} {y} {z}" for x, y, z in vertices]
+    lines += [f"f {a} {b} {c}" for a, b, c in np.concatenate([up, down]) + 1]
+    file.write_text("\n".join(lines) + "\n")
+    obstacle = Obstacle(name="cones", mesh={"file": str(file)}, position=(0.0, 0.0, 3.0))
+    shape = coal_geometry(obstacle)
+    normals, offsets = hull_planes(convex_hull(shape))
+    assert (vertices @ normals.T <= offsets + 1e-9).all()
+    assert 1.0 <= convex_hull(shape).computeVolume() / (2.0 * np.pi * 0.3**2 * 0.2 / 3.0) < 1.02
+    checker = CollisionChecker(robot, [obstacle])
+    assert checker.is_free(robot.home)
+    checker.move("cones", tuple(robot.link_pose(robot.home, "left_link7")[:3, 3]))
+    assert not checker.is_free(robot.home)
+    assert coal_geometry(obstacle) is shape  # loaded once

@@ -66,6 +66,18 @@ def test_what_is_left_out_is_named(robot: Robot, tmp_path: Path) -> None:
         ("resource: rock.obj", "resource: gone.obj", ["gone.obj", "no such file"]),
         ("{resource: rock.obj, dimensions: [0.1, 0.1, 0.1]}", "{vertices: []}", ["meshes.0", "mesh by path"]),
         ("position: [0.1, 0, 0.2]", "position: [0.1, 0]", ["primitive_poses.1.position", "3 finite numbers"]),
+        (
+            "dimensions: [0.05]",
+            "dimensions: [.nan]",
+            ["primitives.1.dimensions.0", "expected a finite number, got nan"],
+        ),
+        ("dimensions: [0.05]", "dimensions: [-1.0]", ["collision_objects.0.sphere.radius", "greater than 0"]),
+        ("position: [0.2]", "position: [.nan]", ["joint_state.position.0", "expected a finite number, got nan"]),
+        ("position: [0.2]", "position: 0.2", ["joint_state.position", "expected a list, got 0.2"]),
+        (SCENE[SCENE.index("world:") :], "world: [1]", ["world", "expected a mapping of keys to values, got [1]"]),
+        ("header: {frame_id: base_link}", "header: base_link", ["collision_objects.0.header", "expected a mapping"]),
+        ("- {type: box, dimensions: [0.4, 0.1, 0.2]}", "- box", ["primitives.0", "expected a mapping", "'box'"]),
+        ("resource: rock.obj, dimensions: [0.1, 0.1, 0.1]", "resource: rock.obj, scale: big", ["meshes.0.scale"]),
         ("position: [0.2]", "position: []", ["robot_state.joint_state", "expected 1 positions"]),
     ],
 )
@@ -77,6 +89,18 @@ def test_what_matters_and_cannot_be_read_is_an_error(
         converted(tmp_path, robot, scene=SCENE.replace(old, new))
     for word in words:
         assert word in str(caught.value)
+
+
+def test_goals_of_the_wrong_form_are_errors(robot: Robot, tmp_path: Path) -> None:
+    head = REQUEST.split("goal_constraints")[0] + "goal_constraints: "
+    for goals, words in (
+        ("{a: 1}", "goal_constraints: expected a list"),
+        ("[1]", "goal_constraints.0: expected a mapping"),
+        ("[{joint_constraints: [{joint_name: left_joint1, position: .inf}]}]", "0.position: expected a finite number"),
+        ("[{joint_constraints: [{joint_name: left_joint1}]}]", "0.position: expected a finite number, got None"),
+    ):
+        with pytest.raises(FileFormatError, match=words):
+            converted(tmp_path, robot, request=head + goals)
 
 
 @pytest.mark.parametrize(

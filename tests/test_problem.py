@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import os
 import pickle
 from pathlib import Path
 
@@ -170,6 +171,10 @@ def test_missing_and_unreadable_files(tmp_path: Path) -> None:
         Problem.load(tmp_path / "gone.yaml")
     with pytest.raises(MissingFileError, match="directory"):
         Problem.load(tmp_path)
+    os.mkfifo(tmp_path / "pipe.yaml")
+    for pipe in (tmp_path / "pipe.yaml", Path("/dev/zero")):
+        with pytest.raises(MissingFileError, match="is a pipe or a device, expected a regular file"):
+            Problem.load(pipe)
     for name in ("x\0y.yaml", "n" * 300 + ".yaml"):
         with pytest.raises(MissingFileError):
             Problem.load(tmp_path / name)
@@ -234,3 +239,16 @@ def test_deep_nesting_is_a_fault_and_no_crash(levels: int, opening: str) -> None
 def test_errors_pass_between_processes(error: errors.ApexError) -> None:
     again = pickle.loads(pickle.dumps(error))
     assert type(again) is type(error) and str(again) == str(error) and vars(again) == vars(error)
+
+
+def test_faults_in_joint_names_name_the_file(problem: Problem, tmp_path: Path) -> None:
+    file = tmp_path / "named.yaml"
+    problem.save(file)
+    loaded = Problem.load(file)
+    assert loaded == problem and loaded.source == str(file)
+    with pytest.raises(FileFormatError, match=r"named.yaml: start: joint 'elbow' is missing"):
+        loaded.start_state([*problem.start, "elbow"])
+    with pytest.raises(FileFormatError, match=r"named.yaml: goal.joints: joint 'elbow' is missing"):
+        loaded.model_copy(update={"scene": ()}).goal_states([*problem.start, "elbow"])
+    with pytest.raises(FileFormatError, match=f"^{problem.name}: start: "):
+        problem.start_state(["elbow"])

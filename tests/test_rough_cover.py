@@ -11,10 +11,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support import ROOT
 
+from apex_ompl.collision.cover.boxes import bounding_boxes
 from apex_ompl.collision.cover.proof import Cover
 from apex_ompl.collision.cover.rough import rough_cover
 from apex_ompl.collision.tabulate import primitives
-from apex_ompl.scene.meshes import bounding_boxes, capped, triangles, winding_number
+from apex_ompl.scene.meshes import capped, triangles, winding_number
 
 MESHES = sorted((ROOT / "problems" / "data").glob("*.obj"))
 

@@ -35,4 +35,6 @@ def run(parsed: argparse.Namespace) -> int:
     for k, fault in enumerate(goal_faults):
         label = "goal" if len(goal_faults) == 1 else f"goal {k}"
         print(f"  {label:<10} {fault or 'free'}{note}")
+    for text in setup.notes:
+        print(f"  note       {text}")
     return 3 if setup.start_fault or all(goal_faults) else 0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 from weakref import WeakKeyDictionary
@@ -13,7 +13,7 @@ import coal
 import numpy as np
 import pinocchio as pin
 
-from apex_ompl.collision.containment import ANCHOR_RADIUS, EnclosingMesh, anchor_points, may_contain
+from apex_ompl.collision.containment import ANCHOR_RADIUS, EnclosingMesh, Extent, anchor_points
 from apex_ompl.collision.distance import HullDistances
 from apex_ompl.collision.shapes import is_shell
 from apex_ompl.robot import Robot
@@ -58,8 +58,8 @@ def exact_requests(data: pin.GeometryData) -> pin.GeometryData:
     return data
 
 
-_enclosing_links: WeakKeyDictionary[Robot, dict[int, EnclosingMesh]] = WeakKeyDictionary()
-"""Robot -> geometry of a link -> its analysed mesh, kept between scenes."""
+_links: WeakKeyDictionary[Robot, list[coal.CollisionGeometry]] = WeakKeyDictionary()
+"""Geometries of a robot's links, kept between scenes with what was computed of them."""
 
 
 class CompiledScene:
@@ -110,14 +110,21 @@ class CompiledScene:
         self.offsets: dict[int, pin.SE3] = {}  # proxy geometry -> its pose in the frame of the original
         self.hollow: list[tuple[int, int, EnclosingMesh, pin.SE3]] = []
         self._add_containment()
+        if self.hollow:
+            self._posed, places = np.unique([entry[:2] for entry in self.hollow], return_inverse=True)
+            self._outer, self._inner = places.reshape(-1, 2).T
+            self._anchors = np.array([offset.translation for _, _, _, offset in self.hollow])
+            self._boxes = np.array([mesh.box for _, _, mesh, _ in self.hollow])
+            self.hollow[0][2].contains(np.zeros(3))  # compiles or loads the test
         self.geometry_data, self.manager = self._broadphase(self.geometry)
-        self.second = self._second_stage()
         self.lock = threading.Lock()
         self._distances: dict[str, HullDistances] = {}
         self._checks: dict[tuple[int, int], list[int]] = {}
         for k, pair in enumerate(self.geometry.collisionPairs):
             self._checks.setdefault(self._key(self.same[pair.first], self.same[pair.second]), []).append(k)
-        self._hollow_pairs = {self._key(h, g) for h, g, _, _ in self.hollow}
+        self._hollow_of: dict[tuple[int, int], list[int]] = {}
+        for k, (h, g, _, _) in enumerate(self.hollow):
+            self._hollow_of.setdefault(self._key(h, g), []).append(k)
 
     @staticmethod
     def _key(a: int, b: int) -> tuple[int, int]:
@@ -148,27 +155,25 @@ class CompiledScene:
         A convex mesh is tested by collision of its hull with anchor points of the inner solid. A mesh that is not
         convex is added to ``hollow``, to be tested by winding numbers.
         """
-        items = self.geometry.geometryObjects
-        links = _enclosing_links.setdefault(self._robot, {})
-        enclosing = dict(links)
+        items = list(self.geometry.geometryObjects)
+        links = _links.setdefault(self._robot, [item.geometry for item in items[: self.links]])
+        shapes = [*links, *(item.geometry for item in items[self.links :])]
+        extents = [Extent.of(shape) for shape in shapes]
         hulls: dict[int, int] = {}
         anchors: dict[int, list[int]] = {}
         for a, b in self.pairs:
             if a < self.links and b < self.links:
                 continue
             for h, g in ((a, b), (b, a)):
-                if not is_shell(items[h].geometry) or not may_contain(items[h].geometry, items[g].geometry):
+                if not is_shell(shapes[h]) or not extents[h].may_contain(extents[g]):
                     continue
-                if h not in enclosing:
-                    enclosing[h] = EnclosingMesh.of(items[h].geometry)
-                    if h < self.links:
-                        links[h] = enclosing[h]
-                points = [pin.SE3(np.eye(3), point) for point in anchor_points(items[g].geometry)]
-                if not enclosing[h].convex:
-                    self.hollow += [(h, g, enclosing[h], point) for point in points]
+                mesh = EnclosingMesh.of(shapes[h])
+                points = [pin.SE3(np.eye(3), point) for point in anchor_points(shapes[g])]
+                if not mesh.convex:
+                    self.hollow += [(h, g, mesh, point) for point in points]
                     continue
                 if h not in hulls:
-                    hulls[h] = self._add_proxy(h, pin.SE3.Identity(), enclosing[h].hull)
+                    hulls[h] = self._add_proxy(h, pin.SE3.Identity(), mesh.hull)
                 if g not in anchors:
                     anchors[g] = [self._add_proxy(g, point, coal.Sphere(ANCHOR_RADIUS)) for point in points]
                 for anchor in anchors[g]:
@@ -188,21 +193,6 @@ class CompiledScene:
         data = exact_requests(geometry.createData())
         return data, Manager(self.model, geometry, data)
 
-    def _second_stage(self) -> Any:
-        """Return a broadphase over the hulls of hollow meshes and anchor points; its hits need an exact test."""
-        if not self.hollow:
-            return None
-        geometry = pin.GeometryModel()
-        items = self.geometry.geometryObjects
-        for k, (h, g, mesh, offset) in enumerate(self.hollow):
-            a, b = items[h], items[g]
-            point = coal.Sphere(ANCHOR_RADIUS)
-            hull = pin.GeometryObject(f"hull{k}", a.parentJoint, a.parentFrame, a.placement, mesh.hull)
-            anchor = pin.GeometryObject(f"point{k}", b.parentJoint, b.parentFrame, b.placement * offset, point)
-            pair = [geometry.addGeometryObject(item) for item in (hull, anchor)]
-            geometry.addCollisionPair(pin.CollisionPair(*pair))
-        return geometry, *self._broadphase(geometry)
-
     def place(self, name: str, placement: pin.SE3) -> None:
         """Move one obstacle."""
         index = self.scene[name]
@@ -211,11 +201,6 @@ class CompiledScene:
         for number, offset in self.offsets.items():
             if self.same[number] == index:
                 items[number].placement = placement * offset
-        for k, (h, g, _, offset) in enumerate(self.hollow):
-            if h == index:
-                self.second[0].geometryObjects[2 * k].placement = placement
-            if g == index:
-                self.second[0].geometryObjects[2 * k + 1].placement = placement * offset
         self._distances.clear()
 
     def collides(self, q: Array) -> bool:
@@ -223,34 +208,36 @@ class CompiledScene:
         with self.lock:
             if pin.computeCollisions(self.model, self.data, self.manager, q, True):
                 return True
-        return self.second is not None and bool(self._contained(q))
+            return bool(self.hollow) and any(True for _ in self._contained())
 
     def any_collides(self, q: Array, pairs: Iterable[tuple[int, int]]) -> bool:
         """Whether any of the given pairs of geometries overlaps at a state in Pinocchio's order."""
-        hollow = False
         with self.lock:
             pin.updateGeometryPlacements(self.model, self.data, self.geometry, self.geometry_data, q)
-            for a, b in pairs:
-                key = self._key(a, b)
-                hollow = hollow or key in self._hollow_pairs
-                for k in self._checks[key]:
-                    if pin.computeCollision(self.geometry, self.geometry_data, k):
-                        return True
-        return hollow and bool(self._contained(q))
+            keys = [self._key(a, b) for a, b in pairs]
+            checks = (k for key in keys for k in self._checks[key])
+            if any(pin.computeCollision(self.geometry, self.geometry_data, k) for k in checks):
+                return True
+            return any(self._inside(k) for key in keys for k in self._hollow_of.get(key, ()))
 
-    def _contained(self, q: Array) -> list[tuple[int, int]]:
-        """Return the pairs of a hollow mesh and a geometry entirely inside it."""
-        geometry, data, manager = self.second
-        with self.lock:
-            if not pin.computeCollisions(self.model, self.data, manager, q, True):
-                return []
-            found = []
-            for k, (h, g, mesh, _) in enumerate(self.hollow):
-                if pin.computeCollision(geometry, data, k):
-                    point = data.oMg[2 * k].actInv(data.oMg[2 * k + 1].translation)
-                    if mesh.contains(point):
-                        found.append((h, g))
-            return found
+    def _inside(self, k: int) -> bool:
+        """Whether the anchor point of a containment test is inside, at the current placements of the geometries."""
+        h, g, mesh, offset = self.hollow[k]
+        placements = self.geometry_data.oMg
+        return mesh.contains(placements[h].actInv(placements[g].act(offset.translation)))
+
+    def _contained(self) -> Iterator[tuple[int, int]]:
+        """Yield the pairs of a hollow mesh and a geometry entirely inside it, at the current placements."""
+        placements = self.geometry_data.oMg
+        poses = np.array([placements[i].homogeneous for i in self._posed.tolist()])
+        outer, inner = poses[self._outer], poses[self._inner]
+        world = (inner[:, :3, :3] @ self._anchors[:, :, None])[:, :, 0] + inner[:, :3, 3]
+        points = ((world - outer[:, :3, 3])[:, None] @ outer[:, :3, :3])[:, 0]
+        near = ((points >= self._boxes[:, 0]) & (points <= self._boxes[:, 1])).all(axis=1)
+        for k in np.flatnonzero(near).tolist():
+            h, g, mesh, _ = self.hollow[k]
+            if mesh.contains(points[k]):
+                yield h, g
 
     def contacts(self, q: Array) -> list[Contact]:
         """Return all overlaps at a state in Pinocchio's order, the deepest first."""
@@ -261,8 +248,7 @@ class CompiledScene:
                 for p, result in zip(self.geometry.collisionPairs, self.geometry_data.collisionResults, strict=True)
                 if result.isCollision()
             ]
-        if self.second is not None:
-            hits += self._contained(q)
+            hits += list(self._contained()) if self.hollow else []
         deepest: dict[tuple[str, str], float] = {}
         for first, second in hits:
             pair = (first, second) if first < second else (second, first)

@@ -13,12 +13,15 @@ from dataclasses import dataclass
 import coal
 import numpy as np
 
-from apex_ompl.collision.shapes import convex_hull, is_shell
-from apex_ompl.scene.meshes import capped, is_closed, piece_points, triangles, winding_number
+from apex_ompl.collision.shapes import convex_hull, hull_corners, hull_planes, is_shell
+from apex_ompl.kernel.compiled.triangle_mesh import encloses
+from apex_ompl.scene.meshes import capped, is_closed, is_watertight, piece_points, triangles
 from apex_ompl.types import Array
+from apex_ompl.util.weak_cache import weakly_cached
 
 ANCHOR_RADIUS = 1e-6  # [m]
 CONVEX_TOLERANCE = 5e-4  # a mesh is convex when its triangles' centres are no deeper than this below its hull [m]
+MOST_DEPTHS = 2**22  # of triangles below faces of the hull; a mesh of more counts as not convex
 
 
 @dataclass(frozen=True)
@@ -34,29 +37,26 @@ class EnclosingMesh:
         convex: Whether the hull represents the solid.
         corners: Corners of the triangles, shape (T, 3, 3) [m], with holes closed by
             :func:`apex_ompl.scene.meshes.capped`.
+        watertight: Whether its winding numbers are whole numbers.
+        box: Bounding box, shape (2, 3) [m].
     """
 
     hull: coal.CollisionGeometry
     convex: bool
     corners: Array
+    watertight: bool
+    box: Array
 
-    @classmethod
-    def of(cls, mesh: coal.BVHModelBase) -> EnclosingMesh:
-        """Analyse a mesh."""
+    @staticmethod
+    @weakly_cached
+    def of(mesh: coal.BVHModelBase) -> EnclosingMesh:
+        """Analyse a mesh; the analysis is kept as long as the mesh."""
         hull = convex_hull(mesh)
         vertices, faces = triangles(mesh)
-        outside = hull_corners(hull)
-        normals = np.cross(outside[:, 1] - outside[:, 0], outside[:, 2] - outside[:, 0])
-        long = np.linalg.norm(normals, axis=1)
-        sound = long > 1e-14
-        normals = normals[sound] / long[sound, None]
-        offsets = np.einsum("ij,ij->i", normals, outside[sound, 0])
-        middle = outside.mean(axis=(0, 1))
-        normals, offsets = (
-            v * np.sign(offsets - normals @ middle)[(...,) + (None,) * (v.ndim - 1)] for v in (normals, offsets)
-        )
-        depth = (offsets - vertices[faces].mean(axis=1) @ normals.T).min(axis=1)
-        return cls(hull, is_closed(vertices, faces) and float(depth.max()) <= CONVEX_TOLERANCE, capped(vertices, faces))
+        corners = np.ascontiguousarray(capped(vertices, faces))
+        convex = is_closed(vertices, faces) and _is_convex(vertices[faces].mean(axis=1), hull)
+        box = np.stack([corners.min(axis=(0, 1)), corners.max(axis=(0, 1))])
+        return EnclosingMesh(hull, convex, corners, is_watertight(corners), box)
 
     @property
     def boundary(self) -> Array:
@@ -65,29 +65,52 @@ class EnclosingMesh:
 
     def contains(self, point: Array) -> bool:
         """Whether a point in the mesh's frame, not on its surface, lies in the solid."""
-        return abs(winding_number(point, self.corners)) > 0.5
+        x, y, z = point.tolist()
+        return bool(encloses(self.corners, self.box, self.watertight, x, y, z))
 
 
-def hull_corners(hull: coal.ConvexBase32) -> Array:
-    """Return the corners of the triangles of a convex hull, shape (T, 3, 3) [m]."""
-    points = np.array(hull.points())
-    rows = [hull.polygons(k) for k in range(hull.num_polygons)]
-    corners: Array = points[np.array([[row[0], row[1], row[2]] for row in rows])]
-    return corners
-
-
-def may_contain(outer: coal.BVHModelBase, inner: coal.CollisionGeometry) -> bool:
-    """Whether ``inner`` may fit into ``outer``, by a bound on the inscribed radius and by the volume."""
-    if inner.getNodeType() == coal.GEOM_HALFSPACE:
+def _is_convex(centres: Array, hull: coal.Convex) -> bool:
+    """Whether no centre of a triangle, shape (T, 3) [m], is deeper below a hull than ``CONVEX_TOLERANCE``."""
+    if len(centres) * hull.num_polygons > MOST_DEPTHS:
         return False
-    hull = convex_hull(outer)
-    outer.computeLocalAABB()
-    box = outer.aabb_local
-    widest_ball = 0.5 * min(box.width(), box.height(), box.depth())
-    volume = convex_hull(inner).computeVolume() if is_shell(inner) else inner.computeVolume()
-    return _inscribed_radius(inner) <= widest_ball and (is_shell(inner) or volume <= hull.computeVolume())
+    normals, offsets = hull_planes(hull)
+    depths = offsets[:, None] - normals @ centres.T
+    return float(depths.min(axis=0).max()) <= CONVEX_TOLERANCE
 
 
+@dataclass(frozen=True)
+class Extent:
+    """Sizes of a solid, by which it is seen that it does not fit into another.
+
+    Attributes:
+        inscribed: Lower bound of the radius of the largest ball inside, infinite for a half-space [m].
+        widest: Upper bound of it, by the bounding box [m].
+        volume: Volume that another solid must have to contain this one, 0 where it is not known [m^3].
+        room: Volume of the convex hull [m^3].
+    """
+
+    inscribed: float
+    widest: float
+    volume: float
+    room: float
+
+    @staticmethod
+    @weakly_cached
+    def of(geometry: coal.CollisionGeometry) -> Extent:
+        """Measure a geometry."""
+        if geometry.getNodeType() == coal.GEOM_HALFSPACE:
+            return Extent(np.inf, np.inf, np.inf, np.inf)
+        geometry.computeLocalAABB()
+        box = geometry.aabb_local
+        widest, room = 0.5 * min(box.width(), box.height(), box.depth()), convex_hull(geometry).computeVolume()
+        return Extent(_inscribed_radius(geometry), widest, 0.0 if is_shell(geometry) else room, room)
+
+    def may_contain(self, inner: Extent) -> bool:
+        """Whether the sizes allow that another solid lies inside this one."""
+        return inner.inscribed <= self.widest and inner.volume <= self.room
+
+
+@weakly_cached
 def anchor_points(geometry: coal.CollisionGeometry) -> Array:
     """Return one point of each connected piece of a solid, in its own frame, shape (pieces, 3) [m]."""
     return piece_points(*triangles(geometry)) if is_shell(geometry) else np.zeros((1, 3))

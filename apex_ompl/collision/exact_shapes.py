@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -10,20 +9,16 @@ import coal
 import numpy as np
 from numpy.typing import NDArray
 
-from apex_ompl.collision.containment import hull_corners
-from apex_ompl.collision.cover.spheres import shape_key
-from apex_ompl.collision.shapes import convex_hull, is_shell
+from apex_ompl.collision.shapes import convex_hull, hull_planes, is_shell
 from apex_ompl.kernel.compiled.arrays import BOX, CAPSULE, CYLINDER, HALF_SPACE, SPHERE
 from apex_ompl.kernel.compiled.layout import Floats, Integers, pack
 from apex_ompl.kernel.compiled.shapes import HULL, ShapeArrays
 from apex_ompl.scene.meshes import triangles
 from apex_ompl.types import Array
+from apex_ompl.util.weak_cache import weakly_cached
 
 CONVEX_TOLERANCE = 1e-7  # a mesh is its hull when its triangles' centres are no deeper than this below it [m]
-MOST_MESHES = 256  # that are kept
 CELLS = 1 << 10  # along each axis, by which triangles are sorted
-
-_meshes: OrderedDict[str, Mesh] = OrderedDict()  # by shape key
 
 
 class Mesh(NamedTuple):
@@ -65,12 +60,9 @@ def has_mesh(geometry: coal.CollisionGeometry) -> bool:
     return _kind(geometry) == HULL
 
 
+@weakly_cached
 def mesh_of(geometry: coal.CollisionGeometry) -> Mesh:
     """Return the hull of a mesh or of a convex body, with a tree over its triangles where it is not convex."""
-    key = shape_key(geometry)
-    if key in _meshes:
-        _meshes.move_to_end(key)
-        return _meshes[key]
     hull = convex_hull(geometry)
     mesh = Mesh(np.array(hull.points()), np.empty((0, 3, 3)), np.empty((0, 4)), *(np.empty(0, np.int64),) * 2)
     if is_shell(geometry):
@@ -79,22 +71,13 @@ def mesh_of(geometry: coal.CollisionGeometry) -> Mesh:
         if _depth(hull, corners) > CONVEX_TOLERANCE:
             corners = corners[_morton_order(corners.mean(axis=1))]
             mesh = Mesh(mesh.points, corners, *ball_tree(corners))
-    while len(_meshes) >= MOST_MESHES:
-        _meshes.popitem(last=False)
-    _meshes[key] = mesh
     return mesh
 
 
 def _depth(hull: coal.CollisionGeometry, corners: Array) -> float:
     """Return the largest depth of a triangle's centre below the faces of a hull [m]."""
-    outside, depth = hull_corners(hull), 0.0
-    normals = np.cross(outside[:, 1] - outside[:, 0], outside[:, 2] - outside[:, 0])
-    long = np.linalg.norm(normals, axis=1)
-    sound = long > 1e-14
-    normals = normals[sound] / long[sound, None]
-    offsets = np.einsum("ij,ij->i", normals, outside[sound, 0])
-    turned = np.sign(offsets - normals @ outside.mean(axis=(0, 1)))
-    normals, offsets = normals * turned[:, None], offsets * turned
+    normals, offsets = hull_planes(hull)
+    depth = 0.0
     for first in range(0, len(corners), 1000):
         centres = corners[first : first + 1000].mean(axis=1)
         depth = max(depth, float((offsets - centres @ normals.T).min(axis=1).max()))

@@ -9,6 +9,7 @@ import numpy as np
 import pinocchio as pin
 
 from apex_ompl.collision.containment import EnclosingMesh
+from apex_ompl.collision.cover.boxes import bounding_boxes
 from apex_ompl.collision.cover.proof import Cover
 from apex_ompl.errors import RobotError
 from apex_ompl.kernel.compiled.arrays import BOX, CAPSULE, CYLINDER, HALF_SPACE, PRISMATIC, REVOLUTE, SPHERE
@@ -17,8 +18,8 @@ from apex_ompl.kernel.robot_specs import BodySpec, JointSpec
 from apex_ompl.kernel.scene_builder import Primitive, scene_tables
 from apex_ompl.kernel.tables import RobotTables, SceneTables
 from apex_ompl.robot import Robot
-from apex_ompl.scene.meshes import bounding_boxes
 from apex_ompl.types import Array
+from apex_ompl.util.weak_cache import weakly_cached
 
 PROBE = 1e-3  # value of a planned joint at which axes and ratios are measured: no joint turns by half a turn or more
 CHECKS = (0.37, -1.13, 2.71)  # values at which they are checked, besides the limits
@@ -130,6 +131,7 @@ def primitives(shape: coal.CollisionGeometry, pose: Array, boxes: Array | None =
     return found
 
 
+@weakly_cached
 def mesh_boxes(mesh: coal.BVHModelBase) -> Array:
     """Return boxes in the mesh's frame that together contain its solid, shape (boxes, 2, 3) [m]."""
     return bounding_boxes(EnclosingMesh.of(mesh).boundary)

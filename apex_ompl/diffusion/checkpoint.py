@@ -22,7 +22,7 @@ from safetensors.torch import save as save_tensors
 from apex_ompl.diffusion.model import LatentDiffusion, ModelConfig
 from apex_ompl.diffusion.proposals import TrajectoryModel
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError, UnknownNameError
-from apex_ompl.util.files import is_file
+from apex_ompl.util.files import BROKEN, is_file, read_file, read_text
 from apex_ompl.util.schema import StrictModel, validate
 
 SCHEMA = "apex-ompl/model/1"
@@ -146,7 +146,7 @@ def load_model(
     for file in (CONFIG, WEIGHTS):
         if not is_file(folder / file):
             raise MissingFileError(str(folder / file), "file of a checkpoint")
-    config, weights = read_config(folder), (folder / WEIGHTS).read_bytes()
+    config, weights = read_config(folder), read_file(folder / WEIGHTS, "file of a checkpoint")
     source = str(folder / WEIGHTS)
     if robot is not None and config.model.robot != robot:
         raise FileFormatError(str(folder / CONFIG), "model.robot", config.model.robot, f"expected {robot!r}")
@@ -157,10 +157,7 @@ def load_model(
         tensors = load_tensors(weights)
     except (SafetensorError, ValueError) as error:
         raise FileFormatError(source, "", str(error), "expected safetensors") from error
-    with torch.random.fork_rng(devices=[]):
-        network = LatentDiffusion(config.model)
-    state = network.state_dict()
-    wanted = {key: tuple(value.shape) for key, value in state.items()}
+    wanted = _shapes(config.model, folder)
     shapes = {key: tuple(value.shape) for key, value in tensors.items()}
     wrong = sorted(set(wanted.items()) ^ set(shapes.items()))
     if wrong:
@@ -169,12 +166,29 @@ def load_model(
     for key, tensor in tensors.items():
         if not torch.isfinite(tensor).all():
             raise FileFormatError(source, key, "numbers that are not finite", "expected finite weights")
+    with torch.random.fork_rng(devices=[]):
+        network = LatentDiffusion(config.model)
+    state = network.state_dict()
     network.load_state_dict({key: tensor.to(state[key].dtype) for key, tensor in tensors.items()})
     try:
         network.to(device)
     except (RuntimeError, AssertionError) as error:
         raise ParameterError("device", str(device), "a device of torch's that is there") from error
     return TrajectoryModel(network, config.trained)
+
+
+def _shapes(config: ModelConfig, folder: Path) -> dict[str, tuple[int, ...]]:
+    """Return the shapes of a model's weights, without memory for them.
+
+    Raises:
+        FileFormatError: There is no such model.
+    """
+    try:
+        with torch.device("meta"):
+            return {key: tuple(value.shape) for key, value in LatentDiffusion(config).state_dict().items()}
+    except (*BROKEN, ParameterError) as error:
+        expected = "expected the configuration of a model that can be made"
+        raise FileFormatError(str(folder / CONFIG), "model", str(error), expected) from error
 
 
 def shared_model(name: str | os.PathLike[str], *, device: str = "cpu", robot: str | None = None) -> TrajectoryModel:
@@ -207,10 +221,10 @@ def read_config(folder: Path) -> CheckpointConfig:
     """
     path = folder / CONFIG
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
+        data = json.loads(read_text(path, "file of a checkpoint"))
         if not isinstance(data, dict):
             raise ValueError
-    except (OSError, ValueError) as error:
+    except (ValueError, RecursionError) as error:
         raise FileFormatError(
             str(path), "", type(error).__name__, "expected the configuration of a checkpoint"
         ) from error

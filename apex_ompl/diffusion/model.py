@@ -19,15 +19,16 @@ from apex_ompl.trajopt.spline import Spline
 from apex_ompl.util.schema import StrictModel
 
 Count = Annotated[int, Field(ge=1)]
+Size = Annotated[int, Field(ge=1, le=16_384)]  # of layers and inputs; larger ones would exhaust the memory
 
 
 class SplineConfig(StrictModel):
     """The spline of the control points, see ``apex_ompl.trajopt.spline.Spline``."""
 
-    points: Count = 14
-    pinned: Count = 1
-    states: Count = 256
-    degree: Count = 5
+    points: Size = 14
+    pinned: Size = 1
+    states: Size = 256
+    degree: Size = 5
 
 
 class LatentConfig(StrictModel):
@@ -43,9 +44,9 @@ class LatentConfig(StrictModel):
     """
 
     kind: Literal["linear", "variational"] = "linear"
-    dim: Count = 64
-    channels: Count = 8
-    width: Annotated[int, Field(ge=8, multiple_of=8)] = 64
+    dim: Size = 64
+    channels: Size = 8
+    width: Annotated[Size, Field(ge=8, multiple_of=8)] = 64
     halvings: Annotated[int, Field(ge=1, le=6)] = 4
 
 
@@ -62,9 +63,9 @@ class ConditionConfig(StrictModel):
 
     scene: Literal["none", "set", "distances"] = "distances"
     point: bool = False
-    width: Count = 256
-    out: Count = 512
-    along: Annotated[int, Field(ge=2)] = 7
+    width: Size = 256
+    out: Size = 512
+    along: Annotated[Size, Field(ge=2)] = 7
 
 
 class DenoiserConfig(StrictModel):
@@ -78,9 +79,9 @@ class DenoiserConfig(StrictModel):
     """
 
     kind: Literal["mlp", "unet", "regression"] = "mlp"
-    width: Annotated[int, Field(ge=8, multiple_of=8)] = 768
-    blocks: Count = 4
-    multipliers: Annotated[tuple[Count, ...], Field(min_length=1, max_length=5)] = (1, 2, 4)
+    width: Annotated[Size, Field(ge=8, multiple_of=8)] = 768
+    blocks: Size = 4
+    multipliers: Annotated[tuple[Size, ...], Field(min_length=1, max_length=5)] = (1, 2, 4)
 
 
 class NoiseConfig(StrictModel):
@@ -94,7 +95,7 @@ class NoiseConfig(StrictModel):
             many obstacles have large components.
     """
 
-    steps: Count = 256
+    steps: Size = 256
     schedule: Literal["cosine", "linear"] = "cosine"
     prediction: Literal["noise", "velocity", "clean"] = "velocity"
     most: Annotated[float, Field(gt=0)] | None = None
@@ -104,7 +105,7 @@ class SamplingConfig(StrictModel):
     """Default sampling of the model, see ``apex_ompl.diffusion.proposals.Sampling``."""
 
     sampler: Literal["ddpm", "ddim", "dpm_solver"] = "ddim"
-    steps: Count = 2
+    steps: Size = 2
 
 
 class ModelConfig(StrictModel):
@@ -124,7 +125,7 @@ class ModelConfig(StrictModel):
 
     robot: str
     joints: Annotated[tuple[str, ...], Field(min_length=1)]
-    probes: Count
+    probes: Size
     spline: SplineConfig = SplineConfig()
     latent: LatentConfig = LatentConfig()
     condition: ConditionConfig = ConditionConfig()

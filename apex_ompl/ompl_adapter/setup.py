@@ -9,6 +9,7 @@ from ompl import base as ob
 from ompl import geometric as og
 
 from apex_ompl.collision import CollisionChecker
+from apex_ompl.collision.shapes import mesh_note
 from apex_ompl.ompl_adapter.space import state_space, to_state
 from apex_ompl.ompl_adapter.validity import MotionCheck, MotionValidator, StateValidityChecker
 from apex_ompl.robot import Robot, load_robot
@@ -39,6 +40,7 @@ class PlanningSetup:
         goal_faults: Why each goal is invalid, or empty; invalid ones are not given to OMPL unless all are. For an
             alignment that was not reached, why.
         alignment: The alignment goal, or None.
+        notes: Sentences on meshes that are no proper solids as they are, and how they are taken.
     """
 
     problem: Problem
@@ -53,6 +55,7 @@ class PlanningSetup:
     start_fault: str
     goal_faults: tuple[str, ...]
     alignment: AlignmentGoal | None
+    notes: tuple[str, ...]
 
     def raise_faults(self) -> None:
         """Raise what the checkers kept inside of OMPL's callbacks, Ctrl-C among it."""
@@ -113,6 +116,7 @@ def assemble(problem: Problem, robot: Robot | None = None, seed: int = 0) -> Pla
         start_fault,
         goal_faults,
         alignment,
+        tuple(filter(None, map(mesh_note, (*problem.scene, *problem.attached)))),
     )
 
 

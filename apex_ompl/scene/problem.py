@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import BeforeValidator, Field, PositiveFloat, Strict, field_validator, model_validator
+from pydantic import BeforeValidator, Field, PositiveFloat, PrivateAttr, Strict, field_validator, model_validator
 
 from apex_ompl.errors import FileFormatError, nearest_name
 from apex_ompl.scene.bodies import AttachedObject, Name, Obstacle, Vector, located
@@ -148,6 +148,19 @@ class Problem(StrictModel):
             raise ValueError(f"the name {twice[0]!r} is given to more than one object")
         return self
 
+    _file: str = PrivateAttr("")
+
+    def __eq__(self, other: object) -> bool:
+        """Whether another problem is the same, wherever it was read."""
+        return isinstance(other, Problem) and dict(self) == dict(other)
+
+    __hash__ = None  # type: ignore[assignment]
+
+    @property
+    def source(self) -> str:
+        """The file that the problem was read from, else its name; stands in errors."""
+        return self._file or self.name
+
     @property
     def moving(self) -> tuple[str, ...]:
         """Names of the obstacles that move."""
@@ -159,7 +172,7 @@ class Problem(StrictModel):
         Raises:
             FileFormatError: A joint is missing or unknown.
         """
-        return _in_order(self.start, joint_names, self.name, "start")
+        return _in_order(self.start, joint_names, self.source, "start")
 
     def goal_states(self, joint_names: Sequence[str]) -> Array:
         """Return the goals in the order of ``joint_names``, shape (goals, dof); none for an alignment.
@@ -171,7 +184,7 @@ class Problem(StrictModel):
         rows = []
         for k, values in enumerate(self.goal.joints or ()):
             field = f"goal.joints.{k}" if several else "goal.joints"
-            rows.append(_in_order(values, joint_names, self.name, field))
+            rows.append(_in_order(values, joint_names, self.source, field))
         return np.array(rows).reshape(-1, len(joint_names))
 
     @classmethod
@@ -186,8 +199,18 @@ class Problem(StrictModel):
         data = read_yaml(path, "problem file")
         if data.get("schema") != SCHEMA:
             raise FileFormatError(str(path), "schema", data.get("schema"), f"expected {SCHEMA!r}")
-        problem = validate(cls, data, str(path))
-        return problem._located(path.resolve().parent)
+        return cls.parse(data, str(path))._located(path.resolve().parent)
+
+    @classmethod
+    def parse(cls, data: dict[str, Any], source: str) -> Problem:
+        """Return the problem in the content of a file; ``source`` is the file, for errors.
+
+        Raises:
+            FileFormatError: The content does not follow the schema; the message names the field.
+        """
+        problem = validate(cls, data, source)
+        problem._file = source
+        return problem
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the problem as YAML, under a temporary name first.

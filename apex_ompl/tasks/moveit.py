@@ -10,7 +10,7 @@ is listed in the notes.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -21,10 +21,11 @@ import pinocchio as pin
 from apex_ompl.errors import FileFormatError, UnknownNameError
 from apex_ompl.robot import Robot
 from apex_ompl.robot.assets import resolve
-from apex_ompl.scene.bodies import AttachedObject, Obstacle, pose_matrix
+from apex_ompl.scene.bodies import AttachedObject, BodyT, Obstacle, pose_matrix
 from apex_ompl.scene.problem import Goal, Problem
+from apex_ompl.tasks.messages import MessageReader, inside
 from apex_ompl.types import Array
-from apex_ompl.util.schema import read_yaml
+from apex_ompl.util.schema import read_yaml, validate
 
 PRIMITIVES = {1: "box", 2: "sphere", 3: "cylinder", 4: "cone"}
 WORLD_FRAMES = ("", "world", "map")
@@ -40,15 +41,11 @@ class Conversion:
 
 
 @dataclass
-class _Reader:
+class _Reader(MessageReader):
     robot: Robot
     joint_map: Mapping[str, str]
     frame_map: Mapping[str, str]
-    file: Path
     notes: list[str] = field(default_factory=list)
-
-    def fail(self, where: str, value: object, expected: str) -> FileFormatError:
-        return FileFormatError(str(self.file), where, value, expected)
 
     def joint(self, name: str, where: str) -> str | None:
         """Return the name of a planned joint of this robot, or None if the robot does not plan the joint."""
@@ -76,37 +73,27 @@ class _Reader:
         """Return a pose message as a matrix, shape (4, 4) [m]; the identity when the message is empty."""
         if not data:
             return np.eye(4)
+        if not isinstance(data, Mapping):
+            raise self.fail(where, data, "expected a mapping of keys to values")
         position = self.numbers(data.get("position"), "xyz", (0.0, 0.0, 0.0), f"{where}.position")
         turn = self.numbers(data.get("orientation"), "xyzw", (0.0, 0.0, 0.0, 1.0), f"{where}.orientation")
         if not float(np.linalg.norm(turn)) > 1e-6:
             turn = np.array([0.0, 0.0, 0.0, 1.0])  # an empty message means no rotation
         return pose_matrix(position, turn)
 
-    def numbers(self, data: Any, keys: str, default: Sequence[float], where: str) -> Array:
-        if data is None:
-            return np.array(default)
-        values = [data.get(k, d) for k, d in zip(keys, default, strict=True)] if isinstance(data, Mapping) else data
-        try:
-            array = np.array(values, dtype=float)
-        except (TypeError, ValueError) as error:
-            raise self.fail(where, data, f"expected {len(keys)} numbers") from error
-        if array.shape != (len(keys),) or not np.isfinite(array).all():
-            raise self.fail(where, data, f"expected {len(keys)} finite numbers")
-        return array
-
     def state(self, data: Mapping[str, Any], where: str) -> dict[str, float]:
         """Return the planned joints of a robot state message."""
-        joints = data.get("joint_state") or {}
-        names, positions = joints.get("name") or [], joints.get("position") or []
+        joints, at = self.section(data, "joint_state", where), f"{where}.joint_state"
+        names, positions = self.entries(joints, "name", at), self.entries(joints, "position", at)
         if len(names) != len(positions):
-            raise self.fail(f"{where}.joint_state", len(positions), f"expected {len(names)} positions")
-        if (data.get("multi_dof_joint_state") or {}).get("joint_names"):
+            raise self.fail(at, len(positions), f"expected {len(names)} positions")
+        if self.section(data, "multi_dof_joint_state", where).get("joint_names"):
             self.notes.append(f"{where}.multi_dof_joint_state: the robot's base does not move")
         found = {}
-        for name, position in zip(names, positions, strict=True):
-            ours = self.joint(str(name), f"{where}.joint_state")
+        for k, (name, position) in enumerate(zip(names, positions, strict=True)):
+            ours = self.joint(str(name), at)
             if ours is not None:
-                found[ours] = float(position)
+                found[ours] = self.number(position, f"{at}.position.{k}")
         return found
 
     def shapes(self, item: Mapping[str, Any], where: str) -> Iterator[tuple[dict[str, Any], Array]]:
@@ -121,7 +108,7 @@ class _Reader:
             yield {"half_space": {"normal": (a, b, c), "offset": -d}}, pose
 
     def paired(self, item: Mapping[str, Any], shapes: str, poses: str, where: str) -> list[tuple[Any, Array]]:
-        found, placed = item.get(shapes) or [], item.get(poses) or []
+        found, placed = self.messages(item, shapes, where), self.entries(item, poses, where)
         if placed and len(placed) != len(found):
             raise self.fail(f"{where}.{poses}", len(placed), f"expected {len(found)} poses, one per shape")
         placed = placed or [None] * len(found)
@@ -130,26 +117,33 @@ class _Reader:
     def primitive(self, data: Mapping[str, Any], where: str) -> dict[str, Any]:
         kind = data.get("type")
         kind = PRIMITIVES.get(kind, kind) if isinstance(kind, int) else str(kind).lower()
-        size = data.get("dimensions") or []
+        size = self.entries(data, "dimensions", where)
         counts = {"box": 3, "sphere": 1, "cylinder": 2}
         if kind not in counts:
             raise self.fail(f"{where}.type", data.get("type"), "cannot be read, expected box, sphere or cylinder")
         if len(size) != counts[kind]:
             raise self.fail(f"{where}.dimensions", size, f"expected {counts[kind]} numbers for a {kind}")
-        values = [float(v) for v in size]
+        values = [self.number(v, f"{where}.dimensions.{k}") for k, v in enumerate(size)]
         if kind == "box":
             return {"box": tuple(values)}
         if kind == "sphere":
             return {"sphere": {"radius": values[0]}}
         return {"cylinder": {"radius": values[1], "length": values[0]}}
 
+    def body(self, kind: type[BodyT], fields: dict[str, Any], where: str) -> BodyT:
+        """Return an obstacle or a held object."""
+        try:
+            return validate(kind, fields, str(self.file))
+        except FileFormatError as error:
+            raise self.fail(inside(where, error.field), error.value, error.expected) from error
+
     def mesh(self, data: Mapping[str, Any], where: str) -> dict[str, Any]:
         resource = data.get("resource")
         if not resource:
             raise self.fail(where, sorted(data), "cannot be read, expected a mesh by path (resource)")
-        scale = data.get("dimensions") or data.get("scale") or (1.0, 1.0, 1.0)
+        scale = self.numbers(data.get("dimensions") or data.get("scale"), "xyz", (1.0, 1.0, 1.0), f"{where}.scale")
         file = resolve(str(resource), self.file.resolve().parent, f"mesh {where}")
-        return {"mesh": {"file": str(file), "scale": tuple(float(v) for v in scale)}}
+        return {"mesh": {"file": str(file), "scale": tuple(scale.tolist())}}
 
 
 def convert(
@@ -175,9 +169,10 @@ def convert(
     """
     scene_data, request_data = read_yaml(scene, "scene file"), read_yaml(request, "request file")
     notes: list[str] = []
-    at_scene = _Reader(robot, joint_map or {}, frame_map or {}, scene, notes)
-    at_request = _Reader(robot, joint_map or {}, frame_map or {}, request, notes)
-    scene_state, start_state = scene_data.get("robot_state") or {}, request_data.get("start_state") or {}
+    at_scene = _Reader(scene, robot, joint_map or {}, frame_map or {}, notes)
+    at_request = _Reader(request, robot, joint_map or {}, frame_map or {}, notes)
+    scene_state = at_scene.section(scene_data, "robot_state")
+    start_state = at_request.section(request_data, "start_state")
     start = dict(zip(robot.joint_names, robot.home.tolist(), strict=True))
     given = at_scene.state(scene_state, "robot_state") | at_request.state(start_state, "start_state")
     if not given:
@@ -195,46 +190,48 @@ def convert(
         if request_data.get(key):
             notes.append(f"{key}: not used")
     name = re.sub(r"[^A-Za-z0-9_.-]+", "_", scene.stem).strip("_.-") or "converted"
-    problem = Problem(
-        name=name, robot=robot.name, scene=tuple(obstacles), attached=tuple(attached), start=start,
-        goal=Goal(joints=tuple(goals)),
-    )  # fmt: skip
+    fields = {
+        "name": name, "robot": robot.name, "scene": tuple(obstacles), "attached": tuple(attached), "start": start,
+        "goal": Goal(joints=tuple(goals)),
+    }  # fmt: skip
+    problem = validate(Problem, fields, str(scene))
     return Conversion(problem, notes)
 
 
 def _obstacles(reader: _Reader, data: Mapping[str, Any], start: Array) -> list[Obstacle]:
-    world = data.get("world", data) or {}
-    if (world.get("octomap") or {}).get("octomap", {}).get("data"):
+    world = reader.section(data, "world") if "world" in data else data
+    octomap = reader.section(reader.section(world, "octomap", "world"), "octomap", "world.octomap")
+    if octomap.get("data"):
         raise reader.fail("world.octomap", "an octomap", "cannot be read, expected primitives and meshes")
     found: list[Obstacle] = []
-    for k, item in enumerate(world.get("collision_objects") or []):
+    for k, item in enumerate(reader.messages(world, "collision_objects")):
         where = f"collision_objects.{k}"
-        base = reader.frame(str((item.get("header") or {}).get("frame_id", "")), start, where)
+        base = reader.frame(str(reader.section(item, "header", where).get("frame_id", "")), start, where)
         for label, shape, pose in _bodies(reader, item, where):
             placed = base @ pose
-            found.append(Obstacle(name=label, **shape, **_placement(placed)))
+            found.append(reader.body(Obstacle, {"name": label, **shape, **_placement(placed)}, where))
     return found
 
 
 def _attached(reader: _Reader, state: Mapping[str, Any], where: str, start: Array) -> Iterator[AttachedObject]:
-    for k, entry in enumerate(state.get("attached_collision_objects") or []):
+    for k, entry in enumerate(reader.messages(state, "attached_collision_objects", where)):
         here = f"{where}.attached_collision_objects.{k}"
         link = reader.frame_map.get(str(entry.get("link_name")), str(entry.get("link_name")))
-        item = entry.get("object") or {}
-        frame = str((item.get("header") or {}).get("frame_id", ""))
+        item = reader.section(entry, "object", here)
+        frame = str(reader.section(item, "header", f"{here}.object").get("frame_id", ""))
         inside = np.linalg.inv(reader.robot.link_pose(start, link))
         # MoveIt gives an attached object in the frame of its link unless the header says otherwise.
         base = np.eye(4) if frame in ("", str(entry.get("link_name"))) else inside @ reader.frame(frame, start, here)
-        touch = [reader.frame_map.get(str(t), str(t)) for t in entry.get("touch_links") or []]
+        touch = [reader.frame_map.get(str(t), str(t)) for t in reader.entries(entry, "touch_links", here)]
         unknown = [t for t in touch if t not in reader.robot.link_names]
         if unknown:
             reader.notes.append(f"{here}.touch_links: {', '.join(unknown)} are no links of {reader.robot.name}")
         known = tuple(t for t in touch if t in reader.robot.link_names)
         for label, shape, pose in _bodies(reader, item, here):
-            yield AttachedObject(
-                name=label, link=link, touch_links=tuple({*known, *reader.robot.hand_of(link)}) if known else None,
-                **shape, **_placement(base @ pose),
-            )  # fmt: skip
+            fields = {"name": label, "link": link, **shape, **_placement(base @ pose)}
+            if known:
+                fields["touch_links"] = tuple({*known, *reader.robot.hand_of(link)})
+            yield reader.body(AttachedObject, fields, here)
 
 
 def _bodies(reader: _Reader, item: Mapping[str, Any], where: str) -> list[tuple[str, dict[str, Any], Array]]:
@@ -254,17 +251,18 @@ def _goals(reader: _Reader, data: Mapping[str, Any], start: Mapping[str, float])
         if any((data.get(key) or {}).values()) if isinstance(data.get(key), Mapping) else data.get(key):
             raise reader.fail(key, "constraints along the path", "cannot be read, expected none")
     goals = []
-    for k, goal in enumerate(data.get("goal_constraints") or []):
+    for k, goal in enumerate(reader.messages(data, "goal_constraints")):
         where = f"goal_constraints.{k}"
         for other in ("position_constraints", "orientation_constraints", "visibility_constraints"):
             if goal.get(other):
                 raise reader.fail(f"{where}.{other}", "a list", "cannot be read, expected joint_constraints only")
         values = dict(start)
         reached = False
-        for j, constraint in enumerate(goal.get("joint_constraints") or []):
-            ours = reader.joint(str(constraint.get("joint_name")), f"{where}.joint_constraints.{j}")
+        for j, constraint in enumerate(reader.messages(goal, "joint_constraints", where)):
+            at = f"{where}.joint_constraints.{j}"
+            ours = reader.joint(str(constraint.get("joint_name")), at)
             if ours is not None:
-                values[ours], reached = float(constraint["position"]), True
+                values[ours], reached = reader.number(constraint.get("position"), f"{at}.position"), True
         if not reached:
             raise reader.fail(where, sorted(goal), "expected joint_constraints on joints of the robot")
         goals.append(values)

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 import yaml
 
-from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError
+from apex_ompl.errors import FileFormatError, ParameterError
 from apex_ompl.types import Array
-from apex_ompl.util.files import BROKEN, suffix_of
+from apex_ompl.util.files import BROKEN, read_file, read_text, suffix_of
 from apex_ompl.util.schema import read_yaml
 
 MESSAGES = (".traj.yaml", ".traj.json")
@@ -79,15 +79,13 @@ def decode(path: Path) -> tuple[Array, list[Array], tuple[str, ...]]:
     suffix = suffix_of(path, SUFFIXES)
     try:
         if suffix == ".npz":
-            with np.load(path, allow_pickle=False) as archive:
+            with np.load(io.BytesIO(read_file(path, ROLE)), allow_pickle=False) as archive:
                 states = [archive[name].astype(float) for name in STATES]
                 return archive["times"].astype(float), states, tuple(str(name) for name in archive["joint_names"])
         if suffix == ".csv":
-            return _from_table(path.read_text(encoding="utf-8-sig"))
+            return _from_table(read_text(path, ROLE))
         return _from_messages(read_yaml(path, ROLE))  # JSON is YAML
-    except OSError as error:
-        raise MissingFileError(str(path), ROLE, (error.strerror or "cannot be read").lower()) from error
-    except (*BROKEN, AttributeError, IndexError, csv.Error) as error:
+    except (OSError, *BROKEN, AttributeError, IndexError, csv.Error) as error:
         raise FileFormatError(str(path), "", str(error), "expected a saved trajectory") from error
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import os
+import stat
 import tempfile
 import tokenize
 import zipfile
@@ -13,7 +14,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from apex_ompl.errors import FolderInUseError, MissingFileError, ParameterError
+from apex_ompl.errors import FileFormatError, FolderInUseError, MissingFileError, ParameterError
 
 OUTPUT = "output file"
 BROKEN = (
@@ -24,11 +25,69 @@ BROKEN = (
 
 
 def is_file(path: Path) -> bool:
-    """Whether a path is an existing file; False also for names that no file can have."""
+    """Whether a path is an existing file; False also for names that no file can have, pipes and devices."""
     try:
         return path.is_file()
     except (OSError, ValueError):
         return False
+
+
+def check_readable(path: Path, role: str) -> None:
+    """Check that a path is a regular file that can be read; reading a pipe or a device may never end.
+
+    Args:
+        path: The file.
+        role: Description of the file for the error.
+
+    Raises:
+        MissingFileError: There is none, it may not be read, or it is a folder, a pipe or a device.
+    """
+    try:
+        mode = path.stat().st_mode
+    except OSError as error:
+        raise MissingFileError(str(path), role, (error.strerror or "cannot be read").lower()) from error
+    except ValueError as error:
+        raise MissingFileError(str(path), role, "no file can have this name") from error
+    if stat.S_ISDIR(mode):
+        raise MissingFileError(str(path), role, "is a directory")
+    if not stat.S_ISREG(mode):
+        raise MissingFileError(str(path), role, "is a pipe or a device, expected a regular file")
+    if not os.access(path, os.R_OK):
+        raise MissingFileError(str(path), role, "permission denied")
+
+
+def read_file(path: Path, role: str) -> bytes:
+    """Return the content of a regular file.
+
+    Args:
+        path: The file.
+        role: Description of the file for the error.
+
+    Raises:
+        MissingFileError: It cannot be read.
+    """
+    check_readable(path, role)
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise MissingFileError(str(path), role, (error.strerror or "cannot be read").lower()) from error
+
+
+def read_text(path: Path, role: str) -> str:
+    """Return the content of a text file in UTF-8, with or without a byte-order mark.
+
+    Args:
+        path: The file.
+        role: Description of the file for the error.
+
+    Raises:
+        MissingFileError: It cannot be read.
+        FileFormatError: It is not UTF-8 text.
+    """
+    try:
+        return read_file(path, role).decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise FileFormatError(str(path), "", str(error.reason), "expected UTF-8 text") from error
 
 
 def suffix_of(path: Path, known: Sequence[str]) -> str:

@@ -10,7 +10,8 @@ from typing import Any, TypeVar, get_args, get_origin
 import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from apex_ompl.errors import FileFormatError, MissingFileError, nearest_name
+from apex_ompl.errors import FileFormatError, nearest_name
+from apex_ompl.util.files import read_text
 
 ModelT = TypeVar("ModelT", bound="StrictModel")
 
@@ -71,15 +72,7 @@ def read_yaml(path: Path, role: str) -> dict[str, Any]:
         MissingFileError: The file cannot be read.
         FileFormatError: It is not YAML, or not a mapping.
     """
-    try:
-        text = path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise MissingFileError(str(path), role, (error.strerror or "cannot be read").lower()) from error
-    except UnicodeDecodeError as error:
-        raise FileFormatError(str(path), "", str(error.reason), "expected UTF-8 text") from error
-    except ValueError as error:
-        raise MissingFileError(str(path), role, str(error)) from error
-    return parse_yaml(text, str(path))
+    return parse_yaml(read_text(path, role), str(path))
 
 
 def parse_yaml(text: str, source: str) -> dict[str, Any]:

@@ -6,8 +6,8 @@ import coal
 import numpy as np
 
 from apex_ompl.collision.containment import EnclosingMesh
+from apex_ompl.collision.cover.boxes import bounding_boxes
 from apex_ompl.collision.cover.proof import PAD, Cover
-from apex_ompl.scene.meshes import bounding_boxes
 from apex_ompl.types import Array
 
 COLUMNS = 6  # columns of boxes along each axis of a mesh
@@ -18,8 +18,8 @@ LEAVES_IN_MESH = 200  # ... and of a mesh
 def rough_cover(geometry: coal.CollisionGeometry) -> Cover:
     """Return a cover of a box or of the solid of a mesh: balls around boxes that are halved recursively.
 
-    The boxes of a mesh are those of :func:`apex_ompl.scene.meshes.bounding_boxes`, which contain the solid. No proof
-    is needed, as a ball around all corners of a box contains the box.
+    The boxes of a mesh are those of :func:`apex_ompl.collision.cover.boxes.bounding_boxes`, which contain the solid.
+    No proof is needed, as a ball around all corners of a box contains the box.
     """
     if geometry.getNodeType() == coal.GEOM_BOX:
         boxes, most = np.array([[-geometry.halfSide, geometry.halfSide]]), LEAVES

@@ -20,10 +20,11 @@ from apex_ompl.collision.cover.proof import PAD, Cover, distances, grow_to_cover
 from apex_ompl.collision.cover.search import search
 from apex_ompl.collision.cover.solids import solid_of
 from apex_ompl.collision.shapes import is_shell
-from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError
+from apex_ompl.errors import FileFormatError, ParameterError
 from apex_ompl.scene.meshes import triangles
 from apex_ompl.types import Array
-from apex_ompl.util.files import write_atomically
+from apex_ompl.util.files import read_text, write_atomically
+from apex_ompl.util.weak_cache import weakly_cached
 
 __all__ = ["GAPS", "Cover", "make_cover", "quality", "read_covers", "shape_key", "unproved", "write_covers"]
 
@@ -35,6 +36,7 @@ MOST = (64, 96, 256)  # most leaves of a quick cover, of other covers, and of a 
 QUICK = 4.0  # size of the boxes in which a quick cover is grown, relative to those of its proof
 
 
+@weakly_cached
 def shape_key(geometry: coal.CollisionGeometry) -> str:
     """Return the identifier of a shape, 16 hexadecimal digits of a hash of its kind and sizes or of its triangles.
 
@@ -162,9 +164,7 @@ def read_covers(path: Path | str) -> dict[str, Cover]:
     """
     name = str(path)
     try:
-        data = json.loads(Path(path).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise MissingFileError(name, "sphere covers", (error.strerror or "cannot be read").lower()) from error
+        data = json.loads(read_text(Path(path), "sphere covers"))
     except (ValueError, RecursionError) as error:
         raise FileFormatError(name, "", str(error), "expected JSON") from error
     if not isinstance(data, dict) or data.get("schema") != SCHEMA:
