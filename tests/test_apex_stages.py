@@ -96,7 +96,7 @@ def test_valid_paths_that_pass_too_near_are_resampled(ready: PlanningSetup) -> N
     assert gaps[1] >= gaps[0] - 1e-9, "nothing is half a metre off, so the one that keeps most distance stands"
     assert wary.times[INSIDE + "resample"] > plain.times.get(INSIDE + "resample", 0.0)
     by_hand = min(ready.checker.distance(q).value for q in wary.path[::4])
-    assert gaps[1] == pytest.approx(min(by_hand, ready.checker.distance(wary.path[-1]).value))
+    assert by_hand - 2e-3 < gaps[1] <= min(by_hand, ready.checker.distance(wary.path[-1]).value) + 1e-5
 
 
 def test_the_same_seed_gives_the_same_path_also_in_threads() -> None:

@@ -119,7 +119,7 @@ def test_distance_is_that_of_closed_forms(robot: Robot) -> None:
     assert (found.first, found.second) == ("left_hand_middle_distal", "ball")
     assert found.value == pytest.approx(0.06 - 0.01 - 0.007, abs=1e-6)
     assert np.linalg.norm(found.points[0] - found.points[1]) == pytest.approx(found.value, abs=1e-6)
-    assert checker.clearance(robot.home) <= found.value
+    assert checker.clearance(robot.home) <= found.value + 1e-9
     floor = Obstacle(name="floor", half_space={"normal": (0.0, 0.0, 2.0), "offset": -0.8})
     alone = CollisionChecker(robot, [floor]).distance(robot.home)
     assert alone.second == "floor" and alone.value < 0.8

@@ -178,7 +178,7 @@ def test_a_deadline_ends_a_proof(grazing: ModuleType, tmp_path: Path) -> None:
     checker, _ = scenes(grazing, robot, tmp_path, 1)
     bare, q = CollisionChecker(robot), robot.home
     there_and_back = np.clip([q + 0.05 * np.sin(k) for k in range(4000)], *limits(robot))
-    proof = bare.prove(there_and_back, tolerance=1e-9, deadline=time.perf_counter())
+    proof = bare.prove(there_and_back, deadline=time.perf_counter())
     assert proof.timed_out and not proof and proof.reason == "not proved in time"
     check = full_check(checker, there_and_back, deadline=time.perf_counter() - 1.0)
     assert check.timed_out and not check
