@@ -13,8 +13,6 @@ from support import CUBE_OBJ, states_around_home
 
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.containment import Extent
-from apex_ompl.collision.shapes import coal_geometry, convex_hull, hull_planes, mesh_note
-from apex_ompl.errors import FileFormatError
 from apex_ompl.kernel.compiled.triangle_mesh import encloses
 from apex_ompl.robot import Robot
 from apex_ompl.robot.model import link_of
@@ -242,79 +240,3 @@ def test_each_piece_of_a_mesh_is_looked_for_inside_links(robot: Robot, tmp_path,
     checker = CollisionChecker(robot, [Obstacle(name="two", mesh={"file": str(file)})])
     assert surface_contacts(checker, robot.home) == []
     assert not checker.is_free(robot.home)
-
-
-FLAT = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\nf 1 2 3\nf 2 4 3\n"
-
-
-FLIPPED = CUBE_OBJ.replace("f 1 3 2", "f 1 2 3")
-
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        (FLAT, "one plane"),
-        ("v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "one plane"),
-        (CUBE_OBJ.replace("v 1 1 1", "v nan 1 1"), "not finite"),
-        (CUBE_OBJ.replace("v 1 1 1", "v 1e300 1 1"), "too far"),
-        (FLIPPED, "oriented against each other"),
-        ("", "expected an STL or OBJ mesh .*, got 'an empty file'"),
-        ("hello\n", "expected an STL or OBJ mesh .*, got 'hello"),
-    ],
-)
-def test_meshes_that_bound_no_solid_are_refused(robot: Robot, tmp_path, capfd, text: str, words: str) -> None:
-    """In Coal, flat and infinite ones end the process."""
-    file = tmp_path / "m.obj"
-    file.write_text(text)
-    with pytest.raises(FileFormatError, match=words):
-        CollisionChecker(robot, [Obstacle(name="m", mesh={"file": str(file)})])
-    assert capfd.readouterr() == ("", "")  # Coal prints lines of its own for numbers that are not finite
-
-
-def test_meshes_that_are_no_proper_solids_are_noted(robot: Robot, tmp_path) -> None:
-    def noted(text: str) -> tuple[str, bool]:
-        file = tmp_path / "m.obj"
-        file.write_text(text)
-        room = Obstacle(name="m", mesh={"file": str(file), "scale": (6, 6, 6)}, position=(-3.0, -3.0, -3.0))
-        return mesh_note(room), CollisionChecker(robot, [room]).is_free(robot.home)
-
-    lines = [line.split() for line in CUBE_OBJ.splitlines()]
-    turned = "\n".join(" ".join(row if row[0] == "v" else [row[0], *row[:0:-1]]) for row in lines)
-    assert noted(CUBE_OBJ) == ("", False)
-    note, free = noted(turned)
-    assert "'m' (m.obj) is inside out" in note and not free
-    note, free = noted(CUBE_OBJ.replace("f 5 6 7\n", ""))
-    assert "'m' (m.obj) is not closed (3 open edges)" in note and not free
-    assert mesh_note(Obstacle(name="b", box=(1.0, 1.0, 1.0))) == ""
-
-
-def test_a_mesh_with_a_hole_is_checked_by_the_winding_number(robot: Robot, tmp_path) -> None:
-    file = tmp_path / "open.obj"
-    file.write_text(CUBE_OBJ.replace("f 5 6 7\n", ""))
-    for position, free in (((-3.0, -3.0, -3.0), False), ((20.0, 0.0, 0.0), True)):
-        room = Obstacle(name="room", mesh={"file": str(file), "scale": (6, 6, 6)}, position=position)
-        assert CollisionChecker(robot, [room]).is_free(robot.home) == free
-
-
-def test_a_hull_of_too_many_neighbours_is_replaced_by_a_little_larger_one(robot: Robot, tmp_path) -> None:
-    """Two cones of 600 triangles at one base: Coal takes no vertex of a hull with more than 255 neighbours."""
-    count, file = 600, tmp_path / "cones.obj"
-    turn = 2.0 * np.pi * np.arange(count) / count
-    rim = np.stack([0.3 * np.cos(turn), 0.3 * np.sin(turn), 0.0 * turn], axis=1)
-    vertices = np.concatenate([rim, [[0.0, 0.0, 0.2], [0.0, 0.0, -0.2]]])
-    k = np.arange(count)
-    up = np.stack([k, (k + 1) % count, np.full(count, count)], axis=1)
-    down = np.stack([(k + 1) % count, k, np.full(count, count + 1)], axis=1)
-    lines = [f"v {x} {y} {z}" for x, y, z in vertices]
-    lines += [f"f {a} {b} {c}" for a, b, c in np.concatenate([up, down]) + 1]
-    file.write_text("\n".join(lines) + "\n")
-    obstacle = Obstacle(name="cones", mesh={"file": str(file)}, position=(0.0, 0.0, 3.0))
-    shape = coal_geometry(obstacle)
-    normals, offsets = hull_planes(convex_hull(shape))
-    assert (vertices @ normals.T <= offsets + 1e-9).all()
-    assert 1.0 <= convex_hull(shape).computeVolume() / (2.0 * np.pi * 0.3**2 * 0.2 / 3.0) < 1.02
-    checker = CollisionChecker(robot, [obstacle])
-    assert checker.is_free(robot.home)
-    checker.move("cones", tuple(robot.link_pose(robot.home, "left_link7")[:3, 3]))
-    assert not checker.is_free(robot.home)
-    assert coal_geometry(obstacle) is shape  # loaded once
