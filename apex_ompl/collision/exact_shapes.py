@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from apex_ompl.collision.shapes import convex_hull, hull_planes, is_shell
 from apex_ompl.kernel.compiled.arrays import BOX, CAPSULE, CYLINDER, HALF_SPACE, SPHERE
-from apex_ompl.kernel.compiled.layout import Floats, Integers, pack
+from apex_ompl.kernel.compiled.layout import Integers
 from apex_ompl.kernel.compiled.shapes import HULL, ShapeArrays
 from apex_ompl.scene.meshes import triangles
 from apex_ompl.types import Array
@@ -132,8 +132,8 @@ def _over_ranges(function: np.ufunc, values: Array, edges: NDArray[np.int64]) ->
     return reduced
 
 
-def pack_shapes(shapes: Mapping[int, PlacedShape]) -> tuple[Integers, Floats]:
-    """Return the packed arrays of shapes by their numbers."""
+def shape_arrays(shapes: Mapping[int, PlacedShape]) -> ShapeArrays:
+    """Return the kernel's arrays of shapes by their numbers."""
     numbers = list(shapes)
     row = np.full(max(numbers, default=-1) + 1, -1, np.int64)
     row[numbers] = np.arange(len(numbers))
@@ -156,7 +156,7 @@ def pack_shapes(shapes: Mapping[int, PlacedShape]) -> tuple[Integers, Floats]:
         point_count += 3 * len(mesh.corners)
         node_count += len(mesh.leaf)
     poses = [_pose(shape) for shape in placed]
-    arrays = ShapeArrays(
+    return ShapeArrays(
         kind=np.array([_kind(s.geometry) for s in placed], np.int64),
         joint=np.array([s.joint for s in placed], np.int64),
         points_of=np.array(spans, np.int64).reshape(-1, 2),
@@ -171,7 +171,22 @@ def pack_shapes(shapes: Mapping[int, PlacedShape]) -> tuple[Integers, Floats]:
         node_ball=np.concatenate([np.empty((0, 4)), *nodes]),
         points=np.concatenate(points),
     )
-    return pack(arrays)
+
+
+def joined(bodies: ShapeArrays, obstacles: ShapeArrays) -> ShapeArrays:
+    """Return the shapes of bodies, whose rows are kept, and of obstacles behind them; ``row`` is the obstacles'."""
+    points, nodes = len(bodies.points), len(bodies.child)
+    moved = obstacles._replace(
+        points_of=obstacles.points_of + np.array([points, 0], np.int64), root=_moved(obstacles.root, nodes),
+        child=_moved(obstacles.child, nodes), corner=_moved(obstacles.corner, points),
+    )  # fmt: skip
+    both = ShapeArrays(*(np.concatenate(pair) for pair in zip(bodies, moved, strict=True)))
+    return both._replace(row=_moved(obstacles.row, len(bodies.kind)))
+
+
+def _moved(numbers: Integers, by: int) -> Integers:
+    """Return numbers plus ``by``, but for those that stand for nothing, -1."""
+    return np.where(numbers >= 0, numbers + by, -1)
 
 
 def _kind(shape: coal.CollisionGeometry) -> int:

@@ -11,12 +11,12 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from apex_ompl.collision.broadphase import CompiledScene
-from apex_ompl.collision.exact_shapes import Mesh, PlacedShape, has_mesh, mesh_of, pack_shapes
+from apex_ompl.collision.exact_shapes import Mesh, PlacedShape, has_mesh, joined, mesh_of, shape_arrays
 from apex_ompl.collision.tabulate import joint_specs
 from apex_ompl.kernel.compiled import curve_proof
 from apex_ompl.kernel.compiled.arrays import FIXED
-from apex_ompl.kernel.compiled.layout import Floats, Integers, new_buffers
-from apex_ompl.kernel.compiled.shapes import PairBuffers
+from apex_ompl.kernel.compiled.layout import new_buffers, pack
+from apex_ompl.kernel.compiled.shapes import PairBuffers, ShapeArrays
 from apex_ompl.kernel.kernel import Kernel
 from apex_ompl.kernel.robot_builder import turn_to
 from apex_ompl.kernel.scene_builder import primitive, scene_tables
@@ -26,10 +26,11 @@ from apex_ompl.types import Array, Flags
 MOST_PACKED = 64  # sets of held objects that are kept for each robot
 TOUCH = 1e-5  # distance that counts as contact [m]
 TOLERANCE = 1e-5  # of the least clearance [m]
+LIMITS = (0.04, 0.2, np.inf)  # of the clearance that is looked for, one after the other [m]
 BUDGET = 1000  # intervals between two looks at the clock: some milliseconds
 
 
-_packed: WeakKeyDictionary[Robot, OrderedDict[int, tuple[Array, tuple[Integers, Floats]]]] = WeakKeyDictionary()
+_bodies: WeakKeyDictionary[Robot, OrderedDict[int, tuple[Array, ShapeArrays]]] = WeakKeyDictionary()
 
 
 @dataclass(frozen=True)
@@ -125,9 +126,9 @@ def obstacles_alone(kernel: Kernel, chosen: Flags) -> Kernel:
     return Kernel(robot, scene_tables(solids))
 
 
-def _packed_bodies(robot: Robot, scene: CompiledScene, kernel: Kernel) -> tuple[Integers, Floats]:
-    """Return the packed shapes of a kernel's bodies; those of the last sets of held objects are kept."""
-    known = _packed.setdefault(robot, OrderedDict())
+def _shapes_of_bodies(robot: Robot, scene: CompiledScene, kernel: Kernel) -> ShapeArrays:
+    """Return the shapes of a kernel's bodies; those of the last sets of held objects are kept."""
+    known = _bodies.setdefault(robot, OrderedDict())
     key = id(kernel.robot.arrays.node_centre)  # shared by all kernels of one set of bodies
     if key not in known:
         turns = [turn_to(j.axis if j.kind != FIXED else None).T for j in joint_specs(robot)]
@@ -138,7 +139,7 @@ def _packed_bodies(robot: Robot, scene: CompiledScene, kernel: Kernel) -> tuple[
             bodies[row] = PlacedShape(shape, joint, turns[joint] @ items[number].placement.homogeneous, mesh)
         while len(known) >= MOST_PACKED:
             known.popitem(last=False)
-        known[key] = kernel.robot.arrays.node_centre, pack_shapes(bodies)
+        known[key] = kernel.robot.arrays.node_centre, shape_arrays(bodies)
     return known[key][1]
 
 
@@ -149,7 +150,7 @@ class PathProver:
         """Make the tables of exact shapes of all bodies and obstacles in ``kernel``."""
         self._scene = scene
         self._local = threading.local()
-        self._bodies = _packed_bodies(robot, scene, kernel)
+        self._bodies = _shapes_of_bodies(robot, scene, kernel)
         self._meshes: dict[int, Mesh] = {}
         self.obstacles_moved(kernel)
 
@@ -161,7 +162,7 @@ class PathProver:
             if has_mesh(items[k].geometry) and k not in self._meshes:
                 self._meshes[k] = mesh_of(items[k].geometry)
             placed[k] = PlacedShape(items[k].geometry, 0, items[k].placement.homogeneous, self._meshes.get(k))
-        self._obstacles = pack_shapes(placed)
+        self._shapes = pack(joined(self._bodies, shape_arrays(placed)))
 
     def prove(
         self, curve: Curve, *, touch: float = TOUCH, tolerance: float = TOLERANCE, deadline: float | None = None
@@ -178,18 +179,20 @@ class PathProver:
         if not (np.isfinite(curve.states).all() and np.isfinite(curve.rates).all()):
             return PathProof.refused("a state that is not finite", curve)
         buffers, knots = self._buffers(), curve.knots
-        p = buffers.proof
-        p.places[:] = 0, 1, 0
-        p.pairs[0], p.intervals[0] = curve_proof.ALL, (knots[0], knots[-1])
-        p.worst[:] = -1
-        p.figures[:] = np.inf if tolerance > 0.0 else 0.0, np.inf, knots[0], 0.0
-        arrays = (*self._kernel.packed, *self._bodies, *self._obstacles, *buffers.arrays)
-        outcome, over = curve_proof.MORE, False
-        while outcome == curve_proof.MORE and not over:
-            outcome = curve_proof.prove_curve(
-                *arrays, knots, curve.states, curve.rates, curve.slack, touch, tolerance, BUDGET
-            )
-            over = outcome == curve_proof.MORE and deadline is not None and time.perf_counter() > deadline
+        p, arrays = buffers.proof, (*self._kernel.packed, *self._shapes, *buffers.arrays)
+        for limit in LIMITS if tolerance > 0.0 else (0.0,):
+            p.places[:] = 0, 1, p.places[2] if limit > LIMITS[0] else 0
+            p.pairs[0], p.intervals[0] = curve_proof.ALL, (knots[0], knots[-1])
+            p.worst[:] = -1
+            p.figures[:] = limit, np.inf, knots[0], 0.0
+            outcome, over = curve_proof.MORE, False
+            while outcome == curve_proof.MORE and not over:
+                outcome = curve_proof.prove_curve(
+                    *arrays, knots, curve.states, curve.rates, curve.slack, touch, tolerance, BUDGET
+                )
+                over = outcome == curve_proof.MORE and deadline is not None and time.perf_counter() > deadline
+            if over or outcome != curve_proof.PROVED or p.figures[curve_proof.LEAST] <= limit:
+                break
         margin, least, where, by_spheres = p.figures.tolist()
         names, ok = self._names(int(p.worst[0]), int(p.worst[1])), outcome == curve_proof.PROVED
         reason, length = "", float(knots[-1] - knots[0])

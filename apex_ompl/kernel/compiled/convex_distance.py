@@ -148,12 +148,11 @@ def _nearest(p: Floats, n: int) -> tuple[float, float, float, int]:
 
 
 @outlined
-def convex_distance(points: Floats, others: Floats, g: PairBuffers, enough: float) -> tuple[float, float]:
+def convex_distance(points: Floats, g: PairBuffers, enough: float) -> tuple[float, float]:
     """Return bounds on the distance of the two pieces in ``g`` [m], the lower one certified by ``g.normal``.
 
     Args:
-        points: Corners of side 0.
-        others: Corners of side 1.
+        points: Corners of hulls and triangles.
         g: The pieces; ``normal`` is the direction to begin with.
         enough: Lower bound that suffices [m].
 
@@ -171,7 +170,7 @@ def convex_distance(points: Floats, others: Floats, g: PairBuffers, enough: floa
             break
         x, y, z = x / long, y / long, z / long
         a = support(points, g, 0, x, y, z)
-        b = support(others, g, 1, -x, -y, -z)
+        b = support(points, g, 1, -x, -y, -z)
         u, v, w = b[0] - a[0], b[1] - a[1], b[2] - a[2]
         plane = x * u + y * v + z * w
         if plane > lower:

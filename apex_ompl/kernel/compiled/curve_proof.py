@@ -3,24 +3,23 @@
 Intervals of the curve are bisected, breadth first. On each the sphere covers are tried first, for all pairs at once.
 The few pairs that they leave are looked at by their exact shapes
 (:func:`apex_ompl.kernel.compiled.pair_distance.pair_bound`); a pair that is not decided goes on to the two halves of
-the interval, alone. Bounds are compared with a margin: 0 for a bare proof; for the least clearance c it is what was
-found so far less a tolerance, so that in the end margin <= c <= found. A pair that is nearer than ``touch`` at a state
-in the middle of an interval counts as touching.
+the interval, alone. Bounds are compared with a margin: 0 for a bare proof; for the least clearance c it is a limit, or
+what was found so far less a tolerance, so that in the end margin <= c <= found. A pair that is nearer than ``touch`` at
+a state in the middle of an interval counts as touching.
 """
 
 from __future__ import annotations
 
-import math
 from typing import Annotated, NamedTuple
 
 from apex_ompl.kernel.compiled.arrays import RobotArrays, SceneArrays, robot_view, scene_view
-from apex_ompl.kernel.compiled.clearance import nearest_bodies, nearest_obstacle
-from apex_ompl.kernel.compiled.compilation import entry_point, inlined, outlined
+from apex_ompl.kernel.compiled.compilation import entry_point, inlined
 from apex_ompl.kernel.compiled.curve import set_motion, set_state
 from apex_ompl.kernel.compiled.kinematics import place_cluster, place_robot
 from apex_ompl.kernel.compiled.layout import Floats, Integers, buffer_view
 from apex_ompl.kernel.compiled.motion_bound import bound_displacements
 from apex_ompl.kernel.compiled.pair_distance import pair_bound
+from apex_ompl.kernel.compiled.relative_motion import Frames
 from apex_ompl.kernel.compiled.separation import tables_hold, unproved
 from apex_ompl.kernel.compiled.shapes import PairBuffers, ShapeArrays, pair_view, shapes_view
 from apex_ompl.kernel.compiled.workspace import Workspace, workspace_view
@@ -31,7 +30,7 @@ MOST_UNPROVED = 256  # pairs that the spheres leave on one interval
 FEW = 12  # pairs that are looked at one by one also on a long interval
 SHORT = 0.01  # share of the curve below which an interval is not long
 SHORTEST = 1e-11  # share of the curve below which a pair that is still open is given up
-SEEDED = 9  # intervals whose nearest spheres show where the least clearance may be
+SEEDED = 9  # first intervals, of which all pairs are looked at, for a small margin early
 ALL = -1  # stands for all pairs
 
 
@@ -76,7 +75,7 @@ def _record(p: ProofBuffers, distance: float, where: float, a: int, b: int, tole
     if distance < p.figures[LEAST]:
         p.figures[LEAST], p.figures[WHERE], p.worst[0], p.worst[1] = distance, where, a, b
         if tolerance > 0.0:
-            p.figures[MARGIN] = max(distance - tolerance, 0.5 * distance)
+            p.figures[MARGIN] = min(p.figures[MARGIN], max(distance - tolerance, 0.5 * distance))
 
 
 @inlined
@@ -88,35 +87,10 @@ def _place_clusters(t: RobotArrays, w: Workspace, q: Floats, a: int, b: int) -> 
             place_cluster(t, w, q, c)
 
 
-@outlined
-def _bound(
-    t: RobotArrays, w: Workspace, h: ShapeArrays, k: ShapeArrays, g: PairBuffers, a: int, b: int, need: float
-) -> tuple[float, float]:
+@inlined
+def _bound(f: Frames, h: ShapeArrays, g: PairBuffers, a: int, b: int, need: float) -> tuple[float, float]:
     """Return :func:`pair_bound` of body ``a`` and body ``b``, or obstacle -1 - ``b``."""
-    if b >= 0:
-        return pair_bound(t, w, h, h.row[a], h, h.row[b], g, need)
-    return pair_bound(t, w, h, h.row[a], k, k.row[-1 - b], g, need)
-
-
-@outlined
-def _seed(
-    t: RobotArrays, s: SceneArrays, w: Workspace, h: ShapeArrays, k: ShapeArrays, g: PairBuffers, p: ProofBuffers,
-    where: float, tolerance: float,
-) -> None:  # fmt: skip
-    """Record the distance now of the two bodies, and of the body and obstacle, whose spheres are nearest."""
-    for i in range(len(w.step)):
-        w.step[i] = w.deviation[i] = w.half_width[i] = 0.0
-    near = nearest_obstacle(t, s, w, p.state, math.inf)
-    if near[1] >= 0:
-        other = -1 - s.owner[near[3]]
-        _place_clusters(t, w, p.state, near[1], other)
-        found = _bound(t, w, h, k, g, near[1], other, math.inf)
-        _record(p, found[1], where, near[1], other, tolerance)
-    own = nearest_bodies(t, w, p.state, p.figures[LEAST])
-    if own[1] >= 0:
-        _place_clusters(t, w, p.state, own[1], own[3])
-        found = _bound(t, w, h, k, g, own[1], own[3], math.inf)
-        _record(p, found[1], where, own[1], own[3], tolerance)
+    return pair_bound(f, h, a, b if b >= 0 else h.row[-1 - b], g, need)
 
 
 @inlined
@@ -161,7 +135,7 @@ def _left_by_spheres(
     w.margin[0] = 0.0
     if count == 0:
         p.figures[BY_SPHERES] += b - a
-    elif count == MOST_UNPROVED or (count > FEW and b - a > SHORT * whole):
+    elif count == MOST_UNPROVED or (count > FEW and b - a > SHORT * whole and p.places[2] > SEEDED):
         if b - a <= SHORTEST * whole:
             return -1
         middle = 0.5 * (a + b)
@@ -173,42 +147,53 @@ def _left_by_spheres(
 
 @inlined
 def _by_shapes(
-    t: RobotArrays, w: Workspace, h: ShapeArrays, k: ShapeArrays, g: PairBuffers, p: ProofBuffers,
+    t: RobotArrays, w: Workspace, h: ShapeArrays, g: PairBuffers, p: ProofBuffers,
     a: float, b: float, count: int, shortest: float, touch: float, tolerance: float,
 ) -> int:  # fmt: skip
     """Look at the pairs in ``found`` by their shapes; append both halves of the interval for those that stay open.
 
+    Where many stay open, the halves are appended for all pairs at once.
+
     Returns:
         PROVED, TOUCHING or UNDECIDED.
     """
-    middle = 0.5 * (a + b)
+    middle, left = 0.5 * (a + b), 0
+    f = Frames(
+        t.joint_parent, t.joint_kind, t.joint_source, t.joint_ratio, w.rotation, w.origin, w.step, w.deviation,
+        w.half_width,
+    )  # fmt: skip
     for m in range(count):
         x, y = p.found[m, 0], p.found[m, 1]
         if m > 0 and p.found[m - 1, 0] == x and p.found[m - 1, 1] == y:
             continue
         _place_clusters(t, w, p.state, x, y)
-        bound, upper = _bound(t, w, h, k, g, x, y, p.figures[MARGIN])
+        bound, upper = _bound(f, h, g, x, y, p.figures[MARGIN])
         _record(p, upper, middle, x, y, tolerance)
         if upper <= touch:
             return TOUCHING
-        if bound > 0.0 and bound >= p.figures[MARGIN]:
-            continue
-        if b - a <= shortest:
-            return UNDECIDED
-        _append(p, a, middle, x, y)
-        _append(p, middle, b, x, y)
+        if not (bound > 0.0 and bound >= p.figures[MARGIN]):
+            p.found[left, 0], p.found[left, 1] = x, y
+            left += 1
+    if left > 0 and b - a <= shortest:
+        return UNDECIDED
+    if left > FEW and b - a > SHORT * shortest / SHORTEST:
+        left = 1
+        p.found[0, 0] = p.found[0, 1] = ALL
+    for m in range(left):
+        _append(p, a, middle, p.found[m, 0], p.found[m, 1])
+        _append(p, middle, b, p.found[m, 0], p.found[m, 1])
     return PROVED
 
 
 @entry_point
 def prove_curve(
-    ri: Integers, rf: Floats, si: Integers, sf: Floats, bi: Integers, bf: Floats, oi: Integers, of: Floats,
+    ri: Integers, rf: Floats, si: Integers, sf: Floats, hi: Integers, hf: Floats,
     wi: Integers, wf: Floats, gi: Integers, gf: Floats, pi: Integers, pf: Floats,
     knots: Floats, states: Floats, rates: Floats, slack: float, touch: float, tolerance: float, budget: int,
 ) -> int:  # fmt: skip
     """Prove a curve free, for at most ``budget`` intervals; another call goes on.
 
-    Robot, scene, shapes of bodies and of obstacles come packed, then the buffers of a state, of a pair and of the
+    Robot, scene and shapes come packed, then the buffers of a state, of a pair and of the
     proof, in which the whole curve is the first interval. ``knots``, ``states``, ``rates`` and ``slack`` are the curve,
     see :func:`apex_ompl.kernel.compiled.curve.set_motion`; ``touch`` is the distance that counts as contact [m],
     ``tolerance`` that of the least clearance [m], 0 for a bare proof.
@@ -217,7 +202,7 @@ def prove_curve(
         PROVED, MORE, TOUCHING (the pair is in ``worst``), UNDECIDED where an
         interval got too short, or OUTSIDE at a state for which the tables do not hold.
     """
-    t, s, h, k = robot_view(ri, rf), scene_view(si, sf), shapes_view(bi, bf), shapes_view(oi, of)
+    t, s, h = robot_view(ri, rf), scene_view(si, sf), shapes_view(hi, hf)
     w, g, p = workspace_view(t, wi, wf), pair_view(gi, gf), _proof_view(pi, pf, len(t.lower))
     whole = knots[len(knots) - 1] - knots[0]
     while p.places[0] < p.places[1] and budget > 0:
@@ -234,13 +219,10 @@ def prove_curve(
         count = 1
         p.found[0, 0], p.found[0, 1] = first, second
         if first == ALL:
-            if tolerance > 0.0 and p.places[2] <= SEEDED:
-                _seed(t, s, w, h, k, g, p, middle, tolerance)
-                set_motion(knots, states, rates, slack, a, b, p.state, w)
             count = _left_by_spheres(t, s, w, p, a, b, whole)
         if count < 0:
             return UNDECIDED
-        outcome = _by_shapes(t, w, h, k, g, p, a, b, count, SHORTEST * whole, touch, tolerance)
+        outcome = _by_shapes(t, w, h, g, p, a, b, count, SHORTEST * whole, touch, tolerance)
         if outcome != PROVED:
             return outcome
     return PROVED if p.places[0] == p.places[1] else MORE

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import math
 
-from apex_ompl.kernel.compiled.arrays import HALF_SPACE, SPHERE, RobotArrays
+from apex_ompl.kernel.compiled.arrays import HALF_SPACE, SPHERE
 from apex_ompl.kernel.compiled.compilation import inlined, outlined
 from apex_ompl.kernel.compiled.convex_distance import convex_distance
 from apex_ompl.kernel.compiled.relative_motion import (
+    Frames,
     convex_bound,
     half_space_distance,
     place_shape,
     set_relative_motion,
 )
 from apex_ompl.kernel.compiled.shapes import HULL, MOST_NODES, PairBuffers, ShapeArrays
-from apex_ompl.kernel.compiled.workspace import Workspace
 
 TRIANGLE = 3  # corners
 
@@ -42,8 +42,8 @@ def _set_node(h: ShapeArrays, g: PairBuffers, s: int, node: int) -> None:
             g.centre[s, i] = o[i] + r[i, 0] * b[0] + r[i, 1] * b[1] + r[i, 2] * b[2]
 
 
-@inlined
-def _balls_apart(h: ShapeArrays, k: ShapeArrays, g: PairBuffers, m: int, n: int) -> float:
+@outlined
+def _balls_apart(h: ShapeArrays, g: PairBuffers, m: int, n: int) -> float:
     """Return the distance of the balls of two nodes, -1 for a side that is a single piece [m]."""
     apart = 0.0
     for i in range(3):
@@ -52,16 +52,16 @@ def _balls_apart(h: ShapeArrays, k: ShapeArrays, g: PairBuffers, m: int, n: int)
             r, c = g.rotation[0], h.node_ball[m]
             a = g.origin[0, i] + r[i, 0] * c[0] + r[i, 1] * c[1] + r[i, 2] * c[2]
         if n >= 0:
-            r, c = g.rotation[1], k.node_ball[n]
+            r, c = g.rotation[1], h.node_ball[n]
             b = g.origin[1, i] + r[i, 0] * c[0] + r[i, 1] * c[1] + r[i, 2] * c[2]
         apart += (a - b) ** 2
     first = g.ball[0, 3] if m < 0 else h.node_ball[m, 3]
-    second = g.ball[1, 3] if n < 0 else k.node_ball[n, 3]
+    second = g.ball[1, 3] if n < 0 else h.node_ball[n, 3]
     return float(math.sqrt(apart) - first - second)
 
 
 @outlined
-def _mesh_bound(h: ShapeArrays, k: ShapeArrays, g: PairBuffers, m: int, n: int, need: float) -> tuple[float, float]:
+def _mesh_bound(h: ShapeArrays, g: PairBuffers, m: int, n: int, need: float) -> tuple[float, float]:
     """Return what :func:`pair_bound` does for shapes of which one or both are meshes, from nodes ``m`` and ``n`` on."""
     bound, least, top = math.inf, math.inf, 1
     g.nodes[0, 0], g.nodes[0, 1] = m, n
@@ -69,35 +69,35 @@ def _mesh_bound(h: ShapeArrays, k: ShapeArrays, g: PairBuffers, m: int, n: int, 
     while top > 0:
         top -= 1
         m, n = g.nodes[top, 0], g.nodes[top, 1]
-        apart = _balls_apart(h, k, g, m, n) - arc
+        apart = _balls_apart(h, g, m, n) - arc
         if apart >= min(need, bound):
             bound = min(bound, apart)
             continue
-        inner, other = m >= 0 and h.child[m] >= 0, n >= 0 and k.child[n] >= 0
+        inner, other = m >= 0 and h.child[m] >= 0, n >= 0 and h.child[n] >= 0
         if m >= 0:
             _set_node(h, g, 0, m)
         if n >= 0:
-            _set_node(k, g, 1, n)
+            _set_node(h, g, 1, n)
         if not (inner and other):
             _set_guess(g)
-            distance, upper = convex_distance(h.points, k.points, g, min(need, bound) + arc)
+            distance, upper = convex_distance(h.points, g, min(need, bound) + arc)
             if distance - arc >= min(need, bound):
                 bound = min(bound, distance - arc)
                 continue
             if not (inner or other):
-                bound = min(bound, convex_bound(h.points, k.points, g, distance, True))
+                bound = min(bound, convex_bound(h.points, g, distance))
                 least = min(least, upper)
                 continue
         if top + 2 > MOST_NODES:
             return -math.inf, least
-        if inner and (not other or h.node_ball[m, 3] >= k.node_ball[n, 3]):
+        if inner and (not other or h.node_ball[m, 3] >= h.node_ball[n, 3]):
             first = h.child[m]
-            swap = _balls_apart(h, k, g, first, n) < _balls_apart(h, k, g, first + 1, n)
+            swap = _balls_apart(h, g, first, n) < _balls_apart(h, g, first + 1, n)
             g.nodes[top, 0], g.nodes[top + 1, 0] = (first + 1, first) if swap else (first, first + 1)
             g.nodes[top, 1] = g.nodes[top + 1, 1] = n
         else:
-            first = k.child[n]
-            swap = _balls_apart(h, k, g, m, first) < _balls_apart(h, k, g, m, first + 1)
+            first = h.child[n]
+            swap = _balls_apart(h, g, m, first) < _balls_apart(h, g, m, first + 1)
             g.nodes[top, 1], g.nodes[top + 1, 1] = (first + 1, first) if swap else (first, first + 1)
             g.nodes[top, 0] = g.nodes[top + 1, 0] = m
         top += 2  # the nearer one is looked at first
@@ -105,18 +105,14 @@ def _mesh_bound(h: ShapeArrays, k: ShapeArrays, g: PairBuffers, m: int, n: int, 
 
 
 @outlined
-def pair_bound(
-    t: RobotArrays, w: Workspace, h: ShapeArrays, a: int, k: ShapeArrays, b: int, g: PairBuffers, need: float
-) -> tuple[float, float]:
+def pair_bound(f: Frames, h: ShapeArrays, a: int, b: int, g: PairBuffers, need: float) -> tuple[float, float]:
     """Return bounds on the distance of two shapes [m].
 
     Args:
-        t: The robot.
-        w: Frames of the state in the middle, and the motion.
-        h: Shapes of the first side, bodies.
-        a: Shape of the first side.
-        k: Shapes of the second side, bodies or obstacles.
-        b: Shape of the second side.
+        f: Frames of the state in the middle, and the motion.
+        h: The shapes.
+        a: Shape of the first side, a body.
+        b: Shape of the second side, a body or an obstacle.
         g: Memory.
         need: Lower bound that suffices [m].
 
@@ -124,22 +120,21 @@ def pair_bound(
         A lower bound during the whole motion, and an upper bound now: the distance of two points of the shapes,
         infinite where it was not needed. Meshes have their surfaces alone.
     """
-    place_shape(w, h, a, g, 0)
-    i, j = h.joint[a], k.joint[b]
-    if k.kind[b] == HALF_SPACE:
-        set_relative_motion(t, w, g, 0, i, j)
-        return half_space_distance(h.points, g, k, b)
-    place_shape(w, k, b, g, 1)
-    set_relative_motion(t, w, g, 0, i, j)
-    set_relative_motion(t, w, g, 1, j, i)
+    place_shape(f, h, a, g, 0)
+    i, j = h.joint[a], h.joint[b]
+    set_relative_motion(f, g, 0, i, j)
+    if h.kind[b] == HALF_SPACE:
+        return half_space_distance(g, h, b)
+    place_shape(f, h, b, g, 1)
+    set_relative_motion(f, g, 1, j, i)
     _set_guess(g)
     arc = min(g.arc_bound[0], g.arc_bound[1])
-    distance, upper = convex_distance(h.points, k.points, g, need + arc)
+    distance, upper = convex_distance(h.points, g, need + arc)
     if distance - arc >= need:
         return distance - arc, math.inf
-    bound = convex_bound(h.points, k.points, g, distance, True)
-    if h.root[a] < 0 and k.root[b] < 0:
-        return max(bound, distance - arc), upper
+    bound = convex_bound(h.points, g, distance)
+    if h.root[a] < 0 and h.root[b] < 0:
+        return bound, upper
     if bound >= need:
         return bound, math.inf
-    return _mesh_bound(h, k, g, h.root[a], k.root[b], need)
+    return _mesh_bound(h, g, h.root[a], h.root[b], need)

@@ -18,20 +18,34 @@ whole motion.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
-from apex_ompl.kernel.compiled.arrays import FIXED, REVOLUTE, RobotArrays
+from apex_ompl.kernel.compiled.arrays import FIXED, REVOLUTE
 from apex_ompl.kernel.compiled.compilation import inlined, outlined
 from apex_ompl.kernel.compiled.convex_distance import radius, support
-from apex_ompl.kernel.compiled.layout import Floats
+from apex_ompl.kernel.compiled.layout import Floats, Integers
 from apex_ompl.kernel.compiled.shapes import PairBuffers, ShapeArrays
-from apex_ompl.kernel.compiled.workspace import Workspace
+
+
+class Frames(NamedTuple):
+    """What the motion of pairs needs of a robot and of the buffers of a state, with their names."""
+
+    joint_parent: Integers
+    joint_kind: Integers
+    joint_source: Integers
+    joint_ratio: Floats
+    rotation: Floats
+    origin: Floats
+    step: Floats
+    deviation: Floats
+    half_width: Floats
 
 
 @inlined
-def place_shape(w: Workspace, h: ShapeArrays, row: int, g: PairBuffers, s: int) -> None:
+def place_shape(f: Frames, h: ShapeArrays, row: int, g: PairBuffers, s: int) -> None:
     """Place a shape on side ``s``, as the piece that is looked at, with its ball."""
     j = h.joint[row]
-    r, o, a, p, ball = w.rotation[j], w.origin[j], h.rotation[row], h.offset[row], h.ball[row]
+    r, o, a, p, ball = f.rotation[j], f.origin[j], h.rotation[row], h.offset[row], h.ball[row]
     for i in range(3):
         g.origin[s, i] = o[i] + r[i, 0] * p[0] + r[i, 1] * p[1] + r[i, 2] * p[2]
         g.ball[s, i] = o[i] + r[i, 0] * ball[0] + r[i, 1] * ball[1] + r[i, 2] * ball[2]
@@ -43,7 +57,7 @@ def place_shape(w: Workspace, h: ShapeArrays, row: int, g: PairBuffers, s: int) 
 
 
 @inlined
-def _chain(t: RobotArrays, g: PairBuffers, joint: int, other: int) -> tuple[int, int]:
+def _chain(f: Frames, g: PairBuffers, joint: int, other: int) -> tuple[int, int]:
     """Put the joints from ``joint`` to ``other`` into ``g.chain``, both ends included.
 
     Returns:
@@ -54,34 +68,34 @@ def _chain(t: RobotArrays, g: PairBuffers, joint: int, other: int) -> tuple[int,
         if a > b:
             g.chain[count] = a
             count += 1
-            a = t.joint_parent[a]
+            a = f.joint_parent[a]
         else:
             below += 1
-            b = t.joint_parent[b]
+            b = f.joint_parent[b]
     b = other
     for k in range(below):
         g.chain[count + below - 1 - k] = b
-        b = t.joint_parent[b]
+        b = f.joint_parent[b]
     return count, count + below
 
 
 @outlined
-def set_relative_motion(t: RobotArrays, w: Workspace, g: PairBuffers, s: int, joint: int, other: int) -> None:
+def set_relative_motion(f: Frames, g: PairBuffers, s: int, joint: int, other: int) -> None:
     """Set velocity, turn and bounds of side ``s``, fixed to ``joint``, as seen from the other side's joint."""
-    mine, count = _chain(t, g, joint, other)
+    mine, count = _chain(f, g, joint, other)
     x, y, z, spread = g.ball[s, 0], g.ball[s, 1], g.ball[s, 2], g.ball[s, 3]
     moved = deviated = levers = curvature = vx = vy = vz = ox = oy = oz = 0.0
     for i in range(count):
         j = g.chain[i]
-        if t.joint_kind[j] == FIXED:
+        if f.joint_kind[j] == FIXED:
             continue
-        k, ratio = t.joint_source[j], t.joint_ratio[j]
-        width, deviation, step = abs(ratio) * w.half_width[k], abs(ratio) * w.deviation[k], ratio * w.step[k]
+        k, ratio = f.joint_source[j], f.joint_ratio[j]
+        width, deviation, step = abs(ratio) * f.half_width[k], abs(ratio) * f.deviation[k], ratio * f.step[k]
         if i >= mine:
             step = -step
-        r, o = w.rotation[j], w.origin[j]
+        r, o = f.rotation[j], f.origin[j]
         ax, ay, az = r[0, 2], r[1, 2], r[2, 2]
-        if t.joint_kind[j] == REVOLUTE:
+        if f.joint_kind[j] == REVOLUTE:
             u, v, c = x - o[0], y - o[1], z - o[2]
             u, v, c = ay * c - az * v, az * u - ax * c, ax * v - ay * u
             arm = math.sqrt(u * u + v * v + c * c) + spread + moved
@@ -112,13 +126,12 @@ def _least(points: Floats, g: PairBuffers, s: int, x: float, y: float, z: float)
 
 @outlined
 def distance_during_motion(
-    points: Floats, others: Floats, g: PairBuffers, s: int, x: float, y: float, z: float, offset: float
+    points: Floats, g: PairBuffers, s: int, x: float, y: float, z: float, offset: float
 ) -> float:
     """Return a lower bound of the distance of two pieces during the motion of ``g`` [m].
 
     Args:
-        points: Corners of the moving side.
-        others: Corners of the other side.
+        points: Corners of hulls and triangles.
         g: The pieces and their motion.
         s: The moving side.
         x: Normal of a separating plane, fixed to the other side, towards the moving one.
@@ -128,7 +141,7 @@ def distance_during_motion(
     """
     if math.isinf(offset):
         c = g.ball[1 - s]
-        offset = x * c[0] + y * c[1] + z * c[2] - _least(others, g, 1 - s, -x, -y, -z)
+        offset = x * c[0] + y * c[1] + z * c[2] - _least(points, g, 1 - s, -x, -y, -z)
     o, v, c = g.turn[s], g.velocity[s], g.ball[s]
     middle = x * c[0] + y * c[1] + z * c[2] - offset
     along = x * v[0] + y * v[1] + z * v[2]
@@ -139,25 +152,25 @@ def distance_during_motion(
 
 
 @inlined
-def half_space_distance(points: Floats, g: PairBuffers, h: ShapeArrays, row: int) -> tuple[float, float]:
+def half_space_distance(g: PairBuffers, h: ShapeArrays, row: int) -> tuple[float, float]:
     """Return the distance of side 0 to a half-space, a lower bound during the motion and its value now [m]."""
-    n, offset = h.offset[row], h.size[row, 0]
+    n, offset, points = h.offset[row], h.size[row, 0], h.points
     x, y, z = n[0], n[1], n[2]
     c = g.ball[0]
     now = x * c[0] + y * c[1] + z * c[2] - offset + _least(points, g, 0, x, y, z)
-    bound = distance_during_motion(points, points, g, 0, x, y, z, offset)
+    bound = distance_during_motion(points, g, 0, x, y, z, offset)
     return max(bound, now - g.arc_bound[0]), now
 
 
-@inlined
-def convex_bound(points: Floats, others: Floats, g: PairBuffers, distance: float, both: bool) -> float:
+@outlined
+def convex_bound(points: Floats, g: PairBuffers, distance: float) -> float:
     """Return a lower bound of the distance of two pieces during the motion, given a lower bound of it now [m].
 
-    ``g.normal`` is the normal of a separating plane from side 0 to side 1; ``both`` says whether the motion of side 1
-    as seen from side 0 is set too.
+    ``g.normal`` is the normal of a separating plane from side 0 to side 1.
     """
     x, y, z = g.normal[0], g.normal[1], g.normal[2]
-    bound = max(distance - g.arc_bound[0], distance_during_motion(points, others, g, 0, -x, -y, -z, math.inf))
-    if both:
-        bound = max(bound, distance_during_motion(others, points, g, 1, x, y, z, math.inf))
+    bound = distance - min(g.arc_bound[0], g.arc_bound[1])
+    for s in range(2):
+        x, y, z = -x, -y, -z
+        bound = max(bound, distance_during_motion(points, g, s, x, y, z, math.inf))
     return float(bound)

@@ -22,7 +22,7 @@ class ShapeArrays(NamedTuple):
     triangles in ``root`` (else -1). An inner node has its first child in ``child``, the second stands behind it; a leaf
     has -1 there, and the first of its three corners in ``corner``. Balls of nodes are in the shape's frame.
 
-    ``row`` gives the shape of a body or obstacle by its number.
+    Bodies come first, in the order of the robot's tables; ``row`` gives the shape of an obstacle by its number.
     """
 
     kind: Integers
