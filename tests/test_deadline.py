@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import bad_planners
@@ -275,11 +275,8 @@ def test_a_path_that_is_not_timed_in_time(
 def test_timing_ends_wherever_it_is_told(timing: Timing, found: PlanResult, ready: PlanningSetup) -> None:
     limits, names = ready.robot.limits, ready.robot.joint_names
 
-    def rejected(motion: object) -> str:
-        return "on purpose"
-
     asked = 0
-    for asked in steps():
+    for asked in (*range(10), *(round(10 * 1.3**k) for k in range(1, 40))):
         calls = counting(asked)
         try:
             made = time_path(states_of(found), limits, names, timing, stop=calls)
@@ -290,12 +287,7 @@ def test_timing_ends_wherever_it_is_told(timing: Timing, found: PlanResult, read
         break
     assert asked > 5
     with pytest.raises(TimingStoppedError, match="on purpose"):
-        time_path(states_of(found), limits, names, timing, rejected, stop=counting(asked))
-
-
-def steps() -> Iterator[int]:
-    yield from range(10)
-    yield from (round(10 * 1.3**k) for k in range(1, 40))
+        time_path(states_of(found), limits, names, timing, lambda _: "on purpose", stop=counting(asked))
 
 
 def test_a_tiny_time_ends_in_time_with_its_reason() -> None:
