@@ -155,8 +155,8 @@ def verify(run: PlanRun, path: Path, simplify: bool, solved_by: str) -> PlanResu
             path, proof = repaired
             return run.result(PlanStatus.EXACT_SOLUTION, path=path, solved_by=f"{solved_by}+repair", proof=proof)
         late |= time.perf_counter() >= end
-    failed = NOT_PROVED if late else "the path found failed the full check and repair"
-    return run.result(PlanStatus.TIMEOUT, f"{failed}, {reason}")
+    failed = "and was not repaired in time" if late else "and repair"
+    return run.result(PlanStatus.TIMEOUT, f"the path found failed the full check {failed}, {reason}")
 
 
 def with_exact_ends(setup: PlanningSetup, path: Path) -> Path:
