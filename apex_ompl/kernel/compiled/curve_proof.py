@@ -26,7 +26,7 @@ from apex_ompl.kernel.compiled.workspace import Workspace, workspace_view
 
 PROVED, MORE, TOUCHING, UNDECIDED, OUTSIDE = range(5)  # outcomes
 QUEUE = 1 << 14  # intervals that wait
-MOST_UNPROVED = 256  # pairs that the spheres leave on one interval
+MOST_UNPROVED = 2048  # pairs that the spheres leave on one interval
 FEW = 12  # pairs that are looked at one by one also on a long interval
 SHORT = 0.01  # share of the curve below which an interval is not long
 SHORTEST = 1e-11  # share of the curve below which a pair that is still open is given up
