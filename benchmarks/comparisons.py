@@ -1,7 +1,7 @@
 """All comparisons with other planners, one command after the other; each resumes where it was stopped.
 
-benchmarks/head_to_head.py, time_to_quality.py and peers.py, then the paper's figures by scripts/reproduce.py. The
-reference lengths of time_to_quality.py are made only where they are missing.
+benchmarks/head_to_head.py, standing.py, time_to_quality.py and peers.py, then the paper's figures by
+scripts/reproduce.py. The reference lengths of time_to_quality.py are made only where they are missing.
 
 Usage: python benchmarks/comparisons.py [--jobs 1]    (needs the extras "bench", "data" and "peers")
 """
@@ -22,6 +22,7 @@ REFERENCE = ROOT / "benchmarks" / "reference_lengths.json"
 NEEDED = ("matplotlib", "ray", "roboplan")
 COMMANDS = (
     ("benchmarks/head_to_head.py",),
+    ("benchmarks/standing.py",),
     *(() if REFERENCE.is_file() else (("benchmarks/time_to_quality.py", "--reference"),)),
     ("benchmarks/time_to_quality.py",),
     ("benchmarks/peers.py",),

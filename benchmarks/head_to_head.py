@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -34,6 +34,7 @@ from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import one_or_more
 
 DEPENDS = ("@benchmark", "benchmarks/controls.py")
+FOLDER = Path(__file__).parent / "runs" / "head_to_head"
 TIMEOUT = 10.0  # [s]
 SLOW = 20  # problems of a level for rows that take long
 TIMES = (("first", 50), ("first", 95), ("first", 99), ("total", 50))
@@ -68,13 +69,21 @@ ROWS = (
 )
 
 
-def together(found: Sequence[Statistics]) -> Table:
-    """Return the statistics of each row over levels of a kind, with its lengths over those of apex."""
+def together(
+    found: Sequence[Statistics], wanted: Sequence[Row] = ROWS, groups: Mapping[str, Sequence[str]] = GROUPS
+) -> Table:
+    """Return the statistics of each row over levels together, with its lengths over those of apex.
+
+    Args:
+        found: Statistics of the rows on each level.
+        wanted: The rows.
+        groups: Name of a group -> its levels, as ``shelf/hard``, or ``hard`` for those of all suites.
+    """
     rows = []
-    for group, levels in GROUPS.items():
-        mine = [f for f in found if f.experiment.split("/")[1] in levels]
+    for group, levels in groups.items():
+        mine = [f for f in found if f.experiment in levels or f.experiment.split("/")[1] in levels]
         best = {run["problem"]: run["length"] for f in mine if f.label == "apex" for run in f.solved}
-        for row in ROWS:
+        for row in wanted:
             parts = [f for f in mine if f.label == row.label]
             if not parts or (row.levels and group == "all"):
                 continue
@@ -105,14 +114,13 @@ def main() -> None:
     )
     parser.add_argument("--jobs", type=one_or_more, default=1, help="runs at a time (default: one, as they are timed)")
     args = parser.parse_args()
-    folder = Path(__file__).parent / "runs" / "head_to_head"
     workers = Workers(args.jobs, modules=("controls",))
     rows = [row if row.runs is None else replace(row, runs=args.slow) for row in ROWS]
     levels, seeds = record.static_levels(args.levels), {row.label: min(args.n, row.runs or args.n) for row in rows}
-    results = bench(levels, rows, folder, runs=args.n, timeout=TIMEOUT, workers=workers, provenance=record.session())
+    results = bench(levels, rows, FOLDER, runs=args.n, timeout=TIMEOUT, workers=workers, provenance=record.session())
     results = replace(results, runs=[run for run in results.runs if run["seed"] < seeds.get(run["label"], 0)])
     write_database(results, write_logs(results))
-    report(folder, folder)
+    report(FOLDER, FOLDER)
     found = [table for table in (together(statistics(results)), *tables(results)) if table.rows]
     text = "\n\n".join([*warnings(results), *(table.markdown() for table in found)])
     data = {"tables": [{"title": t.title, "head": list(t.head), "rows": [list(r) for r in t.rows]} for t in found]}

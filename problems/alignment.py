@@ -5,7 +5,8 @@ kinematics from home + N(0, 0.6^2). Both are free by 1 cm, except that the two o
 
 Obstacles are cubes. Their centres are those of a held object at a random state in the middle half of the straight line
 from start to goal, + N(0, 0.1^2) m; cubes drawn evenly over the workspace would rarely block a motion. A static cube
-keeps 3 cm to start and goal. A moving cube keeps 3 cm to the start at time 0, and to the goal at the time when the
+keeps 3 cm to start and goal. On ``extreme`` 100 and 70 cubes, which may overlap, form a cave: they are spread by
+N(0, 0.2^2) m and keep 1.5 cm. A moving cube keeps 3 cm to the start at time 0, and to the goal at the time when the
 straight line ends there; at earlier times it may overlap the goal.
 """
 
@@ -27,13 +28,14 @@ from apex_ompl.tasks.grasp import HandObjects
 from apex_ompl.types import Array
 
 SIZES = {"small": 0.06, "medium": 0.10, "large": 0.15, "xlarge": 0.20, "huge": 0.30}  # edges of the cubes [m]
-STATIC = ("small", "medium", "large")
+STATIC = ("small", "medium", "large", "extreme")
 SPEEDS = (0.1, 0.2, 0.4)  # [m/s]
 MAX_CUBES = 3
+EXTREME_CUBES = {"vertical": 100, "horizontal": 70}
 START_SPREAD = 0.35  # standard deviation of starts around home [rad]
 START_HEIGHT, START_SEPARATION = 0.08, 0.4  # of the objects above the tables, and of their centres [m]
-CUBE_MARGIN = 0.03  # of cubes to start and goal [m]
-CUBE_SPREAD = 0.1  # standard deviation of the centres of cubes around those of held objects [m]
+CUBE_MARGIN, EXTREME_MARGIN = 0.03, 0.015  # of cubes to start and goal [m]
+CUBE_SPREAD, EXTREME_SPREAD = 0.1, 0.2  # standard deviation of the centres of cubes around those of held objects [m]
 CUBE_ATTEMPTS = 20  # positions tried for a cube
 VELOCITY_SCALE = 0.25  # of the velocity limits, at which straight lines are followed
 
@@ -68,10 +70,12 @@ def draw(rng: np.random.Generator, suite: str, level: str) -> DrawnProblem | Non
     if start is None or goal is None:
         return None
     size, speed = cube_size_and_speed(level)
-    count = int(rng.integers(1, MAX_CUBES + 1)) if speed == 0.0 else 1
+    extreme = level == "extreme"
+    count = EXTREME_CUBES[suite] if extreme else int(rng.integers(1, MAX_CUBES + 1)) if speed == 0.0 else 1
+    margin, spread = (EXTREME_MARGIN, EXTREME_SPREAD) if extreme else (CUBE_MARGIN, CUBE_SPREAD)
     cubes: list[Obstacle] = []
     for k in range(count if size > 0.0 else 0):
-        cube = _draw_cube(rng, sampler, np.stack([start, goal]), size, speed)
+        cube = _draw_cube(rng, sampler, np.stack([start, goal]), size, speed, margin=margin, spread=spread)
         if cube is None:
             return None
         cubes.append(cube.model_copy(update={"name": f"cube_{k}"}))
@@ -82,6 +86,8 @@ def cube_size_and_speed(level: str) -> tuple[float, float]:
     """Return the edge [m] and the speed [m/s] of a level's cubes; size 0 without cubes, speed 0 for static ones."""
     if level == "free":
         return 0.0, 0.0
+    if level == "extreme":
+        return SIZES["xlarge"], 0.0
     moving, _, rest = level.partition("-")
     if moving != "moving":
         return SIZES[level], 0.0
@@ -95,7 +101,14 @@ def straight_line_duration(start: Array, goal: Array) -> float:
 
 
 def _draw_cube(
-    rng: np.random.Generator, sampler: AlignmentSampler, ends: Array, size: float, speed: float
+    rng: np.random.Generator,
+    sampler: AlignmentSampler,
+    ends: Array,
+    size: float,
+    speed: float,
+    *,
+    margin: float,
+    spread: float,
 ) -> Obstacle | None:
     """Return a cube near the straight line of a held object, or None when no position was found.
 
@@ -105,19 +118,21 @@ def _draw_cube(
         ends: Start and goal, shape (2, dof).
         size: Edge of the cube [m].
         speed: Of the cube, in a random horizontal direction [m/s].
+        margin: Distance that it keeps to start and goal [m].
+        spread: Standard deviation of its centre around that of the held object [m].
     """
     duration = straight_line_duration(ends[0], ends[1])
     for _ in range(CUBE_ATTEMPTS):
         fraction, held = rng.uniform(0.25, 0.75), int(rng.integers(len(sampler.attached)))
         state = ends[0] + fraction * (ends[1] - ends[0])
-        centre = sampler.box_corners(state[None])[0, held].mean(axis=0) + rng.normal(0.0, CUBE_SPREAD, 3)
+        centre = sampler.box_corners(state[None])[0, held].mean(axis=0) + rng.normal(0.0, spread, 3)
         heading = rng.uniform(0.0, 2.0 * np.pi)
         velocity = np.round(speed * np.array([np.cos(heading), np.sin(heading), 0.0]), 4)
         centre[2] = max(centre[2], size / 2)  # above the table
         initial = np.round(centre - velocity * fraction * duration, 4)
         final = initial + velocity * duration
         if all(
-            _cube_distance(sampler, q, _cube(size, position)) >= CUBE_MARGIN
+            _cube_distance(sampler, q, _cube(size, position)) >= margin
             for q, position in zip(ends, (initial, final), strict=True)
         ):
             cube = _cube(size, initial)

@@ -15,7 +15,7 @@ SPLITS = {"train": range(800_000), "validation": range(800_000, 900_000), "test"
 MOVING = tuple(f"moving-{size}-{speed}" for size in alignment.SIZES for speed in alignment.SPEEDS)
 LEVELS: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(alignment.SAMPLERS, ("free", *alignment.STATIC, *MOVING)),
-    **dict.fromkeys(scenes.SUITES, scenes.LEVELS),
+    **scenes.LEVELS,
 }
 """Suite of the benchmarks -> its levels."""
 

@@ -33,7 +33,10 @@ from apex_ompl.util.schema import validate
 FOLDER = Path(__file__).parent / "frozen"
 SUMS = "SHA256SUMS"
 SCHEMA = "apex-ompl/frozen/1"
-COUNTS = {"validation": (30, 10), "test": (100, 20)}  # problems of a static level, and of one with moving obstacles
+COUNTS = {
+    "validation": {"static": 30, "extreme": 20, "moving": 10},
+    "test": {"static": 100, "extreme": 30, "moving": 20},
+}  # problems of a level of each kind
 STATE_STEP, TIME_STEP = 1e-4, 1e-3  # quantization of the states of witnesses [rad] and of their times [s]
 
 
@@ -85,8 +88,9 @@ def is_frozen(problem_id: ProblemId) -> bool:
 
 def frozen_seeds(level: str, split: str) -> range:
     """Return the seeds of the frozen problems of a level in a split."""
-    first, count = SPLITS[split].start, COUNTS[split][level.startswith("moving-")]
-    return range(first, first + count)
+    kind = "extreme" if level == "extreme" else "moving" if level.startswith("moving-") else "static"
+    first = SPLITS[split].start
+    return range(first, first + COUNTS[split][kind])
 
 
 def load(problem_id: ProblemId) -> FrozenProblem:

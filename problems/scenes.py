@@ -49,6 +49,7 @@ def shelf(rng: np.random.Generator, level: str) -> ReachingTask:
         "easy": (0.5, 0.36, 0.22, 0.05),
         "medium": (0.44, 0.32, 0.3, 0.1),
         "hard": (0.4, 0.29, 0.36, 0.14),
+        "extreme": (0.34, 0.248, 0.44, 0.19),
     }[level]  # of a compartment; how far the hands reach into it
     front, low = rng.uniform(0.56, 0.62), rng.uniform(0.08, 0.2)
     columns = width * (np.arange(4) - 1.5) + rng.uniform(-0.04, 0.04)
@@ -80,6 +81,7 @@ def bins(rng: np.random.Generator, level: str) -> ReachingTask:
         "easy": (0.16, 0.34, 0.02),
         "medium": (0.3, 0.27, 0.14),
         "hard": (0.34, 0.255, 0.165),
+        "extreme": (0.4, 0.245, 0.165),
     }[level]
     scene, regions = [], []
     for k, middle in enumerate((-0.62, -0.22, 0.22, 0.62)):
@@ -88,8 +90,9 @@ def bins(rng: np.random.Generator, level: str) -> ReachingTask:
             size = (BOARD, width, height) if dx else (width, BOARD, height)
             scene.append(box(f"bin_{k}_{side}", size, (x + dx * width / 2, y + dy * width / 2, height / 2)))
         regions.append(around((x, y, height - reach_in), 0.02, DOWN))
-    if level == "hard":
-        scene.append(box("rack", (0.3, 1.6, BOARD), (0.5, 0.0, 0.9)))
+    rack = {"hard": 0.9, "extreme": 0.75}.get(level)  # its height
+    if rack is not None:
+        scene.append(box("rack", (0.3, 1.6, BOARD), (0.5, 0.0, rack)))
     left, right = rng.permutation([3, 2]), rng.permutation([0, 1])
     return ReachingTask(tuple(scene), (regions[left[0]], regions[right[0]]), (regions[left[1]], regions[right[1]]))
 
@@ -143,7 +146,7 @@ def posts(rng: np.random.Generator, level: str) -> ReachingTask:
 
 def wall(rng: np.random.Generator, level: str) -> ReachingTask:
     """Draw a wall between the arms with two windows, through which the hands reach to the other side."""
-    opening = {"easy": 0.31, "medium": 0.29, "hard": 0.23}[level]
+    opening = {"easy": 0.31, "medium": 0.29, "hard": 0.23, "extreme": 0.2015}[level]
     thickness, near, far, height = 0.03, 0.1, 1.0, 1.1
     x, z = rng.uniform(0.48, 0.54), np.sort(rng.uniform([0.2, 0.58], [0.26, 0.64]))
     windows = [(x, float(z[0])), (x, float(z[1]))]
@@ -155,7 +158,7 @@ def wall(rng: np.random.Generator, level: str) -> ReachingTask:
     for k in range(3):
         low, high = levels[2 * k], levels[2 * k + 1]
         scene.append(box(f"beam_{k}", (opening, thickness, high - low), (x, 0.0, (low + high) / 2)))
-    reach_through = {"easy": 0.06, "medium": 0.1, "hard": 0.12}[level]
+    reach_through = {"easy": 0.06, "medium": 0.1, "hard": 0.12, "extreme": 0.14}[level]
 
     def through(side: float, window: int) -> HandRegion:
         wx, wz = windows[window]
@@ -175,7 +178,7 @@ def wall(rng: np.random.Generator, level: str) -> ReachingTask:
 
 def swap(rng: np.random.Generator, level: str) -> ReachingTask:
     """Draw two pigeonholes before the arms, one higher than the other; the hands exchange their pigeonholes."""
-    size, depth = {"easy": (0.4, 0.1), "medium": (0.315, 0.19), "hard": (0.28, 0.22)}[level]
+    size, depth = {"easy": (0.4, 0.1), "medium": (0.315, 0.19), "hard": (0.28, 0.22), "extreme": (0.248, 0.32)}[level]
     front = rng.uniform(0.55, 0.6)
     side, low = float(rng.choice([-1.0, 1.0])), rng.uniform(0.16, 0.22) + size / 2 - 0.15
     regions, scene = [], []
@@ -196,12 +199,18 @@ def swap(rng: np.random.Generator, level: str) -> ReachingTask:
 
 
 def clutter(rng: np.random.Generator, level: str) -> ReachingTask:
-    """Draw ten to thirty primitives, 4 cm to half a metre long; each hand moves sideways among them."""
-    count, longest, scene = *{"easy": (10, 0.2), "medium": (20, 0.3), "hard": (30, 0.4)}[level], []
+    """Draw ten to forty-five primitives, 4 cm to half a metre long; each hand moves sideways among them."""
+    count, widest, longest = {
+        "easy": (10, 0.14, 0.2),
+        "medium": (20, 0.14, 0.3),
+        "hard": (30, 0.14, 0.4),
+        "extreme": (45, 0.11, 0.5),
+    }[level]
+    scene = []
     for k in range(count):
         quaternion = rng.normal(size=4)
         position = rng.uniform([0.05, -0.8, 0.1], [0.8, 0.8, 1.0])
-        size, kind = rng.uniform(0.04, (0.14, 0.14, longest)), int(rng.integers(4))
+        size, kind = rng.uniform(0.04, (widest, widest, longest)), int(rng.integers(4))
         # Frozen problems hold these names.
         scene.append(primitive(f"thing_{k}", kind, size, position, quaternion))
 
@@ -216,4 +225,8 @@ def clutter(rng: np.random.Generator, level: str) -> ReachingTask:
 SUITES: dict[str, Callable[[np.random.Generator, str], ReachingTask]] = {
     "shelf": shelf, "bins": bins, "cage": cage, "posts": posts, "wall": wall, "swap": swap, "clutter": clutter,
 }  # fmt: skip
-LEVELS = ("easy", "medium", "hard")
+LEVELS = {
+    suite: ("easy", "medium", "hard") if suite in ("cage", "posts") else ("easy", "medium", "hard", "extreme")
+    for suite in SUITES
+}
+"""Suite -> its levels; rrtconnect with a tuned range takes long enough on ``hard`` of ``cage`` and ``posts``."""

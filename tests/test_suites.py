@@ -23,8 +23,10 @@ from apex_ompl.scene.problem import Alignment, Problem
 from apex_ompl.tasks.alignment import AlignmentGoal
 
 SUITE_LEVELS = [(suite, level) for suite, levels in problems.suites().items() for level in levels]
+EXTREME = ("shelf", "bins", "wall", "swap", "clutter")
 HARD = ("shelf", "bins", "cage", "posts", "wall", "swap", "clutter")
 LEVELS = ["free", "small", "large", "moving-medium-0.2", "moving-huge-0.4"]
+HARD_LEVELS = [pair for pair in SUITE_LEVELS if pair[0] in HARD]
 FACES = {"vertical": [("lower", "upper")], "horizontal": [("cup", "ball"), ("block", "peg")]}
 
 
@@ -46,10 +48,11 @@ def box_corners(robot: Robot, problem: Problem, q: np.ndarray) -> list[np.ndarra
 def test_the_suites_and_levels_are_those_of_the_contract() -> None:
     suites = problems.suites()
     assert set(suites) == {"vertical", "horizontal", *HARD}
-    assert all(suites[suite] == ("easy", "medium", "hard") for suite in HARD)
+    for suite in HARD:
+        assert suites[suite] == ("easy", "medium", "hard", *(("extreme",) if suite in EXTREME else ()))
     moving = {f"moving-{size}-{speed}" for size in alignment.SIZES for speed in ("0.1", "0.2", "0.4")}
     for suite in ("vertical", "horizontal"):
-        assert set(suites[suite]) == {"free", "small", "medium", "large"} | moving and len(moving) == 15
+        assert set(suites[suite]) == {"free", "small", "medium", "large", "extreme"} | moving and len(moving) == 15
 
 
 @settings(max_examples=150)
@@ -72,8 +75,7 @@ def test_another_process_draws_the_same() -> None:
     assert done.stdout.strip() == digest(problems.load(name))
 
 
-@pytest.mark.parametrize("level", ["easy", "medium", "hard"])
-@pytest.mark.parametrize("suite", HARD)
+@pytest.mark.parametrize(("suite", "level"), HARD_LEVELS)
 def test_every_scene_can_be_built(suite: str, level: str) -> None:
     """For any random numbers: every body has a positive thickness, and names are unique."""
     for seed in range(150):
@@ -83,8 +85,7 @@ def test_every_scene_can_be_built(suite: str, level: str) -> None:
             assert all(low <= high for low, high in (region.x, region.y, region.z)) and region.fingers
 
 
-@pytest.mark.parametrize("level", ["easy", "medium", "hard"])
-@pytest.mark.parametrize("suite", HARD)
+@pytest.mark.parametrize(("suite", "level"), HARD_LEVELS)
 def test_starts_and_goals_of_the_hard_suites_have_a_clearance_of_a_centimetre(
     robot: Robot, suite: str, level: str
 ) -> None:
@@ -96,10 +97,10 @@ def test_starts_and_goals_of_the_hard_suites_have_a_clearance_of_a_centimetre(
             assert robot.limit_fault(q) is None and checker.is_free(q) and checker.clearance(q) >= 0.01
             assert (q[robot.groups["hands"]] <= 0.4).all()
         if suite == "clutter":
-            assert len(problem.scene) == {"easy": 10, "medium": 20, "hard": 30}[level]
+            assert len(problem.scene) == {"easy": 10, "medium": 20, "hard": 30, "extreme": 45}[level]
 
 
-@pytest.mark.parametrize("level", LEVELS)
+@pytest.mark.parametrize("level", [*LEVELS, "extreme"])
 @pytest.mark.parametrize("suite", ["vertical", "horizontal"])
 def test_alignment_problems_satisfy_the_definition_of_the_paper(robot: Robot, suite: str, level: str) -> None:
     held = set()
@@ -144,6 +145,16 @@ def test_cubes_have_their_size_and_speed_and_are_clear_of_start_and_goal(robot: 
     assert counts == {1} if speed else 1 < len(counts) and counts <= {1, 2, 3}
 
 
+@pytest.mark.parametrize(("suite", "count"), [("vertical", 100), ("horizontal", 70)])
+def test_extreme_alignments_have_many_cubes_clear_of_start_and_goal(robot: Robot, suite: str, count: int) -> None:
+    problem = problems.sample(suite, level="extreme", seed=3)
+    assert len(problem.scene) == count and all(
+        cube.box == (0.2, 0.2, 0.2) and not cube.moving for cube in problem.scene
+    )
+    checker = CollisionChecker(robot, problem.scene, problem.attached)
+    assert min(checker.distance(q).value for q in ends(problem, robot)) >= 0.015
+
+
 def test_splits_are_by_seed() -> None:
     bounds = {"train": (0, 799_999), "validation": (800_000, 899_999), "test": (900_000, 999_999)}
     assert {name: (seeds[0], seeds[-1]) for name, seeds in SPLITS.items()} == bounds
@@ -163,7 +174,7 @@ def test_splits_are_by_seed() -> None:
         ("shelf/hard", ParameterError, "an id such as shelf/easy/12"),
         ("shelf/hard/x12", ParameterError, "an id such as shelf/easy/12"),
         ("shelf/hard/007", ParameterError, "an id such as shelf/easy/12"),
-        ("shelf/HARD/7", UnknownNameError, "did you mean 'hard'|known: easy, hard, medium"),
+        ("shelf/HARD/7", UnknownNameError, "did you mean 'hard'|known: easy, extreme, hard, medium"),
         ("there/is/none", ApexError, "no such file"),
     ],
 )

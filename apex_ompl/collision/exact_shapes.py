@@ -30,6 +30,7 @@ class Mesh(NamedTuple):
         balls: Centre and radius around the triangles below each node of the tree, shape (2 T - 1, 4) [m].
         child: First child of each node, -1 for leaves, shape (2 T - 1,).
         leaf: Triangle of each leaf, -1 for inner nodes, shape (2 T - 1,).
+        depth: Largest depth of a triangle's centre below the hull, 0 for a mesh that is its hull [m].
     """
 
     points: Array
@@ -37,6 +38,7 @@ class Mesh(NamedTuple):
     balls: Array
     child: NDArray[np.int64]
     leaf: NDArray[np.int64]
+    depth: float = 0.0
 
 
 class PlacedShape(NamedTuple):
@@ -68,9 +70,10 @@ def mesh_of(geometry: coal.CollisionGeometry) -> Mesh:
     if is_shell(geometry):
         vertices, faces = triangles(geometry)
         corners = vertices[faces]
-        if _depth(hull, corners) > CONVEX_TOLERANCE:
+        depth = _depth(hull, corners)
+        if depth > CONVEX_TOLERANCE:
             corners = corners[_morton_order(corners.mean(axis=1))]
-            mesh = Mesh(mesh.points, corners, *ball_tree(corners))
+            mesh = Mesh(mesh.points, corners, *ball_tree(corners), depth)
     return mesh
 
 
@@ -168,6 +171,7 @@ def shape_arrays(shapes: Mapping[int, PlacedShape]) -> ShapeArrays:
         offset=np.array([pose[1] for pose in poses]).reshape(-1, 3),
         size=np.array([pose[2] for pose in poses]).reshape(-1, 3),
         ball=np.array([_ball(shape) for shape in placed]).reshape(-1, 4),
+        depth=np.array([0.0 if s.mesh is None else s.mesh.depth for s in placed]),
         node_ball=np.concatenate([np.empty((0, 4)), *nodes]),
         points=np.concatenate(points),
     )

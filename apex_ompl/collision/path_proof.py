@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import OrderedDict
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from weakref import WeakKeyDictionary
 
@@ -26,7 +27,8 @@ from apex_ompl.types import Array, Flags
 MOST_PACKED = 64  # sets of held objects that are kept for each robot
 TOUCH = 1e-5  # distance that counts as contact [m]
 TOLERANCE = 1e-5  # of the least clearance [m]
-LIMITS = (0.04, 0.2, np.inf)  # of the clearance that is looked for, one after the other [m]
+SEEDS = 9  # states whose spheres show what clearance to look for
+SLACK, MOST_LIMIT = 0.01, 0.5  # of what the spheres are larger than the shapes, and of that clearance [m]
 BUDGET = 1000  # intervals between two looks at the clock: some milliseconds
 
 
@@ -180,8 +182,8 @@ class PathProver:
             return PathProof.refused("a state that is not finite", curve)
         buffers, knots = self._buffers(), curve.knots
         p, arrays = buffers.proof, (*self._kernel.packed, *self._shapes, *buffers.arrays)
-        for limit in LIMITS if tolerance > 0.0 else (0.0,):
-            p.places[:] = 0, 1, p.places[2] if limit > LIMITS[0] else 0
+        for limit in self._limits(curve) if tolerance > 0.0 else (0.0,):
+            p.places[:] = 0, 1, 0
             p.pairs[0], p.intervals[0] = curve_proof.ALL, (knots[0], knots[-1])
             p.worst[:] = -1
             p.figures[:] = limit, np.inf, knots[0], 0.0
@@ -207,6 +209,16 @@ class PathProver:
         share = by_spheres / length if length > 0.0 else 0.0
         bound = margin if ok and tolerance > 0.0 else 0.0
         return PathProof(ok, reason, where, p.state.copy(), least, bound, names, share, int(p.places[2]), over)
+
+    def _limits(self, curve: Curve) -> Iterator[float]:
+        """Yield limits of the clearance that is looked for [m], from that of the spheres at some states."""
+        places = np.unique(np.linspace(0, len(curve.states) - 1, SEEDS).round().astype(int))
+        near = float(np.nanmin(self._kernel.clearance(curve.states[places], MOST_LIMIT), initial=MOST_LIMIT))
+        limit = max(near + SLACK, SLACK)
+        while limit < MOST_LIMIT:
+            yield limit
+            limit *= 2.0
+        yield np.inf
 
     def _names(self, first: int, second: int) -> tuple[str, str]:
         if first < 0:

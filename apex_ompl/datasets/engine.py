@@ -29,6 +29,7 @@ STRATEGIES = {
     "easy": (("rrtconnect", "rrtconnect"), ("many bumps", "rrtconnect")),
     "medium": (("rrtconnect", "rrtconnect"), ("many bumps", "rrtconnect")),
     "hard": (("rrtconnect", "bumps"), ("many bumps", "rrtconnect")),
+    "extreme": (("rrtconnect", "bumps"), ("many bumps", "rrtconnect")),
 }
 """Methods by which paths are searched, for the levels of the hard suites and for open scenes: the first ones in turn,
 and, where none of them finds a path, the second ones until one does. Chosen by the yield of each method."""

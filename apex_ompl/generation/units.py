@@ -46,9 +46,10 @@ class Unit:
         return SPLITS[self.split][self.number * self.size :][: self.size]
 
 
-LEVEL_WEIGHTS = {"broad": 6.0, "vertical": 1.2, "horizontal": 1.2, "easy": 1.0, "medium": 0.8, "hard": 0.4}
-"""Relative number of problems drawn of a level, by suite or by level of the hard suites: fewer where one takes
-longer."""
+LEVEL_WEIGHTS = {
+    "extreme": 0.1, "broad": 6.0, "vertical": 1.2, "horizontal": 1.2, "easy": 1.0, "medium": 0.8, "hard": 0.4,
+}  # fmt: skip
+"""Relative number of problems drawn of a level, by level or by suite: fewer where one takes longer."""
 
 
 def static_levels() -> list[tuple[str, str]]:
@@ -72,7 +73,7 @@ def plan_units(count: int, only: Sequence[str] = (), split: str = "train") -> li
         if name not in {s for s, _ in known} | {f"{s}/{level}" for s, level in known}:
             raise UnknownNameError("static suite or level", name, [f"{s}/{level}" for s, level in known])
     chosen = [(s, v) for s, v in known if not only or s in only or f"{s}/{v}" in only]
-    weights = [LEVEL_WEIGHTS[s if s in LEVEL_WEIGHTS else v] for s, v in chosen]
+    weights = [LEVEL_WEIGHTS[v if v in LEVEL_WEIGHTS else s] for s, v in chosen]
     found = [
         (k / weight, index, Unit(s, v, k, split=split))
         for index, ((s, v), weight) in enumerate(zip(chosen, weights, strict=True))

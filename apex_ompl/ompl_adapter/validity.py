@@ -148,10 +148,10 @@ def full_check(
     last = max(len(states) - 2, 0)
     if motion is not None and motion.use(robot.limits)["position"] > 1.0 + ROUNDING:
         return FullCheck(False, "the motion leaves the position limits", None)
-    for k, q in enumerate(states if motion is None else states[:0]):
-        fault = robot.limit_fault(q)
-        if fault:
-            return FullCheck(False, f"state {k}: {fault}", min(k, last))
+    inside = ((states >= robot.limits.lower) & (states <= robot.limits.upper)).all(axis=1)
+    if motion is None and not inside.all():
+        k = int(np.argmin(inside))
+        return FullCheck(False, f"state {k}: {robot.limit_fault(states[k])}", min(k, last))
     if start is not None and not np.array_equal(states[0], start):
         return FullCheck(False, "the path does not begin at the start", 0)
     if goals and not any(np.array_equal(states[-1], goal) for goal in goals):

@@ -28,7 +28,7 @@ from numba.core import config
 F = TypeVar("F", bound=Callable[..., Any])
 
 LOG = logging.getLogger("apex_ompl")
-TYPICAL_SECONDS = 45
+TYPICAL_SECONDS = 75
 
 # Without numba's runtime (_nrt) references to arrays are not counted, which would take most of the time; in return
 # compiled code may allocate nothing.

@@ -27,10 +27,9 @@ from apex_ompl.kernel.compiled.workspace import Workspace, workspace_view
 PROVED, MORE, TOUCHING, UNDECIDED, OUTSIDE = range(5)  # outcomes
 QUEUE = 1 << 14  # intervals that wait
 MOST_UNPROVED = 2048  # pairs that the spheres leave on one interval
-FEW = 12  # pairs that are looked at one by one also on a long interval
+MANY = 12  # pairs from which a long interval is bisected first
 SHORT = 0.01  # share of the curve below which an interval is not long
 SHORTEST = 1e-11  # share of the curve below which a pair that is still open is given up
-SEEDED = 9  # first intervals, of which all pairs are looked at, for a small margin early
 ALL = -1  # stands for all pairs
 
 
@@ -122,26 +121,27 @@ def _place(t: RobotArrays, w: Workspace, p: ProofBuffers) -> bool:
 
 @inlined
 def _left_by_spheres(
-    t: RobotArrays, s: SceneArrays, w: Workspace, p: ProofBuffers, a: float, b: float, whole: float
+    t: RobotArrays, s: SceneArrays, w: Workspace, p: ProofBuffers, a: float, b: float, shortest: float
 ) -> int:
     """Put the pairs that the spheres leave into ``found``, or append both halves of an interval that has too many.
 
     Returns:
         The number of pairs, or -1 where an interval got too short.
     """
+    limit = len(p.found) if b - a <= SHORT * shortest / SHORTEST else MANY
     bound_displacements(t, w)
     w.margin[0] = p.figures[MARGIN]
-    count = unproved(t, s, w, p.state, p.found)
+    count = unproved(t, s, w, p.state, p.found[:limit])
     w.margin[0] = 0.0
-    if count == 0:
-        p.figures[BY_SPHERES] += b - a
-    elif count == MOST_UNPROVED or (count > FEW and b - a > SHORT * whole and p.places[2] > SEEDED):
-        if b - a <= SHORTEST * whole:
+    if count == limit:
+        if b - a <= shortest:
             return -1
         middle = 0.5 * (a + b)
         _append(p, a, middle, ALL, ALL)
         _append(p, middle, b, ALL, ALL)
         return 0
+    if count == 0:
+        p.figures[BY_SPHERES] += b - a
     return count
 
 
@@ -152,12 +152,10 @@ def _by_shapes(
 ) -> int:  # fmt: skip
     """Look at the pairs in ``found`` by their shapes; append both halves of the interval for those that stay open.
 
-    Where many stay open, the halves are appended for all pairs at once.
-
     Returns:
         PROVED, TOUCHING or UNDECIDED.
     """
-    middle, left = 0.5 * (a + b), 0
+    middle = 0.5 * (a + b)
     f = Frames(
         t.joint_parent, t.joint_kind, t.joint_source, t.joint_ratio, w.rotation, w.origin, w.step, w.deviation,
         w.half_width,
@@ -171,17 +169,12 @@ def _by_shapes(
         _record(p, upper, middle, x, y, tolerance)
         if upper <= touch:
             return TOUCHING
-        if not (bound > 0.0 and bound >= p.figures[MARGIN]):
-            p.found[left, 0], p.found[left, 1] = x, y
-            left += 1
-    if left > 0 and b - a <= shortest:
-        return UNDECIDED
-    if left > FEW and b - a > SHORT * shortest / SHORTEST:
-        left = 1
-        p.found[0, 0] = p.found[0, 1] = ALL
-    for m in range(left):
-        _append(p, a, middle, p.found[m, 0], p.found[m, 1])
-        _append(p, middle, b, p.found[m, 0], p.found[m, 1])
+        if bound > 0.0 and bound >= p.figures[MARGIN]:
+            continue
+        if b - a <= shortest:
+            return UNDECIDED
+        _append(p, a, middle, x, y)
+        _append(p, middle, b, x, y)
     return PROVED
 
 
@@ -205,12 +198,13 @@ def prove_curve(
     t, s, h = robot_view(ri, rf), scene_view(si, sf), shapes_view(hi, hf)
     w, g, p = workspace_view(t, wi, wf), pair_view(gi, gf), _proof_view(pi, pf, len(t.lower))
     whole = knots[len(knots) - 1] - knots[0]
+    shortest = SHORTEST * whole
     while p.places[0] < p.places[1] and budget > 0:
         budget -= 1
         e = _take(p)
         a, b, first, second = p.intervals[e, 0], p.intervals[e, 1], p.pairs[e, 0], p.pairs[e, 1]
-        middle = p.where[0] = 0.5 * (a + b)
-        set_state(knots, states, rates, middle, p.state)
+        p.where[0] = 0.5 * (a + b)
+        set_state(knots, states, rates, p.where[0], p.state)
         set_motion(knots, states, rates, slack, a, b, p.state, w)
         if not _place(t, w, p):
             return OUTSIDE
@@ -219,10 +213,10 @@ def prove_curve(
         count = 1
         p.found[0, 0], p.found[0, 1] = first, second
         if first == ALL:
-            count = _left_by_spheres(t, s, w, p, a, b, whole)
-        if count < 0:
-            return UNDECIDED
-        outcome = _by_shapes(t, w, h, g, p, a, b, count, SHORTEST * whole, touch, tolerance)
+            count = _left_by_spheres(t, s, w, p, a, b, shortest)
+            if count < 0:
+                return UNDECIDED
+        outcome = _by_shapes(t, w, h, g, p, a, b, count, shortest, touch, tolerance)
         if outcome != PROVED:
             return outcome
     return PROVED if p.places[0] == p.places[1] else MORE

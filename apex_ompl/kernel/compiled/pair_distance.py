@@ -17,6 +17,7 @@ from apex_ompl.kernel.compiled.relative_motion import (
 from apex_ompl.kernel.compiled.shapes import HULL, MOST_NODES, PairBuffers, ShapeArrays
 
 TRIANGLE = 3  # corners
+MOST_LEAVES = 64  # pairs of triangles whose motion is looked at
 
 
 @inlined
@@ -61,11 +62,29 @@ def _balls_apart(h: ShapeArrays, g: PairBuffers, m: int, n: int) -> float:
 
 
 @outlined
-def _mesh_bound(h: ShapeArrays, g: PairBuffers, m: int, n: int, need: float) -> tuple[float, float]:
-    """Return what :func:`pair_bound` does for shapes of which one or both are meshes, from nodes ``m`` and ``n`` on."""
-    bound, least, top = math.inf, math.inf, 1
+def _mesh_bound(
+    h: ShapeArrays, g: PairBuffers, m: int, n: int, arc: float, need: float, first_order: bool
+) -> tuple[float, float]:
+    """Return bounds on the distance of shapes of which one or both are meshes, from nodes ``m`` and ``n`` on [m].
+
+    Pairs of nodes whose balls are apart by ``need`` plus ``arc``, or by more than another pair is, are left out.
+
+    Args:
+        h: The shapes.
+        g: The pair.
+        m: Node of side 0, -1 for a convex shape.
+        n: Node of side 1, likewise.
+        arc: Bound on the displacement of either side [m].
+        need: Lower bound that suffices [m].
+        first_order: Whether bounds during the motion are sought for triangles that are nearer; else the distance now
+            less ``arc`` is the bound.
+
+    Returns:
+        A lower bound during the motion, and the least distance of two triangles found now; minus infinity where too
+        many triangles are near.
+    """
+    bound, least, top, leaves = math.inf, math.inf, 1, 0
     g.nodes[0, 0], g.nodes[0, 1] = m, n
-    arc = min(g.arc_bound[0], g.arc_bound[1])
     while top > 0:
         top -= 1
         m, n = g.nodes[top, 0], g.nodes[top, 1]
@@ -85,8 +104,11 @@ def _mesh_bound(h: ShapeArrays, g: PairBuffers, m: int, n: int, need: float) -> 
                 bound = min(bound, distance - arc)
                 continue
             if not (inner or other):
-                bound = min(bound, convex_bound(h.points, g, distance))
-                least = min(least, upper)
+                leaves += 1
+                here = convex_bound(h.points, g, distance) if first_order else distance - arc
+                bound, least = min(bound, here), min(least, upper)
+                if leaves > MOST_LEAVES and first_order:
+                    return -math.inf, least
                 continue
         if top + 2 > MOST_NODES:
             return -math.inf, least
@@ -137,4 +159,13 @@ def pair_bound(f: Frames, h: ShapeArrays, a: int, b: int, g: PairBuffers, need: 
         return bound, upper
     if bound >= need:
         return bound, math.inf
-    return _mesh_bound(h, g, h.root[a], h.root[b], need)
+    below = h.depth[a] + h.depth[b]
+    if bound + below < need <= distance + below:  # they move too far, meshes or hulls
+        return bound, math.inf
+    now, upper = _mesh_bound(h, g, h.root[a], h.root[b], arc, need, False)
+    if now >= need or not 0.0 < arc < upper:
+        return max(bound, now), upper
+    place_shape(f, h, a, g, 0)  # as a convex piece, where it is one
+    place_shape(f, h, b, g, 1)
+    later, _ = _mesh_bound(h, g, h.root[a], h.root[b], arc, need, True)
+    return max(bound, now, later), upper

@@ -20,7 +20,8 @@ class ShapeArrays(NamedTuple):
 
     A mesh that is not convex is a HULL, which bounds its distance, with the root of a binary tree of balls around its
     triangles in ``root`` (else -1). An inner node has its first child in ``child``, the second stands behind it; a leaf
-    has -1 there, and the first of its three corners in ``corner``. Balls of nodes are in the shape's frame.
+    has -1 there, and the first of its three corners in ``corner``. Balls of nodes are in the shape's frame. Triangles
+    lie at most ``depth`` below the hull [m].
 
     Bodies come first, in the order of the robot's tables; ``row`` gives the shape of an obstacle by its number.
     """
@@ -36,6 +37,7 @@ class ShapeArrays(NamedTuple):
     offset: Vectors
     size: Vectors
     ball: Balls
+    depth: Floats
     node_ball: Balls
     points: Vectors
 
