@@ -17,20 +17,19 @@ import record
 
 from apex_ompl.benchmark import Row, Workers, bench
 from apex_ompl.benchmark.summary import statistics, warnings
+from apex_ompl.planners.tuned import TUNED
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import one_or_more
 
 DEPENDS = ("@benchmark", "benchmarks/controls.py", "benchmarks/head_to_head.py")
 KINDS = ("hard", "large", "extreme")
-TUNED = {"range": 0.7}
-SHARED = tuple(row for row in head_to_head.ROWS if row.label in ("apex", "apex without trees"))
 NO_PROPOSALS = {"first": 0, "second": 0, "third": 0, "resample": 0}
+TREES = ("rrtconnect+polish", Row.of("rrtconnect", TUNED["rrtconnect"]).label)
 ROWS = (
-    *SHARED,
+    *(row for row in head_to_head.ROWS if row.label in ("apex", "apex without trees")),
     Row("apex, bumps for proposals", "bumps"),
     Row("apex without proposals", "apex", NO_PROPOSALS),
-    Row("rrtconnect+polish[range=0.7]", "rrtconnect+polish", TUNED),
-    Row("rrtconnect[range=0.7]", "rrtconnect", TUNED),
+    *(row for row in head_to_head.ROWS if row.label in TREES),
 )
 
 
