@@ -20,7 +20,7 @@ from apex_ompl.ompl_adapter.validity import full_check
 from apex_ompl.planners import APEX
 from apex_ompl.planners.apex_parameters import ApexParameters
 from apex_ompl.result import INSIDE
-from apex_ompl.trajopt.path import path_length
+from apex_ompl.trajopt.path import path_length, resample
 
 pytestmark = pytest.mark.usefixtures("quiet")
 
@@ -96,7 +96,7 @@ def test_valid_paths_that_pass_too_near_are_resampled(ready: PlanningSetup) -> N
     gaps = [validator.obstacle_distance(result.path.states) for result in (plain, wary)]
     assert gaps[1] >= gaps[0] - 1e-9, "nothing is half a metre off, so the one that keeps most distance stands"
     assert wary.times[INSIDE + "resample"] > plain.times.get(INSIDE + "resample", 0.0)
-    by_hand = min(ready.checker.distance(q).value for q in wary.path[::4])
+    by_hand = min(ready.checker.distance(q).value for q in resample(wary.path.states, 1500))
     assert by_hand - 2e-3 < gaps[1] <= min(by_hand, ready.checker.distance(wary.path[-1]).value) + 1e-5
 
 

@@ -39,9 +39,7 @@ def test_shipped_problems_are_solved_and_proved(name: str | Path) -> None:
     start, goals = problem.start_state(robot.joint_names), problem.goal_states(robot.joint_names)
     assert np.array_equal(result.path[0], start) and np.array_equal(result.path[-1], goals[0])
     # Checked anew by a fresh checker, on a grid that the planner did not use.
-    check = full_check(
-        CollisionChecker(robot, problem.scene, problem.attached), result.path, start, goals, resolution=0.0047
-    )
+    check = full_check(CollisionChecker(robot, problem.scene, problem.attached), result.path, start, goals)
     assert check, check.reason
     assert result.length == pytest.approx(path_length(result.path.states)) and result.length < 40
     assert result.clearance > 0.0 and result.checks > 100
@@ -238,7 +236,7 @@ def test_a_path_that_fails_the_full_check_is_repaired(problem: Problem) -> None:
     import time
 
     mended = repair(ready, path, fault, time.perf_counter() + 30.0)
-    assert mended is not None and full_check(ready.checker, mended, ready.start, ready.goals)
+    assert mended is not None and full_check(ready.checker, mended[0].states, ready.start, ready.goals)
     assert repair(ready, path, fault, time.perf_counter() - 1.0) is None
 
 
@@ -250,7 +248,7 @@ def test_repair_goes_past_states_that_collide_themselves(problem: Problem) -> No
     import time
 
     mended = repair(ready, line, fault, time.perf_counter() + 30.0)
-    assert mended is not None and full_check(ready.checker, mended, ready.start, ready.goals)
+    assert mended is not None and full_check(ready.checker, mended[0].states, ready.start, ready.goals)
 
 
 def test_two_plans_run_in_two_threads(problem: Problem) -> None:
