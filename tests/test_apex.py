@@ -189,7 +189,7 @@ def foreign(name: str) -> tuple[PlanningSetup, og.SimpleSetup]:
     return ready, setup
 
 
-def test_another_checker_judges_and_is_told_of_once(caplog: pytest.LogCaptureFixture) -> None:
+def test_another_checker_decides_and_is_reported_once(caplog: pytest.LogCaptureFixture) -> None:
     ready, setup = foreign(EASY)
     caplog.set_level(logging.INFO, logger="apex_ompl")
     planner = APEX(setup.getSpaceInformation())
@@ -206,7 +206,7 @@ def test_the_example_with_a_checker_of_its_own_runs(capsys: pytest.CaptureFixtur
     assert "EXACT_SOLUTION" in capsys.readouterr().out
 
 
-def test_the_checkers_of_the_moment_judge(ready: PlanningSetup) -> None:
+def test_the_checkers_of_the_moment_decide(ready: PlanningSetup) -> None:
     """One that says more than the checker is asked, and one that is set later on takes the place of the first."""
 
     class Wary(StateValidityChecker):

@@ -9,6 +9,7 @@ import coal
 import numpy as np
 from numpy.typing import NDArray
 
+from apex_ompl.collision.cover.spheres import shape_key
 from apex_ompl.collision.shapes import convex_hull, hull_planes, is_shell
 from apex_ompl.kernel.compiled.arrays import BOX, CAPSULE, CYLINDER, HALF_SPACE, SPHERE
 from apex_ompl.kernel.compiled.layout import Integers
@@ -19,6 +20,11 @@ from apex_ompl.util.weak_cache import weakly_cached
 
 CONVEX_TOLERANCE = 1e-7  # a mesh is its hull when its triangles' centres are no deeper than this below it [m]
 CELLS = 1 << 10  # along each axis, by which triangles are sorted
+
+
+MOST_MESHES = 256  # that are kept
+
+_meshes: dict[str, Mesh] = {}  # by shape key: robots are loaded anew for each plan
 
 
 class Mesh(NamedTuple):
@@ -65,6 +71,15 @@ def has_mesh(geometry: coal.CollisionGeometry) -> bool:
 @weakly_cached
 def mesh_of(geometry: coal.CollisionGeometry) -> Mesh:
     """Return the hull of a mesh or of a convex body, with a tree over its triangles where it is not convex."""
+    key = shape_key(geometry)
+    if key not in _meshes:
+        while len(_meshes) >= MOST_MESHES:
+            _meshes.pop(next(iter(_meshes)), None)
+        _meshes[key] = _analysed(geometry)
+    return _meshes[key]
+
+
+def _analysed(geometry: coal.CollisionGeometry) -> Mesh:
     hull = convex_hull(geometry)
     mesh = Mesh(np.array(hull.points()), np.empty((0, 3, 3)), np.empty((0, 4)), *(np.empty(0, np.int64),) * 2)
     if is_shell(geometry):

@@ -166,8 +166,10 @@ def full_check(
         return FullCheck(True, "", None, proof)
     if proof.timed_out:
         return FullCheck(False, proof.reason, None, proof, True)
+    contacts = checker.contacts(proof.state) if np.isfinite(proof.state).all() and proof.clearance <= 0.0 else []
+    reason = str(contacts[0]) if contacts else proof.reason
     if motion is not None:
-        return FullCheck(False, f"at {proof.parameter:.3f} s: {proof.reason}", None, proof)
+        return FullCheck(False, f"at {proof.parameter:.3f} s: {reason}", None, proof)
     lengths = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(states, axis=0)).max(axis=1))])
     segment = min(int(np.searchsorted(lengths, proof.parameter, side="right")) - 1, last)
-    return FullCheck(False, f"between states {segment} and {segment + 1}: {proof.reason}", segment, proof)
+    return FullCheck(False, f"between states {segment} and {segment + 1}: {reason}", segment, proof)
