@@ -12,6 +12,7 @@ Usage: python benchmarks/overrun.py [--planner apex ...] [--share 1.0]
 from __future__ import annotations
 
 import argparse
+import re
 import tempfile
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -162,7 +163,8 @@ def _cells(mine: Sequence[Measured], limit: float) -> list[Any]:
 
 def reasons(found: Sequence[Measured]) -> str:
     """Return how often which reason was given for a status, as a sentence; what differs from run to run is left out."""
-    counts = Counter(f"{one.status}: {one.reason.partition(',')[0]}" for one in found if one.reason)
+    said = (re.sub(r"is \S+ rad", "is some way", one.reason.partition(",")[0]) for one in found)
+    counts = Counter(f"{one.status}: {reason}" for one, reason in zip(found, said, strict=True) if reason)
     return "Reasons: " + "; ".join(f"{count} {reason}" for reason, count in counts.most_common()) + "."
 
 
