@@ -26,7 +26,7 @@ from apex_ompl.robot import Robot, load_robot
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.trajopt.path import resample
 from apex_ompl.util.entry_point import run_script
-from apex_ompl.util.resolution import FULL_RESOLUTION
+from apex_ompl.util.resolution import FINE_RESOLUTION
 from apex_ompl.util.validation import one_or_more, whole_number
 
 DEPENDS = ("@checking", "apex_ompl/ompl_adapter", "problems")
@@ -152,7 +152,7 @@ def straight_paths(robot: Robot, count: int, wanted: int, rng: np.random.Generat
     checker = CollisionChecker(robot, scene)
     while len(found) < wanted:
         a, b = around_home(robot, rng, 2)
-        if checker.first_collision(np.stack([a, b]), FULL_RESOLUTION) is None:
+        if checker.first_collision(np.stack([a, b]), FINE_RESOLUTION) is None:
             found.append(resample(np.stack([a, b]), 256))
     return scene, found
 

@@ -24,7 +24,7 @@ from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.cover.spheres import quality, read_covers, shape_key
 from apex_ompl.robot import load_robot
 from apex_ompl.util.entry_point import run_script
-from apex_ompl.util.resolution import FULL_RESOLUTION, SEARCH_RESOLUTION
+from apex_ompl.util.resolution import FINE_RESOLUTION, SEARCH_RESOLUTION
 from apex_ompl.util.validation import one_or_more
 
 DEPENDS = ("@checking", "apex_ompl/ompl_adapter", "problems", "benchmarks/collision_checker.py")
@@ -55,7 +55,7 @@ def measure(path: Path, states: int, seeds: int) -> dict[str, float]:
         kernel_us.append(of_batch(kernel.unproved, free))
         free_us.append(microseconds(checker.is_free, free))
         for a, b in zip(free[:150], free[150:300], strict=False):
-            for resolution, times in ((SEARCH_RESOLUTION, search_ms), (FULL_RESOLUTION, full_ms)):
+            for resolution, times in ((SEARCH_RESOLUTION, search_ms), (FINE_RESOLUTION, full_ms)):
                 start = time.perf_counter()
                 clear = checker.first_collision(np.stack([a, b]), resolution) is None
                 if clear:

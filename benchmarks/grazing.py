@@ -17,6 +17,7 @@ import numpy as np
 import pinocchio as pin
 
 from apex_ompl.collision import CollisionChecker
+from apex_ompl.collision.broadphase import CompiledScene
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import AttachedObject, MeshFile, Obstacle
 
@@ -164,11 +165,12 @@ class Grazes:
         self.clear += least > 2e-5
 
 
-def _kind(scene: object, pair: tuple[int, int]) -> str:
+def _kind(scene: CompiledScene, pair: tuple[int, int]) -> str:
+    """Return the kinds of two geometries: a link, or the first word of an object's name."""
     names = []
     for k in pair:
-        label = scene.labels[k]  # type: ignore[attr-defined]
-        of_robot = k < scene.links  # type: ignore[attr-defined]
+        label = scene.labels[k]
+        of_robot = k < scene.links
         names.append("link" if of_robot else label.split("_")[0])
     return " and ".join(sorted(names))
 

@@ -163,8 +163,8 @@ def _cells(mine: Sequence[Measured], limit: float) -> list[Any]:
 
 def reasons(found: Sequence[Measured]) -> str:
     """Return how often which reason was given for a status, as a sentence; what differs from run to run is left out."""
-    said = (re.sub(r"is \S+ rad", "is some way", one.reason.partition(",")[0]) for one in found)
-    counts = Counter(f"{one.status}: {reason}" for one, reason in zip(found, said, strict=True) if reason)
+    shown = (re.sub(r"is \S+ rad", "is some way", one.reason.partition(",")[0]) for one in found)
+    counts = Counter(f"{one.status}: {reason}" for one, reason in zip(found, shown, strict=True) if reason)
     return "Reasons: " + "; ".join(f"{count} {reason}" for reason, count in counts.most_common()) + "."
 
 

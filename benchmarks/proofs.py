@@ -32,7 +32,7 @@ from apex_ompl.collision.discretization import sample_path
 from apex_ompl.robot import Robot, load_robot
 from apex_ompl.scene.bodies import AttachedObject, MeshFile, Obstacle
 from apex_ompl.util.entry_point import run_script
-from apex_ompl.util.resolution import FULL_RESOLUTION, SEARCH_RESOLUTION
+from apex_ompl.util.resolution import FINE_RESOLUTION, SEARCH_RESOLUTION
 from apex_ompl.util.validation import one_or_more, whole_number
 
 DEPENDS = ("@checking", "benchmarks/collision_checker.py", "benchmarks/grazing.py")
@@ -141,7 +141,7 @@ def motions(robot: Robot, rng: np.random.Generator, wanted: int, mesh: Path) -> 
                 found["colliding"] += int((~meshes.are_free(dense)).sum())
             if free:
                 both.check_counts = CheckCounts()
-                if both.first_collision(path, FULL_RESOLUTION) is None:
+                if both.first_collision(path, FINE_RESOLUTION) is None:
                     _add(full, both.check_counts)
     for name, check_counts in (("search", search), ("full", full)):
         found[f"{name}_steps_proved"] = check_counts.proved_steps / check_counts.steps

@@ -16,7 +16,7 @@ from apex_ompl.errors import ParameterError
 from apex_ompl.ompl_adapter.validity import full_check
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import AttachedObject, MeshFile, Obstacle
-from apex_ompl.util.resolution import FULL_RESOLUTION
+from apex_ompl.util.resolution import FINE_RESOLUTION
 
 STEP = """\
 v 0 0 0\nv 0.3 0 0\nv 0.3 0.1 0\nv 0.1 0.1 0\nv 0.1 0.3 0\nv 0 0.3 0
@@ -263,12 +263,12 @@ def test_the_kernel_alone_proves_what_the_spheres_prove(checker: CollisionChecke
     rng, proved, free = np.random.default_rng(11), 0, 0
     for a, b in zip(states_around_home(robot, rng, 60), states_around_home(robot, rng, 60), strict=True):
         line = np.stack([a, 0.7 * a + 0.3 * b, b])
-        by_kernel = checker.kernel.proves(line, FULL_RESOLUTION)
-        by_all = checker.first_collision(line, FULL_RESOLUTION) is None
+        by_kernel = checker.kernel.proves(line, FINE_RESOLUTION)
+        by_all = checker.first_collision(line, FINE_RESOLUTION) is None
         assert by_all or not by_kernel
         proved, free = proved + by_kernel, free + by_all
     assert 0.5 * free <= proved < 60
-    assert not checker.kernel.proves(np.full((2, robot.dof), np.nan), FULL_RESOLUTION)
+    assert not checker.kernel.proves(np.full((2, robot.dof), np.nan), FINE_RESOLUTION)
     for path, resolution in ((robot.home[None], 0.01), (np.stack([robot.home] * 2), 0.0)):
         with pytest.raises(ParameterError, match="path|resolution"):
             checker.kernel.proves(path, resolution)

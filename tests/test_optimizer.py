@@ -14,7 +14,7 @@ from apex_ompl.trajopt.optimizer import Optimizer
 from apex_ompl.trajopt.path import path_length
 from apex_ompl.trajopt.settings import OptimizerSettings
 from apex_ompl.trajopt.spline import Spline
-from apex_ompl.util.resolution import FULL_RESOLUTION
+from apex_ompl.util.resolution import FINE_RESOLUTION
 
 
 @pytest.fixture(scope="module")
@@ -133,7 +133,7 @@ def test_valid_paths_are_taken_as_they_are(robot: Robot) -> None:
     line = optimizer.spline.line(ready.start, ready.goals[0])
     assert full_check(ready.checker, optimizer.spline.path(line), ready.start, ready.goals)
     assert optimizer.improve(kernel, line[None], steps=0).clearance.min() < -0.01
-    pool = CandidatePool(optimizer, kernel, lambda path: ready.checker.first_collision(path, FULL_RESOLUTION) is None)
+    pool = CandidatePool(optimizer, kernel, lambda path: ready.checker.first_collision(path, FINE_RESOLUTION) is None)
     found = pool.add(line[None], "line")
     assert found is not None and np.array_equal(found.control, line) and pool.steps == 0
 
@@ -156,7 +156,7 @@ def test_witnesses_become_shorter(robot: Robot) -> None:
         ready, witness = assemble(problems.load(name), robot), problems.witness(name).path
         checker: CollisionChecker = ready.checker
         control = optimizer.spline.fit(witness, robot.limits.lower, robot.limits.upper).control
-        free = lambda path, v=checker: v.first_collision(path, FULL_RESOLUTION) is None  # noqa: E731
+        free = lambda path, v=checker: v.first_collision(path, FINE_RESOLUTION) is None  # noqa: E731
         found = optimizer.shorten(checker.kernel, control, free)
         assert found is not None, name
         path = optimizer.spline.path(found)

@@ -17,7 +17,7 @@ from apex_ompl.kernel import Kernel
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.trajopt.candidates import first_valid
 from apex_ompl.trajopt.optimizer import Optimizer
-from apex_ompl.util.resolution import FULL_RESOLUTION
+from apex_ompl.util.resolution import FINE_RESOLUTION
 from apex_ompl.util.threads import one_torch_thread
 
 FULL = ROOT / "data" / "dual_panda_softhand"
@@ -50,7 +50,7 @@ def test_a_sample_of_the_model_is_shorter_to_repair_than_the_line(name: str) -> 
         for kind, control in starts.items():
 
             def is_valid(path: np.ndarray, kernel: Kernel = kernel) -> bool:
-                return kernel.proves(path, FULL_RESOLUTION)
+                return kernel.proves(path, FINE_RESOLUTION)
 
             solved[kind] += first_valid(Optimizer(model.spline), kernel, control, is_valid) is not None
     assert solved["model"] > solved["line"], solved

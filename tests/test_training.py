@@ -34,7 +34,7 @@ from apex_ompl.kernel import Kernel, RobotTables
 from apex_ompl.kernel.scene_builder import scene_tables
 from apex_ompl.trajopt.candidates import first_valid
 from apex_ompl.trajopt.optimizer import Optimizer
-from apex_ompl.util.resolution import FULL_RESOLUTION
+from apex_ompl.util.resolution import FINE_RESOLUTION
 from apex_ompl.util.threads import one_torch_thread
 
 
@@ -204,7 +204,7 @@ def test_success_rates_are_those_of_repair_and_proof(few: Path, tmp_path: Path) 
         control = model.propose(
             query_from_problem(problem), kernel, 3, generator=torch.Generator().manual_seed(0)
         ).control
-        found = first_valid(Optimizer(model.spline), kernel, control, lambda p, k=kernel: k.proves(p, FULL_RESOLUTION))
+        found = first_valid(Optimizer(model.spline), kernel, control, lambda p, k=kernel: k.proves(p, FINE_RESOLUTION))
         wanted.append(found is not None)
     assert rates["repaired"] == pytest.approx(np.mean(wanted))
     assert 0.0 <= rates["sampled"] <= rates["repaired"]

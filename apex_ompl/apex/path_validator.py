@@ -19,7 +19,6 @@ Stop = Callable[[], bool]
 
 LOG = logging.getLogger("apex_ompl")
 PLAIN = (ob.MotionValidator, MotionValidator)  # OMPL's own, and this project's
-STRIDE = 4  # of the states whose distance from obstacles is measured
 
 
 class PathValidator:

@@ -22,7 +22,7 @@ from apex_ompl.benchmark.workers import Workers
 from apex_ompl.errors import FileFormatError, ParameterError
 from apex_ompl.util.files import locked, make_folder, write_atomically
 from apex_ompl.util.provenance import hardware, versions
-from apex_ompl.util.resolution import FULL_RESOLUTION, SEARCH_RESOLUTION
+from apex_ompl.util.resolution import SEARCH_RESOLUTION
 from apex_ompl.util.validation import check_integer
 
 
@@ -117,7 +117,7 @@ def _about(
             raise ParameterError("planner", row.label, f"the parameters that it has in {folder}; or another folder")
     return {
         "schema": SCHEMA, "settings": settings, "sessions": before.get("sessions", []), "rows": known,
-        "resolution": {"search": SEARCH_RESOLUTION, "full": FULL_RESOLUTION}, "warm_up": before.get("warm_up", {}),
+        "resolution": before.get("resolution", {"search": SEARCH_RESOLUTION}), "warm_up": before.get("warm_up", {}),
     }  # fmt: skip
 
 

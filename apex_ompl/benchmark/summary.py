@@ -219,12 +219,13 @@ def about(results: Results) -> list[tuple[str, Any]]:
     pairs = [("Command", f"{one['command']} ({one['date']}, {one['jobs']} at a time)") for one in sessions]
     versions = ", ".join(f"{name} {version}" for name, version in last["versions"].items())
     resolution = results.about["resolution"]
+    full = f"{resolution['full']} rad in the full check" if "full" in resolution else "none in the full check, a proof"
     warm = ", ".join(f"{label} {seconds:.2f} s" for label, seconds in results.about["warm_up"].items())
     pairs += [
         ("Hardware", "; ".join(dict.fromkeys(one["hardware"] for one in sessions))),
         ("Versions", f"Python {last['python']}, {versions}"),
         ("Split and first seed", f"{last['split']}, {last['seed']}"),
-        ("Spacing of states", f"{resolution['search']} rad in searches, {resolution['full']} rad in the full check"),
+        ("Spacing of states", f"{resolution['search']} rad in searches, {full}"),
         ("First run of a process, not counted", warm),
     ]  # fmt: skip
     return pairs

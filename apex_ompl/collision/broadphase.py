@@ -262,14 +262,10 @@ class CompiledScene:
         """Return the distances of a set of pairs.
 
         Args:
-            which: ``scene`` for robot and held objects against obstacles, ``all`` for the same with fixtures, or
-                ``pairs`` for all collision pairs.
+            which: ``scene`` for robot and held objects against obstacles, or ``all`` for the same with fixtures.
         """
         if which not in self._distances:
-            if which == "pairs":
-                chosen = self.pairs
-            else:
-                targets = {i for n, i in self.scene.items() if which == "all" or n not in self.fixtures}
-                chosen = [(a, b) for a, b in self.pairs if b in targets]
+            targets = {i for n, i in self.scene.items() if which == "all" or n not in self.fixtures}
+            chosen = [(a, b) for a, b in self.pairs if b in targets]
             self._distances[which] = HullDistances(self.model, self.geometry, chosen, self.labels)
         return self._distances[which]

@@ -167,9 +167,7 @@ class CollisionChecker(SceneBodies):
         if not self.is_free(start):
             contacts = self.contacts(start) if np.isfinite(start).all() else []
             return PathProof.refused(str(contacts[0]) if contacts else "in collision", path)
-        proof = self._prover().prove(path, tolerance=tolerance, deadline=deadline)
-        self.check_counts.intervals += proof.intervals
-        return proof
+        return self._prover().prove(path, tolerance=tolerance, deadline=deadline)
 
     def obstacle_distance(self, path: Array) -> float:
         """Return the least distance of robot and held objects to obstacles along a path, 0 where they touch [m].
@@ -208,11 +206,11 @@ class CollisionChecker(SceneBodies):
     def clearance(self, q: Array) -> float:
         """Return the distance of the nearest pair that is checked, self-collision pairs included [m].
 
-        It is that of the exact shapes at a free state, and minus the largest depth of :meth:`contacts` at a colliding
-        one.
+        It is that of the exact shapes at a free state, minus the largest depth of :meth:`contacts` at a colliding one,
+        and NaN where a hand is outside its limits.
         """
         proof = self.prove(np.asarray(q, float)[None])
-        if proof or proof.clearance > 0.0:
+        if not proof.clearance <= 0.0:
             return proof.clearance
         return -max((contact.depth for contact in self.contacts(q)), default=0.0)
 

@@ -88,7 +88,8 @@ class PathProof:
         reason: Why not: one sentence, empty for a proved path.
         parameter: Where on the curve the fault is, or the least distance found.
         state: The state there, shape (dof,).
-        clearance: Least distance of a checked pair that was found at a state [m], infinite where there is no pair.
+        clearance: Least distance of a checked pair that was found at a state [m], infinite where there is no pair, NaN
+            for hands outside their limits.
         clearance_bound: Least distance that is proved along the whole curve [m]; 0 without a proof.
         pair: Names of the two bodies at the least distance found; empty where there is none.
         by_spheres: Share of the curve's length that the sphere covers proved alone; exact shapes proved the rest.
@@ -203,7 +204,7 @@ class PathProver:
         elif outcome == curve_proof.TOUCHING:
             reason = f"{names[0]} <-> {names[1]} " + ("touch" if least <= 0.0 else f"are {least * 1e6:.2g} um apart")
         elif outcome == curve_proof.OUTSIDE:
-            reason, where = "a hand outside its limits", float(p.where[0])
+            reason, where, least = "a hand outside its limits", float(p.where[0]), np.nan
         elif not ok:
             reason, where = "too close to contact to be proved", float(p.where[0])
         share = by_spheres / length if length > 0.0 else 0.0

@@ -11,7 +11,7 @@ from apex_ompl.kernel import Kernel
 from apex_ompl.trajopt.candidates import first_valid
 from apex_ompl.trajopt.optimizer import Optimizer
 from apex_ompl.types import Array
-from apex_ompl.util.resolution import FULL_RESOLUTION, SEARCH_RESOLUTION
+from apex_ompl.util.resolution import FINE_RESOLUTION, SEARCH_RESOLUTION
 
 FEW, MANY = 1, 8  # initial paths that are optimized together
 BUMP_SIZE = (0.4, 1.2)  # range of the amplitude of random bumps [rad]
@@ -44,7 +44,7 @@ class PathFinder:
     def is_valid(self, states: Array) -> bool:
         """Whether a path, shape (N, dof), passes the full check."""
         inside = bool((states >= self.lower).all() and (states <= self.upper).all())
-        return inside and self.kernel.proves(states, FULL_RESOLUTION)
+        return inside and self.kernel.proves(states, FINE_RESOLUTION)
 
     def is_free(self, line: Array) -> bool:
         """Whether a straight motion, shape (2, dof), is free at the resolution that planners search with."""

@@ -15,7 +15,7 @@ from apex_ompl.diffusion.proposals import Sampling, TrajectoryModel
 from apex_ompl.kernel import Kernel
 from apex_ompl.trajopt.candidates import first_valid
 from apex_ompl.trajopt.optimizer import Optimizer
-from apex_ompl.util.resolution import FULL_RESOLUTION
+from apex_ompl.util.resolution import FINE_RESOLUTION
 
 
 def query_from_problem(problem: KernelProblem) -> Query:
@@ -49,7 +49,7 @@ def success_rates(
         kernel = Kernel(problem.robot, problem.scene)
 
         def is_valid(path: np.ndarray, kernel: Kernel = kernel) -> bool:
-            return kernel.proves(path, FULL_RESOLUTION)
+            return kernel.proves(path, FINE_RESOLUTION)
 
         started = time.perf_counter()
         generator = torch.Generator().manual_seed(seed)

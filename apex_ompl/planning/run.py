@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 from apex_ompl.collision.path_proof import PathProof
@@ -58,12 +58,13 @@ class PlanRun:
     ) -> PlanResult:  # fmt: skip
         """Return a result without what :func:`finish` adds; ``proof`` is that of ``path``."""
         robot = self.setup.robot
-        found = {} if proof is None else {
-            "clearance": proof.clearance, "clearance_bound": proof.clearance_bound, "clearance_pair": proof.pair,
-            "proved_by_spheres": proof.by_spheres,
-        }  # fmt: skip
-        return PlanResult(
+        result = PlanResult(
             status=status, reason=reason, problem=self.setup.problem, robot=robot.name, joint_names=robot.joint_names,
             planner=self.planner, seed=self.seed, path=path, solved_by=solved_by, notes=tuple(self.notes),
-            **found,  # type: ignore[arg-type]
+        )  # fmt: skip
+        if proof is None:
+            return result
+        return replace(
+            result, clearance=proof.clearance, clearance_bound=proof.clearance_bound, clearance_pair=proof.pair,
+            proved_by_spheres=proof.by_spheres,
         )  # fmt: skip

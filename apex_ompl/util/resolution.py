@@ -3,5 +3,6 @@
 SEARCH_RESOLUTION = 0.031
 """Largest spacing of the states that planners check along a motion [rad, max-norm]."""
 
-FULL_RESOLUTION = 0.0031
-"""Largest spacing of the states of the full check, which decides whether a path is a solution [rad, max-norm]."""
+FINE_RESOLUTION = 0.0031
+"""Largest spacing of the states at which the kernel alone, without exact shapes, checks paths: training data and the
+validation of models [rad, max-norm]. What counts as a solution is decided by a proof without any spacing."""

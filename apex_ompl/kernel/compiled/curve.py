@@ -7,14 +7,14 @@ velocities and accelerations at its knots, and constant jerk between them.
 from __future__ import annotations
 
 from apex_ompl.kernel.compiled.compilation import inlined
-from apex_ompl.kernel.compiled.layout import Floats
+from apex_ompl.kernel.compiled.layout import Floats, Integers
 from apex_ompl.kernel.compiled.workspace import Workspace
 
 ROUNDING = 1e-12
 
 
 @inlined
-def piece_of(knots: Floats, u: float) -> int:
+def piece_of(knots: Floats | Integers, u: float) -> int:
     """Return the piece that a parameter lies on: the largest k with ``knots[k] <= u``, the last piece at the end."""
     low, high = 0, len(knots) - 1
     while high - low > 1:

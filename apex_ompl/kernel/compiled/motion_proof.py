@@ -6,6 +6,7 @@ import math
 
 from apex_ompl.kernel.compiled.arrays import robot_view, scene_view
 from apex_ompl.kernel.compiled.compilation import entry_point, inlined
+from apex_ompl.kernel.compiled.curve import piece_of
 from apex_ompl.kernel.compiled.layout import Floats, Integers
 from apex_ompl.kernel.compiled.motion_bound import bound_displacements
 from apex_ompl.kernel.compiled.separation import tables_hold, unproved, unproved_at_state
@@ -42,22 +43,9 @@ def lay_grid(path: Floats, resolution: float, starts: Integers) -> int:
 
 
 @inlined
-def _segment(starts: Integers, g: int) -> int:
-    """Return the segment that state ``g`` of the grid lies on, the last one for the end."""
-    low, high = 0, len(starts) - 1
-    while high - low > 1:
-        middle = (low + high) // 2
-        if starts[middle] <= g:
-            low = middle
-        else:
-            high = middle
-    return low
-
-
-@inlined
 def _state(path: Floats, starts: Integers, g: int, out: Floats) -> None:
     """Put state ``g`` of the grid over a path into ``out``."""
-    k = _segment(starts, g)
+    k = piece_of(starts, g)
     if g == starts[k + 1]:
         k += 1
     if g == starts[k]:
@@ -93,7 +81,7 @@ def _set_motion(path: Floats, starts: Integers, a: int, b: int, middle: Floats, 
     _widen(w, w.end, middle, 2.0 * (a - centre) / (b - a))
     _state(path, starts, b, w.end)
     _widen(w, w.end, middle, 2.0 * (b - centre) / (b - a))
-    for k in range(_segment(starts, a) + 1, _segment(starts, b) + 1):
+    for k in range(piece_of(starts, a) + 1, piece_of(starts, b) + 1):
         _widen(w, path[k], middle, 2.0 * (starts[k] - centre) / (b - a))
     for i in range(dof):
         w.half_width[i] = max(w.half_width[i], abs(w.step[i]) + w.deviation[i]) + 1e-12  # against rounding
