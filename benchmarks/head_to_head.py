@@ -7,7 +7,7 @@ tuned. On the hard and large levels alone: apex with guidance; and, on 20 proble
 Labels of tuned rows name the parameters that benchmarks/tune.py chose; those without any do best with OMPL's defaults.
 apex and rrtconnect+polish have theirs as defaults.
 Each run is stored in benchmarks/runs/head_to_head when it ends, with OMPL's logs and the database for Planner Arena;
-the command resumes where it was stopped.
+the command resumes where it was stopped. The paths are stored there too, for recheck.py.
 
 scripts/reproduce.py keeps runs of its own, in benchmarks/runs/paper_figures.
 
@@ -117,7 +117,9 @@ def main() -> None:
     workers = Workers(args.jobs, modules=("controls",))
     rows = [row if row.runs is None else replace(row, runs=args.slow) for row in ROWS]
     levels, seeds = record.static_levels(args.levels), {row.label: min(args.n, row.runs or args.n) for row in rows}
-    results = bench(levels, rows, FOLDER, runs=args.n, timeout=TIMEOUT, workers=workers, provenance=record.session())
+    results = bench(
+        levels, rows, FOLDER, runs=args.n, timeout=TIMEOUT, workers=workers, keep=True, provenance=record.session()
+    )
     results = replace(results, runs=[run for run in results.runs if run["seed"] < seeds.get(run["label"], 0)])
     write_database(results, write_logs(results))
     report(FOLDER, FOLDER)

@@ -46,7 +46,7 @@ def main() -> None:
     workers = Workers(args.jobs, modules=("controls",))
     results = bench(
         levels, ROWS, head_to_head.FOLDER, runs=args.n, timeout=head_to_head.TIMEOUT, workers=workers,
-        provenance=record.session(),
+        keep=True, provenance=record.session(),
     )  # fmt: skip
     labels = {row.label for row in ROWS}
     mine = [r for r in results.runs if r["label"] in labels and r["experiment"] in levels and r["seed"] < args.n]

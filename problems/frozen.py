@@ -123,6 +123,17 @@ def load(problem_id: ProblemId) -> FrozenProblem:
     return FrozenProblem(problem, Witness(states, times), number)
 
 
+def load_level(suite: str, level: str) -> tuple[dict[int, FrozenProblem], int]:
+    """Return the frozen problems of a suite and level by seed, and the number of draws without a witness.
+
+    Raises:
+        MissingFileError: Their file cannot be read.
+        FileFormatError: The hash of the file is another one, or the file holds something else.
+    """
+    head, rows = _file(FOLDER / _name(suite, level), suite, level)
+    return {seed: load(ProblemId(suite, level, seed)) for seed in rows}, int(head["dropped"])
+
+
 def exists(suite: str, level: str) -> bool:
     """Whether the problems of a suite and level have been frozen."""
     return (FOLDER / _name(suite, level)).is_file()

@@ -2,12 +2,14 @@
 
 Draws for which no witness is found are dropped and drawn anew. Files that exist are left alone, since results refer
 to them; --replace draws them again.
+--mend finds new witnesses for the problems named, which stay as they are.
 
 Witnesses among obstacles that stand still are found by rrtconnect, and on ``extreme`` by apex, or else by rrtconnect
 with a range of 0.7 rad, each in eight seconds. There they keep half a millimetre of clearance: obstacles are a
 millimetre larger on each side for the planner, and the robot's own distances are looked up along its path.
 
 Usage: python scripts/freeze_problems.py [--replace] [--jobs 2] [SUITE/LEVEL ...]
+       python scripts/freeze_problems.py --mend SUITE/LEVEL/SEED [SUITE/LEVEL/SEED ...]
 """
 
 from __future__ import annotations
@@ -15,8 +17,9 @@ from __future__ import annotations
 import argparse
 import multiprocessing
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -173,13 +176,36 @@ def freeze_problem(problem_id: ProblemId) -> tuple[FrozenProblem, int]:
         dropped += 1
 
 
+def mend(names: Sequence[str]) -> bool:
+    """Find new witnesses for frozen problems and write them; return whether all have one."""
+    wanted, complete = [ProblemId.parse(name) for name in names], True
+    for one, name in zip(wanted, names, strict=True):
+        if one is None or not frozen.is_frozen(one):
+            raise SystemExit(f"{name!r} is not a frozen problem; expected SUITE/LEVEL/SEED")
+    for suite, level in dict.fromkeys((one.suite, one.level) for one in wanted if one is not None):
+        kept, dropped = frozen.load_level(suite, level)
+        for one in wanted:
+            if one is None or (one.suite, one.level) != (suite, level):
+                continue
+            found = witness(kept[one.seed].problem)
+            print(f"{one}: {'a new witness' if found else 'no witness found'}", flush=True)
+            complete &= found is not None
+            if found is not None:
+                kept[one.seed] = replace(kept[one.seed], witness=found)
+        frozen.save(suite, level, kept, dropped, replace=True)
+    return complete
+
+
 def main() -> None:
     """Freeze the levels named, or all that are missing."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("levels", nargs="*", metavar="SUITE/LEVEL")
     parser.add_argument("--replace", action="store_true", help="draw levels again whose files exist")
+    parser.add_argument("--mend", action="store_true", help="find new witnesses for the problems named")
     parser.add_argument("--jobs", type=one_or_more, default=2)
     args = parser.parse_args()
+    if args.mend:
+        raise SystemExit(0 if mend(args.levels) else 1)
     every = {f"{suite}/{level}": (suite, level) for suite, level in frozen.suite_levels()}
     for name in args.levels:
         if name not in every:

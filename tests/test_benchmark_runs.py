@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 from support import ROOT
 
-from apex_ompl import benchmark, problems
+from apex_ompl import benchmark, load_problem, problems
 from apex_ompl.benchmark import Row, Workers, bench, runs
 from apex_ompl.benchmark.accounting import first_path_proof
 from apex_ompl.benchmark.rows import Job
 from apex_ompl.errors import ParameterError
 from apex_ompl.ompl_adapter.setup import assemble
 from apex_ompl.ompl_adapter.validity import full_check
+from apex_ompl.result import PlanResult
 from apex_ompl.robot import Robot
 
 
@@ -38,7 +39,11 @@ def test_the_first_path_counts_where_the_shortened_one_is_repaired(robot: Robot)
 
 
 def test_another_robot_warms_up_on_its_own_problem(tmp_path: Path) -> None:
-    found = bench([str(ROOT / "examples" / "baxter_table.yaml")], ["rrtconnect"], tmp_path, runs=1, quiet=True)
+    table = str(ROOT / "examples" / "baxter_table.yaml")
+    found = bench([table], ["rrtconnect"], tmp_path, runs=1, keep=True, quiet=True)
+    kept = PlanResult.load(found.plan_file(found.runs[0]))
+    assert kept.length == found.runs[0]["length"] and kept.problem.name == load_problem(table).name
+    assert "result" not in found.runs[0]
     assert [run["solved"] for run in found.runs] == [True] and found.about["warm_up"]["rrtconnect"] > 0.0
     assert runs._robot_of(str(ROOT / "examples" / "baxter_table.yaml")) == "baxter"
 

@@ -18,6 +18,7 @@ from tqdm import tqdm
 from apex_ompl.api import check_arguments
 from apex_ompl.benchmark.results import ABOUT, RUNS, SCHEMA, Results
 from apex_ompl.benchmark.rows import Job, Row, jobs
+from apex_ompl.benchmark.runs import RESULT
 from apex_ompl.benchmark.workers import Workers
 from apex_ompl.errors import FileFormatError, ParameterError
 from apex_ompl.util.files import locked, make_folder, write_atomically
@@ -29,7 +30,7 @@ from apex_ompl.util.validation import check_integer
 def bench(
     suites: Sequence[str], rows: Sequence[Row | str], out: str | os.PathLike[str], *, runs: int = 100,
     timeout: float = 5.0, seed: int = 0, split: str = "test", simplify: bool = True, workers: Workers | None = None,
-    quiet: bool = False, provenance: Mapping[str, Any] | None = None,
+    keep: bool = False, quiet: bool = False, provenance: Mapping[str, Any] | None = None,
 ) -> Results:  # fmt: skip
     """Run planners on problems through OMPL's Benchmark, with the same space, checker and resolution.
 
@@ -46,6 +47,7 @@ def bench(
         split: Split of the problems.
         simplify: Whether paths are simplified; those of smooth planners are not.
         workers: Where runs are made; by default one at a time, in a process of this machine.
+        keep: Whether to store the result of each run that is made by ``plan``, for ``PlanResult.load``.
         quiet: Whether to show no progress.
         provenance: Further entries of the session, as the commit of the code.
 
@@ -81,7 +83,7 @@ def bench(
         results = Results(folder, about, before.runs)
         results.save_about()
         try:
-            _complete(results, left, len(wanted), workers, quiet)
+            _complete(results, left, len(wanted), workers, keep=keep, quiet=quiet)
         finally:
             results.save_about()
     return Results.load(folder)
@@ -121,7 +123,9 @@ def _about(
     }  # fmt: skip
 
 
-def _complete(results: Results, left: Sequence[Job], of: int, workers: Workers, quiet: bool) -> None:
+def _complete(
+    results: Results, left: Sequence[Job], of: int, workers: Workers, *, keep: bool, quiet: bool
+) -> None:  # fmt: skip
     """Make the runs that are left, and write each when it ends."""
     file = results.folder / RUNS
     if file.is_file() and not file.read_bytes().endswith(b"\n"):  # a killed process left an incomplete line
@@ -129,6 +133,11 @@ def _complete(results: Results, left: Sequence[Job], of: int, workers: Workers, 
     solved, session = 0, len(results.about["sessions"]) - 1
     with file.open("a") as out, tqdm(total=of, initial=of - len(left), unit="run", disable=quiet) as bar:
         for done, run in enumerate(workers.runs_of(left, results.about["warm_up"]), 1):
+            made = run.pop(RESULT, None)
+            if keep and made is not None:
+                file = results.plan_file(run)
+                make_folder(file.parent)
+                made.save(file)
             out.write(json.dumps({**run, "session": session}) + "\n")
             out.flush()
             solved += run["solved"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 from dataclasses import dataclass, field
@@ -14,7 +15,7 @@ from apex_ompl.util.files import read_text, write_atomically
 from apex_ompl.util.validation import check_integer, check_number
 
 SCHEMA = "apex-ompl/benchmark/1"
-RUNS, ABOUT = "runs.jsonl", "about.json"
+RUNS, ABOUT, PLANS = "runs.jsonl", "about.json", "plans"
 ROLE = "folder of benchmark results"
 ABOUT_KINDS = {"settings": dict, "sessions": list, "rows": dict}
 TEXTS = ("key", "experiment", "problem", "label", "planner", "status", "reason", "by")
@@ -35,6 +36,10 @@ class Results:
     folder: Path
     about: dict[str, Any]
     runs: list[Run] = field(default_factory=list)
+
+    def plan_file(self, run: Run) -> Path:
+        """Return where ``bench`` stores the result of a run if it is told to keep it."""
+        return self.folder / PLANS / f"{hashlib.sha256(run['key'].encode()).hexdigest()[:16]}.npz"
 
     @classmethod
     def load(cls, folder: str | os.PathLike[str]) -> Results:

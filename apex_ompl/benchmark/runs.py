@@ -38,6 +38,7 @@ Run = dict[str, Any]
 MEMORY = 16_384.0  # limit of a run [MB]
 UPDATES = 0.05  # period at which a planner's progress is read [s]
 LOOK = 0.1  # period at which OMPL's Benchmark looks whether a planner's time is up [s]
+RESULT = "result"
 NO_PROBLEM, CRASH = "NO_PROBLEM", str(PlanStatus.CRASH)
 WARM_UP = "wall/easy/800000"
 
@@ -144,12 +145,17 @@ def _solved_at(progress: Iterable[Mapping[str, str]]) -> Iterator[float]:
 def run(job: Job) -> Run:
     """Return one run; one that fails in an unforeseen way is not solved and gives the reason.
 
+    Of a run by ``plan`` the entry ``RESULT`` is its ``PlanResult``, for the driver to store or to leave.
+
     Raises:
         ApexError: A file, a parameter or a checkpoint is at fault.
     """
     about = job_columns(job)
     try:
-        return about | (_by_runner(job) if job.runner else columns(*planned(job)))
+        if job.runner:
+            return about | _by_runner(job)
+        planning, experiment, result = planned(job)
+        return about | columns(planning, experiment, result) | {RESULT: result}
     except SuiteError as error:
         return about | unsolved(NO_PROBLEM, str(error))
     except ApexError:

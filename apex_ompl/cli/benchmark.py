@@ -27,6 +27,9 @@ def add_bench_parser(commands: argparse._SubParsersAction[argparse.ArgumentParse
     parser.add_argument("--jobs", type=int, default=1, metavar="N", help="at a time (default: one, as they are timed)")
     parser.add_argument("--address", metavar="HOST:PORT", help="of a Ray cluster to run on")
     parser.add_argument("-o", "--out", type=Path, required=True, metavar="DIR", help="goes on where it was stopped")
+    parser.add_argument(
+        "--keep", action="store_true", help="store each run's path, for apex-ompl render and PlanResult.load"
+    )
     parser.add_argument("--quiet", action="store_true", help="show no progress")
     parser.set_defaults(run=bench)
 
@@ -45,7 +48,7 @@ def bench(parsed: argparse.Namespace) -> int:
     import_extra("scipy", "benchmarks", "bench")  # needed after the runs only; missing packages are reported before
     results = benchmark.bench(
         parsed.suites, _split_planners(parsed.planners), parsed.out, runs=parsed.runs, timeout=parsed.timeout,
-        seed=parsed.seed, split=parsed.split, simplify=not parsed.no_simplify, quiet=parsed.quiet,
+        seed=parsed.seed, split=parsed.split, simplify=not parsed.no_simplify, keep=parsed.keep, quiet=parsed.quiet,
         workers=benchmark.Workers(parsed.jobs, parsed.address),
     )  # fmt: skip
     logs = benchmark.write_logs(results)

@@ -17,6 +17,7 @@ from apex_ompl.trajopt.path import Path
 from apex_ompl.types import Array
 
 MAX_BRIDGES = 20
+RANGE = 1.0  # of the trees, as tuned for rrtconnect [rad]
 
 
 def repair(
@@ -72,7 +73,9 @@ def _bridge(problem: PlanningSetup, a: Array, b: Array, deadline: float, interru
     setup.setStateValidityChecker(validity_checker)
     si.setMotionValidator(motions)
     setup.setStartAndGoalStates(to_state(si, a), to_state(si, b))
-    setup.setPlanner(og.RRTConnect(si))
+    planner = og.RRTConnect(si)
+    planner.setRange(RANGE)
+    setup.setPlanner(planner)
     condition = ends_after(deadline - time.perf_counter())
     with interrupt.ends(condition) as ptc, motions_until(motions, lambda: time.perf_counter() >= deadline):
         status = setup.solve(ptc)
