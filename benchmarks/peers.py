@@ -211,7 +211,7 @@ def prove(
         with timed(times, "repair"):
             repaired = repair(ready, states, check, deadline)
         if repaired is not None:
-            return repaired, ""
+            return repaired[0].states, ""
     return None, reason
 
 
