@@ -88,6 +88,7 @@ class CollisionChecker(SceneBodies):
         if self._two_stages:
             self._first_stage().first_collision(still, 1.0, True, CheckCounts(), lambda *_: True)
             self._first_stage().unproved_at(still[0], CheckCounts())
+            self.kernel.clearance(still[:1], 0.0)  # proofs begin with it
 
     def is_free(self, q: Array) -> bool:
         """Whether the state ``q``, shape (dof,), collides with nothing."""
