@@ -2,8 +2,9 @@
 
 The paths are those that head_to_head.py and standing.py store. Each is timed as ``plan`` times it; one that cannot be
 timed is counted. States on the path and on the motion are then checked one by one by the meshes, with the sphere covers
-only to sort out pairs that are far apart: no proof of this project has a part in it. Each file is one task, and what is
-done is kept in benchmarks/runs/recheck, where the command resumes.
+only to sort out pairs that are far apart: no proof of this project has a part in it. Each path is one task, and what
+is done is kept in benchmarks/runs/recheck by a digest of the path and the spacings, so that the command resumes and a
+path that a later run finds again, bit for bit, is not checked again.
 
 Usage: python benchmarks/recheck.py [--runs head_to_head] [--spacing 0.000155] [--motion-spacing 0.0000155] [--jobs 2]
 """
@@ -11,6 +12,7 @@ Usage: python benchmarks/recheck.py [--runs head_to_head] [--spacing 0.000155] [
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
 import math
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -34,7 +36,7 @@ from apex_ompl.trajectory import Trajectory, time_path
 from apex_ompl.types import Array
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.files import make_folder
-from apex_ompl.util.validation import one_or_more
+from apex_ompl.util.validation import one_or_more, positive_number
 
 DEPENDS = ("@benchmark", "apex_ompl/trajectory", "benchmarks/head_to_head.py", "benchmarks/standing.py")
 RUNS = Path(__file__).parent / "runs"
@@ -64,16 +66,33 @@ def sampled(motion: Trajectory, spacing: float) -> Array:
     return np.asarray(motion(np.concatenate([*pieces, times[-1:]])))
 
 
-def recheck(file: Path, spacing: float, motion_spacing: float) -> dict[str, Any]:
-    """Return the counts of a stored path: states and how many of them collide, on the path and on its motion."""
+def digest(result: PlanResult, spacings: tuple[float, float]) -> str:
+    """Return a digest of what is checked: problem, robot, joints, path and spacings."""
+    path, said = result.path, (result.problem.name, result.robot, result.joint_names, spacings)
+    arrays = (path.states, *(() if path.control is None else (path.control,)))
+    return hashlib.sha256(repr(said).encode() + b"".join(a.tobytes() for a in arrays)).hexdigest()[:16]
+
+
+def digest_of(file: Path, spacings: tuple[float, float]) -> str:
+    """Return the digest of a stored result.
+
+    Raises:
+        SystemExit: It has no path.
+    """
     result = PlanResult.load(file)
     if result.path is None:
         raise SystemExit(f"{file}: expected the result of a solved run, with a path")
+    return digest(result, spacings)
+
+
+def recheck(file: Path, spacings: tuple[float, float]) -> dict[str, Any]:
+    """Return the counts of a stored path: states and how many of them collide, on the path and on its motion."""
+    result = PlanResult.load(file)
     setup = setup_of(result.problem.name, result.robot)
-    states = result.path.sample(spacing)
+    states = result.path.sample(spacings[0])
     found: dict[str, Any] = {
-        "file": file.name, "problem": result.problem.name, "planner": result.planner, "seed": result.seed,
-        "clearance": result.clearance, "path": [len(states), colliding(setup, states)], "motion": None,
+        "digest": digest(result, spacings), "problem": result.problem.name, "clearance": result.clearance,
+        "path": [len(states), colliding(setup, states)], "motion": None,
     }  # fmt: skip
 
     def fault(motion: Trajectory) -> str:
@@ -83,50 +102,79 @@ def recheck(file: Path, spacing: float, motion_spacing: float) -> dict[str, Any]
         motion = time_path(result.path, setup.robot.limits, result.joint_names, fault=fault).trajectory
     except TimingError as error:
         return found | {"reason": str(error)}
-    states = sampled(motion, motion_spacing)
+    states = sampled(motion, spacings[1])
     return found | {"motion": [len(states), colliding(setup, states)]}
+
+
+def missing(kept: Path, files: dict[str, Path], spacings: tuple[float, float], jobs: int) -> dict[str, dict[str, Any]]:
+    """Check what was not checked before, keep it, and return all counts by digest.
+
+    Args:
+        kept: File of the counts that are there.
+        files: File of each path by its digest.
+        spacings: Of states on paths and on motions [rad].
+        jobs: Processes at once.
+    """
+    done = {row["digest"]: row for row in map(json.loads, kept.read_text().splitlines())} if kept.exists() else {}
+    left = [file for key, file in files.items() if key not in done]
+    commit = record.session()["commit"]
+    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool, kept.open("a") as out:
+        tasks = [pool.submit(partial(recheck, spacings=spacings), file) for file in left]
+        for task in tqdm(as_completed(tasks), total=len(left), unit="path"):
+            row = task.result() | {"commit": commit}
+            done[row["digest"]] = row
+            out.write(json.dumps(row) + "\n")
+            out.flush()
+    return done
+
+
+def table_of(rows: list[dict[str, Any]]) -> tuple[list[str], list[list[Any]]]:
+    """Return the table of checked paths by planner: its head and its rows."""
+    head = ["planner", "paths", "states on them", "paths that collide", "timed motions", "not timed",
+            "states on motions", "motions that collide"]  # fmt: skip
+    table = []
+    for label in ("all", *dict.fromkeys(row["label"] for row in rows)):
+        mine = [row for row in rows if label in ("all", row["label"])]
+        paths, motions = ([row[kind] for row in mine if row[kind]] for kind in ("path", "motion"))
+        table.append([
+            label, len(paths), sum(n for n, _ in paths), sum(hits > 0 for _, hits in paths),
+            len(motions), len(mine) - len(motions), sum(n for n, _ in motions), sum(hits > 0 for _, hits in motions),
+        ])  # fmt: skip
+    return head, table
 
 
 def main() -> None:
     """Check what is left, and write the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--runs", default="head_to_head", help="folder in benchmarks/runs (default: %(default)s)")
-    parser.add_argument("--spacing", type=float, default=SPACING, help="of states on paths [rad]")
-    parser.add_argument("--motion-spacing", type=float, default=MOTION_SPACING, help="of states on motions [rad]")
+    parser.add_argument("--spacing", type=positive_number, default=SPACING, metavar="RAD", help="on paths")
+    parser.add_argument(
+        "--motion-spacing", type=positive_number, default=MOTION_SPACING, metavar="RAD", help="on motions"
+    )
     parser.add_argument("--jobs", type=one_or_more, default=2)
     args = parser.parse_args()
+    spacings = (args.spacing, args.motion_spacing)
     results = Results.load(RUNS / args.runs)
-    labels = {results.plan_file(run).name: run["label"] for run in results.runs if run["solved"]}
-    kept = make_folder(RUNS / "recheck") / f"{args.runs}.jsonl"
-    done = {row["file"]: row for row in map(json.loads, kept.read_text().splitlines())} if kept.exists() else {}
-    files = sorted(
-        (run["problem"], file) for run in results.runs if run["solved"] and (file := results.plan_file(run)).exists()
-    )
-    left = [file for _, file in files if file.name not in done]
-    task = partial(recheck, spacing=args.spacing, motion_spacing=args.motion_spacing)
-    with ProcessPoolExecutor(args.jobs, mp_context=get_context("spawn")) as pool, kept.open("a") as out:
-        for future in tqdm(as_completed([pool.submit(task, file) for file in left]), total=len(left), unit="path"):
-            row = future.result()
-            done[row["file"]] = row
-            out.write(json.dumps(row) + "\n")
-            out.flush()
-    rows = [{**done[file.name], "label": labels[file.name]} for _, file in files]
-    table, bad = [], [r for r in rows if any(r[kind] and r[kind][1] for kind in ("path", "motion"))]
-    for label in ("all", *dict.fromkeys(labels.values())):
-        mine = [r for r in rows if label in ("all", r["label"])]
-        paths, motions = ([r[kind] for r in mine if r[kind]] for kind in ("path", "motion"))
-        if paths:
-            table.append([
-                label, len(paths), sum(n for n, _ in paths), sum(bad > 0 for _, bad in paths), len(motions),
-                sum(n for n, _ in motions), sum(bad > 0 for _, bad in motions),
-            ])  # fmt: skip
-    head = ["planner", "paths", "states on them", "paths that collide", "timed motions", "states on them",
-            "motions that collide"]  # fmt: skip
-    text = "\n".join(record.row(r) for r in [head, ["---"] + ["---:"] * 6, *table])
-    text += f"\n\nPaths of solved runs that were not stored: {len(labels) - len(files)}."
-    text += "".join(f"\n\nCollides: {r['label']} on {r['problem']}, seed {r['seed']}." for r in bad)
-    about = {"spacing": f"{args.spacing:g} rad", "motion_spacing": f"{args.motion_spacing:g} rad"}
-    record.write("recheck", {"table": {"head": head, "rows": table}, "colliding": bad}, text, **about)
+    solved = [run for run in results.runs if run["solved"]]
+    stored = sorted((run["problem"], file, run) for run in solved if (file := results.plan_file(run)).exists())
+    if not stored:
+        raise SystemExit(f"{results.folder}: expected stored paths of solved runs, as bench --keep writes them")
+    keys = [digest_of(file, spacings) for _, file, _ in stored]
+    files = {key: file for key, (_, file, _) in zip(keys, stored, strict=True)}
+    done = missing(make_folder(RUNS / "recheck") / f"{args.runs}.jsonl", files, spacings, args.jobs)
+    rows = [
+        {**done[key], "label": run["label"], "seed": run["seed"]} for key, (*_, run) in zip(keys, stored, strict=True)
+    ]
+    colliding_rows = [row for row in rows if any(row[kind] and row[kind][1] for kind in ("path", "motion"))]
+    head, table = table_of(rows)
+    text = "\n".join(record.row(r) for r in [head, ["---"] + ["---:"] * (len(head) - 1), *table])
+    text += f"\n\nPaths of solved runs that were not stored: {len(solved) - len(stored)}."
+    text += "".join(f"\n\nCollides: {r['label']} on {r['problem']}, seed {r['seed']}." for r in colliding_rows)
+    record.write(
+        "recheck", {"table": {"head": head, "rows": table}, "colliding": colliding_rows}, text,
+        spacing=f"{args.spacing:g} rad", motion_spacing=f"{args.motion_spacing:g} rad",
+        check_commits="; ".join(sorted({row["commit"] for row in rows})), **record.made_with(results),
+    )  # fmt: skip
 
 
 if __name__ == "__main__":

@@ -17,6 +17,7 @@ from apex_ompl.apex.stages import Anytime, Shorten
 from apex_ompl.diffusion.checkpoint import shared_model
 from apex_ompl.errors import ParameterError
 from apex_ompl.ompl_adapter.report import SolveReport
+from apex_ompl.ompl_adapter.space import forget_states
 from apex_ompl.planners.apex_parameters import NAME, ApexParameters
 from apex_ompl.trajopt.optimizer import Optimizer
 from apex_ompl.types import Array
@@ -112,6 +113,7 @@ class APEX(ob.Planner):
                 status = self._solve(ptc)
         except Exception as error:
             LOG.exception("%s failed", NAME)
+            forget_states(error)
             self.report.reason = f"{NAME} failed, {error!r}"
             status = Status.CRASH
         return Status(status)

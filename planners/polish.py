@@ -15,7 +15,7 @@ from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ParameterError
 from apex_ompl.ompl_adapter.report import SolveReport
 from apex_ompl.ompl_adapter.simplify import simplify
-from apex_ompl.ompl_adapter.space import array_to_path, path_to_array
+from apex_ompl.ompl_adapter.space import array_to_path, forget_states, path_to_array
 from apex_ompl.ompl_adapter.validity import StateValidityChecker
 from apex_ompl.planners.registry import Parameters, bounded, register
 from apex_ompl.planners.tuned import TUNED
@@ -79,6 +79,7 @@ class PolishedRRTConnect(ob.Planner):
             return self._solve(ptc)
         except Exception as error:
             LOG.exception("%s failed", NAME)
+            forget_states(error)
             self.report.reason = f"{NAME} failed, {error!r}"
             return ob.PlannerStatus(ob.PlannerStatus.CRASH)
 

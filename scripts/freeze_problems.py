@@ -178,15 +178,16 @@ def freeze_problem(problem_id: ProblemId) -> tuple[FrozenProblem, int]:
 
 def mend(names: Sequence[str]) -> bool:
     """Find new witnesses for frozen problems and write them; return whether all have one."""
-    wanted, complete = [ProblemId.parse(name) for name in names], True
-    for one, name in zip(wanted, names, strict=True):
+    wanted: dict[tuple[str, str], list[ProblemId]] = {}
+    for name in names:
+        one = ProblemId.parse(name)
         if one is None or not frozen.is_frozen(one):
             raise SystemExit(f"{name!r} is not a frozen problem; expected SUITE/LEVEL/SEED")
-    for suite, level in dict.fromkeys((one.suite, one.level) for one in wanted if one is not None):
+        wanted.setdefault((one.suite, one.level), []).append(one)
+    complete = True
+    for (suite, level), ids in wanted.items():
         kept, dropped = frozen.load_level(suite, level)
-        for one in wanted:
-            if one is None or (one.suite, one.level) != (suite, level):
-                continue
+        for one in ids:
             found = witness(kept[one.seed].problem)
             print(f"{one}: {'a new witness' if found else 'no witness found'}", flush=True)
             complete &= found is not None

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 import time
+import traceback
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +20,7 @@ from apex_ompl import plan, planners
 from apex_ompl.errors import ApexError, MissingFileError, ParameterError, UnknownNameError
 from apex_ompl.ompl_adapter.setup import PlanningSetup, assemble
 from apex_ompl.ompl_adapter.space import state_space, to_state
-from apex_ompl.ompl_adapter.validity import full_check
+from apex_ompl.ompl_adapter.validity import StateValidityChecker, full_check
 from apex_ompl.planners import APEX
 from apex_ompl.planners.apex_parameters import ApexParameters
 from apex_ompl.problems.suite_robot import robot
@@ -171,3 +173,28 @@ def test_no_obstacles_and_very_many(count: int) -> None:
     problem = base.model_copy(update={"scene": (*scene, *base.scene) if count else ()})
     result = plan(problem, timeout=20.0)
     assert result, result.reason
+
+
+@pytest.mark.parametrize("name", ["apex", "rrtconnect+polish"])
+def test_a_fault_of_a_users_checker_keeps_no_state(
+    name: str, ready: PlanningSetup, caplog: pytest.LogCaptureFixture
+) -> None:
+    """OMPL frees its states, and the bindings would hand out the old object of one for the next at its address."""
+
+    class Breaks(StateValidityChecker):
+        def isValid(self, state: Any) -> bool:  # noqa: N802
+            raise RuntimeError(f"broken on purpose at {state[0]}")
+
+    setup = ready.simple_setup
+    si = setup.getSpaceInformation()
+    planner = planners.make(name, si)
+    setup.setStateValidityChecker(Breaks(si, ready.checker))
+    setup.setPlanner(planner)
+    with caplog.at_level(logging.ERROR, "apex_ompl"):
+        assert setup.solve(within(5.0)).getStatus() == ob.PlannerStatus.CRASH
+    assert "broken on purpose" in planner.report.reason
+    error = caplog.records[-1].exc_info[1]
+    frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)]
+    assert any(frame.f_code.co_name == "isValid" for frame in frames)
+    held = [value for frame in frames for value in frame.f_locals.values() if isinstance(value, ob.State)]
+    assert not held, "the log keeps a state of OMPL"

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 import time
 from collections.abc import Callable
 from typing import Any
@@ -297,43 +295,3 @@ def test_a_tiny_time_ends_in_time_with_its_reason() -> None:
         for timeout in (1e-9, 0.002):
             result = plan("shelf/hard/800012", planner, timeout=timeout)
             assert result.status is PlanStatus.TIMEOUT and result.reason and result.trajectory is None
-
-
-def test_no_code_is_loaded_or_compiled_while_the_time_limit_runs() -> None:
-    """On a new machine a compilation takes longer than the limit, so that the first plan would be out of time."""
-    script = """
-import sys
-from apex_ompl import plan
-from apex_ompl.kernel.compiled import compilation
-from apex_ompl.util.deadline import Deadline
-
-late, running, original, paused = [], [False], compilation._Announced.__call__, Deadline.paused
-
-def started(self, timeout):
-    begin(self, timeout)
-    running[0] = True
-
-def called(self, *arguments):
-    if running[0] and not self._ready:
-        late.append(self.name)
-    return original(self, *arguments)
-
-class Paused:
-    def __init__(self, deadline):
-        self.inner = paused(deadline)
-    def __enter__(self):
-        running[0] = False
-        return self.inner.__enter__()
-    def __exit__(self, *error):
-        running[0] = True
-        return self.inner.__exit__(*error)
-
-begin, Deadline.__init__ = Deadline.__init__, started
-compilation._Announced.__call__, Deadline.paused = called, lambda deadline: Paused(deadline)
-result = plan("shelf/hard/800000", sys.argv[1], timeout=30.0)
-print(result.status, late)
-"""
-    for planner in ("apex", "rrtconnect+polish"):
-        command = [sys.executable, "-c", script, planner]
-        done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=300)
-        assert done.stdout.strip() == "EXACT_SOLUTION []", done.stdout + done.stderr

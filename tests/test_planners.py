@@ -90,9 +90,7 @@ def test_faults_name_the_thing(name: str, values: dict, error: type[Exception], 
         assert word in str(caught.value)
 
 
-OURS = [
-    n for n in planners.names() if "bad_planners" not in type(planners.parameters(n)).__module__
-]  # other tests' own
+OURS = [name for name in planners.names() if "bad_planners" not in type(planners.parameters(name)).__module__]
 
 
 @pytest.mark.parametrize("name", OURS)

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import gc
+import sys
 
 import numpy as np
 import pytest
@@ -116,8 +117,10 @@ def test_a_faulty_checker_never_raises_inside_ompl(problem: Problem, monkeypatch
 
     monkeypatch.setattr(ready.checker, "is_free", broken)
     monkeypatch.setattr(ready.checker, "first_collision", broken)
+    users = sys.getrefcount(state)
     assert not si.isValid(state)
     assert not si.checkMotion(state, state)
+    assert sys.getrefcount(state) == users, "a fault keeps a state of OMPL"
     assert "broken on purpose" in str(ready.validity_checker.fault) and "broken on purpose" in str(
         ready.motion_validator.fault
     )
@@ -182,6 +185,8 @@ def test_clearance_callback_survives_a_fault(problem: Problem, monkeypatch: pyte
     ready = assemble(problem)
     monkeypatch.setattr(CollisionChecker, "clearance", lambda *_: 1 / 0)
     validity_checker: StateValidityChecker = ready.validity_checker
-    si = ready.simple_setup.getSpaceInformation()
-    assert validity_checker.clearance(to_state(si, ready.start)) == 0.0
+    state = to_state(ready.simple_setup.getSpaceInformation(), ready.start)
+    users = sys.getrefcount(state)
+    assert validity_checker.clearance(state) == 0.0
+    assert sys.getrefcount(state) == users, "a fault keeps a state of OMPL"
     assert isinstance(validity_checker.fault, ZeroDivisionError)

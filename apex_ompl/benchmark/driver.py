@@ -135,9 +135,9 @@ def _complete(
         for done, run in enumerate(workers.runs_of(left, results.about["warm_up"]), 1):
             made = run.pop(RESULT, None)
             if keep and made is not None:
-                file = results.plan_file(run)
-                make_folder(file.parent)
-                made.save(file)
+                plan_file = results.plan_file(run)
+                make_folder(plan_file.parent)
+                made.save(plan_file)
             out.write(json.dumps({**run, "session": session}) + "\n")
             out.flush()
             solved += run["solved"]

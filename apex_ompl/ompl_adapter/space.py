@@ -6,6 +6,7 @@ radian, so that OMPL's Euclidean distance is the joint-space distance with hands
 
 from __future__ import annotations
 
+import traceback
 from typing import Any
 
 import numpy as np
@@ -59,6 +60,19 @@ def path_to_array(path: og.PathGeometric, dof: int) -> Array:
 def array_to_path(si: ob.SpaceInformation, states: Array) -> og.PathGeometric:
     """Return an OMPL path through ``states``, shape (N, dof)."""
     path = og.PathGeometric(si)
+    state = si.allocState()
     for q in states:
-        path.append(to_state(si, q))  # a copy
+        state[0 : len(q)] = [float(v) for v in q]
+        path.append(state)  # a copy
     return path
+
+
+def forget_states(error: BaseException) -> None:
+    """Clear the finished frames of an error's traceback, so that no OMPL state lives on in them.
+
+    The Python object of a state must not outlive a state that OMPL owns and frees. OMPL's bindings hand out the object
+    that they know for an address; the next state that is allocated there would get the old object, its own memory
+    would be freed at once, and writing to it damages the heap. A checker of a user that raises, and a log that keeps
+    the error, are enough for that.
+    """
+    traceback.clear_frames(error.__traceback__)

@@ -48,7 +48,7 @@ class StateValidityChecker(ob.StateValidityChecker):
     """OMPL state validity checker over a collision checker.
 
     No exception leaves it, since one would end the process inside OMPL: a fault makes states invalid and is
-    kept in ``fault``.
+    kept in ``fault``, without OMPL's states (see ``forget_states``).
     """
 
     def __init__(self, si: ob.SpaceInformation, checker: CollisionChecker) -> None:
@@ -63,6 +63,7 @@ class StateValidityChecker(ob.StateValidityChecker):
         try:
             return self.checker.is_free(np.array(state[0 : self.dof]))
         except BaseException as error:
+            state = None
             self.fault = self.fault or error
             return False
 
@@ -71,6 +72,7 @@ class StateValidityChecker(ob.StateValidityChecker):
         try:
             return self.checker.clearance(np.array(state[0 : self.dof]))
         except BaseException as error:
+            state = None
             self.fault = self.fault or error
             return 0.0
 
@@ -90,6 +92,7 @@ class MotionValidator(ob.MotionValidator):
         try:
             return self.check(first[0 : self.dof], second[0 : self.dof])
         except BaseException as error:
+            first = second = None
             self.fault = self.fault or error
             return False
 

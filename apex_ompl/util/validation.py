@@ -203,3 +203,18 @@ def one_or_more(text: str) -> int:
     if whole_number(text) < 1:
         raise argparse.ArgumentTypeError(f"{text!r}, expected a whole number, 1 or more")
     return int(text)
+
+
+def positive_number(text: str) -> float:
+    """Return the positive finite number that a text gives; a type of ``argparse``.
+
+    Raises:
+        ArgumentTypeError: It is not one.
+    """
+    try:
+        value = float(text)
+    except ValueError:
+        value = float("nan")
+    if not 0.0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text!r}, expected a positive number")
+    return value
