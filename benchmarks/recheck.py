@@ -68,9 +68,9 @@ def sampled(motion: Trajectory, spacing: float) -> Array:
 
 def digest(result: PlanResult, spacings: tuple[float, float]) -> str:
     """Return a digest of what is checked: problem, robot, joints, path and spacings."""
-    path, said = result.path, (result.problem.name, result.robot, result.joint_names, spacings)
+    path, query = result.path, (result.problem.name, result.robot, result.joint_names, spacings)
     arrays = (path.states, *(() if path.control is None else (path.control,)))
-    return hashlib.sha256(repr(said).encode() + b"".join(a.tobytes() for a in arrays)).hexdigest()[:16]
+    return hashlib.sha256(repr(query).encode() + b"".join(a.tobytes() for a in arrays)).hexdigest()[:16]
 
 
 def digest_of(file: Path, spacings: tuple[float, float]) -> str:
@@ -106,7 +106,9 @@ def recheck(file: Path, spacings: tuple[float, float]) -> dict[str, Any]:
     return found | {"motion": [len(states), colliding(setup, states)]}
 
 
-def missing(kept: Path, files: dict[str, Path], spacings: tuple[float, float], jobs: int) -> dict[str, dict[str, Any]]:
+def check_missing(
+    kept: Path, files: dict[str, Path], spacings: tuple[float, float], jobs: int
+) -> dict[str, dict[str, Any]]:
     """Check what was not checked before, keep it, and return all counts by digest.
 
     Args:
@@ -161,7 +163,7 @@ def main() -> None:
         raise SystemExit(f"{results.folder}: expected stored paths of solved runs, as bench --keep writes them")
     keys = [digest_of(file, spacings) for _, file, _ in stored]
     files = {key: file for key, (_, file, _) in zip(keys, stored, strict=True)}
-    done = missing(make_folder(RUNS / "recheck") / f"{args.runs}.jsonl", files, spacings, args.jobs)
+    done = check_missing(make_folder(RUNS / "recheck") / f"{args.runs}.jsonl", files, spacings, args.jobs)
     rows = [
         {**done[key], "label": run["label"], "seed": run["seed"]} for key, (*_, run) in zip(keys, stored, strict=True)
     ]
@@ -170,10 +172,12 @@ def main() -> None:
     text = "\n".join(record.row(r) for r in [head, ["---"] + ["---:"] * (len(head) - 1), *table])
     text += f"\n\nPaths of solved runs that were not stored: {len(solved) - len(stored)}."
     text += "".join(f"\n\nCollides: {r['label']} on {r['problem']}, seed {r['seed']}." for r in colliding_rows)
+    made_with = record.made_with(results)
+    commits = {made_with.pop("run_commits"), *(row["commit"] for row in rows)}  # a result is as old as its counts
     record.write(
         "recheck", {"table": {"head": head, "rows": table}, "colliding": colliding_rows}, text,
         spacing=f"{args.spacing:g} rad", motion_spacing=f"{args.motion_spacing:g} rad",
-        check_commits="; ".join(sorted({row["commit"] for row in rows})), **record.made_with(results),
+        run_commits="; ".join(sorted(commits)), **made_with,
     )  # fmt: skip
 
 

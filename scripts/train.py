@@ -18,6 +18,7 @@ import yaml
 
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.files import locked, make_folder
+from apex_ompl.util.validation import positive_number
 
 
 def train(args: argparse.Namespace) -> None:
@@ -65,7 +66,7 @@ def main() -> None:
         "--set", type=_setting, action="append", default=[], metavar="KEY=VALUE", help="for example latent.dim=96"
     )
     parser.add_argument(
-        "--minutes", type=_minutes, default=float("inf"), help="time limit; the same command resumes the run"
+        "--minutes", type=positive_number, default=float("inf"), help="time limit; the same command resumes the run"
     )
     parser.add_argument("--quiet", action="store_true", help="show no progress")
     args = parser.parse_args()
@@ -80,16 +81,6 @@ def _setting(text: str) -> tuple[str, Any]:
         return key, yaml.safe_load(value)
     except yaml.YAMLError as error:
         raise argparse.ArgumentTypeError(f"{text!r}, expected a value in YAML") from error
-
-
-def _minutes(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = 0.0
-    if not value > 0.0:
-        raise argparse.ArgumentTypeError(f"{text!r}, expected minutes, more than 0")
-    return value
 
 
 if __name__ == "__main__":
