@@ -16,15 +16,19 @@ if TYPE_CHECKING:
     from apex_ompl.errors import ApexError
     from apex_ompl.result import PlanResult, PlanStatus
     from apex_ompl.robot import Robot, load_robot
-    from apex_ompl.scene.problem import Problem
+    from apex_ompl.scene.problem import Alignment, PoseTarget, Problem
+    from apex_ompl.session import MotionPlanner
     from apex_ompl.trajectory import Timing, Trajectory, time_path
 
 __version__ = "0.1.0"
 
 _HOMES = {
+    "Alignment": "scene.problem",
     "ApexError": "errors",
+    "MotionPlanner": "session",
     "PlanResult": "result",
     "PlanStatus": "result",
+    "PoseTarget": "scene.problem",
     "Problem": "scene.problem",
     "Robot": "robot",
     "Timing": "trajectory",
@@ -38,9 +42,12 @@ _HOMES = {
 }
 
 __all__ = [
+    "Alignment",
     "ApexError",
+    "MotionPlanner",
     "PlanResult",
     "PlanStatus",
+    "PoseTarget",
     "Problem",
     "Robot",
     "Timing",

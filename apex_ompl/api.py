@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,18 +11,13 @@ from ompl import geometric as og
 
 from apex_ompl import planners, problems
 from apex_ompl.errors import ParameterError
-from apex_ompl.ompl_adapter.interrupt import Interrupt
-from apex_ompl.ompl_adapter.process import quiet_ompl, seed_ompl
 from apex_ompl.ompl_adapter.setup import assemble
-from apex_ompl.planners.apex_parameters import WITHOUT_MODEL, default_planner
-from apex_ompl.planning import PlanRun, find_path, finish, parameterize
+from apex_ompl.planners.apex_parameters import default_planner
 from apex_ompl.result import PlanResult
-from apex_ompl.robot import load_robot
 from apex_ompl.scene.problem import Problem
-from apex_ompl.trajectory import Timing, warm_up
-from apex_ompl.util.deadline import Deadline
+from apex_ompl.session import check_arguments, kept_planner
+from apex_ompl.trajectory import Timing
 from apex_ompl.util.files import is_file
-from apex_ompl.util.validation import check_positive, check_seed
 
 
 def load_problem(name_or_path: str | os.PathLike[str]) -> Problem:
@@ -72,6 +66,7 @@ def plan(
     params: Mapping[str, Any] | None = None,
     snapshot: bool = False,
     timing: bool | Timing = True,
+    leave_contact: float = 0.0,
 ) -> PlanResult:
     """Plan a path, prove it by the full check, and time it.
 
@@ -92,6 +87,8 @@ def plan(
         params: Parameters of the planner by name.
         snapshot: Plan among moving obstacles as they stand at time 0.
         timing: How the path is timed, or whether; the timed motion is proved too.
+        leave_contact: Depth of contacts at the start that the path may leave along growing clearance, up to 0.001 [m];
+            a note says so, since that way out is not proved.
 
     Returns:
         The result; it is true only for an exact path that passed the full check and, unless timing is off, is timed.
@@ -100,46 +97,12 @@ def plan(
         ApexError: The problem, the planner or a parameter is unknown or faulty.
         KeyboardInterrupt: Ctrl-C was pressed; planning ended in good order first.
     """
-    started = time.perf_counter()
     check_arguments(timeout, seed)
-    if not isinstance(timing, (bool, Timing)):
-        raise ParameterError("timing", timing, "True, False or a Timing")
-    how = (Timing() if timing else None) if isinstance(timing, bool) else timing
     if planner is not None:
         planners.parameters(planner, **dict(params or {}))  # before the problem is read
     loaded = problem if isinstance(problem, Problem) else load_problem(problem)
-    if loaded.moving and not snapshot:
-        expected = f"True, since the obstacle {loaded.moving[0]!r} moves and plans hold for one moment only"
-        raise ParameterError("snapshot", snapshot, expected)
-    with quiet_ompl():
-        seed_ompl(seed)
-        robot = load_robot(loaded.robot)
-        notes = [f"snapshot: {', '.join(loaded.moving)} taken to stand still"] if loaded.moving else []
-        if planner is None:
-            planner = default_planner(robot.name)
-            if planner == WITHOUT_MODEL:
-                notes.append(f"no model of {robot.name} ships, so {planner} plans")
-        parameters = planners.parameters(planner, **dict(params or {}))
-        if how is not None:
-            how.start(how.limits(robot.limits))  # whether it fits the robot
-        ready = assemble(loaded, robot, seed=seed)
-        notes += ready.notes
-        if how is not None:
-            warm_up()
-        times = {"setup": time.perf_counter() - started}
-        run = PlanRun(ready, planner, parameters, seed, Deadline(timeout), times, notes)
-        with Interrupt() as run.interrupt:
-            result = find_path(run, simplify)
-            if how is not None:
-                result = parameterize(run, result, how)
-        return finish(run, result, started)
-
-
-def check_arguments(timeout: float, seed: int) -> None:
-    """Check what every plan needs.
-
-    Raises:
-        ParameterError: ``timeout`` is not a positive number of seconds, or ``seed`` not a whole number from 0.
-    """
-    check_positive(timeout, "timeout", "a positive number of seconds")
-    check_seed(seed)
+    with kept_planner(loaded.robot) as kept:
+        return kept.plan_problem(
+            loaded, planner, timeout=timeout, seed=seed, simplify=simplify, params=params, snapshot=snapshot,
+            timing=timing, leave_contact=leave_contact,
+        )  # fmt: skip

@@ -69,14 +69,17 @@ class PlanResult:
             timed; TIMING_FAILED for one that could not be timed.
         reason: One sentence that explains a status other than EXACT_SOLUTION.
         problem: The problem.
-        robot: Name of the robot.
+        robot: Name of the robot; its file is that of the problem.
+        robot_digest: Digest of the robot, see :func:`apex_ompl.robot.identity.digest`.
         joint_names: Order of the columns of ``path``.
+        held_joints: Names of the joints that were not planned and stayed as at the start.
         planner: Name of the planner.
         seed: The seed used.
         path: Path whose states, joined by straight lines, passed the full check, with its spline if any; or None.
         trajectory: The timed motion, which passed the full check along its own samples and keeps all limits, or None.
         limit_use: Largest share of each limit that ``trajectory`` uses, by ``position``, ``velocity``,
             ``acceleration`` and ``jerk``; empty without one.
+        timing_method: Method that made ``trajectory``, see ``apex_ompl.trajectory.Timing``; empty without one.
         deviation: Largest distance of ``trajectory`` from ``path`` [rad], NaN without one.
         motion_clearance: Least distance of a checked pair along ``trajectory`` [m], NaN without one.
         times: Seconds per stage, and ``total``; those of a planner's own stages, as ``solve: repair``, are part of
@@ -106,6 +109,7 @@ class PlanResult:
     path: Path | None = None
     trajectory: Trajectory | None = None
     limit_use: Mapping[str, float] = field(default_factory=dict)
+    timing_method: str = ""
     deviation: float = float("nan")
     motion_clearance: float = float("nan")
     times: Mapping[str, float] = field(default_factory=dict)
@@ -117,6 +121,8 @@ class PlanResult:
     checks: int = 0
     solved_by: str = ""
     notes: tuple[str, ...] = ()
+    held_joints: tuple[str, ...] = ()
+    robot_digest: str = ""
 
     def __bool__(self) -> bool:
         """Whether there is an exact path that passed the full check and, unless timing is off, is timed."""
@@ -131,6 +137,7 @@ class PlanResult:
             "reason": self.reason,
             "problem": self.problem.name,
             "robot": self.robot,
+            "robot_digest": self.robot_digest,
             "planner": self.planner,
             "seed": self.seed,
             "solved_by": self.solved_by,
@@ -141,9 +148,11 @@ class PlanResult:
             "times": dict(self.times),
             "notes": list(self.notes),
             "joint_names": list(self.joint_names),
+            "held_joints": list(self.held_joints),
             "path": None if self.path is None else self.path.states.tolist(),
             "spline": None if self.path is None else _spline_fields(self.path),
             "duration": None if motion is None else motion.duration,
+            "timing_method": self.timing_method,
             "limit_use": dict(self.limit_use),
             "deviation": None if np.isnan(self.deviation) else self.deviation,
             "jerk": None if motion is None else motion.jerk,
@@ -186,7 +195,13 @@ class PlanResult:
         data = read_yaml(path, "result file") if path.suffix != ".npz" else _read_npz(path)
         if data.get("schema") != SCHEMA:
             raise FileFormatError(str(path), "schema", data.get("schema"), f"expected {SCHEMA!r}")
-        data = {**dict.fromkeys(PROOF), "clearance_pair": ["", ""]} | data  # older files lack some
+        data = {
+            **dict.fromkeys(PROOF),
+            "clearance_pair": ["", ""],
+            "timing_method": "",
+            "held_joints": [],
+            "robot_digest": "",
+        } | data  # older files lack some
         try:
             states = None if data["path"] is None else finite_array(data["path"], "path")
             number = {k: float("nan") if data[k] is None else float(finite_array(data[k], k)) for k in NUMBERS}
@@ -199,7 +214,9 @@ class PlanResult:
                 joint_names=names, trajectory=Trajectory(**arrays, joint_names=names) if arrays else None,
                 limit_use=_numbers(data["limit_use"], "limit_use"), seed=int(data["seed"]),
                 times=_numbers(data["times"], "times"),
-                checks=int(data["checks"]), solved_by=data["solved_by"], notes=tuple(data["notes"]),
+                timing_method=str(data["timing_method"]), checks=int(data["checks"]), solved_by=data["solved_by"],
+                notes=tuple(data["notes"]), held_joints=tuple(data["held_joints"]),
+                robot_digest=str(data["robot_digest"]),
                 clearance_pair=tuple(data["clearance_pair"]), **number,
             )  # fmt: skip
             check_plan(

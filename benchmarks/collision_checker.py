@@ -20,7 +20,7 @@ import record
 
 from apex_ompl import plan, problems
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.collision.broadphase import exact_requests
+from apex_ompl.collision.mesh_stage import MeshStage, exact_requests
 from apex_ompl.ompl_adapter.validity import full_check
 from apex_ompl.robot import Robot, load_robot
 from apex_ompl.scene.bodies import Obstacle
@@ -64,19 +64,30 @@ def around_home(robot: Robot, rng: np.random.Generator, count: int) -> np.ndarra
     return np.clip(states, robot.limits.lower, robot.limits.upper)
 
 
+def whole_geometry(scene: MeshStage) -> pin.GeometryModel:
+    """Return the solids of a scene and the pairs that are checked as one geometry model of Pinocchio."""
+    geometry, places = pin.GeometryModel(), {}
+    for number, solid in scene.solids.items():
+        item = pin.GeometryObject(f"{solid.name}#{number}", solid.joint, solid.placement, solid.shape)
+        places[number] = geometry.addGeometryObject(item)
+    for a, b in scene.pairs:
+        geometry.addCollisionPair(pin.CollisionPair(places[a], places[b]))
+    return geometry
+
+
 class PlainLoop:
-    """The same geometry checked pair by pair, without a broadphase."""
+    """The same geometry checked pair by pair, by Pinocchio."""
 
     def __init__(self, checker: CollisionChecker) -> None:
-        """Take the compiled scene of ``checker``."""
-        self.robot, self.scene = checker.robot, checker._scene()
-        self.data, self.geometry_data = self.robot.model.createData(), exact_requests(self.scene.geometry.createData())
+        """Take the solids of ``checker``."""
+        self.robot, self.geometry = checker.robot, whole_geometry(checker.meshes)
+        self.data, self.geometry_data = self.robot.model.createData(), exact_requests(self.geometry.createData())
 
     def is_free(self, q: np.ndarray) -> bool:
         """Whether no pair collides at ``q``."""
         state = self.robot.to_pinocchio(q)
         model = self.robot.model
-        return not pin.computeCollisions(model, self.data, self.scene.geometry, self.geometry_data, state, True)
+        return not pin.computeCollisions(model, self.data, self.geometry, self.geometry_data, state, True)
 
 
 def microseconds(check: Callable[[np.ndarray], object], states: np.ndarray, repeats: int = 3) -> float:
@@ -130,7 +141,7 @@ def check_states(robot: Robot, count: int, share: int, rng: np.random.Generator)
     kernel = both.kernel
     proved = kernel.unproved(free_states)[1] == 0
     return {
-        "obstacles": count, "pairs": len(meshes._scene().geometry.collisionPairs), "free_share": float(free.mean()),
+        "obstacles": count, "pairs": len(meshes.meshes.pairs), "free_share": float(free.mean()),
         "proved_of_free": float(proved.mean()),
         "kernel_us": of_batch(kernel.unproved, free_states[proved]),
         "two_stages_free_us": microseconds(both.is_free, free_states),
@@ -165,8 +176,8 @@ def check_paths(checkers: tuple[CollisionChecker, CollisionChecker], paths: list
     both, meshes = checkers
     both.prepare()
     meshes.prepare()
-    scene = meshes._scene()
-    pool = pin.BroadPhaseManagerPool_DynamicAABBTreeCollisionManager(scene.model, scene.geometry, 1)
+    geometry = whole_geometry(meshes.meshes)
+    pool = pin.BroadPhaseManagerPool_DynamicAABBTreeCollisionManager(meshes.robot.model, geometry, 1)
     exact_requests(pool.getGeometryData(0))
     times: dict[str, list[float]] = {}
 

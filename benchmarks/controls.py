@@ -16,9 +16,10 @@ from ompl import base as ob
 
 from apex_ompl import problems
 from apex_ompl.apex.query import make_query
-from apex_ompl.diffusion.conditions import Query
+from apex_ompl.diffusion.array_model import ArrayModel
 from apex_ompl.diffusion.model import LatentDiffusion
-from apex_ompl.diffusion.proposals import Proposals, TrajectoryModel
+from apex_ompl.diffusion.proposals import Proposals
+from apex_ompl.diffusion.query import Query
 from apex_ompl.ompl_adapter.setup import assemble
 from apex_ompl.planners.apex import APEX
 from apex_ompl.planners.apex_parameters import ApexParameters
@@ -27,22 +28,22 @@ from apex_ompl.problems.suite_robot import robot
 from apex_ompl.trajopt.optimizer import Optimizer
 
 
-class Bumps(TrajectoryModel):
+class Bumps(ArrayModel):
     """Random bumps instead of proposals."""
 
     def propose(self, query: Any, kernel: Any, count: int, **options: Any) -> Proposals:
         """Return bumps on the straight lines of queries."""
         queries = [query] if isinstance(query, Query) else list(query)
-        rng = np.random.default_rng(int(torch.randint(2**31, (1,), generator=options.get("generator"))))
+        rng = np.random.default_rng(options["generator"].integers(2**31))
         found = np.concatenate([Optimizer(self.spline).starts(q.start, q.goal, count + 1, rng)[1:] for q in queries])
-        return Proposals(found, torch.empty(0), {})
+        return Proposals(found, np.empty(0), {})
 
     def renoise(self, query: Query, kernel: Any, control: Any, step: int, **options: Any) -> Proposals:
         """Return other bumps: a path is not resampled."""
         return self.propose(query, kernel, len(control), **options)
 
 
-class Shuffled(TrajectoryModel):
+class Shuffled(ArrayModel):
     """Proposals for the problem next to the one at hand, put on its ends."""
 
     other: Query
@@ -68,16 +69,15 @@ class Shuffled(TrajectoryModel):
         return Proposals(self.spline.with_ends(moved, start, goal), found.latent, found.seconds)
 
 
-def drawn(trained: LatentDiffusion) -> LatentDiffusion:
-    """Return a network like a trained one with random weights; its latent space and its limits are those."""
+def drawn(trained: LatentDiffusion) -> ArrayModel:
+    """Return a model like a trained one with random weights; its latent space and its limits are those."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         network = LatentDiffusion(trained.config)
         torch.nn.init.kaiming_uniform_(network.denoiser.leave.weight)  # it would begin at zero
     kept = {k: v for k, v in trained.state_dict().items() if k.startswith(("autoencoder", "probe"))}
     kept |= {k: v for k, v in trained.state_dict().items() if k in ("encoder.lower", "encoder.upper")}
-    network.load_state_dict({**network.state_dict(), **kept})
-    return network
+    return ArrayModel(trained.config, {k: v.numpy() for k, v in (network.state_dict() | kept).items()}, {})
 
 
 def digest(*files: Path) -> str:
@@ -105,5 +105,5 @@ class BumpsParameters(ApexParameters):
     def build(self, si: ob.SpaceInformation) -> ob.Planner:
         """Return the planner."""
         planner = APEX(si, self)
-        planner.model = Bumps(planner.model.network, {})
+        planner.model = Bumps(planner.model.config, planner.model.weights, {})
         return planner

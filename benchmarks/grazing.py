@@ -17,7 +17,8 @@ import numpy as np
 import pinocchio as pin
 
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.collision.broadphase import CompiledScene
+from apex_ompl.collision.mesh_stage import MeshStage
+from apex_ompl.collision.solids import transform
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import AttachedObject, MeshFile, Obstacle
 
@@ -73,22 +74,21 @@ class PairDistances:
 
     def __init__(self, checker: CollisionChecker) -> None:
         """Take the geometries of a checker."""
-        self.scene = checker._scene()
+        self.scene = checker.meshes
         self.robot = checker.robot
-        self.data = self.scene.geometry.createData()
+        self.data = self.robot.model.createData()
 
     def __call__(self, q: np.ndarray, pairs: list[tuple[int, int]]) -> np.ndarray:
         """Return the distances of pairs of geometries at a state, shape (pairs,) [m]."""
-        scene, found = self.scene, []
-        order = self.robot.to_pinocchio(q)
-        pin.updateGeometryPlacements(scene.model, scene.data, scene.geometry, self.data, order)
+        found = []
+        pin.forwardKinematics(self.robot.model, self.data, self.robot.to_pinocchio(q))
         for a, b in pairs:
             request, result = coal.DistanceRequest(), coal.DistanceResult()
             request.gjk_tolerance, request.gjk_max_iterations = EXACT, 1000
             sides = []
             for k in (a, b):
-                pose = self.data.oMg[k]
-                sides += [scene.geometry.geometryObjects[k].geometry, coal.Transform3s(pose.rotation, pose.translation)]
+                solid = self.scene.solids[k]
+                sides += [solid.shape, transform(self.data.oMi[solid.joint] * solid.placement)]
             found.append(coal.distance(*sides, request, result))
         return np.array(found)
 
@@ -160,16 +160,18 @@ class Grazes:
             return
         if proof:
             self.off += least < proof.clearance_bound - 1e-7
-        elif least > 2e-5 and proof.clearance > 0.0 and set(proof.pair) == {distances.scene.labels[k] for k in pair}:
+        elif (
+            least > 2e-5 and proof.clearance > 0.0 and set(proof.pair) == {distances.scene.solids[k].name for k in pair}
+        ):
             self.refused += 1
         self.clear += least > 2e-5
 
 
-def _kind(scene: CompiledScene, pair: tuple[int, int]) -> str:
+def _kind(scene: MeshStage, pair: tuple[int, int]) -> str:
     """Return the kinds of two geometries: a link, or the first word of an object's name."""
     names = []
     for k in pair:
-        label = scene.labels[k]
+        label = scene.solids[k].name
         of_robot = k < scene.links
         names.append("link" if of_robot else label.split("_")[0])
     return " and ".join(sorted(names))

@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 import record
-import torch
 
 from apex_ompl import load_model, problems
 from apex_ompl.apex.query import make_query
@@ -32,7 +31,7 @@ PROBLEM = "shelf/hard/800003"
 COUNTS = (1, 8, 32)
 STEPS = (1, 2, 8)
 GUIDED = Guidance(gamma=1.0)
-LOAD = "import time, torch; b = time.perf_counter(); import apex_ompl; apex_ompl.load_model({name!r}); "
+LOAD = "import time; b = time.perf_counter(); import apex_ompl; apex_ompl.load_model({name!r}); "
 LOAD += "print(time.perf_counter() - b)"
 
 
@@ -51,7 +50,7 @@ def latency(name: str, repeat: int) -> list[dict[str, Any]]:
             for guidance in (Guidance(gamma=0.0), GUIDED):
                 sampling, found = Sampling("ddim", steps, guidance=guidance), []
                 for k in range(repeat + 3):
-                    generator = torch.Generator().manual_seed(k)
+                    generator = np.random.default_rng(k)
                     found.append(model.propose(query, kernel, count, sampling=sampling, generator=generator).seconds)
                 stages = {stage: float(np.median([f[stage] for f in found[3:]])) for stage in found[0]}
                 row = {"count": count, "steps": steps, "guided": guidance.gamma > 0.0, "query_s": query_s}
@@ -60,7 +59,7 @@ def latency(name: str, repeat: int) -> list[dict[str, Any]]:
 
 
 def load_seconds(name: str, repeat: int = 5) -> float:
-    """Return the median time that loading takes in new processes, torch being imported already."""
+    """Return the median time that loading takes in new processes."""
     command = [sys.executable, "-c", LOAD.format(name=name)]
     return float(np.median([float(subprocess.check_output(command)) for _ in range(repeat)]))
 
@@ -70,7 +69,6 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--repeat", type=one_or_more, default=30)
     args = parser.parse_args()
-    torch.set_num_threads(1)
     lines = [["model", "B", "steps", "guided", "condition ms", "network ms", "guidance ms", "decode ms", "total ms"]]
     lines.append(["---", "---:", "---:", "---", *["---:"] * 5])
     models, notes = {}, []
@@ -78,7 +76,7 @@ def main() -> None:
         rows, load = latency(name, args.repeat), load_seconds(name)
         models[name] = {"load_s": load, "rows": rows}
         query_ms = 1e3 * rows[0]["query_s"]
-        notes.append(f"`{name}` loads in {load:.2f} s behind torch; its query is made in {query_ms:.2f} ms.")
+        notes.append(f"`{name}` loads in {load:.2f} s; its query is made in {query_ms:.2f} ms.")
         for row in rows:
             times = [f"{1e3 * t:.2f}" for t in (*row["stages"].values(), row["total_s"])]
             lines.append([name, row["count"], row["steps"], "yes" if row["guided"] else "no", *times])

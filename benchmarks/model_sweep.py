@@ -21,7 +21,7 @@ import record
 import torch
 
 from apex_ompl.datasets.kernel_problems import load_kernel_problems
-from apex_ompl.diffusion.checkpoint import load_model
+from apex_ompl.diffusion.checkpoint import load_torch_model
 from apex_ompl.diffusion.runlog import read_log
 from apex_ompl.diffusion.validation import success_rates
 from apex_ompl.util.entry_point import run_script
@@ -60,7 +60,7 @@ def trained(name: str, args: argparse.Namespace) -> Path:
 
 def figures(folder: Path | None, cases: list[Any]) -> dict[str, Any]:
     """Return the success rates of a variant; without a folder, of the checkpoint that ships."""
-    model = load_model("apex" if folder is None else folder / "checkpoint")
+    model = load_torch_model("apex" if folder is None else folder / "checkpoint")
     last = {} if folder is None else read_log(folder)[-1]
     found: dict[str, Any] = {
         "steps": model.about["step"], "minutes": model.about["seconds"] / 60.0,

@@ -9,7 +9,8 @@ import torch
 from numpy.typing import NDArray
 
 from apex_ompl.datasets.records import Paths
-from apex_ompl.diffusion.conditions import Conditions, ConditionTable, Probes, Query, batch_queries, pad_obstacles
+from apex_ompl.diffusion.conditions import Conditions, ConditionTable, batch_queries, pad_obstacles
+from apex_ompl.diffusion.query import Probes, Query
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel import Kernel, RobotTables
 from apex_ompl.kernel.scene_builder import scene_tables

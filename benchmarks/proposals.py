@@ -26,7 +26,6 @@ from typing import Any
 
 import numpy as np
 import record
-import torch
 from controls import Shuffled, checkpoint_digest, digest, drawn, next_query
 from neighbours import Neighbours
 
@@ -35,7 +34,7 @@ from apex_ompl.apex.query import make_query
 from apex_ompl.benchmark import Results, Row, Workers, bench
 from apex_ompl.benchmark.rows import Job
 from apex_ompl.benchmark.runs import NO_PROBLEM, Run
-from apex_ompl.diffusion.checkpoint import SHIPPED, read_config
+from apex_ompl.diffusion.checkpoint import SHIPPED, load_torch_model, read_config
 from apex_ompl.diffusion.data import shard_paths
 from apex_ompl.diffusion.guidance import Guidance
 from apex_ompl.diffusion.mirror import Mirror
@@ -80,11 +79,11 @@ TIME_LIMIT = 10.0  # of rrtconnect+polish [s]
 @cache
 def model(name: str) -> TrajectoryModel:
     """Return a model by its name, folder or kind."""
-    torch.set_num_threads(1)
     if name == "random weights":
-        return TrajectoryModel(drawn(load_model("apex").network), {})
+        return drawn(load_torch_model("apex").network)
     if name == "shuffled conditions":
-        return Shuffled(load_model("apex").network, {})
+        apex = load_model("apex")
+        return Shuffled(apex.config, apex.weights, {})
     return load_model(name)
 
 
@@ -188,7 +187,7 @@ def proposer(ready: PlanningSetup, optimizer: Optimizer, job: Job) -> Callable[[
 
     def made(count: int) -> np.ndarray:
         query = make_query(ready.checker, start, goal, point=network.sees_point)
-        generator = torch.Generator().manual_seed(seed)
+        generator = np.random.default_rng(seed)
         return network.propose(query, kernel, count, sampling=sampling.get(method), generator=generator).control
 
     return made

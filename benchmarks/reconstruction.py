@@ -20,7 +20,7 @@ from apex_ompl import load_model, problems
 from apex_ompl.datasets.records import Paths
 from apex_ompl.datasets.store import load
 from apex_ompl.diffusion.autoencoder import LinearLatent
-from apex_ompl.diffusion.checkpoint import shipped
+from apex_ompl.diffusion.checkpoint import load_torch_model, shipped
 from apex_ompl.diffusion.data import split
 from apex_ompl.ompl_adapter.setup import assemble
 from apex_ompl.ompl_adapter.validity import full_check
@@ -34,7 +34,7 @@ DATA = record.RESULTS.parent.parent / "data" / "dual_panda_softhand" / "paths.zi
 
 def lost(name: str, paths: Paths, which: np.ndarray) -> dict[str, Any]:
     """Return errors [rad] and the share of paths that stay valid."""
-    network = load_model(name).network
+    network = load_torch_model(name).network
     autoencoder, spline = network.autoencoder, paths.spline
     control = torch.tensor(paths.control(which), dtype=torch.float32)
     with torch.no_grad():

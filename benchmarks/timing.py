@@ -1,8 +1,10 @@
 """Timing of paths: limits, deviation, proof, duration beside TOPP-RA's optimum, computing time; and other methods.
 
 The paths are those that apex finds for the first test problems of each static level; those of rrtconnect, simplified,
-whose corners are sharp, are timed as well. TOPP-RA's optimum is that of the cubic spline through the states of apex's
-paths under the same limits of velocity and acceleration, without any of jerk (package ``toppra``, extra ``peers``).
+whose corners are sharp, are timed as well. Each is timed by both methods of ``Timing``, ruckig and spline, as ``plan``
+does it: with the full check of the motion, whose time is not counted. TOPP-RA's optimum is that of the cubic spline
+through the states of apex's paths under the same limits of velocity and acceleration, without any of jerk (package
+``toppra``, extra ``peers``).
 
 The other methods, on the first problems of each level:
 ``Ruckig along the arc``: one number moves along the same curve by Ruckig, in stretches with limits from the curve's
@@ -20,7 +22,7 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib import metadata
 from typing import Any
 
@@ -40,13 +42,16 @@ from timing_methods import (
 from tqdm import tqdm
 
 from apex_ompl import plan, problems
+from apex_ompl.errors import TimingError
 from apex_ompl.kernel.compiled.polyline_distance import max_distance
 from apex_ompl.ompl_adapter.setup import assemble
 from apex_ompl.ompl_adapter.validity import full_check
 from apex_ompl.problems.suite_robot import robot
-from apex_ompl.result import PlanResult, PlanStatus
-from apex_ompl.trajectory import Trajectory, time_path
+from apex_ompl.result import PlanResult
+from apex_ompl.trajectory import Timing, Trajectory, time_path
 from apex_ompl.trajectory.curve import Polyline
+from apex_ompl.trajectory.methods import METHODS
+from apex_ompl.trajopt.path import Path
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import one_or_more, whole_number
 
@@ -65,6 +70,10 @@ class Figures:
     uses: list[list[float]] = field(default_factory=list)
     seconds: list[float] = field(default_factory=list)
     jerks: list[float] = field(default_factory=list)
+    proofs: list[float] = field(default_factory=list)
+    knots: list[int] = field(default_factory=list)
+    other: int = 0
+    stops: int = 0
     failed: int = 0
     none: int = 0
 
@@ -77,13 +86,15 @@ class Figures:
         made = len(self.durations)
         shares = [made + self.none, f"{made / max(made + self.none, 1):.3f}"]
         whole = [f"{np.median(self.durations):.2f}", f"{np.median(self.jerks):.0f}"] if made else ["-", "-"]
-        return [*shares, *whole, *ratio, *uses, *deviation, self.failed, *took]
+        proof = [f"{1e3 * v:.1f}" for v in record.percentiles(self.proofs, 50, 95)] if self.proofs else ["-"] * 2
+        knots = [f"{np.median(self.knots):.0f}"] if self.knots else ["-"]
+        return [*shares, *whole, *ratio, *uses, *deviation, self.failed, *took, *proof, *knots, self.other, self.stops]
 
 
 HEAD = (
     "N", "timed", "duration s p50", "jerk rad/s^3 p50", "duration / TOPP-RA p50", "p95", "most",
     *(f"most use of {name}" for name in DERIVATIVES), "deviation mrad p50", "p95", "most", "full check failed",
-    "ms p50", "p95",
+    "ms p50", "p95", "proof ms p50", "p95", "knots p50", "by the other method", "stops at corners",
 )  # fmt: skip
 
 
@@ -103,11 +114,36 @@ def measure(figures: Figures, motion: Trajectory | None, path: np.ndarray, check
     figures.uses.append([motion.use(LIMITS)[name] for name in DERIVATIVES])
     figures.deviations.append(deviation_of(motion, path))
     figures.jerks.append(motion.jerk)
-    states = np.clip(motion.sample(EACH).position, LIMITS.lower, LIMITS.upper)
-    states = np.concatenate([path[:1], states[1:-1], path[-1:]])
-    figures.failed += not full_check(checker, states, path[0], [path[-1]])
+    positions = np.clip(motion.positions, LIMITS.lower, LIMITS.upper)
+    positions[[0, -1]] = path[[0, -1]]  # without rounding
+    figures.failed += not full_check(checker, replace(motion, positions=positions), path[0], [path[-1]])
     if best is not None:
         figures.ratios.append(motion.duration / best)
+
+
+def proved(figures: Figures, path: Path, checker: Any, method: str, best: float | None) -> None:
+    """Time a path by a method of ``Timing``, as ``plan`` does it, and add the figures; the proof's time is left out."""
+    proof = 0.0
+
+    def fault(motion: Trajectory) -> str:
+        nonlocal proof
+        started = time.perf_counter()
+        reason = full_check(checker, motion, path.states[0], [path.states[-1]]).reason
+        proof += time.perf_counter() - started
+        return reason
+
+    started = time.perf_counter()
+    try:
+        made = time_path(path, LIMITS, NAMES, Timing(method), fault)
+    except TimingError:
+        figures.none += 1
+        return
+    figures.seconds.append(time.perf_counter() - started - proof)
+    figures.proofs.append(proof)
+    figures.knots.append(len(made.trajectory.times))
+    figures.other += made.method != method
+    figures.stops += made.form == "stops"
+    measure(figures, made.trajectory, path.states, checker, best)
 
 
 def timed_method(
@@ -119,13 +155,7 @@ def timed_method(
     return motion, time.perf_counter() - started
 
 
-def ours(path: np.ndarray) -> Trajectory | None:
-    """Return the motion of ``time_path``."""
-    return time_path(path, LIMITS, NAMES).trajectory
-
-
-METHODS: dict[str, Method] = {
-    "time_path": ours,
+OTHERS: dict[str, Method] = {
     "Ruckig along the arc": along_arc,
     "TOPP-RA, then Ruckig": after_toppra,
     "Ruckig from waypoint to waypoint": by_waypoints,
@@ -147,22 +177,20 @@ def main() -> None:
         for level in record.static_levels(args.levels)
         for k, name in enumerate(problems.frozen_names(*level.split("/"), "test")[: args.n])
     ]
-    planned = {planner: Figures() for planner in ("apex", "rrtconnect")}
-    methods = {**{name: Figures() for name in METHODS}, "Ruckig from corner to corner": Figures()}
+    planned = {(planner, method): Figures() for planner in ("apex", "rrtconnect") for method in METHODS}
+    methods = {**{name: Figures() for name in OTHERS}, "Ruckig from corner to corner": Figures()}
     stages: dict[str, list[float]] = {}
     for name, k in tqdm(names, unit="problem"):
         checker = assemble(problems.load(name), robot()).checker
-        for planner, figures in planned.items():
+        for planner in ("apex", "rrtconnect"):
             result: PlanResult = plan(name, planner, timeout=10.0, seed=k)
-            if result.status is PlanStatus.TIMING_FAILED:
-                figures.none += 1
-            if result.trajectory is None or result.path is None:
+            if result.path is None:
                 continue
-            path, motion = result.path.states, result.trajectory
+            path = result.path.states
             found = optimum(path) if planner == "apex" and len(path) > 2 else None
             best = None if found is None else found[1]
-            measure(figures, motion, path, checker, best)
-            figures.seconds.append(result.times["timing"])
+            for method in METHODS if len(path) > 2 else ():
+                proved(planned[planner, method], result.path, checker, method, best)
             for stage in ("setup", "solve", "verify", "timing", "timing proof", "clearance", "total"):
                 if planner == "apex":
                     stages.setdefault(stage, []).append(result.times.get(stage, 0.0))
@@ -173,18 +201,19 @@ def main() -> None:
                 measure(methods["Ruckig from corner to corner"], made, path, checker, None)
                 methods["Ruckig from corner to corner"].seconds.append(took)
             elif len(path) > 2:
-                for label, method in METHODS.items():
-                    made, took = timed_method(method, path)
+                for label, other in OTHERS.items():
+                    made, took = timed_method(other, path)
                     measure(methods[label], made, path, checker, best)
                     methods[label].seconds.append(took)
     rows = [record.row(["paths", *HEAD]), record.row(["---", *["---:"] * len(HEAD)])]
-    rows += [record.row([planner, *figures.cells()]) for planner, figures in planned.items()]
+    rows += [record.row([f"{planner}, {method}", *f.cells()]) for (planner, method), f in planned.items()]
     rows += ["", record.row(["method", *HEAD]), record.row(["---", *["---:"] * len(HEAD)])]
     rows += [record.row([label, *figures.cells()]) for label, figures in methods.items()]
     rows += ["", record.row(["stage of plan, apex", "ms p50", "p95"]), record.row(["---", "---:", "---:"])]
     for stage, seconds in stages.items():
         rows.append(record.row([stage, *(f"{1e3 * v:.1f}" for v in record.percentiles(seconds, 50, 95))]))
-    figures = {label: f.__dict__ for label, f in {**planned, **methods}.items()}
+    figures = {f"{planner}, {method}": f.__dict__ for (planner, method), f in planned.items()}
+    figures |= {label: f.__dict__ for label, f in methods.items()}
     about = {"split": "test", "seed": "number of the problem in its level", "toppra": metadata.version("toppra")}
     record.write("timing", {"figures": figures}, "\n".join(rows), **about, ruckig=metadata.version("ruckig"))
 

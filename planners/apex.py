@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from weakref import WeakSet
 
-import torch
+import numpy as np
 from ompl import base as ob
 from ompl import util as ou
 
@@ -15,15 +16,16 @@ from apex_ompl.apex.sampler import ProposalSampler
 from apex_ompl.apex.solver import LOG, solve
 from apex_ompl.apex.stages import Anytime, Shorten
 from apex_ompl.diffusion.checkpoint import shared_model
+from apex_ompl.diffusion.proposals import TrajectoryModel
 from apex_ompl.errors import ParameterError
 from apex_ompl.ompl_adapter.report import SolveReport
 from apex_ompl.ompl_adapter.space import forget_states
 from apex_ompl.planners.apex_parameters import NAME, ApexParameters
 from apex_ompl.trajopt.optimizer import Optimizer
 from apex_ompl.types import Array
-from apex_ompl.util.threads import one_torch_thread
 
 Status = ob.PlannerStatus
+_warm_models: WeakSet[TrajectoryModel] = WeakSet()  # that have proposed something in this process
 
 
 class APEX(ob.Planner):
@@ -54,7 +56,7 @@ class APEX(ob.Planner):
         self.validator = PathValidator(si, self.parameters.robot)
         robot = self.validator.checker.robot.name
         self.model = shared_model(self.parameters.model, device=self.parameters.device, robot=robot)
-        steps, most = self.parameters.denoising_steps, self.model.network.schedule.steps
+        steps, most = self.parameters.denoising_steps, self.model.schedule.steps
         if steps > most:
             raise ParameterError("parameter 'denoising_steps'", steps, f"at most {most}, those of the checkpoint")
         self.optimizer = Optimizer(self.model.spline)
@@ -76,13 +78,16 @@ class APEX(ob.Planner):
             return
         checker = self.validator.checker
         self.optimizer.prepare(checker.kernel)
-        query = make_query(checker, checker.robot.home, checker.robot.home, point=self.model.sees_point)
-        sampling = self.parameters.sampling(self.model.sampling)
-        quick = replace(sampling, sampler="ddim", steps=min(2, sampling.steps))
-        with one_torch_thread():
-            proposed = self.model.propose(query, checker.kernel, 1, sampling=quick)
+        home = checker.robot.home
+        if self.model not in _warm_models:
+            query = make_query(checker, home, home, point=self.model.sees_point)
+            sampling = self.parameters.sampling(self.model.sampling)
+            quick = replace(sampling, sampler="ddim", steps=min(2, sampling.steps))
+            with self.model.one_thread():
+                self.model.propose(query, self.validator.kernel, 1, sampling=quick)
+            _warm_models.add(self.model)
         if self.parameters.lambda_obs > 0.0:
-            self.validator.obstacle_distance(self.model.spline.path(proposed.control[0]))
+            self.validator.obstacle_distance(np.stack([home, home]))
         self._warm = True
 
     def clear(self) -> None:
@@ -109,7 +114,7 @@ class APEX(ob.Planner):
         self.report = SolveReport()
         try:
             self._prepare()
-            with one_torch_thread():
+            with self.model.one_thread():
                 status = self._solve(ptc)
         except Exception as error:
             LOG.exception("%s failed", NAME)
@@ -120,9 +125,9 @@ class APEX(ob.Planner):
 
     def _solve(self, ptc: ob.PlannerTerminationCondition) -> ob.PlannerStatus:
         parameters = self.parameters
-        generator = torch.Generator().manual_seed(self.next_seed())
+        generator = np.random.default_rng(self.next_seed())
         sampler = ProposalSampler(
-            self.model, self.validator.checker.kernel, parameters.sampling(self.model.sampling),
+            self.model, self.validator.kernel, parameters.sampling(self.model.sampling),
             generator=generator, stop=lambda: bool(ptc()), report=self.report,
         )  # fmt: skip
         context = SolveContext(

@@ -15,7 +15,7 @@ from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ParameterError
 from apex_ompl.ompl_adapter.report import SolveReport
 from apex_ompl.ompl_adapter.simplify import simplify
-from apex_ompl.ompl_adapter.space import array_to_path, forget_states, path_to_array
+from apex_ompl.ompl_adapter.space import Bounds, array_to_path, bounds_of, forget_states, path_to_array
 from apex_ompl.ompl_adapter.validity import StateValidityChecker
 from apex_ompl.planners.registry import Parameters, bounded, register
 from apex_ompl.planners.tuned import TUNED
@@ -30,19 +30,21 @@ LOG = logging.getLogger("apex_ompl")
 
 
 def polished(
-    optimizer: Optimizer, checker: CollisionChecker, states: Array, stop: Callable[[], bool] = lambda: False
-) -> Path | None:
+    optimizer: Optimizer, checker: CollisionChecker, states: Array, stop: Callable[[], bool] = lambda: False,
+    bounds: Bounds | None = None,
+) -> Path | None:  # fmt: skip
     """Return a short path near a given one, shape (N, dof), that passes the full check, or None.
 
-    The given path is fitted by ``optimizer.spline``, whose control points are optimised.
+    The given path is fitted by ``optimizer.spline``, whose control points are optimised inside of ``bounds``, by
+    default the robot's limits.
     """
-    limits = checker.robot.limits
-    control = optimizer.spline.fit(states, limits.lower, limits.upper).control
+    lower, upper = bounds or (checker.robot.limits.lower, checker.robot.limits.upper)
+    control = optimizer.spline.fit(states, lower, upper).control
 
     def is_valid(found: Array) -> bool:
         return bool(checker.prove(found, tolerance=0.0))
 
-    best = optimizer.shorten(checker.kernel, control, is_valid, stop)
+    best = optimizer.shorten(checker.kernel.within(lower, upper), control, is_valid, stop)
     return None if best is None else Path.on(optimizer.spline, best)
 
 
@@ -99,7 +101,8 @@ class PolishedRRTConnect(ob.Planner):
         self._add(path)
         if not ptc():
             with self.report.timed("polish"):
-                better = polished(self._optimizer, self._checker, path.states, lambda: bool(ptc()))
+                bounds = bounds_of(si, self._checker.robot)
+                better = polished(self._optimizer, self._checker, path.states, lambda: bool(ptc()), bounds)
             if better is not None:
                 self._add(better)
         return status

@@ -1,4 +1,4 @@
-"""The robot of the suites, made once."""
+"""The robot of the suites."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from apex_ompl.tasks.hand_poses import DualArmTables
 ROBOT = "dual_panda_softhand"
 
 
-@cache
 def robot() -> Robot:
     """Return the robot of the suites."""
     return load_robot(ROBOT)

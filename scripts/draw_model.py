@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from apex_ompl import load_model, load_problem
 from apex_ompl.apex.query import make_query
@@ -63,20 +62,19 @@ def denoising(name: str, ready: PlanningSetup, seed: int, file: Path) -> None:
     import matplotlib.pyplot as plt
 
     model, kernel = load_model(name), ready.checker.kernel
-    network, snapshots = model.network, {}
-    ends = [torch.tensor(q, dtype=torch.float32)[None] for q in (ready.start, ready.goals[0])]
-    steps = network.schedule.steps
+    snapshots, ends = {}, (ready.start[None], ready.goals[0][None])
+    steps = model.schedule.steps
     moments = [round(share * steps) for share in MOMENTS]
 
-    def keep(t: int, sample: torch.Tensor, estimate: Any) -> None:
+    def keep(t: int, sample: Any, estimate: Any) -> None:
         del estimate
         if steps - 1 - t in moments:
-            snapshots[steps - 1 - t] = network.autoencoder.decode(sample, *ends)[0].double().numpy()
+            snapshots[steps - 1 - t] = model.spline.path(model.control(sample, ends))[0]
 
-    query, generator = make_query(ready.checker, ready.start, ready.goals[0]), torch.Generator().manual_seed(seed)
+    query, generator = make_query(ready.checker, ready.start, ready.goals[0]), np.random.default_rng(seed)
     sampling = Sampling("ddpm", steps, guidance=GUIDED)
     made = model.propose(query, kernel, 1, sampling=sampling, generator=generator, callback=keep)
-    snapshots[steps] = network.autoencoder.decode(made.latent, *ends)[0].double().numpy()
+    snapshots[steps] = model.spline.path(model.control(made.latent, ends))[0]
     figure, axes = plt.subplots(2, len(MOMENTS), figsize=(12, 6.2), sharex=True, sharey="row", layout="constrained")
     for column, moment in enumerate(moments):
         for row, (first, second) in enumerate(((0, 1), (0, 2))):
@@ -107,7 +105,7 @@ def diversity(name: str, ready: PlanningSetup, seed: int, file: Path, wanted: in
     def is_valid(path: np.ndarray) -> bool:
         return bool(full_check(ready.checker, path, ready.start, [ready.goals[0]]))
 
-    generator = torch.Generator().manual_seed(seed)
+    generator = np.random.default_rng(seed)
     sampling = Sampling("ddim", 8, guidance=Guidance(1.0))
     for control in model.propose(query, kernel, 4 * wanted, sampling=sampling, generator=generator).control:
         if len(found) == wanted:

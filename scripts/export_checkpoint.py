@@ -16,10 +16,11 @@ LARGEST = 24.0  # of all that ship together [MiB]
 
 def export(run: Path, name: str) -> None:
     """Read and check the checkpoint of a run, and write it in half precision."""
-    from apex_ompl.diffusion.checkpoint import SHIPPED, load_model, save_model
+    from apex_ompl.diffusion.checkpoint import SHIPPED, load_torch_model
+    from apex_ompl.diffusion.checkpoint_writer import save_model
 
     folder = run / "checkpoint" if (run / "checkpoint").is_dir() else run
-    model = load_model(folder)
+    model = load_torch_model(folder)
     save_model(SHIPPED / name, model.network, model.about)
     size = sum(file.stat().st_size for file in SHIPPED.glob("*/*")) / 2**20
     print(f"{name}: {model.about.get('phase')}, step {model.about.get('step')}; {size:.1f} MiB ship together")

@@ -11,15 +11,9 @@ from support import DATA
 from apex_ompl.datasets.records import Paths
 from apex_ompl.datasets.store import load
 from apex_ompl.diffusion.autoencoder import LinearLatent
-from apex_ompl.diffusion.conditions import ObstacleSet, Probes, Query
-from apex_ompl.diffusion.model import (
-    ConditionConfig,
-    DenoiserConfig,
-    LatentConfig,
-    LatentDiffusion,
-    ModelConfig,
-    NoiseConfig,
-)
+from apex_ompl.diffusion.model import LatentDiffusion
+from apex_ompl.diffusion.model_config import ConditionConfig, DenoiserConfig, LatentConfig, ModelConfig, NoiseConfig
+from apex_ompl.diffusion.query import ObstacleSet, Probes, Query
 from apex_ompl.kernel import Kernel, RobotTables
 from apex_ompl.kernel.compiled.arrays import BOX, CAPSULE, CYLINDER, SPHERE
 from apex_ompl.kernel.scene_builder import Primitive, scene_tables

@@ -36,19 +36,16 @@ class Naive:
 
     def __init__(self, checker: CollisionChecker) -> None:
         self.robot = checker.robot
-        scene = checker._scene()
-        self.geometry = scene.geometry
+        self.solids, self.pairs = checker.meshes.solids, checker.meshes.pairs
         self.data = self.robot.model.createData()
-        self.pairs = [(p.first, p.second) for p in self.geometry.collisionPairs]
 
     def is_free(self, q: np.ndarray) -> bool:
         pin.forwardKinematics(self.robot.model, self.data, self.robot.to_pinocchio(q))
-        items = self.geometry.geometryObjects
-        poses = [self.data.oMi[g.parentJoint] * g.placement for g in items]
+        poses = {k: self.data.oMi[solid.joint] * solid.placement for k, solid in self.solids.items()}
         for a, b in self.pairs:
             result = coal.CollisionResult()
             transforms = [coal.Transform3s(poses[i].rotation, poses[i].translation) for i in (a, b)]
-            first, second = items[a].geometry, items[b].geometry
+            first, second = self.solids[a].shape, self.solids[b].shape
             coal.collide(first, transforms[0], second, transforms[1], coal.CollisionRequest(), result)
             if result.isCollision():
                 return False

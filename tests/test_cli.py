@@ -37,7 +37,7 @@ def test_plan_prints_status_time_and_length(apex_cli, easy: Path) -> None:
     assert lines[0].startswith("sweep: EXACT_SOLUTION by ")
     assert lines[2].startswith("  solve      query 0.") and lines[7].endswith("planner apex, seed 3")
     assert "time" in lines[1] and "length" in lines[3] and "clearance" in lines[4]
-    assert lines[5].startswith("  motion     ") and "jerk 0." in lines[6]
+    assert lines[5].startswith("  motion     ") and ", jerk " in lines[6]
 
 
 def test_json_goes_to_standard_output_alone_and_out_writes_the_same(apex_cli, easy: Path, tmp_path: Path) -> None:

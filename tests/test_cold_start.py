@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -15,7 +17,7 @@ from apex_ompl.kernel.compiled import compilation
 from apex_ompl.util.deadline import Deadline
 
 late, running = [], False
-begin, paused, original = Deadline.__init__, Deadline.paused, compilation._Announced.__call__
+begin, paused, original = Deadline.__init__, Deadline.paused, compilation.CompiledFunction.__call__
 
 def started(self, timeout):
     global running
@@ -35,7 +37,7 @@ def called(self, *arguments):
         late.append(self.name)
     return original(self, *arguments)
 
-Deadline.__init__, Deadline.paused, compilation._Announced.__call__ = started, stopped, called
+Deadline.__init__, Deadline.paused, compilation.CompiledFunction.__call__ = started, stopped, called
 result = plan("shelf/hard/800000", sys.argv[1], timeout=30.0)
 print(result.status, late)
 """
@@ -47,3 +49,49 @@ def test_no_code_is_loaded_or_compiled_while_the_time_limit_runs(planner: str) -
     command = [sys.executable, "-c", SCRIPT, planner]
     done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=300)
     assert done.stdout.strip() == "EXACT_SOLUTION []", done.stdout + done.stderr
+
+
+TYPES = """
+from numba.core.sigutils import normalize_signature
+from apex_ompl import plan
+from apex_ompl.kernel.ahead_of_time import BESIDE, HERE, _function
+
+assert plan("shelf/hard/800000", timeout=30.0)
+for name, (types, _) in (HERE | BESIDE).items():
+    found = _function(name).dispatcher.signatures
+    assert found == [normalize_signature(f"({types},)")[0]], (name, found)
+print("as declared")
+"""
+
+
+def test_functions_are_called_with_the_types_that_they_were_compiled_for() -> None:
+    """Others would be compiled again."""
+    done = subprocess.run([sys.executable, "-c", TYPES], check=False, capture_output=True, text=True, timeout=300)
+    assert done.stdout == "as declared\n", done.stderr
+
+
+FEW = """
+import sys
+from apex_ompl.kernel import ahead_of_time as ahead
+from apex_ompl.kernel.compiled.compilation import names_in_cache
+
+ahead.HERE = {"time_parameterization.sample_times": ahead.BESIDE["time_parameterization.sample_times"]}
+ahead.BESIDE = {"motion_proof.lay_grid": ahead.BESIDE["motion_proof.lay_grid"]}
+ahead.CHILD = sys.argv[1] or ahead.CHILD
+ahead.compile_ahead()
+assert names_in_cache() == {"sample_times", "lay_grid"}, names_in_cache()
+ahead.compile_ahead()
+"""
+
+
+@pytest.mark.parametrize("child", ["", "raise SystemExit(1)"], ids=["beside", "alone"])
+def test_the_kernel_is_compiled_in_two_processes_or_in_one(tmp_path: Path, child: str) -> None:
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+    command = [sys.executable, "-c", FEW, child]
+    first, second = (
+        subprocess.run(command, env=environment, check=False, capture_output=True, text=True, timeout=120)
+        for _ in range(2)
+    )
+    assert first.returncode == second.returncode == 0, first.stderr + second.stderr
+    assert first.stderr.count("apex_ompl compile") == 2 and str(tmp_path) in first.stderr
+    assert second.stderr == ""

@@ -44,16 +44,17 @@ def test_an_obstacle_wholly_inside_a_link_is_a_collision(robot: Robot, shape: di
 
 def surface_contacts(checker: CollisionChecker, q: np.ndarray) -> list[tuple[str, str]]:
     """The pairs that overlap by meshes and primitives alone, without the cases of containment."""
-    scene = checker._scene()
-    model, geometry = checker.robot.model, scene.geometry
-    data, geometry_data = model.createData(), geometry.createData()
-    pin.computeCollisions(model, data, geometry, geometry_data, checker.robot.to_pinocchio(q), False)
-    pairs = [
-        (p.first, p.second)
-        for p, result in zip(geometry.collisionPairs, geometry_data.collisionResults, strict=True)
-        if result.isCollision() and all(scene.same[i] == i for i in (p.first, p.second))
-    ]
-    return [(scene.labels[a], scene.labels[b]) for a, b in pairs]
+    model, solids = checker.robot.model, checker.meshes.solids
+    data, found = model.createData(), []
+    pin.forwardKinematics(model, data, checker.robot.to_pinocchio(q))
+    for a, b in checker.meshes.pairs:
+        sides = []
+        for solid in (solids[a], solids[b]):
+            pose = data.oMi[solid.joint] * solid.placement
+            sides += [solid.shape, coal.Transform3s(pose.rotation, pose.translation)]
+        if coal.collide(*sides, coal.CollisionRequest(), coal.CollisionResult()):
+            found.append((solids[a].name, solids[b].name))
+    return found
 
 
 def u_shape_obj(scale: float) -> str:

@@ -13,14 +13,14 @@ from models import DOF, VARIATIONAL, WALL, kernel, network, query, some_paths
 
 from apex_ompl.datasets.records import SHAPES
 from apex_ompl.diffusion.autoencoder import LinearLatent, VariationalLatent
-from apex_ompl.diffusion.conditions import ConditionTable, ObstacleSet, Probes, Query, batch_queries
+from apex_ompl.diffusion.conditions import ConditionTable, batch_queries
 from apex_ompl.diffusion.denoisers import UNetDenoiser
 from apex_ompl.diffusion.encoders import ConditionEncoder
 from apex_ompl.diffusion.geometry import rotation_matrices, signed_distances
-from apex_ompl.diffusion.model import (
-    DenoiserConfig,
-)
-from apex_ompl.diffusion.proposals import Sampling, TrajectoryModel
+from apex_ompl.diffusion.model_config import DenoiserConfig
+from apex_ompl.diffusion.proposals import Sampling
+from apex_ompl.diffusion.query import ObstacleSet, Probes, Query
+from apex_ompl.diffusion.torch_model import TorchModel
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel import Kernel
 from apex_ompl.trajopt.spline import Spline
@@ -218,10 +218,10 @@ def test_the_unet_takes_its_condition_and_its_step() -> None:
     "parts", [{}, VARIATIONAL, {"denoiser": DenoiserConfig(kind="regression", width=32, blocks=2)}]
 )
 def test_the_same_seed_gives_the_same_paths(parts: dict[str, object]) -> None:
-    model = TrajectoryModel(network(**parts), {})
+    model = TorchModel(network(**parts), {})
 
     def proposed(seed: int) -> np.ndarray:
-        generator = torch.Generator().manual_seed(seed)
+        generator = np.random.default_rng(seed)
         sampling = Sampling("ddpm", 4)
         return model.propose(query(), kernel(WALL), 3, sampling=sampling, generator=generator).control
 
@@ -234,12 +234,12 @@ def test_the_same_seed_gives_the_same_paths(parts: dict[str, object]) -> None:
 
 def test_noise_up_to_a_step_leaves_paths_near() -> None:
     """One step of noise, and of denoising by whatever network, changes a path less than all of it."""
-    model = TrajectoryModel(network(), {})
+    model = TorchModel(network(), {})
     control = some_paths().control(slice(0, 1)).repeat(6, axis=0)
     ends = Query(control[0, 0], control[0, -1], np.zeros(3), ObstacleSet.from_rows([]))
 
     def change(step: int) -> float:
-        generator = torch.Generator().manual_seed(0)
+        generator = np.random.default_rng(0)
         found = model.renoise(ends, kernel(), control, step, sampling=Sampling(steps=3), generator=generator)
         return float(np.abs(found.control - control).mean())
 
@@ -253,7 +253,7 @@ def test_noise_up_to_a_step_leaves_paths_near() -> None:
 
 
 def test_a_query_of_another_robot_is_refused() -> None:
-    model = TrajectoryModel(network(), {})
+    model = TorchModel(network(), {})
     with pytest.raises(ParameterError, match=r"start: expected finite numbers of shape \(16,\)"):
         model.propose(Query(np.zeros(7), np.zeros(7), np.zeros(3), ObstacleSet.from_rows([])), kernel(), 1)
     tables = kernel().robot

@@ -15,6 +15,7 @@ from apex_ompl.scene.bodies import AttachedObject, ContactFace
 from apex_ompl.scene.problem import Alignment, Goal, Tolerance, WorldVector
 from apex_ompl.tasks.alignment import AlignmentGoal, alignment_goal
 from apex_ompl.tasks.alignment_errors import angle
+from apex_ompl.tasks.goal_sampling import sample
 from apex_ompl.tasks.inverse_kinematics import Links
 
 KINDS = ("vertical", "horizontal", "pour", "handover")
@@ -52,7 +53,7 @@ def test_jacobian_is_that_of_finite_differences(robot: Robot, kind: str) -> None
 def test_sampled_states_are_free_and_hold_by_their_definition(robot: Robot, kind: str) -> None:
     goal = goal_of(robot, kind)
     checker = CollisionChecker(robot, (), [held("a", "left")])
-    found = goal.sample(checker, np.random.default_rng(1), count=5)
+    found = sample(goal, checker, np.random.default_rng(1), count=5)
     assert len(found.states) == 5 and found.fault == "" and found.converged >= 5
     for q in found.states:
         assert checker.is_free(q) and robot.limit_fault(q) is None and goal.is_satisfied(q)
@@ -130,7 +131,7 @@ def test_angles_are_exact_where_axes_are_nearly_parallel() -> None:
 
 def test_unreachable_says_so_with_the_best_error(robot: Robot) -> None:
     far = goal_of(robot, "horizontal", distance=5.0)
-    found = far.sample(CollisionChecker(robot), np.random.default_rng(0), count=3, max_attempts=6)
+    found = sample(far, CollisionChecker(robot), np.random.default_rng(0), count=3, max_attempts=6)
     assert len(found.states) == 0 and found.attempts == 6 and found.converged == 0
     assert found.fault.startswith("not reached in 6 attempts; the best has lateral ") and " m off" in found.fault
     problem = load_problem("ball_in_cup")
@@ -145,8 +146,8 @@ def test_aligned_states_that_all_collide_say_with_what(robot: Robot) -> None:
     from apex_ompl.scene.bodies import Obstacle
 
     wall = Obstacle(name="wall", box=(3.0, 0.6, 3.0), position=(0.0, 0.0, 0.0))
-    found = goal_of(robot, "horizontal").sample(
-        CollisionChecker(robot, [wall]), np.random.default_rng(0), max_attempts=5
+    found = sample(
+        goal_of(robot, "horizontal"), CollisionChecker(robot, [wall]), np.random.default_rng(0), max_attempts=5
     )
     assert "collide, " in found.fault and "mm deep" in found.fault
 
@@ -187,7 +188,7 @@ def test_faulty_alignments_are_named(robot: Robot) -> None:
 
 def test_the_lip_that_pours_is_the_lowest_of_the_rim(robot: Robot) -> None:
     goal = goal_of(robot, "pour")
-    found = goal.sample(CollisionChecker(robot), np.random.default_rng(3), count=3)
+    found = sample(goal, CollisionChecker(robot), np.random.default_rng(3), count=3)
     vessel = held("a", "left", (0.02, 0.0, 0.06))
     for q in found.states:
         pose = robot.link_pose(q, "left_hand_palm") @ vessel.pose

@@ -10,15 +10,15 @@ import pytest
 import torch
 from models import POST, VARIATIONAL, WALL, kernel, network, query, some_paths
 
-from apex_ompl.diffusion.conditions import ObstacleSet, Query
 from apex_ompl.diffusion.denoisers import UNetDenoiser
-from apex_ompl.diffusion.guidance import Guidance, collision_cost, gradient, log_likelihood
-from apex_ompl.diffusion.model import (
-    LatentDiffusion,
-    NoiseConfig,
-)
-from apex_ompl.diffusion.proposals import Sampling, TrajectoryModel
+from apex_ompl.diffusion.guidance import Guidance, collision_cost
+from apex_ompl.diffusion.guidance_gradient import gradient, log_likelihood
+from apex_ompl.diffusion.model import LatentDiffusion
+from apex_ompl.diffusion.model_config import NoiseConfig
+from apex_ompl.diffusion.proposals import Sampling
+from apex_ompl.diffusion.query import ObstacleSet, Query
 from apex_ompl.diffusion.sampler import SAMPLERS
+from apex_ompl.diffusion.torch_model import TorchModel
 from apex_ompl.errors import ParameterError, UnknownNameError
 from apex_ompl.kernel import Kernel
 from apex_ompl.trajopt.spline import Spline
@@ -27,12 +27,12 @@ from apex_ompl.trajopt.spline import Spline
 @pytest.mark.parametrize("parts", [{}, VARIATIONAL], ids=["linear", "variational"])
 @pytest.mark.parametrize("scaling", ["noise", "clean"])
 def test_guidance_of_nothing_is_the_plain_model_bit_for_bit(parts: dict[str, object], scaling: str) -> None:
-    model = TrajectoryModel(network(**parts), {})
+    model = TorchModel(network(**parts), {})
     for name in SAMPLERS:
         found = [
             model.propose(
                 query(), kernel(WALL, POST), 4, sampling=Sampling(name, 5, 1.0, guidance),
-                generator=torch.Generator().manual_seed(4),
+                generator=np.random.default_rng(4),
             ).control
             for guidance in (Guidance(gamma=0.0, scaling=scaling), Guidance(gamma=0.0), Guidance(1.0, active_below=0.0))
         ]  # fmt: skip
@@ -70,7 +70,7 @@ def _likely(model: LatentDiffusion, among: Kernel, ends: tuple, guidance: Guidan
 
 def test_guided_paths_stay_near_where_little_is_left_of_the_sample() -> None:
     """At the first steps almost all is noise, and whatever is divided by what is left of the sample grows large."""
-    model, sizes = TrajectoryModel(network(noise=NoiseConfig(most=4.0)), {}), []
+    model, sizes = TorchModel(network(noise=NoiseConfig(most=4.0)), {}), []
     for gamma in (0.0, 1.0):
         guidance = Guidance(gamma, "noise", active_below=1.0)
         for steps in (1, 2, 8):
@@ -85,10 +85,10 @@ def test_guided_paths_stay_near_where_little_is_left_of_the_sample() -> None:
 
 
 def test_threads_propose_what_one_does() -> None:
-    model = TrajectoryModel(network(), {})
+    model = TorchModel(network(), {})
 
     def proposed(seed: int) -> np.ndarray:
-        return model.propose(query(), kernel(WALL), 3, generator=torch.Generator().manual_seed(seed)).control
+        return model.propose(query(), kernel(WALL), 3, generator=np.random.default_rng(seed)).control
 
     with ThreadPoolExecutor(4) as pool:
         found = list(pool.map(proposed, range(12)))
@@ -104,14 +104,14 @@ def test_a_latent_space_that_the_unet_cannot_halve_is_named() -> None:
 @pytest.mark.parametrize("scaling", ["noise", "clean"])
 @pytest.mark.parametrize("name", SAMPLERS)
 def test_guidance_lowers_the_collision_cost_on_average(name: str, scaling: str) -> None:
-    model, among = TrajectoryModel(network(), {}), kernel(WALL, POST)
+    model, among = TorchModel(network(), {}), kernel(WALL, POST)
     costs = []
     for gamma in (0.0, 3.0):
         guidance, total = Guidance(gamma, scaling, clip=1.0, active_below=0.6), 0.0
         for seed in range(3):
             found = model.propose(
                 query(seed), among, 8, sampling=Sampling(name, 8, 1.0, guidance),
-                generator=torch.Generator().manual_seed(seed),
+                generator=np.random.default_rng(seed),
             )  # fmt: skip
             total += collision_cost(among, model.spline.path(found.control)[:, ::4], 0.03)[0].mean()
         costs.append(total)

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from apex_ompl.errors import ParameterError, UnknownNameError
 from apex_ompl.kernel import FixedVector, Target, angle_target, offset_target, opposition_target
 from apex_ompl.robot import Robot, load_robot
+from apex_ompl.robot.assets import DATA
 from apex_ompl.tasks.inverse_kinematics import Links, in_world
 
 LINKS = {
@@ -146,7 +147,7 @@ def test_bad_input_is_named(robot: Robot) -> None:
 
 
 def test_links_do_not_keep_their_robot_alive() -> None:
-    some = load_robot("baxter")
+    some = load_robot(DATA / "baxter.robot.yaml")  # robots that ship are kept by their name
     kept, _ = weakref.ref(some), Links.of(some)
     del some
     gc.collect()

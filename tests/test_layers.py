@@ -22,6 +22,7 @@ LAYERS = [
     {"planners", "problems"},
     {"generation", "result"},
     {"planning"},
+    {"session"},
     {"api"},
     {"benchmark", "live", "viz"},
     {"cli"},

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import inspect
+from typing import Any
+
+import numba
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -10,12 +14,26 @@ from random_robots import random_robot
 from support import states_around_home
 
 from apex_ompl.collision import CollisionChecker
+from apex_ompl.kernel.compiled.compilation import OPTIONS
 from apex_ompl.kernel.compiled.kinematics import place_joint, place_robot
 from apex_ompl.kernel.compiled.layout import layout
 from apex_ompl.kernel.compiled.motion_bound import bound_displacements, cluster_displacement, relative_displacement
 from apex_ompl.kernel.compiled.workspace import Workspace, workspace_dimensions
 from apex_ompl.kernel.tables import RobotTables
 from apex_ompl.robot import Robot
+
+
+def from_python(function: Any) -> Any:
+    """A function that only compiled ones call, compiled for calls from Python."""
+    names = ", ".join(inspect.signature(function.py_func).parameters)
+    space = {"function": function}
+    exec(f"def call({names}):\n    return function({names})", space)
+    return numba.njit(**OPTIONS)(space["call"])
+
+
+place_all, place_one, bound_all, cluster_bound, relative_bound = map(
+    from_python, (place_robot, place_joint, bound_displacements, cluster_displacement, relative_displacement)
+)
 
 
 def workspace(tables: RobotTables) -> Workspace:
@@ -28,9 +46,9 @@ def workspace(tables: RobotTables) -> Workspace:
 def placed(tables: RobotTables, q: np.ndarray) -> tuple[Workspace, list[np.ndarray]]:
     """The joints at a state, and the world centres of all spheres, cluster by cluster."""
     t, w = tables.arrays, workspace(tables)
-    place_robot.py_func(t, w, q)
+    place_all(t, w, q)
     for j in t.lazy:
-        place_joint.py_func(t, w, q, int(j))
+        place_one(t, w, q, int(j))
     ends = [*t.body_root[1:], len(t.node_first)]
     found = []
     for first, count in t.cluster_bodies:
@@ -47,7 +65,7 @@ def check(tables: RobotTables, middle: np.ndarray, step: np.ndarray, deviation: 
     t, rng = tables.arrays, np.random.default_rng(seed)
     w, here = placed(tables, middle)
     w.step[:], w.deviation[:], w.half_width[:] = step, deviation, np.abs(step) + deviation
-    bound_displacements.py_func(t, w)
+    bound_all(t, w)
     tightest = 0.0
     for along in [-1.0, 1.0, *rng.uniform(-1.0, 1.0, 6)]:
         q = middle + along * step + rng.choice([-1.0, 0.0, 1.0], len(step)) * deviation
@@ -58,10 +76,10 @@ def check(tables: RobotTables, middle: np.ndarray, step: np.ndarray, deviation: 
 
         for c in range(len(here)):
             moved = np.linalg.norm(there[c] - here[c], axis=1).max()
-            assert moved <= cluster_displacement.py_func(w, c) + 1e-9
-            tightest = max(tightest, moved / (cluster_displacement.py_func(w, c) + 1e-9))
+            assert moved <= cluster_bound(w, c) + 1e-9
+            tightest = max(tightest, moved / (cluster_bound(w, c) + 1e-9))
         for (a, b), common in zip(t.pair_clusters, t.pair_common, strict=True):
-            bound = relative_displacement.py_func(w, int(a), int(b), int(common))
+            bound = relative_bound(w, int(a), int(b), int(common))
             before, after = (
                 in_frame(cloud[a], frames, common)[:, None] - in_frame(cloud[b], frames, common)[None]
                 for cloud, frames in ((here, w), (there, there_frames))
@@ -97,3 +115,11 @@ def test_spheres_of_real_robots_stay_within_their_bounds(
         inner = np.clip(q, robot.limits.lower + np.abs(step), robot.limits.upper - np.abs(step))
         tightest = max(tightest, check(tables, inner, step, np.abs(rng.normal(0.0, 0.01 * size, robot.dof)), 1))
     assert tightest > 0.35  # a bound that is far off would be useless
+
+
+def test_functions_that_only_compiled_ones_call_say_so(robot: Robot) -> None:
+    tables = CollisionChecker(robot).kernel.robot
+    work = workspace(tables)
+    assert cluster_bound(work, 0) == 0.0
+    with pytest.raises(TypeError):
+        cluster_displacement(work, 0)

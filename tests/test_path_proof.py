@@ -84,7 +84,7 @@ def test_clearance_of_a_path_holds_at_dense_states(grazing: ModuleType, robot: R
             there = distances(state, distances.scene.pairs)
             assert there.min() == pytest.approx(proof.clearance, abs=1e-7)
             worst = distances.scene.pairs[int(there.argmin())]
-            assert {distances.scene.labels[k] for k in worst} == set(proof.pair)
+            assert {distances.scene.solids[k].name for k in worst} == set(proof.pair)
     assert proved > 3
 
 

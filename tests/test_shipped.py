@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import torch
 from support import DATA, ROOT, needs
 
 from apex_ompl import load_model
@@ -18,7 +17,6 @@ from apex_ompl.problems.suite_robot import robot
 from apex_ompl.trajopt.candidates import first_valid
 from apex_ompl.trajopt.optimizer import Optimizer
 from apex_ompl.util.resolution import FINE_RESOLUTION
-from apex_ompl.util.threads import one_torch_thread
 
 FULL = ROOT / "data" / "dual_panda_softhand"
 
@@ -29,7 +27,7 @@ def test_what_ships_is_small_and_named() -> None:
     for name in shipped():
         assert {file.name for file in (SHIPPED / name).iterdir()} == {"README.md", "config.json", "model.safetensors"}
         model = load_model(name, robot=robot().name)
-        assert model.network.config.joints == robot().joint_names
+        assert model.config.joints == robot().joint_names
         assert model.about["phase"] == "denoiser" and model.about["step"] == model.about["config"]["steps"]
 
 
@@ -40,8 +38,8 @@ def test_a_sample_of_the_model_is_shorter_to_repair_than_the_line(name: str) -> 
     quick = Sampling("ddim", 8) if model.sampling.steps > 8 else None
     for case in load_kernel_problems(DATA / "validation"):
         kernel = Kernel(case.robot, case.scene)
-        generator = torch.Generator().manual_seed(1)
-        with one_torch_thread():
+        generator = np.random.default_rng(1)
+        with model.one_thread():
             proposed = model.propose(query_from_problem(case), kernel, 1, sampling=quick, generator=generator)
         starts = {
             "model": proposed.control,

@@ -22,11 +22,12 @@ from trainings import HERE, SCRIPT, SMALL, VARIATIONAL, assert_same, config, que
 from apex_ompl.datasets.kernel_problems import load_kernel_problems, save_kernel_problems
 from apex_ompl.datasets.records import Paths
 from apex_ompl.datasets.store import Store, load, save
-from apex_ompl.diffusion.checkpoint import load_model
+from apex_ompl.diffusion.checkpoint import load_torch_model
 from apex_ompl.diffusion.config import TrainingConfig
 from apex_ompl.diffusion.distributed import DistributedProcess
-from apex_ompl.diffusion.proposals import Sampling, TrajectoryModel
+from apex_ompl.diffusion.proposals import Sampling
 from apex_ompl.diffusion.runlog import read_log
+from apex_ompl.diffusion.torch_model import TorchModel
 from apex_ompl.diffusion.training import Trainer, TrainingError
 from apex_ompl.diffusion.validation import query_from_problem, success_rates
 from apex_ompl.errors import ApexError, FileFormatError, MissingFileError
@@ -52,11 +53,11 @@ def test_32_trajectories_are_memorized(few: Path, tmp_path: Path) -> None:
     }
     trainer = Trainer(config(few, steps=1000, rate=1.5e-3, ema=0.99, log_every=10_000, **sizes), tmp_path, HERE)
     trainer.run()
-    model, paths = TrajectoryModel(trainer.averaged_network(), {}), load(few)
+    model, paths = TorchModel(trainer.averaged_network(), {}), load(few)
     kernel = Kernel(RobotTables.load(DATA / "robot.npz"), scene_tables([]))
     control, errors, from_line = paths.control(), [], []
     for k in range(len(paths)):
-        generator = torch.Generator().manual_seed(k)
+        generator = np.random.default_rng(k)
         query = query_from_path(paths, k)
         found = model.propose(query, kernel, 4, sampling=Sampling("ddim", 8), generator=generator).control
         errors.append(np.abs(found - control[k]).mean())
@@ -134,7 +135,7 @@ def test_a_killed_command_is_resumed(few: Path, tmp_path: Path) -> None:
     process.wait()
     step = torch.load(state, weights_only=True)["step"]
     assert 0 < step < 3000
-    load_model(tmp_path / "run" / "checkpoint")
+    load_torch_model(tmp_path / "run" / "checkpoint")
     how: dict[str, Any] = {"env": environment, "capture_output": True, "text": True}
     done = subprocess.run([*command, "--minutes", "0.01"], check=False, **how)
     assert done.returncode == 0, done.stderr
@@ -154,7 +155,7 @@ def test_two_processes_train_one_model(few: Path, tmp_path: Path) -> None:
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert "denoiser, step 4 of 4" in done.stdout
-    both = load_model(tmp_path / "run" / "checkpoint").network.state_dict()
+    both = load_torch_model(tmp_path / "run" / "checkpoint").network.state_dict()
     # The same steps by hand: the gradients of both processes' batches, averaged.
     (tmp_path / "single").mkdir()
     single = Trainer(config(few, **changes), tmp_path / "single", HERE)
@@ -196,14 +197,12 @@ class _Given:
 
 def test_success_rates_are_those_of_repair_and_proof(few: Path, tmp_path: Path) -> None:
     problems = load_kernel_problems(DATA / "validation")[::4]
-    model = TrajectoryModel(Trainer(config(few), tmp_path, HERE).averaged_network(), {})
+    model = TorchModel(Trainer(config(few), tmp_path, HERE).averaged_network(), {})
     rates = success_rates(model, problems, 3)
     wanted = []
     for problem in problems:
         kernel = Kernel(problem.robot, problem.scene)
-        control = model.propose(
-            query_from_problem(problem), kernel, 3, generator=torch.Generator().manual_seed(0)
-        ).control
+        control = model.propose(query_from_problem(problem), kernel, 3, generator=np.random.default_rng(0)).control
         found = first_valid(Optimizer(model.spline), kernel, control, lambda p, k=kernel: k.proves(p, FINE_RESOLUTION))
         wanted.append(found is not None)
     assert rates["repaired"] == pytest.approx(np.mean(wanted))

@@ -6,6 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy.interpolate import CubicSpline
 
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError
@@ -198,3 +200,35 @@ def test_faulty_knots_are_refused(motion: Trajectory) -> None:
             Trajectory(**{**good, **change}, joint_names=NAMES)
     with pytest.raises(ParameterError, match="each once"):
         Trajectory(**good, joint_names=("one", "two", "two"))
+
+
+@settings(max_examples=60)
+@given(seed=st.integers(0, 10**6), pieces=st.integers(1, 6), still=st.booleans())
+def test_extremes_are_those_of_dense_samples(seed: int, pieces: int, still: bool) -> None:
+    rng = np.random.default_rng(seed)
+    times = np.concatenate([[0.0], np.cumsum(rng.uniform(0.1, 1.0, pieces))])
+    states = [rng.normal(size=(3, 4))]
+    for length in np.diff(times):
+        q, v, a = states[-1]
+        j = rng.normal(size=4) * (0.0 if still else 1.0) * rng.choice([0.0, 1.0, 5.0], 4)
+        states.append(
+            np.stack([
+                q + length * (v + length * (a / 2.0 + length * j / 6.0)), v + length * (a + length * j / 2.0),
+                a + length * j,
+            ])
+        )  # fmt: skip
+    rows = np.stack(states, axis=1)
+    motion = Trajectory(times, *rows, tuple("abcd"))
+    ones = np.ones(4)
+    limits = Limits(-2.0 * ones, 4.0 * ones, 2.0 * ones, 3.0 * ones, 4.0 * ones)
+    dense = np.linspace(0.0, motion.duration, 20_001)
+    wanted = {
+        "position": np.abs((motion(dense) - 1.0) / 3.0).max(), "velocity": np.abs(motion(dense, 1)).max() / 2.0,
+        "acceleration": np.abs(motion(dense, 2)).max() / 3.0, "jerk": np.abs(motion.jerks).max() / 4.0,
+    }  # fmt: skip
+    found = motion.use(limits)
+    for name, value in wanted.items():
+        assert value - 1e-12 <= found[name] <= value + 2e-3 * (1.0 + value), name
+    slow = motion.slower(2.0).use(limits)
+    again = Trajectory(2.0 * times, rows[0], rows[1] / 2.0, rows[2] / 4.0, tuple("abcd")).use(limits)
+    assert slow == pytest.approx(again, rel=1e-12)

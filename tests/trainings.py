@@ -9,9 +9,9 @@ import torch
 from support import DATA, ROOT
 
 from apex_ompl.datasets.records import Paths
-from apex_ompl.diffusion.conditions import ObstacleSet, Query
 from apex_ompl.diffusion.config import TrainingConfig
 from apex_ompl.diffusion.distributed import DistributedProcess
+from apex_ompl.diffusion.query import ObstacleSet, Query
 from apex_ompl.diffusion.training import Trainer
 
 SCRIPT = ROOT / "scripts" / "train.py"

@@ -21,7 +21,7 @@ from apex_ompl.types import Array
 
 if TYPE_CHECKING:
     from apex_ompl.apex.sampler import ProposalSampler
-    from apex_ompl.diffusion.conditions import Query
+    from apex_ompl.diffusion.query import Query
 
 MIN_GAIN = 1e-3  # least decrease of length that counts as an improvement [rad]
 CLEARANCE_SPACING = 0.1  # of a path's states whose distance from obstacles is compared [rad, max-norm]
@@ -66,7 +66,7 @@ class SolveContext:
         self.starts: list[Array] = []
         self.goals: list[Array] = []
         self.pairs: list[tuple[Array, Array]] = []
-        self.kernel = validator.checker.kernel
+        self.kernel = validator.kernel
         self.pool = self.new_pool()
         self.unchecked: list[tuple[str, Array]] = []
         self.set_aside: list[tuple[float, Candidate]] = []

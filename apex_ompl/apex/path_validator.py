@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from ompl import base as ob
 
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ParameterError
-from apex_ompl.ompl_adapter.space import to_state
+from apex_ompl.kernel import Kernel
+from apex_ompl.ompl_adapter.space import bounds_of, to_state
 from apex_ompl.ompl_adapter.validity import MotionValidator, StateValidityChecker
 from apex_ompl.robot import load_robot
 from apex_ompl.types import Array
@@ -47,6 +49,7 @@ class PathValidator:
         """
         self._si = si
         self._checkers = _checkers(si)
+        self._bounded: tuple[tuple[Any, ...], Kernel] | None = None  # what it was made of, and the kernel
         validity_checker, motions = self._checkers
         self.knows_obstacles = isinstance(validity_checker, StateValidityChecker)
         plain = type(validity_checker).isValid is StateValidityChecker.isValid and type(motions) in PLAIN
@@ -64,6 +67,15 @@ class PathValidator:
                 "the validity checker is not apex_ompl's: it decides, and proposals are kept clear of %s itself only",
                 self.checker.robot.name,
             )
+
+    @property
+    def kernel(self) -> Kernel:
+        """The checker's kernel, with the bounds of the state space as limits."""
+        kernel, bounds = self.checker.kernel, bounds_of(self._si, self.checker.robot)
+        limits = kernel, *(bound.tobytes() for bound in bounds)
+        if self._bounded is None or self._bounded[0] != limits:
+            self._bounded = limits, kernel.within(*bounds)
+        return self._bounded[1]
 
     @property
     def outdated(self) -> bool:

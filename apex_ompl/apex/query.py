@@ -6,7 +6,7 @@ import numpy as np
 
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.checker import NO_POINT
-from apex_ompl.diffusion.conditions import ObstacleSet, Query
+from apex_ompl.diffusion.query import ObstacleSet, Query
 from apex_ompl.types import Array
 
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-import torch
-from torch import Tensor
+import numpy as np
 
-from apex_ompl.diffusion.conditions import Query
+from apex_ompl.diffusion.geometry import Numbers
 from apex_ompl.diffusion.proposals import Proposals, Sampling, TrajectoryModel
+from apex_ompl.diffusion.query import Query
 from apex_ompl.diffusion.schedule import Estimate
 from apex_ompl.kernel import Kernel
 from apex_ompl.ompl_adapter.report import SolveReport
@@ -31,7 +31,7 @@ class ProposalSampler:
     """
 
     def __init__(
-        self, model: TrajectoryModel, kernel: Kernel, sampling: Sampling, *, generator: torch.Generator, stop: Stop,
+        self, model: TrajectoryModel, kernel: Kernel, sampling: Sampling, *, generator: np.random.Generator, stop: Stop,
         report: SolveReport,
     ) -> None:  # fmt: skip
         """Sample from ``model``.
@@ -73,7 +73,7 @@ class ProposalSampler:
         Returns:
             Control points, shape (B, points, dof); None when time ended.
         """
-        step = max(0, round(noise * self.model.network.schedule.steps) - 1)
+        step = max(0, round(noise * self.model.schedule.steps) - 1)
         return self._sampled(
             lambda: self.model.renoise(
                 query, self._kernel, control, step, sampling=self.sampling, generator=self._generator,
@@ -91,7 +91,7 @@ class ProposalSampler:
             times["guidance"] = times.get("guidance", 0.0) + guidance
         return proposals.control
 
-    def _leave(self, step: int, latent: Tensor, estimate: Estimate) -> None:
+    def _leave(self, step: int, latent: Numbers, estimate: Estimate) -> None:
         """Leave the sampler when time is up; called at every denoising step."""
         if self._stop():
             raise OutOfTimeError

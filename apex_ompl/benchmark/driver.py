@@ -15,12 +15,12 @@ from typing import Any
 
 from tqdm import tqdm
 
-from apex_ompl.api import check_arguments
 from apex_ompl.benchmark.results import ABOUT, RUNS, SCHEMA, Results
 from apex_ompl.benchmark.rows import Job, Row, jobs
 from apex_ompl.benchmark.runs import RESULT
 from apex_ompl.benchmark.workers import Workers
 from apex_ompl.errors import FileFormatError, ParameterError
+from apex_ompl.session import check_arguments
 from apex_ompl.util.files import locked, make_folder, write_atomically
 from apex_ompl.util.provenance import hardware, versions
 from apex_ompl.util.resolution import SEARCH_RESOLUTION

@@ -30,7 +30,6 @@ from apex_ompl.trajectory.smoothness import jerk
 from apex_ompl.trajopt.path import path_length
 from apex_ompl.types import Array
 from apex_ompl.util.deadline import Deadline
-from apex_ompl.util.threads import one_torch_thread
 
 Run = dict[str, Any]
 """A run as it is stored, ready for JSON."""
@@ -181,7 +180,7 @@ def unsolved(status: str, reason: str) -> Run:
 
 def _by_runner(job: Job) -> Run:
     """Return the columns of a run that a row's own function makes; ``status`` follows ``solved`` if it has none."""
-    with quiet_ompl(), one_torch_thread():
+    with quiet_ompl():
         seed_ompl(job.seed)
         found = dict(load_runner(job.runner)(job))
     status, by = (PlanStatus.EXACT_SOLUTION, job.planner) if found["solved"] else (PlanStatus.TIMEOUT, "")
@@ -195,7 +194,7 @@ def planned(job: Job) -> tuple[PlanRun, Experiment, PlanResult]:
     problem = load_problem(job.problem)
     if problem.robot not in _robots:
         _robots[problem.robot] = load_robot(problem.robot)
-    with quiet_ompl(), one_torch_thread():
+    with quiet_ompl():
         seed_ompl(job.seed)
         ready = assemble(problem, _robots[problem.robot], seed=job.seed)
         times = {"setup": time.perf_counter() - started}

@@ -4,21 +4,12 @@ from __future__ import annotations
 
 import argparse
 
-from apex_ompl.cli.options import PROBLEM_HELP
-
-
-def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the command and its options."""
-    parser = commands.add_parser("check", help="validate a problem, and say whether start and goal are free")
-    parser.add_argument("problem", help=PROBLEM_HELP)
-    parser.set_defaults(run=run)
+from apex_ompl.api import load_problem
+from apex_ompl.ompl_adapter.setup import assemble
 
 
 def run(parsed: argparse.Namespace) -> int:
     """Validate a problem, and print whether start and goal are free."""
-    from apex_ompl.api import load_problem
-    from apex_ompl.ompl_adapter.setup import assemble
-
     setup = assemble(load_problem(parsed.problem))
     problem = setup.problem
     print(f"{problem.name}: robot {setup.robot.name}, {setup.robot.dof} joints")

@@ -11,17 +11,6 @@ from apex_ompl import __version__
 from apex_ompl.util.provenance import LIBRARIES, versions
 
 
-def add_parsers(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the commands."""
-    for name, run, text in (
-        ("problems", problems, "list the ready-made problems and the suites"),
-        ("planners", planners, "list the planners and their parameters"),
-        ("info", info, "print versions and robots"),
-        ("schema", schema, "print the JSON schema of problem files"),
-    ):
-        commands.add_parser(name, help=text).set_defaults(run=run)
-
-
 def problems(_: argparse.Namespace) -> int:
     """List problems and suites."""
     from apex_ompl import problems as package

@@ -8,7 +8,8 @@ from types import ModuleType
 
 from apex_ompl.errors import MissingFileError, ParameterError
 
-PROBLEM_HELP = "name of a problem, an id as shelf/hard/900012, or a YAML file"
+LIMITS = ("velocity", "acceleration", "jerk")
+"""Limits with the options ``--NAME-scale`` and ``--max-NAME``."""
 
 
 def name_value_pairs(option: str, pairs: Sequence[str]) -> dict[str, str]:
@@ -23,6 +24,21 @@ def name_value_pairs(option: str, pairs: Sequence[str]) -> dict[str, str]:
         if not equals or not name or not value:
             raise ParameterError(option, pair, "NAME=VALUE")
         found[name.strip()] = value.strip()
+    return found
+
+
+def numbers_by_name(option: str, pairs: Sequence[str]) -> dict[str, float]:
+    """Return the numbers of a repeated option NAME=NUMBER by name.
+
+    Raises:
+        ParameterError: A name, a number or the equals sign is missing.
+    """
+    found = {}
+    for name, value in name_value_pairs(option, pairs).items():
+        try:
+            found[name] = float(value)
+        except ValueError as error:
+            raise ParameterError(option, f"{name}={value}", "NAME=NUMBER") from error
     return found
 
 

@@ -1,20 +1,30 @@
-"""The command line ``apex-ompl``: its parser, and the exit codes of errors.
+"""The command line ``apex-ompl``: its options, and the exit codes of errors.
 
 Results go to standard output, logs and errors to standard error. Exit codes: 0 exact, 1 no plan or no timed motion, 2
 wrong usage or an invalid file, 3 invalid start or goal, 4 approximate, 130 interrupted.
+
+Commands are named as MODULE:FUNCTION and imported when they run, so that ``--help`` needs none of what they need.
 """
 
 from __future__ import annotations
 
 import argparse
+import gc
 import os
 import sys
 from collections.abc import Sequence
+from importlib import import_module
+from pathlib import Path
 from typing import NoReturn
 
 from apex_ompl import __version__
-from apex_ompl.cli import benchmark, check, convert, listings, pictures, plan
+from apex_ompl.cli.options import LIMITS
 from apex_ompl.errors import ApexError
+
+PROBLEM_HELP = "name of a problem, an id as shelf/hard/900012, or a YAML file"
+RESULT_HELP = "a saved result (.npz, .json, .yaml)"
+GARBAGE = 50_000  # objects between collections of the youngest
+Commands = argparse._SubParsersAction  # of argparse, which has no public name for it
 
 
 class _Parser(argparse.ArgumentParser):
@@ -26,9 +36,12 @@ class _Parser(argparse.ArgumentParser):
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code; ``arguments`` default to ``sys.argv[1:]``."""
+    if arguments is None:
+        gc.set_threshold(GARBAGE, 50, 50)  # imports make many objects that stay: a tenth of the time of a short plan
     parsed = _parser().parse_args(arguments)
+    module, _, function = parsed.run.partition(":")
     try:
-        code = int(parsed.run(parsed))
+        code = int(getattr(import_module(f"apex_ompl.cli.{module}"), function)(parsed))
         sys.stdout.flush()
         return code
     except ApexError as error:
@@ -52,12 +65,114 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"apex-ompl {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    plan.add_parser(commands)  # in the order of the help text
-    pictures.add_render_parser(commands)
-    pictures.add_plot_parser(commands)
-    convert.add_parser(commands)
-    benchmark.add_bench_parser(commands)
-    benchmark.add_report_parser(commands)
-    check.add_parser(commands)
-    listings.add_parsers(commands)
+    _add_plan(commands)  # in the order of the help text
+    _add_pictures(commands)
+    _add_convert(commands)
+    _add_benchmark(commands)
+    _add_check(commands)
+    for name, text in (
+        ("problems", "list the ready-made problems and the suites"),
+        ("planners", "list the planners and their parameters"),
+        ("info", "print versions and robots"),
+        ("schema", "print the JSON schema of problem files"),
+    ):
+        commands.add_parser(name, help=text).set_defaults(run=f"listings:{name}")
     return parser
+
+
+def _add_plan(commands: Commands[argparse.ArgumentParser]) -> None:
+    parser = commands.add_parser("plan", help="plan a path for a problem")
+    parser.add_argument("problem", help=PROBLEM_HELP)
+    parser.add_argument("--planner", help="see 'apex-ompl planners' (default: apex)")
+    parser.add_argument("--timeout", type=float, default=5.0, metavar="SECONDS", help="default: %(default)s")
+    parser.add_argument("--seed", type=int, default=0, help="default: %(default)s")
+    parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="a planner parameter")
+    parser.add_argument(
+        "--params", type=Path, metavar="FILE", help="planner parameters in YAML; --set goes before them"
+    )
+    parser.add_argument("--no-simplify", action="store_true", help="keep the path as the planner found it")
+    parser.add_argument("--snapshot", action="store_true", help="take moving obstacles to stand still")
+    parser.add_argument(
+        "--leave-contact", type=float, default=0.0, metavar="METRES",
+        help="depth of contacts at the start that the path may leave, up to 0.001 (default: 0)",
+    )  # fmt: skip
+    parser.add_argument("--no-timing", action="store_true", help="leave the path without times")
+    parser.add_argument(
+        "--timing-method", default="ruckig", metavar="NAME",
+        help="of time parameterization: ruckig or spline (default: %(default)s)",
+    )  # fmt: skip
+    for limit in LIMITS:
+        parser.add_argument(
+            f"--{limit}-scale", type=float, default=1.0, metavar="SHARE", help="of the limits (default: %(default)s)"
+        )
+        parser.add_argument(
+            f"--max-{limit}", action="append", default=[], metavar="JOINT=VALUE",
+            help=f"a lower limit of {limit} for a joint",
+        )  # fmt: skip
+    parser.add_argument("--minimum-duration", type=float, default=0.0, metavar="SECONDS", help="of the motion")
+    parser.add_argument(
+        "--out", type=Path, metavar="FILE",
+        help="write the result: .npz, .json, .yaml; or the timed motion: .traj.yaml, .traj.json, .csv",
+    )  # fmt: skip
+    parser.add_argument(
+        "--controllers", action="store_true", help="one ROS 2 message for each group of joints in .traj files"
+    )
+    parser.add_argument("--json", action="store_true", help="print the whole result as JSON")
+    parser.set_defaults(run="plan:run")
+
+
+def _add_pictures(commands: Commands[argparse.ArgumentParser]) -> None:
+    parser = commands.add_parser("render", help="draw a problem or a saved result, without a display")
+    parser.add_argument("source", help=f"a problem as for plan, or {RESULT_HELP}")
+    parser.add_argument("-o", "--out", type=Path, required=True, metavar="FILE", help=".png, .gif or .mp4")
+    parser.add_argument("--azimuth", type=float, default=26.0, help="degrees from the front (default: %(default)s)")
+    parser.set_defaults(run="pictures:render")
+    parser = commands.add_parser("plot", help="draw a timed motion against its limits, and its clearance")
+    parser.add_argument("result", type=Path, help=RESULT_HELP)
+    parser.add_argument("-o", "--out", type=Path, required=True, metavar="FILE", help=".png, .pdf or .svg")
+    parser.set_defaults(run="pictures:plot")
+
+
+def _add_convert(commands: Commands[argparse.ArgumentParser]) -> None:
+    parser = commands.add_parser("convert", help="make a problem of a MoveIt or MotionBenchMaker scene and request")
+    parser.add_argument("scene", type=Path, help="YAML of a moveit_msgs/PlanningScene")
+    parser.add_argument("request", type=Path, help="YAML of a moveit_msgs/MotionPlanRequest")
+    parser.add_argument("-o", "--out", type=Path, required=True, metavar="FILE", help="problem file to write (.yaml)")
+    parser.add_argument("--robot", default="dual_panda_softhand", help="robot name or file (default: %(default)s)")
+    parser.add_argument("--joint", action="append", default=[], metavar="THEIRS=OURS", help="a joint by another name")
+    parser.add_argument("--frame", action="append", default=[], metavar="THEIRS=OURS", help="a frame by another name")
+    parser.set_defaults(run="convert:run")
+
+
+def _add_benchmark(commands: Commands[argparse.ArgumentParser]) -> None:
+    parser = commands.add_parser("bench", help="run planners on suites through OMPL's Benchmark")
+    parser.add_argument(
+        "suites", nargs="+", metavar="SUITE", help="a suite, a level as shelf/hard, a problem or a file"
+    )
+    parser.add_argument(
+        "--planners", default="apex,rrtconnect", metavar="A,B,...",
+        help="names, with parameters as apex[fallback=false;bridge=false] (default: %(default)s)",
+    )  # fmt: skip
+    parser.add_argument("--runs", type=int, default=100, metavar="N", help="on a level (default: %(default)s)")
+    parser.add_argument("--timeout", type=float, default=5.0, metavar="SECONDS", help="default: %(default)s")
+    parser.add_argument("--seed", type=int, default=0, help="of the first run (default: %(default)s)")
+    parser.add_argument("--split", default="test", help="train, validation or test (default: %(default)s)")
+    parser.add_argument("--no-simplify", action="store_true", help="keep paths as planners found them")
+    parser.add_argument("--jobs", type=int, default=1, metavar="N", help="at a time (default: one, as they are timed)")
+    parser.add_argument("--address", metavar="HOST:PORT", help="of a Ray cluster to run on")
+    parser.add_argument("-o", "--out", type=Path, required=True, metavar="DIR", help="goes on where it was stopped")
+    parser.add_argument(
+        "--keep", action="store_true", help="store each run's path, for apex-ompl render and PlanResult.load"
+    )
+    parser.add_argument("--quiet", action="store_true", help="show no progress")
+    parser.set_defaults(run="benchmark:bench")
+    parser = commands.add_parser("report", help="write an HTML page and Markdown of results of bench")
+    parser.add_argument("results", type=Path, metavar="RESULTS", help="folder that bench wrote")
+    parser.add_argument("-o", "--out", type=Path, required=True, metavar="DIR", help="gets report.html and report.md")
+    parser.set_defaults(run="benchmark:report")
+
+
+def _add_check(commands: Commands[argparse.ArgumentParser]) -> None:
+    parser = commands.add_parser("check", help="validate a problem, and say whether start and goal are free")
+    parser.add_argument("problem", help=PROBLEM_HELP)
+    parser.set_defaults(run="check:run")

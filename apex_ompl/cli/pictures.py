@@ -5,34 +5,16 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from apex_ompl.api import load_problem
 from apex_ompl.cli.options import import_extra
 from apex_ompl.result import SCHEMA, PlanResult
 from apex_ompl.util.files import check_writable
 from apex_ompl.util.schema import read_yaml
-
-
-def add_render_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the command ``render`` and its options."""
-    parser = commands.add_parser("render", help="draw a problem or a saved result, without a display")
-    parser.add_argument("source", help="a problem as for plan, or a saved result (.npz, .json, .yaml)")
-    parser.add_argument("-o", "--out", type=Path, required=True, metavar="FILE", help=".png, .gif or .mp4")
-    parser.add_argument("--azimuth", type=float, default=26.0, help="degrees from the front (default: %(default)s)")
-    parser.set_defaults(run=render)
-
-
-def add_plot_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the command ``plot`` and its options."""
-    parser = commands.add_parser("plot", help="draw a timed motion against its limits, and its clearance")
-    parser.add_argument("result", type=Path, help="a saved result (.npz, .json, .yaml)")
-    parser.add_argument("-o", "--out", type=Path, required=True, metavar="FILE", help=".png, .pdf or .svg")
-    parser.set_defaults(run=plot)
+from apex_ompl.viz.render import render as draw
 
 
 def render(parsed: argparse.Namespace) -> int:
     """Draw a problem or a result."""
-    from apex_ompl.api import load_problem
-    from apex_ompl.viz.render import render as draw
-
     source = PlanResult.load(parsed.source) if _is_result(parsed.source) else load_problem(parsed.source)
     draw(source, parsed.out, azimuth=parsed.azimuth)
     print(parsed.out)

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import math
-import threading
 from collections.abc import Iterable
 
 import numpy as np
-import pinocchio as pin
 
-from apex_ompl.collision.broadphase import CompiledScene, Contact
 from apex_ompl.collision.conservative import CheckCounts, ConservativeChecker, NoGridError, UnprovedPairs
 from apex_ompl.collision.discretization import Collision, first_colliding_sample
-from apex_ompl.collision.distance import Distance
+from apex_ompl.collision.hull_distance import Distance
+from apex_ompl.collision.mesh_stage import Contact
 from apex_ompl.collision.path_proof import TOLERANCE, Curve, PathProof, PathProver, obstacles_alone
 from apex_ompl.collision.scene_bodies import SceneBodies
 from apex_ompl.errors import ParameterError
@@ -30,8 +28,8 @@ class CollisionChecker(SceneBodies):
     """Checks states of a robot in a scene for collision, in two stages.
 
     The first stage is conservative: sphere covers that contain the solids prove most free states, and long stretches
-    of motions, to be free. What they cannot prove is checked by the second stage, Coal's meshes under Pinocchio's
-    AABB-tree broadphase. Only the second stage reports a collision, so the result is that of the second stage alone.
+    of motions, to be free. What they cannot prove is checked by the second stage, Coal's meshes pair by
+    pair. Only the second stage reports a collision, so the result is that of the second stage alone.
 
     Meshes collide by their triangles, primitives as solids, and a solid that lies entirely inside a mesh counts as a
     collision. Bodies that never move, such as the robot's base, are not checked against each other. A state with a
@@ -44,6 +42,7 @@ class CollisionChecker(SceneBodies):
         robot: Robot,
         scene: Iterable[Obstacle] = (),
         attached: Iterable[AttachedObject] = (),
+        allowed: Iterable[tuple[str, str]] = (),
         *,
         proofs: bool = True,
     ) -> None:
@@ -53,41 +52,40 @@ class CollisionChecker(SceneBodies):
             robot: The robot.
             scene: Obstacles.
             attached: Held objects.
+            allowed: Pairs of names of bodies that may touch, see :meth:`allow`.
             proofs: Whether the conservative stage is used; without it every state is checked by the meshes.
 
         Raises:
             SceneError: A name is taken already.
-            UnknownNameError: A held object names an unknown link.
+            UnknownNameError: A held object names an unknown link, or a pair an unknown body.
             MissingFileError: A mesh file is missing.
             FileFormatError: A mesh file holds no triangles.
         """
         self.check_counts = CheckCounts()
         self._two_stages = proofs
-        self._conservative: ConservativeChecker | None = None
-        self._provers: dict[bool, PathProver] = {}
-        self._lock = threading.RLock()  # the first queries may come from several threads
-        self._compiled: CompiledScene | None = None
-        super().__init__(robot, scene, attached)
+        super().__init__(robot)
+        self._spheres = ConservativeChecker(robot, self.meshes)
+        self._prover, self._prover_alone = PathProver(robot, self.meshes), PathProver(robot, self.meshes)
+        self._alone: tuple[Kernel, Kernel] | None = None  # a kernel, and the one of its obstacles alone
+        self.fill(scene, attached, allowed)
 
     @property
     def movable(self) -> Flags:
         """Which of the kernel's obstacles are not fixtures of the robot, shape (obstacles,)."""
-        numbers = self._scene().scene
-        owners = [numbers[name] for name in self.obstacle_names]
+        owners = [self.meshes.scene[name] for name in self.obstacle_names]
         return np.isin(self.kernel.scene.arrays.owner, owners)
 
     @property
     def kernel(self) -> Kernel:
         """The compiled kernel of the robot in the current scene: clearances, their gradients, and the tables."""
-        return self._first_stage().kernel
+        return self._spheres.kernel
 
     def prepare(self) -> None:
-        """Compile the scene, make the tables, and load or compile the kernel, so that the first query need not."""
+        """Make the tables, and load or compile the kernel, so that the first query need not."""
         still = np.zeros((2, self.robot.dof))
-        self._scene()
         if self._two_stages:
-            self._first_stage().first_collision(still, 1.0, True, CheckCounts(), lambda *_: True)
-            self._first_stage().unproved_at(still[0], CheckCounts())
+            self._spheres.first_collision(still, 1.0, True, CheckCounts(), lambda *_: True)
+            self._spheres.unproved_at(still[0], CheckCounts())
             self.kernel.clearance(still[:1], 0.0)  # proofs begin with it
 
     def is_free(self, q: Array) -> bool:
@@ -97,7 +95,7 @@ class CollisionChecker(SceneBodies):
             raise shape_error(q, (self.robot.dof,), "state")
         if not self._two_stages:
             return self._free_by_meshes(q)
-        left = self._first_stage().unproved_at(q, self.check_counts)
+        left = self._spheres.unproved_at(q, self.check_counts)
         return left is None or self._free_by_meshes(q, left)
 
     def are_free(self, states: Array) -> Flags:
@@ -111,7 +109,7 @@ class CollisionChecker(SceneBodies):
         if not self._two_stages:
             return np.array([self._free_by_meshes(q) for q in states], bool)
         free = np.ones(len(states), bool)
-        for k, unproved in self._first_stage().unproved_among(states, self.check_counts):
+        for k, unproved in self._spheres.unproved_among(states, self.check_counts):
             free[k] = self._free_by_meshes(states[k], unproved)
         return free
 
@@ -138,7 +136,7 @@ class CollisionChecker(SceneBodies):
             return None if not start or self.is_free(path[0]) else Collision(path[0].copy(), 0)
         if self._two_stages:
             try:
-                first = self._first_stage()
+                first = self._spheres
                 hit = first.first_collision(path, resolution, start, self.check_counts, self._free_by_meshes)
                 return None if hit is None else Collision(*hit)
             except NoGridError:  # a state is not finite, or there are too many steps
@@ -168,7 +166,7 @@ class CollisionChecker(SceneBodies):
         if not self.is_free(start):
             contacts = self.contacts(start) if np.isfinite(start).all() else []
             return PathProof.refused(str(contacts[0]) if contacts else "in collision", path)
-        return self._prover().prove(path, tolerance=tolerance, deadline=deadline)
+        return self._prover.prove(self.kernel, path, tolerance=tolerance, deadline=deadline)
 
     def obstacle_distance(self, path: Array) -> float:
         """Return the least distance of robot and held objects to obstacles along a path, 0 where they touch [m].
@@ -178,11 +176,14 @@ class CollisionChecker(SceneBodies):
         Args:
             path: States joined by straight lines, shape (N, dof).
         """
-        return max(0.0, self._prover(alone=True).prove(Curve.polyline(path)).clearance)
+        kernel, alone = self.kernel, self._alone
+        if alone is None or alone[0] is not kernel:
+            alone = self._alone = kernel, obstacles_alone(kernel, self.movable)
+        return max(0.0, self._prover_alone.prove(alone[1], Curve.polyline(path)).clearance)
 
     def contacts(self, q: Array) -> list[Contact]:
         """Return all overlapping pairs at ``q``, shape (dof,), the deepest first."""
-        return self._scene().contacts(self.robot.to_pinocchio(q))
+        return self.meshes.contacts(self.robot.to_pinocchio(q))
 
     def distance(self, q: Array, fixtures: bool = False) -> Distance:
         """Return the signed distance of robot and held objects to obstacles by convex hulls, and its nearest points.
@@ -194,7 +195,7 @@ class CollisionChecker(SceneBodies):
             q: State, shape (dof,).
             fixtures: Whether the robot's fixtures are obstacles too.
         """
-        return self._scene().distances("all" if fixtures else "scene").closest(self.robot.to_pinocchio(q))
+        return self.meshes.distance(self.robot.to_pinocchio(q), fixtures)
 
     def obstacle_point(self, q: Array) -> Array:
         """Return the obstacle point nearest to the robot by GJK, fixtures excluded, shape (3,) [m].
@@ -221,51 +222,18 @@ class CollisionChecker(SceneBodies):
         order = self.robot.to_pinocchio(q)
         if not np.isfinite(order).all():
             return False
-        scene = self._scene()
         if unproved is not None:
-            if unproved.pairs and scene.any_collides(order, unproved.pairs):
+            if unproved.pairs and self.meshes.any_collides(order, unproved.pairs):
                 return False
             if unproved.complete:
                 return True
-        return not scene.collides(order)
+        return not self.meshes.collides(order)
 
-    def _first_stage(self) -> ConservativeChecker:
-        checker = self._conservative
-        if checker is None:
-            with self._lock:
-                checker = self._conservative = self._conservative or ConservativeChecker(self.robot, self._scene())
-        return checker
+    def _obstacle_moved(self, number: int) -> None:
+        self._spheres.obstacle_moved(number)
 
-    def _prover(self, alone: bool = False) -> PathProver:
-        """Return the prover of all pairs, or of those with obstacles alone, fixtures left out."""
-        prover = self._provers.get(alone)
-        if prover is None:
-            with self._lock:
-                kernel, scene = self.kernel, self._scene()
-                if alone:
-                    kernel = obstacles_alone(kernel, self.movable)
-                prover = self._provers[alone] = self._provers.get(alone) or PathProver(self.robot, scene, kernel)
-        return prover
+    def _obstacles_changed(self) -> None:
+        self._spheres.obstacles_changed()
 
-    def _scene(self) -> CompiledScene:
-        compiled = self._compiled
-        if compiled is None:
-            with self._lock:
-                compiled = self._compiled or CompiledScene(self.robot, self._obstacles, self._attached, self._placed)
-                self._compiled = compiled
-        return compiled
-
-    def _moved(self, name: str) -> None:
-        """Move an obstacle in the compiled scene, if there is one."""
-        if self._compiled is not None:
-            self._compiled.place(name, pin.SE3(self._placed[name][1]))
-            if self._conservative is not None:
-                self._conservative.obstacles_moved()
-        self._provers.pop(True, None)
-        if False in self._provers:
-            self._provers[False].obstacles_moved(self.kernel)
-
-    def _changed(self) -> None:
-        """Drop the compiled scene, after a change of its objects."""
-        self._compiled = self._conservative = None
-        self._provers.clear()
+    def _held_changed(self) -> None:
+        self._spheres.held_changed()

@@ -4,22 +4,21 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Hashable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 from weakref import WeakKeyDictionary
 
-import coal
 import numpy as np
 from numpy.typing import NDArray
 
-from apex_ompl.collision.broadphase import CompiledScene
-from apex_ompl.collision.cover.proof import Cover
-from apex_ompl.collision.cover.rough import rough_cover
-from apex_ompl.collision.cover.spheres import make_cover, read_covers, shape_key
-from apex_ompl.collision.shapes import is_shell
-from apex_ompl.collision.tabulate import mesh_boxes, primitives, tabulate, tabulate_scene
+from apex_ompl.collision.cover.spheres import shape_key
+from apex_ompl.collision.mesh_stage import MeshStage
+from apex_ompl.collision.robot_covers import covers_of
+from apex_ompl.collision.tabulate import primitives, tabulate
+from apex_ompl.kernel.ahead_of_time import compile_ahead
 from apex_ompl.kernel.compiled import motion_proof, queries
 from apex_ompl.kernel.kernel import MOST_PAIRS, Kernel
+from apex_ompl.kernel.scene_builder import Solids, moved, tables_of
 from apex_ompl.kernel.tables import RobotTables, SceneTables
 from apex_ompl.robot import Robot
 from apex_ompl.types import Array
@@ -37,13 +36,10 @@ class UnprovedPairs(NamedTuple):
     complete: bool
 
 
-QUICK_GAPS, LEAVES = (0.02, 0.005), 32  # of covers made at run time
-SLENDER = 0.05  # cylinders thinner or flatter than this are covered like boxes
-
 MOST_TABLES = 64  # kept for each robot: one for each set of held objects
 
-_robots: WeakKeyDictionary[Robot, dict[Hashable, RobotTables]] = WeakKeyDictionary()
-_quick: dict[str, Cover] = {}  # by shape key
+_robots: WeakKeyDictionary[Robot, dict[Hashable, tuple[RobotTables, list[int]]]] = WeakKeyDictionary()
+"""Tables of a robot with what it holds, and the numbers that links and held objects had then."""
 
 
 @dataclass
@@ -72,85 +68,109 @@ class CheckCounts:
         return self.proved + self.meshes
 
 
-def covers_of(robot: Robot, shapes: Sequence[coal.CollisionGeometry]) -> list[Cover]:
-    """Return a cover of each shape: one from the robot's file, or a rough one made now.
-
-    Covers in files are not checked here: ``scripts/make_covers.py`` writes only proved covers, and the tests prove
-    again those that ship.
-
-    Raises:
-        MissingFileError: The robot names a file of covers that cannot be read.
-        FileFormatError: That file does not follow its schema.
-    """
-    given = read_covers(robot.covers) if robot.covers is not None else {}
-    found = []
-    for shape in shapes:
-        key = shape_key(shape)
-        if key not in given and key not in _quick:
-            _quick[key] = _quick_cover(shape)
-        found.append(given[key] if key in given else _quick[key])
-    return found
-
-
-def _quick_cover(shape: coal.CollisionGeometry) -> Cover:
-    kind = shape.getNodeType()
-    if is_shell(shape) or kind == coal.GEOM_BOX:
-        return rough_cover(shape)
-    if kind == coal.GEOM_CYLINDER:
-        sizes = sorted((float(shape.radius), float(shape.halfLength)))
-        if sizes[0] < SLENDER * sizes[1]:
-            return rough_cover(coal.Box(2.0 * shape.radius, 2.0 * shape.radius, 2.0 * shape.halfLength))
-    return make_cover(shape, QUICK_GAPS, effort=1, most=LEAVES)
+def _numbered(tables: RobotTables, before: Sequence[int], now: Sequence[int]) -> RobotTables:
+    """Return tables of the same bodies under other numbers."""
+    if before == now:
+        return tables
+    renamed = dict(zip(before, now, strict=True))
+    return replace(tables, numbers=tuple(renamed[number] for number in tables.numbers))
 
 
 class ConservativeChecker:
-    """Conservative checks of one compiled scene; safe to use from several threads."""
+    """Conservative checks of a scene; safe to use from several threads while the scene is not edited."""
 
-    def __init__(self, robot: Robot, scene: CompiledScene) -> None:
-        """Make the kernel's tables of ``robot`` with its held objects and of the obstacles of ``scene``.
+    def __init__(self, robot: Robot, scene: MeshStage) -> None:
+        """Check ``robot`` with its held objects among the obstacles of ``scene``."""
+        self.scene = scene
+        self._robot = robot
+        self._local = threading.local()
+        self._lock = threading.RLock()
+        self._solids: dict[int, Solids] = {}  # of obstacles, by number; those that are missing are new
+        self._moved: set[int] = set()
+        self._listed = False  # whether the obstacles of the tables are those of the scene, moved or not
+        self._held_listed = False  # whether the held objects are
+        self._kernel: Kernel | None = None
+
+    @property
+    def kernel(self) -> Kernel:
+        """The kernel with the tables of robot and obstacles as they are now.
 
         Raises:
             MissingFileError: The robot names a file of covers that cannot be read.
             FileFormatError: That file does not follow its schema.
             RobotError: A joint moves in a way that the kernel does not know.
         """
-        self.scene = scene
-        self._local = threading.local()
-        self._boxes: dict[int, Array] = {}
-        self.kernel = Kernel(self._robot(robot), self._obstacles())
+        if self._kernel is not None and self._listed and self._held_listed and not self._moved:
+            return self._kernel
+        compile_ahead()
+        with self._lock:
+            old = self._kernel
+            robot = self._robot_tables() if old is None or not self._held_listed else old.robot
+            scene = self._scene_tables() if old is None or not self._listed else self._tables_after_moves(old.scene)
+            self._moved.clear()
+            self._listed = self._held_listed = True
+            self._kernel = Kernel(robot, self._with_allowed(scene, robot))
+            return self._kernel
 
-    def _robot(self, robot: Robot) -> RobotTables:
-        scene = self.scene
+    def obstacles_changed(self) -> None:
+        """Take note that obstacles were added or removed."""
+        self._listed = False
+
+    def obstacle_moved(self, number: int) -> None:
+        """Take note that an obstacle was moved."""
+        self._moved.add(number)
+
+    def held_changed(self) -> None:
+        """Take note that objects were attached or detached."""
+        self._held_listed = False
+
+    def _with_allowed(self, tables: SceneTables, robot: RobotTables) -> SceneTables:
+        """Return tables of the scene with the pairs that may touch, whose bodies are rows of the robot's tables."""
+        allowed = self.scene.allowed_obstacles
+        if not allowed and not len(tables.arrays.allowed):
+            return tables
+        rows = {number: row for row, number in enumerate(robot.numbers)}
+        pairs = sorted((rows[body], obstacle) for body, obstacle in allowed)
+        return replace(tables, arrays=tables.arrays._replace(allowed=np.array(pairs, np.int64).reshape(-1, 2)))
+
+    def _robot_tables(self) -> RobotTables:
+        scene, robot = self.scene, self._robot
         numbers = [*range(scene.links), *scene.held.values()]
-        rows = {number: row for row, number in enumerate(numbers)}
-        items = [scene.geometry.geometryObjects[number] for number in numbers]
-        held = items[scene.links :]
-        poses = tuple((i.parentJoint, i.placement.homogeneous.tobytes(), shape_key(i.geometry)) for i in held)
-        key = (tuple(scene.held.items()), poses, tuple(sorted((k, tuple(sorted(v))) for k, v in scene.touch.items())))
+        solids = [scene.solids[number] for number in numbers]
+        held = solids[scene.links :]
+        poses = tuple((s.joint, s.placement.homogeneous.tobytes(), shape_key(s.shape)) for s in held)
+        touch = tuple(sorted((k, tuple(sorted(v))) for k, v in scene.touch.items()))
+        key = (tuple(scene.held), poses, touch, scene.allowed)
         known = _robots.setdefault(robot, {})
         if key in known:
-            return known[key]
-        covers = covers_of(robot, [item.geometry for item in items])
-        meets = [item.parentJoint > 0 or number >= scene.links for item, number in zip(items, numbers, strict=True)]
-        pairs = [(rows[a], rows[b]) for a, b in scene.pairs if a in rows and b in rows]
-        tables = tabulate(robot, items=items, numbers=numbers, covers=covers, meets_scene=meets, pairs=pairs)
+            return _numbered(*known[key], numbers)
+        rows = {number: row for row, number in enumerate(numbers)}
+        covers = covers_of(robot, [solid.shape for solid in solids])
+        meets = [solid.joint > 0 or number >= scene.links for solid, number in zip(solids, numbers, strict=True)]
+        pairs = [(rows[a], rows[b]) for a, b in scene.body_pairs]
+        tables = tabulate(robot, solids=solids, numbers=numbers, covers=covers, meets_scene=meets, pairs=pairs)
         while len(known) >= MOST_TABLES:
             known.pop(next(iter(known)), None)
-        known[key] = tables
+        known[key] = tables, numbers
         return tables
 
-    def _obstacles(self) -> SceneTables:
-        solids = {}
-        for number in self.scene.scene.values():
-            item = self.scene.geometry.geometryObjects[number]
-            if is_shell(item.geometry) and number not in self._boxes:
-                self._boxes[number] = mesh_boxes(item.geometry)
-            solids[number] = primitives(item.geometry, item.placement.homogeneous, self._boxes.get(number))
-        return tabulate_scene(solids)
+    def _scene_tables(self) -> SceneTables:
+        numbers = self.scene.scene.values()
+        self._solids = {k: self._solids[k] if self._is_known(k) else self._solids_of(k) for k in numbers}
+        return tables_of(self._solids)
 
-    def obstacles_moved(self) -> None:
-        """Make the tables of the obstacles again after they moved."""
-        self.kernel = Kernel(self.kernel.robot, self._obstacles())
+    def _tables_after_moves(self, tables: SceneTables) -> SceneTables:
+        for number in self._moved:
+            self._solids[number] = self._solids_of(number)
+            tables = moved(tables, number, self._solids[number])
+        return tables
+
+    def _is_known(self, number: int) -> bool:
+        return number in self._solids and number not in self._moved
+
+    def _solids_of(self, number: int) -> Solids:
+        solid = self.scene.solids[number]
+        return Solids.of(primitives(solid.shape, solid.placement.homogeneous))
 
     def unproved_at(self, q: Array, check_counts: CheckCounts) -> UnprovedPairs | None:
         """Return the pairs left to the meshes at a state, shape (dof,); None where it is proved free."""
@@ -230,10 +250,11 @@ class ConservativeChecker:
         return hit
 
     def _buffers(self) -> _Buffers:
-        """Return this thread's buffers."""
+        """Return this thread's buffers for the kernel as it is now."""
         buffers: _Buffers | None = getattr(self._local, "buffers", None)
-        if buffers is None:
-            buffers = self._local.buffers = _Buffers(self.kernel)
+        kernel = self.kernel
+        if buffers is None or buffers.robot is not kernel.robot:
+            buffers = self._local.buffers = _Buffers(kernel)
         return buffers
 
 
@@ -245,6 +266,7 @@ class _Buffers:
     """Arrays that one thread passes to compiled code."""
 
     def __init__(self, kernel: Kernel) -> None:
+        self.robot = kernel.robot
         self.workspace = kernel.workspace()
         self.state = np.empty((1, kernel.robot.dof))
         self.found = np.empty((MOST_PAIRS, 2), np.int64)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import coal
@@ -47,25 +49,50 @@ class Mesh(NamedTuple):
     depth: float = 0.0
 
 
-class PlacedShape(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class PlacedShape:
     """A shape that is fixed to a joint.
 
     Attributes:
         geometry: The shape.
         joint: Joint of the kernel.
         pose: Pose in the joint's frame, shape (4, 4) [m].
-        mesh: The mesh for the kernel, None for primitives.
     """
 
     geometry: coal.CollisionGeometry
     joint: int
     pose: Array
-    mesh: Mesh | None = None
 
+    @cached_property
+    def kind(self) -> int:
+        """Kind of the shape in the kernel: BOX ... HALF_SPACE or HULL."""
+        return _kind(self.geometry)
 
-def has_mesh(geometry: coal.CollisionGeometry) -> bool:
-    """Whether a geometry is a mesh or a hull of points, and no primitive."""
-    return _kind(geometry) == HULL
+    @cached_property
+    def mesh(self) -> Mesh | None:
+        """The mesh for the kernel, None for primitives."""
+        return mesh_of(self.geometry) if self.kind == HULL else None
+
+    @cached_property
+    def row(self) -> tuple[Array, Sequence[float] | Array, Sequence[float]]:
+        """Rotation, offset and size; a half-space has its normal as offset and its distance as size."""
+        shape, pose = self.geometry, self.pose
+        if self.kind != HALF_SPACE:
+            return pose[:3, :3], pose[:3, 3], _size(shape)
+        normal = pose[:3, :3] @ shape.n
+        return np.eye(3), normal, (shape.d + float(normal @ pose[:3, 3]), 0.0, 0.0)
+
+    @cached_property
+    def ball(self) -> Array:
+        """Centre and radius of a ball around the solid in the joint's frame, shape (4,) [m]; 0 for half-spaces."""
+        (a, b, c), centre = _size(self.geometry), np.zeros(3)
+        radius = {BOX: float(np.linalg.norm((a, b, c))), SPHERE: a, CYLINDER: float(np.hypot(a, b)), CAPSULE: a + b}
+        if self.mesh is not None:
+            points = self.mesh.points
+            centre = (points.min(axis=0) + points.max(axis=0)) / 2.0
+            radius[HULL] = float(np.linalg.norm(points - centre, axis=1).max())
+        place = self.pose[:3, :3] @ centre + self.pose[:3, 3]
+        return np.append(place, radius.get(self.kind, 0.0) + 1e-12)
 
 
 @weakly_cached
@@ -173,9 +200,9 @@ def shape_arrays(shapes: Mapping[int, PlacedShape]) -> ShapeArrays:
         points += [mesh.points, mesh.corners.reshape(-1, 3)]
         point_count += 3 * len(mesh.corners)
         node_count += len(mesh.leaf)
-    poses = [_pose(shape) for shape in placed]
+    poses = [shape.row for shape in placed]
     return ShapeArrays(
-        kind=np.array([_kind(s.geometry) for s in placed], np.int64),
+        kind=np.array([s.kind for s in placed], np.int64),
         joint=np.array([s.joint for s in placed], np.int64),
         points_of=np.array(spans, np.int64).reshape(-1, 2),
         root=np.array(roots, np.int64),
@@ -185,7 +212,7 @@ def shape_arrays(shapes: Mapping[int, PlacedShape]) -> ShapeArrays:
         rotation=np.array([pose[0] for pose in poses]).reshape(-1, 3, 3),
         offset=np.array([pose[1] for pose in poses]).reshape(-1, 3),
         size=np.array([pose[2] for pose in poses]).reshape(-1, 3),
-        ball=np.array([_ball(shape) for shape in placed]).reshape(-1, 4),
+        ball=np.array([shape.ball for shape in placed]).reshape(-1, 4),
         depth=np.array([0.0 if s.mesh is None else s.mesh.depth for s in placed]),
         node_ball=np.concatenate([np.empty((0, 4)), *nodes]),
         points=np.concatenate(points),
@@ -221,24 +248,3 @@ def _size(shape: coal.CollisionGeometry) -> tuple[float, ...]:
     if kind == SPHERE:
         return (shape.radius, 0.0, 0.0)
     return (shape.radius, shape.halfLength, 0.0) if kind in (CYLINDER, CAPSULE) else (0.0, 0.0, 0.0)
-
-
-def _pose(placed: PlacedShape) -> tuple[Array, Sequence[float] | Array, Sequence[float]]:
-    """Return rotation, offset and size; a half-space has its normal as offset and its distance as size."""
-    shape, pose = placed.geometry, placed.pose
-    if _kind(shape) != HALF_SPACE:
-        return pose[:3, :3], pose[:3, 3], _size(shape)
-    normal = pose[:3, :3] @ shape.n
-    return np.eye(3), normal, (shape.d + float(normal @ pose[:3, 3]), 0.0, 0.0)
-
-
-def _ball(placed: PlacedShape) -> Array:
-    """Return centre and radius of a ball around a solid in the joint's frame, shape (4,) [m]; 0 for half-spaces."""
-    shape, kind, centre = placed.geometry, _kind(placed.geometry), np.zeros(3)
-    a, b, c = _size(shape)
-    radius = {BOX: float(np.linalg.norm((a, b, c))), SPHERE: a, CYLINDER: float(np.hypot(a, b)), CAPSULE: a + b}
-    if placed.mesh is not None:
-        points = placed.mesh.points
-        centre = (points.min(axis=0) + points.max(axis=0)) / 2.0
-        radius[HULL] = float(np.linalg.norm(points - centre, axis=1).max())
-    return np.append(placed.pose[:3, :3] @ centre + placed.pose[:3, 3], radius.get(kind, 0.0) + 1e-12)

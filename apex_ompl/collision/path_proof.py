@@ -11,12 +11,13 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from apex_ompl.collision.broadphase import CompiledScene
-from apex_ompl.collision.exact_shapes import Mesh, PlacedShape, has_mesh, joined, mesh_of, shape_arrays
+from apex_ompl.collision.exact_shapes import PlacedShape, joined, shape_arrays
+from apex_ompl.collision.mesh_stage import MeshStage
+from apex_ompl.collision.solids import Solid
 from apex_ompl.collision.tabulate import joint_specs
 from apex_ompl.kernel.compiled import curve_proof
 from apex_ompl.kernel.compiled.arrays import FIXED
-from apex_ompl.kernel.compiled.layout import new_buffers, pack
+from apex_ompl.kernel.compiled.layout import Floats, Integers, new_buffers, pack
 from apex_ompl.kernel.compiled.shapes import PairBuffers, ShapeArrays
 from apex_ompl.kernel.kernel import Kernel
 from apex_ompl.kernel.robot_builder import turn_to
@@ -126,20 +127,20 @@ def obstacles_alone(kernel: Kernel, chosen: Flags) -> Kernel:
     )
     robot = replace(kernel.robot, arrays=bodies)
     solids = [(int(scene.owner[k]), primitive(scene, int(k))) for k in np.flatnonzero(chosen)]
-    return Kernel(robot, scene_tables(solids))
+    tables = scene_tables(solids)
+    return Kernel(robot, replace(tables, arrays=tables.arrays._replace(allowed=scene.allowed)))
 
 
-def _shapes_of_bodies(robot: Robot, scene: CompiledScene, kernel: Kernel) -> ShapeArrays:
+def _shapes_of_bodies(robot: Robot, scene: MeshStage, kernel: Kernel) -> ShapeArrays:
     """Return the shapes of a kernel's bodies; those of the last sets of held objects are kept."""
     known = _bodies.setdefault(robot, OrderedDict())
     key = id(kernel.robot.arrays.node_centre)  # shared by all kernels of one set of bodies
     if key not in known:
         turns = [turn_to(j.axis if j.kind != FIXED else None).T for j in joint_specs(robot)]
-        bodies, items = {}, scene.geometry.geometryObjects
+        bodies = {}
         for row, number in enumerate(kernel.robot.numbers):
-            shape, joint = items[number].geometry, int(items[number].parentJoint)
-            mesh = mesh_of(shape) if has_mesh(shape) else None
-            bodies[row] = PlacedShape(shape, joint, turns[joint] @ items[number].placement.homogeneous, mesh)
+            solid = scene.solids[number]
+            bodies[row] = PlacedShape(solid.shape, solid.joint, turns[solid.joint] @ solid.placement.homogeneous)
         while len(known) >= MOST_PACKED:
             known.popitem(last=False)
         known[key] = kernel.robot.arrays.node_centre, shape_arrays(bodies)
@@ -147,32 +148,45 @@ def _shapes_of_bodies(robot: Robot, scene: CompiledScene, kernel: Kernel) -> Sha
 
 
 class PathProver:
-    """Proofs for a robot in one compiled scene; safe to use from several threads."""
+    """Proofs for a robot in a scene; safe to use from several threads while the scene is not edited."""
 
-    def __init__(self, robot: Robot, scene: CompiledScene, kernel: Kernel) -> None:
-        """Make the tables of exact shapes of all bodies and obstacles in ``kernel``."""
+    def __init__(self, robot: Robot, scene: MeshStage) -> None:
+        """Prove paths of ``robot`` among the obstacles of ``scene``."""
+        self._robot = robot
         self._scene = scene
         self._local = threading.local()
-        self._bodies = _shapes_of_bodies(robot, scene, kernel)
-        self._meshes: dict[int, Mesh] = {}
-        self.obstacles_moved(kernel)
+        self._lock = threading.Lock()
+        self._placed: dict[int, tuple[Solid, PlacedShape]] = {}
+        self._current: tuple[Kernel, tuple[Integers, Floats]] | None = None
 
-    def obstacles_moved(self, kernel: Kernel) -> None:
-        """Make the tables of the obstacles in ``kernel`` anew, for the poses that they have in the scene now."""
-        items, self._kernel = self._scene.geometry.geometryObjects, kernel
-        placed = {}
-        for k in np.unique(kernel.scene.arrays.owner).tolist():
-            if has_mesh(items[k].geometry) and k not in self._meshes:
-                self._meshes[k] = mesh_of(items[k].geometry)
-            placed[k] = PlacedShape(items[k].geometry, 0, items[k].placement.homogeneous, self._meshes.get(k))
-        self._shapes = pack(joined(self._bodies, shape_arrays(placed)))
+    def _shapes(self, kernel: Kernel) -> tuple[Integers, Floats]:
+        """Return the exact shapes of the bodies and obstacles of a kernel; those of the last one are kept."""
+        current = self._current
+        if current is not None and current[0] is kernel:
+            return current[1]
+        with self._lock:
+            owners = np.unique(kernel.scene.arrays.owner).tolist()
+            placed = {}
+            for number in owners:
+                solid = self._scene.solids[number]
+                known = self._placed.get(number)
+                if known is None or known[0] is not solid:
+                    known = solid, PlacedShape(solid.shape, 0, solid.placement.homogeneous)
+                placed[number] = known
+            self._placed = placed
+            obstacles = shape_arrays({number: shape for number, (_, shape) in placed.items()})
+            shapes = pack(joined(_shapes_of_bodies(self._robot, self._scene, kernel), obstacles))
+            self._current = kernel, shapes
+            return shapes
 
     def prove(
-        self, curve: Curve, *, touch: float = TOUCH, tolerance: float = TOLERANCE, deadline: float | None = None
-    ) -> PathProof:
+        self, kernel: Kernel, curve: Curve, *, touch: float = TOUCH, tolerance: float = TOLERANCE,
+        deadline: float | None = None,
+    ) -> PathProof:  # fmt: skip
         """Prove that a curve is free, and find its least clearance.
 
         Args:
+            kernel: The kernel of the scene as it is now, or of some of its obstacles.
             curve: The curve.
             touch: Distance of a pair that counts as contact [m].
             tolerance: Of the least clearance [m]: ``clearance_bound`` is at least ``clearance`` less this, or half of
@@ -181,9 +195,9 @@ class PathProver:
         """
         if not (np.isfinite(curve.states).all() and np.isfinite(curve.rates).all()):
             return PathProof.refused("a state that is not finite", curve)
-        buffers, knots = self._buffers(), curve.knots
-        p, arrays = buffers.proof, (*self._kernel.packed, *self._shapes, *buffers.arrays)
-        for limit in self._limits(curve) if tolerance > 0.0 else (0.0,):
+        buffers, knots = self._buffers(kernel), curve.knots
+        p, arrays = buffers.proof, (*kernel.packed, *self._shapes(kernel), *buffers.arrays)
+        for limit in self._limits(kernel, curve) if tolerance > 0.0 else (0.0,):
             p.places[:] = 0, 1, 0
             p.pairs[0], p.intervals[0] = curve_proof.ALL, (knots[0], knots[-1])
             p.worst[:] = -1
@@ -197,7 +211,7 @@ class PathProver:
             if over or outcome != curve_proof.PROVED or p.figures[curve_proof.LEAST] <= limit:
                 break
         margin, least, where, by_spheres = p.figures.tolist()
-        names, ok = self._names(int(p.worst[0]), int(p.worst[1])), outcome == curve_proof.PROVED
+        names, ok = self._names(kernel, int(p.worst[0]), int(p.worst[1])), outcome == curve_proof.PROVED
         reason, length = "", float(knots[-1] - knots[0])
         if over:
             reason = "not proved in time"
@@ -211,27 +225,28 @@ class PathProver:
         bound = margin if ok and tolerance > 0.0 else 0.0
         return PathProof(ok, reason, where, p.state.copy(), least, bound, names, share, int(p.places[2]), over)
 
-    def _limits(self, curve: Curve) -> Iterator[float]:
+    @staticmethod
+    def _limits(kernel: Kernel, curve: Curve) -> Iterator[float]:
         """Yield limits of the clearance that is looked for [m], from that of the spheres at some states."""
         places = np.unique(np.linspace(0, len(curve.states) - 1, SEEDS).round().astype(int))
-        near = float(np.nanmin(self._kernel.clearance(curve.states[places], MOST_LIMIT), initial=MOST_LIMIT))
+        near = float(np.nanmin(kernel.clearance(curve.states[places], MOST_LIMIT), initial=MOST_LIMIT))
         limit = max(near + SLACK, SLACK)
         while limit < MOST_LIMIT:
             yield limit
             limit *= 2.0
         yield np.inf
 
-    def _names(self, first: int, second: int) -> tuple[str, str]:
+    def _names(self, kernel: Kernel, first: int, second: int) -> tuple[str, str]:
         if first < 0:
             return "", ""
-        numbers, labels = self._kernel.robot.numbers, self._scene.labels
-        return labels[numbers[first]], labels[numbers[second] if second >= 0 else -1 - second]
+        numbers, solids = kernel.robot.numbers, self._scene.solids
+        return solids[numbers[first]].name, solids[numbers[second] if second >= 0 else -1 - second].name
 
-    def _buffers(self) -> _Buffers:
-        """Return this thread's buffers."""
+    def _buffers(self, kernel: Kernel) -> _Buffers:
+        """Return this thread's buffers for a kernel."""
         buffers: _Buffers | None = getattr(self._local, "buffers", None)
-        if buffers is None:
-            buffers = self._local.buffers = _Buffers(self._kernel)
+        if buffers is None or buffers.robot is not kernel.robot:
+            buffers = self._local.buffers = _Buffers(kernel)
         return buffers
 
 
@@ -239,6 +254,7 @@ class _Buffers:
     """Arrays that one thread passes to compiled code."""
 
     def __init__(self, kernel: Kernel) -> None:
+        self.robot = kernel.robot
         self.proof: curve_proof.ProofBuffers
         integers, floats, self.proof = new_buffers(curve_proof.ProofBuffers, dof=kernel.robot.dof)
         self.arrays = (*kernel.workspace(), *new_buffers(PairBuffers)[:2], integers, floats)

@@ -5,45 +5,69 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-import coal
+from tqdm import tqdm
 
+from apex_ompl.collision.mesh_stage import MeshStage
 from apex_ompl.collision.shapes import coal_geometry, world_geometry
-from apex_ompl.errors import SceneError
+from apex_ompl.errors import SceneError, UnknownNameError
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import AttachedObject, Body, Obstacle
-from apex_ompl.types import Array
 from apex_ompl.util.schema import validate
+
+SHOWN_AFTER = 1.0  # of a progress bar [s]
 
 
 class SceneBodies:
     """Obstacles, the robot's fixtures and what it holds, with their geometry."""
 
-    def __init__(self, robot: Robot, scene: Iterable[Obstacle], attached: Iterable[AttachedObject]) -> None:
-        """Hold the fixtures of ``robot``, the obstacles of ``scene`` and the held objects.
+    def __init__(self, robot: Robot) -> None:
+        """Hold nothing yet; :meth:`fill` adds the fixtures of ``robot``, among others."""
+        self.robot = robot
+        self.meshes = MeshStage(robot)
+        self._obstacles: dict[str, Body] = {}
+        self._attached: dict[str, AttachedObject] = {}
+        self._fixtures = frozenset(body.name for body in robot.fixtures)
+
+    def fill(
+        self, scene: Iterable[Obstacle], attached: Iterable[AttachedObject],
+        allowed: Iterable[tuple[str, str]] = (), *, fixtures: bool = True,
+    ) -> None:  # fmt: skip
+        """Add the robot's fixtures, unless they are there already, obstacles, held objects, and pairs that may touch.
 
         Raises:
             SceneError, UnknownNameError, MissingFileError, FileFormatError: As :meth:`add` and :meth:`attach`.
         """
-        self.robot = robot
-        self._obstacles: dict[str, Body] = {}
-        self._attached: dict[str, AttachedObject] = {}
-        self._placed: dict[str, tuple[coal.CollisionGeometry, Array]] = {}
-        self._fixtures = frozenset(body.name for body in robot.fixtures)
-        for body in (*robot.fixtures, *scene):
+        bodies = (*(self.robot.fixtures if fixtures else ()), *scene)
+        for body in tqdm(bodies, desc="obstacles", delay=SHOWN_AFTER, leave=False, disable=None):
             self.add(body)
         for held in attached:
             self.attach(held)
+        for pair in allowed:
+            self.allow(*pair)
 
-    def _moved(self, name: str) -> None:
-        """Take note that an obstacle was moved; overridden."""
+    def _obstacle_moved(self, number: int) -> None:
+        """Take note that an obstacle was moved, by its number in ``meshes``; overridden."""
 
-    def _changed(self) -> None:
-        """Take note that bodies were added or removed; overridden."""
+    def _obstacles_changed(self) -> None:
+        """Take note that obstacles were added or removed; overridden."""
+
+    def _held_changed(self) -> None:
+        """Take note that objects were attached or detached; overridden."""
 
     @property
     def obstacle_names(self) -> tuple[str, ...]:
         """Names of the obstacles, without the robot's fixtures."""
         return tuple(name for name in self._obstacles if name not in self._fixtures)
+
+    @property
+    def obstacles(self) -> dict[str, Obstacle]:
+        """The obstacles by name, without the robot's fixtures."""
+        return {name: body for name, body in self._obstacles.items() if isinstance(body, Obstacle)}
+
+    @property
+    def held(self) -> dict[str, AttachedObject]:
+        """The held objects by name."""
+        return dict(self._attached)
 
     def add(self, obstacle: Body) -> None:
         """Add an obstacle.
@@ -53,9 +77,9 @@ class SceneBodies:
             MissingFileError, FileFormatError: Its mesh file is missing, or holds no triangles.
         """
         self._claim(obstacle.name)
-        self._placed[obstacle.name] = world_geometry(obstacle)
+        self.meshes.add(obstacle.name, *world_geometry(obstacle))
         self._obstacles[obstacle.name] = obstacle
-        self._changed()
+        self._obstacles_changed()
 
     def move(self, name: str, position: Sequence[float], orientation: Sequence[float] | None = None) -> None:
         """Move an obstacle to a pose in the world [m, quaternion xyzw]; the orientation is kept by default.
@@ -70,11 +94,23 @@ class SceneBodies:
         new = validate(type(old), fields, f"obstacle {name!r}")
         self._obstacles[name] = new
         if new.half_space is not None:  # its pose is part of its geometry
-            self._placed[name] = world_geometry(new)
-            self._changed()
+            self.meshes.remove(name)
+            self.meshes.add(name, *world_geometry(new))
+            self._obstacles_changed()
             return
-        self._placed[name] = (self._placed[name][0], new.pose)
-        self._moved(name)
+        self.meshes.move(name, new.pose)
+        self._obstacle_moved(self.meshes.scene[name])
+
+    def set_velocity(self, name: str, velocity: Sequence[float] | None) -> None:
+        """Give an obstacle a constant velocity [m/s], or none; it is checked where it stands.
+
+        Raises:
+            SceneError: There is no such obstacle.
+            FileFormatError: The velocity is not valid.
+        """
+        old = self._find(self.obstacles, name, "obstacle")
+        fields = {**old.model_dump(), "velocity": None if velocity is None else tuple(velocity)}
+        self._obstacles[name] = validate(Obstacle, fields, f"obstacle {name!r}")
 
     def remove(self, name: str) -> None:
         """Remove an obstacle.
@@ -83,8 +119,10 @@ class SceneBodies:
             SceneError: There is no such obstacle.
         """
         self._find(self._obstacles, name, "obstacle")
-        del self._obstacles[name], self._placed[name]
-        self._changed()
+        del self._obstacles[name]
+        self._forget_allowed(name)
+        self.meshes.remove(name)
+        self._obstacles_changed()
 
     def attach(self, held: AttachedObject) -> None:
         """Attach an object to the link that holds it; it then collides like a part of the robot.
@@ -98,9 +136,9 @@ class SceneBodies:
         self._claim(held.name)
         for link in (held.link, *(held.touch_links or ())):
             self.robot.link_frame(link)
-        self._placed[held.name] = (coal_geometry(held), held.pose)
+        self.meshes.attach(held, coal_geometry(held), held.pose)
         self._attached[held.name] = held
-        self._changed()
+        self._held_changed()
 
     def detach(self, name: str) -> None:
         """Remove a held object.
@@ -109,8 +147,42 @@ class SceneBodies:
             SceneError: There is no such held object.
         """
         self._find(self._attached, name, "held object")
-        del self._attached[name], self._placed[name]
-        self._changed()
+        del self._attached[name]
+        self._forget_allowed(name)
+        self.meshes.detach(name)
+        self._held_changed()
+
+    @property
+    def allowed(self) -> tuple[tuple[str, str], ...]:
+        """Pairs of bodies that may touch, besides those of the robot and of held objects and their hands."""
+        return tuple(sorted((min(pair), max(pair)) for pair in self.meshes.allowed))
+
+    def allow(self, first: str, second: str, allowed: bool = True) -> None:
+        """Let two bodies touch and overlap, links, held objects or obstacles by their names; or no longer.
+
+        Raises:
+            UnknownNameError: There is no such body.
+            SceneError: Both names are of the same body.
+        """
+        links = sorted({self.meshes.solids[k].name for k in range(self.meshes.links)})
+        known = (*self._obstacles, *self._attached, *links)
+        for name in (first, second):
+            if name not in known:
+                raise UnknownNameError("body", name, known)
+        if first == second:
+            raise SceneError(f"the body {first!r} is not checked against itself, expected two bodies")
+        pair = {frozenset((first, second))}
+        self._set_allowed(self.meshes.allowed | pair if allowed else self.meshes.allowed - pair)
+
+    def _forget_allowed(self, name: str) -> None:
+        """Remove the pairs of a body that is gone."""
+        self._set_allowed(frozenset(pair for pair in self.meshes.allowed if name not in pair))
+
+    def _set_allowed(self, allowed: frozenset[frozenset[str]]) -> None:
+        if allowed != self.meshes.allowed:
+            self.meshes.allow(allowed)
+            self._obstacles_changed()
+            self._held_changed()
 
     def _claim(self, name: str) -> None:
         if name in self._obstacles or name in self._attached or self.robot.model.existBodyName(name):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 
 import coal
 import numpy as np
@@ -11,12 +11,13 @@ import pinocchio as pin
 from apex_ompl.collision.containment import EnclosingMesh
 from apex_ompl.collision.cover.boxes import bounding_boxes
 from apex_ompl.collision.cover.proof import Cover
+from apex_ompl.collision.solids import Solid
 from apex_ompl.errors import RobotError
 from apex_ompl.kernel.compiled.arrays import BOX, CAPSULE, CYLINDER, HALF_SPACE, PRISMATIC, REVOLUTE, SPHERE
 from apex_ompl.kernel.robot_builder import robot_tables
 from apex_ompl.kernel.robot_specs import BodySpec, JointSpec
-from apex_ompl.kernel.scene_builder import Primitive, scene_tables
-from apex_ompl.kernel.tables import RobotTables, SceneTables
+from apex_ompl.kernel.scene_builder import Primitive
+from apex_ompl.kernel.tables import RobotTables
 from apex_ompl.robot import Robot
 from apex_ompl.types import Array
 from apex_ompl.util.weak_cache import weakly_cached
@@ -68,7 +69,7 @@ def joint_specs(robot: Robot) -> list[JointSpec]:
 def tabulate(
     robot: Robot,
     *,
-    items: Sequence[pin.GeometryObject],
+    solids: Sequence[Solid],
     numbers: Sequence[int],
     covers: Sequence[Cover],
     meets_scene: Sequence[bool],
@@ -78,18 +79,18 @@ def tabulate(
 
     Args:
         robot: The robot.
-        items: Its geometries and those of what it holds.
+        solids: Its links and what it holds.
         numbers: Number of each outside of the tables.
         covers: The cover of each.
         meets_scene: Whether each is checked against obstacles.
-        pairs: Pairs that are checked for self-collision, by their places in ``items``.
+        pairs: Pairs that are checked for self-collision, by their places in ``solids``.
     """
     bodies = [
         BodySpec(
-            item.name, int(item.parentJoint), item.placement.homogeneous, cover.centres, cover.radii, cover.first,
-            cover.count, meets,
+            solid.part or solid.name, solid.joint, solid.placement.homogeneous, cover.centres, cover.radii,
+            cover.first, cover.count, meets,
         )
-        for item, cover, meets in zip(items, covers, meets_scene, strict=True)
+        for solid, cover, meets in zip(solids, covers, meets_scene, strict=True)
     ]  # fmt: skip
     limits = robot.limits
     return robot_tables(
@@ -98,18 +99,12 @@ def tabulate(
     )  # fmt: skip
 
 
-def tabulate_scene(solids: Mapping[int, Sequence[Primitive]]) -> SceneTables:
-    """Return the tables of obstacles, given by number and the solids that :func:`primitives` returns."""
-    return scene_tables([(number, solid) for number, parts in solids.items() for solid in parts])
-
-
-def primitives(shape: coal.CollisionGeometry, pose: Array, boxes: Array | None = None) -> list[Primitive]:
+def primitives(shape: coal.CollisionGeometry, pose: Array) -> list[Primitive]:
     """Return primitives that together contain a geometry: itself, or boxes around a mesh.
 
     Args:
         shape: The geometry.
         pose: Its pose in the world, shape (4, 4) [m].
-        boxes: Result of :func:`mesh_boxes` for it, if known.
     """
     kind = shape.getNodeType()
     if kind == coal.GEOM_BOX:
@@ -124,7 +119,7 @@ def primitives(shape: coal.CollisionGeometry, pose: Array, boxes: Array | None =
         normal = pose[:3, :3] @ shape.n
         return [Primitive(HALF_SPACE, pose, (*normal, shape.d + float(normal @ pose[:3, 3])))]
     found = []
-    for low, high in mesh_boxes(shape) if boxes is None else boxes:
+    for low, high in mesh_boxes(shape):
         centre = np.eye(4)
         centre[:3, 3] = (low + high) / 2.0
         found.append(Primitive(BOX, pose @ centre, tuple((high - low) / 2.0)))

@@ -33,6 +33,7 @@ from apex_ompl.types import Array
 from apex_ompl.util.files import is_file, make_folder, write_atomically
 
 SCHEMA = "apex-ompl/cases/1"
+STORED = tuple(name for name in SceneArrays._fields if name != "allowed")  # nothing may touch in problems of data sets
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +94,7 @@ def save_kernel_problems(folder: str | os.PathLike[str], problems: Sequence[Kern
         "start": np.stack([p.start for p in problems]), "goal": np.stack([p.goal for p in problems]),
         "points": np.stack([p.points for p in problems]),
     }  # fmt: skip
-    for name in SceneArrays._fields:
+    for name in STORED:
         columns = [getattr(p.scene.arrays, name) for p in problems]
         arrays[name], arrays[f"{name}_count"] = np.concatenate(columns), np.array([len(c) for c in columns])
     stream = io.BytesIO()
@@ -157,14 +158,18 @@ def _scenes(arrays: dict[str, NDArray[Any]], count: int) -> list[SceneTables]:
         ValueError: They do not fit each other.
     """
     columns = {}
-    for name in SceneArrays._fields:
+    for name in STORED:
         counts = arrays[f"{name}_count"]
         if len(counts) != count or counts.sum() != len(arrays[name]):
             raise ValueError(name)
         if counts.ndim != 1 or (counts < 0).any():
             raise ValueError(name)
         columns[name] = np.split(arrays[name], np.cumsum(counts)[:-1])
-    made = [SceneArrays(**{k: np.ascontiguousarray(v[i]) for k, v in columns.items()}) for i in range(count)]
+    nothing = np.empty((0, 2), np.int64)
+    made = [
+        SceneArrays(**{k: np.ascontiguousarray(v[i]) for k, v in columns.items()}, allowed=nothing)
+        for i in range(count)
+    ]
     for scene in made:
         fault = scene_fault(scene)
         if fault:

@@ -103,7 +103,7 @@ class LinearLatent(Autoencoder):
         check_integer(dim, "dimension of the latent space", 1, spline.free * dof)
         self.latent = (dim,)
         self.register_buffer("mean", torch.zeros(spline.free * dof))
-        self.register_buffer("components", torch.eye(spline.free * dof)[:, :dim].clone())
+        self.register_buffer("components", torch.tensor(np.eye(spline.free * dof, dim), dtype=torch.float32))
         self.register_buffer("deviations", torch.ones(dim))
 
     def fit(self, control: Tensor) -> None:

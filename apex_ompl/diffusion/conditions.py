@@ -1,4 +1,4 @@
-"""Conditions of the model as tensors: start, goal, obstacle point, and the obstacles."""
+"""Queries as batches of tensors: start, goal, obstacle point, and the obstacles."""
 
 from __future__ import annotations
 
@@ -7,95 +7,12 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
-from apex_ompl.datasets.records import ObstacleRecord, Paths
+from apex_ompl.datasets.records import Paths
 from apex_ompl.diffusion.geometry import rotation_matrices, signed_distances
-from apex_ompl.kernel import Kernel, RobotTables
-from apex_ompl.kernel.compiled.arrays import BOX, HALF_SPACE, SceneArrays
-from apex_ompl.types import Array
-
-HALVES = np.array([[0.5, 0.5, 0.5], [1.0, 0.5, 0.5], [1.0, 0.5, 0.5], [1.0, 0.5, 0.5]], np.float32)
-"""Factors from the sizes in data sets (edges, lengths) to those of the networks (half edges, half lengths), by shape;
-radii are kept."""
-
-KINEMATICS_BATCH = 1024
-"""Number of paths whose joint frames are in memory at the same time."""
-
-HALF_SPACE_BOX = np.array([3.0, 3.0, 0.5])
-"""Half edges of the box that represents a half-space [m]."""
-
-
-@dataclass(frozen=True, eq=False)
-class ObstacleSet:
-    """M obstacles of primitive shape.
-
-    Attributes:
-        shape: Indices into ``apex_ompl.datasets.records.SHAPES``, shape (M,).
-        position: Positions of the centres in the world, shape (M, 3) [m].
-        rotation: Rotation matrices, obstacle to world, shape (M, 3, 3).
-        size: Half edges; radius; or radius and half length along z, shape (M, 3) [m].
-    """
-
-    shape: NDArray[np.int64]
-    position: Array
-    rotation: Array
-    size: Array
-
-    @classmethod
-    def from_rows(cls, rows: Sequence[ObstacleRecord]) -> ObstacleSet:
-        """Return the obstacles of a data set, given as rows of shape, position, orientation (xyzw) and size."""
-        columns = list(zip(*rows, strict=True)) or [(), (), (), ()]
-        shape = np.array(columns[0], np.int64)
-        position, orientation, size = (
-            np.array(c, float).reshape(-1, n) for c, n in zip(columns[1:], (3, 4, 3), strict=True)
-        )
-        return cls(shape, position, rotation_matrices(orientation).astype(float), size * HALVES[shape])
-
-    @classmethod
-    def from_scene(cls, scene: SceneArrays, chosen: NDArray[np.bool_]) -> ObstacleSet:
-        """Return some obstacles of a kernel scene; a half-space becomes a box larger than the workspace.
-
-        Args:
-            scene: The scene.
-            chosen: Which of its obstacles to take, shape (all obstacles,).
-        """
-        shape, position = scene.kind[chosen].copy(), scene.offset[chosen].copy()
-        rotation, size = scene.rotation[chosen].copy(), scene.size[chosen].copy()
-        for k in np.flatnonzero(shape == HALF_SPACE):
-            normal, distance = position[k].copy(), size[k, 0]
-            rotation[k] = _rotation_to(normal)
-            shape[k], position[k], size[k] = BOX, (distance - HALF_SPACE_BOX[2]) * normal, HALF_SPACE_BOX
-        return cls(shape, position, rotation, size)
-
-    def __len__(self) -> int:
-        """Return the number of obstacles M."""
-        return len(self.shape)
-
-
-def _rotation_to(normal: Array) -> Array:
-    """Return a rotation matrix whose z axis is the unit vector ``normal``, shape (3, 3)."""
-    across = np.cross(normal, np.eye(3)[int(np.argmin(np.abs(normal)))])
-    across /= np.linalg.norm(across)
-    return np.stack([across, np.cross(normal, across), normal], axis=1)
-
-
-@dataclass(frozen=True, eq=False)
-class Query:
-    """Planning query of the model: the vector g of the paper, and the obstacles.
-
-    Attributes:
-        start: Shape (dof,) [rad].
-        goal: Shape (dof,) [rad].
-        point: Obstacle point nearest to the robot at the start, shape (3,) [m].
-        obstacles: The obstacles without fixtures such as tables.
-    """
-
-    start: Array
-    goal: Array
-    point: Array
-    obstacles: ObstacleSet
+from apex_ompl.diffusion.query import HALVES, Probes, Query
+from apex_ompl.kernel import Kernel
 
 
 @dataclass(frozen=True)
@@ -148,7 +65,8 @@ class Conditions:
     def probe_distances(self) -> Tensor:
         """Return the signed distances from each of the T obstacles to its query's probe points, (T, L * P) [m]."""
         owner = self.mask.nonzero()[:, 0]
-        return signed_distances(*self.obstacles(), self.probes.flatten(1, 2)[owner])
+        found: Tensor = signed_distances(*self.obstacles(), self.probes.flatten(1, 2)[owner])
+        return found
 
 
 def pad_obstacles(values: Tensor, mask: Tensor, fill: float) -> Tensor:
@@ -173,47 +91,6 @@ def _zero_padded(tensor: Tensor, most: int) -> Tensor:
         return tensor
     zeros = tensor.new_zeros(len(tensor), most - tensor.shape[1], *tensor.shape[2:])
     return torch.cat([tensor, zeros], dim=1)
-
-
-class Probes:
-    """Probe points: P points fixed to the robot's links, whose distances to the obstacles the encoder sees.
-
-    By default they are the centres of the bounding balls of the sphere cover's clusters.
-
-    Attributes:
-        joint: Joint that carries each point, an index into the kernel's tables, shape (P,).
-        offset: Positions in the joints' frames, shape (P, 3) [m].
-        shares: Where along the straight line from start to goal they are looked at, shape (L,) in 0..1.
-    """
-
-    def __init__(self, joint: NDArray[np.int64], offset: Array, along: int) -> None:
-        """Fix points to joints.
-
-        Args:
-            joint: Joints, shape (P,).
-            offset: Positions in the joints' frames, shape (P, 3) [m].
-            along: Number L of states of the straight line, ends included.
-        """
-        self.joint, self.offset = joint, offset
-        self.shares = np.linspace(0.0, 1.0, along)
-
-    @classmethod
-    def from_robot(cls, robot: RobotTables, along: int) -> Probes:
-        """Return the default probe points of a robot: one for each cluster that moves and can meet obstacles."""
-        a = robot.arrays
-        moved = np.flatnonzero(a.cluster_meets_scene & (a.cluster_joint > 0))
-        return cls(a.cluster_joint[moved], a.cluster_ball[moved, :3], along)
-
-    def positions(self, kernel: Kernel, start: Array, goal: Array) -> NDArray[np.float32]:
-        """Return the points' positions along straight lines between states of shape (B, dof): (B, L, P, 3) [m]."""
-        found = np.empty((len(start), len(self.shares), len(self.joint), 3), np.float32)
-        for k in range(0, len(start), KINEMATICS_BATCH):
-            ends = start[k : k + KINEMATICS_BATCH, None], goal[k : k + KINEMATICS_BATCH, None]
-            states = ends[0] + self.shares[:, None] * (ends[1] - ends[0])
-            rotation, origin = kernel.joint_frames(states.reshape(-1, start.shape[1]))
-            points = np.einsum("npij,pj->npi", rotation[:, self.joint], self.offset) + origin[:, self.joint]
-            found[k : k + KINEMATICS_BATCH] = points.reshape(states.shape[0], *found.shape[1:])
-        return found
 
 
 def batch_queries(queries: Sequence[Query], probes: Probes, kernel: Kernel) -> Conditions:

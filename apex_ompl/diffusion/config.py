@@ -9,7 +9,14 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from apex_ompl.diffusion.model import ConditionConfig, Count, DenoiserConfig, LatentConfig, NoiseConfig, SamplingConfig
+from apex_ompl.diffusion.model_config import (
+    ConditionConfig,
+    Count,
+    DenoiserConfig,
+    LatentConfig,
+    NoiseConfig,
+    SamplingConfig,
+)
 from apex_ompl.errors import FileFormatError
 from apex_ompl.util.schema import StrictModel, read_yaml, validate
 

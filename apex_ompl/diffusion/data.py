@@ -14,9 +14,10 @@ from torch import Tensor
 
 from apex_ompl.datasets.records import SPLINE, Paths
 from apex_ompl.datasets.store import Store, load
-from apex_ompl.diffusion.conditions import Conditions, ConditionTable, Probes
+from apex_ompl.diffusion.conditions import Conditions, ConditionTable
 from apex_ompl.diffusion.config import TrainingConfig
 from apex_ompl.diffusion.mirror import Mirror
+from apex_ompl.diffusion.query import Probes
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel import Kernel, RobotTables
 from apex_ompl.kernel.scene_builder import scene_tables

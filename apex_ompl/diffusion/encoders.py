@@ -10,9 +10,8 @@ from torch import Tensor, nn
 
 from apex_ompl.datasets.records import SHAPES
 from apex_ompl.diffusion.conditions import Conditions, pad_obstacles
+from apex_ompl.diffusion.query import MAX_DISTANCE, WORKSPACE_CENTRE
 
-WORKSPACE_CENTRE = (0.4, 0.0, 0.6)  # origin of all points that the encoder sees [m]
-MAX_DISTANCE = 0.4  # distances are clipped here [m]
 PADDING = -1e4  # below every feature, for the maximum over obstacles
 
 

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from importlib import import_module
+from types import ModuleType
+from typing import Any
+
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from apex_ompl.datasets.records import SHAPES
+
+Numbers = Any
+"""An array of NumPy or a tensor of torch; functions return what they are given."""
 
 
 def rotation_matrices(orientation: NDArray[np.floating]) -> NDArray[np.float32]:
@@ -21,10 +26,11 @@ def rotation_matrices(orientation: NDArray[np.floating]) -> NDArray[np.float32]:
     return np.asarray(np.moveaxis(np.array(rows), (0, 1), (-2, -1)), np.float32)
 
 
-def signed_distances(shape: Tensor, position: Tensor, rotation: Tensor, size: Tensor, points: Tensor) -> Tensor:
+def signed_distances(shape: Numbers, position: Numbers, rotation: Numbers, size: Numbers, points: Numbers) -> Numbers:
     """Return signed distances [m] of points to obstacles, each with points of its own: shape (T, K).
 
-    The formulas are those of the kernel, see :mod:`apex_ompl.kernel.compiled.signed_distance`.
+    Arguments are all arrays, or all tensors. The formulas are those of the kernel, see
+    :mod:`apex_ompl.kernel.compiled.signed_distance`.
 
     Args:
         shape: Indices of shapes, shape (T,).
@@ -33,15 +39,26 @@ def signed_distances(shape: Tensor, position: Tensor, rotation: Tensor, size: Te
         size: Half edges; radius; or radius and half length along z, shape (T, 3) [m].
         points: Shape (T, K, 3) [m].
     """
+    xp = array_module(points)
     local = (points - position[:, None]) @ rotation
     half, kind = size[:, None], shape[:, None]
-    excess = local.abs() - half
-    box = excess.clamp(min=0.0).norm(dim=-1) + excess.amax(dim=-1).clamp(max=0.0)
-    radius, length, from_axis = half[..., 0], half[..., 1], local[..., :2].norm(dim=-1)
-    sphere = local.norm(dim=-1) - radius
-    across, along = from_axis - radius, local[..., 2].abs() - length
-    cylinder = torch.hypot(across.clamp(min=0.0), along.clamp(min=0.0)) + torch.maximum(across, along).clamp(max=0.0)
-    capsule = torch.hypot(from_axis, along.clamp(min=0.0)) - radius
-    found: Tensor = torch.where(kind == SHAPES.index("box"), box, sphere)
-    found = torch.where(kind == SHAPES.index("cylinder"), cylinder, found)
-    return torch.where(kind == SHAPES.index("capsule"), capsule, found)
+    excess = abs(local) - half
+    box = _norm(xp, excess.clip(min=0.0)) + xp.amax(excess, -1).clip(max=0.0)
+    radius, length, from_axis = half[..., 0], half[..., 1], _norm(xp, local[..., :2])
+    sphere = _norm(xp, local) - radius
+    across, along = from_axis - radius, abs(local[..., 2]) - length
+    cylinder = xp.hypot(across.clip(min=0.0), along.clip(min=0.0)) + xp.maximum(across, along).clip(max=0.0)
+    capsule = xp.hypot(from_axis, along.clip(min=0.0)) - radius
+    found = xp.where(kind == SHAPES.index("box"), box, sphere)
+    found = xp.where(kind == SHAPES.index("cylinder"), cylinder, found)
+    return xp.where(kind == SHAPES.index("capsule"), capsule, found)
+
+
+def array_module(values: Numbers) -> ModuleType:
+    """Return the module whose functions work on an array or tensor: NumPy, or torch."""
+    return np if isinstance(values, np.ndarray) else import_module("torch")
+
+
+def _norm(xp: ModuleType, vectors: Numbers) -> Numbers:
+    """Return the norms, shape (...), of vectors, shape (..., n)."""
+    return xp.sqrt((vectors * vectors).sum(-1))

@@ -8,13 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-import torch
-from torch import Tensor
+from numpy.typing import NDArray
 
-from apex_ompl.diffusion.autoencoder import Autoencoder
+from apex_ompl.diffusion.geometry import Numbers, array_module
 from apex_ompl.diffusion.sampler import Predict
 from apex_ompl.diffusion.schedule import Estimate, NoiseSchedule
 from apex_ompl.errors import UnknownNameError
@@ -61,6 +59,10 @@ class Guidance:
         check_positive(self.margin, "margin")
         check_integer(self.samples, "samples", 2)
 
+    def states(self, count: int) -> NDArray[np.int64]:
+        """Return the indices of the states of a path, of ``count`` states, at which the cost is taken."""
+        return np.linspace(0, count - 1, self.samples).round().astype(np.int64)
+
 
 def collision_cost(kernel: Kernel, paths: Array, margin: float) -> tuple[Array, Array]:
     """Return the collision cost of paths, shape (B,), and its gradient, shape (B, N, dof) [1/rad].
@@ -85,41 +87,8 @@ def collision_cost(kernel: Kernel, paths: Array, margin: float) -> tuple[Array, 
     return cost, rows.reshape(count, states, dof) / states
 
 
-class _CollisionCost(torch.autograd.Function):
-    """:func:`collision_cost` as a differentiable function of torch."""
-
-    @staticmethod
-    def forward(context: Any, paths: Tensor, kernel: Kernel, margin: float) -> Tensor:
-        cost, slopes = collision_cost(kernel, paths.detach().cpu().double().numpy(), margin)
-        context.save_for_backward(torch.from_numpy(slopes).to(paths))
-        return torch.from_numpy(cost).to(paths)
-
-    @staticmethod
-    def backward(context: Any, *grads: Tensor) -> tuple[Tensor, None, None]:
-        (slopes,) = context.saved_tensors
-        return grads[0][:, None, None] * slopes, None, None
-
-
-def log_likelihood(
-    autoencoder: Autoencoder, kernel: Kernel, latent: Tensor, ends: tuple[Tensor, Tensor], guidance: Guidance
-) -> Tensor:
-    """Return log p(g | z) of latent vectors up to a constant, shape (B,): minus the collision cost of their paths.
-
-    Args:
-        autoencoder: Decoder of the latent vectors.
-        kernel: The robot among its obstacles.
-        latent: Latent vectors z, shape (B, *latent).
-        ends: Starts and goals, each of shape (B, dof) [rad].
-        guidance: Margin of the cost, and number of states.
-    """
-    which = torch.linspace(0, autoencoder.spline.states - 1, guidance.samples).round().long()
-    paths = autoencoder.decode(latent, *ends)[:, which]
-    cost: Tensor = _CollisionCost.apply(paths, kernel, guidance.margin)  # type: ignore[no-untyped-call]
-    return -cost
-
-
 def guided(
-    predict: Predict, score: Callable[[Tensor], Tensor], schedule: NoiseSchedule, guidance: Guidance,
+    predict: Predict, score: Callable[[Numbers], Numbers], schedule: NoiseSchedule, guidance: Guidance,
     most: float | None = None,
 ) -> Predict:  # fmt: skip
     """Return a guided denoiser.
@@ -145,7 +114,7 @@ def guided(
     if guidance.gamma == 0.0:
         return predict
 
-    def predict_guided(sample: Tensor, t: int) -> Estimate:
+    def predict_guided(sample: Numbers, t: int) -> Estimate:
         estimate = predict(sample, t)
         if t >= guidance.active_below * schedule.steps:
             return estimate
@@ -162,16 +131,9 @@ def guided(
     return predict_guided
 
 
-def gradient(function: Callable[[Tensor], Tensor], at: Tensor) -> Tensor:
-    """Return the gradient, of the shape of ``at``, of a function from (B, ...) to one number a row, (B,)."""
-    with torch.enable_grad():
-        inside = at.detach().requires_grad_()
-        found: Tensor = torch.autograd.grad(function(inside).sum(), inside)[0]
-    return found
-
-
-def clip_norm(gradients: Tensor, most: float) -> Tensor:
+def clip_norm(gradients: Numbers, most: float) -> Numbers:
     """Return gradients (B, ...) scaled down to norm ``most`` where they exceed it."""
-    norm = gradients.flatten(1).norm(dim=1).clamp(min=1e-12)
-    share: Tensor = (most / norm).clamp(max=1.0)
+    rows = gradients.reshape(len(gradients), -1)
+    norm = array_module(rows).sqrt((rows * rows).sum(1)).clip(min=1e-12)
+    share = (most / norm).clip(max=1.0)
     return gradients * share.reshape(-1, *[1] * (gradients.ndim - 1))

@@ -7,7 +7,8 @@ import torch
 from apex_ompl.diffusion.autoencoder import LinearLatent
 from apex_ompl.diffusion.config import TrainingConfig
 from apex_ompl.diffusion.data import TrainingData
-from apex_ompl.diffusion.model import LatentDiffusion, ModelConfig, SplineConfig
+from apex_ompl.diffusion.model import LatentDiffusion
+from apex_ompl.diffusion.model_config import ModelConfig, SplineConfig
 from apex_ompl.kernel import RobotTables
 
 

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import torch
-from torch import Tensor
 
-from apex_ompl.diffusion.conditions import Conditions, Probes, Query, batch_queries
-from apex_ompl.diffusion.guidance import Guidance, gradient, guided, log_likelihood
-from apex_ompl.diffusion.model import LatentDiffusion
-from apex_ompl.diffusion.sampler import SAMPLERS, Callback, ddpm, noise_like
+from apex_ompl.diffusion.geometry import Numbers
+from apex_ompl.diffusion.guidance import Guidance, guided
+from apex_ompl.diffusion.model_config import ModelConfig
+from apex_ompl.diffusion.query import Probes, Query
+from apex_ompl.diffusion.sampler import SAMPLERS, Callback, Predict, ddpm, noise_like
+from apex_ompl.diffusion.schedule import Estimate, NoiseSchedule
 from apex_ompl.errors import ParameterError, UnknownNameError
 from apex_ompl.kernel import Kernel
 from apex_ompl.trajopt.spline import Spline
@@ -60,47 +61,77 @@ class Proposals:
 
     Attributes:
         control: Control points, shape (B, points, dof) [rad], inside the limits; ends are start and goal bit for bit.
-        latent: Latent vectors, shape (B, *latent).
+        latent: Latent vectors, shape (B, *latent), arrays or tensors as the model computes.
         seconds: Time by stage: ``condition``, ``network``, ``guidance``, ``decode`` [s].
     """
 
     control: Array
-    latent: Tensor
+    latent: Numbers
     seconds: Mapping[str, float]
 
 
-class TrajectoryModel:
+class TrajectoryModel(ABC):
     """Trained model that proposes paths; safe to use from several threads.
 
     Attributes:
-        network: The networks.
+        config: Configuration.
         about: Record of the training.
         spline: Spline of the control points.
+        schedule: Noise schedule.
+        probes: Points of the robot whose distances to the obstacles it sees.
         sampling: Default sampling.
     """
 
-    def __init__(self, network: LatentDiffusion, about: Mapping[str, Any]) -> None:
-        """Use a network with its present weights; they are frozen."""
-        self.network = network.eval().requires_grad_(False)
-        self.about = dict(about)
-        self.spline: Spline = network.autoencoder.spline
-        joint, offset = network.probe_joint.cpu().numpy(), network.probe_offset.cpu().double().numpy()
-        self.probes = Probes(joint, offset, network.config.condition.along)
-        self.sampling = Sampling(**network.config.sampling.model_dump())
+    def __init__(self, config: ModelConfig, about: Mapping[str, Any], probes: Probes) -> None:
+        """Make a model of a configuration."""
+        self.config, self.about, self.probes = config, dict(about), probes
+        self.spline = Spline(**config.spline.model_dump())
+        self.schedule = NoiseSchedule(config.noise.steps, config.noise.schedule)
+        self.sampling = Sampling(**config.sampling.model_dump())
 
     @property
     def sees_point(self) -> bool:
         """Whether it looks at the obstacle point of a query."""
-        return self.network.config.condition.point
+        return self.config.condition.point
 
-    @property
-    def device(self) -> torch.device:
-        """Where it runs."""
-        return self.network.probe_offset.device
+    @abstractmethod
+    def one_thread(self) -> AbstractContextManager[None]:
+        """Let its networks compute by one thread inside a block."""
+
+    @abstractmethod
+    def zeros(self, count: int) -> Numbers:
+        """Return ``count`` latent vectors of zeros."""
+
+    @abstractmethod
+    def encode(self, control: Array) -> Numbers:
+        """Return the latent vectors of control points, shape (B, points, dof) [rad]."""
+
+    @abstractmethod
+    def condition(self, queries: Sequence[Query], kernel: Kernel) -> Numbers:
+        """Return the encoded conditions of Q queries, shape (Q, out)."""
+
+    @abstractmethod
+    def denoise(self, latent: Numbers, t: int, condition: Numbers) -> Numbers:
+        """Return the denoiser's output for latent vectors at a step, each with its condition, or one for all."""
+
+    @abstractmethod
+    def score(self, latent: Numbers, kernel: Kernel, ends: tuple[Array, Array], guidance: Guidance) -> Numbers:
+        """Return the gradient of log p(g | z), minus the collision cost of the decoded path, at latent vectors z.
+
+        Args:
+            latent: Latent vectors, shape (B, *latent).
+            kernel: The robot among its obstacles.
+            ends: Starts and goals, each of shape (B, dof) [rad].
+            guidance: Margin of the cost, and number of states.
+        """
+
+    @abstractmethod
+    def control(self, latent: Numbers, ends: tuple[Array, Array]) -> Array:
+        """Return control points, shape (B, points, dof) [rad], of latent vectors between starts and goals."""
 
     def propose(
         self, query: Query | Sequence[Query], kernel: Kernel, count: int, *, sampling: Sampling | None = None,
-        generator: torch.Generator | None = None, callback: Callback | None = None,
+        generator: np.random.Generator | None = None, callback: Callback | None = None,
     ) -> Proposals:  # fmt: skip
         """Return paths from noise (Algorithm 1 of the paper, generate_traj).
 
@@ -117,15 +148,14 @@ class TrajectoryModel:
         """
         sampling, queries = sampling or self.sampling, [query] if isinstance(query, Query) else list(query)
         check_integer(count, "count", 1)
-        shape = torch.zeros(len(queries) * count, *self.network.latent, device=self.device)
-        generator = generator or torch.Generator().manual_seed(0)
-        first = sampling.temperature * noise_like(shape, generator)
-        top = self.network.schedule.steps - 1
+        generator = generator or np.random.default_rng(0)
+        first = sampling.temperature * noise_like(self.zeros(len(queries) * count), generator)
+        top = self.schedule.steps - 1
         return self._denoised(queries, kernel, first, top, sampling=sampling, generator=generator, callback=callback)
 
     def renoise(
         self, query: Query, kernel: Kernel, control: Array, step: int, *, sampling: Sampling | None = None,
-        generator: torch.Generator | None = None, callback: Callback | None = None,
+        generator: np.random.Generator | None = None, callback: Callback | None = None,
     ) -> Proposals:  # fmt: skip
         """Return variations of given paths: noise of a step is added to their latent vectors, and removed again.
 
@@ -142,23 +172,21 @@ class TrajectoryModel:
             ParameterError: Control points have another shape, or there is no such step.
         """
         sampling, control = sampling or self.sampling, np.asarray(control, float)
-        shape = ("B", self.spline.points, len(self.network.config.joints))
-        check_array(control, shape, "control points", finite=True)
-        check_integer(step, "step", 0, self.network.schedule.steps - 1)
-        generator = generator or torch.Generator().manual_seed(0)
-        with torch.no_grad():
-            clean = self.network.autoencoder.encode(torch.tensor(control, dtype=torch.float32, device=self.device))
-            first = self.network.schedule.add_noise(clean, noise_like(clean, generator), step)
+        check_array(control, ("B", self.spline.points, len(self.config.joints)), "control points", finite=True)
+        check_integer(step, "step", 0, self.schedule.steps - 1)
+        generator = generator or np.random.default_rng(0)
+        clean = self.encode(control)
+        first = self.schedule.add_noise(clean, noise_like(clean, generator), step)
         sampling = replace(sampling, steps=min(sampling.steps, step + 1))
         return self._denoised([query], kernel, first, step, sampling=sampling, generator=generator, callback=callback)
 
-    def conditions(self, queries: Sequence[Query], kernel: Kernel) -> Conditions:
-        """Return queries as a batch on the model's device.
+    def _check(self, queries: Sequence[Query], kernel: Kernel) -> None:
+        """Check that queries are of the model's robot.
 
         Raises:
-            ParameterError: The robot is not the model's, or numbers are not finite.
+            ParameterError: They are not, or numbers are not finite.
         """
-        config = self.network.config
+        config = self.config
         if (kernel.robot.name, kernel.robot.joint_names) != (config.robot, config.joints):
             raise ParameterError("robot", kernel.robot.name, f"{config.robot}, which the model was trained for")
         for query in queries:
@@ -168,48 +196,52 @@ class TrajectoryModel:
             numbers = (query.point, obstacles.position, obstacles.rotation, obstacles.size)
             if not all(np.isfinite(values).all() for values in numbers):
                 raise ParameterError("obstacles", "NaN or infinity", "finite positions, rotations and sizes")
-        return batch_queries(queries, self.probes, kernel).to(self.device)
 
     def _denoised(
-        self, queries: Sequence[Query], kernel: Kernel, first: Tensor, top: int, *, sampling: Sampling,
-        generator: torch.Generator, callback: Callback | None,
+        self, queries: Sequence[Query], kernel: Kernel, first: Numbers, top: int, *, sampling: Sampling,
+        generator: np.random.Generator, callback: Callback | None,
     ) -> Proposals:  # fmt: skip
         """Return the paths that the reverse process makes of noisy latent vectors ``first`` at step ``top``."""
-        network, clock = self.network, _StageClock()
-        with torch.no_grad():
-            conditions, each = self.conditions(queries, kernel), len(first) // len(queries)
-            encoded = network.encoder(conditions)
-            if len(queries) > 1:
-                encoded = encoded.repeat_interleave(each, dim=0)
-            start, goal = (ends.repeat_interleave(each, dim=0) for ends in (conditions.start, conditions.goal))
-            clock.lap("condition")
-            if network.is_regression:
-                zero = torch.zeros_like(first)
-                latent = network.denoise(zero, torch.zeros(1, dtype=torch.int64, device=zero.device), encoded)
+        self._check(queries, kernel)
+        clock, each = _StageClock(), len(first) // len(queries)
+        start, goal = (np.array([getattr(q, name) for q in queries], float) for name in ("start", "goal"))
+        ends = np.repeat(start, each, axis=0), np.repeat(goal, each, axis=0)
+        condition = self.condition(queries, kernel)
+        if len(queries) > 1:
+            condition = condition[np.repeat(np.arange(len(queries)), each)]
+        clock.lap("condition")
+        if self.config.denoiser.kind == "regression":
+            latent = self.denoise(self.zeros(len(first)), 0, condition)
+        else:
+
+            def score(clean: Numbers) -> Numbers:
+                with clock.within("guidance"):
+                    return self.score(clean, kernel, ends, sampling.guidance)
+
+            predict = guided(self._predict(condition), score, self.schedule, sampling.guidance, self.config.noise.most)
+            times = self.schedule.timesteps(sampling.steps, top)
+            extra: dict[str, Any] = {} if callback is None else {"callback": callback}
+            if sampling.sampler == "ddpm":
+                latent = ddpm(predict, first, self.schedule, times, generator=generator, **extra)
             else:
-
-                def log_p(clean: Tensor) -> Tensor:
-                    return log_likelihood(network.autoencoder, kernel, clean, (start, goal), sampling.guidance)
-
-                def score(clean: Tensor) -> Tensor:
-                    with clock.within("guidance"):
-                        return gradient(log_p, clean)
-
-                most = network.config.noise.most
-                predict = guided(network.predict(encoded), score, network.schedule, sampling.guidance, most)
-                times = network.schedule.timesteps(sampling.steps, top)
-                extra: dict[str, Any] = {} if callback is None else {"callback": callback}
-                if sampling.sampler == "ddpm":
-                    latent = ddpm(predict, first, network.schedule, times, generator=generator, **extra)
-                else:
-                    latent = SAMPLERS[sampling.sampler](predict, first, network.schedule, times, **extra)
-            clock.lap("network")
-            control = network.autoencoder.control(latent, start, goal).cpu().double().numpy()
-            limits = kernel.robot.arrays
-            ends = (np.repeat([getattr(q, name) for q in queries], each, axis=0) for name in ("start", "goal"))
-            control = self.spline.with_ends(np.clip(control, limits.lower, limits.upper), *ends)
-            clock.lap("decode")
+                latent = SAMPLERS[sampling.sampler](predict, first, self.schedule, times, **extra)
+        clock.lap("network")
+        limits = kernel.robot.arrays
+        control = np.clip(self.control(latent, ends), limits.lower, limits.upper)
+        control = self.spline.with_ends(control, *ends)
+        clock.lap("decode")
         return Proposals(control, latent, clock.seconds)
+
+    def _predict(self, condition: Numbers) -> Predict:
+        """Return the denoiser as samplers call it."""
+        noise = self.config.noise
+
+        def predict(sample: Numbers, t: int) -> Estimate:
+            output = self.denoise(sample, t, condition)
+            estimate = self.schedule.estimate(noise.prediction, sample, output, t)
+            return self.schedule.clipped(estimate, sample, t, noise.most)
+
+        return predict
 
 
 class _StageClock:

@@ -1,4 +1,4 @@
-"""Reverse processes: from noise to samples, as plain functions with a callback at each step.
+"""Reverse processes: from noise to samples, of arrays or tensors, as plain functions with a callback at each step.
 
 Notation: z_t is the noisy sample at step t, z_0 and epsilon its clean sample and noise as the network estimates them,
 abar_t the schedule's ``alpha_bar``, s the step that follows t (abar = 1 behind the last one).
@@ -9,27 +9,27 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 
-import torch
-from torch import Tensor
+import numpy as np
 
+from apex_ompl.diffusion.geometry import Numbers
 from apex_ompl.diffusion.schedule import Estimate, NoiseSchedule
 from apex_ompl.errors import ParameterError
 
-Predict = Callable[[Tensor, int], Estimate]
+Predict = Callable[[Numbers, int], Estimate]
 """Denoiser: return the estimated noise and clean samples of noisy samples, shape (B, ...), at a step."""
 
-Callback = Callable[[int, Tensor, Estimate], None]
+Callback = Callable[[int, Numbers, Estimate], None]
 """Called at each step with its number, the noisy samples and the denoiser's estimate."""
 
 
-def _no_callback(t: int, sample: Tensor, estimate: Estimate) -> None:
+def _no_callback(t: int, sample: Numbers, estimate: Estimate) -> None:
     del t, sample, estimate
 
 
 def ddpm(
-    predict: Predict, sample: Tensor, schedule: NoiseSchedule, times: Sequence[int], *,
-    generator: torch.Generator | None = None, callback: Callback = _no_callback,
-) -> Tensor:  # fmt: skip
+    predict: Predict, sample: Numbers, schedule: NoiseSchedule, times: Sequence[int], *,
+    generator: np.random.Generator | None = None, callback: Callback = _no_callback,
+) -> Numbers:  # fmt: skip
     """Return samples of ancestral sampling, with fresh noise at each step (equation 3 of the paper; Ho et al. 2020).
 
     The next sample is drawn from the posterior q(z_s | z_t, z_0) = N(mean, variance), with alpha = abar_t / abar_s:
@@ -59,9 +59,9 @@ def ddpm(
 
 
 def ddim(
-    predict: Predict, sample: Tensor, schedule: NoiseSchedule, times: Sequence[int], *,
+    predict: Predict, sample: Numbers, schedule: NoiseSchedule, times: Sequence[int], *,
     callback: Callback = _no_callback,
-) -> Tensor:  # fmt: skip
+) -> Numbers:  # fmt: skip
     """Return samples of the deterministic sampler DDIM (Song, Meng and Ermon 2021); arguments as in :func:`ddpm`.
 
     z_s = sqrt(abar_s) z_0 + sqrt(1 - abar_s) epsilon
@@ -77,9 +77,9 @@ def ddim(
 
 
 def dpm_solver(
-    predict: Predict, sample: Tensor, schedule: NoiseSchedule, times: Sequence[int], *,
+    predict: Predict, sample: Numbers, schedule: NoiseSchedule, times: Sequence[int], *,
     callback: Callback = _no_callback,
-) -> Tensor:  # fmt: skip
+) -> Numbers:  # fmt: skip
     """Return samples of the second-order multistep solver DPM-Solver++(2M) (Lu et al. 2022).
 
     Arguments are those of :func:`ddpm`. With lambda = log(sqrt(abar) / sqrt(1 - abar)), h = lambda_s - lambda_t, and
@@ -91,8 +91,8 @@ def dpm_solver(
     The first step, and the last one to the clean sample, are of first order (D = z_0).
     """
     alpha_bars = schedule.alpha_bar
-    lambdas = (0.5 * (alpha_bars.log() - (1.0 - alpha_bars).log())).tolist()
-    previous: tuple[float, Tensor] | None = None
+    lambdas = (0.5 * (np.log(alpha_bars) - np.log1p(-alpha_bars))).tolist()
+    previous: tuple[float, Numbers] | None = None
     for t, following in _pairs(times):
         estimate = predict(sample, t)
         callback(t, sample, estimate)
@@ -112,10 +112,12 @@ SAMPLERS = {"ddpm": ddpm, "ddim": ddim, "dpm_solver": dpm_solver}
 """Samplers by name."""
 
 
-def noise_like(sample: Tensor, generator: torch.Generator | None) -> Tensor:
-    """Return standard normal noise of a sample's shape; drawn on the generator's device, so that it is reproducible."""
-    device = generator.device if generator is not None else sample.device
-    return torch.randn(sample.shape, generator=generator, device=device, dtype=sample.dtype).to(sample.device)
+def noise_like(sample: Numbers, generator: np.random.Generator | None) -> Numbers:
+    """Return standard normal noise of a sample's shape and kind: the same numbers for arrays and tensors."""
+    noise = (generator or np.random.default_rng()).standard_normal(tuple(sample.shape), np.float32)
+    if isinstance(sample, np.ndarray):
+        return noise.astype(sample.dtype, copy=False)
+    return sample.new_tensor(noise)
 
 
 def _pairs(times: Sequence[int]) -> list[tuple[int, int]]:

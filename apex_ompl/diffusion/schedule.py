@@ -8,13 +8,17 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
-import torch
-from torch import Tensor
+import numpy as np
 
+from apex_ompl.diffusion.geometry import Numbers, array_module
 from apex_ompl.errors import UnknownNameError
+from apex_ompl.types import Array
 from apex_ompl.util.validation import check_integer
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 SCHEDULES = ("cosine", "linear")
 PREDICTIONS = ("noise", "velocity", "clean")
@@ -29,8 +33,8 @@ class Estimate(NamedTuple):
         clean: Clean sample z_0, of the sample's shape.
     """
 
-    noise: Tensor
-    clean: Tensor
+    noise: Numbers
+    clean: Numbers
 
 
 @dataclass(frozen=True)
@@ -61,25 +65,25 @@ class NoiseSchedule:
             raise UnknownNameError("noise schedule", self.kind, SCHEDULES)
 
     @cached_property
-    def betas(self) -> Tensor:
-        """Variances beta_t of the noise that each step adds, shape (steps,), float64."""
+    def betas(self) -> Array:
+        """Variances beta_t of the noise that each step adds, shape (steps,)."""
         if self.kind == "linear":
             scale = 1000.0 / self.steps
-            return torch.linspace(1e-4 * scale, 0.02 * scale, self.steps, dtype=torch.float64).clamp(max=MAX_BETA)
-        at = torch.arange(self.steps + 1, dtype=torch.float64) / self.steps
-        alpha_bar = torch.cos((at + 0.008) / 1.008 * math.pi / 2) ** 2
-        return (1.0 - alpha_bar[1:] / alpha_bar[:-1]).clamp(max=MAX_BETA)
+            return np.asarray(np.linspace(1e-4 * scale, 0.02 * scale, self.steps).clip(max=MAX_BETA))
+        at = np.arange(self.steps + 1) / self.steps
+        alpha_bar = np.cos((at + 0.008) / 1.008 * math.pi / 2) ** 2
+        return np.asarray(np.minimum(1.0 - alpha_bar[1:] / alpha_bar[:-1], MAX_BETA))
 
     @cached_property
-    def alpha_bar(self) -> Tensor:
-        """Products abar_t of 1 - beta up to each step, shape (steps,), float64."""
-        return torch.cumprod(1.0 - self.betas, dim=0)
+    def alpha_bar(self) -> Array:
+        """Products abar_t of 1 - beta up to each step, shape (steps,)."""
+        return np.asarray(np.cumprod(1.0 - self.betas))
 
     def scales(self, t: Tensor, like: Tensor) -> tuple[Tensor, Tensor]:
         """Return sqrt(abar_t) and sqrt(1 - abar_t) at steps (B,), in a shape that multiplies tensors like ``like``."""
-        alpha_bar = self.alpha_bar[t.to(self.alpha_bar.device)]
+        alpha_bar = self.alpha_bar[t.cpu().numpy()]
         alpha_bar = alpha_bar.reshape(*alpha_bar.shape, *[1] * (like.ndim - alpha_bar.ndim))
-        return alpha_bar.sqrt().to(like), (1.0 - alpha_bar).sqrt().to(like)
+        return like.new_tensor(np.sqrt(alpha_bar)), like.new_tensor(np.sqrt(1.0 - alpha_bar))
 
     def scale(self, t: int) -> tuple[float, float]:
         """Return sqrt(abar_t) and sqrt(1 - abar_t) at one step."""
@@ -87,9 +91,9 @@ class NoiseSchedule:
 
     @cached_property
     def _scales(self) -> list[tuple[float, float]]:
-        return list(zip(self.alpha_bar.sqrt().tolist(), (1.0 - self.alpha_bar).sqrt().tolist(), strict=True))
+        return list(zip(np.sqrt(self.alpha_bar).tolist(), np.sqrt(1.0 - self.alpha_bar).tolist(), strict=True))
 
-    def add_noise(self, clean: Tensor, noise: Tensor, t: Tensor | int) -> Tensor:
+    def add_noise(self, clean: Numbers, noise: Numbers, t: Tensor | int) -> Numbers:
         """Return noisy samples sqrt(abar_t) z_0 + sqrt(1 - abar_t) epsilon (equation 2) at one step, or at (B,)."""
         signal, sigma = self.scale(t) if isinstance(t, int) else self.scales(t, clean)
         return signal * clean + sigma * noise
@@ -107,7 +111,7 @@ class NoiseSchedule:
         signal, sigma = self.scales(t, clean)
         return signal * noise - sigma * clean
 
-    def estimate(self, prediction: str, sample: Tensor, output: Tensor, t: int) -> Estimate:
+    def estimate(self, prediction: str, sample: Numbers, output: Numbers, t: int) -> Estimate:
         """Return noise and clean sample from a network's output for a noisy sample; inverts :meth:`target`."""
         signal, sigma = self.scale(t)
         if prediction == "noise":
@@ -116,13 +120,13 @@ class NoiseSchedule:
             return Estimate((sample - signal * output) / sigma, output)
         return Estimate(sigma * sample + signal * output, signal * sample - sigma * output)
 
-    def clipped(self, estimate: Estimate, sample: Tensor, t: int, most: float | None) -> Estimate:
+    def clipped(self, estimate: Estimate, sample: Numbers, t: int, most: float | None) -> Estimate:
         """Return an estimate with its clean sample clipped to [-most, most], and the noise recomputed where it was."""
         if most is None:
             return estimate
         signal, sigma = self.scale(t)
-        clean = estimate.clean.clamp(-most, most)
-        return Estimate(torch.where(clean == estimate.clean, estimate.noise, (sample - signal * clean) / sigma), clean)
+        clean, where = estimate.clean.clip(-most, most), array_module(sample).where
+        return Estimate(where(clean == estimate.clean, estimate.noise, (sample - signal * clean) / sigma), clean)
 
     def timesteps(self, count: int, first: int | None = None) -> list[int]:
         """Return ``count`` denoising steps, evenly spaced from ``first`` down ("trailing" spacing, Lin et al. 2024).

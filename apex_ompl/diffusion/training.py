@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from apex_ompl.datasets.kernel_problems import KernelProblem
 from apex_ompl.diffusion.autoencoder import VariationalLatent
-from apex_ompl.diffusion.checkpoint import save_model
+from apex_ompl.diffusion.checkpoint_writer import save_model
 from apex_ompl.diffusion.conditions import Conditions
 from apex_ompl.diffusion.config import TrainingConfig
 from apex_ompl.diffusion.data import TrainingData
@@ -25,8 +25,9 @@ from apex_ompl.diffusion.distributed import DistributedProcess
 from apex_ompl.diffusion.initialization import initial_network
 from apex_ompl.diffusion.model import LatentDiffusion
 from apex_ompl.diffusion.objective import Objective
-from apex_ompl.diffusion.proposals import Sampling, TrajectoryModel
+from apex_ompl.diffusion.proposals import Sampling
 from apex_ompl.diffusion.runlog import RunLog
+from apex_ompl.diffusion.torch_model import TorchModel
 from apex_ompl.diffusion.training_state import EXPECTED, STATE, read_state, write_state
 from apex_ompl.diffusion.validation import success_rates
 from apex_ompl.errors import ApexError, FileFormatError
@@ -264,7 +265,7 @@ class Trainer:
             row["held_out"] = f"{float(held_out):.6f}"
         if self.phase == "denoiser" and self.problems and (self.step % self.config.validate_every == 0 or last):
             sampling = Sampling(**self.config.validation_sampling.model_dump())
-            model, count = TrajectoryModel(network, {}), self.config.proposals
+            model, count = TorchModel(network, {}), self.config.proposals
             rates = success_rates(model, self.problems, count, sampling=sampling)
             row |= {name: f"{rates.pop(name):.4f}" for name in ("sampled", "repaired")}
             row["levels"] = json.dumps({k: round(v, 3) for k, v in rates.items()})

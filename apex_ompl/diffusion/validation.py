@@ -7,11 +7,10 @@ from collections import defaultdict
 from collections.abc import Sequence
 
 import numpy as np
-import torch
 
 from apex_ompl.datasets.kernel_problems import KernelProblem
-from apex_ompl.diffusion.conditions import ObstacleSet, Query
 from apex_ompl.diffusion.proposals import Sampling, TrajectoryModel
+from apex_ompl.diffusion.query import ObstacleSet, Query
 from apex_ompl.kernel import Kernel
 from apex_ompl.trajopt.candidates import first_valid
 from apex_ompl.trajopt.optimizer import Optimizer
@@ -52,7 +51,7 @@ def success_rates(
             return kernel.proves(path, FINE_RESOLUTION)
 
         started = time.perf_counter()
-        generator = torch.Generator().manual_seed(seed)
+        generator = np.random.default_rng(seed)
         query = query_from_problem(problem)
         control = model.propose(query, kernel, count, sampling=sampling, generator=generator).control
         direct = any(is_valid(model.spline.path(points)) for points in control)

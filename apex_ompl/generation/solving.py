@@ -65,7 +65,7 @@ def _model(name: str, spline: Spline) -> TrajectoryModel:
     Raises:
         ApexError: There is no such model, or it is for another robot or spline.
     """
-    from apex_ompl.diffusion.checkpoint import load_model  # imports torch, which is needed with a model only
+    from apex_ompl.diffusion.checkpoint import load_model
 
     model = load_model(name, robot=robot().name)
     if model.spline != spline:
@@ -75,15 +75,12 @@ def _model(name: str, spline: Spline) -> TrajectoryModel:
 
 def _proposer(model: TrajectoryModel, finder: OmplPathFinder) -> Callable[[int, int], Array]:
     """Return a function from a count and a seed to a model's proposals for a problem."""
-    import torch
-
     from apex_ompl.apex.query import make_query
-    from apex_ompl.util.threads import one_torch_thread
 
     def propose(count: int, seed: int) -> Array:
         query = make_query(finder.setup.checker, finder.start, finder.goal, point=model.sees_point)
-        with one_torch_thread():
-            return model.propose(query, finder.kernel, count, generator=torch.Generator().manual_seed(seed)).control
+        with model.one_thread():
+            return model.propose(query, finder.kernel, count, generator=np.random.default_rng(seed)).control
 
     return propose
 

@@ -121,6 +121,8 @@ class IKSolver:
     def __init__(self, robot: RobotTables, targets: Sequence[Target], fixed: Sequence[int] | NDArray[np.intp] = ()):
         """Bring ``targets`` to zero together, but leave the planned joints whose numbers are ``fixed`` alone.
 
+        The numbers of those that are moved are in ``free``.
+
         Raises:
             ParameterError: There is no target, or one hangs on a joint that the robot does not have.
         """
@@ -148,9 +150,9 @@ class IKSolver:
                 k = int(arrays.joint_parent[k])
         self._chain = np.array(sorted(above), np.int64)
         moved = {int(arrays.joint_source[j]) for j in above} - {-1}
-        self._free = np.array(sorted(moved - {int(k) for k in fixed}), np.int64)
+        self.free = np.array(sorted(moved - {int(k) for k in fixed}), np.int64)
         self._workspace_sizes = workspace_sizes(arrays)
-        self._buffer_sizes = ik_buffer_sizes(robot.dof, len(self._free))
+        self._buffer_sizes = ik_buffer_sizes(robot.dof, len(self.free))
 
     def _memory(self, sizes: tuple[int, int]) -> tuple[Integers, Floats]:
         return np.empty(sizes[0], np.int64), np.empty(sizes[1])
@@ -193,7 +195,7 @@ class IKSolver:
             raise shape_error(ends, ("N", self.robot.dof), "states")
         errors, counts = np.empty(len(ends)), np.empty(len(ends), np.int64)
         descend(
-            *self.robot.packed, *self._memory(self._workspace_sizes), self._chain, self._free, *self._targets, ends,
+            *self.robot.packed, *self._memory(self._workspace_sizes), self._chain, self.free, *self._targets, ends,
             errors, counts, float(tolerance), int(max_steps), float(damping), *self._memory(self._buffer_sizes),
         )  # fmt: skip
         return IKDescents(ends, errors, counts)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,14 @@ class Kernel:
         self.scene = scene
         self.packed: tuple[Any, ...] = (*robot.packed, *scene.packed)
         self._workspace_sizes = workspace_sizes(robot.arrays)
+
+    def within(self, lower: Array, upper: Array) -> Kernel:
+        """Return the kernel with other position limits, each of shape (dof,); itself where they are the same."""
+        mine = self.robot.arrays
+        if np.array_equal(lower, mine.lower) and np.array_equal(upper, mine.upper):
+            return self
+        arrays = mine._replace(lower=np.array(lower, float), upper=np.array(upper, float))
+        return Kernel(replace(self.robot, arrays=arrays), self.scene)
 
     def workspace(self) -> tuple[NDArray[np.int64], Array]:
         """Return new buffers for one call, so that several threads may call."""

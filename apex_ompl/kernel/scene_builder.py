@@ -1,16 +1,21 @@
-"""Obstacles as flat arrays, under a tree of boxes."""
+"""Obstacles as flat arrays, under a tree of boxes that can be built in milliseconds and follows moved obstacles."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from apex_ompl.kernel.compiled.arrays import BOX, CAPSULE, HALF_SPACE, SPHERE, SceneArrays
-from apex_ompl.kernel.compiled.layout import Floats
+from apex_ompl.kernel.compiled.layout import Floats, Integers
 from apex_ompl.kernel.tables import SceneTables
+
+LEAF = 4  # obstacles in a leaf of the tree
+ROUNDING = 1e-9  # by which boxes are larger than their solids [m]
 
 
 class Primitive(NamedTuple):
@@ -28,52 +33,160 @@ class Primitive(NamedTuple):
     size: tuple[float, ...]
 
 
-LEAF = 4  # obstacles in a leaf of the tree
+class Solids(NamedTuple):
+    """Primitives as arrays: kind, shape (n,), rotation (n, 3, 3), offset and size (n, 3), box around each (n, 2, 3)."""
+
+    kind: Integers
+    rotation: Floats
+    offset: Floats
+    size: Floats
+    box: Floats
+
+    @classmethod
+    def of(cls, primitives: Sequence[Primitive]) -> Solids:
+        """Return primitives as arrays."""
+        rotation, offset, size = np.zeros((len(primitives), 3, 3)), *np.zeros((2, len(primitives), 3))
+        for k, p in enumerate(primitives):
+            if p.kind == HALF_SPACE:
+                rotation[k], offset[k], size[k, 0] = np.eye(3), p.size[:3], p.size[3]
+            else:
+                rotation[k], offset[k], size[k, : len(p.size)] = p.pose[:3, :3], p.pose[:3, 3], p.size
+        kind = np.array([p.kind for p in primitives], np.int64)
+        return cls(kind, rotation, offset, size, boxes_around(kind, rotation, offset, size))
+
+
+def boxes_around(kind: Integers, rotation: Floats, offset: Floats, size: Floats) -> Floats:
+    """Return the axis-aligned boxes around solids, shape (n, 2, 3) [m]; those of half-spaces hold nothing."""
+    along = np.abs(rotation[:, :, 2])
+    radius, half = size[:, :1], size[:, 1:2]
+    extents = along * half + radius * np.sqrt(np.maximum(0.0, 1.0 - along**2))  # of cylinders
+    kinds = kind[:, None]
+    extents = np.where(kinds == BOX, (np.abs(rotation) @ size[:, :, None])[:, :, 0], extents)
+    extents = np.where(kinds == SPHERE, radius, extents)
+    extents = np.where(kinds == CAPSULE, along * half + radius, extents) + ROUNDING
+    return np.stack([offset - extents, offset + extents], axis=1)
+
+
+class _Structure(NamedTuple):
+    """Shape of the tree over n solids, which depends on n alone.
+
+    Attributes:
+        skip: Next node outside of each node's subtree, nodes in depth-first order, shape (K,).
+        span: First solid below each node and the one behind the last, shape (K, 2).
+        members: Number of solids of each leaf, 0 for inner nodes, shape (K,).
+        levels: For each level but the last, the first solids of the parts that it is sorted in, and whether each part
+            is sorted.
+    """
+
+    skip: Integers
+    span: Integers
+    members: Integers
+    levels: tuple[tuple[Integers, NDArray[np.bool_]], ...]
+
+
+@lru_cache(maxsize=64)
+def _structure(n: int) -> _Structure:
+    skip, span, count = list[int](), list[tuple[int, int]](), list[int]()
+    levels: list[list[tuple[int, bool]]] = []
+
+    def grow(first: int, last: int, depth: int) -> None:
+        at, inner = len(skip), last - first > LEAF
+        skip.append(0)
+        span.append((first, last))
+        count.append(0 if inner else last - first)
+        if len(levels) <= depth:
+            levels.append([])
+        levels[depth].append((first, inner))
+        if inner:
+            middle = first + (last - first) // 2
+            grow(first, middle, depth + 1)
+            grow(middle, last, depth + 1)
+        skip[at] = len(skip)
+
+    if n:
+        grow(0, n, 0)
+    finished: list[int] = []
+    parts = []
+    for level in levels:
+        rows = sorted([*level, *((first, False) for first in finished)])
+        finished += [first for first, inner in level if not inner]
+        if any(inner for _, inner in rows):
+            parts.append((np.array([first for first, _ in rows]), np.array([inner for _, inner in rows])))
+    spans = np.array(span, np.int64).reshape(-1, 2)
+    return _Structure(np.array(skip, np.int64), spans, np.array(count, np.int64), tuple(parts))
 
 
 def scene_tables(solids: Sequence[tuple[int, Primitive]]) -> SceneTables:
-    """Return the arrays of obstacles, each with the number of what it stands for.
+    """Return the arrays of obstacles, each with the number of what it stands for."""
+    rows: dict[int, list[Primitive]] = {}
+    for owner, one in solids:
+        rows.setdefault(owner, []).append(one)
+    return tables_of({owner: Solids.of(some) for owner, some in rows.items()})
+
+
+def tables_of(solids: Mapping[int, Solids]) -> SceneTables:
+    """Return the arrays of obstacles by their number; nothing may touch them.
 
     The tree of boxes is split at the median along its longest side (a standard bounding volume hierarchy).
     """
-    closed = [(o, p) for o, p in solids if p.kind != HALF_SPACE]
-    open_ = [(o, p) for o, p in solids if p.kind == HALF_SPACE]
-    boxes = np.array([_box(p) for _, p in closed]).reshape(-1, 2, 3)
-    order: list[int] = []
-    tree: list[tuple[Floats, int, int, int]] = []  # box, skip, first, count
-
-    def grow(members: NDArray[np.intp]) -> None:
-        at = len(tree)
-        box = np.stack([boxes[members, 0].min(axis=0), boxes[members, 1].max(axis=0)])
-        tree.append((box, 0, len(order), 0))
-        if len(members) <= LEAF:
-            order.extend(int(k) for k in members)
-            tree[at] = (box, len(tree), len(order) - len(members), len(members))
-            return
-        middle = boxes[members].mean(axis=1)
-        ranked = members[np.argsort(middle[:, int(np.argmax(np.ptp(middle, axis=0)))], kind="stable")]
-        grow(ranked[: len(ranked) // 2])
-        grow(ranked[len(ranked) // 2 :])
-        tree[at] = (box, len(tree), 0, 0)
-
-    if closed:
-        grow(np.arange(len(closed)))
-    chosen = [closed[k] for k in order] + open_
-    rows = [_row(p) for _, p in chosen]
-    bounds = np.array([node[0] for node in tree]).reshape(-1, 2, 3)
+    counts = np.array([len(some.kind) for some in solids.values()], np.int64)
+    owner = np.repeat(np.fromiter(solids, np.int64, len(solids)), counts)
+    rank = np.concatenate([np.empty(0, np.int64), *(np.arange(n) for n in counts)])
+    rows = _joined(solids.values())
+    closed = np.flatnonzero(rows.kind != HALF_SPACE)
+    tree = _structure(len(closed))
+    middle = rows.box[closed].mean(axis=1)
+    order = np.arange(len(closed))
+    for starts, sorts in tree.levels:
+        ranked = middle[order]
+        spread = np.maximum.reduceat(ranked, starts) - np.minimum.reduceat(ranked, starts)
+        part = np.repeat(np.arange(len(starts)), np.diff(np.append(starts, len(order))))
+        key = np.where(sorts[part], ranked[np.arange(len(order)), spread.argmax(axis=1)[part]], 0.0)
+        order = order[np.lexsort((key, part))]
+    chosen = np.concatenate([closed[order], np.flatnonzero(rows.kind == HALF_SPACE)])
+    boxes = rows.box[chosen]
+    low, high = _boxes_of(tree, boxes[: len(closed)])
     arrays = SceneArrays(
-        kind=np.array([p.kind for _, p in chosen], np.int64),
-        owner=np.array([o for o, _ in chosen], np.int64),
-        tree_skip=np.array([node[1] for node in tree], np.int64),
-        tree_range=np.array([node[2:] for node in tree], np.int64).reshape(-1, 2),
-        open=np.array([len(open_)], np.int64),
-        rotation=np.array([r[0] for r in rows]).reshape(-1, 3, 3),
-        offset=np.array([r[1] for r in rows]).reshape(-1, 3),
-        size=np.array([r[2] for r in rows]).reshape(-1, 3),
-        tree_low=np.ascontiguousarray(bounds[:, 0]),
-        tree_high=np.ascontiguousarray(bounds[:, 1]),
+        kind=rows.kind[chosen],
+        owner=owner[chosen],
+        tree_skip=tree.skip,
+        tree_range=np.stack([np.where(tree.members, tree.span[:, 0], 0), tree.members], axis=1),
+        open=np.array([len(chosen) - len(closed)], np.int64),
+        allowed=np.empty((0, 2), np.int64),
+        rotation=rows.rotation[chosen],
+        offset=rows.offset[chosen],
+        size=rows.size[chosen],
+        tree_low=low,
+        tree_high=high,
     )
-    return SceneTables(arrays)
+    return SceneTables(arrays, boxes, rank[chosen])
+
+
+def moved(tables: SceneTables, owner: int, solids: Solids) -> SceneTables:
+    """Return tables of a scene in which the solids of one obstacle have other poses.
+
+    The tree keeps its order, and the boxes above the solids are made anew.
+
+    Args:
+        tables: The tables; they are left as they are.
+        owner: Number of the obstacle.
+        solids: Its solids, in the order of :func:`tables_of`.
+    """
+    arrays, boxes = tables.arrays, tables.boxes.copy()
+    places = np.flatnonzero(arrays.owner == owner)
+    mine = tables.rank[places]
+    rotation, offset, size = arrays.rotation.copy(), arrays.offset.copy(), arrays.size.copy()
+    rotation[places], offset[places], size[places] = solids.rotation[mine], solids.offset[mine], solids.size[mine]
+    boxes[places] = solids.box[mine]
+    low, high = arrays.tree_low.copy(), arrays.tree_high.copy()
+    tree = _structure(len(arrays.kind) - int(arrays.open[0]))
+    first, last = tree.span.T
+    behind = np.searchsorted(places, last)
+    for k in np.flatnonzero(np.searchsorted(places, first) < behind).tolist():
+        some = boxes[first[k] : last[k]]
+        low[k], high[k] = some[:, 0].min(axis=0), some[:, 1].max(axis=0)
+    arrays = arrays._replace(rotation=rotation, offset=offset, size=size, tree_low=low, tree_high=high)
+    return replace(tables, arrays=arrays, boxes=boxes)
 
 
 def primitive(arrays: SceneArrays, k: int) -> Primitive:
@@ -86,24 +199,16 @@ def primitive(arrays: SceneArrays, k: int) -> Primitive:
     return Primitive(kind, pose, tuple(arrays.size[k].tolist()))
 
 
-def _row(p: Primitive) -> tuple[Floats, Floats, Floats]:
-    if p.kind == HALF_SPACE:
-        return np.eye(3), np.array(p.size[:3]), np.array([p.size[3], 0.0, 0.0])
-    size = np.zeros(3)
-    size[: len(p.size)] = p.size
-    return p.pose[:3, :3], p.pose[:3, 3], size
+def _joined(parts: Iterable[Solids]) -> Solids:
+    rows = list(parts) or [Solids.of(())]
+    return Solids(*(np.concatenate(columns) for columns in zip(*rows, strict=True)))
 
 
-def _box(p: Primitive) -> Floats:
-    """Return the axis-aligned box around a solid, shape (2, 3)."""
-    turn, middle, size = _row(p)
-    if p.kind == BOX:
-        half = np.abs(turn) @ size
-    elif p.kind == SPHERE:
-        half = np.full(3, size[0])
-    elif p.kind == CAPSULE:
-        half = np.abs(turn[:, 2]) * size[1] + size[0]
-    else:
-        half = np.abs(turn[:, 2]) * size[1] + size[0] * np.sqrt(np.maximum(0.0, 1.0 - turn[:, 2] ** 2))
-    half = half + 1e-9  # rounding
-    return np.stack([middle - half, middle + half])
+def _boxes_of(tree: _Structure, boxes: Floats) -> tuple[Floats, Floats]:
+    """Return the lowest and highest corners of a tree's boxes, each of shape (K, 3) [m]."""
+    if not len(tree.skip):
+        return np.empty((0, 3)), np.empty((0, 3))
+    low = np.append(boxes[:, 0], np.full((1, 3), np.inf), axis=0)  # no solid is behind the last
+    high = np.append(boxes[:, 1], np.full((1, 3), -np.inf), axis=0)
+    ends = tree.span.ravel()
+    return np.minimum.reduceat(low, ends)[::2].copy(), np.maximum.reduceat(high, ends)[::2].copy()

@@ -26,7 +26,7 @@ def scene_fault(s: SceneArrays) -> str:
         name = field.name
         if array.dtype != field.dtype or array.shape[1:] != field.shape:
             return name
-        size = 1 if name == "open" else boxes if name.startswith("tree") else obstacles
+        size = boxes if name.startswith("tree") else {"open": 1, "allowed": len(s.allowed)}.get(name, obstacles)
         if len(array) != size or not np.isfinite(array).all():
             return name
     if obstacles and not BOX <= s.kind.min() <= s.kind.max() <= HALF_SPACE:

@@ -6,7 +6,7 @@ import io
 import json
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -44,7 +44,7 @@ class RobotTables:
         """Pack the arrays."""
         object.__setattr__(self, "packed", pack(self.arrays))
 
-    packed: tuple[Integers, Floats] = (np.empty(0, np.int64), np.empty(0))
+    packed: tuple[Integers, Floats] = field(init=False)
 
     @property
     def dof(self) -> int:
@@ -134,11 +134,11 @@ class RobotTables:
         found = head.get("schema") if isinstance(head, dict) else head
         if found != SCHEMA:
             raise FileFormatError(str(path), "schema", found, f"expected {SCHEMA!r}")
-        for field in layout(RobotArrays):
-            array = arrays[field.name]
-            if array.dtype != field.dtype or array.shape[1:] != field.shape:
-                expected = f"expected {np.dtype(field.dtype)} in rows of shape {field.shape}"
-                raise FileFormatError(str(path), field.name, f"{array.dtype} {array.shape}", expected)
+        for column in layout(RobotArrays):
+            array = arrays[column.name]
+            if array.dtype != column.dtype or array.shape[1:] != column.shape:
+                expected = f"expected {np.dtype(column.dtype)} in rows of shape {column.shape}"
+                raise FileFormatError(str(path), column.name, f"{array.dtype} {array.shape}", expected)
         fault = head_fault(head) or robot_fault(RobotArrays(**arrays), len(head["joints"]), len(head["bodies"]))
         if not fault and len(head["numbers"]) != len(head["bodies"]):
             fault = "numbers"
@@ -154,13 +154,17 @@ class SceneTables:
 
     Attributes:
         arrays: The arrays.
+        boxes: Axis-aligned box around each solid, shape (n, 2, 3) [m]; empty unless obstacles may be moved.
+        rank: Place of each solid among those of its obstacle, shape (n,); likewise.
         packed: The same as :func:`pack` returns them.
     """
 
     arrays: SceneArrays
+    boxes: Floats = field(default_factory=lambda: np.empty((0, 2, 3)))
+    rank: Integers = field(default_factory=lambda: np.empty(0, np.int64))
 
     def __post_init__(self) -> None:
         """Pack the arrays."""
         object.__setattr__(self, "packed", pack(self.arrays))
 
-    packed: tuple[Integers, Floats] = (np.empty(0, np.int64), np.empty(0))
+    packed: tuple[Integers, Floats] = field(init=False)

@@ -113,7 +113,7 @@ def check_timed_path(
     intervals = max(1, int(np.ceil(fastest * times[-1] / OBSTACLE_STEP)))
     bounds = np.linspace(0.0, times[-1], intervals + 1)
     scene = [inflated(o, OBSTACLE_STEP / 2.0) if o.moving else o for o in problem.scene]
-    checker = CollisionChecker(robot, scene, problem.attached)
+    checker = CollisionChecker(robot, scene, problem.attached, problem.allowed)
     for begin, end in zip(bounds[:-1], bounds[1:], strict=True):
         for mover in movers:
             checker.move(mover.name, obstacle_at(mover, (begin + end) / 2.0).position)

@@ -65,7 +65,7 @@ def _free_ends(problem: PlanningSetup, path: Array, segment: int) -> tuple[int, 
 
 def _bridge(problem: PlanningSetup, a: Array, b: Array, deadline: float, interrupt: Interrupt) -> Array | None:
     """Return a path between two free states whose motions are proved, or None."""
-    space = state_space(problem.robot)
+    space = state_space(problem.robot, bounds=problem.bounds)
     setup = og.SimpleSetup(space)
     si = setup.getSpaceInformation()
     validity_checker = StateValidityChecker(si, problem.checker)

@@ -2,24 +2,30 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from ompl import base as ob
 from ompl import geometric as og
 
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.shapes import mesh_note
-from apex_ompl.ompl_adapter.space import state_space, to_state
+from apex_ompl.ompl_adapter.space import Bounds, state_space, to_state
 from apex_ompl.ompl_adapter.validity import MotionCheck, MotionValidator, StateValidityChecker
 from apex_ompl.robot import Robot, load_robot
 from apex_ompl.scene.problem import Problem
 from apex_ompl.tasks.alignment import AlignmentGoal, alignment_goal
+from apex_ompl.tasks.goal_sampling import sample
+from apex_ompl.tasks.pose_goal import PoseGoal
 from apex_ompl.types import Array
 from apex_ompl.util.resolution import SEARCH_RESOLUTION
 
 GOAL_STATES = 8  # how many states an alignment goal is sampled into
 GOAL_ATTEMPTS = 200
+START_SLACK = 1e-3  # by which a joint may be outside its limits at the start [rad; synergies 0..1]
+HELD_WIDTH = 1e-9  # half width of the bounds of joints that stay, for splines that are evaluated with rounding [rad]
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,12 +41,14 @@ class PlanningSetup:
         validity_checker: OMPL's state validity checker.
         motion_validator: OMPL's motion validator.
         start: Start state, shape (dof,).
-        goals: Goal states, shape (goals, dof); for an alignment those that were sampled.
+        goals: Goal states, shape (goals, dof); for one in the workspace those that were sampled.
         start_fault: Why the start is invalid, or empty.
-        goal_faults: Why each goal is invalid, or empty; invalid ones are not given to OMPL unless all are. For an
-            alignment that was not reached, why.
+        goal_faults: Why each goal is invalid, or empty; invalid ones are not given to OMPL unless all are. For a goal
+            in the workspace that was not reached, why.
         alignment: The alignment goal, or None.
-        notes: Sentences on meshes that are no proper solids as they are, and how they are taken.
+        held: Numbers of the joints that stay as at the start.
+        notes: Sentences on joints of the start that were moved to their limits, and on meshes that are no proper solids
+            as they are, and how they are taken.
     """
 
     problem: Problem
@@ -55,6 +63,7 @@ class PlanningSetup:
     start_fault: str
     goal_faults: tuple[str, ...]
     alignment: AlignmentGoal | None
+    held: NDArray[np.intp]
     notes: tuple[str, ...]
 
     def raise_faults(self) -> None:
@@ -64,35 +73,50 @@ class PlanningSetup:
             raise fault
 
     @property
+    def bounds(self) -> Bounds:
+        """Bounds of the state space."""
+        return _bounds(self.robot, self.start, self.held)
+
+    @property
     def valid_goals(self) -> Array:
         """The goals that are inside the limits and free, shape (valid, dof)."""
         return self.goals[[not fault for fault in self.goal_faults[: len(self.goals)]]]
 
 
-def assemble(problem: Problem, robot: Robot | None = None, seed: int = 0) -> PlanningSetup:
+def assemble(
+    problem: Problem, robot: Robot | None = None, seed: int = 0, checker: CollisionChecker | None = None,
+    moving: Sequence[str] | None = None,
+) -> PlanningSetup:  # fmt: skip
     """Make a problem ready for OMPL.
 
     Args:
         problem: The problem; moving obstacles stand where they are at time 0.
         robot: Its robot, when it is loaded already.
         seed: Seed of the sampling of an alignment goal.
+        checker: Collision checker that has the bodies of the problem already.
+        moving: Names of the joints that are planned; the others stay as at the start. All by default.
 
     Raises:
         ApexError: The robot, a mesh or a joint of the problem is unknown or faulty.
     """
     robot = robot or load_robot(problem.robot)
-    start = problem.start_state(robot.joint_names)
+    start, start_notes = within_limits(robot, problem.start_state(robot.joint_names))
     goals = problem.goal_states(robot.joint_names)
-    alignment = alignment_goal(robot, problem)
-    checker = CollisionChecker(robot, problem.scene, problem.attached)
+    names = robot.joint_names
+    held = np.array([k for k, name in enumerate(names) if moving is not None and name not in moving], np.intp)
+    lower, upper = bounds = _bounds(robot, start, held)
+    limits = replace(robot.limits, lower=lower, upper=upper)
+    sampled = workspace_goal(replace(robot, limits=limits) if len(held) else robot, problem)
+    checker = checker or CollisionChecker(robot, problem.scene, problem.attached, problem.allowed)
     checker.prepare()
     start_fault = state_fault(checker, start)
-    goal_faults = tuple(state_fault(checker, goal) for goal in goals)
-    if alignment is not None and not start_fault:
-        sampling = alignment.sample(checker, np.random.default_rng(seed), GOAL_STATES, GOAL_ATTEMPTS)
+    goal_faults = tuple(_held_fault(robot, start, goal, held) or state_fault(checker, goal) for goal in goals)
+    if sampled is not None and not start_fault:
+        sampling = sample(sampled, checker, np.random.default_rng(seed), GOAL_STATES, GOAL_ATTEMPTS)
         goals = sampling.states
+        goals[:, held] = start[held]
         goal_faults = ("",) * len(goals) or (sampling.fault,)
-    space = state_space(robot)
+    space = state_space(robot, bounds=bounds)
     simple_setup = og.SimpleSetup(space)
     si = simple_setup.getSpaceInformation()
     check = MotionCheck(checker, SEARCH_RESOLUTION)
@@ -115,9 +139,56 @@ def assemble(problem: Problem, robot: Robot | None = None, seed: int = 0) -> Pla
         goals,
         start_fault,
         goal_faults,
-        alignment,
-        tuple(filter(None, map(mesh_note, (*problem.scene, *problem.attached)))),
+        sampled if isinstance(sampled, AlignmentGoal) else None,
+        held,
+        (*start_notes, *filter(None, map(mesh_note, (*problem.scene, *problem.attached)))),
     )
+
+
+def within_limits(robot: Robot, start: Array) -> tuple[Array, list[str]]:
+    """Return a start, shape (dof,), with joints that are a little outside their limits moved to them, and notes on it.
+
+    Encoders and controllers are off by some tenths of a milliradian; joints that are further out are left as they are.
+    """
+    inside = np.clip(start, robot.limits.lower, robot.limits.upper)
+    moved = np.flatnonzero((inside != start) & (np.abs(inside - start) <= START_SLACK))
+    notes = [
+        f"{robot.joint_names[k]} starts {abs(inside[k] - start[k]):.2g} outside its limits and is moved to "
+        f"{inside[k]:.6g}"
+        for k in moved
+    ]
+    start = start.copy()
+    start[moved] = inside[moved]
+    return start, notes
+
+
+def _bounds(robot: Robot, start: Array, held: NDArray[np.intp]) -> Bounds:
+    """Return the robot's limits, narrowed to the start for joints that stay."""
+    lower, upper = robot.limits.lower.copy(), robot.limits.upper.copy()
+    lower[held] = np.maximum(lower[held], start[held] - HELD_WIDTH)
+    upper[held] = np.minimum(upper[held], start[held] + HELD_WIDTH)
+    return lower, upper
+
+
+def _held_fault(robot: Robot, start: Array, goal: Array, held: NDArray[np.intp]) -> str:
+    """Return why a goal is out of reach of the joints that are planned, or nothing."""
+    for k in held:
+        if goal[k] != start[k]:
+            name = robot.joint_names[k]
+            return f"{name} = {goal[k]:.6g} at the goal, which is not in the group and stays at {start[k]:.6g}"
+    return ""
+
+
+def workspace_goal(robot: Robot, problem: Problem) -> AlignmentGoal | PoseGoal | None:
+    """Return the goal of a problem that is given in the workspace, or None where it is joint configurations.
+
+    Raises:
+        UnknownNameError: A held object, a link or a hand is unknown.
+        FileFormatError: An alignment does not fit the held objects.
+    """
+    if problem.goal.poses is not None:
+        return PoseGoal(robot, problem.goal.poses, problem.attached, problem.start_state(robot.joint_names))
+    return alignment_goal(robot, problem)
 
 
 def set_goals(simple_setup: og.SimpleSetup, goals: list[Array]) -> None:

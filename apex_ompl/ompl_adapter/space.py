@@ -17,24 +17,41 @@ from apex_ompl.robot import Robot
 from apex_ompl.types import Array
 from apex_ompl.util.resolution import SEARCH_RESOLUTION
 
+Bounds = tuple[Array, Array]
+"""Lowest and highest positions of the joints, each of shape (dof,) [rad; synergies 0..1]."""
 
-def state_space(robot: Robot, resolution: float = SEARCH_RESOLUTION) -> ob.RealVectorStateSpace:
+
+def state_space(
+    robot: Robot, resolution: float = SEARCH_RESOLUTION, bounds: Bounds | None = None
+) -> ob.RealVectorStateSpace:
     """Return the state space of a robot: one real dimension per planned joint, bounded by its limits.
 
     Args:
         robot: The robot.
         resolution: Longest step that OMPL's own interpolation leaves between states [rad].
+        bounds: Bounds inside the robot's limits, which are the default.
     """
+    lower, upper = bounds or (robot.limits.lower, robot.limits.upper)
     space = ob.RealVectorStateSpace(robot.dof)
-    bounds = ob.RealVectorBounds(robot.dof)
+    box = ob.RealVectorBounds(robot.dof)
     for k, name in enumerate(robot.joint_names):
-        bounds.setLow(k, float(robot.limits.lower[k]))
-        bounds.setHigh(k, float(robot.limits.upper[k]))
+        box.setLow(k, float(lower[k]))
+        box.setHigh(k, float(upper[k]))
         space.setDimensionName(k, name)
-    space.setBounds(bounds)
+    space.setBounds(box)
     space.setName(robot.name)
     space.setLongestValidSegmentFraction(resolution / space.getMaximumExtent())
     return space
+
+
+def bounds_of(si: ob.SpaceInformation, robot: Robot) -> Bounds:
+    """Return the bounds of a state space inside of the robot's limits; these where the space has none of its own."""
+    lower, upper = robot.limits.lower, robot.limits.upper
+    space = si.getStateSpace()
+    if not hasattr(space, "getBounds"):
+        return lower, upper
+    box = space.getBounds()
+    return np.maximum(lower, box.low), np.minimum(upper, box.high)
 
 
 def to_array(state: Any, dof: int) -> Array:

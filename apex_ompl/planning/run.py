@@ -10,6 +10,7 @@ from apex_ompl.ompl_adapter.interrupt import Interrupt
 from apex_ompl.ompl_adapter.report import SolveReport
 from apex_ompl.ompl_adapter.setup import PlanningSetup
 from apex_ompl.result import PlanResult, PlanStatus
+from apex_ompl.robot.identity import digest
 from apex_ompl.trajopt.path import Path
 from apex_ompl.types import Array
 from apex_ompl.util.deadline import Deadline
@@ -61,6 +62,8 @@ class PlanRun:
         result = PlanResult(
             status=status, reason=reason, problem=self.setup.problem, robot=robot.name, joint_names=robot.joint_names,
             planner=self.planner, seed=self.seed, path=path, solved_by=solved_by, notes=tuple(self.notes),
+            held_joints=tuple(robot.joint_names[k] for k in self.setup.held),
+            robot_digest=digest(robot),
         )  # fmt: skip
         if proof is None:
             return result

@@ -16,6 +16,7 @@ from apex_ompl.ompl_adapter.setup import PlanningSetup, set_goals
 from apex_ompl.ompl_adapter.simplify import simplify as shorten
 from apex_ompl.ompl_adapter.space import path_to_array
 from apex_ompl.ompl_adapter.validity import full_check
+from apex_ompl.planning.departure import remedy
 from apex_ompl.planning.run import PlanRun
 from apex_ompl.result import FIRST, INSIDE, PlanResult, PlanStatus
 from apex_ompl.trajopt.path import Path
@@ -46,7 +47,7 @@ def query_fault(run: PlanRun) -> PlanResult | None:
     """Return the result of a problem whose start is invalid, or all of whose goals are; else None."""
     setup = run.setup
     if setup.start_fault:
-        return run.result(PlanStatus.INVALID_START, setup.start_fault)
+        return run.result(PlanStatus.INVALID_START, setup.start_fault + remedy(setup))
     if all(setup.goal_faults):
         return run.result(PlanStatus.INVALID_GOAL, "; ".join(setup.goal_faults))
     return None
@@ -160,12 +161,25 @@ def verify(run: PlanRun, path: Path, simplify: bool, solved_by: str) -> PlanResu
 
 
 def with_exact_ends(setup: PlanningSetup, path: Path) -> Path:
-    """Return a path whose ends are the given start and the nearest goal, bit for bit."""
+    """Return a path whose ends are the given start and the nearest goal, bit for bit, as are joints that stay."""
+    path = _holding(setup, path)
     goals, states = setup.valid_goals, path.states
     goal = goals[int(np.argmin(np.linalg.norm(goals - states[-1], axis=1)))]
     if np.array_equal(states[0], setup.start) and np.array_equal(states[-1], goal):
         return path
     return Path(np.concatenate([setup.start[None], states[1:-1], goal[None]]))
+
+
+def _holding(setup: PlanningSetup, path: Path) -> Path:
+    """Return a path along which the joints that stay do so bit for bit; the search lets them off by its rounding."""
+    held, start = setup.held, setup.start
+    if not len(held):
+        return path
+    states, control = path.states.copy(), None if path.control is None else path.control.copy()
+    for array in (states, control):
+        if array is not None:
+            array[:, held] = start[held]
+    return Path(states, path.spline, control)
 
 
 def _set_up(run: PlanRun) -> ob.Planner:

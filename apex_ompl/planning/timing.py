@@ -34,7 +34,7 @@ def parameterize(run: PlanRun, result: PlanResult, timing: Timing) -> PlanResult
 
     def fault(motion: Trajectory) -> str:
         with timed(proof, "motion"):
-            shares = motion.use(timing.limits(limits))
+            shares = motion.use(timing.limits(limits, names))
             over = [f"{name} {share:.4f}" for name, share in shares.items() if share > 1.0 + ROUNDING]
             if over:
                 return f"the share of a limit that it uses is over 1: {', '.join(over)}"
@@ -57,7 +57,7 @@ def parameterize(run: PlanRun, result: PlanResult, timing: Timing) -> PlanResult
         run.times["timing proof"] = proof.get("motion", 0.0)
     motion = made.trajectory
     return replace(
-        result, trajectory=motion, limit_use=motion.use(limits), deviation=made.deviation,
+        result, trajectory=motion, limit_use=motion.use(limits), deviation=made.deviation, timing_method=made.method,
         motion_clearance=nan if found[-1].proof is None else found[-1].proof.clearance,
     )  # fmt: skip
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from itertools import combinations
 from pathlib import Path
 from xml.etree import ElementTree as ET
@@ -171,7 +172,7 @@ def robot_names() -> tuple[str, ...]:
 
 
 def load_robot(name_or_path: str | Path, relative_to: Path | None = None) -> Robot:
-    """Load a robot by name, or from a robot file.
+    """Load a robot by name, or from a robot file; one that ships is read once, since robots do not change.
 
     Args:
         name_or_path: A name out of :func:`robot_names`, or the path of a ``.yaml`` file.
@@ -185,11 +186,17 @@ def load_robot(name_or_path: str | Path, relative_to: Path | None = None) -> Rob
     """
     text = str(name_or_path)
     if text in robot_names():
-        path = DATA / f"{text}.robot.yaml"
-    elif text.endswith((".yaml", ".yml")):
+        return _shipped_robot(text)
+    if text.endswith((".yaml", ".yml")):
         path = resolve(text, relative_to or Path.cwd(), "robot file")
     else:
         raise UnknownNameError("robot", text, robot_names())
+    return build_robot(read_config(path), path)
+
+
+@cache
+def _shipped_robot(name: str) -> Robot:
+    path = DATA / f"{name}.robot.yaml"
     return build_robot(read_config(path), path)
 
 

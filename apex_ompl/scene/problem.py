@@ -15,13 +15,16 @@ import numpy as np
 from pydantic import BeforeValidator, Field, PositiveFloat, PrivateAttr, Strict, field_validator, model_validator
 
 from apex_ompl.errors import FileFormatError, nearest_name
-from apex_ompl.scene.bodies import AttachedObject, Name, Obstacle, Vector, located
+from apex_ompl.scene.bodies import AttachedObject, Name, Obstacle, Quaternion, Vector, located
 from apex_ompl.types import Array
 from apex_ompl.util.files import write_atomically
 from apex_ompl.util.schema import StrictModel, dump_yaml, read_yaml, validate
 
 SCHEMA = "apex-ompl/problem/1"
 
+
+GOALS = ("joints", "alignment", "poses")
+"""Kinds of goals."""
 
 JointValues = dict[str, Annotated[float, Strict()]]
 
@@ -94,8 +97,35 @@ class Alignment(StrictModel):
         return self
 
 
+class PoseTolerance(StrictModel):
+    """Tolerance of a pose: distance [m] and angle [rad]."""
+
+    position: PositiveFloat = 1e-3
+    angle: PositiveFloat = 1e-2
+
+
+class PoseTarget(StrictModel):
+    """A pose in the world that a frame of the robot is to reach.
+
+    Attributes:
+        frame: Name of a hand, whose frame is that of its palm with the grasp point as origin; of a link; or of a held
+            object, whose frame is its own, or its contact face with the outward axis as z where it has one.
+        position: Position of the frame's origin [m].
+        orientation: Orientation of the frame, a quaternion xyzw; any by default. Of a contact face its z axis counts.
+        tolerance: How far from it counts as reached.
+    """
+
+    frame: Name
+    position: Vector
+    orientation: Quaternion | None = None
+    tolerance: PoseTolerance = PoseTolerance()
+
+
 class Goal(StrictModel):
-    """A goal: one or several joint configurations of which one is to be reached, or an alignment of held objects."""
+    """A goal: joint configurations of which one is to be reached, an alignment of held objects, or poses.
+
+    Poses are reached all at once, by one frame each; joints that move none of the frames stay as they are at the start.
+    """
 
     joints: (
         Annotated[
@@ -106,12 +136,17 @@ class Goal(StrictModel):
         | None
     ) = None
     alignment: Alignment | None = None
+    poses: Annotated[tuple[PoseTarget, ...], Field(min_length=1)] | None = None
 
     @model_validator(mode="after")
     def _one_kind(self) -> Self:
-        if (self.joints is None) == (self.alignment is None):
-            found = "none" if self.joints is None else "both"
-            raise ValueError(f"expected exactly one of joints, alignment; found {found}")
+        given = [kind for kind in GOALS if getattr(self, kind) is not None]
+        if len(given) != 1:
+            raise ValueError(f"expected exactly one of {', '.join(GOALS)}; found {' and '.join(given) or 'none'}")
+        frames = [pose.frame for pose in self.poses or ()]
+        twice = sorted({name for name in frames if frames.count(name) > 1})
+        if twice:
+            raise ValueError(f"more than one pose is given for {twice[0]!r}")
         return self
 
 
@@ -123,6 +158,7 @@ class Problem(StrictModel):
         robot: Name of a robot that ships with the package, or path of a robot file.
         scene: Obstacles in the world frame, besides the robot's own fixtures.
         attached: Held objects.
+        allowed: Pairs of bodies that may touch and overlap: names of links, held objects, obstacles and fixtures.
         start: Joint name -> value of the start state.
         goal: The goal.
     """
@@ -132,10 +168,11 @@ class Problem(StrictModel):
     robot: str
     scene: tuple[Obstacle, ...] = ()
     attached: tuple[AttachedObject, ...] = ()
+    allowed: tuple[tuple[str, str], ...] = ()
     start: JointValues
     goal: Goal
 
-    @field_validator("scene", "attached", mode="before")
+    @field_validator("scene", "attached", "allowed", mode="before")
     @classmethod
     def _nothing_is_empty(cls, value: Any) -> Any:
         return () if value is None else value
@@ -175,7 +212,7 @@ class Problem(StrictModel):
         return _in_order(self.start, joint_names, self.source, "start")
 
     def goal_states(self, joint_names: Sequence[str]) -> Array:
-        """Return the goals in the order of ``joint_names``, shape (goals, dof); none for an alignment.
+        """Return the goals in the order of ``joint_names``, shape (goals, dof); none for other kinds of goals.
 
         Raises:
             FileFormatError: A joint is missing or unknown.

@@ -29,13 +29,12 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import FileFormatError, UnknownNameError
 from apex_ompl.kernel import Target, angle_target, offset_target, opposition_target
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import AttachedObject
 from apex_ompl.scene.problem import ALIGNMENT_DEFAULTS, Alignment, Problem, WorldVector
-from apex_ompl.tasks.alignment_errors import UP, AlignmentSamples, angle, lowest_direction, relative_error, within
+from apex_ompl.tasks.alignment_errors import UP, angle, lowest_direction, within
 from apex_ompl.tasks.inverse_kinematics import Links, in_world
 from apex_ompl.tasks.link_faces import LinkFace, lip_direction
 from apex_ompl.types import Array
@@ -183,40 +182,6 @@ class AlignmentGoal:
         limits = self.robot.limits
         ends: Array = self._inverse.descend(np.clip(q0, limits.lower, limits.upper)).states[0]
         return ends
-
-    def sample(
-        self, checker: CollisionChecker, rng: np.random.Generator, count: int = 8, max_attempts: int = 200
-    ) -> AlignmentSamples:
-        """Sample free states that satisfy the alignment, by inverse kinematics from random states.
-
-        Args:
-            checker: Checks the states for collision.
-            rng: Source of the initial states.
-            count: Number of states to find.
-            max_attempts: Largest number of attempts.
-        """
-        states: list[Array] = []
-        best: dict[str, float] = {}
-        converged = attempts = 0
-        colliding: Array | None = None
-        while attempts < max_attempts and len(states) < count:
-            attempts += 1
-            q = self.attempt(rng)
-            errors = self.errors(q)
-            if not best or relative_error(errors, self.bounds) < relative_error(best, self.bounds):
-                best = errors
-            if not within(errors, self.bounds):
-                continue
-            converged += 1
-            if checker.is_free(q):
-                states.append(q)
-            else:
-                colliding = q
-        found = np.array(states).reshape(-1, self.robot.dof)
-        blocked = ""
-        if colliding is not None and not states:
-            blocked = str(next(iter(checker.contacts(colliding)), "in collision"))
-        return AlignmentSamples(found, attempts, converged, best, blocked)
 
     def _hand_joints(self) -> NDArray[np.intp]:
         names = [h.synergy for h in self.robot.hands.values() if h.synergy is not None]

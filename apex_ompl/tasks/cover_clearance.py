@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apex_ompl.collision.shapes import world_geometry
-from apex_ompl.collision.tabulate import primitives, tabulate_scene
+from apex_ompl.collision.tabulate import primitives
 from apex_ompl.kernel import Kernel, RobotTables
+from apex_ompl.kernel.scene_builder import Solids, tables_of
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.types import Array
@@ -17,8 +18,8 @@ from apex_ompl.types import Array
 
 def scene_kernel(robot: Robot, tables: RobotTables, scene: Sequence[Obstacle]) -> Kernel:
     """Return the kernel for ``tables`` of a robot among its fixtures and obstacles; moving ones are at time 0."""
-    solids = {n: primitives(*world_geometry(body)) for n, body in enumerate((*robot.fixtures, *scene))}
-    return Kernel(tables, tabulate_scene(solids))
+    bodies = enumerate((*robot.fixtures, *scene))
+    return Kernel(tables, tables_of({n: Solids.of(primitives(*world_geometry(body))) for n, body in bodies}))
 
 
 def has_clearance(kernel: Kernel, states: Array, margin: float) -> NDArray[np.bool_]:

@@ -9,7 +9,7 @@ import coal
 import numpy as np
 import pinocchio as pin
 
-from apex_ompl.collision.broadphase import exact_requests
+from apex_ompl.collision.mesh_stage import exact_requests
 from apex_ompl.collision.shapes import coal_geometry
 from apex_ompl.errors import SceneError, UnknownNameError
 from apex_ompl.robot import Robot

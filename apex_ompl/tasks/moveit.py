@@ -24,6 +24,7 @@ from apex_ompl.robot.assets import resolve
 from apex_ompl.scene.bodies import AttachedObject, BodyT, Obstacle, pose_matrix
 from apex_ompl.scene.problem import Goal, Problem
 from apex_ompl.tasks.messages import MessageReader, inside
+from apex_ompl.tasks.moveit_allowed import MATRIX, allowed_pairs
 from apex_ompl.types import Array
 from apex_ompl.util.schema import read_yaml, validate
 
@@ -185,13 +186,16 @@ def convert(
     obstacles = _obstacles(at_scene, scene_data, q)
     attached = list(_attached(at_scene, scene_state, "robot_state", q))
     attached += list(_attached(at_request, start_state, "start_state", q))
+    bodies = [body.name for body in (*obstacles, *attached)]
+    allowed = allowed_pairs(at_scene, at_scene.section(scene_data, MATRIX), robot, bodies, frame_map or {}, notes)
     goals = _goals(at_request, request_data, start)
     for key in HARMLESS:
         if request_data.get(key):
             notes.append(f"{key}: not used")
     name = re.sub(r"[^A-Za-z0-9_.-]+", "_", scene.stem).strip("_.-") or "converted"
     fields = {
-        "name": name, "robot": robot.name, "scene": tuple(obstacles), "attached": tuple(attached), "start": start,
+        "name": name, "robot": robot.name, "scene": tuple(obstacles), "attached": tuple(attached),
+        "allowed": tuple(allowed), "start": start,
         "goal": Goal(joints=tuple(goals)),
     }  # fmt: skip
     problem = validate(Problem, fields, str(scene))

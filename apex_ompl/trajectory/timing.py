@@ -2,31 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+import itertools
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cache
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from apex_ompl.errors import ParameterError, TimingError, TimingStoppedError
+from apex_ompl.errors import ParameterError, TimingError, TimingStoppedError, UnknownNameError
 from apex_ompl.kernel.compiled.polyline_distance import max_distance
 from apex_ompl.kernel.compiled.time_parameterization import max_path_speeds, sample_times
 from apex_ompl.robot.model import Limits
 from apex_ompl.trajectory.curve import SAME_STATE, Polyline
 from apex_ompl.trajectory.deviation import deviation_bound
+from apex_ompl.trajectory.methods import DEFAULT_METHOD, METHODS
 from apex_ompl.trajectory.methods.ruckig import from_moving_start, stops
-from apex_ompl.trajectory.methods.spline import blended
 from apex_ompl.trajectory.trajectory import Trajectory
 from apex_ompl.trajopt.path import Path
 from apex_ompl.types import Array
-from apex_ompl.util.validation import check_array, check_number, check_states, finite_array
+from apex_ompl.util.validation import check_array, check_number, check_states, finite_array, is_number
 
 SHORTEST_DURATION = 1e-3  # of a motion between states that count as one [s]
+FALLBACK = "spline"  # where no blended motion of the method asked for is valid
 BLENDS = 6  # deviations that are tried, each half of the one before, until the motion stops at corners
 LIMIT_TOLERANCE = 1e-9  # that a path may be outside the position limits, by rounding [rad]
+LIMITS = ("velocity", "acceleration", "jerk")
 RANGES = {
-    **dict.fromkeys(("velocity_scale", "acceleration_scale", "jerk_scale"), (1e-3, 1.0)),
+    **{f"{limit}_scale": (1e-3, 1.0) for limit in LIMITS},
     "deviation": (1e-3, 10.0), "minimum_duration": (0.0, 3600.0),
 }  # fmt: skip
 
@@ -36,43 +39,80 @@ class Timing:
     """How a path is timed.
 
     Attributes:
+        method: ``ruckig`` or ``spline``, see ``apex_ompl.trajectory.methods``; straight lines, stops and moving starts
+            are by Ruckig with both.
         velocity_scale: Share of the velocity limits that is used, 0.001 to 1.
         acceleration_scale: Share of the acceleration limits.
         jerk_scale: Share of the jerk limits.
         deviation: Largest distance of the motion from the path, 0.001 to 10 [rad, Euclidean; synergies 0..1]; a motion
             from a moving start may leave it by more, as little as can be.
         minimum_duration: Least duration of the motion, up to 3600 [s].
+        max_velocity: Lower limits of velocity by joint name [rad/s]; the scale comes on top.
+        max_acceleration: Lower limits of acceleration, likewise [rad/s^2].
+        max_jerk: Lower limits of jerk, likewise [rad/s^3].
         start_velocity: Velocity at the start, one number a joint, or none for rest [rad/s].
         start_acceleration: Acceleration at the start, likewise [rad/s^2].
     """
 
+    method: str = DEFAULT_METHOD
     velocity_scale: float = 1.0
     acceleration_scale: float = 1.0
     jerk_scale: float = 1.0
     deviation: float = 0.05
     minimum_duration: float = 0.0
+    max_velocity: Mapping[str, float] = field(default_factory=dict)
+    max_acceleration: Mapping[str, float] = field(default_factory=dict)
+    max_jerk: Mapping[str, float] = field(default_factory=dict)
     start_velocity: Sequence[float] = ()
     start_acceleration: Sequence[float] = ()
 
     def __post_init__(self) -> None:
-        """Check the numbers.
+        """Check the name and the numbers.
 
         Raises:
-            ParameterError: One is out of its range.
+            UnknownNameError: No such method.
+            ParameterError: A number is out of its range.
         """
+        if self.method not in METHODS:
+            raise UnknownNameError("timing method", str(self.method), METHODS)
         for name, (low, high) in RANGES.items():
             check_number(getattr(self, name), name, low, high)
+        for limit in LIMITS:
+            for joint, value in _by_joint(self, limit).items():
+                if not (is_number(value) and 0.0 < value < np.inf):
+                    raise ParameterError(f"max_{limit}.{joint}", value, "a positive number")
         for name in ("start_velocity", "start_acceleration"):
             object.__setattr__(
                 self, name, tuple(np.atleast_1d(finite_array(getattr(self, name), name)).ravel().tolist())
             )
 
-    def limits(self, limits: Limits) -> Limits:
-        """Return the scaled limits."""
-        return replace(
-            limits, velocity=limits.velocity * self.velocity_scale,
-            acceleration=limits.acceleration * self.acceleration_scale, jerk=limits.jerk * self.jerk_scale,
-        )  # fmt: skip
+    def from_rest(self) -> Timing:
+        """Return the same without a velocity and an acceleration at the start."""
+        return replace(self, start_velocity=(), start_acceleration=())
+
+    def limits(self, limits: Limits, joint_names: Sequence[str]) -> Limits:
+        """Return the limits of a plan: the lower ones of single joints, scaled.
+
+        Args:
+            limits: The robot's limits, which are upper bounds.
+            joint_names: Names of the joints in their order.
+
+        Raises:
+            UnknownNameError: A joint has a limit and is none of these.
+            ParameterError: A limit is higher than the robot's.
+        """
+        scaled = {}
+        for limit in LIMITS:
+            values = np.array(getattr(limits, limit))
+            for joint, value in _by_joint(self, limit).items():
+                if joint not in joint_names:
+                    raise UnknownNameError("joint", joint, joint_names)
+                k = list(joint_names).index(joint)
+                if value > values[k]:
+                    raise ParameterError(f"max_{limit}.{joint}", value, f"at most {values[k]:g}, the robot's limit")
+                values[k] = value
+            scaled[limit] = values * getattr(self, f"{limit}_scale")
+        return replace(limits, **scaled)
 
     def start(self, limits: Limits) -> tuple[Array, Array] | None:
         """Return velocity and acceleration at the start, each of shape (dof,), or None for rest.
@@ -103,14 +143,16 @@ class TimedPath:
     Attributes:
         trajectory: The motion.
         deviation: Its largest distance from the path [rad].
-        method: ``blended``: along a curve that cuts corners, as fast as the limits allow; ``line``: along a straight
-            line by Ruckig; ``stops``: by Ruckig from corner to corner; with ``moving start`` before it where the motion
-            does not start at rest.
+        method: Name of the method that made it.
+        form: ``blended``: along a curve that cuts corners, as fast as the limits allow; ``line``: along a straight
+            line; ``stops``: from corner to corner; with ``moving start`` before it where the motion does not start at
+            rest.
     """
 
     trajectory: Trajectory
     deviation: float
     method: str
+    form: str
 
 
 def time_path(
@@ -120,9 +162,9 @@ def time_path(
     """Time a path.
 
     A straight line is followed by a jerk-limited profile of Ruckig's (:mod:`apex_ompl.trajectory.methods.ruckig`),
-    which is the fastest. Any other path is followed by a blended motion
-    (:mod:`apex_ompl.trajectory.methods.spline`). Where ``fault`` rejects a motion, half its deviation is tried, and at
-    last a motion that stops at every corner.
+    which is the fastest. Any other path is followed by a blended motion of the method in ``timing``. Where ``fault``
+    rejects a motion, half its deviation is tried; then splines, since Ruckig's motions may leave the position limits;
+    and at last a motion that stops at every corner.
 
     Args:
         path: Path, or states of shape (N, dof). The motion follows the straight lines between its states, also where
@@ -144,7 +186,7 @@ def time_path(
         raise ParameterError("timing", timing, "a Timing")
     states = finite_array(path.states if isinstance(path, Path) else path, "path")
     _check(states, limits, joint_names)
-    scaled = timing.limits(limits)
+    scaled = timing.limits(limits, joint_names)
     start = timing.start(scaled)
     reason, line = "", Polyline.through(states)
     for timed in _from_rest(line, scaled, tuple(joint_names), timing, stop):
@@ -158,6 +200,13 @@ def time_path(
     if stop():
         raise TimingStoppedError(reason or "no motion was found in time")
     raise TimingError(reason or "no motion from the velocity at the start stays within the limits")
+
+
+def _by_joint(timing: Timing, limit: str) -> Mapping[str, float]:
+    given = getattr(timing, f"max_{limit}")
+    if not isinstance(given, Mapping):
+        raise ParameterError(f"max_{limit}", given, "values by joint name")
+    return given
 
 
 def _check(states: Array, limits: Limits, joint_names: Sequence[str]) -> None:
@@ -179,19 +228,19 @@ def _from_rest(
     if stop():
         return
     if line.length <= SAME_STATE:
-        yield TimedPath(_at_rest(line.states, joint_names), 0.0, "line")
+        yield TimedPath(_at_rest(line.states, joint_names), 0.0, "ruckig", "line")
         return
     straight = len(line.corners().states) == 2
     if not straight:
-        for k in range(BLENDS):
-            motion = blended(line, limits, joint_names, timing.deviation / 2**k, stop)
+        for method, k in itertools.product(dict.fromkeys((timing.method, FALLBACK)), range(BLENDS)):
+            motion = METHODS[method](line, limits, joint_names, timing.deviation / 2**k, stop)
             if motion is not None:
-                yield TimedPath(*motion, "blended")
+                yield TimedPath(*motion, method, "blended")
             if stop():
                 return
     motion = stops(line, limits, joint_names, stop)
     if motion is not None:
-        yield TimedPath(*motion, "line" if straight else "stops")
+        yield TimedPath(*motion, "ruckig", "line" if straight else "stops")
 
 
 def _from_moving_start(
@@ -215,7 +264,7 @@ def _from_moving_start(
         arc_at = np.array([0.0, join_time]), np.zeros(2)  # it may be near any point of the path
         head_deviation = deviation_bound(motion, line, arc_at, line.length, timing.deviation, stop=stop)
         deviation = max(head_deviation, timed.deviation)
-        candidates.append(TimedPath(motion, deviation, f"moving start, {timed.method}"))
+        candidates.append(replace(timed, trajectory=motion, deviation=deviation, form=f"moving start, {timed.form}"))
     return sorted(candidates, key=lambda made: (max(made.deviation, timing.deviation), made.trajectory.duration))
 
 

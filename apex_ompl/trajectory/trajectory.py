@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from apex_ompl.errors import FileFormatError, ParameterError
 from apex_ompl.robot.model import Limits
+from apex_ompl.trajectory.extremes import Extremes
 from apex_ompl.trajectory.files import STATES, SUFFIXES, decode, encode
 from apex_ompl.trajectory.smoothness import spectral_arc_length
 from apex_ompl.types import Array
@@ -187,31 +188,17 @@ class Trajectory:
         if len(limits.velocity) != self.dof:
             raise ParameterError("limits", len(limits.velocity), f"those of {self.dof} joints")
         middle, half = (limits.upper + limits.lower) / 2.0, (limits.upper - limits.lower) / 2.0
+        low, high, velocity, acceleration, jerk = self._extremes
         return {
-            "position": float(np.abs((self._extrema(0) - middle) / half).max()),
-            "velocity": float(np.abs(self._extrema(1) / limits.velocity).max()),
-            "acceleration": float(np.abs(self.accelerations / limits.acceleration).max()),
-            "jerk": float(np.abs(self.jerks / limits.jerk).max(initial=0.0)),
+            "position": float((np.maximum(high - middle, middle - low) / half).max()),
+            "velocity": float((velocity / limits.velocity).max()),
+            "acceleration": float((acceleration / limits.acceleration).max()),
+            "jerk": float((jerk / limits.jerk).max()),
         }
 
-    def _extrema(self, order: int) -> Array:
-        """Return positions or velocities at the knots and at extrema between them, shape (n, dof)."""
-        v, a, j = self.velocities[:-1], self.accelerations[:-1], self.jerks
-        length = np.diff(self.times)[:, None]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            if order == 1:
-                roots = [-a / j]
-            else:
-                side = np.sqrt(a * a - 2.0 * j * v)
-                roots = [(-a + side) / j, (-a - side) / j, -v / a]
-        values = [self.positions if order == 0 else self.velocities]
-        for root in roots:
-            since = np.clip(np.nan_to_num(root, nan=0.0, posinf=0.0, neginf=0.0), 0.0, length)
-            if order == 1:
-                values.append(v + since * (a + since * j / 2.0))
-            else:
-                values.append(self.positions[:-1] + since * (v + since * (a / 2.0 + since * j / 6.0)))
-        return np.concatenate(values)
+    @cached_property
+    def _extremes(self) -> Extremes:
+        return Extremes.of(self.times, self.positions, self.velocities, self.accelerations, self.jerks)
 
     @property
     def jerk(self) -> float:
@@ -236,7 +223,10 @@ class Trajectory:
         """
         check_positive(factor, "factor", "a positive number")
         velocities, accelerations = self.velocities / factor, self.accelerations / factor**2
-        return Trajectory(self.times * factor, self.positions, velocities, accelerations, self.joint_names)
+        slow = Trajectory(self.times * factor, self.positions, velocities, accelerations, self.joint_names)
+        if "_extremes" in self.__dict__:
+            slow.__dict__["_extremes"] = self._extremes.slower(factor)
+        return slow
 
     def after(self, time: float) -> Trajectory:
         """Return the rest of the motion from a time on [s].

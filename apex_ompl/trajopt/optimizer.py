@@ -59,6 +59,9 @@ class OptimizationResult:
     damping: Array
 
 
+_prepared: set[Spline] = set()  # for which code is loaded
+
+
 class Optimizer:
     """Levenberg-Marquardt on control points of batches of paths; thread-safe, without random numbers of its own.
 
@@ -72,8 +75,10 @@ class Optimizer:
         self.settings = settings or OptimizerSettings()
 
     def prepare(self, kernel: Kernel) -> None:
-        """Load or compile now what the first steps need."""
-        self.improve(kernel, np.zeros((1, self.spline.points, kernel.robot.dof)), steps=0)
+        """Load or compile now what the first steps in a process need."""
+        if self.spline not in _prepared:
+            self.improve(kernel, np.zeros((1, self.spline.points, kernel.robot.dof)), steps=0)
+            _prepared.add(self.spline)
 
     def finer(self) -> Optimizer:
         """Return an optimiser with more samples."""

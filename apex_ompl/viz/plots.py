@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from apex_ompl.errors import ParameterError
 from apex_ompl.ompl_adapter.setup import assemble
 from apex_ompl.result import PlanResult
-from apex_ompl.robot import load_robot
+from apex_ompl.robot.identity import load_same_robot
 from apex_ompl.util.files import suffix_of, write_atomically
 
 FORMATS = (".png", ".pdf", ".svg")
@@ -41,7 +41,7 @@ def plot_motion(result: PlanResult, out: str | os.PathLike[str]) -> None:
     motion = result.trajectory
     if motion is None:
         raise ParameterError("result", str(result.status), "one with a timed motion")
-    robot = load_robot(result.robot)
+    robot = load_same_robot(result.problem.robot, result.robot_digest)
     checker, limits = assemble(result.problem, robot).checker, robot.limits
     centre, half_range = (limits.upper + limits.lower) / 2.0, (limits.upper - limits.lower) / 2.0
     if result.joint_names != robot.joint_names:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from apex_ompl.errors import ParameterError
 from apex_ompl.ompl_adapter.setup import assemble
 from apex_ompl.result import PlanResult
+from apex_ompl.robot.identity import load_same_robot
 from apex_ompl.scene.problem import Problem
 from apex_ompl.trajopt.path import resample
 from apex_ompl.types import Array
@@ -73,7 +74,11 @@ def _problem_picture(problem: Problem, out: Path, size: tuple[int, int], azimuth
 
 def _film(result: PlanResult, path: Array, suffix: str, size: tuple[int, int], azimuth: float) -> bytes:
     """Return a film of the motion, or of the path at an even pace when there are no times; the last frame is held."""
-    renderer = SceneRenderer(assemble(result.problem), (3 * size[0] // 4, 3 * size[1] // 4), azimuth)
+    renderer = SceneRenderer(
+        assemble(result.problem, load_same_robot(result.problem.robot, result.robot_digest)),
+        (3 * size[0] // 4, 3 * size[1] // 4),
+        azimuth,
+    )
     motion = result.trajectory
     if motion is None:
         states = resample(path, FRAMES)
@@ -85,7 +90,11 @@ def _film(result: PlanResult, path: Array, suffix: str, size: tuple[int, int], a
 
 def _strip(result: PlanResult, path: Array, size: tuple[int, int], azimuth: float) -> bytes:
     """Return a .png of states along the path, in reading order."""
-    renderer = SceneRenderer(assemble(result.problem), (size[0] // 2, size[1] // 2), azimuth)
+    renderer = SceneRenderer(
+        assemble(result.problem, load_same_robot(result.problem.robot, result.robot_digest)),
+        (size[0] // 2, size[1] // 2),
+        azimuth,
+    )
     columns, rows = STRIP
     frames = [renderer.screenshot(q) for q in resample(path, columns * rows)]
     grid = [np.concatenate(frames[k * columns : (k + 1) * columns], axis=1) for k in range(rows)]

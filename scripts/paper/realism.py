@@ -19,7 +19,7 @@ from apex_ompl.datasets.engine import EngineOptions
 from apex_ompl.datasets.records import SOURCES, Paths
 from apex_ompl.datasets.store import Store
 from apex_ompl.diffusion.autoencoder import Autoencoder
-from apex_ompl.diffusion.checkpoint import load_model
+from apex_ompl.diffusion.checkpoint import load_model, load_torch_model
 from apex_ompl.diffusion.guidance import Guidance
 from apex_ompl.diffusion.proposals import Sampling
 from apex_ompl.generation.solving import solve_unit
@@ -93,7 +93,7 @@ def made_for(
 
 def propose(part: Sequence[tuple[str, Array]], seed: int) -> dict[str, tuple[list[Array], float]]:
     """Return the paths of each variant for some problems, from their ends, and the CPU time that they took [s]."""
-    generator = torch.Generator().manual_seed(seed)
+    generator = np.random.default_rng(seed)
     torch.set_num_threads(1)
     sampled = variants()
     made: dict[str, list[Array]] = {label: [] for label in sampled}
@@ -121,7 +121,10 @@ def first_of_each(paths: Paths) -> list[int]:
 
 def feature_spaces() -> dict[str, Callable[[Sequence[Array]], Array]]:
     """Return functions from paths to their features: in the latent space of apex-paper, and in principal components."""
-    spaces = {"VAE": load("apex-paper").network.autoencoder, "PCA": load("apex").network.autoencoder}
+    spaces = {
+        "VAE": load_torch_model("apex-paper").network.autoencoder,
+        "PCA": load_torch_model("apex").network.autoencoder,
+    }
     return {name: partial(features, space=space) for name, space in spaces.items()}
 
 

@@ -10,7 +10,7 @@ from ompl import base as ob
 
 from apex_ompl.apex.context import SolveContext
 from apex_ompl.apex.stages.proposals import BATCH, PROPOSED, RESAMPLED
-from apex_ompl.diffusion.conditions import Query
+from apex_ompl.diffusion.query import Query
 from apex_ompl.trajopt.candidates import STEPS_PER_PATH, Candidate
 from apex_ompl.types import Array
 

@@ -79,7 +79,7 @@ class SceneArrays(NamedTuple):
     half edges, or radius and half length; a half-space has its unit normal in ``offset`` and its distance in ``size``.
     Nodes of the tree are in depth-first order: ``tree_skip`` is the next node outside of a node's subtree,
     ``tree_range`` first obstacle and number of them (0 for inner nodes). The last ``open`` (1,) obstacles are
-    half-spaces, which no box holds.
+    half-spaces, which no box holds. ``allowed`` are pairs of a body and an owner that may touch.
     """
 
     kind: Integers
@@ -87,6 +87,7 @@ class SceneArrays(NamedTuple):
     tree_skip: Integers
     tree_range: Spans
     open: Integers
+    allowed: Pairs
     rotation: Rotations
     offset: Vectors
     size: Vectors

@@ -13,7 +13,7 @@ from apex_ompl.kernel.compiled.arrays import FIXED, REVOLUTE, RobotArrays, Scene
 from apex_ompl.kernel.compiled.compilation import inlined
 from apex_ompl.kernel.compiled.kinematics import node_position, place_cluster
 from apex_ompl.kernel.compiled.layout import Floats
-from apex_ompl.kernel.compiled.scene_tree import next_obstacles
+from apex_ompl.kernel.compiled.scene_tree import is_allowed, next_obstacles
 from apex_ompl.kernel.compiled.signed_distance import direction, distance
 from apex_ompl.kernel.compiled.workspace import Workspace
 
@@ -31,7 +31,7 @@ def nearest_to_obstacle(
     place_cluster(t, w, q, c)
     first = t.cluster_bodies[c, 0]
     for b in range(first, first + t.cluster_bodies[c, 1]):
-        j, top = t.body_joint[b], 1
+        j, top = t.body_joint[b], 0 if is_allowed(s, b, o) else 1
         w.stack[0] = t.body_root[b]
         while top > 0:
             top -= 1

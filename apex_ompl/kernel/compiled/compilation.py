@@ -24,15 +24,20 @@ from typing import Any, TypeVar
 import numba
 from llvmlite import binding as llvm
 from numba.core import config
+from numba.core.sigutils import normalize_signature
+
+from apex_ompl.kernel.compiled.linking import InnerCompiler
 
 F = TypeVar("F", bound=Callable[..., Any])
 
 LOG = logging.getLogger("apex_ompl")
-TYPICAL_SECONDS = 75
 
 # Without numba's runtime (_nrt) references to arrays are not counted, which would take most of the time; in return
 # compiled code may allocate nothing.
-OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "_nrt": False}
+OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "_nrt": False, "no_cfunc_wrapper": True}
+
+# Functions that only compiled ones call need no code that unpacks Python's arguments, which takes long to compile.
+INNER: dict[str, Any] = {**OPTIONS, "no_cpython_wrapper": True, "pipeline_class": InnerCompiler}
 
 _lock = threading.RLock()
 
@@ -64,15 +69,22 @@ def cache_folder() -> Path | None:
     return None
 
 
+def names_in_cache() -> set[str]:
+    """Return the names of the functions of which there is code in the cache."""
+    folder = cache_folder()
+    indices = folder.rglob("*.nbi") if folder else ()
+    return {path.name.split(".")[1].rsplit("-", 1)[0] for path in indices}
+
+
 def inlined(function: F) -> F:
     """Compile a function that only other compiled ones call; LLVM inlines it."""
-    compiled: F = numba.njit(**OPTIONS, forceinline=True)(function)
+    compiled: F = numba.njit(**INNER, forceinline=True)(function)
     return compiled
 
 
 def outlined(function: F) -> F:
     """Compile a function that only other compiled ones call, once for all of them."""
-    compiled: F = numba.njit(**OPTIONS)(function)
+    compiled: F = numba.njit(**INNER)(function)
     return compiled
 
 
@@ -81,56 +93,83 @@ def ir_inlined(function: F) -> F:
 
     Without numba's runtime no array can be returned from a function that is left standing.
     """
-    compiled: F = numba.njit(**OPTIONS, inline="always")(function)
+    compiled: F = numba.njit(**INNER, inline="always")(function)
     return compiled
 
 
-def entry_point(function: Callable[..., Any]) -> Callable[..., Any]:
+def entry_point(function: Callable[..., Any]) -> CompiledFunction:
     """Compile a function that Python calls; its code is cached on disk, and its first compilation is announced.
 
     Calls release the global interpreter lock, and run on the calling thread alone.
     """
+    return _entry_point(function)
+
+
+def reassociating_entry_point(function: Callable[..., Any]) -> CompiledFunction:
+    """Compile a function as :func:`entry_point` does, in which sums may be taken in any order, several at a time."""
+    return _entry_point(function, fastmath={"reassoc", "contract"})
+
+
+def _entry_point(function: Callable[..., Any], **options: Any) -> CompiledFunction:
     folder = cache_folder()
     with _lock:
         before, config.CACHE_DIR = config.CACHE_DIR, str(folder or "")
         try:
-            dispatcher = numba.njit(**OPTIONS, cache=folder is not None)(function)
+            dispatcher = numba.njit(**OPTIONS, cache=folder is not None, **options)(function)
         finally:
             config.CACHE_DIR = before
-    return _Announced(dispatcher, function.__name__)
+    return CompiledFunction(dispatcher, function.__name__)
 
 
-class _Announced:
-    """A compiled function whose first call warns that it compiles, unless an earlier process left its code."""
+class CompiledFunction:
+    """A compiled function whose first call warns that it compiles, unless an earlier process left its code.
+
+    Attributes:
+        name: Its name.
+        dispatcher: numba's dispatcher.
+    """
 
     _announced = False
 
     def __init__(self, dispatcher: Any, name: str) -> None:
+        """Wrap a dispatcher."""
         self.dispatcher = dispatcher
         self.name = name
         self.__wrapped__ = dispatcher.py_func
         self.__doc__ = dispatcher.py_func.__doc__
         self._ready = False
 
+    @property
+    def is_cached(self) -> bool:
+        """Whether there is code of it in the cache."""
+        return self.name in names_in_cache()
+
+    def compile(self, types: str) -> None:
+        """Compile the function into the cache for arguments of the given types, without a warning."""
+        with _lock:
+            self.dispatcher.compile(normalize_signature(f"({types},)")[0])  # the cache takes a text for another key
+            self._ready = True
+
     def __call__(self, *arguments: Any) -> Any:
+        """Call the function, compiled for the types of the arguments."""
         if self._ready:
             return self.dispatcher(*arguments)
         with _lock:
-            folder = cache_folder()
-            if folder is None or not any(folder.rglob(f"*.{self.name}-*.nbi")):
-                self._announce(folder)
+            if self.is_cached:
+                result = self.dispatcher(*arguments)
+            else:
+                self._announce()
                 start = time.perf_counter()
                 result = self.dispatcher(*arguments)
                 LOG.warning("apex_ompl compiled %s in %.1f s", self.name, time.perf_counter() - start)
-            else:
-                result = self.dispatcher(*arguments)
             self._ready = True
         return result
 
     @staticmethod
-    def _announce(folder: Path | None) -> None:
-        if _Announced._announced:
+    def _announce() -> None:
+        if CompiledFunction._announced:
             return
-        _Announced._announced = True
+        CompiledFunction._announced = True
+        folder = cache_folder()
         where = f"kept in {folder}" if folder else "in every process anew, since no cache folder can be written"
-        LOG.warning("apex_ompl compiles its collision kernel (about %d s, %s)", TYPICAL_SECONDS, where)
+        LOG.warning("apex_ompl compiles functions of its collision kernel (%s)", where)

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from apex_ompl.kernel.compiled.compilation import ir_inlined
 
 Floats = NDArray[np.float64]
+Singles = NDArray[np.float32]
 Integers = NDArray[np.int64]
 
 

@@ -35,3 +35,12 @@ def next_obstacles(s: SceneArrays, x: float, y: float, z: float, radius: float, 
         if count > 0:
             return k, first, first + count
     return nodes + 1, obstacles - (s.open[0] if k == nodes else 0), obstacles
+
+
+@inlined
+def is_allowed(s: SceneArrays, body: int, obstacle: int) -> bool:
+    """Whether a body may touch an obstacle."""
+    for k in range(len(s.allowed)):
+        if s.allowed[k, 0] == body and s.allowed[k, 1] == s.owner[obstacle]:
+            return True
+    return False

@@ -14,7 +14,7 @@ from apex_ompl.kernel.compiled.compilation import inlined
 from apex_ompl.kernel.compiled.kinematics import node_position, place_cluster, place_robot
 from apex_ompl.kernel.compiled.layout import Floats, Integers
 from apex_ompl.kernel.compiled.motion_bound import cluster_displacement, relative_displacement
-from apex_ompl.kernel.compiled.scene_tree import next_obstacles
+from apex_ompl.kernel.compiled.scene_tree import is_allowed, next_obstacles
 from apex_ompl.kernel.compiled.signed_distance import distance
 from apex_ompl.kernel.compiled.workspace import Workspace
 
@@ -80,7 +80,7 @@ def cluster_against(
     for b in range(first, first + t.cluster_bodies[c, 1]):
         if distance(s, o, w.root[b, 0], w.root[b, 1], w.root[b, 2]) > t.node_radius[t.body_root[b]] + shift:
             continue
-        if not body_clear(t, s, w, b, o, shift):
+        if not body_clear(t, s, w, b, o, shift) and not is_allowed(s, b, o):
             found[count, 0], found[count, 1] = b, -1 - s.owner[o]
             count += 1
             if count == len(found):

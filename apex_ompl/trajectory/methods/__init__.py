@@ -1,5 +1,18 @@
-"""Methods of time parameterization: from a polyline to a trajectory within joint limits.
+"""Methods of time parameterization by name: from a polyline to a trajectory within joint limits.
 
-Each takes the polyline, the limits and the joint names first, and returns the trajectory and its largest distance from
-the polyline [rad]; ``spline`` is told which distance is allowed, ``ruckig`` follows the polyline.
+Each takes the polyline, the limits, the joint names, the allowed distance from the polyline [rad] and a function that
+is asked whether to give up, and returns the trajectory and a bound on its distance from the polyline [rad], or None.
 """
+
+from __future__ import annotations
+
+from types import MappingProxyType
+
+from apex_ompl.trajectory.methods import ruckig, spline
+
+METHODS = MappingProxyType({"ruckig": ruckig.blended, "spline": spline.blended})
+"""Methods by name."""
+
+DEFAULT_METHOD = "ruckig"
+
+__all__ = ["DEFAULT_METHOD", "METHODS"]

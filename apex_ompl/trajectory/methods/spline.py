@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -25,10 +26,36 @@ SAME_DURATION = 1.0005  # ratio of durations below which the motion with fewer k
 NANOSECOND = 1e-9
 
 
+class Blend(NamedTuple):
+    """Motion along a curve that rounds the corners of a polyline.
+
+    Attributes:
+        trajectory: The motion.
+        deviation: A bound on its distance from the polyline [rad].
+        arc_at: Times of its knots, shape (K,) [s], and the arc lengths along the polyline that it reaches at them,
+            shape (K,) [rad]; for :func:`apex_ompl.trajectory.deviation.deviation_bound`.
+        window: Largest distance along the polyline from there to the nearest point [rad].
+    """
+
+    trajectory: Trajectory
+    deviation: float
+    arc_at: tuple[Array, Array]
+    window: float
+
+
 def blended(
     line: Polyline, limits: Limits, joint_names: tuple[str, ...], deviation: float,
     stop: Callable[[], bool] = lambda: False,
 ) -> tuple[Trajectory, float] | None:  # fmt: skip
+    """Return the motion of :func:`blend` and the bound on its distance from the polyline [rad], or None."""
+    found = blend(line, limits, joint_names, deviation, stop)
+    return None if found is None else (found.trajectory, found.deviation)
+
+
+def blend(
+    line: Polyline, limits: Limits, joint_names: tuple[str, ...], deviation: float,
+    stop: Callable[[], bool] = lambda: False,
+) -> Blend | None:  # fmt: skip
     """Return the fastest motion along a curve that rounds the corners of a polyline.
 
     1. A uniform cubic B-spline q(s) along the polyline rounds its corners (:class:`apex_ompl.trajectory.curve.Curve`).
@@ -47,8 +74,7 @@ def blended(
         stop: Asked before every knot spacing whether to give up.
 
     Returns:
-        The motion and a bound on its distance from the polyline [rad], or None where none keeps ``deviation``, or when
-        told to stop meanwhile.
+        The motion, or None where none keeps ``deviation``, or when told to stop meanwhile.
     """
     if line.length > MAX_SPANS * CONTROL_POINT_SPACING * deviation:
         return None
@@ -77,7 +103,7 @@ def blended(
             control = np.concatenate([points[:1], points[:1], points, points[-1:], points[-1:]])
             tried[index] = (least_knot_spacing(control, limits), control, arc)
         least, control, _ = tried[index]
-        return float(least * (len(control) - 3))
+        return least * (len(control) - 3) if least > 0.0 else math.inf  # 0 at the ends of a closed path
 
     best = FIRST_SPACING
     while (
@@ -91,13 +117,15 @@ def blended(
             return None
         duration_with(index)
         spacing, control, arc = tried[index]
+        if spacing == 0.0:
+            continue
         motion = spline_in_time(control, spacing, joint_names)
         low, high = line.states.min(axis=0), line.states.max(axis=0)  # the spline is inside, except for rounding
         motion = replace(motion, positions=motion.positions.clip(low, high))
         arc = np.concatenate([[0.0], arc, [line.length]])
         bound = deviation_bound(motion, line, (motion.times, arc), window, deviation, stop=stop)
         if bound <= deviation:
-            return motion, bound
+            return Blend(motion, bound, (motion.times, arc), window)
     return None
 
 

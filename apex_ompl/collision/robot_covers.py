@@ -1,0 +1,49 @@
+"""Sphere covers of the solids of a robot and of what it holds: from its file, or rough ones made when needed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import coal
+
+from apex_ompl.collision.cover.proof import Cover
+from apex_ompl.collision.cover.rough import rough_cover
+from apex_ompl.collision.cover.spheres import make_cover, read_covers, shape_key
+from apex_ompl.collision.shapes import is_shell
+from apex_ompl.robot import Robot
+
+QUICK_GAPS, LEAVES = (0.02, 0.005), 32  # of covers made at run time
+SLENDER = 0.05  # cylinders thinner or flatter than this are covered like boxes
+
+_quick: dict[str, Cover] = {}  # by shape key
+
+
+def covers_of(robot: Robot, shapes: Sequence[coal.CollisionGeometry]) -> list[Cover]:
+    """Return a cover of each shape: one from the robot's file, or a rough one made now.
+
+    Covers in files are not checked here: ``scripts/make_covers.py`` writes only proved covers, and the tests prove
+    again those that ship.
+
+    Raises:
+        MissingFileError: The robot names a file of covers that cannot be read.
+        FileFormatError: That file does not follow its schema.
+    """
+    given = read_covers(robot.covers) if robot.covers is not None else {}
+    found = []
+    for shape in shapes:
+        key = shape_key(shape)
+        if key not in given and key not in _quick:
+            _quick[key] = _quick_cover(shape)
+        found.append(given[key] if key in given else _quick[key])
+    return found
+
+
+def _quick_cover(shape: coal.CollisionGeometry) -> Cover:
+    kind = shape.getNodeType()
+    if is_shell(shape) or kind == coal.GEOM_BOX:
+        return rough_cover(shape)
+    if kind == coal.GEOM_CYLINDER:
+        sizes = sorted((float(shape.radius), float(shape.halfLength)))
+        if sizes[0] < SLENDER * sizes[1]:
+            return rough_cover(coal.Box(2.0 * shape.radius, 2.0 * shape.radius, 2.0 * shape.halfLength))
+    return make_cover(shape, QUICK_GAPS, effort=1, most=LEAVES)

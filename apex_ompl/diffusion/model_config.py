@@ -1,0 +1,124 @@
+"""Configuration of a latent diffusion model: all but its weights."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from apex_ompl.util.schema import StrictModel
+
+Count = Annotated[int, Field(ge=1)]
+Size = Annotated[int, Field(ge=1, le=16_384)]  # of layers and inputs; larger ones would exhaust the memory
+
+
+class SplineConfig(StrictModel):
+    """The spline of the control points, see ``apex_ompl.trajopt.spline.Spline``."""
+
+    points: Size = 14
+    pinned: Size = 1
+    states: Size = 256
+    degree: Size = 5
+
+
+class LatentConfig(StrictModel):
+    """The latent space.
+
+    Attributes:
+        kind: ``linear`` for whitened principal components of the free control points, ``variational`` for a network
+            over all states.
+        dim: Number of components of the linear latent space.
+        channels: Channels of the variational latent space.
+        width: Channels of its hidden layers.
+        halvings: Number of its layers that halve the length.
+    """
+
+    kind: Literal["linear", "variational"] = "linear"
+    dim: Size = 64
+    channels: Size = 8
+    width: Annotated[Size, Field(ge=8, multiple_of=8)] = 64
+    halvings: Annotated[int, Field(ge=1, le=6)] = 4
+
+
+class ConditionConfig(StrictModel):
+    """Encoder of conditions, see ``apex_ompl.diffusion.encoders.ConditionEncoder``.
+
+    Attributes:
+        scene: ``none``, ``set`` or ``distances``.
+        point: Whether the obstacle point of the paper is an input.
+        width: Width of the hidden layers.
+        out: Size of the encoded condition.
+        along: Number of states of the straight line at which the probe points are placed.
+    """
+
+    scene: Literal["none", "set", "distances"] = "distances"
+    point: bool = False
+    width: Size = 256
+    out: Size = 512
+    along: Annotated[Size, Field(ge=2)] = 7
+
+
+class DenoiserConfig(StrictModel):
+    """Denoising network.
+
+    Attributes:
+        kind: ``mlp``, ``unet``, or ``regression``: the MLP, evaluated once to predict the latent vector itself.
+        width: Width of the MLP, or channels of the U-Net's first resolution.
+        blocks: Blocks of the MLP.
+        multipliers: Channels of the U-Net's resolutions, in widths.
+    """
+
+    kind: Literal["mlp", "unet", "regression"] = "mlp"
+    width: Annotated[Size, Field(ge=8, multiple_of=8)] = 768
+    blocks: Size = 4
+    multipliers: Annotated[tuple[Size, ...], Field(min_length=1, max_length=5)] = (1, 2, 4)
+
+
+class NoiseConfig(StrictModel):
+    """Diffusion process, see ``apex_ompl.diffusion.schedule.NoiseSchedule``.
+
+    Attributes:
+        steps: Number of steps T.
+        schedule: ``cosine`` or ``linear``.
+        prediction: Quantity that the network predicts: ``noise``, ``velocity`` or ``clean``.
+        most: Number of standard deviations at which clean samples are clipped; not at all by default, as paths among
+            many obstacles have large components.
+    """
+
+    steps: Size = 256
+    schedule: Literal["cosine", "linear"] = "cosine"
+    prediction: Literal["noise", "velocity", "clean"] = "velocity"
+    most: Annotated[float, Field(gt=0)] | None = None
+
+
+class SamplingConfig(StrictModel):
+    """Default sampling of the model, see ``apex_ompl.diffusion.proposals.Sampling``."""
+
+    sampler: Literal["ddpm", "ddim", "dpm_solver"] = "ddim"
+    steps: Size = 2
+
+
+class ModelConfig(StrictModel):
+    """Configuration of a model: all but its weights.
+
+    Attributes:
+        robot: Name of the robot.
+        joints: Its planned joints in state order.
+        probes: Number of probe points on the robot.
+        spline: Spline of the control points.
+        latent: Latent space.
+        condition: Encoder of conditions.
+        denoiser: Denoising network.
+        noise: Diffusion process.
+        sampling: Default sampling.
+    """
+
+    robot: str
+    joints: Annotated[tuple[str, ...], Field(min_length=1)]
+    probes: Size
+    spline: SplineConfig = SplineConfig()
+    latent: LatentConfig = LatentConfig()
+    condition: ConditionConfig = ConditionConfig()
+    denoiser: DenoiserConfig = DenoiserConfig()
+    noise: NoiseConfig = NoiseConfig()
+    sampling: SamplingConfig = SamplingConfig()

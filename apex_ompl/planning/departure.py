@@ -1,0 +1,154 @@
+"""Starts that touch something: the way out of a contact along growing clearance, before the plan proper.
+
+Real robots report states in which a hand rests on a table or an object on a shelf, by fractions of a millimetre inside
+of the model. A plan may begin there where the caller allows it (``leave_contact``): a short straight motion leads out
+of the contact, and what follows is planned and proved as ever.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apex_ompl.collision import CollisionChecker
+from apex_ompl.ompl_adapter.setup import PlanningSetup, state_fault
+from apex_ompl.result import PlanResult
+from apex_ompl.trajectory import Timing, time_path
+from apex_ompl.trajectory.trajectory import concatenate
+from apex_ompl.trajopt.path import Path
+from apex_ompl.types import Array
+
+LARGEST_DEPTH = 1e-3  # of contacts that the refusal of a start names ``leave_contact`` for [m]
+FREE = 1e-4  # clearance at which a way out may end [m]
+REACH = 0.15  # longest way out [rad, max-norm]
+STEP = 1e-3  # spacing of the states that are checked on it [rad, max-norm]
+ROUNDING = 1e-7  # by which distances of contacts are uncertain [m]
+DIRECTIONS = 64  # tried at random where the gradient leads nowhere
+DIFFERENCE = 1e-4  # of the finite differences [rad]
+
+
+@dataclass(frozen=True, eq=False)
+class Departure:
+    """A straight way out of a contact.
+
+    Attributes:
+        start: The start, shape (dof,).
+        end: First state of the plan that follows, shape (dof,).
+        depth: Depth of the deepest contact at the start [m].
+        contact: Names of the two bodies of that contact.
+        states: Number of states that were checked between.
+    """
+
+    start: Array
+    end: Array
+    depth: float
+    contact: tuple[str, str]
+    states: int
+
+    @property
+    def note(self) -> str:
+        """What a user should know."""
+        first, second = self.contact
+        length = float(np.abs(self.end - self.start).max())
+        return (
+            f"{first} and {second} touch at the start, {1e3 * self.depth:.2f} mm deep; the first {length:.4f} rad lead "
+            f"out of it along growing clearance, which {self.states} states show, and only the rest is proved"
+        )
+
+
+def find_departure(setup: PlanningSetup, most: float, seed: int = 0) -> Departure | None:
+    """Return a way out of the contacts at the start, or None where they are deeper than ``most`` or no way is found.
+
+    The clearance, of the nearest pair, does not fall along the way by more than rounding; its end is free. The
+    direction is the gradient of the clearance, or one of a few drawn at random that climb.
+
+    Args:
+        setup: A problem whose start is invalid.
+        most: Largest depth of a contact [m].
+        seed: Seed of the directions.
+    """
+    checker, start = setup.checker, setup.start
+    if checker.robot.limit_fault(start):
+        return None
+    contacts, depth = checker.contacts(start), -checker.clearance(start)
+    if depth > most + ROUNDING or any(contact.depth > most + ROUNDING for contact in contacts):
+        return None
+    names = (contacts[0].first, contacts[0].second) if contacts else nearest_pair(checker, start)
+    rng, free = np.random.default_rng(seed), np.setdiff1d(np.arange(len(start)), setup.held)
+    drawn = np.zeros((DIRECTIONS, len(start)))
+    drawn[:, free] = rng.normal(size=(DIRECTIONS, len(free)))
+    uphill = _gradient(checker, start, free)
+    drawn *= np.where(drawn @ uphill < 0.0, -1.0, 1.0)[:, None]
+    for direction in (uphill, *drawn):
+        size = np.abs(direction).max()
+        if size > 0.0:
+            found = _climbed(setup, direction / size)
+            if found is not None:
+                end, states = found
+                return Departure(start, end, max(depth, 0.0), names, states)
+    return None
+
+
+def remedy(setup: PlanningSetup) -> str:
+    """Return what to do about a start that touches something a little, or nothing."""
+    checker, start = setup.checker, setup.start
+    if checker.robot.limit_fault(start) or checker.clearance(start) < -LARGEST_DEPTH:
+        return ""
+    return f"; leave_contact={LARGEST_DEPTH:g} [m] lets a plan leave contacts up to that depth"
+
+
+def with_departure(result: PlanResult, setup: PlanningSetup, departure: Departure, timing: Timing | None) -> PlanResult:
+    """Return the result of a plan from the end of a departure as one from its start; both motions end at rest.
+
+    Args:
+        result: Result of the plan that follows.
+        setup: The problem as it was given.
+        departure: The way to the start of that plan.
+        timing: How motions are timed.
+    """
+    notes = (*result.notes, departure.note)
+    result = replace(result, problem=setup.problem, notes=notes)
+    if result.path is None:
+        return result
+    path = Path(np.concatenate([departure.start[None], result.path.states]))
+    if result.trajectory is None or timing is None:
+        return replace(result, path=path)
+    limits, names = setup.robot.limits, setup.robot.joint_names
+    line = Path(np.stack([departure.start, departure.end]))
+    first = time_path(line, limits, names, replace(timing, minimum_duration=0.0)).trajectory
+    motion = concatenate([first, result.trajectory])
+    return replace(result, path=path, trajectory=motion, limit_use=motion.use(limits))
+
+
+def nearest_pair(checker: CollisionChecker, q: Array) -> tuple[str, str]:
+    """Return the names of the pair of bodies that is nearest at a state, shape (dof,)."""
+    pair: tuple[str, str] = checker.prove(q[None], tolerance=0.0).pair
+    return pair
+
+
+def _gradient(checker: CollisionChecker, q: Array, free: NDArray[np.integer]) -> Array:
+    """Return the gradient of the clearance by finite differences, shape (dof,) [m/rad]; 0 for joints that stay."""
+    found, limits = np.zeros(len(q)), checker.robot.limits
+    for k in free:
+        low, high = q.copy(), q.copy()
+        low[k], high[k] = max(q[k] - DIFFERENCE, limits.lower[k]), min(q[k] + DIFFERENCE, limits.upper[k])
+        if high[k] > low[k]:
+            found[k] = (checker.clearance(high) - checker.clearance(low)) / (high[k] - low[k])
+    return found
+
+
+def _climbed(setup: PlanningSetup, direction: Array) -> tuple[Array, int] | None:
+    """Return the first free state along a direction, and the number of states on the way, or None if there is none."""
+    checker, limits = setup.checker, setup.robot.limits
+    before = checker.clearance(setup.start)
+    for k in range(1, int(REACH / STEP) + 1):
+        q = np.clip(setup.start + k * STEP * direction, limits.lower, limits.upper)
+        clearance = checker.clearance(q)
+        if clearance < before - ROUNDING or (k > 1 and clearance <= before):
+            return None
+        if clearance >= FREE and not state_fault(checker, q):
+            return q, k
+        before = clearance
+    return None

@@ -1,0 +1,47 @@
+"""Identity of robots: whether the robot that a file describes is the one that a result was made with."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from pathlib import Path
+from weakref import WeakKeyDictionary
+
+from apex_ompl.errors import RobotError
+from apex_ompl.robot.model import Robot, load_robot
+
+FILE_NAME = re.compile(r'filename="([^"]*)"')
+
+_digests: WeakKeyDictionary[Robot, str] = WeakKeyDictionary()
+
+
+def digest(robot: Robot) -> str:
+    """Return a digest of what plans depend on: kinematics, meshes, limits, checked pairs and fixtures."""
+    if robot not in _digests:
+        found = hashlib.sha256(FILE_NAME.sub(lambda match: Path(match[1]).name, robot.urdf).encode())
+        for file in sorted(set(FILE_NAME.findall(robot.urdf)), key=lambda file: Path(file).name):
+            path = Path(file.removeprefix("file://"))
+            found.update(path.read_bytes() if path.is_file() else file.encode())
+        pairs = [(pair.first, pair.second) for pair in robot.geometry.collisionPairs]
+        found.update(repr((robot.name, robot.joint_names, pairs, robot.fixtures)).encode())
+        for array in vars(robot.limits).values():
+            found.update(array.tobytes())
+        _digests[robot] = found.hexdigest()[:16]
+    return _digests[robot]
+
+
+def load_same_robot(name_or_path: str, wanted: str) -> Robot:
+    """Load the robot of a result.
+
+    Args:
+        name_or_path: Its name, or its file.
+        wanted: The digest that it had; empty for results that have none.
+
+    Raises:
+        RobotError: It is another one by now.
+        ApexError: It cannot be loaded.
+    """
+    robot = load_robot(name_or_path)
+    if wanted and digest(robot) != wanted:
+        raise RobotError(f"the robot {name_or_path!r} is no longer the one that the result was made with")
+    return robot

@@ -1,0 +1,254 @@
+"""A planner that is kept: a robot, a model and a world that stay ready between plans."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Self
+
+from ompl import geometric as og
+
+from apex_ompl import planners
+from apex_ompl.collision import CollisionChecker
+from apex_ompl.collision.conservative import CheckCounts
+from apex_ompl.collision.mesh_stage import Contact
+from apex_ompl.errors import ParameterError
+from apex_ompl.ompl_adapter.interrupt import Interrupt
+from apex_ompl.ompl_adapter.process import quiet_ompl, seed_ompl
+from apex_ompl.ompl_adapter.setup import PlanningSetup, assemble, state_fault
+from apex_ompl.planners.apex_parameters import WITHOUT_MODEL, default_planner
+from apex_ompl.planning import PlanRun, find_path, finish, parameterize
+from apex_ompl.planning.departure import LARGEST_DEPTH, find_departure, with_departure
+from apex_ompl.planning.query import Group, State, Target, goal_record, joint_values, planned_joints, state_array
+from apex_ompl.result import PlanResult
+from apex_ompl.robot import Robot, load_robot
+from apex_ompl.scene.problem import Problem
+from apex_ompl.session.world import World
+from apex_ompl.trajectory import Timing, warm_up
+from apex_ompl.util.deadline import Deadline
+from apex_ompl.util.validation import check_number, check_positive, check_seed
+
+
+@dataclass(frozen=True)
+class StateCheck:
+    """Outcome of :meth:`MotionPlanner.check`; true for a state that is inside the limits and free.
+
+    Attributes:
+        reason: Why it is neither, in one sentence; empty for a valid state.
+        clearance: Distance of the nearest pair of bodies that is checked [m], the negative depth where they overlap.
+        contacts: Pairs that overlap, the deepest first.
+    """
+
+    reason: str
+    clearance: float
+    contacts: tuple[Contact, ...]
+
+    def __bool__(self) -> bool:
+        """Whether the state is valid."""
+        return not self.reason
+
+
+class MotionPlanner:
+    """A robot in a world, ready to plan again and again.
+
+    What takes time is done once: the robot is built, its tables and those of the world are made, the model and the
+    compiled code are loaded. The world is edited in place (:class:`apex_ompl.world.World`), as a planning scene of
+    MoveIt's. A planner may be used by several threads; plans, checks and edits of one planner wait for each other, so
+    that a plan holds for the world in which it began. Two planners work at the same time.
+
+        with apex_ompl.MotionPlanner() as planner:
+            planner.world.add(name="post", box=(0.1, 0.1, 0.6), position=(0.5, 0.0, 0.3))
+            result = planner.plan(planner.robot.home, goal)
+    """
+
+    def __init__(self, robot: str | Path | Robot = "dual_panda_softhand", model: str | None = None) -> None:
+        """Make a planner in an empty world.
+
+        Args:
+            robot: Name of a robot that ships, path of a robot file, or a robot.
+            model: Name or folder of the checkpoint that ``apex`` uses; by default its own.
+
+        Raises:
+            ApexError: The robot is unknown, or one of its files is faulty.
+        """
+        self.robot = robot if isinstance(robot, Robot) else load_robot(robot)
+        self.robot_file = self.robot.name if isinstance(robot, Robot) else str(robot)
+        self.model = model
+        self._lock = threading.RLock()
+        self._checker = CollisionChecker(self.robot)
+        self.world = World(self._checker, self._lock)
+
+    def __enter__(self) -> Self:
+        """Return the planner."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Empty the world."""
+        self.world.clear()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what another process needs to make the same planner."""
+        obstacles, held = tuple(self.world.obstacles.values()), tuple(self.world.held.values())
+        return {
+            "robot": self.robot_file, "model": self.model, "obstacles": obstacles, "held": held,
+            "allowed": self.world.allowed,
+        }  # fmt: skip
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Make the planner anew."""
+        self.__init__(state["robot"], state["model"])  # type: ignore[misc]
+        self.world.add(*state["obstacles"])
+        for held in state["held"]:
+            self.world.attach(held)
+        for pair in state["allowed"]:
+            self.world.allow(*pair)
+
+    def plan(
+        self, start: State, goal: Target, planner: str | None = None, *,
+        group: Group | None = None, name: str = "world", **options: Any,
+    ) -> PlanResult:  # fmt: skip
+        """Plan in the world as it is now.
+
+        Args:
+            start: The start.
+            goal: The goal.
+            planner: Name of a planner; see :func:`apex_ompl.plan`.
+            group: Joints that are planned, by names of groups and joints; the others stay as at the start, and a goal
+                by joint names may leave them out. All by default.
+            name: Name of the problem in the result.
+            **options: As of :func:`apex_ompl.plan`: ``timeout``, ``seed``, ``simplify``, ``params``, ``snapshot``,
+                ``timing``, ``leave_contact``.
+
+        Raises:
+            ApexError: The start, the goal, the planner or a parameter is faulty.
+            KeyboardInterrupt: Ctrl-C was pressed; planning ended in good order first.
+        """
+        started = time.perf_counter()
+        with self._lock:
+            return self._plan(self.problem(start, goal, name, group), planner, started, group=group, **options)
+
+    def plan_problem(self, problem: Problem, planner: str | None = None, **options: Any) -> PlanResult:
+        """Put the bodies of a problem into the world in place of those that are there, and plan.
+
+        Args:
+            problem: A problem of this robot.
+            planner: Name of a planner.
+            **options: As of :meth:`plan`, ``group`` among them.
+
+        Raises:
+            ApexError: The problem, the planner or a parameter is faulty.
+        """
+        started = time.perf_counter()
+        with self._lock:
+            self.world.load(problem)
+            return self._plan(problem, planner, started, **options)
+
+    def problem(self, start: State, goal: Target, name: str = "world", group: Group | None = None) -> Problem:
+        """Return the problem of going from a start to a goal in the world as it is now.
+
+        Args:
+            start: The start.
+            goal: The goal.
+            name: Name of the problem.
+            group: Joints that are planned; values of the others are added to a goal by joint names.
+
+        Raises:
+            ParameterError: A state has not the robot's joints.
+            UnknownNameError: There is no such group.
+        """
+        begin = joint_values(self.robot, start, "start")
+        moving = self.robot.joint_names if group is None else planned_joints(self.robot, group)
+        wanted = goal_record(self.robot, goal, {joint: v for joint, v in begin.items() if joint not in moving})
+        with self._lock:
+            return Problem(
+                name=name, robot=self.robot_file, scene=tuple(self.world.obstacles.values()),
+                attached=tuple(self.world.held.values()), allowed=self.world.allowed, start=begin, goal=wanted,
+            )  # fmt: skip
+
+    def check(self, state: State) -> StateCheck:
+        """Check a state in the world as it is now.
+
+        Raises:
+            ParameterError: The state has not the robot's joints.
+        """
+        q = state_array(self.robot, state, "state")
+        with self._lock:
+            contacts = tuple(self._checker.contacts(q))
+            return StateCheck(state_fault(self._checker, q), self._checker.clearance(q), contacts)
+
+    def simple_setup(self, start: State, goal: Target) -> og.SimpleSetup:
+        """Return OMPL's SimpleSetup in the world as it is now, for planners and tools of OMPL's own.
+
+        Edits of the world change what its checkers say.
+
+        Raises:
+            ApexError: The start or the goal is faulty.
+        """
+        ready = self._ready(self.problem(start, goal))
+        ready.simple_setup.setPlannerAllocator(planners.allocator(default_planner(self.robot.name)))
+        return ready.simple_setup
+
+    def _ready(self, problem: Problem, seed: int = 0, moving: Sequence[str] | None = None) -> PlanningSetup:
+        return assemble(problem, self.robot, seed=seed, checker=self._checker, moving=moving)
+
+    def _plan(
+        self, problem: Problem, planner: str | None, started: float, *, timeout: float = 5.0, seed: int = 0,
+        simplify: bool = True, params: Mapping[str, Any] | None = None, snapshot: bool = False,
+        timing: bool | Timing = True, group: Group | None = None, leave_contact: float = 0.0,
+    ) -> PlanResult:  # fmt: skip
+        check_arguments(timeout, seed)
+        check_number(leave_contact, "leave_contact", 0.0, LARGEST_DEPTH)
+        if not isinstance(timing, (bool, Timing)):
+            raise ParameterError("timing", timing, "True, False or a Timing")
+        how = (Timing() if timing else None) if isinstance(timing, bool) else timing
+        if problem.moving and not snapshot:
+            expected = f"True, since the obstacle {problem.moving[0]!r} moves and plans hold for one moment only"
+            raise ParameterError("snapshot", snapshot, expected)
+        with quiet_ompl():
+            seed_ompl(seed)
+            notes = [f"snapshot: {', '.join(problem.moving)} taken to stand still"] if problem.moving else []
+            if planner is None:
+                planner = default_planner(self.robot.name)
+                if planner == WITHOUT_MODEL:
+                    notes.append(f"no model of {self.robot.name} ships, so {planner} plans")
+            parameters = planners.parameters(planner, **self._parameters(planner, params))
+            if how is not None:
+                how.start(how.limits(self.robot.limits, self.robot.joint_names))  # whether it fits the robot
+            self._checker.check_counts = CheckCounts()
+            moving = None if group is None else planned_joints(self.robot, group)
+            given = ready = self._ready(problem, seed, moving)
+            departure = find_departure(ready, leave_contact, seed) if leave_contact and ready.start_fault else None
+            if departure is not None:
+                begin = dict(zip(self.robot.joint_names, departure.end.tolist(), strict=True))
+                ready = self._ready(problem.model_copy(update={"start": begin}), seed, moving)
+            notes += given.notes
+            if how is not None:
+                warm_up()
+            times = {"setup": time.perf_counter() - started}
+            run = PlanRun(ready, planner, parameters, seed, Deadline(timeout), times, notes)
+            with Interrupt() as run.interrupt:
+                result = find_path(run, simplify)
+                if how is not None:
+                    result = parameterize(run, result, how if departure is None else how.from_rest())
+            if departure is not None:
+                result = with_departure(result, given, departure, how)
+            return finish(run, result, started)
+
+    def _parameters(self, planner: str, params: Mapping[str, Any] | None) -> dict[str, Any]:
+        given = dict(params or {})
+        if self.model is not None and hasattr(planners.parameters(planner), "model"):
+            given.setdefault("model", self.model)
+        return given
+
+
+def check_arguments(timeout: float, seed: int) -> None:
+    """Check what every plan needs.
+
+    Raises:
+        ParameterError: ``timeout`` is not a positive number of seconds, or ``seed`` not a whole number from 0.
+    """
+    check_positive(timeout, "timeout", "a positive number of seconds")
+    check_seed(seed)

@@ -1,0 +1,239 @@
+"""The world of a kept planner: obstacles and held objects, edited in place."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import ArrayLike
+
+from apex_ompl.collision import CollisionChecker
+from apex_ompl.errors import SceneError
+from apex_ompl.scene.bodies import AttachedObject, Obstacle
+from apex_ompl.scene.problem import Problem
+from apex_ompl.types import Array
+from apex_ompl.util.schema import validate
+
+
+class World:
+    """Obstacles around a robot and objects that it holds.
+
+    Edits change the collision checker in place. They are safe from any thread: an edit waits until a plan of the same
+    planner has ended. An edit that fails changes nothing.
+    """
+
+    def __init__(self, checker: CollisionChecker, lock: threading.RLock) -> None:
+        """Edit the scene of ``checker`` while ``lock`` is held."""
+        self._checker = checker
+        self._lock = lock
+
+    @property
+    def obstacles(self) -> Mapping[str, Obstacle]:
+        """Obstacles by name, without the robot's own fixtures."""
+        return MappingProxyType(self._checker.obstacles)
+
+    @property
+    def held(self) -> Mapping[str, AttachedObject]:
+        """Held objects by name."""
+        return MappingProxyType(self._checker.held)
+
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Keep other threads from planning and from editing, so that several edits are one."""
+        with self._lock:
+            yield
+
+    def add(self, *obstacles: Obstacle | Mapping[str, Any], **fields: Any) -> None:
+        """Add obstacles, given as records, as the entries of a problem file, or one by its fields.
+
+            world.add(name="post", box=(0.1, 0.1, 0.6), position=(0.5, 0.0, 0.3))
+
+        Raises:
+            FileFormatError: A field is unknown or faulty, or a mesh file holds no solid.
+            MissingFileError: A mesh file is missing.
+            SceneError: A name is taken already.
+        """
+        wanted = [self._read(Obstacle, one, "obstacle") for one in (*obstacles, *([fields] if fields else []))]
+        with self._lock:
+            self._add(wanted)
+
+    def move(self, name: str, position: Sequence[float], orientation: Sequence[float] | None = None) -> None:
+        """Move an obstacle to a pose in the world [m, quaternion xyzw]; the orientation is kept by default.
+
+        Raises:
+            SceneError: There is no such obstacle.
+            FileFormatError: The position or the orientation is not valid.
+        """
+        with self._lock:
+            self._not_a_fixture(name)
+            self._checker.move(name, position, orientation)
+
+    def set_velocity(self, name: str, velocity: Sequence[float] | None) -> None:
+        """Give an obstacle a constant velocity [m/s], or none.
+
+        Raises:
+            SceneError: There is no such obstacle.
+            FileFormatError: The velocity is not valid.
+        """
+        with self._lock:
+            self._not_a_fixture(name)
+            self._checker.set_velocity(name, velocity)
+
+    def remove(self, name: str) -> None:
+        """Remove an obstacle.
+
+        Raises:
+            SceneError: There is no such obstacle, or it is a fixture of the robot.
+        """
+        with self._lock:
+            self._not_a_fixture(name)
+            self._checker.remove(name)
+
+    def attach(
+        self, held: AttachedObject | Mapping[str, Any] | str, link: str | None = None,
+        touch_links: Sequence[str] | None = None, *, at: ArrayLike | None = None,
+    ) -> None:  # fmt: skip
+        """Attach an object to a link; it then collides like a part of the robot.
+
+        Args:
+            held: The object, as a record or as the entry of a problem file; or the name of an obstacle, which is taken
+                where it stands.
+            link: Link that holds it; must be given for an obstacle.
+            touch_links: Links that it may touch; by default those of the hand.
+            at: State at which it is taken, shape (dof,); must be given for an obstacle. The object must not overlap
+                anything there.
+
+        Raises:
+            SceneError: The name is taken, there is no such obstacle, or the object overlaps something.
+            UnknownNameError: An unknown link.
+            FileFormatError: A field is unknown or faulty.
+        """
+        with self._lock:
+            taken = None
+            if isinstance(held, str):
+                if link is None or at is None:
+                    raise SceneError(
+                        f"to attach the obstacle {held!r}, give the link and the state at which it is taken"
+                    )
+                taken = self._obstacle(held)
+                held = self._as_held(taken, link, np.asarray(at, float))
+            wanted = self._read(AttachedObject, held, "held object")
+            changes = {"link": link, "touch_links": None if touch_links is None else tuple(touch_links)}
+            wanted = wanted.model_copy(update={key: value for key, value in changes.items() if value is not None})
+            if taken is not None:
+                self._checker.remove(taken.name)
+            try:
+                self._checker.attach(wanted)
+                if at is not None:
+                    self._check_grasp(wanted.name, np.asarray(at, float))
+            except Exception:
+                if wanted.name in self.held and (taken is not None or self.held[wanted.name] is wanted):
+                    self._checker.detach(wanted.name)
+                if taken is not None:
+                    self._checker.add(taken)
+                raise
+
+    def detach(self, name: str, *, at: ArrayLike | None = None) -> None:
+        """Remove a held object; with a state ``at``, shape (dof,), it stays in the world where it is then.
+
+        Raises:
+            SceneError: There is no such held object.
+        """
+        with self._lock:
+            held = self.held.get(name)
+            self._checker.detach(name)
+            if at is not None and held is not None:
+                pose = self._checker.robot.link_pose(np.asarray(at, float), held.link) @ held.pose
+                shape = held.model_dump(exclude_none=True, exclude={"link", "touch_links", "contact"})
+                self._add([self._read(Obstacle, {**shape, **_placed(pose)}, "obstacle")])
+
+    @property
+    def allowed(self) -> tuple[tuple[str, str], ...]:
+        """Pairs of bodies that may touch, as :meth:`allow` was told."""
+        return self._checker.allowed
+
+    def allow(self, first: str, second: str, allowed: bool = True) -> None:
+        """Let two bodies touch and overlap, as an entry of MoveIt's allowed collision matrix does; or no longer.
+
+        The pair is forgotten when one of the two is removed or detached.
+
+        Args:
+            first: Name of a link, a held object, an obstacle or a fixture.
+            second: Another one.
+            allowed: Whether they may.
+
+        Raises:
+            UnknownNameError: There is no such body.
+            SceneError: Both names are of the same body.
+        """
+        with self._lock:
+            self._checker.allow(first, second, allowed)
+
+    def clear(self) -> None:
+        """Remove all obstacles, held objects and allowed pairs; the robot's fixtures stay."""
+        with self._lock:
+            for pair in self.allowed:
+                self._checker.allow(*pair, allowed=False)
+            for name in tuple(self.held):
+                self._checker.detach(name)
+            for name in tuple(self.obstacles):
+                self._checker.remove(name)
+
+    def load(self, problem: Problem) -> None:
+        """Replace all obstacles, held objects and allowed pairs by those of a problem.
+
+        Raises:
+            ApexError: A body of the problem is faulty; the world is then empty.
+        """
+        with self._lock:
+            self.clear()
+            try:
+                self._checker.fill(problem.scene, problem.attached, problem.allowed, fixtures=False)
+            except Exception:
+                self.clear()
+                raise
+
+    def _add(self, obstacles: Sequence[Obstacle]) -> None:
+        added: list[str] = []
+        try:
+            for obstacle in obstacles:
+                self._checker.add(obstacle)
+                added.append(obstacle.name)
+        except Exception:
+            for name in added:
+                self._checker.remove(name)
+            raise
+
+    def _obstacle(self, name: str) -> Obstacle:
+        if name not in self.obstacles:
+            raise SceneError(f"no obstacle {name!r}; there are: {', '.join(self.obstacles) or 'none'}")
+        return self.obstacles[name]
+
+    def _not_a_fixture(self, name: str) -> None:
+        self._obstacle(name)
+
+    def _check_grasp(self, name: str, q: Array) -> None:
+        contacts = [contact for contact in self._checker.contacts(q) if name in (contact.first, contact.second)]
+        if contacts:
+            raise SceneError(f"the object {name!r} would overlap where it is taken: {contacts[0]}")
+
+    def _as_held(self, obstacle: Obstacle, link: str, q: Array) -> dict[str, Any]:
+        pose = np.linalg.inv(self._checker.robot.link_pose(q, link)) @ obstacle.pose
+        shape = obstacle.model_dump(exclude_none=True, exclude={"velocity"})
+        return {**shape, "link": link, **_placed(pose)}
+
+    @staticmethod
+    def _read(kind: Any, given: Any, role: str) -> Any:
+        return given if isinstance(given, kind) else validate(kind, dict(given), role)
+
+
+def _placed(pose: Array) -> dict[str, tuple[float, ...]]:
+    """Return position and orientation of a pose, shape (4, 4)."""
+    return {
+        "position": tuple(pose[:3, 3].tolist()), "orientation": tuple(pin.Quaternion(pose[:3, :3]).coeffs().tolist())
+    }  # fmt: skip

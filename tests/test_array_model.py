@@ -1,0 +1,120 @@
+"""The model evaluated by NumPy, against torch's evaluation of the same weights."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from models import DOF, POST, REGRESSION, VARIATIONAL, WALL, config, kernel, network, query, some_paths
+
+from apex_ompl.diffusion.array_model import ArrayModel, is_supported, weight_shapes
+from apex_ompl.diffusion.guidance import Guidance
+from apex_ompl.diffusion.model import LatentDiffusion
+from apex_ompl.diffusion.model_config import ConditionConfig, DenoiserConfig, LatentConfig, NoiseConfig
+from apex_ompl.diffusion.proposals import Sampling
+from apex_ompl.diffusion.query import ObstacleSet, Query
+from apex_ompl.diffusion.sampler import SAMPLERS
+from apex_ompl.diffusion.torch_model import TorchModel
+from apex_ompl.errors import ParameterError
+from apex_ompl.kernel.compiled.dense_layer import dense_layer
+
+SCENES: list[dict[str, Any]] = [
+    {},
+    {"condition": ConditionConfig(scene="set", width=16, out=32, along=3)},
+    {"condition": ConditionConfig(scene="none", point=True, width=16, out=32, along=3)},
+    {"noise": NoiseConfig(prediction="noise", schedule="linear", most=4.0)},
+    {"noise": NoiseConfig(prediction="clean")},
+    REGRESSION,
+]
+EMPTY = Query(query().start, query().goal, np.zeros(3), ObstacleSet.from_rows([]))
+
+
+def both(**parts: Any) -> tuple[ArrayModel, TorchModel]:
+    """The same weights as arrays and as modules; limits are those of the robot, so that features are of size one."""
+    net, limits = network(**parts), kernel().robot.arrays
+    net.encoder.set_limits(*(torch.tensor(v, dtype=torch.float32) for v in (limits.lower, limits.upper)))
+    weights = {name: tensor.numpy() for name, tensor in net.state_dict().items()}
+    return ArrayModel(net.config, weights, {}), TorchModel(net, {})
+
+
+@pytest.mark.parametrize("parts", SCENES, ids=["distances", "set", "point", "noise", "clean", "regression"])
+@pytest.mark.parametrize("queries", [query(), [query(1), query(2), EMPTY]], ids=["one", "three"])
+def test_numpy_proposes_what_torch_does(parts: dict[str, Any], queries: Any) -> None:
+    models = both(**parts)
+    for sampling in (Sampling("ddim", 2), Sampling("dpm_solver", 5, 1.6), Sampling("ddpm", 8)):
+        mine, theirs = (
+            model.propose(queries, kernel(WALL, POST), 5, sampling=sampling, generator=np.random.default_rng(3))
+            for model in models
+        )
+        np.testing.assert_allclose(mine.control, theirs.control, atol=2e-4)
+        assert np.ptp(mine.control[:5], axis=0).max() > 1e-2 or parts is REGRESSION
+
+
+@pytest.mark.parametrize("scaling", ["noise", "clean"])
+@pytest.mark.parametrize("name", SAMPLERS)
+def test_guidance_by_numpy_is_that_of_torch(name: str, scaling: str) -> None:
+    sampling = Sampling(name, 4, 1.0, Guidance(1.0, scaling, margin=0.1))
+    plain, *found = (
+        model.propose(query(), kernel(WALL, POST), 4, sampling=how, generator=np.random.default_rng(5)).control
+        for model, how in zip((*both()[:1], *both()), (Sampling(name, 4), sampling, sampling), strict=True)
+    )
+    np.testing.assert_allclose(found[0], found[1], atol=2e-3)  # gradients jump where the nearest pair changes
+    assert np.abs(found[0] - plain).max() > 1e-2
+
+
+def test_paths_noised_by_numpy_are_those_of_torch() -> None:
+    control = some_paths().control(slice(0, 1)).repeat(6, axis=0)
+    ends = Query(control[0, 0], control[0, -1], np.zeros(3), ObstacleSet.from_rows([]))
+    mine, theirs = (
+        model.renoise(ends, kernel(), control, 60, sampling=Sampling(steps=3), generator=np.random.default_rng(0))
+        for model in both()
+    )
+    np.testing.assert_allclose(mine.control, theirs.control, atol=2e-4)
+    np.testing.assert_allclose(mine.latent, theirs.latent.numpy(), atol=2e-4)
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    st.sampled_from(["none", "set", "distances"]), st.booleans(), st.sampled_from(["mlp", "regression"]),
+    st.integers(1, 12 * DOF), st.sampled_from([8, 24, 64]), st.integers(1, 5), st.integers(2, 6),
+)  # fmt: skip
+def test_shapes_of_weights_are_those_of_the_modules(  # noqa: PLR0917
+    scene: Any, point: bool, kind: Any, dim: int, width: int, blocks: int, along: int
+) -> None:
+    made = config(
+        latent=LatentConfig(dim=dim), denoiser=DenoiserConfig(kind=kind, width=width, blocks=blocks),
+        condition=ConditionConfig(scene=scene, point=point, width=width, out=2 * width, along=along),
+    )  # fmt: skip
+    assert is_supported(made)
+    with torch.device("meta"):
+        wanted = {name: tuple(tensor.shape) for name, tensor in LatentDiffusion(made).state_dict().items()}
+    assert weight_shapes(made) == wanted
+
+
+def test_what_numpy_cannot_evaluate_is_said() -> None:
+    assert not is_supported(config(**VARIATIONAL))
+    with pytest.raises(ParameterError, match="dimension of the latent space"):
+        weight_shapes(config(latent=LatentConfig(dim=12 * DOF + 1)))
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 4, 5, 8, 11])
+def test_a_dense_layer_is_a_matrix_product(count: int) -> None:
+    rng = np.random.default_rng(count)
+    weight, bias, rows = (rng.normal(size=s).astype(np.float32) for s in ((37, 53), (37,), (count, 53)))
+    out = np.full((count, 37), np.nan, np.float32)
+    dense_layer(weight, bias, rows, out)
+    np.testing.assert_allclose(out, rows.astype(float) @ weight.astype(float).T + bias, atol=1e-4)
+
+
+def test_a_plan_needs_no_torch() -> None:
+    """Importing it takes longer than most problems."""
+    code = "import sys, apex_ompl; result = apex_ompl.plan('shelf/hard/800003', seed=1); print(result.status); "
+    code += "sys.exit('torch' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300, check=False)
+    assert (done.returncode, done.stdout.split()) == (0, ["EXACT_SOLUTION"]), done.stderr

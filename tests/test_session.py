@@ -1,0 +1,247 @@
+"""A planner that is kept: plans in a world that is edited, and goals of every kind."""
+
+from __future__ import annotations
+
+import pickle
+import threading
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from planning import EXACT, within
+
+from apex_ompl import Alignment, MotionPlanner, PlanStatus, PoseTarget, load_problem, plan
+from apex_ompl.collision import CollisionChecker
+from apex_ompl.errors import ApexError, ParameterError, UnknownNameError
+from apex_ompl.ompl_adapter.validity import full_check
+from apex_ompl.robot import Robot
+from apex_ompl.scene.bodies import Obstacle
+from apex_ompl.scene.problem import Goal, Problem
+
+POST = {"name": "post", "box": (0.1, 0.1, 0.6), "position": (0.45, 0.0, 0.3)}
+
+
+@pytest.fixture
+def planner(robot: Robot) -> MotionPlanner:
+    return MotionPlanner(robot)
+
+
+def ends(problem: Problem, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
+    return problem.start_state(robot.joint_names), problem.goal_states(robot.joint_names)[0]
+
+
+def test_plans_follow_the_world(planner: MotionPlanner, problem: Problem, robot: Robot) -> None:
+    start, goal = ends(problem, robot)
+    empty = planner.plan(start, goal)
+    assert empty and empty.solved_by == "straight line"
+    planner.world.add(**POST)
+    around = planner.plan(start, goal, timeout=20.0)
+    assert around and around.length > empty.length
+    checker = CollisionChecker(robot, [Obstacle(**POST)])
+    assert full_check(checker, around.path, start, [goal]) and full_check(checker, around.trajectory, start, [goal])
+    assert around.problem.scene == (Obstacle(**POST),), "the result holds the world in which it was planned"
+    planner.world.move("post", (0.45, 0.0, 3.0))
+    assert planner.plan(start, goal).solved_by == "straight line"
+    planner.world.remove("post")
+    assert planner.plan(start, goal).checks == empty.checks, "checks are counted anew by each plan"
+
+
+def test_a_problem_is_planned_as_by_plan(planner: MotionPlanner) -> None:
+    planner.world.add(name="other", box=(3.0, 3.0, 0.2), position=(0.0, 0.0, 0.5))
+    loaded = load_problem("shelf/hard/800000")
+    kept, fresh = planner.plan_problem(loaded, timeout=30.0), plan(loaded, timeout=30.0)
+    assert kept and fresh and np.array_equal(kept.path.states, fresh.path.states)
+    assert set(planner.world.obstacles) == {body.name for body in loaded.scene}
+    assert set(planner.world.held) == {body.name for body in loaded.attached}
+    assert planner.plan_problem(loaded, timeout=30.0).path.states.tobytes() == kept.path.states.tobytes()
+
+
+def test_starts_and_goals_by_name_or_several(planner: MotionPlanner, problem: Problem, robot: Robot) -> None:
+    start, goal = ends(problem, robot)
+    named = planner.plan(dict(problem.start), problem.goal.joints[0])
+    assert np.array_equal(named.path.states, planner.plan(start, goal).path.states)
+    blocked = goal.copy()
+    blocked[1] = 1.7
+    assert not planner.check(blocked) and planner.check(goal)
+    several = planner.plan(start, np.stack([blocked, goal]))
+    assert several and np.array_equal(several.path.states[-1], goal)
+    as_goal = planner.plan(start, Goal(joints=(problem.goal.joints[0],)))
+    assert np.array_equal(as_goal.path.states, named.path.states)
+
+
+def test_pose_goals_of_one_hand_and_of_both(planner: MotionPlanner, robot: Robot) -> None:
+    """The goal is where a known state has the palms, by Pinocchio's kinematics."""
+    known = robot.home.copy()
+    known[[0, 3, 7, 10]] += (0.3, 0.2, -0.3, 0.2)
+    assert planner.check(known)
+    for hands in (["left_hand"], ["left_hand", "right_hand"]):
+        targets = []
+        for hand in hands:
+            pose = robot.link_pose(known, robot.hands[hand].palm)
+            point = pose[:3, :3] @ robot.hands[hand].point + pose[:3, 3]
+            turn = np.asarray(pin.Quaternion(pose[:3, :3]).coeffs())
+            targets.append(PoseTarget(frame=hand, position=tuple(point), orientation=tuple(turn)))
+        result = planner.plan(robot.home, targets, timeout=20.0)
+        assert result, result.reason
+        end = result.path.states[-1]
+        for hand, target in zip(hands, targets, strict=True):
+            pose = robot.link_pose(end, robot.hands[hand].palm)
+            point = pose[:3, :3] @ robot.hands[hand].point + pose[:3, 3]
+            assert np.linalg.norm(point - target.position) <= 1e-3
+            wanted = robot.link_pose(known, robot.hands[hand].palm)[:3, :3]
+            turned = np.arccos(np.clip((np.trace(wanted.T @ pose[:3, :3]) - 1.0) / 2.0, -1.0, 1.0))
+            assert turned <= 1e-2
+        if hands == ["left_hand"]:
+            still = robot.groups["right_arm"]
+            assert np.array_equal(end[still], robot.home[still]), "the other arm stays where it is"
+
+
+def test_poses_of_links_and_of_a_face_of_a_held_object(planner: MotionPlanner, robot: Robot) -> None:
+    bar = {
+        "name": "bar", "link": "left_hand_palm", "cylinder": {"radius": 0.02, "length": 0.12},
+        "position": (0.0, 0.02, -0.03), "contact": {"point": (0.0, 0.0, 0.06), "axis": (0.0, 0.0, 1.0)},
+    }  # fmt: skip
+    planner.world.attach(bar)
+    held = planner.world.held["bar"]
+    known = robot.home.copy()
+    known[[0, 3, 5]] += (0.2, 0.15, 0.1)
+    frame = robot.link_pose(known, "left_hand_palm") @ held.pose
+    point, axis = frame[:3, :3] @ (0.0, 0.0, 0.06) + frame[:3, 3], frame[:3, 2]
+    turn = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), axis).coeffs()
+    result = planner.plan(robot.home, PoseTarget(frame="bar", position=tuple(point), orientation=tuple(turn)))
+    assert result, result.reason
+    frame = robot.link_pose(result.path.states[-1], "left_hand_palm") @ held.pose
+    assert np.linalg.norm(frame[:3, :3] @ (0.0, 0.0, 0.06) + frame[:3, 3] - point) <= 1e-3
+    assert np.arccos(min(1.0, frame[:3, 2] @ axis)) <= 1e-2
+    there = robot.link_pose(known, "left_link7")[:3, 3]
+    link = planner.plan(robot.home, PoseTarget(frame="left_link7", position=tuple(there)))
+    assert link and np.linalg.norm(robot.link_pose(link.path.states[-1], "left_link7")[:3, 3] - there) <= 1e-3
+
+
+def test_a_pose_out_of_reach_is_an_invalid_goal_with_the_nearest_residual(planner: MotionPlanner) -> None:
+    result = planner.plan(planner.robot.home, PoseTarget(frame="left_hand", position=(0.0, 0.0, 3.0)))
+    assert result.status is PlanStatus.INVALID_GOAL
+    assert "not reached" in result.reason and "position of left_hand" in result.reason and " m off" in result.reason
+
+
+def test_alignments_are_goals(planner: MotionPlanner) -> None:
+    stacked = load_problem("stack_boxes")
+    planner.world.load(stacked)
+    assert isinstance(stacked.goal.alignment, Alignment)
+    result = planner.plan(dict(stacked.start), stacked.goal.alignment, timeout=20.0)
+    assert result and result.problem.goal == stacked.goal
+
+
+def test_states_are_checked_in_the_world(planner: MotionPlanner, robot: Robot) -> None:
+    free = planner.check(robot.home)
+    assert free and free.reason == "" and free.clearance > 0.0 and not free.contacts
+    palm = robot.link_pose(robot.home, "left_hand_palm")[:3, 3]
+    planner.world.add(name="ball", sphere={"radius": 0.05}, position=tuple(palm))
+    hit = planner.check(robot.home)
+    assert not hit and hit.clearance < 0.0 and "ball" in hit.reason
+    assert "ball" in {hit.contacts[0].first, hit.contacts[0].second}
+    outside = robot.home.copy()
+    outside[0] = 9.0
+    assert "outside its limits" in planner.check(outside).reason
+
+
+def test_ompls_own_planners_run_in_the_world(planner: MotionPlanner, problem: Problem, robot: Robot) -> None:
+    planner.world.add(**POST)
+    start, goal = ends(problem, robot)
+    setup = planner.simple_setup(start, goal)
+    assert setup.solve(within(20.0)).getStatus() == EXACT
+
+
+def test_a_planner_in_another_process_has_the_same_world(planner: MotionPlanner, robot: Robot) -> None:
+    kept = MotionPlanner()
+    kept.world.add(**POST)
+    kept.world.attach(name_of_bar())
+    twin = pickle.loads(pickle.dumps(kept))  # noqa: S301
+    assert dict(twin.world.obstacles) == dict(kept.world.obstacles) and dict(twin.world.held) == dict(kept.world.held)
+    assert bool(twin.check(robot.home)) == bool(kept.check(robot.home))
+    with kept:
+        pass
+    assert not kept.world.obstacles and twin.world.obstacles
+
+
+def name_of_bar() -> dict[str, object]:
+    return {"name": "bar", "link": "left_hand_palm", "cylinder": {"radius": 0.02, "length": 0.12}}
+
+
+def test_two_planners_plan_in_two_threads(robot: Robot) -> None:
+    names = ["shelf/hard/800000", "shelf/hard/800001"]
+    found: dict[str, PlanStatus] = {}
+
+    def work(name: str) -> None:
+        with MotionPlanner() as mine:
+            found[name] = mine.plan_problem(load_problem(name), timeout=30.0).status
+
+    threads = [threading.Thread(target=work, args=(name,)) for name in names]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(120.0)
+    assert found == dict.fromkeys(names, PlanStatus.EXACT_SOLUTION)
+
+
+@pytest.mark.parametrize("name", ["apex", "rrtconnect", "rrtconnect+polish"])
+def test_a_group_moves_while_the_other_joints_stay(name: str, planner: MotionPlanner, robot: Robot) -> None:
+    planner.world.add(**POST)
+    start = robot.home.copy()
+    start[[0, 1, 3]], start[14] = (0.1, 0.4, -1.6), 0.3
+    moved = {joint: float(start[k]) for k, joint in enumerate(robot.joint_names) if joint.startswith("left_joint")}
+    moved |= {"left_joint1": -1.3}
+    result = planner.plan(start, moved, name, group="left_arm", timeout=20.0, seed=1)
+    assert result, result.reason
+    stays = [k for k in range(robot.dof) if k not in robot.groups["left_arm"]]
+    assert np.array_equal(result.path.states[:, stays], np.tile(start[stays], (len(result.path), 1)))
+    assert np.abs(result.trajectory.positions[:, stays] - start[stays]).max() < 1e-12
+    assert result.held_joints == tuple(robot.joint_names[k] for k in stays)
+    assert full_check(CollisionChecker(robot, [Obstacle(**POST)]), result.path, start)
+
+
+def test_both_arms_are_a_group_without_the_hands(planner: MotionPlanner, robot: Robot) -> None:
+    goal = robot.home.copy()
+    goal[[0, 7]] += (0.3, -0.3)
+    result = planner.plan(robot.home, goal, group=["left_arm", "right_arm"])
+    assert result and result.held_joints == ("left_hand_synergy", "right_hand_synergy")
+    known = robot.home.copy()
+    known[0] += 0.3
+    palm = robot.link_pose(known, "left_hand_palm")[:3, 3]
+    sampled = planner.plan(
+        robot.home, PoseTarget(frame="left_hand_palm", position=tuple(palm)), group="left_arm", timeout=10.0
+    )
+    assert sampled and np.array_equal(sampled.path.states[-1][7:], robot.home[7:])
+    goal[7] = 0.2
+    refused = planner.plan(robot.home, goal, group="left_arm")
+    assert (
+        refused.status is PlanStatus.INVALID_GOAL
+        and "right_joint1 = 0.2 at the goal, which is not in the group" in refused.reason
+    )
+    with pytest.raises(UnknownNameError, match="unknown group or joint 'arm'.*left_arm"):
+        planner.plan(robot.home, goal, group="arm")
+    with pytest.raises(ParameterError, match="group"):
+        planner.plan(robot.home, goal, group=[])
+
+
+def test_faulty_arguments_are_named(planner: MotionPlanner, robot: Robot) -> None:
+    home, hard = robot.home, load_problem("shelf/hard/800000")
+    named = dict(zip(robot.joint_names, home.tolist(), strict=True))
+    palm = PoseTarget(frame="left_palm", position=(0, 0, 1))
+    hand = PoseTarget(frame="left_hand", position=(0, 0, 1))
+    faulty: tuple[tuple[type[ApexError], str, object], ...] = (
+        (ParameterError, "start.*shape", lambda: planner.plan(home[:5], home)),
+        (ParameterError, "goal.*shape", lambda: planner.plan(home, home[:5])),
+        (ParameterError, "start", lambda: planner.plan(home * np.nan, home)),
+        (ParameterError, "goal", lambda: planner.plan(home, [])),
+        (ApexError, "left_joint9", lambda: planner.plan({**named, "left_joint9": 0.0}, home)),
+        (ApexError, "missing", lambda: planner.plan({"left_joint1": 0.0}, home)),
+        (UnknownNameError, "unknown joint 'left_joint9'", lambda: planner.check({"left_joint9": 0.0})),
+        (UnknownNameError, "unknown frame of a pose 'left_palm'", lambda: planner.plan(home, palm)),
+        (UnknownNameError, "unknown robot 'panda'", lambda: MotionPlanner("panda")),
+        (UnknownNameError, "unknown checkpoint 'nope'", lambda: MotionPlanner(robot, "nope").plan_problem(hard)),
+        (ApexError, "more than one pose is given for 'left_hand'", lambda: planner.plan(home, [hand, hand])),
+    )
+    for error, said, call in faulty:
+        with pytest.raises(error, match=said):
+            call()  # type: ignore[operator]
