@@ -42,7 +42,7 @@ Call = Callable[[], PlanResult]
 
 def fresh(name: str) -> tuple[float, float, bool]:
     """Return the wall time of a process that plans a problem, what it took beside solve, and whether it solved it."""
-    command = [sys.executable, "-m", "apex_ompl.cli", "plan", name, "--timeout", str(TIMEOUT), "--json"]
+    command = [sys.executable, "-m", "apex_ompl.cli", "plan", name, "--timeout", str(TIMEOUT)]
     begin = time.perf_counter()
     done = subprocess.run(command, check=False, capture_output=True)
     return time.perf_counter() - begin, float("nan"), done.returncode == 0

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
-from typing import Any
-
 import numba
 import numpy as np
 import pytest
@@ -14,41 +11,49 @@ from random_robots import random_robot
 from support import states_around_home
 
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.kernel.compiled.compilation import OPTIONS
+from apex_ompl.kernel.compiled.arrays import robot_view
+from apex_ompl.kernel.compiled.compilation import OPTIONS, outlined
 from apex_ompl.kernel.compiled.kinematics import place_joint, place_robot
-from apex_ompl.kernel.compiled.layout import layout
+from apex_ompl.kernel.compiled.layout import new_buffers
 from apex_ompl.kernel.compiled.motion_bound import bound_displacements, cluster_displacement, relative_displacement
-from apex_ompl.kernel.compiled.workspace import Workspace, workspace_dimensions
+from apex_ompl.kernel.compiled.workspace import Workspace, workspace_dimensions, workspace_view
 from apex_ompl.kernel.tables import RobotTables
 from apex_ompl.robot import Robot
 
 
-def from_python(function: Any) -> Any:
-    """A function that only compiled ones call, compiled for calls from Python."""
-    names = ", ".join(inspect.signature(function.py_func).parameters)
-    space = {"function": function}
-    exec(f"def call({names}):\n    return function({names})", space)
-    return numba.njit(**OPTIONS)(space["call"])
+@numba.njit(**OPTIONS)
+def place(ri, rf, wi, wf, q):  # type: ignore[no-untyped-def]
+    """Place all joints at a state."""
+    t = robot_view(ri, rf)
+    w = workspace_view(t, wi, wf)
+    place_robot(t, w, q)
+    for j in t.lazy:
+        place_joint(t, w, q, j)
 
 
-place_all, place_one, bound_all, cluster_bound, relative_bound = map(
-    from_python, (place_robot, place_joint, bound_displacements, cluster_displacement, relative_displacement)
-)
+@numba.njit(**OPTIONS)
+def bound(ri, rf, wi, wf, q, step, deviation, clusters, pairs):  # type: ignore[no-untyped-def] # noqa: PLR0917
+    """Put the bounds of all clusters and pairs for a motion around a state into place."""
+    t = robot_view(ri, rf)
+    w = workspace_view(t, wi, wf)
+    place_robot(t, w, q)
+    for k in range(len(q)):
+        w.step[k], w.deviation[k], w.half_width[k] = step[k], deviation[k], abs(step[k]) + deviation[k]
+    bound_displacements(t, w)
+    for c in range(len(clusters)):
+        clusters[c] = cluster_displacement(w, c)
+    for p in range(len(pairs)):
+        pairs[p] = relative_displacement(w, t.pair_clusters[p, 0], t.pair_clusters[p, 1], t.pair_common[p])
 
 
-def workspace(tables: RobotTables) -> Workspace:
-    dimensions = workspace_dimensions(tables.arrays)
-    work = Workspace(*(np.zeros(field.sized(dimensions), field.dtype) for field in layout(Workspace)))
-    work.rotation[0] = np.eye(3)
-    return work
+def buffers(tables: RobotTables) -> tuple[np.ndarray, np.ndarray, Workspace]:
+    return new_buffers(Workspace, **workspace_dimensions(tables.arrays))
 
 
 def placed(tables: RobotTables, q: np.ndarray) -> tuple[Workspace, list[np.ndarray]]:
     """The joints at a state, and the world centres of all spheres, cluster by cluster."""
-    t, w = tables.arrays, workspace(tables)
-    place_all(t, w, q)
-    for j in t.lazy:
-        place_one(t, w, q, int(j))
+    t, (wi, wf, w) = tables.arrays, buffers(tables)
+    place(*tables.packed, wi, wf, q)
     ends = [*t.body_root[1:], len(t.node_first)]
     found = []
     for first, count in t.cluster_bodies:
@@ -64,8 +69,8 @@ def check(tables: RobotTables, middle: np.ndarray, step: np.ndarray, deviation: 
     """Compare bounds with samples; return the largest ratio of what moves to its bound."""
     t, rng = tables.arrays, np.random.default_rng(seed)
     w, here = placed(tables, middle)
-    w.step[:], w.deviation[:], w.half_width[:] = step, deviation, np.abs(step) + deviation
-    bound_all(t, w)
+    clusters, pairs = np.empty(len(t.cluster_joint)), np.empty(len(t.pair_common))
+    bound(*tables.packed, *buffers(tables)[:2], middle, step, deviation, clusters, pairs)
     tightest = 0.0
     for along in [-1.0, 1.0, *rng.uniform(-1.0, 1.0, 6)]:
         q = middle + along * step + rng.choice([-1.0, 0.0, 1.0], len(step)) * deviation
@@ -76,15 +81,14 @@ def check(tables: RobotTables, middle: np.ndarray, step: np.ndarray, deviation: 
 
         for c in range(len(here)):
             moved = np.linalg.norm(there[c] - here[c], axis=1).max()
-            assert moved <= cluster_bound(w, c) + 1e-9
-            tightest = max(tightest, moved / (cluster_bound(w, c) + 1e-9))
-        for (a, b), common in zip(t.pair_clusters, t.pair_common, strict=True):
-            bound = relative_bound(w, int(a), int(b), int(common))
+            assert moved <= clusters[c] + 1e-9
+            tightest = max(tightest, moved / (clusters[c] + 1e-9))
+        for (a, b), common, most in zip(t.pair_clusters, t.pair_common, pairs, strict=True):
             before, after = (
                 in_frame(cloud[a], frames, common)[:, None] - in_frame(cloud[b], frames, common)[None]
                 for cloud, frames in ((here, w), (there, there_frames))
             )
-            assert np.linalg.norm(after - before, axis=2).max() <= bound + 1e-9
+            assert np.linalg.norm(after - before, axis=2).max() <= most + 1e-9
     return tightest
 
 
@@ -117,9 +121,13 @@ def test_spheres_of_real_robots_stay_within_their_bounds(
     assert tightest > 0.35  # a bound that is far off would be useless
 
 
-def test_functions_that_only_compiled_ones_call_say_so(robot: Robot) -> None:
-    tables = CollisionChecker(robot).kernel.robot
-    work = workspace(tables)
-    assert cluster_bound(work, 0) == 0.0
+def test_functions_that_only_compiled_ones_call_say_so() -> None:
+    inner = outlined(lambda x: x + 1.0)
+
+    @numba.njit(**OPTIONS)
+    def outer(x):  # type: ignore[no-untyped-def]
+        return inner(x)
+
+    assert outer(1.0) == 2.0
     with pytest.raises(TypeError):
-        cluster_displacement(work, 0)
+        inner(1.0)

@@ -140,7 +140,8 @@ class ConservativeChecker:
         held = solids[scene.links :]
         poses = tuple((s.joint, s.placement.homogeneous.tobytes(), shape_key(s.shape)) for s in held)
         touch = tuple(sorted((k, tuple(sorted(v))) for k, v in scene.touch.items()))
-        key = (tuple(scene.held), poses, touch, scene.allowed)
+        among = frozenset(pair for pair in scene.allowed if not pair & scene.scene.keys())
+        key = (tuple(scene.held), poses, touch, among)
         known = _robots.setdefault(robot, {})
         if key in known:
             return _numbered(*known[key], numbers)

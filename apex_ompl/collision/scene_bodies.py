@@ -64,6 +64,10 @@ class SceneBodies:
         """The obstacles by name, without the robot's fixtures."""
         return {name: body for name, body in self._obstacles.items() if isinstance(body, Obstacle)}
 
+    def is_obstacle(self, name: str) -> bool:
+        """Whether there is an obstacle of that name, which is not a fixture of the robot's."""
+        return name in self._obstacles and name not in self._fixtures
+
     @property
     def held(self) -> dict[str, AttachedObject]:
         """The held objects by name."""
@@ -119,8 +123,8 @@ class SceneBodies:
             SceneError: There is no such obstacle.
         """
         self._find(self._obstacles, name, "obstacle")
-        del self._obstacles[name]
         self._forget_allowed(name)
+        del self._obstacles[name]
         self.meshes.remove(name)
         self._obstacles_changed()
 
@@ -179,10 +183,12 @@ class SceneBodies:
         self._set_allowed(frozenset(pair for pair in self.meshes.allowed if name not in pair))
 
     def _set_allowed(self, allowed: frozenset[frozenset[str]]) -> None:
-        if allowed != self.meshes.allowed:
+        changed = allowed ^ self.meshes.allowed
+        if changed:
             self.meshes.allow(allowed)
             self._obstacles_changed()
-            self._held_changed()
+            if any(not pair & self._obstacles.keys() for pair in changed):
+                self._held_changed()
 
     def _claim(self, name: str) -> None:
         if name in self._obstacles or name in self._attached or self.robot.model.existBodyName(name):

@@ -215,7 +215,8 @@ class World:
         return self.obstacles[name]
 
     def _not_a_fixture(self, name: str) -> None:
-        self._obstacle(name)
+        if not self._checker.is_obstacle(name):
+            self._obstacle(name)  # names those that there are
 
     def _check_grasp(self, name: str, q: Array) -> None:
         contacts = [contact for contact in self._checker.contacts(q) if name in (contact.first, contact.second)]
