@@ -23,7 +23,7 @@ from apex_ompl.trajopt.path import Path
 from apex_ompl.trajopt.spline import Spline
 from apex_ompl.types import Array
 from apex_ompl.util.files import BROKEN, read_file, suffix_of, write_atomically
-from apex_ompl.util.schema import dump_yaml, read_yaml
+from apex_ompl.util.schema import dump_yaml, read_json, read_yaml
 from apex_ompl.util.validation import finite_array
 
 SCHEMA = "apex-ompl/result/2"
@@ -192,7 +192,10 @@ class PlanResult:
         suffixes = tuple(s for s in SUFFIXES if s not in (*MESSAGES, ".csv"))
         if path.suffix not in suffixes or path.name.endswith(MESSAGES):
             raise ParameterError("result file", str(path), f"a file name ending in {', '.join(suffixes)}")
-        data = read_yaml(path, "result file") if path.suffix != ".npz" else _read_npz(path)
+        if path.suffix == ".npz":
+            data = _read_npz(path)
+        else:
+            data = (read_json if path.suffix == ".json" else read_yaml)(path, "result file")
         if data.get("schema") != SCHEMA:
             raise FileFormatError(str(path), "schema", data.get("schema"), f"expected {SCHEMA!r}")
         data = {

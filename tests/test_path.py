@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from planning import HARD, cached_problem
 from scipy.interpolate import BSpline
 
-from apex_ompl import PlanResult, plan
+from apex_ompl import PlanResult, Timing, plan
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.path_proof import Curve
 from apex_ompl.errors import ParameterError
@@ -69,7 +69,7 @@ def test_faulty_paths_and_parameters_are_named() -> None:
 
 
 def test_the_spline_of_the_planner_comes_out_of_plan_and_out_of_files(tmp_path: pathlib.Path) -> None:
-    result = plan(cached_problem(HARD), timeout=20.0)
+    result = plan(cached_problem(HARD), timeout=20.0, timing=Timing(method="spline"))
     assert result and result.path is not None and result.path.spline is not None
     np.testing.assert_array_equal(result.path.spline.path(result.path.control), result.path.states)
     tree = plan(cached_problem(HARD), "rrtconnect", timeout=20.0)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from support import ROOT
 
-from apex_ompl import PlanResult, plan
+from apex_ompl import PlanResult, Timing, plan
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError
 from apex_ompl.scene.problem import Problem
 
@@ -23,7 +23,7 @@ BAXTER = ROOT / "examples" / "baxter_table.yaml"
 def test_results_are_saved_in_every_format(problem: Problem, tmp_path: Path) -> None:
     import yaml
 
-    result = plan(problem, timeout=20.0)
+    result = plan(problem, timeout=20.0, timing=Timing(method="spline"))
     assert result.path is not None
     for suffix in (".npz", ".json", ".yaml", ".csv"):
         result.save(tmp_path / f"r{suffix}")
@@ -66,7 +66,7 @@ def test_results_are_saved_in_every_format(problem: Problem, tmp_path: Path) -> 
 def saved(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     """The content of the file of a timed result."""
     file = tmp_path_factory.mktemp("results") / "r.json"
-    result = plan("shelf/easy/800000", planner="rrtconnect", timeout=20.0)
+    result = plan("shelf/easy/800000", planner="rrtconnect", timeout=20.0, timing=Timing(method="spline"))
     assert result
     result.save(file)
     return json.loads(file.read_text())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Hashable
 from pathlib import Path
@@ -73,6 +74,22 @@ def read_yaml(path: Path, role: str) -> dict[str, Any]:
         FileFormatError: It is not YAML, or not a mapping.
     """
     return parse_yaml(read_text(path, role), str(path))
+
+
+def read_json(path: Path, role: str) -> dict[str, Any]:
+    """Read a JSON object; much faster than :func:`read_yaml` where it is long.
+
+    Raises:
+        MissingFileError: The file cannot be read.
+        FileFormatError: It is not JSON, or not an object.
+    """
+    try:
+        data = json.loads(read_text(path, role))
+    except (ValueError, RecursionError) as error:
+        raise FileFormatError(str(path), "", str(error), "expected JSON") from error
+    if not isinstance(data, dict):
+        raise FileFormatError(str(path), "", type(data).__name__, "expected a mapping of keys to values")
+    return data
 
 
 def parse_yaml(text: str, source: str) -> dict[str, Any]:
