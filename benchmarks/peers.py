@@ -38,7 +38,7 @@ from apex_ompl.planning import NOT_PROVED
 from apex_ompl.problems import load
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.robot import Robot
-from apex_ompl.robot.model import link_of
+from apex_ompl.robot.geometry import link_of
 from apex_ompl.scene.bodies import Body, pose_matrix
 from apex_ompl.scene.problem import Problem
 from apex_ompl.trajopt.path import path_length

@@ -14,7 +14,8 @@ from apex_ompl.kernel.compiled.time_parameterization import max_path_speeds
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.trajectory import Timing, Trajectory
 from apex_ompl.trajectory.curve import Curve, Polyline
-from apex_ompl.trajectory.methods.ruckig import calculate, knots, stops
+from apex_ompl.trajectory.methods.ruckig import stops
+from apex_ompl.trajectory.methods.ruckig_profiles import calculate, knots
 from apex_ompl.trajectory.methods.spline import (
     CONTROL_POINT_SPACING,
     GRID_POINTS_PER_SPAN,

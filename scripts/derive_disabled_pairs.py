@@ -25,7 +25,8 @@ from apex_ompl.collision.shapes import convex_hull
 from apex_ompl.robot import Robot
 from apex_ompl.robot.assets import DATA
 from apex_ompl.robot.config import PAIRS_SCHEMA, RobotConfig, read_config
-from apex_ompl.robot.model import build_robot, link_of
+from apex_ompl.robot.geometry import link_of
+from apex_ompl.robot.model import build_robot
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.files import write_atomically
 from apex_ompl.util.validation import one_or_more, whole_number

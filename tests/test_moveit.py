@@ -57,6 +57,20 @@ def test_what_is_left_out_is_named(robot: Robot, tmp_path: Path) -> None:
         assert word in notes
 
 
+def test_the_allowed_collision_matrix_becomes_pairs_of_the_problem(robot: Robot, tmp_path: Path) -> None:
+    matrix = """
+allowed_collision_matrix:
+  entry_names: [palm, pillar, ghost]
+  entry_values:
+    - {enabled: [true, true, true]}
+    - {enabled: [true, true, false]}
+    - {enabled: [true, false, true]}
+"""
+    done = converted(tmp_path, robot, SCENE + matrix)
+    assert done.problem.allowed == (("left_hand_palm", "pillar"),)
+    assert any("neither links nor objects here, so left out: ghost" in note for note in done.notes)
+
+
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [

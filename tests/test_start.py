@@ -101,6 +101,9 @@ def test_a_deeper_contact_is_not_left() -> None:
     assert result.status is PlanStatus.INVALID_START and "leave_contact" not in result.reason
     with pytest.raises(ParameterError, match="leave_contact: expected"):
         kept.plan(kept.robot.home, goal_of(kept), leave_contact=0.01)
+    pushed = Timing(start_velocity=np.full(kept.robot.dof, 0.01))
+    with pytest.raises(ParameterError, match="leave_contact: expected 0 for a start that moves"):
+        kept.plan(kept.robot.home, goal_of(kept), leave_contact=1e-3, timing=pushed)
 
 
 def test_joints_that_stay_do_not_leave_a_contact() -> None:

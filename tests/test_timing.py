@@ -8,57 +8,16 @@ import ruckig
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from support import distance
+from timings import LIMITS, NAMES, RATE, keeps_limits, paths, timed
 
 from apex_ompl.errors import ParameterError, TimingError, UnknownNameError
 from apex_ompl.kernel.compiled.time_parameterization import max_path_speeds, sample_times
 from apex_ompl.robot import Limits
-from apex_ompl.trajectory import TimedPath, Timing, Trajectory, time_path
+from apex_ompl.trajectory import Timing, Trajectory, time_path
 from apex_ompl.trajectory.curve import Curve, Polyline
 from apex_ompl.trajectory.methods import DEFAULT_METHOD, METHODS
 from apex_ompl.trajectory.methods.ruckig import through_knots
 from apex_ompl.trajectory.methods.spline import blend
-
-NAMES = ("one", "two", "three")
-LIMITS = Limits(
-    np.full(3, -3.0), np.full(3, 3.0), np.array([2.0, 2.5, 1.5]), np.array([10.0, 15.0, 8.0]),
-    np.array([5000.0, 7500.0, 160.0]),
-)  # fmt: skip
-RATE = 0.001
-
-
-def timed(path: np.ndarray, timing: Timing | None = None, limits: Limits = LIMITS, **more: object) -> TimedPath:
-    return time_path(path, limits, NAMES, timing, **more)  # type: ignore[arg-type]
-
-
-def keeps_limits(motion: Trajectory, limits: Limits = LIMITS) -> bool:
-    """By differences of positions at 1 kHz, which are means of the derivatives."""
-    times = np.arange(-5, int(motion.duration / RATE) + 6) * RATE
-    change, good = motion(times), bool(np.all(np.abs(motion(times)) <= 3.0 + 1e-12))
-    for order, limit in enumerate((limits.velocity, limits.acceleration, limits.jerk), 1):
-        change = np.diff(change, axis=0)
-        good = good and bool(np.all(np.abs(change) / RATE**order <= limit * (1.0 + 1e-6) + 1e-4 * (order == 3)))
-    return good and max(motion.use(limits).values()) <= 1.0 + 1e-9
-
-
-@st.composite
-def paths(draw: st.DrawFn) -> np.ndarray:
-    rng = np.random.default_rng(draw(st.integers(0, 10**6)))
-    kind = draw(st.sampled_from(["two", "straight", "zigzag", "near", "smooth", "corners", "there and back"]))
-    a, b = rng.uniform(-2.9, 2.9, (2, 3))
-    if kind == "two":
-        return np.stack([a, b])
-    if kind == "straight":
-        return a + np.sort(rng.uniform(0.0, 1.0, 30))[:, None] * (b - a)
-    if kind == "zigzag":
-        return np.concatenate([a + np.linspace(0, 1, 20)[:, None] * (b - a)]) + 0.1 * (-1.0) ** np.arange(20)[:, None]
-    if kind == "near":
-        corners = rng.uniform(-2.0, 2.0, (5, 3))
-        return np.repeat(corners, 4, axis=0) + rng.normal(0.0, 10.0 ** -rng.integers(3, 13), (20, 3))
-    if kind == "smooth":
-        t = np.linspace(0.0, 1.0, 256)[:, None]
-        return np.sin(2.0 * np.pi * t * rng.uniform(0.1, 1.5, 3) + rng.uniform(0.0, 6.0, 3)) * rng.uniform(0.1, 2.5, 3)
-    corners = rng.uniform(-2.9, 2.9, (int(rng.integers(3, 9)), 3))
-    return corners if kind == "corners" else np.concatenate([corners, corners[::-1]])
 
 
 @settings(max_examples=60)
@@ -200,42 +159,6 @@ def test_scales_and_a_minimum_duration_slow_the_motion() -> None:
     late = timed(path, Timing(minimum_duration=9.0)).trajectory
     assert late.duration == pytest.approx(9.0, abs=1e-9) and keeps_limits(late)
     assert timed(path, Timing(minimum_duration=0.01)).trajectory.duration == quick.duration
-
-
-@settings(max_examples=30)
-@given(path=paths(), seed=st.integers(0, 999), share=st.sampled_from([0.1, 0.6, 0.95]))
-def test_motions_begin_with_a_velocity(path: np.ndarray, seed: int, share: float) -> None:
-    rng = np.random.default_rng(seed)
-    path = np.clip(path, -2.0, 2.0)
-    velocity = share * LIMITS.velocity * rng.uniform(-1.0, 1.0, 3)
-    acceleration = LIMITS.acceleration * rng.uniform(-1.0, 1.0, 3)
-    start = Timing(start_velocity=velocity, start_acceleration=acceleration)
-    try:
-        made = time_path(path, LIMITS, NAMES, start)
-    except TimingError as error:  # it cannot even brake within the limits
-        assert "velocity at the start" in str(error)
-        assert np.any(np.abs(velocity) + acceleration**2 / (2.0 * LIMITS.jerk) > LIMITS.velocity)
-        return
-    motion = made.trajectory
-    assert made.form.startswith("moving start")
-    np.testing.assert_allclose(motion(0.0, 1), velocity, atol=1e-9)
-    np.testing.assert_allclose(motion(0.0, 2), acceleration, atol=1e-9)
-    np.testing.assert_array_equal(motion.positions[[0, -1]], path[[0, -1]])
-    assert not motion.velocities[-1].any() and max(motion.use(LIMITS).values()) <= 1.0 + 1e-9
-    assert (np.abs(motion.jerks) <= LIMITS.jerk * (1.0 + 1e-6)).all()
-    change = motion(np.arange(0.0, motion.duration, RATE))
-    for order, limit in ((1, LIMITS.velocity), (2, LIMITS.acceleration)):
-        change = np.diff(change, axis=0)
-        excess = (np.abs(change) / RATE**order - limit * (1.0 + 1e-6)).max()
-        assert excess <= 4.0 * 1e-8 / RATE**order, "Ruckig ends 1e-8 from where the motion goes on"
-
-
-def test_a_moving_start_is_no_slower_than_rest_where_the_path_goes_its_way() -> None:
-    path = np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0]])
-    moving = timed(path, Timing(start_velocity=(1.5, 0.0, 0.0))).trajectory
-    assert moving.duration < timed(path).trajectory.duration - 0.05
-    late = timed(path, Timing(start_velocity=(1.5, 0.0, 0.0), minimum_duration=4.0)).trajectory
-    assert late.duration >= 4.0 - 1e-6 and late(0.0, 1)[0] == pytest.approx(1.5)
 
 
 def test_where_a_motion_is_at_fault_it_stays_closer_and_stops_at_last() -> None:

@@ -17,7 +17,7 @@ from apex_ompl.collision.containment_tests import ContainmentTest, containment_t
 from apex_ompl.collision.hull_distance import Distance, closest, hull_distance
 from apex_ompl.collision.solids import Solid, overlaps, transform, world_boxes
 from apex_ompl.robot import Robot
-from apex_ompl.robot.model import link_of
+from apex_ompl.robot.geometry import link_of
 from apex_ompl.scene.bodies import AttachedObject
 from apex_ompl.types import Array
 

@@ -187,7 +187,8 @@ def weight_shapes(config: ModelConfig) -> dict[str, tuple[int, ...]]:
 
 def _silu(values: Single) -> Single:
     """Return x / (1 + exp(-x))."""
-    return np.asarray(values / (np.float32(1.0) + np.exp(-values)))
+    with np.errstate(over="ignore"):  # x / inf is the limit, 0
+        return np.asarray(values / (np.float32(1.0) + np.exp(-values)))
 
 
 def _normalized(values: Single) -> Single:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import os
 import threading
 from collections.abc import Callable, Mapping
@@ -21,8 +20,8 @@ from apex_ompl.diffusion.array_model import ArrayModel, is_supported, weight_sha
 from apex_ompl.diffusion.model_config import ModelConfig
 from apex_ompl.diffusion.proposals import TrajectoryModel
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError, UnknownNameError
-from apex_ompl.util.files import BROKEN, is_file, read_file, read_text
-from apex_ompl.util.schema import StrictModel, validate
+from apex_ompl.util.files import BROKEN, is_file, read_file
+from apex_ompl.util.schema import StrictModel, read_json, validate
 
 if TYPE_CHECKING:
     import torch
@@ -183,14 +182,7 @@ def read_config(folder: Path) -> CheckpointConfig:
         FileFormatError: The file is not one.
     """
     path = folder / CONFIG
-    try:
-        data = json.loads(read_text(path, "file of a checkpoint"))
-        if not isinstance(data, dict):
-            raise ValueError
-    except (ValueError, RecursionError) as error:
-        raise FileFormatError(
-            str(path), "", type(error).__name__, "expected the configuration of a checkpoint"
-        ) from error
+    data = read_json(path, "file of a checkpoint")
     if data.get("schema") != SCHEMA:
         raise FileFormatError(str(path), "schema", data.get("schema"), f"expected {SCHEMA!r}")
     return validate(CheckpointConfig, data, str(path))

@@ -5,8 +5,8 @@ What they are compiled for is said here, as numba writes types: ``f8[:, ::1]`` i
 
 from __future__ import annotations
 
-import fcntl
 import logging
+import os
 import subprocess
 import sys
 import threading
@@ -14,12 +14,12 @@ import time
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from importlib import import_module
-from os import environ
 from typing import Any
 
 from tqdm import tqdm
 
 from apex_ompl.kernel.compiled.compilation import CompiledFunction, cache_folder, names_in_cache
+from apex_ompl.util.files import locked
 
 LOG = logging.getLogger("apex_ompl")
 TYPICAL_SECONDS = 30
@@ -45,6 +45,11 @@ BESIDE: dict[str, tuple[str, int]] = {
     "curve_proof.prove_curve": (6 * ROBOT + CURVE, 18),
     "queries.joint_frames": (ROBOT + WORKSPACE + "f8[:, ::1], f8[:, :, :, ::1], f8[:, :, ::1]", 2),
     "motion_proof.lay_grid": ("f8[:, ::1], f8, i8[::1]", 1),
+    "jerk_profiles.join_profiles": (
+        "f8[:, :, ::1], f8[:, :, ::1], i8[::1], f8[:, :, ::1], i8[:, :, ::1], f8[:, :, :, ::1], i8[::1], f8[::1], "
+        "f8[:, :, ::1]",
+        2,
+    ),
     "polyline_distance.max_distance": ("f8[:, ::1], f8[::1], f8[:, ::1], f8[::1], f8", 1),
     "time_parameterization.max_path_speeds": ("f8[:, ::1], f8[:, ::1], f8[::1], f8[::1], f8, f8[::1]", 1),
     "time_parameterization.sample_times": ("f8[::1], f8, f8, f8[::1]", 1),
@@ -72,8 +77,7 @@ def _compile_missing() -> None:
         folder = cache_folder()
         if folder is None or not _missing(HERE | BESIDE):
             return
-        with (folder / "lock").open("w") as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX)
+        with locked(folder, wait=True):
             here, beside = map(_missing, (HERE, BESIDE))
             if here or beside:
                 LOG.warning("apex_ompl compiles its collision kernel (about %d s, kept in %s)", TYPICAL_SECONDS, folder)
@@ -107,9 +111,9 @@ def _compile(here: list[str], beside: list[str]) -> None:
 def _beside(names: list[str], bar: Any, seconds: Mapping[str, int]) -> Iterator[None]:
     """Let a process compile functions during a block, and wait for it behind; it ends with the block's exception."""
     command = [sys.executable, "-c", CHILD, *names]
-    environment = {"PYTHONPATH": ":".join(filter(None, sys.path))}
+    environment = {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     with subprocess.Popen(
-        command, env=environ | environment, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+        command, env=os.environ | environment, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
     ) as child:
 
         def follow() -> None:

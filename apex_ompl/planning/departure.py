@@ -75,7 +75,7 @@ def find_departure(setup: PlanningSetup, most: float, seed: int = 0) -> Departur
     contacts, depth = checker.contacts(start), -checker.clearance(start)
     if depth > most + ROUNDING or any(contact.depth > most + ROUNDING for contact in contacts):
         return None
-    names = (contacts[0].first, contacts[0].second) if contacts else nearest_pair(checker, start)
+    names = (contacts[0].first, contacts[0].second) if contacts else _nearest_pair(checker, start)
     rng, free = np.random.default_rng(seed), np.setdiff1d(np.arange(len(start)), setup.held)
     drawn = np.zeros((DIRECTIONS, len(start)))
     drawn[:, free] = rng.normal(size=(DIRECTIONS, len(free)))
@@ -122,7 +122,7 @@ def with_departure(result: PlanResult, setup: PlanningSetup, departure: Departur
     return replace(result, path=path, trajectory=motion, limit_use=motion.use(limits))
 
 
-def nearest_pair(checker: CollisionChecker, q: Array) -> tuple[str, str]:
+def _nearest_pair(checker: CollisionChecker, q: Array) -> tuple[str, str]:
     """Return the names of the pair of bodies that is nearest at a state, shape (dof,)."""
     pair: tuple[str, str] = checker.prove(q[None], tolerance=0.0).pair
     return pair

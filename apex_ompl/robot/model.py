@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cache
-from itertools import combinations
 from pathlib import Path
-from xml.etree import ElementTree as ET
 
-import coal
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
@@ -19,8 +15,8 @@ from apex_ompl.errors import FileFormatError, RobotError, UnknownNameError
 from apex_ompl.robot.assets import DATA, resolve
 from apex_ompl.robot.compose import compose
 from apex_ompl.robot.config import Hand, RobotConfig, read_config, read_disabled_pairs
+from apex_ompl.robot.geometry import check_geometry, pair_up
 from apex_ompl.scene.bodies import Body
-from apex_ompl.scene.meshes import extent_fault
 from apex_ompl.types import Array
 from apex_ompl.util.validation import shape_error
 
@@ -213,12 +209,12 @@ def build_robot(config: RobotConfig, path: Path) -> Robot:
         geometry = pin.buildGeomFromUrdfString(model, composition.urdf, pin.GeometryType.COLLISION)
     except Exception as error:  # Pinocchio's parser raises several kinds
         raise RobotError(f"{path}: Pinocchio cannot read the composed URDF ({error})") from error
-    _check_geometry(model, geometry, composition.urdf, path)
+    check_geometry(model, geometry, composition.urdf, path)
     order = _state_order(config, model, path)
     disabled = list(composition.disabled_pairs)
     if config.disabled_pairs:
         disabled += read_disabled_pairs(resolve(config.disabled_pairs, path.parent, "file of disabled pairs"))
-    _pair_up(model, geometry, disabled)
+    pair_up(model, geometry, disabled)
     covers = resolve(config.covers, path.parent, "file of sphere covers") if config.covers else None
     names = tuple(config.joints)
     for hand in config.hands.values():
@@ -239,25 +235,6 @@ def build_robot(config: RobotConfig, path: Path) -> Robot:
         geometry=geometry, fixtures=config.fixtures, part_links=composition.part_links,
         urdf=composition.urdf, covers=covers, _order=order,
     )  # fmt: skip
-
-
-def link_of(model: pin.Model, item: pin.GeometryObject) -> str:
-    """Return the name of the link that a geometry belongs to."""
-    return str(model.frames[item.parentFrame].name)
-
-
-def _check_geometry(model: pin.Model, geometry: pin.GeometryModel, urdf: str, path: Path) -> None:
-    """Raise a RobotError if Pinocchio has dropped collision geometry, or if a collision mesh is not a solid."""
-    found = Counter(link_of(model, item) for item in geometry.geometryObjects)
-    for link in ET.fromstring(urdf).findall("link"):
-        name, wanted = str(link.get("name")), len(link.findall("collision"))
-        if found[name] != wanted:
-            raise RobotError(f"{path}: link {name!r} has {wanted} collision geometries, {found[name]} can be read")
-    for item in geometry.geometryObjects:
-        mesh = item.geometry
-        fault = extent_fault(np.array(mesh.vertices())) if mesh.getObjectType() == coal.OT_BVH else ""
-        if fault:
-            raise RobotError(f"{path}: the collision mesh of link {link_of(model, item)!r} has {fault}")
 
 
 def _state_order(config: RobotConfig, model: pin.Model, path: Path) -> NDArray[np.intp]:
@@ -289,16 +266,3 @@ def _limits(config: RobotConfig, model: pin.Model, path: Path) -> Limits:
             raise FileFormatError(str(path), f"joints.{name}", [low, high, speed], expected)
         rows.append((low, high, speed, joint.acceleration, joint.jerk))
     return Limits(*(np.array(column, float) for column in zip(*rows, strict=True)))
-
-
-def _pair_up(model: pin.Model, geometry: pin.GeometryModel, disabled: Sequence[tuple[str, str]]) -> None:
-    """Add a collision pair for any two geometries that move relative to each other and are not disabled."""
-    skip = {frozenset(pair) for pair in disabled}
-    items = list(geometry.geometryObjects)
-    for i, j in combinations(range(len(items)), 2):
-        a, b = items[i], items[j]
-        if a.parentJoint == b.parentJoint:  # rigidly joined, or both fixed to the world
-            continue
-        if frozenset((link_of(model, a), link_of(model, b))) in skip:
-            continue
-        geometry.addCollisionPair(pin.CollisionPair(i, j))

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Annotated, Self, TypeVar
 
 import numpy as np
+import pinocchio as pin
 from numpy.typing import ArrayLike
 from pydantic import AfterValidator, Field, field_validator, model_validator
 
@@ -171,3 +172,9 @@ def pose_matrix(position: ArrayLike, orientation: ArrayLike) -> Array:
     ]
     pose[:3, 3] = position
     return pose
+
+
+def pose_fields(pose: Array) -> dict[str, tuple[float, ...]]:
+    """Return the fields ``position`` [m] and ``orientation`` (quaternion xyzw) of a transform of shape (4, 4)."""
+    turn = pin.Quaternion(pose[:3, :3]).coeffs()
+    return {"position": tuple(pose[:3, 3].tolist()), "orientation": tuple(turn.tolist())}

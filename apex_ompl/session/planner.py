@@ -55,9 +55,9 @@ class MotionPlanner:
     """A robot in a world, ready to plan again and again.
 
     What takes time is done once: the robot is built, its tables and those of the world are made, the model and the
-    compiled code are loaded. The world is edited in place (:class:`apex_ompl.world.World`), as a planning scene of
-    MoveIt's. A planner may be used by several threads; plans, checks and edits of one planner wait for each other, so
-    that a plan holds for the world in which it began. Two planners work at the same time.
+    compiled code are loaded. The world is edited in place (:class:`apex_ompl.session.world.World`), as a planning scene
+    of MoveIt's. A planner may be used by several threads; plans, checks and edits of one planner wait for each other,
+    so that a plan holds for the world in which it began. Two planners work at the same time.
 
         with apex_ompl.MotionPlanner() as planner:
             planner.world.add(name="post", box=(0.1, 0.1, 0.6), position=(0.5, 0.0, 0.3))
@@ -68,7 +68,8 @@ class MotionPlanner:
         """Make a planner in an empty world.
 
         Args:
-            robot: Name of a robot that ships, path of a robot file, or a robot.
+            robot: Name of a robot that ships, path of a robot file, or a robot; one that does not ship is better given
+                by its file, which results and other processes find it by.
             model: Name or folder of the checkpoint that ``apex`` uses; by default its own.
 
         Raises:
@@ -216,7 +217,9 @@ class MotionPlanner:
                     notes.append(f"no model of {self.robot.name} ships, so {planner} plans")
             parameters = planners.parameters(planner, **self._parameters(planner, params))
             if how is not None:
-                how.start(how.limits(self.robot.limits, self.robot.joint_names))  # whether it fits the robot
+                start = how.start(how.limits(self.robot.limits, self.robot.joint_names))  # whether it fits the robot
+                if start is not None and leave_contact:
+                    raise ParameterError("leave_contact", leave_contact, "0 for a start that moves")
             self._checker.check_counts = CheckCounts()
             moving = None if group is None else planned_joints(self.robot, group)
             given = ready = self._ready(problem, seed, moving)
@@ -232,7 +235,7 @@ class MotionPlanner:
             with Interrupt() as run.interrupt:
                 result = find_path(run, simplify)
                 if how is not None:
-                    result = parameterize(run, result, how if departure is None else how.from_rest())
+                    result = parameterize(run, result, how)
             if departure is not None:
                 result = with_departure(result, given, departure, how)
             return finish(run, result, started)

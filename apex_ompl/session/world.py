@@ -9,12 +9,11 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-import pinocchio as pin
 from numpy.typing import ArrayLike
 
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import SceneError
-from apex_ompl.scene.bodies import AttachedObject, Obstacle
+from apex_ompl.scene.bodies import AttachedObject, Obstacle, pose_fields
 from apex_ompl.scene.problem import Problem
 from apex_ompl.types import Array
 from apex_ompl.util.schema import validate
@@ -70,7 +69,7 @@ class World:
             FileFormatError: The position or the orientation is not valid.
         """
         with self._lock:
-            self._not_a_fixture(name)
+            self._obstacle(name)
             self._checker.move(name, position, orientation)
 
     def set_velocity(self, name: str, velocity: Sequence[float] | None) -> None:
@@ -81,7 +80,7 @@ class World:
             FileFormatError: The velocity is not valid.
         """
         with self._lock:
-            self._not_a_fixture(name)
+            self._obstacle(name)
             self._checker.set_velocity(name, velocity)
 
     def remove(self, name: str) -> None:
@@ -91,7 +90,7 @@ class World:
             SceneError: There is no such obstacle, or it is a fixture of the robot.
         """
         with self._lock:
-            self._not_a_fixture(name)
+            self._obstacle(name)
             self._checker.remove(name)
 
     def attach(
@@ -150,7 +149,7 @@ class World:
             if at is not None and held is not None:
                 pose = self._checker.robot.link_pose(np.asarray(at, float), held.link) @ held.pose
                 shape = held.model_dump(exclude_none=True, exclude={"link", "touch_links", "contact"})
-                self._add([self._read(Obstacle, {**shape, **_placed(pose)}, "obstacle")])
+                self._add([self._read(Obstacle, {**shape, **pose_fields(pose)}, "obstacle")])
 
     @property
     def allowed(self) -> tuple[tuple[str, str], ...]:
@@ -210,13 +209,9 @@ class World:
             raise
 
     def _obstacle(self, name: str) -> Obstacle:
-        if name not in self.obstacles:
+        if not self._checker.is_obstacle(name):
             raise SceneError(f"no obstacle {name!r}; there are: {', '.join(self.obstacles) or 'none'}")
         return self.obstacles[name]
-
-    def _not_a_fixture(self, name: str) -> None:
-        if not self._checker.is_obstacle(name):
-            self._obstacle(name)  # names those that there are
 
     def _check_grasp(self, name: str, q: Array) -> None:
         contacts = [contact for contact in self._checker.contacts(q) if name in (contact.first, contact.second)]
@@ -226,15 +221,8 @@ class World:
     def _as_held(self, obstacle: Obstacle, link: str, q: Array) -> dict[str, Any]:
         pose = np.linalg.inv(self._checker.robot.link_pose(q, link)) @ obstacle.pose
         shape = obstacle.model_dump(exclude_none=True, exclude={"velocity"})
-        return {**shape, "link": link, **_placed(pose)}
+        return {**shape, "link": link, **pose_fields(pose)}
 
     @staticmethod
     def _read(kind: Any, given: Any, role: str) -> Any:
         return given if isinstance(given, kind) else validate(kind, dict(given), role)
-
-
-def _placed(pose: Array) -> dict[str, tuple[float, ...]]:
-    """Return position and orientation of a pose, shape (4, 4)."""
-    return {
-        "position": tuple(pose[:3, 3].tolist()), "orientation": tuple(pin.Quaternion(pose[:3, :3]).coeffs().tolist())
-    }  # fmt: skip

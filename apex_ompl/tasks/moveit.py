@@ -16,12 +16,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pinocchio as pin
 
 from apex_ompl.errors import FileFormatError, UnknownNameError
 from apex_ompl.robot import Robot
 from apex_ompl.robot.assets import resolve
-from apex_ompl.scene.bodies import AttachedObject, BodyT, Obstacle, pose_matrix
+from apex_ompl.scene.bodies import AttachedObject, BodyT, Obstacle, pose_fields, pose_matrix
 from apex_ompl.scene.problem import Goal, Problem
 from apex_ompl.tasks.messages import MessageReader, inside
 from apex_ompl.tasks.moveit_allowed import MATRIX, allowed_pairs
@@ -187,7 +186,9 @@ def convert(
     attached = list(_attached(at_scene, scene_state, "robot_state", q))
     attached += list(_attached(at_request, start_state, "start_state", q))
     bodies = [body.name for body in (*obstacles, *attached)]
-    allowed = allowed_pairs(at_scene, at_scene.section(scene_data, MATRIX), robot, bodies, frame_map or {}, notes)
+    allowed, unknown = allowed_pairs(at_scene, at_scene.section(scene_data, MATRIX), robot, bodies, frame_map or {})
+    if unknown:
+        notes.append(f"{MATRIX}: neither links nor objects here, so left out: {', '.join(unknown)}")
     goals = _goals(at_request, request_data, start)
     for key in HARMLESS:
         if request_data.get(key):
@@ -213,7 +214,7 @@ def _obstacles(reader: _Reader, data: Mapping[str, Any], start: Array) -> list[O
         base = reader.frame(str(reader.section(item, "header", where).get("frame_id", "")), start, where)
         for label, shape, pose in _bodies(reader, item, where):
             placed = base @ pose
-            found.append(reader.body(Obstacle, {"name": label, **shape, **_placement(placed)}, where))
+            found.append(reader.body(Obstacle, {"name": label, **shape, **pose_fields(placed)}, where))
     return found
 
 
@@ -232,7 +233,7 @@ def _attached(reader: _Reader, state: Mapping[str, Any], where: str, start: Arra
             reader.notes.append(f"{here}.touch_links: {', '.join(unknown)} are no links of {reader.robot.name}")
         known = tuple(t for t in touch if t in reader.robot.link_names)
         for label, shape, pose in _bodies(reader, item, here):
-            fields = {"name": label, "link": link, **shape, **_placement(base @ pose)}
+            fields = {"name": label, "link": link, **shape, **pose_fields(base @ pose)}
             if known:
                 fields["touch_links"] = tuple({*known, *reader.robot.hand_of(link)})
             yield reader.body(AttachedObject, fields, here)
@@ -273,8 +274,3 @@ def _goals(reader: _Reader, data: Mapping[str, Any], start: Mapping[str, float])
     if not goals:
         raise reader.fail("goal_constraints", None, "expected at least one goal")
     return goals
-
-
-def _placement(pose: Array) -> dict[str, Any]:
-    turn = pin.Quaternion(pose[:3, :3]).coeffs()
-    return {"position": tuple(pose[:3, 3].tolist()), "orientation": tuple(float(v) for v in turn)}

@@ -8,18 +8,17 @@ from itertools import product
 from typing import Any
 
 from apex_ompl.robot import Robot
-from apex_ompl.robot.model import link_of
+from apex_ompl.robot.geometry import link_of
 from apex_ompl.tasks.messages import MessageReader
 
 MATRIX = "allowed_collision_matrix"
 Pair = tuple[str, str]
 
 
-def allowed_pairs(  # noqa: PLR0917
-    reader: MessageReader, matrix: Mapping[str, Any], robot: Robot, bodies: Sequence[str], names: Mapping[str, str],
-    notes: list[str],
-) -> list[Pair]:  # fmt: skip
-    """Return the pairs that a matrix lets touch and that are checked here, by their names.
+def allowed_pairs(
+    reader: MessageReader, matrix: Mapping[str, Any], robot: Robot, bodies: Sequence[str], names: Mapping[str, str]
+) -> tuple[list[Pair], list[str]]:
+    """Return the pairs that a matrix lets touch and that are checked here, and names that are no link or object.
 
     An object of several shapes stands for all of them. A name with a default that allows may touch whatever no entry
     keeps it from.
@@ -30,7 +29,6 @@ def allowed_pairs(  # noqa: PLR0917
         robot: The robot.
         bodies: Names of the obstacles and held objects.
         names: Link in the file -> link of ``robot``.
-        notes: Gets a note on names that are neither links nor objects.
 
     Raises:
         FileFormatError: The matrix is not square, or has other faults.
@@ -50,8 +48,6 @@ def allowed_pairs(  # noqa: PLR0917
     known = (*dict.fromkeys((*robot.link_names, *bodies)),)
     ours = {name: _bodies_of(names.get(name, name), known) for name in (*entries, *defaults)}
     unknown = sorted(name for name, found in ours.items() if not found)
-    if unknown:
-        notes.append(f"{MATRIX}: neither links nor objects here, so left out: {', '.join(unknown)}")
     allowed, kept_apart = set[Pair](), set[Pair]()
     for i, j in product(range(len(entries)), repeat=2):
         if i != j:
@@ -62,7 +58,7 @@ def allowed_pairs(  # noqa: PLR0917
             allowed |= set(map(_sorted, product(ours[name], known))) - kept_apart
     links = set(robot.link_names)
     checked = _pairs_of_links(robot)
-    return sorted(p for p in allowed if p[0] != p[1] and (p in checked or not links.issuperset(p)))
+    return sorted(p for p in allowed if p[0] != p[1] and (p in checked or not links.issuperset(p))), unknown
 
 
 def _sorted(pair: Iterable[str]) -> Pair:

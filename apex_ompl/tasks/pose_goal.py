@@ -129,7 +129,10 @@ def frame_of(robot: Robot, name: str, held: Mapping[str, AttachedObject]) -> Fra
         if held[name].contact is None:
             return Frame(held[name].link, held[name].pose, axial=False)
         face = LinkFace.of_object(held[name])
-        return Frame(face.link, _with_z(face.point, face.axis), axial=True)
+        pose = np.eye(4)
+        pose[:3, :3] = pin.Quaternion.FromTwoVectors(pose[:3, 2], face.axis).matrix()
+        pose[:3, 3] = face.point
+        return Frame(face.link, pose, axial=True)
     if name in robot.hands:
         hand, pose = robot.hands[name], np.eye(4)
         pose[:3, 3] = hand.point
@@ -137,16 +140,6 @@ def frame_of(robot: Robot, name: str, held: Mapping[str, AttachedObject]) -> Fra
     if name in robot.link_names:
         return Frame(name, np.eye(4), axial=False)
     raise UnknownNameError("frame of a pose", name, (*robot.hands, *held, *robot.link_names))
-
-
-def _with_z(point: Array, axis: Array) -> Array:
-    """Return a pose at a point whose z axis is a unit vector, shape (4, 4)."""
-    x = np.eye(3)[int(np.argmin(np.abs(axis)))]
-    x = x - axis * (x @ axis)
-    x /= np.linalg.norm(x)
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = np.stack([x, np.cross(axis, x), axis], axis=1), point
-    return pose
 
 
 def rotation_angle(first: Array, second: Array) -> float:

@@ -15,7 +15,7 @@ import yaml
 from apex_ompl.errors import FileFormatError, ParameterError
 from apex_ompl.types import Array
 from apex_ompl.util.files import BROKEN, read_file, read_text, suffix_of
-from apex_ompl.util.schema import read_yaml
+from apex_ompl.util.schema import read_json, read_yaml
 
 MESSAGES = (".traj.yaml", ".traj.json")
 SUFFIXES = (".npz", ".csv", *MESSAGES)
@@ -84,7 +84,7 @@ def decode(path: Path) -> tuple[Array, list[Array], tuple[str, ...]]:
                 return archive["times"].astype(float), states, tuple(str(name) for name in archive["joint_names"])
         if suffix == ".csv":
             return _from_table(read_text(path, ROLE))
-        return _from_messages(read_yaml(path, ROLE))  # JSON is YAML
+        return _from_messages((read_json if suffix == ".traj.json" else read_yaml)(path, ROLE))
     except (OSError, *BROKEN, AttributeError, IndexError, csv.Error) as error:
         raise FileFormatError(str(path), "", str(error), "expected a saved trajectory") from error
 

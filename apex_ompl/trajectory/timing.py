@@ -17,7 +17,9 @@ from apex_ompl.robot.model import Limits
 from apex_ompl.trajectory.curve import SAME_STATE, Polyline
 from apex_ompl.trajectory.deviation import deviation_bound
 from apex_ompl.trajectory.methods import DEFAULT_METHOD, METHODS
-from apex_ompl.trajectory.methods.ruckig import from_moving_start, stops
+from apex_ompl.trajectory.methods.moving_start import from_moving_start
+from apex_ompl.trajectory.methods.ruckig import stops
+from apex_ompl.trajectory.methods.ruckig_profiles import Profiles, joined
 from apex_ompl.trajectory.trajectory import Trajectory
 from apex_ompl.trajopt.path import Path
 from apex_ompl.types import Array
@@ -85,10 +87,6 @@ class Timing:
             object.__setattr__(
                 self, name, tuple(np.atleast_1d(finite_array(getattr(self, name), name)).ravel().tolist())
             )
-
-    def from_rest(self) -> Timing:
-        """Return the same without a velocity and an acceleration at the start."""
-        return replace(self, start_velocity=(), start_acceleration=())
 
     def limits(self, limits: Limits, joint_names: Sequence[str]) -> Limits:
         """Return the limits of a plan: the lower ones of single joints, scaled.
@@ -291,3 +289,4 @@ def warm_up() -> None:
     max_path_speeds(np.ones((3, 1)), np.zeros((3, 1)), np.ones(1), np.ones(1), 1.0, x)
     sample_times(x, 1.0, 1.0, np.empty(1))
     max_distance(np.zeros((1, 1)), np.zeros(1), np.array([[0.0], [1.0]]), np.array([0.0, 1.0]), 1.0)
+    joined(Profiles(np.ones((1, 1, 1)), np.zeros((1, 1, 1)), np.ones(1), brakes=False), np.zeros((3, 2, 1)), ("joint",))

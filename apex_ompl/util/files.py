@@ -141,8 +141,12 @@ def make_folder(folder: str | os.PathLike[str], role: str = "output folder") -> 
 
 
 @contextmanager
-def locked(folder: Path) -> Iterator[None]:
+def locked(folder: Path, *, wait: bool = False) -> Iterator[None]:
     """Lock a folder against other processes inside the block.
+
+    Args:
+        folder: The folder.
+        wait: Wait until another process has unlocked it.
 
     Raises:
         MissingFileError: The folder cannot be written.
@@ -154,7 +158,7 @@ def locked(folder: Path) -> Iterator[None]:
         raise MissingFileError(str(folder), "output folder", (error.strerror or "cannot be written").lower()) from error
     with file:
         try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
         except OSError as error:
             raise FolderInUseError(str(folder)) from error
         yield
