@@ -7,6 +7,7 @@ import pinocchio as pin
 
 from apex_ompl.kernel import robot_builder, robot_specs
 from apex_ompl.kernel.compiled.arrays import FIXED, PRISMATIC, REVOLUTE
+from apex_ompl.kernel.joint_tree import JointTree
 from apex_ompl.kernel.tables import RobotTables
 
 
@@ -49,7 +50,9 @@ def random_robot(seed: int, joints: int = 9, dof: int = 4) -> tuple[RobotTables,
     pairs = [(a, b) for a in range(joints) for b in range(a) if rng.random() < 0.5]
     names = [f"q{k}" for k in range(dof)]
     box = np.ones(dof)
-    tables = robot_builder.robot_tables("tree", names, lower=-box, upper=box, joints=specs, bodies=bodies, pairs=pairs)
+    tables = robot_builder.robot_tables(
+        "tree", names, lower=-box, upper=box, tree=JointTree(specs), bodies=bodies, pairs=pairs
+    )
     return tables, specs, bodies, pairs
 
 

@@ -22,6 +22,7 @@ from apex_ompl.errors import ParameterError
 from apex_ompl.kernel import Kernel, robot_builder, robot_specs
 from apex_ompl.kernel.compiled import motion_proof, queries
 from apex_ompl.kernel.compiled.arrays import PRISMATIC
+from apex_ompl.kernel.joint_tree import JointTree
 from apex_ompl.kernel.scene_builder import scene_tables
 from apex_ompl.kernel.tables import RobotTables
 from apex_ompl.robot import Robot
@@ -94,7 +95,9 @@ def single_ball() -> RobotTables:
     }
     body = robot_specs.BodySpec("ball", 3, np.eye(4), **cover)
     box = 10.0 * np.ones(3)
-    return robot_builder.robot_tables("ball", "xyz", lower=-box, upper=box, joints=specs, bodies=[body], pairs=[])
+    return robot_builder.robot_tables(
+        "ball", "xyz", lower=-box, upper=box, tree=JointTree(specs), bodies=[body], pairs=[]
+    )
 
 
 def cylinder_surface(shape: coal.Cylinder, at: np.ndarray) -> np.ndarray:

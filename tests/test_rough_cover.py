@@ -12,8 +12,10 @@ from hypothesis import strategies as st
 from support import ROOT
 
 from apex_ompl.collision.cover.boxes import bounding_boxes
-from apex_ompl.collision.cover.proof import Cover
+from apex_ompl.collision.cover.cylinder import cylinder_cover
+from apex_ompl.collision.cover.proof import FINEST, FINEST_SHARE, Cover, uncovered_boxes
 from apex_ompl.collision.cover.rough import rough_cover
+from apex_ompl.collision.cover.solids import solid_of
 from apex_ompl.collision.tabulate import primitives
 from apex_ompl.scene.meshes import capped, triangles, winding_number
 
@@ -91,3 +93,30 @@ def test_covers_of_boxes_contain_them(sides: tuple[float, float, float], seed: i
     assert len(cover.leaves) <= 64
     smaller = Cover(cover.centres, cover.radii - 1e-3, cover.first, cover.count)
     assert not answered_for(smaller, signs * half).all()
+
+
+@settings(max_examples=60)
+@given(radius=st.floats(0.002, 0.5), share=st.floats(0.02, 60.0), seed=st.integers(0, 1000))
+def test_covers_of_cylinders_contain_them(radius: float, share: float, seed: int) -> None:
+    half = radius * share
+    cover = cylinder_cover(radius, half) if share >= 1.0 else rough_cover(coal.Cylinder(radius, 2.0 * half))
+    rng = np.random.default_rng(seed)
+    angle, height = rng.uniform(0.0, 2.0 * np.pi, 3000), rng.uniform(-half, half, 3000)
+    away = radius * np.sqrt(rng.uniform(0.0, 1.0, 3000))
+    away[:1000], height[500:1500] = radius, half * rng.choice([-1.0, 1.0], 1000)  # on the surface, and on the edges
+    points = np.stack([away * np.cos(angle), away * np.sin(angle), height], axis=1)
+    assert answered_for(cover, points).all()
+    smaller = Cover(cover.centres, cover.radii - 0.2 * radius, cover.first, cover.count)
+    assert not answered_for(smaller, points).all()
+
+
+@pytest.mark.parametrize(("radius", "half"), [(0.02, 0.05), (0.03, 0.03), (0.015, 0.15)])
+def test_covers_of_cylinders_are_proved_and_near(radius: float, half: float) -> None:
+    cover = cylinder_cover(radius, half)
+    slack = 2.0 * max(FINEST, 2.0 * half * FINEST_SHARE)  # balls that meet in a point have none
+    wider = Cover(cover.centres, cover.radii + slack, cover.first, cover.count)
+    assert len(uncovered_boxes(solid_of(coal.Cylinder(radius, 2.0 * half)), wider)) == 0
+    leaf = cover.leaves
+    across = np.linalg.norm(cover.centres[leaf, :2], axis=1) + cover.radii[leaf] - radius
+    along = np.abs(cover.centres[leaf, 2]) + cover.radii[leaf] - half
+    assert len(leaf) <= 48 and max(across.max(), along.max()) < 0.2 * radius + 1e-5

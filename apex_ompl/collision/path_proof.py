@@ -14,13 +14,11 @@ import numpy as np
 from apex_ompl.collision.exact_shapes import PlacedShape, joined, shape_arrays
 from apex_ompl.collision.mesh_stage import MeshStage
 from apex_ompl.collision.solids import Solid
-from apex_ompl.collision.tabulate import joint_specs
+from apex_ompl.collision.tabulate import joint_tree
 from apex_ompl.kernel.compiled import curve_proof
-from apex_ompl.kernel.compiled.arrays import FIXED
 from apex_ompl.kernel.compiled.layout import Floats, Integers, new_buffers, pack
 from apex_ompl.kernel.compiled.shapes import PairBuffers, ShapeArrays
 from apex_ompl.kernel.kernel import Kernel
-from apex_ompl.kernel.robot_builder import turn_to
 from apex_ompl.kernel.scene_builder import primitive, scene_tables
 from apex_ompl.robot import Robot
 from apex_ompl.types import Array, Flags
@@ -136,7 +134,7 @@ def _shapes_of_bodies(robot: Robot, scene: MeshStage, kernel: Kernel) -> ShapeAr
     known = _bodies.setdefault(robot, OrderedDict())
     key = id(kernel.robot.arrays.node_centre)  # shared by all kernels of one set of bodies
     if key not in known:
-        turns = [turn_to(j.axis if j.kind != FIXED else None).T for j in joint_specs(robot)]
+        turns = [turn.T for turn in joint_tree(robot).turns]
         bodies = {}
         for row, number in enumerate(kernel.robot.numbers):
             solid = scene.solids[number]

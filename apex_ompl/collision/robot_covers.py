@@ -6,14 +6,15 @@ from collections.abc import Sequence
 
 import coal
 
+from apex_ompl.collision.cover.cylinder import cylinder_cover
 from apex_ompl.collision.cover.proof import Cover
 from apex_ompl.collision.cover.rough import rough_cover
 from apex_ompl.collision.cover.spheres import make_cover, read_covers, shape_key
 from apex_ompl.collision.shapes import is_shell
 from apex_ompl.robot import Robot
+from apex_ompl.util.weak_cache import weakly_cached
 
 QUICK_GAPS, LEAVES = (0.02, 0.005), 32  # of covers made at run time
-SLENDER = 0.05  # cylinders thinner or flatter than this are covered like boxes
 
 _quick: dict[str, Cover] = {}  # by shape key
 
@@ -28,7 +29,7 @@ def covers_of(robot: Robot, shapes: Sequence[coal.CollisionGeometry]) -> list[Co
         MissingFileError: The robot names a file of covers that cannot be read.
         FileFormatError: That file does not follow its schema.
     """
-    given = read_covers(robot.covers) if robot.covers is not None else {}
+    given = _covers_in_file(robot)
     found = []
     for shape in shapes:
         key = shape_key(shape)
@@ -38,12 +39,15 @@ def covers_of(robot: Robot, shapes: Sequence[coal.CollisionGeometry]) -> list[Co
     return found
 
 
+@weakly_cached
+def _covers_in_file(robot: Robot) -> dict[str, Cover]:
+    return read_covers(robot.covers) if robot.covers is not None else {}
+
+
 def _quick_cover(shape: coal.CollisionGeometry) -> Cover:
     kind = shape.getNodeType()
-    if is_shell(shape) or kind == coal.GEOM_BOX:
+    if kind == coal.GEOM_CYLINDER and shape.halfLength >= shape.radius:
+        return cylinder_cover(float(shape.radius), float(shape.halfLength))
+    if is_shell(shape) or kind in (coal.GEOM_BOX, coal.GEOM_CYLINDER):
         return rough_cover(shape)
-    if kind == coal.GEOM_CYLINDER:
-        sizes = sorted((float(shape.radius), float(shape.halfLength)))
-        if sizes[0] < SLENDER * sizes[1]:
-            return rough_cover(coal.Box(2.0 * shape.radius, 2.0 * shape.radius, 2.0 * shape.halfLength))
     return make_cover(shape, QUICK_GAPS, effort=1, most=LEAVES)

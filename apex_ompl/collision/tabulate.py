@@ -14,6 +14,7 @@ from apex_ompl.collision.cover.proof import Cover
 from apex_ompl.collision.solids import Solid
 from apex_ompl.errors import RobotError
 from apex_ompl.kernel.compiled.arrays import BOX, CAPSULE, CYLINDER, HALF_SPACE, PRISMATIC, REVOLUTE, SPHERE
+from apex_ompl.kernel.joint_tree import JointTree
 from apex_ompl.kernel.robot_builder import robot_tables
 from apex_ompl.kernel.robot_specs import BodySpec, JointSpec
 from apex_ompl.kernel.scene_builder import Primitive
@@ -24,6 +25,16 @@ from apex_ompl.util.weak_cache import weakly_cached
 
 PROBE = 1e-3  # value of a planned joint at which axes and ratios are measured: no joint turns by half a turn or more
 CHECKS = (0.37, -1.13, 2.71)  # values at which they are checked, besides the limits
+
+
+@weakly_cached
+def joint_tree(robot: Robot) -> JointTree:
+    """Return the tree of a robot's joints, made once for a robot.
+
+    Raises:
+        RobotError: The motion of a joint is not that of a constant twist about or along an axis.
+    """
+    return JointTree(joint_specs(robot))
 
 
 def joint_specs(robot: Robot) -> list[JointSpec]:
@@ -94,7 +105,7 @@ def tabulate(
     ]  # fmt: skip
     limits = robot.limits
     return robot_tables(
-        robot.name, robot.joint_names, lower=limits.lower, upper=limits.upper, joints=joint_specs(robot),
+        robot.name, robot.joint_names, lower=limits.lower, upper=limits.upper, tree=joint_tree(robot),
         bodies=bodies, pairs=list(pairs), numbers=numbers,
     )  # fmt: skip
 

@@ -144,8 +144,9 @@ def _middle(points: Array, radii: Array) -> Array:
     centre: Array = flat.mean(axis=0)
     for step in range(1, 100):
         offsets = flat - centre
-        k = int(np.argmax(np.linalg.norm(offsets, axis=1) + wide))
-        long = float(np.linalg.norm(offsets[k]))
+        lengths = np.sqrt(np.einsum("ij,ij->i", offsets, offsets))
+        k = int(np.argmax(lengths + wide))
+        long = float(lengths[k])
         if long == 0.0:
             break
         centre = centre + offsets[k] / long * (long + wide[k]) / (step + 1) * 0.5

@@ -7,9 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from apex_ompl.kernel.cluster_balls import ClusterBall, Member, cluster_ball, leaf_radii, transformed
+from apex_ompl.kernel.cluster_balls import ClusterBall, Member, transformed
 from apex_ompl.kernel.compiled.arrays import FIXED, LIMIT_SLACK, RobotArrays
-from apex_ompl.kernel.robot_specs import BodySpec, JointSpec
+from apex_ompl.kernel.joint_tree import JointTree
+from apex_ompl.kernel.robot_specs import BodySpec
 from apex_ompl.kernel.tables import RobotTables
 from apex_ompl.types import Array
 
@@ -20,7 +21,7 @@ def robot_tables(
     *,
     lower: Array,
     upper: Array,
-    joints: Sequence[JointSpec],
+    tree: JointTree,
     bodies: Sequence[BodySpec],
     pairs: Sequence[tuple[int, int]],
     numbers: Sequence[int] | None = None,
@@ -32,40 +33,20 @@ def robot_tables(
         joint_names: Planned joints in state order.
         lower: Their lowest values, shape (dof,).
         upper: Their highest values, shape (dof,).
-        joints: The tree, the world first.
+        tree: Its joints.
         bodies: The solids.
         pairs: Places of the bodies that are checked against each other.
         numbers: Numbers of the bodies outside of the tables; by default their places.
     """
     given = range(len(bodies)) if numbers is None else numbers
-    return _Builder(joints, bodies, lower, upper).tables(name, tuple(joint_names), pairs, given)
-
-
-def turn_to(axis: Array | None) -> Array:
-    """Return the rotation by which the kernel turns a joint's frame, so that ``axis`` is its z; shape (4, 4)."""
-    turn = np.eye(4)
-    if axis is not None:
-        z = np.asarray(axis, float) / np.linalg.norm(axis)
-        x = np.eye(3)[int(np.argmin(np.abs(z)))]
-        x = x - z * (x @ z)
-        x /= np.linalg.norm(x)
-        turn[:3, :3] = np.stack([x, np.cross(z, x), z], axis=1)
-    return turn
+    return _Builder(tree, bodies, lower, upper).tables(name, tuple(joint_names), pairs, given)
 
 
 class _Builder:
-    """Joints with their axes along z, bodies sorted by cluster."""
+    """A tree of joints, and bodies sorted by cluster."""
 
-    def __init__(self, joints: Sequence[JointSpec], bodies: Sequence[BodySpec], lower: Array, upper: Array) -> None:
-        self.joints, self.lower, self.upper = joints, lower, upper
-        turns = [turn_to(j.axis if j.kind != FIXED else None) for j in joints]
-        self.placements = [np.eye(4)]
-        for k, joint in enumerate(joints[1:], start=1):
-            placement = np.eye(4) if joint.placement is None else joint.placement
-            self.placements.append(turns[joint.parent].T @ placement @ turns[k])
-        drivers = [j.source for j in joints if j.kind != FIXED]
-        self.shared = {s for s in drivers if drivers.count(s) > 1}
-        self.home = [self._cluster_joint(k) for k in range(len(joints))]
+    def __init__(self, tree: JointTree, bodies: Sequence[BodySpec], lower: Array, upper: Array) -> None:
+        self.tree, self.lower, self.upper = tree, lower, upper
         keys = [self._key(b, k) for k, b in enumerate(bodies)]
         self.clusters = sorted(set(keys))
         order = sorted(range(len(bodies)), key=lambda b: (self.clusters.index(keys[b]), b))
@@ -73,62 +54,25 @@ class _Builder:
         self.bodies = [bodies[b] for b in order]
         self.cluster_of = [self.clusters.index(keys[b]) for b in order]
         self.centres = [
-            transformed(turns[b.joint].T @ np.asarray(b.placement, float), np.asarray(b.centres, float))
+            transformed(tree.turns[b.joint].T @ np.asarray(b.placement, float), np.asarray(b.centres, float))
             for b in self.bodies
         ]
-        self.lazy = [self._inner(j) for j, _ in self.clusters]
-
-    def _cluster_joint(self, k: int) -> int:
-        """Return the joint of the cluster of a joint's bodies: the joint itself, or the one that carries the hand.
-
-        Joints of which several follow one planned joint are taken for fingers, as long as one planned joint drives
-        all of what hangs there.
-        """
-        chain = [k]
-        while self._is_finger(chain[-1]):
-            chain.append(self.joints[chain[-1]].parent)
-        top = chain[-1]
-        below = [i for i in range(len(self.joints)) if i != top and top in self._chain(i)]
-        fingers = [i for i in below if self.joints[i].kind != FIXED and self._all_fingers(i, top)]
-        driven = {self.joints[i].source for i in fingers}
-        carried = any(not self._is_finger(i) and any(self._is_finger(x) for x in self._chain(i)) for i in below)
-        return k if carried or len(driven) > 1 else top
-
-    def _is_finger(self, k: int) -> bool:
-        joint = self.joints[k]
-        if k == 0:
-            return False
-        if joint.kind == FIXED:
-            return self._is_finger(joint.parent)
-        return joint.source in self.shared
-
-    def _chain(self, k: int) -> list[int]:
-        chain = [k]
-        while chain[-1] > 0:
-            chain.append(self.joints[chain[-1]].parent)
-        return chain
-
-    def _all_fingers(self, k: int, top: int) -> bool:
-        chain = self._chain(k)
-        return all(self._is_finger(x) for x in chain[: chain.index(top)])
+        self.lazy = [tree.inner(j) for j, _ in self.clusters]
 
     def _key(self, body: BodySpec, number: int) -> tuple[int, int]:
         """Return the key of a body's cluster: the joint, and whether it meets the scene; each fixed body is its own."""
-        home = self.home[body.joint]
+        home = self.tree.home[body.joint]
         return (home, number if home == 0 else int(body.meets_scene))
-
-    def _inner(self, top: int) -> list[int]:
-        return [k for k in range(1, len(self.joints)) if k != top and self.home[k] == top and top in self._chain(k)]
 
     def tables(
         self, name: str, joint_names: tuple[str, ...], pairs: Sequence[tuple[int, int]], numbers: Sequence[int]
     ) -> RobotTables:
-        joints, bodies = self.joints, self.bodies
+        joints, bodies = self.tree.joints, self.bodies
         rows = sorted(self.number, key=lambda b: self.number[b])
         inner = {k for ks in self.lazy for k in ks}
         trees = [np.asarray(b.radii, float) for b in bodies]
         starts = np.cumsum([0, *(len(t) for t in trees)])
-        outer = [leaf_radii(c, r, b) for c, r, b in zip(self.centres, trees, bodies, strict=True)]
+        outer = [self.tree.outer_radii(c, b) for c, b in zip(self.centres, bodies, strict=True)]
         balls = [self._ball(c, outer) for c in range(len(self.clusters))]
         pair_rows = self._pairs(pairs)
         arrays = RobotArrays(
@@ -150,8 +94,8 @@ class _Builder:
             pair_common=_ints([common for _, common, _ in pair_rows]),
             pair_bodies=_spans([len(rows) for _, _, rows in pair_rows]),
             bodies=_ints([row for _, _, rows in pair_rows for row in rows]).reshape(-1, 2),
-            joint_rotation=np.array([p[:3, :3] for p in self.placements]),
-            joint_offset=np.array([p[:3, 3] for p in self.placements]),
+            joint_rotation=np.array([p[:3, :3] for p in self.tree.placements]),
+            joint_offset=np.array([p[:3, 3] for p in self.tree.placements]),
             joint_ratio=np.array([j.ratio for j in joints], float),
             joint_shift=np.array([j.shift for j in joints], float),
             lower=np.array(self.lower, float),
@@ -167,7 +111,8 @@ class _Builder:
         return RobotTables(name, joint_names, tuple(b.name for b in bodies), tuple(numbers[b] for b in rows), arrays)
 
     def _dof(self, cluster: int) -> int:
-        sources = [self.joints[k].source for k in self.lazy[cluster] if self.joints[k].kind != FIXED]
+        joints = (self.tree.joints[k] for k in self.lazy[cluster])
+        sources = [joint.source for joint in joints if joint.kind != FIXED]
         return sources[0] if sources else -1
 
     def _pairs(self, pairs: Sequence[tuple[int, int]]) -> list[tuple[tuple[int, int], int, list[tuple[int, int]]]]:
@@ -178,8 +123,8 @@ class _Builder:
             rows.setdefault((self.cluster_of[m], self.cluster_of[n]), []).append((m, n))
         found = []
         for (c, d), members in sorted(rows.items()):
-            above = set(self._chain(self.clusters[d][0]))
-            common = next(k for k in self._chain(self.clusters[c][0]) if k in above)
+            above = set(self.tree.chains[self.clusters[d][0]])
+            common = next(k for k in self.tree.chains[self.clusters[c][0]] if k in above)
             found.append(((c, d), common, sorted(members)))
         return found
 
@@ -191,9 +136,7 @@ class _Builder:
         ]
         dof = self._dof(cluster)
         limits = None if dof < 0 else (float(self.lower[dof]) - LIMIT_SLACK, float(self.upper[dof]) + LIMIT_SLACK)
-        return cluster_ball(
-            members, self.clusters[cluster][0], self.lazy[cluster], self.joints, self.placements, limits
-        )
+        return self.tree.ball(members, self.clusters[cluster][0], self.lazy[cluster], limits)
 
 
 def _ints(values: object) -> NDArray[np.int64]:

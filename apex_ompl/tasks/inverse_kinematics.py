@@ -10,11 +10,10 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
-from apex_ompl.collision.tabulate import joint_specs
+from apex_ompl.collision.tabulate import joint_tree
 from apex_ompl.errors import UnknownNameError
 from apex_ompl.kernel import FixedVector, IKSolver, RobotTables, Target
-from apex_ompl.kernel.compiled.arrays import FIXED
-from apex_ompl.kernel.robot_builder import robot_tables, turn_to
+from apex_ompl.kernel.robot_builder import robot_tables
 from apex_ompl.robot import Robot
 
 
@@ -33,13 +32,13 @@ class Links:
             RobotError: The kernel does not support the type of a joint.
         """
         # No reference to the robot, so that the cache of `of` can release it.
-        specs = joint_specs(robot)
+        tree = joint_tree(robot)
         frames = (f for f in robot.model.frames if f.type == pin.FrameType.BODY)
         self._placements = {f.name: (int(f.parentJoint), f.placement.copy()) for f in frames}
-        self._turns = [turn_to(spec.axis if spec.kind != FIXED else None)[:3, :3] for spec in specs]
+        self._turns = [turn[:3, :3] for turn in tree.turns]
         limits = robot.limits
         self.tables: RobotTables = robot_tables(
-            robot.name, robot.joint_names, lower=limits.lower, upper=limits.upper, joints=specs, bodies=[], pairs=[]
+            robot.name, robot.joint_names, lower=limits.lower, upper=limits.upper, tree=tree, bodies=[], pairs=[]
         )
 
     @classmethod

@@ -1,4 +1,4 @@
-"""Covers of boxes and closed meshes made in milliseconds, for shapes without a cover made offline."""
+"""Covers of boxes, flat cylinders and closed meshes made in milliseconds, for shapes without one made offline."""
 
 from __future__ import annotations
 
@@ -16,13 +16,18 @@ LEAVES_IN_MESH = 200  # ... and of a mesh
 
 
 def rough_cover(geometry: coal.CollisionGeometry) -> Cover:
-    """Return a cover of a box or of the solid of a mesh: balls around boxes that are halved recursively.
+    """Return a cover of a box, a cylinder or the solid of a mesh: balls around boxes that are halved recursively.
 
-    The boxes of a mesh are those of :func:`apex_ompl.collision.cover.boxes.bounding_boxes`, which contain the solid.
-    No proof is needed, as a ball around all corners of a box contains the box.
+    The boxes of a mesh are those of :func:`apex_ompl.collision.cover.boxes.bounding_boxes`, which contain the solid;
+    boxes beside a cylinder are left out. No proof is needed, as a ball around all corners of a box contains the box.
     """
-    if geometry.getNodeType() == coal.GEOM_BOX:
+    disc, kind = np.inf, geometry.getNodeType()
+    if kind == coal.GEOM_BOX:
         boxes, most = np.array([[-geometry.halfSide, geometry.halfSide]]), LEAVES
+    elif kind == coal.GEOM_CYLINDER:
+        disc, most = float(geometry.radius), LEAVES
+        corner = np.array([disc, disc, geometry.halfLength])
+        boxes = np.array([[-corner, corner]])
     else:
         boxes, most = bounding_boxes(EnclosingMesh.of(geometry).boundary, COLUMNS), LEAVES_IN_MESH
     sides = boxes[:, 1] - boxes[:, 0]
@@ -33,6 +38,7 @@ def rough_cover(geometry: coal.CollisionGeometry) -> Cover:
     first, count, at = [], [], 0
     while at < len(queue):
         parts = list(boxes) if at == 0 and len(boxes) > 1 else _halves(queue[at], longest)
+        parts = [box for box in parts if np.linalg.norm(np.clip(0.0, box[0, :2], box[1, :2])) <= disc]
         first.append(len(queue) if parts else 0)
         count.append(len(parts))
         queue += parts
