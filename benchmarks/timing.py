@@ -14,16 +14,20 @@ derivatives and with speeds between them that can be reached; the best of 1 to 3
 acceleration, Ruckig in all joints.
 ``Ruckig from corner to corner``: at rest at each, without leaving the path; of rrtconnect's paths.
 
-Usage: python benchmarks/timing.py [SUITE[/LEVEL] ...] [-n 18] [--others 3]
+rrtconnect's paths are kept in benchmarks/runs, so that they can be planned beside other work (--paths-only).
+
+Usage: python benchmarks/timing.py [SUITE[/LEVEL] ...] [-n 18] [--others 3] [--paths-only]
 """
 
 from __future__ import annotations
 
 import argparse
+import io
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from importlib import metadata
+from pathlib import Path as FilePath
 from typing import Any
 
 import numpy as np
@@ -53,10 +57,12 @@ from apex_ompl.trajectory.curve import Polyline
 from apex_ompl.trajectory.methods import METHODS
 from apex_ompl.trajopt.path import Path
 from apex_ompl.util.entry_point import run_script
+from apex_ompl.util.files import write_atomically
 from apex_ompl.util.validation import one_or_more, whole_number
 
 DEPENDS = ("@planning", "apex_ompl/trajectory")
 Method = Callable[[np.ndarray], Trajectory | None]
+KEPT = FilePath(__file__).parent / "runs" / "timing"  # rrtconnect's paths
 DERIVATIVES = ("position", "velocity", "acceleration", "jerk")
 
 
@@ -155,6 +161,19 @@ def timed_method(
     return motion, time.perf_counter() - started
 
 
+def rrtconnect_path(name: str, seed: int) -> Path | None:
+    """Return rrtconnect's path of a problem, None where it finds none in 10 s; it is kept for later runs."""
+    file = KEPT / f"{name.replace('/', '-')}-{seed}.npy"
+    if not file.exists():
+        path = plan(name, "rrtconnect", timeout=10.0, seed=seed, timing=False).path
+        KEPT.mkdir(parents=True, exist_ok=True)
+        content = io.BytesIO()
+        np.save(content, np.empty((0, 0)) if path is None else path.states)
+        write_atomically(file, content.getvalue())
+    states = np.load(file)
+    return Path(states) if len(states) else None
+
+
 OTHERS: dict[str, Method] = {
     "Ruckig along the arc": along_arc,
     "TOPP-RA, then Ruckig": after_toppra,
@@ -170,6 +189,7 @@ def main() -> None:
     parser.add_argument(
         "--others", type=whole_number, default=3, help="of them for the other methods (default: %(default)s)"
     )
+    parser.add_argument("--paths-only", action="store_true", help="plan rrtconnect's paths, for a later run")
     args = parser.parse_args()
     toppra.setup_logging("ERROR")
     names = [
@@ -177,23 +197,26 @@ def main() -> None:
         for level in record.static_levels(args.levels)
         for k, name in enumerate(problems.frozen_names(*level.split("/"), "test")[: args.n])
     ]
+    sharp = {name: rrtconnect_path(name, k) for name, k in tqdm(names, desc="rrtconnect", unit="problem")}
+    if args.paths_only:
+        return
     planned = {(planner, method): Figures() for planner in ("apex", "rrtconnect") for method in METHODS}
     methods = {**{name: Figures() for name in OTHERS}, "Ruckig from corner to corner": Figures()}
     stages: dict[str, list[float]] = {}
     for name, k in tqdm(names, unit="problem"):
         checker = assemble(problems.load(name), robot()).checker
-        for planner in ("apex", "rrtconnect"):
-            result: PlanResult = plan(name, planner, timeout=10.0, seed=k)
-            if result.path is None:
+        mine: PlanResult = plan(name, "apex", timeout=10.0, seed=k)
+        for planner, way in (("apex", mine.path), ("rrtconnect", sharp[name])):
+            if way is None:
                 continue
-            path = result.path.states
+            path = way.states
             found = optimum(path) if planner == "apex" and len(path) > 2 else None
             best = None if found is None else found[1]
             for method in METHODS if len(path) > 2 else ():
-                proved(planned[planner, method], result.path, checker, method, best)
+                proved(planned[planner, method], way, checker, method, best)
             for stage in ("setup", "solve", "verify", "timing", "timing proof", "clearance", "total"):
                 if planner == "apex":
-                    stages.setdefault(stage, []).append(result.times.get(stage, 0.0))
+                    stages.setdefault(stage, []).append(mine.times.get(stage, 0.0))
             if k >= args.others:
                 continue
             if planner == "rrtconnect":

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -26,8 +25,8 @@ from apex_ompl.types import Array
 from apex_ompl.util.validation import check_array, check_number, check_states, finite_array, is_number
 
 SHORTEST_DURATION = 1e-3  # of a motion between states that count as one [s]
-FALLBACK = "spline"  # where no blended motion of the method asked for is valid
-BLENDS = 6  # deviations that are tried, each half of the one before, until the motion stops at corners
+FALLBACK = "spline"  # where the method asked for has no blended motion
+BLENDS = 8  # deviations that are tried, each half of the one before, until the motion stops at corners
 LIMIT_TOLERANCE = 1e-9  # that a path may be outside the position limits, by rounding [rad]
 LIMITS = ("velocity", "acceleration", "jerk")
 RANGES = {
@@ -161,8 +160,9 @@ def time_path(
 
     A straight line is followed by a jerk-limited profile of Ruckig's (:mod:`apex_ompl.trajectory.methods.ruckig`),
     which is the fastest. Any other path is followed by a blended motion of the method in ``timing``. Where ``fault``
-    rejects a motion, half its deviation is tried; then splines, since Ruckig's motions may leave the position limits;
-    and at last a motion that stops at every corner.
+    rejects a motion, half its deviation is tried, several times, and at last a motion that stops at every corner. Where
+    Ruckig has no motion within the deviation and the position limits, which it does not know, the spline takes its
+    place.
 
     Args:
         path: Path, or states of shape (N, dof). The motion follows the straight lines between its states, also where
@@ -230,12 +230,14 @@ def _from_rest(
         return
     straight = len(line.corners().states) == 2
     if not straight:
-        for method, k in itertools.product(dict.fromkeys((timing.method, FALLBACK)), range(BLENDS)):
-            motion = METHODS[method](line, limits, joint_names, timing.deviation / 2**k, stop)
-            if motion is not None:
-                yield TimedPath(*motion, method, "blended")
-            if stop():
-                return
+        for k in range(BLENDS):
+            for method in dict.fromkeys((timing.method, FALLBACK)):
+                motion = METHODS[method](line, limits, joint_names, timing.deviation / 2**k, stop)
+                if stop():
+                    return
+                if motion is not None:
+                    yield TimedPath(*motion, method, "blended")
+                    break
     motion = stops(line, limits, joint_names, stop)
     if motion is not None:
         yield TimedPath(*motion, "ruckig", "line" if straight else "stops")
