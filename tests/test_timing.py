@@ -171,8 +171,7 @@ def test_where_a_motion_is_at_fault_it_stays_closer_and_stops_at_last() -> None:
 
     made = timed(path, fault=leaves)
     assert made.form == "stops" and tried[-1] < 1e-9 and keeps_limits(made.trajectory)
-    rises = sum(later >= 0.8 * earlier for earlier, later in pairwise(tried))
-    assert rises == 1, "each motion is closer than the one before, but for the first of the splines"
+    assert len(tried) > 6 and all(later < 0.8 * earlier for earlier, later in pairwise(tried))
     for corner in path[1:-1]:
         near = int(np.argmin(np.linalg.norm(made.trajectory.positions - corner, axis=1)))
         np.testing.assert_allclose(made.trajectory.velocities[near], 0.0, atol=1e-12)
