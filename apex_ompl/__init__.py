@@ -12,10 +12,12 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from apex_ompl.api import load_problem, plan, setup
+    from apex_ompl.collision.cloud_contact import filter_points
     from apex_ompl.diffusion.checkpoint import load_model
     from apex_ompl.errors import ApexError
     from apex_ompl.result import PlanResult, PlanStatus
     from apex_ompl.robot import Robot, load_robot
+    from apex_ompl.scene.points import points_from_depth
     from apex_ompl.scene.problem import Alignment, PoseTarget, Problem
     from apex_ompl.session import MotionPlanner
     from apex_ompl.trajectory import Timing, Trajectory, time_path
@@ -35,8 +37,10 @@ _HOMES = {
     "Trajectory": "trajectory",
     "load_model": "diffusion.checkpoint",
     "load_problem": "api",
+    "filter_points": "collision.cloud_contact",
     "load_robot": "robot",
     "plan": "api",
+    "points_from_depth": "scene.points",
     "setup": "api",
     "time_path": "trajectory",
 }
@@ -52,10 +56,12 @@ __all__ = [
     "Robot",
     "Timing",
     "Trajectory",
+    "filter_points",
     "load_model",
     "load_problem",
     "load_robot",
     "plan",
+    "points_from_depth",
     "setup",
     "time_path",
 ]

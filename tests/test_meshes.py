@@ -26,8 +26,8 @@ FLIPPED = CUBE_OBJ.replace("f 1 3 2", "f 1 2 3")
         (CUBE_OBJ.replace("v 1 1 1", "v nan 1 1"), "not finite"),
         (CUBE_OBJ.replace("v 1 1 1", "v 1e300 1 1"), "too far"),
         (FLIPPED, "oriented against each other"),
-        ("", "expected an STL or OBJ mesh .*, got 'an empty file'"),
-        ("hello\n", "expected an STL or OBJ mesh .*, got 'hello"),
+        ("", "expected a mesh of triangles .*, got ''"),
+        ("hello\n", "expected a mesh of triangles .*, got 'hello"),
     ],
 )
 def test_meshes_that_bound_no_solid_are_refused(robot: Robot, tmp_path, capfd, text: str, words: str) -> None:

@@ -137,7 +137,7 @@ def test_pose_matrix_is_scipys(q: list[float]) -> None:
         ("sphere: {radius: 0.1}, ", "", ["mover", "exactly one of box", "none"]),
         ("sphere: {radius: 0.1}", "sphere: {radius: 0.1}, box: [1, 1, 1]", ["exactly one", "box and sphere"]),
         ("name: mover", "name: post", ["'post'", "more than one object"]),
-        ("sphere: {radius: 0.1}", "mesh: {file: a.ply}", ["scene.1.mesh.file", ".stl or .obj", "a.ply"]),
+        ("sphere: {radius: 0.1}", "mesh: {file: a.step}", ["scene.1.mesh.file", ".stl or .obj or .ply", "a.step"]),
         ("cylinder: {radius: 0.035, length: 0.11}", "half_space: {normal: [0, 0, 1]}", ["half_space cannot be held"]),
         ("axis: [0, 0, 1]", "axis: [0, 0, 0]", ["attached.0.contact.axis", "not zero"]),
         ("goal: {joints: {a: 1, b: 2}}", "goal: {joints: []}", ["goal.joints", "at least 1 item"]),

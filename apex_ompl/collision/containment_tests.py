@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 
 from apex_ompl.collision.containment import ANCHOR_RADIUS, EnclosingMesh, Extent, anchor_points
-from apex_ompl.collision.shapes import is_shell
+from apex_ompl.collision.shapes import is_shell, is_surface
 from apex_ompl.collision.solids import Solid, transform
 from apex_ompl.types import Array
 
@@ -48,6 +48,10 @@ def containment_tests(first: Solid, second: Solid) -> list[ContainmentTest]:
     """Return the tests whether one of two solids lies inside of the other; none where sizes rule it out."""
     tests = []
     for outer_first, (outer, inner) in ((True, (first, second)), (False, (second, first))):
-        if is_shell(outer.shape) and Extent.of(outer.shape).may_contain(Extent.of(inner.shape)):
+        if (
+            is_shell(outer.shape)
+            and not is_surface(outer.shape)
+            and Extent.of(outer.shape).may_contain(Extent.of(inner.shape))
+        ):
             tests.append(ContainmentTest(outer_first, EnclosingMesh.of(outer.shape), anchor_points(inner.shape)))
     return tests

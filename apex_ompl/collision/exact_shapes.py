@@ -11,17 +11,19 @@ import coal
 import numpy as np
 from numpy.typing import NDArray
 
+from apex_ompl.collision.clouds import cloud_of
 from apex_ompl.collision.cover.spheres import shape_key
-from apex_ompl.collision.shapes import convex_hull, hull_planes, is_shell
+from apex_ompl.collision.shapes import convex_hull, hull_planes, is_shell, is_surface
 from apex_ompl.kernel.compiled.arrays import BOX, CAPSULE, CYLINDER, HALF_SPACE, SPHERE
+from apex_ompl.kernel.compiled.ball_tree import median_order, node_balls
 from apex_ompl.kernel.compiled.layout import Integers
-from apex_ompl.kernel.compiled.shapes import HULL, ShapeArrays
+from apex_ompl.kernel.compiled.shapes import HULL, POINT, TRIANGLE, ShapeArrays
 from apex_ompl.scene.meshes import triangles
 from apex_ompl.types import Array
 from apex_ompl.util.weak_cache import weakly_cached
 
 CONVEX_TOLERANCE = 1e-7  # a mesh is its hull when its triangles' centres are no deeper than this below it [m]
-CELLS = 1 << 10  # along each axis, by which triangles are sorted
+MANY = 4000  # triangles
 
 
 MOST_MESHES = 256  # that are kept
@@ -38,7 +40,8 @@ class Mesh(NamedTuple):
         balls: Centre and radius around the triangles below each node of the tree, shape (2 T - 1, 4) [m].
         child: First child of each node, -1 for leaves, shape (2 T - 1,).
         leaf: Triangle of each leaf, -1 for inner nodes, shape (2 T - 1,).
-        depth: Largest depth of a triangle's centre below the hull, 0 for a mesh that is its hull [m].
+        depth: Depth of triangles' centres below the hull, 0 for a mesh that is its hull [m].
+        radius: Radius of balls around points, which stand in place of triangles [m].
     """
 
     points: Array
@@ -47,6 +50,7 @@ class Mesh(NamedTuple):
     child: NDArray[np.int64]
     leaf: NDArray[np.int64]
     depth: float = 0.0
+    radius: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,6 +81,8 @@ class PlacedShape:
     def row(self) -> tuple[Array, Sequence[float] | Array, Sequence[float]]:
         """Rotation, offset and size; a half-space has its normal as offset and its distance as size."""
         shape, pose = self.geometry, self.pose
+        if self.mesh is not None:
+            return pose[:3, :3], pose[:3, 3], (self.mesh.radius, 0.0, 0.0)
         if self.kind != HALF_SPACE:
             return pose[:3, :3], pose[:3, 3], _size(shape)
         normal = pose[:3, :3] @ shape.n
@@ -97,8 +103,13 @@ class PlacedShape:
 
 @weakly_cached
 def mesh_of(geometry: coal.CollisionGeometry) -> Mesh:
-    """Return the hull of a mesh or of a convex body, with a tree over its triangles where it is not convex."""
-    key = shape_key(geometry)
+    """Return the hull of a mesh or of a convex body, with a tree over its triangles where it is not convex.
+
+    That of a cloud has a tree over its points.
+    """
+    if cloud_of(geometry) is not None:
+        return _analysed(geometry)
+    key = shape_key(geometry) + (" surface" if is_surface(geometry) else "")
     if key not in _meshes:
         while len(_meshes) >= MOST_MESHES:
             _meshes.pop(next(iter(_meshes)), None)
@@ -107,6 +118,10 @@ def mesh_of(geometry: coal.CollisionGeometry) -> Mesh:
 
 
 def _analysed(geometry: coal.CollisionGeometry) -> Mesh:
+    cloud = cloud_of(geometry)
+    if cloud is not None:
+        points = np.ascontiguousarray(cloud.points[_order(cloud.points)])[:, None]
+        return Mesh(np.array(geometry.points()), points, *ball_tree(points), np.inf, cloud.radius)
     hull = convex_hull(geometry)
     mesh = Mesh(np.array(hull.points()), np.empty((0, 3, 3)), np.empty((0, 4)), *(np.empty(0, np.int64),) * 2)
     if is_shell(geometry):
@@ -114,50 +129,43 @@ def _analysed(geometry: coal.CollisionGeometry) -> Mesh:
         corners = vertices[faces]
         depth = _depth(hull, corners)
         if depth > CONVEX_TOLERANCE:
-            corners = corners[_morton_order(corners.mean(axis=1))]
+            corners = corners[_order(corners.mean(axis=1))]
             mesh = Mesh(mesh.points, corners, *ball_tree(corners), depth)
     return mesh
 
 
 def _depth(hull: coal.CollisionGeometry, corners: Array) -> float:
-    """Return the largest depth of a triangle's centre below the faces of a hull [m]."""
+    """Return the largest depth of a triangle's centre below the faces of a hull [m], of many triangles that of some."""
     normals, offsets = hull_planes(hull)
     depth = 0.0
+    if len(corners) > MANY:
+        some = _depth(hull, corners[:: len(corners) // MANY + 1])
+        if some > CONVEX_TOLERANCE:  # it is not convex, and the depth of the others matters little
+            return some
     for first in range(0, len(corners), 1000):
         centres = corners[first : first + 1000].mean(axis=1)
         depth = max(depth, float((offsets - centres @ normals.T).min(axis=1).max()))
     return depth
 
 
-def _morton_order(centres: Array) -> NDArray[np.intp]:
-    """Return points in the order of a space-filling curve, so that neighbours in it are near."""
-    low = centres.min(axis=0)
-    cells = np.minimum((centres - low) / max(float(np.ptp(centres, axis=0).max()), 1e-12) * CELLS, CELLS - 1)
-    code = np.zeros(len(centres), np.int64)
-    for bit in range(CELLS.bit_length() - 1):
-        for axis in range(3):
-            code |= ((cells[:, axis].astype(np.int64) >> bit) & 1) << (3 * bit + axis)
-    return np.argsort(code, kind="stable")
+def _order(centres: Array) -> NDArray[np.int64]:
+    """Return points in the order of a tree whose nodes are halved across their longest sides."""
+    order = np.arange(len(centres))
+    median_order(np.ascontiguousarray(centres), order, np.empty((128, 2), np.int64))
+    return order
 
 
 def ball_tree(corners: Array) -> tuple[Array, NDArray[np.int64], NDArray[np.int64]]:
-    """Return a binary tree over triangles in their order, shape (T, 3, 3) [m]: balls, children and leaves.
+    """Return a binary tree over triangles or points in their order, shape (T, k, 3) [m]: balls, children and leaves.
 
     Each node holds a range of triangles, its children the two halves; nodes stand level by level. The ball of a node
     has the centre of its bounding box.
     """
-    low, high = corners.min(axis=1), corners.max(axis=1)
     first, last = np.zeros(1, np.int64), np.array([len(corners)])
-    balls, child, leaf, count = [], [], [], 1
+    firsts, lasts, child, leaf, count = [], [], [], [], 1
     while len(first):
-        edges = np.stack([first, last], axis=1).ravel()
-        box_low, box_high = (_over_ranges(f, v, edges) for f, v in ((np.minimum, low), (np.maximum, high)))
-        centre = (box_low + box_high) / 2.0
-        owner = np.repeat(np.arange(len(first)), last - first)
-        inside = np.concatenate([np.arange(a, b) for a, b in zip(first, last, strict=True)])
-        far = np.linalg.norm(corners[inside] - centre[owner][:, None], axis=2).max(axis=1)
-        radius = np.maximum.reduceat(far, np.cumsum([0, *(last - first)])[:-1]) + 1e-12
-        balls.append(np.concatenate([centre, radius[:, None]], axis=1))
+        firsts.append(first)
+        lasts.append(last)
         inner = last - first > 1
         number = np.full(len(first), -1, np.int64)
         number[inner] = count + 2 * np.arange(int(inner.sum()))
@@ -167,14 +175,9 @@ def ball_tree(corners: Array) -> tuple[Array, NDArray[np.int64], NDArray[np.int6
         middle = (first + last)[inner] // 2
         first = np.stack([first[inner], middle], axis=1).ravel()
         last = np.stack([middle, last[inner]], axis=1).ravel()
-    return np.concatenate(balls), np.concatenate(child), np.concatenate(leaf)
-
-
-def _over_ranges(function: np.ufunc, values: Array, edges: NDArray[np.int64]) -> Array:
-    """Return ``function`` over rows of values between each even edge and the odd one behind it."""
-    padded = np.concatenate([values, values[-1:]])  # the last edge may be one behind the end
-    reduced: Array = function.reduceat(padded, edges, axis=0)[::2]
-    return reduced
+    balls = np.empty((count, 4))
+    node_balls(np.ascontiguousarray(corners), np.concatenate(firsts), np.concatenate(lasts), balls)
+    return balls, np.concatenate(child), np.concatenate(leaf)
 
 
 def shape_arrays(shapes: Mapping[int, PlacedShape]) -> ShapeArrays:
@@ -195,10 +198,12 @@ def shape_arrays(shapes: Mapping[int, PlacedShape]) -> ShapeArrays:
         point_count += len(mesh.points)
         roots.append(node_count if len(mesh.leaf) else -1)
         child.append(np.where(mesh.child >= 0, mesh.child + node_count, -1))
-        corner.append(np.where(mesh.leaf >= 0, point_count + 3 * mesh.leaf, -1))
+        each = mesh.corners.shape[1]
+        first = point_count + each * mesh.leaf
+        corner.append(np.where(mesh.leaf < 0, -1, first if each == TRIANGLE else POINT - first))
         nodes.append(mesh.balls)
         points += [mesh.points, mesh.corners.reshape(-1, 3)]
-        point_count += 3 * len(mesh.corners)
+        point_count += each * len(mesh.corners)
         node_count += len(mesh.leaf)
     poses = [shape.row for shape in placed]
     return ShapeArrays(
@@ -224,7 +229,8 @@ def joined(bodies: ShapeArrays, obstacles: ShapeArrays) -> ShapeArrays:
     points, nodes = len(bodies.points), len(bodies.child)
     moved = obstacles._replace(
         points_of=obstacles.points_of + np.array([points, 0], np.int64), root=_moved(obstacles.root, nodes),
-        child=_moved(obstacles.child, nodes), corner=_moved(obstacles.corner, points),
+        child=_moved(obstacles.child, nodes),
+        corner=np.where(obstacles.corner <= POINT, obstacles.corner - points, _moved(obstacles.corner, points)),
     )  # fmt: skip
     both = ShapeArrays(*(np.concatenate(pair) for pair in zip(bodies, moved, strict=True)))
     return both._replace(row=_moved(obstacles.row, len(bodies.kind)))

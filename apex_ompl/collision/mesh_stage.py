@@ -13,7 +13,10 @@ import coal
 import numpy as np
 import pinocchio as pin
 
+from apex_ompl.collision.cloud_contact import cloud_depth, nearest_balls, touches
+from apex_ompl.collision.clouds import cloud_of
 from apex_ompl.collision.containment_tests import ContainmentTest, containment_tests
+from apex_ompl.collision.exact_shapes import PlacedShape
 from apex_ompl.collision.hull_distance import Distance, closest, hull_distance
 from apex_ompl.collision.solids import Solid, overlaps, transform, world_boxes
 from apex_ompl.robot import Robot
@@ -32,7 +35,7 @@ class Contact:
     Attributes:
         first: Name of a link or a held object.
         second: Name of a link, a held object, an obstacle or a fixture.
-        depth: Penetration depth of the convex hulls [m].
+        depth: Penetration depth of the convex hulls, or into the balls of a point cloud [m].
     """
 
     first: str
@@ -214,14 +217,14 @@ class MeshStage:
             obstacles = set(self.scene.values())
             for a, b in hits:
                 first, second = (self.solids[k] for k in sorted((a, b), key=lambda k: (k in obstacles, k)))
-                depth = -hull_distance(first, self._pose(first), second, self._pose(second)).value
+                depth = self._depth(first, second)
                 names = first.name, second.name
                 deepest[names] = max(depth, deepest.get(names, 0.0))
         found = [Contact(a, b, depth) for (a, b), depth in deepest.items()]
         return sorted(found, key=lambda c: (-c.depth, c.first, c.second))
 
     def distance(self, q: Array, fixtures: bool) -> Distance:
-        """Return the distance of the convex hulls of moving bodies and obstacles.
+        """Return the distance of the convex hulls of moving bodies and obstacles, of a cloud that of some balls.
 
         Args:
             q: State in Pinocchio's order.
@@ -232,7 +235,10 @@ class MeshStage:
         others = [self.solids[k] for name, k in self.scene.items() if name not in left_out]
         with self.lock:
             pin.forwardKinematics(self.model, self.data, q)
-            return closest(movers, [self._pose(s) for s in movers], others, [s.placement for s in others])
+            poses = [self._pose(solid) for solid in movers]
+            boxes = world_boxes(movers, poses)
+            others = [part for solid in others for part in nearest_balls(solid, boxes)]
+            return closest(movers, poses, others, [solid.placement for solid in others])
 
     def _pose(self, solid: Solid) -> pin.SE3:
         """Return the pose of a solid in the world at the state that the joints are placed for."""
@@ -250,10 +256,21 @@ class MeshStage:
                 yield moving[i], obstacles[j]
         yield from self._held_pairs()
 
+    def _depth(self, first: Solid, second: Solid) -> float:
+        """Return how deep two solids overlap at the current placements: their hulls, or the balls of a cloud."""
+        at, there = self._pose(first), self._pose(second)
+        cloud = cloud_of(second.shape)
+        if cloud is not None:
+            return cloud_depth(cloud, first.shape, (there.inverse() * at).homogeneous)
+        return -hull_distance(first, at, second, there).value
+
     def _overlap(self, pair: Pair) -> bool:
         """Whether two solids overlap at the current placements, or one contains the other."""
         first, second = self.solids[pair[0]], self.solids[pair[1]]
         at, there = self._pose(first), self._pose(second)
+        cloud = cloud_of(second.shape)
+        if cloud is not None:
+            return touches(cloud, second.shape, PlacedShape(first.shape, 0, (there.inverse() * at).homogeneous))
         result = coal.CollisionResult()
         if coal.collide(first.shape, transform(at), second.shape, transform(there), self._request, result):
             return True

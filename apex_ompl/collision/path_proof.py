@@ -124,7 +124,7 @@ def obstacles_alone(kernel: Kernel, chosen: Flags) -> Kernel:
         pair_clusters=bodies.pair_clusters[:0], pair_common=bodies.pair_common[:0], pair_bodies=bodies.pair_bodies[:0]
     )
     robot = replace(kernel.robot, arrays=bodies)
-    solids = [(int(scene.owner[k]), primitive(scene, int(k))) for k in np.flatnonzero(chosen)]
+    solids = [(int(scene.owner[k]), primitive(kernel.scene, int(k))) for k in np.flatnonzero(chosen)]
     tables = scene_tables(solids)
     return Kernel(robot, replace(tables, arrays=tables.arrays._replace(allowed=scene.allowed)))
 

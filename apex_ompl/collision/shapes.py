@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import hashlib
+import io
 import threading
+from itertools import product
 from pathlib import Path
 from weakref import WeakValueDictionary
 
@@ -11,13 +13,18 @@ import coal
 import numpy as np
 from numpy.typing import NDArray
 
+from apex_ompl.collision.clouds import PointCloud, cloud_geometry
 from apex_ompl.errors import FileFormatError
-from apex_ompl.scene.bodies import Body
-from apex_ompl.scene.meshes import extent_fault, orientation_fault, surface_note, triangles
+from apex_ompl.scene.bodies import Body, GridFile, MeshFile, PointFile
+from apex_ompl.scene.grids import parse_surface
+from apex_ompl.scene.meshes import extent_fault, hole_fault, orientation_fault, surface_note, triangles
+from apex_ompl.scene.points import parse_points
 from apex_ompl.types import Array
 from apex_ompl.util.files import read_file
 from apex_ompl.util.weak_cache import weakly_cached
 
+LOADED_BY_COAL = (".stl", ".obj")  # which takes half a second less than the other library's import
+THICKNESS = 1e-6  # by which hulls of surfaces are larger [m]
 KEPT_MESHES = 32  # meshes that were loaded last and are kept for the next problem
 DIRECTIONS = (400, 60)  # in which hulls of too many vertices are sampled; fewer where Coal takes no more
 MOST_VERTICES = 50_000  # of a mesh whose hull is not sampled
@@ -30,12 +37,12 @@ _recent: list[coal.BVHModelBase] = []
 def coal_geometry(body: Body) -> coal.CollisionGeometry:
     """Return the Coal geometry of a body's shape, in the body's frame.
 
-    Boxes, spheres, cylinders, capsules and half-spaces become solids, meshes become a bounding volume
-    hierarchy over their triangles.
+    Boxes, spheres, cylinders, capsules and half-spaces become solids; meshes, voxels and distance grids a bounding
+    volume hierarchy over their triangles; points what stands for them (:mod:`apex_ompl.collision.clouds`).
 
     Raises:
         MissingFileError: The mesh file cannot be read.
-        FileFormatError: The mesh file holds no solid; see ``apex_ompl.scene.meshes``.
+        FileFormatError: The file holds no solid; see ``apex_ompl.scene.meshes``.
     """
     if body.box is not None:
         return coal.Box(*body.box)
@@ -47,8 +54,9 @@ def coal_geometry(body: Body) -> coal.CollisionGeometry:
         return coal.Capsule(body.capsule.radius, body.capsule.length)
     if body.half_space is not None:
         return _half_space(np.asarray(body.half_space.normal, float), body.half_space.offset)
-    assert body.mesh is not None
-    return _load_mesh(body.name, body.mesh.file, np.asarray(body.mesh.scale, float))
+    shape = body.mesh or body.points or body.voxels or body.distance_grid
+    assert shape is not None
+    return _load(body.name, shape)
 
 
 def world_geometry(body: Body) -> tuple[coal.CollisionGeometry, Array]:
@@ -82,17 +90,21 @@ def is_shell(geometry: coal.CollisionGeometry) -> bool:
 def convex_hull(geometry: coal.CollisionGeometry) -> coal.CollisionGeometry:
     """Return the convex hull of a mesh, or the geometry itself when it is convex already.
 
-    Coal takes at most 255 neighbours of a vertex. Where a hull has more, and of meshes of more than ``MOST_VERTICES``,
+    That of a surface without an inside, which may be flat, is the box around it. Coal takes at most 255 neighbours of a
+    vertex. Where a hull has more, and of meshes of more than ``MOST_VERTICES``,
     which take seconds, a slightly larger body with fewer vertices is returned.
     """
     if not is_shell(geometry):
         return geometry
-    return geometry.convex if geometry.convex is not None else _hull_of_mesh(geometry)
+    return geometry.convex if geometry.convex is not None and not is_surface(geometry) else _hull_of_mesh(geometry)
 
 
 @weakly_cached
 def _hull_of_mesh(mesh: coal.BVHModelBase) -> coal.Convex:
     vertices = np.array(mesh.vertices())
+    if is_surface(mesh):
+        low, high = vertices.min(axis=0) - THICKNESS, vertices.max(axis=0) + THICKNESS
+        return _hull_of(np.array(list(product(*np.stack([low, high], axis=1)))))
     if len(vertices) > MOST_VERTICES:
         return _larger_hull(vertices)
     try:
@@ -167,43 +179,80 @@ def mesh_note(body: Body) -> str:
         MissingFileError: The mesh file cannot be read.
         FileFormatError: The mesh file holds no solid.
     """
-    if body.mesh is None:
+    if body.mesh is None or body.mesh.solid is False:
         return ""
     note = surface_note(*triangles(coal_geometry(body)))
     return f"the mesh of {body.name!r} ({Path(body.mesh.file).name}) {note}" if note else ""
 
 
-def _load_mesh(name: str, file: str, scale: Array) -> coal.CollisionGeometry:
-    """Return the mesh in a file; files of the same content share it."""
-    role = f"mesh of {name!r}"
-    content = read_file(Path(file), role)
-    key = hashlib.sha256(content + Path(file).suffix.lower().encode() + scale.tobytes()).hexdigest()
+def _load(name: str, shape: MeshFile | PointFile | GridFile) -> coal.CollisionGeometry:
+    """Return the geometry in a file; files of the same content, read alike, share it."""
+    role = f"{'mesh' if isinstance(shape, MeshFile) else 'file'} of {name!r}"
+    content = read_file(Path(shape.file), role)
+    how = f"{type(shape).__name__} {shape.model_dump_json(exclude={'file'})} {Path(shape.file).suffix.lower()}"
+    key = hashlib.sha256(content + how.encode()).hexdigest()
     with _loading:
-        mesh = _meshes.get(key)
-        if mesh is None:
-            mesh = _meshes[key] = _parse_mesh(role, file, content, scale)
-        _recent[:] = [mesh, *(other for other in _recent if other is not mesh)][:KEPT_MESHES]
-        return mesh
+        geometry = _meshes.get(key)
+        if geometry is None:
+            geometry = _meshes[key] = _parse(role, shape, content)
+        _recent[:] = [geometry, *(other for other in _recent if other is not geometry)][:KEPT_MESHES]
+        return geometry
 
 
-def _parse_mesh(role: str, file: str, content: bytes, scale: Array) -> coal.CollisionGeometry:
+def _parse(role: str, shape: MeshFile | PointFile | GridFile, content: bytes) -> coal.CollisionGeometry:
+    if isinstance(shape, PointFile):
+        return cloud_geometry(PointCloud(parse_points(shape.file, content), shape.radius))
+    if isinstance(shape, GridFile):
+        return mesh_geometry(*parse_surface(shape.file, content))
+    return _parse_mesh(role, shape, content)
+
+
+def _parse_mesh(role: str, shape: MeshFile, content: bytes) -> coal.CollisionGeometry:
+    file, scale = shape.file, np.asarray(shape.scale, float)
     try:
-        # Trees of oriented boxes, which collisions need, are made of sound vertices only: Coal prints many lines else.
-        parsed = coal.MeshLoader(coal.BV_AABB).load(file, scale) if content.strip() else None
+        vertices, faces = _read_triangles(file, content, scale)
     except Exception as error:
         found = content[:60].decode(errors="replace")
-        raise FileFormatError(file, "", found, f"expected an STL or OBJ mesh ({role})") from error
-    if parsed is None:
-        raise FileFormatError(file, "", "an empty file", f"expected an STL or OBJ mesh ({role})")
-    fault = "no triangles"
-    if parsed.num_tris > 0:
-        vertices, faces = triangles(parsed)
-        fault = extent_fault(vertices) or orientation_fault(vertices, faces)
+        raise FileFormatError(file, "", found, f"expected a mesh of triangles ({role})") from error
+    alone = shape.solid is False
+    fault = "no triangles" if not len(faces) else extent_fault(vertices, flat=alone)
+    fault = fault or ("" if alone else orientation_fault(vertices, faces))
+    fault = fault or (hole_fault(vertices, faces) if shape.solid else "")
     if fault:
-        raise FileFormatError(file, "", fault, f"expected a closed mesh of consistently oriented triangles ({role})")
+        wanted = "finite triangles" if alone else "a closed mesh of consistently oriented triangles"
+        raise FileFormatError(file, "", fault, f"expected {wanted} ({role})")
+    mesh = mesh_geometry(vertices, faces)
+    if alone:
+        is_surface.keep(mesh, True)  # type: ignore[attr-defined]
+    return mesh
+
+
+@weakly_cached
+def is_surface(_: coal.CollisionGeometry) -> bool:
+    """Whether a geometry is a mesh without an inside, as its file was read."""
+    return False
+
+
+def _read_triangles(file: str, content: bytes, scale: Array) -> tuple[Array, NDArray[np.int64]]:
+    """Return the vertices, shape (V, 3) [m], and the triangles, shape (T, 3), of a mesh file; of all that it holds."""
+    if not content.strip():
+        raise ValueError("an empty file")
+    if Path(file).suffix.lower() in LOADED_BY_COAL:
+        # Trees of oriented boxes, which collisions need, are made of sound vertices only: Coal prints many lines else.
+        return triangles(coal.MeshLoader(coal.BV_AABB).load(file, scale))
+    import trimesh
+
+    loaded = trimesh.load_mesh(io.BytesIO(content), file_type=Path(file).suffix[1:].lower(), process=False)
+    return np.array(loaded.vertices, float) * scale, np.array(loaded.faces, np.int64)
+
+
+def mesh_geometry(vertices: Array, faces: NDArray[np.int64]) -> coal.BVHModelOBBRSS:
+    """Return the geometry of triangles, given by vertices, shape (V, 3) [m], and indices, shape (T, 3)."""
     mesh = coal.BVHModelOBBRSS()
     mesh.beginModel(len(faces), len(vertices))
     mesh.addVertices(vertices)
     mesh.addTriangles(faces)
     mesh.endModel()
+    vertices.flags.writeable = faces.flags.writeable = False
+    triangles.keep(mesh, (vertices, faces))  # type: ignore[attr-defined]
     return mesh

@@ -8,18 +8,22 @@ import coal
 import numpy as np
 import pinocchio as pin
 
+from apex_ompl.collision.clouds import cloud_of
 from apex_ompl.collision.containment import EnclosingMesh
 from apex_ompl.collision.cover.boxes import bounding_boxes
 from apex_ompl.collision.cover.proof import Cover
+from apex_ompl.collision.shapes import is_surface
 from apex_ompl.collision.solids import Solid
 from apex_ompl.errors import RobotError
-from apex_ompl.kernel.compiled.arrays import BOX, CAPSULE, CYLINDER, HALF_SPACE, PRISMATIC, REVOLUTE, SPHERE
+from apex_ompl.kernel.compiled.arrays import BOX, CAPSULE, CYLINDER, GRID, HALF_SPACE, PRISMATIC, REVOLUTE, SPHERE
+from apex_ompl.kernel.distance_grid import grid_of_points, grid_of_triangles
 from apex_ompl.kernel.joint_tree import JointTree
 from apex_ompl.kernel.robot_builder import robot_tables
 from apex_ompl.kernel.robot_specs import BodySpec, JointSpec
 from apex_ompl.kernel.scene_builder import Primitive
 from apex_ompl.kernel.tables import RobotTables
 from apex_ompl.robot import Robot
+from apex_ompl.scene.meshes import triangles
 from apex_ompl.types import Array
 from apex_ompl.util.weak_cache import weakly_cached
 
@@ -111,7 +115,7 @@ def tabulate(
 
 
 def primitives(shape: coal.CollisionGeometry, pose: Array) -> list[Primitive]:
-    """Return primitives that together contain a geometry: itself, or boxes around a mesh.
+    """Return primitives that together contain a geometry: itself, or a grid of distances to a mesh or to points.
 
     Args:
         shape: The geometry.
@@ -129,15 +133,18 @@ def primitives(shape: coal.CollisionGeometry, pose: Array) -> list[Primitive]:
     if kind == coal.GEOM_HALFSPACE:
         normal = pose[:3, :3] @ shape.n
         return [Primitive(HALF_SPACE, pose, (*normal, shape.d + float(normal @ pose[:3, 3])))]
+    cloud = cloud_of(shape)
+    if cloud is not None:
+        return [Primitive(GRID, pose, (), grid_of_points(cloud.points, cloud.radius))]
+    if is_surface(shape):
+        vertices, faces = triangles(shape)
+        return [Primitive(GRID, pose, (), grid_of_triangles(vertices[faces], solid=False))]
+    mesh = EnclosingMesh.of(shape)
+    if mesh.watertight:
+        return [Primitive(GRID, pose, (), grid_of_triangles(mesh.corners, solid=True))]
     found = []
-    for low, high in mesh_boxes(shape):
+    for low, high in bounding_boxes(mesh.boundary):
         centre = np.eye(4)
         centre[:3, 3] = (low + high) / 2.0
         found.append(Primitive(BOX, pose @ centre, tuple((high - low) / 2.0)))
     return found
-
-
-@weakly_cached
-def mesh_boxes(mesh: coal.BVHModelBase) -> Array:
-    """Return boxes in the mesh's frame that together contain its solid, shape (boxes, 2, 3) [m]."""
-    return bounding_boxes(EnclosingMesh.of(mesh).boundary)

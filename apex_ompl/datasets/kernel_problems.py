@@ -33,7 +33,7 @@ from apex_ompl.types import Array
 from apex_ompl.util.files import is_file, make_folder, write_atomically
 
 SCHEMA = "apex-ompl/cases/1"
-STORED = tuple(name for name in SceneArrays._fields if name != "allowed")  # nothing may touch in problems of data sets
+STORED = tuple(name for name in SceneArrays._fields if name not in {"allowed", "grid", "values"})
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,11 +165,11 @@ def _scenes(arrays: dict[str, NDArray[Any]], count: int) -> list[SceneTables]:
         if counts.ndim != 1 or (counts < 0).any():
             raise ValueError(name)
         columns[name] = np.split(arrays[name], np.cumsum(counts)[:-1])
-    nothing = np.empty((0, 2), np.int64)
-    made = [
-        SceneArrays(**{k: np.ascontiguousarray(v[i]) for k, v in columns.items()}, allowed=nothing)
-        for i in range(count)
-    ]
+    made = []
+    for i in range(count):  # problems of data sets have neither grids nor bodies that may touch
+        own = {name: np.ascontiguousarray(values[i]) for name, values in columns.items()}
+        grids = np.zeros((len(own["kind"]), 4), np.int64)
+        made.append(SceneArrays(**own, allowed=np.empty((0, 2), np.int64), grid=grids, values=np.empty(0, np.float32)))
     for scene in made:
         fault = scene_fault(scene)
         if fault:

@@ -11,7 +11,10 @@ from numpy.typing import NDArray
 from apex_ompl.datasets.records import ObstacleRecord
 from apex_ompl.diffusion.geometry import rotation_matrices
 from apex_ompl.kernel import Kernel, RobotTables
-from apex_ompl.kernel.compiled.arrays import BOX, HALF_SPACE, SceneArrays
+from apex_ompl.kernel.compiled.arrays import BOX, GRID, HALF_SPACE
+from apex_ompl.kernel.distance_grid import outline
+from apex_ompl.kernel.scene_builder import primitive
+from apex_ompl.kernel.tables import SceneTables
 from apex_ompl.types import Array
 
 HALVES = np.array([[0.5, 0.5, 0.5], [1.0, 0.5, 0.5], [1.0, 0.5, 0.5], [1.0, 0.5, 0.5]], np.float32)
@@ -58,19 +61,31 @@ class ObstacleSet:
         return cls(shape, position, rotation_matrices(orientation).astype(float), size * HALVES[shape])
 
     @classmethod
-    def from_scene(cls, scene: SceneArrays, chosen: NDArray[np.bool_]) -> ObstacleSet:
+    def from_scene(cls, tables: SceneTables, chosen: NDArray[np.bool_]) -> ObstacleSet:
         """Return some obstacles of a kernel scene; a half-space becomes a box larger than the workspace.
 
+        A grid of distances becomes boxes around what it is about.
+
         Args:
-            scene: The scene.
+            tables: The scene.
             chosen: Which of its obstacles to take, shape (all obstacles,).
         """
+        scene = tables.arrays
+        grids = np.flatnonzero(chosen & (scene.kind == GRID))
+        chosen = chosen & (scene.kind != GRID)
         shape, position = scene.kind[chosen].copy(), scene.offset[chosen].copy()
         rotation, size = scene.rotation[chosen].copy(), scene.size[chosen].copy()
         for k in np.flatnonzero(shape == HALF_SPACE):
             normal, distance = position[k].copy(), size[k, 0]
             rotation[k] = _rotation_to(normal)
             shape[k], position[k], size[k] = BOX, (distance - HALF_SPACE_BOX[2]) * normal, HALF_SPACE_BOX
+        for k in grids:
+            solid = primitive(tables, int(k))
+            boxes = outline(solid.grid) if solid.grid is not None else np.empty((0, 2, 3))
+            shape = np.append(shape, np.full(len(boxes), BOX))
+            position = np.append(position, boxes.mean(axis=1) @ solid.pose[:3, :3].T + solid.pose[:3, 3], axis=0)
+            rotation = np.append(rotation, np.tile(solid.pose[:3, :3], (len(boxes), 1, 1)), axis=0)
+            size = np.append(size, (boxes[:, 1] - boxes[:, 0]) / 2.0, axis=0)
         return cls(shape, position, rotation, size)
 
     def __len__(self) -> int:

@@ -25,7 +25,8 @@ LOG = logging.getLogger("apex_ompl")
 TYPICAL_SECONDS = 30
 
 ROBOT = "i8[::1], f8[::1], "
-SCENE = WORKSPACE = BUFFERS = ROBOT
+WORKSPACE = BUFFERS = ROBOT
+SCENE = ROBOT + "f4[::1], "
 PROOF = "f8[:, ::1], i8[::1], i8[:, ::1], i8[::1], f8[::1], i8[:, ::1], i8[::1]"
 CURVE = "f8[::1], f8[:, ::1], f8[:, ::1], f8, f8, f8, i8"
 SETTINGS = "Tuple((f8, f8, f8, f8, f8, f8, i8))"
@@ -42,7 +43,7 @@ HERE: dict[str, tuple[str, int]] = {
 """Functions that this process compiles: module and name -> types of the arguments, and typical time [s]."""
 
 BESIDE: dict[str, tuple[str, int]] = {
-    "curve_proof.prove_curve": (6 * ROBOT + CURVE, 18),
+    "curve_proof.prove_curve": (ROBOT + SCENE + 4 * ROBOT + CURVE, 18),
     "queries.joint_frames": (ROBOT + WORKSPACE + "f8[:, ::1], f8[:, :, :, ::1], f8[:, :, ::1]", 2),
     "motion_proof.lay_grid": ("f8[:, ::1], f8, i8[::1]", 1),
     "jerk_profiles.join_profiles": (

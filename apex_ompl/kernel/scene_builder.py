@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from apex_ompl.kernel.compiled.arrays import BOX, CAPSULE, HALF_SPACE, SPHERE, SceneArrays
-from apex_ompl.kernel.compiled.layout import Floats, Integers
+from apex_ompl.kernel.compiled.layout import Floats, Integers, Singles
+from apex_ompl.kernel.distance_grid import DistanceGrid
 from apex_ompl.kernel.tables import SceneTables
 
 LEAF = 4  # obstacles in a leaf of the tree
@@ -22,25 +23,37 @@ class Primitive(NamedTuple):
     """A solid that the kernel has a shape for.
 
     Attributes:
-        kind: BOX, SPHERE, CYLINDER, CAPSULE or HALF_SPACE.
+        kind: BOX, SPHERE, CYLINDER, CAPSULE, HALF_SPACE or GRID.
         pose: Homogeneous transform in the world, shape (4, 4) [m]; that of a half-space is not looked at.
         size: Half edges of a box; radius and half length along z; radius; or (unit normal, distance) of a half-space,
-            the points x with normal . x <= distance [m].
+            the points x with normal . x <= distance [m]. Empty for a grid.
+        grid: Distances from a surface or points in the frame of ``pose``.
     """
 
     kind: int
     pose: Floats
     size: tuple[float, ...]
+    grid: DistanceGrid | None = None
 
 
 class Solids(NamedTuple):
-    """Primitives as arrays: kind, shape (n,), rotation (n, 3, 3), offset and size (n, 3), box around each (n, 2, 3)."""
+    """Primitives as arrays.
+
+    Attributes:
+        kind: Shape (n,).
+        rotation: Shape (n, 3, 3).
+        offset: Shape (n, 3) [m].
+        size: Shape (n, 3) [m].
+        box: Box around each, shape (n, 2, 3) [m].
+        grids: Grid of each, if it has one.
+    """
 
     kind: Integers
     rotation: Floats
     offset: Floats
     size: Floats
     box: Floats
+    grids: tuple[DistanceGrid | None, ...]
 
     @classmethod
     def of(cls, primitives: Sequence[Primitive]) -> Solids:
@@ -49,10 +62,24 @@ class Solids(NamedTuple):
         for k, p in enumerate(primitives):
             if p.kind == HALF_SPACE:
                 rotation[k], offset[k], size[k, 0] = np.eye(3), p.size[:3], p.size[3]
+            elif p.grid is not None:
+                rotation[k], size[k, 0] = p.pose[:3, :3], p.grid.spacing
+                offset[k] = p.pose[:3, :3] @ p.grid.low + p.pose[:3, 3]
             else:
                 rotation[k], offset[k], size[k, : len(p.size)] = p.pose[:3, :3], p.pose[:3, 3], p.size
         kind = np.array([p.kind for p in primitives], np.int64)
-        return cls(kind, rotation, offset, size, boxes_around(kind, rotation, offset, size))
+        boxes = boxes_around(kind, rotation, offset, size)
+        for k, p in enumerate(primitives):
+            if p.grid is not None:
+                boxes[k] = _box_of_grid(p.grid, p.pose)
+        return cls(kind, rotation, offset, size, boxes, tuple(p.grid for p in primitives))
+
+
+def _box_of_grid(grid: DistanceGrid, pose: Floats) -> Floats:
+    """Return the axis-aligned box around what a grid at a pose is about, shape (2, 3) [m]."""
+    middle = pose[:3, :3] @ grid.box.mean(axis=0) + pose[:3, 3]
+    extent = np.abs(pose[:3, :3]) @ (grid.box[1] - grid.box[0]) / 2.0 + ROUNDING
+    return np.stack([middle - extent, middle + extent])
 
 
 def boxes_around(kind: Integers, rotation: Floats, offset: Floats, size: Floats) -> Floats:
@@ -158,8 +185,25 @@ def tables_of(solids: Mapping[int, Solids]) -> SceneTables:
         size=rows.size[chosen],
         tree_low=low,
         tree_high=high,
+        **_grid_columns([rows.grids[k] for k in chosen]),
     )
-    return SceneTables(arrays, boxes, rank[chosen])
+    return SceneTables(arrays, boxes, rank[chosen], tuple(rows.grids[k] for k in chosen))
+
+
+def _grid_columns(grids: Sequence[DistanceGrid | None]) -> dict[str, Any]:
+    """Return the columns ``grid`` and ``values`` of a scene's arrays."""
+    distinct = {id(grid): grid for grid in grids if grid is not None}
+    places, end = {}, 0
+    for key, grid in distinct.items():
+        places[key] = (end, *grid.values.shape)
+        end += grid.values.size
+    rows = [(0, 0, 0, 0) if grid is None else places[id(grid)] for grid in grids]
+    return {"grid": np.array(rows, np.int64).reshape(-1, 4), "values": _all_values(tuple(distinct.values()))}
+
+
+@lru_cache(maxsize=4)
+def _all_values(grids: tuple[DistanceGrid, ...]) -> Singles:
+    return np.concatenate([np.empty(0, np.float32), *(grid.values.ravel() for grid in grids)])
 
 
 def moved(tables: SceneTables, owner: int, solids: Solids) -> SceneTables:
@@ -189,19 +233,24 @@ def moved(tables: SceneTables, owner: int, solids: Solids) -> SceneTables:
     return replace(tables, arrays=arrays, boxes=boxes)
 
 
-def primitive(arrays: SceneArrays, k: int) -> Primitive:
-    """Return solid ``k`` of a scene's arrays."""
-    kind = int(arrays.kind[k])
+def primitive(tables: SceneTables, k: int) -> Primitive:
+    """Return solid ``k`` of a scene's tables."""
+    arrays = tables.arrays
+    kind, grid = int(arrays.kind[k]), tables.grids[k]
     if kind == HALF_SPACE:
         return Primitive(kind, np.eye(4), (*arrays.offset[k].tolist(), float(arrays.size[k, 0])))
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = arrays.rotation[k], arrays.offset[k]
+    if grid is not None:
+        pose[:3, 3] -= pose[:3, :3] @ grid.low
+        return Primitive(kind, pose, (), grid)
     return Primitive(kind, pose, tuple(arrays.size[k].tolist()))
 
 
 def _joined(parts: Iterable[Solids]) -> Solids:
     rows = list(parts) or [Solids.of(())]
-    return Solids(*(np.concatenate(columns) for columns in zip(*rows, strict=True)))
+    kind, rotation, offset, size, box = (np.concatenate(c) for c in zip(*(row[:-1] for row in rows), strict=True))
+    return Solids(kind, rotation, offset, size, box, tuple(grid for row in rows for grid in row.grids))
 
 
 def _boxes_of(tree: _Structure, boxes: Floats) -> tuple[Floats, Floats]:

@@ -22,8 +22,10 @@ def head_fault(head: dict[str, Any]) -> str:
 def scene_fault(s: SceneArrays) -> str:
     """Return the name of an array with another type or length, or with numbers out of range; else an empty string."""
     obstacles, boxes = len(s.kind), len(s.tree_skip)
-    for field, array in zip(layout(SceneArrays), s, strict=True):
-        name = field.name
+    for field in layout(SceneArrays):
+        name, array = field.name, getattr(s, field.name)
+        if field.single:
+            continue
         if array.dtype != field.dtype or array.shape[1:] != field.shape:
             return name
         size = boxes if name.startswith("tree") else {"open": 1, "allowed": len(s.allowed)}.get(name, obstacles)

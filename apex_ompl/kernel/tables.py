@@ -8,12 +8,14 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from apex_ompl.errors import FileFormatError, MissingFileError, UnknownNameError
 from apex_ompl.kernel.compiled.arrays import RobotArrays, SceneArrays
 from apex_ompl.kernel.compiled.layout import Floats, Integers, layout, pack
+from apex_ompl.kernel.distance_grid import DistanceGrid
 from apex_ompl.kernel.table_checks import head_fault, robot_fault
 from apex_ompl.util.files import is_file, write_atomically
 from apex_ompl.util.validation import check_indices
@@ -44,7 +46,7 @@ class RobotTables:
         """Pack the arrays."""
         object.__setattr__(self, "packed", pack(self.arrays))
 
-    packed: tuple[Integers, Floats] = field(init=False)
+    packed: tuple[Any, ...] = field(init=False)
 
     @property
     def dof(self) -> int:
@@ -156,15 +158,17 @@ class SceneTables:
         arrays: The arrays.
         boxes: Axis-aligned box around each solid, shape (n, 2, 3) [m]; empty unless obstacles may be moved.
         rank: Place of each solid among those of its obstacle, shape (n,); likewise.
+        grids: Grid of each solid, if it has one; likewise.
         packed: The same as :func:`pack` returns them.
     """
 
     arrays: SceneArrays
     boxes: Floats = field(default_factory=lambda: np.empty((0, 2, 3)))
     rank: Integers = field(default_factory=lambda: np.empty(0, np.int64))
+    grids: tuple[DistanceGrid | None, ...] = ()
 
     def __post_init__(self) -> None:
         """Pack the arrays."""
         object.__setattr__(self, "packed", pack(self.arrays))
 
-    packed: tuple[Integers, Floats] = field(init=False)
+    packed: tuple[Any, ...] = field(init=False)

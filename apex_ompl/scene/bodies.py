@@ -17,7 +17,9 @@ from pydantic import AfterValidator, Field, field_validator, model_validator
 from apex_ompl.types import Array
 from apex_ompl.util.schema import StrictModel
 
-MESH_SUFFIXES = (".stl", ".obj")
+MESH_SUFFIXES = (".stl", ".obj", ".ply", ".dae", ".glb", ".off")
+POINT_SUFFIXES = (".npy", ".ply", ".pcd")
+GRID_SUFFIXES = (".npz",)
 LARGEST = 1e4  # longer lengths are errors [m]
 
 
@@ -41,6 +43,12 @@ Quaternion = Annotated[tuple[float, float, float, float], AfterValidator(_unit_q
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_./-]*$")]
 
 
+def _with_suffix(file: str, known: tuple[str, ...], role: str) -> str:
+    if not file.lower().endswith(known):
+        raise ValueError(f"expected a {role} ending in {' or '.join(known)}")
+    return file
+
+
 class Sphere(StrictModel):
     """A ball centred on the object's origin; radius [m]."""
 
@@ -55,17 +63,20 @@ class RoundBar(StrictModel):
 
 
 class MeshFile(StrictModel):
-    """A closed triangle mesh from an STL or OBJ file; a relative path is relative to the problem file."""
+    """A triangle mesh from a file; a relative path is relative to the problem file.
+
+    A ``solid`` has an inside and must be closed. One that is not is a surface alone. By default a mesh is a solid, and
+    holes of it are taken as closed.
+    """
 
     file: str
     scale: Vector = (1.0, 1.0, 1.0)
+    solid: bool | None = None
 
     @field_validator("file")
     @classmethod
     def _known_suffix(cls, file: str) -> str:
-        if not file.lower().endswith(MESH_SUFFIXES):
-            raise ValueError(f"expected a mesh file ending in {' or '.join(MESH_SUFFIXES)}")
-        return file
+        return _with_suffix(file, MESH_SUFFIXES, "mesh file")
 
     @field_validator("scale")
     @classmethod
@@ -73,6 +84,29 @@ class MeshFile(StrictModel):
         if min(scale) <= 0.0:
             raise ValueError("expected three positive factors")
         return scale
+
+
+class PointFile(StrictModel):
+    """Balls of one radius [m] around the points of a file; a relative path is relative to the problem file."""
+
+    file: str
+    radius: Size
+
+    @field_validator("file")
+    @classmethod
+    def _known_suffix(cls, file: str) -> str:
+        return _with_suffix(file, POINT_SUFFIXES, "file of points")
+
+
+class GridFile(StrictModel):
+    """Cells of a grid from a file (:mod:`apex_ompl.scene.grids`); a relative path is relative to the problem file."""
+
+    file: str
+
+    @field_validator("file")
+    @classmethod
+    def _known_suffix(cls, file: str) -> str:
+        return _with_suffix(file, GRID_SUFFIXES, "file of a grid")
 
 
 class HalfSpace(StrictModel):
@@ -91,6 +125,9 @@ class Body(StrictModel):
     cylinder: RoundBar | None = None
     capsule: RoundBar | None = None
     mesh: MeshFile | None = None
+    points: PointFile | None = None
+    voxels: GridFile | None = None
+    distance_grid: GridFile | None = None
     half_space: HalfSpace | None = None
     position: Vector = (0.0, 0.0, 0.0)
     orientation: Quaternion = (0.0, 0.0, 0.0, 1.0)
@@ -115,7 +152,8 @@ class Body(StrictModel):
 
 
 BodyT = TypeVar("BodyT", bound=Body)
-SHAPES = ("box", "sphere", "cylinder", "capsule", "mesh", "half_space")
+SHAPES = ("box", "sphere", "cylinder", "capsule", "mesh", "points", "voxels", "distance_grid", "half_space")
+FILES = ("mesh", "points", "voxels", "distance_grid")  # shapes that are read from files
 
 
 class Obstacle(Body):
@@ -148,17 +186,19 @@ class AttachedObject(Body):
 
     @model_validator(mode="after")
     def _bounded(self) -> Self:
-        if self.half_space is not None:
-            raise ValueError(f"{self.name!r}: a half_space cannot be held")
+        if self.half_space is not None or self.points is not None:
+            raise ValueError(f"{self.name!r}: {'a half_space' if self.half_space else 'points'} cannot be held")
         return self
 
 
 def located(body: BodyT, folder: Path) -> BodyT:
-    """Return a body whose mesh file, if any, has an absolute path; a relative path is relative to ``folder``."""
-    if body.mesh is None:
-        return body
-    file = os.path.abspath(folder / body.mesh.file)
-    return body.model_copy(update={"mesh": body.mesh.model_copy(update={"file": file})})
+    """Return a body whose file, if any, has an absolute path; a relative path is relative to ``folder``."""
+    for name in FILES:
+        shape = getattr(body, name)
+        if shape is not None:
+            file = os.path.abspath(folder / shape.file)
+            return body.model_copy(update={name: shape.model_copy(update={"file": file})})
+    return body
 
 
 def pose_matrix(position: ArrayLike, orientation: ArrayLike) -> Array:

@@ -23,13 +23,16 @@ def triangles(mesh: coal.BVHModelBase) -> tuple[Array, NDArray[np.int64]]:
     return vertices, faces
 
 
-def extent_fault(vertices: Array) -> str:
+def extent_fault(vertices: Array, flat: bool = False) -> str:
     """Return the reason for which vertices, shape (V, 3) [m], are not those of a solid, or an empty string.
 
-    Vertices must be finite, at most ``LARGEST``, and not all in one plane; Coal aborts the process for others.
+    Vertices must be finite, at most ``LARGEST``, and not all in one plane; Coal aborts the process for others. Those of
+    a surface may be ``flat``.
     """
     if not (np.isfinite(vertices).all() and np.abs(vertices).max() < LARGEST):
         return "vertices that are not finite or too far away"
+    if flat:
+        return ""
     spread = np.linalg.svd(vertices - vertices.mean(axis=0), compute_uv=False)
     if len(vertices) < 4 or spread[2] <= 1e-9 * max(spread[0], 1e-9):
         return "vertices that all lie in one plane"
@@ -47,6 +50,21 @@ def orientation_fault(vertices: Array, faces: NDArray[np.int64]) -> str:
     """
     edges = Edges.of(weld(vertices)[faces])
     return "neighbouring triangles that are oriented against each other" if edges.opposed else ""
+
+
+def hole_fault(vertices: Array, faces: NDArray[np.int64]) -> str:
+    """Return where the holes of a mesh are, or an empty string; arguments as of :func:`orientation_fault`."""
+    place = weld(vertices)
+    rim = Edges.of(place[faces]).open
+    if not len(rim):
+        return ""
+    where = np.zeros((int(place.max()) + 1, 3))
+    where[place] = vertices
+    label = _components(rim)[rim[:, 0]]
+    middles = [where[rim[label == loop]].mean(axis=(0, 1)) for loop in np.unique(label)[:3]]
+    around = ", ".join(f"({x:.4g}, {y:.4g}, {z:.4g})" for x, y, z in middles)
+    count = len(np.unique(label))
+    return f"{count} {'hole' if count == 1 else 'holes'}, around {around}{' and others' if count > 3 else ''} m"
 
 
 def surface_note(vertices: Array, faces: NDArray[np.int64]) -> str:
@@ -108,6 +126,7 @@ class Edges:
         return single
 
 
+@weakly_cached
 def weld(vertices: Array) -> NDArray[np.int64]:
     """Return the index of the position of every vertex, shape (V,); vertices at the same position share one."""
     scale = max(float(np.abs(vertices).max()), 1e-9)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -12,9 +13,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from apex_ompl.collision import CollisionChecker
+from apex_ompl.collision.shapes import coal_geometry
 from apex_ompl.errors import SceneError
 from apex_ompl.scene.bodies import AttachedObject, Obstacle, pose_fields
 from apex_ompl.scene.problem import Problem
+from apex_ompl.session.cloud_files import CloudFiles
 from apex_ompl.types import Array
 from apex_ompl.util.schema import validate
 
@@ -30,6 +33,7 @@ class World:
         """Edit the scene of ``checker`` while ``lock`` is held."""
         self._checker = checker
         self._lock = lock
+        self._clouds = CloudFiles()
 
     @property
     def obstacles(self) -> Mapping[str, Obstacle]:
@@ -60,6 +64,42 @@ class World:
         wanted = [self._read(Obstacle, one, "obstacle") for one in (*obstacles, *([fields] if fields else []))]
         with self._lock:
             self._add(wanted)
+
+    def set_points(
+        self, name: str, points: ArrayLike, radius: float, file: str | os.PathLike[str] | None = None
+    ) -> None:
+        """Put balls of a radius [m] around points in the world in place of the cloud of that name, if there is one.
+
+        Results name the file that points come from. Without one that is given, it is temporary: the files of the last
+        clouds are kept as long as the planner.
+
+        Args:
+            name: Name of the obstacle; its allowed pairs are kept.
+            points: Shape (N, 3) [m].
+            radius: Radius of the balls [m].
+            file: A ``.npy`` file that the points are written to.
+
+        Raises:
+            ParameterError: The points have another shape, or are not finite.
+            SceneError: The name is that of something else.
+            FileFormatError: The radius is not positive, or there are no points.
+            MissingFileError: The file cannot be written.
+        """
+        path = self._clouds.write(points, file)
+        wanted = self._read(Obstacle, {"name": name, "points": {"file": str(path), "radius": radius}}, "obstacle")
+        with self._lock:
+            old = self.obstacles.get(name)
+            if old is None:
+                self._add([wanted])
+                return
+            if old.points is None:
+                raise SceneError(f"the name {name!r} is taken by an obstacle that is no cloud of points")
+            coal_geometry(wanted)  # what is wrong with it shows before anything is changed
+            allowed = [pair for pair in self.allowed if name in pair]
+            self._checker.remove(name)
+            self._checker.add(wanted)
+            for pair in allowed:
+                self._checker.allow(*pair)
 
     def move(self, name: str, position: Sequence[float], orientation: Sequence[float] | None = None) -> None:
         """Move an obstacle to a pose in the world [m, quaternion xyzw]; the orientation is kept by default.

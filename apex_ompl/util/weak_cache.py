@@ -13,7 +13,8 @@ R = TypeVar("R")
 def weakly_cached(function: Callable[[Any], R]) -> Callable[[Any], R]:
     """Keep the results of a function of one object, which must not change, until the object is deleted.
 
-    Objects are told apart by identity: those of Coal compare their whole content.
+    Objects are told apart by identity: those of Coal compare their whole content. A result that is known already is
+    kept by the function's ``keep(item, result)``.
     """
     kept: dict[int, tuple[ref[Any], R]] = {}
 
@@ -24,7 +25,12 @@ def weakly_cached(function: Callable[[Any], R]) -> Callable[[Any], R]:
         if found is not None and found[0]() is item:
             return found[1]
         result = function(item)
-        kept[number] = ref(item, lambda _: kept.pop(number, None)), result
+        keep(item, result)
         return result
 
+    def keep(item: Any, result: R) -> None:
+        number = id(item)
+        kept[number] = ref(item, lambda _: kept.pop(number, None)), result
+
+    cached.keep = keep  # type: ignore[attr-defined]
     return cached

@@ -14,6 +14,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from apex_ompl.collision.clouds import PointCloud, cloud_of
 from apex_ompl.collision.shapes import coal_geometry, is_shell
 from apex_ompl.errors import MissingFileError
 from apex_ompl.ompl_adapter.setup import PlanningSetup
@@ -30,6 +31,7 @@ HELD_COLOURS = ("#2a9d8f", "#e9a03b", "#8e6bbf", "#4c78a8")
 OBSTACLE, FIXTURE, BACKGROUND = "#c8553d", "#c9a77c", "#f4f4f1"
 SIDE_COLOURS = {"left": "#e8eef4", "right": "#f3ece2"}
 ARROW_COLOURS = ("#d62728", "#1f4ed8")
+MOST_BALLS = 30_000  # that are drawn of a cloud
 HALF_SPACE_EDGE = 3.0  # edge of the square that stands for a half-space [m]
 
 
@@ -107,16 +109,27 @@ class SceneRenderer:
         return pv.Plane(center=normal * offset, direction=normal, i_size=HALF_SPACE_EDGE, j_size=HALF_SPACE_EDGE)
 
     def _add_body(self, body: Body, colour: str, opacity: float) -> None:
+        cloud = cloud_of(coal_geometry(body))
+        if cloud is not None:
+            self._add_cloud(cloud, body, colour, opacity)
+            return
         mesh = self._mesh(coal_geometry(body)).transform(body.pose, inplace=False)
         self._plotter.add_mesh(mesh, color=colour, opacity=opacity, show_edges=False, specular=0.1)
         if opacity < 1.0 and body.box is not None:
             self._plotter.add_mesh(mesh.extract_feature_edges(30), color="#6b2d20", line_width=1.5)
 
+    def _add_cloud(self, cloud: PointCloud, body: Body, colour: str, opacity: float) -> None:
+        """Draw the balls of a cloud, or of some of its points where they are many."""
+        points = cloud.points[:: len(cloud.points) // MOST_BALLS + 1]
+        ball = self._pv.Sphere(radius=cloud.radius, theta_resolution=8, phi_resolution=8)
+        balls = self._pv.PolyData(points).glyph(geom=ball, scale=False, orient=False)
+        self._plotter.add_mesh(balls.transform(body.pose, inplace=False), color=colour, opacity=opacity)
+
     def _place_camera(self, setup: PlanningSetup, azimuth: float) -> None:
         """Point the camera at the middle of hands and scene; from the front, the left arm is on the right."""
         states = (setup.start, *setup.goals[:1])
         points = [setup.robot.link_pose(q, link)[:3, 3] for q in states for link in self._end_links()]
-        points += [np.asarray(b.position, float) for b in setup.problem.scene if b.half_space is None]
+        points += [_middle(body) for body in setup.problem.scene if body.half_space is None]
         middle = np.mean([np.min(points, axis=0), np.max(points, axis=0)], axis=0)
         focus = np.array([0.5 * middle[0], 0.5 * middle[1], max(0.25, 0.7 * middle[2])])
         turn = np.radians(azimuth)
@@ -159,3 +172,11 @@ def _pyvista() -> Any:
     except ImportError as error:
         raise MissingFileError("pyvista", "package for pictures", "install the extra: apex-ompl[viz]") from error
     return pyvista
+
+
+def _middle(body: Body) -> Array:
+    """Return the middle of the box around a body in the world, shape (3,) [m]."""
+    shape = coal_geometry(body)
+    shape.computeLocalAABB()
+    local = (np.array(shape.aabb_local.min_) + np.array(shape.aabb_local.max_)) / 2.0
+    return np.asarray(body.pose[:3, :3] @ local + body.pose[:3, 3])

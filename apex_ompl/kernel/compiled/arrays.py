@@ -9,10 +9,11 @@ from __future__ import annotations
 
 from typing import Annotated, NamedTuple
 
-from apex_ompl.kernel.compiled.layout import Floats, Integers, table_view
+from apex_ompl.kernel.compiled.layout import Floats, Integers, Singles, table_view
 
 FIXED, REVOLUTE, PRISMATIC = 0, 1, 2
 BOX, SPHERE, CYLINDER, CAPSULE, HALF_SPACE = range(5)
+GRID = 6  # of distances; 5 is a hull, among the exact shapes
 LIMIT_SLACK = 1e-9  # by which clusters' balls hold beyond the limits: motions are bounded with rounding [rad]
 
 Pairs = Annotated[Integers, 2]
@@ -75,8 +76,10 @@ class RobotArrays(NamedTuple):
 class SceneArrays(NamedTuple):
     """Arrays of a scene: obstacles, sorted so that each leaf of a tree of boxes holds a range of them.
 
-    ``kind`` is one of BOX ... HALF_SPACE, ``owner`` the number of the obstacle that a solid is part of. ``size`` holds
-    half edges, or radius and half length; a half-space has its unit normal in ``offset`` and its distance in ``size``.
+    ``kind`` is one of BOX ... HALF_SPACE or GRID, ``owner`` the number of the obstacle that a solid is part of.
+    ``size`` holds half edges, or radius and half length; a half-space has its unit normal in ``offset`` and its
+    distance in ``size``. A grid has its first node at ``offset`` and its spacing in ``size``; ``grid`` says which of
+    ``values`` are its own: the first, and how many along each axis.
     Nodes of the tree are in depth-first order: ``tree_skip`` is the next node outside of a node's subtree,
     ``tree_range`` first obstacle and number of them (0 for inner nodes). The last ``open`` (1,) obstacles are
     half-spaces, which no box holds. ``allowed`` are pairs of a body and an owner that may touch.
@@ -93,6 +96,8 @@ class SceneArrays(NamedTuple):
     size: Vectors
     tree_low: Vectors
     tree_high: Vectors
+    grid: Annotated[Integers, 4]
+    values: Singles
 
 
 robot_view = table_view(RobotArrays)

@@ -16,7 +16,7 @@ from apex_ompl.kernel.compiled.arrays import RobotArrays, SceneArrays, robot_vie
 from apex_ompl.kernel.compiled.compilation import entry_point, inlined
 from apex_ompl.kernel.compiled.curve import set_motion, set_state
 from apex_ompl.kernel.compiled.kinematics import place_cluster, place_robot
-from apex_ompl.kernel.compiled.layout import Floats, Integers, buffer_view
+from apex_ompl.kernel.compiled.layout import Floats, Integers, Singles, buffer_view
 from apex_ompl.kernel.compiled.motion_bound import bound_displacements
 from apex_ompl.kernel.compiled.pair_distance import pair_bound
 from apex_ompl.kernel.compiled.relative_motion import Frames
@@ -180,7 +180,7 @@ def _by_shapes(
 
 @entry_point
 def prove_curve(
-    ri: Integers, rf: Floats, si: Integers, sf: Floats, hi: Integers, hf: Floats,
+    ri: Integers, rf: Floats, si: Integers, sf: Floats, sg: Singles, hi: Integers, hf: Floats,
     wi: Integers, wf: Floats, gi: Integers, gf: Floats, pi: Integers, pf: Floats,
     knots: Floats, states: Floats, rates: Floats, slack: float, touch: float, tolerance: float, budget: int,
 ) -> int:  # fmt: skip
@@ -195,7 +195,7 @@ def prove_curve(
         PROVED, MORE, TOUCHING (the pair is in ``worst``), UNDECIDED where an
         interval got too short, or OUTSIDE at a state for which the tables do not hold.
     """
-    t, s, h = robot_view(ri, rf), scene_view(si, sf), shapes_view(hi, hf)
+    t, s, h = robot_view(ri, rf), scene_view(si, sf, sg), shapes_view(hi, hf)
     w, g, p = workspace_view(t, wi, wf), pair_view(gi, gf), _proof_view(pi, pf, len(t.lower))
     whole = knots[len(knots) - 1] - knots[0]
     shortest = SHORTEST * whole

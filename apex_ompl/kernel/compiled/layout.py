@@ -2,7 +2,8 @@
 
 Passing two arrays to compiled code costs a tenth of passing thirty. A layout is the list of fields of a named tuple:
 each is annotated ``Integers`` or ``Floats``, or with these and a shape, ``Annotated[Floats, "joints", 3]``. From it
-come the sizes of the buffers and the source of the compiled function that slices them.
+come the sizes of the buffers and the source of the compiled function that slices them. A last field of ``Singles``,
+which may be long, is passed as it is.
 """
 
 from __future__ import annotations
@@ -28,17 +29,19 @@ class Field(NamedTuple):
     Attributes:
         name: Name of the field.
         integer: Whether its numbers are integers.
+        single: Whether they are floats of single precision.
         shape: Declared shape: of one row for tables, else of the whole array; names stand for dimensions.
     """
 
     name: str
     integer: bool
+    single: bool
     shape: tuple[int | str, ...]
 
     @property
-    def dtype(self) -> type[np.int64] | type[np.float64]:
+    def dtype(self) -> type[np.int64 | np.float64 | np.float32]:
         """Type of its numbers."""
-        return np.int64 if self.integer else np.float64
+        return np.int64 if self.integer else np.float32 if self.single else np.float64
 
     def sized(self, dimensions: dict[str, int]) -> tuple[int, ...]:
         """Return the shape with numbers for the names."""
@@ -51,34 +54,40 @@ def layout(cls: Any) -> tuple[Field, ...]:
     found = []
     for name, hint in get_type_hints(cls, include_extras=True).items():
         array, *shape = get_args(hint) if get_origin(hint) is Annotated else (hint,)
-        found.append(Field(name, array == Integers, tuple(shape)))
+        found.append(Field(name, array == Integers, array == Singles, tuple(shape)))
     return tuple(found)
 
 
-def pack(arrays: Any) -> tuple[Integers, Floats]:
-    """Return the arrays of a table one behind the other: integers and floats.
+def pack(arrays: Any) -> tuple[Any, ...]:
+    """Return the arrays of a table one behind the other: integers and floats, and singles where there are any.
 
     The integers begin with the first and last place of every field, see :func:`table_view`.
     """
     fields = layout(arrays.__class__)
     places: list[int] = []
     parts: dict[bool, list[NDArray[Any]]] = {True: [], False: []}
-    ends = {True: 2 * len(fields), False: 0}
+    ends = {True: 2 * sum(not field.single for field in fields), False: 0}
     for field, array in zip(fields, arrays, strict=True):
+        if field.single:
+            continue
         places += [ends[field.integer], ends[field.integer] + array.size]
         ends[field.integer] += array.size
         parts[field.integer].append(array.ravel())
-    return np.concatenate([np.array(places, np.int64), *parts[True]]), np.concatenate(parts[False])
+    singles = (array for field, array in zip(fields, arrays, strict=True) if field.single)
+    return np.concatenate([np.array(places, np.int64), *parts[True]]), np.concatenate(parts[False]), *singles
 
 
-def table_view(cls: Any) -> Callable[[Integers, Floats], Any]:
-    """Return the compiled inverse of :func:`pack`: ``view(integers, floats)`` gives a ``cls`` of slices."""
-    slices = []
+def table_view(cls: Any) -> Callable[..., Any]:
+    """Return the compiled inverse of :func:`pack`: ``view(integers, floats[, singles])`` gives a ``cls`` of slices."""
+    slices, singles = [], [field.name for field in layout(cls) if field.single]
     for k, field in enumerate(layout(cls)):
+        if field.single:
+            slices.append(field.name)
+            continue
         rows = f".reshape(-1, {', '.join(map(str, field.shape))})" if field.shape else ""
         buffer = "integers" if field.integer else "floats"
         slices.append(f"{buffer}[integers[{2 * k}] : integers[{2 * k + 1}]]{rows}")
-    return _generated(cls, ["integers", "floats"], [], slices)
+    return _generated(cls, ["integers", "floats", *singles], [], slices)
 
 
 def buffer_view(cls: Any, dimensions: Sequence[str]) -> Callable[..., Any]:

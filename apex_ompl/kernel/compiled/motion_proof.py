@@ -7,7 +7,7 @@ import math
 from apex_ompl.kernel.compiled.arrays import robot_view, scene_view
 from apex_ompl.kernel.compiled.compilation import entry_point, inlined
 from apex_ompl.kernel.compiled.curve import piece_of
-from apex_ompl.kernel.compiled.layout import Floats, Integers
+from apex_ompl.kernel.compiled.layout import Floats, Integers, Singles
 from apex_ompl.kernel.compiled.motion_bound import bound_displacements
 from apex_ompl.kernel.compiled.separation import tables_hold, unproved, unproved_at_state
 from apex_ompl.kernel.compiled.workspace import Workspace, workspace_view
@@ -90,7 +90,8 @@ def _set_motion(path: Floats, starts: Integers, a: int, b: int, middle: Floats, 
 
 @entry_point
 def prove_path(
-    ri: Integers, rf: Floats, si: Integers, sf: Floats, wi: Integers, wf: Floats, path: Floats, starts: Integers,
+    ri: Integers, rf: Floats, si: Integers, sf: Floats, sg: Singles, wi: Integers, wf: Floats,
+    path: Floats, starts: Integers,
     queue: Integers, ends: Integers, state: Floats, found: Integers, counts: Integers,
 ) -> int:  # fmt: skip
     """Prove a path free, up to the first state that is not proved.
@@ -107,7 +108,7 @@ def prove_path(
         their number in ``ends[2]``, as in :func:`apex_ompl.kernel.compiled.queries.check_states`. Another call goes on
         behind it.
     """
-    t, s = robot_view(ri, rf), scene_view(si, sf)
+    t, s = robot_view(ri, rf), scene_view(si, sf, sg)
     w = workspace_view(t, wi, wf)
     while ends[0] < ends[1]:
         a, b = queue[ends[0], 0], queue[ends[0], 1]

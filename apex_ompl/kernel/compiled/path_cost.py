@@ -16,7 +16,7 @@ from typing import Annotated, NamedTuple
 from apex_ompl.kernel.compiled.arrays import RobotArrays, SceneArrays, robot_view, scene_view
 from apex_ompl.kernel.compiled.clearance_cost import state_cost
 from apex_ompl.kernel.compiled.compilation import entry_point, inlined
-from apex_ompl.kernel.compiled.layout import Floats, Integers, buffer_sizes, buffer_view
+from apex_ompl.kernel.compiled.layout import Floats, Integers, Singles, buffer_sizes, buffer_view
 from apex_ompl.kernel.compiled.separation import tables_hold
 from apex_ompl.kernel.compiled.workspace import Workspace, workspace_view
 
@@ -204,11 +204,12 @@ def evaluate(
 
 @entry_point
 def path_cost(
-    ri: Integers, rf: Floats, si: Integers, sf: Floats, wi: Integers, wf: Floats, weights: Floats, first: Integers,
+    ri: Integers, rf: Floats, si: Integers, sf: Floats, sg: Singles, wi: Integers, wf: Floats,
+    weights: Floats, first: Integers,
     speed_gram: Floats, pinned: int, control: Floats, numbers: Numbers, bi: Integers, bf: Floats, gradient: Floats,
 ) -> Report:  # fmt: skip
     """Return the cost of a path, put its gradient (n,) into place; see ``optimize_path`` for the arguments."""
-    t, s = robot_view(ri, rf), scene_view(si, sf)
+    t, s = robot_view(ri, rf), scene_view(si, sf, sg)
     w = workspace_view(t, wi, wf)
     points, dof = control.shape
     b = buffers_view(bi, bf, (points - 2 * pinned) * dof, points, dof)

@@ -15,7 +15,7 @@ import math
 
 from apex_ompl.kernel.compiled.arrays import RobotArrays, robot_view, scene_view
 from apex_ompl.kernel.compiled.compilation import entry_point, inlined
-from apex_ompl.kernel.compiled.layout import Floats, Integers
+from apex_ompl.kernel.compiled.layout import Floats, Integers, Singles
 from apex_ompl.kernel.compiled.path_cost import CostSettings, Numbers, Report, buffers_view, evaluate
 from apex_ompl.kernel.compiled.workspace import workspace_view
 
@@ -94,7 +94,8 @@ def _add_step(t: RobotArrays, control: Floats, pinned: int, step: Floats, trial:
 
 @entry_point
 def optimize_path(
-    ri: Integers, rf: Floats, si: Integers, sf: Floats, wi: Integers, wf: Floats, weights: Floats, first: Integers,
+    ri: Integers, rf: Floats, si: Integers, sf: Floats, sg: Singles, wi: Integers, wf: Floats,
+    weights: Floats, first: Integers,
     speed_gram: Floats, pinned: int, control: Floats, numbers: Numbers, bi: Integers, bf: Floats,
 ) -> Report:  # fmt: skip
     """Improve a path in place; its control points (P, dof) are put inside the limits.
@@ -104,6 +105,7 @@ def optimize_path(
         rf: Robot.
         si: Scene, packed.
         sf: Scene.
+        sg: Scene.
         wi: Workspace, see :func:`apex_ompl.kernel.compiled.workspace.workspace_sizes`.
         wf: Workspace.
         weights: Weights of control points at the samples, shape (N, degree + 1).
@@ -118,7 +120,7 @@ def optimize_path(
     Returns:
         The fields of :class:`apex_ompl.kernel.compiled.path_cost.PathReport`.
     """
-    t, s = robot_view(ri, rf), scene_view(si, sf)
+    t, s = robot_view(ri, rf), scene_view(si, sf, sg)
     w = workspace_view(t, wi, wf)
     points, dof = control.shape
     n = (points - 2 * pinned) * dof

@@ -16,21 +16,21 @@ from apex_ompl.kernel.compiled.clearance import (
 )
 from apex_ompl.kernel.compiled.compilation import entry_point
 from apex_ompl.kernel.compiled.kinematics import place_joint, place_robot
-from apex_ompl.kernel.compiled.layout import Floats, Integers
+from apex_ompl.kernel.compiled.layout import Floats, Integers, Singles
 from apex_ompl.kernel.compiled.separation import tables_hold, unproved_at_state
 from apex_ompl.kernel.compiled.workspace import workspace_view
 
 
 @entry_point
 def check_states(
-    ri: Integers, rf: Floats, si: Integers, sf: Floats, wi: Integers, wf: Floats,
+    ri: Integers, rf: Floats, si: Integers, sf: Floats, sg: Singles, wi: Integers, wf: Floats,
     states: Floats, found: Integers, counts: Integers,
 ) -> None:  # fmt: skip
     """Find for each state, shape (N, dof), the pairs that are not proved apart.
 
     ``found`` (N, K, 2) gets the pairs, ``counts`` (N,) their number, or -1 where the tables do not hold for the state.
     """
-    t, s = robot_view(ri, rf), scene_view(si, sf)
+    t, s = robot_view(ri, rf), scene_view(si, sf, sg)
     w = workspace_view(t, wi, wf)
     for k in range(len(states)):
         counts[k] = unproved_at_state(t, s, w, states[k], found[k])
@@ -38,7 +38,7 @@ def check_states(
 
 @entry_point
 def clearances(
-    ri: Integers, rf: Floats, si: Integers, sf: Floats, wi: Integers, wf: Floats,
+    ri: Integers, rf: Floats, si: Integers, sf: Floats, sg: Singles, wi: Integers, wf: Floats,
     states: Floats, limit: float, values: Floats, gradients: Floats,
 ) -> None:  # fmt: skip
     """Put the signed clearances of states, shape (N, dof), to obstacles and between links into ``values`` (N, 2) [m].
@@ -46,7 +46,7 @@ def clearances(
     Clearances above ``limit`` are given as ``limit``, with gradient 0. ``gradients``, shape (N, 2, dof), gets the
     gradients; shape (0, 2, dof) asks for none. States for which the tables do not hold get NaN.
     """
-    t, s = robot_view(ri, rf), scene_view(si, sf)
+    t, s = robot_view(ri, rf), scene_view(si, sf, sg)
     w = workspace_view(t, wi, wf)
     for k in range(len(states)):
         q = states[k]

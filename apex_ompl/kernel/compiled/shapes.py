@@ -7,6 +7,8 @@ from typing import Annotated, NamedTuple
 from apex_ompl.kernel.compiled.arrays import Balls, Rotations, Spans, Vectors
 from apex_ompl.kernel.compiled.layout import Floats, Integers, buffer_view, table_view
 
+TRIANGLE = 3  # corners
+POINT = -2  # and less, in ``corner``: -2 - the place of a point
 HULL = 5  # kind of a convex hull of points, besides BOX ... HALF_SPACE
 MOST_NODES = 512  # pairs of nodes that wait in a traversal of two trees of triangles
 
@@ -20,7 +22,8 @@ class ShapeArrays(NamedTuple):
 
     A mesh that is not convex is a HULL, which bounds its distance, with the root of a binary tree of balls around its
     triangles in ``root`` (else -1). An inner node has its first child in ``child``, the second stands behind it; a leaf
-    has -1 there, and the first of its three corners in ``corner``. Balls of nodes are in the shape's frame. Triangles
+    has -1 there, and the first of its three corners in ``corner``, or POINT less the place of a single point. A hull
+    may be that of balls around points, whose radius is its ``size``. Balls of nodes are in the shape's frame. Triangles
     lie at most ``depth`` below the hull [m].
 
     Bodies come first, in the order of the robot's tables; ``row`` gives the shape of an obstacle by its number.

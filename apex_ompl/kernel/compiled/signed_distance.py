@@ -1,11 +1,12 @@
-"""Signed distances of points to boxes, spheres, cylinders, capsules and half-spaces, and their gradients."""
+"""Signed distances of points to boxes, spheres, cylinders, capsules, half-spaces and grids, and their gradients."""
 
 from __future__ import annotations
 
 import math
 
-from apex_ompl.kernel.compiled.arrays import BOX, CAPSULE, CYLINDER, HALF_SPACE, SPHERE, SceneArrays
+from apex_ompl.kernel.compiled.arrays import BOX, CAPSULE, CYLINDER, GRID, HALF_SPACE, SPHERE, SceneArrays
 from apex_ompl.kernel.compiled.compilation import inlined
+from apex_ompl.kernel.compiled.grid_distance import grid_direction, grid_distance
 
 
 @inlined
@@ -22,7 +23,7 @@ def local_point(s: SceneArrays, o: int, x: float, y: float, z: float) -> tuple[f
 
 @inlined
 def distance(s: SceneArrays, o: int, x: float, y: float, z: float) -> float:
-    """Return the signed distance of a point of the world to an obstacle [m], negative inside."""
+    """Return the signed distance of a point of the world to an obstacle [m], negative inside; a bound of a grid's."""
     kind, size = s.kind[o], s.size[o]
     if kind == HALF_SPACE:
         n = s.offset[o]
@@ -41,6 +42,8 @@ def distance(s: SceneArrays, o: int, x: float, y: float, z: float) -> float:
         inside = min(max(across, along), 0.0)
         across, along = max(across, 0.0), max(along, 0.0)
         return float(math.sqrt(across * across + along * along) + inside)
+    if kind == GRID:
+        return float(grid_distance(s.grid[o], s.values, size[0], a, b, c))
     c -= min(max(c, -size[1]), size[1])  # CAPSULE
     return float(math.sqrt(a * a + b * b + c * c) - size[0])
 
@@ -71,6 +74,8 @@ def direction(s: SceneArrays, o: int, x: float, y: float, z: float) -> tuple[flo
             a, b, c = a / radial * across, b / radial * across, math.copysign(along, c)
         else:
             a, b, c = across, 0.0, math.copysign(along, c)
+    elif kind == GRID:
+        a, b, c = grid_direction(s.grid[o], s.values, size[0], a, b, c)
     elif kind == CAPSULE:
         c -= min(max(c, -size[1]), size[1])
     length = math.sqrt(a * a + b * b + c * c)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from apex_ompl.kernel.compiled.compilation import entry_point, inlined
+from apex_ompl.kernel.compiled.compilation import entry_point, inlined, outlined
 from apex_ompl.kernel.compiled.layout import Floats
 
 CORNERS = 9
@@ -74,6 +74,16 @@ def _solid_angle(corners: Floats, x: float, y: float, z: float) -> float:
     return total / (2.0 * math.pi)
 
 
+@outlined
+def is_inside(corners: Floats, box: Floats, watertight: bool, x: float, y: float, z: float) -> bool:
+    """Return :func:`encloses` for compiled code."""
+    if not (box[0, 0] <= x <= box[1, 0] and box[0, 1] <= y <= box[1, 1] and box[0, 2] <= z <= box[1, 2]):
+        return False
+    if watertight:
+        return _crossings(corners, x, y, z) != 0
+    return abs(_solid_angle(corners, x, y, z)) > 0.5
+
+
 @entry_point
 def encloses(corners: Floats, box: Floats, watertight: bool, x: float, y: float, z: float) -> bool:
     """Whether the winding number of a mesh around a point that is not on its surface exceeds 1/2, without its sign.
@@ -87,11 +97,7 @@ def encloses(corners: Floats, box: Floats, watertight: bool, x: float, y: float,
         y: The same.
         z: The same.
     """
-    if not (box[0, 0] <= x <= box[1, 0] and box[0, 1] <= y <= box[1, 1] and box[0, 2] <= z <= box[1, 2]):
-        return False
-    if watertight:
-        return _crossings(corners, x, y, z) != 0
-    return abs(_solid_angle(corners, x, y, z)) > 0.5
+    return is_inside(corners, box, watertight, x, y, z)
 
 
 @inlined

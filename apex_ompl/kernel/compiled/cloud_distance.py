@@ -1,0 +1,174 @@
+"""Whether points of a cloud are near a solid or inside of it, by trees of balls over both."""
+
+from __future__ import annotations
+
+import math
+
+from apex_ompl.kernel.compiled.arrays import BOX, CAPSULE, SPHERE
+from apex_ompl.kernel.compiled.compilation import entry_point, inlined
+from apex_ompl.kernel.compiled.grid_building import closest_squared
+from apex_ompl.kernel.compiled.layout import Floats, Integers
+from apex_ompl.kernel.compiled.triangle_mesh import is_inside
+
+Point = tuple[float, float, float]
+
+
+@inlined
+def _local(pose: Floats, x: float, y: float, z: float) -> Point:
+    """Return a point in the frame of a pose, shape (4, 4)."""
+    dx, dy, dz = x - pose[0, 3], y - pose[1, 3], z - pose[2, 3]
+    return (
+        pose[0, 0] * dx + pose[1, 0] * dy + pose[2, 0] * dz,
+        pose[0, 1] * dx + pose[1, 1] * dy + pose[2, 1] * dz,
+        pose[0, 2] * dx + pose[1, 2] * dy + pose[2, 2] * dz,
+    )
+
+
+@entry_point
+def near_mesh(
+    points: Floats, point_balls: Floats, point_child: Integers, point_leaf: Integers,
+    corners: Floats, balls: Floats, child: Integers, leaf: Integers, pose: Floats, limit: float, stack: Integers,
+) -> bool:  # fmt: skip
+    """Whether any of the points is within a distance of any triangle of a mesh.
+
+    Args:
+        points: Shape (N, 1, 3) [m].
+        point_balls: Nodes of a tree over them, see :func:`apex_ompl.collision.exact_shapes.ball_tree`.
+        point_child: First child of each node.
+        point_leaf: Point of each leaf.
+        corners: Corners of the triangles, shape (T, 3, 3) [m].
+        balls: Nodes of a tree over them.
+        child: First child of each node.
+        leaf: Triangle of each leaf.
+        pose: Pose of the mesh in the frame of the points, shape (4, 4) [m].
+        limit: The distance [m].
+        stack: Room for pairs of nodes, shape (n, 2), n longer than both trees are deep.
+    """
+    top = 1
+    stack[0, 0] = stack[0, 1] = 0
+    while top > 0:
+        top -= 1
+        m, n = stack[top, 0], stack[top, 1]
+        x, y, z = _local(pose, point_balls[m, 0], point_balls[m, 1], point_balls[m, 2])
+        apart = math.sqrt((x - balls[n, 0]) ** 2 + (y - balls[n, 1]) ** 2 + (z - balls[n, 2]) ** 2)
+        if apart - point_balls[m, 3] - balls[n, 3] > limit:
+            continue
+        if point_child[m] < 0 and child[n] < 0:
+            p = point_leaf[m]
+            x, y, z = _local(pose, points[p, 0, 0], points[p, 0, 1], points[p, 0, 2])
+            if closest_squared(corners, leaf[n], x, y, z) <= limit * limit:
+                return True
+        elif child[n] < 0 or (point_child[m] >= 0 and point_balls[m, 3] >= balls[n, 3]):
+            stack[top, 0], stack[top, 1], stack[top + 1, 0], stack[top + 1, 1] = (
+                point_child[m],
+                n,
+                point_child[m] + 1,
+                n,
+            )
+            top += 2
+        else:
+            stack[top, 0], stack[top, 1] = m, child[n]
+            stack[top + 1, 0], stack[top + 1, 1] = m, child[n] + 1
+            top += 2
+    return False
+
+
+@entry_point
+def any_inside(
+    points: Floats, point_balls: Floats, point_child: Integers, point_leaf: Integers,
+    corners: Floats, box: Floats, watertight: bool, normals: Floats, offsets: Floats, pose: Floats, stack: Integers,
+) -> bool:  # fmt: skip
+    """Whether any of the points is inside of a mesh, none being on its surface.
+
+    Args:
+        points: Shape (N, 1, 3) [m].
+        point_balls: Nodes of a tree over them.
+        point_child: First child of each node.
+        point_leaf: Point of each leaf.
+        corners: Corners of the triangles, see :func:`apex_ompl.kernel.compiled.triangle_mesh.encloses`.
+        box: Bounding box of the mesh, shape (2, 3) [m].
+        watertight: Whether winding numbers are whole numbers.
+        normals: Outward unit normals of its convex hull, shape (P, 3).
+        offsets: Offsets of its planes, shape (P,) [m].
+        pose: Pose of the mesh in the frame of the points, shape (4, 4) [m].
+        stack: Room for nodes, shape (n, 2).
+    """
+    top = 1
+    stack[0, 0] = 0
+    while top > 0:
+        top -= 1
+        m = stack[top, 0]
+        x, y, z = _local(pose, point_balls[m, 0], point_balls[m, 1], point_balls[m, 2])
+        outside = False
+        for k in range(len(offsets)):
+            if normals[k, 0] * x + normals[k, 1] * y + normals[k, 2] * z - offsets[k] > point_balls[m, 3]:
+                outside = True
+                break
+        if outside:
+            continue
+        if point_child[m] >= 0:
+            stack[top, 0], stack[top + 1, 0] = point_child[m], point_child[m] + 1
+            top += 2
+            continue
+        p = point_leaf[m]
+        x, y, z = _local(pose, points[p, 0, 0], points[p, 0, 1], points[p, 0, 2])
+        if is_inside(corners, box, watertight, x, y, z):
+            return True
+    return False
+
+
+@inlined
+def _primitive_distance(kind: int, size: Floats, x: float, y: float, z: float) -> float:
+    """Return the signed distance of a point from a box, a ball, a cylinder or a capsule around the origin [m]."""
+    if kind == SPHERE:
+        return float(math.sqrt(x * x + y * y + z * z) - size[0])
+    if kind == BOX:
+        x, y, z = abs(x) - size[0], abs(y) - size[1], abs(z) - size[2]
+        inside = min(max(x, y, z), 0.0)
+        x, y, z = max(x, 0.0), max(y, 0.0), max(z, 0.0)
+        return float(math.sqrt(x * x + y * y + z * z) + inside)
+    across, along = math.sqrt(x * x + y * y), abs(z) - size[1]
+    if kind == CAPSULE:
+        along = max(along, 0.0)
+        return float(math.sqrt(across * across + along * along) - size[0])
+    across -= size[0]
+    inside = min(max(across, along), 0.0)
+    across, along = max(across, 0.0), max(along, 0.0)
+    return float(math.sqrt(across * across + along * along) + inside)
+
+
+@entry_point
+def near_primitive(
+    points: Floats, point_balls: Floats, point_child: Integers, point_leaf: Integers,
+    kind: int, size: Floats, pose: Floats, limit: float, stack: Integers,
+) -> bool:  # fmt: skip
+    """Whether any of the points is within a distance of a primitive, or inside of it.
+
+    Args:
+        points: Shape (N, 1, 3) [m].
+        point_balls: Nodes of a tree over them.
+        point_child: First child of each node.
+        point_leaf: Point of each leaf.
+        kind: BOX, SPHERE, CYLINDER or CAPSULE.
+        size: Half edges; radius; or radius and half length, shape (3,) [m].
+        pose: Pose of the primitive in the frame of the points, shape (4, 4) [m].
+        limit: The distance [m].
+        stack: Room for nodes, shape (n, 2).
+    """
+    top = 1
+    stack[0, 0] = 0
+    while top > 0:
+        top -= 1
+        m = stack[top, 0]
+        x, y, z = _local(pose, point_balls[m, 0], point_balls[m, 1], point_balls[m, 2])
+        if _primitive_distance(kind, size, x, y, z) - point_balls[m, 3] > limit:
+            continue
+        if point_child[m] >= 0:
+            stack[top, 0], stack[top + 1, 0] = point_child[m], point_child[m] + 1
+            top += 2
+            continue
+        p = point_leaf[m]
+        x, y, z = _local(pose, points[p, 0, 0], points[p, 0, 1], points[p, 0, 2])
+        if _primitive_distance(kind, size, x, y, z) <= limit:
+            return True
+    return False

@@ -1,0 +1,89 @@
+"""Distances tabulated on a grid (:mod:`apex_ompl.kernel.distance_grid`), and their gradients."""
+
+from __future__ import annotations
+
+import math
+
+from apex_ompl.kernel.compiled.compilation import inlined, outlined
+from apex_ompl.kernel.compiled.layout import Integers, Singles
+
+Place = tuple[int, float]
+
+
+@inlined
+def _place(u: float, nodes: int) -> Place:
+    """Return the cell of a coordinate that is on the grid, in spacings, and the share of the cell up to it."""
+    cell = min(int(u), nodes - 2)
+    return cell, u - cell
+
+
+@outlined
+def grid_distance(grid: Integers, values: Singles, spacing: float, a: float, b: float, c: float) -> float:
+    """Return a lower bound of the distance of a point in the grid's frame [m].
+
+    Outside of the grid, of which the solid is inside, it is the distance of two legs of a right-angled triangle: the
+    one to the nearest point of the grid, and the one from there.
+
+    Args:
+        grid: First value, and number of nodes along each axis, shape (4,).
+        values: Values of all grids.
+        spacing: Of the nodes [m].
+        a: Place of the point [m].
+        b: The same.
+        c: The same.
+    """
+    nx, ny, nz = grid[1], grid[2], grid[3]
+    a, b, c = a / spacing, b / spacing, c / spacing
+    x, y, z = min(max(a, 0.0), nx - 1.0), min(max(b, 0.0), ny - 1.0), min(max(c, 0.0), nz - 1.0)
+    if not math.isfinite(a + b + c):
+        return math.nan
+    i, u = _place(x, nx)
+    j, v = _place(y, ny)
+    k, w = _place(z, nz)
+    n = grid[0] + (i * ny + j) * nz + k
+    row, slab = nz, ny * nz
+    near = (values[n] * (1.0 - w) + values[n + 1] * w) * (1.0 - v) + (
+        values[n + row] * (1.0 - w) + values[n + row + 1] * w
+    ) * v
+    n += slab
+    far = (values[n] * (1.0 - w) + values[n + 1] * w) * (1.0 - v) + (
+        values[n + row] * (1.0 - w) + values[n + row + 1] * w
+    ) * v
+    found = near * (1.0 - u) + far * u
+    a, b, c = a - x, b - y, c - z
+    outside = a * a + b * b + c * c
+    if outside > 0.0:
+        return float(math.sqrt(outside * spacing * spacing + max(found, 0.0) ** 2))
+    return float(found)
+
+
+@outlined
+def grid_direction(
+    grid: Integers, values: Singles, spacing: float, a: float, b: float, c: float
+) -> tuple[float, float, float]:
+    """Return the gradient of :func:`grid_distance`, not of unit length; see there for the arguments."""
+    nx, ny, nz = grid[1], grid[2], grid[3]
+    a, b, c = a / spacing, b / spacing, c / spacing
+    x, y, z = min(max(a, 0.0), nx - 1.0), min(max(b, 0.0), ny - 1.0), min(max(c, 0.0), nz - 1.0)
+    if not math.isfinite(a + b + c):
+        return math.nan, math.nan, math.nan
+    i, u = _place(x, nx)
+    j, v = _place(y, ny)
+    k, w = _place(z, nz)
+    n = grid[0] + (i * ny + j) * nz + k
+    row, slab = nz, ny * nz
+    dx, dy, dz, found = 0.0, 0.0, 0.0, 0.0
+    for corner in range(8):
+        p, q, r = corner // 4, corner // 2 % 2, corner % 2
+        value = values[n + p * slab + q * row + r]
+        along, across, up = (u if p else 1.0 - u), (v if q else 1.0 - v), (w if r else 1.0 - w)
+        dx += (value if p else -value) * across * up
+        dy += (value if q else -value) * along * up
+        dz += (value if r else -value) * along * across
+        found += value * along * across * up
+    a, b, c = a - x, b - y, c - z
+    if a * a + b * b + c * c > 0.0:
+        share = max(found, 0.0) / spacing  # of the leg that is on the grid, where coordinates inside of it count
+        dx, dy, dz = dx / spacing * share, dy / spacing * share, dz / spacing * share
+        return (a if a != 0.0 else dx), (b if b != 0.0 else dy), (c if c != 0.0 else dz)
+    return dx, dy, dz

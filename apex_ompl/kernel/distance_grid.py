@@ -1,0 +1,168 @@
+"""Grids of distances to surfaces and points: lower bounds of the signed distance, whatever the number of triangles.
+
+At the nodes near a surface the distance is exact, elsewhere it is that of a distance transform less its largest error.
+Between nodes it is interpolated linearly along each axis. A distance changes by at most the way, so that interpolation
+is wrong by at most sum_i w_i |x - x_i| <= sqrt(3) / 2 spacings, by which the values at the nodes are lowered.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections import OrderedDict
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apex_ompl.kernel.compiled.grid_building import (
+    FAR,
+    distance_transform,
+    lower_bounds,
+    mark_crossings,
+    negate_inside,
+    raster_points,
+    raster_triangles,
+    split_near,
+)
+from apex_ompl.kernel.compiled.layout import Singles
+from apex_ompl.types import Array
+from apex_ompl.util.weak_cache import weakly_cached
+
+MOST_NODES = 6_000_000
+MOST_NODES_OF_POINTS = 1_000_000  # which are made anew with every image
+FINEST = 0.003  # spacing [m]
+PADDING = 2.5  # nodes around the box of what is tabulated
+BAND = 1.5  # distance up to which nodes are looked at for each triangle, in spacings
+SLACK = math.sqrt(3.0) / 2.0  # largest error of interpolation, and of the nearest node, in spacings
+ROUNDING = 1e-6  # [m]
+OUTLINE_BLOCKS = 12  # of an outline along the longest axis
+KEPT_NODES = 40_000_000  # of grids that are kept by content
+
+
+@dataclass(frozen=True, eq=False)
+class DistanceGrid:
+    """Lower bounds of a signed distance on a grid.
+
+    Attributes:
+        low: Place of the first node, shape (3,) [m].
+        spacing: Distance of neighbouring nodes [m].
+        values: Lower bounds at the nodes that hold between them too, shape (nx, ny, nz) [m].
+        box: Least and largest corner of what is tabulated, shape (2, 3) [m].
+    """
+
+    low: Array
+    spacing: float
+    values: Singles
+    box: Array
+
+
+_kept: OrderedDict[bytes, DistanceGrid] = OrderedDict()
+
+
+def grid_of_triangles(corners: Array, solid: bool) -> DistanceGrid:
+    """Return the grid of a surface; grids of the same surface are shared.
+
+    Args:
+        corners: Corners of the triangles, shape (T, 3, 3) [m].
+        solid: Whether points inside have negative distances; the surface must be watertight then.
+    """
+    corners = np.ascontiguousarray(corners, float)
+    key = hashlib.sha256(corners.tobytes() + bytes([solid])).digest()
+    found = _kept.get(key)
+    return _keep(key, _of_triangles(corners, solid)) if found is None else found
+
+
+def grid_of_points(points: Array, radius: float) -> DistanceGrid:
+    """Return the grid of balls of one radius [m] around points, shape (N, 3) [m]."""
+    points = np.ascontiguousarray(points, float)
+    key = hashlib.sha256(points.tobytes() + np.float64(radius).tobytes()).digest()
+    found = _kept.get(key)
+    return _keep(key, _of_points(points, radius)) if found is None else found
+
+
+def _keep(key: bytes, grid: DistanceGrid) -> DistanceGrid:
+    _kept[key] = grid
+    while len(_kept) > 1 and sum(other.values.size for other in _kept.values()) > KEPT_NODES:
+        _kept.popitem(last=False)
+    return grid
+
+
+def _of_triangles(corners: Array, solid: bool) -> DistanceGrid:
+    box = np.stack([corners.min(axis=(0, 1)), corners.max(axis=(0, 1))])
+    low, spacing, shape = _lattice(box, 0.0, MOST_NODES)
+    scaled = (corners - low) / spacing
+    squared = np.full(shape, FAR, np.float32)
+    raster_triangles(scaled, BAND, squared)
+    values = _bounds(squared, BAND, spacing, ROUNDING)
+    if solid:
+        turns = np.zeros(shape, np.float32)
+        mark_crossings(scaled, turns)
+        negate_inside(turns, values, BAND, SLACK, spacing, ROUNDING)
+    return DistanceGrid(low, spacing, values, box)
+
+
+def _of_points(points: Array, radius: float) -> DistanceGrid:
+    box = np.stack([points.min(axis=0), points.max(axis=0)])
+    low, spacing, shape = _lattice(box, radius, MOST_NODES_OF_POINTS)
+    squared = np.full(shape, FAR, np.float32)
+    raster_points((points - low) / spacing, squared)
+    values = _bounds(squared, 1.0, spacing, radius + ROUNDING)
+    return DistanceGrid(low, spacing, values, box + [[-radius], [radius]])
+
+
+def _lattice(box: Array, radius: float, most: int) -> tuple[Array, float, tuple[int, int, int]]:
+    """Return the first node, the spacing and at most so many nodes along the axes of a box, shape (2, 3) [m]."""
+    sides = box[1] - box[0] + 2.0 * radius
+    spacing = FINEST
+    while True:
+        shape = np.ceil(sides / spacing + 2.0 * PADDING).astype(int) + 1
+        if math.prod(shape.tolist()) <= most:
+            break
+        spacing *= 1.05
+    middle = box.mean(axis=0)
+    nx, ny, nz = shape.tolist()
+    return middle - spacing * (shape - 1) / 2.0, spacing, (nx, ny, nz)
+
+
+def _bounds(squared: Singles, band: float, spacing: float, less: float) -> Singles:
+    """Return lower bounds from squared distances that are exact up to ``band`` [spacings], less a length [m]."""
+    near = np.empty_like(squared)
+    # The node nearest to the closest point of the surface is within the slack of it.
+    split_near(squared, band, SLACK**2 + 1e-3, near)
+    longest = max(squared.shape)
+    distance_transform(squared, np.empty(3 * longest), np.empty(longest, np.int64), np.empty(longest))
+    lower_bounds(squared, near, band, SLACK, spacing, less)
+    return near
+
+
+@weakly_cached
+def outline(grid: DistanceGrid) -> Array:
+    """Return boxes that together contain what a grid is about, shape (boxes, 2, 3) [m]; few, and rough.
+
+    Cells of the grid are taken together in blocks; blocks that hold something are joined along each axis in turn.
+    """
+    shape = np.array(grid.values.shape)
+    block = max(1, math.ceil(float(shape.max()) / OUTLINE_BLOCKS))
+    counts = -(-shape // block)
+    padded = np.full(counts * block, np.inf, np.float32)
+    padded[tuple(slice(n) for n in shape)] = grid.values
+    least = padded.reshape(counts[0], block, counts[1], block, counts[2], block).min(axis=(1, 3, 5))
+    rows = [np.array([k, k + 1]) for k in np.argwhere(least <= 0.0)]
+    for axis in np.argsort(-counts):
+        rows = _joined_along(rows, int(axis))
+    corners = np.array(rows, float).reshape(-1, 2, 3)
+    boxes = grid.low + grid.spacing * (corners * block - [[0.5], [0.5]])
+    return np.stack([np.maximum(boxes[:, 0], grid.box[0]), np.minimum(boxes[:, 1], grid.box[1])], axis=1)
+
+
+def _joined_along(rows: list[NDArray[np.int64]], axis: int) -> list[NDArray[np.int64]]:
+    """Return boxes of blocks, shape (2, 3) each, with those that continue each other along an axis joined."""
+    others = [k for k in range(3) if k != axis]
+    found: list[NDArray[np.int64]] = []
+    for row in sorted(rows, key=lambda r: (*r[:, others].ravel().tolist(), int(r[0, axis]))):
+        if found and np.array_equal(found[-1][:, others], row[:, others]) and found[-1][1, axis] == row[0, axis]:
+            found[-1] = np.stack([found[-1][0], row[1]])
+        else:
+            found.append(row)
+    return found

@@ -1,0 +1,108 @@
+"""Voxels, height fields and distance grids that users bring, as surfaces of triangles.
+
+A ``.npz`` file holds one of ``occupied`` (nx, ny, nz), the cells that are full; ``heights`` (nx, ny) [m], full from
+their least on up to each; or ``distances`` (nx, ny, nz), signed distances at the centres of cells [m]; with
+``resolution``, the side of the cells [m], and ``origin`` (3,), the outer corner of the first one [m].
+"""
+
+from __future__ import annotations
+
+import io
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apex_ompl.errors import FileFormatError
+from apex_ompl.types import Array, Flags
+from apex_ompl.util.files import BROKEN
+from apex_ompl.util.validation import is_number
+
+MOST_CELLS = 100_000_000
+MOST_FACES = 4_000_000
+KINDS = ("occupied", "heights", "distances")
+
+
+def parse_surface(file: str, content: bytes) -> tuple[Array, NDArray[np.int64]]:
+    """Return the surface of the full cells of a file: vertices, shape (V, 3) [m], and triangles, shape (T, 3).
+
+    Cells of a distance grid are full where the surface may reach into them: where the distance is at most half of a
+    cell's diagonal.
+
+    Args:
+        file: Name of the file.
+        content: Its content.
+
+    Raises:
+        FileFormatError: The file holds something else, too many cells, or none that is full.
+    """
+    try:
+        with np.load(io.BytesIO(content), allow_pickle=False) as data:
+            found = [name for name in KINDS if name in data]
+            if len(found) != 1:
+                have = ", ".join(data.files) or "nothing"
+                raise FileFormatError(file, "", have, f"expected one array {' or '.join(KINDS)}")
+            name = found[0]
+            values, resolution, origin = data[name], data["resolution"], np.asarray(data["origin"], float)
+    except BROKEN as error:
+        raise FileFormatError(file, "", str(error)[:80], "expected an .npz file of NumPy") from error
+    side = float(resolution) if resolution.ndim == 0 and is_number(resolution[()]) else np.nan
+    if not 0.0 < side < np.inf:
+        raise FileFormatError(file, "resolution", str(resolution)[:40], "expected a positive number of metres")
+    if origin.shape != (3,) or not np.isfinite(origin).all():
+        raise FileFormatError(file, "origin", str(origin)[:40], "expected three finite numbers of metres")
+    expected = 2 if name == "heights" else 3
+    if values.ndim != expected or not values.size:
+        raise FileFormatError(file, name, f"shape {values.shape}", f"expected an array of {expected} axes")
+    if values.size > MOST_CELLS:
+        raise FileFormatError(file, name, f"{values.size} cells", f"expected at most {MOST_CELLS}")
+    if not np.isfinite(values).all():
+        raise FileFormatError(file, name, "numbers that are not finite", "expected finite ones")
+    occupied = _occupied(file, name, values, side)
+    if not occupied.any():
+        raise FileFormatError(file, name, "no cell that is full", "expected one or more")
+    return surface(occupied, side, origin, file)
+
+
+def _occupied(file: str, name: str, values: Array, side: float) -> Flags:
+    if name == "occupied":
+        return np.asarray(values != 0)
+    if name == "distances":
+        return np.asarray(values <= 0.5 * np.sqrt(3.0) * side)
+    levels = np.ceil((values - values.min()) / side - 1e-9).astype(np.int64) + 1
+    if levels.max() * values.size > MOST_CELLS:
+        raise FileFormatError(file, name, f"{levels.max() * values.size} cells", f"expected at most {MOST_CELLS}")
+    return np.asarray(np.arange(levels.max()) < levels[:, :, None])
+
+
+def surface(occupied: Flags, side: float, origin: Array, file: str = "") -> tuple[Array, NDArray[np.int64]]:
+    """Return the faces of full cells towards empty ones, two triangles each, seen counter-clockwise from outside.
+
+    Args:
+        occupied: Which cells are full, shape (nx, ny, nz).
+        side: Side of a cell [m].
+        origin: Outer corner of the first one, shape (3,) [m].
+        file: Name of the file for errors.
+
+    Raises:
+        FileFormatError: There are more than ``MOST_FACES`` faces.
+    """
+    padded = np.pad(occupied, 1)
+    corners = []
+    for axis in range(3):
+        for sign in (-1, 1):
+            open_face = padded & ~np.roll(padded, -sign, axis=axis)
+            cells = np.argwhere(open_face) - 1
+            u, v = ((axis + 1) % 3, (axis + 2) % 3) if sign > 0 else ((axis + 2) % 3, (axis + 1) % 3)
+            base = cells.copy()
+            base[:, axis] += sign > 0
+            steps = np.zeros((4, 3), np.int64)
+            steps[1, u] = steps[2, u] = steps[2, v] = steps[3, v] = 1
+            corners.append(base[:, None] + steps)
+    quads = np.concatenate(corners)
+    if len(quads) > MOST_FACES:
+        raise FileFormatError(file, "", f"{len(quads)} outer faces", f"expected at most {MOST_FACES}")
+    counts = np.array(occupied.shape) + 1
+    numbers, place = np.unique(np.ravel_multi_index(tuple(quads.reshape(-1, 3).T), tuple(counts)), return_inverse=True)
+    vertices = np.stack(np.unravel_index(numbers, tuple(counts)), axis=1) * side + origin
+    quads = place.reshape(-1, 4).astype(np.int64)
+    return vertices, np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])

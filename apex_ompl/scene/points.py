@@ -1,0 +1,121 @@
+"""Points that users bring: files of clouds, and depth images."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from apex_ompl.errors import FileFormatError, ParameterError
+from apex_ompl.types import Array
+from apex_ompl.util.files import BROKEN
+from apex_ompl.util.validation import check_array, finite_array
+
+LARGEST = 1e4  # larger coordinates are errors [m]
+PCD_TYPES = {"F": "f", "I": "i", "U": "u"}
+
+
+def parse_points(file: str, content: bytes) -> Array:
+    """Return the points of a ``.npy``, ``.ply`` or ``.pcd`` file, shape (N, 3) [m].
+
+    Raises:
+        FileFormatError: The file holds no points, or some that are not finite.
+    """
+    try:
+        if not content:
+            raise ValueError("an empty file")
+        points = np.asarray(READERS[Path(file).suffix.lower()](content), float)
+    except (*BROKEN, AttributeError, IndexError) as error:
+        raise FileFormatError(file, "", str(error)[:80], "expected a cloud of points") from error
+    if points.ndim != 2 or points.shape[1] < 3 or not len(points):
+        raise FileFormatError(file, "", f"an array of shape {points.shape}", "expected one point or more, shape (N, 3)")
+    points = np.ascontiguousarray(points[:, :3])
+    sound = np.isfinite(points).all(axis=1) & (np.abs(points).max(axis=1) < LARGEST)
+    if not sound.all():
+        k = int(np.argmin(sound))
+        raise FileFormatError(file, f"point {k}", points[k].tolist(), f"expected finite numbers below {LARGEST:g} m")
+    return points
+
+
+def _read_npy(content: bytes) -> Array:
+    return np.asarray(np.load(io.BytesIO(content), allow_pickle=False))
+
+
+def _read_ply(content: bytes) -> Array:
+    import trimesh
+
+    loaded: Any = trimesh.load(io.BytesIO(content), file_type="ply", process=False)
+    return np.asarray(loaded.vertices)
+
+
+def _read_pcd(content: bytes) -> Array:
+    """Return the points of a PCD file, ``ascii`` or ``binary`` (the format of the Point Cloud Library, version 0.7)."""
+    head: dict[str, list[str]] = {}
+    at = 0
+    while "DATA" not in head:
+        end = content.index(b"\n", at)
+        words = content[at:end].decode("ascii").split()
+        at = end + 1
+        if words and not words[0].startswith("#"):
+            head[words[0]] = words[1:]
+    names, count = head["FIELDS"], int(head["POINTS"][0])
+    repeats = [int(n) for n in head.get("COUNT", ["1"] * len(names))]
+    kind = head["DATA"][0]
+    if kind == "ascii":
+        table = np.loadtxt(io.BytesIO(content[at:]), ndmin=2, max_rows=count)
+        columns = np.cumsum([0, *repeats])
+        return np.stack([table[:, columns[names.index(axis)]] for axis in "xyz"], axis=1)
+    if kind != "binary":
+        raise ValueError(f"PCD data {kind!r}, expected ascii or binary")
+    formats = [f"<{PCD_TYPES[kind]}{size}" for kind, size in zip(head["TYPE"], head["SIZE"], strict=True)]
+    row = np.dtype([(f"{k}", form, (n,)) for k, (form, n) in enumerate(zip(formats, repeats, strict=True))])
+    rows: Any = np.frombuffer(content, row, count, at)
+    return np.stack([rows[str(names.index(axis))][:, 0] for axis in "xyz"], axis=1)
+
+
+READERS = {".npy": _read_npy, ".ply": _read_ply, ".pcd": _read_pcd}
+
+
+def points_from_depth(
+    depth: ArrayLike, intrinsics: tuple[float, float, float, float], pose: ArrayLike, stride: int = 1,
+    range: tuple[float, float] = (0.1, 5.0),
+) -> Array:  # fmt: skip
+    """Return the points that a depth image sees, in the world, shape (N, 3) [m].
+
+    Pixel (column u, row v) with the depth d along the optical axis is at ((u - cx) d / fx, (v - cy) d / fy, d) in the
+    camera's optical frame, z forward, x right, y down. Pixels that are not finite or out of range are left out.
+
+    Args:
+        depth: Depths, shape (rows, columns) [m].
+        intrinsics: Focal lengths fx, fy and principal point cx, cy [pixels].
+        pose: Pose of the optical frame in the world, shape (4, 4) [m].
+        stride: Every how many rows and columns are taken.
+        range: Least and largest depth that is taken [m].
+
+    Raises:
+        ParameterError: An argument has another shape, or is out of its range.
+    """
+    image = np.asarray(depth, float)
+    if image.ndim != 2:
+        raise ParameterError("depth", image.shape, "an image of shape (rows, columns)")
+    camera, placement = finite_array(intrinsics, "intrinsics"), finite_array(pose, "pose")
+    check_array(camera, (4,), "intrinsics")
+    check_array(placement, (4, 4), "pose")
+    focal_x, focal_y, centre_x, centre_y = camera.tolist()
+    if not (focal_x > 0.0 and focal_y > 0.0):
+        raise ParameterError("intrinsics", (focal_x, focal_y), "positive focal lengths")
+    if isinstance(stride, bool) or not isinstance(stride, (int, np.integer)) or stride < 1:
+        raise ParameterError("stride", stride, "a whole number from 1")
+    near, far = range
+    if not 0.0 < near < far:
+        raise ParameterError("range", range, "two positive depths, the least first")
+    rows, columns = np.mgrid[0 : image.shape[0] : stride, 0 : image.shape[1] : stride]
+    seen = image[::stride, ::stride]
+    with np.errstate(invalid="ignore"):
+        kept = (seen >= near) & (seen <= far)
+    d = seen[kept]
+    local = np.stack([(columns[kept] - centre_x) * d / focal_x, (rows[kept] - centre_y) * d / focal_y, d], axis=1)
+    return np.asarray(local @ placement[:3, :3].T + placement[:3, 3])

@@ -1,0 +1,304 @@
+"""Meshes, points and voxels beside boxes: answers, first paths, the cost of a state, set-up and memory.
+
+1. Validation problems, each in four versions: as it is; with every box, ball, cylinder and capsule as a mesh; with
+   points on them, 5 mm apart, with balls that reach to their surfaces from inside; and as one grid of the cells of 1 cm
+   that are inside of them. Whole calls of a kept planner, the first path of apex, and the answers at states around the
+   problem's start and goal: those of the mesh must be those of the shapes; points and voxels lie inside of these.
+2. Scenes of one large mesh that is not convex, up to 40 000 triangles, of the benchmark's own making: arches, rings and
+   bumpy balls; starts and goals are the validation problems', free in the scene, and the straight line is not.
+3. Proofs of states by the kernel against the number of triangles and points; set-up, and memory.
+
+Usage: python benchmarks/geometry.py [-n 60] [--states 2000]
+"""
+
+from __future__ import annotations
+
+import argparse
+import resource
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import record
+import trimesh
+from tqdm import tqdm
+
+from apex_ompl import MotionPlanner, PlanResult, load_problem, problems
+from apex_ompl.collision import CollisionChecker
+from apex_ompl.ompl_adapter.process import quiet_ompl
+from apex_ompl.problems.suite_robot import robot
+from apex_ompl.scene.bodies import Obstacle
+from apex_ompl.scene.problem import Problem
+from apex_ompl.util.entry_point import run_script
+from apex_ompl.util.validation import one_or_more
+
+DEPENDS = ("@planning", "apex_ompl/trajectory", "apex_ompl/session")
+LEVELS = ("shelf/medium", "bins/medium", "cage/medium", "posts/medium", "wall/medium", "clutter/medium")
+SPACING, RADIUS, CELL = 0.005, 0.004, 0.01  # of points and voxels [m]
+VERSIONS = ("shapes", "meshes", "points", "voxels")
+COUNTS = (100, 1_000, 10_000, 100_000, 1_000_000)
+TIMEOUT = 10.0  # [s]
+
+
+def solid_of(body: Obstacle, shrunk: float = 0.0) -> trimesh.Trimesh:
+    """Return the mesh of an obstacle in its own frame, smaller on all sides by a length [m]."""
+    if body.box is not None:
+        return trimesh.creation.box(np.maximum(np.array(body.box) - 2.0 * shrunk, 1e-4))
+    if body.sphere is not None:
+        return trimesh.creation.icosphere(4, max(body.sphere.radius - shrunk, 1e-4))
+    bar = body.cylinder or body.capsule
+    assert bar is not None
+    radius, length = max(bar.radius - shrunk, 1e-4), bar.length
+    if body.cylinder is not None:
+        return trimesh.creation.cylinder(radius, max(length - 2.0 * shrunk, 1e-4), sections=64)
+    return trimesh.creation.capsule(length, radius, count=[64, 64])
+
+
+def version(problem: Problem, kind: str, folder: Path) -> Problem:
+    """Return a problem in which the obstacles are meshes, points or voxels."""
+    if kind == "shapes":
+        return problem
+    scene: list[Obstacle] = []
+    clouds: list[np.ndarray] = []
+    cells: list[Obstacle] = []
+    for k, body in enumerate(problem.scene):
+        if kind == "meshes":
+            file = folder / f"{k}.stl"
+            solid_of(body).export(file)
+            fields: dict[str, Any] = {"position": body.position, "orientation": body.orientation}
+            scene.append(Obstacle(name=body.name, mesh={"file": str(file)}, **fields))
+        elif kind == "points":
+            solid = solid_of(body, RADIUS)
+            points = trimesh.sample.sample_surface_even(solid, int(2.0 * solid.area / SPACING**2) + 20, seed=k)[0]
+            clouds.append(points @ body.pose[:3, :3].T + body.pose[:3, 3])
+        else:
+            cells.append(body)
+    if clouds:
+        np.save(folder / "cloud.npy", np.concatenate(clouds).astype(np.float32))
+        scene.append(Obstacle(name="cloud", points={"file": str(folder / "cloud.npy"), "radius": RADIUS}))
+    if cells:
+        low, occupied = voxels(cells)
+        np.savez_compressed(folder / "map.npz", occupied=occupied, resolution=CELL, origin=low)
+        scene.append(Obstacle(name="map", voxels={"file": str(folder / "map.npz")}))
+    return problem.model_copy(update={"scene": tuple(scene), "name": f"{problem.name} {kind}"})
+
+
+def holds(body: Obstacle, points: np.ndarray) -> np.ndarray:
+    """Return whether an obstacle holds points of its own frame, shape (..., 3)."""
+    if body.box is not None:
+        return np.asarray((np.abs(points) <= np.array(body.box) / 2.0).all(axis=-1))
+    if body.sphere is not None:
+        return np.asarray(np.linalg.norm(points, axis=-1) <= body.sphere.radius)
+    bar = body.cylinder or body.capsule
+    assert bar is not None
+    across, along = np.linalg.norm(points[..., :2], axis=-1), np.abs(points[..., 2])
+    if body.cylinder is not None:
+        return np.asarray((across <= bar.radius) & (along <= bar.length / 2.0))
+    return np.asarray(np.hypot(across, np.maximum(along - bar.length / 2.0, 0.0)) <= bar.radius)
+
+
+def voxels(bodies: Sequence[Obstacle]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the outer corner of the first cell, and which cells are inside of obstacles with all of their corners."""
+    boxes = []
+    for body in bodies:
+        low, high = solid_of(body).bounds
+        middle = body.pose[:3, :3] @ (low + high) / 2.0 + body.pose[:3, 3]
+        reach = np.abs(body.pose[:3, :3]) @ (high - low) / 2.0
+        boxes.append((middle - reach, middle + reach))
+    low = CELL * np.floor(np.min([box[0] for box in boxes], axis=0) / CELL)
+    count = np.ceil((np.max([box[1] for box in boxes], axis=0) - low) / CELL).astype(int) + 1
+    inside = np.zeros(count + 1, bool)
+    for body, (least, most) in zip(bodies, boxes, strict=True):
+        first = np.maximum(np.floor((least - low) / CELL).astype(int), 0)
+        last = np.minimum(np.ceil((most - low) / CELL).astype(int) + 1, count + 1)
+        nodes = np.stack(np.meshgrid(*[np.arange(a, b) for a, b in zip(first, last, strict=True)], indexing="ij"), -1)
+        local = (low + CELL * nodes - body.pose[:3, 3]) @ body.pose[:3, :3]
+        inside[tuple(slice(a, b) for a, b in zip(first, last, strict=True))] |= holds(body, local)
+    cells = np.ones(count, bool)
+    for k in np.ndindex(2, 2, 2):
+        cells &= inside[k[0] : k[0] + count[0], k[1] : k[1] + count[1], k[2] : k[2] + count[2]]
+    return low, cells
+
+
+def large_mesh(rng: np.random.Generator, kind: int) -> trimesh.Trimesh:
+    """Return a closed mesh that is not convex, as large as a piece of furniture."""
+    if kind % 3 == 0:  # an arch
+        outer = trimesh.creation.annulus(0.25 + 0.1 * rng.random(), 0.45 + 0.1 * rng.random(), 0.15, sections=256)
+        return outer.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2.0, [1, 0, 0]))
+    if kind % 3 == 1:  # a torus
+        return trimesh.creation.torus(0.3 + 0.1 * rng.random(), 0.05 + 0.05 * rng.random(), 200, 100)
+    ball = trimesh.creation.icosphere(5, 0.2)
+    direction = ball.vertices / np.linalg.norm(ball.vertices, axis=1)[:, None]
+    wave = (
+        np.sin(5.0 * direction[:, 0] + rng.random() * 6.0)
+        * np.sin(4.0 * direction[:, 1])
+        * np.sin(6.0 * direction[:, 2])
+    )
+    ball.vertices = ball.vertices * (1.0 + 0.6 * wave)[:, None]
+    return ball
+
+
+def first_path(result: PlanResult) -> float:
+    """Return when the planner had its first path [s]: by the straight line at once."""
+    return result.times.get("solve: first", result.times.get("solve", 0.0)) + result.times.get("line", 0.0)
+
+
+def seen_alike(first: CollisionChecker, second: CollisionChecker, states: np.ndarray) -> tuple[int, int]:
+    """Return how many states only the first finds free, and how many only the second."""
+    a, b = first.are_free(states), second.are_free(states)
+    return int((a & ~b).sum()), int((b & ~a).sum())
+
+
+def versions(count: int, states: int) -> tuple[list[str], dict[str, Any]]:
+    """Measure the versions of problems; return rows and figures."""
+    names = [n for level in LEVELS for n in problems.frozen_names(*level.split("/"), "validation")[: -(-count // 6)]]
+    names = names[:count]
+    solved = dict.fromkeys(VERSIONS, 0)
+    paths: dict[str, list[float]] = {kind: [] for kind in VERSIONS}
+    calls: dict[str, list[float]] = {kind: [] for kind in VERSIONS}
+    setups: dict[str, list[float]] = {kind: [] for kind in VERSIONS}
+    answers: dict[str, list[int]] = {kind: [0, 0] for kind in VERSIONS}
+    seen = 0
+    with quiet_ompl(), MotionPlanner() as planner, tempfile.TemporaryDirectory() as folder:
+        planner.plan_problem(load_problem("wall/easy/800000"))
+        for name in tqdm(names, unit="problem"):
+            problem = load_problem(name)
+            rng = np.random.default_rng(len(name))
+            ends = problem.start_state(robot().joint_names), problem.goal_states(robot().joint_names)[0]
+            drawn = np.concatenate([end + 0.25 * rng.normal(size=(states // 2, len(end))) for end in ends])
+            drawn = np.clip(drawn, robot().limits.lower, robot().limits.upper)
+            plain = CollisionChecker(robot(), problem.scene, problem.attached)
+            seen += len(drawn)
+            for kind in VERSIONS:
+                other = version(problem, kind, Path(folder))
+                began = time.perf_counter()
+                checker = CollisionChecker(robot(), other.scene, other.attached)
+                checker.prepare()
+                setups[kind].append(time.perf_counter() - began)
+                for k, number in enumerate(seen_alike(plain, checker, drawn)):
+                    answers[kind][k] += number
+                planner.plan_problem(other, timeout=TIMEOUT)  # the scene is loaded, as at any second plan in it
+                began = time.perf_counter()
+                result = planner.plan_problem(other, timeout=TIMEOUT)
+                calls[kind].append(time.perf_counter() - began)
+                solved[kind] += bool(result)
+                paths[kind].append(first_path(result) if result.path is not None else np.inf)
+    times = [f"{what} ms p50" for what in ("first path", "whole call", "set-up once")]
+    head = ("version", "N", "solved", *(cell for time in times for cell in (time, "p95")),
+            "states", "free among the shapes alone", "free here alone")  # fmt: skip
+    rows = [record.row([*head]), record.row(["---", *["---:"] * (len(head) - 1)])]
+    for kind in VERSIONS:
+        columns = [f"{1e3 * v:.0f}" for some in (paths, calls, setups) for v in record.percentiles(some[kind], 50, 95)]
+        rows.append(record.row([kind, len(names), f"{solved[kind] / len(names):.3f}", *columns, seen, *answers[kind]]))
+    return rows, {"first path": paths, "call": calls, "setup": setups, "answers": answers}
+
+
+def large(count: int) -> tuple[list[str], dict[str, Any]]:
+    """Measure scenes of one large mesh; return rows and figures."""
+    names = [n for level in LEVELS for n in problems.frozen_names(*level.split("/"), "validation")]
+    rng = np.random.default_rng(0)
+    paths: list[float] = []
+    calls: list[float] = []
+    setups: list[float] = []
+    triangles: list[int] = []
+    stages: dict[str, list[float]] = {}
+    with quiet_ompl(), MotionPlanner() as planner, tempfile.TemporaryDirectory() as folder:
+        planner.plan_problem(load_problem("wall/easy/800000"))
+        bar = tqdm(total=count, unit="scene")
+        while len(calls) < count:
+            problem = load_problem(names[int(rng.integers(len(names)))])
+            mesh = large_mesh(rng, len(calls))
+            file = Path(folder) / f"{len(setups)}-{rng.integers(10**9)}.stl"
+            mesh.export(file)
+            place = tuple(rng.uniform([0.35, -0.3, 0.3], [0.7, 0.3, 0.8]).tolist())
+            turn = tuple(trimesh.transformations.random_quaternion(rng.random(3))[[1, 2, 3, 0]].tolist())
+            body = Obstacle(name="large", mesh={"file": str(file)}, position=place, orientation=turn)
+            scene = problem.model_copy(update={"scene": (body,)})
+            began = time.perf_counter()
+            checker = CollisionChecker(robot(), scene.scene, scene.attached)
+            checker.prepare()
+            took = time.perf_counter() - began
+            ends = problem.start_state(robot().joint_names), problem.goal_states(robot().joint_names)[0]
+            if not checker.are_free(np.array(ends)).all() or checker.prove(np.array(ends), tolerance=0.0):
+                continue  # starts and goals are free, and the straight line is not
+            planner.world.load(scene)
+            began = time.perf_counter()
+            result = planner.plan_problem(scene, timeout=TIMEOUT)
+            calls.append(time.perf_counter() - began)
+            setups.append(took)
+            triangles.append(len(mesh.faces))
+            paths.append(first_path(result) if result.path is not None else np.inf)
+            for stage in ("setup", "line", "solve", "verify", "timing", "timing proof"):
+                stages.setdefault(stage, []).append(result.times.get(stage, 0.0))
+            bar.update()
+    head = ("N", "triangles p50", "solved", "first path ms p50", "p95", "whole call ms p50", "p95",
+            *(f"{stage} ms p50" for stage in ("set-up once", *stages)))  # fmt: skip
+    rows = [record.row([*head]), record.row(["---:"] * len(head))]
+    cells = [f"{1e3 * v:.0f}" for some in (paths, calls) for v in record.percentiles(some, 50, 95)]
+    cells += [f"{1e3 * np.median(some):.0f}" for some in (setups, *stages.values())]
+    rows.append(record.row([count, int(np.median(triangles)), f"{np.isfinite(paths).mean():.3f}", *cells]))
+    return rows, {"large": {"first path": paths, "call": calls, "setup": setups, "stages": stages}}
+
+
+def sizes() -> tuple[list[str], dict[str, Any]]:
+    """Measure a state's cost against the number of triangles and points; return rows and figures."""
+    head = ("kind", "number", "set-up once s", "again ms", "proof of a state us", "clearance us", "MB")
+    rows, figures = [record.row([*head]), record.row(["---", *["---:"] * (len(head) - 1)])], []
+    rng = np.random.default_rng(0)
+    states = np.clip(
+        robot().home + 0.5 * rng.normal(size=(5000, robot().dof)), robot().limits.lower, robot().limits.upper
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        for kind in ("mesh", "points"):
+            for count in COUNTS:
+                file = Path(folder) / f"{kind}{count}.{'stl' if kind == 'mesh' else 'npy'}"
+                if kind == "mesh":
+                    rings = max(4, int(np.sqrt(count / 4.0)))
+                    trimesh.creation.uv_sphere(0.35, [rings, 2 * rings]).export(file)
+                else:
+                    direction = rng.normal(size=(count, 3))
+                    np.save(file, 0.35 * direction / np.linalg.norm(direction, axis=1)[:, None])
+                fields = (
+                    {"mesh": {"file": str(file)}}
+                    if kind == "mesh"
+                    else {"points": {"file": str(file), "radius": 0.005}}
+                )
+                body = Obstacle(name="one", position=(0.75, 0.0, 0.45), **fields)
+                before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+                took = []
+                for _ in range(2):
+                    began = time.perf_counter()
+                    checker = CollisionChecker(robot(), [body])
+                    checker.prepare()
+                    took.append(time.perf_counter() - began)
+                memory = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024.0
+                costs = []
+                for call in (checker.kernel.unproved, checker.kernel.clearance):
+                    call(states)
+                    began = time.perf_counter()
+                    call(states)
+                    costs.append((time.perf_counter() - began) / len(states))
+                cells = [f"{took[0]:.2f}", f"{1e3 * took[1]:.0f}", *(f"{1e6 * c:.1f}" for c in costs), f"{memory:.0f}"]
+                rows.append(record.row([kind, count, *cells]))
+                figures.append([kind, count, *took, *costs, memory])
+    return rows, {"sizes": figures}
+
+
+def main() -> None:
+    """Measure, and write the results."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("-n", type=one_or_more, default=60, help="problems and scenes (default: %(default)s)")
+    parser.add_argument("--states", type=one_or_more, default=2000, help="states of a problem (default: %(default)s)")
+    args = parser.parse_args()
+    rows, figures = sizes()
+    for more, found in (versions(args.n, args.states), large(args.n)):
+        rows += ["", *more]
+        figures |= found
+    record.write("geometry", figures, "\n".join(rows), split="validation", seed="0", trimesh=trimesh.__version__)
+
+
+if __name__ == "__main__":
+    run_script(main)

@@ -1,0 +1,165 @@
+"""Grids of distances against brute force: they are lower bounds, and near."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+from geometry_files import bumpy_sphere
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from apex_ompl.collision.shapes import mesh_geometry
+from apex_ompl.collision.tabulate import primitives
+from apex_ompl.kernel.compiled.arrays import GRID, SceneArrays, scene_view
+from apex_ompl.kernel.compiled.compilation import entry_point
+from apex_ompl.kernel.compiled.layout import Floats, Integers, Singles
+from apex_ompl.kernel.compiled.signed_distance import direction, distance
+from apex_ompl.kernel.distance_grid import SLACK, DistanceGrid, grid_of_points, grid_of_triangles, outline
+from apex_ompl.kernel.scene_builder import Primitive, Solids, moved, primitive, scene_tables
+from apex_ompl.scene.meshes import winding_number
+
+
+@entry_point
+def _evaluate(si: Integers, sf: Floats, sg: Singles, points: Floats, found: Floats) -> None:
+    s = scene_view(si, sf, sg)
+    for k in range(len(points)):
+        found[k, 3] = distance(s, 0, points[k, 0], points[k, 1], points[k, 2])
+        found[k, 0], found[k, 1], found[k, 2] = direction(s, 0, points[k, 0], points[k, 1], points[k, 2])
+
+
+def evaluated(grid: DistanceGrid, pose: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    tables = scene_tables([(0, Primitive(GRID, pose, (), grid))])
+    found = np.empty((len(points), 4))
+    _evaluate(*tables.packed, np.ascontiguousarray(points), found)
+    return found[:, 3], found[:, :3]
+
+
+def random_pose(rng: np.random.Generator) -> np.ndarray:
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.random(random_state=rng).as_matrix()
+    pose[:3, 3] = rng.normal(size=3)
+    return pose
+
+
+def surface_distance(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """By trimesh, triangle by triangle."""
+    found = np.full(len(points), np.inf)
+    for corner in corners:
+        nearest = trimesh.triangles.closest_point(np.tile(corner, (len(points), 1, 1)), points)
+        found = np.minimum(found, np.linalg.norm(points - nearest, axis=1))
+    return found
+
+
+@settings(max_examples=25)
+@given(seed=st.integers(0, 10**6), size=st.floats(0.02, 0.5))
+def test_a_grid_of_triangles_is_a_near_lower_bound(seed: int, size: float) -> None:
+    rng = np.random.default_rng(seed)
+    corners = rng.uniform(-size, size, (int(rng.integers(1, 6)), 3, 3))
+    pose = random_pose(rng)
+    grid = grid_of_triangles(corners, solid=False)
+    points = np.concatenate([rng.uniform(-1.5 * size, 1.5 * size, (20, 3)), corners.mean(axis=1) + 1e-3])
+    true = surface_distance(corners, points)
+    found, _ = evaluated(grid, pose, points @ pose[:3, :3].T + pose[:3, 3])
+    assert (found <= true + 1e-9).all()
+    inside = ((points >= grid.low) & (points <= grid.low + grid.spacing * (np.array(grid.values.shape) - 1))).all(
+        axis=1
+    )
+    assert (true - found)[inside].max() <= 4.0 * SLACK * grid.spacing + 1e-5
+    assert (found >= true / np.sqrt(2.0) - 4.0 * SLACK * grid.spacing)[~inside].all()
+
+
+def test_signs_are_those_of_the_winding_number() -> None:
+    rng = np.random.default_rng(0)
+    vertices, faces = bumpy_sphere(12, 0.15, 0.3)
+    corners = vertices[faces]
+    grid = grid_of_triangles(corners, solid=True)
+    points = rng.uniform(-0.2, 0.2, (400, 3))
+    found, _ = evaluated(grid, np.eye(4), points)
+    inside = np.array([abs(winding_number(p, corners)) > 0.5 for p in points])
+    assert inside.sum() > 40 and (found[inside] < 0.0).all()
+    true = np.where(inside, -1.0, 1.0) * surface_distance(corners, points)
+    assert (found <= true + 1e-9).all() and (true - found)[inside].max() <= 5.0 * SLACK * grid.spacing
+    assert (found[~inside & (true > 3.0 * SLACK * grid.spacing)] > 0.0).all()
+
+
+@settings(max_examples=25)
+@given(seed=st.integers(0, 10**6), count=st.integers(1, 3000), radius=st.floats(0.0005, 0.05))
+def test_a_grid_of_points_is_a_near_lower_bound(seed: int, count: int, radius: float) -> None:
+    rng = np.random.default_rng(seed)
+    cloud = rng.normal(size=(count, 3)) * rng.uniform(0.0, 0.3, 3)
+    pose, places = random_pose(rng), rng.uniform(-0.6, 0.6, (200, 3))
+    places = np.concatenate([places, cloud[:50]])
+    grid = grid_of_points(cloud, radius)
+    true = cKDTree(cloud).query(places)[0] - radius
+    found, _ = evaluated(grid, pose, places @ pose[:3, :3].T + pose[:3, 3])
+    assert (found <= true + 1e-9).all()
+    inside = ((places >= grid.low) & (places <= grid.low + grid.spacing * (np.array(grid.values.shape) - 1))).all(
+        axis=1
+    )
+    assert (true - found)[inside].max() <= 4.0 * SLACK * grid.spacing + 1e-5
+
+
+def test_gradients_are_those_of_finite_differences() -> None:
+    rng = np.random.default_rng(2)
+    vertices, faces = bumpy_sphere(12, 0.15, 0.3)
+    grid, pose = grid_of_triangles(vertices[faces], solid=True), random_pose(rng)
+    points = rng.uniform(-0.4, 0.4, (300, 3)) @ pose[:3, :3].T + pose[:3, 3]
+    _, gradients = evaluated(grid, pose, points)
+    step, numeric = 1e-7, np.empty((300, 3))
+    for k in range(3):
+        offset = step * np.eye(3)[k]
+        numeric[:, k] = evaluated(grid, pose, points + offset)[0] - evaluated(grid, pose, points - offset)[0]
+    numeric /= np.linalg.norm(numeric, axis=1)[:, None]
+    close = np.linalg.norm(gradients - numeric, axis=1) < 1e-3
+    assert close.mean() > 0.97, "all but those at faces of cells, where the gradient jumps"
+    assert np.linalg.norm(gradients, axis=1) == pytest.approx(1.0)
+
+
+def test_states_that_are_not_numbers_are_never_far() -> None:
+    grid = grid_of_points(np.zeros((1, 3)), 0.01)
+    found, _ = evaluated(grid, np.eye(4), np.array([[np.nan, 0.0, 0.0], [np.inf, 0.0, 0.0]]))
+    assert not (found > 0.0).any()
+
+
+def test_scenes_share_values_and_follow_moves() -> None:
+    vertices, faces = bumpy_sphere(8, 0.1, 0.2)
+    grid, rng = grid_of_triangles(vertices[faces], solid=True), np.random.default_rng(0)
+    assert grid_of_triangles(vertices[faces].copy(), solid=True) is grid
+    other = grid_of_points(rng.normal(size=(20, 3)), 0.02)
+    poses = [random_pose(rng) for _ in range(3)]
+    solids = [Primitive(GRID, pose, (), one) for pose, one in zip(poses, (grid, other, grid), strict=True)]
+    tables = scene_tables(list(enumerate(solids)))
+    assert tables.arrays.values.size == grid.values.size + other.values.size
+    for k, owner in enumerate(tables.arrays.owner):
+        again = primitive(tables, k)
+        assert again.grid is solids[owner].grid and again.pose == pytest.approx(solids[owner].pose)
+    there = random_pose(rng)
+    fresh = scene_tables([(0, solids[0]), (1, solids[1]), (2, solids[2]._replace(pose=there))])
+    follows = moved(tables, 2, Solids.of([solids[2]._replace(pose=there)]))
+    row, other_row = (list(t.arrays.owner).index(2) for t in (fresh, follows))
+    for name in ("rotation", "offset", "size"):
+        assert getattr(follows.arrays, name)[other_row] == pytest.approx(getattr(fresh.arrays, name)[row])
+    assert follows.boxes[other_row] == pytest.approx(fresh.boxes[row])
+
+
+@pytest.mark.parametrize("kind", ["mesh", "points"])
+def test_outlines_contain_what_they_are_of(kind: str) -> None:
+    rng = np.random.default_rng(3)
+    vertices, faces = bumpy_sphere(16, 0.2, 0.3)
+    points = vertices if kind == "mesh" else rng.normal(size=(500, 3)) * [0.3, 0.1, 0.01]
+    grid = grid_of_triangles(vertices[faces], solid=True) if kind == "mesh" else grid_of_points(points, 0.005)
+    boxes = outline(grid)
+    held = ((points[:, None] >= boxes[:, 0] - 1e-9) & (points[:, None] <= boxes[:, 1] + 1e-9)).all(axis=2)
+    assert held.any(axis=1).all() and len(boxes) < 200
+    volume = np.prod(boxes[:, 1] - boxes[:, 0], axis=1).sum()
+    assert volume < 0.9 * np.prod(np.ptp(points, axis=0) + 0.02)
+
+
+def test_meshes_that_enclose_nothing_for_sure_are_taken_as_boxes() -> None:
+    vertices, faces = bumpy_sphere(8, 0.1, 0.0)
+    (closed,) = primitives(mesh_geometry(vertices, faces), np.eye(4))
+    assert closed.kind == GRID and closed.grid is not None and closed.grid.values.min() < -0.05
+    assert isinstance(scene_tables([(0, closed)]).arrays, SceneArrays)
