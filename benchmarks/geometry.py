@@ -28,6 +28,8 @@ from tqdm import tqdm
 
 from apex_ompl import MotionPlanner, PlanResult, load_problem, problems
 from apex_ompl.collision import CollisionChecker
+from apex_ompl.collision.cloud_contact import signed_distances
+from apex_ompl.collision.shapes import coal_geometry
 from apex_ompl.ompl_adapter.process import quiet_ompl
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.scene.bodies import Obstacle
@@ -86,20 +88,6 @@ def version(problem: Problem, kind: str, folder: Path) -> Problem:
     return problem.model_copy(update={"scene": tuple(scene), "name": f"{problem.name} {kind}"})
 
 
-def holds(body: Obstacle, points: np.ndarray) -> np.ndarray:
-    """Return whether an obstacle holds points of its own frame, shape (..., 3)."""
-    if body.box is not None:
-        return np.asarray((np.abs(points) <= np.array(body.box) / 2.0).all(axis=-1))
-    if body.sphere is not None:
-        return np.asarray(np.linalg.norm(points, axis=-1) <= body.sphere.radius)
-    bar = body.cylinder or body.capsule
-    assert bar is not None
-    across, along = np.linalg.norm(points[..., :2], axis=-1), np.abs(points[..., 2])
-    if body.cylinder is not None:
-        return np.asarray((across <= bar.radius) & (along <= bar.length / 2.0))
-    return np.asarray(np.hypot(across, np.maximum(along - bar.length / 2.0, 0.0)) <= bar.radius)
-
-
 def voxels(bodies: Sequence[Obstacle]) -> tuple[np.ndarray, np.ndarray]:
     """Return the outer corner of the first cell, and which cells are inside of obstacles with all of their corners."""
     boxes = []
@@ -116,7 +104,9 @@ def voxels(bodies: Sequence[Obstacle]) -> tuple[np.ndarray, np.ndarray]:
         last = np.minimum(np.ceil((most - low) / CELL).astype(int) + 1, count + 1)
         nodes = np.stack(np.meshgrid(*[np.arange(a, b) for a, b in zip(first, last, strict=True)], indexing="ij"), -1)
         local = (low + CELL * nodes - body.pose[:3, 3]) @ body.pose[:3, :3]
-        inside[tuple(slice(a, b) for a, b in zip(first, last, strict=True))] |= holds(body, local)
+        inside[tuple(slice(a, b) for a, b in zip(first, last, strict=True))] |= (
+            signed_distances(coal_geometry(body), local.reshape(-1, 3), 1.0).reshape(local.shape[:-1]) <= 0.0
+        )
     cells = np.ones(count, bool)
     for k in np.ndindex(2, 2, 2):
         cells &= inside[k[0] : k[0] + count[0], k[1] : k[1] + count[1], k[2] : k[2] + count[2]]

@@ -164,17 +164,18 @@ def timed_method(
     return motion, time.perf_counter() - started
 
 
-def rrtconnect_path(name: str, seed: int) -> Path | None:
-    """Return rrtconnect's path of a problem, None where it finds none in 10 s; it is kept for later runs."""
-    file = KEPT / f"{name.replace('/', '-')}-{seed}.npy"
+def rrtconnect_path(name: str, seed: int) -> tuple[Path | None, str]:
+    """Return rrtconnect's path of a problem, None where it finds none in 10 s, and the commit; both are kept."""
+    file = KEPT / f"{name.replace('/', '-')}-{seed}.npz"
     if not file.exists():
         path = plan(name, "rrtconnect", timeout=10.0, seed=seed, timing=False).path
         KEPT.mkdir(parents=True, exist_ok=True)
         content = io.BytesIO()
-        np.save(content, np.empty((0, 0)) if path is None else path.states)
+        states = np.empty((0, 0)) if path is None else path.states
+        np.savez(content, states=states, commit=np.array(record.session()["commit"]))
         write_atomically(file, content.getvalue())
-    states = np.load(file)
-    return Path(states) if len(states) else None
+    with np.load(file) as data:
+        return (Path(data["states"]) if len(data["states"]) else None), str(data["commit"])
 
 
 OTHERS: dict[str, Method] = {
@@ -209,7 +210,7 @@ def main() -> None:
     for name, k in tqdm(names, unit="problem"):
         checker = assemble(problems.load(name), robot()).checker
         mine: PlanResult = plan(name, "apex", timeout=10.0, seed=k)
-        for planner, way in (("apex", mine.path), ("rrtconnect", sharp[name])):
+        for planner, way in (("apex", mine.path), ("rrtconnect", sharp[name][0])):
             if way is None:
                 continue
             path = way.states
@@ -240,7 +241,13 @@ def main() -> None:
         rows.append(record.row([stage, *(f"{1e3 * v:.1f}" for v in record.percentiles(seconds, 50, 95))]))
     figures = {f"{planner}, {method}": f.__dict__ for (planner, method), f in planned.items()}
     figures |= {label: f.__dict__ for label, f in methods.items()}
-    about = {"split": "test", "seed": "number of the problem in its level", "toppra": metadata.version("toppra")}
+    commits = "; ".join(sorted({commit for _, commit in sharp.values()}))
+    about = {
+        "rrtconnect's paths": f"of commit {commits}",
+        "split": "test",
+        "seed": "number of the problem in its level",
+        "toppra": metadata.version("toppra"),
+    }
     record.write("timing", {"figures": figures}, "\n".join(rows), **about, ruckig=metadata.version("ruckig"))
 
 

@@ -17,8 +17,10 @@ from support import states_around_home
 
 from apex_ompl import MotionPlanner, filter_points, points_from_depth
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.collision.cloud_contact import signed_distances
-from apex_ompl.collision.shapes import is_shell, mesh_geometry
+from apex_ompl.collision.cloud_contact import signed_distances, touches
+from apex_ompl.collision.clouds import PointCloud, cloud_geometry
+from apex_ompl.collision.cover.spheres import shape_key
+from apex_ompl.collision.shapes import is_shell, is_surface, mesh_geometry
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError, SceneError
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import AttachedObject, Obstacle
@@ -135,6 +137,17 @@ def test_distances_of_points_from_solids(seed: int) -> None:
                 assert apart == pytest.approx(distance, abs=1e-3)
             else:
                 assert abs(winding_number(point, vertices[faces])) > 0.5
+
+
+def test_a_surface_has_no_inside() -> None:
+    vertices, faces = bumpy_sphere(8, 0.15, 0.2)
+    solid, alone = mesh_geometry(vertices, faces), mesh_geometry(vertices.copy(), faces.copy())
+    is_surface.keep(alone, True)
+    cloud = cloud_geometry(PointCloud(np.zeros((1, 3)), 0.01))
+    assert signed_distances(solid, np.zeros((1, 3)), np.inf) == -signed_distances(alone, np.zeros((1, 3)), np.inf) < 0.0
+    assert touches(cloud, solid, pin.SE3.Identity()) and not touches(cloud, alone, pin.SE3.Identity())
+    assert touches(cloud, alone, pin.SE3(np.eye(3), np.array([0.0, 0.0, 0.155]))), "near the pole"
+    assert shape_key(solid) != shape_key(alone)
 
 
 def test_files_of_points(tmp_path: Path) -> None:

@@ -12,10 +12,10 @@ from numpy.typing import ArrayLike
 from apex_ompl.collision.clouds import PointCloud, cloud_of
 from apex_ompl.collision.containment import EnclosingMesh
 from apex_ompl.collision.exact_shapes import Mesh, PlacedShape, ball_tree, mesh_of
-from apex_ompl.collision.shapes import coal_geometry, hull_planes, is_shell
-from apex_ompl.collision.solids import Solid
-from apex_ompl.kernel.compiled.cloud_distance import any_inside, near_mesh, near_primitive
-from apex_ompl.kernel.compiled.nearest_triangle import surface_distances
+from apex_ompl.collision.shapes import coal_geometry, hull_planes, is_shell, is_surface
+from apex_ompl.collision.solids import Solid, world_boxes
+from apex_ompl.kernel.compiled.cloud_distance import any_inside, near_mesh, near_primitive, primitive_distances
+from apex_ompl.kernel.compiled.triangle_distance import surface_distances
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import AttachedObject
 from apex_ompl.scene.meshes import triangles
@@ -29,28 +29,25 @@ LARGEST_MARGIN = 1.0  # [m]
 NEARLY = 1e-6  # beyond a limit [m]
 
 
-def touches(cloud: PointCloud, cloud_shape: coal.CollisionGeometry, solid: PlacedShape) -> bool:
+def touches(cloud_shape: coal.CollisionGeometry, shape: coal.CollisionGeometry, pose: pin.SE3) -> bool:
     """Whether a solid reaches into the balls of a cloud.
 
     Args:
-        cloud: The cloud.
-        cloud_shape: The geometry that stands for it.
-        solid: The solid, at its pose in the cloud's frame.
+        cloud_shape: The geometry that stands for the cloud.
+        shape: The solid.
+        pose: Its pose in the cloud's frame [m].
     """
-    shape, pose = solid.geometry, np.ascontiguousarray(solid.pose)
-    tree, stack = mesh_of(cloud_shape), np.empty((STACK, 2), np.int64)
+    tree, at, stack = mesh_of(cloud_shape), np.ascontiguousarray(pose.homogeneous), np.empty((STACK, 2), np.int64)
     points = tree.corners, tree.balls, tree.child, tree.leaf
     if not is_shell(shape):
-        size = np.zeros(3)
-        numbers = solid.row[2]
-        size[: len(numbers)] = numbers
-        return bool(near_primitive(*points, solid.kind, size, pose, cloud.radius, stack))
+        return bool(near_primitive(*points, *_primitive(shape), at, tree.radius, stack))
     own = _surface(shape)
-    mesh = own.corners, own.balls, own.child, own.leaf
-    if near_mesh(*points, *mesh, pose, cloud.radius, stack):
+    if near_mesh(*points, own.corners, own.balls, own.child, own.leaf, at, tree.radius, stack):
         return True
-    outer, planes = EnclosingMesh.of(shape), _planes(shape)
-    return bool(any_inside(*points, outer.corners, outer.box, outer.watertight, *planes, pose, stack))
+    if is_surface(shape):
+        return False
+    outer = EnclosingMesh.of(shape)
+    return bool(any_inside(*points, outer.corners, outer.box, outer.watertight, *_planes(shape), at, stack))
 
 
 def nearest_balls(solid: Solid, boxes: Array) -> list[Solid]:
@@ -75,21 +72,12 @@ def _planes(shape: coal.BVHModelBase) -> tuple[Array, Array]:
     return np.ascontiguousarray(normals), np.ascontiguousarray(offsets)
 
 
-def cloud_depth(cloud: PointCloud, shape: coal.CollisionGeometry, pose: Array) -> float:
-    """Return how deep a solid reaches into the balls of a cloud, negative where it does not [m].
+def cloud_depth(cloud: PointCloud, solid: Solid, pose: pin.SE3) -> float:
+    """Return how deep a solid at a pose in a cloud's frame reaches into its balls, negative where it does not [m].
 
     It is that of the deepest ball.
-
-    Args:
-        cloud: The cloud.
-        shape: The solid.
-        pose: Its pose in the cloud's frame, shape (4, 4) [m].
     """
-    near = cloud.inside(_box_at(shape, pose))
-    if not len(near):
-        return -np.inf
-    local = (near - pose[:3, 3]) @ pose[:3, :3]
-    return cloud.radius - float(signed_distances(shape, local, cloud.radius + NEARLY).min())
+    return cloud.radius - float(_distances(cloud.points, solid, pose, cloud.radius + NEARLY).min())
 
 
 def filter_points(
@@ -115,24 +103,20 @@ def filter_points(
     check_number(margin, "margin", 0.0, LARGEST_MARGIN)
     data = robot.model.createData()
     pin.forwardKinematics(robot.model, data, robot.to_pinocchio(q))
-    items = [(g.geometry, (data.oMi[g.parentJoint] * g.placement).homogeneous) for g in robot.geometry.geometryObjects]
-    items += [(coal_geometry(one), robot.link_pose(q, one.link) @ one.pose) for one in held]
+    items = [(item.geometry, data.oMi[item.parentJoint] * item.placement) for item in robot.geometry.geometryObjects]
+    items += [(coal_geometry(one), pin.SE3(robot.link_pose(q, one.link) @ one.pose)) for one in held]
     for shape, pose in items:
-        low, high = _box_at(shape, pose) + [[-margin], [margin]]
-        near = np.flatnonzero(((cloud >= low) & (cloud <= high)).all(axis=1))
-        if len(near):
-            apart = signed_distances(shape, (cloud[near] - pose[:3, 3]) @ pose[:3, :3], margin + NEARLY)
-            cloud = np.delete(cloud, near[apart <= margin], axis=0)
+        cloud = cloud[_distances(cloud, Solid("", 0, pose, shape), pose, margin + NEARLY) > margin]
     return cloud
 
 
-def _box_at(shape: coal.CollisionGeometry, pose: Array) -> Array:
-    """Return the axis-aligned box around a solid at a pose, shape (2, 3) [m]."""
-    shape.computeLocalAABB()
-    low, high = np.array(shape.aabb_local.min_), np.array(shape.aabb_local.max_)
-    middle = pose[:3, :3] @ (low + high) / 2.0 + pose[:3, 3]
-    reach = np.abs(pose[:3, :3]) @ (high - low) / 2.0
-    return np.stack([middle - reach, middle + reach])
+def _distances(points: Array, solid: Solid, pose: pin.SE3, limit: float) -> Array:
+    """Return the signed distances of points to a solid at a pose in their frame, at most ``limit``, shape (N,) [m]."""
+    low, high = world_boxes([solid], [pose])[0]
+    near = ((points >= low - limit) & (points <= high + limit)).all(axis=1)
+    found = np.full(len(points), limit)
+    found[near] = signed_distances(solid.shape, (points[near] - pose.translation) @ pose.rotation, limit)
+    return found
 
 
 def signed_distances(shape: coal.CollisionGeometry, points: Array, limit: float) -> Array:
@@ -143,22 +127,25 @@ def signed_distances(shape: coal.CollisionGeometry, points: Array, limit: float)
         points: Shape (N, 3) [m].
         limit: Largest distance of interest [m].
     """
+    points, distances = np.ascontiguousarray(points), np.empty(len(points))
     if not is_shell(shape):
-        return np.minimum(limit, _primitive_distances(shape, points))
-    tree, points = _surface(shape), np.ascontiguousarray(points)
+        primitive_distances(points, *_primitive(shape), distances)
+        return np.minimum(limit, distances)
+    tree = _surface(shape)
     arrays = np.ascontiguousarray(tree.corners), tree.balls, tree.child, tree.leaf, np.empty(STACK, np.int64)
-    distances = np.empty(len(points))
     surface_distances(points, *arrays, limit, distances)
-    inside = _within(EnclosingMesh.of(shape), points)
+    if is_surface(shape):
+        return distances
+    inside = _within(shape, points)
     deep = np.empty(len(inside))
     surface_distances(np.ascontiguousarray(points[inside]), *arrays, np.inf, deep)
     distances[inside] = -deep
     return distances
 
 
-def _within(mesh: EnclosingMesh, points: Array) -> Indices:
+def _within(shape: coal.BVHModelBase, points: Array) -> Indices:
     """Return the indices of the points that are inside of a mesh."""
-    normals, offsets = hull_planes(mesh.hull)
+    mesh, (normals, offsets) = EnclosingMesh.of(shape), _planes(shape)
     some = np.flatnonzero(((points >= mesh.box[0]) & (points <= mesh.box[1])).all(axis=1))
     some = some[(points[some] @ normals.T <= offsets).all(axis=1)]
     return np.array([k for k in some if mesh.contains(points[k])], np.int64)
@@ -174,19 +161,7 @@ def _surface(shape: coal.BVHModelBase) -> Mesh:
     return Mesh(mesh.points, vertices[faces], *ball_tree(vertices[faces]))
 
 
-def _primitive_distances(shape: coal.CollisionGeometry, points: Array) -> Array:
-    """Return the signed distances of points to a primitive in its frame, shape (N,) [m]."""
-    kind = shape.getNodeType()
-    if kind == coal.GEOM_BOX:
-        beyond = np.abs(points) - np.array(shape.halfSide)
-        return np.asarray(np.linalg.norm(np.maximum(beyond, 0.0), axis=1) + np.minimum(beyond.max(axis=1), 0.0))
-    if kind == coal.GEOM_SPHERE:
-        return np.asarray(np.linalg.norm(points, axis=1) - shape.radius)
-    across, along = np.linalg.norm(points[:, :2], axis=1), np.abs(points[:, 2])
-    if kind == coal.GEOM_CAPSULE:
-        return np.asarray(np.hypot(across, np.maximum(along - shape.halfLength, 0.0)) - shape.radius)
-    if kind == coal.GEOM_CYLINDER:
-        beyond = np.stack([across - shape.radius, along - shape.halfLength], axis=1)
-        return np.asarray(np.linalg.norm(np.maximum(beyond, 0.0), axis=1) + np.minimum(beyond.max(axis=1), 0.0))
-    normals, offsets = hull_planes(shape)  # of a convex body: exact inside, a lower bound outside
-    return np.asarray((points @ normals.T - offsets).max(axis=1))
+def _primitive(shape: coal.CollisionGeometry) -> tuple[int, Array]:
+    """Return kind and size of a primitive for the kernel."""
+    solid = PlacedShape(shape, 0, np.eye(4))
+    return solid.kind, np.array(solid.row[2], float)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from apex_ompl.collision.clouds import cloud_of
 from apex_ompl.collision.cover.spheres import shape_key
-from apex_ompl.collision.shapes import convex_hull, hull_planes, is_shell, is_surface
+from apex_ompl.collision.shapes import convex_hull, hull_planes, is_shell
 from apex_ompl.kernel.compiled.arrays import BOX, CAPSULE, CYLINDER, HALF_SPACE, SPHERE
 from apex_ompl.kernel.compiled.ball_tree import median_order, node_balls
 from apex_ompl.kernel.compiled.layout import Integers
@@ -109,7 +109,7 @@ def mesh_of(geometry: coal.CollisionGeometry) -> Mesh:
     """
     if cloud_of(geometry) is not None:
         return _analysed(geometry)
-    key = shape_key(geometry) + (" surface" if is_surface(geometry) else "")
+    key = shape_key(geometry)
     if key not in _meshes:
         while len(_meshes) >= MOST_MESHES:
             _meshes.pop(next(iter(_meshes)), None)

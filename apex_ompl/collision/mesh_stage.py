@@ -16,7 +16,6 @@ import pinocchio as pin
 from apex_ompl.collision.cloud_contact import cloud_depth, nearest_balls, touches
 from apex_ompl.collision.clouds import cloud_of
 from apex_ompl.collision.containment_tests import ContainmentTest, containment_tests
-from apex_ompl.collision.exact_shapes import PlacedShape
 from apex_ompl.collision.hull_distance import Distance, closest, hull_distance
 from apex_ompl.collision.solids import Solid, overlaps, transform, world_boxes
 from apex_ompl.robot import Robot
@@ -261,16 +260,15 @@ class MeshStage:
         at, there = self._pose(first), self._pose(second)
         cloud = cloud_of(second.shape)
         if cloud is not None:
-            return cloud_depth(cloud, first.shape, (there.inverse() * at).homogeneous)
+            return cloud_depth(cloud, first, there.inverse() * at)
         return -hull_distance(first, at, second, there).value
 
     def _overlap(self, pair: Pair) -> bool:
         """Whether two solids overlap at the current placements, or one contains the other."""
         first, second = self.solids[pair[0]], self.solids[pair[1]]
         at, there = self._pose(first), self._pose(second)
-        cloud = cloud_of(second.shape)
-        if cloud is not None:
-            return touches(cloud, second.shape, PlacedShape(first.shape, 0, (there.inverse() * at).homogeneous))
+        if cloud_of(second.shape) is not None:
+            return touches(second.shape, first.shape, there.inverse() * at)
         result = coal.CollisionResult()
         if coal.collide(first.shape, transform(at), second.shape, transform(there), self._request, result):
             return True

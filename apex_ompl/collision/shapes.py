@@ -223,7 +223,7 @@ def _parse_mesh(role: str, shape: MeshFile, content: bytes) -> coal.CollisionGeo
         raise FileFormatError(file, "", fault, f"expected {wanted} ({role})")
     mesh = mesh_geometry(vertices, faces)
     if alone:
-        is_surface.keep(mesh, True)  # type: ignore[attr-defined]
+        is_surface.keep(mesh, True)
     return mesh
 
 
@@ -254,5 +254,5 @@ def mesh_geometry(vertices: Array, faces: NDArray[np.int64]) -> coal.BVHModelOBB
     mesh.addTriangles(faces)
     mesh.endModel()
     vertices.flags.writeable = faces.flags.writeable = False
-    triangles.keep(mesh, (vertices, faces))  # type: ignore[attr-defined]
+    triangles.keep(mesh, (vertices, faces))
     return mesh

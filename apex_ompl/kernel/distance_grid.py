@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import hashlib
 import math
+import threading
 from collections import OrderedDict
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,13 +19,13 @@ from numpy.typing import NDArray
 
 from apex_ompl.kernel.compiled.grid_building import (
     FAR,
-    distance_transform,
     lower_bounds,
     mark_crossings,
     negate_inside,
     raster_points,
     raster_triangles,
     split_near,
+    transform_lines,
 )
 from apex_ompl.kernel.compiled.layout import Singles
 from apex_ompl.types import Array
@@ -58,6 +60,7 @@ class DistanceGrid:
 
 
 _kept: OrderedDict[bytes, DistanceGrid] = OrderedDict()
+_lock = threading.Lock()  # of these
 
 
 def grid_of_triangles(corners: Array, solid: bool) -> DistanceGrid:
@@ -68,24 +71,25 @@ def grid_of_triangles(corners: Array, solid: bool) -> DistanceGrid:
         solid: Whether points inside have negative distances; the surface must be watertight then.
     """
     corners = np.ascontiguousarray(corners, float)
-    key = hashlib.sha256(corners.tobytes() + bytes([solid])).digest()
-    found = _kept.get(key)
-    return _keep(key, _of_triangles(corners, solid)) if found is None else found
+    return _shared(corners.tobytes() + bytes([solid]), lambda: _of_triangles(corners, solid))
 
 
 def grid_of_points(points: Array, radius: float) -> DistanceGrid:
-    """Return the grid of balls of one radius [m] around points, shape (N, 3) [m]."""
+    """Return the grid of balls of one radius [m] around points, shape (N, 3) [m]; grids of the same are shared."""
     points = np.ascontiguousarray(points, float)
-    key = hashlib.sha256(points.tobytes() + np.float64(radius).tobytes()).digest()
-    found = _kept.get(key)
-    return _keep(key, _of_points(points, radius)) if found is None else found
+    return _shared(points.tobytes() + np.float64(radius).tobytes(), lambda: _of_points(points, radius))
 
 
-def _keep(key: bytes, grid: DistanceGrid) -> DistanceGrid:
-    _kept[key] = grid
-    while len(_kept) > 1 and sum(other.values.size for other in _kept.values()) > KEPT_NODES:
-        _kept.popitem(last=False)
-    return grid
+def _shared(content: bytes, make: Callable[[], DistanceGrid]) -> DistanceGrid:
+    """Return the grid of some content; those that were used last are kept."""
+    key = hashlib.sha256(content).digest()
+    with _lock:
+        if key not in _kept:
+            _kept[key] = make()
+        _kept.move_to_end(key)
+        while len(_kept) > 1 and sum(grid.values.size for grid in _kept.values()) > KEPT_NODES:
+            _kept.popitem(last=False)
+        return _kept[key]
 
 
 def _of_triangles(corners: Array, solid: bool) -> DistanceGrid:
@@ -131,7 +135,10 @@ def _bounds(squared: Singles, band: float, spacing: float, less: float) -> Singl
     # The node nearest to the closest point of the surface is within the slack of it.
     split_near(squared, band, SLACK**2 + 1e-3, near)
     longest = max(squared.shape)
-    distance_transform(squared, np.empty(3 * longest), np.empty(longest, np.int64), np.empty(longest))
+    room = np.empty(3 * longest), np.empty(longest, np.int64), np.empty(longest)
+    nx, ny, nz = squared.shape  # along one axis after the other (Felzenszwalb and Huttenlocher 2012)
+    for lines in ((nx * ny, nz, 1), (nx, ny, nz), (1, nx, ny * nz)):
+        transform_lines(squared.reshape(lines), *room)
     lower_bounds(squared, near, band, SLACK, spacing, less)
     return near
 

@@ -43,10 +43,15 @@ Quaternion = Annotated[tuple[float, float, float, float], AfterValidator(_unit_q
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_./-]*$")]
 
 
-def _with_suffix(file: str, known: tuple[str, ...], role: str) -> str:
-    if not file.lower().endswith(known):
-        raise ValueError(f"expected a {role} ending in {' or '.join(known)}")
-    return file
+def _ending_in(known: tuple[str, ...], role: str) -> AfterValidator:
+    """Return the check of a file's suffix."""
+
+    def check(file: str) -> str:
+        if not file.lower().endswith(known):
+            raise ValueError(f"expected a {role} ending in {' or '.join(known)}")
+        return file
+
+    return AfterValidator(check)
 
 
 class Sphere(StrictModel):
@@ -69,14 +74,9 @@ class MeshFile(StrictModel):
     holes of it are taken as closed.
     """
 
-    file: str
+    file: Annotated[str, _ending_in(MESH_SUFFIXES, "mesh file")]
     scale: Vector = (1.0, 1.0, 1.0)
     solid: bool | None = None
-
-    @field_validator("file")
-    @classmethod
-    def _known_suffix(cls, file: str) -> str:
-        return _with_suffix(file, MESH_SUFFIXES, "mesh file")
 
     @field_validator("scale")
     @classmethod
@@ -89,24 +89,14 @@ class MeshFile(StrictModel):
 class PointFile(StrictModel):
     """Balls of one radius [m] around the points of a file; a relative path is relative to the problem file."""
 
-    file: str
+    file: Annotated[str, _ending_in(POINT_SUFFIXES, "file of points")]
     radius: Size
-
-    @field_validator("file")
-    @classmethod
-    def _known_suffix(cls, file: str) -> str:
-        return _with_suffix(file, POINT_SUFFIXES, "file of points")
 
 
 class GridFile(StrictModel):
     """Cells of a grid from a file (:mod:`apex_ompl.scene.grids`); a relative path is relative to the problem file."""
 
-    file: str
-
-    @field_validator("file")
-    @classmethod
-    def _known_suffix(cls, file: str) -> str:
-        return _with_suffix(file, GRID_SUFFIXES, "file of a grid")
+    file: Annotated[str, _ending_in(GRID_SUFFIXES, "file of a grid")]
 
 
 class HalfSpace(StrictModel):

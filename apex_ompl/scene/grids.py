@@ -8,6 +8,8 @@ their least on up to each; or ``distances`` (nx, ny, nz), signed distances at th
 from __future__ import annotations
 
 import io
+import math
+from typing import IO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,6 +44,8 @@ def parse_surface(file: str, content: bytes) -> tuple[Array, NDArray[np.int64]]:
                 have = ", ".join(data.files) or "nothing"
                 raise FileFormatError(file, "", have, f"expected one array {' or '.join(KINDS)}")
             name = found[0]
+            with data.zip.open(f"{name}.npy") as member:  # before it is read, which may take all memory
+                _check_header(file, name, member)
             values, resolution, origin = data[name], data["resolution"], np.asarray(data["origin"], float)
     except BROKEN as error:
         raise FileFormatError(file, "", str(error)[:80], "expected an .npz file of NumPy") from error
@@ -50,17 +54,29 @@ def parse_surface(file: str, content: bytes) -> tuple[Array, NDArray[np.int64]]:
         raise FileFormatError(file, "resolution", str(resolution)[:40], "expected a positive number of metres")
     if origin.shape != (3,) or not np.isfinite(origin).all():
         raise FileFormatError(file, "origin", str(origin)[:40], "expected three finite numbers of metres")
-    expected = 2 if name == "heights" else 3
-    if values.ndim != expected or not values.size:
-        raise FileFormatError(file, name, f"shape {values.shape}", f"expected an array of {expected} axes")
-    if values.size > MOST_CELLS:
-        raise FileFormatError(file, name, f"{values.size} cells", f"expected at most {MOST_CELLS}")
     if not np.isfinite(values).all():
         raise FileFormatError(file, name, "numbers that are not finite", "expected finite ones")
     occupied = _occupied(file, name, values, side)
     if not occupied.any():
         raise FileFormatError(file, name, "no cell that is full", "expected one or more")
     return surface(occupied, side, origin, file)
+
+
+def _check_header(file: str, name: str, member: IO[bytes]) -> None:
+    """Check what the head of an array in an archive says of it.
+
+    Raises:
+        FileFormatError: It has another number of axes, too many cells or none, or does not hold numbers.
+    """
+    read = {1: np.lib.format.read_array_header_1_0, 2: np.lib.format.read_array_header_2_0}
+    shape, _, dtype = read[np.lib.format.read_magic(member)[0]](member)
+    axes, cells = 2 if name == "heights" else 3, math.prod(shape)
+    if len(shape) != axes or not cells:
+        raise FileFormatError(file, name, f"shape {shape}", f"expected an array of {axes} axes")
+    if cells > MOST_CELLS:
+        raise FileFormatError(file, name, f"{cells} cells", f"expected at most {MOST_CELLS}")
+    if dtype.kind not in "biuf":
+        raise FileFormatError(file, name, str(dtype), "expected numbers")
 
 
 def _occupied(file: str, name: str, values: Array, side: float) -> Flags:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from apex_ompl.collision.clouds import PointCloud, cloud_of
 from apex_ompl.collision.shapes import coal_geometry, is_shell
+from apex_ompl.collision.solids import Solid, world_boxes
 from apex_ompl.errors import MissingFileError
 from apex_ompl.ompl_adapter.setup import PlanningSetup
 from apex_ompl.robot import Robot
@@ -176,7 +177,5 @@ def _pyvista() -> Any:
 
 def _middle(body: Body) -> Array:
     """Return the middle of the box around a body in the world, shape (3,) [m]."""
-    shape = coal_geometry(body)
-    shape.computeLocalAABB()
-    local = (np.array(shape.aabb_local.min_) + np.array(shape.aabb_local.max_)) / 2.0
-    return np.asarray(body.pose[:3, :3] @ local + body.pose[:3, 3])
+    solid = Solid(body.name, 0, pin.SE3(body.pose), coal_geometry(body))
+    return np.asarray(world_boxes([solid], [solid.placement])[0].mean(axis=0))

@@ -19,7 +19,7 @@ from apex_ompl.collision.cover.convex_parts import RoundBody
 from apex_ompl.collision.cover.proof import PAD, Cover, distances, grow_to_cover, uncovered_boxes
 from apex_ompl.collision.cover.search import search
 from apex_ompl.collision.cover.solids import solid_of
-from apex_ompl.collision.shapes import is_shell
+from apex_ompl.collision.shapes import is_shell, is_surface
 from apex_ompl.errors import FileFormatError, ParameterError
 from apex_ompl.scene.meshes import triangles
 from apex_ompl.types import Array
@@ -49,7 +49,8 @@ def shape_key(geometry: coal.CollisionGeometry) -> str:
     digest = hashlib.sha256()
     if is_shell(geometry):
         vertices, faces = triangles(geometry)
-        digest.update(b"mesh" + (np.round(vertices, 9) + 0.0).tobytes() + faces.astype(np.int64).tobytes())
+        digest.update(b"surface" if is_surface(geometry) else b"mesh")
+        digest.update((np.round(vertices, 9) + 0.0).tobytes() + faces.astype(np.int64).tobytes())
     elif kind not in names:
         raise ParameterError("geometry", kind, "a box, sphere, cylinder, capsule, convex body or mesh")
     else:

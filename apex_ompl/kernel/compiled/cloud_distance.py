@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 
-from apex_ompl.kernel.compiled.arrays import BOX, CAPSULE, SPHERE
 from apex_ompl.kernel.compiled.compilation import entry_point, inlined
-from apex_ompl.kernel.compiled.grid_building import closest_squared
 from apex_ompl.kernel.compiled.layout import Floats, Integers
+from apex_ompl.kernel.compiled.signed_distance import primitive_distance
+from apex_ompl.kernel.compiled.triangle_distance import closest_squared
 from apex_ompl.kernel.compiled.triangle_mesh import is_inside
 
 Point = tuple[float, float, float]
@@ -59,12 +59,8 @@ def near_mesh(
             if closest_squared(corners, leaf[n], x, y, z) <= limit * limit:
                 return True
         elif child[n] < 0 or (point_child[m] >= 0 and point_balls[m, 3] >= balls[n, 3]):
-            stack[top, 0], stack[top, 1], stack[top + 1, 0], stack[top + 1, 1] = (
-                point_child[m],
-                n,
-                point_child[m] + 1,
-                n,
-            )
+            stack[top, 0], stack[top, 1] = point_child[m], n
+            stack[top + 1, 0], stack[top + 1, 1] = point_child[m] + 1, n
             top += 2
         else:
             stack[top, 0], stack[top, 1] = m, child[n]
@@ -117,26 +113,6 @@ def any_inside(
     return False
 
 
-@inlined
-def _primitive_distance(kind: int, size: Floats, x: float, y: float, z: float) -> float:
-    """Return the signed distance of a point from a box, a ball, a cylinder or a capsule around the origin [m]."""
-    if kind == SPHERE:
-        return float(math.sqrt(x * x + y * y + z * z) - size[0])
-    if kind == BOX:
-        x, y, z = abs(x) - size[0], abs(y) - size[1], abs(z) - size[2]
-        inside = min(max(x, y, z), 0.0)
-        x, y, z = max(x, 0.0), max(y, 0.0), max(z, 0.0)
-        return float(math.sqrt(x * x + y * y + z * z) + inside)
-    across, along = math.sqrt(x * x + y * y), abs(z) - size[1]
-    if kind == CAPSULE:
-        along = max(along, 0.0)
-        return float(math.sqrt(across * across + along * along) - size[0])
-    across -= size[0]
-    inside = min(max(across, along), 0.0)
-    across, along = max(across, 0.0), max(along, 0.0)
-    return float(math.sqrt(across * across + along * along) + inside)
-
-
 @entry_point
 def near_primitive(
     points: Floats, point_balls: Floats, point_child: Integers, point_leaf: Integers,
@@ -161,7 +137,7 @@ def near_primitive(
         top -= 1
         m = stack[top, 0]
         x, y, z = _local(pose, point_balls[m, 0], point_balls[m, 1], point_balls[m, 2])
-        if _primitive_distance(kind, size, x, y, z) - point_balls[m, 3] > limit:
+        if primitive_distance(kind, size, x, y, z) - point_balls[m, 3] > limit:
             continue
         if point_child[m] >= 0:
             stack[top, 0], stack[top + 1, 0] = point_child[m], point_child[m] + 1
@@ -169,6 +145,13 @@ def near_primitive(
             continue
         p = point_leaf[m]
         x, y, z = _local(pose, points[p, 0, 0], points[p, 0, 1], points[p, 0, 2])
-        if _primitive_distance(kind, size, x, y, z) <= limit:
+        if primitive_distance(kind, size, x, y, z) <= limit:
             return True
     return False
+
+
+@entry_point
+def primitive_distances(points: Floats, kind: int, size: Floats, distances: Floats) -> None:
+    """Put the signed distances of points, shape (N, 3) [m], from a primitive in its frame into ``distances`` (N,)."""
+    for p in range(len(points)):
+        distances[p] = primitive_distance(kind, size, points[p, 0], points[p, 1], points[p, 2])

@@ -9,46 +9,9 @@ import math
 
 from apex_ompl.kernel.compiled.compilation import entry_point, inlined
 from apex_ompl.kernel.compiled.layout import Floats, Integers, Singles
+from apex_ompl.kernel.compiled.triangle_distance import closest_squared
 
-FAR = 1e12  # squared distance that stands for none
-
-
-@inlined
-def squared_distance(a: Floats, b: Floats, c: Floats, x: float, y: float, z: float) -> float:
-    """Return the squared distance of a point to a triangle with given corners, shape (3,) (Ericson 2005, 5.1.5)."""
-    ax, ay, az = a[0], a[1], a[2]
-    ux, uy, uz = b[0] - ax, b[1] - ay, b[2] - az
-    vx, vy, vz = c[0] - ax, c[1] - ay, c[2] - az
-    px, py, pz = x - ax, y - ay, z - az
-    d1, d2 = ux * px + uy * py + uz * pz, vx * px + vy * py + vz * pz
-    uu, uv, vv = ux * ux + uy * uy + uz * uz, ux * vx + uy * vy + uz * vz, vx * vx + vy * vy + vz * vz
-    d3, d4, d5, d6 = d1 - uu, d2 - uv, d1 - uv, d2 - vv
-    va, vb, vc = d3 * d6 - d5 * d4, d5 * d2 - d1 * d6, d1 * d4 - d3 * d2
-    if d1 <= 0.0 and d2 <= 0.0:
-        s, r = 0.0, 0.0
-    elif d3 >= 0.0 and d4 <= d3:
-        s, r = 1.0, 0.0
-    elif d6 >= 0.0 and d5 <= d6:
-        s, r = 0.0, 1.0
-    elif vc <= 0.0 and d1 >= 0.0 and d3 <= 0.0:
-        s, r = d1 / (d1 - d3) if d1 > d3 else 0.0, 0.0
-    elif vb <= 0.0 and d2 >= 0.0 and d6 <= 0.0:
-        s, r = 0.0, d2 / (d2 - d6) if d2 > d6 else 0.0
-    elif va <= 0.0 and d4 - d3 >= 0.0 and d5 - d6 >= 0.0:
-        r = (d4 - d3) / ((d4 - d3) + (d5 - d6)) if d4 - d3 + d5 - d6 > 0.0 else 0.0
-        s = 1.0 - r
-    else:
-        whole = va + vb + vc
-        s, r = vb / whole, vc / whole
-    dx, dy, dz = px - s * ux - r * vx, py - s * uy - r * vy, pz - s * uz - r * vz
-    squared: float = dx * dx + dy * dy + dz * dz
-    return squared
-
-
-@inlined
-def closest_squared(corners: Floats, t: int, x: float, y: float, z: float) -> float:
-    """Return the squared distance of a point to triangle ``t``."""
-    return squared_distance(corners[t, 0], corners[t, 1], corners[t, 2], x, y, z)
+FAR = 2.0**40  # squared distance that stands for none; exact in single precision
 
 
 @entry_point
@@ -191,42 +154,28 @@ def _envelope(line: Floats, n: int, at: Integers, ends: Floats) -> None:
 
 
 @entry_point
-def distance_transform(squared: Singles, line: Floats, at: Integers, ends: Floats) -> None:
-    """Replace squared distances f by min_m f(m) + |n - m|^2 over all nodes m, axis by axis.
+def transform_lines(squared: Singles, line: Floats, at: Integers, ends: Floats) -> None:
+    """Replace squared distances f by min_m f(m) + |n - m|^2 over the nodes m of each line; FAR stands for infinity.
 
     Args:
-        squared: Shape (nx, ny, nz); FAR stands for infinity.
-        line: Room, three times as long as the longest axis.
-        at: Room, as long as that.
+        squared: Shape (before, n, behind); lines are along the axis in the middle.
+        line: Room, shape (3 n,).
+        at: Room, shape (n,).
         ends: Room, likewise.
     """
-    nx, ny, nz = squared.shape
-    for i in range(nx):
-        for j in range(ny):
-            for k in range(nz):
-                line[k] = squared[i, j, k]
-            _envelope(line, nz, at, ends)
-            for k in range(nz):
-                squared[i, j, k] = line[k]
-    for i in range(nx):
-        for k in range(nz):
-            for j in range(ny):
+    before, n, behind = squared.shape
+    for i in range(before):
+        for k in range(behind):
+            for j in range(n):
                 line[j] = squared[i, j, k]
-            _envelope(line, ny, at, ends)
-            for j in range(ny):
+            _envelope(line, n, at, ends)
+            for j in range(n):
                 squared[i, j, k] = line[j]
-    for j in range(ny):
-        for k in range(nz):
-            for i in range(nx):
-                line[i] = squared[i, j, k]
-            _envelope(line, nx, at, ends)
-            for i in range(nx):
-                squared[i, j, k] = line[i]
 
 
 @entry_point
 def split_near(squared: Singles, band: float, seed: float, near: Singles) -> None:
-    """Keep the distances of nodes near something, and prepare the others for :func:`distance_transform`.
+    """Keep the distances of nodes near something, and prepare the others for :func:`transform_lines`.
 
     Args:
         squared: Squared distances, shape (nx, ny, nz); gets 0 where they are at most ``seed``, elsewhere FAR.

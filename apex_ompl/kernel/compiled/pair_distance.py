@@ -7,7 +7,6 @@ import math
 from apex_ompl.kernel.compiled.arrays import HALF_SPACE, SPHERE
 from apex_ompl.kernel.compiled.compilation import inlined, outlined
 from apex_ompl.kernel.compiled.convex_distance import convex_distance
-from apex_ompl.kernel.compiled.grid_building import squared_distance
 from apex_ompl.kernel.compiled.relative_motion import (
     Frames,
     convex_bound,
@@ -16,6 +15,7 @@ from apex_ompl.kernel.compiled.relative_motion import (
     set_relative_motion,
 )
 from apex_ompl.kernel.compiled.shapes import HULL, MOST_NODES, POINT, TRIANGLE, PairBuffers, ShapeArrays
+from apex_ompl.kernel.compiled.triangle_distance import squared_distance
 
 MOST_LEAVES = 64  # pairs of triangles whose motion is looked at
 

@@ -7,6 +7,7 @@ import math
 from apex_ompl.kernel.compiled.arrays import BOX, CAPSULE, CYLINDER, GRID, HALF_SPACE, SPHERE, SceneArrays
 from apex_ompl.kernel.compiled.compilation import inlined
 from apex_ompl.kernel.compiled.grid_distance import grid_direction, grid_distance
+from apex_ompl.kernel.compiled.layout import Floats
 
 
 @inlined
@@ -22,16 +23,8 @@ def local_point(s: SceneArrays, o: int, x: float, y: float, z: float) -> tuple[f
 
 
 @inlined
-def distance(s: SceneArrays, o: int, x: float, y: float, z: float) -> float:
-    """Return the signed distance of a point of the world to an obstacle [m], negative inside; a bound of a grid's."""
-    kind, size = s.kind[o], s.size[o]
-    if kind == HALF_SPACE:
-        n = s.offset[o]
-        return float(n[0] * x + n[1] * y + n[2] * z - size[0])
-    if kind == SPHERE:
-        p = s.offset[o]
-        return float(math.sqrt((x - p[0]) ** 2 + (y - p[1]) ** 2 + (z - p[2]) ** 2) - size[0])
-    a, b, c = local_point(s, o, x, y, z)
+def primitive_distance(kind: int, size: Floats, a: float, b: float, c: float) -> float:
+    """Return the signed distance of a point from a box, a ball, a cylinder or a capsule, in its frame [m]."""
     if kind == BOX:
         a, b, c = abs(a) - size[0], abs(b) - size[1], abs(c) - size[2]
         inside = min(max(a, b, c), 0.0)
@@ -42,10 +35,25 @@ def distance(s: SceneArrays, o: int, x: float, y: float, z: float) -> float:
         inside = min(max(across, along), 0.0)
         across, along = max(across, 0.0), max(along, 0.0)
         return float(math.sqrt(across * across + along * along) + inside)
+    if kind == CAPSULE:
+        c -= min(max(c, -size[1]), size[1])
+    return float(math.sqrt(a * a + b * b + c * c) - size[0])
+
+
+@inlined
+def distance(s: SceneArrays, o: int, x: float, y: float, z: float) -> float:
+    """Return the signed distance of a point of the world to an obstacle [m], negative inside; a bound of a grid's."""
+    kind, size = s.kind[o], s.size[o]
+    if kind == HALF_SPACE:
+        n = s.offset[o]
+        return float(n[0] * x + n[1] * y + n[2] * z - size[0])
+    if kind == SPHERE:
+        p = s.offset[o]
+        return float(math.sqrt((x - p[0]) ** 2 + (y - p[1]) ** 2 + (z - p[2]) ** 2) - size[0])
+    a, b, c = local_point(s, o, x, y, z)
     if kind == GRID:
         return float(grid_distance(s.grid[o], s.values, size[0], a, b, c))
-    c -= min(max(c, -size[1]), size[1])  # CAPSULE
-    return float(math.sqrt(a * a + b * b + c * c) - size[0])
+    return primitive_distance(kind, size, a, b, c)
 
 
 @inlined
