@@ -166,6 +166,18 @@ def test_files_of_points(tmp_path: Path) -> None:
         assert parse_points(name, (tmp_path / name).read_bytes()) == pytest.approx(single, abs=1e-6)
 
 
+def test_compressed_points() -> None:
+    """The file was packed by LibLZF."""
+    points = np.random.default_rng(0).normal(size=(400, 3)).astype(np.float32)
+    points[:, 2] = np.repeat(points[:40, 2], 10)
+    content = (Path(__file__).parent / "data" / "compressed.pcd").read_bytes()
+    assert np.array_equal(parse_points("a.pcd", content), points)
+    at = content.index(b"binary_compressed\n") + 26
+    for broken in (content[:-5], content[:at] + b"\xff\xff\xff" + content[at:]):
+        with pytest.raises(FileFormatError, match="expected a cloud of points"):
+            parse_points("a.pcd", broken)
+
+
 @pytest.mark.parametrize(
     ("name", "content", "words"),
     [

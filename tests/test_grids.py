@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tracemalloc
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +16,9 @@ from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import FileFormatError
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import Obstacle
-from apex_ompl.scene.grids import surface
+from apex_ompl.scene.grids import parse_surface, surface
 from apex_ompl.scene.meshes import is_watertight, winding_number
+from apex_ompl.scene.octomap import parse_octomap
 
 
 def volume(corners: np.ndarray) -> float:
@@ -61,6 +63,34 @@ def test_cells_are_seen_as_their_boxes(robot: Robot, tmp_path: Path) -> None:
     assert 20 < expected.sum() < 190 and np.array_equal(first.are_free(states), expected)
     for q in states[expected][:10]:
         assert first.clearance(q) == pytest.approx(second.clearance(q), abs=2e-6)
+
+
+def test_maps_of_octomap(robot: Robot) -> None:
+    """The file was written by OctoMap, from 60 cells of random places and a block of 4 x 4 x 4, which it pruned."""
+    file = Path(__file__).parent / "data" / "octomap.bt"
+    occupied, side, origin = parse_octomap(file.read_bytes(), 10_000)
+    cells = np.random.default_rng(0).integers(-6, 7, (60, 3)).tolist()
+    cells += [[i, j, k] for i in range(8, 12) for j in range(8, 12) for k in range(4)]
+    found = np.argwhere(occupied) + np.round(origin / side).astype(int)
+    assert side == 0.05 and {tuple(c) for c in found.tolist()} == {tuple(c) for c in cells}
+    body = Obstacle(name="map", voxels={"file": str(file)}, position=(0.0, 0.0, 2.0))
+    assert CollisionChecker(robot, [body]).is_free(robot.home)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda data: data[:300], "cut off"),
+        (lambda data: data.replace(b"id OcTree", b"id ColorOcTree"), "ColorOcTree"),
+        (lambda data: data.replace(b"res 0.05", b"res -1"), "positive"),
+        (lambda data: b"x" + data, "beginning"),
+        (lambda _: b"# Octomap OcTree binary file\nid OcTree\nres 0.1\ndata\n\x00\x00", "no occupied cell"),
+    ],
+)
+def test_faulty_maps_of_octomap(tmp_path: Path, change: Callable[[bytes], bytes], words: str) -> None:
+    data = change((Path(__file__).parent / "data" / "octomap.bt").read_bytes())
+    with pytest.raises(FileFormatError, match=words):
+        parse_surface("map.bt", data)
 
 
 def test_height_fields_are_full_below(robot: Robot, tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ from types import ModuleType
 import coal
 import numpy as np
 import pytest
+import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support import ROOT, states_around_home
@@ -204,13 +205,14 @@ def test_hands_at_their_limits_are_proved_as_whole_intervals() -> None:
 @given(st.integers(2, 200), st.integers(0, 2**32 - 1))
 def test_tree_of_balls_holds_its_triangles(count: int, seed: int) -> None:
     corners = np.random.default_rng(seed).normal(size=(count, 3, 3))
-    balls, child, leaf = ball_tree(corners)
+    balls, halves, child, leaf = ball_tree(corners)
     assert len(balls) == 2 * count - 1 and sorted(leaf[leaf >= 0]) == list(range(count))
     below: dict[int, list[int]] = {}
     for k in reversed(range(len(balls))):
         below[k] = [int(leaf[k])] if child[k] < 0 else below[int(child[k])] + below[int(child[k]) + 1]
-        far = np.linalg.norm(corners[below[k]] - balls[k, :3], axis=2).max()
-        assert far <= balls[k, 3]
+        away = corners[below[k]] - balls[k, :3]
+        assert np.linalg.norm(away, axis=2).max() <= balls[k, 3]
+        assert (np.abs(away).max(axis=(0, 1)) <= halves[k]).all()
     assert sorted(below[0]) == list(range(count))
 
 
@@ -223,3 +225,35 @@ def test_convex_meshes_are_their_hulls(tmp_path: Path, grazing: ModuleType) -> N
     )
     wedge = coal.MeshLoader().load(str(tmp_path / "wedge.obj"), np.ones(3))
     assert len(mesh_of(wedge).corners) == 0 and len(mesh_of(wedge).points) == 4
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(30, 400), st.integers(0, 2**32 - 1))
+def test_corners_of_a_hull_whose_neighbours_are_nearer_are_the_farthest(count: int, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    found = coal.StdVec_Vec3s()
+    found.extend(list(rng.normal(size=(count, 3)) ** 3))
+    hull = mesh_of(coal.Convex.convexHull(found, True, "Qt"))
+    if not len(hull.edge_first):
+        return
+    for direction in rng.normal(size=(50, 3)):
+        along = hull.points @ direction
+        highest = [
+            k
+            for k in range(len(along))
+            if (along[hull.edge_end[hull.edge_first[k] : hull.edge_first[k + 1]]] <= along[k]).all()
+        ]
+        assert along[highest] == pytest.approx(along.max(), abs=1e-12)
+
+
+def test_clearance_to_a_hull_of_many_corners(grazing: ModuleType, robot: Robot, tmp_path: Path) -> None:
+    trimesh.creation.icosphere(3, 0.15).export(tmp_path / "ball.stl")
+    mesh = {"file": str(tmp_path / "ball.stl")}
+    checker = CollisionChecker(robot, [Obstacle(name="ball", mesh=mesh, position=(0.4, 0.0, 0.45))])
+    distances, pairs = grazing.PairDistances(checker), []
+    for q in states_around_home(robot, np.random.default_rng(0), 100, 0.5):
+        if checker.is_free(q):
+            proof = checker.prove(q[None])
+            assert proof.clearance == pytest.approx(distances(q, distances.scene.pairs).min(), abs=TOLERANCE)
+            pairs.append(proof.pair[1])
+    assert pairs.count("ball") > 3

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from apex_ompl.collision.clouds import PointCloud, cloud_of
 from apex_ompl.collision.containment import EnclosingMesh
-from apex_ompl.collision.exact_shapes import Mesh, PlacedShape, ball_tree, mesh_of
+from apex_ompl.collision.exact_shapes import Mesh, PlacedShape, ball_tree, mesh_of, tree_order
 from apex_ompl.collision.shapes import coal_geometry, hull_planes, is_shell, is_surface
 from apex_ompl.collision.solids import Solid, world_boxes
 from apex_ompl.kernel.compiled.cloud_distance import any_inside, near_mesh, near_primitive, primitive_distances
@@ -39,10 +39,12 @@ def touches(cloud_shape: coal.CollisionGeometry, shape: coal.CollisionGeometry, 
     """
     tree, at, stack = mesh_of(cloud_shape), np.ascontiguousarray(pose.homogeneous), np.empty((STACK, 2), np.int64)
     points = tree.corners, tree.balls, tree.child, tree.leaf
+    boxed = tree.corners, tree.balls, tree.halves, tree.child, tree.leaf
     if not is_shell(shape):
         return bool(near_primitive(*points, *_primitive(shape), at, tree.radius, stack))
     own = _surface(shape)
-    if near_mesh(*points, own.corners, own.balls, own.child, own.leaf, at, tree.radius, stack):
+    surface = own.corners, own.balls, own.halves, own.child, own.leaf
+    if near_mesh(*boxed, *surface, at, tree.radius, stack):
         return True
     if is_surface(shape):
         return False
@@ -158,7 +160,9 @@ def _surface(shape: coal.BVHModelBase) -> Mesh:
     if len(mesh.leaf):
         return mesh
     vertices, faces = triangles(shape)
-    return Mesh(mesh.points, vertices[faces], *ball_tree(vertices[faces]))
+    corners = vertices[faces]
+    corners = corners[tree_order(corners.mean(axis=1))]
+    return Mesh(mesh.points, corners, *ball_tree(corners))
 
 
 def _primitive(shape: coal.CollisionGeometry) -> tuple[int, Array]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -24,6 +24,7 @@ from apex_ompl.util.weak_cache import weakly_cached
 
 CONVEX_TOLERANCE = 1e-7  # a mesh is its hull when its triangles' centres are no deeper than this below it [m]
 MANY = 4000  # triangles
+LARGE_HULL = 24  # corners, from which a search by neighbours is faster than one of all
 
 
 MOST_MESHES = 256  # that are kept
@@ -35,21 +36,28 @@ class Mesh(NamedTuple):
     """A mesh for the kernel.
 
     Attributes:
-        points: Corners of its convex hull, shape (P, 3) [m].
+        points: Corners of its convex hull, or of the box around a cloud, shape (P, 3) [m].
         corners: Corners of its triangles in the tree's order, shape (T, 3, 3) [m]; none for a mesh that is its hull.
         balls: Centre and radius around the triangles below each node of the tree, shape (2 T - 1, 4) [m].
+        halves: Half edges of their bounding box, which has the same centre, shape (2 T - 1, 3) [m].
         child: First child of each node, -1 for leaves, shape (2 T - 1,).
         leaf: Triangle of each leaf, -1 for inner nodes, shape (2 T - 1,).
         depth: Depth of triangles' centres below the hull, 0 for a mesh that is its hull [m].
+        edge_first: For each point of a large hull the first of its edges, and the end of the last; shape (P + 1,), else
+            (0,).
+        edge_end: The point at the other end of each edge, shape (edges,).
         radius: Radius of balls around points, which stand in place of triangles [m].
     """
 
     points: Array
     corners: Array
     balls: Array
+    halves: Array
     child: NDArray[np.int64]
     leaf: NDArray[np.int64]
     depth: float = 0.0
+    edge_first: NDArray[np.int64] = np.empty(0, np.int64)
+    edge_end: NDArray[np.int64] = np.empty(0, np.int64)
     radius: float = 0.0
 
 
@@ -120,18 +128,34 @@ def mesh_of(geometry: coal.CollisionGeometry) -> Mesh:
 def _analysed(geometry: coal.CollisionGeometry) -> Mesh:
     cloud = cloud_of(geometry)
     if cloud is not None:
-        points = np.ascontiguousarray(cloud.points[_order(cloud.points)])[:, None]
-        return Mesh(np.array(geometry.points()), points, *ball_tree(points), np.inf, cloud.radius)
+        points = np.ascontiguousarray(cloud.points[tree_order(cloud.points)])[:, None]
+        return Mesh(np.array(geometry.points()), points, *ball_tree(points), np.inf, radius=cloud.radius)
     hull = convex_hull(geometry)
-    mesh = Mesh(np.array(hull.points()), np.empty((0, 3, 3)), np.empty((0, 4)), *(np.empty(0, np.int64),) * 2)
+    mesh = Mesh(
+        np.array(hull.points()), np.empty((0, 3, 3)), np.empty((0, 4)), np.empty((0, 3)), *(np.empty(0, np.int64),) * 2,
+        0.0, *_edges(hull),
+    )  # fmt: skip
     if is_shell(geometry):
         vertices, faces = triangles(geometry)
         corners = vertices[faces]
         depth = _depth(hull, corners)
         if depth > CONVEX_TOLERANCE:
-            corners = corners[_order(corners.mean(axis=1))]
-            mesh = Mesh(mesh.points, corners, *ball_tree(corners), depth)
+            corners = corners[tree_order(corners.mean(axis=1))]
+            mesh = Mesh(mesh.points, corners, *ball_tree(corners), depth, *_edges(hull))
     return mesh
+
+
+def _edges(hull: coal.ConvexBase) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the edges of a hull of many corners, see :class:`Mesh`; a corner of no face has one, to one of a face."""
+    count, empty = hull.num_points, np.empty(0, np.int64)
+    if count < LARGE_HULL:
+        return empty, empty
+    faces = np.array([(row[0], row[1], row[2]) for row in map(hull.polygons, range(hull.num_polygons))])
+    pairs = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    alone = np.setdiff1d(np.arange(count), pairs)
+    pairs = np.concatenate([pairs, pairs[:, ::-1], np.stack([alone, np.full_like(alone, faces[0, 0])], axis=1)])
+    pairs = np.unique(pairs, axis=0)
+    return np.searchsorted(pairs[:, 0], np.arange(count + 1)), np.ascontiguousarray(pairs[:, 1])
 
 
 def _depth(hull: coal.CollisionGeometry, corners: Array) -> float:
@@ -148,18 +172,20 @@ def _depth(hull: coal.CollisionGeometry, corners: Array) -> float:
     return depth
 
 
-def _order(centres: Array) -> NDArray[np.int64]:
+def tree_order(centres: Array) -> NDArray[np.int64]:
     """Return points in the order of a tree whose nodes are halved across their longest sides."""
     order = np.arange(len(centres))
     median_order(np.ascontiguousarray(centres), order, np.empty((128, 2), np.int64))
     return order
 
 
-def ball_tree(corners: Array) -> tuple[Array, NDArray[np.int64], NDArray[np.int64]]:
-    """Return a binary tree over triangles or points in their order, shape (T, k, 3) [m]: balls, children and leaves.
+def ball_tree(corners: Array) -> tuple[Array, Array, NDArray[np.int64], NDArray[np.int64]]:
+    """Return a binary tree over triangles or points in their order, shape (T, k, 3) [m], see :class:`Mesh`.
 
-    Each node holds a range of triangles, its children the two halves; nodes stand level by level. The ball of a node
-    has the centre of its bounding box.
+    Each node holds a range of triangles, its children the two halves; nodes stand level by level.
+
+    Returns:
+        Balls, half edges of boxes, children and leaves.
     """
     first, last = np.zeros(1, np.int64), np.array([len(corners)])
     firsts, lasts, child, leaf, count = [], [], [], [], 1
@@ -175,25 +201,29 @@ def ball_tree(corners: Array) -> tuple[Array, NDArray[np.int64], NDArray[np.int6
         middle = (first + last)[inner] // 2
         first = np.stack([first[inner], middle], axis=1).ravel()
         last = np.stack([middle, last[inner]], axis=1).ravel()
-    balls = np.empty((count, 4))
-    node_balls(np.ascontiguousarray(corners), np.concatenate(firsts), np.concatenate(lasts), balls)
-    return balls, np.concatenate(child), np.concatenate(leaf)
+    balls, halves = np.empty((count, 4)), np.empty((count, 3))
+    node_balls(np.ascontiguousarray(corners), np.concatenate(firsts), np.concatenate(lasts), balls, halves)
+    return balls, halves, np.concatenate(child), np.concatenate(leaf)
 
 
-def shape_arrays(shapes: Mapping[int, PlacedShape]) -> ShapeArrays:
-    """Return the kernel's arrays of shapes by their numbers."""
-    numbers = list(shapes)
-    row = np.full(max(numbers, default=-1) + 1, -1, np.int64)
-    row[numbers] = np.arange(len(numbers))
-    placed, points, nodes, point_count = list(shapes.values()), [np.empty((0, 3))], [], 0
+def shape_arrays(placed: Sequence[PlacedShape]) -> ShapeArrays:
+    """Return the kernel's arrays of shapes."""
+    points, point_count = [np.empty((0, 3))], 0
+    nodes, halves = [np.empty((0, 4))], [np.empty((0, 3))]
     roots, spans, child, corner = [], [], [np.empty(0, np.int64)], [np.empty(0, np.int64)]
-    node_count = 0
+    graphs, edge_first, edge_end = [], [np.empty(0, np.int64)], [np.empty(0, np.int64)]
+    node_count = edge_count = place = 0
     for shape in placed:
         mesh = shape.mesh
         if mesh is None:
             roots.append(-1)
+            graphs.append(-1)
             spans.append((0, 0))
             continue
+        graphs.append(place if len(mesh.edge_first) else -1)
+        edge_first.append(mesh.edge_first + edge_count)
+        edge_end.append(mesh.edge_end)
+        place, edge_count = place + len(mesh.edge_first), edge_count + len(mesh.edge_end)
         spans.append((point_count, len(mesh.points)))
         point_count += len(mesh.points)
         roots.append(node_count if len(mesh.leaf) else -1)
@@ -202,6 +232,7 @@ def shape_arrays(shapes: Mapping[int, PlacedShape]) -> ShapeArrays:
         first = point_count + each * mesh.leaf
         corner.append(np.where(mesh.leaf < 0, -1, first if each == TRIANGLE else POINT - first))
         nodes.append(mesh.balls)
+        halves.append(mesh.halves)
         points += [mesh.points, mesh.corners.reshape(-1, 3)]
         point_count += each * len(mesh.corners)
         node_count += len(mesh.leaf)
@@ -213,27 +244,30 @@ def shape_arrays(shapes: Mapping[int, PlacedShape]) -> ShapeArrays:
         root=np.array(roots, np.int64),
         child=np.concatenate(child),
         corner=np.concatenate(corner),
-        row=row,
+        graph=np.array(graphs, np.int64),
+        edge_first=np.concatenate(edge_first),
+        edge_end=np.concatenate(edge_end),
         rotation=np.array([pose[0] for pose in poses]).reshape(-1, 3, 3),
         offset=np.array([pose[1] for pose in poses]).reshape(-1, 3),
         size=np.array([pose[2] for pose in poses]).reshape(-1, 3),
         ball=np.array([shape.ball for shape in placed]).reshape(-1, 4),
         depth=np.array([0.0 if s.mesh is None else s.mesh.depth for s in placed]),
-        node_ball=np.concatenate([np.empty((0, 4)), *nodes]),
+        node_ball=np.concatenate(nodes),
+        node_half=np.concatenate(halves),
         points=np.concatenate(points),
     )
 
 
 def joined(bodies: ShapeArrays, obstacles: ShapeArrays) -> ShapeArrays:
-    """Return the shapes of bodies, whose rows are kept, and of obstacles behind them; ``row`` is the obstacles'."""
-    points, nodes = len(bodies.points), len(bodies.child)
+    """Return the shapes of bodies, and of obstacles behind them."""
+    points, nodes, edges = len(bodies.points), len(bodies.child), len(bodies.edge_end)
     moved = obstacles._replace(
         points_of=obstacles.points_of + np.array([points, 0], np.int64), root=_moved(obstacles.root, nodes),
-        child=_moved(obstacles.child, nodes),
+        child=_moved(obstacles.child, nodes), graph=_moved(obstacles.graph, len(bodies.edge_first)),
+        edge_first=obstacles.edge_first + edges,
         corner=np.where(obstacles.corner <= POINT, obstacles.corner - points, _moved(obstacles.corner, points)),
     )  # fmt: skip
-    both = ShapeArrays(*(np.concatenate(pair) for pair in zip(bodies, moved, strict=True)))
-    return both._replace(row=_moved(obstacles.row, len(bodies.kind)))
+    return ShapeArrays(*(np.concatenate(pair) for pair in zip(bodies, moved, strict=True)))
 
 
 def _moved(numbers: Integers, by: int) -> Integers:

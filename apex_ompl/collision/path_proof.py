@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import OrderedDict
-from collections.abc import Iterator
+from collections.abc import Hashable, Iterator
 from dataclasses import dataclass, replace
 from weakref import WeakKeyDictionary
 
@@ -31,7 +31,13 @@ SLACK, MOST_LIMIT = 0.01, 0.5  # of what the spheres are larger than the shapes,
 BUDGET = 1000  # intervals between two looks at the clock: some milliseconds
 
 
+MOST_SCENES = 2  # whose packed shapes are kept
+
 _bodies: WeakKeyDictionary[Robot, OrderedDict[int, tuple[Array, ShapeArrays]]] = WeakKeyDictionary()
+
+
+_packed: OrderedDict[Hashable, tuple[ShapeArrays, list[PlacedShape], tuple[Integers, Floats]]] = OrderedDict()
+"""Packed shapes of the last scenes, which are many numbers where clouds are among them."""
 
 
 @dataclass(frozen=True)
@@ -135,14 +141,22 @@ def _shapes_of_bodies(robot: Robot, scene: MeshStage, kernel: Kernel) -> ShapeAr
     key = id(kernel.robot.arrays.node_centre)  # shared by all kernels of one set of bodies
     if key not in known:
         turns = [turn.T for turn in joint_tree(robot).turns]
-        bodies = {}
-        for row, number in enumerate(kernel.robot.numbers):
-            solid = scene.solids[number]
-            bodies[row] = PlacedShape(solid.shape, solid.joint, turns[solid.joint] @ solid.placement.homogeneous)
+        solids = [scene.solids[number] for number in kernel.robot.numbers]
+        bodies = [PlacedShape(s.shape, s.joint, turns[s.joint] @ s.placement.homogeneous) for s in solids]
         while len(known) >= MOST_PACKED:
             known.popitem(last=False)
         known[key] = kernel.robot.arrays.node_centre, shape_arrays(bodies)
     return known[key][1]
+
+
+def _pack(bodies: ShapeArrays, obstacles: list[PlacedShape]) -> tuple[Integers, Floats]:
+    """Return the packed shapes of bodies and obstacles; those of the last scenes are kept."""
+    key = id(bodies), tuple((id(shape.geometry), shape.pose.tobytes()) for shape in obstacles)
+    found = _packed.pop(key, None) or (bodies, obstacles, pack(joined(bodies, shape_arrays(obstacles))))
+    _packed[key] = found
+    while len(_packed) > MOST_SCENES:
+        _packed.pop(next(iter(_packed), key), None)
+    return found[2]
 
 
 class PathProver:
@@ -155,10 +169,13 @@ class PathProver:
         self._local = threading.local()
         self._lock = threading.Lock()
         self._placed: dict[int, tuple[Solid, PlacedShape]] = {}
-        self._current: tuple[Kernel, tuple[Integers, Floats]] | None = None
+        self._current: tuple[Kernel, tuple[Integers, Floats, Integers]] | None = None
 
-    def _shapes(self, kernel: Kernel) -> tuple[Integers, Floats]:
-        """Return the exact shapes of the bodies and obstacles of a kernel; those of the last one are kept."""
+    def _shapes(self, kernel: Kernel) -> tuple[Integers, Floats, Integers]:
+        """Return the exact shapes of the bodies and obstacles of a kernel, and the rows of the obstacles by number.
+
+        Those of the last kernel are kept.
+        """
         current = self._current
         if current is not None and current[0] is kernel:
             return current[1]
@@ -172,8 +189,10 @@ class PathProver:
                     known = solid, PlacedShape(solid.shape, 0, solid.placement.homogeneous)
                 placed[number] = known
             self._placed = placed
-            obstacles = shape_arrays({number: shape for number, (_, shape) in placed.items()})
-            shapes = pack(joined(_shapes_of_bodies(self._robot, self._scene, kernel), obstacles))
+            bodies = _shapes_of_bodies(self._robot, self._scene, kernel)
+            rows = np.full(max(owners, default=-1) + 1, -1, np.int64)
+            rows[owners] = len(bodies.kind) + np.arange(len(owners))
+            shapes = *_pack(bodies, [shape for _, shape in placed.values()]), rows
             self._current = kernel, shapes
             return shapes
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import io
+import logging
 import threading
 from itertools import product
 from pathlib import Path
@@ -27,7 +28,11 @@ LOADED_BY_COAL = (".stl", ".obj")  # which takes half a second less than the oth
 THICKNESS = 1e-6  # by which hulls of surfaces are larger [m]
 KEPT_MESHES = 32  # meshes that were loaded last and are kept for the next problem
 DIRECTIONS = (400, 60)  # in which hulls of too many vertices are sampled; fewer where Coal takes no more
+CELLS = 24  # along the longest side of a grid over vertices
+MANY_TRIANGLES = 200_000  # which take seconds
 MOST_VERTICES = 50_000  # of a mesh whose hull is not sampled
+
+LOG = logging.getLogger("apex_ompl")
 
 _loading = threading.RLock()
 _meshes: WeakValueDictionary[str, coal.BVHModelBase] = WeakValueDictionary()  # by content and scale
@@ -164,12 +169,24 @@ def _hull_of(points: Array) -> coal.Convex:
 
 
 def _farthest(directions: Array, points: Array) -> tuple[NDArray[np.intp], Array]:
-    """Return the point that is farthest in each direction, shape (D,), and how far it is, shape (D,) [m]."""
-    columns = np.ascontiguousarray(points.T)
+    """Return the point that is farthest in each direction, shape (D,), and how far it is, shape (D,) [m].
+
+    Of the points of a grid's cells only those are looked at whose cell may reach farther than any first point of one.
+    """
+    low, wide = points.min(axis=0), float(np.ptp(points, axis=0).max())
+    side = max(wide / CELLS, 1e-12)
+    cells = np.ravel_multi_index(tuple(((points - low) / side).astype(np.int64).T), (CELLS + 1,) * 3)
+    order = np.argsort(cells, kind="stable")
+    first = np.flatnonzero(np.diff(cells[order], prepend=-1))
+    last, points = np.append(first[1:], len(order)), points[order]
+    middles = low + side * (np.floor((points[first] - low) / side) + 0.5)
     found = np.empty(len(directions), np.intp)
-    for k in range(0, len(directions), 4):  # few at a time stay in the processor's cache
-        found[k : k + 4] = (directions[k : k + 4] @ columns).argmax(axis=1)
-    return found, np.einsum("ij,ij->i", directions, points[found])
+    for k, direction in enumerate(directions):
+        reach = middles @ direction + (0.5 + 1e-6) * side * np.abs(direction).sum()
+        among = np.flatnonzero(reach >= (points[first] @ direction).max())
+        some = np.concatenate([np.arange(first[n], last[n]) for n in among])
+        found[k] = some[(points[some] @ direction).argmax()]
+    return order[found], np.einsum("ij,ij->i", directions, points[found])
 
 
 def mesh_note(body: Body) -> str:
@@ -248,6 +265,8 @@ def _read_triangles(file: str, content: bytes, scale: Array) -> tuple[Array, NDA
 
 def mesh_geometry(vertices: Array, faces: NDArray[np.int64]) -> coal.BVHModelOBBRSS:
     """Return the geometry of triangles, given by vertices, shape (V, 3) [m], and indices, shape (T, 3)."""
+    if len(faces) > MANY_TRIANGLES:
+        LOG.warning("apex_ompl prepares %d triangles (about %d s, once)", len(faces), len(faces) * 1e-5)
     mesh = coal.BVHModelOBBRSS()
     mesh.beginModel(len(faces), len(vertices))
     mesh.addVertices(vertices)

@@ -43,10 +43,10 @@ HERE: dict[str, tuple[str, int]] = {
 """Functions that this process compiles: module and name -> types of the arguments, and typical time [s]."""
 
 BESIDE: dict[str, tuple[str, int]] = {
-    "curve_proof.prove_curve": (ROBOT + SCENE + 4 * ROBOT + CURVE, 18),
+    "curve_proof.prove_curve": (ROBOT + SCENE + ROBOT + "i8[::1], " + 3 * ROBOT + CURVE, 18),
     "queries.joint_frames": (ROBOT + WORKSPACE + "f8[:, ::1], f8[:, :, :, ::1], f8[:, :, ::1]", 2),
     "ball_tree.median_order": ("f8[:, ::1], i8[::1], i8[:, ::1]", 1),
-    "ball_tree.node_balls": ("f8[:, :, ::1], i8[::1], i8[::1], f8[:, ::1]", 1),
+    "ball_tree.node_balls": ("f8[:, :, ::1], i8[::1], i8[::1], f8[:, ::1], f8[:, ::1]", 1),
     "motion_proof.lay_grid": ("f8[:, ::1], f8, i8[::1]", 1),
     "jerk_profiles.join_profiles": (
         "f8[:, :, ::1], f8[:, :, ::1], i8[::1], f8[:, :, ::1], i8[:, :, ::1], f8[:, :, :, ::1], i8[::1], f8[::1], "

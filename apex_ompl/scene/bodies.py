@@ -20,6 +20,7 @@ from apex_ompl.util.schema import StrictModel
 MESH_SUFFIXES = (".stl", ".obj", ".ply", ".dae", ".glb", ".off")
 POINT_SUFFIXES = (".npy", ".ply", ".pcd")
 GRID_SUFFIXES = (".npz",)
+VOXEL_SUFFIXES = (".npz", ".bt")
 LARGEST = 1e4  # longer lengths are errors [m]
 
 
@@ -99,6 +100,12 @@ class GridFile(StrictModel):
     file: Annotated[str, _ending_in(GRID_SUFFIXES, "file of a grid")]
 
 
+class VoxelFile(GridFile):
+    """Cells of a grid that are full, from a file, which may be a map of OctoMap (:mod:`apex_ompl.scene.octomap`)."""
+
+    file: Annotated[str, _ending_in(VOXEL_SUFFIXES, "file of voxels")]
+
+
 class HalfSpace(StrictModel):
     """All points x of the object's frame with normal . x <= offset [m]; the normal points out of the solid."""
 
@@ -116,7 +123,7 @@ class Body(StrictModel):
     capsule: RoundBar | None = None
     mesh: MeshFile | None = None
     points: PointFile | None = None
-    voxels: GridFile | None = None
+    voxels: VoxelFile | None = None
     distance_grid: GridFile | None = None
     half_space: HalfSpace | None = None
     position: Vector = (0.0, 0.0, 0.0)

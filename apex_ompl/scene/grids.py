@@ -3,6 +3,7 @@
 A ``.npz`` file holds one of ``occupied`` (nx, ny, nz), the cells that are full; ``heights`` (nx, ny) [m], full from
 their least on up to each; or ``distances`` (nx, ny, nz), signed distances at the centres of cells [m]; with
 ``resolution``, the side of the cells [m], and ``origin`` (3,), the outer corner of the first one [m].
+A ``.bt`` file holds a map of OctoMap.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apex_ompl.errors import FileFormatError
+from apex_ompl.scene.octomap import parse_octomap
 from apex_ompl.types import Array, Flags
 from apex_ompl.util.files import BROKEN
 from apex_ompl.util.validation import is_number
@@ -37,6 +39,11 @@ def parse_surface(file: str, content: bytes) -> tuple[Array, NDArray[np.int64]]:
     Raises:
         FileFormatError: The file holds something else, too many cells, or none that is full.
     """
+    if file.lower().endswith(".bt"):
+        try:
+            return surface(*parse_octomap(content, MOST_CELLS), file)
+        except BROKEN as error:
+            raise FileFormatError(file, "", str(error)[:80], "expected a binary map of OctoMap") from error
     try:
         with np.load(io.BytesIO(content), allow_pickle=False) as data:
             found = [name for name in KINDS if name in data]

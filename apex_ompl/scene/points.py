@@ -52,7 +52,7 @@ def _read_ply(content: bytes) -> Array:
 
 
 def _read_pcd(content: bytes) -> Array:
-    """Return the points of a PCD file, ``ascii`` or ``binary`` (the format of the Point Cloud Library, version 0.7)."""
+    """Return the points of a PCD file (the format of the Point Cloud Library, version 0.7)."""
     head: dict[str, list[str]] = {}
     at = 0
     while "DATA" not in head:
@@ -68,12 +68,49 @@ def _read_pcd(content: bytes) -> Array:
         table = np.loadtxt(io.BytesIO(content[at:]), ndmin=2, max_rows=count)
         columns = np.cumsum([0, *repeats])
         return np.stack([table[:, columns[names.index(axis)]] for axis in "xyz"], axis=1)
+    formats = [np.dtype(f"<{PCD_TYPES[kind]}{size}") for kind, size in zip(head["TYPE"], head["SIZE"], strict=True)]
+    if kind == "binary_compressed":  # field by field
+        packed, size = np.frombuffer(content, "<u4", 2, at).tolist()
+        data, at = _decompressed(content[at + 8 : at + 8 + packed], size), 0
+        fields: list[Array] = []
+        for form, n in zip(formats, repeats, strict=True):
+            fields.append(np.frombuffer(data, form, count * n, at).reshape(count, n)[:, 0])
+            at += count * n * form.itemsize
+        return np.stack([fields[names.index(axis)] for axis in "xyz"], axis=1)
     if kind != "binary":
-        raise ValueError(f"PCD data {kind!r}, expected ascii or binary")
-    formats = [f"<{PCD_TYPES[kind]}{size}" for kind, size in zip(head["TYPE"], head["SIZE"], strict=True)]
+        raise ValueError(f"PCD data {kind!r}, expected ascii, binary or binary_compressed")
     row = np.dtype([(f"{k}", form, (n,)) for k, (form, n) in enumerate(zip(formats, repeats, strict=True))])
     rows: Any = np.frombuffer(content, row, count, at)
     return np.stack([rows[str(names.index(axis))][:, 0] for axis in "xyz"], axis=1)
+
+
+def _decompressed(packed: bytes, size: int) -> bytes:
+    """Return what LZF packed (the format of Marc Lehmann's LibLZF), of ``size`` bytes.
+
+    A byte below 32 comes before as many bytes and one more, taken as they are. Another one, with the next, gives length
+    and distance of a run that was there before.
+    """
+    found, at = bytearray(), 0
+    while at < len(packed):
+        control = packed[at]
+        at += 1
+        if control < 32:
+            found += packed[at : at + control + 1]
+            at += control + 1
+            continue
+        long, back = control >> 5, (control & 31) << 8
+        if long == 7:
+            long += packed[at]
+            at += 1
+        begin, long = len(found) - back - packed[at] - 1, long + 2
+        at += 1
+        if begin < 0:
+            raise ValueError("compressed data that is damaged")
+        run = found[begin : begin + long]
+        found += (run * (long // len(run) + 1))[:long]
+    if len(found) != size:
+        raise ValueError(f"compressed data of {len(found)} bytes, expected {size}")
+    return bytes(found)
 
 
 READERS = {".npy": _read_npy, ".ply": _read_ply, ".pcd": _read_pcd}

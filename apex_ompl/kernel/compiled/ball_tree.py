@@ -61,14 +61,15 @@ def median_order(centres: Floats, order: Integers, ranges: Integers) -> None:
 
 
 @entry_point
-def node_balls(corners: Floats, first: Integers, last: Integers, balls: Floats) -> None:
-    """Write for each node the ball around the corners of its triangles; its centre is that of their bounding box.
+def node_balls(corners: Floats, first: Integers, last: Integers, balls: Floats, halves: Floats) -> None:
+    """Write for each node the bounding box of the corners of its triangles, and a ball around them with its centre.
 
     Args:
         corners: Corners of triangles, or points, shape (T, k, 3) [m].
         first: First triangle of each node, shape (n,).
         last: The one behind its last, shape (n,).
         balls: Gets centre and radius, shape (n, 4) [m].
+        halves: Gets the half edges of the boxes, shape (n, 3) [m].
     """
     for n in range(len(first)):
         for i in range(3):
@@ -76,7 +77,7 @@ def node_balls(corners: Floats, first: Integers, last: Integers, balls: Floats) 
             for t in range(first[n], last[n]):
                 for k in range(corners.shape[1]):
                     low, high = min(low, corners[t, k, i]), max(high, corners[t, k, i])
-            balls[n, i] = 0.5 * (low + high)
+            balls[n, i], halves[n, i] = 0.5 * (low + high), 0.5 * (high - low) + 1e-12
         most = 0.0
         for t in range(first[n], last[n]):
             for k in range(corners.shape[1]):

@@ -24,20 +24,40 @@ def _local(pose: Floats, x: float, y: float, z: float) -> Point:
     )
 
 
+@inlined
+def _from_box(ball: Floats, half: Floats, x: float, y: float, z: float) -> float:
+    """Return the distance of a point from a box around the centre of a node's ball [m]."""
+    x, y, z = abs(x - ball[0]) - half[0], abs(y - ball[1]) - half[1], abs(z - ball[2]) - half[2]
+    return float(math.sqrt(max(x, 0.0) ** 2 + max(y, 0.0) ** 2 + max(z, 0.0) ** 2))
+
+
+@inlined
+def _world(pose: Floats, ball: Floats) -> Point:
+    """Return the centre of a ball that is given in the frame of a pose, shape (4, 4)."""
+    return (
+        pose[0, 0] * ball[0] + pose[0, 1] * ball[1] + pose[0, 2] * ball[2] + pose[0, 3],
+        pose[1, 0] * ball[0] + pose[1, 1] * ball[1] + pose[1, 2] * ball[2] + pose[1, 3],
+        pose[2, 0] * ball[0] + pose[2, 1] * ball[1] + pose[2, 2] * ball[2] + pose[2, 3],
+    )
+
+
 @entry_point
 def near_mesh(
-    points: Floats, point_balls: Floats, point_child: Integers, point_leaf: Integers,
-    corners: Floats, balls: Floats, child: Integers, leaf: Integers, pose: Floats, limit: float, stack: Integers,
+    points: Floats, point_balls: Floats, point_halves: Floats, point_child: Integers, point_leaf: Integers,
+    corners: Floats, balls: Floats, halves: Floats, child: Integers, leaf: Integers,
+    pose: Floats, limit: float, stack: Integers,
 ) -> bool:  # fmt: skip
     """Whether any of the points is within a distance of any triangle of a mesh.
 
     Args:
         points: Shape (N, 1, 3) [m].
         point_balls: Nodes of a tree over them, see :func:`apex_ompl.collision.exact_shapes.ball_tree`.
+        point_halves: Half edges of their boxes [m].
         point_child: First child of each node.
         point_leaf: Point of each leaf.
         corners: Corners of the triangles, shape (T, 3, 3) [m].
         balls: Nodes of a tree over them.
+        halves: Half edges of their boxes [m].
         child: First child of each node.
         leaf: Triangle of each leaf.
         pose: Pose of the mesh in the frame of the points, shape (4, 4) [m].
@@ -50,8 +70,10 @@ def near_mesh(
         top -= 1
         m, n = stack[top, 0], stack[top, 1]
         x, y, z = _local(pose, point_balls[m, 0], point_balls[m, 1], point_balls[m, 2])
-        apart = math.sqrt((x - balls[n, 0]) ** 2 + (y - balls[n, 1]) ** 2 + (z - balls[n, 2]) ** 2)
-        if apart - point_balls[m, 3] - balls[n, 3] > limit:
+        if _from_box(balls[n], halves[n], x, y, z) > limit + point_balls[m, 3]:
+            continue
+        x, y, z = _world(pose, balls[n])
+        if _from_box(point_balls[m], point_halves[m], x, y, z) > limit + balls[n, 3]:
             continue
         if point_child[m] < 0 and child[n] < 0:
             p = point_leaf[m]

@@ -13,7 +13,7 @@ import math
 from apex_ompl.kernel.compiled.arrays import BOX, CAPSULE, CYLINDER, SPHERE
 from apex_ompl.kernel.compiled.compilation import inlined, outlined
 from apex_ompl.kernel.compiled.layout import Floats
-from apex_ompl.kernel.compiled.shapes import PairBuffers
+from apex_ompl.kernel.compiled.shapes import Corners, PairBuffers
 
 MOST_STEPS = 100
 TOLERANCE = 1e-7  # of distances [m]
@@ -27,9 +27,30 @@ def radius(g: PairBuffers, s: int) -> float:
     return float(g.size[s, 0]) if g.kind[s] == SPHERE or g.kind[s] == CAPSULE else 0.0
 
 
+@inlined
+def _climb(corners: Corners, g: PairBuffers, s: int, x: float, y: float, z: float) -> int:
+    """Return the corner of the hull on side ``s`` that is farthest along a direction in its frame.
+
+    From the corner that was found last, by way of neighbours that are farther: where none is, no corner is.
+    """
+    points, first, graph, at = corners.points, g.first[s], g.graph[s], g.at[s]
+    best = points[first + at, 0] * x + points[first + at, 1] * y + points[first + at, 2] * z
+    before = -1
+    while before != at:
+        before = at
+        for e in range(corners.edge_first[graph + before], corners.edge_first[graph + before + 1]):
+            k = corners.edge_end[e]
+            value = points[first + k, 0] * x + points[first + k, 1] * y + points[first + k, 2] * z
+            if value > best:
+                best, at = value, k
+    g.at[s] = at
+    return int(first + at)
+
+
 @outlined
-def support(points: Floats, g: PairBuffers, s: int, x: float, y: float, z: float) -> Vector:
+def support(corners: Corners, g: PairBuffers, s: int, x: float, y: float, z: float) -> Vector:
     """Return the point of the core of side ``s`` that is farthest along a direction, in the world [m]."""
+    points = corners.points
     kind, o = g.kind[s], g.centre[s]
     if kind == SPHERE:
         return o[0], o[1], o[2]
@@ -45,6 +66,9 @@ def support(points: Floats, g: PairBuffers, s: int, x: float, y: float, z: float
         across = math.sqrt(a * a + b * b)
         a, b = (a / across * size[0], b / across * size[0]) if across > 0.0 else (0.0, 0.0)
         c = math.copysign(size[1], c)
+    elif g.graph[s] >= 0:
+        at = _climb(corners, g, s, a, b, c)
+        a, b, c = points[at, 0], points[at, 1], points[at, 2]
     else:
         best, at = -math.inf, g.first[s]
         for k in range(g.first[s], g.first[s] + g.corners[s]):
@@ -148,11 +172,11 @@ def _nearest(p: Floats, n: int) -> tuple[float, float, float, int]:
 
 
 @outlined
-def convex_distance(points: Floats, g: PairBuffers, enough: float) -> tuple[float, float]:
+def convex_distance(corners: Corners, g: PairBuffers, enough: float) -> tuple[float, float]:
     """Return bounds on the distance of the two pieces in ``g`` [m], the lower one certified by ``g.normal``.
 
     Args:
-        points: Corners of hulls and triangles.
+        corners: Corners of hulls and triangles.
         g: The pieces; ``normal`` is the direction to begin with.
         enough: Lower bound that suffices [m].
 
@@ -169,8 +193,8 @@ def convex_distance(points: Floats, g: PairBuffers, enough: float) -> tuple[floa
             upper = 0.0
             break
         x, y, z = x / long, y / long, z / long
-        a = support(points, g, 0, x, y, z)
-        b = support(points, g, 1, -x, -y, -z)
+        a = support(corners, g, 0, x, y, z)
+        b = support(corners, g, 1, -x, -y, -z)
         u, v, w = b[0] - a[0], b[1] - a[1], b[2] - a[2]
         plane = x * u + y * v + z * w
         if plane > lower:

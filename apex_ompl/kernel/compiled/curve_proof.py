@@ -87,9 +87,11 @@ def _place_clusters(t: RobotArrays, w: Workspace, q: Floats, a: int, b: int) -> 
 
 
 @inlined
-def _bound(f: Frames, h: ShapeArrays, g: PairBuffers, a: int, b: int, need: float) -> tuple[float, float]:
-    """Return :func:`pair_bound` of body ``a`` and body ``b``, or obstacle -1 - ``b``."""
-    return pair_bound(f, h, a, b if b >= 0 else h.row[-1 - b], g, need)
+def _bound(
+    f: Frames, h: ShapeArrays, rows: Integers, g: PairBuffers, a: int, b: int, need: float
+) -> tuple[float, float]:
+    """Return :func:`pair_bound` of body ``a`` and body ``b``, or obstacle -1 - ``b``, whose shape is in ``rows``."""
+    return pair_bound(f, h, a, b if b >= 0 else rows[-1 - b], g, need)
 
 
 @inlined
@@ -147,7 +149,7 @@ def _left_by_spheres(
 
 @inlined
 def _by_shapes(
-    t: RobotArrays, w: Workspace, h: ShapeArrays, g: PairBuffers, p: ProofBuffers,
+    t: RobotArrays, w: Workspace, h: ShapeArrays, rows: Integers, g: PairBuffers, p: ProofBuffers,
     a: float, b: float, count: int, shortest: float, touch: float, tolerance: float,
 ) -> int:  # fmt: skip
     """Look at the pairs in ``found`` by their shapes; append both halves of the interval for those that stay open.
@@ -165,7 +167,7 @@ def _by_shapes(
         if m > 0 and p.found[m - 1, 0] == x and p.found[m - 1, 1] == y:
             continue
         _place_clusters(t, w, p.state, x, y)
-        bound, upper = _bound(f, h, g, x, y, p.figures[MARGIN])
+        bound, upper = _bound(f, h, rows, g, x, y, p.figures[MARGIN])
         _record(p, upper, middle, x, y, tolerance)
         if upper <= touch:
             return TOUCHING
@@ -180,16 +182,16 @@ def _by_shapes(
 
 @entry_point
 def prove_curve(
-    ri: Integers, rf: Floats, si: Integers, sf: Floats, sg: Singles, hi: Integers, hf: Floats,
+    ri: Integers, rf: Floats, si: Integers, sf: Floats, sg: Singles, hi: Integers, hf: Floats, rows: Integers,
     wi: Integers, wf: Floats, gi: Integers, gf: Floats, pi: Integers, pf: Floats,
     knots: Floats, states: Floats, rates: Floats, slack: float, touch: float, tolerance: float, budget: int,
 ) -> int:  # fmt: skip
     """Prove a curve free, for at most ``budget`` intervals; another call goes on.
 
-    Robot, scene and shapes come packed, then the buffers of a state, of a pair and of the
-    proof, in which the whole curve is the first interval. ``knots``, ``states``, ``rates`` and ``slack`` are the curve,
-    see :func:`apex_ompl.kernel.compiled.curve.set_motion`; ``touch`` is the distance that counts as contact [m],
-    ``tolerance`` that of the least clearance [m], 0 for a bare proof.
+    Robot, scene and shapes come packed; ``rows`` gives the shape of an obstacle by its number. Then come the buffers of
+    a state, of a pair and of the proof, in which the whole curve is the first interval. ``knots``, ``states``,
+    ``rates`` and ``slack`` are the curve, see :func:`apex_ompl.kernel.compiled.curve.set_motion`; ``touch`` is the
+    distance that counts as contact [m], ``tolerance`` that of the least clearance [m], 0 for a bare proof.
 
     Returns:
         PROVED, MORE, TOUCHING (the pair is in ``worst``), UNDECIDED where an
@@ -216,7 +218,7 @@ def prove_curve(
             count = _left_by_spheres(t, s, w, p, a, b, shortest)
             if count < 0:
                 return UNDECIDED
-        outcome = _by_shapes(t, w, h, g, p, a, b, count, shortest, touch, tolerance)
+        outcome = _by_shapes(t, w, h, rows, g, p, a, b, count, shortest, touch, tolerance)
         if outcome != PROVED:
             return outcome
     return PROVED if p.places[0] == p.places[1] else MORE

@@ -24,7 +24,7 @@ from apex_ompl.kernel.compiled.arrays import FIXED, REVOLUTE
 from apex_ompl.kernel.compiled.compilation import inlined, outlined
 from apex_ompl.kernel.compiled.convex_distance import radius, support
 from apex_ompl.kernel.compiled.layout import Floats, Integers
-from apex_ompl.kernel.compiled.shapes import PairBuffers, ShapeArrays
+from apex_ompl.kernel.compiled.shapes import Corners, PairBuffers, ShapeArrays, corners_of
 
 
 class Frames(NamedTuple):
@@ -54,6 +54,7 @@ def place_shape(f: Frames, h: ShapeArrays, row: int, g: PairBuffers, s: int) -> 
             g.rotation[s, i, k] = r[i, 0] * a[0, k] + r[i, 1] * a[1, k] + r[i, 2] * a[2, k]
     g.ball[s, 3] = ball[3]
     g.kind[s], g.first[s], g.corners[s] = h.kind[row], h.points_of[row, 0], h.points_of[row, 1]
+    g.graph[s], g.at[s] = h.graph[row], 0
 
 
 @inlined
@@ -116,9 +117,9 @@ def set_relative_motion(f: Frames, g: PairBuffers, s: int, joint: int, other: in
 
 
 @inlined
-def _least(points: Floats, g: PairBuffers, s: int, x: float, y: float, z: float) -> float:
+def _least(corners: Corners, g: PairBuffers, s: int, x: float, y: float, z: float) -> float:
     """Return the least value of direction . (p - c) over the piece of side ``s``, c the centre of the side's ball."""
-    p = support(points, g, s, -x, -y, -z)
+    p = support(corners, g, s, -x, -y, -z)
     c = g.ball[s]
     along = x * (p[0] - c[0]) + y * (p[1] - c[1]) + z * (p[2] - c[2])
     return float(along - radius(g, s) * math.sqrt(x * x + y * y + z * z))
@@ -126,12 +127,12 @@ def _least(points: Floats, g: PairBuffers, s: int, x: float, y: float, z: float)
 
 @outlined
 def distance_during_motion(
-    points: Floats, g: PairBuffers, s: int, x: float, y: float, z: float, offset: float
+    corners: Corners, g: PairBuffers, s: int, x: float, y: float, z: float, offset: float
 ) -> float:
     """Return a lower bound of the distance of two pieces during the motion of ``g`` [m].
 
     Args:
-        points: Corners of hulls and triangles.
+        corners: Corners of hulls and triangles.
         g: The pieces and their motion.
         s: The moving side.
         x: Normal of a separating plane, fixed to the other side, towards the moving one.
@@ -141,29 +142,29 @@ def distance_during_motion(
     """
     if math.isinf(offset):
         c = g.ball[1 - s]
-        offset = x * c[0] + y * c[1] + z * c[2] - _least(points, g, 1 - s, -x, -y, -z)
+        offset = x * c[0] + y * c[1] + z * c[2] - _least(corners, g, 1 - s, -x, -y, -z)
     o, v, c = g.turn[s], g.velocity[s], g.ball[s]
     middle = x * c[0] + y * c[1] + z * c[2] - offset
     along = x * v[0] + y * v[1] + z * v[2]
     u, p, q = y * o[2] - z * o[1], z * o[0] - x * o[2], x * o[1] - y * o[0]  # n x turn
-    ahead = middle + along + _least(points, g, s, x + u, y + p, z + q)
-    behind = middle - along + _least(points, g, s, x - u, y - p, z - q)
+    ahead = middle + along + _least(corners, g, s, x + u, y + p, z + q)
+    behind = middle - along + _least(corners, g, s, x - u, y - p, z - q)
     return float(min(ahead, behind) - g.remainder[s])
 
 
 @inlined
 def half_space_distance(g: PairBuffers, h: ShapeArrays, row: int) -> tuple[float, float]:
     """Return the distance of side 0 to a half-space, a lower bound during the motion and its value now [m]."""
-    n, offset, points = h.offset[row], h.size[row, 0], h.points
+    n, offset, corners = h.offset[row], h.size[row, 0], corners_of(h)
     x, y, z = n[0], n[1], n[2]
     c = g.ball[0]
-    now = x * c[0] + y * c[1] + z * c[2] - offset + _least(points, g, 0, x, y, z)
-    bound = distance_during_motion(points, g, 0, x, y, z, offset)
+    now = x * c[0] + y * c[1] + z * c[2] - offset + _least(corners, g, 0, x, y, z)
+    bound = distance_during_motion(corners, g, 0, x, y, z, offset)
     return max(bound, now - g.arc_bound[0]), now
 
 
 @outlined
-def convex_bound(points: Floats, g: PairBuffers, distance: float) -> float:
+def convex_bound(corners: Corners, g: PairBuffers, distance: float) -> float:
     """Return a lower bound of the distance of two pieces during the motion, given a lower bound of it now [m].
 
     ``g.normal`` is the normal of a separating plane from side 0 to side 1.
@@ -172,5 +173,5 @@ def convex_bound(points: Floats, g: PairBuffers, distance: float) -> float:
     bound = distance - min(g.arc_bound[0], g.arc_bound[1])
     for s in range(2):
         x, y, z = -x, -y, -z
-        bound = max(bound, distance_during_motion(points, g, s, x, y, z, math.inf))
+        bound = max(bound, distance_during_motion(corners, g, s, x, y, z, math.inf))
     return float(bound)

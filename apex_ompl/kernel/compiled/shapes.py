@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Annotated, NamedTuple
 
 from apex_ompl.kernel.compiled.arrays import Balls, Rotations, Spans, Vectors
+from apex_ompl.kernel.compiled.compilation import inlined
 from apex_ompl.kernel.compiled.layout import Floats, Integers, buffer_view, table_view
 
 TRIANGLE = 3  # corners
@@ -23,10 +24,15 @@ class ShapeArrays(NamedTuple):
     A mesh that is not convex is a HULL, which bounds its distance, with the root of a binary tree of balls around its
     triangles in ``root`` (else -1). An inner node has its first child in ``child``, the second stands behind it; a leaf
     has -1 there, and the first of its three corners in ``corner``, or POINT less the place of a single point. A hull
-    may be that of balls around points, whose radius is its ``size``. Balls of nodes are in the shape's frame. Triangles
-    lie at most ``depth`` below the hull [m].
+    may be that of balls around points, whose radius is its ``size``. Balls of nodes are in the shape's frame, with the
+    half edges of the nodes' bounding boxes around the same centres in ``node_half``. Triangles lie at most ``depth``
+    below the hull [m].
 
-    Bodies come first, in the order of the robot's tables; ``row`` gives the shape of an obstacle by its number.
+    A hull of many corners has the place of its first corner in ``edge_first`` as its ``graph`` (else -1). The
+    neighbours of corner k, which count from 0 as the corners do, are those from ``edge_first[graph + k]`` to
+    ``edge_first[graph + k + 1]`` in ``edge_end``.
+
+    Bodies come first, in the order of the robot's tables.
     """
 
     kind: Integers
@@ -35,14 +41,31 @@ class ShapeArrays(NamedTuple):
     root: Integers
     child: Integers
     corner: Integers
-    row: Integers
+    graph: Integers
+    edge_first: Integers
+    edge_end: Integers
     rotation: Rotations
     offset: Vectors
     size: Vectors
     ball: Balls
     depth: Floats
     node_ball: Balls
+    node_half: Vectors
     points: Vectors
+
+
+class Corners(NamedTuple):
+    """Corners of hulls and triangles, and the neighbours of those of large hulls, see :class:`ShapeArrays`."""
+
+    points: Vectors
+    edge_first: Integers
+    edge_end: Integers
+
+
+@inlined
+def corners_of(h: ShapeArrays) -> Corners:
+    """Return the corners of shapes."""
+    return Corners(h.points, h.edge_first, h.edge_end)
 
 
 class PairBuffers(NamedTuple):
@@ -52,6 +75,8 @@ class PairBuffers(NamedTuple):
         kind: Kind of the convex piece that is looked at on a side.
         first: First of its points.
         corners: Number of its points.
+        graph: Place of the neighbours of its points, -1 where it has none.
+        at: The point that was found last.
         nodes: Pairs of nodes that wait in a traversal.
         chain: Joints between the two sides.
         rotation: Rotations of the shapes in the world.
@@ -70,6 +95,8 @@ class PairBuffers(NamedTuple):
     kind: Annotated[Integers, 2]
     first: Annotated[Integers, 2]
     corners: Annotated[Integers, 2]
+    graph: Annotated[Integers, 2]
+    at: Annotated[Integers, 2]
     nodes: Annotated[Integers, MOST_NODES, 2]
     chain: Annotated[Integers, 256]
     rotation: Annotated[Floats, 2, 3, 3]
