@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from apex_ompl.kernel.compiled.arrays import BOX, CAPSULE, HALF_SPACE, SPHERE, SceneArrays
 from apex_ompl.kernel.compiled.layout import Floats, Integers, Singles
-from apex_ompl.kernel.distance_grid import DistanceGrid
+from apex_ompl.kernel.distance_grid import SLACK, DistanceGrid
 from apex_ompl.kernel.tables import SceneTables
 
 LEAF = 4  # obstacles in a leaf of the tree
@@ -63,7 +63,7 @@ class Solids(NamedTuple):
             if p.kind == HALF_SPACE:
                 rotation[k], offset[k], size[k, 0] = np.eye(3), p.size[:3], p.size[3]
             elif p.grid is not None:
-                rotation[k], size[k, 0] = p.pose[:3, :3], p.grid.spacing
+                rotation[k], size[k] = p.pose[:3, :3], (p.grid.spacing, SLACK * p.grid.spacing, 0.0)
                 offset[k] = p.pose[:3, :3] @ p.grid.low + p.pose[:3, 3]
             else:
                 rotation[k], offset[k], size[k, : len(p.size)] = p.pose[:3, :3], p.pose[:3, 3], p.size

@@ -78,8 +78,8 @@ class SceneArrays(NamedTuple):
 
     ``kind`` is one of BOX ... HALF_SPACE or GRID, ``owner`` the number of the obstacle that a solid is part of.
     ``size`` holds half edges, or radius and half length; a half-space has its unit normal in ``offset`` and its
-    distance in ``size``. A grid has its first node at ``offset`` and its spacing in ``size``; ``grid`` says which of
-    ``values`` are its own: the first, and how many along each axis.
+    distance in ``size``. A grid has its first node at ``offset``, and in ``size`` its spacing and by how much its
+    values were lowered; ``grid`` says which of ``values`` are its own: the first, and how many along each axis.
     Nodes of the tree are in depth-first order: ``tree_skip`` is the next node outside of a node's subtree,
     ``tree_range`` first obstacle and number of them (0 for inner nodes). The last ``open`` (1,) obstacles are
     half-spaces, which no box holds. ``allowed`` are pairs of a body and an owner that may touch.

@@ -5,7 +5,8 @@ and the cost are
 
     r_k = max(0, (m - d_k) / m),   c = 1/2 sum_k r_k^2,   dc/dq = -sum_k r_k u_k,   G = sum_k u_k u_k^T,
 
-where u_k = (dd_k/dq) / m. There is one margin for the scene and one for self-collision.
+where u_k = (dd_k/dq) / m. There is one margin for the scene and one for self-collision. Distances of grids, which are
+lowered to be bounds elsewhere, count here as they were found: near smooth surfaces they are right.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from apex_ompl.kernel.compiled.arrays import RobotArrays, SceneArrays
+from apex_ompl.kernel.compiled.arrays import GRID, RobotArrays, SceneArrays
 from apex_ompl.kernel.compiled.clearance import (
     Nearest,
     gradient_between_bodies,
@@ -100,13 +101,15 @@ def state_cost(
             if first == end:
                 break
             for o in range(first, end):
-                near = nearest_to_obstacle(t, s, w, q, c, o, (scene_margin, -1, -1, -1, -1))
+                lowered = s.size[o, 1] if s.kind[o] == GRID else 0.0
+                near = nearest_to_obstacle(t, s, w, q, c, o, (scene_margin - lowered, -1, -1, -1, -1))
                 if near[1] >= 0:
-                    scene = min(scene, near[0])
+                    clearance = near[0] + lowered
+                    scene = min(scene, clearance)
                     for i in range(len(row)):
                         row[i] = 0.0
                     gradient_to_obstacle(t, s, w, near, row)
-                    cost += _add_violation(near[0], scene_margin, row, gradient, gram)
+                    cost += _add_violation(clearance, scene_margin, row, gradient, gram)
     for p in range(len(t.pair_common)):
         near = _nearest_of_pair(t, w, q, p, own_margin)
         if near[1] >= 0:
