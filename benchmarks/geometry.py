@@ -41,6 +41,7 @@ DEPENDS = ("@planning", "apex_ompl/trajectory", "apex_ompl/session")
 LEVELS = ("shelf/medium", "bins/medium", "cage/medium", "posts/medium", "wall/medium", "clutter/medium")
 SPACING, RADIUS, CELL = 0.005, 0.004, 0.01  # of points and voxels [m]
 VERSIONS = ("shapes", "meshes", "points", "voxels")
+WARM = 200  # triangles and points of a first one, which compiles what is not compiled yet
 COUNTS = (100, 1_000, 10_000, 100_000, 1_000_000)
 TIMEOUT = 10.0  # [s]
 
@@ -243,7 +244,7 @@ def sizes() -> tuple[list[str], dict[str, Any]]:
     )
     with tempfile.TemporaryDirectory() as folder:
         for kind in ("mesh", "points"):
-            for count in COUNTS:
+            for number, count in enumerate((WARM, *COUNTS)):
                 file = Path(folder) / f"{kind}{count}.{'stl' if kind == 'mesh' else 'npy'}"
                 if kind == "mesh":
                     rings = max(4, int(np.sqrt(count / 4.0)))
@@ -271,6 +272,8 @@ def sizes() -> tuple[list[str], dict[str, Any]]:
                     began = time.perf_counter()
                     call(states)
                     costs.append((time.perf_counter() - began) / len(states))
+                if number == 0:
+                    continue
                 cells = [f"{took[0]:.2f}", f"{1e3 * took[1]:.0f}", *(f"{1e6 * c:.1f}" for c in costs), f"{memory:.0f}"]
                 rows.append(record.row([kind, count, *cells]))
                 figures.append([kind, count, *took, *costs, memory])
