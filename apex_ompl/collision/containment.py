@@ -15,7 +15,7 @@ import numpy as np
 
 from apex_ompl.collision.shapes import convex_hull, hull_corners, hull_planes, is_shell
 from apex_ompl.kernel.compiled.triangle_mesh import encloses
-from apex_ompl.scene.meshes import capped, is_closed, is_watertight, piece_points, triangles
+from apex_ompl.scene.meshes import capped, edges_of, is_watertight, piece_points, triangles
 from apex_ompl.types import Array
 from apex_ompl.util.weak_cache import weakly_cached
 
@@ -53,10 +53,12 @@ class EnclosingMesh:
         """Analyse a mesh; the analysis is kept as long as the mesh."""
         hull = convex_hull(mesh)
         vertices, faces = triangles(mesh)
-        corners = np.ascontiguousarray(capped(vertices, faces))
-        convex = is_closed(vertices, faces) and _is_convex(vertices[faces].mean(axis=1), hull)
+        corners, edges = np.ascontiguousarray(capped(vertices, faces)), edges_of(vertices, faces)
+        closed = not len(edges.open)
+        convex = closed and _is_convex(vertices[faces].mean(axis=1), hull)
         box = np.stack([corners.min(axis=(0, 1)), corners.max(axis=(0, 1))])
-        return EnclosingMesh(hull, convex, corners, is_watertight(corners), box)
+        watertight = not edges.balance.any() if closed else is_watertight(corners)
+        return EnclosingMesh(hull, convex, corners, watertight, box)
 
     @property
     def boundary(self) -> Array:

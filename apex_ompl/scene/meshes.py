@@ -48,14 +48,14 @@ def orientation_fault(vertices: Array, faces: NDArray[np.int64]) -> str:
         vertices: Shape (V, 3) [m].
         faces: Indices of the corners, shape (T, 3).
     """
-    edges = Edges.of(weld(vertices)[faces])
-    return "neighbouring triangles that are oriented against each other" if edges.opposed else ""
+    opposed = edges_of(vertices, faces).opposed
+    return "neighbouring triangles that are oriented against each other" if opposed else ""
 
 
 def hole_fault(vertices: Array, faces: NDArray[np.int64]) -> str:
     """Return where the holes of a mesh are, or an empty string; arguments as of :func:`orientation_fault`."""
     place = weld(vertices)
-    rim = Edges.of(place[faces]).open
+    rim = edges_of(vertices, faces).open
     if not len(rim):
         return ""
     where = np.zeros((int(place.max()) + 1, 3))
@@ -74,18 +74,13 @@ def surface_note(vertices: Array, faces: NDArray[np.int64]) -> str:
         vertices: Shape (V, 3) [m].
         faces: Indices of the corners, shape (T, 3).
     """
-    count = len(Edges.of(weld(vertices)[faces]).open)
+    count = len(edges_of(vertices, faces).open)
     if count:
         return f"is not closed ({count} open edges): its holes are taken as closed where something may lie inside"
     a, b, c = np.moveaxis(vertices[faces] - vertices.mean(axis=0), 1, 0)
     if float(np.einsum("ij,ij->", a, np.cross(b, c))) < 0.0:
         return "is inside out (its triangles face inwards): it is taken as the solid that they enclose"
     return ""
-
-
-def is_closed(vertices: Array, faces: NDArray[np.int64]) -> bool:
-    """Whether every edge of a mesh belongs to more than one triangle."""
-    return not len(Edges.of(weld(vertices)[faces]).open)
 
 
 @dataclass(frozen=True)
@@ -124,6 +119,20 @@ class Edges:
         """Edges of a single triangle, as it has them, shape (holes' edges, 2)."""
         single: NDArray[np.int64] = self.ends[self.uses == 1]
         return single
+
+
+@weakly_cached
+def _known_edges(_: Array) -> dict[int, tuple[NDArray[np.int64], Edges]]:
+    """Return the edges that are known of triangles between some vertices, by the identity of the triangles."""
+    return {}
+
+
+def edges_of(vertices: Array, faces: NDArray[np.int64]) -> Edges:
+    """Return the edges of a mesh, which are kept as long as its vertices, shape (V, 3) [m]; faces have shape (T, 3)."""
+    known = _known_edges(vertices)
+    if id(faces) not in known:
+        known[id(faces)] = faces, Edges.of(weld(vertices)[faces])
+    return known[id(faces)][1]
 
 
 @weakly_cached
@@ -177,9 +186,8 @@ def capped(vertices: Array, faces: NDArray[np.int64]) -> Array:
     place = weld(vertices)
     where = np.zeros((int(place.max()) + 1, 3))
     where[place] = vertices
-    rows = place[faces]
-    corners: Array = where[rows]
-    rim = Edges.of(rows).open
+    corners: Array = where[place[faces]]
+    rim = edges_of(vertices, faces).open
     if not len(rim):
         return corners
     label = _components(rim)
