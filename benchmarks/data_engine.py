@@ -26,7 +26,7 @@ import record
 from apex_ompl.datasets.engine import EngineOptions
 from apex_ompl.datasets.records import SOURCES
 from apex_ompl.generation.solving import solve_unit
-from apex_ompl.generation.units import LEVEL_WEIGHTS, UNIT_SIZE, Unit, static_levels
+from apex_ompl.generation.units import UNIT_SIZE, Unit, level_weight, static_levels
 from apex_ompl.problems import scenes
 from apex_ompl.trajopt.spline import Spline
 from apex_ompl.util.entry_point import run_script
@@ -140,7 +140,7 @@ def _mixed(levels: list[dict[str, Any]]) -> float:
     paths = seconds = 0.0
     for f in levels:
         suite, level = f["level"].split("/")
-        share = LEVEL_WEIGHTS[suite if suite in LEVEL_WEIGHTS else level]
+        share = level_weight(suite, level)
         seconds += share * f["seconds_per_problem"]
         paths += share * f["seconds_per_problem"] * f["rate"]
     return paths / seconds

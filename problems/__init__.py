@@ -5,7 +5,7 @@ training, 800 000 to 899 999 for validation, 900 000 to 999 999 for tests.
 
 - ``catalogue``: suites, levels, splits and ids; ``generator`` draws a problem by its id.
 - ``scenes``, ``alignment``, ``broad``: the generators of the suites; ``obstacles`` and ``objects``: what they put into
-  scenes and hands.
+  scenes and hands. ``broad`` is for training alone, and ``unseen``, which it draws too, for validation alone.
 - ``frozen``: the stored problems of validation and test, with their witnesses.
 """
 
@@ -19,6 +19,7 @@ if not __name__.startswith("apex_ompl."):  # the folder also lies at the top of 
     raise ImportError("import apex_ompl.problems, not problems")
 
 from apex_ompl.errors import ParameterError, UnknownNameError
+from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Problem
 
 if TYPE_CHECKING:
@@ -94,6 +95,39 @@ def sample(suite: str, *, level: str, seed: int) -> Problem:
     return frozen.load(problem_id).problem if frozen.is_frozen(problem_id) else first_draw(problem_id)[1]
 
 
+def primitives(problem: Problem, *, enclosing: bool = False) -> tuple[Obstacle, ...]:
+    """Return the obstacles of a problem as primitives: those that meshes and points of a suite were made from.
+
+    They are the obstacles of the problem itself, unless it is one of ``broad`` or ``unseen`` by its name. There they
+    contain the meshes, and are thinner than the balls around points by their radius.
+
+    Args:
+        problem: The problem.
+        enclosing: Whether those that points were made from are larger, so that they contain the balls.
+
+    Raises:
+        SuiteError: No problem can be drawn for that seed.
+        MissingFileError: The file of a frozen problem cannot be read.
+        FileFormatError: The hash or the content of the file of a frozen problem is wrong.
+    """
+    from apex_ompl.problems import frozen
+    from apex_ompl.problems.broad.levels import LEVELS
+    from apex_ompl.problems.broad.representation import swollen
+    from apex_ompl.problems.catalogue import ProblemId
+    from apex_ompl.problems.generator import first_drawn
+
+    problem_id = ProblemId.parse(problem.name) if is_id(problem.name) else None
+    if problem_id is None or problem_id.suite not in LEVELS:
+        return problem.scene
+    if frozen.is_frozen(problem_id):
+        kept = frozen.load(problem_id)
+        scene, groups = kept.problem.scene if kept.primitives is None else kept.primitives, kept.groups
+    else:
+        drawn = first_drawn(problem_id)[1]
+        scene, groups = drawn.scene, drawn.groups
+    return swollen(scene, groups) if enclosing else scene
+
+
 def frozen_names(suite: str, level: str, split: str = "test") -> tuple[str, ...]:
     """Return the ids of the frozen problems of a suite and level, of the split ``validation`` or ``test``.
 
@@ -101,12 +135,12 @@ def frozen_names(suite: str, level: str, split: str = "test") -> tuple[str, ...]
         UnknownNameError: No such suite, level or split.
     """
     from apex_ompl.problems import frozen
-    from apex_ompl.problems.catalogue import ProblemId
+    from apex_ompl.problems.catalogue import SPLITS, ProblemId
 
-    ProblemId(suite, level, 0)
+    ProblemId(suite, level, SPLITS["validation"].start)
     if split not in frozen.COUNTS:
         raise UnknownNameError("split with frozen problems", split, frozen.COUNTS)
-    return tuple(f"{suite}/{level}/{seed}" for seed in frozen.frozen_seeds(level, split))
+    return tuple(f"{suite}/{level}/{seed}" for seed in frozen.frozen_seeds(suite, level, split))
 
 
 def witness(name: str) -> Witness:
@@ -126,4 +160,4 @@ def witness(name: str) -> Witness:
     return frozen.load(problem_id).witness
 
 
-__all__ = ["frozen_names", "is_id", "load", "names", "sample", "suites", "witness"]
+__all__ = ["frozen_names", "is_id", "load", "names", "primitives", "sample", "suites", "witness"]

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from apex_ompl.errors import ParameterError, UnknownNameError
-from apex_ompl.problems import alignment, broad, scenes
+from apex_ompl.problems import alignment, scenes
+from apex_ompl.problems.broad import levels as broad
 
 SPLITS = {"train": range(800_000), "validation": range(800_000, 900_000), "test": range(900_000, 1_000_000)}
 
@@ -19,10 +20,13 @@ LEVELS: dict[str, tuple[str, ...]] = {
 }
 """Suite of the benchmarks -> its levels."""
 
-TRAINING = {broad.SUITE: broad.LEVELS}
+TRAINING = {broad.SUITE: broad.LEVELS[broad.SUITE]}
 """Suite for training only -> its levels; none of its problems is frozen."""
 
-KNOWN = {**LEVELS, **TRAINING}
+VALIDATION = {broad.UNSEEN: broad.LEVELS[broad.UNSEEN]}
+"""Suite for validation only -> its levels; none of its problems is drawn for training."""
+
+KNOWN = {**LEVELS, **TRAINING, **VALIDATION}
 """Every suite -> its levels."""
 
 ID = re.compile(r"([A-Za-z_]+)/([A-Za-z0-9_.-]+)/(0|[1-9][0-9]{0,19})")
@@ -47,7 +51,8 @@ class ProblemId:
 
         Raises:
             UnknownNameError: No such suite or level.
-            ParameterError: The seed is not a whole number from 0 to 999 999.
+            ParameterError: The seed is not a whole number from 0 to 999 999, or not one of validation where the suite
+                is for that alone.
         """
         if not isinstance(self.suite, str) or self.suite not in KNOWN:
             raise UnknownNameError("suite", str(self.suite), KNOWN)
@@ -56,6 +61,10 @@ class ProblemId:
         is_integer = isinstance(self.seed, (int, np.integer)) and not isinstance(self.seed, bool)
         if not is_integer or not 0 <= self.seed < SPLITS["test"].stop:
             raise ParameterError("seed", self.seed, f"a whole number from 0 to {SPLITS['test'].stop - 1}")
+        allowed = SPLITS["validation"]
+        if self.suite in VALIDATION and self.seed not in allowed:
+            wanted = f"{allowed.start} to {allowed.stop - 1}: {self.suite} is for validation only, never for training"
+            raise ParameterError("seed", self.seed, wanted)
 
     def __str__(self) -> str:
         """Return the name of the problem, ``suite/level/seed``."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from apex_ompl.problems.broad.representation import Group, given
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import AttachedObject, Obstacle
 from apex_ompl.scene.problem import Goal, Problem
@@ -17,21 +18,23 @@ class DrawnProblem:
     """Obstacles, held objects, and a start and a goal in the order of the robot's joints.
 
     Attributes:
-        scene: Obstacles.
+        scene: Obstacles; primitives where there are ``groups``.
         start: Shape (dof,).
         goal: Shape (dof,).
         attached: Held objects.
+        groups: Obstacles, by their place in ``scene``, that are given as a mesh or as points.
     """
 
     scene: tuple[Obstacle, ...]
     start: Array
     goal: Array
     attached: tuple[AttachedObject, ...] = ()
+    groups: tuple[Group, ...] = ()
 
     def to_problem(self, name: str, robot: Robot) -> Problem:
         """Return the problem under a name, for the robot that it was drawn for."""
         start, goal = (dict(zip(robot.joint_names, q.tolist(), strict=True)) for q in (self.start, self.goal))
         return Problem(
-            name=name, robot=robot.name, scene=self.scene, attached=self.attached, start=start,
+            name=name, robot=robot.name, scene=given(self.scene, self.groups), attached=self.attached, start=start,
             goal=Goal(joints=(goal,)),
         )  # fmt: skip

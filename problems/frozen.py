@@ -1,8 +1,9 @@
 """The frozen problems: the first validation and test problems of every suite and level, each with a witness.
 
 They are stored in ``problems/frozen``, a file per suite and level (JSON, compressed by LZMA), and are read, never drawn
-again. ``SHA256SUMS`` holds the hashes of the files. A witness is a path that passed the full check; it has times where
-obstacles move. Its states between start and goal are stored as multiples of 1e-4 rad.
+again. Of ``unseen`` only validation problems are frozen. ``SHA256SUMS`` holds the hashes of the files. A witness is a
+path that passed the full check; it has times where obstacles move. Its states between start and goal are stored as
+multiples of 1e-4 rad. Where obstacles are meshes or points, the primitives that they are made from are stored.
 """
 
 from __future__ import annotations
@@ -21,10 +22,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError
-from apex_ompl.problems.catalogue import LEVELS, SPLITS, ProblemId
+from apex_ompl.problems.broad.representation import Group, given
+from apex_ompl.problems.catalogue import LEVELS, SPLITS, VALIDATION, ProblemId
 from apex_ompl.problems.objects import DATA
 from apex_ompl.problems.suite_robot import ROBOT, robot
-from apex_ompl.scene.bodies import located
+from apex_ompl.scene.bodies import Obstacle, located
 from apex_ompl.scene.problem import Problem
 from apex_ompl.types import Array
 from apex_ompl.util.files import write_atomically
@@ -34,9 +36,10 @@ FOLDER = Path(__file__).parent / "frozen"
 SUMS = "SHA256SUMS"
 SCHEMA = "apex-ompl/frozen/1"
 COUNTS = {
-    "validation": {"static": 30, "extreme": 20, "moving": 10},
-    "test": {"static": 100, "extreme": 30, "moving": 20},
+    "validation": {"static": 30, "extreme": 20, "moving": 10, "unseen": 36},
+    "test": {"static": 100, "extreme": 30, "moving": 20, "unseen": 0},
 }  # problems of a level of each kind
+FROZEN = {**LEVELS, **VALIDATION}
 STATE_STEP, TIME_STEP = 1e-4, 1e-3  # quantization of the states of witnesses [rad] and of their times [s]
 
 
@@ -68,11 +71,15 @@ class FrozenProblem:
         problem: The problem.
         witness: Its witness.
         draw_number: Number of the draw, see :func:`apex_ompl.problems.generator.draw`.
+        primitives: Obstacles before some of them are given as meshes or points; None where all are as they are given.
+        groups: Those that are given together.
     """
 
     problem: Problem
     witness: Witness
     draw_number: int
+    primitives: tuple[Obstacle, ...] | None = None
+    groups: tuple[Group, ...] = ()
 
     @property
     def digest(self) -> str:
@@ -82,13 +89,14 @@ class FrozenProblem:
 
 def is_frozen(problem_id: ProblemId) -> bool:
     """Whether a problem is among the frozen ones."""
-    seeds = (frozen_seeds(problem_id.level, split) for split in COUNTS)
-    return problem_id.suite in LEVELS and any(problem_id.seed in some for some in seeds)
+    seeds = (frozen_seeds(problem_id.suite, problem_id.level, split) for split in COUNTS)
+    return problem_id.suite in FROZEN and any(problem_id.seed in some for some in seeds)
 
 
-def frozen_seeds(level: str, split: str) -> range:
-    """Return the seeds of the frozen problems of a level in a split."""
+def frozen_seeds(suite: str, level: str, split: str) -> range:
+    """Return the seeds of the frozen problems of a suite and level in a split."""
     kind = "extreme" if level == "extreme" else "moving" if level.startswith("moving-") else "static"
+    kind = "unseen" if suite in VALIDATION else kind
     first = SPLITS[split].start
     return range(first, first + COUNTS[split][kind])
 
@@ -115,12 +123,15 @@ def load(problem_id: ProblemId) -> FrozenProblem:
         states = np.concatenate([[row["start"]], inner, [row["goal"]]])
         times = np.array(row["times"], float) * TIME_STEP if "times" in row else None
         number = int(row["draw"])
+        groups = tuple(Group(*group) for group in row.get("groups", ()))
     except (KeyError, IndexError, TypeError, ValueError) as error:
         seed = f"problems, seed {problem_id.seed}"
         raise FileFormatError(str(path), seed, repr(error), "expected a problem and its witness") from error
     problem = validate(Problem, fields, f"{path}, {problem_id}")
-    problem = problem.model_copy(update={"attached": tuple(located(body, DATA) for body in problem.attached)})
-    return FrozenProblem(problem, Witness(states, times), number)
+    primitives, scene = problem.scene, given(problem.scene, groups)
+    attached = tuple(located(body, DATA) for body in problem.attached)
+    problem = problem.model_copy(update={"scene": scene, "attached": attached})
+    return FrozenProblem(problem, Witness(states, times), number, primitives if groups else None, groups)
 
 
 def load_level(suite: str, level: str) -> tuple[dict[int, FrozenProblem], int]:
@@ -167,10 +178,12 @@ def save(suite: str, level: str, frozen: Mapping[int, FrozenProblem], dropped: i
             held.append(attached)
         start, goal = item.problem.start_state(joints), item.problem.goal_states(joints)[0]
         row: dict[str, Any] = {
-            "seed": seed, "draw": item.draw_number, "held": held.index(attached), "scene": data.get("scene", []),
+            "seed": seed, "draw": item.draw_number, "held": held.index(attached), "scene": _primitives(item),
             "start": start.tolist(), "goal": goal.tolist(),
             "path": _quantized(item.witness.path[1:-1], STATE_STEP).tolist(),
         }  # fmt: skip
+        if item.groups:
+            row["groups"] = [list(group) for group in item.groups]
         if item.witness.times is not None:
             row["times"] = _quantized(item.witness.times, TIME_STEP).tolist()
         rows.append(row)
@@ -187,17 +200,24 @@ def save(suite: str, level: str, frozen: Mapping[int, FrozenProblem], dropped: i
 
 
 def digest(problem: Problem) -> str:
-    """Return the first 16 digits of the SHA-256 of a problem; of meshes only the file names enter."""
+    """Return the first 16 digits of the SHA-256 of a problem; of meshes and points only the file names enter."""
     data = problem.as_dict()
     data["attached"] = [_with_mesh_name(body) for body in data.get("attached", [])]
+    data.update({"scene": [_with_mesh_name(body) for body in data["scene"]]} if "scene" in data else {})
     return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()[:16]
 
 
+def _primitives(item: FrozenProblem) -> list[Any]:
+    """Return the obstacles of a problem as they are stored: those that meshes and points are made from."""
+    primitives = item.problem.scene if item.primitives is None else item.primitives
+    found: list[Any] = item.problem.model_copy(update={"scene": primitives}).as_dict().get("scene", [])
+    return found
+
+
 def _with_mesh_name(body: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a held object with the file name of its mesh, if it has one, in place of the path."""
-    if "mesh" not in body:
-        return dict(body)
-    return {**body, "mesh": {**body["mesh"], "file": Path(body["mesh"]["file"]).name}}
+    """Return a body with the file name of its mesh or its points, if it has one, in place of the path."""
+    files = {key: {**body[key], "file": Path(body[key]["file"]).name} for key in ("mesh", "points") if key in body}
+    return {**body, **files}
 
 
 def _quantized(values: Array, step: float) -> NDArray[np.int64]:
@@ -261,4 +281,4 @@ def clear_cache() -> None:
 
 def suite_levels() -> Sequence[tuple[str, str]]:
     """Return every suite with each of its levels; each pair has a file."""
-    return [(suite, level) for suite, levels in LEVELS.items() for level in levels]
+    return [(suite, level) for suite, levels in FROZEN.items() for level in levels]

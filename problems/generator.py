@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import zlib
+from functools import lru_cache
 
 import numpy as np
 
 from apex_ompl.errors import ApexError
-from apex_ompl.problems import alignment, broad, scenes
+from apex_ompl.problems import alignment, scenes
+from apex_ompl.problems.broad import drawing, simple
+from apex_ompl.problems.broad.levels import GRAMMARS, SUITE
 from apex_ompl.problems.catalogue import ProblemId
 from apex_ompl.problems.drawn_problem import MARGIN, DrawnProblem
 from apex_ompl.problems.suite_robot import empty_hand_tables, robot
@@ -28,13 +31,29 @@ def draw(problem_id: ProblemId, number: int) -> DrawnProblem | None:
     rng = np.random.default_rng([level_hash, problem_id.seed, number])
     if problem_id.suite in alignment.SAMPLERS:
         return alignment.draw(rng, problem_id.suite, problem_id.level)
-    if problem_id.suite == broad.SUITE:
-        return broad.draw(rng, problem_id.level, SYNERGIES)
+    if problem_id.suite == SUITE and problem_id.level in simple.LEVELS:
+        return simple.draw(rng, problem_id.level, SYNERGIES)
+    if problem_id.suite in GRAMMARS:
+        return drawing.draw(rng, problem_id.suite, problem_id.level)
     task = scenes.SUITES[problem_id.suite](rng, problem_id.level)
     poses = HandPoseSampler(empty_hand_tables(), task.scene, MARGIN)
     start = poses.sample(rng, task.start, SYNERGIES)
     goal = None if start is None else poses.sample(rng, task.goal, SYNERGIES)
     return None if start is None or goal is None else DrawnProblem(task.scene, start, goal)
+
+
+@lru_cache(maxsize=64)
+def first_drawn(problem_id: ProblemId, after: int = -1) -> tuple[int, DrawnProblem]:
+    """Return the number and the problem of the first draw after ``after`` that has a start and a goal, as it is drawn.
+
+    Raises:
+        SuiteError: None of the first ``MAX_DRAWS`` draws has.
+    """
+    for number in range(after + 1, MAX_DRAWS):
+        drawn = draw(problem_id, number)
+        if drawn is not None:
+            return number, drawn
+    raise SuiteError(f"problem {problem_id}: none of {MAX_DRAWS} draws has a start and a goal")
 
 
 def first_draw(problem_id: ProblemId, after: int = -1) -> tuple[int, Problem]:
@@ -43,8 +62,5 @@ def first_draw(problem_id: ProblemId, after: int = -1) -> tuple[int, Problem]:
     Raises:
         SuiteError: None of the first ``MAX_DRAWS`` draws has.
     """
-    for number in range(after + 1, MAX_DRAWS):
-        drawn = draw(problem_id, number)
-        if drawn is not None:
-            return number, drawn.to_problem(str(problem_id), robot())
-    raise SuiteError(f"problem {problem_id}: none of {MAX_DRAWS} draws has a start and a goal")
+    number, drawn = first_drawn(problem_id, after)
+    return number, drawn.to_problem(str(problem_id), robot())

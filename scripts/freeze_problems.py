@@ -7,6 +7,7 @@ to them; --replace draws them again.
 Witnesses among obstacles that stand still are found by rrtconnect, and on ``extreme`` by apex, or else by rrtconnect
 with a range of 0.7 rad, each in eight seconds. There they keep half a millimetre of clearance: obstacles are a
 millimetre larger on each side for the planner, and the robot's own distances are looked up along its path.
+On ``unseen`` apex, and else rrtconnect with its tuned range, each have ten seconds.
 
 Usage: python scripts/freeze_problems.py [--replace] [--jobs 2] [SUITE/LEVEL ...]
        python scripts/freeze_problems.py --mend SUITE/LEVEL/SEED [SUITE/LEVEL/SEED ...]
@@ -29,11 +30,12 @@ from apex_ompl.collision import CollisionChecker
 from apex_ompl.live.moving import check_timed_path, constant_velocity_times, inflated, obstacle_at
 from apex_ompl.ompl_adapter.setup import assemble
 from apex_ompl.ompl_adapter.validity import full_check
+from apex_ompl.planners.tuned import TUNED
 from apex_ompl.problems import frozen
 from apex_ompl.problems.alignment import VELOCITY_SCALE, straight_line_duration
-from apex_ompl.problems.catalogue import ProblemId
+from apex_ompl.problems.catalogue import VALIDATION, ProblemId
 from apex_ompl.problems.frozen import FrozenProblem, Witness
-from apex_ompl.problems.generator import first_draw
+from apex_ompl.problems.generator import first_drawn
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.scene.problem import Problem
 from apex_ompl.trajopt.path import states_between
@@ -45,7 +47,9 @@ from apex_ompl.util.validation import one_or_more
 LIMITS = ((0, 10.0), (1, 20.0))  # seeds and time limits of rrtconnect [s]
 FINDERS = (("apex", {}), ("rrtconnect", {"range": 0.7}))  # of witnesses on the level extreme
 EXTREME_LIMIT = 8.0  # of each of them [s]
-STRIDES = (16, 8, 4, 2, 1)  # a witness on extreme is every k-th state of a path, for the first k that will do
+UNSEEN_FINDERS = (("apex", {}), ("rrtconnect", TUNED["rrtconnect"]))  # of witnesses of the suite unseen
+UNSEEN_LIMIT = 10.0  # of each of them [s]
+STRIDES = (16, 8, 4, 2, 1)  # a witness on extreme or unseen is every k-th state of a path, for the first k that will do
 SCENE_GAP, OWN_GAP = 1e-3, 5e-4  # clearance of witnesses of extreme to obstacles, and of all other pairs [m]
 GAP_SPACING = 0.03  # of the states at which the robot's own clearance is looked up [rad]
 QUICK = 1.0  # time limit among obstacles that were stopped [s]
@@ -58,7 +62,24 @@ def witness(problem: Problem) -> Witness | None:
     """Return a witness for a problem, or None when none was found."""
     if problem.moving:
         return _timed_witness(problem)
+    if problem.name.partition("/")[0] in VALIDATION:
+        return _unseen_witness(problem)
     return _extreme_witness(problem) if "/extreme/" in problem.name else _static_witness(problem)
+
+
+def _unseen_witness(problem: Problem) -> Witness | None:
+    ready = assemble(problem)
+    for planner, params in UNSEEN_FINDERS:
+        for shorter in (True, False):
+            result = plan(problem, planner, timeout=UNSEEN_LIMIT, simplify=shorter, params=params, timing=False)
+            if not result or result.path is None:
+                break
+            states = result.path.states
+            for stride in STRIDES:
+                found = Witness(np.concatenate([states[:-1:stride], states[-1:]])).rounded()
+                if full_check(ready.checker, found.path, ready.start, ready.goals):
+                    return found
+    return None
 
 
 def _static_witness(problem: Problem) -> Witness | None:
@@ -159,7 +180,7 @@ def freeze(level: tuple[str, str]) -> tuple[dict[int, FrozenProblem], int, float
     found: dict[int, FrozenProblem] = {}
     dropped, begin = 0, time.perf_counter()
     for split in frozen.COUNTS:
-        for seed in frozen.frozen_seeds(level[1], split):
+        for seed in frozen.frozen_seeds(*level, split):
             found[seed], failures = freeze_problem(ProblemId(*level, seed))
             dropped += failures
     return found, dropped, time.perf_counter() - begin
@@ -169,10 +190,12 @@ def freeze_problem(problem_id: ProblemId) -> tuple[FrozenProblem, int]:
     """Return the first draw of a problem with a witness, and how many draws before it had none."""
     number, dropped = -1, 0
     while True:
-        number, problem = first_draw(problem_id, number)
+        number, drawn = first_drawn(problem_id, number)
+        problem = drawn.to_problem(str(problem_id), robot())
         proof = witness(problem)
         if proof is not None:
-            return FrozenProblem(problem, proof, number), dropped
+            primitives = drawn.scene if drawn.groups else None
+            return FrozenProblem(problem, proof, number, primitives, drawn.groups), dropped
         dropped += 1
 
 

@@ -1,5 +1,7 @@
 """Draw a few problems of every suite and level into docs/pictures/suites, a sheet a suite: start, and goal as a ghost.
 
+The sheets of ``broad`` and ``unseen``, a problem a grammar, are drawn where they are named.
+
 Usage: python scripts/make_contact_sheets.py [--first 0] [--columns 3] [SUITE ...]
 """
 
@@ -14,6 +16,8 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from apex_ompl import problems
+from apex_ompl.problems.broad.levels import GRAMMARS
+from apex_ompl.problems.catalogue import SPLITS, TRAINING
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.files import write_atomically
 from apex_ompl.util.validation import one_or_more, whole_number
@@ -36,8 +40,19 @@ def picture(name: str, azimuth: float) -> Image.Image:
     return drawn
 
 
+def _tiled(names: list[str], columns: int) -> Image.Image:
+    """Return the sheet of some problems, by name."""
+    whole = Image.new("RGB", (SIZE[0] * columns, SIZE[1] * -(-len(names) // columns)), "white")
+    for k, name in enumerate(names):
+        whole.paste(picture(name, FROM_ABOVE_LEFT), (k % columns * SIZE[0], k // columns * SIZE[1]))
+    return whole
+
+
 def sheet(suite: str, first: int, columns: int) -> Image.Image:
-    """Return the sheet of a suite: a row a level."""
+    """Return the sheet of a suite: a row a level; of ``broad`` and ``unseen`` a problem a level."""
+    if suite in GRAMMARS:
+        split = SPLITS["train" if suite in TRAINING else "validation"]
+        return _tiled([f"{suite}/{level}/{split[first]}" for level in GRAMMARS[suite]], columns)
     levels = [v for v in problems.suites()[suite] if not v.startswith("moving") or v in SOME_MOVING]
     whole = Image.new("RGB", (SIZE[0] * columns, SIZE[1] * len(levels)))
     for row, level in enumerate(levels):

@@ -27,7 +27,12 @@ from apex_ompl.trajopt.spline import Spline
 from apex_ompl.util.cluster import ClusterError, spread
 
 SCRIPT = ROOT / "scripts" / "generate_data.py"
-UNITS = [Unit("vertical", "medium", 3, 4), Unit("wall", "easy", 3, 3), Unit("broad", "free", 3, 4)]
+UNITS = [
+    Unit("vertical", "medium", 3, 4),
+    Unit("wall", "easy", 3, 3),
+    Unit("broad", "free", 3, 4),
+    Unit("broad", "arches", 3, 4),
+]
 
 
 @pytest.fixture(scope="module")
@@ -68,11 +73,9 @@ def test_every_path_passes_the_full_check_and_its_record_is_true(made: list[Path
             nearest = ready.checker.distance(path[0])
             point = nearest.points[1] if problem.scene else NO_POINT
             np.testing.assert_allclose(a["point"][k], point, atol=1e-3)
-            mine = slice(bounds[owner], bounds[owner + 1])
-            np.testing.assert_allclose(
-                a["position"][mine], [o.position for o in problem.scene] or np.zeros((0, 3)), atol=1e-6
-            )
-            for number, obstacle in zip(a["shape"][mine], problem.scene, strict=True):
+            mine, things = slice(bounds[owner], bounds[owner + 1]), problems.primitives(problem)
+            np.testing.assert_allclose(a["position"][mine], [o.position for o in things] or np.zeros((0, 3)), atol=1e-6)
+            for number, obstacle in zip(a["shape"][mine], things, strict=True):
                 assert getattr(obstacle, SHAPES[number]) is not None
     assert {"bumps", "rrtconnect", "reversed", "part"} <= sources
 
@@ -118,7 +121,7 @@ def script(*arguments: object, **options: object) -> subprocess.CompletedProcess
     return subprocess.run(command, check=False, capture_output=True, text=True, timeout=240, **options)
 
 
-SMALL = ("vertical/small", "wall/easy", "broad", "--problems", 60, "--parts", 1, "--quiet")
+SMALL = ("vertical/small", "wall/easy", "broad/free", "--problems", 60, "--parts", 1, "--quiet")
 
 
 def test_a_killed_run_goes_on_and_ends_as_one_that_was_not(tmp_path: Path) -> None:

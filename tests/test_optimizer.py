@@ -49,7 +49,7 @@ def test_the_gradient_is_that_of_finite_differences(robot: Robot, spline: Spline
 def test_the_cost_is_what_it_says(robot: Robot) -> None:
     """Without obstacles near, half the squared length of a straight line; the clearances are the kernel's."""
     spline = Spline()
-    free = assemble(problems.load("broad/free/3"), robot)
+    free = assemble(problems.load("vertical/free/3"), robot)
     line = spline.line(free.start, free.goals[0])
     tight = Optimizer(spline, OptimizerSettings(scene_margin=1e-6, own_margin=1e-6, stiffness=1.0))
     about, _ = tight.evaluate(free.checker.kernel, line)

@@ -26,13 +26,14 @@ SUFFIX_STARTS = (0.1, 0.6)  # range of the state at which the rest of a path sta
 DUPLICATE_DISTANCE = 0.1  # a path nearer to another one is not kept [rad, max-norm]
 STRATEGIES = {
     "open": (("bumps", "bumps"), ("rrtconnect", "many bumps")),
+    "broad": (("bumps", "rrtconnect"), ("many bumps", "rrtconnect")),
     "easy": (("rrtconnect", "rrtconnect"), ("many bumps", "rrtconnect")),
     "medium": (("rrtconnect", "rrtconnect"), ("many bumps", "rrtconnect")),
     "hard": (("rrtconnect", "bumps"), ("many bumps", "rrtconnect")),
     "extreme": (("rrtconnect", "bumps"), ("many bumps", "rrtconnect")),
 }
-"""Methods by which paths are searched, for the levels of the hard suites and for open scenes: the first ones in turn,
-and, where none of them finds a path, the second ones until one does. Chosen by the yield of each method."""
+"""Methods by which paths are searched, for the levels of the hard suites, for open scenes and for broad ones: the first
+ones in turn, and, where none finds a path, the second ones until one does. Chosen by the yield of each method."""
 
 
 @dataclass(frozen=True)

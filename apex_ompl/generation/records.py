@@ -23,7 +23,10 @@ from apex_ompl.scene.problem import Problem
 
 
 def kernel_problems(unit: Unit) -> list[KernelProblem]:
-    """Return the problems of a unit as tables of the kernel, for machines without Pinocchio, Coal and OMPL."""
+    """Return the problems of a unit as tables of the kernel, for machines without Pinocchio, Coal and OMPL.
+
+    There obstacles are primitives, which contain the meshes and the points that a problem has.
+    """
     found = []
     with quiet_ompl():
         for seed in unit.seeds:
@@ -31,7 +34,8 @@ def kernel_problems(unit: Unit) -> list[KernelProblem]:
                 problem = problems.load(f"{unit.suite}/{unit.level}/{seed}")
             except SuiteError:
                 continue
-            setup = assemble(problem, robot())
+            scene = problems.primitives(problem, enclosing=True)
+            setup = assemble(problem.model_copy(update={"scene": scene}), robot())
             kernel, start, goal = setup.checker.kernel, setup.start, setup.goals[0]
             points = np.stack([setup.checker.obstacle_point(start), setup.checker.obstacle_point(goal)])
             names, record = (unit.name, unit.suite, unit.level, unit.strategy), problem_record(problem, seed)
@@ -40,13 +44,16 @@ def kernel_problems(unit: Unit) -> list[KernelProblem]:
 
 
 def problem_record(problem: Problem, seed: int) -> ProblemRecord:
-    """Return the record of a problem in a data set; held meshes are named by their files, without folders."""
+    """Return the record of a problem in a data set: its obstacles as primitives, whatever they are given as.
+
+    Held meshes are named by their files, without folders.
+    """
     bodies = [h.model_dump(mode="json", exclude_defaults=True) for h in problem.attached]
     for body in bodies:
         if "mesh" in body:
             body["mesh"]["file"] = Path(body["mesh"]["file"]).name
     held = json.dumps(bodies)
-    return ProblemRecord(seed, held, [_obstacle_record(obstacle) for obstacle in problem.scene])
+    return ProblemRecord(seed, held, [_obstacle_record(obstacle) for obstacle in problems.primitives(problem)])
 
 
 def _obstacle_record(obstacle: Obstacle) -> ObstacleRecord:

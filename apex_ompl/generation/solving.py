@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from apex_ompl.diffusion.proposals import TrajectoryModel
 
 MAX_ITERATIONS = 30_000  # of rrtconnect
+BROAD_ITERATIONS = 8_000  # among broad scenes, where a problem need not have a solution
 
 
 def solve_unit(unit: Unit, options: EngineOptions, spline: Spline) -> tuple[Paths, dict[str, float]]:
@@ -52,6 +53,8 @@ def solve_unit(unit: Unit, options: EngineOptions, spline: Spline) -> tuple[Path
                 except SuiteError:
                     engine.counts["not drawn"] += 1
                     continue
+            if unit.strategy == "broad":
+                finder.iterations = BROAD_ITERATIONS
             if model is not None:
                 finder.proposer = _proposer(model, finder)
             engine.solve(finder, problem_record(finder.setup.problem, seed))
@@ -90,12 +93,14 @@ class OmplPathFinder(PathFinder):
 
     Attributes:
         setup: The problem, ready for OMPL.
+        iterations: Of rrtconnect, at most.
     """
 
     def __init__(self, setup: PlanningSetup, optimizer: Optimizer) -> None:
         """Find paths from the start to the first goal of ``setup``."""
         super().__init__(setup.checker.kernel, setup.start, setup.goals[0], optimizer)
         self.setup = setup
+        self.iterations = MAX_ITERATIONS
 
     def is_valid(self, states: Array) -> bool:
         """Whether a path, shape (N, dof), passes the full check."""
@@ -111,7 +116,7 @@ class OmplPathFinder(PathFinder):
         simple_setup, si = self.setup.simple_setup, self.setup.simple_setup.getSpaceInformation()
         simple_setup.clear()
         simple_setup.setPlanner(og.RRTConnect(si))
-        left = iter(range(MAX_ITERATIONS))
+        left = iter(range(self.iterations))
         status = simple_setup.solve(ob.PlannerTerminationCondition(lambda: next(left, None) is None))
         self._raise_faults()
         if status.getStatus() != ob.PlannerStatus.EXACT_SOLUTION:

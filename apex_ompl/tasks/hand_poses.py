@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.kernel import Kernel, RobotTables, offset_target, opposition_target
+from apex_ompl.kernel import Kernel, RobotTables, SceneTables, offset_target, opposition_target
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.tasks.cover_clearance import has_clearance, scene_kernel
@@ -16,6 +16,7 @@ from apex_ompl.tasks.inverse_kinematics import Links, in_world
 from apex_ompl.types import Array
 
 Interval = tuple[float, float]
+Synergies = tuple[float | Array, float | Array]
 Direction = tuple[float, float, float]
 
 POSE_TOLERANCE = 1e-3  # largest residual of a hand pose that counts as reached [m, and of unit vectors]
@@ -52,7 +53,7 @@ class DualArmTables:
 
     Attributes:
         robot: The robot.
-        both: Tables of the whole robot.
+        both: Tables of the whole robot, with what it holds.
         arms: Tables that check the left arm with its hand, and the right one, and ignore all other bodies.
         joints: Numbers of the joints of the left arm and hand, and of the right ones.
     """
@@ -81,20 +82,29 @@ class HandPoseSampler:
     and the first combination with the margin is returned.
     """
 
-    def __init__(self, tables: DualArmTables, scene: Sequence[Obstacle], margin: float) -> None:
-        """Prepare the kernels of ``scene``; states keep ``margin`` [m] to obstacles, fixtures and between bodies."""
+    def __init__(self, tables: DualArmTables, scene: Sequence[Obstacle] | SceneTables, margin: float) -> None:
+        """Prepare the kernels of a scene; states keep ``margin`` [m] to obstacles, fixtures and between bodies.
+
+        Args:
+            tables: The robot with what it holds.
+            scene: Obstacles beside the robot's fixtures, or the kernel's tables of both.
+            margin: [m].
+        """
         self.robot = tables.robot
         self.margin = margin
         self._joints = tables.joints
         self._hands = self.robot.groups["hands"]
-        self._kernel = scene_kernel(self.robot, tables.both, scene)
+        if isinstance(scene, SceneTables):
+            self._kernel = Kernel(tables.both, scene)
+        else:
+            self._kernel = scene_kernel(self.robot, tables.both, scene)
         self._arm_kernels = [Kernel(arm, self._kernel.scene) for arm in tables.arms]
 
     def sample(
         self,
         rng: np.random.Generator,
         regions: tuple[HandRegion, HandRegion],
-        synergies: Interval,
+        synergies: Synergies,
         attempts: int = 4,
     ) -> Array | None:
         """Return a state with the left and the right hand in their regions, or None when none was found.
@@ -102,7 +112,7 @@ class HandPoseSampler:
         Args:
             rng: Source of targets and seeds.
             regions: Of the left and of the right hand.
-            synergies: Interval of the hands' synergies.
+            synergies: Least and largest synergy of both hands, or of each, shape (2,).
             attempts: How many pairs of targets to try.
 
         Returns:
@@ -120,7 +130,7 @@ class HandPoseSampler:
                 return np.array(both[clear[0]])
         return None
 
-    def _sample_arm(self, rng: np.random.Generator, arm: int, region: HandRegion, synergies: Interval) -> Array:
+    def _sample_arm(self, rng: np.random.Generator, arm: int, region: HandRegion, synergies: Synergies) -> Array:
         """Return up to ``MAX_ARM_STATES`` states with one hand in its region; the other arm is ignored."""
         links, hand = Links.of(self.robot), list(self.robot.hands.values())[arm]
         point, fingers = region.sample(rng)

@@ -1,4 +1,4 @@
-"""The suite ``broad``, for training only: random scenes with few obstacles, and hands anywhere.
+"""The levels of ``broad`` that no grammar makes: random scenes with few obstacles, and hands anywhere.
 
 ``broad/free`` goes between two free states with the hands in wide regions; ``broad/alignment`` goes from a random start
 to an aligned goal with objects in both hands. Up to twelve primitives keep a margin to start and goal; about half of
@@ -21,7 +21,6 @@ from apex_ompl.tasks.hand_poses import HandPoseSampler, HandRegion, Interval
 from apex_ompl.tasks.inverse_kinematics import Links
 from apex_ompl.types import Array
 
-SUITE = "broad"
 LEVELS = ("free", "alignment")
 MAX_OBSTACLES = 12
 SIZE = (0.04, 0.3)  # edges and diameters [m]

@@ -1,0 +1,157 @@
+"""Grammars of furniture and of what stands in rooms: racks, cabinets, drawers, tables, stairs, benches and chairs."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from apex_ompl.problems.broad.built import between, hollow_box, stack, table
+from apex_ompl.problems.broad.composition import Composition, Place, at
+from apex_ompl.problems.broad.shapes import (
+    CAPSULE,
+    Part,
+    box,
+    line,
+    mirror,
+    moved,
+    place,
+    repeat,
+    rod,
+    shift,
+    turn,
+)  # fmt: skip
+
+FORWARD, DOWN = (1.0, 0.0, 0.0), (0.0, 0.0, -1.0)
+
+
+def rack(rng: np.random.Generator) -> Composition:
+    """Draw a rack of boards on four posts or between walls, with things on its boards."""
+    depth, width, thick = rng.uniform(0.2, 0.45), rng.uniform(0.35, 1.0), rng.uniform(0.008, 0.03)
+    heights = np.cumsum([rng.uniform(0.02, 0.15), *rng.uniform(0.24, 0.38, int(rng.integers(2, 4)))])
+    parts, places = list[Part](), list[Place]()
+    for z in heights:
+        parts += box(depth, width, thick, at=(0, 0, z))
+    top = float(heights[-1])
+    if rng.random() < 0.5:
+        parts += repeat(box(depth, thick, top), line(2 + int(rng.integers(2)), (0, width / 2, 0)))
+        parts = [*parts[: len(heights)], *moved(parts[len(heights) :], 0, 0, top / 2)]
+    else:
+        post = rod((0, 0, 0), (0, 0, top), 0.012)
+        parts += repeat(post, [shift(x * depth / 2, y * width / 2, 0) for x in (-1, 1) for y in (-1, 1)])
+    if rng.random() < 0.4:
+        parts += box(thick, width, top, at=(depth / 2, 0, top / 2))
+    for low, high in zip(heights[:-1], heights[1:], strict=True):
+        for y in rng.uniform(-width / 2, width / 2, 2):
+            places.append(at(rng.uniform(-depth / 2, depth / 6), y, (low + high) / 2, FORWARD))
+            if rng.random() < 0.5:
+                pile = stack(rng, 2, 0.1)
+                parts += moved(pile, rng.uniform(-depth / 3, depth / 3), rng.uniform(-width / 2, width / 2), low)
+    return Composition(parts, places)
+
+
+def drawers(rng: np.random.Generator) -> Composition:
+    """Draw a chest with drawers pulled out by different lengths."""
+    rows, columns, depth = int(rng.integers(2, 4)), int(rng.integers(1, 4)), rng.uniform(0.25, 0.4)
+    width, height, thick = rng.uniform(0.26, 0.34), rng.uniform(0.18, 0.26), 0.012
+    parts = moved(hollow_box(depth, columns * width, rows * height, 0.015), 0, 0, rows * height / 2)
+    places = []
+    for row in range(rows):
+        for column in range(columns):
+            out = float(rng.choice([0.0, 1.0])) * rng.uniform(0.3, 0.9) * depth
+            y, z = (column - (columns - 1) / 2) * width, row * height
+            tray = hollow_box(depth - 0.03, width - 0.05, 0.6 * height, thick, ("top",))
+            parts += moved(tray, -out, y, z + 0.35 * height)
+            if out > 0.0:
+                places.append(at(-out - depth / 4, y, z + 0.5 * height, DOWN))
+                places.append(at(-depth / 2 - out - 0.08, y, z + 0.4 * height, FORWARD))
+    places += [at(-depth / 2 - 0.1, y, 0.15, DOWN) for y in (-width, width)]
+    return Composition(parts, places)
+
+
+def cabinet(rng: np.random.Generator) -> Composition:
+    """Draw a cabinet with doors ajar, its hinges at its sides or its top."""
+    depth, width, height, thick = rng.uniform(0.2, 0.4), rng.uniform(0.4, 0.8), rng.uniform(0.3, 0.6), 0.015
+    parts = hollow_box(depth, width, height, thick)
+    if rng.random() < 0.5:
+        parts += box(depth, width, thick, at=(0, 0, rng.uniform(-0.1, 0.1)))
+    if rng.random() < 0.7:
+        for side in (-1.0, 1.0):
+            leaf = moved(box(thick, width / 2, height), 0, -side * width / 4, 0)
+            ajar = turn("z", -side * rng.uniform(0.6, 2.4))
+            parts += place(leaf, shift(-depth / 2 - thick, side * (width / 2 + thick), 0) @ ajar)
+    else:
+        leaf = moved(box(thick, width, height), 0, 0, -height / 2)
+        parts += place(leaf, shift(-depth / 2 - thick, 0, height / 2) @ turn("y", rng.uniform(0.7, 1.9)))
+    points = rng.uniform((-depth / 2, -width / 3, -height / 3), (depth / 8, width / 3, height / 3), (4, 3))
+    raised = shift(0, 0, height / 2 + rng.uniform(0.0, 0.3))
+    return Composition(parts, [Place(p, FORWARD) for p in points]).placed(raised)
+
+
+def tables(rng: np.random.Generator) -> Composition:
+    """Draw tables and stools under and beside each other, with things on and beneath them."""
+    parts, places = list[Part](), list[Place]()
+    for _ in range(int(rng.integers(1, 4))):
+        x, y, height = rng.uniform(0.2, 0.5), rng.uniform(0.25, 0.7), rng.uniform(0.2, 0.6)
+        pose = shift(rng.uniform(-0.15, 0.15), rng.uniform(-0.4, 0.4), 0) @ turn("z", rng.normal(0, 0.5))
+        one = table(x, y, height, rng.uniform(0.01, 0.05), rng.uniform(0.015, 0.04))
+        one += moved(stack(rng, int(rng.integers(1, 5)), 0.12), rng.uniform(-x, x) / 2, rng.uniform(-y, y) / 2, height)
+        around = Composition(one, [at(0, rng.uniform(-y, y) / 2.5, 0.55 * height), at(0, 0, height + 0.12, DOWN)])
+        parts += around.placed(pose).parts
+        places += around.placed(pose).places
+    return Composition(parts, places)
+
+
+def stairs(rng: np.random.Generator) -> Composition:
+    """Draw steps, solid or of boards, with a railing; they rise to the front, the back or a side."""
+    count, rise, run = int(rng.integers(3, 7)), rng.uniform(0.06, 0.13), rng.uniform(0.08, 0.16)
+    width, solid = rng.uniform(0.3, 0.6), bool(rng.integers(2))
+    parts, places = list[Part](), list[Place]()
+    for k in range(count):
+        x, z = (k - count / 2) * run, (k + 1) * rise
+        parts += box(run, width, z if solid else 0.02, at=(x, 0, z / 2 if solid else z))
+        parts += rod((x, width / 2, z), (x, width / 2, z + 0.2), 0.008) if rng.random() < 0.8 else []
+        places.append(at(x, rng.uniform(-width, width) / 2, z + rng.uniform(0.08, 0.2), DOWN))
+        if not solid and z > 0.2:
+            places.append(at(x, 0, z - 0.13))
+    half = count / 2 * run
+    parts += rod((-half, width / 2, rise + 0.2), (half, width / 2, (count + 1) * rise + 0.2), 0.015, CAPSULE)
+    return Composition(parts, places).placed(turn("z", float(rng.choice([0.0, np.pi / 2, np.pi, -np.pi / 2]))))
+
+
+def bench(rng: np.random.Generator) -> Composition:
+    """Draw a bench with a board of tools on its back, a lamp and a vice."""
+    width, depth, height = rng.uniform(0.6, 1.1), rng.uniform(0.25, 0.4), rng.uniform(0.05, 0.25)
+    back = rng.uniform(0.4, 0.7)
+    parts = [*box(depth, width, 0.03, at=(0, 0, height)), *box(0.02, width, back, at=(depth / 2, 0, height + back / 2))]
+    places = [at(depth / 2 - 0.12, y, height + rng.uniform(0.15, back), FORWARD) for y in rng.uniform(-0.4, 0.4, 3)]
+    for y in np.linspace(-width / 2, width / 2, int(rng.integers(5, 12))):
+        z, long = height + back * rng.uniform(0.4, 0.9), rng.uniform(0.08, 0.25)
+        parts += rod((depth / 2, y, z), (depth / 2 - 0.06, y, z), 0.005)
+        tool = box(0.02, rng.uniform(0.02, 0.06), long)
+        parts += place(tool, shift(depth / 2 - 0.05, y, z - long / 2) @ turn("x", rng.normal(0, 0.3)))
+    jaw = box(0.12, 0.03, 0.14, at=(-depth / 3, 0.08, height + 0.07))
+    vice = [*jaw, *mirror(jaw), *rod((-depth / 3, -0.2, height + 0.05), (-depth / 3, 0.2, height + 0.05), 0.012)]
+    parts += moved(vice, 0, rng.uniform(-0.25, 0.25), 0)
+    elbow = np.array([-depth / 2, rng.uniform(-0.3, 0.3), height + rng.uniform(0.35, 0.6)])
+    parts += rod((depth / 2, elbow[1], height), elbow, 0.012, CAPSULE)
+    parts += rod(elbow, elbow + (-0.05, 0.05, -0.12), 0.05)
+    return Composition(parts, [*places, at(-depth / 3, 0, height + 0.16, DOWN)])
+
+
+def chairs(rng: np.random.Generator) -> Composition:
+    """Draw chairs that stand, lie, and are stacked upside down, the legs among each other."""
+    parts, places = list[Part](), list[Place]()
+    for _ in range(int(rng.integers(2, 5))):
+        seat, height = rng.uniform(0.22, 0.35), rng.uniform(0.2, 0.35)
+        chair = table(seat, seat, height, 0.02, 0.025)
+        for y in between((0, -seat / 2, 0), (0, seat / 2, 0), int(rng.integers(2, 6)))[:, 1]:
+            chair += rod((seat / 2, y, height), (seat / 2 + 0.05, y, 2 * height), 0.01)
+        chair += box(0.02, seat, 0.06, at=(seat / 2 + 0.05, 0, 2 * height))
+        lying = float(rng.choice([0.0, np.pi / 2, np.pi]))
+        pose = shift(rng.uniform(-0.15, 0.15), rng.uniform(-0.45, 0.45), height * (lying > 1.0)) @ turn(
+            "z", rng.normal(0, 2)
+        )
+        one = Composition(chair, [at(0, 0, height / 2), at(0, 0, height + 0.12)])
+        one = one.placed(pose @ turn("x", lying))
+        parts += one.parts
+        places += one.places
+    return Composition(parts, places)

@@ -1,0 +1,223 @@
+"""Grammars of the suite ``unseen``, never trained for: what flows, grows, winds, sags and turns.
+
+The grammars of ``broad`` are of straight, standing or scattered things, their curved ones short and alone. These are
+connected structures of another spirit: networks of pipes (``pipework``), bent tunnels to reach into (``tunnel``),
+branching trees (``tree``), helices around a hand (``spiral``), sagging nets (``net``), gears and shafts in a housing
+(``machine``), and ribs along a bent spine (``skeleton``); :mod:`frameworks` has those that repeat one element.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from apex_ompl.problems.broad.built import bend, hollow_box, ring, sagging, smooth, tube
+from apex_ompl.problems.broad.composition import Composition, Place, at, places_at
+from apex_ompl.problems.broad.shapes import (
+    CAPSULE,
+    Part,
+    Parts,
+    along,
+    ball,
+    box,
+    circle,
+    moved,
+    place,
+    repeat,
+    rod,
+    shift,
+    turn,
+)  # fmt: skip
+from apex_ompl.types import Array
+
+FORWARD, DOWN = (1.0, 0.0, 0.0), (0.0, 0.0, -1.0)
+
+
+def pipework(rng: np.random.Generator) -> Composition:
+    """Draw pipes that run along the axes with elbows, flanges, valves and a vessel, crossing each other."""
+    parts, places, low, high = list[Part](), list[Place](), np.array([-0.25, -0.6, 0.05]), np.array([0.3, 0.6, 0.9])
+    for _ in range(int(rng.integers(3, 9))):
+        radius, point = rng.uniform(0.008, 0.035), rng.uniform(low, high)
+        before = -1
+        for _ in range(int(rng.integers(3, 7))):
+            axis = int(rng.choice([k for k in range(3) if k != before]))
+            end = point.copy()
+            end[axis] = rng.uniform(low[axis], high[axis])
+            if abs(end[axis] - point[axis]) < 0.06:
+                continue
+            parts += [*rod(point, end, radius), *ball(1.15 * radius, end)]
+            pose, length = along(point, end)
+            if rng.random() < 0.5:
+                parts += place(
+                    rod((0, 0, -0.01), (0, 0, 0.01), 1.8 * radius), pose @ shift(0, 0, rng.uniform(-0.3, 0.3) * length)
+                )
+            if rng.random() < 0.2:
+                parts += place(rod((0, 0, 0), (0, 0.08, 0), 0.006), pose)
+                parts += place(ring(0.04, 0.006, 8), pose @ shift(0, 0.08, 0) @ turn("z", np.pi / 2))
+            places.append(Place((point + end) / 2 + rng.normal(0, 0.1, 3)))
+            point, before = end, axis
+    vessel = rng.uniform(low, high)
+    parts += rod(vessel, vessel + (0, 0, 0.25), rng.uniform(0.06, 0.12), CAPSULE) if rng.random() < 0.6 else []
+    return Composition(parts, places)
+
+
+def _frames(points: Array) -> list[Array]:
+    """Return poses at the middles of the pieces of a curve, z along it, that turn about it as little as possible."""
+    found: list[Array] = []
+    for a, b in zip(points[:-1], points[1:], strict=True):
+        pose, _ = along(a, b)
+        if found:
+            z = pose[:3, 2]
+            x = found[-1][:3, 0] - z * (found[-1][:3, 0] @ z)
+            x /= np.linalg.norm(x)
+            pose[:3, :3] = np.stack([x, np.cross(z, x), z], axis=1)
+        found.append(pose)
+    return found
+
+
+def tunnel(rng: np.random.Generator) -> Composition:
+    """Draw a bent tunnel of staves or of rings from the front to its end somewhere, wide enough for a hand."""
+    parts, places = list[Part](), list[Place]()
+    for side in ((-1, 1), (-1, 1), (-1,), (1,))[int(rng.integers(4))]:
+        radius, pieces = rng.uniform(0.13, 0.18), int(rng.integers(4, 7))
+        turns = np.array([[0, 0, 0], [0.16, 0, 0], [0.32, *rng.normal(0, 0.1, 2)], [0.45, *rng.normal(0, 0.18, 2)]])
+        points = smooth(turns + (-0.2, side * rng.uniform(0.2, 0.4), rng.uniform(0.2, 0.6)), pieces + 1)
+        ribs, poses = rng.random() < 0.5, _frames(points)
+        for pose, step in zip(poses, np.linalg.norm(np.diff(points, axis=0), axis=1), strict=True):
+            hoop = place(ring(radius, 0.008), turn("y", np.pi / 2)) if ribs else tube(radius, step, 0.006, 9)
+            parts += place(hoop, pose)
+        if ribs:
+            for angle in np.arange(6) * np.pi / 3:
+                offset = radius * np.array([np.cos(angle), np.sin(angle), 0.0, 0.0]) + (0, 0, 0, 1)
+                parts += bend(np.array([(pose @ offset)[:3] for pose in poses]), 0.006)
+        places += [Place(pose[:3, 3], (pose[0, 2], pose[1, 2], pose[2, 2])) for pose in poses[:-1]]
+        places.append(at(points[0][0] - 0.1, points[0][1], points[0][2], FORWARD))
+    return Composition(parts, places)
+
+
+def tree(rng: np.random.Generator) -> Composition:
+    """Draw trees: branches that fork three to five times, getting thinner, with fruits at some of their ends."""
+    parts, places = list[Part](), list[Place]()
+
+    def grow(a: Array, way: Array, radius: float, depth: int) -> None:
+        b = a + way
+        parts.extend(rod(a, b, radius, CAPSULE))
+        places.append(Place(b + rng.normal(0, 0.09, 3)))
+        if depth == 0:
+            if rng.random() < 0.3:
+                parts.extend(ball(rng.uniform(0.015, 0.04), b))
+            return
+        for _ in range(int(rng.integers(2, 4))):
+            bent = turn(rng.normal(size=3), rng.uniform(0.3, 0.9))[:3, :3] @ way
+            grow(b, bent * rng.uniform(0.6, 0.9), 0.7 * radius, depth - 1)
+
+    for _ in range(int(rng.integers(1, 4))):
+        root = np.array([*rng.uniform((-0.1, -0.5), (0.3, 0.5)), 0.0])
+        hangs = rng.random() < 0.3
+        root[2] = 1.1 if hangs else 0.0
+        way = np.array([*rng.normal(0, 0.05, 2), (-1 if hangs else 1) * rng.uniform(0.15, 0.35)])
+        grow(root, way, rng.uniform(0.012, 0.035), int(rng.integers(3, 5)))
+    return Composition(parts, places)
+
+
+def spiral(rng: np.random.Generator) -> Composition:
+    """Draw helices: springs along any axis that hands are inside of, cones, and stairs that wind around a post."""
+    parts, places = list[Part](), list[Place]()
+    for _ in range(int(rng.integers(1, 4))):
+        radius, turns, rise = rng.uniform(0.14, 0.25), rng.uniform(1.5, 3.5), rng.uniform(0.12, 0.28)
+        angle = np.linspace(0.0, 2 * np.pi * turns, int(14 * turns))
+        r = radius * (1.0 + rng.choice([0.0, 0.4]) * angle / angle[-1])
+        z = rise * angle / (2 * np.pi)
+        if rng.random() < 0.7:
+            one: Parts = bend(np.stack([r * np.cos(angle), r * np.sin(angle), z], 1), rng.uniform(0.004, 0.02))
+        else:
+            step = box(radius, 0.08, 0.015)
+            one = [
+                p
+                for a, h in zip(angle[::2], z[::2], strict=True)
+                for p in place(step, shift(0, 0, h) @ turn("z", a) @ shift(radius / 2 + 0.02, 0, 0))
+            ]
+            one += rod((0, 0, 0), (0, 0, z[-1]), 0.02)
+        inside = [at(0, 0, h, DOWN) for h in rng.uniform(0, z[-1], 2)] + [at(radius + 0.1, 0, z[-1] / 2)]
+        pose = shift(rng.uniform(-0.1, 0.1), rng.uniform(-0.45, 0.45), rng.uniform(0.02, 0.3))
+        lying = turn("y", float(rng.choice([0.0, 0.0, 0.5, -np.pi / 2]))) @ turn("z", rng.uniform(0, 6))
+        found = Composition(one, inside).placed(pose @ lying)
+        parts += found.parts
+        places += found.places
+    return Composition(parts, places)
+
+
+def net(rng: np.random.Generator) -> Composition:
+    """Draw sagging nets and hammocks of thin ropes between posts, torn here and there, level or upright."""
+    parts, places = list[Part](), list[Place]()
+    for _ in range(int(rng.integers(1, 3))):
+        width, depth, sag = rng.uniform(0.5, 1.1), rng.uniform(0.3, 0.5), rng.uniform(0.02, 0.3)
+        rows, columns, radius = int(rng.integers(3, 6)), int(rng.integers(4, 8)), rng.uniform(0.003, 0.008)
+        knots = np.array([
+            sagging((x, -width / 2, 0), (x, width / 2, 0), sag * (1 - 0.5 * abs(x) / depth), columns)
+            for x in np.linspace(-depth / 2, depth / 2, rows)
+        ])  # fmt: skip
+        knots[1:-1, 1:-1] += rng.normal(0, 0.015, (rows - 2, columns - 2, 3))
+        ropes = [(knots[i, j], knots[i, j + 1]) for i in range(rows) for j in range(columns - 1)]
+        ropes += [(knots[i, j], knots[i + 1, j]) for i in range(rows - 1) for j in range(columns)]
+        one = [p for a, b in ropes if rng.random() < 0.9 for p in rod(a, b, radius, CAPSULE)]
+        corners = knots[[0, 0, -1, -1], [0, -1, 0, -1]]
+        upright = rng.random() < 0.4
+        if not upright:
+            one += [p for corner in corners for p in rod(corner, corner - (0, 0, 0.8), 0.012)]
+        holes = (knots[:-1, :-1] + knots[1:, 1:]) / 2
+        chosen = holes.reshape(-1, 3)[rng.permutation(holes[..., 0].size)[:4]]
+        ways = [*places_at(chosen + (0, 0, 0.05), DOWN), *places_at(chosen - (0, 0, 0.1))]
+        ways += places_at(chosen + (0, 0, 0.15), DOWN)
+        tilt = turn("y", -np.pi / 2 + rng.normal(0, 0.3)) if upright else turn("y", rng.normal(0, 0.2))
+        pose = shift(rng.uniform(-0.1, 0.15), rng.normal(0, 0.15), rng.uniform(0.35, 0.75))
+        found = Composition(one, ways).placed(pose @ tilt)
+        parts += found.parts
+        places += found.places
+    return Composition(parts, places)
+
+
+def machine(rng: np.random.Generator) -> Composition:
+    """Draw the inside of a machine: gears with teeth on shafts, pistons, and a housing that is open in front."""
+    parts, places = list[Part](), list[Place]()
+    for _ in range(int(rng.integers(2, 6))):
+        radius, thick, teeth = rng.uniform(0.05, 0.18), rng.uniform(0.015, 0.05), int(rng.integers(8, 18))
+        gear = rod((-thick / 2, 0, 0), (thick / 2, 0, 0), radius)
+        tooth = box(0.03, 0.02, thick)
+        gear += place(repeat(tooth, circle(teeth, radius + 0.01)), turn("y", np.pi / 2)) if rng.random() < 0.7 else []
+        gear += rod((-0.2, 0, 0), (0.25, 0, 0), rng.uniform(0.01, 0.025))
+        pose = shift(*rng.uniform((-0.05, -0.5, 0.15), (0.2, 0.5, 0.75))) @ turn(
+            "z", float(rng.choice([0.0, 0.0, np.pi / 2]))
+        )
+        parts += place(gear, pose)
+        places += [Place((pose @ (x, y, 0, 1))[:3]) for x in (-0.12, 0.12) for y in (-0.5 * radius, radius + 0.12)]
+    for y in rng.uniform(-0.5, 0.5, int(rng.integers(0, 4))):
+        z, long = rng.uniform(0.3, 0.9), rng.uniform(0.05, 0.25)
+        parts += [*rod((0.1, y, z), (0.1, y, z + long), 0.05), *rod((0.1, y, z - 0.2), (0.1, y, z), 0.012)]
+        parts += box(0.08, 0.1, 0.05, at=(0.1, y, z - 0.2))
+    if rng.random() < 0.6:
+        sides = ("near", "top") if rng.random() < 0.5 else ("near",)
+        parts += moved(hollow_box(0.5, 1.25, 0.95, 0.01, sides), 0.1, 0, 0.5)
+    return Composition(parts, places)
+
+
+def skeleton(rng: np.random.Generator) -> Composition:
+    """Draw a bent spine with pairs of curved ribs around a hollow that hands reach into from between the ribs."""
+    count, size = int(rng.integers(4, 9)), rng.uniform(0.16, 0.28)
+    bends = np.array([[0, -0.45, 0], *rng.normal(0, 0.08, (2, 3)), [0, 0.45, 0]])
+    bends[1, 1], bends[2, 1] = -0.15, 0.15
+    spine = smooth(bends, count + 1)
+    parts, places = bend(spine, rng.uniform(0.015, 0.03)), list[Place]()
+    for pose in _frames(spine):
+        y = np.cross((0.0, 0.0, 1.0), pose[:3, 2])
+        turned = np.eye(4)
+        turned[:3, :3] = np.stack([y / np.linalg.norm(y), pose[:3, 2], np.cross(y / np.linalg.norm(y), pose[:3, 2])], 1)
+        turned[:3, 3] = pose[:3, 3]
+        wide = size * rng.uniform(0.8, 1.15)
+        for side in (-1, 1):
+            angles = np.linspace(0.0, rng.uniform(2.0, 2.9), 7)
+            rib = np.stack([side * wide * np.sin(angles), np.zeros(7), wide * (np.cos(angles) - 1.0)], axis=1)
+            parts += place(bend(rib, rng.uniform(0.005, 0.014)), turned)
+        places.append(Place((turned @ (0, 0, -wide, 1))[:3]))
+        places.append(Place((turned @ (-0.5 * wide, size / 3, -wide, 1))[:3], FORWARD))
+    lift = shift(0, 0, 2.2 * size + rng.uniform(0, 0.3))
+    return Composition(parts, places).placed(lift @ turn("y", float(rng.choice([0.0, 0.0, -np.pi / 2, np.pi]))))
