@@ -18,10 +18,11 @@ from __future__ import annotations
 import argparse
 import multiprocessing
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
@@ -63,23 +64,8 @@ def witness(problem: Problem) -> Witness | None:
     if problem.moving:
         return _timed_witness(problem)
     if problem.name.partition("/")[0] in VALIDATION:
-        return _unseen_witness(problem)
+        return _found_by(UNSEEN_FINDERS, problem, UNSEEN_LIMIT)
     return _extreme_witness(problem) if "/extreme/" in problem.name else _static_witness(problem)
-
-
-def _unseen_witness(problem: Problem) -> Witness | None:
-    ready = assemble(problem)
-    for planner, params in UNSEEN_FINDERS:
-        for shorter in (True, False):
-            result = plan(problem, planner, timeout=UNSEEN_LIMIT, simplify=shorter, params=params, timing=False)
-            if not result or result.path is None:
-                break
-            states = result.path.states
-            for stride in STRIDES:
-                found = Witness(np.concatenate([states[:-1:stride], states[-1:]])).rounded()
-                if full_check(ready.checker, found.path, ready.start, ready.goals):
-                    return found
-    return None
 
 
 def _static_witness(problem: Problem) -> Witness | None:
@@ -97,17 +83,24 @@ def _static_witness(problem: Problem) -> Witness | None:
 
 def _extreme_witness(problem: Problem) -> Witness | None:
     thicker = problem.model_copy(update={"scene": tuple(inflated(body, SCENE_GAP) for body in problem.scene)})
-    ready = assemble(thicker)
-    for planner, params in FINDERS:
+    return _found_by(FINDERS, thicker, EXTREME_LIMIT, lambda path: _own_clearance(problem, path) >= OWN_GAP)
+
+
+def _found_by(
+    finders: Sequence[tuple[str, Mapping[str, Any]]], problem: Problem, limit: float,
+    is_clear: Callable[[Array], bool] = lambda _: True,
+) -> Witness | None:  # fmt: skip
+    """Return the first witness by one of some planners, with parameters, each with a time limit [s]."""
+    ready = assemble(problem)
+    for planner, params in finders:
         for shorter in (True, False):
-            result = plan(thicker, planner, timeout=EXTREME_LIMIT, simplify=shorter, params=params, timing=False)
+            result = plan(problem, planner, timeout=limit, simplify=shorter, params=params, timing=False)
             if not result or result.path is None:
                 break
             states = result.path.states
             for stride in STRIDES:
                 found = Witness(np.concatenate([states[:-1:stride], states[-1:]])).rounded()
-                valid = full_check(ready.checker, found.path, ready.start, ready.goals)
-                if valid and _own_clearance(problem, found.path) >= OWN_GAP:
+                if full_check(ready.checker, found.path, ready.start, ready.goals) and is_clear(found.path):
                     return found
     return None
 

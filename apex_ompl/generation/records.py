@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +15,7 @@ from apex_ompl.errors import UnknownNameError
 from apex_ompl.generation.units import Unit
 from apex_ompl.ompl_adapter.process import quiet_ompl
 from apex_ompl.ompl_adapter.setup import assemble
+from apex_ompl.problems.broad.representation import part_of
 from apex_ompl.problems.generator import SuiteError
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.scene.bodies import Obstacle
@@ -62,15 +62,7 @@ def _obstacle_record(obstacle: Obstacle) -> ObstacleRecord:
     Raises:
         UnknownNameError: The obstacle is a mesh or a half-space.
     """
-    if obstacle.box is not None:
-        size: Sequence[float] = obstacle.box
-        kind = "box"
-    elif obstacle.sphere is not None:
-        size, kind = (obstacle.sphere.radius, 0.0, 0.0), "sphere"
-    elif obstacle.cylinder is not None:
-        size, kind = (obstacle.cylinder.radius, obstacle.cylinder.length, 0.0), "cylinder"
-    elif obstacle.capsule is not None:
-        size, kind = (obstacle.capsule.radius, obstacle.capsule.length, 0.0), "capsule"
-    else:
-        raise UnknownNameError("shape of an obstacle in a data set", "mesh or half_space", SHAPES)
-    return SHAPES.index(kind), obstacle.position, obstacle.orientation, size
+    if obstacle.shape not in SHAPES:
+        raise UnknownNameError("shape of an obstacle in a data set", obstacle.shape, SHAPES)
+    part = part_of(obstacle)
+    return part.kind, obstacle.position, obstacle.orientation, part.size

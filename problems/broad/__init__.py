@@ -4,7 +4,7 @@ A grammar is a small program that places, repeats, tilts, mirrors, nests, cuts a
 hands are sent to. Each is a level: those of furniture, containers, panels, single curved things and scattered solids
 make up ``broad``; those of networks, tunnels, trees, helices, nets, machines and frameworks ``unseen``.
 
-- ``shapes``, ``built``: parts and their algebra; ``surfaces``: distances, triangles and points of parts.
+- ``shapes``, ``compounds``: parts and their algebra; ``surfaces``: distances, triangles and points of parts.
 - ``furniture``, ``containers``, ``panels``, ``curved``, ``scattered``, ``unseen``, ``frameworks``: the grammars, which
   give a ``composition``.
 - ``simple``: two levels of few obstacles that no grammar makes, ``free`` and ``alignment``.

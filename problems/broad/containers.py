@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from apex_ompl.problems.broad.built import SIDES, frame, grille, hollow_box, lattice, ring, tube
 from apex_ompl.problems.broad.composition import FLOATING, Composition, Place, at
+from apex_ompl.problems.broad.compounds import SIDES, frame, grille, hollow_box, lattice, ring, tube
 from apex_ompl.problems.broad.shapes import (
     Part,
     ball,
@@ -21,9 +21,8 @@ from apex_ompl.problems.broad.shapes import (
     shift,
     turn,
 )  # fmt: skip
+from apex_ompl.problems.scenes import DOWN, FORWARD
 from apex_ompl.tasks.hand_poses import Direction
-
-FORWARD, DOWN = (1.0, 0.0, 0.0), (0.0, 0.0, -1.0)
 
 
 def crates(rng: np.random.Generator) -> Composition:

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from apex_ompl.problems.broad.built import arc, bend, bent_sheet, ring, smooth, tube
 from apex_ompl.problems.broad.composition import FLOATING, Composition, Place, at
+from apex_ompl.problems.broad.compounds import arc, bend, bent_sheet, ring, smooth, tube
 from apex_ompl.problems.broad.shapes import Part, box, circle, place, rod, shift, turn
-
-FORWARD, DOWN = (1.0, 0.0, 0.0), (0.0, 0.0, -1.0)
+from apex_ompl.problems.scenes import DOWN, FORWARD
 
 
 def arches(rng: np.random.Generator) -> Composition:

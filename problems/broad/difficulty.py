@@ -2,7 +2,8 @@
 
 Class 0: the straight line is free. Class 1: the optimizer repairs the straight line. Class 2: a sprint of rrtconnect
 finds a path. Class 3: none of these does; such a problem need not have a solution. Each is measured with fixed numbers
-of steps and no clock.
+of steps and no clock. The sprint is not OMPL's, whose random numbers are one sequence for the whole process: a problem
+is drawn the same from its own random numbers, whatever else the process plans.
 """
 
 from __future__ import annotations

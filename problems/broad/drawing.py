@@ -18,7 +18,7 @@ from apex_ompl.problems.broad.difficulty import difficulty
 from apex_ompl.problems.broad.ends import EndSampler, clear_parts, palm_line, scene_of
 from apex_ompl.problems.broad.held import Held, draw_held
 from apex_ompl.problems.broad.levels import GRAMMARS, SUITE, Grammar
-from apex_ompl.problems.broad.representation import Plan, draw_plan, feasible, obstacles
+from apex_ompl.problems.broad.representation import Representation, draw_representation, feasible, obstacles
 from apex_ompl.problems.broad.scattered import solid
 from apex_ompl.problems.broad.shapes import Parts, extents, kept, place, shift, turn
 from apex_ompl.problems.drawn_problem import MARGIN, DrawnProblem
@@ -43,13 +43,13 @@ class Candidate:
         parts: The parts.
         ends: Start and goal, shape (2, dof).
         held: What the hands hold.
-        plan: How the parts are given.
+        representation: How the parts are given.
     """
 
     parts: Parts
     ends: Array
     held: Held
-    plan: Plan
+    representation: Representation
 
 
 def draw(rng: np.random.Generator, suite: str, level: str) -> DrawnProblem | None:
@@ -60,7 +60,7 @@ def draw(rng: np.random.Generator, suite: str, level: str) -> DrawnProblem | Non
         found = _candidate(rng, suite, GRAMMARS[suite][level], held)
         if found is None:
             continue
-        kernel = Kernel(found.held.tables.both, scene_of(found.parts, found.plan.swelling))
+        kernel = Kernel(found.held.tables.both, scene_of(found.parts, found.representation.swelling))
         measured = difficulty(kernel, found.ends, rng, wanted)
         if measured > hardest:
             best, hardest = found, measured
@@ -68,14 +68,14 @@ def draw(rng: np.random.Generator, suite: str, level: str) -> DrawnProblem | Non
             break
     if best is None:
         return None
-    groups = best.plan.groups(len(best.parts))
+    groups = best.representation.groups(len(best.parts))
     groups = groups if feasible(best.parts, groups) else ()
     return DrawnProblem(obstacles(best.parts), best.ends[0], best.ends[1], best.held.attached, groups)
 
 
 def _candidate(rng: np.random.Generator, suite: str, grammar: Grammar, held: Held) -> Candidate | None:
-    plan = draw_plan(rng)
-    margin = MARGIN + ROUNDING + plan.swelling
+    representation = draw_representation(rng)
+    margin = MARGIN + ROUNDING + representation.swelling
     scene = _composition(rng, suite, grammar)
     way = rng.random()
     if suite == SUITE and way < ALIGNED:
@@ -95,7 +95,7 @@ def _candidate(rng: np.random.Generator, suite: str, grammar: Grammar, held: Hel
             centre = palms[int(rng.integers(len(palms)))] + rng.normal(0.0, 0.18, 3)
             parts = [*parts, *place(solid(rng, 0.015, 0.2), shift(*centre))]
     parts = clear_parts(held.tables.both, _near(parts)[:MOST_OBSTACLES], ends, margin)
-    return Candidate(parts, ends, held, plan)
+    return Candidate(parts, ends, held, representation)
 
 
 def _composition(rng: np.random.Generator, suite: str, grammar: Grammar) -> Composition:

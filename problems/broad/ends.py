@@ -11,11 +11,10 @@ from numpy.typing import NDArray
 from apex_ompl.collision.shapes import world_geometry
 from apex_ompl.collision.tabulate import primitives
 from apex_ompl.kernel import Kernel, RobotTables, SceneTables
-from apex_ompl.kernel.compiled import arrays
 from apex_ompl.kernel.scene_builder import Solids, boxes_around, tables_of
 from apex_ompl.problems.broad.composition import Place
 from apex_ompl.problems.broad.held import Held
-from apex_ompl.problems.broad.shapes import BOX, CAPSULE, CYLINDER, SPHERE, Part
+from apex_ompl.problems.broad.shapes import Part, kernel_columns
 from apex_ompl.problems.scenes import DOWN, FORWARD
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.tasks.cover_clearance import has_clearance
@@ -31,8 +30,6 @@ PLACED, RESTING = 0.7, 0.07  # share of hands that are sent to places, and of st
 CONTORTED = 0.13  # share of states that are drawn evenly from the limits
 BATCH = 48  # such states at once
 REST_SPREAD = 0.15  # standard deviation of a state at rest around home [rad]
-KINDS = np.zeros(4, np.int64)
-KINDS[[BOX, SPHERE, CYLINDER, CAPSULE]] = arrays.BOX, arrays.SPHERE, arrays.CYLINDER, arrays.CAPSULE
 
 
 @cache
@@ -48,15 +45,8 @@ def scene_of(parts: Sequence[Part], swelling: float = 0.0) -> SceneTables:
         swelling: By how much every part is thicker on each side [m].
     """
     found = dict(enumerate(_fixtures()))
-    poses = np.array([part.pose for part in parts]).reshape(-1, 4, 4)
-    shape, rows = np.array([part.kind for part in parts], int), np.array([p.size for p in parts]).reshape(-1, 3)
-    bars, boxes = np.isin(shape, (CYLINDER, CAPSULE)), shape == BOX
-    size = np.zeros((len(parts), 3))
-    size[:, 0] = rows[:, 0] + swelling
-    size[bars, 1] = rows[bars, 1] / 2.0 + swelling * (shape[bars] == CYLINDER)
-    size[boxes] = rows[boxes] / 2.0 + swelling
-    kind, rotation, offset = KINDS[shape], poses[:, :3, :3].copy(), poses[:, :3, 3].copy()
-    around = boxes_around(kind, rotation, offset, size) if len(parts) else np.empty((0, 2, 3))
+    kind, rotation, offset, size = kernel_columns(parts, swelling)
+    around = boxes_around(kind, rotation, offset, size) if parts else np.empty((0, 2, 3))
     for k in range(len(parts)):
         one = slice(k, k + 1)
         found[len(found)] = Solids(kind[one], rotation[one], offset[one], size[one], around[one], (None,))

@@ -8,11 +8,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from apex_ompl.problems.broad.built import fan, ring, tube
 from apex_ompl.problems.broad.composition import FLOATING, Composition, Place, at
+from apex_ompl.problems.broad.compounds import fan, ring, tube
 from apex_ompl.problems.broad.shapes import CAPSULE, CYLINDER, Part, place, random_turn, rod, shift, turn
-
-FORWARD = (1.0, 0.0, 0.0)
+from apex_ompl.problems.scenes import FORWARD
 
 
 def blades(rng: np.random.Generator) -> Composition:

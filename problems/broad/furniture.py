@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from apex_ompl.problems.broad.built import between, hollow_box, stack, table
 from apex_ompl.problems.broad.composition import Composition, Place, at
+from apex_ompl.problems.broad.compounds import between, hollow_box, stack, table
 from apex_ompl.problems.broad.shapes import (
     CAPSULE,
     Part,
@@ -19,8 +19,7 @@ from apex_ompl.problems.broad.shapes import (
     shift,
     turn,
 )  # fmt: skip
-
-FORWARD, DOWN = (1.0, 0.0, 0.0), (0.0, 0.0, -1.0)
+from apex_ompl.problems.scenes import DOWN, FORWARD
 
 
 def rack(rng: np.random.Generator) -> Composition:

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from apex_ompl.problems.broad.built import frame, hollow_box, window
 from apex_ompl.problems.broad.composition import FLOATING, Composition, Place, at
+from apex_ompl.problems.broad.compounds import frame, hollow_box, window
 from apex_ompl.problems.broad.shapes import Part, box, line, moved, place, repeat, rod, shift, turn
-
-FORWARD, DOWN, LEFT, RIGHT = (1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0), (0.0, -1.0, 0.0)
+from apex_ompl.problems.scenes import DOWN, FORWARD
 
 
 def windows(rng: np.random.Generator) -> Composition:

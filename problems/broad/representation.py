@@ -53,7 +53,7 @@ class Group(NamedTuple):
         return round(COVERAGE * self.spacing, 4)
 
 
-class Plan(NamedTuple):
+class Representation(NamedTuple):
     """How parts are to be given, before it is known how many there are.
 
     Attributes:
@@ -83,19 +83,19 @@ class Plan(NamedTuple):
         return tuple(found)
 
 
-def draw_plan(rng: np.random.Generator) -> Plan:
+def draw_representation(rng: np.random.Generator) -> Representation:
     """Draw how the parts of a problem are given."""
     share, spacing = rng.random(), round(float(rng.uniform(*SPACING)), 4)
     a_mesh = MESH if rng.random() < 0.5 else SURFACE
     if share < PRIMITIVES_SHARE:
-        return Plan(("",), (1.0,), spacing)
+        return Representation(("",), (1.0,), spacing)
     if share < PRIMITIVES_SHARE + MESH_SHARE:
         pieces = int(rng.integers(1, 4))
-        return Plan((a_mesh,) * pieces, tuple(np.linspace(0, 1, pieces + 1)[1:].tolist()), spacing)
+        return Representation((a_mesh,) * pieces, tuple(np.linspace(0, 1, pieces + 1)[1:].tolist()), spacing)
     if share < PRIMITIVES_SHARE + MESH_SHARE + POINTS_SHARE:
-        return Plan((POINTS,), (1.0,), spacing)
+        return Representation((POINTS,), (1.0,), spacing)
     forms = [str(form) for form in rng.permutation(["", a_mesh, POINTS])]
-    return Plan(tuple(forms), (*np.sort(np.round(rng.uniform(size=2), 2)).tolist(), 1.0), spacing)
+    return Representation(tuple(forms), (*np.sort(np.round(rng.uniform(size=2), 2)).tolist(), 1.0), spacing)
 
 
 def feasible(parts: Sequence[Part], groups: Sequence[Group]) -> bool:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from apex_ompl.problems.broad.built import (
+from apex_ompl.problems.broad.composition import FLOATING, Composition, Place, places_at
+from apex_ompl.problems.broad.compounds import (
     arc,
     bend,
     bent_sheet,
@@ -18,7 +19,6 @@ from apex_ompl.problems.broad.built import (
     tube,
     window,
 )  # fmt: skip
-from apex_ompl.problems.broad.composition import FLOATING, Composition, Place, places_at
 from apex_ompl.problems.broad.shapes import (
     BOX,
     CAPSULE,

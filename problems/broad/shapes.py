@@ -6,14 +6,19 @@ returns new parts and leaves its arguments as they are.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
 
+from apex_ompl.kernel.compiled import arrays
+from apex_ompl.kernel.scene_builder import boxes_around
 from apex_ompl.types import Array, Flags
 
 BOX, SPHERE, CYLINDER, CAPSULE = range(4)
+KINDS = np.array([arrays.BOX, arrays.SPHERE, arrays.CYLINDER, arrays.CAPSULE])  # the kernel's
 THINNEST = 0.002  # least edge and radius [m]
 
 
@@ -50,10 +55,8 @@ def turn(axis: str | Point, angle: float) -> Array:
         angle: [rad].
     """
     direction = np.eye(3)["xyz".index(axis)] if isinstance(axis, str) else np.asarray(axis, float)
-    x, y, z = direction / np.linalg.norm(direction)
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     pose = np.eye(4)
-    pose[:3, :3] += np.sin(angle) * cross + (1.0 - np.cos(angle)) * cross @ cross
+    pose[:3, :3] = pin.exp3(angle / np.linalg.norm(direction) * direction)
     return pose
 
 
@@ -73,8 +76,9 @@ def along(a: Point, b: Point) -> tuple[Array, float]:
 
 def random_turn(rng: np.random.Generator) -> Array:
     """Return a rotation drawn evenly from all, shape (4, 4)."""
-    x, y, z, w = (q := rng.normal(size=4)) / np.linalg.norm(q)
-    return turn((x, y, z), 2.0 * float(np.arctan2(np.linalg.norm((x, y, z)), w)))
+    pose, q = np.eye(4), rng.normal(size=4)
+    pose[:3, :3] = pin.Quaternion(q / np.linalg.norm(q)).toRotationMatrix()
+    return pose
 
 
 def box(x: float, y: float, z: float, at: Point = (0.0, 0.0, 0.0)) -> Parts:
@@ -91,12 +95,6 @@ def rod(a: Point, b: Point, radius: float, kind: int = CYLINDER) -> Parts:
     """Return a cylinder, or a capsule, between two points, by its radius [m]."""
     pose, length = along(a, b)
     return [Part(kind, (max(radius, THINNEST), max(length, THINNEST), 0.0), pose)]
-
-
-def plank(a: Point, b: Point, width: float, thick: float) -> Parts:
-    """Return a box from one point to another, by its width across, level where it can be, and its thickness [m]."""
-    pose, length = along(a, b)
-    return [Part(BOX, (max(width, THINNEST), max(thick, THINNEST), max(length, THINNEST)), pose)]
 
 
 def place(parts: Iterable[Part], pose: Array) -> Parts:
@@ -166,16 +164,26 @@ def scale(parts: Iterable[Part], factor: float) -> Parts:
     return found
 
 
+def kernel_columns(parts: Sequence[Part], swelling: float = 0.0) -> tuple[NDArray[np.int64], Array, Array, Array]:
+    """Return kind, rotation, offset and size of parts as the kernel has them, a row each.
+
+    Args:
+        parts: The parts.
+        swelling: By how much every part is thicker on each side [m].
+    """
+    poses = np.array([part.pose for part in parts]).reshape(-1, 4, 4)
+    shape, rows = np.array([part.kind for part in parts], int), np.array([p.size for p in parts]).reshape(-1, 3)
+    bars, boxes = np.isin(shape, (CYLINDER, CAPSULE)), shape == BOX
+    size = np.zeros((len(parts), 3))
+    size[:, 0] = rows[:, 0] + swelling
+    size[bars, 1] = rows[bars, 1] / 2.0 + swelling * (shape[bars] == CYLINDER)
+    size[boxes] = rows[boxes] / 2.0 + swelling
+    return KINDS[shape], poses[:, :3, :3].copy(), poses[:, :3, 3].copy(), size
+
+
 def extents(parts: Sequence[Part]) -> Array:
     """Return the axis-aligned box around each part, shape (n, 2, 3) [m]."""
-    poses = np.array([part.pose for part in parts]).reshape(-1, 4, 4)
-    kind, size = np.array([part.kind for part in parts], int)[:, None], np.array([p.size for p in parts]).reshape(-1, 3)
-    turned, centre = np.abs(poses[:, :3, :3]), poses[:, :3, 3]
-    radius, half, up = size[:, :1], size[:, 1:2] / 2.0, turned[:, :, 2]
-    half_box = (turned @ size[:, :, None])[:, :, 0] / 2.0
-    half_rod = up * half + radius * np.sqrt(np.maximum(0.0, 1.0 - up**2))
-    reach = np.where(kind == BOX, half_box, np.where(kind == CYLINDER, half_rod, up * half + radius))
-    return np.stack([centre - reach, centre + reach], axis=1)
+    return boxes_around(*kernel_columns(parts)) if parts else np.empty((0, 2, 3))
 
 
 def bounds(parts: Sequence[Part]) -> Array:
@@ -211,8 +219,3 @@ def jitter(rng: np.random.Generator, parts: Iterable[Part], position: float, ang
         pose[:3, 3] += rng.normal(0.0, position, 3)
         found.append(Part(kind, size, pose))
     return found
-
-
-def choose(rng: np.random.Generator, *options: Callable[[], Parts]) -> Parts:
-    """Return what one of some functions gives."""
-    return options[int(rng.integers(len(options)))]()

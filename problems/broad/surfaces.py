@@ -7,48 +7,31 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from apex_ompl.problems.broad.shapes import BOX, CAPSULE, CYLINDER, SPHERE, Part
+from apex_ompl.kernel.compiled.cloud_distance import primitive_distances
+from apex_ompl.problems.broad.shapes import BOX, CAPSULE, CYLINDER, Part, kernel_columns
 from apex_ompl.types import Array
 
 SIDES, STACKS = 24, 6  # around a round part, and from the middle to the pole of a half ball
 HIDDEN = 1e-3  # depth in another part at which a triangle is left out of an open mesh [m]
 
-BOX_CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) / 2.0
-BOX_FACES = np.array([
-    [0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4],
-    [1, 5, 7], [1, 7, 3],
-])  # fmt: skip
-
 
 def distances(parts: Sequence[Part], points: Array) -> Array:
     """Return the signed distances of points, shape (n, 3), to each part, shape (parts, n) [m]."""
-    return np.stack([_distance(part, points) for part in parts])
-
-
-def _distance(part: Part, points: Array) -> Array:
-    local = (points - part.pose[:3, 3]) @ part.pose[:3, :3]
-    if part.kind == SPHERE:
-        found: Array = np.linalg.norm(local, axis=1) - part.size[0]
-        return found
-    if part.kind == CAPSULE:
-        local[:, 2] -= np.clip(local[:, 2], -part.size[1] / 2, part.size[1] / 2)
-        found = np.linalg.norm(local, axis=1) - part.size[0]
-        return found
-    if part.kind == CYLINDER:
-        over = np.stack([np.hypot(local[:, 0], local[:, 1]) - part.size[0], np.abs(local[:, 2]) - part.size[1] / 2], 1)
-    else:
-        over = np.abs(local) - np.array(part.size) / 2.0
-    found = np.linalg.norm(np.maximum(over, 0.0), axis=1) + np.minimum(over.max(axis=1), 0.0)
+    found = np.empty((len(parts), len(points)))
+    for k, (kind, rotation, offset, size) in enumerate(zip(*kernel_columns(parts), strict=True)):
+        primitive_distances(np.ascontiguousarray((points - offset) @ rotation), int(kind), size, found[k])
     return found
 
 
 def triangles(part: Part) -> tuple[Array, NDArray[np.int64]]:
     """Return the vertices, shape (V, 3) [m], and the triangles, shape (T, 3), of a part; they lie on its surface."""
+    from trimesh import creation  # takes half a second
+
     if part.kind == BOX:
-        vertices, faces = BOX_CORNERS * np.array(part.size), BOX_FACES
+        made = creation.box(part.size)
     else:
-        vertices, faces = _turned(_profile(part))
-    return vertices @ part.pose[:3, :3].T + part.pose[:3, 3], faces
+        made = creation.revolve(_profile(part), sections=SIDES)
+    return made.vertices @ part.pose[:3, :3].T + part.pose[:3, 3], np.asarray(made.faces, np.int64)
 
 
 def _profile(part: Part) -> Array:
@@ -61,24 +44,6 @@ def _profile(part: Part) -> Array:
     upper[-1, 0] = 0.0
     lower = (upper * (1.0, -1.0))[::-1]
     return np.concatenate([lower, upper if part.kind == CAPSULE else upper[1:]])
-
-
-def _turned(profile: Array) -> tuple[Array, NDArray[np.int64]]:
-    """Return the closed surface of revolution of a profile whose ends are poles."""
-    angles = np.arange(SIDES) * 2.0 * np.pi / SIDES
-    circle = np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    rings = [np.column_stack([r * circle, np.full(SIDES, z)]) for r, z in profile[1:-1]]
-    vertices = np.concatenate([[(0.0, 0.0, profile[0, 1])], *rings, [(0.0, 0.0, profile[-1, 1])]])
-    here = np.arange(SIDES)
-    after, top, faces = (here + 1) % SIDES, len(vertices) - 1, []
-    faces.append(np.stack([np.zeros_like(here), 1 + after, 1 + here], axis=1))
-    for k in range(len(rings) - 1):
-        low, high = 1 + k * SIDES, 1 + (k + 1) * SIDES
-        faces.append(np.stack([low + here, low + after, high + after], axis=1))
-        faces.append(np.stack([low + here, high + after, high + here], axis=1))
-    last = 1 + (len(rings) - 1) * SIDES
-    faces.append(np.stack([last + here, last + after, np.full(SIDES, top)], axis=1))
-    return vertices, np.concatenate(faces)
 
 
 def mesh(parts: Sequence[Part], *, is_open: bool) -> tuple[Array, NDArray[np.int64]]:

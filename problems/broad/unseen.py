@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from apex_ompl.problems.broad.built import bend, hollow_box, ring, sagging, smooth, tube
 from apex_ompl.problems.broad.composition import Composition, Place, at, places_at
+from apex_ompl.problems.broad.compounds import bend, hollow_box, ring, sagging, smooth, tube
 from apex_ompl.problems.broad.shapes import (
     CAPSULE,
     Part,
@@ -27,9 +27,8 @@ from apex_ompl.problems.broad.shapes import (
     shift,
     turn,
 )  # fmt: skip
+from apex_ompl.problems.scenes import DOWN, FORWARD
 from apex_ompl.types import Array
-
-FORWARD, DOWN = (1.0, 0.0, 0.0), (0.0, 0.0, -1.0)
 
 
 def pipework(rng: np.random.Generator) -> Composition:

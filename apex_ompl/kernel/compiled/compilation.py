@@ -13,7 +13,6 @@ import logging
 import os
 import platform
 import sys
-import tempfile
 import threading
 import time
 from collections.abc import Callable
@@ -27,6 +26,7 @@ from numba.core import config
 from numba.core.sigutils import normalize_signature
 
 from apex_ompl.kernel.compiled.linking import InnerCompiler
+from apex_ompl.util.cache import user_cache
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -56,17 +56,7 @@ def _digest() -> str:
 def cache_folder() -> Path | None:
     """Return the folder that compiled code is kept in, or None when no place for it can be written."""
     given = os.environ.get("NUMBA_CACHE_DIR")
-    homes = [Path(given)] if given else []
-    homes.append(Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache"))
-    for home in homes:
-        try:
-            folder = home.expanduser() / "apex_ompl" / f"kernel-{_digest()}"
-            folder.mkdir(parents=True, exist_ok=True)
-            tempfile.TemporaryFile(dir=folder).close()
-        except (OSError, RuntimeError):  # RuntimeError: the user has no home folder
-            continue
-        return folder
-    return None
+    return user_cache(f"kernel-{_digest()}", (given,) if given else ())
 
 
 def names_in_cache() -> set[str]:
