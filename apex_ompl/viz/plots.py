@@ -14,11 +14,11 @@ from apex_ompl.ompl_adapter.setup import assemble
 from apex_ompl.result import PlanResult
 from apex_ompl.robot.identity import load_same_robot
 from apex_ompl.util.files import suffix_of, write_atomically
+from apex_ompl.viz.curves import ORDERS, clearances, shares_of_limits
 
 FORMATS = (".png", ".pdf", ".svg")
 TIME_STEP, MAX_SAMPLES = 0.002, 4000  # of a curve [s]
 CLEARANCE_SAMPLES = 128
-ROWS = ("position", "velocity", "acceleration", "jerk")
 
 
 def plot_motion(result: PlanResult, out: str | os.PathLike[str]) -> None:
@@ -42,20 +42,17 @@ def plot_motion(result: PlanResult, out: str | os.PathLike[str]) -> None:
     if motion is None:
         raise ParameterError("result", str(result.status), "one with a timed motion")
     robot = load_same_robot(result.problem.robot, result.robot_digest)
-    checker, limits = assemble(result.problem, robot).checker, robot.limits
-    centre, half_range = (limits.upper + limits.lower) / 2.0, (limits.upper - limits.lower) / 2.0
+    checker = assemble(result.problem, robot).checker
     if result.joint_names != robot.joint_names:
         raise ParameterError("result", ", ".join(result.joint_names), f"the joints of {robot.name}")
-    times = motion.sample(max(TIME_STEP, motion.duration / MAX_SAMPLES)).time
-    scaled = [(motion(times) - centre) / half_range]
-    bounds = (limits.velocity, limits.acceleration, limits.jerk)
-    scaled += [motion(times, order) / bound for order, bound in enumerate(bounds, 1)]
+    times = np.asarray(motion.sample(max(TIME_STEP, motion.duration / MAX_SAMPLES)).time)
+    scaled = shares_of_limits(motion, robot, times)
     groups = robot.groups or {"joints": np.arange(robot.dof)}
 
     figure = Figure(figsize=(4.2 * len(groups), 11), layout="constrained")
-    grid = figure.add_gridspec(len(ROWS) + 1, len(groups))
+    grid = figure.add_gridspec(len(ORDERS) + 1, len(groups))
     for column, (group, joints) in enumerate(groups.items()):
-        for row, (name, values) in enumerate(zip(ROWS, scaled, strict=True)):
+        for row, (name, values) in enumerate(zip(ORDERS, scaled, strict=True)):
             axis = figure.add_subplot(grid[row, column])
             for joint in joints:
                 axis.plot(times, values[:, joint], linewidth=1.2, label=robot.joint_names[joint])
@@ -71,8 +68,8 @@ def plot_motion(result: PlanResult, out: str | os.PathLike[str]) -> None:
             if column == 0:
                 axis.set_ylabel(f"{name}\nshare of limit", fontsize=9)
     clearance_times = np.linspace(0.0, motion.duration, CLEARANCE_SAMPLES)
-    axis = figure.add_subplot(grid[len(ROWS), :])
-    axis.plot(clearance_times, [1e3 * checker.clearance(q) for q in motion(clearance_times)], color="#0b6e4f")
+    axis = figure.add_subplot(grid[len(ORDERS), :])
+    axis.plot(clearance_times, 1e3 * clearances(checker, motion(clearance_times)), color="#0b6e4f")
     axis.set_ylim(bottom=0.0)
     axis.grid(alpha=0.25)
     axis.set_ylabel("clearance mm", fontsize=9)

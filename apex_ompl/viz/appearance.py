@@ -1,0 +1,205 @@
+"""How a scene looks: one list of items that pictures, films and pages are drawn from.
+
+Obstacles are red, fixtures have the colour of wood, held objects have colours of their own. The contact faces of an
+alignment are arrows along their outward axes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import trimesh
+
+from apex_ompl.collision.clouds import cloud_of
+from apex_ompl.collision.shapes import coal_geometry, is_shell
+from apex_ompl.ompl_adapter.setup import PlanningSetup
+from apex_ompl.robot import Robot
+from apex_ompl.scene.bodies import Body
+from apex_ompl.scene.meshes import triangles
+from apex_ompl.types import Array
+
+ROBOT, HELD, FACES, FIXTURES, OBSTACLES = LAYERS = ("robot", "held", "faces", "fixtures", "obstacles")
+"""Layers of items: the first three move with the robot."""
+
+GHOST_OPACITY = 0.3
+HELD_COLOURS = ("#2a9d8f", "#e9a03b", "#8e6bbf", "#4c78a8")
+OBSTACLE, FIXTURE, BACKGROUND, EDGE, CONTACT = "#c8553d", "#c9a77c", "#f4f4f1", "#6b2d20", "#e0101b"
+HAND, LINK = "#4a4e57", "#d9dce1"
+SIDE_COLOURS = {"left": "#e8eef4", "right": "#f3ece2"}
+FACE_COLOURS = ("#d62728", "#1f4ed8")
+WAY_COLOURS = ("#1f6fb4", "#d97a1a", "#2b9348", "#8e44ad")  # of the ways of hands
+SOLID, PLATE = 0.9, 0.14  # opacities of obstacles; thin plates show what is behind them
+ARROW_LENGTH = 0.12  # [m]
+MOST_POINTS = 30_000  # that are drawn of a cloud
+HALF_SPACE_EDGE = 3.0  # edge of the square that stands for a half-space [m]
+SECTIONS, FINE = 32, 0.05  # of round shapes; spheres and capsules of a larger radius have more triangles [m]
+
+
+@dataclass(frozen=True, eq=False)
+class Item:
+    """One thing that is drawn: a mesh, or balls around points.
+
+    Attributes:
+        name: Name, unique among the items of a layer.
+        layer: One of ``LAYERS``.
+        body: Name of the link, the held object, the fixture or the obstacle that it is, or is part of.
+        colour: As ``#rrggbb``.
+        opacity: 0 to 1.
+        joint: Joint of the robot's model that carries it; 0 for the world.
+        placement: Pose in the frame of that joint, shape (4, 4).
+        mesh: The mesh, or None for balls.
+        points: Centres of the balls, shape (N, 3) [m]; none for a mesh.
+        radius: Of the balls [m].
+    """
+
+    name: str
+    layer: str
+    body: str
+    colour: str
+    opacity: float
+    joint: int
+    placement: Array
+    mesh: trimesh.Trimesh | None = None
+    points: Array | None = None
+    radius: float = 0.0
+
+    @property
+    def moves(self) -> bool:
+        """Whether it moves with the robot."""
+        return self.joint > 0
+
+    @property
+    def ghost(self) -> Item:
+        """A translucent copy."""
+        return replace(self, opacity=GHOST_OPACITY)
+
+
+def items_of(setup: PlanningSetup) -> list[Item]:
+    """Return all items of a problem: the robot, what it holds, contact faces, fixtures and obstacles."""
+    robot = setup.robot
+    return [
+        *robot_items(robot),
+        *held_items(setup),
+        *face_items(setup),
+        *(body_item(body, FIXTURES) for body in robot.fixtures),
+        *(body_item(body, OBSTACLES) for body in setup.problem.scene),
+    ]
+
+
+def robot_items(robot: Robot, coarse: bool = False) -> Iterator[Item]:
+    """Yield the visual meshes of a robot's links, or its coarser collision geometry."""
+    if coarse:
+        shapes = robot.geometry
+    else:
+        shapes = pin.buildGeomFromUrdfString(robot.model, robot.urdf, pin.GeometryType.VISUAL)
+    for k, item in enumerate(shapes.geometryObjects):
+        is_hand = "hand" in item.name or "gripper" in item.name
+        colour = HAND if is_hand else SIDE_COLOURS.get(item.name.split("_", 1)[0], LINK)
+        link = robot.model.frames[item.parentFrame].name
+        place = np.array(item.placement.homogeneous)
+        yield Item(f"{k}_{item.name}", ROBOT, link, colour, 1.0, item.parentJoint, place, mesh_of(item.geometry))
+
+
+def held_items(setup: PlanningSetup) -> Iterator[Item]:
+    """Yield the held objects of a problem."""
+    robot = setup.robot
+    for k, held in enumerate(setup.problem.attached):
+        frame = robot.model.frames[robot.link_frame(held.link)]
+        place = np.array((frame.placement * pin.SE3(held.pose)).homogeneous)
+        colour = HELD_COLOURS[k % len(HELD_COLOURS)]
+        yield _item(held, HELD, colour, 1.0, (frame.parentJoint, place))
+
+
+def face_items(setup: PlanningSetup) -> Iterator[Item]:
+    """Yield an arrow for each contact face of an alignment, along its outward axis."""
+    if setup.alignment is None:
+        return
+    robot = setup.robot
+    for face, colour in zip((setup.alignment.first, setup.alignment.second), FACE_COLOURS, strict=True):
+        frame = robot.model.frames[robot.link_frame(face.link)]
+        name, place = f"face_{face.link}", np.array(frame.placement.homogeneous)
+        yield Item(name, FACES, face.link, colour, 1.0, frame.parentJoint, place, arrow(face.point, face.axis))
+
+
+def body_item(body: Body, layer: str) -> Item:
+    """Return a fixture or an obstacle as an item."""
+    if layer == FIXTURES:
+        return _item(body, layer, FIXTURE, 1.0, (0, body.pose))
+    return _item(body, layer, OBSTACLE, PLATE if is_thin_plate(body) else SOLID, (0, body.pose))
+
+
+def _item(body: Body, layer: str, colour: str, opacity: float, at: tuple[int, Array]) -> Item:
+    geometry = coal_geometry(body)
+    cloud = cloud_of(geometry)
+    plain = Item(body.name, layer, body.name, colour, opacity, *at)
+    if cloud is None:
+        return replace(plain, mesh=mesh_of(geometry))
+    points = np.asarray(cloud.points[:: len(cloud.points) // MOST_POINTS + 1], float)
+    return replace(plain, points=points, radius=float(cloud.radius))
+
+
+def mesh_of(geometry: Any) -> trimesh.Trimesh:
+    """Return the mesh of a Coal geometry; a half-space becomes a square."""
+    kind, found = type(geometry).__name__, trimesh.Trimesh()
+    if is_shell(geometry):
+        found = trimesh.Trimesh(*triangles(geometry), process=False)
+    elif kind == "Box":
+        found = trimesh.creation.box(2.0 * np.asarray(geometry.halfSide))
+    elif kind == "Sphere":
+        found = trimesh.creation.icosphere(3 if geometry.radius > FINE else 2, geometry.radius)
+    elif kind == "Cylinder":
+        found = trimesh.creation.cylinder(geometry.radius, 2.0 * geometry.halfLength, sections=SECTIONS)
+    elif kind == "Capsule":
+        count = SECTIONS if geometry.radius > FINE else SECTIONS // 2
+        found = trimesh.creation.capsule(2.0 * geometry.halfLength, geometry.radius, count=[count, count])
+    else:
+        normal, half = np.asarray(geometry.n, float), 0.5 * HALF_SPACE_EDGE
+        corners = half * np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
+        found = trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], process=False)
+        found.apply_transform(_turned_to(normal, normal * float(geometry.d)))
+    return found
+
+
+def arrow(point: Sequence[float] | Array, axis: Sequence[float] | Array) -> trimesh.Trimesh:
+    """Return an arrow from a point along a direction, both of shape (3,)."""
+    shaft = trimesh.creation.cylinder(0.035 * ARROW_LENGTH, 0.7 * ARROW_LENGTH)
+    shaft.apply_translation([0.0, 0.0, 0.35 * ARROW_LENGTH])
+    tip = trimesh.creation.cone(0.09 * ARROW_LENGTH, 0.3 * ARROW_LENGTH)
+    tip.apply_translation([0.0, 0.0, 0.7 * ARROW_LENGTH])
+    whole = trimesh.Trimesh(
+        np.concatenate([shaft.vertices, tip.vertices]), np.concatenate([shaft.faces, tip.faces + len(shaft.vertices)])
+    )
+    whole.apply_transform(_turned_to(np.asarray(axis, float), point))
+    return whole
+
+
+def is_thin_plate(body: Body) -> bool:
+    """Whether a body is a thin plate, which is drawn translucent to show what is behind it."""
+    return body.box is not None and min(body.box) <= 0.25 * sorted(body.box)[1]
+
+
+def joint_poses(robot: Robot, data: pin.Data, q: Array) -> list[Array]:
+    """Return the poses of all joints of a robot's model at a state, each of shape (4, 4).
+
+    Args:
+        robot: The robot.
+        data: Data of its model, which are overwritten.
+        q: The state, shape (dof,) [rad].
+    """
+    pin.forwardKinematics(robot.model, data, robot.to_pinocchio(q))
+    return [np.array(pose.homogeneous) for pose in data.oMi]
+
+
+def end_links(robot: Robot) -> list[str]:
+    """Return the links whose ways are drawn: the palms, or else the last link."""
+    return [hand.palm for hand in robot.hands.values()] or [robot.link_names[-1]]
+
+
+def _turned_to(direction: Array, origin: Sequence[float] | Array) -> Array:
+    """Return a pose whose z axis has a direction."""
+    turn = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), np.asarray(direction, float)).matrix()
+    return np.array(pin.SE3(turn, np.asarray(origin, float)).homogeneous)

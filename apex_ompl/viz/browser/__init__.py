@@ -1,0 +1,1 @@
+"""Scenes, motions and plans in a browser, live or as pages that play offline."""

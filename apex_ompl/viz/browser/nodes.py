@@ -1,0 +1,149 @@
+"""Nodes of a page: items of a scene below the joints that carry them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import trimesh
+from numpy.typing import NDArray
+
+from apex_ompl.robot import Robot
+from apex_ompl.types import Array
+from apex_ompl.viz.appearance import CONTACT, ROBOT, Item
+
+FLAT = 300  # meshes with fewer triangles are shaded flat
+LINK_TRIANGLES, MOST_TRIANGLES = 3_000, 20_000  # that are kept of a link's mesh, and of another one
+STILL = 1e-7  # change of a pose's numbers below which it is not sent
+SIZE = 2.0  # of a drawn point, in radii of its ball
+
+
+def rgb(colour: str) -> tuple[int, int, int]:
+    """Return the numbers of a colour ``#rrggbb``."""
+    return (int(colour[1:3], 16), int(colour[3:5], 16), int(colour[5:7], 16))
+
+
+def turn_of(pose: Array) -> Array:
+    """Return the quaternion wxyz of a pose, shape (4, 4)."""
+    x, y, z, w = pin.Quaternion(np.ascontiguousarray(pose[:3, :3])).coeffs()
+    return np.array([w, x, y, z])
+
+
+def pose_of(wxyz: Any, position: Any) -> Array:
+    """Return a pose, shape (4, 4), of a quaternion wxyz and a position [m]."""
+    w, x, y, z = (float(v) for v in wxyz)
+    turn = pin.Quaternion(w, x, y, z).normalized().matrix()
+    return np.array(pin.SE3(turn, np.asarray(position, float)).homogeneous)
+
+
+def add_item(api: Any, name: str, item: Item, placement: Array | None = None) -> Any:
+    """Add an item below a node, and return its handle.
+
+    Args:
+        api: The scene of a ``viser`` server.
+        name: Path of the node.
+        item: The item.
+        placement: Pose in the frame of the node above, shape (4, 4); by default the item's.
+    """
+    pose = item.placement if placement is None else placement
+    at = {"wxyz": turn_of(pose), "position": pose[:3, 3]}
+    if item.mesh is None:
+        points = np.asarray(item.points, np.float32)
+        return api.add_point_cloud(
+            name, points, rgb(item.colour), point_size=SIZE * item.radius, point_shape="circle", precision="float32",
+            **at,
+        )  # fmt: skip
+    vertices, faces = lighter(item.mesh, LINK_TRIANGLES if item.layer == ROBOT else MOST_TRIANGLES)
+    return api.add_mesh_simple(
+        name, vertices, faces, color=rgb(item.colour), opacity=None if item.opacity >= 1.0 else item.opacity,
+        flat_shading=len(faces) < FLAT, side="double", cast_shadow=False, receive_shadow=False, **at,
+    )  # fmt: skip
+
+
+def lighter(mesh: trimesh.Trimesh, most: int) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
+    """Return vertices and triangles of a mesh, or of one like it with fewer triangles where it has too many."""
+    vertices, faces = np.array(mesh.vertices, np.float32), np.array(mesh.faces, np.int32)
+    if len(faces) > most:
+        import fast_simplification
+
+        vertices, faces = fast_simplification.simplify(vertices, faces, target_count=most)
+    return vertices, np.asarray(faces, np.uint32)
+
+
+class RobotNodes:
+    """A copy of a robot with what it holds, at a state that can be changed.
+
+    Frames of joints are nested as the joints are, and only those that move are sent.
+
+    Attributes:
+        robot: The robot.
+        root: Handle of the node above all.
+    """
+
+    def __init__(
+        self, api: Any, root: str, robot: Robot, items: Iterable[Item], joints: Iterable[int] = (),
+        *,
+        visible: bool = True,
+    ) -> None:  # fmt: skip
+        """Add the items that move with ``robot`` below the node ``root``, and nodes of further joints."""
+        self.robot = robot
+        self._data, self._model = robot.model.createData(), robot.model
+        items = list(items)
+        self.root = api.add_frame(root, show_axes=False, visible=visible)
+        self._paths, self._frames, self._sent = {0: root}, {}, dict[int, Array]()
+        for joint in sorted({j for k in (*joints, *(item.joint for item in items)) for j in self._chain(k)}):
+            path = f"{self._paths[int(self._model.parents[joint])]}/{joint}"
+            self._paths[joint], self._frames[joint] = path, api.add_frame(path, show_axes=False)
+        self._handles = [(item, add_item(api, f"{self._paths[item.joint]}/{plain(item.name)}", item)) for item in items]
+
+    def _chain(self, joint: int) -> Iterable[int]:
+        while joint > 0:
+            yield joint
+            joint = int(self._model.parents[joint])
+
+    def path_of(self, joint: int) -> str:
+        """Return the path of the node of a joint that carries something."""
+        return self._paths[joint]
+
+    def show(self, q: Array) -> None:
+        """Move to a state, shape (dof,)."""
+        pin.forwardKinematics(self._model, self._data, self.robot.to_pinocchio(q))
+        for joint, frame in self._frames.items():
+            pose = np.array(self._data.liMi[joint].homogeneous)
+            known = self._sent.get(joint)
+            if known is None or np.abs(pose[:3, :3] - known[:3, :3]).max() > STILL:
+                frame.wxyz = turn_of(pose)
+            if known is None or np.abs(pose[:3, 3] - known[:3, 3]).max() > STILL:
+                frame.position = pose[:3, 3]
+            self._sent[joint] = pose
+
+    def mark(self, bodies: Sequence[str]) -> None:
+        """Draw links and held objects of some names in the colour of contacts, and all others in their own."""
+        for item, handle in self._handles:
+            colour = rgb(CONTACT if item.body in bodies else item.colour)
+            if item.mesh is not None and tuple(handle.color) != colour:
+                handle.color = colour
+
+
+def plain(name: str) -> str:
+    """Return a name without slashes, which would part nodes."""
+    return name.replace("/", "_")
+
+
+def add_way(api: Any, name: str, points: Array, colour: str, thickness: float = 0.006) -> Any:
+    """Add a line through points, shape (N, 3) [m], and return its handle."""
+    pieces = np.stack([points[:-1], points[1:]], axis=1).astype(np.float32)
+    return api.add_line_segments(name, pieces, rgb(colour), thickness=thickness)
+
+
+def link_ways(robot: Robot, links: Sequence[str], states: Iterable[Array]) -> list[Array]:
+    """Return the way of each link's origin through states, each of shape (N, 3) [m]."""
+    data, numbers = robot.model.createData(), [robot.link_frame(link) for link in links]
+    ways: list[list[Array]] = [[] for _ in numbers]
+    for q in states:
+        pin.framesForwardKinematics(robot.model, data, robot.to_pinocchio(q))
+        for way, number in zip(ways, numbers, strict=True):
+            way.append(np.array(data.oMf[number].translation))
+    return [np.array(way) for way in ways]

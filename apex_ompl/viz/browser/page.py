@@ -1,0 +1,168 @@
+"""Pages that play offline: one self-contained file with a scene, its motion, and curves beside it."""
+
+from __future__ import annotations
+
+import html
+import io
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from apex_ompl.types import Array
+from apex_ompl.util.files import check_writable, write_atomically
+from apex_ompl.viz.appearance import BACKGROUND, end_links
+from apex_ompl.viz.browser.nodes import rgb
+from apex_ompl.viz.browser.scene import BrowserScene
+from apex_ompl.viz.browser.server import serving
+from apex_ompl.viz.browser.shown import Shown, ordered
+
+FRAME_RATE = 30.0  # [1/s]
+HOLD = 0.6  # how long the last state stays [s]
+WAY_STATES = 80
+FIELD_OF_VIEW = 0.75  # [rad]
+SVG_SIZE = (3.4, 2.6)  # of the curves [inch]
+
+PANEL = """
+<style>
+#facts {{position: fixed; top: 12px; right: 12px; z-index: 5; max-width: 330px; font: 13px/1.4 sans-serif;
+  background: rgba(255, 255, 255, 0.88); border-radius: 6px; padding: 8px 12px; color: #222; pointer-events: none}}
+#facts svg {{width: 100%; height: auto; display: block}}
+#facts p {{margin: 2px 0}}
+@media (max-width: 700px) {{#facts svg {{display: none}}}}
+</style>
+<div id="facts">{facts}{curves}</div>
+<script>
+(function () {{
+  const duration = {duration}, left = {left}, right = {right};
+  function move() {{
+    const slider = document.querySelector('[role="slider"]'), cursor = document.getElementById("cursor");
+    if (slider && cursor && duration > 0) {{
+      const share = Math.min(parseFloat(slider.getAttribute("aria-valuenow")) / duration, 1.0);
+      cursor.setAttribute("transform", "translate(" + share * (right - left) + ", 0)");
+    }}
+    window.requestAnimationFrame(move);
+  }}
+  move();
+}})();
+</script>
+"""
+"""What stands over the scene: facts, curves, and a cursor that follows the player's slider."""
+
+
+def write_page(sources: Sequence[Shown], out: str | os.PathLike[str], cover: bool = False) -> None:
+    """Write problems or results, side by side, as one page that needs no network.
+
+    The motions play together; the page has a slider, speeds, and a tree of the scene in which layers can be hidden.
+
+    Args:
+        sources: What it shows.
+        out: Where to write: .html.
+        cover: Whether the page has the sphere cover as a layer; it is hidden at first.
+
+    Raises:
+        MissingFileError: The file cannot be written, or the ``view`` extra is not installed.
+    """
+    path = Path(out)
+    check_writable(path)
+    with serving() as server:
+        text = _recorded(server, sources, cover)
+    end = text.rindex("</body>")
+    write_atomically(path, (text[:end] + _panel(sources) + text[end:]).encode())
+
+
+def _recorded(server: Any, sources: Sequence[Shown], cover: bool) -> str:
+    scenes = draw(server, sources)
+    if cover:
+        for one, scene in zip(sources, scenes, strict=True):
+            scene.show_cover(one.setup.start, visible=False)
+    recorder = server.get_scene_serializer()
+    duration = max(one.duration for one in sources)
+    if duration > 0.0:
+        times = np.linspace(0.0, duration, max(2, round(duration * FRAME_RATE) + 1))
+        for time in times:
+            for one, scene in zip(sources, scenes, strict=True):
+                scene.show(one.state(float(time)))
+            recorder.insert_sleep(duration / (len(times) - 1))
+        recorder.insert_sleep(HOLD)
+    found: str = recorder.as_html()
+    return found
+
+
+def draw(server: Any, sources: Sequence[Shown]) -> list[BrowserScene]:
+    """Draw what is shown, side by side, with ghosts and ways, and point the camera at it."""
+    scenes = []
+    server.scene.set_background_image(np.full((1, 1, 3), rgb(BACKGROUND), np.uint8), format="png")
+    for k, (one, offset) in enumerate(ordered(sources)):
+        scene = BrowserScene(server.scene, one.setup, f"/{k + 1}", offset)
+        for name, q, fault in one.faults:
+            if name != "start" or one.duration > 0.0:
+                scene.explain(name, scene.show_ghost(f"{name} ghost", q), q, fault)
+            else:
+                scene.explain(name, scene.robot, q, fault)
+        if one.duration > 0.0:
+            scene.show_ways(one.states(WAY_STATES))
+        scene.show(one.state(0.0))
+        scenes.append(scene)
+    place_camera(server, sources)
+    return scenes
+
+
+def place_camera(server: Any, sources: Sequence[Shown]) -> None:
+    """Point the camera at the middle of hands and scenes, from the front of the robot."""
+    points = []
+    for one, offset in ordered(sources):
+        ready = one.setup
+        states = (ready.start, *ready.goals[:1])
+        points += [ready.robot.link_pose(q, link)[:3, 3] + offset for q in states for link in end_links(ready.robot)]
+        points += [body.pose[:3, 3] + offset for body in ready.problem.scene if body.half_space is None]
+    low, high = np.min(points, axis=0), np.max(points, axis=0)
+    middle: Array = 0.5 * (low + high)
+    focus = np.array([0.5 * middle[0], middle[1], max(0.3, 0.7 * middle[2])])
+    away = max(2.9, 1.2 * float(np.abs(high - low)[:2].max()))
+    server.initial_camera.look_at = focus
+    server.initial_camera.position = focus + away * np.array([0.85, 0.42, 0.45])
+    server.initial_camera.fov = FIELD_OF_VIEW
+    server.initial_camera.up = (0.0, 0.0, 1.0)
+
+
+def _panel(sources: Sequence[Shown]) -> str:
+    """Return the facts and the curves as HTML."""
+    facts = "".join(
+        f"<p>{html.escape(row).replace('**', '')}</p>" for one in sources for row in one.facts.split("\n\n") if row
+    )
+    duration = max(one.duration for one in sources) + HOLD
+    curves, left, right = _curves(sources, duration)
+    return PANEL.format(facts=facts, curves=curves, duration=duration, left=left, right=right)
+
+
+def _curves(sources: Sequence[Shown], duration: float) -> tuple[str, float, float]:
+    """Return clearance and use of limits over time as SVG, and the axes' left and right border in its units."""
+    timed = [one for one in sources if one.curves]
+    if not timed:
+        return "", 0.0, 0.0
+    with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "apex", "font.size": 7}):
+        figure = Figure(figsize=SVG_SIZE)
+        axes = figure.subplots(2, 1, sharex=True)
+        figure.subplots_adjust(left=0.13, right=0.97, top=0.98, bottom=0.13, hspace=0.12)
+        for k, one in enumerate(timed):
+            curves, style = one.curves, ("-", "--", ":", "-.")[k % 4]
+            axes[0].plot(curves["time"], curves["clearance"], style, color="#0b6e4f", linewidth=1.0)
+            for name, colour in (("velocity", "#1f6fb4"), ("acceleration", "#d97a1a"), ("jerk", "#8e44ad")):
+                label = name if k == 0 else None
+                axes[1].plot(curves["time"], curves[name], style, color=colour, linewidth=0.8, label=label)
+        axes[0].set(ylabel="clearance mm", ylim=(0.0, None), xlim=(0.0, duration))
+        axes[1].set(ylabel="share of limit", xlabel="time s", ylim=(0.0, 1.05))
+        axes[1].legend(fontsize=6, loc="upper right", frameon=False)
+        cursor = figure.add_artist(Line2D([0.13, 0.13], [0.13, 0.98], color="#c8553d", linewidth=0.9))
+        cursor.set_gid("cursor")
+        buffer = io.StringIO()
+        figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None})
+    drawn = buffer.getvalue()
+    width = 72.0 * SVG_SIZE[0]
+    return drawn[drawn.index("<svg") :], 0.13 * width, 0.97 * width

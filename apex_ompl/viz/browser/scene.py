@@ -1,0 +1,183 @@
+"""One scene of a page: a problem with its robot, ghosts, ways of the hands, sphere cover and contacts."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import trimesh
+
+from apex_ompl.collision.tabulate import joint_tree
+from apex_ompl.ompl_adapter.setup import PlanningSetup
+from apex_ompl.scene.bodies import Obstacle
+from apex_ompl.types import Array
+from apex_ompl.viz.appearance import (
+    CONTACT,
+    EDGE,
+    OBSTACLES,
+    ROBOT,
+    SOLID,
+    WAY_COLOURS,
+    Item,
+    body_item,
+    end_links,
+    items_of,
+    robot_items,
+)
+from apex_ompl.viz.browser.nodes import RobotNodes, add_item, add_way, link_ways, plain, rgb, turn_of
+
+COVER, COVER_OPACITY = "#3a86c8", 0.35
+LABEL_HEIGHT = 0.1  # of a label above what it is about [m]
+
+
+class BrowserScene:
+    """Nodes of one problem below a root, with the robot at a state that can be changed.
+
+    Attributes:
+        setup: The problem.
+        robot: Nodes of the robot with what it holds.
+        obstacles: Handles of obstacles by name.
+    """
+
+    def __init__(self, api: Any, setup: PlanningSetup, root: str = "/scene", offset: Sequence[float] = (0, 0, 0)):
+        """Add a problem.
+
+        Args:
+            api: The scene of a ``viser`` server.
+            setup: The problem.
+            root: Path of the node above all.
+            offset: Where that is [m].
+        """
+        self.setup, self._api, self._root = setup, api, root
+        api.add_frame(root, show_axes=False, position=np.asarray(offset, float))
+        items = items_of(setup)
+        self._moving = [item for item in items if item.moves]
+        self.robot = RobotNodes(api, f"{root}/robot", setup.robot, self._moving)
+        self.obstacles: dict[str, Any] = {}
+        for item in items:
+            if not item.moves:
+                self._add(item)
+        self._ghosts: dict[str, RobotNodes] = {}
+        self._cover: RobotNodes | None = None
+        self._labels: dict[str, Any] = {}
+
+    def _add(self, item: Item) -> None:
+        handle = add_item(self._api, f"{self._root}/{item.layer}/{plain(item.name)}", item)
+        if item.layer == OBSTACLES:
+            self.obstacles[item.name] = handle
+            if item.mesh is not None and item.opacity < 0.5 * SOLID:
+                lines = _edges(item.mesh)
+                path = f"{self._root}/{item.layer}/{plain(item.name)}/edges"
+                self._api.add_line_segments(path, lines, rgb(EDGE), thickness=0.003)
+
+    def show(self, q: Array) -> None:
+        """Put the robot, and its sphere cover if there is one, at a state of shape (dof,)."""
+        self.robot.show(q)
+        if self._cover is not None:
+            self._cover.show(q)
+
+    def show_ghost(self, name: str, q: Array) -> RobotNodes:
+        """Put a translucent copy of the robot, made if need be, at a state, and return it."""
+        if name not in self._ghosts:
+            coarse = robot_items(self.setup.robot, coarse=True)
+            items = [item.ghost for item in (*coarse, *(one for one in self._moving if one.layer != ROBOT))]
+            self._ghosts[name] = RobotNodes(self._api, f"{self._root}/{plain(name)}", self.setup.robot, items)
+        self._ghosts[name].show(q)
+        return self._ghosts[name]
+
+    def explain(self, name: str, nodes: RobotNodes, q: Array, fault: str) -> None:
+        """Mark what touches at a state in red, and say why the state is invalid; nothing where ``fault`` is empty.
+
+        Args:
+            name: What the state is, for example ``goal``.
+            nodes: The copy of the robot that stands there.
+            q: The state.
+            fault: Why it is invalid, in one sentence.
+        """
+        contacts = self.setup.checker.contacts(q) if fault else []
+        touching = {body for contact in contacts for body in (contact.first, contact.second)}
+        nodes.mark(sorted(touching))
+        label = self._labels.pop(name, None)
+        if label is not None:
+            label.remove()
+        if fault:
+            nearest = self.setup.checker.distance(q, fixtures=True).points.mean(axis=0)
+            at = nearest if np.isfinite(nearest).all() else self._hand(q)
+            self._labels[name] = self._api.add_label(
+                f"{self._root}/why {plain(name)}", f"{name}: {fault}", position=at + (0.0, 0.0, LABEL_HEIGHT)
+            )
+
+    def _hand(self, q: Array) -> Array:
+        return self.setup.robot.link_pose(q, end_links(self.setup.robot)[0])[:3, 3]
+
+    def mark_obstacles(self, names: Sequence[str]) -> None:
+        """Draw obstacles of some names in the colour of contacts, and all others in their own."""
+        for body in self.setup.problem.scene:
+            handle = self.obstacles.get(body.name)
+            if handle is not None and hasattr(handle, "color"):
+                handle.color = rgb(CONTACT if body.name in names else body_item(body, OBSTACLES).colour)
+
+    def show_ways(self, states: Sequence[Array], name: str = "ways", colours: Sequence[str] = WAY_COLOURS) -> None:
+        """Draw the ways of the hands through states."""
+        links = end_links(self.setup.robot)
+        for k, (link, way) in enumerate(zip(links, link_ways(self.setup.robot, links, states), strict=True)):
+            add_way(self._api, f"{self._root}/{plain(name)}/{link}", way, colours[k % len(colours)])
+
+    def show_lines(self, name: str, paths: Sequence[Array], colour: str, thickness: float = 0.003) -> Any:
+        """Draw the ways of the hands along several paths, each of shape (N, dof), as one node, and return it."""
+        links, robot = end_links(self.setup.robot), self.setup.robot
+        ways = [way for path in paths for way in link_ways(robot, links, path)]
+        pieces = np.concatenate([np.stack([way[:-1], way[1:]], axis=1) for way in ways]).astype(np.float32)
+        return self._api.add_line_segments(f"{self._root}/{plain(name)}", pieces, rgb(colour), thickness=thickness)
+
+    def show_cover(self, q: Array, visible: bool = True) -> None:
+        """Show or hide the sphere cover that the kernel checks the robot by; it is made when first shown."""
+        if self._cover is None:
+            balls = _cover_of(self.setup)
+            path = f"{self._root}/sphere cover"
+            self._cover = RobotNodes(self._api, path, self.setup.robot, (), balls, visible=visible)
+            ball = trimesh.creation.icosphere(1, 1.0)
+            for joint, rows in balls.items():
+                self._api.add_batched_meshes_simple(
+                    f"{self._cover.path_of(joint)}/balls", np.asarray(ball.vertices, np.float32),
+                    np.asarray(ball.faces, np.uint32), batched_wxyzs=np.tile([1.0, 0.0, 0.0, 0.0], (len(rows), 1)),
+                    batched_positions=rows[:, :3].astype(np.float32), batched_scales=rows[:, 3].astype(np.float32),
+                    batched_colors=rgb(COVER), opacity=COVER_OPACITY, cast_shadow=False, receive_shadow=False,
+                )  # fmt: skip
+            self._cover.show(q)
+        self._cover.root.visible = visible
+
+    def add_obstacle(self, body: Obstacle) -> None:
+        """Add an obstacle, or put another one in the place of that of its name."""
+        self.remove_obstacle(body.name)
+        self._add(body_item(body, OBSTACLES))
+
+    def move_obstacle(self, name: str, pose: Array) -> None:
+        """Move an obstacle to a pose, shape (4, 4)."""
+        self.obstacles[name].wxyz, self.obstacles[name].position = turn_of(pose), pose[:3, 3]
+
+    def remove_obstacle(self, name: str) -> None:
+        """Remove an obstacle if it is there."""
+        if name in self.obstacles:
+            self.obstacles.pop(name).remove()
+
+
+def _cover_of(setup: PlanningSetup) -> Mapping[int, Array]:
+    """Return the leaf spheres of the kernel's cover by joint, rows of centre in the joint's frame and radius [m]."""
+    tables, turns = setup.checker.kernel.robot.arrays, joint_tree(setup.robot).turns
+    ends = np.append(tables.body_root[1:], len(tables.node_count))
+    joint = np.repeat(tables.body_joint, ends - tables.body_root)
+    leaf = tables.node_count == 0
+    found = {}
+    for j in sorted(set(joint[leaf].tolist()) - {0}):
+        which = np.flatnonzero(leaf & (joint == j))
+        centres = tables.node_centre[which] @ np.asarray(turns[j])[:3, :3].T
+        found[int(j)] = np.column_stack([centres, tables.node_radius[which]])
+    return found
+
+
+def _edges(mesh: trimesh.Trimesh) -> Array:
+    """Return the sharp edges of a mesh as pairs of points, shape (E, 2, 3)."""
+    sharp = mesh.face_adjacency_edges[mesh.face_adjacency_angles > 0.5]
+    return np.asarray(mesh.vertices[sharp], np.float32)

@@ -1,0 +1,138 @@
+"""What a page shows: problems and results, made ready and with their motions."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from apex_ompl.errors import ParameterError
+from apex_ompl.ompl_adapter.setup import PlanningSetup, assemble
+from apex_ompl.result import SCHEMA, PlanResult
+from apex_ompl.robot.identity import load_same_robot
+from apex_ompl.scene.problem import Problem
+from apex_ompl.trajopt.path import resample
+from apex_ompl.types import Array
+from apex_ompl.viz.curves import ORDERS, clearances, shares_of_limits
+
+UNTIMED, STATES = 4.0, 120  # how long a path without times plays [s], and its states
+CURVE_SAMPLES = 160
+RESULTS = (".json", ".npz", ".yaml")
+
+
+@dataclass(eq=False)
+class Shown:
+    """A problem or a result that is shown.
+
+    Attributes:
+        name: Its title.
+        setup: The problem, ready.
+        result: The result, or None.
+    """
+
+    name: str
+    setup: PlanningSetup
+    result: PlanResult | None = None
+
+    @classmethod
+    def of(cls, source: Problem | PlanResult, name: str = "") -> Shown:
+        """Make a problem or a result ready.
+
+        Raises:
+            ApexError: The robot or a body cannot be loaded, or the robot is not the one of the result.
+        """
+        if isinstance(source, Problem):
+            return cls(name or source.name, assemble(source))
+        robot = load_same_robot(source.problem.robot, source.robot_digest)
+        return cls(name or source.problem.name, assemble(source.problem, robot), source)
+
+    @property
+    def duration(self) -> float:
+        """How long its motion plays, 0 without one [s]."""
+        if self.result is None or self.result.path is None:
+            return 0.0
+        motion = self.result.trajectory
+        return UNTIMED if motion is None else float(motion.duration)
+
+    @cached_property
+    def _untimed(self) -> Array:
+        assert self.result is not None and self.result.path is not None
+        return resample(self.result.path.states, STATES)
+
+    def state(self, time: float) -> Array:
+        """Return the state at a time, shape (dof,); the start where nothing moves."""
+        duration = self.duration
+        if duration <= 0.0 or self.result is None:
+            return self.setup.start
+        time = min(max(time, 0.0), duration)
+        if self.result.trajectory is not None:
+            return np.asarray(self.result.trajectory(time))
+        return np.asarray(self._untimed[min(STATES - 1, round(time / duration * (STATES - 1)))])
+
+    def states(self, count: int) -> list[Array]:
+        """Return states at an even pace of time."""
+        return [self.state(t) for t in np.linspace(0.0, self.duration, count)]
+
+    @cached_property
+    def curves(self) -> dict[str, Array]:
+        """Curves of a timed motion over ``time`` [s]: ``clearance`` [mm] and the use of limits, by name."""
+        if self.result is None or self.result.trajectory is None:
+            return {}
+        motion, robot = self.result.trajectory, self.setup.robot
+        times = np.linspace(0.0, motion.duration, CURVE_SAMPLES)
+        shares = np.abs(shares_of_limits(motion, robot, times)).max(axis=2)
+        found = {"time": times, "clearance": 1e3 * clearances(self.setup.checker, np.asarray(motion(times)))}
+        return {**found, **dict(zip(ORDERS, shares, strict=True))}
+
+    @property
+    def faults(self) -> tuple[tuple[str, Array, str], ...]:
+        """Name, state and fault of start and goals, those that are shown as ghosts; faults are empty where valid."""
+        ready = self.setup
+        goals = zip(ready.goals[:1], ready.goal_faults[:1], strict=False)
+        return (("start", ready.start, ready.start_fault), *(("goal", goal, fault) for goal, fault in goals))
+
+    @property
+    def facts(self) -> str:
+        """Facts in Markdown."""
+        rows = [f"**{self.name}**"]
+        result = self.result
+        if result is None:
+            held = len(self.setup.problem.attached)
+            rows.append(f"{len(self.setup.problem.scene)} obstacles, {held} held objects")
+        else:
+            rows.append(f"{result.planner}: {result.status.value}" + (f", by {result.solved_by}" if result else ""))
+            if result.path is not None:
+                rows.append(f"{result.length:.2f} rad, clearance {1e3 * result.clearance:.1f} mm")
+            if result.trajectory is not None:
+                rows.append(f"{result.trajectory.duration:.2f} s, times by {result.timing_method}")
+            rows += [result.reason] if result.reason else []
+        rows += [f"{name}: {fault}" for name, _, fault in self.faults if fault]
+        return "\n\n".join(rows)
+
+
+def results_in(folder: Path) -> list[Path]:
+    """Return the files of results in a folder and below, sorted by name.
+
+    Raises:
+        ParameterError: There are none.
+    """
+    found = [path for path in sorted(folder.rglob("*")) if path.suffix in RESULTS and _is_result(path)]
+    if not found:
+        raise ParameterError("folder", str(folder), "one with results: files written by plan --out or bench --keep")
+    return found
+
+
+def _is_result(path: Path) -> bool:
+    if path.suffix == ".npz":
+        with np.load(path, allow_pickle=False) as file:
+            return "result" in file.files
+    return SCHEMA.rpartition("/")[0] in path.read_text(encoding="utf-8", errors="replace")[:2000]
+
+
+def ordered(sources: Sequence[Shown]) -> list[tuple[Shown, tuple[float, float, float]]]:
+    """Return what is shown with its place: side by side from the robot's left to its right [m]."""
+    gap = 3.0
+    return [(one, (0.0, -gap * k, 0.0)) for k, one in enumerate(sources)]

@@ -1,0 +1,76 @@
+"""Headless Chromium for the tests of pages, by Debian's packages chromium and chromium-driver."""
+
+from __future__ import annotations
+
+import io
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from PIL import Image
+
+SIZE = (1000, 700)
+BROWSER, DRIVER = shutil.which("chromium"), shutil.which("chromedriver")
+needs_browser = pytest.mark.skipif(
+    BROWSER is None or DRIVER is None, reason="no browser: apt-get install chromium chromium-driver"
+)
+FLAGS = (
+    "--headless=new", "--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking",
+    "--disable-component-update", "--disable-sync", "--hide-scrollbars", "--enable-unsafe-swiftshader",
+    "--use-angle=swiftshader", "--disable-dev-shm-usage", f"--window-size={SIZE[0]},{SIZE[1]}",
+)  # fmt: skip
+HARMLESS = ("GPU stall due to ReadPixels", "favicon")
+
+
+@contextmanager
+def browser() -> Iterator[Any]:
+    """A browser without a window."""
+    from selenium import webdriver
+
+    options = webdriver.ChromeOptions()
+    options.binary_location = str(BROWSER)
+    for flag in FLAGS:
+        options.add_argument(flag)
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+    driver = webdriver.Chrome(options, webdriver.ChromeService(str(DRIVER)))
+    try:
+        driver.set_window_size(*SIZE)
+        yield driver
+    finally:
+        driver.quit()
+
+
+def until(condition: Callable[[], Any], what: str, seconds: float = 60.0) -> Any:
+    """Wait until a condition holds, and return what it gave."""
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        found = condition()
+        if found:
+            return found
+        time.sleep(0.1)
+    raise AssertionError(f"not within {seconds:g} s: {what}")
+
+
+def picture(driver: Any) -> NDArray[np.int64]:
+    """What the browser shows, shape (height, width, 3)."""
+    image = Image.open(io.BytesIO(driver.get_screenshot_as_png())).convert("RGB")
+    return np.asarray(image, int)
+
+
+def errors(driver: Any) -> list[str]:
+    """What the browser's console says of errors since it was last asked."""
+    log = driver.get_log("browser")
+    return [
+        row["message"] for row in log if row["level"] == "SEVERE" and not any(h in row["message"] for h in HARMLESS)
+    ]
+
+
+def address(page: Path) -> str:
+    """The address of a file."""
+    return page.resolve().as_uri()
