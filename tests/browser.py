@@ -51,7 +51,7 @@ def until(condition: Callable[[], Any], what: str, seconds: float = 60.0) -> Any
     end = time.monotonic() + seconds
     while time.monotonic() < end:
         found = condition()
-        if found:
+        if found is not None and found is not False and np.size(found):
             return found
         time.sleep(0.1)
     raise AssertionError(f"not within {seconds:g} s: {what}")

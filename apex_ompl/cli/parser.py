@@ -67,6 +67,7 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     _add_plan(commands)  # in the order of the help text
     _add_pictures(commands)
+    _add_view(commands)
     _add_convert(commands)
     _add_benchmark(commands)
     _add_check(commands)
@@ -131,6 +132,18 @@ def _add_pictures(commands: Commands[argparse.ArgumentParser]) -> None:
     parser.add_argument("result", type=Path, help=RESULT_HELP)
     parser.add_argument("-o", "--out", type=Path, required=True, metavar="FILE", help=".png, .pdf or .svg")
     parser.set_defaults(run="pictures:plot")
+
+
+def _add_view(commands: Commands[argparse.ArgumentParser]) -> None:
+    parser = commands.add_parser("view", help="show problems and results in a browser, or write them as a page")
+    parser.add_argument(
+        "sources", nargs="+", metavar="SOURCE", help=f"a problem as for plan, {RESULT_HELP}, or a folder of results"
+    )
+    parser.add_argument("--port", type=int, metavar="N", help="on this machine (default: the first free one from 8080)")
+    parser.add_argument("--no-browser", action="store_true", help="open no browser, only print the address")
+    parser.add_argument("-o", "--out", type=Path, metavar="FILE", help="write a page that plays offline: .html")
+    parser.add_argument("--cover", action="store_true", help="with --out: the sphere cover as a layer of the page")
+    parser.set_defaults(run="view:run")
 
 
 def _add_convert(commands: Commands[argparse.ArgumentParser]) -> None:

@@ -15,7 +15,7 @@ from apex_ompl.viz.render import render as draw
 
 def render(parsed: argparse.Namespace) -> int:
     """Draw a problem or a result."""
-    source = PlanResult.load(parsed.source) if _is_result(parsed.source) else load_problem(parsed.source)
+    source = PlanResult.load(parsed.source) if is_result(parsed.source) else load_problem(parsed.source)
     draw(source, parsed.out, azimuth=parsed.azimuth)
     print(parsed.out)
     return 0
@@ -30,7 +30,7 @@ def plot(parsed: argparse.Namespace) -> int:
     return 0
 
 
-def _is_result(source: str) -> bool:
+def is_result(source: str) -> bool:
     """Whether a file is a saved result rather than a problem."""
     path = Path(source)
     if path.suffix in (".npz", ".json"):

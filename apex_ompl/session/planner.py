@@ -169,6 +169,16 @@ class MotionPlanner:
                 attached=tuple(self.world.held.values()), allowed=self.world.allowed, start=begin, goal=wanted,
             )  # fmt: skip
 
+    def is_free(self, state: State) -> bool:
+        """Whether a state is inside the limits and free in the world as it is now; :meth:`check` says why it is not.
+
+        Raises:
+            ParameterError: The state has not the robot's joints.
+        """
+        q = state_array(self.robot, state, "state")
+        with self._lock:
+            return self.robot.limit_fault(q) is None and self._checker.is_free(q)
+
     def check(self, state: State) -> StateCheck:
         """Check a state in the world as it is now.
 

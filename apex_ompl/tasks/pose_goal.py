@@ -108,6 +108,11 @@ class PoseGoal:
                 targets.append(opposition_target(axis, in_world(wanted[:, k]), -1.0))
         return targets
 
+    def nearest(self, q: Array) -> Array:
+        """Return the result of inverse kinematics from a state, shape (dof,); it need not reach the poses."""
+        found: Array = self._inverse.descend(np.asarray(q, float), tolerance=RESIDUAL).states[0]
+        return found
+
     def attempt(self, rng: np.random.Generator) -> Array:
         """Return the result of inverse kinematics from a state around the start, near or far, shape (dof,)."""
         moved = self._inverse.free
@@ -115,8 +120,7 @@ class PoseGoal:
         q0[moved] += rng.normal(0.0, SPREAD * rng.random(), len(moved))
         limits = self.robot.limits
         q0[moved] = np.clip(q0[moved], limits.lower[moved], limits.upper[moved])
-        ends: Array = self._inverse.descend(q0, tolerance=RESIDUAL).states[0]
-        return ends
+        return self.nearest(q0)
 
 
 def frame_of(robot: Robot, name: str, held: Mapping[str, AttachedObject]) -> Frame:

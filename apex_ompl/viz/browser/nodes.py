@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Sequence, Set
 from typing import Any
 
 import numpy as np
@@ -119,7 +119,7 @@ class RobotNodes:
                 frame.position = pose[:3, 3]
             self._sent[joint] = pose
 
-    def mark(self, bodies: Sequence[str]) -> None:
+    def mark(self, bodies: Set[str]) -> None:
         """Draw links and held objects of some names in the colour of contacts, and all others in their own."""
         for item, handle in self._handles:
             colour = rgb(CONTACT if item.body in bodies else item.colour)

@@ -87,7 +87,7 @@ def _recorded(server: Any, sources: Sequence[Shown], cover: bool) -> str:
         times = np.linspace(0.0, duration, max(2, round(duration * FRAME_RATE) + 1))
         for time in times:
             for one, scene in zip(sources, scenes, strict=True):
-                scene.show(one.state(float(time)))
+                one.draw(scene, float(time))
             recorder.insert_sleep(duration / (len(times) - 1))
         recorder.insert_sleep(HOLD)
     found: str = recorder.as_html()
@@ -101,13 +101,12 @@ def draw(server: Any, sources: Sequence[Shown]) -> list[BrowserScene]:
     for k, (one, offset) in enumerate(ordered(sources)):
         scene = BrowserScene(server.scene, one.setup, f"/{k + 1}", offset)
         for name, q, fault in one.faults:
-            if name != "start" or one.duration > 0.0:
-                scene.explain(name, scene.show_ghost(f"{name} ghost", q), q, fault)
-            else:
-                scene.explain(name, scene.robot, q, fault)
+            nodes = scene.robot if name == "start" and one.duration <= 0.0 else scene.show_ghost(f"{name} ghost", q)
+            if fault:
+                scene.explain(name, nodes, q, fault, one.setup.checker.contacts(q))
         if one.duration > 0.0:
             scene.show_ways(one.states(WAY_STATES))
-        scene.show(one.state(0.0))
+        one.draw(scene, 0.0)
         scenes.append(scene)
     place_camera(server, sources)
     return scenes

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from typing import Any
 
 import numpy as np
 import trimesh
 
+from apex_ompl.collision.mesh_stage import Contact
 from apex_ompl.collision.tabulate import joint_tree
 from apex_ompl.ompl_adapter.setup import PlanningSetup
 from apex_ompl.scene.bodies import Obstacle
@@ -15,6 +16,7 @@ from apex_ompl.types import Array
 from apex_ompl.viz.appearance import (
     CONTACT,
     EDGE,
+    OBSTACLE,
     OBSTACLES,
     ROBOT,
     SOLID,
@@ -38,6 +40,9 @@ class BrowserScene:
         setup: The problem.
         robot: Nodes of the robot with what it holds.
         obstacles: Handles of obstacles by name.
+        api: The scene of the ``viser`` server.
+        root: Path of the node above all.
+        extras: What else is drawn in it, by name; for those who draw it.
     """
 
     def __init__(self, api: Any, setup: PlanningSetup, root: str = "/scene", offset: Sequence[float] = (0, 0, 0)):
@@ -49,7 +54,7 @@ class BrowserScene:
             root: Path of the node above all.
             offset: Where that is [m].
         """
-        self.setup, self._api, self._root = setup, api, root
+        self.setup, self.api, self.root = setup, api, root
         api.add_frame(root, show_axes=False, position=np.asarray(offset, float))
         items = items_of(setup)
         self._moving = [item for item in items if item.moves]
@@ -60,16 +65,19 @@ class BrowserScene:
                 self._add(item)
         self._ghosts: dict[str, RobotNodes] = {}
         self._cover: RobotNodes | None = None
+        self.extras: dict[str, Any] = {}
         self._labels: dict[str, Any] = {}
+        self._touching: dict[str, set[str]] = {}
+        self._ways: list[Any] = []
 
     def _add(self, item: Item) -> None:
-        handle = add_item(self._api, f"{self._root}/{item.layer}/{plain(item.name)}", item)
+        handle = add_item(self.api, f"{self.root}/{item.layer}/{plain(item.name)}", item)
         if item.layer == OBSTACLES:
             self.obstacles[item.name] = handle
             if item.mesh is not None and item.opacity < 0.5 * SOLID:
                 lines = _edges(item.mesh)
-                path = f"{self._root}/{item.layer}/{plain(item.name)}/edges"
-                self._api.add_line_segments(path, lines, rgb(EDGE), thickness=0.003)
+                path = f"{self.root}/{item.layer}/{plain(item.name)}/edges"
+                self.api.add_line_segments(path, lines, rgb(EDGE), thickness=0.003)
 
     def show(self, q: Array) -> None:
         """Put the robot, and its sphere cover if there is one, at a state of shape (dof,)."""
@@ -82,11 +90,11 @@ class BrowserScene:
         if name not in self._ghosts:
             coarse = robot_items(self.setup.robot, coarse=True)
             items = [item.ghost for item in (*coarse, *(one for one in self._moving if one.layer != ROBOT))]
-            self._ghosts[name] = RobotNodes(self._api, f"{self._root}/{plain(name)}", self.setup.robot, items)
+            self._ghosts[name] = RobotNodes(self.api, f"{self.root}/{plain(name)}", self.setup.robot, items)
         self._ghosts[name].show(q)
         return self._ghosts[name]
 
-    def explain(self, name: str, nodes: RobotNodes, q: Array, fault: str) -> None:
+    def explain(self, name: str, nodes: RobotNodes, q: Array, fault: str, contacts: Sequence[Contact]) -> None:
         """Mark what touches at a state in red, and say why the state is invalid; nothing where ``fault`` is empty.
 
         Args:
@@ -94,52 +102,61 @@ class BrowserScene:
             nodes: The copy of the robot that stands there.
             q: The state.
             fault: Why it is invalid, in one sentence.
+            contacts: What touches there.
         """
-        contacts = self.setup.checker.contacts(q) if fault else []
-        touching = {body for contact in contacts for body in (contact.first, contact.second)}
-        nodes.mark(sorted(touching))
+        touching = {body for contact in contacts for body in (contact.first, contact.second)} if fault else set()
+        nodes.mark(touching)
+        self._touching[name] = touching
+        self._mark_obstacles(set().union(*self._touching.values()))
         label = self._labels.pop(name, None)
         if label is not None:
             label.remove()
         if fault:
-            nearest = self.setup.checker.distance(q, fixtures=True).points.mean(axis=0)
-            at = nearest if np.isfinite(nearest).all() else self._hand(q)
-            self._labels[name] = self._api.add_label(
-                f"{self._root}/why {plain(name)}", f"{name}: {fault}", position=at + (0.0, 0.0, LABEL_HEIGHT)
-            )
+            links = [c.first for c in contacts if c.first in self.setup.robot.link_names]
+            link = next(iter(links), end_links(self.setup.robot)[0])
+            at = self.setup.robot.link_pose(q, link)[:3, 3] + (0.0, 0.0, LABEL_HEIGHT)
+            self._labels[name] = self.api.add_label(f"{self.root}/why {plain(name)}", f"{name}: {fault}", position=at)
 
-    def _hand(self, q: Array) -> Array:
-        return self.setup.robot.link_pose(q, end_links(self.setup.robot)[0])[:3, 3]
-
-    def mark_obstacles(self, names: Sequence[str]) -> None:
-        """Draw obstacles of some names in the colour of contacts, and all others in their own."""
-        for body in self.setup.problem.scene:
-            handle = self.obstacles.get(body.name)
-            if handle is not None and hasattr(handle, "color"):
-                handle.color = rgb(CONTACT if body.name in names else body_item(body, OBSTACLES).colour)
+    def _mark_obstacles(self, names: Set[str]) -> None:
+        for name, handle in self.obstacles.items():
+            if hasattr(handle, "color") and tuple(handle.color) != (
+                colour := rgb(CONTACT if name in names else OBSTACLE)
+            ):
+                handle.color = colour
 
     def show_ways(self, states: Sequence[Array], name: str = "ways", colours: Sequence[str] = WAY_COLOURS) -> None:
         """Draw the ways of the hands through states."""
         links = end_links(self.setup.robot)
+        self._ways.append(self.api.add_frame(f"{self.root}/{plain(name)}", show_axes=False))
         for k, (link, way) in enumerate(zip(links, link_ways(self.setup.robot, links, states), strict=True)):
-            add_way(self._api, f"{self._root}/{plain(name)}/{link}", way, colours[k % len(colours)])
+            add_way(self.api, f"{self.root}/{plain(name)}/{link}", way, colours[k % len(colours)])
+
+    def set_ways_visible(self, visible: bool) -> None:
+        """Show or hide the ways of the hands."""
+        for node in self._ways:
+            node.visible = visible
 
     def show_lines(self, name: str, paths: Sequence[Array], colour: str, thickness: float = 0.003) -> Any:
         """Draw the ways of the hands along several paths, each of shape (N, dof), as one node, and return it."""
         links, robot = end_links(self.setup.robot), self.setup.robot
         ways = [way for path in paths for way in link_ways(robot, links, path)]
         pieces = np.concatenate([np.stack([way[:-1], way[1:]], axis=1) for way in ways]).astype(np.float32)
-        return self._api.add_line_segments(f"{self._root}/{plain(name)}", pieces, rgb(colour), thickness=thickness)
+        return self.api.add_line_segments(f"{self.root}/{plain(name)}", pieces, rgb(colour), thickness=thickness)
+
+    @property
+    def has_cover(self) -> bool:
+        """Whether the sphere cover was made."""
+        return self._cover is not None
 
     def show_cover(self, q: Array, visible: bool = True) -> None:
         """Show or hide the sphere cover that the kernel checks the robot by; it is made when first shown."""
         if self._cover is None:
             balls = _cover_of(self.setup)
-            path = f"{self._root}/sphere cover"
-            self._cover = RobotNodes(self._api, path, self.setup.robot, (), balls, visible=visible)
+            path = f"{self.root}/sphere cover"
+            self._cover = RobotNodes(self.api, path, self.setup.robot, (), balls, visible=visible)
             ball = trimesh.creation.icosphere(1, 1.0)
             for joint, rows in balls.items():
-                self._api.add_batched_meshes_simple(
+                self.api.add_batched_meshes_simple(
                     f"{self._cover.path_of(joint)}/balls", np.asarray(ball.vertices, np.float32),
                     np.asarray(ball.faces, np.uint32), batched_wxyzs=np.tile([1.0, 0.0, 0.0, 0.0], (len(rows), 1)),
                     batched_positions=rows[:, :3].astype(np.float32), batched_scales=rows[:, 3].astype(np.float32),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import socket
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stdout
 from typing import Any
 
@@ -35,8 +35,9 @@ def serving(port: int | None = None, label: str = "apex_ompl") -> Iterator[Any]:
     with redirect_stdout(io.StringIO()):  # of its banner
         server = viser.ViserServer(host=HOST, port=found, label=label, verbose=False)
     try:
-        if server.get_port() != found:
-            raise ParameterError("port", found, "a port that no other program takes")
+        if port is not None and server.get_port() != port:
+            raise ParameterError("port", port, "a port of this machine that is free")
+        server.gui.configure_theme(show_logo=False, show_share_button=False)  # sharing would tunnel to another machine
         yield server
     finally:
         with redirect_stdout(io.StringIO()):
@@ -87,3 +88,18 @@ def import_viser() -> Any:
         name = error.name or "a package"
         raise MissingFileError(name, "package for pages", "install the extra: apex-ompl[view]") from error
     return viser
+
+
+def asked(do: Callable[[Callable[[], None]], None], action: Callable[[], None]) -> Callable[[Any], None]:
+    """Return a callback of a control that passes an action on where a browser asked for it, and not this program.
+
+    Args:
+        do: Takes what is to be done in the page's own thread.
+        action: What is to be done.
+    """
+
+    def handle(event: Any) -> None:
+        if event.client is not None:
+            do(action)
+
+    return handle

@@ -16,6 +16,7 @@ from apex_ompl.robot.identity import load_same_robot
 from apex_ompl.scene.problem import Problem
 from apex_ompl.trajopt.path import resample
 from apex_ompl.types import Array
+from apex_ompl.viz.browser.scene import BrowserScene
 from apex_ompl.viz.curves import ORDERS, clearances, shares_of_limits
 
 UNTIMED, STATES = 4.0, 120  # how long a path without times plays [s], and its states
@@ -71,6 +72,10 @@ class Shown:
         if self.result.trajectory is not None:
             return np.asarray(self.result.trajectory(time))
         return np.asarray(self._untimed[min(STATES - 1, round(time / duration * (STATES - 1)))])
+
+    def draw(self, scene: BrowserScene, time: float) -> None:
+        """Show it at a time [s] in its scene."""
+        scene.show(self.state(time))
 
     def states(self, count: int) -> list[Array]:
         """Return states at an even pace of time."""

@@ -1,0 +1,68 @@
+"""Scenes, motions and plans in a browser; needs the ``view`` extra (viser)."""
+
+from __future__ import annotations
+
+import os
+import webbrowser
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TypeAlias
+
+from apex_ompl.errors import ParameterError
+from apex_ompl.result import PlanResult
+from apex_ompl.scene.problem import Problem
+from apex_ompl.util.files import check_writable
+from apex_ompl.viz.browser.server import HOST, import_viser, serving
+from apex_ompl.viz.browser.shown import Shown
+
+MOST = 6  # sources side by side
+Source: TypeAlias = Problem | PlanResult | Shown
+
+
+def view(
+    sources: Source | Sequence[Source], out: str | os.PathLike[str] | None = None, *, port: int | None = None,
+    cover: bool = False, opened: bool = True, ready: Callable[[str], None] = print,
+    until: Callable[[], bool] = lambda: False,
+) -> None:  # fmt: skip
+    """Show problems or results in a browser, side by side, until the page is closed; or write them as a page.
+
+    A page on this machine alone (127.0.0.1) has a player with the curves of clearance and use of limits, layers, and
+    for a single problem or result editing, planning and the proposals of the model. A written page plays offline.
+
+    Args:
+        sources: What is shown.
+        out: Page to write, .html; by default it is served.
+        port: Of the served page; by default the first free one from 8080 on.
+        cover: Whether a written page has the sphere cover as a layer.
+        opened: Whether a browser is opened.
+        ready: Called with the address once it is served.
+        until: Ends the serving when it holds, besides the closing of the page and Ctrl-C.
+
+    Raises:
+        ParameterError: Nothing or too much to show, another suffix, or a port that is taken.
+        MissingFileError: The page cannot be written, or the ``view`` extra is not installed.
+        ApexError: The robot or a body of a problem cannot be loaded, or the robot is not the one of a result.
+    """
+    given = [sources] if isinstance(sources, (Problem, PlanResult, Shown)) else list(sources)
+    if not 1 <= len(given) <= MOST:
+        raise ParameterError("sources", len(given), f"1 to {MOST} problems or results")
+    if out is not None and Path(out).suffix != ".html":
+        raise ParameterError("output", os.fspath(out), "a file name ending in .html")
+    import_viser()
+    if out is not None:
+        check_writable(Path(out))
+    shown = [one if isinstance(one, Shown) else Shown.of(one) for one in given]
+    if out is not None:
+        from apex_ompl.viz.browser.page import write_page
+
+        write_page(shown, out, cover)
+        return
+    from apex_ompl.viz.browser.live_page import LivePage
+
+    with serving(port) as server:
+        page = LivePage(server, shown)
+        address = f"http://{HOST}:{server.get_port()}"
+        ready(address)
+        if opened:
+            webbrowser.open(address)
+        page.run(until)

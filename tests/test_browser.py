@@ -1,0 +1,159 @@
+"""Pages in headless Chromium: no errors, pictures that are not blank, the robot where kinematics says, and editing."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from browser import address, browser, errors, needs_browser, picture, until
+
+from apex_ompl import plan
+from apex_ompl.scene.bodies import Obstacle
+from apex_ompl.scene.problem import Problem
+from apex_ompl.viz.browser.page import FIELD_OF_VIEW, draw, write_page
+from apex_ompl.viz.browser.server import serving
+from apex_ompl.viz.browser.shown import Shown
+
+pytestmark = [needs_browser, pytest.mark.xdist_group("browser")]
+RED = (0xE0, 0x10, 0x1B)
+VIEW = (sys.executable, "-c", "import sys; from apex_ompl.cli import main; sys.exit(main())", "view")
+BUTTON = "//button[.//*[text()='{0}'] or text()='{0}']"
+
+
+@pytest.fixture(scope="module")
+def driver() -> Iterator[Any]:
+    with browser() as found:
+        yield found
+
+
+def opened(driver: Any, where: str) -> None:
+    driver.get(where)
+    until(lambda: driver.find_elements("css selector", "canvas"), "a canvas")
+
+
+def is_drawn(driver: Any) -> bool:
+    """Whether the middle of the picture has many colours."""
+    middle = picture(driver)[100:-100, 250:650]
+    return len(np.unique(middle.reshape(-1, 3), axis=0)) > 200
+
+
+@pytest.mark.parametrize("name", ["ball_in_cup", "shelf/hard/900012", "a cloud"])
+def test_written_pages_show_and_play_to_the_end(driver: Any, name: str, problem: Problem, tmp_path: Path) -> None:
+    if name == "a cloud":
+        points = np.random.default_rng(0).uniform((0.5, -0.1, 0.2), (0.6, 0.1, 0.5), (400, 3))
+        np.save(tmp_path / "cloud.npy", points)
+        cloud = Obstacle(name="cloud", points={"file": str(tmp_path / "cloud.npy"), "radius": 0.01})
+        result = plan(problem.model_copy(update={"scene": (cloud,)}), timeout=20.0)
+    else:
+        result = plan(name, timeout=20.0)
+    write_page([Shown.of(result)], tmp_path / "page.html")
+    opened(driver, address(tmp_path / "page.html"))
+    until(lambda: is_drawn(driver), "a picture that is not blank")
+    slider = until(lambda: driver.find_elements("css selector", "[role=slider]"), "a slider")[0]
+    seen = [0.0]
+
+    def at_the_end() -> bool:
+        seen.append(float(slider.get_attribute("aria-valuenow")))
+        return result.trajectory is not None and max(seen) > 0.8 * result.trajectory.duration
+
+    until(at_the_end, "the motion played to its end")
+    cursor = driver.find_element("id", "cursor").get_attribute("transform")
+    assert cursor and cursor.startswith("translate(")
+    assert errors(driver) == []
+
+
+def projected(points: np.ndarray, camera: Any, size: tuple[int, int]) -> np.ndarray:
+    """Where a camera that looks at a point sees points, in pixels, shape (N, 2)."""
+    eye, target = np.array(camera.position), np.array(camera.look_at)
+    ahead = (target - eye) / np.linalg.norm(target - eye)
+    right = np.cross(ahead, (0.0, 0.0, 1.0))
+    right /= np.linalg.norm(right)
+    local = (points - eye) @ np.stack([right, np.cross(right, ahead), ahead]).T
+    focal = 0.5 * size[1] / np.tan(0.5 * FIELD_OF_VIEW)
+    return np.stack([
+        0.5 * size[0] + focal * local[:, 0] / local[:, 2], 0.5 * size[1] - focal * local[:, 1] / local[:, 2]
+    ], axis=1)  # fmt: skip
+
+
+def test_a_link_is_seen_where_forward_kinematics_says(driver: Any, problem: Problem) -> None:
+    shown = Shown.of(problem.model_copy(update={"scene": ()}))
+    link, robot = "left_link6", shown.setup.robot
+    with serving() as server:
+        scenes = draw(server, [shown])
+        for ghost in scenes[0]._ghosts.values():
+            ghost.root.visible = False
+        scenes[0].robot.mark({link})
+        opened(driver, f"http://127.0.0.1:{server.get_port()}")
+
+        def red() -> Any:
+            seen = picture(driver)
+            hue = (seen[..., 0] > 90) & (seen[..., 0] > 2.2 * seen[..., 1]) & (seen[..., 0] > 2.2 * seen[..., 2])
+            hue[:180, :330] = False  # the browser's warning that it has no graphics card
+            return np.argwhere(hue)[:, ::-1] if hue.sum() > 50 else None
+
+        seen = until(red, "a red link")
+        canvas = driver.find_element("css selector", "canvas").rect
+        camera = server.initial_camera
+    item = next(item for item in scenes[0]._moving if item.body == link and item.mesh is not None)
+    pose = robot.link_pose(shown.setup.start, link)
+    frame = robot.model.frames[robot.model.getFrameId(link)]
+    corners = np.asarray(item.mesh.vertices) @ item.placement[:3, :3].T + item.placement[:3, 3]
+    local = (corners - frame.placement.translation) @ frame.placement.rotation
+    wanted = projected(local @ pose[:3, :3].T + pose[:3, 3], camera, (canvas["width"], canvas["height"]))
+    wanted += (canvas["x"], canvas["y"])
+    assert np.abs(np.median(seen, axis=0) - np.median(wanted, axis=0)).max() < 12.0
+    assert (seen.min(axis=0) > wanted.min(axis=0) - 5.0).all() and (seen.max(axis=0) < wanted.max(axis=0) + 5.0).all()
+
+
+def started(*arguments: str) -> tuple[subprocess.Popen[str], str]:
+    """A served page by the command line, and its address."""
+    process = subprocess.Popen([*VIEW, *arguments, "--no-browser"], stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    line = process.stdout.readline()
+    return process, line.split()[0]
+
+
+def test_editing_in_the_page_changes_the_scene_and_plan_answers(driver: Any) -> None:
+    process, where = started("posts/medium/900003")
+    try:
+        opened(driver, where)
+        until(lambda: is_drawn(driver), "a picture")
+        before = picture(driver)
+        until(lambda: driver.find_elements("xpath", BUTTON.format("add a box")), "a button")[0].click()
+        until(lambda: "box_1" in driver.page_source, "a box")
+        until(lambda: (np.abs(picture(driver) - before)[:, :650].max(axis=2) > 40).sum() > 200, "another picture")
+        driver.find_element("xpath", BUTTON.format("plan")).click()
+        until(lambda: "ms in all" in driver.page_source, "a plan")
+        assert errors(driver) == []
+        driver.get("about:blank")
+        closed = time.monotonic()
+        assert process.wait(60) == 0, "closing the page ends the command"
+        assert time.monotonic() - closed < 30.0
+    finally:
+        process.kill()
+
+
+def test_ctrl_c_leaves_nothing_running(driver: Any) -> None:
+    process, where = started("ball_in_cup", "--port", "8391")
+    try:
+        assert where == "http://127.0.0.1:8391"
+        taken = subprocess.run(
+            [*VIEW, "ball_in_cup", "--port", "8391", "--no-browser"], capture_output=True, text=True, check=False,
+        )  # fmt: skip
+        assert taken.returncode == 2 and taken.stderr.count("\n") == 1 and "8391" in taken.stderr
+        opened(driver, where)
+        process.send_signal(signal.SIGINT)
+        assert process.wait(30) == 130
+    finally:
+        process.kill()
+    again, where = started("ball_in_cup", "--port", "8391")
+    again.terminate()
+    again.wait(30)
+    assert where == "http://127.0.0.1:8391", "the port is free again"
