@@ -30,7 +30,7 @@ SVG_SIZE = (3.4, 2.6)  # of the curves [inch]
 
 PANEL = """
 <style>
-#facts {{position: fixed; top: 12px; right: 12px; z-index: 5; max-width: 330px; font: 13px/1.4 sans-serif;
+#facts {{position: fixed; top: 12px; right: 12px; z-index: 5; max-width: 290px; font: 12px/1.35 sans-serif;
   background: rgba(255, 255, 255, 0.88); border-radius: 6px; padding: 8px 12px; color: #222; pointer-events: none}}
 #facts svg {{width: 100%; height: auto; display: block}}
 #facts p {{margin: 2px 0}}
@@ -125,7 +125,8 @@ def place_camera(server: Any, sources: Sequence[Shown]) -> None:
     focus = np.array([0.5 * middle[0], middle[1], max(0.3, 0.7 * middle[2])])
     away = max(2.9, 1.2 * float(np.abs(high - low)[:2].max()))
     server.initial_camera.look_at = focus
-    server.initial_camera.position = focus + away * np.array([0.85, 0.42, 0.45])
+    aside = 0.42 if len(sources) == 1 else 0.0
+    server.initial_camera.position = focus + away * np.array([0.85, aside, 0.45])
     server.initial_camera.fov = FIELD_OF_VIEW
     server.initial_camera.up = (0.0, 0.0, 1.0)
 

@@ -108,11 +108,12 @@ class Shown:
             held = len(self.setup.problem.attached)
             rows.append(f"{len(self.setup.problem.scene)} obstacles, {held} held objects")
         else:
-            rows.append(f"{result.planner}: {result.status.value}" + (f", by {result.solved_by}" if result else ""))
+            said = f"{result.planner}: {result.status.value}" + (f", by {result.solved_by}" if result else "")
             if result.path is not None:
-                rows.append(f"{result.length:.2f} rad, clearance {1e3 * result.clearance:.1f} mm")
+                said += f"; {result.length:.2f} rad, clearance {1e3 * result.clearance:.1f} mm"
             if result.trajectory is not None:
-                rows.append(f"{result.trajectory.duration:.2f} s, times by {result.timing_method}")
+                said += f"; {result.trajectory.duration:.2f} s by {result.timing_method}"
+            rows.append(said)
             rows += [result.reason] if result.reason else []
         rows += [f"{name}: {fault}" for name, _, fault in self.faults if fault]
         return "\n\n".join(rows)
