@@ -5,6 +5,7 @@ Usage: python scripts/make_pages.py
 
 from __future__ import annotations
 
+import argparse
 import tempfile
 from pathlib import Path
 
@@ -40,6 +41,7 @@ def scanned(problem: Problem, folder: Path) -> Problem:
 
 def main() -> None:
     """Plan, and write the pages."""
+    argparse.ArgumentParser(description=__doc__.splitlines()[0]).parse_args()
     make_folder(OUT)
     view(plan("ball_in_cup"), OUT / "ball_in_cup.html")
     both = [Shown.of(plan(SHELF, name, timeout=30.0), f"{SHELF} by {name}") for name in ("apex", "rrtconnect")]

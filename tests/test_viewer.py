@@ -228,6 +228,17 @@ def test_layers_of_a_run_show_what_was_fed_last(server: Any, problem: Problem, t
     assert (tmp_path / "run.html").stat().st_size < LARGEST
 
 
+def test_of_a_folder_one_result_is_chosen_at_a_time(server: Any, result: PlanResult, tmp_path: Path) -> None:
+    files = [tmp_path / f"{k}.npz" for k in range(2)]
+    result.save(files[0])
+    replace(result, planner="another").save(files[1])
+    page = LivePage(server, [], results_in(tmp_path))
+    assert "another" not in page.player._facts.content
+    page._choice.value = files[1].as_posix()
+    page._choose()
+    assert "another" in page.player._facts.content and page.editor is not None
+
+
 def test_pages_are_served_to_this_machine_alone(server: Any) -> None:
     port = server.get_port()
     with urllib.request.urlopen(f"http://{HOST}:{port}", timeout=10) as answer:
@@ -249,7 +260,8 @@ def test_bad_input_is_one_sentence(
         (["nothing"], "unknown problem 'nothing'"),
         ([str(tmp_path / "r.npz"), "-o", str(tmp_path / "r.gif")], "ending in .html"),
         ([str(tmp_path / "r.npz"), "-o", str(tmp_path / "no" / "r.html")], "does not exist"),
-        ([str(tmp_path / "r.npz")] * 7, "at most 6"),
+        ([str(tmp_path / "r.npz")] * 7, "1 to 6 problems"),
+        ([str(tmp_path), "ball_in_cup"], "a folder alone"),
         (["ball_in_cup", "--port", "70000", "--no-browser"], "65535"),
     ):
         assert main(["view", *given]) == 2, given

@@ -10,20 +10,20 @@ from apex_ompl.cli.options import import_extra
 from apex_ompl.cli.pictures import is_result
 from apex_ompl.errors import ParameterError
 from apex_ompl.result import PlanResult
+from apex_ompl.scene.problem import Problem
 
 
 def run(parsed: argparse.Namespace) -> int:
     """Show problems or results in a browser, or write them as a page."""
     module = import_extra("apex_ompl.viz.view", "pages", "view")
     module.import_viser()
-    shown = import_extra("apex_ompl.viz.browser.shown", "pages", "view")
-    files: list[str | Path] = []
-    for source in parsed.sources:
-        files += shown.results_in(Path(source)) if Path(source).is_dir() else [source]
-    if len(files) > module.MOST:
-        given = f"{len(files)} results" if len(parsed.sources) == 1 else f"{len(files)} problems or results"
-        raise ParameterError("sources", given, f"at most {module.MOST}; name some of them")
-    sources = [PlanResult.load(file) if is_result(str(file)) else load_problem(file) for file in files]
+    folders = [source for source in parsed.sources if Path(source).is_dir()]
+    if folders and len(parsed.sources) > 1:
+        raise ParameterError("sources", folders[0], "a folder alone, or problems and results")
+    if folders:
+        sources: Path | list[PlanResult | Problem] = Path(folders[0])
+    else:
+        sources = [PlanResult.load(one) if is_result(one) else load_problem(one) for one in parsed.sources]
     module.view(
         sources, parsed.out, port=parsed.port, cover=parsed.cover, opened=not parsed.no_browser,
         ready=lambda address: print(f"{address} (Ctrl-C ends it)", flush=True),

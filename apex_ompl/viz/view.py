@@ -13,14 +13,14 @@ from apex_ompl.result import PlanResult
 from apex_ompl.scene.problem import Problem
 from apex_ompl.util.files import check_writable
 from apex_ompl.viz.browser.server import HOST, import_viser, serving
-from apex_ompl.viz.browser.shown import Shown
+from apex_ompl.viz.browser.shown import Shown, results_in
 
 MOST = 6  # sources side by side
 Source: TypeAlias = Problem | PlanResult | Shown
 
 
 def view(
-    sources: Source | Sequence[Source], out: str | os.PathLike[str] | None = None, *, port: int | None = None,
+    sources: Source | Sequence[Source] | Path, out: str | os.PathLike[str] | None = None, *, port: int | None = None,
     cover: bool = False, opened: bool = True, ready: Callable[[str], None] = print,
     until: Callable[[], bool] = lambda: False,
 ) -> None:  # fmt: skip
@@ -30,7 +30,7 @@ def view(
     for a single problem or result editing, planning and the proposals of the model. A written page plays offline.
 
     Args:
-        sources: What is shown.
+        sources: What is shown; of a folder its results, of which more than six are shown one at a time.
         out: Page to write, .html; by default it is served.
         port: Of the served page; by default the first free one from 8080 on.
         cover: Whether a written page has the sphere cover as a layer.
@@ -43,8 +43,14 @@ def view(
         MissingFileError: The page cannot be written, or the ``view`` extra is not installed.
         ApexError: The robot or a body of a problem cannot be loaded, or the robot is not the one of a result.
     """
-    given = [sources] if isinstance(sources, (Problem, PlanResult, Shown)) else list(sources)
-    if not 1 <= len(given) <= MOST:
+    choices: list[Path] = []
+    if isinstance(sources, Path):
+        files = results_in(sources)
+        choices = files if len(files) > MOST and out is None else []
+        given: list[Source] = [] if choices else [PlanResult.load(file) for file in files]
+    else:
+        given = [sources] if isinstance(sources, (Problem, PlanResult, Shown)) else list(sources)
+    if not choices and not 1 <= len(given) <= MOST:
         raise ParameterError("sources", len(given), f"1 to {MOST} problems or results")
     if out is not None and Path(out).suffix != ".html":
         raise ParameterError("output", os.fspath(out), "a file name ending in .html")
@@ -60,7 +66,7 @@ def view(
     from apex_ompl.viz.browser.live_page import LivePage
 
     with serving(port) as server:
-        page = LivePage(server, shown)
+        page = LivePage(server, shown, choices)
         address = f"http://{HOST}:{server.get_port()}"
         ready(address)
         if opened:

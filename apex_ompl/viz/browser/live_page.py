@@ -6,12 +6,15 @@ import logging
 import queue
 import time
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 from apex_ompl.errors import ApexError
+from apex_ompl.result import PlanResult
 from apex_ompl.viz.browser.editor import Editor
 from apex_ompl.viz.browser.inspection import Inspection
 from apex_ompl.viz.browser.player import Player
+from apex_ompl.viz.browser.server import asked
 from apex_ompl.viz.browser.shown import Shown
 
 LOG = logging.getLogger("apex_ompl")
@@ -28,15 +31,40 @@ class LivePage:
         inspection: Shows proposals, or None likewise.
     """
 
-    def __init__(self, server: Any, sources: Sequence[Shown]) -> None:
-        """Show ``sources`` side by side."""
-        self._server = server
+    player: Player
+    editor: Editor | None
+    inspection: Inspection | None
+
+    def __init__(self, server: Any, sources: Sequence[Shown], choices: Sequence[Path] = ()) -> None:
+        """Show ``sources`` side by side.
+
+        Args:
+            server: A ``viser`` server.
+            sources: What is shown.
+            choices: Files of results, of which one is shown at a time in place of ``sources``.
+
+        Raises:
+            ApexError: A result cannot be loaded.
+        """
+        self._server, self._choices = server, {path.as_posix(): path for path in choices}
         self._actions: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._seen = False
+        self._chosen = next(iter(self._choices), "")
+        self._show(sources or [Shown.of(PlanResult.load(self._choices[self._chosen]))])
+
+    def _show(self, sources: Sequence[Shown]) -> None:
+        server, alone = self._server, len(sources) == 1
+        server.gui.reset()
+        if self._choices:
+            self._choice = server.gui.add_dropdown("result", tuple(self._choices), initial_value=self._chosen)
+            self._choice.on_update(asked(self._actions.put, self._choose))
         self.player = Player(server, self._actions.put, sources)
-        alone = len(sources) == 1
         self.editor = Editor(server, self._actions.put, self.player) if alone else None
         self.inspection = Inspection(server, self._actions.put, self.player) if alone else None
+
+    def _choose(self) -> None:
+        self._chosen = self._choice.value
+        self._show([Shown.of(PlanResult.load(self._choices[self._chosen]))])
 
     def step(self, passed: float) -> None:
         """Do what the browser asked for since the last step, and go on playing.
