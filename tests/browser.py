@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 SIZE = (1000, 700)
+TRIES = 6
 BROWSER, DRIVER = shutil.which("chromium"), shutil.which("chromedriver")
 needs_browser = pytest.mark.skipif(
     BROWSER is None or DRIVER is None, reason="no browser: apt-get install chromium chromium-driver"
@@ -58,8 +59,17 @@ def until(condition: Callable[[], Any], what: str, seconds: float = 60.0) -> Any
 
 
 def picture(driver: Any) -> NDArray[np.int64]:
-    """What the browser shows, shape (height, width, 3)."""
-    image = Image.open(io.BytesIO(driver.get_screenshot_as_png())).convert("RGB")
+    """What the browser shows, shape (height, width, 3); on a busy machine it may need several tries."""
+    from selenium.common.exceptions import TimeoutException
+
+    for k in range(TRIES):
+        try:
+            content = driver.get_screenshot_as_png()
+            break
+        except TimeoutException:
+            if k == TRIES - 1:
+                raise
+    image = Image.open(io.BytesIO(content)).convert("RGB")
     return np.asarray(image, int)
 
 

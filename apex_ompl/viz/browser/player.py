@@ -44,6 +44,7 @@ class Player:
         self._speed = gui.add_dropdown("speed", tuple(SPEEDS), initial_value="1")
         self._cover = gui.add_checkbox("sphere cover", initial_value=False)
         self._ways = gui.add_checkbox("ways of the hands", initial_value=True)
+        self._curves = gui.add_folder("over time")
         self._plots: list[tuple[Any, Array]] = []
         self._slider.on_update(asked(do, self._seek))
         self._cover.on_update(asked(do, self._layers))
@@ -116,6 +117,7 @@ class Player:
             plot.remove()
         self._plots = []
         timed = [one for one in self.sources if one.curves]
+        self._curves.visible = bool(timed)
         if not timed:
             return
         longest = max(timed, key=lambda one: one.duration)
@@ -134,7 +136,8 @@ class Player:
         data = (times, *(values for _, values, _ in lines), np.full(len(times), np.nan))
         series.append({"label": "now", "stroke": CURSOR, "width": 3, "points": {"show": True, "size": 8}})
         scales = {"x": {"time": False}, "y": {"range": (0.0, 1.05 * float(top) + 1e-6)}}
-        plot = self._server.gui.add_uplot(
-            data, tuple(series), title=title, scales=scales, height=PLOT_HEIGHT, legend={"show": len(lines) > 1}
-        )
+        with self._curves:
+            plot = self._server.gui.add_uplot(
+                data, tuple(series), title=title, scales=scales, height=PLOT_HEIGHT, legend={"show": len(lines) > 1}
+            )
         self._plots.append((plot, np.asarray(float(top))))

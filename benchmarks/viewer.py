@@ -1,0 +1,106 @@
+"""The viewer: sizes of written pages, how often a drag is answered, and what playing costs the server.
+
+1. Pages of results on problems of the test split: size, and time to write.
+2. An obstacle is dragged through the scene of validation problems: time from a pose to the answer whether start and goal
+   are free, as the page asks for it.
+3. Steps of the player, 30 a second: time of one, and as a share of a core.
+
+Usage: python benchmarks/viewer.py [-n 20]
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+import record
+
+from apex_ompl import load_problem, plan, problems
+from apex_ompl.ompl_adapter.process import quiet_ompl
+from apex_ompl.scene.problem import Problem
+from apex_ompl.util.entry_point import run_script
+from apex_ompl.util.validation import one_or_more
+from apex_ompl.viz.browser.live_page import PERIOD, LivePage
+from apex_ompl.viz.browser.page import write_page
+from apex_ompl.viz.browser.server import serving
+from apex_ompl.viz.browser.shown import Shown
+
+DEPENDS = ("@planning", "apex_ompl/viz", "apex_ompl/session")
+PAGES = ("ball_in_cup", "shelf/hard/900012", "cage/hard/900001", "clutter/hard/900002")
+LEVELS = ("shelf/hard", "clutter/hard", "cage/hard", "posts/medium")
+DRAGS = 100  # poses of a drag
+
+
+def pages() -> list[list[str]]:
+    """Return rows of pages: size and time to write."""
+    rows = []
+    with tempfile.TemporaryDirectory() as folder:
+        for name in PAGES:
+            result, file = plan(name, timeout=20.0), Path(folder) / "page.html"
+            began = time.perf_counter()
+            write_page([Shown.of(result)], file)
+            took = time.perf_counter() - began
+            duration = 0.0 if result.trajectory is None else result.trajectory.duration
+            rows.append([f"page of {name}, {duration:.1f} s", f"{file.stat().st_size / 1e6:.2f} MB", f"{took:.2f} s"])
+    return rows
+
+
+def drags(problem: Problem) -> list[float]:
+    """Return how long answers took while the first obstacle was dragged [s]."""
+    with serving() as server:
+        page = LivePage(server, [Shown.of(problem)])
+        assert page.editor is not None
+        name, found = problem.scene[0].name, []
+        page.editor.select(name)
+        pose = problem.scene[0].pose
+        for shift in np.linspace(0.0, 0.3, DRAGS):
+            moved = pose.copy()
+            moved[0, 3] -= shift
+            began = time.perf_counter()
+            page.editor.drag(moved)
+            found.append(time.perf_counter() - began)
+    return found
+
+
+def steps(problem: Problem) -> list[float]:
+    """Return how long steps of the player took [s]."""
+    with serving() as server:
+        page = LivePage(server, [Shown.of(plan(problem, timeout=20.0))])
+        found = []
+        for _ in range(150):
+            began = time.perf_counter()
+            page.step(PERIOD)
+            found.append(time.perf_counter() - began)
+    return found
+
+
+def main() -> None:
+    """Measure, and write the results."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("-n", type=one_or_more, default=20, help="problems (default: %(default)s)")
+    args = parser.parse_args()
+    names = [name for level in LEVELS for name in problems.frozen_names(*level.split("/"), "validation")]
+    names = names[:: max(1, len(names) // args.n)][: args.n]
+    with quiet_ompl():
+        written = pages()
+        dragged = [t for name in names for t in drags(load_problem(name))]
+        stepped = [t for name in names[:4] for t in steps(load_problem(name))]
+    head = ["what", "p50", "p95"]
+    ms = [f"{1e3 * v:.2f} ms" for v in record.percentiles(dragged, 50, 95)]
+    step = [f"{1e3 * v:.2f} ms" for v in record.percentiles(stepped, 50, 95)]
+    share = 100.0 * float(np.mean(stepped)) / PERIOD
+    table = "\n".join([
+        record.row(["page", "size", "time to write"]), record.row(["---", "---:", "---:"]), *map(record.row, written), "",
+        record.row(head), record.row(["---", "---:", "---:"]),
+        record.row([f"answer to a drag ({len(dragged)})", *ms]), record.row([f"step of the player ({len(stepped)})", *step]),
+        "", f"Playing takes {share:.1f} % of a core.",
+    ])  # fmt: skip
+    data = {"pages": written, "drags": dragged, "steps": stepped, "share": share}
+    record.write("viewer", data, table, split="validation; pages: test", n=len(names))
+
+
+if __name__ == "__main__":
+    run_script(main)
