@@ -1,8 +1,8 @@
 """The viewer: sizes of written pages, how often a drag is answered, and what playing costs the server.
 
 1. Pages of results on problems of the test split: size, and time to write.
-2. An obstacle is dragged through the scene of validation problems: time from a pose to the answer whether start and goal
-   are free, as the page asks for it.
+2. An obstacle is dragged through the scene of validation problems: time from a pose to the answer whether start and
+   goal are free, as the page asks for it.
 3. Steps of the player, 30 a second: time of one, and as a share of a core.
 
 Usage: python benchmarks/viewer.py [-n 20]
@@ -88,16 +88,12 @@ def main() -> None:
         written = pages()
         dragged = [t for name in names for t in drags(load_problem(name))]
         stepped = [t for name in names[:4] for t in steps(load_problem(name))]
-    head = ["what", "p50", "p95"]
-    ms = [f"{1e3 * v:.2f} ms" for v in record.percentiles(dragged, 50, 95)]
-    step = [f"{1e3 * v:.2f} ms" for v in record.percentiles(stepped, 50, 95)]
     share = 100.0 * float(np.mean(stepped)) / PERIOD
-    table = "\n".join([
-        record.row(["page", "size", "time to write"]), record.row(["---", "---:", "---:"]), *map(record.row, written), "",
-        record.row(head), record.row(["---", "---:", "---:"]),
-        record.row([f"answer to a drag ({len(dragged)})", *ms]), record.row([f"step of the player ({len(stepped)})", *step]),
-        "", f"Playing takes {share:.1f} % of a core.",
-    ])  # fmt: skip
+    rows = [["page", "size", "time to write"], ["---", "---:", "---:"], *written, [], ["what", "p50", "p95"]]
+    rows.append(["---", "---:", "---:"])
+    for what, times in (("answer to a drag", dragged), ("step of the player", stepped)):
+        rows.append([f"{what} ({len(times)})", *(f"{1e3 * v:.2f} ms" for v in record.percentiles(times, 50, 95))])
+    table = "\n".join(record.row(row) if row else "" for row in rows) + f"\n\nPlaying takes {share:.1f} % of a core."
     data = {"pages": written, "drags": dragged, "steps": stepped, "share": share}
     record.write("viewer", data, table, split="validation; pages: test", n=len(names))
 
