@@ -117,7 +117,7 @@ def started(*arguments: str) -> tuple[subprocess.Popen[str], str]:
     process = subprocess.Popen([*VIEW, *arguments, "--no-browser"], stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
     line = process.stdout.readline()
-    return process, line.split()[0]
+    return process, line.strip()
 
 
 def test_editing_in_the_page_changes_the_scene_and_plan_answers(driver: Any) -> None:

@@ -250,6 +250,13 @@ def test_pages_are_served_to_this_machine_alone(server: Any) -> None:
     assert server.get_host() == "127.0.0.1"
 
 
+def test_without_a_browser_the_address_is_given(problem: Problem, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("webbrowser.open", lambda address: False)
+    said: list[str] = []
+    view(problem, ready=said.append, until=lambda: True)
+    assert said[0].startswith("http://127.0.0.1:") and "no browser was found" in said[1]
+
+
 def test_bad_input_is_one_sentence(
     result: PlanResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -26,7 +26,7 @@ def run(parsed: argparse.Namespace) -> int:
         sources = [PlanResult.load(one) if is_result(one) else load_problem(one) for one in parsed.sources]
     module.view(
         sources, parsed.out, port=parsed.port, cover=parsed.cover, opened=not parsed.no_browser,
-        ready=lambda address: print(f"{address} (Ctrl-C ends it)", flush=True),
+        ready=lambda said: print(said, flush=True),
     )  # fmt: skip
     if parsed.out is not None:
         print(parsed.out)

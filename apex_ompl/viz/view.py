@@ -35,7 +35,7 @@ def view(
         port: Of the served page; by default the first free one from 8080 on.
         cover: Whether a written page has the sphere cover as a layer.
         opened: Whether a browser is opened.
-        ready: Called with the address once it is served.
+        ready: Called with the address once it is served, and with what else is to be said.
         until: Ends the serving when it holds, besides the closing of the page and Ctrl-C.
 
     Raises:
@@ -69,6 +69,6 @@ def view(
         page = LivePage(server, shown, choices)
         address = f"http://{HOST}:{server.get_port()}"
         ready(address)
-        if opened:
-            webbrowser.open(address)
+        if opened and not webbrowser.open(address):
+            ready("no browser was found on this machine: open the address in one")
         page.run(until)
