@@ -5,6 +5,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,15 +13,18 @@ from hypothesis import settings as hypothesis_settings
 from planning import HARD, cached_problem
 from support import DATA
 
+from apex_ompl import plan
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.datasets.records import Paths
 from apex_ompl.datasets.store import load, save
 from apex_ompl.ompl_adapter.process import quiet_ompl
 from apex_ompl.ompl_adapter.setup import PlanningSetup, assemble
 from apex_ompl.problems.suite_robot import robot as suite_robot
+from apex_ompl.result import PlanResult
 from apex_ompl.robot import Robot, load_robot
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Goal, Problem
+from apex_ompl.viz.browser.server import serving
 
 hypothesis_settings.register_profile("here", derandomize=True, deadline=None)  # the same examples on every machine
 hypothesis_settings.load_profile("here")
@@ -102,3 +106,16 @@ def quiet() -> Iterator[None]:
 def ready() -> PlanningSetup:
     """The planning setup of a hard problem."""
     return assemble(cached_problem(HARD), suite_robot())
+
+
+@pytest.fixture(scope="session")
+def server() -> Iterator[Any]:
+    with serving() as found:
+        yield found
+
+
+@pytest.fixture(scope="session")
+def result() -> PlanResult:
+    found = plan("ball_in_cup", timeout=20.0)
+    assert found
+    return found

@@ -5,9 +5,11 @@ from __future__ import annotations
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Any
 
 import numpy as np
@@ -17,12 +19,14 @@ from browser import address, browser, errors, needs_browser, picture, until
 from apex_ompl import plan
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Problem
+from apex_ompl.viz.appearance import CONTACT
+from apex_ompl.viz.browser.nodes import paint
 from apex_ompl.viz.browser.page import FIELD_OF_VIEW, draw, write_page
 from apex_ompl.viz.browser.server import serving
 from apex_ompl.viz.browser.shown import Shown
+from apex_ompl.viz.view import view
 
-pytestmark = [needs_browser, pytest.mark.xdist_group("browser")]
-RED = (0xE0, 0x10, 0x1B)
+pytestmark = needs_browser
 VIEW = (sys.executable, "-c", "import sys; from apex_ompl.cli import main; sys.exit(main())", "view")
 BUTTON = "//button[.//*[text()='{0}'] or text()='{0}']"
 
@@ -34,39 +38,62 @@ def driver() -> Iterator[Any]:
 
 
 def opened(driver: Any, where: str) -> None:
+    driver.get("about:blank")
+    driver.get_log("browser")  # what a page said whose server has gone
     driver.get(where)
     until(lambda: driver.find_elements("css selector", "canvas"), "a canvas")
 
 
 def is_drawn(driver: Any) -> bool:
     """Whether the middle of the picture has many colours."""
-    middle = picture(driver)[100:-100, 250:650]
+    middle = picture(driver)[100:-100, 340:650]
     return len(np.unique(middle.reshape(-1, 3), axis=0)) > 200
 
 
+def reddish(driver: Any) -> int:
+    """How many pixels have the hue of obstacles, far from what the browser itself shows."""
+    seen = picture(driver)[180:, 340:650]
+    return int(((seen[..., 0] > 1.4 * seen[..., 1]) & (seen[..., 0] > 1.4 * seen[..., 2])).sum())
+
+
+def with_a_cloud(problem: Problem, folder: Path) -> Problem:
+    points = np.random.default_rng(0).uniform((0.5, -0.1, 0.2), (0.6, 0.1, 0.5), (400, 3))
+    np.save(folder / "cloud.npy", points)
+    cloud = Obstacle(name="cloud", points={"file": str(folder / "cloud.npy"), "radius": 0.01})
+    return problem.model_copy(update={"scene": (cloud,)})
+
+
 @pytest.mark.parametrize("name", ["ball_in_cup", "shelf/hard/900012", "a cloud"])
-def test_written_pages_show_and_play_to_the_end(driver: Any, name: str, problem: Problem, tmp_path: Path) -> None:
-    if name == "a cloud":
-        points = np.random.default_rng(0).uniform((0.5, -0.1, 0.2), (0.6, 0.1, 0.5), (400, 3))
-        np.save(tmp_path / "cloud.npy", points)
-        cloud = Obstacle(name="cloud", points={"file": str(tmp_path / "cloud.npy"), "radius": 0.01})
-        result = plan(problem.model_copy(update={"scene": (cloud,)}), timeout=20.0)
-    else:
-        result = plan(name, timeout=20.0)
+def test_pages_show_and_play_to_the_end(driver: Any, name: str, problem: Problem, tmp_path: Path) -> None:
+    result = plan(with_a_cloud(problem, tmp_path) if name == "a cloud" else name, timeout=20.0)
+    assert result.trajectory is not None
     write_page([Shown.of(result)], tmp_path / "page.html")
     opened(driver, address(tmp_path / "page.html"))
-    until(lambda: is_drawn(driver), "a picture that is not blank")
+    until(lambda: is_drawn(driver) and reddish(driver) > 100, "a picture with obstacles")
     slider = until(lambda: driver.find_elements("css selector", "[role=slider]"), "a slider")[0]
+    end = result.trajectory.duration
     seen = [0.0]
 
     def at_the_end() -> bool:
         seen.append(float(slider.get_attribute("aria-valuenow")))
-        return result.trajectory is not None and max(seen) > 0.8 * result.trajectory.duration
+        return seen[-1] >= end or seen[-1] < seen[-2]  # it begins anew after the end
 
     until(at_the_end, "the motion played to its end")
     cursor = driver.find_element("id", "cursor").get_attribute("transform")
     assert cursor and cursor.startswith("translate(")
     assert errors(driver) == []
+    said, stop = SimpleQueue[str](), threading.Event()
+    options: dict[str, Any] = {"opened": False, "ready": said.put, "until": stop.is_set}
+    serve = threading.Thread(target=view, args=(result,), kwargs=options)
+    serve.start()
+    try:
+        opened(driver, said.get(timeout=60))
+        until(lambda: is_drawn(driver) and reddish(driver) > 100, "a live picture with obstacles")
+        assert f"{result.length:.2f} rad" in driver.page_source and errors(driver) == []
+    finally:
+        stop.set()
+        serve.join(30)
+    assert not serve.is_alive()
 
 
 def projected(points: np.ndarray, camera: Any, size: tuple[int, int]) -> np.ndarray:
@@ -89,7 +116,9 @@ def test_a_link_is_seen_where_forward_kinematics_says(driver: Any, problem: Prob
         scenes = draw(server, [shown])
         for ghost in scenes[0]._ghosts.values():
             ghost.root.visible = False
-        scenes[0].robot.mark({link})
+        for item, handle in scenes[0].robot.handles:
+            if item.body == link:
+                paint(item, handle, CONTACT)
         opened(driver, f"http://127.0.0.1:{server.get_port()}")
 
         def red() -> Any:
@@ -101,7 +130,7 @@ def test_a_link_is_seen_where_forward_kinematics_says(driver: Any, problem: Prob
         seen = until(red, "a red link")
         canvas = driver.find_element("css selector", "canvas").rect
         camera = server.initial_camera
-    item = next(item for item in scenes[0]._moving if item.body == link and item.mesh is not None)
+    item = next(item for item, _ in scenes[0].robot.handles if item.body == link and item.mesh is not None)
     pose = robot.link_pose(shown.setup.start, link)
     frame = robot.model.frames[robot.model.getFrameId(link)]
     corners = np.asarray(item.mesh.vertices) @ item.placement[:3, :3].T + item.placement[:3, 3]

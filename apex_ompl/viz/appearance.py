@@ -16,6 +16,7 @@ import trimesh
 
 from apex_ompl.collision.clouds import cloud_of
 from apex_ompl.collision.shapes import coal_geometry, is_shell
+from apex_ompl.collision.solids import Solid, world_boxes
 from apex_ompl.ompl_adapter.setup import PlanningSetup
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import Body
@@ -32,6 +33,15 @@ HAND, LINK = "#4a4e57", "#d9dce1"
 SIDE_COLOURS = {"left": "#e8eef4", "right": "#f3ece2"}
 FACE_COLOURS = ("#d62728", "#1f4ed8")
 WAY_COLOURS = ("#1f6fb4", "#d97a1a", "#2b9348", "#8e44ad")  # of the ways of hands
+CLEARANCE_COLOURS = ("#0b6e4f", "#7a9e1f", "#16798c", "#555b66")  # of curves, by result
+LIMIT_COLOURS = {"velocity": "#1f6fb4", "acceleration": "#d97a1a", "jerk": "#8e44ad"}
+NOW, COVER = "#c8553d", "#3a86c8"  # of the cursor of curves, and of sphere covers
+PROPOSAL_COLOURS = {"sampled": "#8a8f98", "guided": "#1f6fb4", "repaired": "#2b9348", "not repaired": "#d97a1a"}
+DENOISED = "#8e44ad"
+RUN_COLOURS = {
+    "true": "#c8553d", "observed": "#e9a03b", "predicted": "#8e44ad", "committed": "#2b9348", "stop": "#e0101b",
+}  # fmt: skip
+RUN_OPACITIES = {"true": 0.9, "observed": 0.5, "predicted": 0.22}
 SOLID, PLATE = 0.9, 0.14  # opacities of obstacles; thin plates show what is behind them
 ARROW_LENGTH = 0.12  # [m]
 MOST_POINTS = 30_000  # that are drawn of a cloud
@@ -72,11 +82,6 @@ class Item:
         """Whether it moves with the robot."""
         return self.joint > 0
 
-    @property
-    def ghost(self) -> Item:
-        """A translucent copy."""
-        return replace(self, opacity=GHOST_OPACITY)
-
 
 def items_of(setup: PlanningSetup) -> list[Item]:
     """Return all items of a problem: the robot, what it holds, contact faces, fixtures and obstacles."""
@@ -88,6 +93,12 @@ def items_of(setup: PlanningSetup) -> list[Item]:
         *(body_item(body, FIXTURES) for body in robot.fixtures),
         *(body_item(body, OBSTACLES) for body in setup.problem.scene),
     ]
+
+
+def ghosts_of(setup: PlanningSetup) -> list[Item]:
+    """Return translucent items that move with the robot: its coarser geometry, what it holds, and contact faces."""
+    items = (*robot_items(setup.robot, coarse=True), *held_items(setup), *face_items(setup))
+    return [replace(item, opacity=GHOST_OPACITY) for item in items if item.moves]
 
 
 def robot_items(robot: Robot, coarse: bool = False) -> Iterator[Item]:
@@ -119,9 +130,10 @@ def face_items(setup: PlanningSetup) -> Iterator[Item]:
     if setup.alignment is None:
         return
     robot = setup.robot
-    for face, colour in zip((setup.alignment.first, setup.alignment.second), FACE_COLOURS, strict=True):
+    faces = (setup.alignment.first, setup.alignment.second)
+    for k, (face, colour) in enumerate(zip(faces, FACE_COLOURS, strict=True)):
         frame = robot.model.frames[robot.link_frame(face.link)]
-        name, place = f"face_{face.link}", np.array(frame.placement.homogeneous)
+        name, place = f"face_{k}_{face.link}", np.array(frame.placement.homogeneous)
         yield Item(name, FACES, face.link, colour, 1.0, frame.parentJoint, place, arrow(face.point, face.axis))
 
 
@@ -197,6 +209,23 @@ def joint_poses(robot: Robot, data: pin.Data, q: Array) -> list[Array]:
 def end_links(robot: Robot) -> list[str]:
     """Return the links whose ways are drawn: the palms, or else the last link."""
     return [hand.palm for hand in robot.hands.values()] or [robot.link_names[-1]]
+
+
+def focus_of(setup: PlanningSetup) -> tuple[Array, float]:
+    """Return the point that a camera looks at, shape (3,) [m], and how wide hands and obstacles are spread [m]."""
+    states = (setup.start, *setup.goals[:1])
+    points = [setup.robot.link_pose(q, link)[:3, 3] for q in states for link in end_links(setup.robot)]
+    points += [_middle(body) for body in setup.problem.scene if body.half_space is None]
+    low, high = np.min(points, axis=0), np.max(points, axis=0)
+    middle = 0.5 * (low + high)
+    focus = np.array([0.5 * middle[0], 0.5 * middle[1], max(0.25, 0.7 * middle[2])])
+    return focus, float((high - low)[:2].max())
+
+
+def _middle(body: Body) -> Array:
+    """Return the middle of the box around a body in the world, shape (3,) [m]."""
+    solid = Solid(body.name, 0, pin.SE3(body.pose), coal_geometry(body))
+    return np.asarray(world_boxes([solid], [solid.placement])[0].mean(axis=0))
 
 
 def _turned_to(direction: Array, origin: Sequence[float] | Array) -> Array:

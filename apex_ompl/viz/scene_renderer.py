@@ -7,16 +7,12 @@ from ctypes.util import find_library
 from typing import Any
 
 import numpy as np
-import pinocchio as pin
 from numpy.typing import NDArray
 
-from apex_ompl.collision.shapes import coal_geometry
-from apex_ompl.collision.solids import Solid, world_boxes
 from apex_ompl.errors import MissingFileError
 from apex_ompl.ompl_adapter.setup import PlanningSetup
-from apex_ompl.scene.bodies import Body
 from apex_ompl.types import Array
-from apex_ompl.viz.appearance import BACKGROUND, EDGE, OBSTACLES, Item, end_links, items_of, joint_poses
+from apex_ompl.viz.appearance import BACKGROUND, EDGE, OBSTACLES, Item, focus_of, ghosts_of, items_of, joint_poses
 
 SIZE = (1280, 960)
 AZIMUTH = 26.0
@@ -37,7 +33,7 @@ class SceneRenderer:
             MissingFileError: The ``viz`` extra is not installed.
         """
         self._pv = _pyvista()
-        self.robot = setup.robot
+        self.robot, self._setup = setup.robot, setup
         self._data = self.robot.model.createData()
         self._plotter = self._pv.Plotter(off_screen=True, window_size=size, lighting="three lights")
         self._plotter.set_background(BACKGROUND)
@@ -64,11 +60,7 @@ class SceneRenderer:
 
     def _place_camera(self, setup: PlanningSetup, azimuth: float) -> None:
         """Point the camera at the middle of hands and scene; from the front, the left arm is on the right."""
-        states = (setup.start, *setup.goals[:1])
-        points = [setup.robot.link_pose(q, link)[:3, 3] for q in states for link in end_links(setup.robot)]
-        points += [_middle(body) for body in setup.problem.scene if body.half_space is None]
-        middle = np.mean([np.min(points, axis=0), np.max(points, axis=0)], axis=0)
-        focus = np.array([0.5 * middle[0], 0.5 * middle[1], max(0.25, 0.7 * middle[2])])
+        focus, _ = focus_of(setup)
         turn = np.radians(azimuth)
         offset = np.array([2.6 * np.cos(turn), 2.6 * np.sin(turn), 1.25])
         self._plotter.camera_position = [focus + offset, focus, (0.0, 0.0, 1.0)]
@@ -76,8 +68,9 @@ class SceneRenderer:
 
     def add_ghost(self, q: Array) -> None:
         """Add a translucent copy of robot and held objects at a state."""
-        for item, pose in zip(self._moving, self._poses(q), strict=True):
-            self._add(item.ghost, pose)
+        joints = joint_poses(self.robot, self._data, q)
+        for item in ghosts_of(self._setup):
+            self._add(item, joints[item.joint] @ item.placement)
 
     def _poses(self, q: Array) -> list[Array]:
         joints = joint_poses(self.robot, self._data, q)
@@ -100,9 +93,3 @@ def _pyvista() -> Any:
     except ImportError as error:
         raise MissingFileError("pyvista", "package for pictures", "install the extra: apex-ompl[viz]") from error
     return pyvista
-
-
-def _middle(body: Body) -> Array:
-    """Return the middle of the box around a body in the world, shape (3,) [m]."""
-    solid = Solid(body.name, 0, pin.SE3(body.pose), coal_geometry(body))
-    return np.asarray(world_boxes([solid], [solid.placement])[0].mean(axis=0))

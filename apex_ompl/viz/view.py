@@ -50,10 +50,17 @@ def view(
         given: list[Source] = [] if choices else [PlanResult.load(file) for file in files]
     else:
         given = [sources] if isinstance(sources, (Problem, PlanResult, Shown)) else list(sources)
+    wrong = next((one for one in given if not isinstance(one, (Problem, PlanResult, Shown))), None)
+    if wrong is not None:
+        raise ParameterError("sources", wrong, "problems or results; a folder as pathlib.Path")
     if not choices and not 1 <= len(given) <= MOST:
         raise ParameterError("sources", len(given), f"1 to {MOST} problems or results")
     if out is not None and Path(out).suffix != ".html":
         raise ParameterError("output", os.fspath(out), "a file name ending in .html")
+    if out is not None and port is not None:
+        raise ParameterError("port", port, "none for a page that is written")
+    if out is None and cover:
+        raise ParameterError("cover", cover, "False for a page that is served: it has a switch for that")
     import_viser()
     if out is not None:
         check_writable(Path(out))

@@ -5,14 +5,14 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from apex_ompl import planners
-from apex_ompl.errors import ApexError
+from apex_ompl.errors import ApexError, ParameterError
 from apex_ompl.planners.apex_parameters import default_planner
-from apex_ompl.result import PlanResult
 from apex_ompl.scene.bodies import pose_fields
 from apex_ompl.scene.problem import PoseTarget, Problem
 from apex_ompl.session import MotionPlanner
@@ -20,14 +20,15 @@ from apex_ompl.tasks.pose_goal import PoseGoal, frame_of
 from apex_ompl.types import Array
 from apex_ompl.viz.browser.nodes import pose_of, turn_of
 from apex_ompl.viz.browser.player import Player
-from apex_ompl.viz.browser.server import asked
-from apex_ompl.viz.browser.shown import Shown
+from apex_ompl.viz.browser.server import Asked, Do, asked
+from apex_ompl.viz.browser.shown import Shown, markdown
 
 NOTHING, GOAL = "nothing", "goal of "
 NEW_BOX, NEW_PLACE = 0.1, (0.5, 0.0, 0.6)  # edge and place of a box that is added [m]
 REACHED = 2e-3  # residual of inverse kinematics at which a hand is where it was dragged
-QUIET = 0.25  # how long nothing was dragged before faults are explained [s]
+QUIET = 0.25  # how long nothing was edited before faults are explained [s]
 CONTROL_SIZE = 0.25  # of what is dragged [m]
+LONGEST = 60.0  # time limit of a plan [s]; the page waits for it
 
 
 class Editor:
@@ -36,19 +37,23 @@ class Editor:
     Attributes:
         planner: The planner; its world is the scene.
         start: Start, shape (dof,).
-        goal: Goal, shape (dof,), or None where none was found.
-        checks: Number of states that were checked while something was dragged.
+        goal: Goal, shape (dof,), or None where none was found. It is a state of a goal in the workspace, until it is
+            dragged.
     """
 
-    def __init__(self, server: Any, do: Callable[[Callable[[], None]], None], player: Player) -> None:
+    def __init__(self, server: Any, do: Do, player: Player) -> None:
         """Add the controls for what ``player`` shows, a single problem or result."""
         self._server, self._do, self._player = server, do, player
-        ready = player.sources[0].setup
-        self._problem, robot = ready.problem, ready.robot
+        shown = player.sources[0]
+        self._problem, robot = shown.setup.problem, shown.setup.robot
+        held = () if shown.result is None else shown.result.held_joints
+        self._group = [name for name in robot.joint_names if name not in held] if held else None
         self.planner = MotionPlanner(self._problem.robot)
         self.planner.world.load(self._problem)
-        self.start, self.goal = ready.start, ready.goals[0].copy() if len(ready.goals) else None
-        self.checks, self._dragged_at, self._explained = 0, 0.0, True
+        self.start, self.goal = shown.setup.start, shown.ends[-1][1]
+        self._goal_dragged, self._is_reached = False, True
+        self._edited_at, self._is_explained, self._written = 0.0, True, set[Path]()
+        self._grabbed = NOTHING
         self._control: Any = None
         gui = server.gui
         with gui.add_folder("edit"):
@@ -56,40 +61,39 @@ class Editor:
             self._state = gui.add_markdown("")
             add, remove = gui.add_button("add a box"), gui.add_button("remove the obstacle")
         with gui.add_folder("plan"):
-            self._name = gui.add_dropdown("planner", planners.names(), initial_value=default_planner(robot.name))
+            chosen = default_planner(robot.name)
+            self._planner = gui.add_dropdown("planner", planners.names(), initial_value=chosen)
             self._seed = gui.add_number("seed", initial_value=0, min=0, step=1)
-            self._limit = gui.add_number("time limit s", initial_value=5.0, min=0.1, max=600.0)
+            self._limit = gui.add_number("time limit s", initial_value=5.0, min=0.1, max=LONGEST)
             run = gui.add_button("plan")
             self._file = gui.add_text("file", initial_value=f"{self._problem.name.replace('/', '_')}.yaml")
             save = gui.add_button("save the problem")
             self._said = gui.add_markdown("")
-        self._what.on_update(asked(do, self._grab))
+        self._what.on_update(asked(do, self.grab))
         for button, action in ((add, self.add_box), (remove, self.remove), (run, self.plan), (save, self.save)):
-            button.on_click(asked(do, partial(self._said_by, action)))
+            button.on_click(asked(do, partial(self._say, action)))
+        player.replaced.append(self._replaced)
         self._check()
 
     def _names(self) -> tuple[str, ...]:
         hands = self.planner.robot.hands if self.goal is not None else {}
         return (NOTHING, *self.planner.world.obstacles, *(f"{GOAL}{hand}" for hand in hands))
 
-    def _said_by(self, action: Callable[[], str]) -> None:
+    def _say(self, action: Callable[[], str], _: Any = None) -> None:
         """Do something, and show what it says, or why it failed."""
         try:
-            self._said.content = action()
+            said = action()
         except (ApexError, OSError) as error:
-            self._said.content = f"error: {error}"
+            said = f"error: {error}"
+        self._said.content = markdown([said])
 
-    def select(self, name: str) -> None:
-        """Choose what is dragged, as in the page."""
-        self._what.value = name
-        self._grab()
-
-    def _grab(self) -> None:
-        """Put a control where the chosen thing is."""
-        name = self._what.value
+    def grab(self, name: str) -> None:
+        """Choose what is dragged: an obstacle, or the goal of a hand; a control stands where it is."""
         if self._control is not None:
             self._control.remove()
-            self._control = None
+        self._grabbed, self._control = name, None
+        if self._what.value != name:
+            self._what.value = name
         if name == NOTHING:
             return
         if name.startswith(GOAL):
@@ -97,49 +101,55 @@ class Editor:
             pose = self.planner.robot.link_pose(np.asarray(self.goal), frame.link) @ frame.pose
         else:
             pose = self.planner.world.obstacles[name].pose
-        self._control = self._server.scene.add_transform_controls(
+        control = self._control = self._server.scene.add_transform_controls(
             "/drag", scale=CONTROL_SIZE, wxyz=turn_of(pose), position=pose[:3, 3], depth_test=False
         )
-        self._control.on_update(lambda _: self._do(self._drag))
+        drag = partial(self._drag_by, control)
+        control.on_update(lambda _: self._do(Asked(drag, pose_of(control.wxyz, control.position))))
 
-    def _drag(self) -> None:
-        if self._control is not None:
-            self.drag(pose_of(self._control.wxyz, self._control.position))
+    def _replaced(self) -> None:
+        """Put a new control where what is chosen is now: the nodes are new."""
+        self._control = None
+        self.grab(self._grabbed)
+
+    def _drag_by(self, control: Any, pose: Array) -> None:
+        if control is self._control:
+            self.drag(pose)
 
     def drag(self, pose: Array) -> None:
-        """Move what is chosen to a pose, shape (4, 4), and show whether start and goal are valid then."""
-        name, scene = self._what.value, self._player.scenes[0]
+        """Move what is chosen to a pose, shape (4, 4), and show whether start and goal are free then."""
         fields = pose_fields(pose)
-        if name.startswith(GOAL):
-            self._move_goal(name.removeprefix(GOAL), fields)
-        elif name != NOTHING:
-            self.planner.world.move(name, fields["position"], fields["orientation"])
-            scene.move_obstacle(name, pose)
-        self._dragged_at, self._explained = time.perf_counter(), False
+        if self._grabbed.startswith(GOAL):
+            self._move_goal(self._grabbed.removeprefix(GOAL), fields)
+        elif self._grabbed != NOTHING:
+            self.planner.world.move(self._grabbed, fields["position"], fields["orientation"])
+            self._player.scenes[0].move_obstacle(self._grabbed, pose)
         self._check()
 
     def _move_goal(self, hand: str, fields: dict[str, Any]) -> None:
         target = PoseTarget(frame=hand, **fields)
         reach = PoseGoal(self.planner.robot, [target], (), np.asarray(self.goal))
         found = reach.nearest(np.asarray(self.goal))
-        if max(reach.errors(found).values()) <= REACHED:
-            self.goal = found
+        self._is_reached = max(reach.errors(found).values()) <= REACHED
+        if self._is_reached:
+            self.goal, self._goal_dragged = found, True
             self._player.scenes[0].show_ghost("goal ghost", found)
 
     def _check(self) -> None:
-        """Say whether start and goal are valid, by the kernel."""
-        said = []
-        for name, q in (("start", self.start), ("goal", self.goal)):
-            if q is not None:
-                said.append(f"{name} {'free' if self.planner.is_free(q) else '**blocked**'}")
-                self.checks += 1
-        self._state.content = ", ".join(said)
+        """Say whether start and goal are free, by the kernel; why not is said when nothing is edited any more."""
+        self._edited_at, self._is_explained = time.perf_counter(), False
+        states = [("start", self.start), *([] if self.goal is None else [("goal", self.goal)])]
+        said = [f"{name} {'free' if self.planner.is_free(q) else '**blocked**'}" for name, q in states]
+        self._state.content = ", ".join([*said, *([] if self._is_reached else ["out of reach"])])
 
     def step(self) -> None:
-        """Explain faults once nothing is dragged any more."""
-        if self._explained or time.perf_counter() - self._dragged_at < QUIET:
+        """Explain faults once nothing is edited any more, and put the control back where its thing is."""
+        if self._is_explained or time.perf_counter() - self._edited_at < QUIET:
             return
-        self._explained = True
+        self._is_explained = True
+        if not self._is_reached:
+            self._is_reached = True
+            self.grab(self._grabbed)
         scene, said = self._player.scenes[0], []
         for name, q in (("start", self.start), ("goal", self.goal)):
             if q is None:
@@ -149,69 +159,81 @@ class Editor:
             nodes = scene.robot if stands else scene.show_ghost(f"{name} ghost", q)
             scene.explain(name, nodes, q, found.reason, found.contacts)
             said.append(f"{name} {'free' if found else f'blocked: {found.reason}'}, {1e3 * found.clearance:.1f} mm")
-        self._state.content = "\n\n".join(said)
+        self._state.content = markdown(said)
 
     def add_box(self) -> str:
         """Add a box in front of the robot, choose it, and return its name."""
-        taken, k = self.planner.world.obstacles, 1
-        while f"box_{k}" in taken:
-            k += 1
+        k = next(k for k in range(1, 10_000) if f"box_{k}" not in self.planner.world.obstacles)
         name = f"box_{k}"
         self.planner.world.add(name=name, box=(NEW_BOX,) * 3, position=NEW_PLACE)
         self._player.scenes[0].add_obstacle(self.planner.world.obstacles[name])
         self._what.options = self._names()
-        self.select(name)
-        self._dragged_at, self._explained = time.perf_counter(), False
+        self.grab(name)
         self._check()
         return name
 
     def remove(self) -> str:
         """Remove the obstacle that is chosen."""
-        name = self._what.value
+        name = self._grabbed
         if name not in self.planner.world.obstacles:
             return "choose an obstacle first"
         self.planner.world.remove(name)
         self._player.scenes[0].remove_obstacle(name)
+        self.grab(NOTHING)
         self._what.options = self._names()
-        self.select(NOTHING)
         self._check()
         return f"{name} removed"
 
     def problem(self) -> Problem:
-        """Return the problem as it was edited; a goal in the workspace that was not dragged stays one.
-
-        Raises:
-            ApexError: There is no goal.
-        """
-        ready = self._player.sources[0].setup
-        kept = self.goal is None or (len(ready.goals) and np.array_equal(self.goal, ready.goals[0]))
+        """Return the problem as it was edited; a goal that was not dragged stays as it was given."""
         world = self.planner.world
-        edited = {"scene": tuple(world.obstacles.values()), "attached": tuple(world.held.values())}
-        if kept:
-            return self._problem.model_copy(update=edited)
-        made = self.planner.problem(self.start, np.asarray(self.goal), self._problem.name)
-        return self._problem.model_copy(update={**edited, "goal": made.goal})
+        edited: dict[str, Any] = {
+            "scene": tuple(world.obstacles.values()), "attached": tuple(world.held.values()), "allowed": world.allowed
+        }  # fmt: skip
+        if self._goal_dragged:
+            made = self.planner.problem(self.start, np.asarray(self.goal), self._problem.name)
+            edited["goal"] = made.goal
+        return self._problem.model_copy(update=edited)
 
     def plan(self) -> str:
-        """Plan in the world as it is, and show the result."""
+        """Plan in the world as it is, show the result, and return what was found.
+
+        Obstacles that move are taken to stand still.
+
+        Raises:
+            ApexError: The seed, the time limit or the problem is faulty.
+        """
         self._said.content = "planning ..."
         problem = self.problem()
-        result = self.planner.plan_problem(
-            problem, self._name.value, timeout=float(self._limit.value), seed=int(self._seed.value)
-        )
-        self._shown(result)
-        if not result:
-            return f"{result.status.value}: {result.reason}"
-        took = result.times.get("total", 0.0)
-        return f"{result.solved_by}, {1e3 * took:.0f} ms in all"
-
-    def _shown(self, result: PlanResult) -> None:
-        chosen = self._what.value
-        self._control = None
+        try:
+            result = self.planner.plan_problem(
+                problem, self._planner.value, timeout=float(self._limit.value), seed=int(self._seed.value),
+                group=self._group, snapshot=bool(problem.moving),
+            )  # fmt: skip
+        except ApexError:
+            self.planner.world.load(problem)
+            raise
+        if not self._goal_dragged and result.path is not None:
+            self.goal = result.path.states[-1]
         self._player.show([Shown.of(result)])
-        self.select(chosen)
+        self._check()
+        notes = "".join(f"; {note}" for note in result.notes)
+        if not result:
+            return f"{result.status.value}: {result.reason}{notes}"
+        return f"{result.solved_by}, {1e3 * result.times.get('total', 0.0):.0f} ms in all{notes}"
 
     def save(self) -> str:
-        """Write the problem as YAML to the file that is named in the page."""
-        self.problem().save(self._file.value)
-        return f"saved {self._file.value}"
+        """Write the problem as YAML to the file that is named in the page, in the working folder.
+
+        Raises:
+            ParameterError: The name is none of a .yaml file, or a file that this page did not write has it.
+            ApexError: The file cannot be written.
+        """
+        path = Path(self._file.value)
+        if path.name != self._file.value or path.suffix not in (".yaml", ".yml"):
+            raise ParameterError("file", self._file.value, "a name ending in .yaml, without a folder")
+        if path.exists() and path.absolute() not in self._written:
+            raise ParameterError("file", self._file.value, "the name of a file that is not there yet")
+        self.problem().save(path)
+        self._written.add(path.absolute())
+        return f"saved {path.absolute()}"

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from apex_ompl.apex.query import make_query
+from apex_ompl.collision import CollisionChecker
 from apex_ompl.diffusion.checkpoint import shared_model
 from apex_ompl.diffusion.guidance import Guidance
 from apex_ompl.diffusion.proposals import Sampling, TrajectoryModel
@@ -17,22 +17,23 @@ from apex_ompl.trajopt.optimizer import Optimizer
 from apex_ompl.trajopt.spline import Spline
 from apex_ompl.types import Array
 from apex_ompl.util.resolution import FINE_RESOLUTION
+from apex_ompl.viz.appearance import DENOISED, PROPOSAL_COLOURS
+from apex_ompl.viz.browser.editor import Editor
 from apex_ompl.viz.browser.player import Player
-from apex_ompl.viz.browser.server import asked
+from apex_ompl.viz.browser.server import Do, asked
+from apex_ompl.viz.browser.shown import markdown
 
 STEPS = 24  # of the denoising that is shown
 REPAIR_STEPS = 48  # of the optimizer on each proposal
 STATES = 60  # of a drawn path
-KINDS = {"sampled": "#8a8f98", "guided": "#1f6fb4", "repaired": "#2b9348", "not repaired": "#d97a1a"}
-DENOISED = "#8e44ad"
 
 
 class Inspection:
     """Draws the ways of the hands along a model's proposals for the problem that is shown."""
 
-    def __init__(self, server: Any, do: Callable[[Callable[[], None]], None], player: Player) -> None:
-        """Add the controls for what ``player`` shows, a single problem or result."""
-        self._player, self._nodes = player, dict[str, Any]()
+    def __init__(self, server: Any, do: Do, player: Player, editor: Editor) -> None:
+        """Add the controls for what ``player`` shows, a single problem or result, as ``editor`` has it."""
+        self._player, self._editor, self._nodes = player, editor, dict[str, Any]()
         self._estimates: list[Array] = []
         self._model: TrajectoryModel | None = None
         if default_planner(player.sources[0].setup.robot.name) != NAME:
@@ -43,28 +44,39 @@ class Inspection:
             self._seed = server.gui.add_number("seed", initial_value=0, min=0, step=1)
             draw = server.gui.add_button("draw proposals")
             self._said = server.gui.add_markdown("")
-            self._seen = {kind: server.gui.add_checkbox(kind, initial_value=kind != "sampled") for kind in KINDS}
+            self._seen = {
+                kind: server.gui.add_checkbox(kind, initial_value=kind != "sampled") for kind in PROPOSAL_COLOURS
+            }
             self._step = server.gui.add_slider("denoising", min=0, max=STEPS, step=1, initial_value=STEPS)
+        player.replaced.append(self._forget)
         draw.on_click(asked(do, self.draw))
         self._step.on_update(asked(do, self.denoise))
         for box in self._seen.values():
             box.on_update(asked(do, self._layers))
 
-    def draw(self) -> None:
+    def _forget(self) -> None:
+        """Forget what was drawn: its nodes are gone."""
+        self._nodes, self._estimates, self._said.content = {}, [], ""
+
+    def draw(self, _: Any = None) -> None:
         """Draw proposals as they are sampled, guided, and repaired; and say how many are valid."""
         try:
-            self._said.content = self._drawn()
+            said = self._drawn()
         except ApexError as error:
-            self._said.content = f"error: {error}"
+            said = f"error: {error}"
+        self._said.content = markdown([said])
 
     def _drawn(self) -> str:
-        ready = self._player.sources[0].setup
-        if not len(ready.goals):
+        editor, robot = self._editor, self._editor.planner.robot
+        if editor.goal is None:
             return "there is no goal"
+        checker = CollisionChecker(
+            robot, *(getattr(editor.problem(), part) for part in ("scene", "attached", "allowed"))
+        )
         if self._model is None:
-            self._model = shared_model(ApexParameters().model, device="cpu", robot=ready.robot.name)
-        model, kernel = self._model, ready.checker.kernel
-        query = make_query(ready.checker, ready.start, ready.goals[0], point=model.sees_point)
+            self._model = shared_model(ApexParameters().model, device="cpu", robot=robot.name)
+        model, kernel = self._model, checker.kernel
+        query = make_query(checker, editor.start, editor.goal, point=model.sees_point)
         count, seed = int(self._count.value), int(self._seed.value)
         estimates: list[Array] = []
 
@@ -89,14 +101,14 @@ class Inspection:
             "not repaired": improved[~np.array(proved)],
         }  # fmt: skip
         for kind, control in groups.items():
-            self._redraw(kind, control, model.spline, KINDS[kind])
+            self._redraw(kind, control, model.spline, PROPOSAL_COLOURS[kind])
         self._estimates = [*estimates, guided]
         self.denoise()
         self._layers()
         before = sum(kernel.proves(path, FINE_RESOLUTION) for path in model.spline.path(guided))
         return f"{count} proposals: {before} free as they are, {sum(proved)} after {REPAIR_STEPS} steps of repair"
 
-    def denoise(self) -> None:
+    def denoise(self, _: Any = None) -> None:
         """Draw the model's estimate of the guided proposals after some steps of denoising."""
         if self._estimates and self._model is not None:
             k = min(int(self._step.value), len(self._estimates) - 1)
@@ -110,7 +122,7 @@ class Inspection:
             paths = spline.path(control)[:, :: max(1, spline.states // STATES)]
             self._nodes[name] = self._player.scenes[0].show_lines(f"proposals/{name}", list(paths), colour)
 
-    def _layers(self) -> None:
+    def _layers(self, _: Any = None) -> None:
         for kind, box in self._seen.items():
             if kind in self._nodes:
                 self._nodes[kind].visible = box.value

@@ -6,6 +6,7 @@ import logging
 import queue
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,7 @@ class LivePage:
 
     Attributes:
         player: Plays what is shown.
-        editor: Edits it, or None where several things are shown.
+        editor: Edits it, or None where several things are shown, or a run.
         inspection: Shows proposals, or None likewise.
     """
 
@@ -47,44 +48,60 @@ class LivePage:
             ApexError: A result cannot be loaded.
         """
         self._server, self._choices = server, {path.as_posix(): path for path in choices}
-        self._actions: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
-        self._seen = False
+        self._actions: queue.SimpleQueue[tuple[int, Callable[[], None]]] = queue.SimpleQueue()
+        self._seen, self._shows = False, 0
         self._chosen = next(iter(self._choices), "")
         self._show(sources or [Shown.of(PlanResult.load(self._choices[self._chosen]))])
 
     def _show(self, sources: Sequence[Shown]) -> None:
-        server, alone = self._server, len(sources) == 1
+        self._shows += 1  # what was asked of controls that are gone is not done
+        server, do = self._server, partial(self._put, self._shows)
         server.gui.reset()
         if self._choices:
-            self._choice = server.gui.add_dropdown("result", tuple(self._choices), initial_value=self._chosen)
-            self._choice.on_update(asked(self._actions.put, self._choose))
-        self.player = Player(server, self._actions.put, sources)
-        self.editor = Editor(server, self._actions.put, self.player) if alone else None
-        self.inspection = Inspection(server, self._actions.put, self.player) if alone else None
+            choice = server.gui.add_dropdown("result", tuple(self._choices), initial_value=self._chosen)
+            choice.on_update(asked(do, self.choose))
+        self.player, self.editor, self.inspection = Player(server, do, sources), None, None
+        if len(sources) == 1 and sources[0].is_editable:
+            self.editor = Editor(server, do, self.player)
+            self.inspection = Inspection(server, do, self.player, self.editor)
 
-    def _choose(self) -> None:
-        self._chosen = self._choice.value
-        self._show([Shown.of(PlanResult.load(self._choices[self._chosen]))])
+    def _put(self, shows: int, action: Callable[[], None]) -> None:
+        self._actions.put((shows, action))
+
+    def choose(self, name: str) -> None:
+        """Show the result of a file of the folder, by its name there.
+
+        Raises:
+            ApexError: It cannot be loaded.
+        """
+        source = Shown.of(PlanResult.load(self._choices[name]))
+        self._chosen = name
+        self._show([source])
 
     def step(self, passed: float) -> None:
         """Do what the browser asked for since the last step, and go on playing.
 
-        Of the same thing asked for several times, as positions of something that is dragged, the last one is done.
+        Of the same thing asked for several times, as positions of something that is dragged, the last one is done. What
+        fails is logged, and the page goes on.
 
         Args:
             passed: Time since the last step [s].
         """
-        asked: dict[Any, Callable[[], None]] = {}
+        wanted: dict[Any, tuple[int, Callable[[], None]]] = {}
         while not self._actions.empty():
-            action = self._actions.get()
-            key = action if hasattr(action, "__self__") else id(action)
-            asked.pop(key, None)
-            asked[key] = action
-        for action in asked.values():
+            shows, action = self._actions.get()
+            key = getattr(action, "action", action)
+            wanted.pop(key, None)
+            wanted[key] = shows, action
+        for shows, action in wanted.values():
+            if shows != self._shows:
+                continue
             try:
                 action()
             except ApexError as error:
                 LOG.warning("%s", error)
+            except Exception:
+                LOG.exception("a control of the page failed")
         if self.editor is not None:
             self.editor.step()
         self.player.step(passed)
@@ -98,8 +115,8 @@ class LivePage:
         last = alone_since = time.perf_counter()
         while not until():
             now = time.perf_counter()
-            if self._server.get_clients():
-                self._seen, alone_since = True, now
+            if self._server.get_clients() or now - last > 1.0:  # after a long step a page may be about to come back
+                self._seen, alone_since = self._seen or bool(self._server.get_clients()), now
             elif self._seen and now - alone_since > LEFT_ALONE:
                 return
             self.step(now - last)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence, Set
+from collections.abc import Iterable, Sequence
 from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 import pinocchio as pin
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 
 from apex_ompl.robot import Robot
 from apex_ompl.types import Array
-from apex_ompl.viz.appearance import CONTACT, ROBOT, Item
+from apex_ompl.viz.appearance import ROBOT, Item
 
 FLAT = 300  # meshes with fewer triangles are shaded flat
 LINK_TRIANGLES, MOST_TRIANGLES = 3_000, 20_000  # that are kept of a link's mesh, and of another one
@@ -38,17 +39,10 @@ def pose_of(wxyz: Any, position: Any) -> Array:
     return np.array(pin.SE3(turn, np.asarray(position, float)).homogeneous)
 
 
-def add_item(api: Any, name: str, item: Item, placement: Array | None = None) -> Any:
-    """Add an item below a node, and return its handle.
-
-    Args:
-        api: The scene of a ``viser`` server.
-        name: Path of the node.
-        item: The item.
-        placement: Pose in the frame of the node above, shape (4, 4); by default the item's.
-    """
-    pose = item.placement if placement is None else placement
-    at = {"wxyz": turn_of(pose), "position": pose[:3, 3]}
+def add_item(api: Any, above: str, item: Item) -> Any:
+    """Add an item below the node ``above`` of a ``viser`` scene, and return its handle."""
+    at = {"wxyz": turn_of(item.placement), "position": item.placement[:3, 3]}
+    name = f"{above}/{item.layer}/{plain(item.name)}"
     if item.mesh is None:
         points = np.asarray(item.points, np.float32)
         return api.add_point_cloud(
@@ -72,6 +66,15 @@ def lighter(mesh: trimesh.Trimesh, most: int) -> tuple[NDArray[np.float32], NDAr
     return vertices, np.asarray(faces, np.uint32)
 
 
+def paint(item: Item, handle: Any, colour: str) -> None:
+    """Draw an item in a colour, if it is not drawn so."""
+    if item.mesh is None:
+        if not np.array_equal(handle.colors, rgb(colour)):
+            handle.colors = np.array(rgb(colour), np.uint8)
+    elif tuple(handle.color) != rgb(colour):
+        handle.color = rgb(colour)
+
+
 class RobotNodes:
     """A copy of a robot with what it holds, at a state that can be changed.
 
@@ -80,6 +83,7 @@ class RobotNodes:
     Attributes:
         robot: The robot.
         root: Handle of the node above all.
+        handles: The items with their handles.
     """
 
     def __init__(
@@ -94,9 +98,9 @@ class RobotNodes:
         self.root = api.add_frame(root, show_axes=False, visible=visible)
         self._paths, self._frames, self._sent = {0: root}, {}, dict[int, Array]()
         for joint in sorted({j for k in (*joints, *(item.joint for item in items)) for j in self._chain(k)}):
-            path = f"{self._paths[int(self._model.parents[joint])]}/{joint}"
+            path = f"{self._paths[int(self._model.parents[joint])]}/joint {joint}"
             self._paths[joint], self._frames[joint] = path, api.add_frame(path, show_axes=False)
-        self._handles = [(item, add_item(api, f"{self._paths[item.joint]}/{plain(item.name)}", item)) for item in items]
+        self.handles = [(item, add_item(api, self._paths[item.joint], item)) for item in items]
 
     def _chain(self, joint: int) -> Iterable[int]:
         while joint > 0:
@@ -119,23 +123,10 @@ class RobotNodes:
                 frame.position = pose[:3, 3]
             self._sent[joint] = pose
 
-    def mark(self, bodies: Set[str]) -> None:
-        """Draw links and held objects of some names in the colour of contacts, and all others in their own."""
-        for item, handle in self._handles:
-            colour = rgb(CONTACT if item.body in bodies else item.colour)
-            if item.mesh is not None and tuple(handle.color) != colour:
-                handle.color = colour
-
 
 def plain(name: str) -> str:
-    """Return a name without slashes, which would part nodes."""
-    return name.replace("/", "_")
-
-
-def add_way(api: Any, name: str, points: Array, colour: str, thickness: float = 0.006) -> Any:
-    """Add a line through points, shape (N, 3) [m], and return its handle."""
-    pieces = np.stack([points[:-1], points[1:]], axis=1).astype(np.float32)
-    return api.add_line_segments(name, pieces, rgb(colour), thickness=thickness)
+    """Return a name as part of a node's path: without slashes, and different for different names."""
+    return quote(name, safe=" ")
 
 
 def link_ways(robot: Robot, links: Sequence[str], states: Iterable[Array]) -> list[Array]:

@@ -14,9 +14,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from apex_ompl.types import Array
 from apex_ompl.util.files import check_writable, write_atomically
-from apex_ompl.viz.appearance import BACKGROUND, end_links
+from apex_ompl.viz.appearance import BACKGROUND, CLEARANCE_COLOURS, LIMIT_COLOURS, NOW, focus_of
 from apex_ompl.viz.browser.nodes import rgb
 from apex_ompl.viz.browser.scene import BrowserScene
 from apex_ompl.viz.browser.server import serving
@@ -30,7 +29,7 @@ SVG_SIZE = (3.4, 2.6)  # of the curves [inch]
 
 PANEL = """
 <style>
-#facts {{position: fixed; top: 12px; right: 12px; z-index: 5; max-width: 290px; font: 12px/1.35 sans-serif;
+#facts {{position: fixed; top: 12px; left: 12px; z-index: 5; max-width: 290px; font: 12px/1.35 sans-serif;
   background: rgba(255, 255, 255, 0.88); border-radius: 6px; padding: 8px 12px; color: #222; pointer-events: none}}
 #facts svg {{width: 100%; height: auto; display: block}}
 #facts p {{margin: 2px 0}}
@@ -100,7 +99,9 @@ def draw(server: Any, sources: Sequence[Shown]) -> list[BrowserScene]:
     server.scene.set_background_image(np.full((1, 1, 3), rgb(BACKGROUND), np.uint8), format="png")
     for k, (one, offset) in enumerate(ordered(sources)):
         scene = BrowserScene(server.scene, one.setup, f"/{k + 1}", offset)
-        for name, q, fault in one.faults:
+        for name, q, fault in one.ends:
+            if q is None:
+                continue
             nodes = scene.robot if name == "start" and one.duration <= 0.0 else scene.show_ghost(f"{name} ghost", q)
             if fault:
                 scene.explain(name, nodes, q, fault, one.setup.checker.contacts(q))
@@ -114,28 +115,20 @@ def draw(server: Any, sources: Sequence[Shown]) -> list[BrowserScene]:
 
 def place_camera(server: Any, sources: Sequence[Shown]) -> None:
     """Point the camera at the middle of hands and scenes, from the front of the robot."""
-    points = []
-    for one, offset in ordered(sources):
-        ready = one.setup
-        states = (ready.start, *ready.goals[:1])
-        points += [ready.robot.link_pose(q, link)[:3, 3] + offset for q in states for link in end_links(ready.robot)]
-        points += [body.pose[:3, 3] + offset for body in ready.problem.scene if body.half_space is None]
-    low, high = np.min(points, axis=0), np.max(points, axis=0)
-    middle: Array = 0.5 * (low + high)
-    focus = np.array([0.5 * middle[0], middle[1], max(0.3, 0.7 * middle[2])])
-    away = max(2.9, 1.2 * float(np.abs(high - low)[:2].max()))
-    server.initial_camera.look_at = focus
+    found = [(*focus_of(one.setup), np.asarray(offset)) for one, offset in ordered(sources)]
+    focus = np.mean([point + offset for point, _, offset in found], axis=0)
+    spread = max(wide for _, wide, _ in found) + abs(found[-1][2][1])
     aside = 0.42 if len(sources) == 1 else 0.0
-    server.initial_camera.position = focus + away * np.array([0.85, aside, 0.45])
+    server.initial_camera.look_at = focus
+    server.initial_camera.position = focus + max(2.9, 1.2 * spread) * np.array([0.85, aside, 0.45])
     server.initial_camera.fov = FIELD_OF_VIEW
     server.initial_camera.up = (0.0, 0.0, 1.0)
 
 
 def _panel(sources: Sequence[Shown]) -> str:
     """Return the facts and the curves as HTML."""
-    facts = "".join(
-        f"<p>{html.escape(row).replace('**', '')}</p>" for one in sources for row in one.facts.split("\n\n") if row
-    )
+    rows = [row for one in sources for row in (f"<b>{html.escape(one.facts[0])}</b>", *map(html.escape, one.facts[1:]))]
+    facts = "".join(f"<p>{row}</p>" for row in rows)
     duration = max(one.duration for one in sources) + HOLD
     curves, left, right = _curves(sources, duration)
     return PANEL.format(facts=facts, curves=curves, duration=duration, left=left, right=right)
@@ -152,14 +145,17 @@ def _curves(sources: Sequence[Shown], duration: float) -> tuple[str, float, floa
         figure.subplots_adjust(left=0.13, right=0.97, top=0.98, bottom=0.13, hspace=0.12)
         for k, one in enumerate(timed):
             curves, style = one.curves, ("-", "--", ":", "-.")[k % 4]
-            axes[0].plot(curves["time"], curves["clearance"], style, color="#0b6e4f", linewidth=1.0)
-            for name, colour in (("velocity", "#1f6fb4"), ("acceleration", "#d97a1a"), ("jerk", "#8e44ad")):
+            shade = CLEARANCE_COLOURS[k % len(CLEARANCE_COLOURS)]
+            axes[0].plot(curves["time"], curves["clearance"], style, color=shade, linewidth=1.0, label=one.name)
+            for name, colour in LIMIT_COLOURS.items():
                 label = name if k == 0 else None
                 axes[1].plot(curves["time"], curves[name], style, color=colour, linewidth=0.8, label=label)
         axes[0].set(ylabel="clearance mm", ylim=(0.0, None), xlim=(0.0, duration))
+        if len(timed) > 1:
+            axes[0].legend(fontsize=5, loc="upper right", frameon=False)
         axes[1].set(ylabel="share of limit", xlabel="time s", ylim=(0.0, 1.05))
         axes[1].legend(fontsize=6, loc="upper right", frameon=False)
-        cursor = figure.add_artist(Line2D([0.13, 0.13], [0.13, 0.98], color="#c8553d", linewidth=0.9))
+        cursor = figure.add_artist(Line2D([0.13, 0.13], [0.13, 0.98], color=NOW, linewidth=0.9))
         cursor.set_gid("cursor")
         buffer = io.StringIO()
         figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None})

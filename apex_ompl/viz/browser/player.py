@@ -8,27 +8,29 @@ from typing import Any
 import numpy as np
 
 from apex_ompl.types import Array
+from apex_ompl.viz.appearance import CLEARANCE_COLOURS, LIMIT_COLOURS, NOW
 from apex_ompl.viz.browser.page import HOLD, draw
-from apex_ompl.viz.browser.server import asked
-from apex_ompl.viz.browser.shown import Shown
+from apex_ompl.viz.browser.server import Do, asked
+from apex_ompl.viz.browser.shown import Shown, markdown
 
 SPEEDS = {"0.25": 0.25, "0.5": 0.5, "1": 1.0, "2": 2.0, "4": 4.0}
 PLOT_HEIGHT = 150  # [pixels]
-LINES = (("velocity", "#1f6fb4"), ("acceleration", "#d97a1a"), ("jerk", "#8e44ad"))
-CURSOR = "#c8553d"
 CURSOR_PERIOD = 0.1  # at which the cursor of the curves is moved [s]
 
 
 class Player:
     """Shows problems and results side by side, and plays their motions together.
 
+    What grows, as a run that goes on, is followed: its end is shown while it plays.
+
     Attributes:
         sources: What is shown.
         scenes: Their scenes.
         time: Time of the motion [s].
+        replaced: Called when other things are shown, whose nodes are new.
     """
 
-    def __init__(self, server: Any, do: Callable[[Callable[[], None]], None], sources: Sequence[Shown]) -> None:
+    def __init__(self, server: Any, do: Do, sources: Sequence[Shown]) -> None:
         """Add the controls, and show ``sources``.
 
         Args:
@@ -38,6 +40,7 @@ class Player:
         """
         self._server, gui = server, server.gui
         self.time, self._waited, self._cursor_at = 0.0, 0.0, -1.0
+        self.replaced: list[Callable[[], None]] = []
         self._facts = gui.add_markdown("")
         self._play = gui.add_checkbox("play", initial_value=True)
         self._slider = gui.add_slider("time s", min=0.0, max=1.0, step=0.001, initial_value=0.0)
@@ -46,7 +49,7 @@ class Player:
         self._ways = gui.add_checkbox("ways of the hands", initial_value=True)
         self._curves = gui.add_folder("over time")
         self._plots: list[tuple[Any, Array]] = []
-        self._slider.on_update(asked(do, self._seek))
+        self._slider.on_update(asked(do, self.seek))
         self._cover.on_update(asked(do, self._layers))
         self._ways.on_update(asked(do, self._layers))
         self.show(sources)
@@ -57,20 +60,27 @@ class Player:
         with self._server.atomic():
             self._server.scene.reset()
             self.scenes = draw(self._server, sources)
-        self._facts.content = "\n\n".join(one.facts for one in sources)
-        moving = self.duration > 0.0
-        for handle in (self._play, self._slider, self._speed, self._ways):
-            handle.visible = moving
-        if moving:
-            self._slider.max = self.duration
-            self._slider.value = 0.0
+        self._facts.content = "\n\n".join(markdown(one.facts) for one in sources)
+        self._slider.value = 0.0
+        self._size()
         self._plot()
         self._layers()
+        for call in self.replaced:
+            call()
 
     @property
     def duration(self) -> float:
         """Duration of the longest motion [s]."""
         return max(one.duration for one in self.sources)
+
+    def _size(self) -> None:
+        """Fit the controls to the duration."""
+        duration = self.duration
+        for handle in (self._play, self._slider, self._speed, self._ways):
+            if handle.visible != (duration > 0.0):
+                handle.visible = duration > 0.0
+        if duration > 0.0 and self._slider.max != duration:
+            self._slider.max = duration
 
     def step(self, passed: float) -> None:
         """Go on playing.
@@ -78,9 +88,14 @@ class Player:
         Args:
             passed: Time since the last step [s].
         """
+        grows = any(one.grows for one in self.sources)
+        if grows:
+            self._size()
         if self.duration <= 0.0 or not self._play.value:
             return
-        if self.time >= self.duration:
+        if grows:
+            self.time = self.duration
+        elif self.time >= self.duration:
             self._waited += passed
             if self._waited < HOLD:
                 return
@@ -90,9 +105,10 @@ class Player:
         self._slider.value = round(self.time, 3)
         self._draw()
 
-    def _seek(self) -> None:
+    def seek(self, time: float) -> None:
+        """Go to a time [s], and stop there."""
         self._play.value = False
-        self.time = float(self._slider.value)
+        self.time = float(time)
         self._draw()
 
     def _draw(self) -> None:
@@ -106,7 +122,7 @@ class Player:
                 line = np.where(np.abs(x - self.time) <= 0.5 * (x[1] - x[0]) + 1e-9, top, np.nan)
                 plot.data = (*plot.data[:-1], line)
 
-    def _layers(self) -> None:
+    def _layers(self, _: Any = None) -> None:
         for one, scene in zip(self.sources, self.scenes, strict=True):
             scene.set_ways_visible(self._ways.value)
             if self._cover.value or scene.has_cover:
@@ -120,24 +136,25 @@ class Player:
         self._curves.visible = bool(timed)
         if not timed:
             return
-        longest = max(timed, key=lambda one: one.duration)
-        times = longest.curves["time"]
+        times = max(timed, key=lambda one: one.duration).curves["time"]
 
-        def at(one: Shown, name: str) -> Array:
-            return np.interp(times, one.curves["time"], one.curves[name], right=np.nan)
+        def line(one: Shown, name: str, colour: str) -> tuple[str, Array, str]:
+            label = name if len(timed) == 1 else f"{name}, {one.name}"
+            return colour, np.interp(times, one.curves["time"], one.curves[name], right=np.nan), label
 
-        gaps = [at(one, "clearance") for one in timed]
-        self._add_plot("clearance mm", times, [("#0b6e4f", gap, "clearance mm") for gap in gaps], np.nanmax(gaps))
-        shares = [(colour, at(one, name), name) for one in timed for name, colour in LINES]
+        colours = [CLEARANCE_COLOURS[k % len(CLEARANCE_COLOURS)] for k in range(len(timed))]
+        gaps = [line(one, "clearance", colour) for one, colour in zip(timed, colours, strict=True)]
+        self._add_plot("clearance mm", times, gaps, max(float(np.nanmax(values)) for _, values, _ in gaps))
+        shares = [line(one, name, colour) for one in timed for name, colour in LIMIT_COLOURS.items()]
         self._add_plot("share of limits", times, shares, 1.0)
 
     def _add_plot(self, title: str, times: Array, lines: Sequence[tuple[str, Array, str]], top: float) -> None:
         series = [{"label": "s"}, *({"label": label, "stroke": colour, "width": 1.5} for colour, _, label in lines)]
         data = (times, *(values for _, values, _ in lines), np.full(len(times), np.nan))
-        series.append({"label": "now", "stroke": CURSOR, "width": 3, "points": {"show": True, "size": 8}})
-        scales = {"x": {"time": False}, "y": {"range": (0.0, 1.05 * float(top) + 1e-6)}}
+        series.append({"label": "now", "stroke": NOW, "width": 3, "points": {"show": True, "size": 8}})
+        scales = {"x": {"time": False}, "y": {"range": (0.0, 1.05 * top + 1e-6)}}
         with self._curves:
             plot = self._server.gui.add_uplot(
                 data, tuple(series), title=title, scales=scales, height=PLOT_HEIGHT, legend={"show": len(lines) > 1}
             )
-        self._plots.append((plot, np.asarray(float(top))))
+        self._plots.append((plot, np.asarray(top)))

@@ -4,26 +4,23 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from apex_ompl.errors import ParameterError
-from apex_ompl.ompl_adapter.setup import PlanningSetup
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.types import Array
 from apex_ompl.util.validation import check_array, check_nonnegative
-from apex_ompl.viz.appearance import OBSTACLES, body_item
-from apex_ompl.viz.browser.nodes import add_item, plain, rgb, turn_of
+from apex_ompl.viz.appearance import RUN_COLOURS, RUN_OPACITIES, body_item
+from apex_ompl.viz.browser.nodes import add_item, turn_of
 from apex_ompl.viz.browser.scene import BrowserScene
 from apex_ompl.viz.browser.shown import Shown
 
 TRUE, OBSERVED, PREDICTED = BODIES = ("true", "observed", "predicted")
 COMMITTED, STOP = MOTIONS = ("committed", "stop")
 EVENTS = "events"
-COLOURS = {TRUE: "#c8553d", OBSERVED: "#e9a03b", PREDICTED: "#8e44ad", COMMITTED: "#2b9348", STOP: "#e0101b"}
-OPACITIES = {TRUE: 0.9, OBSERVED: 0.5, PREDICTED: 0.22}
 EVENT_HEIGHT = 1.35  # of the label of the last event [m]
 EVENT_TIME = 1.0  # how long it is shown [s]
 
@@ -34,16 +31,25 @@ class ShownRun(Shown):
 
     Layers of obstacles are ``true``, ``observed`` and ``predicted``; of motions ``committed``, what the robot will do,
     and ``stop``, how it would come to rest; ``events`` are texts. What was fed to a layer last before a time is what is
-    shown then.
+    shown then. It may be fed by one thread while another shows it.
+
+    Attributes:
+        has_ended: Whether nothing more is fed, so that it is played from its beginning.
     """
 
+    has_ended: bool = False
     _times: dict[str, list[float]] = field(default_factory=dict)
     _values: dict[str, list[Any]] = field(default_factory=dict)
 
-    @classmethod
-    def begun(cls, name: str, setup: PlanningSetup) -> ShownRun:
-        """Return a run with nothing in it yet."""
-        return cls(name, setup)
+    @property
+    def grows(self) -> bool:
+        """Whether it goes on; set ``has_ended`` when it does not."""
+        return not self.has_ended
+
+    @property
+    def is_editable(self) -> bool:
+        """Whether its problem can be edited: not that of a run."""
+        return False
 
     def feed_state(self, time: float, q: Array) -> None:
         """Say where the robot was at a time [s], shape (dof,).
@@ -86,18 +92,13 @@ class ShownRun(Shown):
         times = self._times.setdefault(layer, [])
         if times and time < times[-1]:
             raise ParameterError("time", time, f"at least {times[-1]}, that of the last {layer}")
-        times.append(float(time))
         self._values.setdefault(layer, []).append(value)
+        times.append(float(time))  # last: a page may be reading in another thread, by the times
 
     @property
     def duration(self) -> float:
         """Time of the last thing that was fed [s]."""
         return max((times[-1] for times in self._times.values()), default=0.0)
-
-    @property
-    def events(self) -> Mapping[float, str]:
-        """The events by time."""
-        return dict(self._values.get(EVENTS, ()))
 
     def state(self, time: float) -> Array:
         """Return the state at a time, between those that were fed; shape (dof,)."""
@@ -156,11 +157,8 @@ class LayerNodes:
                 continue
             if before is not None:
                 before[1].remove()
-            item = body_item(body, OBSTACLES)
-            path = f"{self._scene.root}/{layer}/{plain(name)}"
-            handle = add_item(self._scene.api, path, item)
-            if item.mesh is not None:
-                handle.color, handle.opacity = rgb(COLOURS[layer]), OPACITIES[layer]
+            item = replace(body_item(body, layer), colour=RUN_COLOURS[layer], opacity=RUN_OPACITIES[layer])
+            handle = add_item(self._scene.api, self._scene.root, item)
             known[name] = body, handle
 
     def _show_motion(self, layer: str, states: Array | None) -> None:
@@ -168,7 +166,7 @@ class LayerNodes:
         if old is not None:
             old.remove()
         if states is not None and len(states) > 1:
-            self._motions[layer] = self._scene.show_lines(layer, [states], COLOURS[layer], 0.008)
+            self._motions[layer] = self._scene.show_lines(layer, [states], RUN_COLOURS[layer], 0.008)
 
     def _show_event(self, number: int, event: tuple[float, str] | None, time: float) -> None:
         late = event is None or time - event[0] > EVENT_TIME

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,22 +15,22 @@ from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.types import Array
 from apex_ompl.viz.appearance import (
     CONTACT,
+    COVER,
     EDGE,
-    OBSTACLE,
     OBSTACLES,
-    ROBOT,
     SOLID,
     WAY_COLOURS,
     Item,
     body_item,
     end_links,
+    ghosts_of,
     items_of,
-    robot_items,
 )
-from apex_ompl.viz.browser.nodes import RobotNodes, add_item, add_way, link_ways, plain, rgb, turn_of
+from apex_ompl.viz.browser.nodes import RobotNodes, add_item, link_ways, paint, plain, rgb, turn_of
 
-COVER, COVER_OPACITY = "#3a86c8", 0.35
+COVER_OPACITY = 0.35
 LABEL_HEIGHT = 0.1  # of a label above what it is about [m]
+WAY, LINE = 0.006, 0.003  # thickness of the ways of a motion, and of proposals [m]
 
 
 class BrowserScene:
@@ -39,7 +39,6 @@ class BrowserScene:
     Attributes:
         setup: The problem.
         robot: Nodes of the robot with what it holds.
-        obstacles: Handles of obstacles by name.
         api: The scene of the ``viser`` server.
         root: Path of the node above all.
         extras: What else is drawn in it, by name; for those who draw it.
@@ -57,9 +56,8 @@ class BrowserScene:
         self.setup, self.api, self.root = setup, api, root
         api.add_frame(root, show_axes=False, position=np.asarray(offset, float))
         items = items_of(setup)
-        self._moving = [item for item in items if item.moves]
-        self.robot = RobotNodes(api, f"{root}/robot", setup.robot, self._moving)
-        self.obstacles: dict[str, Any] = {}
+        self.robot = RobotNodes(api, f"{root}/robot", setup.robot, [item for item in items if item.moves])
+        self._static: dict[tuple[str, str], tuple[Item, Any]] = {}
         for item in items:
             if not item.moves:
                 self._add(item)
@@ -70,14 +68,17 @@ class BrowserScene:
         self._touching: dict[str, set[str]] = {}
         self._ways: list[Any] = []
 
+    @property
+    def obstacles(self) -> dict[str, Any]:
+        """Handles of obstacles by name."""
+        return {name: handle for (layer, name), (_, handle) in self._static.items() if layer == OBSTACLES}
+
     def _add(self, item: Item) -> None:
-        handle = add_item(self.api, f"{self.root}/{item.layer}/{plain(item.name)}", item)
-        if item.layer == OBSTACLES:
-            self.obstacles[item.name] = handle
-            if item.mesh is not None and item.opacity < 0.5 * SOLID:
-                lines = _edges(item.mesh)
-                path = f"{self.root}/{item.layer}/{plain(item.name)}/edges"
-                self.api.add_line_segments(path, lines, rgb(EDGE), thickness=0.003)
+        handle = add_item(self.api, self.root, item)
+        self._static[item.layer, item.name] = item, handle
+        if item.layer == OBSTACLES and item.mesh is not None and item.opacity < 0.5 * SOLID:
+            path = f"{self.root}/{item.layer}/{plain(item.name)}/edges"
+            self.api.add_line_segments(path, _edges(item.mesh), rgb(EDGE), thickness=LINE)
 
     def show(self, q: Array) -> None:
         """Put the robot, and its sphere cover if there is one, at a state of shape (dof,)."""
@@ -88,9 +89,8 @@ class BrowserScene:
     def show_ghost(self, name: str, q: Array) -> RobotNodes:
         """Put a translucent copy of the robot, made if need be, at a state, and return it."""
         if name not in self._ghosts:
-            coarse = robot_items(self.setup.robot, coarse=True)
-            items = [item.ghost for item in (*coarse, *(one for one in self._moving if one.layer != ROBOT))]
-            self._ghosts[name] = RobotNodes(self.api, f"{self.root}/{plain(name)}", self.setup.robot, items)
+            path = f"{self.root}/{plain(name)}"
+            self._ghosts[name] = RobotNodes(self.api, path, self.setup.robot, ghosts_of(self.setup))
         self._ghosts[name].show(q)
         return self._ghosts[name]
 
@@ -105,9 +105,12 @@ class BrowserScene:
             contacts: What touches there.
         """
         touching = {body for contact in contacts for body in (contact.first, contact.second)} if fault else set()
-        nodes.mark(touching)
+        for item, handle in nodes.handles:
+            paint(item, handle, CONTACT if item.body in touching else item.colour)
         self._touching[name] = touching
-        self._mark_obstacles(set().union(*self._touching.values()))
+        known = set().union(*self._touching.values())
+        for item, handle in self._static.values():
+            paint(item, handle, CONTACT if item.body in known else item.colour)
         label = self._labels.pop(name, None)
         if label is not None:
             label.remove()
@@ -117,31 +120,28 @@ class BrowserScene:
             at = self.setup.robot.link_pose(q, link)[:3, 3] + (0.0, 0.0, LABEL_HEIGHT)
             self._labels[name] = self.api.add_label(f"{self.root}/why {plain(name)}", f"{name}: {fault}", position=at)
 
-    def _mark_obstacles(self, names: Set[str]) -> None:
-        for name, handle in self.obstacles.items():
-            if hasattr(handle, "color") and tuple(handle.color) != (
-                colour := rgb(CONTACT if name in names else OBSTACLE)
-            ):
-                handle.color = colour
-
-    def show_ways(self, states: Sequence[Array], name: str = "ways", colours: Sequence[str] = WAY_COLOURS) -> None:
-        """Draw the ways of the hands through states."""
-        links = end_links(self.setup.robot)
-        self._ways.append(self.api.add_frame(f"{self.root}/{plain(name)}", show_axes=False))
-        for k, (link, way) in enumerate(zip(links, link_ways(self.setup.robot, links, states), strict=True)):
-            add_way(self.api, f"{self.root}/{plain(name)}/{link}", way, colours[k % len(colours)])
+    def show_ways(self, states: Sequence[Array]) -> None:
+        """Draw the ways of the hands through states, each in a colour of its own."""
+        links, robot = end_links(self.setup.robot), self.setup.robot
+        for k, (link, way) in enumerate(zip(links, link_ways(robot, links, states), strict=True)):
+            colour = WAY_COLOURS[k % len(WAY_COLOURS)]
+            self._ways.append(self._add_lines(f"ways/{plain(link)}", [way], colour, WAY))
 
     def set_ways_visible(self, visible: bool) -> None:
         """Show or hide the ways of the hands."""
         for node in self._ways:
             node.visible = visible
 
-    def show_lines(self, name: str, paths: Sequence[Array], colour: str, thickness: float = 0.003) -> Any:
+    def show_lines(self, name: str, paths: Sequence[Array], colour: str, thickness: float = LINE) -> Any:
         """Draw the ways of the hands along several paths, each of shape (N, dof), as one node, and return it."""
         links, robot = end_links(self.setup.robot), self.setup.robot
-        ways = [way for path in paths for way in link_ways(robot, links, path)]
+        return self._add_lines(
+            name, [way for path in paths for way in link_ways(robot, links, path)], colour, thickness
+        )
+
+    def _add_lines(self, name: str, ways: Sequence[Array], colour: str, thickness: float) -> Any:
         pieces = np.concatenate([np.stack([way[:-1], way[1:]], axis=1) for way in ways]).astype(np.float32)
-        return self.api.add_line_segments(f"{self.root}/{plain(name)}", pieces, rgb(colour), thickness=thickness)
+        return self.api.add_line_segments(f"{self.root}/{name}", pieces, rgb(colour), thickness=thickness)
 
     @property
     def has_cover(self) -> bool:
@@ -172,12 +172,13 @@ class BrowserScene:
 
     def move_obstacle(self, name: str, pose: Array) -> None:
         """Move an obstacle to a pose, shape (4, 4)."""
-        self.obstacles[name].wxyz, self.obstacles[name].position = turn_of(pose), pose[:3, 3]
+        handle = self._static[OBSTACLES, name][1]
+        handle.wxyz, handle.position = turn_of(pose), pose[:3, 3]
 
     def remove_obstacle(self, name: str) -> None:
         """Remove an obstacle if it is there."""
-        if name in self.obstacles:
-            self.obstacles.pop(name).remove()
+        if (OBSTACLES, name) in self._static:
+            self._static.pop((OBSTACLES, name))[1].remove()
 
 
 def _cover_of(setup: PlanningSetup) -> Mapping[int, Array]:

@@ -6,6 +6,7 @@ import io
 import socket
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stdout
+from dataclasses import dataclass
 from typing import Any
 
 from apex_ompl.errors import MissingFileError, ParameterError
@@ -16,12 +17,11 @@ PORT, PORTS = 8080, 100  # where a free port is looked for, and how many are tri
 
 
 @contextmanager
-def serving(port: int | None = None, label: str = "apex_ompl") -> Iterator[Any]:
+def serving(port: int | None = None) -> Iterator[Any]:
     """Serve an empty page on 127.0.0.1 inside a block; ``get_port`` of what is yielded gives the port.
 
     Args:
         port: The port; by default the first free one from 8080 on.
-        label: Title of the panel.
 
     Yields:
         A ``viser.ViserServer``.
@@ -33,11 +33,13 @@ def serving(port: int | None = None, label: str = "apex_ompl") -> Iterator[Any]:
     viser = import_viser()
     found = free_port(port)
     with redirect_stdout(io.StringIO()):  # of its banner
-        server = viser.ViserServer(host=HOST, port=found, label=label, verbose=False)
+        server = viser.ViserServer(host=HOST, port=found, label="apex_ompl", verbose=False)
     try:
         if port is not None and server.get_port() != port:
             raise ParameterError("port", port, "a port of this machine that is free")
-        server.gui.configure_theme(show_logo=False, show_share_button=False)  # sharing would tunnel to another machine
+        server.gui.configure_theme(show_logo=False, show_share_button=False)
+        for message in (viser._messages.ShareUrlRequest, viser._messages.ShareUrlDisconnect):
+            server._websock_server.unregister_handler(message)  # sharing would tunnel to another machine
         yield server
     finally:
         with redirect_stdout(io.StringIO()):
@@ -90,16 +92,37 @@ def import_viser() -> Any:
     return viser
 
 
-def asked(do: Callable[[Callable[[], None]], None], action: Callable[[], None]) -> Callable[[Any], None]:
-    """Return a callback of a control that passes an action on where a browser asked for it, and not this program.
+Do = Callable[[Callable[[], None]], None]
+"""Takes what is to be done in the page's own thread."""
+
+
+def asked(do: Do, action: Callable[[Any], None]) -> Callable[[Any], None]:
+    """Return a callback of a control: the action, with the control's value, where a browser asked for it.
 
     Args:
-        do: Takes what is to be done in the page's own thread.
-        action: What is to be done.
+        do: Takes what is to be done.
+        action: What is to be done; what the program itself sets asks for nothing.
     """
 
     def handle(event: Any) -> None:
         if event.client is not None:
-            do(action)
+            do(Asked(action, event.target.value))
 
     return handle
+
+
+@dataclass(frozen=True)
+class Asked:
+    """An action with the value that it was asked for with; asked for again, it takes the place of the one before.
+
+    Attributes:
+        action: What is to be done.
+        value: What it is called with.
+    """
+
+    action: Callable[[Any], None]
+    value: Any
+
+    def __call__(self) -> None:
+        """Do it."""
+        self.action(self.value)

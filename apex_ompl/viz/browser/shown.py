@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import html
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -16,12 +18,14 @@ from apex_ompl.robot.identity import load_same_robot
 from apex_ompl.scene.problem import Problem
 from apex_ompl.trajopt.path import resample
 from apex_ompl.types import Array
+from apex_ompl.util.files import BROKEN
 from apex_ompl.viz.browser.scene import BrowserScene
 from apex_ompl.viz.curves import ORDERS, clearances, shares_of_limits
 
 UNTIMED, STATES = 4.0, 120  # how long a path without times plays [s], and its states
 CURVE_SAMPLES = 160
-RESULTS = (".json", ".npz", ".yaml")
+RESULTS, HEAD = (".json", ".npz", ".yaml"), 2000  # of a result's file, the characters that name its schema
+MARKS = re.compile(r"([\\`*_\[\]#|~])")  # that mean something in Markdown
 
 
 @dataclass(eq=False)
@@ -37,6 +41,16 @@ class Shown:
     name: str
     setup: PlanningSetup
     result: PlanResult | None = None
+
+    @property
+    def grows(self) -> bool:
+        """Whether its motion becomes longer while it is shown."""
+        return False
+
+    @property
+    def is_editable(self) -> bool:
+        """Whether its problem can be edited and planned."""
+        return True
 
     @classmethod
     def of(cls, source: Problem | PlanResult, name: str = "") -> Shown:
@@ -93,30 +107,41 @@ class Shown:
         return {**found, **dict(zip(ORDERS, shares, strict=True))}
 
     @property
-    def faults(self) -> tuple[tuple[str, Array, str], ...]:
-        """Name, state and fault of start and goals, those that are shown as ghosts; faults are empty where valid."""
+    def ends(self) -> tuple[tuple[str, Array | None, str], ...]:
+        """Name, state and fault of start and goal; faults are empty where they are valid.
+
+        The goal of a result is where its path ends; of a problem, the first valid one. A goal in the workspace that was
+        not reached has a fault and no state.
+        """
         ready = self.setup
-        goals = zip(ready.goals[:1], ready.goal_faults[:1], strict=False)
-        return (("start", ready.start, ready.start_fault), *(("goal", goal, fault) for goal, fault in goals))
+        start = "start", ready.start, ready.start_fault
+        if self.result is not None and self.result.path is not None:
+            return start, ("goal", self.result.path.states[-1], "")
+        if not len(ready.goals):
+            return start, *(("goal", None, fault) for fault in ready.goal_faults[:1])
+        k = next((k for k in range(len(ready.goals)) if not ready.goal_faults[k]), 0)
+        return start, ("goal", ready.goals[k], ready.goal_faults[k])
 
     @property
-    def facts(self) -> str:
-        """Facts in Markdown."""
-        rows = [f"**{self.name}**"]
+    def facts(self) -> list[str]:
+        """Facts, a sentence each; the first is its name."""
         result = self.result
         if result is None:
             held = len(self.setup.problem.attached)
-            rows.append(f"{len(self.setup.problem.scene)} obstacles, {held} held objects")
+            rows = [self.name, f"{len(self.setup.problem.scene)} obstacles, {held} held objects"]
         else:
             said = f"{result.planner}: {result.status.value}" + (f", by {result.solved_by}" if result else "")
             if result.path is not None:
                 said += f"; {result.length:.2f} rad, clearance {1e3 * result.clearance:.1f} mm"
             if result.trajectory is not None:
                 said += f"; {result.trajectory.duration:.2f} s by {result.timing_method}"
-            rows.append(said)
-            rows += [result.reason] if result.reason else []
-        rows += [f"{name}: {fault}" for name, _, fault in self.faults if fault]
-        return "\n\n".join(rows)
+            rows = [self.name, said, *filter(None, [result.reason])]
+        return rows + [f"{name}: {fault}" for name, _, fault in self.ends if fault]
+
+
+def markdown(rows: Sequence[str]) -> str:
+    """Return sentences as Markdown that shows them as they are."""
+    return "\n\n".join(html.escape(MARKS.sub(r"\\\1", row)) for row in rows)
 
 
 def results_in(folder: Path) -> list[Path]:
@@ -125,17 +150,24 @@ def results_in(folder: Path) -> list[Path]:
     Raises:
         ParameterError: There are none.
     """
-    found = [path for path in sorted(folder.rglob("*")) if path.suffix in RESULTS and _is_result(path)]
+    found = [
+        path for path in sorted(folder.rglob("*")) if path.suffix in RESULTS and path.is_file() and _is_result(path)
+    ]
     if not found:
         raise ParameterError("folder", str(folder), "one with results: files written by plan --out or bench --keep")
     return found
 
 
 def _is_result(path: Path) -> bool:
-    if path.suffix == ".npz":
-        with np.load(path, allow_pickle=False) as file:
-            return "result" in file.files
-    return SCHEMA.rpartition("/")[0] in path.read_text(encoding="utf-8", errors="replace")[:2000]
+    """Whether a file is a result, by its beginning."""
+    try:
+        if path.suffix == ".npz":
+            with np.load(path, allow_pickle=False) as file:
+                return "result" in file.files
+        with path.open(encoding="utf-8") as lines:
+            return SCHEMA.rpartition("/")[0] in lines.read(HEAD)
+    except (OSError, AttributeError, *BROKEN):
+        return False
 
 
 def ordered(sources: Sequence[Shown]) -> list[tuple[Shown, tuple[float, float, float]]]:
