@@ -15,8 +15,8 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
-SIZE = (1000, 560)
-TRIES = 6
+SIZE = (720, 440)
+TRIES, PAUSE = 6, 0.4  # [s]
 BROWSER, DRIVER = shutil.which("chromium"), shutil.which("chromedriver")
 needs_browser = pytest.mark.skipif(
     BROWSER is None or DRIVER is None, reason="no browser: apt-get install chromium chromium-driver"
@@ -54,7 +54,7 @@ def until(condition: Callable[[], Any], what: str, seconds: float = 60.0) -> Any
         found = condition()
         if found is not None and found is not False and np.size(found):
             return found
-        time.sleep(0.1)
+        time.sleep(PAUSE)
     raise AssertionError(f"not within {seconds:g} s: {what}")
 
 

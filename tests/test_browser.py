@@ -6,7 +6,6 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from queue import SimpleQueue
@@ -14,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from browser import address, browser, errors, needs_browser, picture, until
+from browser import SIZE, address, browser, errors, needs_browser, picture, until
 
 from apex_ompl import plan
 from apex_ompl.scene.bodies import Obstacle
@@ -44,16 +43,14 @@ def opened(driver: Any, where: str) -> None:
     until(lambda: driver.find_elements("css selector", "canvas"), "a canvas")
 
 
-def is_drawn(driver: Any) -> bool:
-    """Whether the middle of the picture has many colours."""
-    middle = picture(driver)[100:-100, 340:650]
-    return len(np.unique(middle.reshape(-1, 3), axis=0)) > 200
+WRITTEN, LIVE = slice(310, 700), slice(20, 380)  # columns that no panel covers
 
 
-def reddish(driver: Any) -> int:
-    """How many pixels have the hue of obstacles, far from what the browser itself shows."""
-    seen = picture(driver)[180:, 340:650]
-    return int(((seen[..., 0] > 1.4 * seen[..., 1]) & (seen[..., 0] > 1.4 * seen[..., 2])).sum())
+def is_drawn(driver: Any, columns: slice, reds: int = 100) -> bool:
+    """Whether the picture has many colours, and pixels of the hue of obstacles."""
+    seen = picture(driver)[140:-60, columns].reshape(-1, 3)
+    red = (seen[:, 0] > 1.4 * seen[:, 1]) & (seen[:, 0] > 1.4 * seen[:, 2])
+    return len(np.unique(seen, axis=0)) > 200 and red.sum() >= reds
 
 
 def with_a_cloud(problem: Problem, folder: Path) -> Problem:
@@ -69,7 +66,7 @@ def test_pages_show_and_play_to_the_end(driver: Any, name: str, problem: Problem
     assert result.trajectory is not None
     write_page([Shown.of(result)], tmp_path / "page.html")
     opened(driver, address(tmp_path / "page.html"))
-    until(lambda: is_drawn(driver) and reddish(driver) > 100, "a picture with obstacles")
+    until(lambda: is_drawn(driver, WRITTEN), "a picture with obstacles")
     slider = until(lambda: driver.find_elements("css selector", "[role=slider]"), "a slider")[0]
     end = result.trajectory.duration
     seen = [0.0]
@@ -88,7 +85,7 @@ def test_pages_show_and_play_to_the_end(driver: Any, name: str, problem: Problem
     serve.start()
     try:
         opened(driver, said.get(timeout=60))
-        until(lambda: is_drawn(driver) and reddish(driver) > 100, "a live picture with obstacles")
+        until(lambda: is_drawn(driver, LIVE), "a live picture with obstacles")
         assert f"{result.length:.2f} rad" in driver.page_source and errors(driver) == []
     finally:
         stop.set()
@@ -110,6 +107,7 @@ def projected(points: np.ndarray, camera: Any, size: tuple[int, int]) -> np.ndar
 
 
 def test_a_link_is_seen_where_forward_kinematics_says(driver: Any, problem: Problem) -> None:
+    driver.set_window_size(1200, 640)  # wide enough for the middle to be clear of the panel
     shown = Shown.of(problem.model_copy(update={"scene": ()}))
     link, robot = "left_link6", shown.setup.robot
     with serving() as server:
@@ -124,12 +122,13 @@ def test_a_link_is_seen_where_forward_kinematics_says(driver: Any, problem: Prob
         def red() -> Any:
             seen = picture(driver)
             hue = (seen[..., 0] > 90) & (seen[..., 0] > 2.2 * seen[..., 1]) & (seen[..., 0] > 2.2 * seen[..., 2])
-            hue[:180, :330] = False  # the browser's warning that it has no graphics card
+            hue[:140, :330] = hue[:, 870:] = False  # the browser's warning that it has no graphics card; the panel
             return np.argwhere(hue)[:, ::-1] if hue.sum() > 50 else None
 
         seen = until(red, "a red link")
         canvas = driver.find_element("css selector", "canvas").rect
         camera = server.initial_camera
+    driver.set_window_size(*SIZE)
     item = next(item for item, _ in scenes[0].robot.handles if item.body == link and item.mesh is not None)
     pose = robot.link_pose(shown.setup.start, link)
     frame = robot.model.frames[robot.model.getFrameId(link)]
@@ -153,18 +152,16 @@ def test_editing_in_the_page_changes_the_scene_and_plan_answers(driver: Any) -> 
     process, where = started("posts/medium/900003")
     try:
         opened(driver, where)
-        until(lambda: is_drawn(driver), "a picture")
+        until(lambda: is_drawn(driver, LIVE), "a picture")
         before = picture(driver)
         until(lambda: driver.find_elements("xpath", BUTTON.format("add a box")), "a button")[0].click()
         until(lambda: "box_1" in driver.page_source, "a box")
-        until(lambda: (np.abs(picture(driver) - before)[:, :650].max(axis=2) > 40).sum() > 200, "another picture")
+        until(lambda: (np.abs(picture(driver) - before)[:, LIVE].max(axis=2) > 40).sum() > 100, "another picture")
         driver.find_element("xpath", BUTTON.format("plan")).click()
         until(lambda: "ms in all" in driver.page_source, "a plan")
         assert errors(driver) == []
         driver.get("about:blank")
-        closed = time.monotonic()
-        assert process.wait(60) == 0, "closing the page ends the command"
-        assert time.monotonic() - closed < 30.0
+        assert process.wait(90) == 0, "closing the page ends the command"
     finally:
         process.kill()
 
@@ -179,7 +176,7 @@ def test_ctrl_c_leaves_nothing_running(driver: Any) -> None:
         assert taken.returncode == 2 and taken.stderr.count("\n") == 1 and "8391" in taken.stderr
         opened(driver, where)
         process.send_signal(signal.SIGINT)
-        assert process.wait(30) == 130
+        assert process.wait(60) == 130
     finally:
         process.kill()
     again, where = started("ball_in_cup", "--port", "8391")

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import logging
 import queue
+import signal
+import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -113,12 +116,30 @@ class LivePage:
             KeyboardInterrupt: Ctrl-C was pressed.
         """
         last = alone_since = time.perf_counter()
-        while not until():
-            now = time.perf_counter()
-            if self._server.get_clients() or now - last > 1.0:  # after a long step a page may be about to come back
-                self._seen, alone_since = self._seen or bool(self._server.get_clients()), now
-            elif self._seen and now - alone_since > LEFT_ALONE:
-                return
-            self.step(now - last)
-            last = now
-            time.sleep(max(0.0, PERIOD - (time.perf_counter() - now)))
+        with _interruptions() as interrupted:
+            while not until() and not interrupted.is_set():
+                now = time.perf_counter()
+                clients = bool(self._server.get_clients())
+                if clients or now - last > 1.0:  # after a long step a page may be about to come back
+                    self._seen, alone_since = self._seen or clients, now
+                elif self._seen and now - alone_since > LEFT_ALONE:
+                    break
+                self.step(now - last)
+                last = now
+                time.sleep(max(0.0, PERIOD - (time.perf_counter() - now)))
+        if interrupted.is_set():
+            raise KeyboardInterrupt
+
+
+@contextmanager
+def _interruptions() -> Iterator[threading.Event]:
+    """Note Ctrl-C inside a block instead of raising it anywhere, where it could be lost; in the main thread alone."""
+    noted = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield noted
+        return
+    before = signal.signal(signal.SIGINT, lambda *_: noted.set())
+    try:
+        yield noted
+    finally:
+        signal.signal(signal.SIGINT, before)
