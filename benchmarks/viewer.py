@@ -1,8 +1,8 @@
 """The viewer: sizes of written pages, how often a drag is answered, and what playing costs the server.
 
 1. Pages of results on problems of the test split: size, and time to write.
-2. An obstacle is dragged through the scene of validation problems: time from a pose to the answer whether start and
-   goal are free, as the page asks for it.
+2. An obstacle, and then the goal of a hand, is dragged through the scene of validation problems: time from a pose to
+   the answer whether start and goal are free, as the page asks for it.
 3. Steps of the player, 30 a second: time of one, and as a share of a core.
 
 Usage: python benchmarks/viewer.py [-n 20]
@@ -23,7 +23,9 @@ from apex_ompl.ompl_adapter.process import quiet_ompl
 from apex_ompl.scene.problem import Problem
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import one_or_more
+from apex_ompl.viz.browser.editor import GOAL
 from apex_ompl.viz.browser.live_page import PERIOD, LivePage
+from apex_ompl.viz.browser.nodes import pose_of
 from apex_ompl.viz.browser.page import write_page
 from apex_ompl.viz.browser.server import serving
 from apex_ompl.viz.browser.shown import Shown
@@ -48,21 +50,25 @@ def pages() -> list[list[str]]:
     return rows
 
 
-def drags(problem: Problem) -> list[float]:
-    """Return how long answers took while the first obstacle was dragged [s]."""
+def drags(problem: Problem) -> tuple[list[float], list[float]]:
+    """Return how long answers took while the first obstacle was dragged, and while the goal of a hand was [s]."""
     with serving() as server:
         page = LivePage(server, [Shown.of(problem)])
-        assert page.editor is not None
-        name, found = problem.scene[0].name, []
-        page.editor.select(name)
-        pose = problem.scene[0].pose
-        for shift in np.linspace(0.0, 0.3, DRAGS):
-            moved = pose.copy()
-            moved[0, 3] -= shift
-            began = time.perf_counter()
-            page.editor.drag(moved)
-            found.append(time.perf_counter() - began)
-    return found
+        editor = page.editor
+        assert editor is not None
+        found: list[list[float]] = []
+        for name in (problem.scene[0].name, f"{GOAL}{next(iter(editor.planner.robot.hands))}"):
+            editor.grab(name)
+            pose = pose_of(editor._control.wxyz, editor._control.position)
+            times = []
+            for shift in np.linspace(0.0, 0.3, DRAGS):
+                moved = pose.copy()
+                moved[0, 3] -= shift
+                began = time.perf_counter()
+                editor.drag(moved)
+                times.append(time.perf_counter() - began)
+            found.append(times)
+    return found[0], found[1]
 
 
 def steps(problem: Problem) -> list[float]:
@@ -86,15 +92,21 @@ def main() -> None:
     names = names[:: max(1, len(names) // args.n)][: args.n]
     with quiet_ompl():
         written = pages()
-        dragged = [t for name in names for t in drags(load_problem(name))]
+        both = [drags(load_problem(name)) for name in names]
         stepped = [t for name in names[:4] for t in steps(load_problem(name))]
     share = 100.0 * float(np.mean(stepped)) / PERIOD
     rows = [["page", "size", "time to write"], ["---", "---:", "---:"], *written, [], ["what", "p50", "p95"]]
     rows.append(["---", "---:", "---:"])
-    for what, times in (("answer to a drag", dragged), ("step of the player", stepped)):
+    dragged, goals = ([t for one in both for t in one[k]] for k in range(2))
+    measured = {
+        "answer to a dragged obstacle": dragged,
+        "answer to a dragged goal": goals,
+        "step of the player": stepped,
+    }
+    for what, times in measured.items():
         rows.append([f"{what} ({len(times)})", *(f"{1e3 * v:.2f} ms" for v in record.percentiles(times, 50, 95))])
     table = "\n".join(record.row(row) if row else "" for row in rows) + f"\n\nPlaying takes {share:.1f} % of a core."
-    data = {"pages": written, "drags": dragged, "steps": stepped, "share": share}
+    data = {"pages": written, "drags": dragged, "goals": goals, "steps": stepped, "share": share}
     record.write("viewer", data, table, split="validation; pages: test", n=len(names))
 
 
