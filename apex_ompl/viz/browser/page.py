@@ -30,7 +30,8 @@ SVG_SIZE = (3.4, 2.6)  # of the curves [inch]
 PANEL = """
 <style>
 #facts {{position: fixed; top: 12px; left: 12px; z-index: 5; max-width: 290px; font: 12px/1.35 sans-serif;
-  background: rgba(255, 255, 255, 0.88); border-radius: 6px; padding: 8px 12px; color: #222; pointer-events: none}}
+  background: rgba(255, 255, 255, 0.88); border-radius: 6px; padding: 8px 12px; color: #222; pointer-events: none;
+  max-height: calc(100vh - 80px); overflow: hidden}}
 #facts svg {{width: 100%; height: auto; display: block}}
 #facts p {{margin: 2px 0}}
 @media (max-width: 700px) {{#facts svg {{display: none}}}}
