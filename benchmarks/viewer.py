@@ -98,15 +98,16 @@ def main() -> None:
     rows = [["page", "size", "time to write"], ["---", "---:", "---:"], *written, [], ["what", "p50", "p95"]]
     rows.append(["---", "---:", "---:"])
     dragged, goals = ([t for one in both for t in one[k]] for k in range(2))
-    measured = {
-        "answer to a dragged obstacle": dragged,
-        "answer to a dragged goal": goals,
-        "step of the player": stepped,
-    }
-    for what, times in measured.items():
-        rows.append([f"{what} ({len(times)})", *(f"{1e3 * v:.2f} ms" for v in record.percentiles(times, 50, 95))])
+    found = {}
+    for what, times in (
+        ("answer to a dragged obstacle", dragged),
+        ("answer to a dragged goal", goals),
+        ("step of the player", stepped),
+    ):
+        found[what] = record.percentiles(times, 50, 95)
+        rows.append([f"{what} ({len(times)})", *(f"{1e3 * v:.2f} ms" for v in found[what])])
     table = "\n".join(record.row(row) if row else "" for row in rows) + f"\n\nPlaying takes {share:.1f} % of a core."
-    data = {"pages": written, "drags": dragged, "goals": goals, "steps": stepped, "share": share}
+    data = {"pages": written, "p50 and p95 [s]": found, "share of a core [%]": share}
     record.write("viewer", data, table, split="validation; pages: test", n=len(names))
 
 

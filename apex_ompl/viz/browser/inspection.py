@@ -70,9 +70,8 @@ class Inspection:
         editor, robot = self._editor, self._editor.planner.robot
         if editor.goal is None:
             return "there is no goal"
-        checker = CollisionChecker(
-            robot, *(getattr(editor.problem(), part) for part in ("scene", "attached", "allowed"))
-        )
+        problem = editor.problem()
+        checker = CollisionChecker(robot, problem.scene, problem.attached, problem.allowed)
         if self._model is None:
             self._model = shared_model(ApexParameters().model, device="cpu", robot=robot.name)
         model, kernel = self._model, checker.kernel

@@ -9,9 +9,11 @@ from urllib.parse import quote
 import numpy as np
 import pinocchio as pin
 import trimesh
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+from PIL import ImageColor
 
 from apex_ompl.robot import Robot
+from apex_ompl.scene.bodies import pose_fields, pose_matrix
 from apex_ompl.types import Array
 from apex_ompl.viz.appearance import ROBOT, Item
 
@@ -23,20 +25,18 @@ SIZE = 2.0  # of a drawn point, in radii of its ball
 
 def rgb(colour: str) -> tuple[int, int, int]:
     """Return the numbers of a colour ``#rrggbb``."""
-    return (int(colour[1:3], 16), int(colour[3:5], 16), int(colour[5:7], 16))
+    red, green, blue, *_ = ImageColor.getrgb(colour)
+    return red, green, blue
 
 
 def turn_of(pose: Array) -> Array:
     """Return the quaternion wxyz of a pose, shape (4, 4)."""
-    x, y, z, w = pin.Quaternion(np.ascontiguousarray(pose[:3, :3])).coeffs()
-    return np.array([w, x, y, z])
+    return np.roll(pose_fields(pose)["orientation"], 1)
 
 
-def pose_of(wxyz: Any, position: Any) -> Array:
+def pose_of(wxyz: ArrayLike, position: ArrayLike) -> Array:
     """Return a pose, shape (4, 4), of a quaternion wxyz and a position [m]."""
-    w, x, y, z = (float(v) for v in wxyz)
-    turn = pin.Quaternion(w, x, y, z).normalized().matrix()
-    return np.array(pin.SE3(turn, np.asarray(position, float)).homogeneous)
+    return pose_matrix(position, np.roll(np.asarray(wxyz, float), -1))
 
 
 def add_item(api: Any, above: str, item: Item) -> Any:

@@ -18,8 +18,7 @@ from apex_ompl.viz.browser.nodes import add_item, turn_of
 from apex_ompl.viz.browser.scene import BrowserScene
 from apex_ompl.viz.browser.shown import Shown
 
-TRUE, OBSERVED, PREDICTED = BODIES = ("true", "observed", "predicted")
-COMMITTED, STOP = MOTIONS = ("committed", "stop")
+BODIES, MOTIONS = ("true", "observed", "predicted"), ("committed", "stop")
 EVENTS = "events"
 EVENT_HEIGHT = 1.35  # of the label of the last event [m]
 EVENT_TIME = 1.0  # how long it is shown [s]
@@ -40,6 +39,7 @@ class ShownRun(Shown):
     has_ended: bool = False
     _times: dict[str, list[float]] = field(default_factory=dict)
     _values: dict[str, list[Any]] = field(default_factory=dict)
+    _nodes: LayerNodes | None = None
 
     @property
     def grows(self) -> bool:
@@ -117,16 +117,21 @@ class ShownRun(Shown):
     def draw(self, scene: BrowserScene, time: float) -> None:
         """Show the run at a time in its scene."""
         scene.show(self.state(time))
-        nodes: LayerNodes = scene.extras.setdefault("layers", LayerNodes(scene))
-        nodes.show(self, time)
+        if self._nodes is None or self._nodes.scene is not scene:
+            self._nodes = LayerNodes(scene)
+        self._nodes.show(self, time)
 
 
 class LayerNodes:
-    """Nodes of the layers of a run; only what changes is sent."""
+    """Nodes of the layers of a run; only what changes is sent.
+
+    Attributes:
+        scene: The scene that they are drawn in.
+    """
 
     def __init__(self, scene: BrowserScene) -> None:
         """Draw below the root of a scene."""
-        self._scene = scene
+        self.scene = scene
         self._shown: dict[str, int] = {}
         self._bodies: dict[str, dict[str, tuple[Obstacle, Any]]] = {layer: {} for layer in BODIES}
         self._motions: dict[str, Any] = {}
@@ -158,7 +163,7 @@ class LayerNodes:
             if before is not None:
                 before[1].remove()
             item = replace(body_item(body, layer), colour=RUN_COLOURS[layer], opacity=RUN_OPACITIES[layer])
-            handle = add_item(self._scene.api, self._scene.root, item)
+            handle = add_item(self.scene.api, self.scene.root, item)
             known[name] = body, handle
 
     def _show_motion(self, layer: str, states: Array | None) -> None:
@@ -166,7 +171,7 @@ class LayerNodes:
         if old is not None:
             old.remove()
         if states is not None and len(states) > 1:
-            self._motions[layer] = self._scene.show_lines(layer, [states], RUN_COLOURS[layer], 0.008)
+            self._motions[layer] = self.scene.show_lines(layer, [states], RUN_COLOURS[layer], 0.008)
 
     def _show_event(self, number: int, event: tuple[float, str] | None, time: float) -> None:
         late = event is None or time - event[0] > EVENT_TIME
@@ -174,8 +179,8 @@ class LayerNodes:
             self._event[1].remove()
             self._event = None
         if event is not None and not late and self._event is None:
-            path, at = f"{self._scene.root}/event", (0.0, 0.0, EVENT_HEIGHT)
-            self._event = number, self._scene.api.add_label(path, event[1], position=at)
+            path, at = f"{self.scene.root}/event", (0.0, 0.0, EVENT_HEIGHT)
+            self._event = number, self.scene.api.add_label(path, event[1], position=at)
 
 
 def _same_shape(first: Obstacle, second: Obstacle) -> bool:

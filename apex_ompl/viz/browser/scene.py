@@ -41,7 +41,6 @@ class BrowserScene:
         robot: Nodes of the robot with what it holds.
         api: The scene of the ``viser`` server.
         root: Path of the node above all.
-        extras: What else is drawn in it, by name; for those who draw it.
     """
 
     def __init__(self, api: Any, setup: PlanningSetup, root: str = "/scene", offset: Sequence[float] = (0, 0, 0)):
@@ -63,7 +62,6 @@ class BrowserScene:
                 self._add(item)
         self._ghosts: dict[str, RobotNodes] = {}
         self._cover: RobotNodes | None = None
-        self.extras: dict[str, Any] = {}
         self._labels: dict[str, Any] = {}
         self._touching: dict[str, set[str]] = {}
         self._ways: list[Any] = []

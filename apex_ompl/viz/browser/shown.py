@@ -24,6 +24,7 @@ from apex_ompl.viz.curves import ORDERS, clearances, shares_of_limits
 
 UNTIMED, STATES = 4.0, 120  # how long a path without times plays [s], and its states
 CURVE_SAMPLES = 160
+APART = 3.0  # of things that are shown side by side [m]
 RESULTS, HEAD = (".json", ".npz", ".yaml"), 2000  # of a result's file, the characters that name its schema
 MARKS = re.compile(r"([\\`*_\[\]#|~])")  # that mean something in Markdown
 
@@ -172,5 +173,4 @@ def _is_result(path: Path) -> bool:
 
 def ordered(sources: Sequence[Shown]) -> list[tuple[Shown, tuple[float, float, float]]]:
     """Return what is shown with its place: side by side from the robot's left to its right [m]."""
-    gap = 3.0
-    return [(one, (0.0, -gap * k, 0.0)) for k, one in enumerate(sources)]
+    return [(one, (0.0, -APART * k, 0.0)) for k, one in enumerate(sources)]
