@@ -20,11 +20,11 @@ LAYERS = [
     {"diffusion", "ompl_adapter"},
     {"apex"},
     {"planners", "problems"},
-    {"generation", "result"},
+    {"generation", "live", "result"},
     {"planning"},
     {"session"},
     {"api"},
-    {"benchmark", "live", "viz"},
+    {"benchmark", "viz"},
     {"cli"},
 ]
 HEIGHT = {name: height for height, names in enumerate(LAYERS) for name in names}

@@ -185,12 +185,12 @@ def tables_of(solids: Mapping[int, Solids]) -> SceneTables:
         size=rows.size[chosen],
         tree_low=low,
         tree_high=high,
-        **_grid_columns([rows.grids[k] for k in chosen]),
+        **grid_columns([rows.grids[k] for k in chosen]),
     )
     return SceneTables(arrays, boxes, rank[chosen], tuple(rows.grids[k] for k in chosen))
 
 
-def _grid_columns(grids: Sequence[DistanceGrid | None]) -> dict[str, Any]:
+def grid_columns(grids: Sequence[DistanceGrid | None]) -> dict[str, Any]:
     """Return the columns ``grid`` and ``values`` of a scene's arrays."""
     distinct = {id(grid): grid for grid in grids if grid is not None}
     places, end = {}, 0
