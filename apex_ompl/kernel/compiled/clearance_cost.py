@@ -44,7 +44,7 @@ class StateCost(NamedTuple):
 
 
 @inlined
-def _add_violation(clearance: float, margin: float, row: Floats, gradient: Floats, gram: Floats) -> float:
+def add_violation(clearance: float, margin: float, row: Floats, gradient: Floats, gram: Floats) -> float:
     """Add the square of a violation whose clearance has the gradient ``row``, which is scaled; return its cost."""
     for i in range(len(row)):
         row[i] /= margin
@@ -109,7 +109,7 @@ def state_cost(
                     for i in range(len(row)):
                         row[i] = 0.0
                     gradient_to_obstacle(t, s, w, near, row)
-                    cost += _add_violation(clearance, scene_margin, row, gradient, gram)
+                    cost += add_violation(clearance, scene_margin, row, gradient, gram)
     for p in range(len(t.pair_common)):
         near = _nearest_of_pair(t, w, q, p, own_margin)
         if near[1] >= 0:
@@ -117,5 +117,5 @@ def state_cost(
             for i in range(len(row)):
                 row[i] = 0.0
             gradient_between_bodies(t, w, near, row)
-            cost += _add_violation(near[0], own_margin, row, gradient, gram)
+            cost += add_violation(near[0], own_margin, row, gradient, gram)
     return StateCost(cost, scene, own)

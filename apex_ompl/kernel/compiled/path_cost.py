@@ -114,7 +114,9 @@ def optimization_buffer_sizes(unknowns: int, points: int, dof: int) -> tuple[int
 
 
 @inlined
-def _sample(weights: Floats, first: Integers, k: int, control: Floats, lower: Floats, upper: Floats, q: Floats) -> None:
+def set_sample(
+    weights: Floats, first: Integers, k: int, control: Floats, lower: Floats, upper: Floats, q: Floats
+) -> None:
     """Put sample ``k`` of a path into ``q``, inside the limits in spite of rounding."""
     for i in range(len(q)):
         total = 0.0
@@ -124,7 +126,7 @@ def _sample(weights: Floats, first: Integers, k: int, control: Floats, lower: Fl
 
 
 @inlined
-def _add_sample(
+def add_sample(
     share: float, weights: Floats, first: int, pinned: int, free: int, here: Floats, matrix: Floats, gradient: Floats,
     gram: Floats,
 ) -> None:  # fmt: skip
@@ -148,7 +150,7 @@ def _add_sample(
 
 
 @inlined
-def _add_speed(
+def add_speed(
     stiffness: float, speed_gram: Floats, pinned: int, control: Floats, gradient: Floats, gram: Floats
 ) -> float:
     """Add gradient and matrix of stiffness / 2 P^T A P; return the term."""
@@ -171,16 +173,30 @@ def _add_speed(
     return total
 
 
+class PathProblem(NamedTuple):
+    """What the cost of a path needs: where its samples are, and how its speed counts.
+
+    Attributes:
+        weights: Weights of control points at the samples, shape (N, degree + 1).
+        first: The first control point that they belong to, shape (N,).
+        speed_gram: Gram matrix A of the speed, shape (P, P).
+    """
+
+    weights: Floats
+    first: Integers
+    speed_gram: Floats
+
+
 @inlined
-def evaluate(
-    t: RobotArrays, s: SceneArrays, w: Workspace, weights: Floats, first: Integers, speed_gram: Floats, pinned: int,
-    control: Floats, settings: CostSettings, b: Buffers, gradient: Floats, gram: Floats,
+def evaluate_path(
+    problem: PathProblem, t: RobotArrays, s: SceneArrays, w: Workspace, pinned: int, control: Floats,
+    settings: CostSettings, b: Buffers, gradient: Floats, gram: Floats,
 ) -> PathCost:  # fmt: skip
     """Return the cost of a path; put its gradient (n,) and the upper half of its matrix (n, n) into place.
 
     The unknowns are the free control points: number i * dof + d for joint d of free point i.
     """
-    dof = control.shape[1]
+    weights, first, dof = problem.weights, problem.first, control.shape[1]
     free = len(control) - 2 * pinned
     for i in range(free * dof):
         gradient[i] = 0.0
@@ -189,7 +205,7 @@ def evaluate(
     scene, own = settings.scene_margin, settings.own_margin
     total, share, q = 0.0, 1.0 / len(weights), b.state
     for k in range(len(weights)):
-        _sample(weights, first, k, control, t.lower, t.upper, q)
+        set_sample(weights, first, k, control, t.lower, t.upper, q)
         if not tables_hold(t, q, w.half_width):
             return PathCost(math.inf, math.inf, -math.inf, -math.inf)
         cost, scene, own = state_cost(
@@ -197,8 +213,8 @@ def evaluate(
         )  # fmt: skip
         if cost > 0.0:
             total += share * cost
-            _add_sample(share, weights[k], first[k], pinned, free, b.state_gradient, b.state_gram, gradient, gram)
-    speed = _add_speed(settings.stiffness, speed_gram, pinned, control, gradient, gram)
+            add_sample(share, weights[k], first[k], pinned, free, b.state_gradient, b.state_gram, gradient, gram)
+    speed = add_speed(settings.stiffness, problem.speed_gram, pinned, control, gradient, gram)
     return PathCost(total + speed, total, scene, own)
 
 
@@ -214,5 +230,6 @@ def path_cost(
     points, dof = control.shape
     b = buffers_view(bi, bf, (points - 2 * pinned) * dof, points, dof)
     settings = CostSettings(*numbers)
-    c = evaluate(t, s, w, weights, first, speed_gram, pinned, control, settings, b, gradient, b.gram[0])
+    problem = PathProblem(weights, first, speed_gram)
+    c = evaluate_path(problem, t, s, w, pinned, control, settings, b, gradient, b.gram[0])
     return c.cost, c.clearance_cost, c.scene_clearance, c.own_clearance, 0, settings.damping

@@ -12,14 +12,28 @@ et al. 2018).
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from typing import Any
 
-from apex_ompl.kernel.compiled.arrays import RobotArrays, robot_view, scene_view
+from apex_ompl.kernel.compiled.arrays import RobotArrays, SceneArrays, robot_view, scene_view
 from apex_ompl.kernel.compiled.compilation import entry_point, inlined
 from apex_ompl.kernel.compiled.layout import Floats, Integers, Singles
-from apex_ompl.kernel.compiled.path_cost import CostSettings, Numbers, Report, buffers_view, evaluate
-from apex_ompl.kernel.compiled.workspace import workspace_view
+from apex_ompl.kernel.compiled.path_cost import (
+    Buffers,
+    CostSettings,
+    Numbers,
+    PathCost,
+    PathProblem,
+    Report,
+    buffers_view,
+    evaluate_path,
+)
+from apex_ompl.kernel.compiled.workspace import Workspace, workspace_view
 
 LEAST_DAMPING, MOST_DAMPING = 1e-9, 1e9
+
+Evaluate = Callable[..., PathCost]
+Problem = Any
 
 
 @inlined
@@ -92,6 +106,63 @@ def _add_step(t: RobotArrays, control: Floats, pinned: int, step: Floats, trial:
         trial[a, d] = min(max(control[a, d] + step[i], t.lower[d]), t.upper[d])
 
 
+@inlined
+def descend(
+    evaluate: Evaluate, problem: Problem, t: RobotArrays, s: SceneArrays, w: Workspace, speed_gram: Floats, pinned: int,
+    control: Floats, settings: CostSettings, b: Buffers, width: int,
+) -> tuple[PathCost, int, float]:  # fmt: skip
+    """Take the steps on control points (P, dof), in place; return the cost, the number of steps, and the damping.
+
+    Args:
+        evaluate: Compiled function ``(problem, t, s, w, pinned, control, settings, b, gradient, gram)`` that returns
+            the cost of control points, and puts gradient and matrix into place.
+        problem: What it needs besides.
+        t: The robot.
+        s: The scene.
+        w: Workspace.
+        speed_gram: Matrix A of the damping, shape (P, P).
+        pinned: Number of control points at each end that stay.
+        control: Control points.
+        settings: Settings.
+        b: Buffers.
+        width: Number of neighbouring control points that a sample depends on.
+    """
+    points, dof = control.shape
+    n = (points - 2 * pinned) * dof
+    for i in range(points):
+        for d in range(dof):
+            if pinned <= i < points - pinned:
+                control[i, d] = min(max(control[i, d], t.lower[d]), t.upper[d])
+            b.trial[i, d] = control[i, d]
+    now, taken, damping, band = 0, 0, settings.damping, min(n, width * dof)
+    cost = evaluate(problem, t, s, w, pinned, control, settings, b, b.gradient[now], b.gram[now])
+    while taken < settings.steps and math.isfinite(cost.cost):
+        if cost.scene_clearance >= settings.enough and cost.own_clearance >= settings.enough:
+            break
+        taken += 1
+        new = cost
+        _hold(t, control, pinned, b.gradient[now], b.held, b.step)
+        better = _newton_step(b.gram[now], speed_gram, damping, pinned, dof, b.held, band, b.factor, b.step)
+        if better:
+            _add_step(t, control, pinned, b.step, b.trial)
+            new = evaluate(problem, t, s, w, pinned, b.trial, settings, b, b.gradient[1 - now], b.gram[1 - now])
+            better = new.cost < cost.cost
+        if not better:
+            damping = max(4.0 * damping, LEAST_DAMPING)
+            if damping > MOST_DAMPING:
+                break
+            continue
+        gain = cost.cost - new.cost
+        cost, now = new, 1 - now
+        damping = max(damping / 3.0, LEAST_DAMPING)
+        for i in range(points):
+            for d in range(dof):
+                control[i, d] = b.trial[i, d]
+        if gain < settings.tolerance * cost.cost:
+            break
+    return cost, taken, damping
+
+
 @entry_point
 def optimize_path(
     ri: Integers, rf: Floats, si: Integers, sf: Floats, sg: Singles, wi: Integers, wf: Floats,
@@ -123,40 +194,9 @@ def optimize_path(
     t, s = robot_view(ri, rf), scene_view(si, sf, sg)
     w = workspace_view(t, wi, wf)
     points, dof = control.shape
-    n = (points - 2 * pinned) * dof
-    b = buffers_view(bi, bf, n, points, dof)
-    settings = CostSettings(*numbers)
-    for i in range(points):
-        for d in range(dof):
-            if pinned <= i < points - pinned:
-                control[i, d] = min(max(control[i, d], t.lower[d]), t.upper[d])
-            b.trial[i, d] = control[i, d]
-    now, taken, damping, band = 0, 0, settings.damping, min(n, weights.shape[1] * dof)
-    cost = evaluate(t, s, w, weights, first, speed_gram, pinned, control, settings, b, b.gradient[now], b.gram[now])
-    while taken < settings.steps and math.isfinite(cost.cost):
-        if cost.scene_clearance >= settings.enough and cost.own_clearance >= settings.enough:
-            break
-        taken += 1
-        new = cost
-        _hold(t, control, pinned, b.gradient[now], b.held, b.step)
-        better = _newton_step(b.gram[now], speed_gram, damping, pinned, dof, b.held, band, b.factor, b.step)
-        if better:
-            _add_step(t, control, pinned, b.step, b.trial)
-            new = evaluate(
-                t, s, w, weights, first, speed_gram, pinned, b.trial, settings, b, b.gradient[1 - now], b.gram[1 - now]
-            )
-            better = new.cost < cost.cost
-        if not better:
-            damping = max(4.0 * damping, LEAST_DAMPING)
-            if damping > MOST_DAMPING:
-                break
-            continue
-        gain = cost.cost - new.cost
-        cost, now = new, 1 - now
-        damping = max(damping / 3.0, LEAST_DAMPING)
-        for i in range(points):
-            for d in range(dof):
-                control[i, d] = b.trial[i, d]
-        if gain < settings.tolerance * cost.cost:
-            break
-    return cost.cost, cost.clearance_cost, cost.scene_clearance, cost.own_clearance, taken, damping
+    b = buffers_view(bi, bf, (points - 2 * pinned) * dof, points, dof)
+    c, taken, damping = descend(
+        evaluate_path, PathProblem(weights, first, speed_gram), t, s, w, speed_gram, pinned, control,
+        CostSettings(*numbers), b, weights.shape[1],
+    )  # fmt: skip
+    return c.cost, c.clearance_cost, c.scene_clearance, c.own_clearance, taken, damping

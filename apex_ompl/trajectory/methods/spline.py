@@ -143,11 +143,34 @@ def least_knot_spacing(control: Array, limits: Limits) -> float:
     return NANOSECOND * float(math.ceil(max(least) * (1.0 + 1e-9) / NANOSECOND))
 
 
-def spline_in_time(control: Array, spacing: float, joint_names: tuple[str, ...]) -> Trajectory:
-    """Return the uniform cubic B-spline in time with control points of shape (K + 2, dof) and a knot spacing [s]."""
+def spline_in_time(
+    control: Array, spacing: float, joint_names: tuple[str, ...], start: tuple[Array, Array, Array] | None = None
+) -> Trajectory:
+    """Return the uniform cubic B-spline in time with control points of shape (K + 2, dof) and a knot spacing [s].
+
+    It ends at rest in the last control point, three times given; and begins so, or at ``start``: position, velocity and
+    acceleration, of which the first three control points are made (:func:`start_points`). Both are exact.
+    """
     before, at, after = control[:-2], control[1:-1], control[2:]
     positions = (before + 4.0 * at + after) / 6.0
-    positions[0], positions[-1] = control[0], control[-1]
     velocities, accelerations = (after - before) / (2.0 * spacing), (after - 2.0 * at + before) / spacing**2
+    positions[0], positions[-1] = control[0], control[-1]
+    if start is not None:
+        positions[0], velocities[0], accelerations[0] = start
     times = np.arange(len(positions), dtype=float) * spacing
     return Trajectory(times, positions, velocities, accelerations, joint_names)
+
+
+def start_points(start: tuple[Array, Array, Array], spacing: float) -> Array:
+    """Return the first three control points of a uniform cubic B-spline in time that begins in a given way.
+
+    With (c_0 + 4 c_1 + c_2) / 6 = q, (c_2 - c_0) / 2h = v and (c_0 - 2 c_1 + c_2) / h^2 = a.
+
+    Args:
+        start: Position q, velocity v and acceleration a, each of shape (dof,).
+        spacing: Knot spacing h [s].
+    """
+    q, v, a = start
+    middle = q - a * spacing**2 / 6.0
+    mean = middle + a * spacing**2 / 2.0
+    return np.stack([mean - v * spacing, middle, mean + v * spacing])
