@@ -28,9 +28,7 @@ def ends(robot: Robot) -> tuple[np.ndarray, np.ndarray]:
 
 
 def line(start: np.ndarray, goal: np.ndarray, duration: float) -> TimedSpline:
-    def states(times: np.ndarray) -> np.ndarray:
-        return start + (np.clip(times / duration, 0.0, 1.0) ** 2)[:, None] * (goal - start)
-
+    states = start + (np.linspace(0.0, 1.0, 101) ** 2)[:, None] * (goal - start)
     return TimedSpline.along(states, duration, Start.at_rest(start), goal)
 
 
@@ -57,8 +55,7 @@ def test_motions_begin_exactly_and_end_at_rest(robot: Robot, seed: int) -> None:
     rng = np.random.default_rng(seed)
     start, goal = random_start(robot, rng), rng.uniform(robot.limits.lower, robot.limits.upper)
     duration = rng.uniform(0.5, 4.0)
-    spline = TimedSpline.along(lambda t: np.outer(1 - t / duration, start[0]) + np.outer(t / duration, goal), duration,
-                               start, goal)  # fmt: skip
+    spline = TimedSpline.along(np.stack([start.position, goal]), duration, start, goal)
     motion = spline.trajectory(robot.joint_names)  # which checks that constant jerk joins its knots
     assert motion.duration == pytest.approx(spline.duration)
     for order, value in enumerate(start):
@@ -136,6 +133,8 @@ def test_bad_input_is_named(robot: Robot, bare: CollisionChecker) -> None:
     start, goal = ends(robot)
     with pytest.raises(ParameterError, match="duration"):
         line(start, goal, -1.0)
+    with pytest.raises(ParameterError, match="states"):
+        TimedSpline.along(start[None], 1.0, Start.at_rest(start), goal)
     optimizer = MotionOptimizer(bare.kernel, Movers([]), robot.limits, MotionSettings(steps=2))
     spline = line(start, goal, 1.0)
     with pytest.raises(ParameterError, match="control points"):

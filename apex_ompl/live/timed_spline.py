@@ -87,19 +87,24 @@ class TimedSpline(NamedTuple):
         return (len(self.control) - PINNED) * self.spacing
 
     @classmethod
-    def along(cls, motion: Callable[[Array], Array], duration: float, start: Start, goal: Array) -> TimedSpline:
+    def along(cls, states: Array, duration: float, start: Start, goal: Array) -> TimedSpline:
         """Return the spline whose control points are states of a motion, evenly spaced in time.
 
         Args:
-            motion: States, shape (N, dof), at times of shape (N,) [s].
+            states: States of the motion, evenly spaced in time, shape (N, dof).
             duration: Its duration [s]; the spline takes two knot spacings longer, since it rounds both ends.
             start: How the spline begins.
             goal: Where it ends, shape (dof,).
+
+        Raises:
+            ParameterError: ``duration`` is not positive, or the states have another shape.
         """
+        check_array(states, ("N", len(goal)), "states", finite=True, least=2)
         check_positive(duration, "duration")
         count = int(np.clip(round(duration / KNOT_SPACING), LEAST_SPANS, MOST_SPANS))
         spacing = float(duration / count)
-        states = motion(np.linspace(0.0, duration, count + 1))
+        given, wanted = np.linspace(0.0, 1.0, len(states)), np.linspace(0.0, 1.0, count + 1)
+        states = np.stack([np.interp(wanted, given, column) for column in states.T], axis=1)
         control = np.concatenate([states[:1], states[:1], states, states[-1:], states[-1:]])
         control[-PINNED:] = goal
         return cls(control, spacing, start).lasting(spacing)

@@ -1,5 +1,6 @@
 """Steps of ``plan``: query, straight line, solve, verify, repair, time; the benchmark composes the same steps."""
 
+from apex_ompl.planning.among_movers import plan_among_movers
 from apex_ompl.planning.run import PlanRun
 from apex_ompl.planning.solving import (
     NOT_PROVED,
@@ -20,6 +21,7 @@ __all__ = [
     "find_path",
     "finish",
     "parameterize",
+    "plan_among_movers",
     "query_fault",
     "solve",
     "straight_line",

@@ -18,13 +18,14 @@ from apex_ompl.collision.mesh_stage import Contact
 from apex_ompl.errors import ParameterError
 from apex_ompl.ompl_adapter.interrupt import Interrupt
 from apex_ompl.ompl_adapter.process import quiet_ompl, seed_ompl
-from apex_ompl.ompl_adapter.setup import PlanningSetup, assemble, state_fault
+from apex_ompl.ompl_adapter.setup import assemble, state_fault
 from apex_ompl.planners.apex_parameters import WITHOUT_MODEL, default_planner
-from apex_ompl.planning import PlanRun, find_path, finish, parameterize
+from apex_ompl.planning import PlanRun, find_path, finish, parameterize, plan_among_movers
 from apex_ompl.planning.departure import LARGEST_DEPTH, find_departure, with_departure
 from apex_ompl.planning.query import Group, State, Target, goal_record, joint_values, planned_joints, state_array
 from apex_ompl.result import PlanResult
 from apex_ompl.robot import Robot, load_robot
+from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Problem
 from apex_ompl.session.world import World
 from apex_ompl.trajectory import Timing, warm_up
@@ -198,12 +199,9 @@ class MotionPlanner:
         Raises:
             ApexError: The start or the goal is faulty.
         """
-        ready = self._ready(self.problem(start, goal))
+        ready = assemble(self.problem(start, goal), self.robot, checker=self._checker)
         ready.simple_setup.setPlannerAllocator(planners.allocator(default_planner(self.robot.name)))
         return ready.simple_setup
-
-    def _ready(self, problem: Problem, seed: int = 0, moving: Sequence[str] | None = None) -> PlanningSetup:
-        return assemble(problem, self.robot, seed=seed, checker=self._checker, moving=moving)
 
     def _plan(
         self, problem: Problem, planner: str | None, started: float, *, timeout: float = 5.0, seed: int = 0,
@@ -215,12 +213,11 @@ class MotionPlanner:
         if not isinstance(timing, (bool, Timing)):
             raise ParameterError("timing", timing, "True, False or a Timing")
         how = (Timing() if timing else None) if isinstance(timing, bool) else timing
-        if problem.moving and not snapshot:
-            expected = f"True, since the obstacle {problem.moving[0]!r} moves and plans hold for one moment only"
-            raise ParameterError("snapshot", snapshot, expected)
+        movers = _movers(problem, snapshot, how, leave_contact)
         with quiet_ompl():
             seed_ompl(seed)
-            notes = [f"snapshot: {', '.join(problem.moving)} taken to stand still"] if problem.moving else []
+            still = problem.moving if snapshot else ()
+            notes = [f"snapshot: {', '.join(still)} taken to stand still"] if still else []
             if planner is None:
                 planner = default_planner(self.robot.name)
                 if planner == WITHOUT_MODEL:
@@ -230,25 +227,39 @@ class MotionPlanner:
                 start = how.start(how.limits(self.robot.limits, self.robot.joint_names))  # whether it fits the robot
                 if start is not None and leave_contact:
                     raise ParameterError("leave_contact", leave_contact, "0 for a start that moves")
-            self._checker.check_counts = CheckCounts()
             moving = None if group is None else planned_joints(self.robot, group)
-            given = ready = self._ready(problem, seed, moving)
+            checker = self._without(movers)
+            checker.check_counts = CheckCounts()
+            given = ready = assemble(problem, self.robot, seed=seed, checker=checker, moving=moving)
             departure = find_departure(ready, leave_contact, seed) if leave_contact and ready.start_fault else None
             if departure is not None:
                 begin = dict(zip(self.robot.joint_names, departure.end.tolist(), strict=True))
-                ready = self._ready(problem.model_copy(update={"start": begin}), seed, moving)
+                departed = problem.model_copy(update={"start": begin})
+                ready = assemble(departed, self.robot, seed=seed, checker=checker, moving=moving)
             notes += given.notes
             if how is not None:
                 warm_up()
             times = {"setup": time.perf_counter() - started}
             run = PlanRun(ready, planner, parameters, seed, Deadline(timeout), times, notes)
             with Interrupt() as run.interrupt:
-                result = find_path(run, simplify)
-                if how is not None:
-                    result = parameterize(run, result, how)
+                if movers and how is not None:
+                    result = plan_among_movers(run, movers, simplify, how)
+                else:
+                    result = find_path(run, simplify)
+                    if how is not None:
+                        result = parameterize(run, result, how)
             if departure is not None:
                 result = with_departure(result, given, departure, how)
             return finish(run, result, started)
+
+    def _without(self, movers: Sequence[Obstacle]) -> CollisionChecker:
+        """Return a checker of the world without some of its obstacles: its own where there are none."""
+        if not movers:
+            return self._checker
+        gone = {o.name for o in movers}
+        scene = [o for o in self.world.obstacles.values() if o.name not in gone]
+        allowed = [pair for pair in self.world.allowed if not gone & set(pair)]
+        return CollisionChecker(self.robot, scene, self.world.held.values(), allowed)
 
     def _parameters(self, planner: str, params: Mapping[str, Any] | None) -> dict[str, Any]:
         given = dict(params or {})
@@ -265,3 +276,17 @@ def check_arguments(timeout: float, seed: int) -> None:
     """
     check_positive(timeout, "timeout", "a positive number of seconds")
     check_seed(seed)
+
+
+def _movers(problem: Problem, snapshot: bool, timing: Timing | None, leave_contact: float) -> tuple[Obstacle, ...]:
+    """Return the obstacles that a plan is made among in time: those that move, unless they are to stand still.
+
+    Raises:
+        ParameterError: There are such, and an option that does not go with them.
+    """
+    movers = () if snapshot else tuple(o for o in problem.scene if o.moving)
+    if movers and timing is None:
+        raise ParameterError("timing", False, f"True or a Timing, since the obstacle {movers[0].name!r} moves")
+    if movers and leave_contact:
+        raise ParameterError("leave_contact", leave_contact, f"0, since the obstacle {movers[0].name!r} moves")
+    return movers

@@ -1,0 +1,243 @@
+"""Plans among obstacles that move at constant velocity: motions in time, proved in time.
+
+1. A path among what stands still is found and timed as ever; where its motion meets no mover, that is the plan.
+2. Else the motion along the path is retimed: it waits, slows down or hurries (:mod:`apex_ompl.live.retime`).
+3. Motions are optimised in space and time from several paths and durations (:mod:`apex_ompl.live.timed_spline`).
+4. Where all that fails, paths are planned around what the movers sweep.
+
+The motion that arrives first is taken.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from apex_ompl.live.moving import obstacle_at
+from apex_ompl.live.timed_proof import TimedProver
+from apex_ompl.live.timed_spline import MotionOptimizer, Start, TimedSpline
+from apex_ompl.ompl_adapter.setup import assemble
+from apex_ompl.ompl_adapter.validity import full_check
+from apex_ompl.planning.run import PlanRun
+from apex_ompl.planning.solving import find_path, query_fault
+from apex_ompl.planning.timing import parameterize
+from apex_ompl.result import PlanResult, PlanStatus
+from apex_ompl.robot.model import Limits
+from apex_ompl.scene.bodies import Obstacle
+from apex_ompl.trajectory import Timing, Trajectory
+from apex_ompl.trajopt.optimizer import Optimizer
+from apex_ompl.trajopt.path import Path
+from apex_ompl.types import Array
+from apex_ompl.util.stopwatch import timed
+
+RETIMED, SPACE_TIME, SWEPT = "retiming", "space-time", "swept"
+STAGES = (RETIMED, SPACE_TIME, SWEPT)
+FACTORS = (1.0, 1.3, 1.7, 2.4, 3.5, 5.0)  # durations that are tried, as multiples of that without movers
+MARGIN = 0.005  # that motions keep from movers, where the start does [m]
+GOALS = 2  # nearest goals of which there are several
+BUMPS, BUMP_SIZE = 4, 0.6  # paths with random bumps that motions are optimised from, and their amplitude [rad]
+PATH_STATES = (256, 1024)  # of the path of a motion, the first number for which it is proved
+SWEPT_SECONDS = 6.0  # of the movers' ways that paths are planned around [s]
+SWEPT_STEP = 0.5  # spacing of their places on the way, as a share of the least extent
+
+
+@dataclass(frozen=True)
+class Among:
+    """What a plan among movers works on.
+
+    Attributes:
+        run: The call of ``plan``, among what stands still.
+        prover: The proof of motions.
+        timing: How motions are timed.
+        limits: The limits by it.
+        stages: Those of ``STAGES`` that are tried.
+    """
+
+    run: PlanRun
+    prover: TimedProver
+    timing: Timing
+    limits: Limits
+    stages: Sequence[str] = STAGES
+
+    def stop(self) -> bool:
+        """Whether time is up."""
+        return self.run.interrupt.pressed or self.run.deadline.expired
+
+    def accepts(self, motion: Trajectory) -> bool:
+        """Whether a motion keeps clear of movers, of what stands still and of itself, from the start to a goal."""
+        setup = self.run.setup
+        if not self.prover.prove(motion, stop=self.stop):
+            return False
+        return bool(full_check(setup.checker, motion, setup.start, setup.goals, deadline=self.run.deadline.at))
+
+
+def plan_among_movers(
+    run: PlanRun, movers: Sequence[Obstacle], simplify: bool, timing: Timing, stages: Sequence[str] = STAGES
+) -> PlanResult:
+    """Return a motion among obstacles that move, or why there is none.
+
+    Args:
+        run: The call of ``plan`` on a problem that is set up without the movers.
+        movers: The obstacles that move, where they are at time 0, when the motion begins.
+        simplify: Whether paths of planners that leave it to others are shortened.
+        timing: How motions are timed.
+        stages: Those of ``STAGES`` that are tried where the path's own motion meets a mover.
+
+    Raises:
+        ApexError: As :func:`apex_ompl.planning.solving.find_path`.
+    """
+    setup, problem = run.setup, run.setup.problem
+    fault = query_fault(run)
+    if fault is not None:
+        return fault
+    meets = TimedProver(setup.checker, movers, problem.allowed).fault_at_start(setup.start)
+    if meets:
+        return run.result(PlanStatus.INVALID_START, f"at 0 s: {meets}")
+    prover = TimedProver(setup.checker, movers, problem.allowed, margin=MARGIN)
+    if prover.fault_at_start(setup.start):
+        prover = TimedProver(setup.checker, movers, problem.allowed)
+    robot = setup.robot
+    among = Among(run, prover, timing, timing.limits(robot.limits, robot.joint_names), stages)
+    still = parameterize(run, find_path(run, simplify), timing)
+    if not still or still.trajectory is None:
+        return still
+    with timed(run.times, "movers"):
+        proof = prover.prove(still.trajectory, stop=among.stop)
+        found = still if proof else _in_time(among, still, simplify)
+    if found is not None:
+        return found
+    return run.result(
+        PlanStatus.TIMEOUT,
+        f"no motion among the moving obstacles was found in time; that along the path, {proof.reason}",
+    )
+
+
+def _in_time(among: Among, still: PlanResult, simplify: bool) -> PlanResult | None:
+    """Return the result with the motion that arrives first, or None."""
+    best: PlanResult | None = None
+    if SPACE_TIME in among.stages:
+        best = _earlier(best, _by_space_time(among, still, 0))
+    if best is None and SWEPT in among.stages:
+        best = _around_sweeps(among, simplify)
+    if SPACE_TIME in among.stages:
+        for turn in itertools.count(1):
+            if best is not None or among.stop():
+                break
+            best = _by_space_time(among, still, turn)
+    return best
+
+
+def _earlier(first: PlanResult | None, second: PlanResult | None) -> PlanResult | None:
+    """Return that of two results whose motion ends earlier; None for no motion."""
+    ends = [(r.trajectory.duration, k) for k, r in enumerate((first, second)) if r and r.trajectory is not None]
+    return (first, second)[min(ends)[1]] if ends else None
+
+
+def _by_space_time(among: Among, still: PlanResult, turn: int) -> PlanResult | None:
+    """Return the motion that is optimised in space and time and ends first, or None; larger bumps at later turns."""
+    run, motion = among.run, still.trajectory
+    assert motion is not None
+    optimizer = MotionOptimizer(run.setup.checker.kernel, among.prover.movers, among.limits)
+    found: Trajectory | None = None
+    for factor in FACTORS:
+        for guess in _guesses(among, motion, turn):
+            duration = factor * guess.duration
+            if among.stop() or (found is not None and duration >= found.duration):
+                break
+            spline = TimedSpline.along(guess.states, duration, _start(among), guess.states[-1])
+            better = optimizer.repair(spline, among.accepts, stop=among.stop)
+            if better is not None and (found is None or better.duration < found.duration):
+                found = better
+        if found is not None:
+            break
+    return None if found is None else _result(among, still, found, SPACE_TIME)
+
+
+def _start(among: Among) -> Start:
+    """Return what the robot does when the motion begins."""
+    q = among.run.setup.start
+    derivatives = among.timing.start(among.limits)
+    return Start.at_rest(q) if derivatives is None else Start(q, *derivatives)
+
+
+class Guess(NamedTuple):
+    """A motion to start from.
+
+    Attributes:
+        states: States evenly spaced in time, shape (N, dof).
+        duration: Its duration [s].
+    """
+
+    states: Array
+    duration: float
+
+
+def _guesses(among: Among, motion: Trajectory, turn: int) -> Iterator[Guess]:
+    """Yield motions to start from: the path's own, straight lines, and lines with bumps."""
+    run, optimizer = among.run, Optimizer()
+    if turn == 0:
+        yield Guess(motion(np.linspace(0.0, motion.duration, 256)), motion.duration)
+    goals, rng = run.setup.valid_goals, np.random.default_rng([run.seed, turn])
+    for goal in goals[np.argsort(np.linalg.norm(goals - run.setup.start, axis=1))][:GOALS]:
+        for control in optimizer.starts(run.setup.start, goal, BUMPS, rng, BUMP_SIZE * (1 + turn)):
+            states = optimizer.spline.path(control)
+            yield Guess(states, _least_duration(states, among.limits))
+
+
+def _least_duration(states: Array, limits: Limits) -> float:
+    """Return about how long a path takes at an even pace of its parameter [s]."""
+    speed = np.abs(np.diff(states, axis=0)) * (len(states) - 1)
+    distance = np.abs(states[-1] - states[0]) / limits.acceleration
+    return float(max((speed / limits.velocity).max(), 2.0 * np.sqrt(distance.max()), 0.1))
+
+
+def _around_sweeps(among: Among, simplify: bool) -> PlanResult | None:
+    """Return the motion of a path that is planned around what the movers sweep, or None."""
+    run, problem = among.run, among.run.setup.problem
+    swept = [copy for o in among.prover.obstacles for copy in _sweep(o)]
+    still = tuple(o for o in problem.scene if not o.moving)
+    blocked = problem.model_copy(update={"scene": (*still, *swept)})
+    setup = assemble(blocked, run.setup.robot, seed=run.seed)
+    inner = replace(run, setup=replace(setup, problem=problem), rejected_lines=[])
+    found = parameterize(inner, find_path(inner, simplify), among.timing)
+    if not found or found.trajectory is None or not among.accepts(found.trajectory):
+        return None
+    return replace(found, solved_by=f"{found.solved_by}+{SWEPT}")
+
+
+def _sweep(obstacle: Obstacle) -> list[Obstacle]:
+    """Return copies of an obstacle along its way."""
+    speed = float(np.linalg.norm(obstacle.velocity or (0.0, 0.0, 0.0)))
+    size = obstacle.box or (0.1,)
+    step = SWEPT_STEP * min(size) / max(speed, 1e-9)
+    times = np.arange(0.0, SWEPT_SECONDS + step, step)
+    return [
+        obstacle_at(obstacle, float(t)).model_copy(update={"name": f"{obstacle.name} at {t:.2f} s", "velocity": None})
+        for t in times
+    ]
+
+
+def _result(among: Among, still: PlanResult, motion: Trajectory, method: str) -> PlanResult | None:
+    """Return a result with another motion, and with the way that it takes as its path, or None."""
+    run = among.run
+    for count in PATH_STATES:
+        times = np.linspace(0.0, motion.duration, count)
+        states = motion(times)
+        check = full_check(run.setup.checker, states, run.setup.start, run.setup.goals, deadline=run.deadline.at)
+        if check:
+            break
+    else:
+        return None
+    largest = np.linalg.norm(np.abs(motion.accelerations).max(axis=0))
+    exact = run.result(
+        PlanStatus.EXACT_SOLUTION, path=Path(states), solved_by=f"{still.solved_by}+{method}", proof=check.proof
+    )
+    return replace(
+        exact, trajectory=motion, limit_use=motion.use(run.setup.robot.limits), timing_method=method,
+        deviation=float(largest * (times[1] - times[0]) ** 2 / 8.0),
+        motion_clearance=still.motion_clearance if check.proof is None else check.proof.clearance,
+    )  # fmt: skip
