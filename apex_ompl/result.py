@@ -97,6 +97,8 @@ class PlanResult:
             and was planned anew; ``straight line`` where that is a solution, so that no planner ran; empty without a
             path.
         notes: What a user should know about this run, such as a snapshot of moving obstacles.
+        movers: Names of the moving obstacles that ``trajectory`` was proved apart from, where they are in time when it
+            begins at time 0; ``path`` and the clearances are those among what stands still.
     """
 
     status: PlanStatus
@@ -123,6 +125,7 @@ class PlanResult:
     notes: tuple[str, ...] = ()
     held_joints: tuple[str, ...] = ()
     robot_digest: str = ""
+    movers: tuple[str, ...] = ()
 
     def __bool__(self) -> bool:
         """Whether there is an exact path that passed the full check and, unless timing is off, is timed."""
@@ -147,6 +150,7 @@ class PlanResult:
             "checks": self.checks,
             "times": dict(self.times),
             "notes": list(self.notes),
+            "movers": list(self.movers),
             "joint_names": list(self.joint_names),
             "held_joints": list(self.held_joints),
             "path": None if self.path is None else self.path.states.tolist(),
@@ -198,13 +202,8 @@ class PlanResult:
             data = (read_json if path.suffix == ".json" else read_yaml)(path, "result file")
         if data.get("schema") != SCHEMA:
             raise FileFormatError(str(path), "schema", data.get("schema"), f"expected {SCHEMA!r}")
-        data = {
-            **dict.fromkeys(PROOF),
-            "clearance_pair": ["", ""],
-            "timing_method": "",
-            "held_joints": [],
-            "robot_digest": "",
-        } | data  # older files lack some
+        older = {"clearance_pair": ["", ""], "timing_method": "", "held_joints": [], "robot_digest": "", "movers": []}
+        data = dict.fromkeys(PROOF) | older | data  # older files lack some
         try:
             states = None if data["path"] is None else finite_array(data["path"], "path")
             number = {k: float("nan") if data[k] is None else float(finite_array(data[k], k)) for k in NUMBERS}
@@ -219,7 +218,7 @@ class PlanResult:
                 times=_numbers(data["times"], "times"),
                 timing_method=str(data["timing_method"]), checks=int(data["checks"]), solved_by=data["solved_by"],
                 notes=tuple(data["notes"]), held_joints=tuple(data["held_joints"]),
-                robot_digest=str(data["robot_digest"]),
+                robot_digest=str(data["robot_digest"]), movers=tuple(map(str, data["movers"])),
                 clearance_pair=tuple(data["clearance_pair"]), **number,
             )  # fmt: skip
             check_plan(

@@ -192,15 +192,6 @@ def test_a_broken_checker_is_a_crash_status(problem: Problem, monkeypatch: pytes
     assert result.status is PlanStatus.CRASH and "broken on purpose" in result.reason
 
 
-def test_moving_obstacles_need_a_snapshot(problem: Problem) -> None:
-    mover = Obstacle(name="mover", sphere={"radius": 0.05}, position=(0.9, 0.0, 0.9), velocity=(0.0, -0.2, 0.0))
-    moving = problem.model_copy(update={"scene": (*problem.scene, mover)})
-    with pytest.raises(ParameterError, match="snapshot: expected True, since the obstacle 'mover' moves"):
-        plan(moving)
-    result = plan(moving, snapshot=True, timeout=20.0)
-    assert result and result.notes == ("snapshot: mover taken to stand still",)
-
-
 @pytest.mark.parametrize(
     ("options", "error", "match"),
     [

@@ -171,16 +171,15 @@ def load_runner(name: str) -> RunnerFunction:
     return found
 
 
-def experiments(suites: Sequence[str], moving: bool = False) -> dict[str, bool]:
+def experiments(suites: Sequence[str]) -> dict[str, bool]:
     """Return the experiments that names stand for; True for a level of problems, False for a single problem.
 
     Args:
         suites: Suites, levels as ``shelf/hard``, problems by name or id, or files. A suite stands for its levels
             without moving obstacles.
-        moving: Whether levels and problems with moving obstacles are taken.
 
     Raises:
-        ApexError: No such suite, level or problem; one with moving obstacles that is not taken; or none is given.
+        ApexError: No such suite, level or problem; or none is given.
     """
     if not suites:
         raise ParameterError("suites", "nothing", "a suite, a level as shelf/hard, or a problem")
@@ -192,12 +191,9 @@ def experiments(suites: Sequence[str], moving: bool = False) -> dict[str, bool]:
             static = [v for v in known[name] if not v.startswith("moving-")]
             found |= {f"{name}/{v}": True for v in static}
         elif suite in known and level in known[suite]:
-            if level.startswith("moving-") and not moving:
-                raise ParameterError("suite", name, "a level without moving obstacles: plans hold for one moment only")
             found[name] = True
         else:
-            if load_problem(name).moving and not moving:
-                raise ParameterError("problem", name, "one without moving obstacles: plans hold for one moment only")
+            load_problem(name)
             found[os.fspath(Path(name).resolve()) if name.endswith((".yaml", ".yml")) else name] = False
     return found
 
@@ -208,7 +204,7 @@ def jobs(
     """Return the runs of a benchmark in their order: all rows on a problem, the first problems of all levels first.
 
     The k-th run on a level is on the k-th problem of the split, with the seed ``seed + k``; a single problem is that of
-    all its runs. Levels with moving obstacles are taken where each row has a runner of its own.
+    all its runs.
 
     Raises:
         ApexError: A suite, planner, parameter or split is unknown, or two rows have the same label.
@@ -226,7 +222,7 @@ def jobs(
         if row.runner:
             load_runner(row.runner)
     found = []
-    for experiment, is_level in experiments(suites, moving=all(row.runner for row in rows)).items():
+    for experiment, is_level in experiments(suites).items():
         for row in rows:
             for k in range(min(runs, row.runs or runs) if row.runs_on(experiment) else 0):
                 problem = f"{experiment}/{SPLITS[split].start + k}" if is_level else experiment

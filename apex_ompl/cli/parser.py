@@ -92,7 +92,9 @@ def _add_plan(commands: Commands[argparse.ArgumentParser]) -> None:
         "--params", type=Path, metavar="FILE", help="planner parameters in YAML; --set goes before them"
     )
     parser.add_argument("--no-simplify", action="store_true", help="keep the path as the planner found it")
-    parser.add_argument("--snapshot", action="store_true", help="take moving obstacles to stand still")
+    parser.add_argument(
+        "--snapshot", action="store_true", help="take moving obstacles to stand where they are at time 0"
+    )
     parser.add_argument(
         "--leave-contact", type=float, default=0.0, metavar="METRES",
         help="depth of contacts at the start that the path may leave, up to 0.001 (default: 0)",

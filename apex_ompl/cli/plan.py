@@ -106,6 +106,8 @@ def _summary(result: PlanResult) -> str:
             f"at most {result.deviation:.4f} rad off the path, {result.motion_clearance * 1e3:.2f} mm clear"
         )
         lines.append(f"  limits     {uses} used")
+    if result.movers:
+        lines.append(f"  movers     proved apart from {', '.join(result.movers)} in time")
     lines.append(f"  checks     {result.checks} states checked, planner {result.planner}, seed {result.seed}")
     lines += [f"  note       {note}" for note in result.notes]
     return "\n".join(lines)

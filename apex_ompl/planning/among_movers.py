@@ -109,7 +109,7 @@ def plan_among_movers(
         proof = prover.prove(still.trajectory, stop=among.stop)
         found = still if proof else _in_time(among, still, simplify)
     if found is not None:
-        return found
+        return replace(found, movers=tuple(o.name for o in movers))
     return run.result(
         PlanStatus.TIMEOUT,
         f"no motion among the moving obstacles was found in time; that along the path, {proof.reason}",

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from apex_ompl.collision import CollisionChecker
+from apex_ompl.live.moving import obstacle_at
 from apex_ompl.robot import Robot
+from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.trajectory import Trajectory
 from apex_ompl.types import Array
 
@@ -29,6 +33,20 @@ def shares_of_limits(motion: Trajectory, robot: Robot, times: Array) -> Array:
     return np.stack([*scaled, *(motion(times, order) / bound for order, bound in enumerate(bounds, 1))])
 
 
-def clearances(checker: CollisionChecker, states: Array) -> Array:
-    """Return the clearance of each state of shape (N, dof), shape (N,) [m]."""
-    return np.array([checker.clearance(q) for q in states])
+def clearances(checker: CollisionChecker, motion: Trajectory, times: Array, movers: Sequence[Obstacle] = ()) -> Array:
+    """Return the clearance of a motion at some times, shape (N,) [m].
+
+    Args:
+        checker: The robot in its scene.
+        motion: The motion.
+        times: Shape (N,) [s].
+        movers: Obstacles of the scene that move, where they are at time 0; they are put back there in the end.
+    """
+    found = []
+    for time, q in zip(times.tolist(), motion(times), strict=True):
+        for mover in movers:
+            checker.move(mover.name, obstacle_at(mover, time).position)
+        found.append(checker.clearance(q))
+    for mover in movers:
+        checker.move(mover.name, mover.position)
+    return np.array(found)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apex_ompl.errors import ParameterError
+from apex_ompl.live.moving import obstacle_at
 from apex_ompl.ompl_adapter.setup import assemble
 from apex_ompl.result import PlanResult
 from apex_ompl.robot.identity import load_same_robot
@@ -34,7 +35,8 @@ def render(
     """Draw a problem or a result.
 
     The .png of a problem shows the start, and a goal as a ghost. The .png of a result shows states along its path in
-    reading order. A .gif or .mp4 shows the motion of a result; a timed motion in real time, up to 30 s.
+    reading order. A .gif or .mp4 shows the motion of a result; a timed motion in real time, up to 30 s. Obstacles that
+    the motion was proved among in time move.
 
     Args:
         source: A problem, or a result that has a path.
@@ -81,24 +83,37 @@ def _film(result: PlanResult, path: Array, suffix: str, size: tuple[int, int], a
     )
     motion = result.trajectory
     if motion is None:
-        states = resample(path, FRAMES)
+        frames = [renderer.screenshot(q) for q in resample(path, FRAMES)]
     else:
-        states = motion.sample(max(1.0 / FRAME_RATE, motion.duration / MAX_FRAMES)).position
-    frames = [renderer.screenshot(q) for q in states]
+        sample = motion.sample(max(1.0 / FRAME_RATE, motion.duration / MAX_FRAMES))
+        frames = [_moment(renderer, result, float(t)) for t in np.atleast_1d(sample.time)]
     return _encode([*frames, *[frames[-1]] * (FRAME_RATE // 2)], suffix)
 
 
 def _strip(result: PlanResult, path: Array, size: tuple[int, int], azimuth: float) -> bytes:
-    """Return a .png of states along the path, in reading order."""
+    """Return a .png of states along the path, or of moments among moving obstacles, in reading order."""
     renderer = SceneRenderer(
         assemble(result.problem, load_same_robot(result.problem.robot, result.robot_digest)),
         (size[0] // 2, size[1] // 2),
         azimuth,
     )
     columns, rows = STRIP
-    frames = [renderer.screenshot(q) for q in resample(path, columns * rows)]
+    if result.movers and result.trajectory is not None:
+        times = np.linspace(0.0, result.trajectory.duration, columns * rows)
+        frames = [_moment(renderer, result, float(t)) for t in times]
+    else:
+        frames = [renderer.screenshot(q) for q in resample(path, columns * rows)]
     grid = [np.concatenate(frames[k * columns : (k + 1) * columns], axis=1) for k in range(rows)]
     return _encode([np.concatenate(grid, axis=0)], ".png")
+
+
+def _moment(renderer: SceneRenderer, result: PlanResult, time: float) -> NDArray[np.uint8]:
+    """Return an image of a motion at a time [s], with the obstacles that it was proved among where they are then."""
+    assert result.trajectory is not None
+    for obstacle in result.problem.scene:
+        if obstacle.name in result.movers:
+            renderer.move(obstacle_at(obstacle, time))
+    return renderer.screenshot(result.trajectory(time))
 
 
 def _encode(frames: Sequence[NDArray[np.uint8]], suffix: str) -> bytes:

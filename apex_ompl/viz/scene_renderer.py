@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from apex_ompl.errors import MissingFileError
 from apex_ompl.ompl_adapter.setup import PlanningSetup
+from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.types import Array
 from apex_ompl.viz.appearance import BACKGROUND, EDGE, OBSTACLES, Item, focus_of, ghosts_of, items_of, joint_poses
 
@@ -40,9 +41,12 @@ class SceneRenderer:
         items = items_of(setup)
         self._moving = [item for item in items if item.moves]
         self._actors = [self._add(item, np.eye(4)) for item in self._moving]
+        self._obstacles: dict[str, tuple[Array, Any]] = {}
         for item in items:
             if not item.moves:
-                self._add(item, item.placement)
+                actor = self._add(item, item.placement)
+                if item.layer == OBSTACLES:
+                    self._obstacles[item.name] = item.placement, actor
         self._place_camera(setup, azimuth)
 
     def _add(self, item: Item, pose: Array) -> Any:
@@ -71,6 +75,11 @@ class SceneRenderer:
         joints = joint_poses(self.robot, self._data, q)
         for item in ghosts_of(self._setup):
             self._add(item, joints[item.joint] @ item.placement)
+
+    def move(self, obstacle: Obstacle) -> None:
+        """Show an obstacle of the scene at the pose of its record."""
+        placed, actor = self._obstacles[obstacle.name]
+        actor.user_matrix = obstacle.pose @ np.linalg.inv(placed)
 
     def _poses(self, q: Array) -> list[Array]:
         joints = joint_poses(self.robot, self._data, q)

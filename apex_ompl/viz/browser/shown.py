@@ -12,9 +12,11 @@ from pathlib import Path
 import numpy as np
 
 from apex_ompl.errors import ParameterError
+from apex_ompl.live.moving import obstacle_at
 from apex_ompl.ompl_adapter.setup import PlanningSetup, assemble
 from apex_ompl.result import SCHEMA, PlanResult
 from apex_ompl.robot.identity import load_same_robot
+from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Problem
 from apex_ompl.trajopt.path import resample
 from apex_ompl.types import Array
@@ -89,8 +91,15 @@ class Shown:
         return np.asarray(self._untimed[min(STATES - 1, round(time / duration * (STATES - 1)))])
 
     def draw(self, scene: BrowserScene, time: float) -> None:
-        """Show it at a time [s] in its scene."""
+        """Show it at a time [s] in its scene; obstacles that its motion was proved among are where they are then."""
         scene.show(self.state(time))
+        for obstacle in self._movers:
+            scene.move_obstacle(obstacle.name, obstacle_at(obstacle, min(max(time, 0.0), self.duration)).pose)
+
+    @cached_property
+    def _movers(self) -> tuple[Obstacle, ...]:
+        names = () if self.result is None else self.result.movers
+        return tuple(o for o in self.setup.problem.scene if o.name in names)
 
     def states(self, count: int) -> list[Array]:
         """Return states at an even pace of time."""
@@ -104,7 +113,7 @@ class Shown:
         motion, robot = self.result.trajectory, self.setup.robot
         times = np.linspace(0.0, motion.duration, CURVE_SAMPLES)
         shares = np.abs(shares_of_limits(motion, robot, times)).max(axis=2)
-        found = {"time": times, "clearance": 1e3 * clearances(self.setup.checker, np.asarray(motion(times)))}
+        found = {"time": times, "clearance": 1e3 * clearances(self.setup.checker, motion, times, self._movers)}
         return {**found, **dict(zip(ORDERS, shares, strict=True))}
 
     @property
