@@ -32,6 +32,8 @@ FAST = np.array([1.25, 1.6, 2.0, 2.5, 3.2, 4.0, 5.0, 6.5, 8.0, 10.0])
 UNIT = len(SLOW) - 1  # level of the motion's own rate
 SPACINGS = (0.012, 0.01, 0.008, 0.006, 0.004)  # of the motion's knots [s]
 SAME_PLACE = 1e-9  # [s]
+LEAD = 3  # steps that the motion that is made keeps the rate of the given one
+HEADS, EASY = 9, 0.8  # places that are looked at, and the share of the acceleration limits that leaves room there
 PUSHING = 0.4  # part of a window in which the acceleration along the path may change at the largest jerk
 HURRYING = 0.7  # share of the velocity limits up to which a motion may be hurried
 SAME_TIME = 1e-9  # [s]
@@ -45,17 +47,20 @@ class Attempt(NamedTuple):
         share: Of the limits of acceleration.
         window: Over which the places of the profile are averaged in time, for lower jerks [s].
         margin: By which blocked intervals are longer at each end for the search [s].
-        forced: Number of stages at the start that keep the motion's own rate, unless it starts at rest.
+        forced: Number of stages at the start that keep the motion's own rate; from rest at least two.
+        hurries: Whether it may be faster than the motion.
     """
 
     share: float
     window: float
     margin: float
     forced: int
+    hurries: bool
 
 
 ATTEMPTS = (
-    Attempt(0.95, 0.0, 0.015, 0), Attempt(0.9, 0.04, 0.04, 1), Attempt(0.7, 0.08, 0.06, 1), Attempt(0.5, 0.12, 0.08, 2),
+    Attempt(0.95, 0.0, 0.015, 0, True), Attempt(0.85, 0.0, 0.02, 1, True), Attempt(0.95, 0.0, 0.02, 1, False),
+    Attempt(0.9, 0.04, 0.04, 1, False), Attempt(0.7, 0.08, 0.06, 1, False), Attempt(0.5, 0.12, 0.08, 2, False),
 )  # fmt: skip
 
 
@@ -182,7 +187,7 @@ class _Search:
 
     def _profile(self, attempt: Attempt) -> Profile | None:
         """Return the profile that arrives first."""
-        x, points = self._levels(), self.stages + 1
+        x, points = self._levels() if attempt.hurries else SLOW, self.stages + 1
         limits, window = self.limits, PUSHING * max(attempt.window, 2.0 * SPACINGS[0])
         lowest, highest = np.empty((2, self.rates.shape[1], len(x)))
         push_bounds(
@@ -192,8 +197,8 @@ class _Search:
         levels, departures = np.empty(points, np.int64), np.empty((points, 2))
         found = earliest_arrivals(
             self.pieces.longer(attempt.margin), self.pieces.counts, self.stops.longer(attempt.margin),
-            self.stops.counts, lowest, highest, x, self.length, -1 if self.rests else UNIT,
-            0 if self.rests else attempt.forced, self.clock, self.latest, self.hold,
+            self.stops.counts, lowest, highest, x, self.length, UNIT, self.rests,
+            max(attempt.forced, 2 * self.rests), self.clock, self.latest, self.hold,
             np.empty((points, len(x), MOST_TIMES, 2)), np.empty((points, len(x)), np.int64),
             np.empty((points, MOST_TIMES, 2)), np.empty(points, np.int64), np.empty((4 * MOST_TIMES, 2)),
             np.empty(PIECES + 1), levels, departures,
@@ -212,8 +217,7 @@ class _Search:
             if self._free(self._places(profile, self.clock, CHECKED, 0.0), self.clock, CHECKED):
                 yield Retimed(motion, "", 0.0)
             return
-        longest = max(head * self.length - window / 2.0, 0.0)
-        for begin in dict.fromkeys((self.time + longest, self.time + longest / 2.0, self.time)):
+        for begin in self._begins(head * self.length - window / 2.0 - LEAD * SPACINGS[0]):
             started = self.clock + wait + begin - self.time
             before = self._places(profile, self.clock, CHECKED, 0.0)[: math.ceil((started - self.clock) / CHECKED) + 1]
             if not self._free(before, self.clock, CHECKED):
@@ -224,6 +228,14 @@ class _Search:
                 if followed is not None and self._free(places, started, h):
                     times, states, off = followed
                     yield Retimed(self._with_head(wait, begin, times, states), "", off)
+
+    def _begins(self, longest: float) -> list[float]:
+        """Return places from which to leave the given motion, the latest first, where it keeps from its limits."""
+        places = np.linspace(0.0, max(longest, 0.0), HEADS) + self.time
+        looked = places[:, None] + SPACINGS[0] * np.arange(LEAD)
+        use = np.abs(self.motion(looked.ravel(), 2)) / self.limits.acceleration
+        easy = use.max(axis=1).reshape(looked.shape).max(axis=1) <= EASY
+        return list(dict.fromkeys([*places[easy][::-1].tolist()[:2], float(places[-1]), self.time]))
 
     def _places(self, profile: Profile, begin: float, h: float, window: float) -> Array:
         """Return the places of a profile at times h apart from ``begin`` on, averaged over a window in time."""

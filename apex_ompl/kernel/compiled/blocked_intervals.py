@@ -14,9 +14,10 @@ from apex_ompl.kernel.compiled.compilation import entry_point, inlined
 from apex_ompl.kernel.compiled.kinematics import node_position, place_cluster
 from apex_ompl.kernel.compiled.layout import Floats, Integers, Singles
 from apex_ompl.kernel.compiled.motion_bound import cluster_displacement
-from apex_ompl.kernel.compiled.mover_intervals import Interval, add_span, holds_span, meeting_times
+from apex_ompl.kernel.compiled.mover_intervals import Interval, meeting_times
 from apex_ompl.kernel.compiled.movers import MoverArrays, movers_view, scene_of_movers, set_interval
 from apex_ompl.kernel.compiled.scene_tree import is_allowed
+from apex_ompl.kernel.compiled.time_sets import add_span, holds_span
 from apex_ompl.kernel.compiled.workspace import Workspace, workspace_view
 
 MOST_SPANS = 8  # of a place

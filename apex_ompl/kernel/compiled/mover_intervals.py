@@ -17,7 +17,6 @@ import math
 
 from apex_ompl.kernel.compiled.arrays import BOX, CAPSULE, CYLINDER, GRID, SPHERE
 from apex_ompl.kernel.compiled.compilation import inlined
-from apex_ompl.kernel.compiled.layout import Floats
 from apex_ompl.kernel.compiled.movers import MoverArrays
 
 NEVER = (math.inf, -math.inf)
@@ -147,48 +146,3 @@ def meeting_times(m: MoverArrays, o: int, x: float, y: float, z: float, radius: 
     if first < 0.0:
         found = _hull(found, _in_shape(m, o, p, u, margin, 0.0, (first, min(last, 0.0))))
     return found[0] + stamp, found[1] + stamp
-
-
-@inlined
-def add_span(spans: Floats, count: int, first: float, last: float) -> int:
-    """Add an interval to disjoint ones in order, (N, 2), the first ``count`` rows; return their number.
-
-    Those that meet become one; where there is no room for one more, so do the two that are nearest.
-    """
-    k = 0
-    while k < count and spans[k, 1] < first:
-        k += 1
-    end = k
-    while end < count and spans[end, 0] <= last:
-        first, last = min(first, spans[end, 0]), max(last, spans[end, 1])
-        end += 1
-    if end > k:
-        spans[k, 0], spans[k, 1] = first, last
-        for n in range(end, count):
-            spans[k + 1 + n - end, 0], spans[k + 1 + n - end, 1] = spans[n, 0], spans[n, 1]
-        return count - (end - k) + 1
-    if count == len(spans):
-        return _merged(spans, count, k, first, last)
-    for n in range(count, k, -1):
-        spans[n, 0], spans[n, 1] = spans[n - 1, 0], spans[n - 1, 1]
-    spans[k, 0], spans[k, 1] = first, last
-    return count + 1
-
-
-@inlined
-def _merged(spans: Floats, count: int, k: int, first: float, last: float) -> int:
-    """Extend the nearer neighbour of place ``k`` by an interval; return the number of intervals."""
-    if k == count or (k > 0 and first - spans[k - 1, 1] < spans[k, 0] - last):
-        spans[k - 1, 1] = last
-    else:
-        spans[k, 0] = first
-    return count
-
-
-@inlined
-def holds_span(spans: Floats, count: int, first: float, last: float) -> bool:
-    """Whether one of the first ``count`` intervals contains another one."""
-    for k in range(count):
-        if spans[k, 0] <= first and last <= spans[k, 1]:
-            return True
-    return False

@@ -19,9 +19,9 @@ import math
 
 from apex_ompl.kernel.compiled.compilation import entry_point, inlined
 from apex_ompl.kernel.compiled.layout import Floats, Integers
-from apex_ompl.kernel.compiled.mover_intervals import add_span
+from apex_ompl.kernel.compiled.time_sets import add_free, add_span, free_until
 
-MOST_TIMES = 8  # intervals of times that are kept of a point and a level
+MOST_TIMES = 12  # intervals of times that are kept of a point and a level
 SAME = 1e-9  # [s]
 
 
@@ -72,53 +72,6 @@ def _allowed(
 
 
 @inlined
-def _add_free(
-    first: float, last: float, spans: Floats, counts: Integers, stage: int, pieces: int, passing: Floats, out: Floats,
-    count: int, work: Floats,
-) -> int:  # fmt: skip
-    """Add the arrivals of a stage begun between two times that meet no blocked interval to ``out``; return how many."""
-    work[0, 0], work[0, 1] = first, last
-    parts = 1
-    for f in range(pieces):
-        p = stage * pieces + f
-        for n in range(counts[p]):
-            low, high = spans[p, n, 0] - passing[f + 1], spans[p, n, 1] - passing[f]
-            k = 0
-            while k < parts:
-                if work[k, 1] <= low or work[k, 0] >= high:
-                    k += 1
-                elif work[k, 0] <= low and work[k, 1] >= high and parts < len(work):
-                    for r in range(parts, k + 1, -1):
-                        work[r, 0], work[r, 1] = work[r - 1, 0], work[r - 1, 1]
-                    work[k + 1, 0], work[k + 1, 1] = high, work[k, 1]
-                    work[k, 1] = low
-                    parts, k = parts + 1, k + 2
-                elif work[k, 0] <= low:
-                    work[k, 1] = low
-                    k += 1
-                elif work[k, 1] >= high:
-                    work[k, 0] = high
-                    k += 1
-                else:
-                    for r in range(k, parts - 1):
-                        work[r, 0], work[r, 1] = work[r + 1, 0], work[r + 1, 1]
-                    parts -= 1
-    for k in range(parts):
-        if count < len(out):
-            count = add_span(out, count, work[k, 0] + passing[pieces], work[k, 1] + passing[pieces])
-    return count
-
-
-@inlined
-def free_until(spans: Floats, count: int, time: float) -> float:
-    """Return the end of the free interval that a time is in: infinity, or the time itself where it is blocked."""
-    for n in range(count):
-        if spans[n, 1] > time:
-            return float(max(spans[n, 0], time))
-    return math.inf
-
-
-@inlined
 def _wait(spans: Floats, count: int, arrivals: Floats, number: int, latest: float, out: Floats) -> int:
     """Put arrivals, extended by waiting while a point is free, into ``out``; return their number."""
     found = 0
@@ -130,7 +83,7 @@ def _wait(spans: Floats, count: int, arrivals: Floats, number: int, latest: floa
 
 @inlined
 def _set_start(
-    spans: Floats, count: int, start_level: int, begin: float, latest: float, times: Floats, numbers: Integers,
+    spans: Floats, count: int, own: int, rests: bool, begin: float, latest: float, times: Floats, numbers: Integers,
     arrivals: Floats, arrived: Integers,
 ) -> None:  # fmt: skip
     """Set the times of the first point, and no others."""
@@ -139,12 +92,12 @@ def _set_start(
         for m in range(numbers.shape[1]):
             numbers[k, m] = 0
     last = begin
-    if start_level < 0:
+    if rests:
         last = min(free_until(spans, count, begin), latest)
         arrivals[0, 0] = arrivals[0, 1] = begin
         arrived[0] = 1
     for m in range(numbers.shape[1]):
-        if start_level < 0 or m == start_level:  # at rest q' is 0: it may go at any level
+        if rests or m == own:  # at rest q' is 0: it may go at any level
             times[m, 0, 0], times[m, 0, 1] = begin, last
             numbers[0, m] = 1
 
@@ -152,7 +105,7 @@ def _set_start(
 @entry_point
 def earliest_arrivals(
     spans: Floats, counts: Integers, point_spans: Floats, point_counts: Integers, lowest: Floats, highest: Floats,
-    x: Floats, length: float, start_level: int, forced: int, begin: float, latest: float, hold: float,
+    x: Floats, length: float, own: int, rests: bool, forced: int, begin: float, latest: float, hold: float,
     times: Floats, numbers: Integers, arrivals: Floats, arrived: Integers, work: Floats, passing: Floats,
     levels: Integers, departures: Floats,
 ) -> bool:  # fmt: skip
@@ -167,8 +120,9 @@ def earliest_arrivals(
         highest: The same.
         x: Levels, increasing from 0.
         length: Of a stage in s [s].
-        start_level: Level at the start, or -1 at rest: then it may wait, and go at any level, as q' is 0.
-        forced: Number of stages at the start that keep that level.
+        own: Level of the motion's own rate, x = 1: that at the start.
+        rests: Whether it starts at rest: then it may wait there, and go at any level, as q' is 0.
+        forced: Number of stages at the start that keep the motion's own rate.
         begin: Time at the start [s].
         latest: The last time at the end [s].
         hold: Time for which the end must stay free from the arrival on [s].
@@ -186,11 +140,11 @@ def earliest_arrivals(
     """
     stages, most = len(point_counts) - 1, lowest.shape[1]
     pieces = len(counts) // stages
-    _set_start(point_spans[0], point_counts[0], start_level, begin, latest, times[0], numbers, arrivals[0], arrived)
+    _set_start(point_spans[0], point_counts[0], own, rests, begin, latest, times[0], numbers, arrivals[0], arrived)
     for k in range(stages):
         for i in range(most):
             for j in range(most):
-                if (k < forced and j != start_level) or numbers[k, i] == 0:
+                if (k < forced and not i == j == own) or numbers[k, i] == 0:
                     continue
                 if not _allowed(x, lowest, highest, i, j, length, k * pieces, pieces):
                     continue
@@ -200,7 +154,7 @@ def earliest_arrivals(
                 for n in range(numbers[k, i]):
                     first, last = times[k, i, n, 0], min(times[k, i, n, 1], latest - passing[pieces])
                     if first <= last:
-                        count = _add_free(first, last, spans, counts, k, pieces, passing, out, count, work)
+                        count = add_free(first, last, spans, counts, k, pieces, passing, out, count, work)
                 if j == 0:
                     arrived[k + 1] = count
                 else:
@@ -209,7 +163,7 @@ def earliest_arrivals(
             point_spans[k + 1], point_counts[k + 1], arrivals[k + 1], arrived[k + 1], latest, times[k + 1, 0]
         )
     return _follow_back(
-        spans, counts, point_spans, point_counts, lowest, highest, x, length, start_level, hold, times, numbers,
+        spans, counts, point_spans, point_counts, lowest, highest, x, length, forced, own, rests, hold, times, numbers,
         arrivals, arrived, passing, levels, departures,
     )  # fmt: skip
 
@@ -250,10 +204,20 @@ def _passes(first: float, spans: Floats, counts: Integers, stage: int, pieces: i
 
 
 @inlined
+def _last_arrival(arrivals: Floats, number: int, time: float) -> float:
+    """Return the last arrival from which it can have waited until a time."""
+    latest = -math.inf
+    for n in range(number):
+        if arrivals[n, 0] <= time + SAME:
+            latest = max(latest, min(arrivals[n, 1], time))
+    return latest
+
+
+@inlined
 def _follow_back(
     spans: Floats, counts: Integers, point_spans: Floats, point_counts: Integers, lowest: Floats, highest: Floats,
-    x: Floats, length: float, start_level: int, hold: float, times: Floats, numbers: Integers, arrivals: Floats,
-    arrived: Integers, passing: Floats, levels: Integers, departures: Floats,
+    x: Floats, length: float, forced: int, own: int, rests: bool, hold: float, times: Floats, numbers: Integers,
+    arrivals: Floats, arrived: Integers, passing: Floats, levels: Integers, departures: Floats,
 ) -> bool:  # fmt: skip
     """Set levels and times of the earliest arrival; each level the nearest to the one behind it."""
     stages = len(point_counts) - 1
@@ -264,19 +228,17 @@ def _follow_back(
     levels[stages] = level
     departures[stages, 0] = departures[stages, 1] = time
     for k in range(stages, -1, -1):
-        if levels[k] == 0 and k > 0 or k == 0 and start_level < 0:
-            latest = -math.inf  # the last arrival from which it can have waited until then
-            for n in range(arrived[k]):
-                if arrivals[k, n, 0] <= time + SAME:
-                    latest = max(latest, min(arrivals[k, n, 1], time))
-            time = departures[k, 0] = latest
+        if levels[k] == 0 and k > 0 or k == 0 and rests:
+            time = departures[k, 0] = _last_arrival(arrivals[k], arrived[k], time)
         if k == 0:
             return True
         chosen, started = -1, 0.0
         for i in range(numbers.shape[1]):
             if chosen >= 0 and abs(i - levels[k]) >= abs(chosen - levels[k]):
                 continue
-            if not _allowed(x, lowest, highest, i, levels[k], length, (k - 1) * pieces, pieces):
+            if (k <= forced and not i == levels[k] == own) or not _allowed(
+                x, lowest, highest, i, levels[k], length, (k - 1) * pieces, pieces
+            ):
                 continue
             for f in range(pieces + 1):
                 passing[f] = passing_time(x, i, levels[k], f / pieces, length)
