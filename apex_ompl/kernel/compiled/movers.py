@@ -139,7 +139,7 @@ def _interval_clear(
 
 
 @inlined
-def _set_interval(
+def set_interval(
     t: RobotArrays, knots: Floats, states: Floats, rates: Floats, slack: float, a: float, b: float, q: Floats,
     w: Workspace,
 ) -> bool:  # fmt: skip
@@ -208,7 +208,7 @@ def first_conflict(
             b = last
         found[2] += 1
         place_movers(m, clock + 0.5 * (a + b), offset)
-        clear = _set_interval(t, knots, states, rates, slack, a, b, state, w)
+        clear = set_interval(t, knots, states, rates, slack, a, b, state, w)
         if clear:
             clear = _interval_clear(t, m, s, w, state, 0.5 * (b - a), clock + b, found)
         if clear:

@@ -1,0 +1,83 @@
+"""Stops from any state of motion: along the path of a motion, or joint by joint."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from apex_ompl.kernel.compiled.path_stop import MOST_STEPS, stop_on_path
+from apex_ompl.kernel.compiled.stop_profiles import PHASES, stop_joints
+from apex_ompl.robot.model import Limits
+from apex_ompl.trajectory.trajectory import Trajectory
+from apex_ompl.types import Array
+
+DEVIATION = 1e-3  # of a stop from the path [rad]
+
+
+class Stop(NamedTuple):
+    """A motion to rest.
+
+    Attributes:
+        trajectory: The motion, from the state that it was asked for.
+        beyond: How far it passes the position limits of each joint, shape (dof,) [rad; synergies 0..1]. A joint for
+            which this is not 0 has no stop within its limits: the state was not in its stoppable set.
+        deviation: Largest distance of any joint from the path along which it stops [rad]; infinity where it stops
+            joint by joint.
+    """
+
+    trajectory: Trajectory
+    beyond: Array
+    deviation: float
+
+    @property
+    def within_limits(self) -> bool:
+        """Whether it keeps the position limits."""
+        return not self.beyond.any()
+
+
+def stop(limits: Limits, joint_names: tuple[str, ...], position: Array, velocity: Array, acceleration: Array) -> Stop:
+    """Return the soonest stop from a state, of each joint by itself.
+
+    It is what Ruckig's velocity interface finds (Berscheid and Kroeger 2021), in closed form:
+    :mod:`apex_ompl.kernel.compiled.stop_profiles`. A joint whose soonest stop would pass a position limit brakes for
+    longer, as long as keeps the limit, and swings back. The limits of acceleration and jerk are kept; that of velocity
+    is where it can be, i.e. where |v + a |a| / (2 J)| is within it.
+
+    Args:
+        limits: Limits of the joints.
+        joint_names: Their names.
+        position: Shape (dof,) [rad; synergies 0..1].
+        velocity: Within the limits, likewise [rad/s].
+        acceleration: Within the limits, likewise [rad/s^2].
+    """
+    dof = len(position)
+    lengths, jerks, beyond = np.empty((dof, PHASES)), np.empty((dof, PHASES)), np.empty(dof)
+    times, knots = np.empty(dof * PHASES + 2), np.empty((3, dof * PHASES + 2, dof))
+    bounds = limits.lower, limits.upper, limits.acceleration, limits.jerk
+    count = stop_joints(position, velocity, acceleration, *bounds, lengths, jerks, times, knots, beyond)
+    return Stop(Trajectory.unchecked(times[:count], knots[:, :count], joint_names), beyond, np.inf)
+
+
+def stop_along(motion: Trajectory, time: float, limits: Limits, deviation: float = DEVIATION) -> Stop:
+    """Return the soonest stop along the path of a motion, among profiles of slowing down.
+
+    It begins with the state of the motion at ``time``, exactly, keeps the limits of velocity, acceleration and jerk,
+    and is the rest of the motion itself where no profile ends sooner (:mod:`apex_ompl.kernel.compiled.path_stop`).
+
+    Args:
+        motion: A motion within the limits that ends at rest.
+        time: Time of the motion, from 0 to its end [s].
+        limits: Limits of the joints.
+        deviation: Largest distance of any joint from the path [rad].
+    """
+    dof = motion.dof
+    states = np.stack([motion.positions, motion.velocities, motion.accelerations])
+    room = len(motion.times) + MOST_STEPS + 4
+    start, control, work, still = np.empty((3, dof)), np.empty((MOST_STEPS + 4, dof)), np.empty((2, dof)), np.zeros(dof)
+    times, knots = np.empty(room), np.empty((3, room, dof))
+    bounds = limits.lower, limits.upper, limits.velocity, limits.acceleration, limits.jerk
+    count = stop_on_path(motion.times, states, time, start, *bounds, deviation, control, *work, times, knots)
+    if not count:
+        return Stop(motion.after(time), still, 0.0)
+    return Stop(Trajectory.unchecked(times[:count], knots[:, :count], motion.joint_names), still, float(work[1].max()))

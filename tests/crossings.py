@@ -1,0 +1,63 @@
+"""Motions of a robot, and movers that cross them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from apex_ompl.kernel import Kernel
+from apex_ompl.live.movers import Movers
+from apex_ompl.robot import Robot
+from apex_ompl.scene.bodies import Obstacle
+from apex_ompl.trajectory import Timing, Trajectory, time_path
+
+SPEEDS = (0.1, 0.2, 0.4)  # of movers [m/s]
+
+
+def arm_motion(robot: Robot, rng: np.random.Generator, speed: float) -> Trajectory:
+    """Motion of the arms from home over a state to another one, at a share of the velocity limits."""
+    limits, arms = robot.limits, 14
+    middle, goal = robot.home.copy(), robot.home.copy()
+    goal[:arms] += rng.normal(0.0, 0.6, arms)
+    middle[:arms] += (goal - robot.home)[:arms] / 2.0 + rng.normal(0.0, 0.1, arms)
+    path = np.clip(np.stack([robot.home, middle, goal]), limits.lower, limits.upper)
+    return time_path(path, limits, robot.joint_names, Timing(velocity_scale=speed)).trajectory
+
+
+def shape(kind: str, size: float) -> dict[str, object]:
+    if kind == "box":
+        return {"box": (size, 0.7 * size, 1.4 * size)}
+    if kind == "sphere":
+        return {"sphere": {"radius": size}}
+    return {kind: {"radius": 0.5 * size, "length": 2.0 * size}}
+
+
+def place_on(kernel: Kernel, motion: Trajectory, rng: np.random.Generator, time: float) -> np.ndarray:
+    """The origin, at a time of a motion, of a joint that has moved by more than 15 cm; NaN where none has."""
+    there, at_start = (kernel.joint_frames(motion(t)[None])[1][0] for t in (time, 0.0))
+    moved = np.flatnonzero(np.linalg.norm(there - at_start, axis=1) > 0.15)
+    return there[rng.choice(moved)] if len(moved) else np.full(3, np.nan)
+
+
+def crossing(
+    kernel: Kernel, motion: Trajectory, rng: np.random.Generator, kind: str = "box",
+    growth: tuple[float, float] = (0.0, 0.0),
+) -> Movers | None:  # fmt: skip
+    """A mover that is where the robot is at a time of a motion, or None where no joint moves far."""
+    time = rng.uniform(0.3, 0.8) * motion.duration
+    velocity = rng.normal(0.0, 1.0, 3)
+    velocity *= rng.choice(SPEEDS) / np.linalg.norm(velocity)
+    place = place_on(kernel, motion, rng, time) - velocity * time + rng.normal(0.0, 0.05, 3)
+    if np.isnan(place).any():
+        return None
+    turn = rng.normal(0.0, 1.0, 4)
+    turn /= np.linalg.norm(turn)
+    movers = Movers(
+        [
+            Obstacle(
+                name="mover", position=tuple(place), velocity=tuple(velocity), orientation=tuple(turn),
+                **shape(kind, float(rng.choice([0.04, 0.08, 0.15]))),
+            )
+        ]
+    )  # fmt: skip
+    movers.update("mover", growth=growth)
+    return movers
