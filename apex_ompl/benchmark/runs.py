@@ -23,6 +23,8 @@ from apex_ompl.ompl_adapter.process import quiet_ompl, seed_ompl
 from apex_ompl.ompl_adapter.report import SolveReport, report_of
 from apex_ompl.ompl_adapter.setup import assemble
 from apex_ompl.planning import PlanRun, finish, plan_among_movers, query_fault, solve, with_exact_ends
+from apex_ompl.planning.among_movers import STAGES
+from apex_ompl.planning.among_movers import warm_up as warm_up_among_movers
 from apex_ompl.problems.generator import SuiteError
 from apex_ompl.result import FIRST, PlanResult, PlanStatus
 from apex_ompl.robot import Robot, load_robot
@@ -200,15 +202,21 @@ def planned(job: Job) -> tuple[PlanRun, Experiment, PlanResult]:
         return planning, experiment, finish(planning, result, started)
 
 
-def in_time(job: Job) -> tuple[PlanRun, Experiment, PlanResult]:
-    """Return a run among moving obstacles: as :func:`planned`, without OMPL's experiment and with the motion."""
+def in_time(job: Job, stages: Sequence[str] = STAGES) -> tuple[PlanRun, Experiment, PlanResult]:
+    """Return a run among moving obstacles: as :func:`planned`, without OMPL's experiment and with the motion.
+
+    Args:
+        job: The run.
+        stages: See :func:`apex_ompl.planning.plan_among_movers`.
+    """
     started, problem = time.perf_counter(), load_problem(job.problem)
     with quiet_ompl():
         still = problem.model_copy(update={"scene": tuple(o for o in problem.scene if not o.moving)})
         planning = _ready(job, still, started)
         planning.setup = replace(planning.setup, problem=problem)
         movers = [o for o in problem.scene if o.moving]
-        result = plan_among_movers(planning, movers, job.simplify, Timing())
+        warm_up_among_movers(planning.setup.checker)
+        result = plan_among_movers(planning, movers, job.simplify, Timing(), stages)
         return planning, Experiment(), finish(planning, result, started)
 
 

@@ -11,13 +11,16 @@ The motion that arrives first is taken.
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
+from apex_ompl.collision import CollisionChecker
 from apex_ompl.live.moving import obstacle_at
+from apex_ompl.live.retime import retime
 from apex_ompl.live.timed_proof import TimedProver
 from apex_ompl.live.timed_spline import MotionOptimizer, Start, TimedSpline
 from apex_ompl.ompl_adapter.setup import assemble
@@ -27,8 +30,8 @@ from apex_ompl.planning.solving import find_path, query_fault
 from apex_ompl.planning.timing import parameterize
 from apex_ompl.result import PlanResult, PlanStatus
 from apex_ompl.robot.model import Limits
-from apex_ompl.scene.bodies import Obstacle
-from apex_ompl.trajectory import Timing, Trajectory
+from apex_ompl.scene.bodies import Obstacle, Sphere
+from apex_ompl.trajectory import Timing, Trajectory, time_path
 from apex_ompl.trajopt.optimizer import Optimizer
 from apex_ompl.trajopt.path import Path
 from apex_ompl.types import Array
@@ -39,6 +42,7 @@ STAGES = (RETIMED, SPACE_TIME, SWEPT)
 FACTORS = (1.0, 1.3, 1.7, 2.4, 3.5, 5.0)  # durations that are tried, as multiples of that without movers
 MARGIN = 0.005  # that motions keep from movers, where the start does [m]
 GOALS = 2  # nearest goals of which there are several
+LONGER = 3  # turns, each with durations twice as long as the one before
 BUMPS, BUMP_SIZE = 4, 0.6  # paths with random bumps that motions are optimised from, and their amplitude [rad]
 PATH_STATES = (256, 1024)  # of the path of a motion, the first number for which it is proved
 SWEPT_SECONDS = 6.0  # of the movers' ways that paths are planned around [s]
@@ -119,15 +123,17 @@ def plan_among_movers(
 def _in_time(among: Among, still: PlanResult, simplify: bool) -> PlanResult | None:
     """Return the result with the motion that arrives first, or None."""
     best: PlanResult | None = None
+    if RETIMED in among.stages:
+        best = _retimed(among, still)
     if SPACE_TIME in among.stages:
-        best = _earlier(best, _by_space_time(among, still, 0))
+        best = _earlier(best, _by_space_time(among, still, 0, best))
     if best is None and SWEPT in among.stages:
         best = _around_sweeps(among, simplify)
     if SPACE_TIME in among.stages:
         for turn in itertools.count(1):
             if best is not None or among.stop():
                 break
-            best = _by_space_time(among, still, turn)
+            best = _by_space_time(among, still, turn, None)
     return best
 
 
@@ -137,24 +143,46 @@ def _earlier(first: PlanResult | None, second: PlanResult | None) -> PlanResult 
     return (first, second)[min(ends)[1]] if ends else None
 
 
-def _by_space_time(among: Among, still: PlanResult, turn: int) -> PlanResult | None:
-    """Return the motion that is optimised in space and time and ends first, or None; larger bumps at later turns."""
+def _retimed(among: Among, still: PlanResult) -> PlanResult | None:
+    """Return the result with its motion retimed, or None."""
+    motion, kernel = still.trajectory, among.run.setup.checker.kernel
+    assert motion is not None
+    made = retime(kernel, among.prover.movers, motion, among.limits, hold=0.0)
+    if made.trajectory is None or not among.accepts(made.trajectory):
+        return None
+    return replace(
+        still, trajectory=made.trajectory, solved_by=f"{still.solved_by}+{RETIMED}", timing_method=RETIMED,
+        deviation=still.deviation + math.sqrt(motion.dof) * made.deviation,
+        limit_use=made.trajectory.use(among.run.setup.robot.limits),
+    )  # fmt: skip
+
+
+def _by_space_time(among: Among, still: PlanResult, turn: int, best: PlanResult | None) -> PlanResult | None:
+    """Return the motion that is optimised in space and time and ends first, or None.
+
+    Args:
+        among: What it works on.
+        still: The path among what stands still, with its motion.
+        turn: Number of times that it was called before; bumps become larger.
+        best: A result; motions that end no earlier are not looked for.
+    """
     run, motion = among.run, still.trajectory
     assert motion is not None
     optimizer = MotionOptimizer(run.setup.checker.kernel, among.prover.movers, among.limits)
-    found: Trajectory | None = None
+    found = None if best is None else best.trajectory
+    given = found
     for factor in FACTORS:
         for guess in _guesses(among, motion, turn):
-            duration = factor * guess.duration
+            duration = factor * 2.0 ** min(turn, LONGER) * guess.duration
             if among.stop() or (found is not None and duration >= found.duration):
                 break
             spline = TimedSpline.along(guess.states, duration, _start(among), guess.states[-1])
             better = optimizer.repair(spline, among.accepts, stop=among.stop)
             if better is not None and (found is None or better.duration < found.duration):
                 found = better
-        if found is not None:
+        if found is not given:
             break
-    return None if found is None else _result(among, still, found, SPACE_TIME)
+    return None if found is None or found is given else _result(among, still, found, SPACE_TIME)
 
 
 def _start(among: Among) -> Start:
@@ -162,6 +190,28 @@ def _start(among: Among) -> Start:
     q = among.run.setup.start
     derivatives = among.timing.start(among.limits)
     return Start.at_rest(q) if derivatives is None else Start(q, *derivatives)
+
+
+_warm: set[str] = set()  # robots of which the code is loaded
+
+
+def warm_up(checker: CollisionChecker) -> None:
+    """Load, or compile, what plans among movers need besides, so that it does not count as time of a plan."""
+    robot = checker.robot
+    if robot.name in _warm:
+        return
+    start, goal = robot.home, robot.home + np.where(np.arange(robot.dof) == 0, 0.5, 0.0)
+    motion = time_path(np.stack([start, goal]), robot.limits, robot.joint_names, Timing(method="spline")).trajectory
+    hand = robot.link_pose(motion(0.5 * motion.duration), robot.link_names[-1])[:3, 3]
+    far = tuple((hand + (0.0, 0.0, 0.5 * motion.duration)).tolist())
+    prover = TimedProver(
+        checker, [Obstacle(name="ball", sphere=Sphere(radius=0.05), position=far, velocity=(0, 0, -1))]
+    )
+    prover.prove(motion)
+    retime(checker.kernel, prover.movers, motion, robot.limits, hold=0.0)
+    spline = TimedSpline.along(motion(motion.times), motion.duration, Start.at_rest(start), goal)
+    MotionOptimizer(checker.kernel, prover.movers, robot.limits).improve(spline, steps=1)
+    _warm.add(robot.name)
 
 
 class Guess(NamedTuple):
@@ -183,9 +233,13 @@ def _guesses(among: Among, motion: Trajectory, turn: int) -> Iterator[Guess]:
         yield Guess(motion(np.linspace(0.0, motion.duration, 256)), motion.duration)
     goals, rng = run.setup.valid_goals, np.random.default_rng([run.seed, turn])
     for goal in goals[np.argsort(np.linalg.norm(goals - run.setup.start, axis=1))][:GOALS]:
-        for control in optimizer.starts(run.setup.start, goal, BUMPS, rng, BUMP_SIZE * (1 + turn)):
+        for control in optimizer.starts(run.setup.start, goal, BUMPS, rng, BUMP_SIZE * (1 + turn % 3)):
             states = optimizer.spline.path(control)
             yield Guess(states, _least_duration(states, among.limits))
+            if turn > 0:  # aside, back, and then along the line
+                bump = states - optimizer.spline.path(optimizer.spline.line(states[0], goal))
+                line = np.linspace(states[0], goal, len(states))
+                yield Guess(np.concatenate([states[0] + bump, line]), _least_duration(line, among.limits))
 
 
 def _least_duration(states: Array, limits: Limits) -> float:

@@ -21,6 +21,7 @@ from apex_ompl.ompl_adapter.process import quiet_ompl, seed_ompl
 from apex_ompl.ompl_adapter.setup import assemble, state_fault
 from apex_ompl.planners.apex_parameters import WITHOUT_MODEL, default_planner
 from apex_ompl.planning import PlanRun, find_path, finish, parameterize, plan_among_movers
+from apex_ompl.planning.among_movers import warm_up as warm_up_among_movers
 from apex_ompl.planning.departure import LARGEST_DEPTH, find_departure, with_departure
 from apex_ompl.planning.query import Group, State, Target, goal_record, joint_values, planned_joints, state_array
 from apex_ompl.result import PlanResult
@@ -239,6 +240,8 @@ class MotionPlanner:
             notes += given.notes
             if how is not None:
                 warm_up()
+            if movers:
+                warm_up_among_movers(checker)
             times = {"setup": time.perf_counter() - started}
             run = PlanRun(ready, planner, parameters, seed, Deadline(timeout), times, notes)
             with Interrupt() as run.interrupt:
