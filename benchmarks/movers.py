@@ -1,8 +1,8 @@
 """Obstacles that move, in the kernel: soundness and cost of proofs, blocked intervals, stops and retiming.
 
 Motions are random ones of the two Pandas, free of themselves and of the tables, at half of the velocity limits; movers
-are boxes, balls, cylinders and capsules that come near a link at a random moment. A motion that is proved apart from its
-mover is checked by the meshes at 100 moments; where it is not proved, the meshes say whether there is contact within
+are boxes, balls, cylinders and capsules that come near a link at a random moment. A motion that is proved apart from
+its mover is checked by the meshes at 100 moments; where it is not proved, the meshes say whether there is contact within
 20 ms. Motions of the table of costs last 3 s.
 
 Usage: python benchmarks/movers.py [-n 10000] [--costs 300]
@@ -63,10 +63,8 @@ def mover_near(motion: Trajectory, rng: np.random.Generator, name: str) -> Obsta
 
 def soundness(checker: CollisionChecker, motions: list[Trajectory], count: int) -> dict[str, int]:
     """Return how many motions are proved, proved in spite of a contact, and not proved without one near."""
-    rng, found = (
-        np.random.default_rng(1),
-        {"n": count, "proved": 0, "falsely proved": 0, "not proved without contact": 0},
-    )
+    rng = np.random.default_rng(1)
+    found = {"n": count, "proved": 0, "falsely proved": 0, "open without contact": 0}
     for k in range(count):
         motion = motions[k % len(motions)]
         mover = mover_near(motion, rng, "mover")
