@@ -2,8 +2,8 @@
 
 Motions are random ones of the two Pandas, free of themselves and of the tables, at half of the velocity limits; movers
 are boxes, balls, cylinders and capsules that come near a link at a random moment. A motion that is proved apart from
-its mover is checked by the meshes at 100 moments; where it is not proved, the meshes say whether there is contact within
-20 ms. Motions of the table of costs last 3 s.
+its mover is checked by the meshes at 100 moments; where it is not proved, the meshes say whether there is contact in
+20 ms from there. Motions of the table of costs last 3 s.
 
 Usage: python benchmarks/movers.py [-n 10000] [--costs 300]
 """

@@ -15,6 +15,7 @@ from apex_ompl.viz.render import render
 
 OUT = Path(__file__).resolve().parent.parent / "docs" / "pictures"
 SIZE = (960, 720)
+MOVING = "vertical/moving-large-0.2/900003"
 FROM_BEHIND = {"shelf_swap": 150.0}
 
 
@@ -28,6 +29,8 @@ def main() -> None:
     result = plan("ball_in_cup", timeout=20.0)
     render(result, OUT / "ball_in_cup_motion.png", (1280, 960))
     print(OUT / "ball_in_cup_motion.png")
+    render(plan(MOVING, timeout=20.0), OUT / "moving.png", (1280, 960))
+    print(OUT / "moving.png")
     plot_motion(plan("shelf_swap", timeout=20.0), OUT / "shelf_swap_timing.png")
     print(OUT / "shelf_swap_timing.png")
 
