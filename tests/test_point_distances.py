@@ -67,10 +67,10 @@ def test_obstacles_that_do_not_count_are_left_out() -> None:
     tables, solids = scene(9)
     points = np.random.default_rng(3).uniform(-1, 1, (300, 3))
     chosen = np.arange(9) % 2 == 0  # by owner; the tables have another order
-    seen = chosen[tables.arrays.owner].astype(np.int64)
+    seen = chosen[tables.arrays.owner]
     wanted = brute([p for p, kept in zip(solids, chosen, strict=True) if kept], points).min(axis=0)
     np.testing.assert_allclose(nearest_points(tables, points, seen=seen)[0], wanted, atol=1e-6)
-    none, slopes = nearest_points(tables, points, 0.5, np.zeros(9, np.int64))
+    none, slopes = nearest_points(tables, points, 0.5, np.zeros(9, bool))
     assert (none == 0.5).all() and not slopes.any()
 
 
@@ -102,7 +102,7 @@ def test_groups_have_the_clearance_of_their_nearest_ball() -> None:
     ("call", "words"),
     [
         (lambda s: nearest_points(s, np.zeros(3)), "points"),
-        (lambda s: nearest_points(s, np.zeros((1, 3)), seen=np.ones(2, np.int64)), "obstacles that count"),
+        (lambda s: nearest_points(s, np.zeros((1, 3)), seen=np.ones(2, bool)), "obstacles that count"),
         (lambda s: group_clearances(s, np.zeros((2, 4))), "balls"),
     ],
 )

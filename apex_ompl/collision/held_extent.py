@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from itertools import product
 
+import coal
 import numpy as np
 
 from apex_ompl.collision.shapes import coal_geometry
@@ -19,9 +20,13 @@ def held_extent(held: AttachedObject) -> Array:
     Raises:
         MissingFileError, FileFormatError: Its mesh cannot be read.
     """
-    geometry = coal_geometry(held)
+    return extent_in_link(coal_geometry(held), held.pose)
+
+
+def extent_in_link(geometry: coal.CollisionGeometry, pose: Array) -> Array:
+    """Return :func:`held_extent` of a geometry at a pose in its link's frame, shape (4, 4) [m]."""
     geometry.computeLocalAABB()
     low, high = geometry.aabb_local.min_, geometry.aabb_local.max_
     corners = np.array(list(product(*zip(low, high, strict=True))))
-    placed = corners @ held.pose[:3, :3].T + held.pose[:3, 3]
+    placed = corners @ pose[:3, :3].T + pose[:3, 3]
     return np.stack([placed.min(axis=0), placed.max(axis=0)])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -23,6 +24,9 @@ SHAPES = ("box", "sphere", "cylinder", "capsule")
 
 ObstacleRecord = tuple[int, Sequence[float], Sequence[float], Sequence[float]]
 """An obstacle: index of its shape in :data:`SHAPES`, position [m], orientation (xyzw), size [m]."""
+
+HeldExtent = tuple[str, Array]
+"""A link that holds an object, and the least and largest corner of a box around it in the link's frame, (2, 3) [m]."""
 
 PROBLEM_FIELDS: dict[str, tuple[Any, tuple[int, ...]]] = {
     "seed": (np.int32, ()), "suite": (np.uint8, ()), "level": (np.uint8, ()), "held": (np.uint32, ()),
@@ -153,6 +157,19 @@ class Paths:
             before += part.problems
         arrays = {name: np.concatenate(column) for name, column in columns.items()}
         return cls(arrays, {key: tuple(values) for key, values in names.items()}, parts[0].about)
+
+
+def held_extents(held: str) -> list[HeldExtent]:
+    """Return the extents of held objects, given as JSON.
+
+    Raises:
+        DatasetError: One has none: the data were made before these were stored.
+    """
+    try:
+        return [(str(body["link"]), np.array(body["extent"], float).reshape(2, 3)) for body in json.loads(held)]
+    except (KeyError, TypeError, ValueError) as error:
+        expected = "expected a link and an extent of each; make the data anew"
+        raise DatasetError(f"held objects {held[:60]!r}: {expected}") from error
 
 
 def to_half(control: Array, lower: Array, upper: Array) -> Array:

@@ -8,12 +8,12 @@ from numpy.typing import ArrayLike
 from apex_ompl.kernel.compiled import point_distance
 from apex_ompl.kernel.compiled.layout import Integers
 from apex_ompl.kernel.tables import SceneTables
-from apex_ompl.types import Array
+from apex_ompl.types import Array, Flags
 from apex_ompl.util.validation import shape_error
 
 
 def nearest_points(
-    scene: SceneTables, points: ArrayLike, limit: float = np.inf, seen: Integers | None = None
+    scene: SceneTables, points: ArrayLike, limit: float = np.inf, seen: Flags | None = None
 ) -> tuple[Array, Array]:
     """Return the signed distances of points from the nearest obstacle, and their gradients.
 
@@ -38,9 +38,7 @@ def nearest_points(
     return distances, gradients
 
 
-def group_clearances(
-    scene: SceneTables, balls: ArrayLike, limit: float = np.inf, seen: Integers | None = None
-) -> Array:
+def group_clearances(scene: SceneTables, balls: ArrayLike, limit: float = np.inf, seen: Flags | None = None) -> Array:
     """Return the least signed distance of the balls of each group from the obstacles, shape (G,) [m].
 
     Args:
@@ -61,11 +59,10 @@ def group_clearances(
     return clearances
 
 
-def _counted(scene: SceneTables, seen: Integers | None) -> Integers:
+def _counted(scene: SceneTables, seen: Flags | None) -> Integers:
     """Return which obstacles count, shape (obstacles,)."""
     count = len(scene.arrays.kind)
-    if seen is None:
-        return np.ones(count, np.int64)
-    if seen.shape != (count,):
-        raise shape_error(seen, (count,), "obstacles that count")
-    return np.ascontiguousarray(seen, np.int64)
+    counted = np.ones(count, np.int64) if seen is None else np.ascontiguousarray(seen, np.int64)
+    if counted.shape != (count,):
+        raise shape_error(counted.astype(float), (count,), "obstacles that count")
+    return counted
