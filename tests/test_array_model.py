@@ -105,7 +105,9 @@ def test_shapes_of_weights_are_those_of_the_modules(  # noqa: PLR0917
 ) -> None:
     made = config(
         latent=LatentConfig(dim=dim), denoiser=DenoiserConfig(kind=kind, width=width, blocks=blocks),
-        condition=ConditionConfig(scene=scene, point=point, width=width, out=2 * width, along=along, keys=along, hands=HANDS),
+        condition=ConditionConfig(
+            scene=scene, point=point, width=width, out=2 * width, along=along, keys=along, hands=HANDS
+        ),
     )  # fmt: skip
     assert is_supported(made)
     with torch.device("meta"):

@@ -100,8 +100,8 @@ def batch_queries(queries: Sequence[Query], eyes: Probes | Sight, kernel: Kernel
     """Return queries as a batch; of the kernel only the robot's kinematics are used, not its scene."""
     if isinstance(eyes, Sight):
         rows = (np.stack([getattr(q, name) for q in queries]) for name in ("start", "goal", "point"))
-        start, goal, point = (torch.tensor(row, dtype=torch.float32) for row in rows)
-        return _of_features(start, goal, point, torch.from_numpy(eyes.features(queries, kernel)))
+        ends = (torch.tensor(row, dtype=torch.float32) for row in rows)
+        return _of_features(torch.from_numpy(eyes.features(queries, kernel)), *ends)
     most = max((len(q.obstacles) for q in queries), default=0)
     count = len(queries)
     shape, mask = np.zeros((count, most), np.int64), np.zeros((count, most), bool)
@@ -118,7 +118,7 @@ def batch_queries(queries: Sequence[Query], eyes: Probes | Sight, kernel: Kernel
     return Conditions(*[*columns, torch.empty(count, 0)])
 
 
-def _of_features(start: Tensor, goal: Tensor, point: Tensor, seen: Tensor) -> Conditions:
+def _of_features(seen: Tensor, start: Tensor, goal: Tensor, point: Tensor) -> Conditions:
     """Return conditions with the features of a sight, shape (B, F), and without obstacles."""
     count, none = len(start), start.new_empty(len(start), 0, 3)
     shape, mask = torch.zeros(count, 0, dtype=torch.int64), torch.zeros(count, 0, dtype=torch.bool)
@@ -189,7 +189,7 @@ class SightTable:
         """Return the conditions of some paths by their indices, shape (B,)."""
         problem = self.problem[which]
         parts = (self._at_keys[problem].float(), self._along[which].float(), self._held[problem])
-        return _of_features(self.start[which], self.goal[which], self.point[which], torch.cat(parts, dim=1))
+        return _of_features(torch.cat(parts, dim=1), self.start[which], self.goal[which], self.point[which])
 
 
 def condition_table(paths: Paths, eyes: Probes | Sight, kernel: Kernel) -> ConditionTable | SightTable:
