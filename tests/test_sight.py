@@ -95,7 +95,7 @@ def test_features_are_those_of_the_mirror_image() -> None:
     theirs = replace(mine, obstacles=ObstacleSet.from_rows(rows), start=MIRROR.states(mine.start))
     theirs = replace(theirs, goal=MIRROR.states(mine.goal))
     found = sight.features([replace(mine, obstacles=ObstacleSet.from_rows(ROWS))], kernel())[0]
-    there = replace(sight, keys=image, _placed={}).features([theirs], kernel())[0]
+    there = replace(sight, keys=image).features([theirs], kernel())[0]
     keyed, points = 2 * len(keys().state), ALONG * 14
 
     def swapped(values: np.ndarray, width: int) -> np.ndarray:

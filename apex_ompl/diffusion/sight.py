@@ -30,7 +30,7 @@ from apex_ompl.kernel.scene_builder import scene_tables
 from apex_ompl.kernel.tables import SceneTables
 from apex_ompl.types import Array, Flags
 
-ROUNDS = 10  # of Lloyd's algorithm, by which they are made
+ROUNDS = 10  # of Lloyd's algorithm, which divides a cluster's spheres among its pieces
 KEY_RANGE = 0.3  # clearances at key states are clipped here [m]
 HELD_SIZE = 0.2  # scale of held objects [m]
 HALF = 2.0**-11  # relative rounding of half precision, in which checkpoints store balls
@@ -153,7 +153,7 @@ class Sight:
     keys: KeyStates
     probes: Probes
     hands: Sequence[str]
-    _placed: dict[str, tuple[tuple[Array, Array], Array]] = field(default_factory=dict)
+    _placed: dict[str, tuple[tuple[Array, Array], Array]] = field(default_factory=dict, init=False)
 
     @property
     def size(self) -> int:
