@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from geometry_files import bumpy_sphere
 from models import CLEARANCES, HANDS, kernel, keys, query, some_paths
 from models import config as model_config
 from support import ROOT
@@ -129,6 +130,29 @@ def test_what_obstacles_are_made_of_does_not_matter(sight: Sight) -> None:
     outside = found[0] > 0.05
     outside[keyed : keyed + 3 * points] = outside[keyed + 4 * points :] = False
     np.testing.assert_allclose(found[0][outside], found[1][outside], atol=1e-6)
+
+
+def test_a_ball_is_seen_alike_as_a_mesh_and_as_points(sight: Sight, tmp_path: Path) -> None:
+    radius, middle, thick = 0.2, (0.5, 0.1, 0.6), 0.01
+    vertices, faces = bumpy_sphere(24, radius, 0.0)
+    lines = [f"v {x} {y} {z}" for x, y, z in vertices] + [f"f {a} {b} {c}" for a, b, c in faces + 1]
+    (tmp_path / "ball.obj").write_text("\n".join(lines))
+    rng = np.random.default_rng(0)
+    cloud = rng.normal(size=(6000, 3))
+    np.save(tmp_path / "ball.npy", cloud / np.linalg.norm(cloud, axis=1, keepdims=True) * (radius - thick))
+    shapes = [
+        {"sphere": {"radius": radius}}, {"mesh": {"file": str(tmp_path / "ball.obj")}},
+        {"points": {"file": str(tmp_path / "ball.npy"), "radius": thick}},
+    ]  # fmt: skip
+    found, mine, keyed = [], query(1), 2 * len(keys().state)
+    for shape in shapes:
+        ball = Obstacle.model_validate({"name": "ball", "position": middle, **shape})
+        asked = make_query(CollisionChecker(robot(), [ball]), mine.start, mine.goal, point=False)
+        found.append(sight.features([asked], kernel())[0][:keyed] * KEY_RANGE)
+    outside = found[0] > 0.0
+    assert outside.sum() > 10 and np.ptp(found[0]) > 0.1
+    for other in found[1:]:
+        assert np.abs(other - found[0])[outside].max() < 0.03 and np.median(np.abs(other - found[0])) < 0.01
 
 
 def test_features_of_a_table_are_those_of_queries(sight: Sight) -> None:

@@ -25,7 +25,7 @@ def nearest_points(
 
     Returns:
         Distances, shape (N,) [m], negative inside an obstacle, and gradients, shape (N, 3), 0 where a distance is
-        ``limit``. From grids of distances they are bounds.
+        ``limit``. Those from grids are estimates, not bounds.
 
     Raises:
         ParameterError: Another shape.
