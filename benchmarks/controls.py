@@ -1,18 +1,16 @@
 """Controls of the model in comparisons: random bumps, random weights, another problem's conditions.
 
-Importing this module registers the planner ``bumps``: APEX with random bumps.
+:mod:`control_planners` makes planners of them.
 """
 
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from ompl import base as ob
 
 from apex_ompl import problems
 from apex_ompl.apex.query import make_query
@@ -21,9 +19,6 @@ from apex_ompl.diffusion.model import LatentDiffusion
 from apex_ompl.diffusion.proposals import Proposals
 from apex_ompl.diffusion.query import Query
 from apex_ompl.ompl_adapter.setup import assemble
-from apex_ompl.planners.apex import APEX
-from apex_ompl.planners.apex_parameters import ApexParameters
-from apex_ompl.planners.registry import register
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.trajopt.optimizer import Optimizer
 
@@ -34,7 +29,7 @@ class Bumps(ArrayModel):
     def propose(self, query: Any, kernel: Any, count: int, **options: Any) -> Proposals:
         """Return bumps on the straight lines of queries."""
         queries = [query] if isinstance(query, Query) else list(query)
-        rng = np.random.default_rng(options["generator"].integers(2**31))
+        rng = options.get("generator") or np.random.default_rng(0)
         found = np.concatenate([Optimizer(self.spline).starts(q.start, q.goal, count + 1, rng)[1:] for q in queries])
         return Proposals(found, np.empty(0), {})
 
@@ -95,15 +90,3 @@ def next_query(name: str) -> Query:
     level, number = name.rsplit("/", 1)
     setup = assemble(problems.load(f"{level}/{int(number) + 1}"), robot())
     return make_query(setup.checker, setup.start, setup.goals[0])
-
-
-@register("bumps")
-@dataclass(frozen=True)
-class BumpsParameters(ApexParameters):
-    """APEX with random bumps instead of proposals."""
-
-    def build(self, si: ob.SpaceInformation) -> ob.Planner:
-        """Return the planner."""
-        planner = APEX(si, self)
-        planner.model = Bumps(planner.model.config, planner.model.weights, {})
-        return planner

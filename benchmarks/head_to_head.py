@@ -33,7 +33,7 @@ from apex_ompl.planners.tuned import TUNED
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import one_or_more
 
-DEPENDS = ("@benchmark", "benchmarks/controls.py")
+DEPENDS = ("@benchmark", "benchmarks/controls.py", "benchmarks/control_planners.py", "benchmarks/neighbours.py")
 FOLDER = Path(__file__).parent / "runs" / "head_to_head"
 TIMEOUT = 10.0  # [s]
 SLOW = 20  # problems of a level for rows that take long
@@ -114,7 +114,7 @@ def main() -> None:
     )
     parser.add_argument("--jobs", type=one_or_more, default=1, help="runs at a time (default: one, as they are timed)")
     args = parser.parse_args()
-    workers = Workers(args.jobs, modules=("controls",))
+    workers = Workers(args.jobs, modules=("control_planners",))
     rows = [row if row.runs is None else replace(row, runs=args.slow) for row in ROWS]
     levels, seeds = record.static_levels(args.levels), {row.label: min(args.n, row.runs or args.n) for row in rows}
     results = bench(

@@ -21,7 +21,10 @@ from apex_ompl.planners.tuned import TUNED
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import one_or_more
 
-DEPENDS = ("@benchmark", "benchmarks/controls.py", "benchmarks/head_to_head.py")
+DEPENDS = (
+    "@benchmark", "benchmarks/controls.py", "benchmarks/control_planners.py", "benchmarks/neighbours.py",
+    "benchmarks/head_to_head.py",
+)  # fmt: skip
 KINDS = ("hard", "large", "extreme")
 NO_PROPOSALS = {"first": 0, "second": 0, "third": 0, "resample": 0}
 TREES = ("rrtconnect+polish", Row.of("rrtconnect", TUNED["rrtconnect"]).label)
@@ -43,7 +46,7 @@ def main() -> None:
     levels = [level for level in record.static_levels(args.levels) if level.split("/")[1] in KINDS]
     if not levels:
         parser.error(f"no level of the kinds {', '.join(KINDS)} is named")
-    workers = Workers(args.jobs, modules=("controls",))
+    workers = Workers(args.jobs, modules=("control_planners",))
     results = bench(
         levels, ROWS, head_to_head.FOLDER, runs=args.n, timeout=head_to_head.TIMEOUT, workers=workers,
         keep=True, provenance=record.session(),

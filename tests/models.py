@@ -12,8 +12,16 @@ from apex_ompl.datasets.records import Paths
 from apex_ompl.datasets.store import load
 from apex_ompl.diffusion.autoencoder import LinearLatent
 from apex_ompl.diffusion.model import LatentDiffusion
-from apex_ompl.diffusion.model_config import ConditionConfig, DenoiserConfig, LatentConfig, ModelConfig, NoiseConfig
+from apex_ompl.diffusion.model_config import (
+    ConditionConfig,
+    DenoiserConfig,
+    LatentConfig,
+    ModelConfig,
+    NoiseConfig,
+    key_shapes,
+)
 from apex_ompl.diffusion.query import ObstacleSet, Probes, Query
+from apex_ompl.diffusion.sight import KeyStates, key_states
 from apex_ompl.kernel import Kernel, RobotTables
 from apex_ompl.kernel.compiled.arrays import BOX, CAPSULE, CYLINDER, SPHERE
 from apex_ompl.kernel.scene_builder import Primitive, scene_tables
@@ -46,7 +54,17 @@ def config(**parts: object) -> ModelConfig:
         "latent": LatentConfig(dim=24, width=16), "condition": ConditionConfig(width=16, out=32, along=3),
         "denoiser": DenoiserConfig(width=32, blocks=2), "noise": NoiseConfig(),
     }  # fmt: skip
-    return ModelConfig(robot=robot.name, joints=robot.joint_names, probes=count, **(small | parts))
+    parts = small | parts
+    arms = (2, 7) if parts["condition"].scene == "clearances" else (0, 0)
+    return ModelConfig(robot=robot.name, joints=robot.joint_names, probes=count, arms=arms, **parts)
+
+
+@cache
+def keys(count: int = 24) -> KeyStates:
+    """Key states of the robot among the states of some paths."""
+    paths = some_paths()
+    states = paths.spline.path(paths.control(slice(0, 200))).reshape(-1, DOF)
+    return key_states(kernel().robot, states, count, np.random.default_rng(0))
 
 
 def network(seed: int = 0, **parts: object) -> LatentDiffusion:
@@ -56,6 +74,9 @@ def network(seed: int = 0, **parts: object) -> LatentDiffusion:
     probes = Probes.from_robot(kernel().robot, 3)
     model.probe_joint.copy_(torch.from_numpy(probes.joint))
     model.probe_offset.copy_(torch.from_numpy(probes.offset))
+    if model.config.condition.scene == "clearances":
+        for name, values in zip(key_shapes(model.config), (keys().state, keys().joint, keys().ball), strict=True):
+            getattr(model, name).copy_(torch.from_numpy(values))
     if isinstance(model.autoencoder, LinearLatent):
         model.autoencoder.fit(torch.tensor(some_paths().control(), dtype=torch.float32))
     for parameter in model.denoiser.parameters():
@@ -70,6 +91,8 @@ VARIATIONAL = {
     "condition": ConditionConfig(scene="none", point=True, width=16, out=32, along=2),
 }
 REGRESSION = {"denoiser": DenoiserConfig(kind="regression", width=32, blocks=2)}
+HANDS = ("left_hand_palm", "right_hand_palm")
+CLEARANCES = {"condition": ConditionConfig(scene="clearances", width=16, out=32, along=3, keys=24, hands=HANDS)}
 WALL = ("box", (0.45, 0.0, 0.6), (0.05, 0.4, 0.3))
 POST = ("cylinder", (0.4, 0.3, 0.5), (0.05, 0.3))
 
@@ -80,4 +103,5 @@ def query(seed: int = 0) -> Query:
     middle, span = (limits.lower + limits.upper) / 2, limits.upper - limits.lower
     ends = middle + 0.3 * span * rng.uniform(-0.5, 0.5, (2, DOF))
     rows = [(0, WALL[1], (0, 0, 0, 1), (0.1, 0.8, 0.6)), (2, POST[1], (0, 0, 0, 1), (0.05, 0.6, 0.0))]
-    return Query(ends[0], ends[1], np.array([0.4, 0.0, 0.5]), ObstacleSet.from_rows(rows))
+    held = [(HANDS[1], rng.uniform(-0.1, 0.1, (1, 3)) + np.array([[-0.05], [0.05]]))]
+    return Query(ends[0], ends[1], np.array([0.4, 0.0, 0.5]), ObstacleSet.from_rows(rows), held=held)

@@ -11,7 +11,20 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from models import DOF, POST, REGRESSION, VARIATIONAL, WALL, config, kernel, network, query, some_paths
+from models import (
+    CLEARANCES,
+    DOF,
+    HANDS,
+    POST,
+    REGRESSION,
+    VARIATIONAL,
+    WALL,
+    config,
+    kernel,
+    network,
+    query,
+    some_paths,
+)
 
 from apex_ompl.diffusion.array_model import ArrayModel, is_supported, weight_shapes
 from apex_ompl.diffusion.guidance import Guidance
@@ -31,6 +44,7 @@ SCENES: list[dict[str, Any]] = [
     {"noise": NoiseConfig(prediction="noise", schedule="linear", most=4.0)},
     {"noise": NoiseConfig(prediction="clean")},
     REGRESSION,
+    CLEARANCES,
 ]
 EMPTY = Query(query().start, query().goal, np.zeros(3), ObstacleSet.from_rows([]))
 
@@ -43,7 +57,9 @@ def both(**parts: Any) -> tuple[ArrayModel, TorchModel]:
     return ArrayModel(net.config, weights, {}), TorchModel(net, {})
 
 
-@pytest.mark.parametrize("parts", SCENES, ids=["distances", "set", "point", "noise", "clean", "regression"])
+@pytest.mark.parametrize(
+    "parts", SCENES, ids=["distances", "set", "point", "noise", "clean", "regression", "clearances"]
+)
 @pytest.mark.parametrize("queries", [query(), [query(1), query(2), EMPTY]], ids=["one", "three"])
 def test_numpy_proposes_what_torch_does(parts: dict[str, Any], queries: Any) -> None:
     models = both(**parts)
@@ -81,7 +97,7 @@ def test_paths_noised_by_numpy_are_those_of_torch() -> None:
 
 @settings(max_examples=25, deadline=None)
 @given(
-    st.sampled_from(["none", "set", "distances"]), st.booleans(), st.sampled_from(["mlp", "regression"]),
+    st.sampled_from(["none", "set", "distances", "clearances"]), st.booleans(), st.sampled_from(["mlp", "regression"]),
     st.integers(1, 12 * DOF), st.sampled_from([8, 24, 64]), st.integers(1, 5), st.integers(2, 6),
 )  # fmt: skip
 def test_shapes_of_weights_are_those_of_the_modules(  # noqa: PLR0917
@@ -89,7 +105,9 @@ def test_shapes_of_weights_are_those_of_the_modules(  # noqa: PLR0917
 ) -> None:
     made = config(
         latent=LatentConfig(dim=dim), denoiser=DenoiserConfig(kind=kind, width=width, blocks=blocks),
-        condition=ConditionConfig(scene=scene, point=point, width=width, out=2 * width, along=along),
+        condition=ConditionConfig(
+            scene=scene, point=point, width=width, out=2 * width, along=along, keys=along, hands=HANDS
+        ),
     )  # fmt: skip
     assert is_supported(made)
     with torch.device("meta"):

@@ -11,15 +11,17 @@ from support import ROOT
 
 from apex_ompl import problems
 from apex_ompl.datasets.kernel_problems import KernelProblem, load_kernel_problems, save_kernel_problems
+from apex_ompl.datasets.path_finder import PathFinder
 from apex_ompl.datasets.records import SOURCES
 from apex_ompl.datasets.store import Store
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError
 from apex_ompl.generation.records import kernel_problems
 from apex_ompl.generation.units import Unit
-from apex_ompl.kernel import RobotTables
+from apex_ompl.kernel import Kernel, RobotTables
 from apex_ompl.ompl_adapter.setup import assemble
 from apex_ompl.ompl_adapter.validity import full_check
 from apex_ompl.problems.suite_robot import robot
+from apex_ompl.trajopt.optimizer import Optimizer
 from apex_ompl.trajopt.spline import Spline
 
 WITHOUT = """
@@ -71,6 +73,30 @@ def test_they_are_solved_without_pinocchio_coal_and_ompl(cases: list[KernelProbl
             assert SOURCES[paths.arrays["source"][k]] in ("line", "bumps", "reversed")
             seen += 1
     assert seen >= 8
+
+
+def test_parts_of_paths_are_valid_where_the_straight_line_is_not(cases: list[KernelProblem]) -> None:
+    rng, spline = np.random.default_rng(0), Spline()
+    kept = left_out = 0
+    for case in cases:
+        finder = PathFinder(Kernel(case.robot, case.scene), case.start, case.goal, Optimizer(spline))
+        path = finder.optimize_bumps(rng, line=False, many=True)
+        if path is None:
+            continue
+        states = spline.path(path)
+        for _ in range(15):
+            first = int(rng.integers(120))
+            last = int(rng.integers(first + 90, 256))
+            part = finder.part(path, first, last)
+            ends = np.round(states[[first, last]], 6)
+            if finder.is_valid(ends):
+                assert part is None
+                left_out += 1
+            elif part is not None:
+                kept += 1
+                assert np.array_equal(part[[0, -1]], ends) and finder.is_valid(spline.path(part))
+                assert np.abs(spline.path(part)[128] - states[(first + last) // 2]).max() < 0.5, "it goes the same way"
+    assert kept > 3 and left_out > 3
 
 
 def test_damaged_files_are_named(cases: list[KernelProblem], tmp_path: Path) -> None:

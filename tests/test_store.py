@@ -95,6 +95,26 @@ def test_joined_sets_keep_what_belongs_together(tmp_path: Path) -> None:
         Paths.concatenate([])
 
 
+def test_sets_have_more_held_objects_than_a_byte_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    parts = []
+    for k in range(300):
+        one = random_paths(k)
+        parts.append(Paths(one.arrays, {**one.names, "held": (f"first {k}", f"second {k}")}, ABOUT))
+    joined = Paths.concatenate(parts)
+    assert len(joined.names["held"]) == 600
+    for k in (0, 150, 299):
+        mine = joined.arrays["held"][3 * k : 3 * k + 3]
+        wanted = [parts[k].names["held"][h] for h in parts[k].arrays["held"]]
+        assert [joined.names["held"][h] for h in mine] == wanted
+    save(tmp_path / "many.zip", joined)
+    assert same(load(tmp_path / "many.zip"), joined)
+    monkeypatch.setitem(FIELDS, "held", (np.uint8, ()))  # as sets were written before
+    save(tmp_path / "old.zip", random_paths(3))
+    monkeypatch.undo()
+    old = load(tmp_path / "old.zip")
+    assert same(old, random_paths(3)) and old.arrays["held"].dtype == np.uint32
+
+
 def test_a_set_made_otherwise_is_not_gone_on_with(tmp_path: Path) -> None:
     Store.create(tmp_path, MANIFEST, MANIFEST)
     with pytest.raises(DatasetError, match="seed is 0 there, expected 1"):

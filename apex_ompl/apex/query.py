@@ -13,7 +13,7 @@ from apex_ompl.types import Array
 def make_query(checker: CollisionChecker, start: Array, goal: Array, *, point: bool = True) -> Query:
     """Return the query of going from a state to another, among the obstacles of now.
 
-    Fixtures of the robot are left out. Meshes and points are seen as boxes around them.
+    Fixtures of the robot are left out. As ``obstacles``, meshes and points are boxes around them.
 
     Args:
         checker: The robot among obstacles.
@@ -21,6 +21,8 @@ def make_query(checker: CollisionChecker, start: Array, goal: Array, *, point: b
         goal: Shape (dof,) [rad].
         point: Whether the obstacle point is looked for; models that do not see it can do without.
     """
-    obstacles = ObstacleSet.from_scene(checker.kernel.scene, checker.movable)
+    scene, movable = checker.kernel.scene, checker.movable
+    obstacles = ObstacleSet.from_scene(scene, movable)
     nearest = checker.obstacle_point(start) if point else np.array(NO_POINT)
-    return Query(np.asarray(start, float), np.asarray(goal, float), nearest, obstacles)
+    ends = np.asarray(start, float), np.asarray(goal, float)
+    return Query(*ends, nearest, obstacles, (scene, movable), checker.held_extents)

@@ -15,7 +15,7 @@ from typing import Any
 from apex_ompl import planners, problems
 from apex_ompl.api import load_problem
 from apex_ompl.errors import ParameterError, UnknownNameError
-from apex_ompl.problems.catalogue import SPLITS
+from apex_ompl.problems.catalogue import SPLITS, VALIDATION
 from apex_ompl.util.validation import check_positive
 
 RUNNER = re.compile(r"[\w.]+:\w+")
@@ -183,7 +183,7 @@ def experiments(suites: Sequence[str]) -> dict[str, bool]:
     """
     if not suites:
         raise ParameterError("suites", "nothing", "a suite, a level as shelf/hard, or a problem")
-    known = problems.suites()
+    known = {**problems.suites(), **VALIDATION}
     found: dict[str, bool] = {}
     for name in suites:
         suite, _, level = name.partition("/")
@@ -207,7 +207,8 @@ def jobs(
     all its runs.
 
     Raises:
-        ApexError: A suite, planner, parameter or split is unknown, or two rows have the same label.
+        ApexError: A suite, planner, parameter or split is unknown, a suite has no such split, or two rows have the same
+            label.
     """
     if split not in SPLITS:
         raise UnknownNameError("split", split, SPLITS)
@@ -223,6 +224,9 @@ def jobs(
             load_runner(row.runner)
     found = []
     for experiment, is_level in experiments(suites).items():
+        suite = experiment.partition("/")[0]
+        if is_level and suite in VALIDATION and split != "validation":
+            raise ParameterError("split", split, f"validation, the only one of {suite}")
         for row in rows:
             for k in range(min(runs, row.runs or runs) if row.runs_on(experiment) else 0):
                 problem = f"{experiment}/{SPLITS[split].start + k}" if is_level else experiment

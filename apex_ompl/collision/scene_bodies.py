@@ -7,11 +7,13 @@ from typing import Any
 
 from tqdm import tqdm
 
+from apex_ompl.collision.held_extent import extent_in_link
 from apex_ompl.collision.mesh_stage import MeshStage
 from apex_ompl.collision.shapes import coal_geometry, world_geometry
 from apex_ompl.errors import SceneError, UnknownNameError
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import AttachedObject, Body, Obstacle
+from apex_ompl.types import Array
 from apex_ompl.util.schema import validate
 
 SHOWN_AFTER = 1.0  # of a progress bar [s]
@@ -26,6 +28,7 @@ class SceneBodies:
         self.meshes = MeshStage(robot)
         self._obstacles: dict[str, Body] = {}
         self._attached: dict[str, AttachedObject] = {}
+        self._extents: dict[str, tuple[str, Array]] = {}
         self._fixtures = frozenset(body.name for body in robot.fixtures)
 
     def fill(
@@ -72,6 +75,11 @@ class SceneBodies:
     def held(self) -> dict[str, AttachedObject]:
         """The held objects by name."""
         return dict(self._attached)
+
+    @property
+    def held_extents(self) -> tuple[tuple[str, Array], ...]:
+        """The link that holds each held object, and the corners of a box around it in its frame, shape (2, 3) [m]."""
+        return tuple(self._extents.values())
 
     def add(self, obstacle: Body) -> None:
         """Add an obstacle.
@@ -140,8 +148,10 @@ class SceneBodies:
         self._claim(held.name)
         for link in (held.link, *(held.touch_links or ())):
             self.robot.link_frame(link)
-        self.meshes.attach(held, coal_geometry(held), held.pose)
+        geometry = coal_geometry(held)
+        self.meshes.attach(held, geometry, held.pose)
         self._attached[held.name] = held
+        self._extents[held.name] = held.link, extent_in_link(geometry, held.pose)
         self._held_changed()
 
     def detach(self, name: str) -> None:
@@ -151,7 +161,7 @@ class SceneBodies:
             SceneError: There is no such held object.
         """
         self._find(self._attached, name, "held object")
-        del self._attached[name]
+        del self._attached[name], self._extents[name]
         self._forget_allowed(name)
         self.meshes.detach(name)
         self._held_changed()

@@ -22,7 +22,8 @@ from apex_ompl.types import Array
 from apex_ompl.util.stopwatch import timed
 
 STRAIGHT_SHARE = 0.2  # largest share of the kept problems that the straight line solves
-SUFFIX_STARTS = (0.1, 0.6)  # range of the state at which the rest of a path starts, as a share of its states
+PART_LENGTHS = (0.25, 0.9)  # range of the length of a part of a path, as a share of its states
+RESTS = 0.5  # share of the parts that end where their path does
 DUPLICATE_DISTANCE = 0.1  # a path nearer to another one is not kept [rad, max-norm]
 STRATEGIES = {
     "open": (("bumps", "bumps"), ("rrtconnect", "many bumps")),
@@ -43,7 +44,7 @@ class EngineOptions:
     Attributes:
         seed: Seed of all random choices but the problems themselves.
         copies: Number of searches for each problem.
-        parts: Number of rests that are kept of each path, from a random state to its goal.
+        parts: Number of parts that are tried of each path, between two of its states.
         model: Name or folder of a model whose proposals are tried first; none by default.
     """
 
@@ -152,7 +153,7 @@ class Engine:
                 yield source, control
 
     def _keep(self, finder: PathFinder, number: int, kept: list[tuple[str, Array]]) -> None:
-        """Keep paths, their reversals, and rests of both."""
+        """Keep paths, their reversals, and parts of both."""
         rng = np.random.default_rng([zlib.crc32(self._unit.encode()), self._options.seed, number, 1])
         with self.timed("homotopy"):
             classes = finder.homotopy_classes([control for _, control in kept])
@@ -167,10 +168,9 @@ class Engine:
             for path in (control,) if backwards is None else (control, backwards):
                 for _ in range(self._options.parts):
                     with self.timed("parts"):
-                        first = int(rng.integers(*(np.array(SUFFIX_STARTS) * self.optimizer.spline.states)))
-                        rest = finder.suffix(path, first)
-                    if rest is not None:
-                        self._add_path(finder, number, "part", rest, homotopy)
+                        part = finder.part(path, *_part_ends(rng, self.optimizer.spline.states))
+                    if part is not None:
+                        self._add_path(finder, number, "part", part, homotopy)
 
     def _add_problem(self, record: ProblemRecord) -> int:
         rows, number = self._rows, len(self._rows["seed"])
@@ -217,6 +217,13 @@ class Engine:
     def timed(self, stage: str) -> AbstractContextManager[None]:
         """Add the time of a block to a stage."""
         return timed(self.times, stage)
+
+
+def _part_ends(rng: np.random.Generator, states: int) -> tuple[int, int]:
+    """Draw the first and the last state of a part of a path."""
+    length = int(rng.uniform(*PART_LENGTHS) * states)
+    first = states - 1 - length if rng.random() < RESTS else int(rng.integers(states - length))
+    return first, first + length
 
 
 def _distance(spline: Spline, a: Array, b: Array) -> float:

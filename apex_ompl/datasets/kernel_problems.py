@@ -1,7 +1,7 @@
 """Problems as tables of the kernel, to be solved on machines without Pinocchio, Coal and OMPL.
 
 They are written on a machine that has those (:mod:`apex_ompl.generation.records`), and solved from the straight line
-and from random bumps; paths that the sphere cover proves free are kept. Rests of paths are left out: the obstacle point
+and from random bumps; paths that the sphere cover proves free are kept. Parts of paths are left out: the obstacle point
 at their start needs Coal.
 """
 

@@ -15,7 +15,7 @@ from apex_ompl.util.resolution import FINE_RESOLUTION, SEARCH_RESOLUTION
 
 FEW, MANY = 1, 8  # initial paths that are optimized together
 BUMP_SIZE = (0.4, 1.2)  # range of the amplitude of random bumps [rad]
-SUFFIX_STEPS = 12  # optimizer steps for the rest of a path
+PART_STEPS = 12  # optimizer steps for a part of a path
 COMPARED_STATES = 12  # number of states at which two paths are compared
 CLEARANCE_RANGE = 0.2  # clearances are measured up to here [m]
 
@@ -95,20 +95,20 @@ class PathFinder:
         stored = self.optimizer.spline.with_ends(stored, stored[0], stored[-1])
         return stored if self.is_valid(self.optimizer.spline.path(stored)) else None
 
-    def suffix(self, control: Array, first: int) -> Array | None:
-        """Return the control points of a path's rest from state ``first`` on.
+    def part(self, control: Array, first: int, last: int) -> Array | None:
+        """Return the control points of a path's part from state ``first`` to state ``last``.
 
-        None where the straight line to the goal is valid, or where the fitted rest is not.
+        None where the straight line between these is valid, or where the fitted part is not.
         """
         spline = self.optimizer.spline
-        states = spline.path(control)[first:].copy()
-        states[0] = np.round(states[0], 6)
+        states = spline.path(control)[first : last + 1].copy()
+        states[[0, -1]] = np.round(states[[0, -1]], 6)
         if self.is_valid(states[[0, -1]]):
             return None
         fitted = spline.fit(states, self.lower, self.upper).control
         stored = self.quantize(fitted)
         if stored is None:
-            stored = self.quantize(self.optimizer.improve(self.kernel, fitted[None], steps=SUFFIX_STEPS).control[0])
+            stored = self.quantize(self.optimizer.improve(self.kernel, fitted[None], steps=PART_STEPS).control[0])
         return stored
 
     def homotopy_classes(self, paths: Sequence[Array]) -> list[int]:

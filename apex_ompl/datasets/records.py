@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -16,7 +17,7 @@ from apex_ompl.types import Array
 MICRO = 1e-6  # states are stored in whole microradians; the suites draw states of six decimals
 SOURCES = ("line", "bumps", "rrtconnect", "reversed", "part", "model")
 """Origin of a path: straight line; optimization from random bumps; rrtconnect and optimization; the reversal of another
-path; the rest of another path from one of its states; optimization from a model's proposal."""
+path; a part of another path between two of its states; optimization from a model's proposal."""
 
 SHAPES = ("box", "sphere", "cylinder", "capsule")
 """Shapes of obstacles. Sizes are edges; radius; or radius and length along z [m]."""
@@ -24,8 +25,11 @@ SHAPES = ("box", "sphere", "cylinder", "capsule")
 ObstacleRecord = tuple[int, Sequence[float], Sequence[float], Sequence[float]]
 """An obstacle: index of its shape in :data:`SHAPES`, position [m], orientation (xyzw), size [m]."""
 
+HeldExtent = tuple[str, Array]
+"""A link that holds an object, and the least and largest corner of a box around it in the link's frame, (2, 3) [m]."""
+
 PROBLEM_FIELDS: dict[str, tuple[Any, tuple[int, ...]]] = {
-    "seed": (np.int32, ()), "suite": (np.uint8, ()), "level": (np.uint8, ()), "held": (np.uint8, ()),
+    "seed": (np.int32, ()), "suite": (np.uint8, ()), "level": (np.uint8, ()), "held": (np.uint32, ()),
     "things": (np.uint16, ()),
 }  # fmt: skip
 OBSTACLE_FIELDS: dict[str, tuple[Any, tuple[int, ...]]] = {
@@ -139,7 +143,7 @@ class Paths:
         parts = list(several)
         if not parts:
             raise DatasetError("data set: no paths to join")
-        names: dict[str, list[str]] = {key: [] for key in ("suite", "level", "held")}
+        names: dict[str, dict[str, int]] = {key: {} for key in ("suite", "level", "held")}
         columns: dict[str, list[NDArray[Any]]] = {name: [] for name in FIELDS}
         if any(dict(part.about) != dict(parts[0].about) for part in parts):
             raise DatasetError("data set: its units have states of different robots or splines")
@@ -153,6 +157,19 @@ class Paths:
             before += part.problems
         arrays = {name: np.concatenate(column) for name, column in columns.items()}
         return cls(arrays, {key: tuple(values) for key, values in names.items()}, parts[0].about)
+
+
+def held_extents(held: str) -> list[HeldExtent]:
+    """Return the extents of held objects, given as JSON.
+
+    Raises:
+        DatasetError: One has none: the data were made before these were stored.
+    """
+    try:
+        return [(str(body["link"]), np.array(body["extent"], float).reshape(2, 3)) for body in json.loads(held)]
+    except (KeyError, TypeError, ValueError) as error:
+        expected = "expected a link and an extent of each; make the data anew"
+        raise DatasetError(f"held objects {held[:60]!r}: {expected}") from error
 
 
 def to_half(control: Array, lower: Array, upper: Array) -> Array:
@@ -173,14 +190,10 @@ def from_micro(states: NDArray[np.int32]) -> Array:
     return np.asarray(states, float) / 1e6
 
 
-def _reindexed(indices: NDArray[Any], names: Iterable[str], known: list[str]) -> NDArray[Any]:
-    """Return indices into ``names`` as indices into ``known``, to which new names are appended."""
-    table = []
-    for name in names:
-        if name not in known:
-            known.append(name)
-        table.append(known.index(name))
-    return np.array(table, np.uint8)[indices] if len(indices) else indices
+def _reindexed(indices: NDArray[Any], names: Iterable[str], known: dict[str, int]) -> NDArray[Any]:
+    """Return indices into ``names`` as the numbers in ``known``, to which new names are added."""
+    table = [known.setdefault(name, len(known)) for name in names]
+    return np.array(table, indices.dtype)[indices] if len(indices) else indices
 
 
 def arrays_fault(arrays: Mapping[str, NDArray[Any]]) -> str:

@@ -178,7 +178,7 @@ def load(path: str | os.PathLike[str]) -> Paths:
             group = zarr.open_group(store, mode="r")
             head: dict[str, Any] = dict(group.attrs)
             found = head["schema"]
-            arrays = {name: np.asarray(group[name]) for name in FIELDS} if found == SCHEMA else {}
+            stored = {name: np.asarray(group[name]) for name in FIELDS} if found == SCHEMA else {}
         if found == SCHEMA:
             names = {key: tuple(str(v) for v in head["names"][key]) for key in ("suite", "level", "held")}
             about, counts, digest = head["about"], head["counts"], head["digest"]
@@ -186,12 +186,19 @@ def load(path: str | os.PathLike[str]) -> Paths:
         raise FileFormatError(str(path), "", type(error).__name__, "expected paths of a data set") from error
     if found != SCHEMA:
         raise FileFormatError(str(path), "schema", found, f"expected {SCHEMA!r}")
+    arrays = {name: _widened(array, FIELDS[name][0]) for name, array in stored.items()}
     fault = arrays_fault(arrays) or names_fault(arrays, names) or about_fault(about, arrays)
-    if not fault and digest != _digest(arrays):  # a chunk that is missed reads as zeros
+    if not fault and digest != _digest(stored):  # a chunk that is missed reads as zeros
         fault = "digest"
     if fault:
         raise FileFormatError(str(path), fault, "values that do not fit", "expected arrays that fit each other")
     return Paths(arrays, names, about, counts)
+
+
+def _widened(array: NDArray[Any], kind: Any) -> NDArray[Any]:
+    """Return whole numbers of a narrower type as ``kind``: sets of few held objects were written with fewer bytes."""
+    fits = array.dtype.kind == "u" and array.dtype != kind and np.can_cast(array.dtype, kind)
+    return array.astype(kind) if fits else array
 
 
 def _digest(arrays: Mapping[str, NDArray[Any]]) -> str:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from apex_ompl.datasets.records import SHAPES
 from apex_ompl.diffusion.geometry import signed_distances
 from apex_ompl.diffusion.guidance import Guidance, collision_cost
-from apex_ompl.diffusion.model_config import ModelConfig
+from apex_ompl.diffusion.model_config import OBSTACLE_SCENES, ModelConfig, key_shapes
 from apex_ompl.diffusion.proposals import TrajectoryModel
 from apex_ompl.diffusion.query import MAX_DISTANCE, WORKSPACE_CENTRE, ObstacleSet, Probes, Query
 from apex_ompl.kernel import Kernel
@@ -46,7 +46,8 @@ class ArrayModel(TrajectoryModel):
     def __init__(self, config: ModelConfig, weights: Mapping[str, NDArray[Any]], about: Mapping[str, Any]) -> None:
         """Use weights that fit a configuration, see :func:`is_supported`."""
         joint, offset = weights["probe_joint"], np.asarray(weights["probe_offset"], float)
-        super().__init__(config, about, Probes(np.asarray(joint, np.int64), offset, config.condition.along))
+        probes = Probes(np.asarray(joint, np.int64), offset, config.condition.along)
+        super().__init__(config, about, probes, {name: weights[name] for name in key_shapes(config)})
         self.weights = {k: np.ascontiguousarray(v, np.float32) for k, v in weights.items()}
         half = STEP_SIZE // 2
         self._frequencies = np.exp(np.float32(-math.log(10_000.0)) * np.arange(half, dtype=np.float32) / half)
@@ -81,12 +82,18 @@ class ArrayModel(TrajectoryModel):
         centre = np.array(WORKSPACE_CENTRE, np.float32)
         if self.config.condition.point:
             parts.append(np.array([q.point for q in queries], np.float32) - centre)
-        if self.config.condition.scene != "none":
+        if self.sight is not None:
+            parts.append(self.sight.features(queries, kernel))
+        if self.config.condition.scene in OBSTACLE_SCENES:
             start, goal = (np.array([getattr(q, name) for q in queries], float) for name in ("start", "goal"))
             probes = self.probes.positions(kernel, start, goal)
             features = [self._obstacle_features(q.obstacles, points) for q, points in zip(queries, probes, strict=True)]
             parts.append(np.array(features, np.float32))
-        return self._linear("encoder.phi.2", _silu(self._linear("encoder.phi.0", np.concatenate(parts, axis=1))))
+        found, *rest = (f"encoder.phi.{k}" for k in ((0, 2, 4) if self.sight is not None else (0, 2)))
+        encoded = self._linear(found, np.concatenate(parts, axis=1))
+        for name in rest:
+            encoded = self._linear(name, _silu(encoded))
+        return encoded
 
     def denoise(self, latent: Single, t: int, condition: Single) -> Single:
         """Return the denoiser's output for latent vectors at a step, each with its condition, or one for all."""
@@ -161,18 +168,23 @@ def weight_shapes(config: ModelConfig) -> dict[str, tuple[int, ...]]:
     shapes: dict[str, tuple[int, ...]] = {
         "probe_joint": (config.probes,), "probe_offset": (config.probes, 3), "autoencoder.mean": (free,),
         "autoencoder.components": (free, dim), "autoencoder.deviations": (dim,),
-        "encoder.lower": (dof,), "encoder.upper": (dof,),
+        "encoder.lower": (dof,), "encoder.upper": (dof,), **key_shapes(config),
     }  # fmt: skip
     layers: list[tuple[str, int, int]] = []
     size = 2 * dof + 3 * condition.point
-    if condition.scene != "none":
+    if condition.scene in OBSTACLE_SCENES:
         features = len(SHAPES) + 15 + (3 * config.probes if condition.scene == "distances" else 0)
         layers += [("encoder.thing.0", features, condition.width)]
         layers += [(f"encoder.thing.{k}", condition.width, condition.width) for k in (2, 4)]
         size += 2 * condition.width
     if condition.scene == "distances":
         size += 4 * condition.along * config.probes
-    layers += [("encoder.phi.0", size, 2 * condition.width), ("encoder.phi.2", 2 * condition.width, condition.out)]
+    hidden = 2 * condition.width
+    layers.append(("encoder.phi.0", size + config.seen, hidden))
+    if condition.scene == "clearances":
+        layers += [("encoder.phi.2", hidden, hidden), ("encoder.phi.4", hidden, condition.out)]
+    else:
+        layers.append(("encoder.phi.2", hidden, condition.out))
     width = denoiser.width
     layers += [("denoiser.step.1", STEP_SIZE, condition.out), ("denoiser.enter", dim, width)]
     layers += [("denoiser.leave", width, dim)]

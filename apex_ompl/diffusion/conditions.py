@@ -9,9 +9,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from apex_ompl.datasets.records import Paths
+from apex_ompl.datasets.records import Paths, held_extents
 from apex_ompl.diffusion.geometry import rotation_matrices, signed_distances
-from apex_ompl.diffusion.query import HALVES, Probes, Query
+from apex_ompl.diffusion.query import HALVES, ObstacleSet, Probes, Query
+from apex_ompl.diffusion.sight import Sight
 from apex_ompl.kernel import Kernel
 
 
@@ -29,6 +30,7 @@ class Conditions:
         rotation: Rotation matrices, shape (B, M, 3, 3).
         size: Half edges; radius; or radius and half length along z, shape (B, M, 3) [m].
         mask: True for an obstacle, False for padding, shape (B, M).
+        seen: Features of a :class:`Sight`, shape (B, F). Where there are any, obstacles and probe points are left out.
     """
 
     start: Tensor
@@ -40,6 +42,7 @@ class Conditions:
     rotation: Tensor
     size: Tensor
     mask: Tensor
+    seen: Tensor
 
     def to(self, device: torch.device | str) -> Conditions:
         """Return a copy on a device."""
@@ -93,8 +96,12 @@ def _zero_padded(tensor: Tensor, most: int) -> Tensor:
     return torch.cat([tensor, zeros], dim=1)
 
 
-def batch_queries(queries: Sequence[Query], probes: Probes, kernel: Kernel) -> Conditions:
+def batch_queries(queries: Sequence[Query], eyes: Probes | Sight, kernel: Kernel) -> Conditions:
     """Return queries as a batch; of the kernel only the robot's kinematics are used, not its scene."""
+    if isinstance(eyes, Sight):
+        rows = (np.stack([getattr(q, name) for q in queries]) for name in ("start", "goal", "point"))
+        ends = (torch.tensor(row, dtype=torch.float32) for row in rows)
+        return _of_features(torch.from_numpy(eyes.features(queries, kernel)), *ends)
     most = max((len(q.obstacles) for q in queries), default=0)
     count = len(queries)
     shape, mask = np.zeros((count, most), np.int64), np.zeros((count, most), bool)
@@ -105,10 +112,18 @@ def batch_queries(queries: Sequence[Query], probes: Probes, kernel: Kernel) -> C
         shape[k, :n], mask[k, :n], position[k, :n] = obstacles.shape, True, obstacles.position
         rotation[k, :n], size[k, :n] = obstacles.rotation, obstacles.size
     start, goal = np.stack([q.start for q in queries]), np.stack([q.goal for q in queries])
-    numbers = (start, goal, np.stack([q.point for q in queries]), probes.positions(kernel, start, goal))
+    numbers = (start, goal, np.stack([q.point for q in queries]), eyes.positions(kernel, start, goal))
     rest = (shape, position, rotation, size, mask)
     columns = [torch.tensor(a, dtype=torch.float32) for a in numbers] + [torch.from_numpy(a) for a in rest]
-    return Conditions(*columns)
+    return Conditions(*[*columns, torch.empty(count, 0)])
+
+
+def _of_features(seen: Tensor, start: Tensor, goal: Tensor, point: Tensor) -> Conditions:
+    """Return conditions with the features of a sight, shape (B, F), and without obstacles."""
+    count, none = len(start), start.new_empty(len(start), 0, 3)
+    shape, mask = torch.zeros(count, 0, dtype=torch.int64), torch.zeros(count, 0, dtype=torch.bool)
+    turns = start.new_empty(count, 0, 3, 3)
+    return Conditions(start, goal, point, turns, shape, none, turns, none, mask, seen)
 
 
 class ConditionTable:
@@ -139,4 +154,45 @@ class ConditionTable:
         at = torch.where(mask, first[:, None] + torch.arange(most), 0)
         columns = [table[which] for table in (self.start, self.goal, self.point, self.probes)]
         columns += [table[at] for table in (self.shape, self.position, self.rotation, self.size)]
-        return Conditions(*[*columns, mask])
+        return Conditions(*[*columns, mask, torch.empty(len(which), 0)])
+
+
+class SightTable:
+    """Conditions of the paths of a data set by a sight: features are computed once, and kept in half precision."""
+
+    def __init__(self, paths: Paths, sight: Sight, kernel: Kernel) -> None:
+        """Compute the features of all paths; of the kernel only the robot's kinematics are used, not its scene.
+
+        Raises:
+            DatasetError: Held objects have no extents.
+        """
+        a, start, goal = paths.arrays, paths.start, paths.goal
+        self.start, self.goal = (torch.tensor(v, dtype=torch.float32) for v in (start, goal))
+        self.point = torch.from_numpy(np.asarray(a["point"], np.float32))
+        self.problem = torch.from_numpy(a["problem"].astype(np.int64))
+        held = [sight.held(held_extents(text)) for text in paths.names["held"]]
+        first, balls = np.concatenate([[0], np.cumsum(a["things"])]).astype(int), sight.balls(kernel)
+        at_keys = np.empty((paths.problems, len(balls)), np.float16)
+        along = np.empty((len(paths), sight.along_size), np.float16)
+        order = np.argsort(a["problem"], kind="stable")
+        owners, begins = np.unique(a["problem"][order], return_index=True)
+        for p, which in zip(owners, np.split(order, begins[1:]), strict=True):
+            columns = (a[name][first[p] : first[p + 1]] for name in ("shape", "position", "orientation", "size"))
+            scene = ObstacleSet.from_rows(list(zip(*columns, strict=True))).tables()
+            at_keys[p] = sight.at_keys(balls, scene, None)
+            for k, points in zip(which, sight.probes.positions(kernel, start[which], goal[which]), strict=True):
+                along[k] = sight.along(points, scene, None)
+        self._at_keys, self._along = torch.from_numpy(at_keys), torch.from_numpy(along)
+        self._held = torch.from_numpy(np.array(held, np.float32).reshape(len(held), -1)[a["held"]])
+
+    def batch(self, which: Tensor) -> Conditions:
+        """Return the conditions of some paths by their indices, shape (B,)."""
+        problem = self.problem[which]
+        parts = (self._at_keys[problem].float(), self._along[which].float(), self._held[problem])
+        return _of_features(torch.cat(parts, dim=1), self.start[which], self.goal[which], self.point[which])
+
+
+def condition_table(paths: Paths, eyes: Probes | Sight, kernel: Kernel) -> ConditionTable | SightTable:
+    """Return the conditions of paths as a model with these eyes sees them."""
+    table = SightTable if isinstance(eyes, Sight) else ConditionTable
+    return table(paths, eyes, kernel)  # type: ignore[arg-type]

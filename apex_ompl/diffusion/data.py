@@ -14,16 +14,18 @@ from torch import Tensor
 
 from apex_ompl.datasets.records import SPLINE, Paths
 from apex_ompl.datasets.store import Store, load
-from apex_ompl.diffusion.conditions import Conditions, ConditionTable
+from apex_ompl.diffusion.conditions import Conditions, condition_table
 from apex_ompl.diffusion.config import TrainingConfig
 from apex_ompl.diffusion.mirror import Mirror
 from apex_ompl.diffusion.query import Probes
+from apex_ompl.diffusion.sight import Sight, key_states
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel import Kernel, RobotTables
 from apex_ompl.kernel.scene_builder import scene_tables
 from apex_ompl.types import Array
 from apex_ompl.util.files import is_file
 
+KEY_PATHS = 5_000  # paths of whose states key states are chosen
 STATISTICS_PATHS = 100_000  # most paths from which the statistics of the latent space are computed
 VALIDATION_SHARE = 0.02  # most of all problems on which the validation loss is taken
 PASSES, UNLIMITED = 4, 2**40  # passes over a shard before the next; steps where there is only one shard
@@ -43,12 +45,14 @@ class Shard:
         cumulated: Cumulated sampling weights, shape (N,).
     """
 
-    def __init__(self, sets: Sequence[Paths], probes: Probes, kernel: Kernel, weights: Mapping[str, float]) -> None:
+    def __init__(
+        self, sets: Sequence[Paths], eyes: Probes | Sight, kernel: Kernel, weights: Mapping[str, float]
+    ) -> None:
         """Compute the tensors of paths.
 
         Args:
             sets: The paths.
-            probes: Probe points of the robot.
+            eyes: Probe points of the robot, or what a model of scene ``clearances`` sees.
             kernel: The robot.
             weights: Sampling weight of each path, by patterns of ``suite/level``; the first that matches counts.
 
@@ -56,7 +60,7 @@ class Shard:
             ParameterError: There are no paths, or all weights are 0.
         """
         sets = [paths for paths in sets if len(paths)]
-        self._tables = [ConditionTable(paths, probes, kernel) for paths in sets]
+        self._tables = [condition_table(paths, eyes, kernel) for paths in sets]
         self.control = torch.cat([torch.tensor(paths.control(), dtype=torch.float32) for paths in sets] or [_EMPTY])
         found = [_weights(paths, weights) for paths in sets]
         self._ends = np.cumsum([len(paths) for paths in sets])
@@ -143,6 +147,7 @@ class TrainingData:
         validation: Paths of held-out problems, the same during the whole run, or None.
         spline: Fields of the paths' spline.
         probes: Probe points of the robot.
+        sight: What a model of scene ``clearances`` sees, None for others.
         number: Index of the shard.
         left: Number of steps before the next shard.
     """
@@ -161,6 +166,7 @@ class TrainingData:
                 raise ParameterError("mirror", len(config.mirror.order), f"{robot.dof} joints")
             self._mirror = Mirror(**config.mirror.model_dump())
         self.validation: Shard | None = None
+        self.sight: Sight | None = None
         self.number = self.left = 0
         self.shard = self._read(0)
         self._reset_steps()
@@ -200,8 +206,14 @@ class TrainingData:
             raise ParameterError("data", paths.about["robot"], f"paths of {robot.name}, whose tables are given")
         self.spline = {k: paths.about[k] for k in SPLINE}
         train, _ = split(paths, config.held_out)
+        if self.sight is None and config.condition.scene == "clearances":
+            rng = np.random.default_rng(config.seed)
+            control = train.control(np.sort(rng.integers(len(train), size=min(KEY_PATHS, len(train)))))
+            keys = key_states(robot, train.spline.path(control).reshape(-1, robot.dof), config.condition.keys, rng)
+            self.sight = Sight(keys, self.probes, config.condition.hands)
+        eyes = self.sight or self.probes
         if self.validation is None:
             few = split(paths, min(config.held_out, VALIDATION_SHARE))[1]  # the same problems for every larger share
-            self.validation = Shard([few], self.probes, self._kernel, {}) if len(few) else None
+            self.validation = Shard([few], eyes, self._kernel, {}) if len(few) else None
         sets = [train] if self._mirror is None else [train, self._mirror.paths(train, self._kernel)]
-        return Shard(sets, self.probes, self._kernel, config.weights)
+        return Shard(sets, eyes, self._kernel, config.weights)

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from apex_ompl.datasets.records import SHAPES
 from apex_ompl.diffusion.conditions import Conditions, pad_obstacles
+from apex_ompl.diffusion.model_config import OBSTACLE_SCENES
 from apex_ompl.diffusion.query import MAX_DISTANCE, WORKSPACE_CENTRE
 
 PADDING = -1e4  # below every feature, for the maximum over obstacles
@@ -21,24 +22,28 @@ class ConditionEncoder(nn.Module):
     With ``scene="none"`` it is the paper's phi: an MLP over the vector g of start, goal and obstacle point. ``set``
     adds the obstacles, each through an MLP and then pooled by mean and maximum, so that their order does not matter
     (Zaheer et al. 2017). ``distances`` adds the positions of the robot's probe points along the straight line
-    from start to goal, and their signed distances to each obstacle and to the nearest one.
+    from start to goal, and their signed distances to each obstacle and to the nearest one. ``clearances`` sees no
+    obstacles but features of distances, see :mod:`apex_ompl.diffusion.sight`.
     """
 
     lower: Tensor
     upper: Tensor
     centre: Tensor
 
-    def __init__(self, dof: int, *, out: int, width: int, scene: str, point: bool, probes: int, along: int) -> None:
+    def __init__(  # noqa: PLR0913
+        self, dof: int, *, out: int, width: int, scene: str, point: bool, probes: int, along: int, seen: int = 0
+    ) -> None:
         """Make an encoder.
 
         Args:
             dof: Number of joints.
             out: Size of the vector.
             width: Width of the hidden layers.
-            scene: ``none``, ``set`` or ``distances``.
+            scene: ``none``, ``set``, ``distances`` or ``clearances``.
             point: Whether the obstacle point is an input.
             probes: Number P of probe points.
             along: Number L of states of the straight line at which they are placed.
+            seen: Number of features of ``clearances``.
         """
         super().__init__()
         self.scene, self.point, self.along = scene, point, along
@@ -46,7 +51,7 @@ class ConditionEncoder(nn.Module):
         self.register_buffer("upper", torch.full((dof,), 1.0))
         self.register_buffer("centre", torch.tensor(WORKSPACE_CENTRE), persistent=False)
         size = 2 * dof + 3 * point
-        if scene != "none":
+        if scene in OBSTACLE_SCENES:
             features = len(SHAPES) + 15 + (3 * probes if scene == "distances" else 0)
             self.thing = nn.Sequential(
                 nn.Linear(features, width), nn.SiLU(), nn.Linear(width, width), nn.SiLU(), nn.Linear(width, width)
@@ -54,7 +59,11 @@ class ConditionEncoder(nn.Module):
             size += 2 * width
         if scene == "distances":
             size += 4 * along * probes
-        self.phi = nn.Sequential(nn.Linear(size, 2 * width), nn.SiLU(), nn.Linear(2 * width, out))
+        inner: list[nn.Module] = []
+        if scene == "clearances":
+            size += seen
+            inner = [nn.Linear(2 * width, 2 * width), nn.SiLU()]
+        self.phi = nn.Sequential(nn.Linear(size, 2 * width), nn.SiLU(), *inner, nn.Linear(2 * width, out))
 
     def set_limits(self, lower: Tensor, upper: Tensor) -> None:
         """Set the robot's limits, shape (dof,) [rad], by which states are scaled to -1..1."""
@@ -67,8 +76,9 @@ class ConditionEncoder(nn.Module):
         parts = [2.0 * (q - self.lower) / span - 1.0 for q in (conditions.start, conditions.goal)]
         if self.point:
             parts.append(conditions.point - self.centre)
-        if self.scene != "none":
+        if self.scene in OBSTACLE_SCENES:
             parts += self._obstacle_features(conditions)
+        parts.append(conditions.seen)
         encoded: Tensor = self.phi(torch.cat(parts, dim=1))
         return encoded
 

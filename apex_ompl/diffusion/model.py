@@ -11,7 +11,7 @@ from apex_ompl.diffusion.autoencoder import Autoencoder, LinearLatent, Variation
 from apex_ompl.diffusion.conditions import Conditions
 from apex_ompl.diffusion.denoisers import MLPDenoiser, UNetDenoiser
 from apex_ompl.diffusion.encoders import ConditionEncoder
-from apex_ompl.diffusion.model_config import ModelConfig
+from apex_ompl.diffusion.model_config import ModelConfig, key_shapes
 from apex_ompl.diffusion.schedule import NoiseSchedule
 from apex_ompl.trajopt.spline import Spline
 
@@ -29,6 +29,9 @@ class LatentDiffusion(nn.Module):
         schedule: Noise schedule.
         probe_joint: Joints that carry the probe points, shape (P,).
         probe_offset: Positions of the probe points in the joints' frames, shape (P, 3) [m].
+
+    Models of scene ``clearances`` have the arrays of :class:`apex_ompl.diffusion.sight.KeyStates` too: ``key_state``,
+    ``key_joint`` and ``key_ball``.
     """
 
     probe_joint: Tensor
@@ -47,17 +50,20 @@ class LatentDiffusion(nn.Module):
             self.autoencoder = VariationalLatent(spline, dof, latent.channels, latent.width, latent.halvings)
         self.encoder = ConditionEncoder(
             dof, out=condition.out, width=condition.width, scene=condition.scene, point=condition.point,
-            probes=config.probes, along=condition.along,
+            probes=config.probes, along=condition.along, seen=config.seen,
         )  # fmt: skip
-        shape, net = self.autoencoder.latent, config.denoiser
+        latent_shape, net = self.autoencoder.latent, config.denoiser
         if net.kind == "unet":
-            channels = shape[0] if len(shape) > 1 else 1
+            channels = latent_shape[0] if len(latent_shape) > 1 else 1
             self.denoiser: nn.Module = UNetDenoiser(channels, condition.out, net.width, net.multipliers)
         else:
-            self.denoiser = MLPDenoiser(math.prod(shape), condition.out, net.width, net.blocks)
+            self.denoiser = MLPDenoiser(math.prod(latent_shape), condition.out, net.width, net.blocks)
         self.schedule = NoiseSchedule(config.noise.steps, config.noise.schedule)
         self.register_buffer("probe_joint", torch.zeros(config.probes, dtype=torch.int64))
         self.register_buffer("probe_offset", torch.zeros(config.probes, 3))
+        for name, shape in key_shapes(config).items():
+            kind = torch.int64 if name == "key_joint" else torch.float32
+            self.register_buffer(name, torch.zeros(shape, dtype=kind))
 
     @property
     def latent(self) -> tuple[int, ...]:

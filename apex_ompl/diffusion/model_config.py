@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from apex_ompl.util.schema import StrictModel
 
 Count = Annotated[int, Field(ge=1)]
 Size = Annotated[int, Field(ge=1, le=16_384)]  # of layers and inputs; larger ones would exhaust the memory
+
+
+OBSTACLE_SCENES = ("set", "distances")
+"""Scenes of conditions that see obstacles one by one."""
 
 
 class SplineConfig(StrictModel):
@@ -44,18 +48,22 @@ class ConditionConfig(StrictModel):
     """Encoder of conditions, see ``apex_ompl.diffusion.encoders.ConditionEncoder``.
 
     Attributes:
-        scene: ``none``, ``set`` or ``distances``.
+        scene: ``none``, ``set``, ``distances`` or ``clearances``.
         point: Whether the obstacle point of the paper is an input.
         width: Width of the hidden layers.
         out: Size of the encoded condition.
         along: Number of states of the straight line at which the probe points are placed.
+        keys: Number of key states of ``clearances``.
+        hands: Links whose held objects ``clearances`` sees.
     """
 
-    scene: Literal["none", "set", "distances"] = "distances"
+    scene: Literal["none", "set", "distances", "clearances"] = "distances"
     point: bool = False
     width: Size = 256
     out: Size = 512
     along: Annotated[Size, Field(ge=2)] = 7
+    keys: Size = 512
+    hands: tuple[str, ...] = ()
 
 
 class DenoiserConfig(StrictModel):
@@ -105,6 +113,7 @@ class ModelConfig(StrictModel):
         robot: Name of the robot.
         joints: Its planned joints in state order.
         probes: Number of probe points on the robot.
+        arms: Numbers of arms and of their clusters of bodies that are seen at key states; 0 where none are.
         spline: Spline of the control points.
         latent: Latent space.
         condition: Encoder of conditions.
@@ -116,9 +125,42 @@ class ModelConfig(StrictModel):
     robot: str
     joints: Annotated[tuple[str, ...], Field(min_length=1)]
     probes: Size
+    arms: tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]] = (0, 0)
     spline: SplineConfig = SplineConfig()
     latent: LatentConfig = LatentConfig()
     condition: ConditionConfig = ConditionConfig()
     denoiser: DenoiserConfig = DenoiserConfig()
     noise: NoiseConfig = NoiseConfig()
     sampling: SamplingConfig = SamplingConfig()
+
+    @model_validator(mode="after")
+    def _arms_fit(self) -> Self:
+        if (self.condition.scene == "clearances") != (min(self.arms) > 0):
+            raise ValueError("expected arms where the scene is 'clearances', and none elsewhere")
+        return self
+
+    @property
+    def seen(self) -> int:
+        """Number of features of a scene ``clearances``, 0 of others."""
+        condition = self.condition
+        if condition.scene != "clearances":
+            return 0
+        return feature_count(condition.keys, self.arms[0], condition.along, self.probes, len(condition.hands))
+
+
+PIECES = 4  # balls of a cluster of bodies that moves together, at key states
+HELD_FEATURES = 7  # of a hand: whether it holds something, the centre and the half edges of a box around it
+
+
+def feature_count(keys: int, arms: int, along: int, probes: int, hands: int) -> int:
+    """Return the number of features of K key states of A arms, P probe points at L states, and H hands."""
+    return keys * arms + 7 * along * probes + HELD_FEATURES * hands
+
+
+def key_shapes(config: ModelConfig) -> dict[str, tuple[int, ...]]:
+    """Return the shapes of the buffers of key states, by name; none where a model has no key states."""
+    if config.condition.scene != "clearances":
+        return {}
+    arms, clusters = config.arms
+    dof, keys = len(config.joints), config.condition.keys
+    return {"key_state": (keys, dof), "key_joint": (arms, clusters), "key_ball": (arms, clusters, 1 + PIECES, 4)}

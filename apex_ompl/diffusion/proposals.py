@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from apex_ompl.diffusion.geometry import Numbers
 from apex_ompl.diffusion.guidance import Guidance, guided
@@ -17,6 +18,7 @@ from apex_ompl.diffusion.model_config import ModelConfig
 from apex_ompl.diffusion.query import Probes, Query
 from apex_ompl.diffusion.sampler import SAMPLERS, Callback, Predict, ddpm, noise_like
 from apex_ompl.diffusion.schedule import Estimate, NoiseSchedule
+from apex_ompl.diffusion.sight import KeyStates, Sight
 from apex_ompl.errors import ParameterError, UnknownNameError
 from apex_ompl.kernel import Kernel
 from apex_ompl.trajopt.spline import Spline
@@ -79,14 +81,18 @@ class TrajectoryModel(ABC):
         spline: Spline of the control points.
         schedule: Noise schedule.
         probes: Points of the robot whose distances to the obstacles it sees.
+        sight: What it sees of a scene ``clearances``, None of others.
         sampling: Default sampling.
     """
 
-    def __init__(self, config: ModelConfig, about: Mapping[str, Any], probes: Probes) -> None:
-        """Make a model of a configuration."""
+    def __init__(
+        self, config: ModelConfig, about: Mapping[str, Any], probes: Probes, keys: Mapping[str, NDArray[Any]]
+    ) -> None:
+        """Make a model of a configuration; ``keys`` are the buffers of its key states, if it has any."""
         self.config, self.about, self.probes = config, dict(about), probes
         self.spline = Spline(**config.spline.model_dump())
         self.schedule = NoiseSchedule(config.noise.steps, config.noise.schedule)
+        self.sight = Sight(KeyStates.of(**keys), probes, config.condition.hands) if keys else None
         self.sampling = Sampling(**config.sampling.model_dump())
 
     @property

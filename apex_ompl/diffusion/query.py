@@ -8,14 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from apex_ompl.datasets.records import ObstacleRecord
+from apex_ompl.datasets.records import HeldExtent, ObstacleRecord
 from apex_ompl.diffusion.geometry import rotation_matrices
 from apex_ompl.kernel import Kernel, RobotTables
 from apex_ompl.kernel.compiled.arrays import BOX, GRID, HALF_SPACE
 from apex_ompl.kernel.distance_grid import outline
-from apex_ompl.kernel.scene_builder import primitive
+from apex_ompl.kernel.scene_builder import Solids, boxes_around, primitive, tables_of
 from apex_ompl.kernel.tables import SceneTables
-from apex_ompl.types import Array
+from apex_ompl.types import Array, Flags
 
 HALVES = np.array([[0.5, 0.5, 0.5], [1.0, 0.5, 0.5], [1.0, 0.5, 0.5], [1.0, 0.5, 0.5]], np.float32)
 """Factors from the sizes in data sets (edges, lengths) to those of the networks (half edges, half lengths), by shape;
@@ -92,6 +92,13 @@ class ObstacleSet:
         """Return the number of obstacles M."""
         return len(self.shape)
 
+    def tables(self) -> SceneTables:
+        """Return the obstacles as tables of the kernel."""
+        position, rotation, size = (np.asarray(v, float) for v in (self.position, self.rotation, self.size))
+        kind = np.asarray(self.shape, np.int64)
+        boxes = boxes_around(kind, rotation, position, size)
+        return tables_of({0: Solids(kind, rotation, position, size, boxes, (None,) * len(kind))})
+
 
 def _rotation_to(normal: Array) -> Array:
     """Return a rotation matrix whose z axis is the unit vector ``normal``, shape (3, 3)."""
@@ -109,12 +116,20 @@ class Query:
         goal: Shape (dof,) [rad].
         point: Obstacle point nearest to the robot at the start, shape (3,) [m].
         obstacles: The obstacles without fixtures such as tables.
+        scene: The same as tables of the kernel, where there are any, and which of their solids are no fixtures.
+        held: Links that hold something, and the corners of boxes around it in their frames, each of shape (2, 3) [m].
     """
 
     start: Array
     goal: Array
     point: Array
     obstacles: ObstacleSet
+    scene: tuple[SceneTables, Flags] | None = None
+    held: Sequence[HeldExtent] = ()
+
+    def seen(self) -> tuple[SceneTables, Flags | None]:
+        """Return tables of the obstacles, and which of their solids are obstacles, None for all."""
+        return (self.obstacles.tables(), None) if self.scene is None else self.scene
 
 
 class Probes:

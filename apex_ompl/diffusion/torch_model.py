@@ -14,6 +14,7 @@ from apex_ompl.diffusion.conditions import batch_queries
 from apex_ompl.diffusion.guidance import Guidance
 from apex_ompl.diffusion.guidance_gradient import gradient, log_likelihood
 from apex_ompl.diffusion.model import LatentDiffusion
+from apex_ompl.diffusion.model_config import key_shapes
 from apex_ompl.diffusion.proposals import TrajectoryModel
 from apex_ompl.diffusion.query import Probes, Query
 from apex_ompl.kernel import Kernel
@@ -31,7 +32,8 @@ class TorchModel(TrajectoryModel):
     def __init__(self, network: LatentDiffusion, about: Mapping[str, Any]) -> None:
         """Use a network with its present weights; they are frozen."""
         joint, offset = network.probe_joint.cpu().numpy(), network.probe_offset.cpu().double().numpy()
-        super().__init__(network.config, about, Probes(joint, offset, network.config.condition.along))
+        keys = {name: getattr(network, name).cpu().numpy() for name in key_shapes(network.config)}
+        super().__init__(network.config, about, Probes(joint, offset, network.config.condition.along), keys)
         self.network = network.eval().requires_grad_(False)
 
     @property
@@ -55,7 +57,7 @@ class TorchModel(TrajectoryModel):
     @torch.no_grad()
     def condition(self, queries: Sequence[Query], kernel: Kernel) -> Tensor:
         """Return the encoded conditions of Q queries, shape (Q, out)."""
-        found: Tensor = self.network.encoder(batch_queries(queries, self.probes, kernel).to(self.device))
+        found: Tensor = self.network.encoder(batch_queries(queries, self.sight or self.probes, kernel).to(self.device))
         return found
 
     @torch.no_grad()

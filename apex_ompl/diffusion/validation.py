@@ -9,6 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from apex_ompl.datasets.kernel_problems import KernelProblem
+from apex_ompl.datasets.records import held_extents
 from apex_ompl.diffusion.proposals import Sampling, TrajectoryModel
 from apex_ompl.diffusion.query import ObstacleSet, Query
 from apex_ompl.kernel import Kernel
@@ -20,7 +21,8 @@ from apex_ompl.util.resolution import FINE_RESOLUTION
 def query_from_problem(problem: KernelProblem) -> Query:
     """Return the model's query of a problem."""
     obstacles = ObstacleSet.from_rows(problem.record.obstacles)
-    return Query(problem.start, problem.goal, problem.points[0], obstacles)
+    held = held_extents(problem.record.held)
+    return Query(problem.start, problem.goal, problem.points[0], obstacles, held=held)
 
 
 def success_rates(

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from apex_ompl import problems
+from apex_ompl.collision.held_extent import held_extent
 from apex_ompl.datasets.engine import ProblemRecord
 from apex_ompl.datasets.kernel_problems import KernelProblem
 from apex_ompl.datasets.records import SHAPES, ObstacleRecord
@@ -18,7 +20,7 @@ from apex_ompl.ompl_adapter.setup import assemble
 from apex_ompl.problems.broad.representation import part_of
 from apex_ompl.problems.generator import SuiteError
 from apex_ompl.problems.suite_robot import robot
-from apex_ompl.scene.bodies import Obstacle
+from apex_ompl.scene.bodies import AttachedObject, Obstacle
 from apex_ompl.scene.problem import Problem
 
 
@@ -46,14 +48,21 @@ def kernel_problems(unit: Unit) -> list[KernelProblem]:
 def problem_record(problem: Problem, seed: int) -> ProblemRecord:
     """Return the record of a problem in a data set: its obstacles as primitives, whatever they are given as.
 
-    Held meshes are named by their files, without folders.
+    The primitives contain the meshes and the balls around points. Held meshes are named by their files, without
+    folders; each held object has its ``extent``, see :func:`apex_ompl.collision.held_extent.held_extent`.
     """
-    bodies = [h.model_dump(mode="json", exclude_defaults=True) for h in problem.attached]
-    for body in bodies:
+    scene = problems.primitives(problem, enclosing=True)
+    return ProblemRecord(seed, held_text(problem.attached), [_obstacle_record(obstacle) for obstacle in scene])
+
+
+def held_text(attached: Sequence[AttachedObject]) -> str:
+    """Return held objects as JSON, as data sets store them."""
+    bodies = [h.model_dump(mode="json", exclude_defaults=True) for h in attached]
+    for body, held in zip(bodies, attached, strict=True):
         if "mesh" in body:
             body["mesh"]["file"] = Path(body["mesh"]["file"]).name
-    held = json.dumps(bodies)
-    return ProblemRecord(seed, held, [_obstacle_record(obstacle) for obstacle in problems.primitives(problem)])
+        body["extent"] = np.round(held_extent(held), 4).tolist()
+    return json.dumps(bodies)
 
 
 def _obstacle_record(obstacle: Obstacle) -> ObstacleRecord:

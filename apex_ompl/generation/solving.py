@@ -22,6 +22,7 @@ from apex_ompl.ompl_adapter.setup import PlanningSetup, assemble
 from apex_ompl.ompl_adapter.simplify import simplify
 from apex_ompl.ompl_adapter.space import path_to_array
 from apex_ompl.ompl_adapter.validity import full_check
+from apex_ompl.planners.tuned import TUNED
 from apex_ompl.problems.generator import SuiteError
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.trajopt.optimizer import Optimizer
@@ -115,7 +116,9 @@ class OmplPathFinder(PathFinder):
         seed_ompl(seed)
         simple_setup, si = self.setup.simple_setup, self.setup.simple_setup.getSpaceInformation()
         simple_setup.clear()
-        simple_setup.setPlanner(og.RRTConnect(si))
+        planner = og.RRTConnect(si)
+        planner.setRange(TUNED["rrtconnect"]["range"])
+        simple_setup.setPlanner(planner)
         left = iter(range(self.iterations))
         status = simple_setup.solve(ob.PlannerTerminationCondition(lambda: next(left, None) is None))
         self._raise_faults()

@@ -1,0 +1,100 @@
+"""Apex and its controls on the frozen problems of ``unseen``: scenes of kinds that no training data are of.
+
+Rows: apex; the same planner with random bumps, a network of random weights, another problem's conditions, or the
+nearest training paths in the place of proposals; rrtconnect+polish; rrtconnect as OMPL has it and tuned; the straight
+line and its repair, which ends by itself. With --model, apex with another checkpoint stands beside the one that ships,
+under the checkpoint's digest, and controls of a network are those of this checkpoint.
+Each run is stored in benchmarks/runs/unseen when it ends; the command resumes where it was stopped.
+
+Usage: python benchmarks/unseen.py [LEVEL ...] [-n 36] [--rows NAME ...] [--model FOLDER] [--jobs 1] [--report]
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import record
+from controls import checkpoint_digest
+from head_to_head import ROWS, together
+
+from apex_ompl.benchmark import Results, Row, Workers, bench
+from apex_ompl.benchmark.summary import statistics, warnings
+from apex_ompl.diffusion.checkpoint import read_config
+from apex_ompl.planners.tuned import TUNED
+from apex_ompl.problems.catalogue import VALIDATION
+from apex_ompl.util.entry_point import run_script
+from apex_ompl.util.validation import one_or_more
+
+DEPENDS = (
+    "@benchmark", "benchmarks/controls.py", "benchmarks/control_planners.py", "benchmarks/neighbours.py",
+    "benchmarks/head_to_head.py",
+)  # fmt: skip
+FOLDER = record.RESULTS.parent / "runs" / "unseen"
+TIMEOUT = 10.0  # [s]
+FROZEN = 36  # problems of a level
+SUITE = "unseen"
+CONTROLS = ("bumps", "random weights", "shuffled conditions", "nearest paths")
+OF_A_MODEL = ("random weights", "shuffled conditions")
+TREES = ("rrtconnect+polish", "rrtconnect", Row.of("rrtconnect", TUNED["rrtconnect"]).label, "straight line + repair")
+NAMES = ("apex", *CONTROLS, *TREES)
+
+
+def rows(names: Sequence[str], model: Path | None) -> list[Row]:
+    """Return the rows of some names; those of a checkpoint are labelled with its digest.
+
+    Raises:
+        ApexError: The checkpoint cannot be read.
+    """
+    known = {row.label: row for row in ROWS if row.label in TREES}
+    params, mark = {}, ""
+    if model is not None:
+        read_config(model)
+        params, mark = {"model": str(model.resolve())}, f", {checkpoint_digest(model)}"
+    found = []
+    for name in names:
+        if name == "apex":
+            found += [Row("apex", "apex"), *([Row(f"apex{mark}", "apex", params)] if mark else [])]
+        elif name in CONTROLS:
+            own = name in OF_A_MODEL
+            found.append(Row(name + mark * own, name, params if own else {}))
+        else:
+            found.append(known[name])
+    return found
+
+
+def main() -> None:
+    """Run what is missing, and write the table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("levels", nargs="*", metavar="LEVEL", help="of unseen (default: all)")
+    parser.add_argument("-n", type=one_or_more, default=FROZEN, help="problems of a level (default: %(default)s)")
+    parser.add_argument("--rows", nargs="*", choices=NAMES, default=NAMES, metavar="NAME", help="(default: all)")
+    parser.add_argument("--model", type=Path, metavar="FOLDER", help="checkpoint beside the one that ships")
+    parser.add_argument("--jobs", type=one_or_more, default=1, help="runs at a time (default: one, as they are timed)")
+    parser.add_argument("--store", type=Path, default=FOLDER, help="folder of the runs")
+    parser.add_argument("--report", action="store_true", help="run nothing; write the results of the stored runs")
+    args = parser.parse_args()
+    if args.n > FROZEN or not set(args.levels) <= set(VALIDATION[SUITE]):
+        parser.error(f"expected at most {FROZEN} problems of the levels {', '.join(VALIDATION[SUITE])}")
+    levels = [f"{SUITE}/{level}" for level in args.levels or VALIDATION[SUITE]]
+    wanted, workers = rows(args.rows, args.model), Workers(args.jobs, modules=("control_planners",))
+    if not args.report:
+        bench(
+            levels, wanted, args.store, runs=args.n, timeout=TIMEOUT, split="validation", workers=workers,
+            provenance=record.session(),
+        )  # fmt: skip
+    results = Results.load(args.store)
+    labels = {row.label for row in wanted}
+    mine = [r for r in results.runs if r["label"] in labels and r["experiment"] in levels and r["seed"] < args.n]
+    results = replace(results, runs=mine)
+    table = together(statistics(results), wanted, {"all": levels, **{level: (level,) for level in levels}})
+    text = "\n\n".join([*warnings(results), table.markdown()])
+    data = {"table": {"title": table.title, "head": list(table.head), "rows": [list(row) for row in table.rows]}}
+    about = {"timeout": f"{TIMEOUT:g} s", "seeds": f"0 to {args.n - 1}"}
+    record.write("unseen", data, text, split="validation", **about, **record.made_with(results))
+
+
+if __name__ == "__main__":
+    run_script(main)
