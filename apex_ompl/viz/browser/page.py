@@ -22,7 +22,7 @@ from apex_ompl.viz.browser.server import serving
 from apex_ompl.viz.browser.shown import Shown, ordered
 
 FRAME_RATE = 30.0  # [1/s]
-HOLD = 0.6  # how long the last state stays [s]
+HOLD, LOOP = 0.6, 5.0  # least time that the last state stays, and least time until the player begins anew [s]
 WAY_STATES = 80
 FIELD_OF_VIEW = 0.75  # [rad]
 AMBIENT = 1.5  # intensity of the light from everywhere
@@ -90,7 +90,8 @@ def _recorded(server: Any, sources: Sequence[Shown], cover: bool) -> str:
             for one, scene in zip(sources, scenes, strict=True):
                 one.draw(scene, float(time))
             recorder.insert_sleep(duration / (len(times) - 1))
-        recorder.insert_sleep(HOLD)
+        # The player builds the whole scene anew each time, which takes a second where no graphics card is.
+        recorder.insert_sleep(max(HOLD, LOOP - duration))
     found: str = recorder.as_html()
     return found
 
