@@ -18,7 +18,7 @@ from apex_ompl.problems import load
 from apex_ompl.result import PlanResult, PlanStatus
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import Obstacle
-from apex_ompl.scene.problem import Problem
+from apex_ompl.scene.problem import Goal, Problem
 from apex_ompl.trajectory import Timing
 
 
@@ -70,6 +70,34 @@ def test_a_mover_in_the_way_is_met_without_time_and_missed_in_time(problem: Prob
     assert result.trajectory.duration < still.trajectory.duration + 2.0
     snapshot = plan(crossed, timeout=20.0, snapshot=True)
     assert snapshot and snapshot.movers == () and snapshot.notes == ("snapshot: mover taken to stand still",)
+
+
+def test_pairs_that_may_touch_do_so_among_movers(problem: Problem, robot: Robot) -> None:
+    crossed = with_mover(problem, robot)
+    bodies = CollisionChecker(robot).kernel.robot.body_names
+    hand = sorted({name.rsplit("_", 1)[0] for name in bodies if name.startswith("left_hand")})
+    pairs = (*((name, "mover") for name in hand), ("left_link7", "right_link7"))
+    result = plan(crossed.model_copy(update={"allowed": pairs}), timeout=20.0)
+    assert result and result.trajectory is not None and result.movers == ("mover",)
+    moments = np.linspace(0.0, result.trajectory.duration, 40)
+    touched = set()
+    for time in moments:
+        state, there = result.trajectory(time), [obstacle_at(crossed.scene[0], float(time))]
+        assert CollisionChecker(robot, there, allowed=pairs).is_free(state), time
+        touched.add(CollisionChecker(robot, there).is_free(state))
+    assert False in touched  # the straight line leads through the mover
+
+
+def test_joints_that_are_not_planned_stay_among_movers(problem: Problem, robot: Robot) -> None:
+    start, goal = problem.start_state(robot.joint_names), problem.goal_states(robot.joint_names)[0]
+    moved = np.array([name.startswith("left_joint") for name in robot.joint_names])
+    goal = dict(zip(robot.joint_names, np.where(moved, goal, start).tolist(), strict=True))
+    crossed = with_mover(problem, robot).model_copy(update={"goal": Goal(joints=(goal,))})
+    result = MotionPlanner(robot.name).plan_problem(crossed, group="left_arm", timeout=20.0)
+    assert result and result.trajectory is not None and result.solved_by.endswith(("retiming", "space-time", "swept"))
+    states = result.trajectory(np.linspace(0.0, result.trajectory.duration, 500))
+    assert np.array_equal(states[:, ~moved], np.broadcast_to(start[~moved], states[:, ~moved].shape))
+    clearances_in_time(robot, result, 40)
 
 
 def test_results_among_movers_are_kept(problem: Problem, robot: Robot, tmp_path: Path) -> None:

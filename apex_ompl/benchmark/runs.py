@@ -211,8 +211,7 @@ def in_time(job: Job, stages: Sequence[str] = STAGES) -> tuple[PlanRun, Experime
     """
     started, problem = time.perf_counter(), load_problem(job.problem)
     with quiet_ompl():
-        still = problem.model_copy(update={"scene": tuple(o for o in problem.scene if not o.moving)})
-        planning = _ready(job, still, started)
+        planning = _ready(job, problem.still, started)
         planning.setup = replace(planning.setup, problem=problem)
         movers = [o for o in problem.scene if o.moving]
         warm_up_among_movers(planning.setup.checker)

@@ -194,5 +194,6 @@ class SightTable:
 
 def condition_table(paths: Paths, eyes: Probes | Sight, kernel: Kernel) -> ConditionTable | SightTable:
     """Return the conditions of paths as a model with these eyes sees them."""
-    table = SightTable if isinstance(eyes, Sight) else ConditionTable
-    return table(paths, eyes, kernel)  # type: ignore[arg-type]
+    if isinstance(eyes, Sight):
+        return SightTable(paths, eyes, kernel)
+    return ConditionTable(paths, eyes, kernel)

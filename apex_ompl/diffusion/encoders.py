@@ -30,7 +30,7 @@ class ConditionEncoder(nn.Module):
     upper: Tensor
     centre: Tensor
 
-    def __init__(  # noqa: PLR0913
+    def __init__(
         self, dof: int, *, out: int, width: int, scene: str, point: bool, probes: int, along: int, seen: int = 0
     ) -> None:
         """Make an encoder.

@@ -159,7 +159,7 @@ def tables_of(solids: Mapping[int, Solids]) -> SceneTables:
     counts = np.array([len(some.kind) for some in solids.values()], np.int64)
     owner = np.repeat(np.fromiter(solids, np.int64, len(solids)), counts)
     rank = np.concatenate([np.empty(0, np.int64), *(np.arange(n) for n in counts)])
-    rows = _joined(solids.values())
+    rows = joined(solids.values())
     closed = np.flatnonzero(rows.kind != HALF_SPACE)
     tree = _structure(len(closed))
     middle = rows.box[closed].mean(axis=1)
@@ -247,7 +247,8 @@ def primitive(tables: SceneTables, k: int) -> Primitive:
     return Primitive(kind, pose, tuple(arrays.size[k].tolist()))
 
 
-def _joined(parts: Iterable[Solids]) -> Solids:
+def joined(parts: Iterable[Solids]) -> Solids:
+    """Return solids one behind the other."""
     rows = list(parts) or [Solids.of(())]
     kind, rotation, offset, size, box = (np.concatenate(c) for c in zip(*(row[:-1] for row in rows), strict=True))
     return Solids(kind, rotation, offset, size, box, tuple(grid for row in rows for grid in row.grids))

@@ -17,7 +17,7 @@ from apex_ompl.errors import ParameterError, SceneError, UnknownNameError
 from apex_ompl.kernel import Kernel
 from apex_ompl.kernel.compiled.layout import pack
 from apex_ompl.kernel.compiled.movers import MoverArrays, clearances_in_time, first_conflict, movers_view
-from apex_ompl.kernel.scene_builder import Solids, grid_columns
+from apex_ompl.kernel.scene_builder import Solids, grid_columns, joined
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.trajectory import Trajectory
 from apex_ompl.types import Array
@@ -57,32 +57,30 @@ class Movers:
             ParameterError: An obstacle is a half-space.
         """
         given = tuple(obstacles)
-        self.obstacles = {o.name: o for o in given}
-        if len(self.obstacles) < len(given):
+        self.names = tuple(o.name for o in given)
+        if len(set(self.names)) < len(given):
             raise SceneError(f"names of movers must differ, found {', '.join(o.name for o in given)}")
         for o in given:
             if o.half_space is not None:
                 raise ParameterError(f"mover {o.name}", "a half_space", "a shape that is bounded")
-        self.names = tuple(self.obstacles)
         rows = [Solids.of(primitives(*world_geometry(o))) for o in given]
-        owner = np.repeat(np.arange(len(rows)), [len(some.kind) for some in rows])
-        joined = [np.concatenate(columns) for columns in zip(*(some[:4] for some in rows), strict=True)]
-        kind, rotation, offset, size = joined if rows else (np.empty(0, np.int64), np.empty((0, 3, 3)), *_NO_ROWS)
+        owner = np.repeat(np.arange(len(rows)), np.array([len(some.kind) for some in rows], int))
+        solids = joined(rows)
         places = np.array([o.position for o in given], float).reshape(-1, 3)
-        self._from_body = offset - places[owner]
+        self._from_body = solids.offset - places[owner]
         pairs = [(body, self._row(name)) for body, name in allowed]
         velocity = np.array([o.velocity or (0.0, 0.0, 0.0) for o in given], float).reshape(-1, 3)
         arrays = MoverArrays(
-            kind=kind,
+            kind=solids.kind,
             owner=owner.astype(np.int64),
             allowed=np.array(pairs, np.int64).reshape(-1, 2),
-            rotation=rotation,
-            place=offset,
-            size=size,
+            rotation=solids.rotation,
+            place=solids.offset,
+            size=solids.size,
             velocity=velocity[owner],
-            stamp=np.full(len(kind), float(stamp)),
-            growth=np.zeros((len(kind), 2)),
-            **grid_columns([grid for some in rows for grid in some.grids]),
+            stamp=np.full(len(owner), float(stamp)),
+            growth=np.zeros((len(owner), 2)),
+            **grid_columns(solids.grids),
         )
         self.packed = pack(arrays)
         self.arrays: MoverArrays = movers_view.py_func(*self.packed)  # type: ignore[attr-defined]
@@ -134,12 +132,9 @@ class Movers:
         return found
 
     def _row(self, name: str) -> int:
-        if name not in self.obstacles:
+        if name not in self.names:
             raise UnknownNameError("mover", name, self.names)
         return self.names.index(name)
-
-
-_NO_ROWS = (np.empty((0, 3)), np.empty((0, 3)))
 
 
 class Conflict(NamedTuple):

@@ -28,13 +28,11 @@ class TimedProof:
         ok: Whether the motion is proved apart from the movers.
         reason: Why not: one sentence, empty for a proved motion.
         time: First moment that is not proved [s], infinite for a proved motion.
-        slices: Number of slices of time that exact shapes were needed for.
     """
 
     ok: bool
     reason: str
     time: float
-    slices: int
 
     def __bool__(self) -> bool:
         """Whether the motion is proved."""
@@ -81,20 +79,19 @@ class TimedProver:
             motion: The motion.
             stop: Asked between slices of time whether to give up.
         """
-        kernel, time, slices, longest = self._checker.kernel, 0.0, 0, SLICE
+        kernel, time, longest = self._checker.kernel, 0.0, SLICE
         while True:
             conflict = prove_motion(kernel, self.movers, motion, time)
             if not conflict:
-                return TimedProof(True, "", math.inf, slices)
+                return TimedProof(True, "", math.inf)
             if stop():
-                return TimedProof(False, "not proved in time", conflict.time, slices)
+                return TimedProof(False, "not proved in time", conflict.time)
             reason, length = self._prove_slice(motion, conflict.time, longest)
-            slices += 1
             if reason:
-                return TimedProof(False, f"at {conflict.time:.3f} s: {reason}", conflict.time, slices)
+                return TimedProof(False, f"at {conflict.time:.3f} s: {reason}", conflict.time)
             time, longest = conflict.time + length, min(2.0 * length, SLICE)
             if time >= motion.duration:
-                return TimedProof(True, "", math.inf, slices)
+                return TimedProof(True, "", math.inf)
 
     def fault_at_start(self, q: Array) -> str:
         """Return why the robot may not stand at a state, shape (dof,), at time 0 and a moment longer, or nothing."""
@@ -128,8 +125,7 @@ class TimedProver:
     def _exact_among(self, length: float) -> CollisionChecker:
         """Return a checker among the movers, as large as what they sweep in slices of a length [s]."""
         if length not in self._exact:
-            names = {o.name for o in self.obstacles}
             swept = [inflated(o, self._margin + 0.5 * length * self._speeds[o.name]) for o in self.obstacles]
-            pairs = [pair for pair in self._allowed if names & set(pair)]
+            pairs = [pair for pair in self._allowed if not any(map(self._checker.is_obstacle, pair))]
             self._exact[length] = CollisionChecker(self._checker.robot, swept, self._checker.held.values(), pairs)
         return self._exact[length]

@@ -118,8 +118,11 @@ class TimedSpline(NamedTuple):
         return TimedSpline(control, spacing, self.start)
 
     def trajectory(self, joint_names: Sequence[str]) -> Trajectory:
-        """Return the motion itself; begin and end are exact."""
-        return spline_in_time(self.control, self.spacing, tuple(joint_names), self.start)
+        """Return the motion itself; begin and end are exact, and so are joints that stay."""
+        motion = spline_in_time(self.control, self.spacing, tuple(joint_names), self.start)
+        inner = motion.positions[1:-1]  # averages of control points
+        np.clip(inner, self.control.min(axis=0), self.control.max(axis=0), out=inner)
+        return motion
 
 
 class MotionOptimizer:

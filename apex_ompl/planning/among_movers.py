@@ -12,19 +12,21 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 
 from apex_ompl.collision import CollisionChecker
+from apex_ompl.collision.path_proof import PathProof
+from apex_ompl.kernel import Kernel
 from apex_ompl.live.moving import obstacle_at
 from apex_ompl.live.retime import retime
 from apex_ompl.live.timed_proof import TimedProver
 from apex_ompl.live.timed_spline import MotionOptimizer, Start, TimedSpline
 from apex_ompl.ompl_adapter.setup import assemble
 from apex_ompl.ompl_adapter.validity import full_check
+from apex_ompl.planning.motion_guesses import guesses
 from apex_ompl.planning.run import PlanRun
 from apex_ompl.planning.solving import find_path, query_fault
 from apex_ompl.planning.timing import parameterize
@@ -32,21 +34,19 @@ from apex_ompl.result import PlanResult, PlanStatus
 from apex_ompl.robot.model import Limits
 from apex_ompl.scene.bodies import Obstacle, Sphere
 from apex_ompl.trajectory import Timing, Trajectory, time_path
-from apex_ompl.trajopt.optimizer import Optimizer
 from apex_ompl.trajopt.path import Path
-from apex_ompl.types import Array
+from apex_ompl.util.deadline import Deadline
 from apex_ompl.util.stopwatch import timed
 
 RETIMED, SPACE_TIME, SWEPT = "retiming", "space-time", "swept"
 STAGES = (RETIMED, SPACE_TIME, SWEPT)
 FACTORS = (1.0, 1.3, 1.7, 2.4, 3.5, 5.0)  # durations that are tried, as multiples of that without movers
 MARGIN = 0.005  # that motions keep from movers, where the start does [m]
-GOALS = 2  # nearest goals of which there are several
 LONGER = 3  # turns, each with durations twice as long as the one before
-BUMPS, BUMP_SIZE = 4, 0.6  # paths with random bumps that motions are optimised from, and their amplitude [rad]
 PATH_STATES = (256, 1024)  # of the path of a motion, the first number for which it is proved
 SWEPT_SECONDS = 6.0  # of the movers' ways that paths are planned around [s]
-SWEPT_STEP = 0.5  # spacing of their places on the way, as a share of the least extent
+SWEPT_SHARE = 0.3  # of the time that is left, for that
+SWEPT_STEP, MOST_COPIES = 0.05, 100  # spacing of their places on the way [m], and most of these
 
 
 @dataclass(frozen=True)
@@ -71,12 +71,28 @@ class Among:
         """Whether time is up."""
         return self.run.interrupt.pressed or self.run.deadline.expired
 
-    def accepts(self, motion: Trajectory) -> bool:
-        """Whether a motion keeps clear of movers, of what stands still and of itself, from the start to a goal."""
+    @property
+    def kernel(self) -> Kernel:
+        """The kernel among what stands still, in which joints that are not planned stay."""
+        setup, arrays = self.run.setup, self.run.setup.checker.kernel.robot.arrays
+        lower, upper = arrays.lower.copy(), arrays.upper.copy()
+        lower[setup.held] = upper[setup.held] = setup.start[setup.held]
+        return setup.checker.kernel.within(lower, upper)
+
+    def proof(self, motion: Trajectory) -> PathProof | None:
+        """Return the proof that a motion is clear of what stands still and of itself, or None.
+
+        It is None, too, where the motion meets a mover, or does not go from the start to a goal.
+        """
         setup = self.run.setup
         if not self.prover.prove(motion, stop=self.stop):
-            return False
-        return bool(full_check(setup.checker, motion, setup.start, setup.goals, deadline=self.run.deadline.at))
+            return None
+        check = full_check(setup.checker, motion, setup.start, setup.goals, deadline=self.run.deadline.at)
+        return check.proof if check else None
+
+    def accepts(self, motion: Trajectory) -> bool:
+        """Whether a motion has a proof."""
+        return self.proof(motion) is not None
 
 
 def plan_among_movers(
@@ -145,15 +161,16 @@ def _earlier(first: PlanResult | None, second: PlanResult | None) -> PlanResult 
 
 def _retimed(among: Among, still: PlanResult) -> PlanResult | None:
     """Return the result with its motion retimed, or None."""
-    motion, kernel = still.trajectory, among.run.setup.checker.kernel
+    motion, kernel = still.trajectory, among.kernel
     assert motion is not None
     made = retime(kernel, among.prover.movers, motion, among.limits, hold=0.0)
-    if made.trajectory is None or not among.accepts(made.trajectory):
+    proof = None if made.trajectory is None else among.proof(made.trajectory)
+    if made.trajectory is None or proof is None:
         return None
     return replace(
         still, trajectory=made.trajectory, solved_by=f"{still.solved_by}+{RETIMED}", timing_method=RETIMED,
         deviation=still.deviation + math.sqrt(motion.dof) * made.deviation,
-        limit_use=made.trajectory.use(among.run.setup.robot.limits),
+        limit_use=made.trajectory.use(among.run.setup.robot.limits), motion_clearance=proof.clearance,
     )  # fmt: skip
 
 
@@ -166,16 +183,18 @@ def _by_space_time(among: Among, still: PlanResult, turn: int, best: PlanResult 
         turn: Number of times that it was called before; bumps become larger.
         best: A result; motions that end no earlier are not looked for.
     """
-    run, motion = among.run, still.trajectory
+    motion = still.trajectory
     assert motion is not None
-    optimizer = MotionOptimizer(run.setup.checker.kernel, among.prover.movers, among.limits)
+    optimizer = MotionOptimizer(among.kernel, among.prover.movers, among.limits)
     found = None if best is None else best.trajectory
     given = found
     for factor in FACTORS:
-        for guess in _guesses(among, motion, turn):
+        for guess in guesses(among.run, among.limits, motion, turn):
             duration = factor * 2.0 ** min(turn, LONGER) * guess.duration
-            if among.stop() or (found is not None and duration >= found.duration):
+            if among.stop():
                 break
+            if found is not None and duration >= found.duration:
+                continue
             spline = TimedSpline.along(guess.states, duration, _start(among), guess.states[-1])
             better = optimizer.repair(spline, among.accepts, stop=among.stop)
             if better is not None and (found is None or better.duration < found.duration):
@@ -214,49 +233,15 @@ def warm_up(checker: CollisionChecker) -> None:
     _warm.add(robot.name)
 
 
-class Guess(NamedTuple):
-    """A motion to start from.
-
-    Attributes:
-        states: States evenly spaced in time, shape (N, dof).
-        duration: Its duration [s].
-    """
-
-    states: Array
-    duration: float
-
-
-def _guesses(among: Among, motion: Trajectory, turn: int) -> Iterator[Guess]:
-    """Yield motions to start from: the path's own, straight lines, and lines with bumps."""
-    run, optimizer = among.run, Optimizer()
-    if turn == 0:
-        yield Guess(motion(np.linspace(0.0, motion.duration, 256)), motion.duration)
-    goals, rng = run.setup.valid_goals, np.random.default_rng([run.seed, turn])
-    for goal in goals[np.argsort(np.linalg.norm(goals - run.setup.start, axis=1))][:GOALS]:
-        for control in optimizer.starts(run.setup.start, goal, BUMPS, rng, BUMP_SIZE * (1 + turn % 3)):
-            states = optimizer.spline.path(control)
-            yield Guess(states, _least_duration(states, among.limits))
-            if turn > 0:  # aside, back, and then along the line
-                bump = states - optimizer.spline.path(optimizer.spline.line(states[0], goal))
-                line = np.linspace(states[0], goal, len(states))
-                yield Guess(np.concatenate([states[0] + bump, line]), _least_duration(line, among.limits))
-
-
-def _least_duration(states: Array, limits: Limits) -> float:
-    """Return about how long a path takes at an even pace of its parameter [s]."""
-    speed = np.abs(np.diff(states, axis=0)) * (len(states) - 1)
-    distance = np.abs(states[-1] - states[0]) / limits.acceleration
-    return float(max((speed / limits.velocity).max(), 2.0 * np.sqrt(distance.max()), 0.1))
-
-
 def _around_sweeps(among: Among, simplify: bool) -> PlanResult | None:
     """Return the motion of a path that is planned around what the movers sweep, or None."""
     run, problem = among.run, among.run.setup.problem
+    names = [name for k, name in enumerate(run.setup.robot.joint_names) if k not in run.setup.held]
     swept = [copy for o in among.prover.obstacles for copy in _sweep(o)]
-    still = tuple(o for o in problem.scene if not o.moving)
-    blocked = problem.model_copy(update={"scene": (*still, *swept)})
-    setup = assemble(blocked, run.setup.robot, seed=run.seed)
-    inner = replace(run, setup=replace(setup, problem=problem), rejected_lines=[])
+    blocked = problem.still.model_copy(update={"scene": (*problem.still.scene, *swept)})
+    setup = replace(assemble(blocked, run.setup.robot, seed=run.seed, moving=names), problem=problem)
+    deadline = Deadline(max(1e-3, SWEPT_SHARE * run.deadline.remaining))
+    inner = replace(run, setup=setup, deadline=deadline, rejected_lines=[])
     found = parameterize(inner, find_path(inner, simplify), among.timing)
     if not found or found.trajectory is None or not among.accepts(found.trajectory):
         return None
@@ -265,10 +250,8 @@ def _around_sweeps(among: Among, simplify: bool) -> PlanResult | None:
 
 def _sweep(obstacle: Obstacle) -> list[Obstacle]:
     """Return copies of an obstacle along its way."""
-    speed = float(np.linalg.norm(obstacle.velocity or (0.0, 0.0, 0.0)))
-    size = obstacle.box or (0.1,)
-    step = SWEPT_STEP * min(size) / max(speed, 1e-9)
-    times = np.arange(0.0, SWEPT_SECONDS + step, step)
+    way = SWEPT_SECONDS * float(np.linalg.norm(obstacle.velocity or (0.0, 0.0, 0.0)))
+    times = np.linspace(0.0, SWEPT_SECONDS, min(MOST_COPIES, 2 + int(way / SWEPT_STEP)))
     return [
         obstacle_at(obstacle, float(t)).model_copy(update={"name": f"{obstacle.name} at {t:.2f} s", "velocity": None})
         for t in times
@@ -277,7 +260,9 @@ def _sweep(obstacle: Obstacle) -> list[Obstacle]:
 
 def _result(among: Among, still: PlanResult, motion: Trajectory, method: str) -> PlanResult | None:
     """Return a result with another motion, and with the way that it takes as its path, or None."""
-    run = among.run
+    run, proof = among.run, among.proof(motion)
+    if proof is None:
+        return None
     for count in PATH_STATES:
         times = np.linspace(0.0, motion.duration, count)
         states = motion(times)
@@ -293,5 +278,5 @@ def _result(among: Among, still: PlanResult, motion: Trajectory, method: str) ->
     return replace(
         exact, trajectory=motion, limit_use=motion.use(run.setup.robot.limits), timing_method=method,
         deviation=float(largest * (times[1] - times[0]) ** 2 / 8.0),
-        motion_clearance=still.motion_clearance if check.proof is None else check.proof.clearance,
+        motion_clearance=proof.clearance,
     )  # fmt: skip

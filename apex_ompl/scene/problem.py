@@ -203,6 +203,12 @@ class Problem(StrictModel):
         """Names of the obstacles that move."""
         return tuple(o.name for o in self.scene if o.moving)
 
+    @property
+    def still(self) -> Problem:
+        """The problem without the obstacles that move, and without pairs that name them."""
+        pairs = tuple(pair for pair in self.allowed if not {*pair} & {*self.moving})
+        return self.model_copy(update={"scene": tuple(o for o in self.scene if not o.moving), "allowed": pairs})
+
     def start_state(self, joint_names: Sequence[str]) -> Array:
         """Return the start in the order of ``joint_names``, shape (dof,).
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
@@ -229,7 +229,7 @@ class MotionPlanner:
                 if start is not None and leave_contact:
                     raise ParameterError("leave_contact", leave_contact, "0 for a start that moves")
             moving = None if group is None else planned_joints(self.robot, group)
-            checker = self._without(movers)
+            checker = self._without_movers(problem) if movers else self._checker
             checker.check_counts = CheckCounts()
             given = ready = assemble(problem, self.robot, seed=seed, checker=checker, moving=moving)
             departure = find_departure(ready, leave_contact, seed) if leave_contact and ready.start_fault else None
@@ -255,14 +255,9 @@ class MotionPlanner:
                 result = with_departure(result, given, departure, how)
             return finish(run, result, started)
 
-    def _without(self, movers: Sequence[Obstacle]) -> CollisionChecker:
-        """Return a checker of the world without some of its obstacles: its own where there are none."""
-        if not movers:
-            return self._checker
-        gone = {o.name for o in movers}
-        scene = [o for o in self.world.obstacles.values() if o.name not in gone]
-        allowed = [pair for pair in self.world.allowed if not gone & set(pair)]
-        return CollisionChecker(self.robot, scene, self.world.held.values(), allowed)
+    def _without_movers(self, problem: Problem) -> CollisionChecker:
+        """Return a checker of what stands still in a problem."""
+        return CollisionChecker(self.robot, problem.still.scene, problem.attached, problem.still.allowed)
 
     def _parameters(self, planner: str, params: Mapping[str, Any] | None) -> dict[str, Any]:
         given = dict(params or {})
