@@ -22,7 +22,7 @@ LAYERS = [
     {"planners", "problems"},
     {"generation", "live", "result"},
     {"planning"},
-    {"session"},
+    {"session", "loop"},
     {"api"},
     {"benchmark", "viz"},
     {"cli"},
