@@ -129,6 +129,9 @@ class MotionOptimizer:
     """Levenberg-Marquardt on splines in time, among still obstacles and movers; without random numbers of its own.
 
     The cost is that of :mod:`apex_ompl.kernel.compiled.motion_optimization`.
+
+    Attributes:
+        samples: Number of samples that steps have looked at so far.
     """
 
     def __init__(self, kernel: Kernel, movers: Movers, limits: Limits, settings: MotionSettings | None = None) -> None:
@@ -140,10 +143,12 @@ class MotionOptimizer:
         check_array(limits.velocity, (kernel.robot.dof,), "limits")
         self.kernel, self.movers, self.limits = kernel, movers, limits
         self.settings = settings or MotionSettings()
+        self.samples = 0
 
     def improve(
-        self, spline: TimedSpline, *, clock: float = 0.0, steps: int | None = None, enough: float = np.inf
-    ) -> tuple[TimedSpline, PathReport]:
+        self, spline: TimedSpline, *, clock: float = 0.0, steps: int | None = None, enough: float = np.inf,
+        damping: float | None = None,
+    ) -> tuple[TimedSpline, PathReport]:  # fmt: skip
         """Return a spline of the same duration with a lower cost, and what came of the steps.
 
         Args:
@@ -151,11 +156,13 @@ class MotionOptimizer:
             clock: Time of the movers' stamps when it begins [s].
             steps: Most steps; by default the settings'.
             enough: The steps end when the clearances at the samples reach this [m].
+            damping: Of the first step; by default the settings'. The report has that to go on with.
 
         Raises:
             ParameterError: Control points of another shape.
         """
-        better, report, _ = self._run(spline, clock, self.settings.steps if steps is None else steps, enough, 0)
+        steps = self.settings.steps if steps is None else steps
+        better, report, _ = self._run(spline, clock, steps, enough, 0, damping)
         return better, report
 
     def evaluate(self, spline: TimedSpline, *, clock: float = 0.0) -> tuple[PathReport, Array]:
@@ -194,7 +201,7 @@ class MotionOptimizer:
         return None
 
     def _run(
-        self, spline: TimedSpline, clock: float, steps: int, enough: float, slopes: int
+        self, spline: TimedSpline, clock: float, steps: int, enough: float, slopes: int, damping: float | None = None
     ) -> tuple[TimedSpline, PathReport, Array]:
         control = np.array(spline.control, order="C")
         points, dof = len(control), self.kernel.robot.dof
@@ -211,15 +218,17 @@ class MotionOptimizer:
         report = optimize_motion(
             *self.kernel.packed, *self.movers.packed, *self.kernel.workspace(),
             np.empty((len(self.movers.arrays.kind), 3)), weights, first, gram, times, most, float(s.limit_weight),
-            PINNED, control, tuple(self._numbers(steps, enough)), np.empty(integers, np.int64), np.empty(floats), slope,
+            PINNED, control, tuple(self._numbers(steps, enough, damping)), np.empty(integers, np.int64), np.empty(floats), slope,
         )  # fmt: skip
-        return spline._replace(control=control), PathReport(*report), slope
+        made = PathReport(*report)
+        self.samples += (made.steps + 1) * len(times)
+        return spline._replace(control=control), made, slope
 
-    def _numbers(self, steps: int, enough: float) -> CostSettings:
+    def _numbers(self, steps: int, enough: float, damping: float | None) -> CostSettings:
         s = self.settings
         return CostSettings(
-            float(s.scene_margin), float(s.own_margin), float(s.stiffness), float(s.damping), float(enough),
-            float(s.tolerance), int(steps),
+            float(s.scene_margin), float(s.own_margin), float(s.stiffness),
+            float(s.damping if damping is None else damping), float(enough), float(s.tolerance), int(steps),
         )  # fmt: skip
 
 

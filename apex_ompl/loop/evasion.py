@@ -1,0 +1,43 @@
+"""Steps aside: for a robot that stands where an obstacle comes."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from apex_ompl.live.movers import clearance_in_time
+from apex_ompl.loop.request import Request
+from apex_ompl.loop.search import STATES, Search, least_duration
+from apex_ompl.trajectory import Trajectory
+
+SOON = 0.8  # time before a contact from which on a step aside is looked for [s]
+AROUND, STRAYS = 48, (0.15, 0.3, 0.5)  # states that a robot may step aside to, and how far they are [rad]
+LOOKS, SEEN = 8, 0.2  # moments at which such a state is looked at, and distances that are told apart [m]
+TRIED, DURATION = 4, 0.35  # states that are tried, and about how long a step aside takes [s]
+NEARNESS = 0.05  # clearance that a step shorter by 1 rad is worth [m]
+
+
+def endangered(request: Request) -> bool:
+    """Whether the robot stands and an obstacle is about to touch it."""
+    return request.following.at_rest(request.join) and request.conflict < request.join + SOON
+
+
+def step_aside(search: Search) -> Trajectory | None:
+    """Return a proved motion to a state nearby that stays clear, or None."""
+    request, ready = search.request, search.ready
+    q, limits, hold = search.start.position, ready.setup.robot.limits, ready.settings.rest_hold
+    size = np.repeat(STRAYS, AROUND // len(STRAYS))[:, None]
+    states = np.clip(q + size * search.rng.normal(size=(len(size), len(q))), limits.lower, limits.upper)
+    states[:, ready.fingers] = q[ready.fingers]
+    looks = request.join + DURATION + np.linspace(0.0, hold, LOOKS)
+    clear, _ = clearance_in_time(
+        ready.kernel, request.predicted, np.repeat(states, LOOKS, axis=0), np.tile(looks, len(states)), SEEN
+    )
+    near = np.minimum(clear.reshape(-1, LOOKS).min(axis=1), ready.kernel.clearance(states, SEEN).min(axis=1))
+    search.charges.charge("clearance in time", len(states) * (LOOKS + 1))
+    pool = search.pool()
+    for k in np.argsort(-(near - NEARNESS * size[:, 0]), kind="stable")[:TRIED]:
+        if near[k] > 0.0 and not search.charges.over():
+            path = np.linspace(q, states[k], STATES)
+            pool.add(path, least_duration(path, ready.limits), states[k], "evade")
+    found = pool.improve(search.wanted)
+    return None if found is None else found[1]

@@ -1,0 +1,226 @@
+"""The executor: what the robot follows, and the proved stop that is always in hand.
+
+At every step the robot goes on only where the next step and a stop behind it are proved clear of all that obstacles of
+bounded speed can reach; else it follows the stop that was proved a step before. By induction it is at rest whenever it
+is touched, as long as no obstacle is faster than was assumed, and each was seen, within the error assumed, not longer
+ago than what was known when the stop was proved. (A fail-safe manoeuvre that is verified online, Althoff and Dolan
+2014; Pereira and Althoff 2015.)
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+from apex_ompl.live.movers import Movers
+from apex_ompl.loop.charges import Charges
+from apex_ompl.loop.following import Following
+from apex_ompl.loop.ready import Ready
+from apex_ompl.loop.request import Answer, Replanner, Request
+from apex_ompl.loop.result import Event
+from apex_ompl.loop.tracking import Tracker
+from apex_ompl.scene.bodies import Obstacle
+from apex_ompl.types import Array
+
+SHORTEST = 0.05  # of a motion that a standing robot sets out on, if it does not reach a goal [s]
+SOON = 1.0  # time before a contact from which on a standing robot may leave without a proved stop [s]
+SHARE = 0.85  # of the budget after which nothing new is begun
+FASTER = 0.9  # share of the time to a goal that a plan must have at most to replace one without a conflict
+
+
+@dataclass(frozen=True, eq=False)
+class Pending:
+    """A replan whose answer is not known yet.
+
+    Attributes:
+        known: Time of the clock at which it is [s].
+        request: What was asked for.
+        answer: What comes.
+    """
+
+    known: float
+    request: Request
+    answer: Answer
+
+
+@dataclass(eq=False)
+class Executor:
+    """One run's executor.
+
+    Attributes:
+        ready: The robot among what stands still.
+        replanner: How motions are planned anew.
+        tracker: What is known of the obstacles.
+        seed: Of random choices.
+        following: What the robot follows.
+        stop: The stop that was proved last, which begins at the next step; None behind a motion that leaves.
+        followed: What was followed from which times on.
+        events: What happened.
+        route: The last motion to a goal, or None.
+        pending: The replan that is under way, or None.
+        asked: Number of replans so far.
+        conflict: Time of the first conflict of what is followed [s], or infinity.
+        endangered: Since when a conflict is known that the command does not answer yet [s], or None.
+        leaving: Whether the robot leaves a place that an obstacle comes to, and goes on without a proved stop.
+    """
+
+    ready: Ready
+    replanner: Replanner
+    tracker: Tracker
+    seed: int
+    following: Following
+    stop: Following | None = None
+    followed: list[tuple[float, Following]] = field(default_factory=list)
+    events: list[Event] = field(default_factory=list)
+    route: Following | None = None
+    pending: Pending | None = None
+    asked: int = 0
+    conflict: float = math.inf
+    endangered: float | None = None
+    leaving: bool = False
+
+    def log(self, time: float, kind: str, **data: Any) -> None:
+        """Note an event."""
+        self.events.append(Event(time, kind, data))
+
+    def follow(self, one: Following, time: float) -> None:
+        """Follow another motion from a time on."""
+        self.following = one
+        self.followed.append((time, one))
+
+    def step(self, now: float, predicted: Movers, obstacles: tuple[Obstacle, ...]) -> None:
+        """Decide what the robot does until the next step.
+
+        Args:
+            now: Time of the clock [s].
+            predicted: The obstacles as they are expected to move.
+            obstacles: Their records where they are now, with velocities.
+        """
+        settings = self.ready.settings
+        reachable = self.tracker.reachable(settings.error, settings.fastest) if settings.guarded else None
+        self._answer(now, predicted, reachable)
+        if settings.monitored:
+            self._look(now, predicted)
+        if reachable is not None:
+            self._guard(now, reachable)
+        self._ask(now, predicted, obstacles)
+
+    def _look(self, now: float, predicted: Movers) -> None:
+        """Find the first conflict of what is followed."""
+        settings, one = self.ready.settings, self.following
+        hold = settings.hold if one.to_goal else settings.rest_hold
+        until = max(one.end, now) + hold
+        found = self.ready.first_conflict(predicted, one, now, until)
+        if math.isfinite(found) and not math.isfinite(self.conflict):
+            self.log(now, "conflict", at=found)
+            self.endangered = now
+        if not math.isfinite(found):
+            self.endangered = None
+        self.conflict = found
+
+    def _guard(self, now: float, reachable: Movers) -> None:
+        """Go on with a proved stop behind the next step, or stop."""
+        then = now + self.ready.settings.period
+        found = self.ready.proved_stop(reachable, self.following, now, then)
+        if found is not None:
+            self.stop, self.leaving = found, False
+            return
+        if self.leaving or self.following.at_rest(now):
+            self.stop = None
+        elif self.stop is None:
+            self.log(now, "broken assumption", what="no stop is in hand")
+        elif self.stop is not self.following:
+            self.log(now, "stop", at=self.stop.end)
+            self._answered(now, "stop")
+            self.follow(self.stop, now)
+
+    def _answered(self, now: float, how: str) -> None:
+        """Note how long after a conflict was known the command changed."""
+        if self.endangered is not None:
+            self.log(now, "reaction", seconds=now - self.endangered, how=how)
+            self.endangered = None
+
+    def _answer(self, now: float, predicted: Movers, reachable: Movers | None) -> None:
+        """Take the answer of a replan that is known by now, where it is of use."""
+        pending = self.pending
+        if pending is None or now < pending.known - 1e-9:
+            return
+        self.pending = None
+        found, request = pending.answer.found, pending.request
+        if found is None:
+            self.log(now, "rejected", why="nothing was found", number=request.number)
+            return
+        why, leaving = self._fault(now, pending, predicted), False
+        if not why and reachable is not None:
+            then = found.begin + self.ready.settings.period
+            leaving = self.ready.proved_stop(reachable, found, found.begin, then) is None
+            if leaving and not self._may_leave(now, found):
+                why = "no stop behind its first step is proved"
+        if why:
+            self.log(now, "rejected", why=why, number=request.number, part=pending.answer.part)
+            return
+        self.log(
+            now, "accepted", number=request.number, part=pending.answer.part, arrival=found.end, to_goal=found.to_goal
+        )  # fmt: skip
+        self._answered(now, pending.answer.part)
+        if found.to_goal:
+            self.route = found
+        head = self.following.piece(now, request.join) if request.join > now + 1e-9 else None
+        self.follow(found if head is None else found.behind(head, now), now)
+        self.leaving, self.stop = leaving, None if leaving else self.stop
+
+    def _fault(self, now: float, pending: Pending, predicted: Movers) -> str:
+        """Return why an answer is of no use any more, or nothing."""
+        found, request, settings = pending.answer.found, pending.request, self.ready.settings
+        assert found is not None
+        if request.following is not self.following:
+            return "the robot follows another motion by now"
+        if now > request.join + 1e-9:
+            return "it came too late"
+        if not math.isfinite(self.conflict) and self.following.to_goal and found.to_goal:
+            if found.end - now > FASTER * (self.following.end - now):
+                return "it is hardly faster"
+        hold = settings.hold if found.to_goal else settings.rest_hold
+        if math.isfinite(self.ready.first_conflict(predicted, found, found.begin, found.end + hold)):
+            return "what was seen since then is in the way"
+        return ""
+
+    def _may_leave(self, now: float, found: Following) -> bool:
+        """Whether a standing robot may set out without a proved stop, since what comes would touch it where it is."""
+        return self.following.at_rest(found.begin) and self.conflict < now + SOON
+
+    def _ask(self, now: float, predicted: Movers, obstacles: tuple[Obstacle, ...]) -> None:
+        """Ask for a replan where one is of use."""
+        settings = self.ready.settings
+        if self.pending is not None or not self._wants(now):
+            return
+        join = now + settings.budget
+        self.asked += 1
+        request = Request(
+            self.asked, now, join, self.following, self.route, predicted, obstacles, self.conflict, self.seed
+        )
+        self.log(now, "request", number=self.asked, join=join)
+        charges = Charges(SHARE * settings.budget)
+        answer = self.replanner.replan(self.ready, request, charges)
+        taken = charges.spent if settings.latency < 0.0 else settings.latency
+        self.pending = Pending(now + taken, request, answer)
+
+    def _wants(self, now: float) -> bool:
+        """Whether the robot needs another motion."""
+        settings = self.ready.settings
+        if not math.isfinite(self.tracker.last):  # nothing was seen yet
+            return False
+        if not settings.monitored:
+            return self.route is None
+        if math.isfinite(self.conflict):
+            return True
+        return not self.following.to_goal
+
+    def done(self, now: float) -> bool:
+        """Whether the robot stands at a goal."""
+        return self.following.to_goal and self.following.at_rest(now)
+
+    def state(self, now: float) -> Array:
+        """Return the robot's state, shape (dof,)."""
+        return self.following.state(now)

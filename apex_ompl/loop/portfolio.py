@@ -1,0 +1,118 @@
+"""Replanning while the robot moves: the speed along the path, and splines in space and time from several sources."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from apex_ompl.live.retime import retime
+from apex_ompl.loop.charges import Charges
+from apex_ompl.loop.evasion import endangered, step_aside
+from apex_ompl.loop.motion_pool import MotionCandidate, MotionPool
+from apex_ompl.loop.ready import Ready
+from apex_ompl.loop.request import Answer, Request
+from apex_ompl.loop.search import STATES, Search, Source, least_duration
+from apex_ompl.trajectory import Trajectory
+
+FACTORS = (1.0, 1.5, 2.3)  # durations that are tried, as multiples of what a path takes without obstacles
+CARRIED = 4  # candidates that are carried over to the next replan
+SHARE = 0.5  # of the time that is left, for candidates before the next source is asked
+
+
+@dataclass(eq=False)
+class Portfolio:
+    """Retiming, and a pool of motions in space and time from several sources; what arrives first is taken.
+
+    Candidates of a replan that failed are carried over to the next one of the same run.
+
+    Attributes:
+        sources: Where motions to start from come from, those that gain most for their time first.
+        retimes: Whether the speed along the rest of the motion is chosen anew.
+        evades: Whether a robot that stands where an obstacle comes steps aside.
+    """
+
+    sources: Sequence[Source]
+    retimes: bool = True
+    evades: bool = True
+    carried: list[tuple[MotionCandidate, float]] = field(default_factory=list)
+
+    def prepare(self, ready: Ready) -> None:
+        """Load what the sources need, and forget earlier runs."""
+        self.carried = []
+        for source in self.sources:
+            source.prepare(ready)
+
+    def replan(self, ready: Ready, request: Request, charges: Charges) -> Answer:
+        """Return a motion from the time of joining on that is proved among what is expected, or none."""
+        search = Search(ready, request, charges)
+        if self.evades and endangered(request):
+            aside = step_aside(search)
+            if aside is not None:
+                return Answer(search.following(aside), "evade", charges)
+        if self.retimes:
+            motion = retimed(search)
+            if motion is not None:
+                search.take(motion, "retime")
+        if self.sources and not charges.over():
+            self._optimise(search)
+        return Answer(search.best, search.part, charges)
+
+    def _optimise(self, search: Search) -> None:
+        """Improve motions in space and time while there is time."""
+        pool, goals = search.pool(), search.goals
+        if not len(goals):
+            return
+        for one, begun in self.carried:
+            shift = search.request.join - begun
+            motion = one.spline.trajectory(search.ready.names)
+            rest = motion(np.linspace(min(shift, 0.5 * motion.duration), motion.duration, STATES))
+            duration = least_duration(rest, search.ready.limits)
+            pool.add(rest, max(duration, motion.duration - shift), one.goal, one.origin)
+        sources = iter(self.sources)
+        while not search.charges.over():
+            source = next(sources, None)
+            if source is None and not pool.candidates:
+                break
+            if source is not None:
+                self._ask(source, search, pool)
+            left = search.charges.limit - search.charges.spent
+            until = search.charges.spent + (SHARE * left if source is not None else left)
+            if not self._improve(search, pool, until) and source is None:
+                break
+        open_ones = sorted((one for one in pool.candidates if not one.given_up), key=lambda one: one.priority)
+        self.carried = [(one, search.request.join) for one in open_ones[:CARRIED]]
+
+    @staticmethod
+    def _ask(source: Source, search: Search, pool: MotionPool) -> None:
+        """Take the motions of a source into the pool."""
+        for guess in source.guesses(search):
+            for factor in FACTORS:
+                if search.charges.over():
+                    return
+                if factor * guess.duration < search.wanted():
+                    pool.add(guess.states, factor * guess.duration, guess.goal, source.name)
+
+    @staticmethod
+    def _improve(search: Search, pool: MotionPool, until: float) -> bool:
+        """Improve motions until a time by the charges; return whether there is more to improve."""
+        while True:
+            found = pool.improve(search.wanted, until)
+            if found is None:
+                return search.charges.spent >= until
+            search.take(found[1], found[0].origin)
+
+
+def retimed(search: Search) -> Trajectory | None:
+    """Return the rest of the motion at another speed, where it goes to a goal and that is proved, or None."""
+    ready, request = search.ready, search.request
+    following = request.following
+    if not following.to_goal or following.at_rest(request.join):
+        return None
+    made = retime(
+        ready.kernel, request.predicted, following.motion, ready.limits, time=request.join - following.begin,
+        clock=request.join, hold=ready.settings.hold,
+    )  # fmt: skip
+    search.charges.charge("retiming")
+    return made.trajectory if made.trajectory is not None and search.accepts(made.trajectory) else None

@@ -1,0 +1,138 @@
+"""All that a run of the closed loop keeps ready, so that a replan pays for nothing but the plan."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from apex_ompl.collision import CollisionChecker
+from apex_ompl.collision.path_proof import Curve
+from apex_ompl.kernel import Kernel
+from apex_ompl.live.movers import Movers, curve_of, prove_motion
+from apex_ompl.live.stopping import stop, stop_along
+from apex_ompl.loop.charges import Charges
+from apex_ompl.loop.following import Following
+from apex_ompl.loop.settings import LoopSettings
+from apex_ompl.ompl_adapter.setup import PlanningSetup
+from apex_ompl.robot.model import Limits
+from apex_ompl.trajectory import Trajectory
+from apex_ompl.types import Array
+
+
+@dataclass(eq=False)
+class Ready:
+    """The robot among what stands still.
+
+    Attributes:
+        setup: The problem without the obstacles that move.
+        limits: Limits of motions; at most the robot's.
+        settings: Parameters of the loop.
+    """
+
+    setup: PlanningSetup
+    limits: Limits
+    settings: LoopSettings
+
+    @property
+    def checker(self) -> CollisionChecker:
+        """The collision checker."""
+        return self.setup.checker
+
+    @property
+    def kernel(self) -> Kernel:
+        """The kernel."""
+        return self.setup.checker.kernel
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the joints."""
+        return self.setup.robot.joint_names
+
+    @property
+    def goals(self) -> Array:
+        """Valid goal states, shape (goals, dof)."""
+        return self.setup.valid_goals
+
+    @property
+    def fingers(self) -> list[int]:
+        """Indices of the joints that close hands, which stay where there is nothing to be grasped."""
+        return [self.names.index(hand.synergy) for hand in self.setup.robot.hands.values()]
+
+    def is_goal(self, q: Array) -> bool:
+        """Whether a state, shape (dof,), is a goal."""
+        return bool(len(self.goals)) and bool((np.abs(self.goals - q).max(axis=1) == 0.0).any())
+
+    def clear_of_still(self, motion: Trajectory, charges: Charges | None = None) -> bool:
+        """Whether a motion is proved free of what stands still and of itself, and keeps the limits."""
+        if not self.keeps_limits(motion):
+            return False
+        proof = self.checker.prove(curve_of(motion), tolerance=0.0)
+        if charges is not None:
+            charges.charge("proof interval", proof.intervals)
+            charges.charge("exact proof", int(proof.by_spheres < 1.0))
+        return bool(proof)
+
+    def keeps_limits(self, motion: Trajectory) -> bool:
+        """Whether a motion keeps the limits."""
+        return max(motion.use(self.limits).values()) <= 1.0 + 1e-9
+
+    def first_conflict(
+        self, movers: Movers, following: Following, begin: float, until: float, charges: Charges | None = None
+    ) -> float:
+        """Return the time of the clock at which a motion can no longer be proved clear of movers [s], or infinity.
+
+        Args:
+            movers: The obstacles.
+            following: The motion.
+            begin: Time of the clock from which on it is looked at [s].
+            until: Time until which it is looked at [s], behind its end, too.
+            charges: Gets the number of intervals.
+        """
+        zero = following.begin
+        found = prove_motion(self.kernel, movers, following.motion, begin - zero, until - zero, clock=zero)
+        if charges is not None:
+            charges.charge("interval among movers", found.intervals)
+        return found.time + zero
+
+    def proved_stop(self, reachable: Movers, following: Following, now: float, then: float) -> Following | None:
+        """Return a stop from a motion at a later time that nothing can come in the way of, or None.
+
+        Whatever obstacles do that were seen where ``reachable`` says, they touch the robot neither until that time nor
+        during the stop.
+
+        Args:
+            reachable: The obstacles, as large as all that they can reach.
+            following: The motion.
+            now: Time of the clock [s].
+            then: Time of the clock at which the stop begins [s].
+        """
+        if following.at_rest(then):
+            stopped = Following.standing(following.motion.positions[-1], then, self.names, to_goal=following.to_goal)
+            clear = following.at_rest(now) or np.isinf(self.first_conflict(reachable, following, now, following.end))
+            return stopped if clear else None
+        if np.isfinite(self.first_conflict(reachable, following, now, then)):
+            return None
+        for along in (True, False):
+            found = self._stop(following, then, along)
+            if found is not None and np.isinf(self.first_conflict(reachable, found, then, found.end)):
+                return found
+        return None
+
+    def _stop(self, following: Following, then: float, along: bool) -> Following | None:
+        """Return a stop from a motion along its path, or else joint by joint, that meets nothing that stands still."""
+        at = then - following.begin
+        if along:
+            made = stop_along(following.motion, at, self.setup.robot.limits)
+            ends_there = abs(made.trajectory.duration - (following.motion.duration - at)) < 1e-9
+            if ends_there:  # the rest of the motion itself, which is proved
+                return Following(made.trajectory, then, following.to_goal)
+        else:
+            start = following.start(then)
+            made = stop(self.setup.robot.limits, self.names, *start)
+            if not made.within_limits:
+                return None
+        curve = Curve.cubic(
+            made.trajectory.times, made.trajectory.positions, made.trajectory.velocities, made.trajectory.accelerations
+        )
+        return Following(made.trajectory, then) if self.checker.prove(curve, tolerance=0.0) else None

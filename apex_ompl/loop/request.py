@@ -1,0 +1,71 @@
+"""What a replan is asked for, and what it answers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from apex_ompl.live.movers import Movers
+from apex_ompl.loop.charges import Charges
+from apex_ompl.loop.following import Following
+from apex_ompl.loop.ready import Ready
+from apex_ompl.scene.bodies import Obstacle
+
+
+@dataclass(frozen=True, eq=False)
+class Request:
+    """What a replan is asked for.
+
+    Attributes:
+        number: Which request of the run it is; seeds random choices.
+        asked: Time of the clock [s].
+        join: Time of the clock at which the new motion is to begin [s].
+        following: What the robot follows until then.
+        route: The last motion to a goal, or None.
+        predicted: The obstacles as they are expected to move.
+        obstacles: Their records, where they are expected to be when the new motion begins, with velocities.
+        conflict: Time of the clock of the first conflict of what the robot follows [s], infinite without one.
+        seed: The run's.
+    """
+
+    number: int
+    asked: float
+    join: float
+    following: Following
+    route: Following | None
+    predicted: Movers
+    obstacles: tuple[Obstacle, ...]
+    conflict: float
+    seed: int
+
+    @property
+    def rng(self) -> np.random.Generator:
+        """Source of random choices, the same at each call."""
+        return np.random.default_rng([self.seed, self.number])
+
+
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """What a replan found.
+
+    Attributes:
+        found: The motion from the time of joining on, or None.
+        part: Name of the part that found it.
+        charges: What it cost.
+    """
+
+    found: Following | None
+    part: str
+    charges: Charges
+
+
+class Replanner(Protocol):
+    """A way of replanning."""
+
+    def prepare(self, ready: Ready) -> None:
+        """Load, or compile, what it needs, before a run."""
+
+    def replan(self, ready: Ready, request: Request, charges: Charges) -> Answer:
+        """Return a motion from the time of joining on that is proved among what is expected, or none."""

@@ -1,0 +1,68 @@
+"""Parameters of the closed loop."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from apex_ompl.errors import ParameterError, UnknownNameError
+from apex_ompl.util.validation import check_number
+
+PREDICTIONS = ("still", "cv", "truth")
+"""How obstacles are predicted: where they were seen (the paper), at constant velocity, or as they truly move."""
+
+RANGES = {
+    "period": (1e-3, 0.1), "budget": (1e-3, 10.0), "hold": (0.0, 10.0), "rest_hold": (0.0, 10.0),
+    "margin": (0.0, 0.1), "error": (0.0, 0.5), "fastest": (0.0, 5.0), "timeout": (0.1, 600.0),
+    "stuck": (0.1, 600.0), "latency": (-1.0, 10.0),
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class LoopSettings:
+    """Parameters of the closed loop.
+
+    Attributes:
+        period: Time between two looks at the world [s].
+        budget: Time that a replan may take; what it finds begins this long after it was asked for [s].
+        latency: Time after which the answer of a replan is known [s]; -1 charges what the replan did by the table of
+            costs.
+        prediction: One of ``PREDICTIONS``: what plans are proved against.
+        guarded: Whether the robot only goes on while a stop behind the next step is proved.
+        monitored: Whether the motion is looked at again while it is followed; without, it is followed blindly.
+        hold: Time for which the goal must stay clear from the arrival on [s].
+        rest_hold: Time for which a robot that stands elsewhere looks ahead [s].
+        margin: Distance that is kept from obstacles that move [m].
+        error: Largest error of an observed place, for the guarantee [m].
+        fastest: Largest speed of any obstacle, for the guarantee [m/s].
+        timeout: Time after which a run ends [s].
+        stuck: Time of rest after which a run ends [s].
+    """
+
+    period: float = 0.01
+    budget: float = 0.05
+    latency: float = -1.0
+    prediction: str = "cv"
+    guarded: bool = True
+    monitored: bool = True
+    hold: float = 0.1
+    rest_hold: float = 1.5
+    margin: float = 0.005
+    error: float = 0.024
+    fastest: float = 0.4
+    timeout: float = 30.0
+    stuck: float = 30.0
+
+    def __post_init__(self) -> None:
+        """Check the numbers.
+
+        Raises:
+            ParameterError: A number is out of its range, or the budget is no multiple of the period.
+            UnknownNameError: No such prediction.
+        """
+        if self.prediction not in PREDICTIONS:
+            raise UnknownNameError("prediction", str(self.prediction), PREDICTIONS)
+        for name, (low, high) in RANGES.items():
+            check_number(getattr(self, name), name, low, high)
+        steps = self.budget / self.period
+        if abs(steps - round(steps)) > 1e-6:
+            raise ParameterError("budget", self.budget, f"a multiple of the period, {self.period:g} s")

@@ -1,0 +1,159 @@
+"""Estimates of obstacles that move: Kalman filters of constant velocity, and where obstacles may be.
+
+Each obstacle has a filter of its own whose state is place and velocity, with white noise of the acceleration
+(Bar-Shalom, Li and Kirubarajan 2001, section 6.2.2). The axes are alike, so that one covariance serves all three.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from apex_ompl.kernel import Kernel
+from apex_ompl.live.movers import Movers, allowed_rows
+from apex_ompl.loop.observation import Observation
+from apex_ompl.scene.bodies import Obstacle
+from apex_ompl.types import Array
+
+GATE = 16.0  # squared Mahalanobis distance, of three axes, behind which an obstacle has turned
+AXES = 3
+
+
+@dataclass(frozen=True)
+class TrackSettings:
+    """Parameters of the filters.
+
+    Attributes:
+        noise: Standard deviation of an observed place on each axis [m].
+        power: Power of the noise of the acceleration [m^2/s^3].
+        speed: Standard deviation of the velocity on each axis of an obstacle that is new or has turned [m/s].
+        widths: Standard deviations by which obstacles count as larger.
+        most: Largest growth of that behind the present [m/s].
+    """
+
+    noise: float = 0.008
+    power: float = 0.01
+    speed: float = 0.2
+    widths: float = 2.0
+    most: float = 0.1
+
+
+@dataclass(eq=False)
+class Track:
+    """Estimate of an obstacle.
+
+    Attributes:
+        shape: The obstacle where it was seen last.
+        stamp: When [s].
+        place: Estimate of the place then, shape (3,) [m].
+        velocity: Shape (3,) [m/s].
+        covariance: Of place and velocity on each axis, shape (2, 2).
+        seen: Number of observations since it was new or turned.
+    """
+
+    shape: Obstacle
+    stamp: float
+    place: Array
+    velocity: Array
+    covariance: Array
+    seen: int = 1
+
+    @classmethod
+    def new(cls, seen: Obstacle, stamp: float, settings: TrackSettings) -> Track:
+        """Begin with an observation."""
+        spread = np.diag([settings.noise**2, settings.speed**2])
+        return cls(seen, stamp, np.array(seen.position, float), np.zeros(AXES), spread)
+
+    def update(self, seen: Obstacle, stamp: float, settings: TrackSettings) -> bool:
+        """Take a later observation; return False where the obstacle has turned, and the velocity begins anew."""
+        dt, noise = stamp - self.stamp, settings.noise**2 + 1e-12
+        forward = np.array([[1.0, dt], [0.0, 1.0]])
+        drift = settings.power * np.array([[dt**3 / 3.0, dt**2 / 2.0], [dt**2 / 2.0, dt]])
+        expected = forward @ self.covariance @ forward.T + drift
+        miss = np.array(seen.position, float) - (self.place + dt * self.velocity)
+        spread = expected[0, 0] + noise
+        self.shape, self.stamp = seen, stamp
+        if miss @ miss > GATE * spread:
+            fresh = Track.new(seen, stamp, settings)
+            self.place, self.velocity, self.covariance, self.seen = fresh.place, fresh.velocity, fresh.covariance, 1
+            return False
+        gain = expected[:, 0] / spread
+        self.place = self.place + dt * self.velocity + gain[0] * miss
+        self.velocity = self.velocity + gain[1] * miss
+        self.covariance = expected - np.outer(gain, expected[0])
+        self.seen += 1
+        return True
+
+    def growth(self, settings: TrackSettings) -> tuple[float, float]:
+        """Return by how much the obstacle counts as larger at the stamp [m], and behind it [m/s]."""
+        place, speed = (math.sqrt(max(v, 0.0)) for v in np.diag(self.covariance))
+        return settings.widths * place, min(settings.widths * speed, settings.most)
+
+
+@dataclass(eq=False)
+class Tracker:
+    """What the loop knows of obstacles that move.
+
+    Attributes:
+        kernel: The robot's kernel, for pairs of bodies that may touch.
+        settings: Parameters of the filters.
+        allowed: Pairs of names of bodies that may touch.
+        tracks: Estimates by name.
+        last: The newest stamp [s].
+    """
+
+    kernel: Kernel
+    settings: TrackSettings = field(default_factory=TrackSettings)
+    allowed: tuple[tuple[str, str], ...] = ()
+    tracks: dict[str, Track] = field(default_factory=dict)
+    last: float = -math.inf
+
+    def take(self, observation: Observation) -> None:
+        """Take an observation, by its stamp and not by its arrival; what is older than what is known says nothing.
+
+        Places that are not finite are left out.
+        """
+        self.last = max(self.last, observation.stamp)
+        for seen in observation.seen:
+            if not np.isfinite(seen.position).all():
+                continue
+            track = self.tracks.get(seen.name)
+            if track is None:
+                self.tracks[seen.name] = Track.new(seen, observation.stamp, self.settings)
+            elif observation.stamp > track.stamp:
+                track.update(seen, observation.stamp, self.settings)
+
+    def predicted(self, margin: float, prediction: str = "cv") -> Movers:
+        """Return the obstacles as they are expected to move, larger by a margin [m] and by what is uncertain."""
+        movers = self._movers(track.shape for track in self.tracks.values())
+        for name, track in self.tracks.items():
+            if prediction == "still":
+                movers.update(name, track.shape.position, np.zeros(AXES), stamp=track.stamp, growth=(margin, 0.0))
+            else:
+                first, later = track.growth(self.settings)
+                movers.update(
+                    name, track.place, track.velocity, stamp=track.stamp, growth=(margin + first, later)
+                )  # fmt: skip
+        return movers
+
+    def reachable(self, error: float, fastest: float, margin: float = 0.0) -> Movers:
+        """Return the obstacles as large as all that they can reach: seen within an error [m], no faster than [m/s]."""
+        movers = self._movers(track.shape for track in self.tracks.values())
+        for name, track in self.tracks.items():
+            movers.update(
+                name, track.shape.position, np.zeros(AXES), stamp=track.stamp, growth=(error + margin, fastest)
+            )  # fmt: skip
+        return movers
+
+    def _movers(self, shapes: Iterable[Obstacle]) -> Movers:
+        some = list(shapes)
+        return Movers(some, allowed_rows(self.kernel, self.allowed, [o.name for o in some]))
+
+
+def as_they_are(kernel: Kernel, present: Iterable[Obstacle], time: float, allowed: Iterable[tuple[str, str]]) -> Movers:
+    """Return obstacles as they truly move now, from a time on [s]."""
+    some = list(present)
+    return Movers(some, allowed_rows(kernel, allowed, [o.name for o in some]), stamp=time)
