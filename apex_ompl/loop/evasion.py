@@ -10,8 +10,9 @@ from apex_ompl.loop.search import STATES, Search, least_duration
 from apex_ompl.trajectory import Trajectory
 
 SOON = 0.8  # time before a contact from which on a step aside is looked for [s]
-AROUND, STRAYS = 48, (0.15, 0.3, 0.5)  # states that a robot may step aside to, and how far they are [rad]
-LOOKS, SEEN = 8, 0.2  # moments at which such a state is looked at, and distances that are told apart [m]
+AROUND, STRAYS = 24, (0.05, 0.2, 0.4)  # states that a robot may step aside to, and how far they are at first [rad]
+ASCENTS, STRIDE = 3, 0.25  # steps of these away from obstacles, and their length [rad]
+LOOKS, SEEN = 4, 0.3  # moments at which such a state is looked at, and distances that are told apart [m]
 TRIED, DURATION = 4, 0.35  # states that are tried, and about how long a step aside takes [s]
 NEARNESS = 0.05  # clearance that a step shorter by 1 rad is worth [m]
 
@@ -26,16 +27,25 @@ def step_aside(search: Search) -> Trajectory | None:
     request, ready = search.request, search.ready
     q, limits, hold = search.start.position, ready.setup.robot.limits, ready.settings.rest_hold
     size = np.repeat(STRAYS, AROUND // len(STRAYS))[:, None]
-    states = np.clip(q + size * search.rng.normal(size=(len(size), len(q))), limits.lower, limits.upper)
-    states[:, ready.fingers] = q[ready.fingers]
+    states = q + size * search.rng.normal(size=(len(size), len(q)))
     looks = request.join + DURATION + np.linspace(0.0, hold, LOOKS)
-    clear, _ = clearance_in_time(
-        ready.kernel, request.predicted, np.repeat(states, LOOKS, axis=0), np.tile(looks, len(states)), SEEN
-    )
-    near = np.minimum(clear.reshape(-1, LOOKS).min(axis=1), ready.kernel.clearance(states, SEEN).min(axis=1))
-    search.charges.charge("clearance in time", len(states) * (LOOKS + 1))
+    rows = np.arange(len(states))
+    for turn in range(ASCENTS + 1):
+        states = np.clip(states, limits.lower, limits.upper)
+        states[:, ready.fingers] = q[ready.fingers]
+        clear, slopes = clearance_in_time(
+            ready.kernel, request.predicted, np.repeat(states, LOOKS, axis=0), np.tile(looks, len(states)), SEEN
+        )
+        search.charges.charge("clearance in time", len(clear))
+        clear, slopes = clear.reshape(-1, LOOKS), slopes.reshape(len(states), LOOKS, -1)[:, :, :-1]
+        if turn < ASCENTS:  # away from what comes nearest
+            slope = slopes[rows, clear.argmin(axis=1)]
+            states = states + STRIDE * slope / np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), 1e-6)
+    near = np.minimum(clear.min(axis=1), ready.kernel.clearance(states, SEEN).min(axis=1))
+    search.charges.charge("clearance in time", len(states))
+    size = np.abs(states - q).max(axis=1)
     pool = search.pool()
-    for k in np.argsort(-(near - NEARNESS * size[:, 0]), kind="stable")[:TRIED]:
+    for k in np.argsort(-(near - NEARNESS * size), kind="stable")[:TRIED]:
         if near[k] > 0.0 and not search.charges.over():
             path = np.linspace(q, states[k], STATES)
             pool.add(path, least_duration(path, ready.limits), states[k], "evade")

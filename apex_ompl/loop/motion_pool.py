@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -17,6 +17,7 @@ ROUND, ROUNDS = 4, 8  # optimiser steps in a round, and rounds that a candidate 
 PENALTY = 2.0  # factor on the priority of a candidate for every round spent on it
 CLEAR = -0.003  # clearance at the samples from which on a proof is tried; spheres protrude [m]
 ENOUGH = 0.03  # at which a round ends early [m]
+REFIT = 64  # states of a candidate that begins from elsewhere
 SLOWER = 1.02  # least factor on the duration of a candidate over its limits
 LEAST = 1e-6  # clearance cost that counts as none
 
@@ -90,6 +91,23 @@ class MotionPool:
         self._improve(one, 0)
         self.candidates.append(one)
         return one
+
+    def carry(self, one: MotionCandidate, shift: float) -> None:
+        """Take a candidate of an earlier pool in, whose motion began some time before [s].
+
+        It goes on as it is where the robot stands where it stood, and begins from where the robot is now else.
+        """
+        old, now = one.spline.start, self._start
+        resting = not (old.velocity.any() or now.velocity.any() or now.acceleration.any())
+        if resting and np.array_equal(old.position, now.position):
+            same = replace(one, damping=None)
+            self._improve(same, 0)
+            self.candidates.append(same)
+            return
+        motion = one.spline.trajectory(self._optimizer.kernel.robot.joint_names)
+        begin = min(shift, 0.5 * motion.duration)
+        rest = motion(np.linspace(begin, motion.duration, REFIT))
+        self.add(rest, motion.duration - begin, one.goal, one.origin)
 
     def improve(self, shorter: Callable[[], float], until: float = np.inf) -> tuple[MotionCandidate, Trajectory] | None:
         """Improve candidates until one is proved, or time is up.

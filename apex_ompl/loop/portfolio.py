@@ -5,19 +5,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-import numpy as np
-
 from apex_ompl.live.retime import retime
 from apex_ompl.loop.charges import Charges
 from apex_ompl.loop.evasion import endangered, step_aside
-from apex_ompl.loop.motion_pool import MotionCandidate, MotionPool
+from apex_ompl.loop.motion_pool import ROUNDS, MotionCandidate, MotionPool
 from apex_ompl.loop.ready import Ready
 from apex_ompl.loop.request import Answer, Request
-from apex_ompl.loop.search import STATES, Search, Source, least_duration
+from apex_ompl.loop.search import Search, Source
 from apex_ompl.trajectory import Trajectory
 
-FACTORS = (1.0, 1.5, 2.3)  # durations that are tried, as multiples of what a path takes without obstacles
-CARRIED = 4  # candidates that are carried over to the next replan
+FACTORS = (1.0, 1.8)  # durations that are tried, as multiples of what a path takes without obstacles
+ENOUGH = 10  # candidates at which no further source is asked
+CARRIED = 6  # candidates that are carried over to the next replan
 SHARE = 0.5  # of the time that is left, for candidates before the next source is asked
 
 
@@ -65,23 +64,20 @@ class Portfolio:
         if not len(goals):
             return
         for one, begun in self.carried:
-            shift = search.request.join - begun
-            motion = one.spline.trajectory(search.ready.names)
-            rest = motion(np.linspace(min(shift, 0.5 * motion.duration), motion.duration, STATES))
-            duration = least_duration(rest, search.ready.limits)
-            pool.add(rest, max(duration, motion.duration - shift), one.goal, one.origin)
+            pool.carry(one, search.request.join - begun)
         sources = iter(self.sources)
         while not search.charges.over():
             source = next(sources, None)
             if source is None and not pool.candidates:
                 break
-            if source is not None:
+            if source is not None and len(pool.candidates) < ENOUGH:
                 self._ask(source, search, pool)
             left = search.charges.limit - search.charges.spent
             until = search.charges.spent + (SHARE * left if source is not None else left)
             if not self._improve(search, pool, until) and source is None:
                 break
-        open_ones = sorted((one for one in pool.candidates if not one.given_up), key=lambda one: one.priority)
+        open_ones = [one for one in pool.candidates if not one.given_up and one.rounds < ROUNDS]
+        open_ones.sort(key=lambda one: one.priority)
         self.carried = [(one, search.request.join) for one in open_ones[:CARRIED]]
 
     @staticmethod

@@ -8,7 +8,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from apex_ompl.live.timed_spline import MotionOptimizer, Start
+from apex_ompl.live.timed_spline import MotionOptimizer, MotionSettings, Start
 from apex_ompl.loop.charges import Charges
 from apex_ompl.loop.following import Following
 from apex_ompl.loop.motion_pool import MotionPool
@@ -18,6 +18,7 @@ from apex_ompl.robot.model import Limits
 from apex_ompl.trajectory import Trajectory
 from apex_ompl.types import Array
 
+MOTIONS = MotionSettings(samples=2)
 STATES = 64  # of a motion that splines begin from
 BETTER = 0.97  # share of the duration of the best motion so far below which another one is worth its while
 
@@ -48,7 +49,7 @@ class Search:
 
     def __post_init__(self) -> None:
         """Read the request."""
-        self.optimizer = MotionOptimizer(self.ready.kernel, self.request.predicted, self.ready.limits)
+        self.optimizer = MotionOptimizer(self.ready.kernel, self.request.predicted, self.ready.limits, MOTIONS)
         self.start, self.rng = self.request.following.start(self.request.join), self.request.rng
 
     @property

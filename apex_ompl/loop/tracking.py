@@ -30,14 +30,16 @@ class TrackSettings:
         noise: Standard deviation of an observed place on each axis [m].
         power: Power of the noise of the acceleration [m^2/s^3].
         speed: Standard deviation of the velocity on each axis of an obstacle that is new or has turned [m/s].
-        widths: Standard deviations by which obstacles count as larger.
-        most: Largest growth of that behind the present [m/s].
+        widths: Standard deviations of the place by which obstacles count as larger.
+        speed_widths: Standard deviations of the velocity by which they grow behind the present.
+        most: Largest such growth [m/s].
     """
 
     noise: float = 0.008
-    power: float = 0.01
+    power: float = 0.003
     speed: float = 0.2
     widths: float = 2.0
+    speed_widths: float = 1.0
     most: float = 0.1
 
 
@@ -90,7 +92,7 @@ class Track:
     def growth(self, settings: TrackSettings) -> tuple[float, float]:
         """Return by how much the obstacle counts as larger at the stamp [m], and behind it [m/s]."""
         place, speed = (math.sqrt(max(v, 0.0)) for v in np.diag(self.covariance))
-        return settings.widths * place, min(settings.widths * speed, settings.most)
+        return settings.widths * place, min(settings.speed_widths * speed, settings.most)
 
 
 @dataclass(eq=False)
