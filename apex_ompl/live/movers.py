@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from copy import copy
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -122,6 +123,14 @@ class Movers:
             getattr(self.arrays, key)[mine] = value
         if stamp is not None:
             self.arrays.stamp[mine] = stamp
+
+    def larger(self, by: float) -> Movers:
+        """Return a copy with margins that are larger by a distance [m]."""
+        other = copy(self)
+        other.packed = tuple(array.copy() for array in self.packed)
+        other.arrays = movers_view.py_func(*other.packed)  # type: ignore[attr-defined]
+        other.arrays.growth[:, 0] += by
+        return other
 
     def at(self, time: float) -> dict[str, Array]:
         """Return where the obstacles are at a time [s]: positions, shape (3,) [m], by name."""

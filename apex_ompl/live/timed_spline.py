@@ -162,7 +162,7 @@ class MotionOptimizer:
             ParameterError: Control points of another shape.
         """
         steps = self.settings.steps if steps is None else steps
-        better, report, _ = self._run(spline, clock, steps, enough, 0, damping)
+        better, report, _ = self._run(spline, clock, steps, enough, 0, damping=damping)
         return better, report
 
     def evaluate(self, spline: TimedSpline, *, clock: float = 0.0) -> tuple[PathReport, Array]:
@@ -201,7 +201,14 @@ class MotionOptimizer:
         return None
 
     def _run(
-        self, spline: TimedSpline, clock: float, steps: int, enough: float, slopes: int, damping: float | None = None
+        self,
+        spline: TimedSpline,
+        clock: float,
+        steps: int,
+        enough: float,
+        slopes: int,
+        *,
+        damping: float | None = None,
     ) -> tuple[TimedSpline, PathReport, Array]:
         control = np.array(spline.control, order="C")
         points, dof = len(control), self.kernel.robot.dof
@@ -218,7 +225,8 @@ class MotionOptimizer:
         report = optimize_motion(
             *self.kernel.packed, *self.movers.packed, *self.kernel.workspace(),
             np.empty((len(self.movers.arrays.kind), 3)), weights, first, gram, times, most, float(s.limit_weight),
-            PINNED, control, tuple(self._numbers(steps, enough, damping)), np.empty(integers, np.int64), np.empty(floats), slope,
+            PINNED, control, tuple(self._numbers(steps, enough, damping)), np.empty(integers, np.int64),
+            np.empty(floats), slope,
         )  # fmt: skip
         made = PathReport(*report)
         self.samples += (made.steps + 1) * len(times)

@@ -198,7 +198,16 @@ class Executor:
         join = now + settings.budget
         self.asked += 1
         request = Request(
-            self.asked, now, join, self.following, self.route, predicted, obstacles, self.conflict, self.seed
+            self.asked,
+            now,
+            join,
+            self.following,
+            self.route,
+            predicted,
+            predicted.larger(settings.berth),
+            obstacles,
+            self.conflict,
+            self.seed,
         )
         self.log(now, "request", number=self.asked, join=join)
         charges = Charges(SHARE * settings.budget)

@@ -24,7 +24,8 @@ class Request:
         join: Time of the clock at which the new motion is to begin [s].
         following: What the robot follows until then.
         route: The last motion to a goal, or None.
-        predicted: The obstacles as they are expected to move.
+        predicted: The obstacles as they are expected to move; what motions are proved against.
+        wide: The same, larger by a berth; what motions are optimised among.
         obstacles: Their records, where they are expected to be when the new motion begins, with velocities.
         conflict: Time of the clock of the first conflict of what the robot follows [s], infinite without one.
         seed: The run's.
@@ -36,6 +37,7 @@ class Request:
     following: Following
     route: Following | None
     predicted: Movers
+    wide: Movers
     obstacles: tuple[Obstacle, ...]
     conflict: float
     seed: int

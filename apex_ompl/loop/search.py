@@ -49,7 +49,7 @@ class Search:
 
     def __post_init__(self) -> None:
         """Read the request."""
-        self.optimizer = MotionOptimizer(self.ready.kernel, self.request.predicted, self.ready.limits, MOTIONS)
+        self.optimizer = MotionOptimizer(self.ready.kernel, self.request.wide, self.ready.limits, MOTIONS)
         self.start, self.rng = self.request.following.start(self.request.join), self.request.rng
 
     @property

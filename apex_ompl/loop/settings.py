@@ -12,7 +12,7 @@ PREDICTIONS = ("still", "cv", "truth")
 
 RANGES = {
     "period": (1e-3, 0.1), "budget": (1e-3, 10.0), "hold": (0.0, 10.0), "rest_hold": (0.0, 10.0),
-    "margin": (0.0, 0.1), "error": (0.0, 0.5), "fastest": (0.0, 5.0), "timeout": (0.1, 600.0),
+    "margin": (0.0, 0.1), "berth": (0.0, 0.5), "error": (0.0, 0.5), "fastest": (0.0, 5.0), "timeout": (0.1, 600.0),
     "stuck": (0.1, 600.0), "latency": (-1.0, 10.0),
 }  # fmt: skip
 
@@ -32,6 +32,7 @@ class LoopSettings:
         hold: Time for which the goal must stay clear from the arrival on [s].
         rest_hold: Time for which a robot that stands elsewhere looks ahead [s].
         margin: Distance that is kept from obstacles that move [m].
+        berth: Distance beyond it at which motions are optimised to pass by, where there is room [m].
         error: Largest error of an observed place, for the guarantee [m].
         fastest: Largest speed of any obstacle, for the guarantee [m/s].
         timeout: Time after which a run ends [s].
@@ -47,6 +48,7 @@ class LoopSettings:
     hold: float = 0.1
     rest_hold: float = 1.5
     margin: float = 0.005
+    berth: float = 0.05
     error: float = 0.024
     fastest: float = 0.4
     timeout: float = 30.0

@@ -78,6 +78,8 @@ def simulate(world: World, ready: Ready, replanner: Replanner, eyes: Eyes, seed:
             records = present
         else:
             predicted = tracker.predicted(settings.margin, settings.prediction)
+            soon = now + np.array([0.0, 1.0, 2.0]) * settings.budget
+            tracker.eased(predicted, executor.state(now), soon)
             records = _records(tracker, predicted, now)
         executor.step(now, predicted, records)
         if not begun and executor.route is not None:

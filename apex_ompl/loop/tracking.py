@@ -11,15 +11,17 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from apex_ompl.kernel import Kernel
-from apex_ompl.live.movers import Movers, allowed_rows
+from apex_ompl.live.movers import Movers, allowed_rows, clearance_in_time
 from apex_ompl.loop.observation import Observation
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.types import Array
 
 GATE = 16.0  # squared Mahalanobis distance, of three axes, behind which an obstacle has turned
 AXES = 3
+LEAST = 0.002  # clearance to margins that a robot has where it stands [m]
 
 
 @dataclass(frozen=True)
@@ -139,6 +141,21 @@ class Tracker:
                 movers.update(
                     name, track.place, track.velocity, stamp=track.stamp, growth=(margin + first, later)
                 )  # fmt: skip
+        return movers
+
+    def eased(self, movers: Movers, q: Array, times: ArrayLike) -> Movers:
+        """Take so much of the margins away that the robot may stand where it is, in place, and return the obstacles.
+
+        Args:
+            movers: Obstacles with margins.
+            q: The robot's state, shape (dof,).
+            times: Times of the clock at which it may stand there [s].
+        """
+        at = np.atleast_1d(np.asarray(times, float))
+        clear, _ = clearance_in_time(self.kernel, movers, np.repeat(q[None], len(at), axis=0), at, 2.0 * LEAST)
+        missing = LEAST - float(np.min(clear, initial=LEAST))
+        if missing > 0.0:
+            movers.arrays.growth[:, 0] = np.maximum(movers.arrays.growth[:, 0] - missing, 0.0)
         return movers
 
     def reachable(self, error: float, fastest: float, margin: float = 0.0) -> Movers:
