@@ -44,7 +44,7 @@ def step_aside(search: Search) -> Trajectory | None:
     near = np.minimum(clear.min(axis=1), ready.kernel.clearance(states, SEEN).min(axis=1))
     search.charges.charge("clearance in time", len(states))
     size = np.abs(states - q).max(axis=1)
-    pool = search.pool()
+    pool = search.pool(berth=False)
     for k in np.argsort(-(near - NEARNESS * size), kind="stable")[:TRIED]:
         if near[k] > 0.0 and not search.charges.over():
             path = np.linspace(q, states[k], STATES)

@@ -61,7 +61,7 @@ class MotionPool:
 
     def __init__(
         self, optimizer: MotionOptimizer, start: Start, clock: float, charges: Charges,
-        accepts: Callable[[Trajectory], bool],
+        accepts: Callable[[Trajectory], bool], berth: float = 0.0,
     ) -> None:  # fmt: skip
         """Start an empty pool.
 
@@ -71,9 +71,10 @@ class MotionPool:
             clock: Time of the clock then [s].
             charges: Gets the samples that are looked at.
             accepts: The proof.
+            berth: By how much obstacles are larger for the optimiser than for the proof [m].
         """
         self._optimizer, self._start, self._clock, self._charges = optimizer, start, clock, charges
-        self._accepts = accepts
+        self._accepts, self._least = accepts, CLEAR - berth
         self.candidates: list[MotionCandidate] = []
         self._own: dict[bytes, float] = {}
 
@@ -158,5 +159,5 @@ class MotionPool:
         self._charges.charge("sample of a motion", self._optimizer.samples - before)
         one.cost = report.clearance_cost
         ends = self._own_clearance(one.goal)
-        one.clear = report.scene_clearance >= CLEAR and report.own_clearance >= min(0.0, ends) + CLEAR
+        one.clear = report.scene_clearance >= self._least and report.own_clearance >= min(0.0, ends) + CLEAR
         one.damping = report.damping if steps else one.damping

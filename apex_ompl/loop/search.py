@@ -31,7 +31,6 @@ class Search:
         ready: The robot among what stands still.
         request: What is asked for.
         charges: What was spent.
-        optimizer: Optimises motions among the obstacles.
         start: What the robot does when the motion begins.
         rng: Source of random choices.
         best: The best motion so far, or None.
@@ -41,7 +40,6 @@ class Search:
     ready: Ready
     request: Request
     charges: Charges
-    optimizer: MotionOptimizer = field(init=False)
     start: Start = field(init=False)
     rng: np.random.Generator = field(init=False)
     best: Following | None = None
@@ -49,7 +47,6 @@ class Search:
 
     def __post_init__(self) -> None:
         """Read the request."""
-        self.optimizer = MotionOptimizer(self.ready.kernel, self.request.wide, self.ready.limits, MOTIONS)
         self.start, self.rng = self.request.following.start(self.request.join), self.request.rng
 
     @property
@@ -79,9 +76,13 @@ class Search:
         if motion.duration < self.wanted():
             self.best, self.part = self.following(motion), part
 
-    def pool(self) -> MotionPool:
-        """Return an empty pool of motions."""
-        return MotionPool(self.optimizer, self.start, self.request.join, self.charges, self.accepts)
+    def pool(self, berth: bool = True) -> MotionPool:
+        """Return an empty pool of motions, which are optimised with a berth around obstacles or without."""
+        request, ready = self.request, self.ready
+        movers = request.wide if berth else request.predicted
+        optimizer = MotionOptimizer(ready.kernel, movers, ready.limits, MOTIONS)
+        beyond = ready.settings.berth if berth else 0.0
+        return MotionPool(optimizer, self.start, request.join, self.charges, self.accepts, beyond)
 
 
 class Guess(NamedTuple):
