@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apex_ompl.errors import ParameterError
-from apex_ompl.live.moving import obstacle_at
 from apex_ompl.ompl_adapter.setup import assemble
 from apex_ompl.result import PlanResult
 from apex_ompl.robot.identity import load_same_robot
 from apex_ompl.scene.problem import Problem
+from apex_ompl.scene.scripts import is_there, obstacle_at
 from apex_ompl.trajopt.path import resample
 from apex_ompl.types import Array
 from apex_ompl.util.files import check_writable, write_atomically
@@ -112,7 +112,8 @@ def _moment(renderer: SceneRenderer, result: PlanResult, time: float) -> NDArray
     assert result.trajectory is not None
     for obstacle in result.problem.scene:
         if obstacle.name in result.movers:
-            renderer.move(obstacle_at(obstacle, time))
+            pose = obstacle_at(obstacle, time).pose if is_there(obstacle, time) else None
+            renderer.show_obstacle(obstacle.name, pose)
     return renderer.screenshot(result.trajectory(time))
 
 

@@ -12,12 +12,12 @@ from pathlib import Path
 import numpy as np
 
 from apex_ompl.errors import ParameterError
-from apex_ompl.live.moving import obstacle_at
 from apex_ompl.ompl_adapter.setup import PlanningSetup, assemble
 from apex_ompl.result import SCHEMA, PlanResult
 from apex_ompl.robot.identity import load_same_robot
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Problem
+from apex_ompl.scene.scripts import is_there, obstacle_at
 from apex_ompl.trajopt.path import resample
 from apex_ompl.types import Array
 from apex_ompl.util.files import BROKEN
@@ -93,8 +93,9 @@ class Shown:
     def draw(self, scene: BrowserScene, time: float) -> None:
         """Show it at a time [s] in its scene; obstacles that its motion was proved among are where they are then."""
         scene.show(self.state(time))
+        at = min(max(time, 0.0), self.duration)
         for obstacle in self._movers:
-            scene.move_obstacle(obstacle.name, obstacle_at(obstacle, min(max(time, 0.0), self.duration)).pose)
+            scene.show_obstacle(obstacle.name, obstacle_at(obstacle, at).pose if is_there(obstacle, at) else None)
 
     @cached_property
     def _movers(self) -> tuple[Obstacle, ...]:
