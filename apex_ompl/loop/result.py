@@ -26,6 +26,7 @@ SCHEMA = "apex-ompl/run/1"
 SUFFIXES = (".npz", ".json")
 ARCHIVE, ROLE = "run", "run file"  # name of the text in a NumPy archive, and what errors call the file
 TEXTS = ("reason", "robot", "method", "prediction", "clock")
+JSON_NAMES = {"str": "text", "list": "list", "dict": "mapping"}
 START_TOLERANCE = 2e-3  # from the problem's start, whose joints may be moved to their limits [rad]
 
 
@@ -207,6 +208,5 @@ def _event(row: Mapping[str, Any], name: str) -> Event:
 def _typed(value: Any, kind: type, name: str) -> Any:
     """Return a value of a type of JSON."""
     if not isinstance(value, kind):
-        words = {str: "a text", list: "a list", dict: "a mapping"}
-        raise ParameterError(name, value, words[kind])
+        raise ParameterError(name, value, f"a {JSON_NAMES[kind.__name__]}")
     return value
