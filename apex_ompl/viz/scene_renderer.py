@@ -17,6 +17,7 @@ from apex_ompl.viz.appearance import BACKGROUND, EDGE, OBSTACLES, Item, focus_of
 
 SIZE = (1280, 960)
 AZIMUTH = 26.0
+CAPTION = "#222222"  # colour of text
 
 
 class SceneRenderer:
@@ -94,10 +95,15 @@ class SceneRenderer:
         joints = joint_poses(self.robot, self._data, q)
         return [joints[item.joint] @ item.placement for item in self._moving]
 
-    def screenshot(self, q: Array) -> NDArray[np.uint8]:
-        """Return an image of the scene with the robot at a state, shape (height, width, 3)."""
+    def screenshot(self, q: Array, caption: str = "") -> NDArray[np.uint8]:
+        """Return an image of the scene with the robot at a state, shape (height, width, 3), and a line of text."""
         for actor, pose in zip(self._actors, self._poses(q), strict=True):
             actor.user_matrix = pose
+        if caption:
+            size = max(6, self._plotter.window_size[1] // 45)
+            self._plotter.add_text(
+                caption, position=(size, size), font_size=size, color=CAPTION, name="caption", render=False
+            )
         self._plotter.render()
         return np.asarray(self._plotter.screenshot(None, return_img=True), dtype=np.uint8)
 

@@ -11,6 +11,8 @@ import numpy as np
 from apex_ompl.errors import ParameterError
 from apex_ompl.loop.result import ARCHIVE, RunResult
 from apex_ompl.result import PlanResult
+from apex_ompl.robot import Robot
+from apex_ompl.robot.identity import load_same_robot
 from apex_ompl.util.files import BROKEN, is_file
 
 Saved: TypeAlias = PlanResult | RunResult
@@ -49,6 +51,20 @@ def load_saved(path: Path) -> Saved:
         ParameterError: It has another suffix.
     """
     return (saved_kind(path) or PlanResult).load(path)
+
+
+def robot_of(saved: Saved) -> Robot:
+    """Return the robot of a saved plan or run.
+
+    Raises:
+        RobotError: It is another one by now.
+        ParameterError: It has other joints than the motion.
+        ApexError: It cannot be loaded.
+    """
+    robot, motion = load_same_robot(saved.problem.robot, saved.robot_digest), saved.trajectory
+    if motion is not None and motion.joint_names != robot.joint_names:
+        raise ParameterError("trajectory", ", ".join(motion.joint_names), f"the joints of {robot.name}, in their order")
+    return robot
 
 
 def saved_in(folder: Path) -> list[Path]:

@@ -10,17 +10,16 @@ import numpy as np
 from apex_ompl.loop.result import RunResult
 from apex_ompl.ompl_adapter.setup import assemble
 from apex_ompl.result import PlanResult
-from apex_ompl.robot.identity import load_same_robot
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Problem
 from apex_ompl.scene.scripts import is_there, obstacle_at
 from apex_ompl.trajectory import Trajectory
 from apex_ompl.types import Array
+from apex_ompl.viz.appearance import SILENT_EVENTS
 from apex_ompl.viz.browser.run import ShownRun
 from apex_ompl.viz.browser.scene import BrowserScene
 from apex_ompl.viz.browser.shown import Shown
-
-SILENT = ("observation", "reaction")  # kinds of events that are too many for labels
+from apex_ompl.viz.sources import robot_of
 
 
 @dataclass(eq=False)
@@ -41,10 +40,9 @@ class SavedRun(ShownRun):
         Raises:
             ApexError: The robot or a body cannot be loaded, or the robot is not the one of the run.
         """
-        robot = load_same_robot(run.problem.robot, run.robot_digest)
-        shown = cls(name or run.problem.name, assemble(run.problem, robot), run=run)
+        shown = cls(name or run.problem.name, assemble(run.problem, robot_of(run)), run=run)
         for event in run.events:
-            if event.kind not in SILENT:
+            if event.kind not in SILENT_EVENTS:
                 shown.feed_event(event.time, event.kind)
         return shown
 
@@ -99,8 +97,9 @@ class SavedRun(ShownRun):
 def summary(run: RunResult) -> str:
     """Return the main metrics of a run in one line; those that it lacks are left out."""
     words = (
-        ("replans_accepted", "{:.0f} replans", 1.0), ("stops", "{:.0f} stops", 1.0), ("rest_time", "{:.2f} s at rest", 1.0),
-        ("clearance", "at least {:.0f} mm from movers", 1e3), ("reaction_p95", "reaction p95 {:.0f} ms", 1e3),
+        ("replans_accepted", "{:.0f} replans", 1.0), ("stops", "{:.0f} stops", 1.0),
+        ("rest_time", "{:.2f} s at rest", 1.0), ("clearance", "at least {:.0f} mm from movers", 1e3),
+        ("reaction_p95", "reaction p95 {:.0f} ms", 1e3),
     )  # fmt: skip
     return ", ".join(text.format(unit * run.metrics[name]) for name, text, unit in words if name in run.metrics)
 
