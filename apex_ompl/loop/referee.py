@@ -180,6 +180,8 @@ class ExactMovers:
         """Return the first contact at some times, shape (N,), increasing from 0 [s]; or None."""
         kernel = self._scripted.kernel
         for piece in self._scripted.pieces(float(times[-1])):
+            if piece.begin == piece.end:  # a moment, of which there is nothing to prove
+                return self._among(motion, times, piece)
             time = piece.begin
             while len(piece.movers):
                 conflict = prove_motion(kernel, piece.movers, motion, time, piece.end)
@@ -188,9 +190,9 @@ class ExactMovers:
                 time = min(conflict.time + STRETCH, piece.end)
                 looked = times[(times >= conflict.time - SPACING) & (times >= piece.begin) & (times <= time)]
                 found = self._among(motion, looked, piece)
-                if found is not None or time >= piece.end:
-                    if found is not None:
-                        return found
+                if found is not None:
+                    return found
+                if time >= piece.end:
                     break
         return None
 
@@ -211,6 +213,8 @@ class ExactMovers:
 
     def _among(self, motion: Trajectory, times: Array, piece: Piece) -> RunContact | None:
         """Return the first contact at times inside of a piece, or None."""
+        if not len(piece.movers):
+            return None
         spheres = clearance_in_time(self._scripted.kernel, piece.movers, motion(times), times, NEAR)[0]
         for time in times[~(spheres > 0.0)].tolist():
             found = self.contact_at(motion, time, piece.movers.names)
