@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import os
 import pathlib
@@ -18,17 +17,17 @@ from apex_ompl.errors import FileFormatError, ParameterError
 from apex_ompl.scene.problem import Problem
 from apex_ompl.trajectory import Trajectory
 from apex_ompl.trajectory.checks import check_plan
-from apex_ompl.trajectory.files import MESSAGES, STATES
+from apex_ompl.trajectory.files import KNOTS, MESSAGES
 from apex_ompl.trajopt.path import Path
 from apex_ompl.trajopt.spline import Spline
 from apex_ompl.types import Array
-from apex_ompl.util.files import BROKEN, read_file, suffix_of, write_atomically
+from apex_ompl.util.archives import pack_archive, read_archive
+from apex_ompl.util.files import BROKEN, suffix_of, write_atomically
 from apex_ompl.util.schema import dump_yaml, read_json, read_yaml
-from apex_ompl.util.validation import finite_array
+from apex_ompl.util.validation import finite_array, finite_numbers
 
 SCHEMA = "apex-ompl/result/2"
 SUFFIXES = (*MESSAGES, ".npz", ".csv", ".json", ".yaml")
-KNOTS = ("times", *STATES)
 PROOF = ("clearance", "clearance_bound", "proved_by_spheres", "motion_clearance")
 NUMBERS = ("length", "deviation", *PROOF)
 
@@ -214,8 +213,8 @@ class PlanResult:
                 path=None if states is None else _path(states, data.get("spline")),
                 problem=Problem.parse(data["problem_file"], str(path)), planner=data["planner"],
                 joint_names=names, trajectory=Trajectory(**arrays, joint_names=names) if arrays else None,
-                limit_use=_numbers(data["limit_use"], "limit_use"), seed=int(data["seed"]),
-                times=_numbers(data["times"], "times"),
+                limit_use=finite_numbers(data["limit_use"], "limit_use"), seed=int(data["seed"]),
+                times=finite_numbers(data["times"], "times"),
                 timing_method=str(data["timing_method"]), checks=int(data["checks"]), solved_by=data["solved_by"],
                 notes=tuple(data["notes"]), held_joints=tuple(data["held_joints"]),
                 robot_digest=str(data["robot_digest"]), movers=tuple(map(str, data["movers"])),
@@ -245,13 +244,10 @@ class PlanResult:
             rows = [",".join(self.joint_names)]
             rows += [",".join(repr(float(v)) for v in q) for q in self.path.states]
             return ("\n".join(rows) + "\n").encode()
-        buffer = io.BytesIO()
         states = np.empty((0, len(self.joint_names))) if self.path is None else self.path.states
         del data["path"], data["trajectory"]
-        arrays = {} if self.trajectory is None else {key: getattr(self.trajectory, key) for key in KNOTS}
-        names = np.array(self.joint_names)
-        np.savez(buffer, path=states, joint_names=names, result=np.array(json.dumps(data)), **arrays)
-        return buffer.getvalue()
+        knots = {} if self.trajectory is None else {key: getattr(self.trajectory, key) for key in KNOTS}
+        return pack_archive("result", data, {"path": states, "joint_names": np.array(self.joint_names), **knots})
 
 
 def _finite(value: float) -> float | None:
@@ -263,11 +259,6 @@ def _status(name: object) -> PlanStatus:
     if name not in list(PlanStatus):
         raise ParameterError("status", name, f"one of {', '.join(PlanStatus)}")
     return PlanStatus(str(name))
-
-
-def _numbers(given: Mapping[str, Any], name: str) -> dict[str, float]:
-    """Return finite numbers by name."""
-    return {str(key): float(finite_array(value, f"{name}.{key}")) for key, value in given.items()}
 
 
 def _spline_fields(path: Path) -> dict[str, Any] | None:
@@ -287,12 +278,8 @@ def _path(states: Array, spline: dict[str, Any] | None) -> Path:
 
 
 def _read_npz(path: pathlib.Path) -> dict[str, Any]:
-    try:
-        with np.load(io.BytesIO(read_file(path, "result file")), allow_pickle=False) as archive:
-            data = json.loads(str(archive["result"]))
-            if not isinstance(data, dict):
-                raise ValueError("no mapping")
-            knots = {key: archive[key] for key in KNOTS} if KNOTS[0] in archive else None
-            return data | {"path": archive["path"] if len(archive["path"]) else None, "trajectory": knots}
-    except (OSError, *BROKEN) as error:
-        raise FileFormatError(str(path), "", str(error), "expected a saved result") from error
+    data, arrays = read_archive(path, "result", "result file")
+    if "path" not in arrays:
+        raise FileFormatError(str(path), "path", sorted(arrays), "expected an array")
+    knots = {key: arrays.get(key) for key in KNOTS} if KNOTS[0] in arrays else None
+    return data | {"path": arrays["path"] if len(arrays["path"]) else None, "trajectory": knots}

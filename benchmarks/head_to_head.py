@@ -26,11 +26,11 @@ import numpy as np
 import record
 
 from apex_ompl.benchmark import Row, Workers, bench, report, write_database, write_logs
-from apex_ompl.benchmark.metrics import share_interval
 from apex_ompl.benchmark.rows import PAPER
 from apex_ompl.benchmark.summary import SHARE_TIMES, Statistics, Table, statistics, tables, warnings
 from apex_ompl.planners.tuned import TUNED
 from apex_ompl.util.entry_point import run_script
+from apex_ompl.util.statistics import share_interval
 from apex_ompl.util.validation import one_or_more
 
 DEPENDS = ("@benchmark", "benchmarks/controls.py", "benchmarks/control_planners.py", "benchmarks/neighbours.py")

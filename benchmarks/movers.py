@@ -20,12 +20,12 @@ import record
 
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.live.movers import Movers, clearance_in_time, curve_of, prove_motion
-from apex_ompl.live.moving import obstacle_at
 from apex_ompl.live.retime import retime
 from apex_ompl.live.safe_intervals import blocked
 from apex_ompl.live.stopping import stop, stop_along
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.scene.bodies import Obstacle
+from apex_ompl.scene.scripts import obstacle_at
 from apex_ompl.trajectory import Timing, Trajectory, time_path
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import one_or_more

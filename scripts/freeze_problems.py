@@ -28,7 +28,7 @@ import numpy as np
 
 from apex_ompl.api import plan
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.live.moving import check_timed_path, constant_velocity_times, inflated, obstacle_at
+from apex_ompl.live.moving import check_timed_path, constant_velocity_times, inflated
 from apex_ompl.ompl_adapter.setup import assemble
 from apex_ompl.ompl_adapter.validity import full_check
 from apex_ompl.planners.tuned import TUNED
@@ -39,6 +39,7 @@ from apex_ompl.problems.frozen import FrozenProblem, Witness
 from apex_ompl.problems.generator import first_drawn
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.scene.problem import Problem
+from apex_ompl.scene.scripts import obstacle_at
 from apex_ompl.trajopt.path import states_between
 from apex_ompl.types import Array
 from apex_ompl.util.entry_point import run_script

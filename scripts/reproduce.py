@@ -28,6 +28,7 @@ from apex_ompl.benchmark.summary import Statistics, Table, about, statistics, wa
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.files import make_folder, write_atomically
 from apex_ompl.util.provenance import hardware, versions
+from apex_ompl.util.statistics import share_interval
 from apex_ompl.util.validation import one_or_more
 
 if TYPE_CHECKING:
@@ -85,7 +86,7 @@ def failure(args: argparse.Namespace) -> tuple[dict[str, Any], list[Table], Figu
             mine = [f for f in per_level if f.experiment.startswith(f"{task}/") and f.label == row.label]
             f = Statistics(task, row.label, [run for one in mine for run in one.runs])
             ratio = metrics.failure_ratio([run["solved"] for run in f.runs])
-            low, high = (100.0 * (1.0 - v) for v in metrics.share_interval(len(f.solved), len(f.runs)))
+            low, high = (100.0 * (1.0 - v) for v in share_interval(len(f.solved), len(f.runs)))
             length, raw, took = f.median("length"), f.median("raw_length"), f.percentile("total", 50)
             found[f"{task}, {row.label}"] = {
                 "N": len(f.runs), "R_f": ratio, "interval": [high, low], "S_r": length, "S_r as found": raw,
@@ -123,7 +124,7 @@ def size(args: argparse.Namespace) -> tuple[dict[str, Any], list[Table], Figure,
             for level, edge in EDGES.items():
                 f = by[f"{task}/{level}", label]
                 ratio = metrics.failure_ratio([run["solved"] for run in f.runs])
-                low, high = (100.0 * (1.0 - v) for v in metrics.share_interval(len(f.solved), len(f.runs)))
+                low, high = (100.0 * (1.0 - v) for v in share_interval(len(f.solved), len(f.runs)))
                 found[f"{task}/{level}, {label}"] = {"N": len(f.runs), "R_f": ratio, "interval": [high, low]}
                 cells = [f"{edge:.2f}", str(len(f.runs)), f"{ratio:.1f}", f"{high:.1f} to {low:.1f}"]
                 rows.append([task, label, *cells])

@@ -11,7 +11,7 @@ from apex_ompl import MotionPlanner, plan
 from apex_ompl.benchmark import Row, bench
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ParameterError
-from apex_ompl.live.moving import check_timed_path, obstacle_at
+from apex_ompl.live.moving import check_timed_path
 from apex_ompl.live.timed_proof import TimedProver
 from apex_ompl.planning.among_movers import MARGIN
 from apex_ompl.problems import load
@@ -19,6 +19,7 @@ from apex_ompl.result import PlanResult, PlanStatus
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Goal, Problem
+from apex_ompl.scene.scripts import obstacle_at
 from apex_ompl.trajectory import Timing
 
 

@@ -22,7 +22,8 @@ from apex_ompl.viz.browser.live_page import LivePage
 from apex_ompl.viz.browser.nodes import pose_of
 from apex_ompl.viz.browser.run import ShownRun
 from apex_ompl.viz.browser.scene import BrowserScene
-from apex_ompl.viz.browser.shown import Shown, results_in
+from apex_ompl.viz.browser.shown import Shown
+from apex_ompl.viz.sources import saved_in
 from apex_ompl.viz.view import view
 
 RED = (0xE0, 0x10, 0x1B)  # of contacts
@@ -231,7 +232,7 @@ def test_of_a_folder_one_result_is_chosen_at_a_time(server: Any, result: PlanRes
     files = [tmp_path / f"{k}.npz" for k in range(2)]
     result.save(files[0])
     replace(result, planner="another").save(files[1])
-    page = LivePage(server, [], results_in(tmp_path))
+    page = LivePage(server, [], saved_in(tmp_path))
     assert "another" not in page.player._facts.content
     page.choose(files[1].as_posix())
     assert "another" in page.player._facts.content and page.editor is not None

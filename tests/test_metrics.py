@@ -12,6 +12,7 @@ from scipy import linalg
 from apex_ompl.benchmark import metrics
 from apex_ompl.errors import ParameterError
 from apex_ompl.trajectory import smoothness
+from apex_ompl.util.statistics import share_interval
 
 
 def test_failure_ratio_is_a_percentage() -> None:
@@ -27,7 +28,7 @@ def test_share_interval_is_wilsons(of: int, share: float) -> None:
     p = count / of
     middle = (p + z * z / (2 * of)) / (1 + z * z / of)
     half = z / (1 + z * z / of) * math.sqrt(p * (1 - p) / of + z * z / (4 * of * of))
-    low, high = metrics.share_interval(count, of)
+    low, high = share_interval(count, of)
     assert low == pytest.approx(max(0.0, middle - half), abs=1e-9)
     assert high == pytest.approx(min(1.0, middle + half), abs=1e-9)
 

@@ -9,10 +9,11 @@ from hypothesis import strategies as st
 
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ParameterError
-from apex_ompl.live.moving import check_timed_path, constant_velocity_times, inflated, obstacle_at
+from apex_ompl.live.moving import check_timed_path, constant_velocity_times, inflated
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Goal, Problem
+from apex_ompl.scene.scripts import obstacle_at
 
 SHAPES = [
     {"box": (0.12, 0.1, 0.08)}, {"sphere": {"radius": 0.06}}, {"cylinder": {"radius": 0.05, "length": 0.15}},

@@ -27,7 +27,8 @@ from apex_ompl.viz.browser.nodes import RobotNodes, pose_of
 from apex_ompl.viz.browser.page import write_page
 from apex_ompl.viz.browser.scene import _cover_of
 from apex_ompl.viz.browser.server import HOST, free_port
-from apex_ompl.viz.browser.shown import Shown, markdown, results_in
+from apex_ompl.viz.browser.shown import Shown, markdown
+from apex_ompl.viz.sources import saved_in
 from apex_ompl.viz.view import view
 
 RED = (0xE0, 0x10, 0x1B)  # of contacts
@@ -163,7 +164,7 @@ def test_bad_input_is_one_sentence(
     (tmp_path / "empty" / "e.json").mkdir()
     assert main(["view", str(tmp_path / "empty")]) == 2
     assert "with results" in capfd.readouterr().err
-    assert results_in(tmp_path) == [tmp_path / "r.npz"]
+    assert saved_in(tmp_path) == [tmp_path / "r.npz"]
     with pytest.raises(ParameterError, match="problems or results"):
         view("ball_in_cup", tmp_path / "x.html")  # type: ignore[arg-type]
     with pytest.raises(RobotError, match="no longer the one"):

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from apex_ompl.errors import ParameterError
 from apex_ompl.trajopt.path import resample
 from apex_ompl.types import Array
-from apex_ompl.util.validation import check_array, check_integer, check_path
+from apex_ompl.util.validation import check_array, check_path
 
 STEPS = 128  # segments of a path that is resampled for distances between paths
 BLOCK = 2048  # rows of a kernel matrix at a time
@@ -29,19 +29,6 @@ def failure_ratio(solved: ArrayLike) -> float:
     if not outcomes.size:
         raise ParameterError("tasks", 0, "one or more")
     return float(100.0 * np.mean(~outcomes))
-
-
-def share_interval(count: int, of: int, confidence: float = 0.95) -> tuple[float, float]:
-    """Return Wilson's interval for a share, ``count`` of ``of`` (Wilson 1927).
-
-    Raises:
-        ParameterError: ``count`` is not from 0 to ``of``, or ``of`` is 0.
-    """
-    check_integer(count, "count", 0, check_integer(of, "tasks", 1))
-    from scipy import stats
-
-    interval = stats.binomtest(count, of).proportion_ci(confidence, method="wilson")
-    return float(interval.low), float(interval.high)
 
 
 def next_percentile(values: ArrayLike, percentile: float) -> float:

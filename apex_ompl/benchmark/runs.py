@@ -25,6 +25,7 @@ from apex_ompl.ompl_adapter.setup import assemble
 from apex_ompl.planning import PlanRun, finish, plan_among_movers, query_fault, solve, with_exact_ends
 from apex_ompl.planning.among_movers import STAGES
 from apex_ompl.planning.among_movers import warm_up as warm_up_among_movers
+from apex_ompl.planning.movers import movers_of
 from apex_ompl.problems.generator import SuiteError
 from apex_ompl.result import FIRST, PlanResult, PlanStatus
 from apex_ompl.robot import Robot, load_robot
@@ -210,10 +211,10 @@ def in_time(job: Job, stages: Sequence[str] = STAGES) -> tuple[PlanRun, Experime
         stages: See :func:`apex_ompl.planning.plan_among_movers`.
     """
     started, problem = time.perf_counter(), load_problem(job.problem)
+    movers = movers_of(problem)
     with quiet_ompl():
         planning = _ready(job, problem.still, started)
         planning.setup = replace(planning.setup, problem=problem)
-        movers = [o for o in problem.scene if o.moving]
         warm_up_among_movers(planning.setup.checker)
         result = plan_among_movers(planning, movers, job.simplify, Timing(), stages)
         return planning, Experiment(), finish(planning, result, started)

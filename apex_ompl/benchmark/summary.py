@@ -10,10 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from apex_ompl.benchmark.metrics import next_percentile, percentile_interval, share_interval
+from apex_ompl.benchmark.metrics import next_percentile, percentile_interval
 from apex_ompl.benchmark.results import Results
 from apex_ompl.benchmark.runs import NO_PROBLEM, Run, ompl_status
 from apex_ompl.result import PlanStatus
+from apex_ompl.util.statistics import share_interval
 
 TOLERATED_LOAD = 0.5  # load average above that of the runs themselves
 SHARE_TIMES = (0.1, 0.5, 2.0, 10.0)  # at which the share of runs with a first path is given [s]

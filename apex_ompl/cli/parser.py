@@ -22,7 +22,7 @@ from apex_ompl.cli.options import LIMITS
 from apex_ompl.errors import ApexError
 
 PROBLEM_HELP = "name of a problem, an id as shelf/hard/900012, or a YAML file"
-RESULT_HELP = "a saved result (.npz, .json, .yaml)"
+RESULT_HELP = "a saved plan or run (.npz, .json, .yaml)"
 GARBAGE = 50_000  # objects between collections of the youngest
 Commands = argparse._SubParsersAction  # of argparse, which has no public name for it
 
@@ -130,7 +130,7 @@ def _add_pictures(commands: Commands[argparse.ArgumentParser]) -> None:
     parser.add_argument("-o", "--out", type=Path, required=True, metavar="FILE", help=".png, .gif or .mp4")
     parser.add_argument("--azimuth", type=float, default=26.0, help="degrees from the front (default: %(default)s)")
     parser.set_defaults(run="pictures:render")
-    parser = commands.add_parser("plot", help="draw a timed motion against its limits, and its clearance")
+    parser = commands.add_parser("plot", help="draw a timed motion against its limits, and its clearance; or a run")
     parser.add_argument("result", type=Path, help=RESULT_HELP)
     parser.add_argument("-o", "--out", type=Path, required=True, metavar="FILE", help=".png, .pdf or .svg")
     parser.set_defaults(run="pictures:plot")

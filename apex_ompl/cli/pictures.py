@@ -7,32 +7,38 @@ from pathlib import Path
 
 from apex_ompl.api import load_problem
 from apex_ompl.cli.options import import_extra
-from apex_ompl.result import SCHEMA, PlanResult
+from apex_ompl.loop.result import RunResult
+from apex_ompl.result import PlanResult
+from apex_ompl.scene.problem import Problem
 from apex_ompl.util.files import check_writable
-from apex_ompl.util.schema import read_yaml
 from apex_ompl.viz.render import render as draw
+from apex_ompl.viz.sources import is_saved, load_saved
 
 
 def render(parsed: argparse.Namespace) -> int:
-    """Draw a problem or a result."""
-    source = PlanResult.load(parsed.source) if is_result(parsed.source) else load_problem(parsed.source)
-    draw(source, parsed.out, azimuth=parsed.azimuth)
+    """Draw a problem, a plan or a run."""
+    draw(load_source(parsed.source), parsed.out, azimuth=parsed.azimuth)
     print(parsed.out)
     return 0
 
 
 def plot(parsed: argparse.Namespace) -> int:
-    """Draw a timed motion."""
+    """Draw a timed motion, or the time line of a run."""
     plots = import_extra("apex_ompl.viz.plots", "pictures", "viz")
     check_writable(parsed.out)
-    plots.plot_motion(PlanResult.load(parsed.result), parsed.out)
+    result = load_saved(parsed.result)
+    if isinstance(result, RunResult):
+        import_extra("apex_ompl.viz.timeline", "pictures", "viz").plot_run(result, parsed.out)
+    else:
+        plots.plot_motion(result, parsed.out)
     print(parsed.out)
     return 0
 
 
-def is_result(source: str) -> bool:
-    """Whether a file is a saved result rather than a problem."""
-    path = Path(source)
-    if path.suffix in (".npz", ".json"):
-        return True
-    return path.suffix in (".yaml", ".yml") and path.is_file() and read_yaml(path, "file").get("schema") == SCHEMA
+def load_source(source: str) -> Problem | PlanResult | RunResult:
+    """Return a saved plan or run, or the problem of a name or a file.
+
+    Raises:
+        ApexError: There is no such thing, or it cannot be read.
+    """
+    return load_saved(Path(source)) if is_saved(Path(source)) else load_problem(source)

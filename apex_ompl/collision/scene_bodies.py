@@ -13,6 +13,7 @@ from apex_ompl.collision.shapes import coal_geometry, world_geometry
 from apex_ompl.errors import SceneError, UnknownNameError
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import AttachedObject, Body, Obstacle
+from apex_ompl.scene.scripts import moved_to, standing
 from apex_ompl.types import Array
 from apex_ompl.util.schema import validate
 
@@ -96,14 +97,20 @@ class SceneBodies:
     def move(self, name: str, position: Sequence[float], orientation: Sequence[float] | None = None) -> None:
         """Move an obstacle to a pose in the world [m, quaternion xyzw]; the orientation is kept by default.
 
+        The places of a script move by as much.
+
         Raises:
             SceneError: There is no such obstacle.
             FileFormatError: The position or the orientation is not valid.
         """
         old = self._find(self._obstacles, name, "obstacle")
         turn = old.orientation if orientation is None else orientation
-        fields = {**old.model_dump(), "position": tuple(position), "orientation": tuple(turn)}
-        new = validate(type(old), fields, f"obstacle {name!r}")
+        kept = {key: value for key, value in old.model_dump().items() if key != "trajectory"}
+        new = validate(
+            type(old), {**kept, "position": tuple(position), "orientation": tuple(turn)}, f"obstacle {name!r}"
+        )
+        if isinstance(old, Obstacle) and old.trajectory is not None:
+            new = moved_to(old, new.position).model_copy(update={"orientation": new.orientation})
         self._obstacles[name] = new
         if new.half_space is not None:  # its pose is part of its geometry
             self.meshes.remove(name)
@@ -114,14 +121,14 @@ class SceneBodies:
         self._obstacle_moved(self.meshes.scene[name])
 
     def set_velocity(self, name: str, velocity: Sequence[float] | None) -> None:
-        """Give an obstacle a constant velocity [m/s], or none; it is checked where it stands.
+        """Give an obstacle a constant velocity [m/s], or none, in place of a script; it is checked where it stands.
 
         Raises:
             SceneError: There is no such obstacle.
             FileFormatError: The velocity is not valid.
         """
         old = self._find(self.obstacles, name, "obstacle")
-        fields = {**old.model_dump(), "velocity": None if velocity is None else tuple(velocity)}
+        fields = {**standing(old).model_dump(), "velocity": None if velocity is None else tuple(velocity)}
         self._obstacles[name] = validate(Obstacle, fields, f"obstacle {name!r}")
 
     def remove(self, name: str) -> None:

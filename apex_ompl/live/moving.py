@@ -1,11 +1,14 @@
-"""Moving obstacles: their poses over time, and the collision check of timed paths among them.
+"""The collision check of timed paths among obstacles that move, and obstacles that contain what they sweep.
 
-Obstacles move at constant velocity v from time 0, when the path starts: p(t) = p(0) + v t.
+Obstacles move from time 0 on, when the path starts, at constant velocity or by a script
+(:mod:`apex_ompl.scene.scripts`).
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,6 +18,7 @@ from apex_ompl.errors import ParameterError
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Problem
+from apex_ompl.scene.scripts import is_there, problem_at, script_times, velocity_at
 from apex_ompl.types import Array
 from apex_ompl.util.validation import check_states, check_times
 
@@ -40,14 +44,6 @@ class TimedPathCheck:
     def __bool__(self) -> bool:
         """Whether the path is inside the limits and collision-free."""
         return self.ok
-
-
-def obstacle_at(obstacle: Obstacle, time: float) -> Obstacle:
-    """Return an obstacle at its position at a time [s]."""
-    if not obstacle.moving:
-        return obstacle
-    x, y, z = (float(v) for v in np.add(obstacle.position, np.multiply(obstacle.velocity or (0, 0, 0), time)))
-    return obstacle.model_copy(update={"position": (x, y, z)})
 
 
 def inflated(obstacle: Obstacle, by: float) -> Obstacle:
@@ -78,13 +74,14 @@ def check_timed_path(
 ) -> TimedPathCheck:
     """Check whether a timed path is inside the limits and free of collisions with still and moving obstacles.
 
-    Between states the path is straight and its velocity constant. Time is divided into intervals in which no obstacle
-    moves more than ``OBSTACLE_STEP``. In each, the obstacles stand where they are in its middle, inflated by half of
-    ``OBSTACLE_STEP``, and so contain all that they sweep; the path of that time is proved free of them.
+    Between states the path is straight and its velocity constant. Time is divided where a script has a place or an
+    obstacle appears, and these pieces into intervals in which no obstacle moves more than ``OBSTACLE_STEP``. In each,
+    the obstacles stand where they are in its middle, inflated by half of ``OBSTACLE_STEP``, and so contain all that
+    they sweep; the path of that time is proved free of them. One that appears when the path ends is not looked at.
 
     Args:
         robot: The robot.
-        problem: The problem, with obstacles where they are at time 0, and held objects.
+        problem: The problem, with obstacles as they are from time 0 on, and held objects.
         path: States, shape (N, dof).
         times: Times of the states, increasing from 0, shape (N,) [s].
 
@@ -105,24 +102,48 @@ def check_timed_path(
         return TimedPathCheck(
             False, f"{name} at {speeds[worst, joint]:.3g}, its limit is {limit:.3g} rad/s", float(times[worst])
         )
-    movers = [o for o in problem.scene if o.moving]
-    fastest = max((float(np.linalg.norm(o.velocity or (0, 0, 0))) for o in movers), default=0.0)
-    if fastest * times[-1] / OBSTACLE_STEP > MAX_INTERVALS:
-        farthest = MAX_INTERVALS * OBSTACLE_STEP
-        raise ParameterError("times", float(times[-1]), f"an end before an obstacle has moved {farthest:g} m")
-    intervals = max(1, int(np.ceil(fastest * times[-1] / OBSTACLE_STEP)))
-    bounds = np.linspace(0.0, times[-1], intervals + 1)
-    scene = [inflated(o, OBSTACLE_STEP / 2.0) if o.moving else o for o in problem.scene]
-    checker = CollisionChecker(robot, scene, problem.attached, problem.allowed)
-    for begin, end in zip(bounds[:-1], bounds[1:], strict=True):
-        for mover in movers:
-            checker.move(mover.name, obstacle_at(mover, (begin + end) / 2.0).position)
+    movers, checkers = [o for o in problem.scene if o.moving], dict[frozenset[str], CollisionChecker]()
+    names = {o.name for o in movers}
+    for begin, end in _intervals(movers, float(times[-1])):
+        now = problem_at(problem, (begin + end) / 2.0)
+        here = frozenset(o.name for o in now.scene)
+        if here not in checkers:
+            scene = [inflated(o, OBSTACLE_STEP / 2.0) if o.name in names else o for o in now.scene]
+            checkers[here] = CollisionChecker(robot, scene, now.attached, now.allowed)
+        for obstacle in now.scene:
+            if obstacle.name in names:
+                checkers[here].move(obstacle.name, obstacle.position)
         knots = np.concatenate([[begin], times[(times > begin) & (times < end)], [end]])
         states = np.stack([np.interp(knots, times, column) for column in path.T], axis=1)
-        proof = checker.prove(states, tolerance=0.0)
+        proof = checkers[here].prove(states, tolerance=0.0)
         if not proof:
-            return TimedPathCheck(False, f"between {begin:.3f} and {end:.3f} s: {proof.reason}", float(end))
+            return TimedPathCheck(False, f"between {begin:.3f} and {end:.3f} s: {proof.reason}", end)
     return TimedPathCheck(True)
+
+
+def _intervals(movers: Sequence[Obstacle], until: float) -> list[tuple[float, float]]:
+    """Return begins and ends of the intervals of a check [s].
+
+    In none of them does an obstacle change its velocity, appear, or move more than ``OBSTACLE_STEP``.
+
+    Raises:
+        ParameterError: There would be too many.
+    """
+    bounds = sorted({0.0, until, *(t for o in movers for t in script_times(o) if t < until)})
+    found: list[tuple[float, float]] = []
+    for begin, end in pairwise(bounds):
+        middle = (begin + end) / 2.0
+        way = (end - begin) * max((_speed(o, middle) for o in movers if is_there(o, middle)), default=0.0)
+        if way / OBSTACLE_STEP > MAX_INTERVALS - len(found):
+            farthest = MAX_INTERVALS * OBSTACLE_STEP
+            raise ParameterError("times", until, f"an end before an obstacle has moved {farthest:g} m")
+        knots = np.linspace(begin, end, max(1, int(np.ceil(way / OBSTACLE_STEP))) + 1).tolist()
+        found += pairwise(knots)
+    return found
+
+
+def _speed(obstacle: Obstacle, time: float) -> float:
+    return float(np.linalg.norm(velocity_at(obstacle, time)))
 
 
 def constant_velocity_times(robot: Robot, path: Array, velocity_scale: float) -> Array:

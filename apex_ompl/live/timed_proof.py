@@ -11,8 +11,9 @@ import numpy as np
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.path_proof import Curve
 from apex_ompl.live.movers import Movers, allowed_rows, prove_motion
-from apex_ompl.live.moving import inflated, obstacle_at
+from apex_ompl.live.moving import inflated
 from apex_ompl.scene.bodies import Obstacle
+from apex_ompl.scene.scripts import obstacle_at
 from apex_ompl.trajectory import Trajectory
 from apex_ompl.types import Array
 

@@ -1,14 +1,33 @@
-"""A run of the closed loop as data."""
+"""A run of the closed loop as data, and its files."""
 
 from __future__ import annotations
 
+import json
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
+from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from apex_ompl.errors import FileFormatError, ParameterError
 from apex_ompl.scene.problem import Problem
 from apex_ompl.trajectory import Trajectory
+from apex_ompl.trajectory.files import KNOTS
+from apex_ompl.types import Array
+from apex_ompl.util.archives import pack_archive, read_archive
+from apex_ompl.util.files import BROKEN, suffix_of, write_atomically
+from apex_ompl.util.schema import read_json
+from apex_ompl.util.validation import check_number, check_seed, finite_array, finite_numbers
+
+SCHEMA = "apex-ompl/run/1"
+SUFFIXES = (".npz", ".json")
+ARCHIVE, ROLE = "run", "run file"  # name of the text in a NumPy archive, and what errors call the file
+TEXTS = ("reason", "robot", "method", "prediction", "clock")
+JSON_NAMES = {"str": "text", "list": "list", "dict": "mapping"}
+START_TOLERANCE = 2e-3  # from the problem's start, whose joints may be moved to their limits [rad]
 
 
 class Outcome(StrEnum):
@@ -34,8 +53,8 @@ class Event:
 
     Attributes:
         time: When [s].
-        kind: ``observation``, ``conflict``, ``stop``, ``request``, ``accepted``, ``rejected``, ``evasion``, ``goal``,
-            ``broken assumption`` or ``contact``.
+        kind: ``observation``, ``conflict``, ``stop``, ``request``, ``accepted``, ``rejected``, ``reaction``,
+            ``evasion``, ``goal``, ``broken assumption`` or ``contact``.
         data: What there is to say of it: texts and numbers, JSON's.
     """
 
@@ -62,6 +81,7 @@ class RunResult:
         metrics: Numbers by name: ``time_to_goal`` [s], ``rest_time`` [s], ``stops``, ``replans_asked``,
             ``replans_accepted``, ``clearance`` [m], ``reaction_p95`` [s], ``broken_assumptions``, ...
         settings: Those of the loop and of the sensor, and the version of the table of costs; JSON's.
+        robot_digest: Digest of the robot, see :func:`apex_ompl.robot.identity.digest`; empty where it is not known.
     """
 
     outcome: Outcome
@@ -76,7 +96,117 @@ class RunResult:
     events: tuple[Event, ...] = ()
     metrics: Mapping[str, float] = field(default_factory=dict)
     settings: Mapping[str, Any] = field(default_factory=dict)
+    robot_digest: str = ""
 
     def __bool__(self) -> bool:
         """Whether the goal was reached."""
         return self.outcome is Outcome.REACHED
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the fields as plain data, ready for JSON."""
+        motion = self.trajectory
+        return {
+            "schema": SCHEMA,
+            "outcome": str(self.outcome),
+            **{name: getattr(self, name) for name in TEXTS},
+            "robot_digest": self.robot_digest,
+            "seed": self.seed,
+            "metrics": dict(self.metrics),
+            "settings": dict(self.settings),
+            "events": [{"time": e.time, "kind": e.kind, "data": dict(e.data)} for e in self.events],
+            "joint_names": list(motion.joint_names),
+            "trajectory": {key: getattr(motion, key).tolist() for key in KNOTS},
+            "problem_file": self.problem.as_dict(),
+        }
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write all fields, for :meth:`load`: compact as ``.npz``, as text ``.json``.
+
+        Raises:
+            ParameterError: Another suffix; or events, metrics or settings that are not JSON's, or not finite.
+            MissingFileError: The folder is missing or cannot be written.
+        """
+        path = Path(path)
+        suffix, data = suffix_of(path, SUFFIXES), self.as_dict()
+        _check_plain(data)
+        if suffix == ".json":
+            write_atomically(path, (json.dumps(data, indent=1) + "\n").encode())
+            return
+        del data["trajectory"]
+        knots = {key: getattr(self.trajectory, key) for key in KNOTS}
+        write_atomically(path, pack_archive(ARCHIVE, data, knots, compressed=True))
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> RunResult:
+        """Read a run that was saved.
+
+        Raises:
+            MissingFileError: The file cannot be read.
+            FileFormatError: It is not a saved run, or contradicts itself.
+            ParameterError: It has another suffix.
+        """
+        path = Path(path)
+        if path.suffix not in SUFFIXES or path.name == path.suffix:
+            raise ParameterError(ROLE, str(path), f"a file name ending in {', '.join(SUFFIXES)}")
+        if path.suffix == ".json":
+            data = read_json(path, ROLE)
+        else:
+            data, arrays = read_archive(path, ARCHIVE, ROLE)
+            data["trajectory"] = arrays
+        if data.get("schema") != SCHEMA:
+            raise FileFormatError(str(path), "schema", data.get("schema"), f"expected {SCHEMA!r}")
+        try:
+            return _parsed(data, str(path))
+        except ParameterError as error:
+            raise FileFormatError(str(path), error.name, error.value, f"expected {error.expected}") from error
+        except KeyError as error:
+            raise FileFormatError(str(path), str(error.args[0]), None, "required field is missing") from error
+        except (*BROKEN, AttributeError) as error:
+            raise FileFormatError(str(path), "", str(error), "expected a complete saved run") from error
+
+
+def _check_plain(data: Mapping[str, Any]) -> None:
+    """Check that metrics, settings and events are JSON's, without numbers that are not finite."""
+    for name in ("metrics", "settings", "events"):
+        try:
+            json.dumps(data[name], allow_nan=False)
+        except (TypeError, ValueError) as error:
+            raise ParameterError(name, str(error), "texts, finite numbers, lists and mappings") from error
+
+
+def _parsed(data: Mapping[str, Any], source: str) -> RunResult:
+    """Return a run of the content of a file; what does not fit raises."""
+    _check_plain(data)
+    knots = {key: finite_array(data["trajectory"][key], f"trajectory.{key}") for key in KNOTS}
+    texts = {name: _typed(data[name], str, name) for name in (*TEXTS, "robot_digest")}
+    outcome, rows = data["outcome"], enumerate(_typed(data["events"], list, "events"))
+    if outcome not in list(Outcome):
+        raise ParameterError("outcome", outcome, f"one of {', '.join(Outcome)}")
+    found = RunResult(
+        outcome=Outcome(outcome), problem=Problem.parse(data["problem_file"], source), **texts,
+        seed=check_seed(data["seed"]), trajectory=Trajectory(**knots, joint_names=tuple(data["joint_names"])),
+        events=tuple(_event(row, f"events.{k}") for k, row in rows),
+        metrics=finite_numbers(_typed(data["metrics"], dict, "metrics"), "metrics"),
+        settings=_typed(data["settings"], dict, "settings"),
+    )  # fmt: skip
+    times = [event.time for event in found.events]
+    if times != sorted(times):
+        raise ParameterError("events", "times that go back", "events by time")
+    start: Array = found.problem.start_state(found.trajectory.joint_names)
+    off = float(np.abs(found.trajectory.positions[0] - start).max())
+    if off > START_TOLERANCE:
+        raise ParameterError("trajectory", f"a begin {off:.3g} rad away from it", "a motion from the problem's start")
+    return found
+
+
+def _event(row: Mapping[str, Any], name: str) -> Event:
+    check_number(row["time"], f"{name}.time", 0.0)
+    data = _typed(row["data"], dict, f"{name}.data")
+    return Event(float(row["time"]), _typed(row["kind"], str, f"{name}.kind"), data)
+
+
+def _typed(value: Any, kind: type, name: str) -> Any:
+    """Return a value of a type of JSON."""
+    if not isinstance(value, kind):
+        raise ParameterError(name, value, f"a {JSON_NAMES[kind.__name__]}")
+    return value

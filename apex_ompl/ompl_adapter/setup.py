@@ -16,6 +16,7 @@ from apex_ompl.ompl_adapter.space import Bounds, state_space, to_state
 from apex_ompl.ompl_adapter.validity import MotionCheck, MotionValidator, StateValidityChecker
 from apex_ompl.robot import Robot, load_robot
 from apex_ompl.scene.problem import Problem
+from apex_ompl.scene.scripts import problem_at
 from apex_ompl.tasks.alignment import AlignmentGoal, alignment_goal
 from apex_ompl.tasks.goal_sampling import sample
 from apex_ompl.tasks.pose_goal import PoseGoal
@@ -90,7 +91,7 @@ def assemble(
     """Make a problem ready for OMPL.
 
     Args:
-        problem: The problem; moving obstacles stand where they are at time 0.
+        problem: The problem; moving obstacles stand where they are at time 0, if they are there then.
         robot: Its robot, when it is loaded already.
         seed: Seed of the sampling of an alignment goal.
         checker: Collision checker that has the bodies of the problem already.
@@ -107,7 +108,8 @@ def assemble(
     lower, upper = bounds = _bounds(robot, start, held)
     limits = replace(robot.limits, lower=lower, upper=upper)
     sampled = workspace_goal(replace(robot, limits=limits) if len(held) else robot, problem)
-    checker = checker or CollisionChecker(robot, problem.scene, problem.attached, problem.allowed)
+    now = problem_at(problem, 0.0)
+    checker = checker or CollisionChecker(robot, now.scene, now.attached, now.allowed)
     checker.prepare()
     start_fault = state_fault(checker, start)
     goal_faults = tuple(_held_fault(robot, start, goal, held) or state_fault(checker, goal) for goal in goals)

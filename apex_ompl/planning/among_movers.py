@@ -20,7 +20,6 @@ import numpy as np
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.path_proof import PathProof
 from apex_ompl.kernel import Kernel
-from apex_ompl.live.moving import obstacle_at
 from apex_ompl.live.retime import retime
 from apex_ompl.live.timed_proof import TimedProver
 from apex_ompl.live.timed_spline import MotionOptimizer, Start, TimedSpline
@@ -33,6 +32,7 @@ from apex_ompl.planning.timing import parameterize
 from apex_ompl.result import PlanResult, PlanStatus
 from apex_ompl.robot.model import Limits
 from apex_ompl.scene.bodies import Obstacle, Sphere
+from apex_ompl.scene.scripts import obstacle_at
 from apex_ompl.trajectory import Timing, Trajectory, time_path
 from apex_ompl.trajopt.path import Path
 from apex_ompl.util.deadline import Deadline

@@ -37,10 +37,12 @@ def _non_zero(v: tuple[float, float, float]) -> tuple[float, float, float]:
 
 
 Coordinate = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
+Time = Annotated[float, Field(ge=0.0)]
 Size = Annotated[float, Field(gt=0.0, le=LARGEST)]
 Vector = tuple[Coordinate, Coordinate, Coordinate]
 Direction = Annotated[Vector, AfterValidator(_non_zero)]
 Quaternion = Annotated[tuple[float, float, float, float], AfterValidator(_unit_quaternion)]
+PlaceInTime = tuple[Time, Coordinate, Coordinate, Coordinate]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_./-]*$")]
 
 
@@ -150,18 +152,47 @@ class Body(StrictModel):
 
 BodyT = TypeVar("BodyT", bound=Body)
 SHAPES = ("box", "sphere", "cylinder", "capsule", "mesh", "points", "voxels", "distance_grid", "half_space")
+MOTION = ("velocity", "trajectory", "appears")  # fields of how an obstacle moves
 FILES = ("mesh", "points", "voxels", "distance_grid")  # shapes that are read from files
 
 
 class Obstacle(Body):
-    """A solid in the world frame; it moves if it has a ``velocity`` [m/s]."""
+    """A solid in the world frame, which may move from time 0 on, without turning; :mod:`apex_ompl.scene.scripts`.
+
+    Attributes:
+        velocity: Of a motion that is straight for ever [m/s]; ``position`` is that at time 0.
+        trajectory: Rows of a time [s] and the place then [m], joined by straight lines; behind the last one it stands.
+            Times increase from 0, and ``position`` is the first place, which it is filled with.
+        appears: When it comes into being [s]; it moves all the same before.
+    """
 
     velocity: Vector | None = None
+    trajectory: Annotated[tuple[PlaceInTime, ...], Field(min_length=1)] | None = None
+    appears: Time = 0.0
+
+    @model_validator(mode="after")
+    def _from_first_place(self) -> Self:
+        if self.trajectory is None:
+            return self
+        times, place = [row[0] for row in self.trajectory], self.trajectory[0][1:]
+        if self.velocity is not None:
+            raise ValueError(f"{self.name!r}: expected a velocity or a trajectory, found both")
+        if times[0] != 0.0 or any(b <= a for a, b in zip(times, times[1:], strict=False)):
+            raise ValueError(f"{self.name!r}: expected times of the trajectory that increase from 0")
+        if "position" in self.model_fields_set and self.position != place:
+            raise ValueError(f"{self.name!r}: expected no position, or the first place of the trajectory")
+        object.__setattr__(self, "position", place)
+        return self
+
+    @property
+    def scripted(self) -> bool:
+        """Whether it moves otherwise than at one velocity for ever: it appears, or has places in time that differ."""
+        return self.appears > 0.0 or len({row[1:] for row in self.trajectory or ()}) > 1
 
     @property
     def moving(self) -> bool:
-        """Whether the obstacle has a velocity other than zero."""
-        return self.velocity is not None and any(v != 0.0 for v in self.velocity)
+        """Whether it is scripted, or has a velocity other than zero."""
+        return self.scripted or any(self.velocity or ())
 
 
 class ContactFace(StrictModel):

@@ -23,11 +23,13 @@ from apex_ompl.planners.apex_parameters import WITHOUT_MODEL, default_planner
 from apex_ompl.planning import PlanRun, find_path, finish, parameterize, plan_among_movers
 from apex_ompl.planning.among_movers import warm_up as warm_up_among_movers
 from apex_ompl.planning.departure import LARGEST_DEPTH, find_departure, with_departure
+from apex_ompl.planning.movers import movers_of, snapshot_notes
 from apex_ompl.planning.query import Group, State, Target, goal_record, joint_values, planned_joints, state_array
 from apex_ompl.result import PlanResult
 from apex_ompl.robot import Robot, load_robot
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Problem
+from apex_ompl.scene.scripts import problem_at
 from apex_ompl.session.world import World
 from apex_ompl.trajectory import Timing, warm_up
 from apex_ompl.util.deadline import Deadline
@@ -217,8 +219,7 @@ class MotionPlanner:
         movers = _movers(problem, snapshot, how, leave_contact)
         with quiet_ompl():
             seed_ompl(seed)
-            still = problem.moving if snapshot else ()
-            notes = [f"snapshot: {', '.join(still)} taken to stand still"] if still else []
+            notes = snapshot_notes(problem) if snapshot else []
             if planner is None:
                 planner = default_planner(self.robot.name)
                 if planner == WITHOUT_MODEL:
@@ -229,7 +230,7 @@ class MotionPlanner:
                 if start is not None and leave_contact:
                     raise ParameterError("leave_contact", leave_contact, "0 for a start that moves")
             moving = None if group is None else planned_joints(self.robot, group)
-            checker = self._without_movers(problem) if movers else self._checker
+            checker = self._checker_of(problem, bool(movers))
             checker.check_counts = CheckCounts()
             given = ready = assemble(problem, self.robot, seed=seed, checker=checker, moving=moving)
             departure = find_departure(ready, leave_contact, seed) if leave_contact and ready.start_fault else None
@@ -255,9 +256,12 @@ class MotionPlanner:
                 result = with_departure(result, given, departure, how)
             return finish(run, result, started)
 
-    def _without_movers(self, problem: Problem) -> CollisionChecker:
-        """Return a checker of what stands still in a problem."""
-        return CollisionChecker(self.robot, problem.still.scene, problem.attached, problem.still.allowed)
+    def _checker_of(self, problem: Problem, among_movers: bool) -> CollisionChecker:
+        """Return a checker of what stands still in a problem, or of what is there at time 0."""
+        seen = problem.still if among_movers else problem_at(problem, 0.0)
+        if len(seen.scene) == len(problem.scene):
+            return self._checker
+        return CollisionChecker(self.robot, seen.scene, seen.attached, seen.allowed)
 
     def _parameters(self, planner: str, params: Mapping[str, Any] | None) -> dict[str, Any]:
         given = dict(params or {})
@@ -280,9 +284,9 @@ def _movers(problem: Problem, snapshot: bool, timing: Timing | None, leave_conta
     """Return the obstacles that a plan is made among in time: those that move, unless they are to stand still.
 
     Raises:
-        ParameterError: There are such, and an option that does not go with them.
+        ParameterError: There are such, and an option that does not go with them; or one follows a script.
     """
-    movers = () if snapshot else tuple(o for o in problem.scene if o.moving)
+    movers = () if snapshot else movers_of(problem)
     if movers and timing is None:
         raise ParameterError("timing", False, f"True or a Timing, since the obstacle {movers[0].name!r} moves")
     if movers and leave_contact:

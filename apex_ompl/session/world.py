@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.shapes import coal_geometry
 from apex_ompl.errors import SceneError
-from apex_ompl.scene.bodies import AttachedObject, Obstacle, pose_fields
+from apex_ompl.scene.bodies import MOTION, AttachedObject, Obstacle, pose_fields
 from apex_ompl.scene.problem import Problem
 from apex_ompl.session.cloud_files import CloudFiles
 from apex_ompl.types import Array
@@ -104,6 +104,8 @@ class World:
     def move(self, name: str, position: Sequence[float], orientation: Sequence[float] | None = None) -> None:
         """Move an obstacle to a pose in the world [m, quaternion xyzw]; the orientation is kept by default.
 
+        The places of a script move by as much.
+
         Raises:
             SceneError: There is no such obstacle.
             FileFormatError: The position or the orientation is not valid.
@@ -113,7 +115,7 @@ class World:
             self._checker.move(name, position, orientation)
 
     def set_velocity(self, name: str, velocity: Sequence[float] | None) -> None:
-        """Give an obstacle a constant velocity [m/s], or none.
+        """Give an obstacle a constant velocity [m/s], or none, in place of a script that it may have.
 
         Raises:
             SceneError: There is no such obstacle.
@@ -260,7 +262,7 @@ class World:
 
     def _as_held(self, obstacle: Obstacle, link: str, q: Array) -> dict[str, Any]:
         pose = np.linalg.inv(self._checker.robot.link_pose(q, link)) @ obstacle.pose
-        shape = obstacle.model_dump(exclude_none=True, exclude={"velocity"})
+        shape = obstacle.model_dump(exclude_none=True, exclude={*MOTION})
         return {**shape, "link": link, **pose_fields(pose)}
 
     @staticmethod

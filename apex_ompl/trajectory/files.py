@@ -21,6 +21,7 @@ MESSAGES = (".traj.yaml", ".traj.json")
 SUFFIXES = (".npz", ".csv", *MESSAGES)
 ROLE = "trajectory"
 STATES = ("positions", "velocities", "accelerations")
+KNOTS = ("times", *STATES)
 COLUMN_SUFFIXES = ("", "_velocity", "_acceleration")  # after the name of a joint
 NANOSECONDS = 1_000_000_000  # in a second
 

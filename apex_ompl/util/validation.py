@@ -6,7 +6,8 @@ All number and shape checks of the package are made here, so that their messages
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -97,6 +98,15 @@ def finite_array(given: ArrayLike, name: str) -> Array:
     if not np.isfinite(found).all():
         raise ParameterError(name, float(found[~np.isfinite(found)].flat[0]), "finite numbers")
     return found
+
+
+def finite_numbers(given: Mapping[str, Any], name: str) -> dict[str, float]:
+    """Return finite numbers by name.
+
+    Raises:
+        ParameterError: One is no finite number.
+    """
+    return {str(key): float(finite_array(value, f"{name}.{key}")) for key, value in given.items()}
 
 
 def check_nonnegative(values: ArrayLike, name: str) -> None:

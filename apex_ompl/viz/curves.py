@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.live.moving import obstacle_at
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import Obstacle
+from apex_ompl.scene.scripts import is_there, obstacle_at
 from apex_ompl.trajectory import Trajectory
 from apex_ompl.types import Array
 
@@ -40,13 +40,25 @@ def clearances(checker: CollisionChecker, motion: Trajectory, times: Array, move
         checker: The robot in its scene.
         motion: The motion.
         times: Shape (N,) [s].
-        movers: Obstacles of the scene that move, where they are at time 0; they are put back there in the end.
+        movers: Obstacles of the scene that move; those that have appeared are where they are at each time.
     """
-    found = []
+    found, among = [], dict[frozenset[str], CollisionChecker]()
     for time, q in zip(times.tolist(), motion(times), strict=True):
-        for mover in movers:
-            checker.move(mover.name, obstacle_at(mover, time).position)
-        found.append(checker.clearance(q))
-    for mover in movers:
-        checker.move(mover.name, mover.position)
+        here = [obstacle_at(mover, time) for mover in movers if is_there(mover, time)]
+        names = frozenset(mover.name for mover in here)
+        if names not in among:
+            among[names] = _among(checker, movers, here)
+        for mover in here:
+            among[names].move(mover.name, mover.position)
+        found.append(among[names].clearance(q))
     return np.array(found)
+
+
+def _among(checker: CollisionChecker, movers: Sequence[Obstacle], here: Sequence[Obstacle]) -> CollisionChecker:
+    """Return a checker with those of the movers that are there."""
+    if not movers:
+        return checker
+    names, present = {mover.name for mover in movers}, {mover.name for mover in here}
+    scene = [*(o for o in checker.obstacles.values() if o.name not in names), *here]
+    pairs = [pair for pair in checker.allowed if not {*pair} & (names - present)]
+    return CollisionChecker(checker.robot, scene, checker.held.values(), pairs)

@@ -11,15 +11,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apex_ompl.errors import ParameterError
-from apex_ompl.live.moving import obstacle_at
+from apex_ompl.loop.result import RunResult
 from apex_ompl.ompl_adapter.setup import assemble
 from apex_ompl.result import PlanResult
-from apex_ompl.robot.identity import load_same_robot
+from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Problem
+from apex_ompl.scene.scripts import is_there, obstacle_at
+from apex_ompl.trajectory import Trajectory
 from apex_ompl.trajopt.path import resample
 from apex_ompl.types import Array
 from apex_ompl.util.files import check_writable, write_atomically
+from apex_ompl.viz.appearance import SILENT_EVENTS
 from apex_ompl.viz.scene_renderer import AZIMUTH, SIZE, SceneRenderer
+from apex_ompl.viz.sources import robot_of
 
 PICTURES, FILMS = (".png",), (".gif", ".mp4")
 STRIP = (3, 2)  # columns and rows of the frames of a result's picture
@@ -27,19 +31,19 @@ FRAMES, MAX_FRAMES, FRAME_RATE = 72, 720, 24  # frames of an untimed path, and o
 
 
 def render(
-    source: Problem | PlanResult,
+    source: Problem | PlanResult | RunResult,
     out: str | os.PathLike[str],
     size: tuple[int, int] = SIZE,
     azimuth: float = AZIMUTH,
 ) -> None:
-    """Draw a problem or a result.
+    """Draw a problem, a plan or a run.
 
     The .png of a problem shows the start, and a goal as a ghost. The .png of a result shows states along its path in
     reading order. A .gif or .mp4 shows the motion of a result; a timed motion in real time, up to 30 s. Obstacles that
-    the motion was proved among in time move.
+    the motion was proved among in time move, and all those of a run, whose pictures have the time and the last event.
 
     Args:
-        source: A problem, or a result that has a path.
+        source: A problem, a plan that has a path, or a run.
         out: Where to write: .png, .gif or .mp4.
         size: Width and height [pixels].
         azimuth: Direction of the camera from the front of the robot, counter-clockwise [degrees].
@@ -54,12 +58,12 @@ def render(
     check_writable(out)
     if isinstance(source, Problem):
         content = _problem_picture(source, out, size, azimuth)
-    elif source.path is None or source.problem is None:
+    elif isinstance(source, PlanResult) and (source.path is None or source.problem is None):
         raise ParameterError("result", source.status.value, "a result with a path and its problem")
     elif out.suffix in FILMS:
-        content = _film(source, source.path.states, out.suffix, size, azimuth)
+        content = _film(source, out.suffix, size, azimuth)
     else:
-        content = _strip(source, source.path.states, size, azimuth)
+        content = _strip(source, size, azimuth)
     write_atomically(out, content)
 
 
@@ -74,46 +78,60 @@ def _problem_picture(problem: Problem, out: Path, size: tuple[int, int], azimuth
     return _encode([renderer.screenshot(setup.start)], ".png")
 
 
-def _film(result: PlanResult, path: Array, suffix: str, size: tuple[int, int], azimuth: float) -> bytes:
+def _film(source: PlanResult | RunResult, suffix: str, size: tuple[int, int], azimuth: float) -> bytes:
     """Return a film of the motion, or of the path at an even pace when there are no times; the last frame is held."""
-    renderer = SceneRenderer(
-        assemble(result.problem, load_same_robot(result.problem.robot, result.robot_digest)),
-        (3 * size[0] // 4, 3 * size[1] // 4),
-        azimuth,
-    )
-    motion = result.trajectory
+    renderer, motion = _renderer(source, (3 * size[0] // 4, 3 * size[1] // 4), azimuth), source.trajectory
     if motion is None:
-        frames = [renderer.screenshot(q) for q in resample(path, FRAMES)]
+        frames = [renderer.screenshot(q) for q in resample(_path(source), FRAMES)]
     else:
         sample = motion.sample(max(1.0 / FRAME_RATE, motion.duration / MAX_FRAMES))
-        frames = [_moment(renderer, result, float(t)) for t in np.atleast_1d(sample.time)]
+        frames = [_moment(renderer, source, motion, float(t)) for t in np.atleast_1d(sample.time)]
     return _encode([*frames, *[frames[-1]] * (FRAME_RATE // 2)], suffix)
 
 
-def _strip(result: PlanResult, path: Array, size: tuple[int, int], azimuth: float) -> bytes:
+def _strip(source: PlanResult | RunResult, size: tuple[int, int], azimuth: float) -> bytes:
     """Return a .png of states along the path, or of moments among moving obstacles, in reading order."""
-    renderer = SceneRenderer(
-        assemble(result.problem, load_same_robot(result.problem.robot, result.robot_digest)),
-        (size[0] // 2, size[1] // 2),
-        azimuth,
-    )
+    renderer, motion = _renderer(source, (size[0] // 2, size[1] // 2), azimuth), source.trajectory
     columns, rows = STRIP
-    if result.movers and result.trajectory is not None:
-        times = np.linspace(0.0, result.trajectory.duration, columns * rows)
-        frames = [_moment(renderer, result, float(t)) for t in times]
+    if motion is not None and (_movers(source) or isinstance(source, RunResult)):
+        times = np.linspace(0.0, motion.duration, columns * rows)
+        frames = [_moment(renderer, source, motion, float(t)) for t in times]
     else:
-        frames = [renderer.screenshot(q) for q in resample(path, columns * rows)]
+        frames = [renderer.screenshot(q) for q in resample(_path(source), columns * rows)]
     grid = [np.concatenate(frames[k * columns : (k + 1) * columns], axis=1) for k in range(rows)]
     return _encode([np.concatenate(grid, axis=0)], ".png")
 
 
-def _moment(renderer: SceneRenderer, result: PlanResult, time: float) -> NDArray[np.uint8]:
-    """Return an image of a motion at a time [s], with the obstacles that it was proved among where they are then."""
-    assert result.trajectory is not None
-    for obstacle in result.problem.scene:
-        if obstacle.name in result.movers:
-            renderer.move(obstacle_at(obstacle, time))
-    return renderer.screenshot(result.trajectory(time))
+def _renderer(source: PlanResult | RunResult, size: tuple[int, int], azimuth: float) -> SceneRenderer:
+    return SceneRenderer(assemble(source.problem, robot_of(source)), size, azimuth)
+
+
+def _path(source: PlanResult | RunResult) -> Array:
+    """Return the states of the path of a plan that has one."""
+    assert isinstance(source, PlanResult) and source.path is not None
+    return source.path.states
+
+
+def _movers(source: PlanResult | RunResult) -> list[Obstacle]:
+    """Return the obstacles that move: those of a run, and of a plan those that it was proved among in time."""
+    names = source.problem.moving if isinstance(source, RunResult) else source.movers
+    return [obstacle for obstacle in source.problem.scene if obstacle.name in names]
+
+
+def _moment(
+    renderer: SceneRenderer, source: PlanResult | RunResult, motion: Trajectory, time: float
+) -> NDArray[np.uint8]:
+    """Return an image of a motion at a time [s], with the obstacles that move where they are then."""
+    for obstacle in _movers(source):
+        pose = obstacle_at(obstacle, time).pose if is_there(obstacle, time) else None
+        renderer.show_obstacle(obstacle.name, pose)
+    return renderer.screenshot(motion(time), caption(source, time) if isinstance(source, RunResult) else "")
+
+
+def caption(run: RunResult, time: float) -> str:
+    """Return a line on a run at a time [s]: the time, and the last event by then that is worth a word."""
+    last = [event for event in run.events if event.time <= time and event.kind not in SILENT_EVENTS]
+    return f"{time:.2f} s" + (f"   {last[-1].kind} at {last[-1].time:.2f} s" if last else "")
 
 
 def _encode(frames: Sequence[NDArray[np.uint8]], suffix: str) -> bytes:

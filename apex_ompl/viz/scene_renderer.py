@@ -11,12 +11,13 @@ from numpy.typing import NDArray
 
 from apex_ompl.errors import MissingFileError
 from apex_ompl.ompl_adapter.setup import PlanningSetup
-from apex_ompl.scene.bodies import Obstacle
+from apex_ompl.scene.scripts import is_there
 from apex_ompl.types import Array
 from apex_ompl.viz.appearance import BACKGROUND, EDGE, OBSTACLES, Item, focus_of, ghosts_of, items_of, joint_poses
 
 SIZE = (1280, 960)
 AZIMUTH = 26.0
+CAPTION = "#222222"  # colour of text
 
 
 class SceneRenderer:
@@ -41,12 +42,15 @@ class SceneRenderer:
         items = items_of(setup)
         self._moving = [item for item in items if item.moves]
         self._actors = [self._add(item, np.eye(4)) for item in self._moving]
-        self._obstacles: dict[str, tuple[Array, Any]] = {}
+        self._obstacles: dict[str, tuple[Array, list[Any]]] = {}  # where they were placed, and their actors
         for item in items:
+            if item.layer == OBSTACLES:
+                self._obstacles[item.name] = item.placement, []
             if not item.moves:
-                actor = self._add(item, item.placement)
-                if item.layer == OBSTACLES:
-                    self._obstacles[item.name] = item.placement, actor
+                self._add(item, item.placement)
+        for obstacle in setup.problem.scene:
+            if not is_there(obstacle, 0.0):
+                self.show_obstacle(obstacle.name, None)
         self._place_camera(setup, azimuth)
 
     def _add(self, item: Item, pose: Array) -> Any:
@@ -58,9 +62,12 @@ class SceneRenderer:
         else:
             mesh = pv.wrap(item.mesh)
         mesh = mesh.transform(pose, inplace=False)
-        if item.layer == OBSTACLES and item.opacity < 0.5:
-            self._plotter.add_mesh(mesh.extract_feature_edges(30), color=EDGE, line_width=1.5)
-        return self._plotter.add_mesh(mesh, color=item.colour, opacity=item.opacity, specular=0.15)
+        actors = [self._plotter.add_mesh(mesh, color=item.colour, opacity=item.opacity, specular=0.15)]
+        if item.layer == OBSTACLES:
+            if item.opacity < 0.5:
+                actors.append(self._plotter.add_mesh(mesh.extract_feature_edges(30), color=EDGE, line_width=1.5))
+            self._obstacles[item.name][1].extend(actors)
+        return actors[0]
 
     def _place_camera(self, setup: PlanningSetup, azimuth: float) -> None:
         """Point the camera at the middle of hands and scene; from the front, the left arm is on the right."""
@@ -76,19 +83,27 @@ class SceneRenderer:
         for item in ghosts_of(self._setup):
             self._add(item, joints[item.joint] @ item.placement)
 
-    def move(self, obstacle: Obstacle) -> None:
-        """Show an obstacle of the scene at the pose of its record."""
-        placed, actor = self._obstacles[obstacle.name]
-        actor.user_matrix = obstacle.pose @ np.linalg.inv(placed)
+    def show_obstacle(self, name: str, pose: Array | None) -> None:
+        """Show an obstacle of the scene at a pose, shape (4, 4), or hide it."""
+        placed, actors = self._obstacles[name]
+        for actor in actors:
+            actor.visibility = pose is not None
+            if pose is not None:
+                actor.user_matrix = pose @ np.linalg.inv(placed)
 
     def _poses(self, q: Array) -> list[Array]:
         joints = joint_poses(self.robot, self._data, q)
         return [joints[item.joint] @ item.placement for item in self._moving]
 
-    def screenshot(self, q: Array) -> NDArray[np.uint8]:
-        """Return an image of the scene with the robot at a state, shape (height, width, 3)."""
+    def screenshot(self, q: Array, caption: str = "") -> NDArray[np.uint8]:
+        """Return an image of the scene with the robot at a state, shape (height, width, 3), and a line of text."""
         for actor, pose in zip(self._actors, self._poses(q), strict=True):
             actor.user_matrix = pose
+        if caption:
+            size = max(6, self._plotter.window_size[1] // 45)
+            self._plotter.add_text(
+                caption, position=(size, size), font_size=size, color=CAPTION, name="caption", render=False
+            )
         self._plotter.render()
         return np.asarray(self._plotter.screenshot(None, return_img=True), dtype=np.uint8)
 

@@ -9,14 +9,18 @@ from pathlib import Path
 from typing import TypeAlias
 
 from apex_ompl.errors import ParameterError
+from apex_ompl.loop.result import RunResult
 from apex_ompl.result import PlanResult
 from apex_ompl.scene.problem import Problem
 from apex_ompl.util.files import check_writable
+from apex_ompl.viz.browser.saved_run import shown_of
 from apex_ompl.viz.browser.server import HOST, import_viser, serving
-from apex_ompl.viz.browser.shown import Shown, results_in
+from apex_ompl.viz.browser.shown import Shown
+from apex_ompl.viz.sources import load_saved, saved_in
 
 MOST = 6  # sources side by side
-Source: TypeAlias = Problem | PlanResult | Shown
+KINDS = (Problem, PlanResult, RunResult, Shown)
+Source: TypeAlias = Problem | PlanResult | RunResult | Shown
 
 
 def view(
@@ -24,7 +28,7 @@ def view(
     cover: bool = False, opened: bool = True, ready: Callable[[str], None] = print,
     until: Callable[[], bool] = lambda: False,
 ) -> None:  # fmt: skip
-    """Show problems or results in a browser, side by side, until the page is closed; or write them as a page.
+    """Show problems, plans or runs in a browser, side by side, until the page is closed; or write them as a page.
 
     A page on this machine alone (127.0.0.1) has a player with the curves of clearance and use of limits, layers, and
     for a single problem or result editing, planning and the proposals of the model. A written page plays offline.
@@ -45,12 +49,12 @@ def view(
     """
     choices: list[Path] = []
     if isinstance(sources, Path):
-        files = results_in(sources)
+        files = saved_in(sources)
         choices = files if len(files) > MOST and out is None else []
-        given: list[Source] = [] if choices else [PlanResult.load(file) for file in files]
+        given: list[Source] = [] if choices else [load_saved(file) for file in files]
     else:
-        given = [sources] if isinstance(sources, (Problem, PlanResult, Shown)) else list(sources)
-    wrong = next((one for one in given if not isinstance(one, (Problem, PlanResult, Shown))), None)
+        given = [sources] if isinstance(sources, KINDS) else list(sources)
+    wrong = next((one for one in given if not isinstance(one, KINDS)), None)
     if wrong is not None:
         raise ParameterError("sources", wrong, "problems or results; a folder as pathlib.Path")
     if not choices and not 1 <= len(given) <= MOST:
@@ -64,7 +68,7 @@ def view(
     import_viser()
     if out is not None:
         check_writable(Path(out))
-    shown = [one if isinstance(one, Shown) else Shown.of(one) for one in given]
+    shown = [one if isinstance(one, Shown) else shown_of(one) for one in given]
     if out is not None:
         from apex_ompl.viz.browser.page import write_page
 

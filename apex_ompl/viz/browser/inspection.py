@@ -13,6 +13,7 @@ from apex_ompl.diffusion.guidance import Guidance
 from apex_ompl.diffusion.proposals import Sampling, TrajectoryModel
 from apex_ompl.errors import ApexError
 from apex_ompl.planners.apex_parameters import NAME, ApexParameters, default_planner
+from apex_ompl.scene.scripts import problem_at
 from apex_ompl.trajopt.optimizer import Optimizer
 from apex_ompl.trajopt.spline import Spline
 from apex_ompl.types import Array
@@ -70,7 +71,7 @@ class Inspection:
         editor, robot = self._editor, self._editor.planner.robot
         if editor.goal is None:
             return "there is no goal"
-        problem = editor.problem()
+        problem = problem_at(editor.problem(), 0.0)
         checker = CollisionChecker(robot, problem.scene, problem.attached, problem.allowed)
         if self._model is None:
             self._model = shared_model(ApexParameters().model, device="cpu", robot=robot.name)

@@ -14,12 +14,13 @@ from pathlib import Path
 from typing import Any
 
 from apex_ompl.errors import ApexError
-from apex_ompl.result import PlanResult
 from apex_ompl.viz.browser.editor import Editor
 from apex_ompl.viz.browser.inspection import Inspection
 from apex_ompl.viz.browser.player import Player
+from apex_ompl.viz.browser.saved_run import shown_of
 from apex_ompl.viz.browser.server import asked
 from apex_ompl.viz.browser.shown import Shown
+from apex_ompl.viz.sources import load_saved
 
 LOG = logging.getLogger("apex_ompl")
 PERIOD = 1.0 / 30.0  # of steps [s]
@@ -45,7 +46,7 @@ class LivePage:
         Args:
             server: A ``viser`` server.
             sources: What is shown.
-            choices: Files of results, of which one is shown at a time in place of ``sources``.
+            choices: Files of plans and runs, of which one is shown at a time in place of ``sources``.
 
         Raises:
             ApexError: A result cannot be loaded.
@@ -54,7 +55,7 @@ class LivePage:
         self._actions: queue.SimpleQueue[tuple[int, Callable[[], None]]] = queue.SimpleQueue()
         self._seen, self._shows = False, 0
         self._chosen = next(iter(self._choices), "")
-        self._show(sources or [Shown.of(PlanResult.load(self._choices[self._chosen]))])
+        self._show(sources or [shown_of(load_saved(self._choices[self._chosen]))])
 
     def _show(self, sources: Sequence[Shown]) -> None:
         self._shows += 1  # what was asked of controls that are gone is not done
@@ -77,7 +78,7 @@ class LivePage:
         Raises:
             ApexError: It cannot be loaded.
         """
-        source = Shown.of(PlanResult.load(self._choices[name]))
+        source = shown_of(load_saved(self._choices[name]))
         self._chosen = name
         self._show([source])
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from apex_ompl.errors import ParameterError
-from apex_ompl.scene.bodies import Obstacle
+from apex_ompl.scene.bodies import MOTION, Obstacle
 from apex_ompl.types import Array
 from apex_ompl.util.validation import check_array, check_nonnegative
 from apex_ompl.viz.appearance import RUN_COLOURS, RUN_OPACITIES, body_item
@@ -184,7 +184,7 @@ class LayerNodes:
 
 
 def _same_shape(first: Obstacle, second: Obstacle) -> bool:
-    left = {"position", "orientation", "velocity"}
+    left = {"position", "orientation", *MOTION}
     return first.model_dump(exclude=left) == second.model_dump(exclude=left)
 
 

@@ -12,6 +12,7 @@ from apex_ompl.collision.mesh_stage import Contact
 from apex_ompl.collision.tabulate import joint_tree
 from apex_ompl.ompl_adapter.setup import PlanningSetup
 from apex_ompl.scene.bodies import Obstacle
+from apex_ompl.scene.scripts import is_there
 from apex_ompl.types import Array
 from apex_ompl.viz.appearance import (
     CONTACT,
@@ -60,6 +61,9 @@ class BrowserScene:
         for item in items:
             if not item.moves:
                 self._add(item)
+        for obstacle in setup.problem.scene:
+            if not is_there(obstacle, 0.0):
+                self.show_obstacle(obstacle.name, None)
         self._ghosts: dict[str, RobotNodes] = {}
         self._cover: RobotNodes | None = None
         self._labels: dict[str, Any] = {}
@@ -172,6 +176,14 @@ class BrowserScene:
         """Move an obstacle to a pose, shape (4, 4)."""
         handle = self._static[OBSTACLES, name][1]
         handle.wxyz, handle.position = turn_of(pose), pose[:3, 3]
+
+    def show_obstacle(self, name: str, pose: Array | None) -> None:
+        """Show an obstacle at a pose, shape (4, 4), or hide it; nothing where it was removed."""
+        handle = self.obstacles.get(name)
+        if handle is not None and handle.visible != (pose is not None):
+            handle.visible = pose is not None
+        if handle is not None and pose is not None:
+            self.move_obstacle(name, pose)
 
     def remove_obstacle(self, name: str) -> None:
         """Remove an obstacle if it is there."""

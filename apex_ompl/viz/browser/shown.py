@@ -7,27 +7,24 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 
 import numpy as np
 
-from apex_ompl.errors import ParameterError
-from apex_ompl.live.moving import obstacle_at
 from apex_ompl.ompl_adapter.setup import PlanningSetup, assemble
-from apex_ompl.result import SCHEMA, PlanResult
+from apex_ompl.result import PlanResult
 from apex_ompl.robot.identity import load_same_robot
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Problem
+from apex_ompl.scene.scripts import is_there, obstacle_at
+from apex_ompl.trajectory import Trajectory
 from apex_ompl.trajopt.path import resample
 from apex_ompl.types import Array
-from apex_ompl.util.files import BROKEN
 from apex_ompl.viz.browser.scene import BrowserScene
 from apex_ompl.viz.curves import ORDERS, clearances, shares_of_limits
 
 UNTIMED, STATES = 4.0, 120  # how long a path without times plays [s], and its states
 CURVE_SAMPLES = 160
 APART = 3.0  # of things that are shown side by side [m]
-RESULTS, HEAD = (".json", ".npz", ".yaml"), 2000  # of a result's file, the characters that name its schema
 MARKS = re.compile(r"([\\`*_\[\]#|~])")  # that mean something in Markdown
 
 
@@ -93,8 +90,9 @@ class Shown:
     def draw(self, scene: BrowserScene, time: float) -> None:
         """Show it at a time [s] in its scene; obstacles that its motion was proved among are where they are then."""
         scene.show(self.state(time))
+        at = min(max(time, 0.0), self.duration)
         for obstacle in self._movers:
-            scene.move_obstacle(obstacle.name, obstacle_at(obstacle, min(max(time, 0.0), self.duration)).pose)
+            scene.show_obstacle(obstacle.name, obstacle_at(obstacle, at).pose if is_there(obstacle, at) else None)
 
     @cached_property
     def _movers(self) -> tuple[Obstacle, ...]:
@@ -110,10 +108,13 @@ class Shown:
         """Curves of a timed motion over ``time`` [s]: ``clearance`` [mm] and the use of limits, by name."""
         if self.result is None or self.result.trajectory is None:
             return {}
-        motion, robot = self.result.trajectory, self.setup.robot
+        return self.curves_of(self.result.trajectory, self._movers)
+
+    def curves_of(self, motion: Trajectory, movers: Sequence[Obstacle]) -> dict[str, Array]:
+        """Return the curves of a motion among obstacles that move."""
         times = np.linspace(0.0, motion.duration, CURVE_SAMPLES)
-        shares = np.abs(shares_of_limits(motion, robot, times)).max(axis=2)
-        found = {"time": times, "clearance": 1e3 * clearances(self.setup.checker, motion, times, self._movers)}
+        shares = np.abs(shares_of_limits(motion, self.setup.robot, times)).max(axis=2)
+        found = {"time": times, "clearance": 1e3 * clearances(self.setup.checker, motion, times, movers)}
         return {**found, **dict(zip(ORDERS, shares, strict=True))}
 
     @property
@@ -152,32 +153,6 @@ class Shown:
 def markdown(rows: Sequence[str]) -> str:
     """Return sentences as Markdown that shows them as they are."""
     return "\n\n".join(html.escape(MARKS.sub(r"\\\1", row)) for row in rows)
-
-
-def results_in(folder: Path) -> list[Path]:
-    """Return the files of results in a folder and below, sorted by name.
-
-    Raises:
-        ParameterError: There are none.
-    """
-    found = [
-        path for path in sorted(folder.rglob("*")) if path.suffix in RESULTS and path.is_file() and _is_result(path)
-    ]
-    if not found:
-        raise ParameterError("folder", str(folder), "one with results: files written by plan --out or bench --keep")
-    return found
-
-
-def _is_result(path: Path) -> bool:
-    """Whether a file is a result, by its beginning."""
-    try:
-        if path.suffix == ".npz":
-            with np.load(path, allow_pickle=False) as file:
-                return "result" in file.files
-        with path.open(encoding="utf-8") as lines:
-            return SCHEMA.rpartition("/")[0] in lines.read(HEAD)
-    except (OSError, AttributeError, *BROKEN):
-        return False
 
 
 def ordered(sources: Sequence[Shown]) -> list[tuple[Shown, tuple[float, float, float]]]:

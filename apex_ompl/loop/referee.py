@@ -1,0 +1,267 @@
+"""What truly happened in a run: contacts of the executed motion, limits, and where it ends.
+
+The motion is looked at by the exact shapes at samples ``SPACING`` apart, with each obstacle where its script has it
+then. Stretches of time that the sphere covers prove apart from all movers need no samples; what stands still, and the
+robot itself, is proved apart along the motion's own cubic pieces.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from apex_ompl.collision import CollisionChecker
+from apex_ompl.collision.path_proof import Curve
+from apex_ompl.collision.scene_bodies import SceneBodies
+from apex_ompl.errors import ParameterError
+from apex_ompl.live.movers import clearance_in_time, prove_motion
+from apex_ompl.live.scripted import Piece, ScriptedMovers
+from apex_ompl.loop.result import Outcome
+from apex_ompl.ompl_adapter.setup import workspace_goal
+from apex_ompl.robot import Robot
+from apex_ompl.robot.model import Limits
+from apex_ompl.scene.bodies import Obstacle, pose_matrix
+from apex_ompl.scene.problem import Problem
+from apex_ompl.scene.scripts import place_at
+from apex_ompl.tasks.alignment_errors import within
+from apex_ompl.trajectory import Trajectory
+from apex_ompl.trajectory.checks import SAME_STATE
+from apex_ompl.trajectory.rests import AT_REST, is_at_rest
+from apex_ompl.trajectory.trajectory import ROUNDING
+from apex_ompl.types import Array
+from apex_ompl.util.validation import check_number, check_states
+
+SPACING = 1e-3  # of the samples [s]
+STRETCH = 0.01  # of time that is sampled before a proof is tried anew [s]
+NEAR = 1e-3  # clearances of spheres that are told apart [m]
+
+
+@dataclass(frozen=True)
+class RunContact:
+    """Two bodies that overlap.
+
+    Attributes:
+        time: The first sample at which they do [s].
+        first: Name of the link or the held object.
+        second: Name of the obstacle, or of the other link or held object.
+        depth: Penetration depth [m]; 0 where they are too near to be proved apart.
+        moved: Whether the robot moved then.
+    """
+
+    time: float
+    first: str
+    second: str
+    depth: float
+    moved: bool
+
+    def __str__(self) -> str:
+        """Return ``at 1.234 s: left_link5 <-> cube, 4 mm deep, while the robot moved``."""
+        how = "while the robot moved" if self.moved else "while the robot stood"
+        return f"at {self.time:.3f} s: {self.first} <-> {self.second}, {1e3 * self.depth:.3g} mm deep, {how}"
+
+
+@dataclass(frozen=True)
+class RefereeReport:
+    """What the referee found.
+
+    Attributes:
+        contact: First contact with an obstacle that moves, or None.
+        still_contact: First contact with what stands still or of the robot with itself, or None.
+        limit_use: Largest share of each limit that the motion uses, by ``position``, ``velocity``, ``acceleration`` and
+            ``jerk``.
+        clearance: Lower bound of the least distance to obstacles that move, over all samples, by the sphere cover
+            [m]: it is negative where only the spheres touch, and infinite where there is no such obstacle.
+        clearance_time: When that is [s], NaN without one.
+        at_rest: Whether the motion ends at rest.
+        at_goal: Whether it ends at a goal.
+    """
+
+    contact: RunContact | None
+    still_contact: RunContact | None
+    limit_use: Mapping[str, float]
+    clearance: float
+    clearance_time: float
+    at_rest: bool
+    at_goal: bool
+
+    @property
+    def exceeded(self) -> dict[str, float]:
+        """The limits that are exceeded, with the shares that are used."""
+        return {name: share for name, share in self.limit_use.items() if share > 1.0 + ROUNDING}
+
+    @property
+    def outcome(self) -> Outcome | None:
+        """The outcome: that of the first contact, else LIMITS or REACHED; None where only the goal was not reached."""
+        hits = [hit for hit in (self.contact, self.still_contact) if hit is not None]
+        first = min(hits, key=lambda hit: hit.time, default=None)
+        if first is not None:
+            if first is self.still_contact:
+                return Outcome.HIT_STILL
+            return Outcome.HIT_MOVING if first.moved else Outcome.HIT_AT_REST
+        if self.exceeded:
+            return Outcome.LIMITS
+        return Outcome.REACHED if self.at_rest and self.at_goal else None
+
+    @property
+    def faults(self) -> tuple[str, ...]:
+        """All that speaks against the run, a sentence each, contacts by time."""
+        hits = [hit for hit in (self.contact, self.still_contact) if hit is not None]
+        over = ", ".join(f"{name} {share:.4g}" for name, share in self.exceeded.items())
+        return (
+            *(str(hit) for hit in sorted(hits, key=lambda hit: hit.time)),
+            *([f"shares of limits above 1: {over}"] if over else []),
+            *([] if self.at_rest else ["the motion does not end at rest"]),
+            *([] if self.at_goal else ["the motion does not end at a goal"]),
+        )
+
+
+def judge(
+    robot: Robot, problem: Problem, trajectory: Trajectory, *, end: float | None = None,
+    goals: ArrayLike | None = None, limits: Limits | None = None,
+) -> RefereeReport:  # fmt: skip
+    """Find out what truly happened in a run.
+
+    Args:
+        robot: The robot.
+        problem: The problem, with the scripts of the obstacles that moved.
+        trajectory: The executed motion from time 0 on; behind its end the robot stands.
+        end: When the run ended [s], by default with the motion.
+        goals: States of which the motion is to end in one, shape (N, dof); by default the goal of the problem.
+        limits: Limits that are to be kept, by default the robot's.
+
+    Raises:
+        ParameterError: The motion is one of other joints, ``end`` is before its end, or the goals have another shape.
+        ApexError: The problem does not fit the robot, or a body of it cannot be loaded.
+    """
+    if trajectory.joint_names != robot.joint_names:
+        raise ParameterError("trajectory", ", ".join(trajectory.joint_names), f"the joints of {robot.name}")
+    until = trajectory.duration if end is None else end
+    check_number(until, "end", trajectory.duration)
+    still = problem.still
+    checker = CollisionChecker(robot, still.scene, problem.attached, still.allowed)
+    moving = [o for o in problem.scene if o.moving]
+    scripted = ScriptedMovers(checker.kernel, moving, problem.allowed)
+    times = np.append(SPACING * np.arange(np.ceil(until / SPACING - 1e-9)), until)
+    clearances = scripted.clearances(trajectory, times)
+    least = int(np.nanargmin(clearances)) if not np.isnan(clearances).all() else 0
+    speeds, rates = np.abs(trajectory.velocities[-1]), np.abs(trajectory.accelerations[-1])
+    return RefereeReport(
+        contact=ExactMovers(robot, problem, scripted).first_contact(trajectory, times),
+        still_contact=still_contact(checker, trajectory, times),
+        limit_use=trajectory.use(limits or robot.limits),
+        clearance=float(clearances[least]),
+        clearance_time=float(times[least]) if np.isfinite(clearances[least]) else np.nan,
+        at_rest=bool((speeds <= AT_REST).all() and (rates <= AT_REST).all()),
+        at_goal=is_at_goal(robot, problem, trajectory.positions[-1], goals),
+    )
+
+
+class ExactMovers:
+    """The exact shapes of a robot, of what it holds and of obstacles that move."""
+
+    def __init__(self, robot: Robot, problem: Problem, scripted: ScriptedMovers) -> None:
+        """Take the robot, the problem for what is held and may touch, and the obstacles."""
+        self._robot, self._scripted = robot, scripted
+        self._obstacles: dict[str, Obstacle] = {o.name: o for o in scripted.obstacles}
+        bodies = SceneBodies(robot)
+        bodies.fill(scripted.obstacles, problem.attached, fixtures=False)
+        self._meshes = bodies.meshes
+        known = {solid.name for solid in self._meshes.solids.values()}
+        for pair in problem.allowed:
+            if known.issuperset(pair):
+                bodies.allow(*pair)
+        numbers = self._meshes.scene
+        self._pairs = {name: [p for p in self._meshes.pairs if p[1] == n] for name, n in numbers.items()}
+
+    def first_contact(self, motion: Trajectory, times: Array) -> RunContact | None:
+        """Return the first contact at some times, shape (N,), increasing from 0 [s]; or None."""
+        kernel = self._scripted.kernel
+        for piece in self._scripted.pieces(float(times[-1])):
+            if piece.begin == piece.end:  # a moment, of which there is nothing to prove
+                return self._among(motion, times, piece)
+            time = piece.begin
+            while len(piece.movers):
+                conflict = prove_motion(kernel, piece.movers, motion, time, piece.end)
+                if not conflict:
+                    break
+                time = min(conflict.time + STRETCH, piece.end)
+                looked = times[(times >= conflict.time - SPACING) & (times >= piece.begin) & (times <= time)]
+                found = self._among(motion, looked, piece)
+                if found is not None:
+                    return found
+                if time >= piece.end:
+                    break
+        return None
+
+    def contact_at(self, motion: Trajectory, time: float, there: tuple[str, ...]) -> RunContact | None:
+        """Return the deepest contact with one of the obstacles that are there at a time [s], or None."""
+        order = self._robot.to_pinocchio(motion(time))
+        if not np.isfinite(order).all():  # a hand outside its limits, which is a fault by itself
+            return None
+        for name in there:
+            obstacle = self._obstacles[name]
+            self._meshes.move(name, pose_matrix(place_at(obstacle, time), obstacle.orientation))
+        if not self._meshes.any_collides(order, [pair for name in there for pair in self._pairs[name]]):
+            return None
+        deepest = next((c for c in self._meshes.contacts(order) if c.second in there), None)
+        if deepest is None:
+            return None
+        return RunContact(time, deepest.first, deepest.second, deepest.depth, not is_at_rest(motion, time))
+
+    def _among(self, motion: Trajectory, times: Array, piece: Piece) -> RunContact | None:
+        """Return the first contact at times inside of a piece, or None."""
+        if not len(piece.movers):
+            return None
+        spheres = clearance_in_time(self._scripted.kernel, piece.movers, motion(times), times, NEAR)[0]
+        for time in times[~(spheres > 0.0)].tolist():
+            found = self.contact_at(motion, time, piece.movers.names)
+            if found is not None:
+                return found
+        return None
+
+
+def still_contact(checker: CollisionChecker, motion: Trajectory, times: Array) -> RunContact | None:
+    """Return the first contact of a motion with the scene of a checker or of the robot with itself, or None.
+
+    The motion is proved along its cubic pieces; only where that fails the first sample in contact is looked for.
+
+    Args:
+        checker: The robot among what stands still.
+        motion: The motion.
+        times: Times of the samples, shape (N,), increasing [s].
+    """
+    curve = Curve.cubic(motion.times, motion.positions, motion.velocities, motion.accelerations)
+    proof = checker.prove(curve, tolerance=0.0)
+    if proof:
+        return None
+    where = proof.parameter if motion.duration else 0.0
+    before = times[times < where].tolist()
+    time = next((t for t in before if not checker.is_free(motion(t))), where)
+    q = motion(time)
+    contacts = checker.contacts(q) if np.isfinite(checker.robot.to_pinocchio(q)).all() else []
+    names, depth = ((contacts[0].first, contacts[0].second), contacts[0].depth) if contacts else (proof.pair, 0.0)
+    return RunContact(time, *names, depth, not is_at_rest(motion, time))
+
+
+def is_at_goal(robot: Robot, problem: Problem, q: Array, goals: ArrayLike | None = None) -> bool:
+    """Whether a state is a goal.
+
+    Args:
+        robot: The robot.
+        problem: The problem, whose goal is a region or some states.
+        q: The state, shape (dof,).
+        goals: Goal states in place of the problem's, shape (N, dof).
+
+    Raises:
+        ParameterError: The goals have another shape.
+        ApexError: The problem does not fit the robot.
+    """
+    region = workspace_goal(robot, problem) if goals is None else None
+    if region is not None:
+        return within(region.errors(q), region.bounds)
+    states = problem.goal_states(robot.joint_names) if goals is None else np.atleast_2d(np.asarray(goals, float))
+    check_states(states, robot.dof, "goals")
+    return bool((np.abs(states - q).max(axis=1, initial=0.0) <= SAME_STATE).any())
