@@ -6,14 +6,15 @@ import numpy as np
 
 from apex_ompl.live.movers import clearance_in_time
 from apex_ompl.loop.request import Request
-from apex_ompl.loop.search import STATES, Search, least_duration
-from apex_ompl.trajectory import Trajectory
+from apex_ompl.loop.search import Search
+from apex_ompl.trajectory import Trajectory, time_path
 
-SOON = 0.8  # time before a contact from which on a step aside is looked for [s]
+SOON = 1.2  # time before a contact from which on a step aside is looked for [s]
 AROUND, STRAYS = 24, (0.05, 0.2, 0.4)  # states that a robot may step aside to, and how far they are at first [rad]
 ASCENTS, STRIDE = 3, 0.25  # steps of these away from obstacles, and their length [rad]
 LOOKS, SEEN = 4, 0.3  # moments at which such a state is looked at, and distances that are told apart [m]
-TRIED, DURATION = 4, 0.35  # states that are tried, and about how long a step aside takes [s]
+DURATION = 0.35  # about how long a step aside takes [s]
+GAIN = 0.2  # time that a step aside that is touched in the end must gain [s]
 NEARNESS = 0.05  # clearance that a step shorter by 1 rad is worth [m]
 
 
@@ -23,7 +24,7 @@ def endangered(request: Request) -> bool:
 
 
 def step_aside(search: Search) -> Trajectory | None:
-    """Return a proved motion to a state nearby that stays clear, or None."""
+    """Return the straight motion to a state nearby that stays clear, or else clear for longest, or None."""
     request, ready = search.request, search.ready
     q, limits, hold = search.start.position, ready.setup.robot.limits, ready.settings.rest_hold
     size = np.repeat(STRAYS, AROUND // len(STRAYS))[:, None]
@@ -44,10 +45,16 @@ def step_aside(search: Search) -> Trajectory | None:
     near = np.minimum(clear.min(axis=1), ready.kernel.clearance(states, SEEN).min(axis=1))
     search.charges.charge("clearance in time", len(states))
     size = np.abs(states - q).max(axis=1)
-    pool = search.pool(berth=False)
-    for k in np.argsort(-(near - NEARNESS * size), kind="stable")[:TRIED]:
-        if near[k] > 0.0 and not search.charges.over():
-            path = np.linspace(q, states[k], STATES)
-            pool.add(path, least_duration(path, ready.limits), states[k], "evade")
-    found = pool.improve(search.wanted)
-    return None if found is None else found[1]
+    best, latest = None, request.conflict + GAIN
+    for k in np.argsort(-(near - NEARNESS * size), kind="stable"):
+        if search.charges.over():
+            break
+        motion = time_path(np.stack([q, states[k]]), ready.limits, ready.names).trajectory
+        search.charges.charge("straight motion")
+        one = search.following(motion)
+        conflict = ready.first_conflict(request.predicted, one, one.begin, one.end + hold, search.charges)
+        if conflict > latest and ready.clear_of_still(motion, search.charges):
+            best, latest = motion, conflict
+            if np.isinf(conflict):
+                break
+    return best

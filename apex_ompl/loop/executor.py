@@ -15,6 +15,7 @@ from typing import Any
 
 from apex_ompl.live.movers import Movers
 from apex_ompl.loop.charges import Charges
+from apex_ompl.loop.evasion import GAIN, SOON
 from apex_ompl.loop.following import Following
 from apex_ompl.loop.ready import Ready
 from apex_ompl.loop.request import Answer, Replanner, Request
@@ -24,7 +25,6 @@ from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.types import Array
 
 SHORTEST = 0.05  # of a motion that a standing robot sets out on, if it does not reach a goal [s]
-SOON = 1.0  # time before a contact from which on a standing robot may leave without a proved stop [s]
 SHARE = 0.85  # of the budget after which nothing new is begun
 FASTER = 0.9  # share of the time to a goal that a plan must have at most to replace one without a conflict
 
@@ -182,7 +182,9 @@ class Executor:
             if found.end - now > FASTER * (self.following.end - now):
                 return "it is hardly faster"
         hold = settings.hold if found.to_goal else settings.rest_hold
-        if math.isfinite(self.ready.first_conflict(predicted, found, found.begin, found.end + hold)):
+        conflict = self.ready.first_conflict(predicted, found, found.begin, found.end + hold)
+        gains = self._may_leave(now, found) and conflict > self.conflict + GAIN
+        if math.isfinite(conflict) and not gains:
             return "what was seen since then is in the way"
         return ""
 

@@ -61,7 +61,7 @@ class MotionPool:
 
     def __init__(
         self, optimizer: MotionOptimizer, start: Start, clock: float, charges: Charges,
-        accepts: Callable[[Trajectory], bool], berth: float = 0.0,
+        accepts: Callable[[Trajectory], bool], *, berth: float = 0.0,
     ) -> None:  # fmt: skip
         """Start an empty pool.
 

@@ -82,7 +82,7 @@ class Search:
         movers = request.wide if berth else request.predicted
         optimizer = MotionOptimizer(ready.kernel, movers, ready.limits, MOTIONS)
         beyond = ready.settings.berth if berth else 0.0
-        return MotionPool(optimizer, self.start, request.join, self.charges, self.accepts, beyond)
+        return MotionPool(optimizer, self.start, request.join, self.charges, self.accepts, berth=beyond)
 
 
 class Guess(NamedTuple):
