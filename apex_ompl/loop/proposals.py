@@ -1,0 +1,97 @@
+"""Fresh proposals of a trajectory model while the robot moves, with obstacles where they will be."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from apex_ompl.apex.query import make_query
+from apex_ompl.collision import CollisionChecker
+from apex_ompl.diffusion.checkpoint import shared_model
+from apex_ompl.diffusion.proposals import TrajectoryModel
+from apex_ompl.live.movers import clearance_in_time
+from apex_ompl.loop.ready import Ready
+from apex_ompl.loop.search import Guess, Search, least_duration
+from apex_ompl.scene.scripts import vector
+from apex_ompl.types import Array
+
+LOOKS = 16  # at the straight line, to see where an obstacle comes nearest
+TEMPERATURES = (1.0, 1.6)  # of the noise, in one replan after the other
+
+
+@dataclass(eq=False)
+class Proposals:
+    """Paths of a latent diffusion model from the state that the robot will be in.
+
+    The model was trained among obstacles that stand still. It is shown each obstacle that moves where it comes nearest
+    to the straight line in time.
+
+    Attributes:
+        model: Name or folder of the checkpoint.
+        count: Number of proposals.
+    """
+
+    model: str = "apex"
+    count: int = 4
+    name: str = "proposals"
+    _loaded: TrajectoryModel | None = field(default=None, repr=False)
+    _checker: CollisionChecker | None = field(default=None, repr=False)
+
+    def prepare(self, ready: Ready) -> None:
+        """Load the model, and propose something.
+
+        Raises:
+            ApexError: The checkpoint cannot be loaded, or is of another robot.
+        """
+        setup = ready.setup
+        self._loaded = shared_model(self.model, robot=setup.robot.name)
+        self._checker = CollisionChecker(
+            setup.robot, setup.problem.scene, setup.problem.attached, setup.problem.allowed
+        )  # fmt: skip
+        query = make_query(self._checker, setup.start, setup.start, point=self._loaded.sees_point)
+        with self._loaded.one_thread():
+            self._loaded.propose(query, self._checker.kernel, self.count)
+
+    def guesses(self, search: Search) -> Iterator[Guess]:
+        """Yield the proposals."""
+        model, goals = self._loaded, search.goals
+        assert model is not None
+        if not len(goals):
+            return
+        goal = goals[0]
+        checker = self._among(search, goal)
+        query = make_query(checker, search.start.position, goal, point=model.sees_point)
+        temperature = TEMPERATURES[search.request.number % len(TEMPERATURES)]
+        sampling = model.sampling
+        with model.one_thread():
+            made = model.propose(
+                query, checker.kernel, self.count, generator=search.rng,
+                sampling=type(sampling)(sampling.sampler, sampling.steps, temperature, sampling.guidance),
+            )  # fmt: skip
+        search.charges.charge("proposals")
+        search.charges.charge("proposal", self.count)
+        for control in made.control:
+            states = model.spline.path(control)
+            yield Guess(states, goal, least_duration(states, search.ready.limits))
+
+    def _among(self, search: Search, goal: Array) -> CollisionChecker:
+        """Return the checker with each obstacle where it comes nearest to the straight line in time."""
+        checker, request = self._checker, search.request
+        assert checker is not None
+        line = np.linspace(search.start.position, goal, LOOKS)
+        duration = least_duration(line, search.ready.limits)
+        times = request.join + np.linspace(0.0, duration, LOOKS)
+        clear, _ = clearance_in_time(search.ready.kernel, request.predicted, line, times)
+        nearest = float(times[int(np.argmin(clear))])
+        search.charges.charge("clearance in time", LOOKS)
+        for o in request.obstacles:
+            way = np.multiply(o.velocity or (0.0, 0.0, 0.0), nearest - request.asked)
+            place = vector(np.add(o.position, way))
+            if checker.is_obstacle(o.name):
+                checker.move(o.name, place)
+            else:
+                checker.add(o.model_copy(update={"position": place, "velocity": None}))
+        return checker
+

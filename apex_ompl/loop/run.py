@@ -1,0 +1,148 @@
+"""A run of the closed loop: a world, a sensor, a robot that replans, and a referee."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import asdict, replace
+from typing import Any
+
+import numpy as np
+
+from apex_ompl.errors import ParameterError, UnknownNameError
+from apex_ompl.loop.charges import cost_table
+from apex_ompl.loop.metrics import run_metrics
+from apex_ompl.loop.methods import adapted, method
+from apex_ompl.loop.ready import Ready
+from apex_ompl.loop.referee import judge
+from apex_ompl.loop.result import Event, Outcome, RunResult
+from apex_ompl.loop.sensor import Sensor, SensorStream
+from apex_ompl.loop.settings import LoopSettings
+from apex_ompl.loop.simulation import Simulated, simulate
+from apex_ompl.ompl_adapter.process import quiet_ompl, seed_ompl
+from apex_ompl.ompl_adapter.setup import assemble
+from apex_ompl.problems import worlds
+from apex_ompl.problems.worlds import World
+from apex_ompl.robot.identity import digest
+from apex_ompl.robot.model import Limits
+from apex_ompl.scene.problem import Problem
+from apex_ompl.trajectory import Timing, Trajectory
+from apex_ompl.util.validation import check_seed
+
+CLOCKS = ("sim",)
+SHARE = 1.0 - 1e-6  # of the limits that is used: pieces of motions are rounded where they are joined
+
+
+def run(
+    problem: Problem | World | str | os.PathLike[str],
+    planner: str = "apex",
+    *,
+    clock: str = "sim",
+    prediction: str = "cv",
+    seed: int = 0,
+    speed: float = 1.0,
+    settings: LoopSettings | None = None,
+    sensor: Sensor | None = None,
+) -> RunResult:
+    """Let a robot go to a goal while obstacles move, and say what came of it.
+
+    The robot sees obstacles by a sensor, tracks them, follows a motion only as long as a stop behind its next step is
+    proved clear of all that obstacles can reach, and plans anew where its motion meets what is predicted.
+
+    Args:
+        problem: A world, its name (:func:`apex_ompl.problems.worlds.load`), a problem among whose obstacles some move,
+            its name, or its file.
+        planner: Name of a way of replanning, see :func:`apex_ompl.loop.methods.names`.
+        clock: ``sim``, on which work is charged by counts, so that the same seed gives the same run.
+        prediction: ``still``, ``cv`` or ``truth``, see :class:`apex_ompl.loop.settings.LoopSettings`.
+        seed: Of random choices, and of the sensor where none is given.
+        speed: Share of the velocity limits that motions use, 0.001 to 1.
+        settings: Parameters of the loop; ``prediction`` counts instead of theirs.
+        sensor: How obstacles are seen.
+
+    Raises:
+        ApexError: The world, the problem, a name or a number is unknown or faulty.
+    """
+    if clock not in CLOCKS:
+        raise UnknownNameError("clock", str(clock), CLOCKS)
+    check_seed(seed)
+    one = method(planner)
+    sensor = sensor or Sensor(seed=seed)
+    world = _world(problem)
+    least = replace(settings or LoopSettings(fastest=max(world.fastest, 1e-3), error=max(sensor.largest_error, 1e-4)))
+    used = adapted(replace(least, prediction=prediction), one)
+    with quiet_ompl():
+        seed_ompl(seed)
+        setup = assemble(world.problem.still, seed=seed)
+        timing = Timing(velocity_scale=speed)
+        limits = timing.limits(setup.robot.limits, setup.robot.joint_names)
+        ready = Ready(setup, _within(limits), used)
+        made = {
+            "loop": asdict(used), "sensor": asdict(sensor), "speed": speed, "costs": cost_table()["version"],
+        }  # fmt: skip
+        fault = setup.start_fault
+        if fault or not len(ready.goals):
+            still = np.zeros((1, len(setup.start)))
+            motion = Trajectory(np.zeros(1), setup.start[None], still, still, ready.names)
+            outcome = Outcome.START_INVALID if fault else Outcome.STUCK
+            done = Simulated(motion, (), False, fault or "; ".join(setup.goal_faults), 0)
+            return _result(world, ready, done, outcome, done.ended, planner, seed, made)
+        replanner = one.make()
+        replanner.prepare(ready)
+        done = simulate(world, ready, replanner, SensorStream(sensor, world), seed)
+    return _judged(world, ready, done, planner, seed, made)
+
+
+def _within(limits: Limits) -> Limits:
+    """Return limits that leave room for rounding."""
+    some = {name: SHARE * getattr(limits, name) for name in ("velocity", "acceleration", "jerk")}
+    return replace(limits, **some)
+
+
+def _world(problem: Problem | World | str | os.PathLike[str]) -> World:
+    if isinstance(problem, World):
+        return problem
+    if isinstance(problem, Problem):
+        from apex_ompl.problems.world_scripts import moving_world
+
+        return moving_world(problem)
+    return worlds.load(os.fspath(problem))
+
+
+def _judged(
+    world: World, ready: Ready, done: Simulated, planner: str, seed: int, made: Mapping[str, Any]
+) -> RunResult:  # fmt: skip
+    """Return the result with what the referee says."""
+    problem = _as_it_was(world)
+    report = judge(ready.setup.robot, problem, done.trajectory, goals=ready.goals)
+    outcome, reason = report.outcome, "; ".join(report.faults)
+    if outcome is None:
+        ended = {"stuck": Outcome.STUCK, "timeout": Outcome.TIMEOUT}
+        outcome = Outcome.REACHED if done.reached else ended[done.ended]
+        reason = "" if done.reached else f"no goal was reached in {done.trajectory.duration:.3g} s"
+    events = done.events
+    if report.contact is not None:
+        contact = report.contact
+        told = Event(contact.time, "contact", {"first": contact.first, "second": contact.second, "moved": contact.moved})
+        events = tuple(sorted((*events, told), key=lambda event: event.time))
+    done = replace(done, events=events)
+    return _result(world, ready, done, outcome, reason, planner, seed, made, clearance=report.clearance)
+
+
+def _as_it_was(world: World) -> Problem:
+    """Return the problem with what obstacles did."""
+    still = world.problem.still
+    return still.model_copy(update={"scene": (*still.scene, *world.script())})
+
+
+def _result(
+    world: World, ready: Ready, done: Simulated, outcome: Outcome, reason: str, planner: str, seed: int,
+    made: Mapping[str, Any], clearance: float = float("inf"),
+) -> RunResult:  # fmt: skip
+    robot = ready.setup.robot
+    metrics = run_metrics(done.trajectory, done.events, robot.limits, clearance=clearance)
+    return RunResult(
+        outcome=outcome, reason=reason, problem=_as_it_was(world), robot=robot.name, method=planner,
+        prediction=ready.settings.prediction, clock="sim", seed=seed, trajectory=done.trajectory, events=done.events,
+        metrics={**metrics, "broken_steps": float(done.broken)}, settings=made, robot_digest=digest(robot),
+    )  # fmt: skip
