@@ -1,13 +1,43 @@
-"""Worlds in which obstacles move while a robot executes: scripted ones, and ones that answer to what the robot does."""
+"""Worlds in which obstacles move while a robot executes: scripted ones, and ones that answer to what the robot does.
+
+A world of the kind ``moving`` goes by the name of its problem, such as ``vertical/moving-large-0.2/900003``, or by a
+problem file. Those of the other kinds go by ``KIND/SUITE/SIZE/SEED``, such as ``popup/vertical/large/12``: one cube, or
+three (``crowd``), of the sizes of the suites' moving levels, and the problem ``SUITE/free/SEED``, which has no
+obstacles of its own. The same seed gives the same world on every machine, if the robot does the same. Seeds are split
+into those for training, validation and tests as the suites' are.
+
+- ``moving``: obstacles do what their problem says, whatever the robot does.
+- ``popup``: a cube comes into being before a hand during the first motion (:mod:`apex_ompl.problems.world_ambushes`).
+- ``interceptor``: a cube at constant velocity is to meet the first motion (the same module).
+- ``turning``: a cube takes a new direction every .5 to 2 s (:mod:`apex_ompl.problems.world_wanderers`).
+- ``crowd``: three cubes cross in front of the robot (the same module).
+- ``pusher``: a cube comes to the nearest link, and leaves (:mod:`apex_ompl.problems.world_pusher`).
+"""
 
 from __future__ import annotations
 
+import re
+import zlib
 from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from itertools import islice, product
+from pathlib import Path
 
+import numpy as np
+
+from apex_ompl import problems
+from apex_ompl.errors import ParameterError, UnknownNameError
+from apex_ompl.problems.alignment import SAMPLERS, SIZES
+from apex_ompl.problems.catalogue import MOVING, SPLITS, ProblemId
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Problem
 from apex_ompl.trajectory import Trajectory
 from apex_ompl.types import Array
+from apex_ompl.util.validation import check_integer
+
+MOVING_KIND = "moving"
+GENERATED = ("popup", "interceptor", "turning", "crowd", "pusher")
+SEED = re.compile(r"0|[1-9][0-9]{0,19}")
 
 
 class World(ABC):
@@ -39,3 +69,124 @@ class World(ABC):
     @abstractmethod
     def script(self) -> tuple[Obstacle, ...]:
         """Return what the moving obstacles did up to the last step: obstacles with ``trajectory`` and ``appears``."""
+
+
+@dataclass(frozen=True)
+class WorldId:
+    """Id of a world that is drawn.
+
+    Attributes:
+        kind: One of ``GENERATED``.
+        suite: ``vertical`` or ``horizontal``.
+        size: Of its cubes, one of ``SIZES``.
+        seed: 0 to 999 999; its split is that of the problem.
+    """
+
+    kind: str
+    suite: str
+    size: str
+    seed: int
+
+    def __post_init__(self) -> None:
+        """Check all.
+
+        Raises:
+            UnknownNameError: No such kind, suite or size.
+            ParameterError: The seed is not a whole number from 0 to 999 999.
+        """
+        known = (("kind of worlds", self.kind, GENERATED), ("suite of worlds", self.suite, SAMPLERS))
+        for what, name, names in (*known, ("size of cubes", self.size, SIZES)):
+            if name not in names:
+                raise UnknownNameError(what, str(name), names)
+        _ = self.problem
+
+    def __str__(self) -> str:
+        """Return the name of the world, ``kind/suite/size/seed``."""
+        return f"{self.kind}/{self.suite}/{self.size}/{self.seed}"
+
+    @property
+    def problem(self) -> ProblemId:
+        """The problem of what stands still."""
+        return ProblemId(self.suite, "free", self.seed)
+
+    @classmethod
+    def parse(cls, name: str) -> WorldId:
+        """Return the id that a text names.
+
+        Raises:
+            UnknownNameError: No such kind, suite or size.
+            ParameterError: The text has another form, or the seed is not from 0 to 999 999.
+        """
+        kind, *rest = name.split("/")
+        if kind not in GENERATED:
+            raise UnknownNameError("kind of worlds", kind, GENERATED)
+        if len(rest) != 3 or not SEED.fullmatch(rest[2]):
+            raise ParameterError("world", name, f"a name such as {kind}/vertical/large/12")
+        return cls(kind, rest[0], rest[1], int(rest[2]))
+
+
+def kinds() -> tuple[str, ...]:
+    """Names of the kinds of worlds."""
+    return (MOVING_KIND, *GENERATED)
+
+
+def ids(kind: str, split: str, count: int) -> tuple[str, ...]:
+    """Return the names of the first worlds of a kind: one of each suite, size and speed, then the next seed.
+
+    Args:
+        kind: One of :func:`kinds`.
+        split: ``train``, ``validation`` or ``test``, which the seeds are of.
+        count: How many.
+
+    Raises:
+        UnknownNameError: No such kind or split.
+        ParameterError: The count is not a whole number, or larger than there are worlds.
+    """
+    if kind not in kinds():
+        raise UnknownNameError("kind of worlds", kind, kinds())
+    if split not in SPLITS:
+        raise UnknownNameError("split", split, SPLITS)
+    levels = MOVING if kind == MOVING_KIND else SIZES
+    check_integer(count, "count", 0, len(SPLITS[split]) * len(SAMPLERS) * len(levels))
+    every = (f"{suite}/{level}/{seed}" for seed, suite, level in product(SPLITS[split], SAMPLERS, levels))
+    return tuple(name if kind == MOVING_KIND else f"{kind}/{name}" for name in islice(every, count))
+
+
+def load(name: str) -> World:
+    """Return a world, new at each call, by its name, that of a problem, or a problem file.
+
+    Raises:
+        UnknownNameError: No such kind, suite, level, size or problem; the message lists the known ones.
+        ParameterError: The name has another form, or the seed is not from 0 to 999 999.
+        SuiteError: No problem or no place for a cube can be drawn for that seed.
+        ApexError: A problem file, or a file that it names, is faulty.
+    """
+    from apex_ompl.problems.world_scripts import moving_world
+
+    kind, *rest = name.split("/")
+    if name.endswith((".yaml", ".yml")) or Path(name).is_absolute():
+        return moving_world(Problem.load(name))
+    if kind not in GENERATED and (problems.is_id(name) or name in problems.names()):
+        return moving_world(problems.load(name))
+    if not rest:
+        known = (f"{one}/vertical/large/12" for one in GENERATED)
+        raise UnknownNameError("world", name, (*problems.names(), *known))
+    return _drawn(WorldId.parse(name))
+
+
+def _drawn(world: WorldId) -> World:
+    """Return the world of an id."""
+    from apex_ompl.problems.world_ambushes import InterceptorWorld, PopupWorld
+    from apex_ompl.problems.world_pusher import PusherWorld
+    from apex_ompl.problems.world_wanderers import WanderersWorld
+
+    level = zlib.crc32(f"{world.kind}/{world.suite}/{world.size}".encode())
+    rng = np.random.default_rng([level, world.seed])
+    name, problem, edge = str(world), problems.load(str(world.problem)), SIZES[world.size]
+    if world.kind == "popup":
+        return PopupWorld(name, problem, edge, rng)
+    if world.kind == "interceptor":
+        return InterceptorWorld(name, problem, edge, rng)
+    if world.kind == "pusher":
+        return PusherWorld(name, problem, edge, rng)
+    return WanderersWorld(name, problem, edge, rng, turns=world.kind == "turning")

@@ -70,6 +70,16 @@ def script_times(obstacle: Obstacle) -> tuple[float, ...]:
     return tuple(sorted({0.0, obstacle.appears, *(row[0] for row in obstacle.trajectory or ())}))
 
 
+def recorded(obstacle: Obstacle, until: float) -> Obstacle:
+    """Return what an obstacle did up to a time [s], as a script; behind it stands."""
+    rows = obstacle.trajectory or ((0.0, *obstacle.position),)
+    past = [row for row in rows if row[0] < until]
+    last = until if obstacle.trajectory is None else min(until, rows[-1][0])
+    end = row_of(last, place_at(obstacle, last))
+    script = (*past, end) if not past or last > past[-1][0] else tuple(past)
+    return obstacle.model_copy(update={"velocity": None, "trajectory": script})
+
+
 def moved_to(obstacle: Obstacle, position: ArrayLike) -> Obstacle:
     """Return an obstacle that is at a position at time 0, shape (3,) [m], with its whole script moved by as much."""
     place = vector(position)

@@ -1,0 +1,104 @@
+"""The model of a sensor: when it looks, how late that is known, how far off it is, and what it misses.
+
+Its numbers are those of a depth camera whose images are searched for obstacles, and this project's own choice.
+"""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass
+
+import numpy as np
+
+from apex_ompl.errors import ParameterError
+from apex_ompl.loop.observation import Observation
+from apex_ompl.problems.worlds import World
+from apex_ompl.scene.bodies import Obstacle
+from apex_ompl.scene.scripts import standing, vector
+from apex_ompl.util.validation import check_number, check_positive, check_seed
+
+CUT = 3.0  # largest error, in standard deviations of one axis
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """Settings of a sensor that sees all obstacles that move.
+
+    An ideal one is ``Sensor(rate=100.0, age=0.0, noise=0.0, dropout=0.0)``.
+
+    Attributes:
+        rate: How often it looks [1/s], at the times k / rate.
+        age: How much later that is known [s].
+        noise: Standard deviation of the error of each coordinate [m]. Errors longer than 3 of these are shortened.
+        dropout: Share of the obstacles that are missed each time, each one by itself, from 0 to 1.
+        seed: Seed of errors and of what is missed.
+    """
+
+    rate: float = 30.0
+    age: float = 0.05
+    noise: float = 0.008
+    dropout: float = 0.02
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Check all numbers.
+
+        Raises:
+            ParameterError: One is outside its range.
+        """
+        check_positive(self.rate, "rate", "a positive number of looks a second")
+        check_number(self.age, "age", 0.0)
+        check_number(self.noise, "noise", 0.0)
+        check_number(self.dropout, "dropout", 0.0, 1.0)
+        check_seed(self.seed)
+
+    @property
+    def largest_error(self) -> float:
+        """Largest distance between where an obstacle is and where it is seen [m]."""
+        return CUT * self.noise
+
+    def observe(self, world: World, number: int) -> Observation:
+        """Return what the look of a number shows, from 0 on; the world must have come to that time.
+
+        It does not depend on other looks, nor do the errors of one obstacle on which others there are.
+        """
+        stamp = number / self.rate
+        seen = [self._seen(obstacle, number) for obstacle in world.present(stamp)]
+        return Observation(stamp, stamp + self.age, tuple(obstacle for obstacle in seen if obstacle is not None))
+
+    def _seen(self, obstacle: Obstacle, number: int) -> Obstacle | None:
+        rng = np.random.default_rng([self.seed, number, zlib.crc32(obstacle.name.encode())])
+        if rng.random() < self.dropout:
+            return None
+        error = self.noise * rng.normal(size=3)
+        length = float(np.linalg.norm(error))
+        if length > self.largest_error:
+            error *= self.largest_error / length
+        return standing(obstacle).model_copy(update={"position": vector(np.add(obstacle.position, error))})
+
+
+class SensorStream:
+    """The looks of a sensor at one world, in order, each given once."""
+
+    def __init__(self, sensor: Sensor, world: World) -> None:
+        """Begin with the look at time 0."""
+        self.sensor, self._world = sensor, world
+        self._number, self._until = 0, 0.0
+
+    def observations(self, until: float) -> tuple[Observation, ...]:
+        """Return the observations with a stamp up to a time [s] that were not given yet, in order of stamp.
+
+        The world is not asked about times behind ``until``. When an observation may be used is said by ``received``.
+
+        Raises:
+            ParameterError: The time is before the one of the last call.
+        """
+        check_number(until, "until")
+        if until < self._until:
+            raise ParameterError("until", until, f"at least {self._until:g}, as in the last call")
+        self._until = until
+        found = []
+        while self._number / self.sensor.rate <= until:
+            found.append(self.sensor.observe(self._world, self._number))
+            self._number += 1
+        return tuple(found)

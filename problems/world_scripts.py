@@ -1,0 +1,86 @@
+"""Worlds whose obstacles move by records of the scene: fixed from the beginning, or made when the robot sets out."""
+
+from __future__ import annotations
+
+import math
+
+from apex_ompl.errors import ParameterError
+from apex_ompl.problems.worlds import World
+from apex_ompl.scene.bodies import Obstacle
+from apex_ompl.scene.problem import Problem
+from apex_ompl.scene.scripts import fastest, is_there, obstacle_at, recorded
+from apex_ompl.trajectory import Trajectory
+from apex_ompl.types import Array
+from apex_ompl.util.validation import check_number
+
+
+class ScriptedWorld(World):
+    """A world of obstacles with a velocity or a script.
+
+    Attributes:
+        foreseen: Time up to which ``present`` may be asked, besides the last step [s]; infinite where all is fixed.
+    """
+
+    foreseen: float = math.inf
+
+    def __init__(self, name: str, problem: Problem, obstacles: tuple[Obstacle, ...], fastest: float) -> None:
+        """Make a world.
+
+        Args:
+            name: Its name.
+            problem: What stands still.
+            obstacles: What moves, from time 0 on.
+            fastest: Largest speed that there will be [m/s].
+        """
+        self.name, self.problem, self.fastest = name, problem, fastest
+        self._obstacles = obstacles
+        self._now = 0.0
+
+    def begin(self, motion: Trajectory, time: float) -> None:
+        """Take the first motion, and when it begins [s].
+
+        Raises:
+            ParameterError: The time is before the last step.
+        """
+        check_number(time, "time", self._now)
+
+    def advance(self, time: float, q: Array) -> None:
+        """Take the robot's state, shape (dof,), at a time [s].
+
+        Raises:
+            ParameterError: The time is before the last step.
+        """
+        check_number(time, "time", self._now)
+        self._now = float(time)
+
+    def present(self, time: float) -> tuple[Obstacle, ...]:
+        """Return the moving obstacles that are there at a time [s], where they are then, with their velocities.
+
+        Raises:
+            ParameterError: The time is negative, or it is not decided yet what will be then.
+        """
+        check_number(time, "time", 0.0, max(self._now, self.foreseen))
+        return tuple(obstacle_at(o, time) for o in self._until(time) if is_there(o, time))
+
+    def script(self) -> tuple[Obstacle, ...]:
+        """Return what the moving obstacles did up to the last step."""
+        return tuple(recorded(o, self._now) for o in self._until(self._now) if is_there(o, self._now))
+
+    def _until(self, time: float) -> tuple[Obstacle, ...]:
+        """Return the obstacles, with scripts that last longer than up to a time [s]; of wanderers overridden."""
+        return self._obstacles
+
+
+def moving_world(problem: Problem) -> ScriptedWorld:
+    """Return the world of a problem's own obstacles, which do what their records say whatever the robot does.
+
+    Obstacles with a velocity go on for ever.
+
+    Raises:
+        ParameterError: A pair of bodies that may touch names an obstacle that moves.
+    """
+    touching = next((pair for pair in problem.allowed if {*pair} & {*problem.moving}), None)
+    if touching is not None:
+        raise ParameterError("allowed", touching, "no obstacle that moves in a pair that may touch")
+    movers = tuple(o for o in problem.scene if o.moving)
+    return ScriptedWorld(problem.name, problem.still, movers, max(map(fastest, movers), default=0.0))

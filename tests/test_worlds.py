@@ -1,0 +1,412 @@
+"""Worlds of obstacles that move: their names and splits, what they tell, and what each kind promises."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from apex_ompl import problems
+from apex_ompl.collision import CollisionChecker
+from apex_ompl.errors import ApexError, ParameterError, UnknownNameError
+from apex_ompl.problems import world_wanderers, worlds
+from apex_ompl.problems.alignment import SIZES
+from apex_ompl.problems.suite_robot import robot
+from apex_ompl.problems.world_ambushes import moment_of
+from apex_ompl.problems.world_robot import BASE_REACH, BASES, RobotPlaces, base_entry, cube
+from apex_ompl.problems.worlds import World
+from apex_ompl.scene.bodies import Obstacle
+from apex_ompl.scene.problem import Problem
+from apex_ompl.scene.scripts import is_there, obstacle_at, place_at
+from apex_ompl.trajectory import Timing, Trajectory, time_path
+from apex_ompl.types import Array
+
+STEP, BEGIN = 0.01, 0.25  # of the clock, and when the first motion begins [s]
+seeds = st.integers(0, 999)
+sizes, suites, paces = (
+    st.sampled_from(sorted(SIZES)),
+    st.sampled_from(["vertical", "horizontal"]),
+    st.sampled_from([0.25, 1.0]),
+)
+several = settings(max_examples=12)
+
+
+@cache
+def straight(problem_name: str, pace: float) -> Trajectory:
+    """Motion of the straight line of a problem."""
+    problem, names = problems.load(problem_name), robot().joint_names
+    line = np.stack([problem.start_state(names), problem.goal_states(names)[0]])
+    motion = time_path(line, robot().limits, names, Timing(velocity_scale=pace)).trajectory
+    assert motion is not None
+    return motion
+
+
+def first_motion(world: World, pace: float = 0.25) -> Trajectory:
+    return straight(world.problem.name, pace)
+
+
+def state(motion: Trajectory, time: float) -> Array:
+    """State at a time of a run whose motion begins at ``BEGIN``."""
+    return np.asarray(motion(min(max(time - BEGIN, 0.0), motion.duration)))
+
+
+def run(
+    world: World, motion: Trajectory, seconds: float, step: float = STEP
+) -> list[tuple[float, tuple[Obstacle, ...]]]:
+    """Follow the motion, and return what was there at each step."""
+    seen, begun = [], False
+    for time in np.arange(0.0, seconds, step).tolist():
+        if time >= BEGIN and not begun:
+            world.begin(motion, BEGIN)
+            begun = True
+        world.advance(time, state(motion, time))
+        seen.append((time, world.present(time)))
+    return seen
+
+
+def check_consistency(world: World, seen: list[tuple[float, tuple[Obstacle, ...]]]) -> None:
+    """The script says what was there, and nothing was faster than it may be."""
+    script = {o.name: o for o in world.script()}
+    last: dict[str, tuple[float, Array]] = {}
+    for time, present in seen:
+        assert {o.name for o in present} == {name for name, o in script.items() if is_there(o, time)}
+        for o in present:
+            np.testing.assert_allclose(o.position, place_at(script[o.name], time), atol=1e-9)
+            assert np.linalg.norm(o.velocity or (0, 0, 0)) <= world.fastest + 1e-9
+            assert o.trajectory is None and o.appears == 0.0
+            if o.name in last:
+                before, place = last[o.name]
+                assert np.linalg.norm(np.subtract(o.position, place)) <= world.fastest * (time - before) + 1e-9
+            last[o.name] = time, np.array(o.position)
+    for o in script.values():
+        assert o.velocity is None and o.trajectory is not None and o.trajectory[-1][0] <= seen[-1][0]
+        assert Obstacle.model_validate(o.model_dump()) == o
+
+
+def exact(world: World, *cubes: Obstacle) -> CollisionChecker:
+    return CollisionChecker(robot(), [*world.problem.scene, *cubes], world.problem.attached)
+
+
+@several
+@given(st.sampled_from(worlds.GENERATED), suites, sizes, seeds, paces)
+def test_scripts_say_what_was_there(kind: str, suite: str, size: str, seed: int, pace: float) -> None:
+    name = f"{kind}/{suite}/{size}/{seed}"
+    world, again = worlds.load(name), worlds.load(name)
+    assert world.name == name and world.problem == problems.load(f"{suite}/free/{seed}")
+    motion = first_motion(world, pace)
+    seconds = motion.duration + 3.0
+    seen = run(world, motion, seconds)
+    check_consistency(world, seen)
+    assert seen == run(again, motion, seconds) and world.script() == again.script()
+    assert all(o.box == (SIZES[size],) * 3 for _, present in seen for o in present)
+    for time, present in seen[::7]:  # as told before, up to rounding
+        for now, before in zip(world.present(time), present, strict=True):
+            np.testing.assert_allclose([now.position, now.velocity], [before.position, before.velocity], atol=1e-9)
+
+
+def test_speeds_are_as_said_and_reached() -> None:
+    for kind in ("interceptor", "turning", "crowd"):
+        for seed in range(5):
+            world = worlds.load(f"{kind}/vertical/small/{seed}")
+            seen = run(world, first_motion(world), 1.0)
+            speeds = [np.linalg.norm(o.velocity) for _, present in seen for o in present]
+            assert 0.1 <= min(speeds) and max(speeds) == pytest.approx(world.fastest) and world.fastest <= 0.4
+
+
+def test_frozen_problems_are_worlds() -> None:
+    name = "vertical/moving-large-0.2/900003"
+    problem, world = problems.load(name), worlds.load(name)
+    assert world.name == name and world.problem == problem.still and world.fastest == pytest.approx(0.2, abs=1e-4)
+    seen = run(world, straight("vertical/free/3", 1.0), 1.0)
+    check_consistency(world, seen)
+    for time, present in seen[::10]:
+        assert present == tuple(obstacle_at(o, time) for o in problem.scene if o.moving)
+    assert world.present(1000.0)[0].position == obstacle_at(problem.scene[0], 1000.0).position
+
+
+def test_problem_files_with_scripts_are_worlds(problem: Problem, tmp_path: Path) -> None:
+    script = ((0, 2, 0, 0.5), (0.5, 2, 0.2, 0.5), (0.6, 2, 0.2, 0.8))
+    turns = Obstacle(name="turns", box=(0.1, 0.1, 0.1), trajectory=script, appears=0.1)
+    late = Obstacle(name="late", sphere={"radius": 0.1}, position=(2, 1, 1), appears=5.0)
+    made = problem.model_copy(update={"scene": (*problem.scene, turns, late)})
+    made.save(tmp_path / "p.yaml")
+    world = worlds.load(str(tmp_path / "p.yaml"))
+    assert world.problem == problem and world.fastest == pytest.approx(3.0)
+    seen = run(world, straight("vertical/free/3", 1.0), 1.0)
+    check_consistency(world, seen)
+    assert world.script() == (turns,) and seen[0][1] == () and len(seen[20][1]) == 1
+    touching = made.model_copy(update={"allowed": (("turns", "post"),)})
+    touching.save(tmp_path / "q.yaml")
+    with pytest.raises(ParameterError, match="allowed.*'turns'"):
+        worlds.load(str(tmp_path / "q.yaml"))
+
+
+def test_names_and_splits() -> None:
+    assert worlds.kinds() == ("moving", *worlds.GENERATED)
+    everything: set[str] = set()
+    for kind in worlds.kinds():
+        for split, least in (("train", 0), ("validation", 800_000), ("test", 900_000)):
+            found = worlds.ids(kind, split, 70)
+            assert len(set(found)) == 70 and not everything & set(found)
+            everything |= set(found)
+            assert {int(name.rpartition("/")[2]) for name in found} == {
+                least + k for k in range(3 if kind == "moving" else 7)
+            }
+            if kind == "moving":
+                assert {problems.is_id(name) for name in found} == {True}
+            else:
+                assert all(str(worlds.WorldId.parse(name)) == name for name in found)
+                assert {worlds.WorldId.parse(name).problem.split for name in found} == {split}
+    assert worlds.ids("popup", "test", 0) == ()
+
+
+@pytest.mark.parametrize(
+    ("name", "error", "words"),
+    [
+        ("popop/vertical/large/12", UnknownNameError, "kind of worlds 'popop', did you mean 'popup'"),
+        ("popup/vertica/large/12", UnknownNameError, "suite of worlds 'vertica'"),
+        ("popup/shelf/large/12", UnknownNameError, "suite of worlds 'shelf'.*horizontal, vertical"),
+        ("popup/vertical/larg/12", UnknownNameError, "size of cubes 'larg'.*did you mean 'large'"),
+        ("popup/vertical/large/1000000", ParameterError, "seed"),
+        ("popup/vertical/large/012", ParameterError, "a name such as popup/vertical/large/12"),
+        ("popup/vertical/12", ParameterError, "a name such as popup/vertical/large/12"),
+        ("popup", UnknownNameError, "world 'popup'"),
+        ("vertical/moving-larg-0.2/3", UnknownNameError, "level of vertical"),
+        ("nothing", UnknownNameError, "world 'nothing'.*ball_in_cup"),
+        ("no/such/file.yaml", ApexError, "no/such/file.yaml"),
+    ],
+)  # fmt: skip
+def test_unknown_worlds_are_named(name: str, error: type[ApexError], words: str) -> None:
+    with pytest.raises(error, match=words):
+        worlds.load(name)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [(("popop", "test", 3), "kind of worlds"), (("popup", "tests", 3), "split"), (("popup", "test", -1), "count"),
+     (("popup", "test", 10**9), "count")],
+)  # fmt: skip
+def test_wrong_requests_for_names_are_named(arguments: tuple[str, str, int], words: str) -> None:
+    with pytest.raises(ApexError, match=words):
+        worlds.ids(*arguments)
+
+
+@pytest.mark.parametrize("kind", worlds.GENERATED)
+def test_time_does_not_go_back(kind: str) -> None:
+    world = worlds.load(f"{kind}/vertical/small/1")
+    motion = first_motion(world)
+    world.advance(1.0, motion(0.0))
+    for call in (
+        lambda: world.advance(0.9, motion(0.0)),
+        lambda: world.begin(motion, 0.9),
+        lambda: world.present(-0.1),
+    ):
+        with pytest.raises(ParameterError, match="time"):
+            call()
+
+
+@pytest.mark.parametrize("kind", ["popup", "interceptor", "pusher"])
+def test_what_is_not_decided_is_not_told(kind: str) -> None:
+    world = worlds.load(f"{kind}/vertical/small/1")
+    world.advance(0.1, first_motion(world)(0.0))
+    world.present(0.1)
+    with pytest.raises(ParameterError, match="time"):
+        world.present(0.2)
+
+
+@several
+@given(suites, sizes, seeds, paces)
+def test_popups_appear_before_a_hand_and_clear_of_the_robot(suite: str, size: str, seed: int, pace: float) -> None:
+    world = worlds.load(f"popup/{suite}/{size}/{seed}")
+    motion = first_motion(world, pace)
+    seen = run(world, motion, motion.duration + BEGIN)
+    if not world.script():
+        return
+    appears, (made,) = next((time, present) for time, present in seen if present)
+    share = [moment_of(motion, s) + BEGIN for s in (0.2, 0.7)]
+    assert share[0] <= appears <= share[1] + STEP
+    q = state(motion, appears)
+    assert exact(world, made).is_free(q) and exact(world, made).obstacle_distance(q[None]) >= 0.04
+    links = [held.link for held in world.problem.attached]
+    fronts = []
+    for link in links:
+        now, before = (robot().link_pose(state(motion, t), link)[:3, 3] for t in (appears, appears - 2 * STEP))
+        ahead = np.dot(np.subtract(made.position, now), now - before) > 0.0
+        fronts.append(np.linalg.norm(np.subtract(made.position, now)) - SIZES[size] / 2 if ahead else np.inf)
+    assert 0.15 < min(fronts) < 0.7  # a cube on the tables is lifted, and hands go on between two steps
+    if not any(made.velocity or ()):
+        assert exact(world, made).obstacle_distance(motion.positions[-1:]) >= 0.03
+
+
+def test_most_popups_are_in_the_way() -> None:
+    met = []
+    for name in worlds.ids("popup", "train", 20):
+        world = worlds.load(name)
+        motion = first_motion(world)
+        seen = run(world, motion, motion.duration + BEGIN, 0.05)
+        met.append(any(present and not exact(world, *present).is_free(state(motion, t)) for t, present in seen))
+    assert np.mean(met) > 0.6
+
+
+def test_popups_wait_until_there_is_room() -> None:
+    world = worlds.load("popup/vertical/medium/3")
+    motion = first_motion(world)
+    run(world, motion, motion.duration)
+    (made,) = world.script()
+    again, place = worlds.load("popup/vertical/medium/3"), made.position
+    again.begin(motion, BEGIN)
+    away = robot().home
+    places = RobotPlaces(again.problem)
+    inside = next(
+        q for q in robot().random_state(np.random.default_rng(0), 4000)
+        if places.balls(q).clearance(np.array(place), SIZES["medium"]) < 0.0
+    )  # fmt: skip
+    again.advance(made.appears + 0.1, inside)
+    assert again.script() == ()
+    again.advance(made.appears + 0.2, away)
+    assert again.script()[0].appears == made.appears + 0.2
+
+
+@several
+@given(suites, sizes, seeds, paces)
+def test_interceptors_meet_the_motion_that_is_followed(suite: str, size: str, seed: int, pace: float) -> None:
+    world = worlds.load(f"interceptor/{suite}/{size}/{seed}")
+    motion = first_motion(world, pace)
+    seen = run(world, motion, BEGIN + 1.7)
+    if not world.script():
+        return
+    assert all(bool(present) == (time >= BEGIN) for time, present in seen)
+    begin = world.present(BEGIN)[0]
+    checker, touch = exact(world, begin), []
+    assert checker.obstacle_distance(motion.positions[:1]) >= 0.04
+    for time, present in seen[int(BEGIN / STEP) + 1 :: 2]:
+        checker.move("cube_0", present[0].position)
+        touch += [] if checker.is_free(state(motion, time)) else [time]
+    assert touch and touch[0] <= BEGIN + 1.5
+
+
+def test_few_interceptors_find_no_way() -> None:
+    made = []
+    for name in worlds.ids("interceptor", "train", 40):
+        world = worlds.load(name)
+        world.begin(first_motion(world), 0.0)
+        made.append(len(world.present(0.0)))
+    assert np.mean(made) > 0.8
+
+
+@several
+@given(st.sampled_from(["turning", "crowd"]), suites, sizes, seeds)
+def test_wanderers_stay_before_the_robot(kind: str, suite: str, size: str, seed: int) -> None:
+    world, edge = worlds.load(f"{kind}/{suite}/{size}/{seed}"), SIZES[size]
+    start = world.present(0.0)
+    assert len(start) == (1 if kind == "turning" else 3)
+    q = world.problem.start_state(robot().joint_names)
+    for one in start:
+        assert exact(world, one).obstacle_distance(q[None]) >= world_wanderers.START_CLEARANCE
+    world.advance(120.0, q)
+    low, high = world_wanderers.box_of(edge)
+    for o in world.script():
+        rows = np.array(o.trajectory)
+        lengths, speeds = (
+            np.diff(rows[:, 0]),
+            np.linalg.norm(np.diff(rows[:, 1:], axis=0), axis=1) / np.diff(rows[:, 0]),
+        )
+        np.testing.assert_allclose(speeds, speeds[0], rtol=1e-6)
+        assert (rows[:, 1:] >= low - 1e-9).all() and (rows[:, 1:] <= high + 1e-9).all()
+        dense = np.array([place_at(o, t) for t in np.linspace(0.0, 120.0, 6000)])
+        for base in BASES:
+            assert np.abs(dense[:, :2] - base).max(axis=1).min() >= BASE_REACH + edge / 2 - 1e-6
+        assert dense[:, 2].min() >= edge / 2
+        if kind == "turning":
+            assert lengths.max() <= 2.0 + 1e-9 and len(rows) > 60
+        else:
+            turns = rows[1:-1, 1:]
+            on_wall = np.minimum(np.abs(turns - low), np.abs(turns - high)).min(axis=1) < 1e-6
+            sides = [np.abs(np.abs(turns[:, :2] - base) - BASE_REACH - edge / 2).min(axis=1) < 1e-6 for base in BASES]
+            assert (on_wall | sides[0] | sides[1]).all()
+
+
+def test_wanderers_do_not_depend_on_when_they_are_asked() -> None:
+    first, second = (worlds.load("crowd/horizontal/large/5") for _ in range(2))
+    late = first.present(200.0)
+    for time in np.linspace(0.0, 200.0, 300):
+        now = second.present(float(time))
+    assert now == late
+
+
+@several
+@given(suites, sizes, seeds)
+def test_pushers_come_and_leave(suite: str, size: str, seed: int) -> None:
+    world, edge = worlds.load(f"pusher/{suite}/{size}/{seed}"), SIZES[size]
+    q = world.problem.start_state(robot().joint_names)
+    rest = Trajectory(np.zeros(1), q[None], np.zeros((1, 16)), np.zeros((1, 16)), robot().joint_names)
+    seen = run(world, rest, 9.0)
+    check_consistency(world, seen)
+    places = np.array([present[0].position for _, present in seen])
+    times = np.array([time for time, _ in seen])
+    balls = RobotPlaces(world.problem).balls(q)
+    gaps = np.array([balls.clearance(place, edge) for place in places])
+    assert 0.25 <= gaps[0] < 0.45 and exact(world, *seen[0][1]).is_free(q)
+    moves = np.linalg.norm(np.diff(places, axis=0), axis=1) > 1e-9
+    out = times[np.argmax(moves)]
+    assert moves.any() and BEGIN <= out <= BEGIN + 1.0 + 0.02
+    coming = (times >= out) & (times <= out + 1.0)
+    assert gaps[coming][-1] < gaps[0] - 0.05 and (np.diff(gaps[coming]) < 1e-3).all()
+    farthest = np.argmax(np.linalg.norm(places - places[0], axis=1))
+    assert times[farthest] <= out + 3.0 + 0.03
+    np.testing.assert_allclose(places[-1], places[0], atol=1e-9)
+    script = np.array(world.script()[0].trajectory)
+    back = script[:, 0] > out + 3.0 + STEP
+    assert (np.diff(script[~back, 0]) >= 0.1 - 1e-6)[1:-1].all()
+    again = np.array([place_at(world.script()[0], 2 * (out + 3.0) - t) for t in times[coming]])
+    assert np.linalg.norm(again - places[coming], axis=1).max() < 0.15 * 4 * STEP  # the way back is the way it came
+
+
+def test_pushers_answer_to_the_robot() -> None:
+    here, there = (worlds.load("pusher/vertical/small/4") for _ in range(2))
+    motion = first_motion(here, 1.0)
+    still = Trajectory(np.zeros(1), motion.positions[:1], np.zeros((1, 16)), np.zeros((1, 16)), robot().joint_names)
+    first, second = run(here, motion, 4.0), run(there, still, 4.0)
+    assert first[0] == second[0] and first[-1] != second[-1]
+
+
+@given(
+    st.tuples(*[st.floats(-1.5, 1.5)] * 3), st.tuples(*[st.floats(-0.5, 0.5)] * 3), st.sampled_from([0.06, 0.3])
+)  # fmt: skip
+def test_columns_above_the_bases_are_entered_when_samples_say(place: tuple, velocity: tuple, edge: float) -> None:
+    place, velocity = np.array(place), np.round(np.array(velocity), 3)
+    time, axis = base_entry(place, velocity, edge)
+    half = BASE_REACH + edge / 2
+
+    def depth(t: float) -> float:
+        return max(half - np.abs((place + t * velocity)[:2] - base).max() for base in BASES)
+
+    before = np.linspace(0.0, min(time, 30.0), 400)
+    if time > 0.0:
+        assert max(map(depth, before)) < 1e-6
+    if np.isfinite(time):
+        assert depth(time + 1e-6) > -1e-9
+        if time > 0.0:
+            sides = [abs(abs((place + time * velocity)[axis] - base[axis]) - half) for base in BASES]
+            assert min(sides) < 1e-6 and velocity[axis] != 0.0
+
+
+def test_balls_contain_the_robot_and_columns_what_cannot_evade() -> None:
+    problem = problems.load("horizontal/free/3")
+    places, rng = RobotPlaces(problem), np.random.default_rng(0)
+    assert places.hands == ("left_hand_palm", "right_hand_palm")
+    for q in robot().random_state(rng, 20):
+        place, edge = rng.uniform([0.1, -0.6, 0.1], [0.8, 0.6, 0.9]), 0.1
+        checker = CollisionChecker(robot(), [cube("cube", edge, place)], problem.attached)
+        bound, distance = places.balls(q).clearance(place, edge), checker.obstacle_distance(q[None])
+        assert bound <= distance + 1e-6 and (distance < 0.02 or bound > distance - 0.02)
+        every, evading = places.balls(q), places.balls(q, evading=True)
+        kept = {tuple(c) for c in evading.centres}
+        stays = np.array([tuple(c) not in kept for c in every.centres])
+        assert 0 < stays.sum() < len(stays)
+        reach = np.abs(every.centres[stays, None, :2] - np.array(BASES)).max(axis=2).min(axis=1) + every.radii[stays]
+        assert reach.max() <= BASE_REACH
