@@ -56,10 +56,12 @@ class ScriptedWorld(World):
     def present(self, time: float) -> tuple[Obstacle, ...]:
         """Return the moving obstacles that are there at a time [s], where they are then, with their velocities.
 
+        Before time 0 obstacles of constant velocity move, and scripts stand.
+
         Raises:
-            ParameterError: The time is negative, or it is not decided yet what will be then.
+            ParameterError: It is not decided yet what will be then.
         """
-        check_number(time, "time", 0.0, max(self._now, self.foreseen))
+        check_number(time, "time", high=max(self._now, self.foreseen))
         return tuple(obstacle_at(o, time) for o in self._until(time) if is_there(o, time))
 
     def script(self) -> tuple[Obstacle, ...]:

@@ -94,4 +94,3 @@ class Proposals:
             else:
                 checker.add(o.model_copy(update={"position": place, "velocity": None}))
         return checker
-

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from apex_ompl.errors import ParameterError, UnknownNameError
+from apex_ompl.errors import UnknownNameError
 from apex_ompl.loop.charges import cost_table
-from apex_ompl.loop.metrics import run_metrics
 from apex_ompl.loop.methods import adapted, method
+from apex_ompl.loop.metrics import run_metrics
 from apex_ompl.loop.ready import Ready
 from apex_ompl.loop.referee import judge
 from apex_ompl.loop.result import Event, Outcome, RunResult
@@ -34,16 +34,10 @@ SHARE = 1.0 - 1e-6  # of the limits that is used: pieces of motions are rounded 
 
 
 def run(
-    problem: Problem | World | str | os.PathLike[str],
-    planner: str = "apex",
-    *,
-    clock: str = "sim",
-    prediction: str = "cv",
-    seed: int = 0,
-    speed: float = 1.0,
-    settings: LoopSettings | None = None,
+    problem: Problem | World | str | os.PathLike[str], planner: str = "apex", *, clock: str = "sim",
+    prediction: str = "cv", seed: int = 0, speed: float = 1.0, settings: LoopSettings | None = None,
     sensor: Sensor | None = None,
-) -> RunResult:
+) -> RunResult:  # fmt: skip
     """Let a robot go to a goal while obstacles move, and say what came of it.
 
     The robot sees obstacles by a sensor, tracks them, follows a motion only as long as a stop behind its next step is
@@ -77,20 +71,19 @@ def run(
         timing = Timing(velocity_scale=speed)
         limits = timing.limits(setup.robot.limits, setup.robot.joint_names)
         ready = Ready(setup, _within(limits), used)
-        made = {
-            "loop": asdict(used), "sensor": asdict(sensor), "speed": speed, "costs": cost_table()["version"],
-        }  # fmt: skip
+        noted = {"loop": asdict(used), "sensor": asdict(sensor), "speed": speed, "costs": cost_table()["version"]}
+        made = _Made(world, ready, planner, seed, noted)
         fault = setup.start_fault
         if fault or not len(ready.goals):
             still = np.zeros((1, len(setup.start)))
             motion = Trajectory(np.zeros(1), setup.start[None], still, still, ready.names)
             outcome = Outcome.START_INVALID if fault else Outcome.STUCK
             done = Simulated(motion, (), False, fault or "; ".join(setup.goal_faults), 0)
-            return _result(world, ready, done, outcome, done.ended, planner, seed, made)
+            return made.result(done, outcome, done.ended)
         replanner = one.make()
         replanner.prepare(ready)
-        done = simulate(world, ready, replanner, SensorStream(sensor, world), seed)
-    return _judged(world, ready, done, planner, seed, made)
+        done = simulate(world, ready, replanner, SensorStream(sensor, world, used.watched), seed)
+    return made.judged(done)
 
 
 def _within(limits: Limits) -> Limits:
@@ -109,40 +102,42 @@ def _world(problem: Problem | World | str | os.PathLike[str]) -> World:
     return worlds.load(os.fspath(problem))
 
 
-def _judged(
-    world: World, ready: Ready, done: Simulated, planner: str, seed: int, made: Mapping[str, Any]
-) -> RunResult:  # fmt: skip
-    """Return the result with what the referee says."""
-    problem = _as_it_was(world)
-    report = judge(ready.setup.robot, problem, done.trajectory, goals=ready.goals)
-    outcome, reason = report.outcome, "; ".join(report.faults)
-    if outcome is None:
-        ended = {"stuck": Outcome.STUCK, "timeout": Outcome.TIMEOUT}
-        outcome = Outcome.REACHED if done.reached else ended[done.ended]
-        reason = "" if done.reached else f"no goal was reached in {done.trajectory.duration:.3g} s"
-    events = done.events
-    if report.contact is not None:
-        contact = report.contact
-        told = Event(contact.time, "contact", {"first": contact.first, "second": contact.second, "moved": contact.moved})
-        events = tuple(sorted((*events, told), key=lambda event: event.time))
-    done = replace(done, events=events)
-    return _result(world, ready, done, outcome, reason, planner, seed, made, clearance=report.clearance)
+@dataclass(frozen=True, eq=False)
+class _Made:
+    """What a result says besides what happened."""
 
+    world: World
+    ready: Ready
+    planner: str
+    seed: int
+    settings: Mapping[str, Any]
 
-def _as_it_was(world: World) -> Problem:
-    """Return the problem with what obstacles did."""
-    still = world.problem.still
-    return still.model_copy(update={"scene": (*still.scene, *world.script())})
+    def result(self, done: Simulated, outcome: Outcome, reason: str, clearance: float = float("inf")) -> RunResult:
+        """Return the result."""
+        robot = self.ready.setup.robot
+        metrics = run_metrics(done.trajectory, done.events, robot.limits, clearance=clearance)
+        return RunResult(
+            outcome=outcome, reason=reason, problem=self.problem(), robot=robot.name, method=self.planner,
+            prediction=self.ready.settings.prediction, clock="sim", seed=self.seed, trajectory=done.trajectory,
+            events=done.events, metrics={**metrics, "broken_steps": float(done.broken)}, settings=self.settings,
+            robot_digest=digest(robot),
+        )  # fmt: skip
 
+    def judged(self, done: Simulated) -> RunResult:
+        """Return the result with what the referee says."""
+        report = judge(self.ready.setup.robot, self.problem(), done.trajectory, goals=self.ready.goals)
+        outcome, reason = report.outcome, "; ".join(report.faults)
+        if outcome is None:
+            ended = {"stuck": Outcome.STUCK, "timeout": Outcome.TIMEOUT}
+            outcome = Outcome.REACHED if done.reached else ended[done.ended]
+            reason = "" if done.reached else f"no goal was reached in {done.trajectory.duration:.3g} s"
+        if report.contact is not None:
+            one = report.contact
+            told = Event(one.time, "contact", {"first": one.first, "second": one.second, "moved": one.moved})
+            done = replace(done, events=tuple(sorted((*done.events, told), key=lambda event: event.time)))
+        return self.result(done, outcome, reason, report.clearance)
 
-def _result(
-    world: World, ready: Ready, done: Simulated, outcome: Outcome, reason: str, planner: str, seed: int,
-    made: Mapping[str, Any], clearance: float = float("inf"),
-) -> RunResult:  # fmt: skip
-    robot = ready.setup.robot
-    metrics = run_metrics(done.trajectory, done.events, robot.limits, clearance=clearance)
-    return RunResult(
-        outcome=outcome, reason=reason, problem=_as_it_was(world), robot=robot.name, method=planner,
-        prediction=ready.settings.prediction, clock="sim", seed=seed, trajectory=done.trajectory, events=done.events,
-        metrics={**metrics, "broken_steps": float(done.broken)}, settings=made, robot_digest=digest(robot),
-    )  # fmt: skip
+    def problem(self) -> Problem:
+        """Return the problem with what obstacles did."""
+        still = self.world.problem.still
+        return still.model_copy(update={"scene": (*still.scene, *self.world.script())})

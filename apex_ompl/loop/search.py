@@ -102,7 +102,9 @@ class Guess(NamedTuple):
 class Source(Protocol):
     """Where motions to start from come from."""
 
-    name: str
+    @property
+    def name(self) -> str:
+        """Its name."""
 
     def prepare(self, ready: Ready) -> None:
         """Load what it needs, before a run."""

@@ -17,6 +17,8 @@ from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.scripts import standing, vector
 from apex_ompl.util.validation import check_number, check_positive, check_seed
 
+EARLIEST = 2**20  # looks before time 0 at most
+LONGEST = 3600.0  # time for which a world is watched before [s]
 CUT = 3.0  # largest error, in standard deviations of one axis
 
 
@@ -58,7 +60,7 @@ class Sensor:
         return CUT * self.noise
 
     def observe(self, world: World, number: int) -> Observation:
-        """Return what the look of a number shows, from 0 on; the world must have come to that time.
+        """Return what the look of a number shows, negative before time 0; the world must have come to that time.
 
         It does not depend on other looks, nor do the errors of one obstacle on which others there are.
         """
@@ -67,7 +69,7 @@ class Sensor:
         return Observation(stamp, stamp + self.age, tuple(obstacle for obstacle in seen if obstacle is not None))
 
     def _seen(self, obstacle: Obstacle, number: int) -> Obstacle | None:
-        rng = np.random.default_rng([self.seed, number, zlib.crc32(obstacle.name.encode())])
+        rng = np.random.default_rng([self.seed, number + EARLIEST, zlib.crc32(obstacle.name.encode())])
         if rng.random() < self.dropout:
             return None
         error = self.noise * rng.normal(size=3)
@@ -80,10 +82,15 @@ class Sensor:
 class SensorStream:
     """The looks of a sensor at one world, in order, each given once."""
 
-    def __init__(self, sensor: Sensor, world: World) -> None:
-        """Begin with the look at time 0."""
+    def __init__(self, sensor: Sensor, world: World, watched: float = 0.0) -> None:
+        """Begin with the look at time 0, or some time before [s].
+
+        Raises:
+            ParameterError: That time is not from 0 to an hour.
+        """
+        check_number(watched, "watched", 0.0, LONGEST)
         self.sensor, self._world = sensor, world
-        self._number, self._until = 0, 0.0
+        self._number, self._until = -int(watched * sensor.rate + 1e-9), -watched
 
     def observations(self, until: float) -> tuple[Observation, ...]:
         """Return the observations with a stamp up to a time [s] that were not given yet, in order of stamp.

@@ -11,9 +11,9 @@ PREDICTIONS = ("still", "cv", "truth")
 """How obstacles are predicted: where they were seen (the paper), at constant velocity, or as they truly move."""
 
 RANGES = {
-    "period": (1e-3, 0.1), "budget": (1e-3, 10.0), "hold": (0.0, 10.0), "rest_hold": (0.0, 10.0),
-    "margin": (0.0, 0.1), "berth": (0.0, 0.5), "error": (0.0, 0.5), "fastest": (0.0, 5.0), "timeout": (0.1, 600.0),
-    "stuck": (0.1, 600.0), "latency": (-1.0, 10.0),
+    "watched": (0.0, 60.0), "period": (1e-3, 0.1), "budget": (1e-3, 10.0), "hold": (0.0, 10.0),
+    "rest_hold": (0.0, 10.0), "margin": (0.0, 0.1), "berth": (0.0, 0.5), "error": (0.0, 0.5), "fastest": (0.0, 5.0),
+    "timeout": (0.1, 600.0), "stuck": (0.1, 600.0), "latency": (-1.0, 10.0),
 }  # fmt: skip
 
 
@@ -22,6 +22,7 @@ class LoopSettings:
     """Parameters of the closed loop.
 
     Attributes:
+        watched: Time for which obstacles were observed before the run begins [s].
         period: Time between two looks at the world [s].
         budget: Time that a replan may take; what it finds begins this long after it was asked for [s].
         latency: Time after which the answer of a replan is known [s]; -1 charges what the replan did by the table of
@@ -39,6 +40,7 @@ class LoopSettings:
         stuck: Time of rest after which a run ends [s].
     """
 
+    watched: float = 0.3
     period: float = 0.01
     budget: float = 0.05
     latency: float = -1.0

@@ -25,7 +25,7 @@ from apex_ompl.trajectory import Trajectory
 class Eyes(Protocol):
     """What observes a world."""
 
-    def observations(self, world: World, until: float) -> Iterable[Observation]:
+    def observations(self, until: float) -> Iterable[Observation]:
         """Return the observations with stamps up to a time [s] that were not returned before, in their order."""
 
 
@@ -67,7 +67,7 @@ def simulate(world: World, ready: Ready, replanner: Replanner, eyes: Eyes, seed:
     for k in range(math.ceil(settings.timeout / settings.period) + 1):
         now = k * settings.period
         world.advance(now, executor.state(now))
-        waiting += eyes.observations(world, now)
+        waiting += eyes.observations(now)
         for observation in [one for one in waiting if one.received <= now + 1e-9]:
             tracker.take(observation)
         waiting = [one for one in waiting if one.received > now + 1e-9]

@@ -17,7 +17,7 @@ from apex_ompl.types import Array
 
 def is_there(obstacle: Obstacle, time: float) -> bool:
     """Whether an obstacle has appeared by a time [s], which counts."""
-    return time >= obstacle.appears
+    return time >= obstacle.appears or obstacle.appears == 0.0
 
 
 def place_at(obstacle: Obstacle, time: float) -> Array:
