@@ -1,8 +1,8 @@
 """APEX for OMPL: dual-arm planning with latent diffusion, real meshes and proven paths.
 
-``plan`` solves a problem, ``load_problem`` reads one, ``setup`` gives OMPL's SimpleSetup of one, ``load_model`` reads
-a trained model, ``time_path`` times any path. Planners are in ``apex_ompl.planners``, ready-made problems in
-``apex_ompl.problems``.
+``plan`` solves a problem, ``run`` goes to a goal in closed loop while obstacles move, ``load_problem`` reads a problem,
+``setup`` gives OMPL's SimpleSetup of one, ``load_model`` reads a trained model, ``time_path`` times any path. Planners
+are in ``apex_ompl.planners``, ready-made problems in ``apex_ompl.problems``.
 """
 
 from __future__ import annotations
@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from apex_ompl.collision.cloud_contact import filter_points
     from apex_ompl.diffusion.checkpoint import load_model
     from apex_ompl.errors import ApexError
+    from apex_ompl.loop.result import RunResult
+    from apex_ompl.loop.run import run
     from apex_ompl.result import PlanResult, PlanStatus
     from apex_ompl.robot import Robot, load_robot
     from apex_ompl.scene.points import points_from_depth
@@ -33,6 +35,7 @@ _HOMES = {
     "PoseTarget": "scene.problem",
     "Problem": "scene.problem",
     "Robot": "robot",
+    "RunResult": "loop.result",
     "Timing": "trajectory",
     "Trajectory": "trajectory",
     "load_model": "diffusion.checkpoint",
@@ -41,6 +44,7 @@ _HOMES = {
     "load_robot": "robot",
     "plan": "api",
     "points_from_depth": "scene.points",
+    "run": "loop.run",
     "setup": "api",
     "time_path": "trajectory",
 }
@@ -54,6 +58,7 @@ __all__ = [
     "PoseTarget",
     "Problem",
     "Robot",
+    "RunResult",
     "Timing",
     "Trajectory",
     "filter_points",
@@ -62,6 +67,7 @@ __all__ = [
     "load_robot",
     "plan",
     "points_from_depth",
+    "run",
     "setup",
     "time_path",
 ]

@@ -66,6 +66,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"apex-ompl {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     _add_plan(commands)  # in the order of the help text
+    _add_run(commands)
     _add_pictures(commands)
     _add_view(commands)
     _add_convert(commands)
@@ -122,6 +123,23 @@ def _add_plan(commands: Commands[argparse.ArgumentParser]) -> None:
     )
     parser.add_argument("--json", action="store_true", help="print the whole result as JSON")
     parser.set_defaults(run="plan:run")
+
+
+def _add_run(commands: Commands[argparse.ArgumentParser]) -> None:
+    parser = commands.add_parser("run", help="go to a goal in closed loop while obstacles move")
+    parser.add_argument("world", help=f"a world such as popup/vertical/large/12, or {PROBLEM_HELP}")
+    parser.add_argument("--planner", default="apex", help="apex, no-network or blind (default: %(default)s)")
+    parser.add_argument(
+        "--prediction", default="cv", help="of obstacles: still, cv (constant velocity) or truth (default: %(default)s)"
+    )
+    parser.add_argument("--speed", type=float, default=1.0, metavar="SHARE", help="of the velocity limits")
+    parser.add_argument("--budget", type=float, default=0.05, metavar="SECONDS", help="of a replan")
+    parser.add_argument("--latency", type=float, metavar="SECONDS", help="of a replan (default: what its work costs)")
+    parser.add_argument("--timeout", type=float, default=30.0, metavar="SECONDS", help="default: %(default)s")
+    parser.add_argument("--seed", type=int, default=0, help="default: %(default)s")
+    parser.add_argument("--out", type=Path, metavar="FILE", help="write the run: .npz or .json")
+    parser.add_argument("--json", action="store_true", help="print the outcome and the metrics as JSON")
+    parser.set_defaults(run="run:run")
 
 
 def _add_pictures(commands: Commands[argparse.ArgumentParser]) -> None:

@@ -22,6 +22,7 @@ from apex_ompl.loop.simulation import Simulated, simulate
 from apex_ompl.ompl_adapter.process import quiet_ompl, seed_ompl
 from apex_ompl.ompl_adapter.setup import assemble
 from apex_ompl.problems import worlds
+from apex_ompl.problems.world_scripts import moving_world
 from apex_ompl.problems.worlds import World
 from apex_ompl.robot.identity import digest
 from apex_ompl.robot.model import Limits
@@ -62,9 +63,8 @@ def run(
     check_seed(seed)
     one = method(planner)
     sensor = sensor or Sensor(seed=seed)
-    world = _world(problem)
-    least = replace(settings or LoopSettings(fastest=max(world.fastest, 1e-3), error=max(sensor.largest_error, 1e-4)))
-    used = adapted(replace(least, prediction=prediction), one)
+    world = load_world(problem)
+    used = adapted(replace(settings or default_settings(world, sensor), prediction=prediction), one)
     with quiet_ompl():
         seed_ompl(seed)
         setup = assemble(world.problem.still, seed=seed)
@@ -92,14 +92,20 @@ def _within(limits: Limits) -> Limits:
     return replace(limits, **some)
 
 
-def _world(problem: Problem | World | str | os.PathLike[str]) -> World:
+def load_world(problem: Problem | World | str | os.PathLike[str]) -> World:
+    """Return a world, or that of its name, a problem, its name, or its file.
+
+    Raises:
+        ApexError: It is unknown or faulty.
+    """
     if isinstance(problem, World):
         return problem
-    if isinstance(problem, Problem):
-        from apex_ompl.problems.world_scripts import moving_world
+    return moving_world(problem) if isinstance(problem, Problem) else worlds.load(os.fspath(problem))
 
-        return moving_world(problem)
-    return worlds.load(os.fspath(problem))
+
+def default_settings(world: World, sensor: Sensor) -> LoopSettings:
+    """Return the parameters of the loop for a world and a sensor: obstacles are as fast, and seen as well, as there."""
+    return LoopSettings(fastest=world.fastest, error=sensor.largest_error)
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,4 +146,4 @@ class _Made:
     def problem(self) -> Problem:
         """Return the problem with what obstacles did."""
         still = self.world.problem.still
-        return still.model_copy(update={"scene": (*still.scene, *self.world.script())})
+        return still.model_copy(update={"name": self.world.name, "scene": (*still.scene, *self.world.script())})
