@@ -54,14 +54,19 @@ class Proposals:
         with self._loaded.one_thread():
             self._loaded.propose(query, self._checker.kernel, self.count)
 
+    @property
+    def model_and_checker(self) -> tuple[TrajectoryModel, CollisionChecker]:
+        """The model and the obstacles that it is shown, after :meth:`prepare`."""
+        assert self._loaded is not None and self._checker is not None
+        return self._loaded, self._checker
+
     def guesses(self, search: Search) -> Iterator[Guess]:
         """Yield the proposals."""
-        model, goals = self._loaded, search.goals
-        assert model is not None
+        (model, checker), goals = self.model_and_checker, search.goals
         if not len(goals):
             return
         goal = goals[0]
-        checker = self._among(search, goal)
+        self._place(checker, search, goal)
         query = make_query(checker, search.start.position, goal, point=model.sees_point)
         temperature = TEMPERATURES[search.request.number % len(TEMPERATURES)]
         sampling = model.sampling
@@ -76,10 +81,10 @@ class Proposals:
             states = model.spline.path(control)
             yield Guess(states, goal, least_duration(states, search.ready.limits))
 
-    def _among(self, search: Search, goal: Array) -> CollisionChecker:
-        """Return the checker with each obstacle where it comes nearest to the straight line in time."""
-        checker, request = self._checker, search.request
-        assert checker is not None
+    @staticmethod
+    def _place(checker: CollisionChecker, search: Search, goal: Array) -> None:
+        """Place each obstacle where it comes nearest to the straight line in time."""
+        request = search.request
         line = np.linspace(search.start.position, goal, LOOKS)
         duration = least_duration(line, search.ready.limits)
         times = request.join + np.linspace(0.0, duration, LOOKS)
@@ -93,4 +98,3 @@ class Proposals:
                 checker.move(o.name, place)
             else:
                 checker.add(o.model_copy(update={"position": place, "velocity": None}))
-        return checker

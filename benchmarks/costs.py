@@ -1,0 +1,130 @@
+"""Costs of work in the closed loop: the table by which the simulated clock charges it, measured on this machine.
+
+Each kind of work is timed in worlds of the validation split; it costs the median over the worlds of the least of five
+calls. With --write the table becomes that of the package, under the next version number.
+
+Usage: python benchmarks/costs.py [-n 12] [--write]
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections import defaultdict
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import record
+
+from apex_ompl.collision import CollisionChecker
+from apex_ompl.live.movers import Movers, clearance_in_time, curve_of, prove_motion
+from apex_ompl.live.retime import retime
+from apex_ompl.live.timed_spline import MotionOptimizer, Start, TimedSpline
+from apex_ompl.loop.charges import TABLE
+from apex_ompl.loop.proposals import Proposals
+from apex_ompl.loop.ready import Ready
+from apex_ompl.loop.search import MOTIONS
+from apex_ompl.loop.settings import LoopSettings
+from apex_ompl.ompl_adapter.setup import assemble
+from apex_ompl.problems import worlds
+from apex_ompl.trajectory import time_path
+from apex_ompl.util.entry_point import run_script
+from apex_ompl.util.files import write_atomically
+from apex_ompl.util.validation import one_or_more
+
+DEPENDS = ("@planning", "apex_ompl/live", "apex_ompl/loop", "apex_ompl/trajectory")
+REPEATS = 5
+
+
+def seconds(call: Callable[[], Any]) -> float:
+    """Return the least time of a call among several [s]."""
+    times = []
+    for _ in range(REPEATS):
+        begin = time.perf_counter()
+        call()
+        times.append(time.perf_counter() - begin)
+    return min(times)
+
+
+def interval_of_proof(ready: Ready) -> float:
+    """Return what an interval of a proof by spheres alone costs, of a motion of the robot without obstacles [s]."""
+    checker, rng = CollisionChecker(ready.setup.robot), np.random.default_rng(0)
+    for _ in range(100):
+        ends = ready.setup.robot.home + rng.normal(size=(2, len(ready.names))) * 0.3
+        ends[:, ready.fingers] = 0.5
+        motion = time_path(np.clip(ends, ready.limits.lower, ready.limits.upper), ready.limits, ready.names).trajectory
+        proof = checker.prove(curve_of(motion), tolerance=0.0)
+        if proof and proof.by_spheres == 1.0:
+            return seconds(lambda m=motion: checker.prove(curve_of(m), tolerance=0.0)) / proof.intervals
+    raise SystemExit("no motion is proved by spheres alone, expected one of 100")
+
+
+def measured(name: str, found: dict[str, list[float]]) -> None:
+    """Add what each kind of work costs a unit in a world [s]."""
+    world = worlds.load(name)
+    setup = assemble(world.problem.still)
+    ready = Ready(setup, setup.robot.limits, LoopSettings())
+    kernel, limits, goal = ready.kernel, ready.limits, ready.goals[0]
+    movers = Movers(world.present(0.0))
+    ends = np.stack([setup.start, goal])
+    found["straight motion"].append(seconds(lambda: time_path(ends, limits, ready.names)))
+    motion = time_path(ends, limits, ready.names).trajectory
+    curve = curve_of(motion)
+    rate = interval_of_proof(ready)
+    found["proof interval"].append(rate)
+    proof = ready.checker.prove(curve, tolerance=0.0)
+    taken = seconds(lambda: ready.checker.prove(curve, tolerance=0.0))
+    if proof.by_spheres < 1.0:
+        found["exact proof"].append(max(taken - rate * proof.intervals, 0.0))
+    intervals = prove_motion(kernel, movers, motion).intervals
+    found["interval among movers"].append(seconds(lambda: prove_motion(kernel, movers, motion)) / max(intervals, 1))
+    line = np.linspace(setup.start, goal, 64)
+    spline = TimedSpline.along(line, motion.duration, Start.at_rest(setup.start), goal)
+    optimizer = MotionOptimizer(kernel, movers, limits, MOTIONS)
+    optimizer.improve(spline, steps=4)
+    count = optimizer.samples
+    found["sample of a motion"].append(seconds(lambda: optimizer.improve(spline, steps=4)) / count)
+    found["retiming"].append(seconds(lambda: retime(kernel, movers, motion, limits)))
+    times = np.linspace(0.0, motion.duration, 64)
+    found["clearance in time"].append(seconds(lambda: clearance_in_time(kernel, movers, line, times, 0.3)) / 64)
+
+
+def network() -> dict[str, float]:
+    """Return the costs of a call of the network, and of each proposal [s]."""
+    from apex_ompl.apex.query import make_query
+
+    setup = assemble(worlds.load("vertical/moving-large-0.2/800000").problem.still)
+    ready, source = Ready(setup, setup.robot.limits, LoopSettings()), Proposals()
+    source.prepare(ready)
+    model, checker = source.model_and_checker
+    query = make_query(checker, setup.start, ready.goals[0], point=model.sees_point)
+    taken = {}
+    with model.one_thread():
+        for count in (1, 8):
+            taken[count] = seconds(lambda n=count: model.propose(query, checker.kernel, n))
+    each = max((taken[8] - taken[1]) / 7.0, 0.0)
+    return {"proposals": taken[1] - each, "proposal": each}
+
+
+def main() -> None:
+    """Measure, and write the results."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("-n", type=one_or_more, default=30, help="worlds (default: %(default)s)")
+    parser.add_argument("--write", action="store_true", help="write the table of the package, too")
+    args = parser.parse_args()
+    found: dict[str, list[float]] = defaultdict(list)
+    for name in worlds.ids("moving", "validation", args.n):
+        measured(name, found)
+    table = {kind: float(np.median(values)) for kind, values in found.items()} | network()
+    rows = [["kind of work", "us a unit"], ["---", "---:"], *([kind, f"{1e6 * v:.3g}"] for kind, v in table.items())]
+    if args.write:
+        version = json.loads(TABLE.read_text())["version"]
+        content = {"version": version + 1, "seconds": {kind: float(f"{v:.3g}") for kind, v in table.items()}}
+        write_atomically(TABLE, (json.dumps(content, indent=1) + "\n").encode())
+    record.write("costs", {"seconds": table}, "\n".join(map(record.row, rows)), seed=0, n=args.n)
+
+
+if __name__ == "__main__":
+    run_script(main)
