@@ -65,7 +65,7 @@ def measured(name: str, found: dict[str, list[float]]) -> None:
     """Add what each kind of work costs a unit in a world [s]."""
     world = worlds.load(name)
     setup = assemble(world.problem.still)
-    ready = Ready(setup, setup.robot.limits, LoopSettings())
+    ready = Ready(setup, setup.robot.limits, setup.robot.limits, LoopSettings())
     kernel, limits, goal = ready.kernel, ready.limits, ready.goals[0]
     movers = Movers(world.present(0.0))
     ends = np.stack([setup.start, goal])
@@ -96,7 +96,7 @@ def network() -> dict[str, float]:
     from apex_ompl.apex.query import make_query
 
     setup = assemble(worlds.load("vertical/moving-large-0.2/800000").problem.still)
-    ready, source = Ready(setup, setup.robot.limits, LoopSettings()), Proposals()
+    ready, source = Ready(setup, setup.robot.limits, setup.robot.limits, LoopSettings()), Proposals()
     source.prepare(ready)
     model, checker = source.model_and_checker
     query = make_query(checker, setup.start, ready.goals[0], point=model.sees_point)

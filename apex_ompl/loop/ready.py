@@ -26,12 +26,14 @@ class Ready:
 
     Attributes:
         setup: The problem without the obstacles that move.
-        limits: Limits of motions; at most the robot's.
+        limits: Limits of motions; at most those of stops.
+        stopping: Limits of stops.
         settings: Parameters of the loop.
     """
 
     setup: PlanningSetup
     limits: Limits
+    stopping: Limits
     settings: LoopSettings
 
     @property
@@ -123,13 +125,13 @@ class Ready:
         """Return a stop from a motion along its path, or else joint by joint, that meets nothing that stands still."""
         at = then - following.begin
         if along:
-            made = stop_along(following.motion, at, self.setup.robot.limits)
+            made = stop_along(following.motion, at, self.stopping)
             ends_there = abs(made.trajectory.duration - (following.motion.duration - at)) < 1e-9
             if ends_there:  # the rest of the motion itself, which is proved
                 return Following(made.trajectory, then, following.to_goal)
         else:
             start = following.start(then)
-            made = stop(self.setup.robot.limits, self.names, *start)
+            made = stop(self.stopping, self.names, *start)
             if not made.within_limits:
                 return None
         curve = Curve.cubic(

@@ -70,7 +70,7 @@ def run(
         setup = assemble(world.problem.still, seed=seed)
         timing = Timing(velocity_scale=speed)
         limits = timing.limits(setup.robot.limits, setup.robot.joint_names)
-        ready = Ready(setup, _within(limits), used)
+        ready = Ready(setup, _within(limits), _within(setup.robot.limits), used)
         noted = {"loop": asdict(used), "sensor": asdict(sensor), "speed": speed, "costs": cost_table()["version"]}
         made = _Made(world, ready, planner, seed, noted)
         fault = setup.start_fault
