@@ -9,9 +9,12 @@ ago than what was known when the stop was proved. (A fail-safe manoeuvre that is
 
 from __future__ import annotations
 
+import logging
 import math
 from dataclasses import dataclass, field
 from typing import Any
+
+import numpy as np
 
 from apex_ompl.live.movers import Movers
 from apex_ompl.loop.charges import Charges
@@ -24,7 +27,9 @@ from apex_ompl.loop.tracking import Tracker
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.types import Array
 
-SHORTEST = 0.05  # of a motion that a standing robot sets out on, if it does not reach a goal [s]
+LOG = logging.getLogger("apex_ompl")
+
+SAME = 1e-6  # difference of states that count as one [rad, rad/s, rad/s^2]
 SHARE = 0.85  # of the budget after which nothing new is begun
 FASTER = 0.9  # share of the time to a goal that a plan must have at most to replace one without a conflict
 
@@ -149,7 +154,7 @@ class Executor:
         self.pending = None
         found, request = pending.answer.found, pending.request
         if found is None:
-            self.log(now, "rejected", why="nothing was found", number=request.number)
+            self.log(now, "rejected", why=pending.answer.part or "nothing was found", number=request.number)
             return
         why, leaving = self._fault(now, pending, predicted), False
         if not why and reachable is not None:
@@ -178,6 +183,11 @@ class Executor:
             return "the robot follows another motion by now"
         if now > request.join + 1e-9:
             return "it came too late"
+        expected, start = request.following.start(request.join), found.start(request.join)
+        if found.begin != request.join or max(np.abs(a - b).max() for a, b in zip(start, expected, strict=True)) > SAME:
+            return "it does not begin where the robot will be"
+        if np.abs(found.motion.velocities[-1]).max() > SAME or not self.ready.clear_of_still(found.motion):
+            return "it does not end at rest, keep the limits and stay clear of what stands still"
         if not math.isfinite(self.conflict) and self.following.to_goal and found.to_goal:
             if found.end - now > FASTER * (self.following.end - now):
                 return "it is hardly faster"
@@ -199,21 +209,17 @@ class Executor:
             return
         join = now + settings.budget
         self.asked += 1
+        wide = predicted.larger(settings.berth)
         request = Request(
-            self.asked,
-            now,
-            join,
-            self.following,
-            self.route,
-            predicted,
-            predicted.larger(settings.berth),
-            obstacles,
-            self.conflict,
-            self.seed,
-        )
+            self.asked, now, join, self.following, self.route, predicted, wide, obstacles, self.conflict, self.seed
+        )  # fmt: skip
         self.log(now, "request", number=self.asked, join=join)
         charges = Charges(SHARE * settings.budget)
-        answer = self.replanner.replan(self.ready, request, charges)
+        try:
+            answer = self.replanner.replan(self.ready, request, charges)
+        except Exception as error:
+            LOG.exception("the replanner failed")
+            answer = Answer(None, f"failed: {error}", charges)
         taken = charges.spent if settings.latency < 0.0 else settings.latency
         self.pending = Pending(now + taken, request, answer)
 

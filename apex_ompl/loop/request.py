@@ -54,7 +54,7 @@ class Answer:
 
     Attributes:
         found: The motion from the time of joining on, or None.
-        part: Name of the part that found it.
+        part: Name of the part that found it, or why nothing was found where there is something to say.
         charges: What it cost.
     """
 
