@@ -9,7 +9,6 @@ ago than what was known when the stop was proved. (A fail-safe manoeuvre that is
 
 from __future__ import annotations
 
-import logging
 import math
 from dataclasses import dataclass, field
 from typing import Any
@@ -19,7 +18,7 @@ import numpy as np
 from apex_ompl.live.movers import Movers
 from apex_ompl.loop.charges import Charges
 from apex_ompl.loop.evasion import GAIN, SOON
-from apex_ompl.loop.following import Following
+from apex_ompl.loop.following import SAME_TIME, Following
 from apex_ompl.loop.ready import Ready
 from apex_ompl.loop.request import Answer, Replanner, Request
 from apex_ompl.loop.result import Event
@@ -27,9 +26,7 @@ from apex_ompl.loop.tracking import Tracker
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.types import Array
 
-LOG = logging.getLogger("apex_ompl")
-
-SAME = 1e-6  # difference of states that count as one [rad, rad/s, rad/s^2]
+SAME_STATE = 1e-6  # largest jump of positions, velocities and accelerations where a motion begins
 SHARE = 0.85  # of the budget after which nothing new is begun
 FASTER = 0.9  # share of the time to a goal that a plan must have at most to replace one without a conflict
 
@@ -42,11 +39,13 @@ class Pending:
         known: Time of the clock at which it is [s].
         request: What was asked for.
         answer: What comes.
+        failed: Why it finds nothing, where that is known.
     """
 
     known: float
     request: Request
     answer: Answer
+    failed: str = "nothing was found"
 
 
 @dataclass(eq=False)
@@ -154,7 +153,7 @@ class Executor:
         self.pending = None
         found, request = pending.answer.found, pending.request
         if found is None:
-            self.log(now, "rejected", why=pending.answer.part or "nothing was found", number=request.number)
+            self.log(now, "rejected", why=pending.failed, number=request.number)
             return
         why, leaving = self._fault(now, pending, predicted), False
         if not why and reachable is not None:
@@ -183,11 +182,9 @@ class Executor:
             return "the robot follows another motion by now"
         if now > request.join + 1e-9:
             return "it came too late"
-        expected, start = request.following.start(request.join), found.start(request.join)
-        if found.begin != request.join or max(np.abs(a - b).max() for a, b in zip(start, expected, strict=True)) > SAME:
-            return "it does not begin where the robot will be"
-        if np.abs(found.motion.velocities[-1]).max() > SAME or not self.ready.clear_of_still(found.motion):
-            return "it does not end at rest, keep the limits and stay clear of what stands still"
+        unfit = self._misfit(found, request)
+        if unfit:
+            return unfit
         if not math.isfinite(self.conflict) and self.following.to_goal and found.to_goal:
             if found.end - now > FASTER * (self.following.end - now):
                 return "it is hardly faster"
@@ -196,6 +193,24 @@ class Executor:
         gains = self._may_leave(now, found) and conflict > self.conflict + GAIN
         if math.isfinite(conflict) and not gains:
             return "what was seen since then is in the way"
+        return ""
+
+    def _misfit(self, found: Following, request: Request) -> str:
+        """Return why a motion can never be followed behind what a request says, or nothing."""
+        motion = found.motion
+        if motion.joint_names != self.ready.names:
+            return "it is a motion of other joints"
+        behind = request.following.start(request.join)
+        states = motion.positions[0], motion.velocities[0], motion.accelerations[0]
+        off = max(float(np.abs(one - other).max()) for one, other in zip(states, behind, strict=True))
+        if abs(found.begin - request.join) > SAME_TIME or not off <= SAME_STATE:
+            return "it does not begin where the robot will be"
+        if motion.velocities[-1].any() or motion.accelerations[-1].any():
+            return "it does not end at rest"
+        if found.to_goal and not self.ready.is_goal(motion.positions[-1]):
+            return "it does not end at a goal"
+        if not self.ready.clear_of_still(motion):
+            return "it exceeds limits, or is not proved clear of what stands still"
         return ""
 
     def _may_leave(self, now: float, found: Following) -> bool:
@@ -215,13 +230,13 @@ class Executor:
         )  # fmt: skip
         self.log(now, "request", number=self.asked, join=join)
         charges = Charges(SHARE * settings.budget)
+        failed = Pending.failed
         try:
             answer = self.replanner.replan(self.ready, request, charges)
-        except Exception as error:
-            LOG.exception("the replanner failed")
-            answer = Answer(None, f"failed: {error}", charges)
+        except Exception as error:  # whatever a way of replanning does, the robot goes on or stops
+            answer, failed = Answer(None, "", charges), f"{type(error).__name__}: {error}"
         taken = charges.spent if settings.latency < 0.0 else settings.latency
-        self.pending = Pending(now + taken, request, answer)
+        self.pending = Pending(now + taken, request, answer, failed)
 
     def _wants(self, now: float) -> bool:
         """Whether the robot needs another motion."""

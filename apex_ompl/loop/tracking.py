@@ -118,8 +118,10 @@ class Tracker:
     def take(self, observation: Observation) -> None:
         """Take an observation, by its stamp and not by its arrival; what is older than what is known says nothing.
 
-        Places that are not finite are left out.
+        Stamps and places that are not finite are left out.
         """
+        if not math.isfinite(observation.stamp):
+            return
         self.last = max(self.last, observation.stamp)
         for seen in observation.seen:
             if not np.isfinite(seen.position).all():

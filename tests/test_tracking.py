@@ -1,0 +1,200 @@
+"""Estimates of obstacles that move: the filter against matrices written out, and where obstacles may be."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from apex_ompl.collision import CollisionChecker
+from apex_ompl.live.movers import Movers, clearance_in_time
+from apex_ompl.loop.observation import Observation
+from apex_ompl.loop.tracking import LEAST, Track, Tracker, TrackSettings
+from apex_ompl.problems.suite_robot import robot as suite_robot
+from apex_ompl.scene.bodies import Obstacle
+
+RATE = 30.0
+NAN, INF = float("nan"), float("inf")
+BOX = Obstacle(name="box", box=(0.1, 0.1, 0.1), position=(0.0, 0.0, 0.0))
+KERNEL = CollisionChecker(suite_robot()).kernel
+seeds = st.integers(0, 10**6)
+
+
+def at(place: Any, name: str = "box") -> Obstacle:
+    return BOX.model_copy(update={"name": name, "position": tuple(map(float, place))})
+
+
+def look(stamp: float, place: Any, late: float = 0.05) -> Observation:
+    return Observation(stamp, stamp + late, (at(place),))
+
+
+def tracked(*looks: Observation, **parameters: float) -> Tracker:
+    tracker = Tracker(KERNEL, TrackSettings(**parameters))
+    for one in looks:
+        tracker.take(one)
+    return tracker
+
+
+def drawn(seed: int, count: int = 25) -> tuple[np.ndarray, np.ndarray]:
+    """Stamps and places of an obstacle at constant velocity, some looks missed."""
+    rng = np.random.default_rng(seed)
+    stamps = np.sort(rng.choice(3 * count, count, replace=False)) / RATE
+    velocity, error = rng.uniform(-0.15, 0.15, 3), np.clip(rng.normal(size=(count, 3)), -1.5, 1.5)
+    return stamps, rng.uniform(-1, 1, 3) + stamps[:, None] * velocity + 0.008 * error
+
+
+def same(one: Track, other: Track) -> bool:
+    values = [(t.shape, t.stamp, t.seen, *t.place, *t.velocity, *t.covariance.ravel()) for t in (one, other)]
+    return values[0] == values[1]
+
+
+@settings(max_examples=20)
+@given(seeds)
+def test_filters_are_those_of_six_dimensions(seed: int) -> None:
+    stamps, places = drawn(seed)
+    given_ = TrackSettings()
+    eye, none = np.eye(3), np.zeros((3, 3))
+    observe, spread = np.block([eye, none]), (given_.noise**2 + 1e-12) * eye
+    x = np.append(places[0], np.zeros(3))
+    cov = np.block([[given_.noise**2 * eye, none], [none, given_.speed**2 * eye]])
+    for dt, z in zip(np.diff(stamps), places[1:], strict=True):
+        forward = np.block([[eye, dt * eye], [none, eye]])
+        push = given_.power * np.block([[dt**3 / 3 * eye, dt**2 / 2 * eye], [dt**2 / 2 * eye, dt * eye]])
+        x, cov = forward @ x, forward @ cov @ forward.T + push
+        gain = cov @ observe.T @ np.linalg.inv(observe @ cov @ observe.T + spread)
+        x = x + gain @ (z - observe @ x)
+        rest = np.eye(6) - gain @ observe
+        cov = rest @ cov @ rest.T + gain @ spread @ gain.T  # Joseph's form, which is not the one of the filter
+    track = tracked(*map(look, stamps, places)).tracks["box"]
+    assert track.seen == len(stamps) and track.stamp == stamps[-1]
+    np.testing.assert_allclose(np.append(track.place, track.velocity), x, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(np.kron(track.covariance, eye), cov, rtol=1e-7, atol=1e-12)
+
+
+@settings(max_examples=20)
+@given(seeds)
+def test_without_noise_of_the_acceleration_filters_are_least_squares(seed: int) -> None:
+    stamps, places = drawn(seed)
+    track = tracked(*map(look, stamps, places), power=0.0).tracks["box"]
+    since, noise = stamps - stamps[-1], TrackSettings.noise
+    rows = np.stack([np.ones_like(since), since], axis=1) / noise
+    prior = np.array([[0.0, 1.0 / TrackSettings.speed]])
+    found = np.linalg.lstsq(np.vstack([rows, prior]), np.vstack([places / noise, np.zeros((1, 3))]), rcond=None)[0]
+    np.testing.assert_allclose([track.place, track.velocity], found, atol=1e-6)
+
+
+@pytest.mark.parametrize("velocity", [(0.2, 0.0, 0.0), (-0.2, 0.2, 0.1), (0.0, 0.0, 0.0)])
+def test_constant_velocities_are_found(velocity: tuple[float, ...]) -> None:
+    stamps = np.arange(60) / RATE
+    tracker = tracked(*(look(t, np.multiply(velocity, t)) for t in stamps))
+    track = tracker.tracks["box"]
+    assert np.abs(track.velocity - velocity).max() < 2e-3 and track.seen == 60
+    then = tracker.predicted(0.0).at(stamps[-1] + 1.0)["box"]
+    np.testing.assert_allclose(then, np.multiply(velocity, stamps[-1] + 1.0), atol=5e-3)
+    np.testing.assert_allclose(tracker.predicted(0.0, "still").at(9.0)["box"], np.multiply(velocity, stamps[-1]))
+    grown, growing = track.growth(tracker.settings)
+    assert 0.0 < grown < 2.0 * TrackSettings.noise and 0.0 < growing <= TrackSettings.most
+
+
+def test_turns_begin_the_velocity_anew() -> None:
+    before = [look(k / RATE, (0.3 * k / RATE, 0.0, 0.0)) for k in range(30)]
+    tracker = tracked(*before, look(1.0, (0.3, 0.5, 0.0)))
+    fresh = Track.new(at((0.3, 0.5, 0.0)), 1.0, tracker.settings)
+    assert same(tracker.tracks["box"], fresh) and not fresh.velocity.any()
+    for k in range(1, 31):
+        tracker.take(look(1.0 + k / RATE, (0.3, 0.5 - 0.3 * k / RATE, 0.0)))
+    assert np.abs(tracker.tracks["box"].velocity - (0.0, -0.3, 0.0)).max() < 0.02
+    assert tracker.tracks["box"].seen == 31
+
+
+@given(st.lists(st.integers(0, 20), min_size=1, max_size=25), seeds)
+def test_what_is_older_says_nothing(order: list[int], seed: int) -> None:
+    stamps, places = drawn(seed)
+    looks = [look(stamps[k], places[k]) for k in order]
+    newer = [k for n, k in enumerate(order) if k > max(order[:n], default=-1)]
+    one, other = tracked(*looks), tracked(*(look(stamps[k], places[k]) for k in newer))
+    assert same(one.tracks["box"], other.tracks["box"]) and one.last == other.last == stamps[max(order)]
+
+
+def test_how_late_an_observation_is_received_does_not_matter() -> None:
+    stamps, places = drawn(3)
+    soon, late = (tracked(*(look(t, p, by) for t, p in zip(stamps, places, strict=True))) for by in (0.0, 0.7))
+    assert same(soon.tracks["box"], late.tracks["box"])
+
+
+@pytest.mark.parametrize("bad", [(NAN, 0.0, 0.0), (0.0, INF, 0.0), (0.0, 0.0, -INF)])
+def test_places_that_are_not_finite_are_left_out(bad: tuple[float, ...]) -> None:
+    stamps, places = drawn(1)
+    good = list(map(look, stamps, places))
+    one = tracked(*good[:5], look(stamps[4] + 0.01, bad), *good[5:])
+    assert same(one.tracks["box"], tracked(*good).tracks["box"])
+    assert not tracked(look(0.0, bad)).tracks
+    both = tracked(Observation(0.0, 0.0, (at(bad), at((1.0, 0.0, 0.0), "other"))))
+    assert set(both.tracks) == {"other"}
+
+
+@pytest.mark.parametrize("stamp", [NAN, INF, -INF])
+def test_stamps_that_are_not_finite_are_left_out(stamp: float) -> None:
+    stamps, places = drawn(1)
+    good = list(map(look, stamps, places))
+    for looks in ([look(stamp, (1.0, 0.0, 0.0)), *good], [*good, look(stamp, (1.0, 0.0, 0.0))]):
+        one = tracked(*looks)
+        assert same(one.tracks["box"], tracked(*good).tracks["box"]) and one.last == stamps[-1]
+
+
+@settings(max_examples=25)
+@given(seeds, st.floats(0.0, 0.1), st.floats(0.0, 1.0), st.floats(0.0, 0.05))
+def test_obstacles_are_within_what_they_can_reach(seed: int, error: float, fastest: float, margin: float) -> None:
+    rng = np.random.default_rng(seed)
+    times = np.arange(0, 201) * 0.01
+    ways = rng.normal(size=(200, 3))
+    ways *= rng.choice([0.3, 1.0], (200, 1)) * 0.01 * fastest / np.linalg.norm(ways, axis=1, keepdims=True)
+    ways = np.repeat(ways[::10], 10, axis=0) if seed % 2 else ways  # turns at every step, or seldom
+    truth = rng.uniform(-1, 1, 3) + np.vstack([np.zeros(3), np.cumsum(ways, axis=0)])
+    tracker = Tracker(KERNEL)
+    for k in range(0, 201, 3):
+        if k and rng.random() < 0.3:
+            continue
+        off = rng.normal(size=3)
+        tracker.take(look(times[k], truth[k] + error * rng.random() * off / np.linalg.norm(off)))
+        movers = tracker.reachable(error, fastest, margin)
+        a = movers.arrays
+        for j in range(k, min(k + 40, 201)):
+            allowed = a.growth[0, 0] + a.growth[0, 1] * (times[j] - a.stamp[0])
+            assert np.linalg.norm(truth[j] - movers.at(times[j])["box"]) <= allowed - margin + 1e-9
+
+
+@settings(max_examples=40)
+@given(seeds, st.floats(0.0, 0.1), st.floats(0.0, 0.03))
+def test_margins_are_eased_where_the_robot_stands(seed: int, margin: float, gap: float) -> None:
+    rng, q = np.random.default_rng(seed), suite_robot().home
+    direction = rng.normal(size=3)
+    direction /= np.linalg.norm(direction)
+    low, high = 0.0, 3.0
+    alone = Movers([at((0, 0, 0))])
+    for _ in range(40):  # as near in that direction as leaves the gap
+        middle = 0.5 * (low + high)
+        alone.update("box", np.array((0.4, 0.0, 0.6)) + middle * direction)
+        clear = clearance_in_time(KERNEL, alone, q[None], np.zeros(1), 1.0)[0][0]
+        low, high = (low, middle) if clear > LEAST + gap else (middle, high)
+    place = np.array((0.4, 0.0, 0.6)) + high * direction
+    tracker = tracked(look(0.0, place))
+    raw = tracker.predicted(margin, "still")
+    before = raw.arrays.growth.copy()
+    eased = tracker.eased(raw, q, [0.0, 0.1])
+    clear = clearance_in_time(KERNEL, eased, np.stack([q, q]), np.array([0.0, 0.1]), 1.0)[0]
+    assert clear.min() >= LEAST - 1e-9, "what stands clear stays clear"
+    assert (eased.arrays.growth >= 0.0).all() and (eased.arrays.growth <= before).all()
+    if margin < gap:
+        assert np.array_equal(eased.arrays.growth, before), "no more is taken than is missing"
+
+
+def test_no_margin_is_left_where_an_obstacle_touches_the_robot() -> None:
+    q = suite_robot().home
+    palm = suite_robot().link_pose(q, "left_hand_palm")[:3, 3]
+    tracker = tracked(look(0.0, palm))
+    eased = tracker.eased(tracker.predicted(0.05), q, [0.0])
+    assert (eased.arrays.growth[:, 0] == 0.0).all() and (eased.arrays.growth[:, 1] > 0.0).all()
