@@ -242,6 +242,8 @@ class Executor:
         failed = Pending.failed
         try:
             answer = self.replanner.replan(self.ready, request, charges)
+            if not isinstance(answer, Answer):
+                raise TypeError(f"{type(answer).__name__} is no answer")
         except Exception as error:  # whatever a way of replanning does, the robot goes on or stops
             answer, failed = Answer(None, "", charges), f"{type(error).__name__}: {error}"
         taken = charges.spent if settings.latency < 0.0 else settings.latency
