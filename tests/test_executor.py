@@ -2,95 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import subprocess
+import sys
 from dataclasses import replace
-from functools import cache
 from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from loops import BLOCKED, PROBLEM, ByHand, Find, boxes, crossing, go, line, line_from, setup_of
 
-from apex_ompl import problems
+from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ApexError
-from apex_ompl.live.timed_spline import Start, TimedSpline
+from apex_ompl.live.timed_spline import Start
 from apex_ompl.loop.charges import Charges
 from apex_ompl.loop.following import Following
 from apex_ompl.loop.ready import Ready
-from apex_ompl.loop.referee import RefereeReport, judge
+from apex_ompl.loop.referee import RefereeReport
 from apex_ompl.loop.request import Answer, Request
 from apex_ompl.loop.run import run
-from apex_ompl.loop.sensor import Sensor, SensorStream
+from apex_ompl.loop.sensor import Sensor
 from apex_ompl.loop.settings import LoopSettings
-from apex_ompl.loop.simulation import Simulated, simulate
-from apex_ompl.ompl_adapter.setup import PlanningSetup, assemble
-from apex_ompl.problems.world_scripts import moving_world
+from apex_ompl.loop.simulation import Simulated
 from apex_ompl.scene.bodies import Obstacle
-from apex_ompl.trajectory import Timing, Trajectory, time_path
-from apex_ompl.trajectory.methods.spline import least_knot_spacing
+from apex_ompl.scene.scripts import place_at
+from apex_ompl.trajectory import Trajectory
 from apex_ompl.trajectory.rests import is_at_rest
-
-PROBLEM, BLOCKED = "vertical/free/1", "vertical/free/0"  # the straight line is free, and meets what stands still
-Find = Callable[[Ready, Request], Following | None]
-FAR = Obstacle(name="far", box=(0.1, 0.1, 0.1), position=(2.0, 2.0, 1.0), velocity=(0.0, 0.01, 0.0))
-
-
-class ByHand:
-    """A way of replanning that answers what a function says."""
-
-    def __init__(self, find: Find, seconds: float = 0.03) -> None:
-        self.find, self.seconds, self.asked = find, seconds, []
-
-    def prepare(self, ready: Ready) -> None:
-        """Nothing is needed."""
-
-    def replan(self, ready: Ready, request: Request, charges: Charges) -> Answer:
-        self.asked.append(request)
-        charges.spent += self.seconds
-        return Answer(self.find(ready, request), "by hand", charges)
-
-
-@cache
-def setup_of(name: str) -> PlanningSetup:
-    return assemble(problems.load(name).still, seed=0)
-
-
-def line(ready: Ready, request: Request) -> Following:
-    """The straight line to the goal, whatever is in its way."""
-    start, goal = request.following.start(request.join), ready.goals[0]
-    return Following(line_from(ready, start, goal), request.join, to_goal=True)
-
-
-def line_from(ready: Ready, start: Start, goal: np.ndarray) -> Trajectory:
-    if not np.stack(start)[1:].any():
-        return time_path(np.stack([start.position, goal]), ready.limits, ready.names).trajectory
-    spline = TimedSpline.along(np.linspace(start.position, goal, 32), 0.8, start, goal)
-    for _ in range(20):
-        least = least_knot_spacing(spline.control, ready.limits)
-        if least <= spline.spacing:
-            break
-        spline = spline.lasting(max(least, 1.05 * spline.spacing))
-    return spline.trajectory(ready.names)
-
-
-def go(
-    replanner: Any, *obstacles: Obstacle, name: str = PROBLEM, speed: float = 1.0, sensor: Sensor | None = None,
-    **parameters: Any,
-) -> tuple[Simulated, RefereeReport]:  # fmt: skip
-    """A run, and what the referee says of it."""
-    setup = setup_of(name)
-    problem = problems.load(name).still
-    world = moving_world(problem.model_copy(update={"scene": (*problem.scene, *(obstacles or (FAR,)))}))
-    share = 1.0 - 1e-6
-    limits = Timing(velocity_scale=speed).limits(setup.robot.limits, setup.robot.joint_names)
-    kinds = ("velocity", "acceleration", "jerk")
-    limits = replace(limits, **{kind: share * getattr(limits, kind) for kind in kinds})
-    ready = Ready(setup, limits, LoopSettings(**{"timeout": 3.0, **parameters}))
-    stream = SensorStream(sensor or Sensor(), world, ready.settings.watched)
-    done = simulate(world, ready, replanner, stream, seed=0)
-    truth = problem.model_copy(update={"scene": (*problem.scene, *world.script())})
-    return done, judge(setup.robot, truth, done.trajectory, goals=ready.goals)
 
 
 def reasons(done: Simulated) -> set[str]:
@@ -109,51 +47,38 @@ def check_limits(report: RefereeReport) -> None:
     assert max(report.limit_use.values()) <= 1.0 + 1e-9
 
 
-def boxes(seed: int, fastest: float) -> list[Obstacle]:
-    """Boxes that go to where the straight line is, and turn or not, no faster than allowed."""
-    rng, setup = np.random.default_rng(seed), setup_of(PROBLEM)
+def touched(obstacles: list[Obstacle], motion: Trajectory) -> list[float]:
+    """Times at which the exact shapes touch while the robot moves."""
+    checker = CollisionChecker(setup_of(PROBLEM).robot, obstacles)
     found = []
-    for k in range(3):
-        share, edge = rng.random(), rng.uniform(0.05, 0.15)
-        q = setup.start + share * (setup.valid_goals[0] - setup.start)
-        side = ("left", "right")[int(rng.integers(2))]
-        target = setup.robot.link_pose(q, f"{side}_hand_palm")[:3, 3]
-        place, time = target + rng.uniform(-0.5, 0.5, 3), 0.0
-        rows = [(time, *place)]
-        while time < 6.0:
-            way = target + rng.uniform(-0.3, 0.3, 3) - place
-            lasts = np.linalg.norm(way) / (fastest * rng.uniform(0.3, 1.0))
-            lasts, way = (lasts, way) if rng.random() < 0.5 else (0.5 * lasts, 0.5 * way)
-            place, time = place + way, time + lasts
-            rows.append((time, *place))
-        rows = tuple(tuple(map(float, row)) for row in rows)
-        found.append(Obstacle(name=f"box_{k}", box=(edge,) * 3, position=rows[0][1:], trajectory=rows))
+    for time in np.arange(0.0, motion.duration, 0.005).tolist():
+        if is_at_rest(motion, time):
+            continue
+        for o in obstacles:
+            checker.move(o.name, place_at(o, time))
+        free = checker.is_free(motion(time)) or not any(
+            c.second.startswith("box") for c in checker.contacts(motion(time))
+        )
+        found += [] if free else [time]
     return found
 
 
-@settings(max_examples=8)
-@given(st.integers(0, 10**6), st.sampled_from([0.2, 0.4, 0.8]), st.sampled_from(["still", "cv"]))
-def test_the_robot_never_touches_what_moves_while_it_moves(seed: int, fastest: float, prediction: str) -> None:
-    done, report = go(
-        ByHand(line), *boxes(seed, fastest), fastest=fastest, prediction=prediction, sensor=Sensor(seed=seed)
-    )  # fmt: skip
-    assert done.broken == 0
-    assert report.contact is None or not report.contact.moved, str(report.contact)
-    assert report.still_contact is None
+@settings(max_examples=10)
+@given(st.integers(0, 10**6), st.sampled_from([0.2, 0.4, 0.8]), st.sampled_from(["still", "cv"]), st.booleans())
+def test_the_robot_touches_nothing_while_it_moves(seed: int, fastest: float, prediction: str, monitored: bool) -> None:
+    """But where it leaves a place that a box comes to, which is said in the event."""
+    some = boxes(seed, fastest)
+    parameters = {"fastest": fastest, "prediction": prediction, "monitored": monitored}
+    done, report = go(ByHand(line), *some, sensor=Sensor(seed=seed), **parameters)
+    assert done.broken == 0 and report.still_contact is None
     check_limits(report)
-
-
-def crossing(setup: PlanningSetup) -> Obstacle:
-    """A box that comes into the straight line soon after the robot set out."""
-    middle = 0.4 * setup.start + 0.6 * setup.valid_goals[0]
-    links = ("left_hand_palm", "right_hand_palm")
-    moves = [np.linalg.norm(setup.robot.link_pose(setup.start, n)[:3, 3] - setup.robot.link_pose(middle, n)[:3, 3])
-             for n in links]  # fmt: skip
-    target = setup.robot.link_pose(middle, links[int(np.argmax(moves))])[:3, 3]
-    begin = target + (0.0, 0.0, 0.45)
-    rows = ((0.0, *begin), (1.0, *target), (9.0, *target))
-    rows = tuple(tuple(map(float, row)) for row in rows)
-    return Obstacle(name="box", box=(0.1, 0.1, 0.1), position=rows[0][1:], trajectory=rows)
+    accepted = [event for event in done.events if event.kind == "accepted"]
+    assert monitored or not any(event.data["leaving"] for event in accepted)
+    hits = touched(some, done.trajectory)
+    if report.contact is not None and report.contact.moved:
+        hits.append(report.contact.time)
+    for time in hits:
+        assert [event for event in accepted if event.time <= time][-1].data["leaving"], time
 
 
 def test_without_the_guard_the_robot_runs_into_it() -> None:
@@ -243,7 +168,7 @@ def first_line_then(find: Find) -> Find:
 def test_a_robot_that_moves_stops_where_answers_are_of_no_use(find: Find) -> None:
     box = crossing(setup_of(PROBLEM))
     done, report = go(ByHand(first_line_then(find)), box, prediction="still", speed=0.3, fastest=0.5)
-    assert {"accepted", "conflict", "rejected", "stop"} <= kinds(done) and not stood(done) and not done.reached
+    assert {"accepted", "rejected", "stop"} <= kinds(done) and not stood(done) and not done.reached
     assert report.contact is None or not report.contact.moved
     assert report.still_contact is None and report.at_rest
     check_limits(report)
@@ -294,8 +219,9 @@ def test_a_goal_that_is_reached_ends_the_run_whatever_is_under_way() -> None:
     """A box comes to the goal behind the arrival, so that replans are asked for that never answer."""
     setup = setup_of(PROBLEM)
     palm = setup.robot.link_pose(setup.valid_goals[0], "left_hand_palm")[:3, 3]
-    box = Obstacle(name="box", box=(0.1, 0.1, 0.1), position=tuple(map(float, palm + (0.0, 0.0, 1.0))),
-                   velocity=(0.0, 0.0, -0.5))  # fmt: skip
+    rows = ((0.0, *(palm + (0.0, 0.0, 1.0))), (0.3, *(palm + (0.0, 0.0, 1.0))), (2.1, *(palm + (0.0, 0.0, 0.1))))
+    rows = tuple(tuple(map(float, row)) for row in rows)
+    box = Obstacle(name="box", box=(0.1, 0.1, 0.1), position=rows[0][1:], trajectory=rows)
 
     class Slow(ByHand):
         def replan(self, ready: Ready, request: Request, charges: Charges) -> Answer:
@@ -310,7 +236,14 @@ def test_a_goal_that_is_reached_ends_the_run_whatever_is_under_way() -> None:
 
 @pytest.mark.parametrize("planner", ["no-network", "apex"])
 def test_the_same_seed_gives_the_same_run(planner: str) -> None:
-    one, other = (run("vertical/moving-large-0.2/800001", planner, seed=5, speed=0.5) for _ in range(2))
+    one = run("vertical/moving-large-0.2/800001", planner, seed=5, speed=0.5)
+    busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(2)]  # on a loaded machine too
+    try:
+        other = run("vertical/moving-large-0.2/800001", planner, seed=5, speed=0.5)
+    finally:
+        for process in busy:
+            process.kill()
+            process.wait()
     assert one.events == other.events and len(one.events) > 2 and one.outcome == other.outcome
     for name in ("times", "positions", "velocities", "accelerations"):
         assert np.array_equal(getattr(one.trajectory, name), getattr(other.trajectory, name))
