@@ -3,8 +3,9 @@
 At every step the robot goes on only where the next step and a stop behind it are proved clear of all that obstacles of
 bounded speed can reach; else it follows the stop that was proved a step before. By induction it is at rest whenever it
 is touched, as long as no obstacle is faster than was assumed, and each was seen, within the error assumed, not longer
-ago than what was known when the stop was proved. (A fail-safe manoeuvre that is verified online, Althoff and Dolan
-2014; Pereira and Althoff 2015.)
+ago than what was known when the stop was proved. The one exception is a robot that leaves a place that an obstacle
+comes to: it goes on without a proved stop until there is one again. (A fail-safe manoeuvre that is verified online,
+Althoff and Dolan 2014; Pereira and Althoff 2015.)
 """
 
 from __future__ import annotations
@@ -165,7 +166,8 @@ class Executor:
             self.log(now, "rejected", why=why, number=request.number, part=pending.answer.part)
             return
         self.log(
-            now, "accepted", number=request.number, part=pending.answer.part, arrival=found.end, to_goal=found.to_goal
+            now, "accepted", number=request.number, part=pending.answer.part, arrival=found.end, to_goal=found.to_goal,
+            leaving=leaving,
         )  # fmt: skip
         self._answered(now, pending.answer.part)
         if found.to_goal:
@@ -233,6 +235,8 @@ class Executor:
         failed = Pending.failed
         try:
             answer = self.replanner.replan(self.ready, request, charges)
+            if not isinstance(answer, Answer):
+                raise TypeError(f"{type(answer).__name__} is no answer")
         except Exception as error:  # whatever a way of replanning does, the robot goes on or stops
             answer, failed = Answer(None, "", charges), f"{type(error).__name__}: {error}"
         taken = charges.spent if settings.latency < 0.0 else settings.latency

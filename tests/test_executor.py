@@ -1,0 +1,250 @@
+"""The executor: the guarantee whatever a way of replanning says, and what happens to answers that are of no use."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from loops import BLOCKED, PROBLEM, ByHand, Find, boxes, crossing, go, line, line_from, setup_of
+
+from apex_ompl.collision import CollisionChecker
+from apex_ompl.errors import ApexError
+from apex_ompl.live.timed_spline import Start
+from apex_ompl.loop.charges import Charges
+from apex_ompl.loop.following import Following
+from apex_ompl.loop.ready import Ready
+from apex_ompl.loop.referee import RefereeReport
+from apex_ompl.loop.request import Answer, Request
+from apex_ompl.loop.run import run
+from apex_ompl.loop.sensor import Sensor
+from apex_ompl.loop.settings import LoopSettings
+from apex_ompl.loop.simulation import Simulated
+from apex_ompl.scene.bodies import Obstacle
+from apex_ompl.scene.scripts import place_at
+from apex_ompl.trajectory import Trajectory
+from apex_ompl.trajectory.rests import is_at_rest
+
+
+def reasons(done: Simulated) -> set[str]:
+    return {event.data["why"] for event in done.events if event.kind == "rejected"}
+
+
+def kinds(done: Simulated) -> set[str]:
+    return {event.kind for event in done.events}
+
+
+def stood(done: Simulated) -> bool:
+    return bool((done.trajectory.positions == done.trajectory.positions[0]).all())
+
+
+def check_limits(report: RefereeReport) -> None:
+    assert max(report.limit_use.values()) <= 1.0 + 1e-9
+
+
+def touched(obstacles: list[Obstacle], motion: Trajectory) -> list[float]:
+    """Times at which the exact shapes touch while the robot moves."""
+    checker = CollisionChecker(setup_of(PROBLEM).robot, obstacles)
+    found = []
+    for time in np.arange(0.0, motion.duration, 0.005).tolist():
+        if is_at_rest(motion, time):
+            continue
+        for o in obstacles:
+            checker.move(o.name, place_at(o, time))
+        free = checker.is_free(motion(time)) or not any(
+            c.second.startswith("box") for c in checker.contacts(motion(time))
+        )
+        found += [] if free else [time]
+    return found
+
+
+@settings(max_examples=10)
+@given(st.integers(0, 10**6), st.sampled_from([0.2, 0.4, 0.8]), st.sampled_from(["still", "cv"]), st.booleans())
+def test_the_robot_touches_nothing_while_it_moves(seed: int, fastest: float, prediction: str, monitored: bool) -> None:
+    """But where it leaves a place that a box comes to, which is said in the event."""
+    some = boxes(seed, fastest)
+    parameters = {"fastest": fastest, "prediction": prediction, "monitored": monitored}
+    done, report = go(ByHand(line), *some, sensor=Sensor(seed=seed), **parameters)
+    assert done.broken == 0 and report.still_contact is None
+    check_limits(report)
+    accepted = [event for event in done.events if event.kind == "accepted"]
+    assert monitored or not any(event.data["leaving"] for event in accepted)
+    hits = touched(some, done.trajectory)
+    if report.contact is not None and report.contact.moved:
+        hits.append(report.contact.time)
+    for time in hits:
+        assert [event for event in accepted if event.time <= time][-1].data["leaving"], time
+
+
+def test_without_the_guard_the_robot_runs_into_it() -> None:
+    """So the guard is what keeps it from that in the other tests."""
+    box, slow = crossing(setup_of(PROBLEM)), {"speed": 0.3, "fastest": 0.5}
+    blind, hit = go(ByHand(line), box, prediction="still", guarded=False, monitored=False, **slow)
+    assert hit.contact is not None and hit.contact.moved and "stop" not in kinds(blind)
+    done, report = go(ByHand(line), box, prediction="still", monitored=False, **slow)
+    assert report.contact is None or not report.contact.moved
+    assert "stop" in kinds(done) and not done.reached and is_at_rest(done.trajectory, done.trajectory.duration)
+    check_limits(report)
+
+
+def test_the_straight_line_is_followed_where_nothing_is_in_the_way() -> None:
+    done, report = go(ByHand(line))
+    assert done.reached and report.at_goal and report.at_rest and not report.faults
+    assert [event.kind for event in done.events] == ["request", "accepted", "goal"]
+    check_limits(report)
+
+
+def shifted(ready: Ready, request: Request) -> Following:
+    start = ready.setup.start.copy()
+    start[0] += 1e-3
+    return Following(line_from(ready, Start.at_rest(start), ready.goals[0]), request.join, to_goal=True)
+
+
+def under_way(ready: Ready, request: Request) -> Following:
+    """Begins with a speed that the robot does not have."""
+    found = line(ready, request)
+    return Following(found.motion.after(0.1), request.join, to_goal=True)
+
+
+def unfinished(ready: Ready, request: Request) -> Following:
+    motion = line(ready, request).motion
+    half = np.searchsorted(motion.times, 0.5 * motion.duration)
+    rows = (getattr(motion, name)[:half] for name in ("times", "positions", "velocities", "accelerations"))
+    return Following(Trajectory(*rows, motion.joint_names), request.join)
+
+
+def fast(ready: Ready, request: Request) -> Following:
+    motion = line(ready, request).motion
+    rows = 0.5 * motion.times, motion.positions, 2.0 * motion.velocities, 4.0 * motion.accelerations
+    return Following(Trajectory(*rows, motion.joint_names), request.join, to_goal=True)
+
+
+def boasting(ready: Ready, request: Request) -> Following:
+    halfway = 0.5 * (ready.setup.start + ready.goals[0])
+    return Following(line_from(ready, Start.at_rest(ready.setup.start), halfway), request.join, to_goal=True)
+
+
+def hasty(ready: Ready, request: Request) -> Following:
+    return replace(line(ready, request), begin=request.join - 0.02)
+
+
+def renamed(ready: Ready, request: Request) -> Following:
+    found = line(ready, request)
+    return replace(found, motion=replace(found.motion, joint_names=tuple(reversed(ready.names))))
+
+
+@pytest.mark.parametrize(
+    ("find", "name", "why"),
+    [(shifted, PROBLEM, "it does not begin where the robot will be"),
+     (under_way, PROBLEM, "it does not begin where the robot will be"),
+     (hasty, PROBLEM, "it does not begin where the robot will be"),
+     (unfinished, PROBLEM, "it does not end at rest"),
+     (boasting, PROBLEM, "it does not end at a goal"),
+     (renamed, PROBLEM, "it is a motion of other joints"),
+     (fast, PROBLEM, "it exceeds limits, or is not proved clear of what stands still"),
+     (line, BLOCKED, "it exceeds limits, or is not proved clear of what stands still"),
+     (lambda ready, request: None, PROBLEM, "nothing was found")],
+    ids=["shifted", "under-way", "hasty", "unfinished", "boasting", "renamed", "fast", "blocked", "nothing"],
+)  # fmt: skip
+def test_answers_that_do_not_fit_are_rejected_and_the_robot_stands(find: Find, name: str, why: str) -> None:
+    replanner = ByHand(find)
+    done, report = go(replanner, name=name, timeout=0.5)
+    assert reasons(done) == {why} and stood(done) and not done.reached and done.ended == "timeout"
+    assert kinds(done) == {"request", "rejected"} and len(replanner.asked) > 3
+    assert report.contact is None and report.still_contact is None
+
+
+def first_line_then(find: Find) -> Find:
+    """The straight line at first, and then something else."""
+    return lambda ready, request: line(ready, request) if request.number == 1 else find(ready, request)
+
+
+@pytest.mark.parametrize("find", [shifted, under_way, boasting, lambda ready, request: 1 / 0])
+def test_a_robot_that_moves_stops_where_answers_are_of_no_use(find: Find) -> None:
+    box = crossing(setup_of(PROBLEM))
+    done, report = go(ByHand(first_line_then(find)), box, prediction="still", speed=0.3, fastest=0.5)
+    assert {"accepted", "rejected", "stop"} <= kinds(done) and not stood(done) and not done.reached
+    assert report.contact is None or not report.contact.moved
+    assert report.still_contact is None and report.at_rest
+    check_limits(report)
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [(ApexError("no way"), "ApexError: no way"), (ValueError("a bad number"), "ValueError: a bad number"),
+     (MemoryError(), "MemoryError: ")],
+)  # fmt: skip
+def test_a_way_of_replanning_that_fails_is_an_event(error: Exception, words: str) -> None:
+    def fail(ready: Ready, request: Request) -> Following:
+        raise error
+
+    done, _ = go(ByHand(fail), timeout=0.5)
+    assert reasons(done) == {words} and stood(done) and done.ended == "timeout"
+
+
+def test_something_that_is_no_answer_is_an_event() -> None:
+    class Silent(ByHand):
+        def replan(self, ready: Ready, request: Request, charges: Charges) -> Any:
+            return None
+
+    done, _ = go(Silent(line), timeout=0.3)
+    assert stood(done) and reasons(done) == {"TypeError: NoneType is no answer"}
+
+
+@pytest.mark.parametrize(("latency", "followed"), [(0.0, True), (0.05, True), (0.06, False), (0.2, False)])
+def test_answers_behind_their_join_are_rejected(latency: float, followed: bool) -> None:
+    replanner = ByHand(line)
+    done, _ = go(replanner, latency=latency, timeout=1.5)
+    assert done.reached == followed and stood(done) != followed
+    assert reasons(done) == (set() if followed else {"it came too late"})
+    known = [event.time for event in done.events if event.kind in ("accepted", "rejected")]
+    asked = [request.asked for request in replanner.asked]
+    for begin, end in zip(asked, known, strict=False):
+        assert latency - 1e-9 <= end - begin <= latency + LoopSettings.period + 1e-9
+
+
+def test_work_that_takes_longer_than_the_budget_comes_too_late() -> None:
+    late, _ = go(ByHand(line, seconds=0.08), timeout=0.5)
+    assert reasons(late) == {"it came too late"} and stood(late)
+    never, _ = go(ByHand(line, seconds=99.0), timeout=0.5)
+    assert stood(never) and [event.kind for event in never.events] == ["request"]
+
+
+def test_a_goal_that_is_reached_ends_the_run_whatever_is_under_way() -> None:
+    """A box comes to the goal behind the arrival, so that replans are asked for that never answer."""
+    setup = setup_of(PROBLEM)
+    palm = setup.robot.link_pose(setup.valid_goals[0], "left_hand_palm")[:3, 3]
+    rows = ((0.0, *(palm + (0.0, 0.0, 1.0))), (0.3, *(palm + (0.0, 0.0, 1.0))), (2.1, *(palm + (0.0, 0.0, 0.1))))
+    rows = tuple(tuple(map(float, row)) for row in rows)
+    box = Obstacle(name="box", box=(0.1, 0.1, 0.1), position=rows[0][1:], trajectory=rows)
+
+    class Slow(ByHand):
+        def replan(self, ready: Ready, request: Request, charges: Charges) -> Answer:
+            self.seconds = 0.03 if request.number == 1 else 9.0
+            return super().replan(ready, request, charges)
+
+    replanner = Slow(line)
+    done, report = go(replanner, box, fastest=0.5, hold=1.5)
+    assert len(replanner.asked) > 1, "a replan is under way"
+    assert done.reached and done.events[-1].kind == "goal" and report.at_goal and report.contact is None
+
+
+@pytest.mark.parametrize("planner", ["no-network", "apex"])
+def test_the_same_seed_gives_the_same_run(planner: str) -> None:
+    one = run("vertical/moving-large-0.2/800001", planner, seed=5, speed=0.5)
+    busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(2)]  # on a loaded machine too
+    try:
+        other = run("vertical/moving-large-0.2/800001", planner, seed=5, speed=0.5)
+    finally:
+        for process in busy:
+            process.kill()
+            process.wait()
+    assert one.events == other.events and len(one.events) > 2 and one.outcome == other.outcome
+    for name in ("times", "positions", "velocities", "accelerations"):
+        assert np.array_equal(getattr(one.trajectory, name), getattr(other.trajectory, name))
+    assert max(one.trajectory.use(setup_of(PROBLEM).robot.limits).values()) <= 1.0 + 1e-9

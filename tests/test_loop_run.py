@@ -1,0 +1,94 @@
+"""Runs of the closed loop in worlds of each kind, and what is asked for wrongly."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from apex_ompl import problems
+from apex_ompl.errors import ApexError
+from apex_ompl.loop.result import Outcome, RunResult
+from apex_ompl.loop.run import run
+from apex_ompl.loop.settings import LoopSettings
+from apex_ompl.problems import worlds
+from apex_ompl.problems.suite_robot import robot
+from apex_ompl.scene.bodies import Obstacle
+from apex_ompl.scene.scripts import place_at
+
+MOVING = "vertical/moving-large-0.2/800001"
+NAN = float("nan")
+
+
+@pytest.mark.parametrize("kind", worlds.kinds())
+def test_runs_in_all_worlds_are_results(kind: str, tmp_path: Path) -> None:
+    name = worlds.ids(kind, "validation", 1)[0]
+    settings = LoopSettings(timeout=8.0, stuck=3.0, fastest=max(worlds.load(name).fastest, 1e-3))
+    found = run(name, "no-network", speed=1.0, settings=settings)
+    motion = found.trajectory
+    assert found.outcome not in (Outcome.START_INVALID, Outcome.LIMITS, Outcome.HIT_STILL)
+    assert bool(found) == (found.outcome is Outcome.REACHED) == (found.reason == "")
+    assert 0.0 < motion.duration <= 8.0 + 0.01 and max(motion.use(robot().limits).values()) <= 1.0 + 1e-9
+    assert found.metrics["replans_asked"] >= 1.0
+    late = kind in ("popup", "interceptor")  # what comes into being is not seen at once
+    assert late or found.metrics["broken_steps"] == 0.0
+    moved = [o for o in found.problem.scene if o.moving]
+    assert moved or late
+    for o in moved:
+        assert np.isfinite(place_at(o, motion.duration)).all()
+    found.save(tmp_path / "run.npz")
+    again = RunResult.load(tmp_path / "run.npz")
+    assert again.as_dict() == found.as_dict() and again.outcome is found.outcome
+    assert np.array_equal(again.trajectory.positions, motion.positions)
+    if found:
+        goals = found.problem.goal_states(robot().joint_names)
+        assert (np.abs(goals - motion.positions[-1]).max(axis=1) < 1e-9).any()
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [({"planner": "apx"}, "way of replanning 'apx', did you mean 'apex'"), ({"clock": "rel"}, "clock 'rel'"),
+     ({"prediction": "cvv"}, "prediction 'cvv'"), ({"problem": "popup/vertical/larg/12"}, "size of cubes 'larg'"),
+     ({"problem": "nothing"}, "world 'nothing'"), ({"problem": "no/such/file.yaml"}, "no/such/file.yaml"),
+     ({"speed": 0.0}, "velocity_scale|speed"), ({"speed": NAN}, "velocity_scale|speed"),
+     ({"speed": -1.0}, "velocity_scale|speed"), ({"speed": 1.5}, "velocity_scale|speed"), ({"seed": -1}, "seed"),
+     ({"seed": 0.5}, "seed")],
+)  # fmt: skip
+def test_what_is_asked_for_wrongly_is_named(given: dict[str, Any], words: str) -> None:
+    arguments = {"problem": MOVING, "planner": "no-network", **given}
+    with pytest.raises(ApexError, match=words):
+        run(**arguments)
+
+
+@pytest.mark.parametrize(
+    "given",
+    [{"period": 0.0}, {"period": NAN}, {"budget": 0.055}, {"timeout": 0.0}, {"timeout": float("inf")},
+     {"fastest": -0.1}, {"error": NAN}, {"latency": -2.0}, {"prediction": "best"}],
+    ids=str,
+)  # fmt: skip
+def test_parameters_outside_their_ranges_are_named(given: dict[str, Any]) -> None:
+    with pytest.raises(ApexError, match=next(iter(given))):
+        LoopSettings(**given)
+
+
+def test_a_start_in_collision_is_an_outcome(tmp_path: Path) -> None:
+    problem = problems.load(MOVING)
+    q = problem.start_state(robot().joint_names)
+    palm = tuple(map(float, robot().link_pose(q, "left_hand_palm")[:3, 3]))
+    post = Obstacle(name="post", box=(0.1, 0.1, 0.1), position=palm)
+    found = run(problem.model_copy(update={"scene": (*problem.scene, post)}), "no-network")
+    assert found.outcome is Outcome.START_INVALID and not found and "post" in found.reason
+    assert found.trajectory.duration == 0.0 and found.events == ()
+    found.save(tmp_path / "run.json")
+    assert RunResult.load(tmp_path / "run.json").reason == found.reason
+
+
+def test_a_goal_in_collision_is_no_error() -> None:
+    problem = problems.load(MOVING)
+    goal = problem.goal_states(robot().joint_names)[0]
+    palm = tuple(map(float, robot().link_pose(goal, "left_hand_palm")[:3, 3]))
+    post = Obstacle(name="post", box=(0.03, 0.03, 0.03), position=palm)
+    found = run(problem.model_copy(update={"scene": (*problem.scene, post)}), "no-network")
+    assert found.outcome is Outcome.STUCK and "post" in found.reason
