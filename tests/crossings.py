@@ -38,11 +38,10 @@ def place_on(kernel: Kernel, motion: Trajectory, rng: np.random.Generator, time:
     return there[rng.choice(moved)] if len(moved) else np.full(3, np.nan)
 
 
-def crossing(
-    kernel: Kernel, motion: Trajectory, rng: np.random.Generator, kind: str = "box",
-    growth: tuple[float, float] = (0.0, 0.0),
-) -> Movers | None:  # fmt: skip
-    """A mover that is where the robot is at a time of a motion, or None where no joint moves far."""
+def crossing_obstacle(
+    kernel: Kernel, motion: Trajectory, rng: np.random.Generator, kind: str = "box"
+) -> Obstacle | None:  # fmt: skip
+    """An obstacle that is where the robot is at a time of a motion, or None where no joint moves far."""
     time = rng.uniform(0.3, 0.8) * motion.duration
     velocity = rng.normal(0.0, 1.0, 3)
     velocity *= rng.choice(SPEEDS) / np.linalg.norm(velocity)
@@ -51,13 +50,20 @@ def crossing(
         return None
     turn = rng.normal(0.0, 1.0, 4)
     turn /= np.linalg.norm(turn)
-    movers = Movers(
-        [
-            Obstacle(
-                name="mover", position=tuple(place), velocity=tuple(velocity), orientation=tuple(turn),
-                **shape(kind, float(rng.choice([0.04, 0.08, 0.15]))),
-            )
-        ]
+    return Obstacle(
+        name="mover", position=tuple(place), velocity=tuple(velocity), orientation=tuple(turn),
+        **shape(kind, float(rng.choice([0.04, 0.08, 0.15]))),
     )  # fmt: skip
+
+
+def crossing(
+    kernel: Kernel, motion: Trajectory, rng: np.random.Generator, kind: str = "box",
+    growth: tuple[float, float] = (0.0, 0.0),
+) -> Movers | None:  # fmt: skip
+    """The mover of :func:`crossing_obstacle`, or None."""
+    obstacle = crossing_obstacle(kernel, motion, rng, kind)
+    if obstacle is None:
+        return None
+    movers = Movers([obstacle])
     movers.update("mover", growth=growth)
     return movers

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from crossings import arm_motion, crossing
+from crossings import arm_motion, crossing, crossing_obstacle
 
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.kernel import Kernel
@@ -112,12 +112,11 @@ def test_states_are_blocked_when_meshes_touch_movers(kernel: Kernel, robot: Robo
     rng, times, contacts = np.random.default_rng(3), np.arange(0.0, HORIZON, SAMPLING), 0
     for _ in range(4):
         motion = arm_motion(robot, rng, 0.25)
-        movers = crossing(kernel, motion, rng, kind)
-        if movers is None:
+        mover = crossing_obstacle(kernel, motion, rng, kind)
+        if mover is None:
             continue
-        place = np.full((1, 2), rng.uniform(0.3, 0.8) * motion.duration)
+        movers, place = Movers([mover]), np.full((1, 2), rng.uniform(0.3, 0.8) * motion.duration)
         found, state = blocked(kernel, movers, motion, place, begin=0.0, end=HORIZON), motion(place[0, 0])
-        mover = movers.obstacles["mover"]
         checker = CollisionChecker(robot, [mover])
         near = clearance_in_time(kernel, movers, np.tile(state, (len(times), 1)), times)[0] <= 0.0
         for time in rng.permutation(times[near])[:100]:

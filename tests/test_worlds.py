@@ -200,13 +200,20 @@ def test_time_does_not_go_back(kind: str) -> None:
     world = worlds.load(f"{kind}/vertical/small/1")
     motion = first_motion(world)
     world.advance(1.0, motion(0.0))
-    for call in (
-        lambda: world.advance(0.9, motion(0.0)),
-        lambda: world.begin(motion, 0.9),
-        lambda: world.present(-0.1),
-    ):
+    for call in (lambda: world.advance(0.9, motion(0.0)), lambda: world.begin(motion, 0.9)):
         with pytest.raises(ParameterError, match="time"):
             call()
+
+
+def test_before_the_beginning_obstacles_of_constant_velocity_move_and_others_stand() -> None:
+    name = "vertical/moving-large-0.2/800001"
+    (cube,) = worlds.load(name).present(-0.3)
+    (given,) = (o for o in problems.load(name).scene if o.moving)
+    assert np.allclose(cube.position, np.subtract(given.position, np.multiply(given.velocity, 0.3)), atol=1e-12)
+    for kind in ("turning", "crowd", "pusher"):
+        world = worlds.load(f"{kind}/vertical/small/1")
+        before, first = ([o.position for o in world.present(t)] for t in (-0.3, 0.0))
+        assert np.allclose(before, first, atol=1e-12), kind
 
 
 @pytest.mark.parametrize("kind", ["popup", "interceptor", "pusher"])
