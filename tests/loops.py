@@ -80,7 +80,7 @@ def go(
     limits = Timing(velocity_scale=speed).limits(setup.robot.limits, setup.robot.joint_names)
     kinds = ("velocity", "acceleration", "jerk")
     limits = replace(limits, **{kind: share * getattr(limits, kind) for kind in kinds})
-    ready = Ready(setup, limits, LoopSettings(**{"timeout": 3.0, **parameters}))
+    ready = Ready(setup, limits, limits, LoopSettings(**{"timeout": 3.0, **parameters}))
     stream = SensorStream(sensor or Sensor(), world, ready.settings.watched)
     done = simulate(world, ready, replanner, stream, seed=0)
     truth = problem.model_copy(update={"scene": (*problem.scene, *world.script())})
