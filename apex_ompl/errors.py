@@ -125,6 +125,10 @@ class TimingStoppedError(TimingError):
     """A time parameterization that was told to stop before it had a valid motion."""
 
 
+class PlannerProcessError(ApexError):
+    """The process in which replans are made could not be made ready."""
+
+
 class RobotError(ApexError):
     """A robot description that is not valid."""
 

@@ -124,6 +124,8 @@ def main() -> None:
         with ProcessPoolExecutor(args.jobs) as pool:
             pending = {pool.submit(made, job): job for job in missing}
             for future in tqdm(as_completed(pending), total=len(pending)):
+                if future.exception() is not None:
+                    pool.shutdown(cancel_futures=True)
                 text = json.dumps(future.result(), indent=1)
                 write_atomically(args.store / pending[future].file, text.encode())
     rows: dict[str, list[dict[str, Any]]] = {}

@@ -12,15 +12,17 @@ import numpy as np
 from apex_ompl import problems
 from apex_ompl.live.timed_spline import Start, TimedSpline
 from apex_ompl.loop.charges import Charges
+from apex_ompl.loop.cycle import RunRecord
 from apex_ompl.loop.following import Following
 from apex_ompl.loop.ready import Ready
 from apex_ompl.loop.referee import RefereeReport, judge
 from apex_ompl.loop.request import Answer, Request
 from apex_ompl.loop.sensor import Sensor, SensorStream
 from apex_ompl.loop.settings import LoopSettings
-from apex_ompl.loop.simulation import Simulated, simulate
+from apex_ompl.loop.simulation import simulate
 from apex_ompl.ompl_adapter.setup import PlanningSetup, assemble
 from apex_ompl.problems.world_scripts import moving_world
+from apex_ompl.problems.worlds import World
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.trajectory import Timing, Trajectory, time_path
 from apex_ompl.trajectory.methods.spline import least_knot_spacing
@@ -68,23 +70,32 @@ def line_from(ready: Ready, start: Start, goal: np.ndarray) -> Trajectory:
     return spline.trajectory(ready.names)
 
 
-def go(
-    replanner: Any, *obstacles: Obstacle, name: str = PROBLEM, speed: float = 1.0, sensor: Sensor | None = None,
-    **parameters: Any,
-) -> tuple[Simulated, RefereeReport]:  # fmt: skip
-    """A run, and what the referee says of it."""
-    setup = setup_of(name)
-    problem = problems.load(name).still
-    world = moving_world(problem.model_copy(update={"scene": (*problem.scene, *(obstacles or (FAR,)))}))
-    share = 1.0 - 1e-6
+def ready_of(name: str, *, speed: float = 1.0, **parameters: Any) -> Ready:
+    """What a run keeps ready."""
+    setup, share = setup_of(name), 1.0 - 1e-6
     limits = Timing(velocity_scale=speed).limits(setup.robot.limits, setup.robot.joint_names)
     kinds = ("velocity", "acceleration", "jerk")
     limits = replace(limits, **{kind: share * getattr(limits, kind) for kind in kinds})
-    ready = Ready(setup, limits, limits, LoopSettings(**{"timeout": 3.0, **parameters}))
+    return Ready(setup, limits, limits, LoopSettings(**{"timeout": 3.0, **parameters}))
+
+
+def world_of(name: str, *obstacles: Obstacle) -> World:
+    """A problem's world with obstacles that move."""
+    problem = problems.load(name).still
+    return moving_world(problem.model_copy(update={"scene": (*problem.scene, *(obstacles or (FAR,)))}))
+
+
+def go(
+    replanner: Any, *obstacles: Obstacle, name: str = PROBLEM, speed: float = 1.0, sensor: Sensor | None = None,
+    **parameters: Any,
+) -> tuple[RunRecord, RefereeReport]:  # fmt: skip
+    """A run, and what the referee says of it."""
+    ready, world = ready_of(name, speed=speed, **parameters), world_of(name, *obstacles)
     stream = SensorStream(sensor or Sensor(), world, ready.settings.watched)
     done = simulate(world, ready, replanner, stream, seed=0)
-    truth = problem.model_copy(update={"scene": (*problem.scene, *world.script())})
-    return done, judge(setup.robot, truth, done.trajectory, goals=ready.goals)
+    truth = problems.load(name).still
+    truth = truth.model_copy(update={"scene": (*truth.scene, *world.script())})
+    return done, judge(ready.setup.robot, truth, done.trajectory, goals=ready.goals)
 
 
 def boxes(seed: int, fastest: float) -> list[Obstacle]:

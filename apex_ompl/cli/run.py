@@ -14,6 +14,7 @@ from apex_ompl.util.files import check_writable, suffix_of
 
 SHOWN = {
     "time_to_goal": ("s", 1.0), "rest_time": ("s", 1.0), "clearance": ("mm", 1e3), "reaction_p95": ("ms", 1e3),
+    "tick_p99": ("ms", 1e3), "deadline_misses": ("", 1.0),
 }  # fmt: skip
 
 
@@ -28,8 +29,8 @@ def run(parsed: argparse.Namespace) -> int:
         default_settings(world, sensor), budget=parsed.budget, latency=latency, timeout=parsed.timeout
     )  # fmt: skip
     result = run_loop(
-        world, parsed.planner, prediction=parsed.prediction, seed=parsed.seed, speed=parsed.speed, settings=settings,
-        sensor=sensor,
+        world, parsed.planner, clock=parsed.clock, prediction=parsed.prediction, seed=parsed.seed, speed=parsed.speed,
+        settings=settings, sensor=sensor,
     )  # fmt: skip
     if parsed.out is not None:
         result.save(parsed.out)

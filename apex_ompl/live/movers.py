@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Sequence
 from copy import copy
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -83,8 +83,20 @@ class Movers:
             growth=np.zeros((len(owner), 2)),
             **grid_columns(solids.grids),
         )
-        self.packed = pack(arrays)
-        self.arrays: MoverArrays = movers_view.py_func(*self.packed)  # type: ignore[attr-defined]
+        self._pack(pack(arrays))
+
+    def _pack(self, packed: tuple[Array, ...]) -> None:
+        self.packed = packed
+        self.arrays: MoverArrays = movers_view.py_func(*packed)  # type: ignore[attr-defined]
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the state without views of its arrays."""
+        return {name: value for name, value in self.__dict__.items() if name != "arrays"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Take a state, and make the views anew."""
+        self.__dict__.update(state)
+        self._pack(self.packed)
 
     def __len__(self) -> int:
         """Return the number of obstacles."""
@@ -127,8 +139,7 @@ class Movers:
     def larger(self, by: float) -> Movers:
         """Return a copy with margins that are larger by a distance [m]."""
         other = copy(self)
-        other.packed = tuple(array.copy() for array in self.packed)
-        other.arrays = movers_view.py_func(*other.packed)  # type: ignore[attr-defined]
+        other._pack(tuple(array.copy() for array in self.packed))
         other.arrays.growth[:, 0] += by
         return other
 

@@ -17,37 +17,19 @@ from typing import Any
 import numpy as np
 
 from apex_ompl.live.movers import Movers, clearance_in_time
-from apex_ompl.loop.charges import Charges
 from apex_ompl.loop.evasion import GAIN, SOON
 from apex_ompl.loop.following import SAME_TIME, Following
 from apex_ompl.loop.ready import Ready
-from apex_ompl.loop.request import Answer, Replanner, Request
+from apex_ompl.loop.replanning import Replanning
+from apex_ompl.loop.request import Request
 from apex_ompl.loop.result import Event
 from apex_ompl.loop.tracking import Tracker
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.types import Array
 
 SAME_STATE = 1e-6  # largest jump of positions, velocities and accelerations where a motion begins
-SHARE = 0.85  # of the budget after which nothing new is begun
 NEARER = 0.01  # by which an obstacle must come nearer than where a motion began, within the trigger, to stop it [m]
 FASTER = 0.9  # share of the time to a goal that a plan must have at most to replace one without a conflict
-
-
-@dataclass(frozen=True, eq=False)
-class Pending:
-    """A replan whose answer is not known yet.
-
-    Attributes:
-        known: Time of the clock at which it is [s].
-        request: What was asked for.
-        answer: What comes.
-        failed: Why it finds nothing, where that is known.
-    """
-
-    known: float
-    request: Request
-    answer: Answer
-    failed: str = "nothing was found"
 
 
 @dataclass(eq=False)
@@ -56,7 +38,7 @@ class Executor:
 
     Attributes:
         ready: The robot among what stands still.
-        replanner: How motions are planned anew.
+        replanning: Who plans motions anew.
         tracker: What is known of the obstacles.
         seed: Of random choices.
         following: What the robot follows.
@@ -64,16 +46,17 @@ class Executor:
         followed: What was followed from which times on.
         events: What happened.
         route: The last motion to a goal, or None.
-        pending: The replan that is under way, or None.
+        pending: What was asked for and is not answered yet, or None.
         asked: Number of replans so far.
         conflict: Time of the first conflict of what is followed [s], or infinity.
         endangered: Since when a conflict is known that the command does not answer yet [s], or None.
         nearest: Distance of an obstacle below which the motion counts as blocked, where that goes by distance [m].
         leaving: Whether the robot leaves a place that an obstacle comes to, and goes on without a proved stop.
+        lead: How long before a step it is decided, by what was seen until then [s].
     """
 
     ready: Ready
-    replanner: Replanner
+    replanning: Replanning
     tracker: Tracker
     seed: int
     following: Following
@@ -81,12 +64,13 @@ class Executor:
     followed: list[tuple[float, Following]] = field(default_factory=list)
     events: list[Event] = field(default_factory=list)
     route: Following | None = None
-    pending: Pending | None = None
+    pending: Request | None = None
     asked: int = 0
     conflict: float = math.inf
     endangered: float | None = None
     nearest: float = 0.0
     leaving: bool = False
+    lead: float = 0.0
 
     def log(self, time: float, kind: str, **data: Any) -> None:
         """Note an event."""
@@ -154,6 +138,27 @@ class Executor:
         self._answered(now, "stop")
         self.follow(stop, now)
 
+    @property
+    def _patience(self) -> float:
+        """Time behind which a motion was to begin for which its answer is waited for [s]."""
+        settings = self.ready.settings
+        return settings.stuck if settings.from_rest else settings.period
+
+    def late(self, time: float, following: Following, stop: Following | None) -> None:
+        """Follow from a time on what a driver has: nothing was decided for it in time.
+
+        Args:
+            time: Time of the clock [s].
+            following: What was followed until then.
+            stop: The proved stop that begins then, if there is one.
+        """
+        self.log(time, "late")
+        if stop is not None and not following.at_rest(time):
+            following = stop
+        self.pending, self.stop = None, stop
+        if following is not self.following:
+            self.follow(following, time)
+
     def _guard(self, now: float, reachable: Movers) -> None:
         """Go on with a proved stop behind the next step, or stop."""
         then = now + self.ready.settings.period
@@ -171,37 +176,40 @@ class Executor:
     def _answered(self, now: float, how: str) -> None:
         """Note how long after a conflict was known the command changed."""
         if self.endangered is not None:
-            self.log(now, "reaction", seconds=now - self.endangered, how=how)
+            self.log(now, "reaction", seconds=now - self.endangered + self.lead, how=how)
             self.endangered = None
 
     def _answer(self, now: float, predicted: Movers, reachable: Movers | None) -> None:
         """Take the answer of a replan that is known by now, where it is of use."""
-        pending = self.pending
-        if pending is None or now < pending.known - 1e-9:
+        reply, request = self.replanning.reply(now), self.pending
+        for fault in self.replanning.faults():
+            self.log(now, "planner fault", what=fault)
+        if request is None:
             return
-        self.pending = None
-        found, request = pending.answer.found, pending.request
-        if found is not None and self.ready.settings.from_rest and self.following.at_rest(request.join):
+        if reply is None or reply.number != request.number:
+            if now > request.join + self._patience + 1e-9:
+                self.log(now, "rejected", why="no answer came in time", number=request.number, part="")
+                self.pending = None
+            return
+        self.pending, found, part = None, reply.answer.found, reply.answer.part
+        took = {"number": request.number, "part": part, "took": reply.answer.charges.spent}
+        if found is None:
+            self.log(now, "rejected", why=reply.failed, **took)
+            return
+        if self.ready.settings.from_rest and self.following.at_rest(request.join):
             request = replace(request, join=max(request.join, now))  # a robot that stands can wait
             found = replace(found, begin=request.join)
-            pending = replace(pending, request=request, answer=replace(pending.answer, found=found))
-        if found is None:
-            self.log(now, "rejected", why=pending.failed, number=request.number)
-            return
-        why, leaving = self._fault(now, pending, predicted), False
+        why, leaving = self._fault(now, request, found, predicted), False
         if not why and reachable is not None:
             then = found.begin + self.ready.settings.period
             leaving = self.ready.proved_stop(reachable, found, found.begin, then) is None
             if leaving and not self._may_leave(now, found):
                 why = "no stop behind its first step is proved"
         if why:
-            self.log(now, "rejected", why=why, number=request.number, part=pending.answer.part)
+            self.log(now, "rejected", why=why, **took)
             return
-        self.log(
-            now, "accepted", number=request.number, part=pending.answer.part, arrival=found.end, to_goal=found.to_goal,
-            leaving=leaving,
-        )  # fmt: skip
-        self._answered(now, pending.answer.part)
+        self.log(now, "accepted", **took, arrival=found.end, to_goal=found.to_goal, leaving=leaving)
+        self._answered(now, part)
         if found.to_goal:
             self.route = found
         head = self.following.piece(now, request.join) if request.join > now + 1e-9 else None
@@ -210,10 +218,9 @@ class Executor:
         if self.ready.settings.by_distance:
             self.nearest = min(self.ready.settings.trigger, self._distance(now, predicted) - NEARER)
 
-    def _fault(self, now: float, pending: Pending, predicted: Movers) -> str:
+    def _fault(self, now: float, request: Request, found: Following, predicted: Movers) -> str:
         """Return why an answer is of no use any more, or nothing."""
-        found, request, settings = pending.answer.found, pending.request, self.ready.settings
-        assert found is not None
+        settings = self.ready.settings
         if request.following is not self.following:
             return "the robot follows another motion by now"
         if now > request.join + 1e-9:
@@ -266,16 +273,8 @@ class Executor:
             self.asked, now, join, self.following, self.route, predicted, wide, obstacles, self.conflict, self.seed
         )  # fmt: skip
         self.log(now, "request", number=self.asked, join=join)
-        charges = Charges(SHARE * settings.budget)
-        failed = Pending.failed
-        try:
-            answer = self.replanner.replan(self.ready, request, charges)
-            if not isinstance(answer, Answer):
-                raise TypeError(f"{type(answer).__name__} is no answer")
-        except Exception as error:  # whatever a way of replanning does, the robot goes on or stops
-            answer, failed = Answer(None, "", charges), f"{type(error).__name__}: {error}"
-        taken = charges.spent if settings.latency < 0.0 else settings.latency
-        self.pending = Pending(now + taken, request, answer, failed)
+        self.pending = request
+        self.replanning.submit(request)
 
     def _wants(self, now: float) -> bool:
         """Whether the robot needs another motion."""

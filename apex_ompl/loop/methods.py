@@ -86,3 +86,12 @@ def method(name: str) -> Method:
 def adapted(settings: LoopSettings, one: Method) -> LoopSettings:
     """Return the parameters of the loop with what a way of replanning changes of them."""
     return replace(settings, **one.settings)
+
+
+def replanner_of(name: str) -> Replanner:
+    """Return a new replanner of a way of replanning by its name.
+
+    Raises:
+        UnknownNameError: There is none of that name.
+    """
+    return method(name).make()

@@ -11,14 +11,17 @@ import numpy as np
 
 from apex_ompl.errors import UnknownNameError
 from apex_ompl.loop.charges import cost_table
-from apex_ompl.loop.methods import adapted, method
+from apex_ompl.loop.cycle import RunRecord
+from apex_ompl.loop.methods import adapted, method, replanner_of
 from apex_ompl.loop.metrics import run_metrics
+from apex_ompl.loop.planner_process import PlannerProcess, Work
 from apex_ompl.loop.ready import Ready
+from apex_ompl.loop.real_time import cores, run_in_real_time
 from apex_ompl.loop.referee import judge
 from apex_ompl.loop.result import Event, Outcome, RunResult
 from apex_ompl.loop.sensor import Sensor, SensorStream
 from apex_ompl.loop.settings import LoopSettings
-from apex_ompl.loop.simulation import Simulated, simulate
+from apex_ompl.loop.simulation import simulate
 from apex_ompl.ompl_adapter.process import quiet_ompl, seed_ompl
 from apex_ompl.ompl_adapter.setup import assemble
 from apex_ompl.problems import worlds
@@ -30,7 +33,7 @@ from apex_ompl.scene.problem import Problem
 from apex_ompl.trajectory import Timing, Trajectory
 from apex_ompl.util.validation import check_seed
 
-CLOCKS = ("sim",)
+CLOCKS = ("sim", "real")
 SHARE = 1.0 - 1e-6  # of the limits that is used: pieces of motions are rounded where they are joined
 
 
@@ -48,7 +51,8 @@ def run(
         problem: A world, its name (:func:`apex_ompl.problems.worlds.load`), a problem among whose obstacles some move,
             its name, or its file.
         planner: Name of a way of replanning, see :func:`apex_ompl.loop.methods.names`.
-        clock: ``sim``, on which work is charged by counts, so that the same seed gives the same run.
+        clock: ``sim``, on which work is charged by counts, so that the same seed gives the same run; or ``real``, the
+            clock on the wall, with the planner in a process of its own.
         prediction: ``still``, ``cv`` or ``truth``, see :class:`apex_ompl.loop.settings.LoopSettings`.
         seed: Of random choices, and of the sensor where none is given.
         speed: Share of the velocity limits that motions use, 0.001 to 1.
@@ -72,17 +76,23 @@ def run(
         limits = timing.limits(setup.robot.limits, setup.robot.joint_names)
         ready = Ready(setup, _within(limits), _within(setup.robot.limits), used)
         noted = {"loop": asdict(used), "sensor": asdict(sensor), "speed": speed, "costs": cost_table()["version"]}
-        made = _Made(world, ready, planner, seed, noted)
+        made = _Made(world, ready, planner, clock, seed, noted)
         fault = setup.start_fault
         if fault or not len(ready.goals):
             still = np.zeros((1, len(setup.start)))
             motion = Trajectory(np.zeros(1), setup.start[None], still, still, ready.names)
             outcome = Outcome.START_INVALID if fault else Outcome.STUCK
-            done = Simulated(motion, (), False, fault or "; ".join(setup.goal_faults), 0)
+            done = RunRecord(motion, (), False, fault or "; ".join(setup.goal_faults), 0)
             return made.result(done, outcome, done.ended)
-        replanner = one.make()
-        replanner.prepare(ready)
-        done = simulate(world, ready, replanner, SensorStream(sensor, world, used.watched), seed)
+        eyes = SensorStream(sensor, world, used.watched)
+        if clock == "real":
+            work = Work(world.problem.still, ready.limits, ready.stopping, used, replanner_of, (planner,), seed)
+            with PlannerProcess(work, cores()[1]) as process:
+                done = run_in_real_time(world, ready, process, eyes, seed)
+        else:
+            replanner = one.make()
+            replanner.prepare(ready)
+            done = simulate(world, ready, replanner, eyes, seed)
     return made.judged(done)
 
 
@@ -115,21 +125,23 @@ class _Made:
     world: World
     ready: Ready
     planner: str
+    clock: str
     seed: int
     settings: Mapping[str, Any]
 
-    def result(self, done: Simulated, outcome: Outcome, reason: str, clearance: float = float("inf")) -> RunResult:
+    def result(self, done: RunRecord, outcome: Outcome, reason: str, clearance: float = float("inf")) -> RunResult:
         """Return the result."""
         robot = self.ready.setup.robot
         metrics = run_metrics(done.trajectory, done.events, robot.limits, clearance=clearance)
+        metrics |= {**done.measured, "broken_steps": float(done.broken)}
         return RunResult(
             outcome=outcome, reason=reason, problem=self.problem(), robot=robot.name, method=self.planner,
-            prediction=self.ready.settings.prediction, clock="sim", seed=self.seed, trajectory=done.trajectory,
-            events=done.events, metrics={**metrics, "broken_steps": float(done.broken)}, settings=self.settings,
+            prediction=self.ready.settings.prediction, clock=self.clock, seed=self.seed, trajectory=done.trajectory,
+            events=done.events, metrics=metrics, settings=self.settings,
             robot_digest=digest(robot),
         )  # fmt: skip
 
-    def judged(self, done: Simulated) -> RunResult:
+    def judged(self, done: RunRecord) -> RunResult:
         """Return the result with what the referee says."""
         report = judge(self.ready.setup.robot, self.problem(), done.trajectory, goals=self.ready.goals)
         outcome, reason = report.outcome, "; ".join(report.faults)

@@ -1,0 +1,142 @@
+"""A run: a world that moves on, eyes that observe it, and a robot that follows exactly what it is told."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+
+from apex_ompl.live.movers import Movers
+from apex_ompl.loop.executor import Executor
+from apex_ompl.loop.following import Following, executed
+from apex_ompl.loop.observation import Observation
+from apex_ompl.loop.ready import Ready
+from apex_ompl.loop.replanning import Replanning
+from apex_ompl.loop.result import Event
+from apex_ompl.loop.tracking import Tracker, as_they_are
+from apex_ompl.problems.worlds import World
+from apex_ompl.scene.bodies import Obstacle
+from apex_ompl.trajectory import Trajectory
+
+
+class Eyes(Protocol):
+    """What observes a world."""
+
+    def observations(self, until: float) -> Iterable[Observation]:
+        """Return the observations with stamps up to a time [s] that were not returned before, in their order."""
+
+
+@dataclass(frozen=True, eq=False)
+class RunRecord:
+    """What came of a run.
+
+    Attributes:
+        trajectory: What the robot did.
+        events: What happened.
+        reached: Whether the robot came to rest at a goal.
+        ended: Why the run ended else: ``timeout`` or ``stuck``.
+        broken: Number of steps at which an obstacle was where the assumptions of the guarantee exclude it.
+        measured: What was measured on a real clock, by name.
+    """
+
+    trajectory: Trajectory
+    events: tuple[Event, ...]
+    reached: bool
+    ended: str
+    broken: int
+    measured: Mapping[str, float] = field(default_factory=dict)
+
+
+class Loop:
+    """One run under way, step by step, on whatever clock.
+
+    Attributes:
+        executor: Decides what the robot follows.
+    """
+
+    def __init__(
+        self, world: World, ready: Ready, replanning: Replanning, eyes: Eyes, seed: int, *, lead: float = 0.0
+    ) -> None:  # fmt: skip
+        """Begin with a robot that stands at the start.
+
+        Args:
+            world: What truly happens.
+            ready: The robot among what stands still.
+            replanning: Who plans motions anew.
+            eyes: What observes the world.
+            seed: Of random choices.
+            lead: How long before a step it is decided [s].
+        """
+        self._world, self._ready, self._eyes = world, ready, eyes
+        self._allowed = tuple(ready.setup.problem.allowed)
+        self._tracker = Tracker(ready.kernel, allowed=self._allowed)
+        standing = Following.standing(ready.setup.start, 0.0, ready.names)
+        self.executor = Executor(
+            ready, replanning, self._tracker, seed, standing, followed=[(0.0, standing)], lead=lead
+        )  # fmt: skip
+        self._waiting: list[Observation] = []
+        self._begun, self._rest, self._broken = False, 0.0, 0
+        self._present: tuple[Obstacle, ...] = ()
+
+    def observe(self, now: float) -> None:
+        """Let the world move on to a time [s], and take the observations that have arrived by then."""
+        settings = self._ready.settings
+        self._world.advance(now, self.executor.state(now))
+        self._waiting += self._eyes.observations(now)
+        for observation in [one for one in self._waiting if one.received <= now + 1e-9]:
+            self._tracker.take(observation)
+        self._waiting = [one for one in self._waiting if one.received > now + 1e-9]
+        self._present = tuple(self._world.present(now))
+        self._broken += unexpected(self._tracker, self._present, now, settings.error, settings.fastest)
+
+    def step(self, now: float) -> RunRecord | None:
+        """Decide what the robot does from a time on [s], and return what came of the run where it is over."""
+        settings, tracker, executor = self._ready.settings, self._tracker, self.executor
+        if settings.prediction == "truth":
+            predicted = as_they_are(self._ready.kernel, self._present, now, self._allowed)
+            records = self._present
+        else:
+            predicted = tracker.predicted(settings.margin, settings.prediction)
+            soon = now + np.array([0.0, 1.0, 2.0]) * settings.budget
+            tracker.eased(predicted, executor.state(now), soon)
+            records = _records(tracker, predicted, now)
+        executor.step(now, predicted, records)
+        if not self._begun and executor.route is not None:
+            self._world.begin(executor.route.motion, max(executor.route.begin, now))
+            self._begun = True
+        if executor.done(now):
+            executor.log(now, "goal")
+            return self._ended(now, True, "")
+        self._rest = self._rest + settings.period if executor.following.at_rest(now) else 0.0
+        if self._rest > settings.stuck:
+            return self._ended(now, False, "stuck")
+        return self._ended(now, False, "timeout") if now >= settings.timeout - 1e-9 else None
+
+    def _ended(self, now: float, reached: bool, why: str) -> RunRecord:
+        trajectory = executed(self.executor.followed, now)
+        return RunRecord(trajectory, tuple(self.executor.events), reached, why, self._broken)
+
+
+def unexpected(tracker: Tracker, present: Iterable[Obstacle], now: float, error: float, fastest: float) -> bool:
+    """Whether an obstacle is where the assumptions of the guarantee exclude it: unseen, or farther than it can be."""
+    for o in present:
+        track = tracker.tracks.get(o.name)
+        if track is None:
+            return True
+        way = float(np.linalg.norm(np.subtract(o.position, track.shape.position)))
+        if way > error + fastest * (now - track.stamp) + 1e-9:
+            return True
+    return False
+
+
+def _records(tracker: Tracker, predicted: Movers, now: float) -> tuple[Obstacle, ...]:
+    """Return the tracked obstacles where they are expected to be now, with their velocities."""
+    places = predicted.at(now)
+    return tuple(
+        track.shape.model_copy(
+            update={"position": tuple(places[name].tolist()), "velocity": tuple(track.velocity.tolist())}
+        )
+        for name, track in tracker.tracks.items()
+    )

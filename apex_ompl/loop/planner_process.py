@@ -1,0 +1,192 @@
+"""Replans made by a process of its own, which may die."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import pickle
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from typing import Any, Self
+
+from apex_ompl.errors import ApexError, PlannerProcessError
+from apex_ompl.loop.charges import Charges
+from apex_ompl.loop.replanning import Reply
+from apex_ompl.loop.request import Replanner, Request
+from apex_ompl.loop.settings import LoopSettings
+from apex_ompl.robot.model import Limits
+from apex_ompl.scene.problem import Problem
+
+STARTED = 120.0  # time that the process has to make itself ready [s]
+HUNG = 10.0  # time without an answer after which the process is made anew [s]
+ENDED = 2.0  # time that it has to end [s]
+
+
+class WallTime(Charges):
+    """Charges by the clock on the wall, from when they are made."""
+
+    def __init__(self, limit: float) -> None:
+        """Begin now, with a limit [s]."""
+        super().__init__(limit)
+        self._begun = time.perf_counter()
+
+    def charge(self, kind: str, count: int = 1) -> None:
+        """Count units of work, and look at the clock."""
+        self.counts[kind] += count
+        self.spent = time.perf_counter() - self._begun
+
+    def over(self) -> bool:
+        """Whether the time is used up."""
+        self.spent = time.perf_counter() - self._begun
+        return super().over()
+
+
+@dataclass(frozen=True, eq=False)
+class Work:
+    """What a planner process is to do; it travels to it.
+
+    Attributes:
+        problem: The problem without the obstacles that move.
+        limits: Limits of motions.
+        stopping: Limits of stops.
+        settings: Parameters of the loop.
+        make: Makes the way of replanning; a function or class of a module.
+        arguments: Its arguments.
+        seed: Of random choices.
+    """
+
+    problem: Problem
+    limits: Limits
+    stopping: Limits
+    settings: LoopSettings
+    make: Callable[..., Replanner]
+    arguments: tuple[Any, ...]
+    seed: int
+
+
+class PlannerProcess:
+    """Replans made by a process of its own; one that dies is made anew.
+
+    As a context manager it waits until the process is ready, and ends it.
+
+    Attributes:
+        process: The process.
+        restarts: How often it was made anew.
+    """
+
+    def __init__(self, work: Work, core: int | None = None) -> None:
+        """Start a process.
+
+        Args:
+            work: What it is to do.
+            core: Processor core that it keeps to; any by default.
+        """
+        self._work, self._core, self.restarts = work, core, 0
+        self._faults: list[str] = []
+        self._start()
+
+    def _start(self) -> None:
+        mine, other = multiprocessing.Pipe()
+        environment = {**os.environ, "OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "passive"}
+        command = [sys.executable, "-m", "apex_ompl.loop.planner_worker", str(other.fileno())]
+        self.process = subprocess.Popen(
+            command, pass_fds=[other.fileno()], env=environment, stdin=subprocess.DEVNULL, start_new_session=True
+        )
+        other.close()
+        self._connection: Connection[Any, Any] = mine
+        self._ready = False
+        self._asked: float | None = None
+        first = sys.path, self._core, pickle.dumps(self._work)
+        threading.Thread(target=_sent, args=(mine, first), daemon=True).start()
+
+    def __enter__(self) -> Self:
+        """Wait until it is ready.
+
+        Raises:
+            PlannerProcessError: It could not be made ready.
+        """
+        try:
+            if not self._connection.poll(STARTED):
+                raise PlannerProcessError(f"the planner process was not ready within {STARTED:g} s")
+            self._take(self._connection.recv())
+        except (EOFError, OSError) as error:
+            self.close()
+            raise PlannerProcessError("the planner process died while it was made ready") from error
+        except ApexError:
+            self.close()
+            raise
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """End it."""
+        self.close()
+
+    def _take(self, said: str) -> None:
+        if said:
+            raise PlannerProcessError(f"the planner process could not be made ready: {said}")
+        self._ready = True
+
+    def submit(self, request: Request) -> None:
+        """Send a request; it is lost where the process is not there, or busy with another one.
+
+        A process that has been busy for ``HUNG`` is made anew.
+        """
+        if self._asked is not None and time.monotonic() > self._asked + HUNG:
+            self._replace("did not answer")
+        if self._ready and self._asked is None:
+            try:
+                self._connection.send_bytes(pickle.dumps(request))
+                self._asked = time.monotonic()
+            except OSError:
+                self._replace("died")
+
+    def reply(self, now: float) -> Reply | None:
+        """Return the newest answer that has come, if any."""
+        del now
+        newest = None
+        try:
+            while self._connection.poll():
+                said = self._connection.recv()
+                if isinstance(said, str):
+                    self._take(said)
+                else:
+                    newest, self._asked = said, None
+        except (EOFError, OSError):
+            self._replace("died")
+        except PlannerProcessError as error:
+            self._faults.append(str(error))
+        return newest
+
+    def faults(self) -> tuple[str, ...]:
+        """Return what went wrong since the last call."""
+        found, self._faults = tuple(self._faults), []
+        return found
+
+    def _replace(self, why: str) -> None:
+        """Make the process anew."""
+        self._faults.append(f"the planner process {why}")
+        self.close(wait=0.0)
+        self.restarts += 1
+        self._start()
+
+    def close(self, wait: float = ENDED) -> None:
+        """End the process, by force where it goes on for some time [s]."""
+        self._ready = False
+        self._connection.close()
+        try:
+            self.process.wait(wait)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
+
+
+def _sent(connection: Connection[Any, Any], message: object) -> None:
+    """Send a message to a process that may not read it."""
+    with suppress(OSError):
+        connection.send(message)

@@ -1,0 +1,40 @@
+"""Ways of replanning that fail, for processes of their own: straight lines at first, then something else."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from typing import Any
+
+from loops import line
+
+from apex_ompl.loop.charges import Charges
+from apex_ompl.loop.following import Following
+from apex_ompl.loop.ready import Ready
+from apex_ompl.loop.request import Answer, Request
+
+
+class Faulty:
+    """A straight line, and then faults in turn, the last one for ever."""
+
+    def __init__(self, *faults: str) -> None:
+        self.faults, self.calls = faults, 0
+
+    def prepare(self, ready: Ready) -> None:
+        del ready
+
+    def replan(self, ready: Ready, request: Request, charges: Charges) -> Any:
+        fault = ("", *self.faults)[min(self.calls, len(self.faults))]
+        self.calls += 1
+        if fault == "killed":
+            os.kill(os.getpid(), signal.SIGKILL)
+        if fault == "never":
+            time.sleep(3600.0)
+        if fault == "late":
+            time.sleep(0.2)
+        if fault == "raises":
+            raise ValueError("a bad number")
+        if fault == "nonsense":
+            return Answer(Following(line(ready, request).motion, request.join + 1.0), "nonsense", charges)
+        return Answer(line(ready, request), "line", charges)

@@ -1,0 +1,123 @@
+"""The clock on the wall: the planner in a process of its own, which fails in every way, and steps that come late."""
+
+from __future__ import annotations
+
+import pickle
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from faulty_replanners import Faulty
+from loops import BLOCKED, PROBLEM, crossing, ready_of, setup_of, world_of
+
+from apex_ompl.errors import PlannerProcessError
+from apex_ompl.live.movers import Movers, clearance_in_time
+from apex_ompl.loop.cycle import RunRecord
+from apex_ompl.loop.methods import replanner_of
+from apex_ompl.loop.observation import Observation
+from apex_ompl.loop.planner_process import PlannerProcess, Work
+from apex_ompl.loop.real_time import run_in_real_time
+from apex_ompl.loop.referee import RefereeReport, judge
+from apex_ompl.loop.result import Outcome, RunResult
+from apex_ompl.loop.run import run
+from apex_ompl.loop.sensor import Sensor, SensorStream
+from apex_ompl.problems.worlds import World
+from apex_ompl.trajectory.rests import is_at_rest
+
+
+class BadEyes:
+    """A sensor whose observations are doubled, out of order, late by turns, or not numbers."""
+
+    def __init__(self, world: World) -> None:
+        self._eyes = SensorStream(Sensor(), world, 0.3)
+
+    def observations(self, until: float) -> list[Observation]:
+        found: list[Observation] = []
+        for k, one in enumerate(self._eyes.observations(until)):
+            late = replace(one, received=one.received + 0.15)
+            nowhere = tuple(o.model_copy(update={"position": (float("nan"),) * 3}) for o in one.seen)
+            found += [one, one] if k % 2 else [late, one]
+            found += [replace(one, seen=nowhere), replace(one, stamp=float("nan"))]
+        return found[::-1]
+
+
+def go(*faults: str, eyes: type[BadEyes] | None = None) -> tuple[RunRecord, RefereeReport, PlannerProcess]:
+    ready = ready_of(PROBLEM, speed=0.3, prediction="still", fastest=0.5, timeout=3.0)
+    world = world_of(PROBLEM, crossing(setup_of(PROBLEM)))
+    work = Work(world.problem.still, ready.limits, ready.stopping, ready.settings, Faulty, faults, 0)
+    seen = SensorStream(Sensor(), world, ready.settings.watched) if eyes is None else eyes(world)
+    with PlannerProcess(work) as process:
+        done = run_in_real_time(world, ready, process, seen, seed=0)
+    truth = world.problem.still
+    truth = truth.model_copy(update={"scene": (*truth.scene, *world.script())})
+    return done, judge(ready.setup.robot, truth, done.trajectory, goals=ready.goals), process
+
+
+def check_defined(done: RunRecord, report: RefereeReport, process: PlannerProcess) -> None:
+    """At rest, with a reason, nothing touched by a robot that moves, no process left."""
+    assert done.reached or done.ended == "timeout"
+    assert is_at_rest(done.trajectory, done.trajectory.duration) or not done.reached
+    assert report.contact is None or not report.contact.moved
+    assert report.still_contact is None and max(report.limit_use.values()) <= 1.0 + 1e-9
+    assert process.process.poll() is not None
+    assert done.measured["tick_p50"] > 0.0 and done.measured["deadline_misses"] >= 0.0
+
+
+def test_faults_of_the_planner_end_defined() -> None:
+    done, report, process = go(*["raises"] * 4, *["nonsense"] * 4, *["late"] * 2, "killed")
+    check_defined(done, report, process)
+    why = {event.data["why"] for event in done.events if event.kind == "rejected"}
+    assert {"ValueError: a bad number", "it does not begin where the robot will be", "no answer came in time"} <= why
+    assert process.restarts and any(event.kind == "planner fault" for event in done.events)
+
+
+def test_a_planner_that_never_answers_ends_defined() -> None:
+    done, report, process = go("never")
+    check_defined(done, report, process)
+    assert "no answer came in time" in {event.data["why"] for event in done.events if event.kind == "rejected"}
+
+
+def test_observations_may_be_late_doubled_out_of_order_or_no_numbers() -> None:
+    check_defined(*go(eyes=BadEyes))
+
+
+def test_a_run_by_name_is_a_result(tmp_path: Path) -> None:
+    found = run("vertical/moving-small-0.1/800000", "no-network", clock="real")
+    assert found.clock == "real" and found.outcome in (Outcome.REACHED, Outcome.TIMEOUT, Outcome.HIT_AT_REST)
+    assert {"tick_p50", "tick_p99", "tick_worst", "deadline_misses"} <= found.metrics.keys()
+    found.save(tmp_path / "run.npz")
+    assert RunResult.load(tmp_path / "run.npz").as_dict() == found.as_dict()
+
+
+def test_a_process_that_cannot_be_made_ready_is_a_sentence() -> None:
+    ready, world = ready_of(PROBLEM), world_of(PROBLEM)
+    work = Work(world.problem.still, ready.limits, ready.stopping, ready.settings, replanner_of, ("apx",), 0)
+    with pytest.raises(PlannerProcessError, match="apx"), PlannerProcess(work):
+        pass
+
+
+def test_a_process_that_dies_while_it_is_made_ready_is_a_sentence() -> None:
+    ready, world = ready_of(BLOCKED), world_of(BLOCKED)
+    work = Work(world.problem.still, ready.limits, ready.stopping, ready.settings, replanner_of, ("apex",), 0)
+    process = PlannerProcess(work)
+    process.process.kill()
+    with pytest.raises(PlannerProcessError, match="died"), process:
+        pass
+    assert process.process.poll() is not None
+
+
+def test_movers_travel_between_processes() -> None:
+    setup, box = setup_of(PROBLEM), crossing(setup_of(PROBLEM))
+    movers = Movers([box])
+    movers.update(box.name, velocity=(0.1, 0.0, 0.0), growth=(0.01, 0.1))
+    other = pickle.loads(pickle.dumps(movers))
+    arguments: tuple[Any, ...] = setup.start[None], np.array([0.5]), 1.0
+    assert np.array_equal(clearance_in_time(setup.checker.kernel, movers, *arguments)[0],
+                          clearance_in_time(setup.checker.kernel, other, *arguments)[0])  # fmt: skip
+    other.update(box.name, position=(0.0, 0.0, 5.0))  # its arrays are views again
+    assert (
+        clearance_in_time(setup.checker.kernel, other, *arguments)[0]
+        > clearance_in_time(setup.checker.kernel, movers, *arguments)[0]
+    )
