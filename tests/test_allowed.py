@@ -45,7 +45,7 @@ def names(checker: CollisionChecker, q: np.ndarray) -> set[frozenset[str]]:
 def test_an_allowed_pair_is_not_checked_by_either_stage(crowded: CollisionChecker, robot: Robot) -> None:
     home, checker = robot.home, crowded
     rng = np.random.default_rng(0)
-    states = np.clip(home + 0.2 * rng.normal(size=(40, robot.dof)), robot.limits.lower, robot.limits.upper)
+    states = np.clip(home + 0.2 * rng.normal(size=(12, robot.dof)), robot.limits.lower, robot.limits.upper)
     touching, deep = names(checker, home), checker.kernel.clearance(home[None], 1.0)[0, 0]
     assert touching and not checker.is_free(home)
     before = {k: names(checker, q) for k, q in enumerate(states)}

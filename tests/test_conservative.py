@@ -134,7 +134,7 @@ def test_motions_and_paths_are_sampled_alike(which: str, request: pytest.Fixture
     robot: Robot = request.getfixturevalue(which)
     rng = np.random.default_rng(11)
     both, meshes = checkers(robot, clutter(rng, tmp_path / "step.obj"), held(robot))
-    states = states_around_home(robot, rng, 150, 0.5)
+    states = states_around_home(robot, rng, 80, 0.5)
     states = states[meshes.are_free(states)]
     outcomes = []
     for a, b, c in zip(states, states[1:], states[2:], strict=False):
