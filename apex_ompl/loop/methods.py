@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from apex_ompl.errors import UnknownNameError
+from apex_ompl.loop.mppi import PathIntegral
 from apex_ompl.loop.portfolio import Portfolio
 from apex_ompl.loop.proposals import Proposals
 from apex_ompl.loop.request import Replanner
@@ -41,6 +42,7 @@ METHODS = {
         {"prediction": "still", "guarded": False, "monitored": False},
         "a plan among obstacles where they were seen at first, followed blindly",
     ),
+    "mppi": Method(PathIntegral, {}, "model predictive path integral control"),
 }  # fmt: skip
 
 
