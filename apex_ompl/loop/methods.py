@@ -9,6 +9,7 @@ from typing import Any
 from apex_ompl.errors import UnknownNameError
 from apex_ompl.loop.mppi import PathIntegral
 from apex_ompl.loop.portfolio import Portfolio
+from apex_ompl.loop.potential_field import PotentialField
 from apex_ompl.loop.proposals import Proposals
 from apex_ompl.loop.request import Replanner
 from apex_ompl.loop.settings import LoopSettings
@@ -43,6 +44,7 @@ METHODS = {
         "a plan among obstacles where they were seen at first, followed blindly",
     ),
     "mppi": Method(PathIntegral, {}, "model predictive path integral control"),
+    "potential-field": Method(PotentialField, {}, "a reflex down an artificial potential"),
 }  # fmt: skip
 
 
