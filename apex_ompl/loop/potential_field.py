@@ -16,7 +16,7 @@ from apex_ompl.loop.search import Search
 from apex_ompl.loop.short_horizon import Horizon, finish, first_proved
 from apex_ompl.types import Array
 
-LEAST = 0.02  # clearance below which the potential goes on with the slope that it has there, as a share of the reach
+LEAST = 0.25  # clearance below which the potential goes on with the slope that it has there, as a share of the reach
 
 
 class Field(NamedTuple):
@@ -24,25 +24,26 @@ class Field(NamedTuple):
 
     The attractive part is ``attraction * |q - goal|^2 / 2``, which goes on as a cone beyond ``cone``. The repulsive
     parts are ``repulsion * (reach / d - 1)^2 / 2`` for clearances d below the reach: of obstacles that move, of what
-    stands still, and of the robot to itself.
+    stands still, and of the robot to itself. The last two fade with the square of the distance to the goal inside the
+    cone, so that a goal close to contact is a minimum (Ge and Cui 2000).
 
     Attributes:
         goal: Shape (dof,).
         attraction: Gain [1/s^2].
         cone: Distance to the goal from which on its force is constant [rad].
-        repulsion: Gain [rad^2/s^2].
+        repulsion: Gain for obstacles that move [rad^2/s^2].
+        own_repulsion: Gain for what stands still and the robot itself [rad^2/s^2].
         reach: Clearance to obstacles that move below which they repel [m].
         own_reach: The same of what stands still and of the robot itself [m].
-        allowance: By how much the clearance of the robot to itself counts as larger [m].
     """
 
     goal: Array
     attraction: float
     cone: float
     repulsion: float
+    own_repulsion: float
     reach: float
     own_reach: float
-    allowance: float = 0.0
 
     def potential_and_force(self, kernel: Kernel, movers: Movers, q: Array, time: float) -> tuple[float, Array]:
         """Return the potential [rad^2/s^2] at a state, shape (dof,), and its force, shape (dof,) [rad/s^2].
@@ -60,15 +61,16 @@ class Field(NamedTuple):
         force = -self.attraction * way * (inside / max(distance, 1e-12))
         moving, slope = clearance_in_time(kernel, movers, q[None], np.array([time]), self.reach)
         values, slopes = kernel.clearance_gradient(q, self.own_reach)
-        for clearance, gradient, reach in (
-            (moving[0], slope[0, :-1], self.reach),
-            (values[0, 0], slopes[0, 0], self.own_reach),
-            (values[0, 1] + self.allowance, slopes[0, 1], self.own_reach),
+        fade, fading = (inside / self.cone) ** 2, 2.0 * way / self.cone**2 * (distance < self.cone)
+        for clearance, gradient, reach, gain, share, sharing in (
+            (moving[0], slope[0, :-1], self.reach, self.repulsion, 1.0, 0.0),
+            (values[0, 0], slopes[0, 0], self.own_reach, self.own_repulsion, fade, fading),
+            (values[0, 1], slopes[0, 1], self.own_reach, self.own_repulsion, fade, fading),
         ):
             if clearance < reach:
                 height, steepness = repulsive(clearance / reach)
-                potential += self.repulsion * height
-                force = force + self.repulsion * steepness / reach * gradient
+                potential += gain * share * height
+                force = force + gain * (share * steepness / reach * gradient - sharing * height)
         return potential, force
 
 
@@ -94,21 +96,23 @@ class PotentialField:
         attraction: See :class:`Field`.
         cone: Likewise.
         repulsion: Likewise.
+        own_repulsion: Likewise.
         reach: Likewise.
         own_reach: Likewise.
         counts: Numbers of steps of which a proof is tried.
         near: Distance of any joint to a goal from which on the straight motion to it is tried first [rad].
     """
 
-    steps: int = 20
+    steps: int = 14
     step: float = 0.05
     damping: float = 8.0
     attraction: float = 30.0
     cone: float = 0.8
-    repulsion: float = 0.5
+    repulsion: float = 0.1
+    own_repulsion: float = 0.3
     reach: float = 0.15
     own_reach: float = 0.03
-    counts: tuple[int, ...] = (20, 14, 9)
+    counts: tuple[int, ...] = (14, 8)
     near: float = 0.5
 
     def prepare(self, ready: Ready) -> None:
@@ -125,16 +129,14 @@ class PotentialField:
             motion, part = first_proved(search, horizon, self.controls(search, horizon), self.counts), "field"
         return Answer(None if motion is None else search.following(motion), part, charges)
 
-    def field(self, ready: Ready, goal: Array) -> Field:
-        """Return the potential with a goal, at which the robot does not repel itself."""
-        own = float(ready.kernel.clearance(goal, self.own_reach)[0, 1])
-        gains = self.attraction, self.cone, self.repulsion, self.reach, self.own_reach
-        return Field(goal, *gains, self.own_reach - own)
+    def field(self, goal: Array) -> Field:
+        """Return the potential with a goal, shape (dof,)."""
+        return Field(goal, self.attraction, self.cone, self.repulsion, self.own_repulsion, self.reach, self.own_reach)
 
     def controls(self, search: Search, horizon: Horizon) -> Array:
         """Return the accelerations down the potential, shape (K, dof) [rad/s^2]."""
         ready, request = search.ready, search.request
-        field, fingers = self.field(ready, search.goals[0]), ready.fingers
+        field, fingers = self.field(search.goals[0]), ready.fingers
 
         def control(k: int, speed: Array, at: Array) -> Array:
             time = request.join + (k + 1) * self.step
