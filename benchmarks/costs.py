@@ -22,14 +22,20 @@ from apex_ompl.collision import CollisionChecker
 from apex_ompl.live.movers import Movers, clearance_in_time, curve_of, prove_motion
 from apex_ompl.live.retime import retime
 from apex_ompl.live.timed_spline import MotionOptimizer, Start, TimedSpline
-from apex_ompl.loop.charges import TABLE
+from apex_ompl.loop.charges import TABLE, Charges
+from apex_ompl.loop.following import Following
+from apex_ompl.loop.paper import OneProposal
 from apex_ompl.loop.proposals import Proposals
 from apex_ompl.loop.ready import Ready
-from apex_ompl.loop.search import MOTIONS
+from apex_ompl.loop.request import Request
+from apex_ompl.loop.search import MOTIONS, Search
 from apex_ompl.loop.settings import LoopSettings
+from apex_ompl.loop.snapshot import Snapshot
+from apex_ompl.ompl_adapter.process import quiet_ompl
 from apex_ompl.ompl_adapter.setup import assemble
 from apex_ompl.problems import worlds
 from apex_ompl.trajectory import time_path
+from apex_ompl.trajopt.optimizer import Optimizer
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.files import write_atomically
 from apex_ompl.util.validation import one_or_more
@@ -89,6 +95,31 @@ def measured(name: str, found: dict[str, list[float]]) -> None:
     found["retiming"].append(seconds(lambda: retime(kernel, movers, motion, limits)))
     times = np.linspace(0.0, motion.duration, 64)
     found["clearance in time"].append(seconds(lambda: clearance_in_time(kernel, movers, line, times, 0.3)) / 64)
+    bent = np.stack([setup.start, 0.5 * (setup.start + goal) + 0.05, goal])
+    bent = np.clip(
+        Optimizer().spline.path(Optimizer().spline.fit(bent, limits.lower, limits.upper).control),
+        limits.lower,
+        limits.upper,
+    )
+    found["path in time"].append(seconds(lambda: time_path(bent, limits, ready.names)))
+
+
+def trees() -> dict[str, float]:
+    """Return what a motion of RRTConnect's trees costs, with all that it does else among obstacles that stand [s]."""
+    spent, motions = 0.0, 0
+    for name in worlds.ids("moving", "validation", 30):
+        world = worlds.load(name)
+        setup, present = assemble(world.problem.still), tuple(world.present(0.0))
+        ready, source = Ready(setup, setup.robot.limits, setup.robot.limits, LoopSettings()), Snapshot()
+        source.prepare(ready)
+        movers, standing = Movers(present), Following.standing(setup.start, 0.0, ready.names)
+        search = Search(ready, Request(1, 0.0, 0.05, standing, None, movers, movers, present, np.inf, 0), Charges(0.1))
+        with quiet_ompl():
+            begin = time.perf_counter()
+            source.path(search)
+            spent += time.perf_counter() - begin
+        motions += search.charges.counts["motion of a tree"]
+    return {"motion of a tree": spent / motions}
 
 
 def network() -> dict[str, float]:
@@ -105,7 +136,12 @@ def network() -> dict[str, float]:
         for count in (1, 8):
             taken[count] = seconds(lambda n=count: model.propose(query, checker.kernel, n))
     each = max((taken[8] - taken[1]) / 7.0, 0.0)
-    return {"proposals": taken[1] - each, "proposal": each}
+    paths = {}
+    for guided, kind in ((False, "path of the paper"), (True, "guided path of the paper")):
+        paper = OneProposal(guided)
+        paper.prepare(ready)
+        paths[kind] = seconds(lambda one=paper: one.propose(setup.start, ready.goals[0], np.random.default_rng(0)))
+    return {"proposals": taken[1] - each, "proposal": each, **paths}
 
 
 def main() -> None:
@@ -117,7 +153,7 @@ def main() -> None:
     found: dict[str, list[float]] = defaultdict(list)
     for name in worlds.ids("moving", "validation", args.n):
         measured(name, found)
-    table = {kind: float(np.median(values)) for kind, values in found.items()} | network()
+    table = {kind: float(np.median(values)) for kind, values in found.items()} | network() | trees()
     rows = [["kind of work", "us a unit"], ["---", "---:"], *([kind, f"{1e6 * v:.3g}"] for kind, v in table.items())]
     if args.write:
         version = json.loads(TABLE.read_text())["version"]

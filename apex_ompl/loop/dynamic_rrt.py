@@ -87,7 +87,7 @@ class DynamicRRT:
         """Return the motion along a path made shorter, or None where there is no time for it any more."""
         self.waypoints = path
         short, charges = shortened(path, clear), search.charges
-        kind = "straight motion" if len(short) == 2 else "path with corners"
+        kind = "straight motion" if len(short) == 2 else "path in time"
         if charges.spent + cost_table()["seconds"][kind] > charges.limit:
             return None
         charges.charge(kind)

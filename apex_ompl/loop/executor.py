@@ -11,12 +11,12 @@ Althoff and Dolan 2014; Pereira and Althoff 2015.)
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
-from apex_ompl.live.movers import Movers
+from apex_ompl.live.movers import Movers, clearance_in_time
 from apex_ompl.loop.charges import Charges
 from apex_ompl.loop.evasion import GAIN, SOON
 from apex_ompl.loop.following import SAME_TIME, Following
@@ -29,6 +29,7 @@ from apex_ompl.types import Array
 
 SAME_STATE = 1e-6  # largest jump of positions, velocities and accelerations where a motion begins
 SHARE = 0.85  # of the budget after which nothing new is begun
+NEARER = 0.01  # by which an obstacle must come nearer than where a motion began, within the trigger, to stop it [m]
 FASTER = 0.9  # share of the time to a goal that a plan must have at most to replace one without a conflict
 
 
@@ -67,6 +68,7 @@ class Executor:
         asked: Number of replans so far.
         conflict: Time of the first conflict of what is followed [s], or infinity.
         endangered: Since when a conflict is known that the command does not answer yet [s], or None.
+        nearest: Distance of an obstacle below which the motion counts as blocked, where that goes by distance [m].
         leaving: Whether the robot leaves a place that an obstacle comes to, and goes on without a proved stop.
     """
 
@@ -83,6 +85,7 @@ class Executor:
     asked: int = 0
     conflict: float = math.inf
     endangered: float | None = None
+    nearest: float = 0.0
     leaving: bool = False
 
     def log(self, time: float, kind: str, **data: Any) -> None:
@@ -107,6 +110,8 @@ class Executor:
         self._answer(now, predicted, reachable)
         if settings.monitored:
             self._look(now, predicted)
+            if settings.from_rest:
+                self._halt(now)
         if reachable is not None:
             self._guard(now, reachable)
         self._ask(now, predicted, obstacles)
@@ -116,13 +121,38 @@ class Executor:
         settings, one = self.ready.settings, self.following
         hold = settings.hold if one.to_goal else settings.rest_hold
         until = max(one.end, now) + hold
-        found = self.ready.first_conflict(predicted, one, now, until)
+        if settings.by_distance:
+            found = now if self._distance(now, predicted) < self.nearest else math.inf
+        else:
+            found = self.ready.first_conflict(predicted, one, now, until)
         if math.isfinite(found) and not math.isfinite(self.conflict):
             self.log(now, "conflict", at=found)
             self.endangered = now
         if not math.isfinite(found):
             self.endangered = None
         self.conflict = found
+
+    def _distance(self, now: float, predicted: Movers) -> float:
+        """Return how far obstacles are from the robot, at most twice the trigger [m]."""
+        looked = np.array([now])
+        clear, _ = clearance_in_time(
+            self.ready.kernel, predicted, self.state(now)[None], looked, 2.0 * self.ready.settings.trigger
+        )
+        return float(clear.min())
+
+    def _halt(self, now: float) -> None:
+        """Stop where the way to a goal is blocked."""
+        if not (math.isfinite(self.conflict) and self.following.to_goal) or self.following.at_rest(now):
+            return
+        guarded = self.ready.settings.guarded
+        stop = self.stop if guarded else self.ready.unproved_stop(self.following, now)
+        if stop is not None and not stop.to_goal:
+            self._follow_stop(now, stop)
+
+    def _follow_stop(self, now: float, stop: Following) -> None:
+        self.log(now, "stop", at=stop.end)
+        self._answered(now, "stop")
+        self.follow(stop, now)
 
     def _guard(self, now: float, reachable: Movers) -> None:
         """Go on with a proved stop behind the next step, or stop."""
@@ -136,9 +166,7 @@ class Executor:
         elif self.stop is None:
             self.log(now, "broken assumption", what="no stop is in hand")
         elif self.stop is not self.following:
-            self.log(now, "stop", at=self.stop.end)
-            self._answered(now, "stop")
-            self.follow(self.stop, now)
+            self._follow_stop(now, self.stop)
 
     def _answered(self, now: float, how: str) -> None:
         """Note how long after a conflict was known the command changed."""
@@ -153,6 +181,10 @@ class Executor:
             return
         self.pending = None
         found, request = pending.answer.found, pending.request
+        if found is not None and self.ready.settings.from_rest and self.following.at_rest(request.join):
+            request = replace(request, join=max(request.join, now))  # a robot that stands can wait
+            found = replace(found, begin=request.join)
+            pending = replace(pending, request=request, answer=replace(pending.answer, found=found))
         if found is None:
             self.log(now, "rejected", why=pending.failed, number=request.number)
             return
@@ -175,6 +207,8 @@ class Executor:
         head = self.following.piece(now, request.join) if request.join > now + 1e-9 else None
         self.follow(found if head is None else found.behind(head, now), now)
         self.leaving, self.stop = leaving, None if leaving else self.stop
+        if self.ready.settings.by_distance:
+            self.nearest = min(self.ready.settings.trigger, self._distance(now, predicted) - NEARER)
 
     def _fault(self, now: float, pending: Pending, predicted: Movers) -> str:
         """Return why an answer is of no use any more, or nothing."""
@@ -185,7 +219,7 @@ class Executor:
         if now > request.join + 1e-9:
             return "it came too late"
         unfit = self._misfit(found, request)
-        if unfit:
+        if unfit or not settings.verified:
             return unfit
         if not math.isfinite(self.conflict) and self.following.to_goal and found.to_goal:
             if found.end - now > FASTER * (self.following.end - now):
@@ -211,7 +245,8 @@ class Executor:
             return "it does not end at rest"
         if found.to_goal and not self.ready.is_goal(motion.positions[-1]):
             return "it does not end at a goal"
-        if not self.ready.clear_of_still(motion):
+        verified = self.ready.settings.verified
+        if not (self.ready.clear_of_still(motion) if verified else self.ready.keeps_limits(motion)):
             return "it exceeds limits, or is not proved clear of what stands still"
         return ""
 
@@ -249,7 +284,9 @@ class Executor:
             return False
         if not settings.monitored:
             return self.route is None
-        if math.isfinite(self.conflict):
+        if settings.from_rest and not self.following.at_rest(now + settings.budget):
+            return False
+        if math.isfinite(self.conflict) and not settings.by_distance:
             return True
         return not self.following.to_goal
 

@@ -7,12 +7,16 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from apex_ompl.errors import UnknownNameError
+from apex_ompl.loop.dynamic_rrt import DynamicRRT
 from apex_ompl.loop.mppi import PathIntegral
+from apex_ompl.loop.paper import OneProposal
 from apex_ompl.loop.portfolio import Portfolio
 from apex_ompl.loop.potential_field import PotentialField
 from apex_ompl.loop.proposals import Proposals
 from apex_ompl.loop.request import Replanner
+from apex_ompl.loop.resuming import Resume
 from apex_ompl.loop.settings import LoopSettings
+from apex_ompl.loop.snapshot import Snapshot
 from apex_ompl.loop.sources import Lines, Route
 
 
@@ -31,20 +35,43 @@ class Method:
     about: str
 
 
+FROM_REST = {"from_rest": True}
+BLIND = {"prediction": "still", "guarded": False}
+PAPER = {**BLIND, "verified": False, "from_rest": True, "by_distance": True}
+
+
+def _no_network() -> Portfolio:
+    return Portfolio([Route(), Lines(), Lines(bumps=3)])
+
+
 METHODS = {
     "apex": Method(
         lambda: Portfolio([Route(), Lines(), Proposals(), Lines(bumps=3)]), {}, "all parts, the network among them"
     ),
-    "no-network": Method(
-        lambda: Portfolio([Route(), Lines(), Lines(bumps=3)]), {}, "all parts but the network's proposals"
+    "no-network": Method(_no_network, {}, "all parts but the network's proposals"),
+    "apex-paper": Method(
+        lambda: OneProposal(guided=True), PAPER,
+        "the paper's loop: stop near an obstacle, one guided proposal from rest, followed unproved",
+    ),
+    "apex-paper-unguided": Method(lambda: OneProposal(guided=False), PAPER, "the same without guidance"),
+    "retime": Method(
+        lambda: Resume(_no_network(), retimes=True), {}, "one plan, along which the speed alone is chosen anew"
+    ),
+    "stop-and-wait": Method(
+        lambda: Resume(_no_network()), FROM_REST, "one plan; stops where it is blocked, goes on when it is clear"
+    ),
+    "rrtconnect": Method(
+        Snapshot, FROM_REST, "stops where the way is blocked; RRTConnect from rest, among obstacles where they are seen"
     ),
     "blind": Method(
-        lambda: Portfolio([Route(), Lines(), Proposals(), Lines(bumps=3)], evades=False),
-        {"prediction": "still", "guarded": False, "monitored": False},
+        lambda: Portfolio([Route(), Lines(), Proposals(), Lines(bumps=3)], evades=False), {**BLIND, "monitored": False},
         "a plan among obstacles where they were seen at first, followed blindly",
     ),
     "mppi": Method(PathIntegral, {}, "model predictive path integral control"),
     "potential-field": Method(PotentialField, {}, "a reflex down an artificial potential"),
+    "dynamic-rrt": Method(
+        DynamicRRT, FROM_REST, "stops where the way is blocked; a tree from the goal that is kept and repaired"
+    ),
 }  # fmt: skip
 
 

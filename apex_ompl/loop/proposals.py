@@ -12,9 +12,9 @@ from apex_ompl.collision import CollisionChecker
 from apex_ompl.diffusion.checkpoint import shared_model
 from apex_ompl.diffusion.proposals import TrajectoryModel
 from apex_ompl.live.movers import clearance_in_time
+from apex_ompl.loop.placing import fresh_checker, place
 from apex_ompl.loop.ready import Ready
 from apex_ompl.loop.search import Guess, Search, least_duration
-from apex_ompl.scene.scripts import vector
 from apex_ompl.types import Array
 
 LOOKS = 16  # at the straight line, to see where an obstacle comes nearest
@@ -46,10 +46,7 @@ class Proposals:
             ApexError: The checkpoint cannot be loaded, or is of another robot.
         """
         setup = ready.setup
-        self._loaded = shared_model(self.model, robot=setup.robot.name)
-        self._checker = CollisionChecker(
-            setup.robot, setup.problem.scene, setup.problem.attached, setup.problem.allowed
-        )  # fmt: skip
+        self._loaded, self._checker = shared_model(self.model, robot=setup.robot.name), fresh_checker(ready)
         query = make_query(self._checker, setup.start, setup.start, point=self._loaded.sees_point)
         with self._loaded.one_thread():
             self._loaded.propose(query, self._checker.kernel, self.count)
@@ -93,8 +90,4 @@ class Proposals:
         search.charges.charge("clearance in time", LOOKS)
         for o in request.obstacles:
             way = np.multiply(o.velocity or (0.0, 0.0, 0.0), nearest - request.asked)
-            place = vector(np.add(o.position, way))
-            if checker.is_obstacle(o.name):
-                checker.move(o.name, place)
-            else:
-                checker.add(o.model_copy(update={"position": place, "velocity": None}))
+            place(checker, o, np.add(o.position, way))

@@ -121,6 +121,11 @@ class Ready:
                 return found
         return None
 
+    def unproved_stop(self, following: Following, then: float) -> Following:
+        """Return a stop from a motion along its path from a time of the clock on [s]."""
+        made = stop_along(following.motion, then - following.begin, self.stopping)
+        return Following(made.trajectory, then)
+
     def _stop(self, following: Following, then: float, along: bool) -> Following | None:
         """Return a stop from a motion along its path, or else joint by joint, that meets nothing that stands still."""
         at = then - following.begin

@@ -13,7 +13,7 @@ PREDICTIONS = ("still", "cv", "truth")
 RANGES = {
     "watched": (0.0, 60.0), "period": (1e-3, 0.1), "budget": (1e-3, 10.0), "hold": (0.0, 10.0),
     "rest_hold": (0.0, 10.0), "margin": (0.0, 0.1), "berth": (0.0, 0.5), "error": (0.0, 0.5), "fastest": (0.0, 5.0),
-    "timeout": (0.1, 600.0), "stuck": (0.1, 600.0), "latency": (-1.0, 10.0),
+    "trigger": (0.0, 1.0), "timeout": (0.1, 600.0), "stuck": (0.1, 600.0), "latency": (-1.0, 10.0),
 }  # fmt: skip
 
 
@@ -30,6 +30,11 @@ class LoopSettings:
         prediction: One of ``PREDICTIONS``: what plans are proved against.
         guarded: Whether the robot only goes on while a stop behind the next step is proved.
         monitored: Whether the motion is looked at again while it is followed; without, it is followed blindly.
+        verified: Whether motions are taken only where they are proved.
+        from_rest: Whether the robot stops where its motion is blocked, and plans anew only where it stands.
+        by_distance: Whether a motion counts as blocked where an obstacle is nearer than ``trigger``, instead of where a
+            conflict is predicted; once motion began nearer than that, where one comes nearer still.
+        trigger: That distance, lambda_obs of the paper's Algorithm 1 [m].
         hold: Time for which the goal must stay clear from the arrival on [s].
         rest_hold: Time for which a robot that stands elsewhere looks ahead [s].
         margin: Distance that is kept from obstacles that move [m].
@@ -47,6 +52,10 @@ class LoopSettings:
     prediction: str = "cv"
     guarded: bool = True
     monitored: bool = True
+    verified: bool = True
+    from_rest: bool = False
+    by_distance: bool = False
+    trigger: float = 0.05
     hold: float = 0.1
     rest_hold: float = 1.5
     margin: float = 0.005

@@ -1,0 +1,93 @@
+"""RRTConnect from rest, among obstacles where they are seen."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+import numpy as np
+from ompl import base as ob
+from ompl import geometric as og
+
+from apex_ompl.loop.charges import Charges
+from apex_ompl.loop.placing import fresh_checker, place
+from apex_ompl.loop.ready import Ready
+from apex_ompl.loop.request import Answer, Request
+from apex_ompl.loop.resuming import timed
+from apex_ompl.loop.search import Search
+from apex_ompl.ompl_adapter.process import seed_ompl
+from apex_ompl.ompl_adapter.setup import PlanningSetup, assemble, set_goals
+from apex_ompl.ompl_adapter.simplify import simplify
+from apex_ompl.ompl_adapter.space import path_to_array, to_state
+from apex_ompl.ompl_adapter.validity import MotionValidator
+from apex_ompl.planners.registry import parameters
+from apex_ompl.planners.tuned import TUNED
+from apex_ompl.types import Array
+
+RRTCONNECT = "rrtconnect"
+
+
+@contextmanager
+def charged(validator: MotionValidator, charges: Charges) -> Iterator[None]:
+    """While the block runs, charge every motion that is checked."""
+    check = validator.check
+
+    def counted(first: Array, second: Array) -> bool:
+        charges.charge("motion of a tree")
+        return check(first, second)
+
+    validator.check = counted
+    try:
+        yield
+    finally:
+        validator.check = check
+
+
+@dataclass(eq=False)
+class Snapshot:
+    """OMPL's RRTConnect, with the range that is tuned on validation, among obstacles where they are seen now."""
+
+    _setup: PlanningSetup | None = field(default=None, repr=False)
+
+    def prepare(self, ready: Ready) -> None:
+        """Set OMPL up with a checker of its own, whose obstacles are placed anew by each replan."""
+        self._setup = assemble(ready.setup.problem, ready.setup.robot, checker=fresh_checker(ready))
+
+    def replan(self, ready: Ready, request: Request, charges: Charges) -> Answer:
+        """Return a motion from rest that is proved among what is expected, or none."""
+        search = Search(ready, request, charges)
+        states = self.path(search) if request.following.at_rest(request.join) else None
+        motion = None if states is None else timed(search, states)
+        if motion is not None and search.accepts(motion):
+            search.take(motion, RRTCONNECT)
+        return Answer(search.best, search.part, charges)
+
+    def path(self, search: Search) -> Array | None:
+        """Return a path among obstacles where they are seen now, shape (N, dof), or None."""
+        assert self._setup is not None
+        setup = self._setup
+        for obstacle in search.request.obstacles:
+            place(setup.checker, obstacle, obstacle.position)
+        goals = [goal for goal in search.goals if setup.checker.is_free(goal)]
+        if not goals:
+            return None
+        simple_setup = setup.simple_setup
+        si = simple_setup.getSpaceInformation()
+
+        simple_setup.clear()
+        simple_setup.setStartState(to_state(si, search.start.position))
+        set_goals(simple_setup, goals)
+        simple_setup.setPlanner(parameters(RRTCONNECT, **TUNED[RRTCONNECT]).build(si))
+        seed_ompl(int(search.rng.integers(1, 2**31)))
+        path = None
+        with charged(setup.motion_validator, search.charges):
+            status = simple_setup.solve(ob.PlannerTerminationCondition(search.charges.over))
+            if status.getStatus() == ob.PlannerStatus.EXACT_SOLUTION:
+                found = path_to_array(simple_setup.getSolutionPath(), setup.robot.dof)
+                path = simplify(og.PathSimplifier(si), si, found, search.charges.over)
+        setup.raise_faults()
+        if path is None:
+            return None
+        goal = min(goals, key=lambda goal: float(np.linalg.norm(goal - path[-1])))
+        return np.concatenate([search.start.position[None], path[1:-1], goal[None]])
