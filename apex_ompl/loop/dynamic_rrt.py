@@ -13,11 +13,12 @@ from apex_ompl.loop.goal_tree import GoalTree
 from apex_ompl.loop.ready import Ready
 from apex_ompl.loop.request import Answer, Request
 from apex_ompl.loop.search import Search
-from apex_ompl.trajectory import Trajectory, time_path
+from apex_ompl.trajectory import Timing, Trajectory, time_path
 from apex_ompl.types import Array
 from apex_ompl.util.resolution import SEARCH_RESOLUTION
 
 DEEP = 0.03  # overlap of spheres beyond which a state counts as in contact without a look at exact shapes [m]
+DEVIATION = 0.02  # of the motion from the path [rad]
 SEEN = 0.01  # clearances beyond this are not told apart [m]
 
 
@@ -62,8 +63,12 @@ class DynamicRRT:
         self.tree.trim(clear)
         node = self._grow(search, self.tree, clear)
         motion = None if node < 0 else self._timed(search, self.tree.path(node), clear)
-        found = motion is not None and search.accepts(motion)
-        return Answer(search.following(motion) if motion is not None and found else None, "tree", charges)
+        if motion is None:
+            return Answer(None, "", charges)
+        if not ready.clear_of_still(motion, charges):
+            self.prepare(ready)
+            return Answer(None, "the path of the tree is not proved", charges)
+        return Answer(search.following(motion) if search.accepts(motion) else None, "tree", charges)
 
     def _grow(self, search: Search, tree: GoalTree, clear: Clearances) -> int:
         """Grow the tree until it has the robot's state; return the number of its node, or -1 where time is up."""
@@ -91,7 +96,7 @@ class DynamicRRT:
         if charges.spent + cost_table()["seconds"][kind] > charges.limit:
             return None
         charges.charge(kind)
-        return time_path(short, search.ready.limits, search.ready.names).trajectory
+        return time_path(short, search.ready.limits, search.ready.names, Timing(deviation=DEVIATION)).trajectory
 
 
 @dataclass(frozen=True, eq=False)
