@@ -16,6 +16,7 @@ from apex_ompl.types import Array
 
 SHARES = np.array([0.0, 0.25, 0.5, 1.0])  # of the largest speed, of rollouts that go straight to a goal; 0 is a stop
 
+
 @dataclass(eq=False)
 class PathIntegral:
     """Model predictive path integral control (Williams et al. 2017) in joint space, as STORM has it (Bhardwaj et al.).
@@ -158,7 +159,8 @@ def near_clearance(search: Search, states: Array, berth: float, near: float) -> 
 def softmax(costs: Array, temperature: float) -> Array:
     """Return weights exp(-S / temperature) of costs S, shape (N,), which add up to 1."""
     weights: Array = np.exp((costs.min() - costs) / temperature)
-    return weights / weights.sum()
+    weights /= weights.sum()
+    return weights
 
 
 def depth(clearance: Array, berth: float) -> Array:

@@ -108,8 +108,8 @@ class PotentialField:
     damping: float = 8.0
     attraction: float = 30.0
     cone: float = 0.8
-    repulsion: float = 0.1
-    own_repulsion: float = 0.3
+    repulsion: float = 1.5
+    own_repulsion: float = 1.0
     reach: float = 0.15
     own_reach: float = 0.03
     counts: tuple[int, ...] = (14, 8)

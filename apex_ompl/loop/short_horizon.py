@@ -8,13 +8,14 @@ them, too; the acceleration is at most half the jerk limit times h, so that jerk
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
 from apex_ompl.live.timed_spline import Start, TimedSpline
+from apex_ompl.loop.evasion import GAIN, endangered
 from apex_ompl.loop.search import Search, least_duration
 from apex_ompl.robot.model import Limits
 from apex_ompl.trajectory import Trajectory, time_path
@@ -53,8 +54,8 @@ class Horizon:
         Args:
             start: What the robot does at first.
             shape: Number K of steps, and number N of rollouts.
-            control: Accelerations that are wanted at a step, of shape (N, dof) [rad/s^2], by its number, the speeds, and
-                the states.
+            control: Returns the accelerations that are wanted at a step, shape (N, dof) [rad/s^2], from its number, the
+                speeds, and the states.
 
         Returns:
             Control points, shape (K + 3, N, dof) [rad]: the first three say how the motion begins; number k is about
@@ -63,11 +64,12 @@ class Horizon:
         count, rollouts = shape
         points = np.empty((count + 3, rollouts, len(start.position)))
         points[:3] = start_points(start, self.step)[:, None]
-        low, high = self._range(start)
+        bounds = self._range(start)
         for k in range(count):
             speed, at = (points[k + 2] - points[k + 1]) / self.step, points[k + 2]
-            points[k + 3] = self._next(speed, at, control(k, speed, at), count - 1 - k, low, high)
-            low, high = -self.most, self.most
+            wanted = self._keeping(speed + self.step * control(k, speed, at), at, count - 1 - k)
+            low, high = bounds if k == 0 else (-self.most, self.most)
+            points[k + 3] = at + self.step * np.clip(wanted, speed + self.step * low, speed + self.step * high)
         points[-1] = points[-2]  # but for rounding they are the same
         return points
 
@@ -82,14 +84,13 @@ class Horizon:
         control = np.concatenate([points, points[-1:]])
         return TimedSpline(control, self.step, start).trajectory(names)
 
-    def _next(self, speed: Array, at: Array, control: Array, left: int, low: Array, high: Array) -> Array:
-        """Return the states one step later, with accelerations from ``low`` to ``high``, at rest ``left`` steps on."""
-        limits, h = self.limits, self.step
-        fastest, wanted = np.minimum(limits.velocity, self.most * h * left), speed + h * control
-        wanted = np.minimum(wanted, np.minimum(fastest, self._stoppable(limits.upper - at)))
-        wanted = np.maximum(wanted, -np.minimum(fastest, self._stoppable(at - limits.lower)))
-        following: Array = at + h * np.clip(wanted, speed + h * low, speed + h * high)
-        return following
+    def _keeping(self, wanted: Array, at: Array, left: int) -> Array:
+        """Return speeds from which the robot can stop within ``left`` steps, and within the limits of its position."""
+        limits = self.limits
+        fastest = np.minimum(limits.velocity, self.most * self.step * left)
+        below = np.minimum(wanted, np.minimum(fastest, self._stoppable(limits.upper - at)))
+        kept: Array = np.maximum(below, -np.minimum(fastest, self._stoppable(at - limits.lower)))
+        return kept
 
     def _range(self, start: Start) -> tuple[Array, Array]:
         """Return the least and the largest acceleration of the first step, by the jerk."""
@@ -108,19 +109,34 @@ class Horizon:
 def first_proved(search: Search, horizon: Horizon, controls: Array, counts: tuple[int, ...]) -> Trajectory | None:
     """Return the motion of the first controls and then a stop, of the first count of controls that is proved.
 
+    A robot that stands where an obstacle comes may take one that is touched in the end, where that is later.
+
     Args:
         search: The replan.
         horizon: The steps.
         controls: Accelerations, shape (K, dof) [rad/s^2].
         counts: Numbers of steps that are tried, the stop among them.
     """
+    motions = []
     for count in counts:
         points = horizon.roll(search.start, controls[:count, None])[:, 0]
-        motion = horizon.motion(search.start, points, search.ready.names)
+        motions.append(horizon.motion(search.start, points, search.ready.names))
         search.charges.charge("short motion")
-        if search.accepts(motion):
-            return motion
-    return None
+        if search.accepts(motions[-1]):
+            return motions[-1]
+    return latest_touched(search, motions) if endangered(search.request) else None
+
+
+def latest_touched(search: Search, motions: Sequence[Trajectory]) -> Trajectory | None:
+    """Return the motion that is touched last, where that gains time and it meets nothing that stands still, or None."""
+    best, latest = None, search.request.conflict + GAIN
+    for motion in motions:
+        one = search.following(motion)
+        until = one.end + search.ready.settings.rest_hold
+        conflict = search.ready.first_conflict(search.request.predicted, one, one.begin, until, search.charges)
+        if conflict > latest and search.ready.clear_of_still(motion, search.charges):
+            best, latest = motion, conflict
+    return best
 
 
 def finish(search: Search, near: float) -> Trajectory | None:
