@@ -21,8 +21,8 @@ SHARES = np.array([0.0, 0.25, 0.5, 1.0])  # of the largest speed, of rollouts th
 class PathIntegral:
     """Model predictive path integral control (Williams et al. 2017) in joint space, as STORM has it (Bhardwaj et al.).
 
-    Rollouts are noise around the controls of the replan before, shifted to the time of joining; beside them are the
-    controls themselves, a stop, and straight ways to the nearest goal at several speeds. A rollout costs what its states
+    Rollouts are noise around the controls of the replan before, shifted to the time of joining; beside them are a stop,
+    and straight ways to the nearest goal at several speeds. A rollout costs what its states
     are away from the nearest goal, and what they are nearer than a berth to obstacles when these are there, to what
     stands still, and to the robot itself. The mean, weighted by the softmax of the costs, is followed by a stop and
     proved; where the whole horizon is not, a shorter part of it is tried.
@@ -76,7 +76,7 @@ class PathIntegral:
         if direct is not None:
             return Answer(search.following(direct), "finish", charges)
         horizon = Horizon(ready.limits, self.step)
-        points = horizon.roll(search.start, self._tried(search, horizon))
+        points = horizon.roll(search.start, self.tried(search, horizon))
         weights = softmax(self.costs(search, horizon, points), self.temperature)
         charges.charge("state of a rollout", self.rollouts * self.steps)
         self.controls = np.tensordot(weights, horizon.applied(points), axes=(0, 1))
@@ -106,7 +106,7 @@ class PathIntegral:
         total += self.collision * self.step * self.sparse * depth(own, self.own_berth).sum(axis=0)
         return np.asarray(total)
 
-    def _tried(self, search: Search, horizon: Horizon) -> Array:
+    def tried(self, search: Search, horizon: Horizon) -> Array:
         """Return controls of rollouts, shape (K, N, dof)."""
         dof, fixed = len(search.start.position), len(SHARES)
         values = search.rng.normal(size=(self.knots, self.rollouts, dof)) * horizon.most

@@ -1,6 +1,6 @@
 """Motions over a short horizon: what a control does in steps, as a spline in time that ends at rest.
 
-The states of the steps are the control points P_k of a uniform cubic B-spline in time with a knot spacing of one step h.
+The states of the steps are the control points P_k of a uniform cubic B-spline in time with knots one step h apart.
 Its velocities are averages of the speeds (P_k+1 - P_k) / h, its accelerations averages of their changes over h, and its
 jerks changes of these over h. So a rollout whose speeds and accelerations are kept within limits is a motion that keeps
 them, too; the acceleration is at most half the jerk limit times h, so that jerks keep theirs.
