@@ -100,10 +100,12 @@ class Horizon:
         return low, high
 
     def _stoppable(self, room: Array) -> Array:
-        """Return the largest speed of the next step from which a stop keeps within the room to a limit [rad/s]."""
-        half = 0.5 * self.step
-        speed: Array = self.most * (np.sqrt(half**2 + 2.0 * np.maximum(room, 0.0) / self.most) - half)
-        return speed
+        """Return the largest speed of the next step from which a stop keeps within the room to a limit [rad/s].
+
+        With speed d, acceleration a and steps h a stop takes at most d^2 / 2a + d h / 2 + a h^2 / 8.
+        """
+        speed = self.most * (np.sqrt(2.0 * np.maximum(room, 0.0) / self.most) - 0.5 * self.step)
+        return np.asarray(np.maximum(speed, 0.0))
 
 
 def first_proved(search: Search, horizon: Horizon, controls: Array, counts: tuple[int, ...]) -> Trajectory | None:
