@@ -145,7 +145,7 @@ def controls(name: str, found: dict[str, list[float]]) -> None:
         q = search.rng.uniform(ready.limits.lower, ready.limits.upper)
         tree.extend(tree.nearest(q), q, lambda states: np.ones(len(states), bool))
     tree.trim(lambda states: np.arange(len(states)) < len(states) - 1)
-    clear, q = Clearances(search, (0.0,)), search.start.position
+    clear, q = Clearances(search), search.start.position
     before, counts = seconds(lambda: clear(tree.edges[0])), len(tree.edges[0])
     each = max(before - counts * (moving / len(states) + own / len(some)), 0.0)
     found["extension of a tree"].append(each + seconds(lambda: tree.extend(tree.nearest(q), q, refused)))

@@ -8,14 +8,13 @@ them, too; the acceleration is at most half the jerk limit times h, so that jerk
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
 from apex_ompl.live.timed_spline import Start, TimedSpline
-from apex_ompl.loop.evasion import GAIN, endangered
 from apex_ompl.loop.search import Search, least_duration
 from apex_ompl.robot.model import Limits
 from apex_ompl.trajectory import Trajectory, time_path
@@ -111,34 +110,19 @@ class Horizon:
 def first_proved(search: Search, horizon: Horizon, controls: Array, counts: tuple[int, ...]) -> Trajectory | None:
     """Return the motion of the first controls and then a stop, of the first count of controls that is proved.
 
-    A robot that stands where an obstacle comes may take one that is touched in the end, where that is later.
-
     Args:
         search: The replan.
         horizon: The steps.
         controls: Accelerations, shape (K, dof) [rad/s^2].
         counts: Numbers of steps that are tried, the stop among them.
     """
-    motions = []
     for count in counts:
         points = horizon.roll(search.start, controls[:count, None])[:, 0]
-        motions.append(horizon.motion(search.start, points, search.ready.names))
+        motion = horizon.motion(search.start, points, search.ready.names)
         search.charges.charge("short motion")
-        if search.accepts(motions[-1]):
-            return motions[-1]
-    return latest_touched(search, motions) if endangered(search.request) else None
-
-
-def latest_touched(search: Search, motions: Sequence[Trajectory]) -> Trajectory | None:
-    """Return the motion that is touched last, where that gains time and it meets nothing that stands still, or None."""
-    best, latest = None, search.request.conflict + GAIN
-    for motion in motions:
-        one = search.following(motion)
-        until = one.end + search.ready.settings.rest_hold
-        conflict = search.ready.first_conflict(search.request.predicted, one, one.begin, until, search.charges)
-        if conflict > latest and search.ready.clear_of_still(motion, search.charges):
-            best, latest = motion, conflict
-    return best
+        if search.accepts(motion):
+            return motion
+    return None
 
 
 def finish(search: Search, near: float) -> Trajectory | None:
