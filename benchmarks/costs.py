@@ -17,27 +17,35 @@ from typing import Any
 
 import numpy as np
 import record
+from numpy.typing import NDArray
 
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.live.movers import Movers, clearance_in_time, curve_of, prove_motion
 from apex_ompl.live.retime import retime
 from apex_ompl.live.timed_spline import MotionOptimizer, Start, TimedSpline
 from apex_ompl.loop.charges import TABLE, Charges
+from apex_ompl.loop.dynamic_rrt import Clearances, DynamicRRT
 from apex_ompl.loop.following import Following
+from apex_ompl.loop.goal_tree import GoalTree
+from apex_ompl.loop.mppi import PathIntegral, softmax
 from apex_ompl.loop.paper import OneProposal
+from apex_ompl.loop.potential_field import PotentialField
 from apex_ompl.loop.proposals import Proposals
 from apex_ompl.loop.ready import Ready
 from apex_ompl.loop.request import Request
 from apex_ompl.loop.search import MOTIONS, Search
 from apex_ompl.loop.settings import LoopSettings
+from apex_ompl.loop.short_horizon import Horizon
 from apex_ompl.loop.snapshot import Snapshot
 from apex_ompl.ompl_adapter.process import quiet_ompl
 from apex_ompl.ompl_adapter.setup import assemble
 from apex_ompl.problems import worlds
 from apex_ompl.trajectory import time_path
 from apex_ompl.trajopt.optimizer import Optimizer
+from apex_ompl.types import Array
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.files import write_atomically
+from apex_ompl.util.resolution import SEARCH_RESOLUTION
 from apex_ompl.util.validation import one_or_more
 
 DEPENDS = ("@planning", "apex_ompl/live", "apex_ompl/loop", "apex_ompl/trajectory")
@@ -104,6 +112,50 @@ def measured(name: str, found: dict[str, list[float]]) -> None:
     found["path in time"].append(seconds(lambda: time_path(bent, limits, ready.names)))
 
 
+def controls(name: str, found: dict[str, list[float]]) -> None:
+    """Add what each kind of work of the controls over a short horizon, and of dynamic RRT, costs a unit in a world."""
+    world = worlds.load(name)
+    setup = assemble(world.problem.still)
+    ready = Ready(setup, setup.robot.limits, setup.robot.limits, LoopSettings())
+    movers, standing = Movers(world.present(0.0)), Following.standing(setup.start, 0.0, ready.names)
+    search = Search(ready, Request(1, 0.0, 0.05, standing, None, movers, movers, (), np.inf, 0), Charges(0.1))
+    control, horizon = PathIntegral(), Horizon(ready.limits)
+    points = horizon.roll(search.start, control.tried(search, horizon))
+    states = np.ascontiguousarray(points[3:]).reshape(-1, points.shape[2])
+    times = np.repeat(0.05 * np.arange(control.steps), control.rollouts)
+    some = np.ascontiguousarray(states[:: control.sparse])
+    moving = seconds(lambda: clearance_in_time(ready.kernel, movers, states, times, control.berth))
+    own = seconds(lambda: ready.kernel.clearance(some, control.own_berth))
+    found["near clearance in time"].append(moving / len(states))
+    found["near clearance"].append(own / len(some))
+
+    def rollouts() -> None:
+        rolled = horizon.roll(search.start, control.tried(search, horizon))
+        softmax(control.costs(search, horizon, rolled), control.temperature)
+
+    found["state of a rollout"].append(max(seconds(rollouts) - moving - own, 0.0) / len(states))
+    one = np.zeros((control.steps, len(setup.start)))
+    found["short motion"].append(
+        seconds(lambda: horizon.motion(search.start, horizon.roll(search.start, one[:, None])[:, 0], ready.names))
+    )
+    reflex = PotentialField()
+    found["force"].append(seconds(lambda: reflex.controls(search, horizon)) / reflex.steps)
+    tree = GoalTree(ready.goals, DynamicRRT.step, SEARCH_RESOLUTION, 200)
+    while not tree.full:
+        q = search.rng.uniform(ready.limits.lower, ready.limits.upper)
+        tree.extend(tree.nearest(q), q, lambda states: np.ones(len(states), bool))
+    tree.trim(lambda states: np.arange(len(states)) < len(states) - 1)
+    clear, q = Clearances(search), search.start.position
+    before, counts = seconds(lambda: clear(tree.edges[0])), len(tree.edges[0])
+    each = max(before - counts * (moving / len(states) + own / len(some)), 0.0)
+    found["extension of a tree"].append(each + seconds(lambda: tree.extend(tree.nearest(q), q, refused)))
+
+
+def refused(states: Array) -> NDArray[np.bool_]:
+    """Return that no state is clear."""
+    return np.zeros(len(states), bool)
+
+
 def trees() -> dict[str, float]:
     """Return what a motion of RRTConnect's trees costs, with all that it does else among obstacles that stand [s]."""
     spent, motions = 0.0, 0
@@ -153,6 +205,7 @@ def main() -> None:
     found: dict[str, list[float]] = defaultdict(list)
     for name in worlds.ids("moving", "validation", args.n):
         measured(name, found)
+        controls(name, found)
     table = {kind: float(np.median(values)) for kind, values in found.items()} | network() | trees()
     rows = [["kind of work", "us a unit"], ["---", "---:"], *([kind, f"{1e6 * v:.3g}"] for kind, v in table.items())]
     if args.write:

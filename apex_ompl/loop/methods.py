@@ -7,8 +7,11 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from apex_ompl.errors import UnknownNameError
+from apex_ompl.loop.dynamic_rrt import DynamicRRT
+from apex_ompl.loop.mppi import PathIntegral
 from apex_ompl.loop.paper import OneProposal
 from apex_ompl.loop.portfolio import Portfolio
+from apex_ompl.loop.potential_field import PotentialField
 from apex_ompl.loop.proposals import Proposals
 from apex_ompl.loop.request import Replanner
 from apex_ompl.loop.resuming import Resume
@@ -63,6 +66,11 @@ METHODS = {
     "blind": Method(
         lambda: Portfolio([Route(), Lines(), Proposals(), Lines(bumps=3)], evades=False), {**BLIND, "monitored": False},
         "a plan among obstacles where they were seen at first, followed blindly",
+    ),
+    "mppi": Method(PathIntegral, {}, "model predictive path integral control"),
+    "potential-field": Method(PotentialField, {}, "a reflex down an artificial potential"),
+    "dynamic-rrt": Method(
+        DynamicRRT, FROM_REST, "stops where the way is blocked; a tree from the goal that is kept and repaired"
     ),
 }  # fmt: skip
 

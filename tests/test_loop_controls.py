@@ -1,0 +1,144 @@
+"""Controls of the closed loop: path integrals, a potential field, and a tree that is kept."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from loops import PROBLEM, crossing, go, setup_of
+from numpy.typing import NDArray
+
+from apex_ompl.live.movers import Movers
+from apex_ompl.live.timed_spline import Start
+from apex_ompl.loop.goal_tree import GoalTree
+from apex_ompl.loop.methods import METHODS
+from apex_ompl.loop.mppi import softmax
+from apex_ompl.loop.potential_field import Field, PotentialField, repulsive
+from apex_ompl.loop.result import Outcome
+from apex_ompl.loop.run import run
+from apex_ompl.loop.short_horizon import Horizon
+from apex_ompl.scene.bodies import Obstacle
+
+CONTROLS = ("mppi", "potential-field", "dynamic-rrt")
+MOVING = "vertical/moving-medium-0.1/800000"
+
+
+@pytest.mark.parametrize("name", CONTROLS)
+def test_the_goal_is_reached_where_nothing_is_in_the_way(name: str) -> None:
+    done, report = go(METHODS[name].make(), timeout=6.0, **METHODS[name].settings)
+    assert done.reached and report.contact is None
+    assert max(report.limit_use.values()) <= 1.0 + 1e-9
+
+
+@pytest.mark.parametrize("name", CONTROLS)
+def test_nothing_is_touched_while_the_robot_moves(name: str) -> None:
+    found = run(MOVING, name)
+    assert found.outcome is Outcome.REACHED and found.metrics["broken_steps"] == 0.0, found.reason
+    assert found.metrics["limit_use"] <= 1.0 + 1e-9
+    parts = {event.data["part"] for event in found.events if event.kind == "accepted"}
+    assert parts <= {"mppi", "field", "finish", "tree"}
+    if name == "potential-field":
+        assert run(MOVING, name).events == found.events
+
+
+@pytest.mark.parametrize("name", CONTROLS)
+def test_a_box_that_crosses_is_not_run_into(name: str) -> None:
+    box = crossing(setup_of(PROBLEM))
+    done, report = go(METHODS[name].make(), box, timeout=2.5, fastest=0.5, **METHODS[name].settings)
+    assert done.broken == 0
+    if report.contact is not None and report.contact.moved:  # only a robot that leaves a place that the box comes to
+        accepted = [event for event in done.events if event.kind == "accepted" and event.time <= report.contact.time]
+        assert accepted[-1].data["leaving"]
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_rollouts_are_motions_within_the_limits_that_end_at_rest(seed: int) -> None:
+    rng, setup = np.random.default_rng(seed), setup_of(PROBLEM)
+    limits, names = setup.robot.limits, setup.robot.joint_names
+    horizon, count = Horizon(limits), int(rng.integers(9, 25))
+    controls = 2.0 * rng.normal(size=(count, 3, len(names))) * limits.acceleration
+    start = Start.at_rest(setup.start)
+    for _ in range(3):  # on and on from where the robot is at a knot of the motion before
+        points = horizon.roll(start, controls)
+        motion = horizon.motion(start, points[:, 1], names)
+        assert max(motion.use(limits).values()) <= 1.0 + 1e-9
+        assert not (motion.velocities[-1].any() or motion.accelerations[-1].any())
+        assert all(np.array_equal(motion(0.0, order), start[order]) for order in range(3))
+        start = Start(motion(0.2), motion(0.2, 1), motion(0.2, 2))
+    again = horizon.roll(Start.at_rest(setup.start), controls)
+    assert np.allclose(horizon.roll(Start.at_rest(setup.start), horizon.applied(again)), again, atol=1e-9)
+
+
+def test_weights_are_the_softmax_of_costs() -> None:
+    costs, temperature = np.random.default_rng(0).uniform(0.0, 0.3, 50), 0.05
+    wanted = np.exp(-costs / temperature) / np.exp(-costs / temperature).sum()
+    assert np.allclose(softmax(costs, temperature), wanted, rtol=1e-12)
+    assert np.allclose(softmax(costs + 1e4, temperature), wanted, rtol=1e-6)
+    assert np.array_equal(softmax(np.array([0.0, 1e6]), temperature), [1.0, 0.0])
+
+
+def test_the_force_is_the_slope_of_the_potential() -> None:
+    setup, rng = setup_of(PROBLEM), np.random.default_rng(1)
+    goal = setup.valid_goals[0]
+    palm = setup.robot.link_pose(setup.start, "left_hand_palm")[:3, 3]
+    box = Obstacle(name="box", box=(0.1, 0.1, 0.1), position=tuple((palm + (0.0, 0.0, 0.2)).tolist()))
+    movers, kernel, reflex = Movers([box]), setup.checker.kernel, PotentialField()
+    field, near = replace(reflex, reach=0.4).field(goal), replace(reflex, own_reach=0.3).field(goal)
+    repelled, matching = 0, 0
+    for k in range(40):
+        one: Field = (field, near)[k % 2]
+        q = (setup.start if k % 4 < 2 else goal) + 0.05 * rng.normal(size=len(goal))
+        q[-2:] = goal[-2:]
+        _, force = one.potential_and_force(kernel, movers, q, 0.0)
+        way = rng.normal(size=len(q))
+        way[-2:] = 0.0
+        ends = [one.potential_and_force(kernel, movers, q + s * way, 0.0)[0] for s in (1e-6, -1e-6)]
+        slope = (ends[0] - ends[1]) / 2e-6
+        matching += abs(slope + force @ way) <= 1e-3 * max(1.0, abs(slope))
+        attracted = one._replace(repulsion=0.0, own_repulsion=0.0).potential_and_force(kernel, movers, q, 0.0)[1]
+        repelled += not np.allclose(force, attracted)
+    assert repelled >= 20
+    assert matching >= 38  # where two spheres are as near the gradient is that of one
+
+
+def test_repulsion_has_no_step_where_it_goes_on_as_a_tangent() -> None:
+    shares = np.array([0.25 - 1e-9, 0.25 + 1e-9, 1.0])
+    values = [repulsive(share) for share in shares.tolist()]
+    assert np.allclose(values[0], values[1], rtol=1e-6) and values[2] == (0.0, 0.0)
+    assert repulsive(-1.0)[0] > repulsive(0.0)[0] > repulsive(0.25)[0]
+
+
+def test_a_trimmed_tree_keeps_what_is_clear_and_nothing_else() -> None:
+    rng = np.random.default_rng(2)
+
+    def free(states: np.ndarray) -> NDArray[np.bool_]:
+        return np.ones(len(states), bool)
+
+    tree = GoalTree(np.array([[0.0, 0.0], [1.0, 1.0]]), 0.2, 0.03, 300)
+    for _ in range(300):
+        q = rng.uniform(-1.0, 2.0, 2)
+        tree.extend(tree.nearest(q), q, free)
+    assert len(tree) == 302 and tree.full
+    states, parents, edges = tree.states.copy(), tree.parents.copy(), tree.edges.copy()
+    assert np.abs(np.diff(edges, axis=1)).max() <= 0.03 and np.array_equal(edges[:, -1], states[2:])
+    centre = np.array([0.7, 0.3])
+
+    def clear(some: np.ndarray) -> NDArray[np.bool_]:
+        return np.asarray(np.linalg.norm(some - centre, axis=1) > 0.3)
+
+    def connected(k: int) -> bool:
+        while parents[k] >= 0:
+            if not clear(edges[k - 2]).all():
+                return False
+            k = int(parents[k])
+        return True
+
+    wanted = np.array([connected(k) for k in range(302)])
+    tree.trim(clear)
+    assert 2 < wanted.sum() < 302 and np.array_equal(tree.states, states[wanted])
+    assert clear(tree.edges.reshape(-1, 2)).all()
+    for k in range(len(tree)):
+        path = tree.path(k)
+        assert np.array_equal(path[0], tree.states[k]) and tree.at(path[-1]) in (0, 1)
+        assert np.abs(np.diff(path, axis=0)).max(initial=0.0) <= 0.2 + 1e-12
