@@ -130,8 +130,9 @@ def test_files_are_told_apart_by_what_they_hold(
 ) -> None:
     run.save(tmp_path / "a.npz")
     run.save(tmp_path / "b.json")
-    for name in ("c.npz", "d.json", "e.yaml"):
-        result.save(tmp_path / name)
+    result.save(tmp_path / "c.npz")
+    for name in ("d.json", "e.yaml"):  # a motion as YAML text takes seconds
+        replace(result, trajectory=None).save(tmp_path / name)
     result.problem.save(tmp_path / "f.yaml")
     (tmp_path / "g.json").write_text("{}")
     kinds = [saved_kind(path) for path in sorted(tmp_path.iterdir())]
