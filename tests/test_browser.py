@@ -79,6 +79,10 @@ def test_pages_show_and_play_to_the_end(driver: Any, name: str, problem: Problem
     cursor = driver.find_element("id", "cursor").get_attribute("transform")
     assert cursor and cursor.startswith("translate(")
     assert errors(driver) == []
+
+
+def test_live_pages_show_results(driver: Any) -> None:
+    result = plan("ball_in_cup", timeout=20.0)
     said, stop = SimpleQueue[str](), threading.Event()
     options: dict[str, Any] = {"opened": False, "ready": said.put, "until": stop.is_set}
     serve = threading.Thread(target=view, args=(result,), kwargs=options)
