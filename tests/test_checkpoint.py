@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import shutil
@@ -12,6 +13,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from safetensors.numpy import load_file as load_arrays
+from safetensors.numpy import save_file as save_arrays
 from safetensors.torch import load_file, save_file
 from support import DATA
 from trainings import HERE, config, query_from_path
@@ -20,6 +23,7 @@ import apex_ompl
 from apex_ompl.datasets.store import load
 from apex_ompl.diffusion.checkpoint import load_model, load_torch_model
 from apex_ompl.diffusion.checkpoint_writer import save_model
+from apex_ompl.diffusion.eight_bits import expanded, quantized
 from apex_ompl.diffusion.training import Trainer
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError, UnknownNameError
 from apex_ompl.kernel import Kernel, RobotTables
@@ -63,6 +67,41 @@ def test_a_checkpoint_gives_the_model_back(saved: Path, few: Path, tmp_path: Pat
         for m in (apex_ompl.load_model(saved), load_model(str(tmp_path / "again")))
     )
     np.testing.assert_array_equal(first, second)
+
+
+def test_eight_bits_are_a_step_of_each_row_off_and_half_the_size(saved: Path, few: Path, tmp_path: Path) -> None:
+    rng = np.random.default_rng(2)
+    wide = (rng.normal(size=(200, 300)) * rng.uniform(0.01, 3.0, (200, 1))).astype(np.float32)
+    wide[7] = 0.0
+    weights = {"a.weight": wide, "a.bias": wide[:, 0], "small": wide[:3, :3], "whole": np.arange(5)}
+    packed = quantized(weights)
+    assert packed["a.weight"].dtype == np.int8 and len(packed) == 5
+    found = expanded(packed)
+    assert list(found) == list(weights)
+    assert (np.abs(found["a.weight"] - wide) <= 0.5001 * np.abs(wide).max(axis=1, keepdims=True) / 127).all()
+    assert all(found[name] is weights[name] for name in weights if name != "a.weight")
+    again = quantized(found)
+    assert np.array_equal(again["a.weight"], packed["a.weight"])
+
+    model = load_torch_model(saved)
+    save_model(tmp_path / "eight", model.network, model.about, bits=8)
+    sizes = [(folder / "model.safetensors").stat().st_size for folder in (saved, tmp_path / "eight")]
+    assert sizes[1] < 0.75 * sizes[0]
+    kernel, query = Kernel(RobotTables.load(DATA / "robot.npz"), scene_tables([])), query_from_path(load(few), 0)
+    first, second = (
+        load_model(folder).propose(query, kernel, 3, generator=np.random.default_rng(1)).control
+        for folder in (saved, tmp_path / "eight")
+    )
+    assert 0.0 < np.abs(first - second).max() < 0.02 * np.ptp(first)
+    source = tmp_path / "eight" / "model.safetensors"
+    arrays = load_arrays(source)
+    gone = next(name for name in arrays if name.endswith(".scale"))
+    save_arrays({name: values for name, values in arrays.items() if name != gone}, source)
+    data = json.loads((tmp_path / "eight" / "config.json").read_text())
+    data["digest"] = hashlib.sha256(source.read_bytes()).hexdigest()
+    (tmp_path / "eight" / "config.json").write_text(json.dumps(data))
+    with pytest.raises(FileFormatError, match="expected a scale for each row"):
+        load_model(tmp_path / "eight")
 
 
 def _changed(saved: Path, folder: Path, **changes: Any) -> Path:

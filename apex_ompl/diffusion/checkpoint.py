@@ -17,6 +17,7 @@ from safetensors import SafetensorError
 from safetensors.numpy import load as load_arrays
 
 from apex_ompl.diffusion.array_model import ArrayModel, is_supported, weight_shapes
+from apex_ompl.diffusion.eight_bits import expanded
 from apex_ompl.diffusion.model_config import ModelConfig
 from apex_ompl.diffusion.proposals import TrajectoryModel
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError, UnknownNameError
@@ -100,7 +101,7 @@ def _read(name: str | os.PathLike[str], robot: str | None) -> tuple[CheckpointCo
     if found != config.digest:
         raise FileFormatError(str(source), "", f"SHA-256 {found[:12]}...", f"expected {config.digest[:12]}...: damaged")
     try:
-        weights = load_arrays(content)
+        weights = expanded(load_arrays(content))
     except (SafetensorError, ValueError, KeyError) as error:
         raise FileFormatError(str(source), "", str(error), "expected safetensors") from error
     for key, values in weights.items():

@@ -9,11 +9,13 @@ import shutil
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-from safetensors.torch import save as save_tensors
+from numpy.typing import NDArray
+from safetensors.numpy import save as save_arrays
 
 from apex_ompl.diffusion.checkpoint import CONFIG, SCHEMA, WEIGHTS
+from apex_ompl.diffusion.eight_bits import quantized
 from apex_ompl.diffusion.model import LatentDiffusion
 from apex_ompl.diffusion.model_config import ModelConfig
 from apex_ompl.errors import MissingFileError
@@ -24,7 +26,11 @@ PART = ".part"
 
 
 def save_model(
-    folder: str | os.PathLike[str], network: LatentDiffusion, trained: Mapping[str, Any], *, half: bool = True
+    folder: str | os.PathLike[str],
+    network: LatentDiffusion,
+    trained: Mapping[str, Any],
+    *,
+    bits: Literal[8, 16, 32] = 16,
 ) -> None:
     """Write a checkpoint with its model card, completely or not at all; an existing one is replaced.
 
@@ -32,7 +38,7 @@ def save_model(
         folder: Folder of the checkpoint.
         network: The model.
         trained: Record of its training, ready for JSON.
-        half: Whether weights are stored in half precision.
+        bits: Size of a stored weight; 8 is for large matrices, with all others in half precision.
 
     Raises:
         MissingFileError: The folder cannot be written, or is not a checkpoint's.
@@ -40,11 +46,11 @@ def save_model(
     folder = Path(folder)
     if folder.exists() and not is_file(folder / CONFIG):
         raise MissingFileError(str(folder), "folder for a checkpoint", "something else is there")
-    kept = {
-        name: (tensor.half() if half and tensor.is_floating_point() else tensor).cpu().contiguous()
+    kept: dict[str, NDArray[Any]] = {
+        name: (tensor.half() if bits < 32 and tensor.is_floating_point() else tensor).cpu().contiguous().numpy()
         for name, tensor in network.state_dict().items()
     }
-    weights = save_tensors(kept)
+    weights = save_arrays(quantized(kept) if bits == 8 else kept)
     config = {
         "schema": SCHEMA, "model": network.config.model_dump(mode="json"),
         "digest": hashlib.sha256(weights).hexdigest(), "trained": dict(trained),
