@@ -4,6 +4,10 @@ Every run is judged by the referee at samples 1 ms apart with what truly happene
 (30 Hz, 50 ms late, errors of 8 mm, 2 % missed), and obstacles were observed for 0.3 s before a run begins. Each run is
 stored in benchmarks/runs/closed_loop when it ends; the command resumes where it was stopped.
 
+The row ``clairvoyant`` is no loop: ``plan`` knows from the beginning how everything will move, begins at once, and
+gives the shortest motion of what it finds in 10 s with as many seeds as fit. Times to the goal are compared with its,
+over the runs that both end at the goal. (It is made where motions are independent of the robot's, in moving worlds.)
+
 Usage: python benchmarks/closed_loop.py [-n 60] [--jobs 1] [--split test] [--kinds moving popup] [--report]
 """
 
@@ -12,6 +16,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import time
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
@@ -20,11 +25,13 @@ from typing import Any, NamedTuple
 import record
 from tqdm import tqdm
 
+from apex_ompl import plan, problems
 from apex_ompl.loop.charges import cost_table
 from apex_ompl.loop.methods import METHODS
 from apex_ompl.loop.result import Outcome
 from apex_ompl.loop.run import run
 from apex_ompl.problems import worlds
+from apex_ompl.trajectory.timing import Timing
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.files import write_atomically
 from apex_ompl.util.statistics import share_interval
@@ -34,6 +41,11 @@ DEPENDS = ("@planning", "apex_ompl/live", "apex_ompl/loop", "apex_ompl/trajector
 FOLDER = record.RESULTS.parent / "runs" / "closed_loop"
 SPEEDS = (1.0, 0.25)
 KEPT = ("time_to_goal", "rest_time", "stops", "reaction_p95", "clearance", "limit_use", "broken_steps")
+
+
+CLAIRVOYANT = "clairvoyant"
+SEARCHED = 10.0  # [s]
+SCRIPTED = "moving"  # kind of the worlds whose obstacles go their way whatever the robot does
 
 
 class Job(NamedTuple):
@@ -51,17 +63,52 @@ class Job(NamedTuple):
 
 def made(job: Job) -> dict[str, Any]:
     """Run once, and return what is kept."""
+    if job.method == CLAIRVOYANT:
+        return offline(job)
     result = run(job.world, job.method, speed=job.speed, seed=0)
+    replans = [event.data["took"] for event in result.events if event.kind in ("accepted", "rejected")]
     moving = result.outcome is Outcome.HIT_MOVING
     return {
         **job._asdict(), "outcome": str(result.outcome), "reason": result.reason, "costs": cost_table()["version"],
-        "hit_while_expected": moving and not result.metrics["broken_steps"],
+        "hit_while_expected": moving and not result.metrics["broken_steps"], "replans": replans,
         **{name: result.metrics[name] for name in KEPT if name in result.metrics},
     }  # fmt: skip
 
 
-def summary(some: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Return the failure ratio of some runs with Wilson's interval, causes, and percentiles of those that succeed."""
+def offline(job: Job) -> dict[str, Any]:
+    """Plan with all that will happen known, and return what is kept."""
+    problem, begun, found, seed = problems.load(job.world), time.perf_counter(), [], 0
+    while time.perf_counter() - begun < SEARCHED:
+        result = plan(problem, timeout=SEARCHED, seed=seed, timing=Timing(velocity_scale=job.speed))
+        if result and result.trajectory is not None:
+            found.append(result.trajectory.duration)
+        seed += 1
+    reached = (
+        {"time_to_goal": min(found), "stops": 0.0, "limit_use": 1.0} if found else {"stops": 0.0, "limit_use": 0.0}
+    )
+    return {
+        **job._asdict(), "outcome": str(Outcome.REACHED if found else Outcome.TIMEOUT), "hit_while_expected": False,
+        "seeds": seed, "replans": [], **reached,
+    }  # fmt: skip
+
+
+def ratios(some: Sequence[dict[str, Any]], best: Sequence[dict[str, Any]]) -> list[float]:
+    """Return times to the goal by those of other runs in the same worlds, where both came there."""
+    of = {(one["world"], one["speed"]): one for one in best if one["outcome"] == "reached"}
+    return [
+        one["time_to_goal"] / of[one["world"], one["speed"]]["time_to_goal"]
+        for one in some
+        if one["outcome"] == "reached" and (one["world"], one["speed"]) in of
+    ]
+
+
+def summary(some: Sequence[dict[str, Any]], best: Sequence[dict[str, Any]] = ()) -> dict[str, Any]:
+    """Return the failure ratio of some runs with Wilson's interval, causes, and percentiles of those that succeed.
+
+    Args:
+        some: The runs.
+        best: The clairvoyant's in the same worlds.
+    """
     good = [one for one in some if one["outcome"] == "reached"]
     failed = len(some) - len(good)
     causes: dict[str, int] = {}
@@ -69,29 +116,62 @@ def summary(some: Sequence[dict[str, Any]]) -> dict[str, Any]:
         if one["outcome"] != "reached":
             causes[one["outcome"]] = causes.get(one["outcome"], 0) + 1
     times = [one["time_to_goal"] for one in good]
+    compared, replans = ratios(some, best), [took for one in some for took in one["replans"]]
+    levels: dict[str, list[bool]] = {}
+    for one in some:
+        levels.setdefault(one["world"].rpartition("/")[0], []).append(one["outcome"] != "reached")
     reactions = [one["reaction_p95"] for one in some if "reaction_p95" in one]
     return {
         "n": len(some), "failed": failed / len(some), "interval": list(share_interval(failed, len(some))),
         "causes": causes, "hits_while_expected": sum(one["hit_while_expected"] for one in some),
         "time_to_goal_s": record.percentiles(times, 50, 95) if times else [None, None],
+        "by_clairvoyant": record.percentiles(compared, 50, 95) if compared else [None, None], "compared": len(compared),
+        "replan_s": record.percentiles(replans, 50, 95) if replans else [None, None], "replans": len(replans),
+        "worst_level": max(sum(row) / len(row) for row in levels.values()),
         "stops": sum(one["stops"] for one in some) / len(some),
         "reaction_p95_s": record.percentiles(reactions, 50, 95) if reactions else [None, None],
         "over_limits": sum(one["limit_use"] > 1.0 + 1e-9 for one in some),
     }  # fmt: skip
 
 
+def shown(value: float | None, unit: float = 1.0) -> str:
+    """Return a number as the tables have it."""
+    return "-" if value is None else f"{unit * value:.3g}"
+
+
+def by_size(runs: Sequence[dict[str, Any]]) -> tuple[str, dict[str, Any]]:
+    """Return the table of failure ratios over the size of obstacles, and its numbers."""
+    found: dict[str, dict[str, list[bool]]] = {}
+    for one in runs:
+        size = one["world"].split("/")[-2].removeprefix("moving-").split("-")[0]
+        row = f"speed {one['speed']:g}, {one['method']}"
+        found.setdefault(row, {}).setdefault(size, []).append(one["outcome"] != "reached")
+    sizes = list(next(iter(found.values())))
+    lines: list[list[Any]] = [
+        ["moving, failed %, by size", *sizes, "N of a size"],
+        ["---", *["---:"] * (len(sizes) + 1)],
+    ]
+    for name, row in found.items():
+        shares = [f"{100 * sum(row[size]) / len(row[size]):.1f}" if size in row else "-" for size in sizes]
+        lines.append([name, *shares, min(map(len, row.values()))])
+    numbers = {name: {size: [sum(x), len(x)] for size, x in row.items()} for name, row in found.items()}
+    return "\n".join(record.row(line) for line in lines), numbers
+
+
 def table(rows: dict[str, dict[str, Any]]) -> str:
     """Return the Markdown table of rows."""
     head = ["", "N", "failed", "95 % interval", "causes", "hit while moving, as assumed", "time to goal s p50", "p95",
-            "stops", "over limits"]  # fmt: skip
+            "by clairvoyant's p50", "p95", "stops",
+            "replan ms p50", "p95", "reaction ms p95", "over limits"]  # fmt: skip
     lines = [head, ["---", *["---:"] * (len(head) - 1)]]
     for name, s in rows.items():
         low, high = s["interval"]
         causes = ", ".join(f"{count} {cause}" for cause, count in sorted(s["causes"].items())) or "-"
-        times = ["-" if v is None else f"{v:.3g}" for v in s["time_to_goal_s"]]
+        times = [shown(v) for v in (*s["time_to_goal_s"], *s["by_clairvoyant"])]
+        replans = [shown(v, 1e3) for v in (*s["replan_s"], s["reaction_p95_s"][1])]
         lines.append([
             name, s["n"], f"{100 * s['failed']:.1f} %", f"{100 * low:.1f} to {100 * high:.1f}", causes,
-            s["hits_while_expected"], *times, f"{s['stops']:.2g}", s["over_limits"],
+            s["hits_while_expected"], *times, f"{s['stops']:.2g}", *replans, s["over_limits"],
         ])  # fmt: skip
     return "\n".join(record.row(line) for line in lines)
 
@@ -112,7 +192,7 @@ def main() -> None:
         kind: [
             Job(world, method, speed)
             for world in worlds.ids(kind, args.split, args.n)
-            for method in args.methods
+            for method in (*args.methods, *[CLAIRVOYANT] * (kind == SCRIPTED))
             for speed in args.speeds
         ]
         for kind in args.kinds
@@ -128,14 +208,22 @@ def main() -> None:
                     pool.shutdown(cancel_futures=True)
                 text = json.dumps(future.result(), indent=1)
                 write_atomically(args.store / pending[future].file, text.encode())
-    rows: dict[str, list[dict[str, Any]]] = {}
+    rows: dict[tuple[str, float, str], list[dict[str, Any]]] = {}
     for kind, some in jobs.items():
         for job in some:
             if (args.store / job.file).exists():
-                row = f"{kind}, speed {job.speed:g}, {job.method}"
+                row = kind, job.speed, job.method
                 rows.setdefault(row, []).append(json.loads((args.store / job.file).read_text()))
-    found = {name: summary(some) for name, some in rows.items()}
-    record.write("closed_loop", {"rows": found}, table(found), split=args.split, n=args.n, seed=0)
+    found = {
+        f"{kind}, speed {speed:g}, {method}": summary(some, rows.get((kind, speed, CLAIRVOYANT), ()))
+        for (kind, speed, method), some in rows.items()
+    }
+    text, data = table(found), {"rows": found}
+    moving = [one for (kind, _, _), some in rows.items() if kind == SCRIPTED for one in some]
+    if moving:
+        sizes, data["by_size"] = by_size(moving)
+        text = f"{text}\n\n{sizes}"
+    record.write("closed_loop", data, text, split=args.split, n=args.n, seed=0)
 
 
 if __name__ == "__main__":

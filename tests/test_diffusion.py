@@ -75,7 +75,7 @@ def test_the_variational_network_learns_to_give_paths_back() -> None:
     model.fit_scale(control)
     optimizer = torch.optim.Adam(model.parameters(), 2e-3)
     errors = []
-    for k in range(60):
+    for k in range(120):
         noise = torch.randn(64, *model.latent, generator=torch.Generator().manual_seed(k))
         loss, error = model.loss(control, noise, 1e-6)
         optimizer.zero_grad()
