@@ -7,11 +7,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from loops import PROBLEM, ready_of, world_of
+from runs import motion_between
 
 from apex_ompl import problems
 from apex_ompl.errors import ApexError
+from apex_ompl.loop.cycle import RunRecord
 from apex_ompl.loop.result import Outcome, RunResult
-from apex_ompl.loop.run import run
+from apex_ompl.loop.run import _Made, run
 from apex_ompl.loop.settings import LoopSettings
 from apex_ompl.problems import worlds
 from apex_ompl.problems.suite_robot import robot
@@ -92,3 +95,12 @@ def test_a_goal_in_collision_is_no_error() -> None:
     post = Obstacle(name="post", box=(0.03, 0.03, 0.03), position=palm)
     found = run(problem.model_copy(update={"scene": (*problem.scene, post)}), "no-network")
     assert found.outcome is Outcome.STUCK and "post" in found.reason
+
+
+def test_rest_elsewhere_than_at_a_goal_is_no_success() -> None:
+    ready, world = ready_of(PROBLEM), world_of(PROBLEM)
+    q = ready.setup.start
+    aside = np.where(np.arange(len(q)) == 0, q + 0.05 * np.sign(-q), q)
+    record = RunRecord(motion_between(robot(), q, aside), (), reached=True, ended="", broken=0)
+    found = _Made(world, ready, "no-network", "simulated", 0, {}).judged(record)
+    assert found.outcome is Outcome.MISALIGNED and found.reason == "the motion does not end at a goal"

@@ -147,8 +147,9 @@ class _Made:
         outcome, reason = report.outcome, "; ".join(report.faults)
         if outcome is None:
             ended = {"stuck": Outcome.STUCK, "timeout": Outcome.TIMEOUT}
-            outcome = Outcome.REACHED if done.reached else ended[done.ended]
-            reason = "" if done.reached else f"no goal was reached in {done.trajectory.duration:.3g} s"
+            outcome = Outcome.MISALIGNED if done.reached else ended[done.ended]
+            if not done.reached:
+                reason = f"no goal was reached in {done.trajectory.duration:.3g} s"
         if report.contact is not None:
             one = report.contact
             told = Event(one.time, "contact", {"first": one.first, "second": one.second, "moved": one.moved})
