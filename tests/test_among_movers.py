@@ -13,11 +13,12 @@ from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ParameterError
 from apex_ompl.live.moving import check_timed_path
 from apex_ompl.live.timed_proof import TimedProver
+from apex_ompl.planning import among_movers
 from apex_ompl.planning.among_movers import MARGIN
 from apex_ompl.problems import load
 from apex_ompl.result import PlanResult, PlanStatus
 from apex_ompl.robot import Robot
-from apex_ompl.scene.bodies import Obstacle
+from apex_ompl.scene.bodies import AttachedObject, Obstacle
 from apex_ompl.scene.problem import Goal, Problem
 from apex_ompl.scene.scripts import obstacle_at
 from apex_ompl.trajectory import Timing
@@ -99,6 +100,15 @@ def test_joints_that_are_not_planned_stay_among_movers(problem: Problem, robot: 
     states = result.trajectory(np.linspace(0.0, result.trajectory.duration, 500))
     assert np.array_equal(states[:, ~moved], np.broadcast_to(start[~moved], states[:, ~moved].shape))
     clearances_in_time(robot, result, 40)
+
+
+def test_held_objects_may_have_any_name_where_a_process_plans_its_first_motion(
+    problem: Problem, robot: Robot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(among_movers, "_warm", set())
+    ball = {"name": "ball", "link": "left_hand_palm", "sphere": {"radius": 0.02}, "position": (0.0, 0.0, 0.12)}
+    held = problem.model_copy(update={"attached": (AttachedObject.model_validate(ball),)})
+    assert plan(with_mover(held, robot), timeout=20.0)
 
 
 def test_results_among_movers_are_kept(problem: Problem, robot: Robot, tmp_path: Path) -> None:

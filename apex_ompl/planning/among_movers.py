@@ -223,9 +223,9 @@ def warm_up(checker: CollisionChecker) -> None:
     motion = time_path(np.stack([start, goal]), robot.limits, robot.joint_names, Timing(method="spline")).trajectory
     hand = robot.link_pose(motion(0.5 * motion.duration), robot.link_names[-1])[:3, 3]
     far = tuple((hand + (0.0, 0.0, 0.5 * motion.duration)).tolist())
-    prover = TimedProver(
-        checker, [Obstacle(name="ball", sphere=Sphere(radius=0.05), position=far, velocity=(0, 0, -1))]
-    )
+    checker = CollisionChecker(robot)  # of its own: all names are free in it
+    ball = Obstacle(name="ball", sphere=Sphere(radius=0.05), position=far, velocity=(0, 0, -1))
+    prover = TimedProver(checker, [ball])
     prover.prove(motion)
     retime(checker.kernel, prover.movers, motion, robot.limits, hold=0.0)
     spline = TimedSpline.along(motion(motion.times), motion.duration, Start.at_rest(start), goal)
