@@ -76,6 +76,15 @@ def test_parameters_outside_their_ranges_are_named(given: dict[str, Any]) -> Non
         LoopSettings(**given)
 
 
+@pytest.mark.parametrize("name", ["vertical/moving-medium-0.4/800005", "vertical/moving-huge-0.4/800007"])
+def test_a_robot_that_leaves_is_not_held_by_a_stop_before_it_has_set_out(name: str) -> None:
+    """A cube comes to where the robot stands within 0.2 s."""
+    found = run(name, "no-network", seed=0)
+    first = next(event for event in found.events if event.kind == "accepted")
+    assert first.data["part"] == "evade" and first.data["leaving"]
+    assert found.outcome is Outcome.REACHED and found.metrics["clearance"] > 0.0
+
+
 def test_a_start_in_collision_is_an_outcome(tmp_path: Path) -> None:
     problem = problems.load(MOVING)
     q = problem.start_state(robot().joint_names)

@@ -164,7 +164,8 @@ class Executor:
         then = now + self.ready.settings.period
         found = self.ready.proved_stop(reachable, self.following, now, then)
         if found is not None:
-            self.stop, self.leaving = found, False
+            waits = not self.following.start(now).velocity.any()  # a stop in place is not what it leaves for
+            self.stop, self.leaving = found, self.leaving and waits
             return
         if self.leaving or self.following.at_rest(now):
             self.stop = None
@@ -202,8 +203,9 @@ class Executor:
         why, leaving = self._fault(now, request, found, predicted), False
         if not why and reachable is not None:
             then = found.begin + self.ready.settings.period
-            leaving = self.ready.proved_stop(reachable, found, found.begin, then) is None
-            if leaving and not self._may_leave(now, found):
+            may, stops = self._may_leave(now, found), self.ready.proved_stop(reachable, found, found.begin, then)
+            leaving = stops is None or (may and not found.to_goal)  # a stop at once is no way to leave
+            if leaving and not may:
                 why = "no stop behind its first step is proved"
         if why:
             self.log(now, "rejected", why=why, **took)
