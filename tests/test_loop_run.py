@@ -85,6 +85,13 @@ def test_a_robot_that_leaves_is_not_held_by_a_stop_before_it_has_set_out(name: s
     assert found.outcome is Outcome.REACHED and found.metrics["clearance"] > 0.0
 
 
+def test_candidates_that_no_duration_makes_possible_are_not_carried_on() -> None:
+    """One of a week made every later replan raise, and the robot stood until time was up."""
+    found = run("horizontal/moving-medium-0.4/800005", "apex", seed=0)
+    assert found.outcome is Outcome.REACHED
+    assert not [event for event in found.events if "Error" in str(event.data.get("why", ""))]
+
+
 def test_a_start_in_collision_is_an_outcome(tmp_path: Path) -> None:
     problem = problems.load(MOVING)
     q = problem.start_state(robot().joint_names)

@@ -19,6 +19,7 @@ CLEAR = -0.003  # clearance at the samples from which on a proof is tried; spher
 ENOUGH = 0.03  # at which a round ends early [m]
 REFIT = 64  # states of a candidate that begins from elsewhere
 SLOWER = 1.02  # least factor on the duration of a candidate over its limits
+LONGEST = 60.0  # duration at which a candidate is of no use [s]
 LEAST = 1e-6  # clearance cost that counts as none
 
 
@@ -34,7 +35,7 @@ class MotionCandidate:
         clear: Whether a proof is worth its while: no sample is in contact.
         damping: Of the next step.
         rounds: Number of rounds that it had.
-        given_up: Whether it is clear at the samples and not proved.
+        given_up: Whether it was found, or is of no use any more.
     """
 
     spline: TimedSpline
@@ -132,6 +133,7 @@ class MotionPool:
             least = least_knot_spacing(one.spline.control, self._optimizer.limits)
             if least > one.spline.spacing:
                 one.spline = one.spline.lasting(max(least, SLOWER * one.spline.spacing))
+                one.given_up = one.spline.duration > LONGEST
                 if least_knot_spacing(one.spline.control, self._optimizer.limits) > one.spline.spacing:
                     continue
                 self._improve(one, 0)

@@ -63,7 +63,8 @@ class Portfolio:
         pool, goals = search.pool(), search.goals
         if not len(goals):
             return
-        for one, begun in self.carried:
+        carried, self.carried = self.carried, []
+        for one, begun in carried:
             pool.carry(one, search.request.join - begun)
         sources = iter(self.sources)
         while not search.charges.over():
