@@ -28,6 +28,7 @@ from tqdm import tqdm
 from apex_ompl import plan, problems
 from apex_ompl.loop.charges import cost_table
 from apex_ompl.loop.methods import METHODS
+from apex_ompl.loop.referee import LIMIT_TOLERANCE
 from apex_ompl.loop.result import Outcome
 from apex_ompl.loop.run import run
 from apex_ompl.problems import worlds
@@ -130,7 +131,7 @@ def summary(some: Sequence[dict[str, Any]], best: Sequence[dict[str, Any]] = ())
         "worst_level": max(sum(row) / len(row) for row in levels.values()),
         "stops": sum(one["stops"] for one in some) / len(some),
         "reaction_p95_s": record.percentiles(reactions, 50, 95) if reactions else [None, None],
-        "over_limits": sum(one["limit_use"] > 1.0 + 1e-9 for one in some),
+        "over_limits": sum(one["limit_use"] > 1.0 + LIMIT_TOLERANCE for one in some),
     }  # fmt: skip
 
 

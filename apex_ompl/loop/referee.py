@@ -30,12 +30,12 @@ from apex_ompl.tasks.alignment_errors import within
 from apex_ompl.trajectory import Trajectory
 from apex_ompl.trajectory.checks import SAME_STATE
 from apex_ompl.trajectory.rests import AT_REST, is_at_rest
-from apex_ompl.trajectory.trajectory import ROUNDING
 from apex_ompl.types import Array
 from apex_ompl.util.validation import check_number, check_states
 
 SPACING = 1e-3  # of the samples [s]
 STRETCH = 0.01  # of time that is sampled before a proof is tried anew [s]
+LIMIT_TOLERANCE = 1e-5  # share over a limit: jerk between knots that are 1 ns apart is rounded to this
 NEAR = 1e-3  # clearances of spheres that are told apart [m]
 
 
@@ -90,7 +90,7 @@ class RefereeReport:
     @property
     def exceeded(self) -> dict[str, float]:
         """The limits that are exceeded, with the shares that are used."""
-        return {name: share for name, share in self.limit_use.items() if share > 1.0 + ROUNDING}
+        return {name: share for name, share in self.limit_use.items() if share > 1.0 + LIMIT_TOLERANCE}
 
     @property
     def outcome(self) -> Outcome | None:
