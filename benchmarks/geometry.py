@@ -2,8 +2,10 @@
 
 1. Validation problems, each in four versions: as it is; with every box, ball, cylinder and capsule as a mesh; with
    points on them, 5 mm apart, with balls that reach to their surfaces from inside; and as one grid of the cells of 1 cm
-   that are inside of them. Whole calls of a kept planner, the first path of apex, and the answers at states around the
-   problem's start and goal: those of the mesh must be those of the shapes; points and voxels lie inside of these.
+   whose centres are inside of them. Whole calls of a kept planner, the first path of apex, and the answers at states
+   around the problem's start and goal: those of the mesh must be those of the shapes; points lie inside of these. How
+   far proposals of the model are from those among the shapes, with the same noise, over the standard deviation of
+   these: two that have nothing to do with each other are 1.4 apart.
 2. Scenes of one large mesh that is not convex, up to 40 000 triangles, of the benchmark's own making: arches, rings and
    bumpy balls; starts and goals are the validation problems', free in the scene, and the straight line is not.
 3. Proofs of states by the kernel against the number of triangles and points; set-up, and memory.
@@ -26,10 +28,12 @@ import record
 import trimesh
 from tqdm import tqdm
 
-from apex_ompl import MotionPlanner, PlanResult, load_problem, problems
+from apex_ompl import MotionPlanner, PlanResult, load_model, load_problem, problems
+from apex_ompl.apex.query import make_query
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.cloud_contact import signed_distances
 from apex_ompl.collision.shapes import coal_geometry
+from apex_ompl.diffusion.proposals import TrajectoryModel
 from apex_ompl.ompl_adapter.process import quiet_ompl
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.scene.bodies import Obstacle
@@ -44,6 +48,7 @@ VERSIONS = ("shapes", "meshes", "points", "voxels")
 WARM = 200  # triangles and points of a first one, which compiles what is not compiled yet
 COUNTS = (100, 1_000, 10_000, 100_000, 1_000_000)
 TIMEOUT = 10.0  # [s]
+PROPOSALS = 8
 
 
 def solid_of(body: Obstacle, shrunk: float = 0.0) -> trimesh.Trimesh:
@@ -90,7 +95,7 @@ def version(problem: Problem, kind: str, folder: Path) -> Problem:
 
 
 def voxels(bodies: Sequence[Obstacle]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the outer corner of the first cell, and which cells are inside of obstacles with all of their corners."""
+    """Return the outer corner of the first cell, and which cells have their centres inside of obstacles."""
     boxes = []
     for body in bodies:
         low, high = solid_of(body).bounds
@@ -99,19 +104,22 @@ def voxels(bodies: Sequence[Obstacle]) -> tuple[np.ndarray, np.ndarray]:
         boxes.append((middle - reach, middle + reach))
     low = CELL * np.floor(np.min([box[0] for box in boxes], axis=0) / CELL)
     count = np.ceil((np.max([box[1] for box in boxes], axis=0) - low) / CELL).astype(int) + 1
-    inside = np.zeros(count + 1, bool)
+    inside = np.zeros(count, bool)
     for body, (least, most) in zip(bodies, boxes, strict=True):
         first = np.maximum(np.floor((least - low) / CELL).astype(int), 0)
-        last = np.minimum(np.ceil((most - low) / CELL).astype(int) + 1, count + 1)
-        nodes = np.stack(np.meshgrid(*[np.arange(a, b) for a, b in zip(first, last, strict=True)], indexing="ij"), -1)
-        local = (low + CELL * nodes - body.pose[:3, 3]) @ body.pose[:3, :3]
+        last = np.minimum(np.ceil((most - low) / CELL).astype(int) + 1, count)
+        cells = np.stack(np.meshgrid(*[np.arange(a, b) for a, b in zip(first, last, strict=True)], indexing="ij"), -1)
+        local = (low + CELL * (cells + 0.5) - body.pose[:3, 3]) @ body.pose[:3, :3]
         inside[tuple(slice(a, b) for a, b in zip(first, last, strict=True))] |= (
             signed_distances(coal_geometry(body), local.reshape(-1, 3), 1.0).reshape(local.shape[:-1]) <= 0.0
         )
-    cells = np.ones(count, bool)
-    for k in np.ndindex(2, 2, 2):
-        cells &= inside[k[0] : k[0] + count[0], k[1] : k[1] + count[1], k[2] : k[2] + count[2]]
-    return low, cells
+    return low, inside
+
+
+def proposed(model: TrajectoryModel, checker: CollisionChecker, ends: Sequence[np.ndarray]) -> np.ndarray:
+    """Return proposals of a model, always with the same noise: control points, shape (PROPOSALS, points, dof) [rad]."""
+    query, generator = make_query(checker, *ends, point=False), np.random.default_rng(0)
+    return model.propose(query, checker.kernel, PROPOSALS, generator=generator).control
 
 
 def large_mesh(rng: np.random.Generator, kind: int) -> trimesh.Trimesh:
@@ -151,6 +159,8 @@ def versions(count: int, states: int) -> tuple[list[str], dict[str, Any]]:
     paths: dict[str, list[float]] = {kind: [] for kind in VERSIONS}
     calls: dict[str, list[float]] = {kind: [] for kind in VERSIONS}
     setups: dict[str, list[float]] = {kind: [] for kind in VERSIONS}
+    unlike: dict[str, list[float]] = {kind: [] for kind in VERSIONS}
+    model = load_model("apex")
     answers: dict[str, list[int]] = {kind: [0, 0] for kind in VERSIONS}
     seen = 0
     with quiet_ompl(), MotionPlanner() as planner, tempfile.TemporaryDirectory() as folder:
@@ -162,6 +172,8 @@ def versions(count: int, states: int) -> tuple[list[str], dict[str, Any]]:
             drawn = np.concatenate([end + 0.25 * rng.normal(size=(states // 2, len(end))) for end in ends])
             drawn = np.clip(drawn, robot().limits.lower, robot().limits.upper)
             plain = CollisionChecker(robot(), problem.scene, problem.attached)
+            wanted = proposed(model, plain, ends)
+            spread = np.sqrt(((wanted - wanted.mean(axis=0)) ** 2).mean())
             seen += len(drawn)
             for kind in VERSIONS:
                 other = version(problem, kind, Path(folder))
@@ -169,6 +181,8 @@ def versions(count: int, states: int) -> tuple[list[str], dict[str, Any]]:
                 checker = CollisionChecker(robot(), other.scene, other.attached)
                 checker.prepare()
                 setups[kind].append(time.perf_counter() - began)
+                apart = proposed(model, checker, ends) - wanted
+                unlike[kind].append(float(np.sqrt((apart**2).mean()) / spread))
                 for k, number in enumerate(seen_alike(plain, checker, drawn)):
                     answers[kind][k] += number
                 planner.plan_problem(other, timeout=TIMEOUT)  # the scene is loaded, as at any second plan in it
@@ -179,12 +193,13 @@ def versions(count: int, states: int) -> tuple[list[str], dict[str, Any]]:
                 paths[kind].append(first_path(result) if result.path is not None else np.inf)
     times = [f"{what} ms p50" for what in ("first path", "whole call", "set-up once")]
     head = ("version", "N", "solved", *(cell for time in times for cell in (time, "p95")),
-            "states", "free among the shapes alone", "free here alone")  # fmt: skip
+            "proposals' distance p50", "p95", "states", "free among the shapes alone", "free here alone")  # fmt: skip
     rows = [record.row([*head]), record.row(["---", *["---:"] * (len(head) - 1)])]
     for kind in VERSIONS:
         columns = [f"{1e3 * v:.0f}" for some in (paths, calls, setups) for v in record.percentiles(some[kind], 50, 95)]
+        columns += [f"{v:.2f}" for v in record.percentiles(unlike[kind], 50, 95)]
         rows.append(record.row([kind, len(names), f"{solved[kind] / len(names):.3f}", *columns, seen, *answers[kind]]))
-    return rows, {"first path": paths, "call": calls, "setup": setups, "answers": answers}
+    return rows, {"first path": paths, "call": calls, "setup": setups, "answers": answers, "unlike": unlike}
 
 
 def large(count: int) -> tuple[list[str], dict[str, Any]]:

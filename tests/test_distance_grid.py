@@ -17,7 +17,7 @@ from apex_ompl.kernel.compiled.arrays import GRID, SceneArrays, scene_view
 from apex_ompl.kernel.compiled.compilation import entry_point
 from apex_ompl.kernel.compiled.layout import Floats, Integers, Singles
 from apex_ompl.kernel.compiled.signed_distance import direction, distance
-from apex_ompl.kernel.distance_grid import SLACK, DistanceGrid, grid_of_points, grid_of_triangles, outline
+from apex_ompl.kernel.distance_grid import SLACK, DistanceGrid, grid_of_points, grid_of_triangles
 from apex_ompl.kernel.scene_builder import Primitive, Solids, moved, primitive, scene_tables
 from apex_ompl.scene.meshes import winding_number
 
@@ -143,19 +143,6 @@ def test_scenes_share_values_and_follow_moves() -> None:
     for name in ("rotation", "offset", "size"):
         assert getattr(follows.arrays, name)[other_row] == pytest.approx(getattr(fresh.arrays, name)[row])
     assert follows.boxes[other_row] == pytest.approx(fresh.boxes[row])
-
-
-@pytest.mark.parametrize("kind", ["mesh", "points"])
-def test_outlines_contain_what_they_are_of(kind: str) -> None:
-    rng = np.random.default_rng(3)
-    vertices, faces = bumpy_sphere(16, 0.2, 0.3)
-    points = vertices if kind == "mesh" else rng.normal(size=(500, 3)) * [0.3, 0.1, 0.01]
-    grid = grid_of_triangles(vertices[faces], solid=True) if kind == "mesh" else grid_of_points(points, 0.005)
-    boxes = outline(grid)
-    held = ((points[:, None] >= boxes[:, 0] - 1e-9) & (points[:, None] <= boxes[:, 1] + 1e-9)).all(axis=2)
-    assert held.any(axis=1).all() and len(boxes) < 200
-    volume = np.prod(boxes[:, 1] - boxes[:, 0], axis=1).sum()
-    assert volume < 0.9 * np.prod(np.ptp(points, axis=0) + 0.02)
 
 
 def test_meshes_that_enclose_nothing_for_sure_are_taken_as_boxes() -> None:

@@ -13,7 +13,8 @@ from apex_ompl.types import Array
 def make_query(checker: CollisionChecker, start: Array, goal: Array, *, point: bool = True) -> Query:
     """Return the query of going from a state to another, among the obstacles of now.
 
-    Fixtures of the robot are left out. As ``obstacles``, meshes and points are boxes around them.
+    Fixtures of the robot are left out. As ``obstacles``, meshes and points are the primitives that
+    they look like.
 
     Args:
         checker: The robot among obstacles.

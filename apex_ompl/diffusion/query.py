@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from apex_ompl.datasets.records import HeldExtent, ObstacleRecord
 from apex_ompl.diffusion.geometry import rotation_matrices
+from apex_ompl.diffusion.primitive_fit import fitted_shapes
 from apex_ompl.kernel import Kernel, RobotTables
 from apex_ompl.kernel.compiled.arrays import BOX, GRID, HALF_SPACE
-from apex_ompl.kernel.distance_grid import outline
 from apex_ompl.kernel.scene_builder import Solids, boxes_around, primitive, tables_of
 from apex_ompl.kernel.tables import SceneTables
 from apex_ompl.types import Array, Flags
@@ -64,7 +64,8 @@ class ObstacleSet:
     def from_scene(cls, tables: SceneTables, chosen: NDArray[np.bool_]) -> ObstacleSet:
         """Return some obstacles of a kernel scene; a half-space becomes a box larger than the workspace.
 
-        A grid of distances becomes boxes around what it is about.
+        A grid of distances becomes primitives that look like what it is about, see
+        :mod:`apex_ompl.diffusion.primitive_fit`.
 
         Args:
             tables: The scene.
@@ -79,14 +80,13 @@ class ObstacleSet:
             normal, distance = position[k].copy(), size[k, 0]
             rotation[k] = _rotation_to(normal)
             shape[k], position[k], size[k] = BOX, (distance - HALF_SPACE_BOX[2]) * normal, HALF_SPACE_BOX
+        rows = [(shape, position, rotation, size)]
         for k in grids:
             solid = primitive(tables, int(k))
-            boxes = outline(solid.grid) if solid.grid is not None else np.empty((0, 2, 3))
-            shape = np.append(shape, np.full(len(boxes), BOX))
-            position = np.append(position, boxes.mean(axis=1) @ solid.pose[:3, :3].T + solid.pose[:3, 3], axis=0)
-            rotation = np.append(rotation, np.tile(solid.pose[:3, :3], (len(boxes), 1, 1)), axis=0)
-            size = np.append(size, (boxes[:, 1] - boxes[:, 0]) / 2.0, axis=0)
-        return cls(shape, position, rotation, size)
+            if solid.grid is not None:
+                fit, turn = fitted_shapes(solid.grid), solid.pose[:3, :3]
+                rows.append((fit.kind, fit.position @ turn.T + solid.pose[:3, 3], turn @ fit.rotation, fit.size))
+        return cls(*(np.concatenate(column) for column in zip(*rows, strict=True)))
 
     def __len__(self) -> int:
         """Return the number of obstacles M."""

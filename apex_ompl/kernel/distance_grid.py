@@ -15,7 +15,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from apex_ompl.kernel.compiled.grid_building import (
     FAR,
@@ -29,7 +28,6 @@ from apex_ompl.kernel.compiled.grid_building import (
 )
 from apex_ompl.kernel.compiled.layout import Singles
 from apex_ompl.types import Array
-from apex_ompl.util.weak_cache import weakly_cached
 
 MOST_NODES = 6_000_000
 MOST_NODES_OF_POINTS = 1_000_000  # which are made anew with every image
@@ -38,7 +36,6 @@ PADDING = 2.5  # nodes around the box of what is tabulated
 BAND = 1.5  # distance up to which nodes are looked at for each triangle, in spacings
 SLACK = math.sqrt(3.0) / 2.0  # largest error of interpolation, and of the nearest node, in spacings
 ROUNDING = 1e-6  # [m]
-OUTLINE_BLOCKS = 12  # of an outline along the longest axis
 KEPT_NODES = 40_000_000  # of grids that are kept by content
 
 
@@ -51,12 +48,14 @@ class DistanceGrid:
         spacing: Distance of neighbouring nodes [m].
         values: Lower bounds at the nodes that hold between them too, shape (nx, ny, nz) [m].
         box: Least and largest corner of what is tabulated, shape (2, 3) [m].
+        radius: Of the balls around points, 0 for a surface [m].
     """
 
     low: Array
     spacing: float
     values: Singles
     box: Array
+    radius: float = 0.0
 
 
 _kept: OrderedDict[bytes, DistanceGrid] = OrderedDict()
@@ -112,7 +111,7 @@ def _of_points(points: Array, radius: float) -> DistanceGrid:
     squared = np.full(shape, FAR, np.float32)
     raster_points((points - low) / spacing, squared)
     values = _bounds(squared, 1.0, spacing, radius + ROUNDING)
-    return DistanceGrid(low, spacing, values, box + [[-radius], [radius]])
+    return DistanceGrid(low, spacing, values, box + [[-radius], [radius]], radius)
 
 
 def _lattice(box: Array, radius: float, most: int) -> tuple[Array, float, tuple[int, int, int]]:
@@ -141,35 +140,3 @@ def _bounds(squared: Singles, band: float, spacing: float, less: float) -> Singl
         transform_lines(squared.reshape(lines), *room)
     lower_bounds(squared, near, band, SLACK, spacing, less)
     return near
-
-
-@weakly_cached
-def outline(grid: DistanceGrid) -> Array:
-    """Return boxes that together contain what a grid is about, shape (boxes, 2, 3) [m]; few, and rough.
-
-    Cells of the grid are taken together in blocks; blocks that hold something are joined along each axis in turn.
-    """
-    shape = np.array(grid.values.shape)
-    block = max(1, math.ceil(float(shape.max()) / OUTLINE_BLOCKS))
-    counts = -(-shape // block)
-    padded = np.full(counts * block, np.inf, np.float32)
-    padded[tuple(slice(n) for n in shape)] = grid.values
-    least = padded.reshape(counts[0], block, counts[1], block, counts[2], block).min(axis=(1, 3, 5))
-    rows = [np.array([k, k + 1]) for k in np.argwhere(least <= 0.0)]
-    for axis in np.argsort(-counts):
-        rows = _joined_along(rows, int(axis))
-    corners = np.array(rows, float).reshape(-1, 2, 3)
-    boxes = grid.low + grid.spacing * (corners * block - [[0.5], [0.5]])
-    return np.stack([np.maximum(boxes[:, 0], grid.box[0]), np.minimum(boxes[:, 1], grid.box[1])], axis=1)
-
-
-def _joined_along(rows: list[NDArray[np.int64]], axis: int) -> list[NDArray[np.int64]]:
-    """Return boxes of blocks, shape (2, 3) each, with those that continue each other along an axis joined."""
-    others = [k for k in range(3) if k != axis]
-    found: list[NDArray[np.int64]] = []
-    for row in sorted(rows, key=lambda r: (*r[:, others].ravel().tolist(), int(r[0, axis]))):
-        if found and np.array_equal(found[-1][:, others], row[:, others]) and found[-1][1, axis] == row[0, axis]:
-            found[-1] = np.stack([found[-1][0], row[1]])
-        else:
-            found.append(row)
-    return found
