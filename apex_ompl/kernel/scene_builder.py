@@ -15,7 +15,7 @@ from apex_ompl.kernel.compiled.layout import Floats, Integers, Singles
 from apex_ompl.kernel.distance_grid import SLACK, DistanceGrid
 from apex_ompl.kernel.tables import SceneTables
 
-LEAF = 4  # obstacles in a leaf of the tree
+LEAF = 1  # obstacles in a leaf of the tree
 ROUNDING = 1e-9  # by which boxes are larger than their solids [m]
 
 

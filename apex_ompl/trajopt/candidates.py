@@ -12,10 +12,11 @@ from apex_ompl.trajopt.optimizer import LAST_RESORT, Check, Optimizer
 from apex_ompl.types import Array
 
 ROUND, ROUNDS = 4, 12  # optimiser steps in a round of repair, and rounds a candidate has at most
-SOFT_ROUNDS = 2  # the last rounds, with less weight on the speed term
-PENALTY = 2.0  # factor on the priority of a candidate for every round spent on it
+SOFT_ROUNDS = 2  # the last rounds, with still less weight on the speed term
+SLACK = 0.3  # factor on the settings' weight of the speed term: clear comes before short
+PENALTY = 3.0  # factor on the priority of a candidate for every round spent on it
 STEPS_PER_PATH = 16  # on average
-CLEAR = 0.01  # clearance at the samples at which a round ends early [m]
+CLEAR = 0.005  # clearance at the samples at which a round ends early [m]
 MIN_CLEARANCE = -0.005  # at the samples, for the full check; spheres protrude from what they cover [m]
 
 
@@ -45,7 +46,7 @@ class Candidate:
 
     @property
     def priority(self) -> float:
-        """Clearance cost, doubled for every round of repair; the candidate with the least is improved next."""
+        """Clearance cost times PENALTY for every round of repair; the candidate with the least is improved next."""
         return self.clearance_cost * PENALTY**self.rounds
 
 
@@ -117,7 +118,7 @@ class CandidatePool:
             optimizer = self._fine if chosen.fine else self._optimizer
             improved = optimizer.improve(
                 self._kernel, chosen.control[None], steps=ROUND, damping=chosen.damping, enough=CLEAR,
-                stiffness=(LAST_RESORT if soft else 1.0) * settings.stiffness,
+                stiffness=(LAST_RESORT if soft else SLACK) * settings.stiffness,
             )  # fmt: skip
             chosen.control, chosen.clearance_cost = improved.control[0], float(improved.clearance_cost[0])
             chosen.clearance, chosen.damping = float(improved.clearance[0].min()), float(improved.damping[0])

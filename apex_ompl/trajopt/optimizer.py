@@ -31,7 +31,8 @@ from apex_ompl.util.validation import check_array, check_integer, check_nonnegat
 Check = Callable[[Array], bool]
 """Whether a path, shape (states, dof), is valid."""
 
-STIFFER, SHORTENINGS = 5.0, 4  # factor from one round of shortening to the next, and how many rounds
+STIFFNESSES = (25.0, 5.0, 1.0, 0.1)  # factors on the stiffness in shortening, until a path comes out valid
+STIFFEST = 125.0  # factor in the round after the first of these
 PART = 4  # steps between two looks at the clock
 FINER = 2  # factor on the number of samples for paths that are clear at them and yet not valid
 LAST_RESORT = 0.1  # factor on the stiffness where nothing came out valid
@@ -168,8 +169,9 @@ class Optimizer:
     ) -> Array | None:
         """Return the last valid path of stiffer and stiffer ones, control points of shape (points, dof), or None.
 
-        Stiffer paths are shorter. The stiffness grows from round to round, until a path fails the check; where the
-        first one fails already, a softer one has its turn, with more samples.
+        Stiffer paths are shorter. The first stiffness is high, since most paths go through with it; where the path
+        fails the check, softer ones have their turn, the last with more samples. From a valid path on the stiffness
+        grows once more.
 
         Args:
             kernel: The robot among its obstacles.
@@ -180,23 +182,21 @@ class Optimizer:
         Raises:
             ParameterError: Control points of another shape.
         """
-        now, stiffness = self._control(kernel, control)[:1], self.settings.stiffness
+        now = self._control(kernel, control)[:1]
         best: Array | None = None
-        optimizer = self
-        for k in range(SHORTENINGS):
-            if stop():
-                break
-            improved = optimizer._in_parts(kernel, now, stiffness, stop)
+        for factor in STIFFNESSES:
+            optimizer = self.finer() if factor < 1.0 else self
+            improved = None if stop() else optimizer._in_parts(kernel, now, factor * self.settings.stiffness, stop)
             if improved is None:
+                return None
+            now = improved
+            if is_valid(self.spline.path(now[0])):
+                best = now[0]
                 break
-            if is_valid(self.spline.path(improved[0])):
-                best, now = improved[0], improved
-                stiffness *= STIFFER
-            elif best is None and k < 2:
-                now, stiffness, optimizer = improved, LAST_RESORT * stiffness, self.finer()
-            else:
-                break
-        return best
+        if best is None or factor < STIFFNESSES[0]:
+            return best
+        improved = None if stop() else self._in_parts(kernel, now, STIFFEST * self.settings.stiffness, stop)
+        return improved[0] if improved is not None and is_valid(self.spline.path(improved[0])) else best
 
     def _in_parts(self, kernel: Kernel, control: Array, stiffness: float, stop: Callable[[], bool]) -> Array | None:
         """Return a path, shape (1, points, dof), improved as far as it goes, or None when told to stop meanwhile."""

@@ -29,7 +29,7 @@ class OptimizerSettings:
     stiffness: float = 1e-3
     damping: float = 1e-2
     steps: int = 30
-    tolerance: float = 2e-3
+    tolerance: float = 5e-3
 
     def __post_init__(self) -> None:
         """Check the numbers.

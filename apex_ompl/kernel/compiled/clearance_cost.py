@@ -23,7 +23,7 @@ from apex_ompl.kernel.compiled.clearance import (
     nearest_to_obstacle,
 )
 from apex_ompl.kernel.compiled.compilation import inlined
-from apex_ompl.kernel.compiled.kinematics import place_cluster, place_robot
+from apex_ompl.kernel.compiled.kinematics import mark_pair, place_cluster, place_robot
 from apex_ompl.kernel.compiled.layout import Floats
 from apex_ompl.kernel.compiled.scene_tree import next_obstacles
 from apex_ompl.kernel.compiled.workspace import Workspace
@@ -65,13 +65,17 @@ def _nearest_of_pair(t: RobotArrays, w: Workspace, q: Floats, p: int, margin: fl
     a, b = t.pair_clusters[p, 0], t.pair_clusters[p, 1]
     u, v = w.ball[a], w.ball[b]
     apart = math.sqrt((u[0] - v[0]) ** 2 + (u[1] - v[1]) ** 2 + (u[2] - v[2]) ** 2)
-    if a != b and apart - t.cluster_outer[a] - t.cluster_outer[b] >= margin:
-        return near
-    place_cluster(t, w, q, a)
-    place_cluster(t, w, q, b)
+    if a == b:
+        place_cluster(t, w, q, a)
+    else:
+        reach_a, reach_b = t.cluster_outer[a] + margin, t.cluster_outer[b] + margin
+        if apart - t.cluster_outer[b] >= reach_a or not mark_pair(t, w, q, t.node_outer, a, b, reach_a, reach_b):
+            return near
     first = t.pair_bodies[p, 0]
     for k in range(first, first + t.pair_bodies[p, 1]):
-        near = nearest_leaves(t, w, t.bodies[k, 0], t.bodies[k, 1], near)
+        m, n = t.bodies[k, 0], t.bodies[k, 1]
+        if a == b or (w.near[m] and w.near[n]):
+            near = nearest_leaves(t, w, m, n, near)
     return near
 
 

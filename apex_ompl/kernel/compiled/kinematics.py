@@ -69,3 +69,68 @@ def place_cluster(t: RobotArrays, w: Workspace, q: Floats, c: int) -> None:
     first = t.cluster_bodies[c, 0]
     for b in range(first, first + t.cluster_bodies[c, 1]):
         w.root[b, 0], w.root[b, 1], w.root[b, 2] = node_position(t, w, t.body_joint[b], t.body_root[b])
+
+
+@inlined
+def is_near_ball(t: RobotArrays, w: Workspace, radii: Floats, b: int, c: int, reach: float) -> bool:
+    """Whether leaves of a body, as spheres of ``radii``, are within ``reach`` of the centre of a cluster's ball."""
+    j, top = t.body_joint[b], 1
+    u, v, r = w.ball[c, 0], w.ball[c, 1], w.ball[c, 2]
+    w.stack[0] = t.body_root[b]
+    while top > 0:
+        top -= 1
+        n = w.stack[top]
+        x, y, z = node_position(t, w, j, n)
+        apart = radii[n] + reach
+        if (x - u) ** 2 + (y - v) ** 2 + (z - r) ** 2 > apart * apart:
+            continue
+        if t.node_count[n] == 0:
+            return True
+        for k in range(t.node_first[n], t.node_first[n] + t.node_count[n]):
+            w.stack[top] = k
+            top += 1
+    return False
+
+
+@inlined
+def mark_near(t: RobotArrays, w: Workspace, q: Floats, radii: Floats, c: int, other: int, reach: float) -> bool:
+    """Mark the bodies of a cluster that are within ``reach`` of the centre of another's ball; whether there are any.
+
+    A body of a cluster of several is looked at as its root sphere alone. What is not a number counts as near.
+    """
+    place_cluster(t, w, q, c)
+    first, count = t.cluster_bodies[c, 0], t.cluster_bodies[c, 1]
+    if count == 1:
+        w.near[first] = 1
+        return is_near_ball(t, w, radii, first, other, reach)
+    found = False
+    u, v, r = w.ball[other, 0], w.ball[other, 1], w.ball[other, 2]
+    for b in range(first, first + count):
+        apart = radii[t.body_root[b]] + reach
+        far = (w.root[b, 0] - u) ** 2 + (w.root[b, 1] - v) ** 2 + (w.root[b, 2] - r) ** 2 > apart * apart
+        w.near[b] = 0 if far else 1
+        found = found or not far
+    return found
+
+
+@inlined
+def mark_pair(
+    t: RobotArrays, w: Workspace, q: Floats, radii: Floats, a: int, b: int, reach_a: float, reach_b: float
+) -> bool:
+    """Mark the bodies of two clusters that are near the other's ball; False where no two can be.
+
+    A cluster with inner joints is placed last, and only where the other is near its ball.
+
+    Args:
+        t: The robot.
+        w: Workspace.
+        q: The state.
+        radii: Radius of each node that counts [m].
+        a: A cluster.
+        b: Another cluster.
+        reach_a: Radius around the first one's ball within which the spheres of the second are near [m].
+        reach_b: Radius around the second one's ball [m].
+    """
+    if t.cluster_lazy[a, 1] > t.cluster_lazy[b, 1]:
+        return mark_near(t, w, q, radii, b, a, reach_a) and mark_near(t, w, q, radii, a, b, reach_b)
+    return mark_near(t, w, q, radii, a, b, reach_b) and mark_near(t, w, q, radii, b, a, reach_a)

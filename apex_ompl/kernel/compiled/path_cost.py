@@ -130,8 +130,14 @@ def add_sample(
     share: float, weights: Floats, first: int, pinned: int, free: int, here: Floats, matrix: Floats, gradient: Floats,
     gram: Floats,
 ) -> None:  # fmt: skip
-    """Add the gradient ``here`` of a sample's cost and its ``matrix`` (lower half), mapped to the control points."""
+    """Add the gradient ``here`` of a sample's cost and its ``matrix``, mapped to the control points.
+
+    Of the matrix the lower half is read; the upper one becomes its image.
+    """
     dof = len(here)
+    for d in range(dof):
+        for e in range(d):
+            matrix[e, d] = matrix[d, e]
     for m in range(len(weights)):
         i = first + m - pinned
         if i < 0 or i >= free:
@@ -142,11 +148,10 @@ def add_sample(
         for k in range(m, min(len(weights), free + pinned - first)):
             g, at = f * weights[k], (first + k - pinned) * dof
             for d in range(dof):
-                target = gram[i * dof + d]
-                for e in range(d + 1):
-                    target[at + e] += g * matrix[d, e]
-                for e in range(d + 1, dof):
-                    target[at + e] += g * matrix[e, d]
+                if matrix[d, d] > 0.0:  # else the joint moves nothing that is near
+                    target, source = gram[i * dof + d], matrix[d]
+                    for e in range(dof):
+                        target[at + e] += g * source[e]
 
 
 @inlined

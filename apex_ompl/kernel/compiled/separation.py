@@ -11,7 +11,7 @@ import math
 
 from apex_ompl.kernel.compiled.arrays import LIMIT_SLACK, RobotArrays, SceneArrays
 from apex_ompl.kernel.compiled.compilation import inlined
-from apex_ompl.kernel.compiled.kinematics import node_position, place_cluster, place_robot
+from apex_ompl.kernel.compiled.kinematics import mark_pair, node_position, place_cluster, place_robot
 from apex_ompl.kernel.compiled.layout import Floats, Integers
 from apex_ompl.kernel.compiled.motion_bound import cluster_displacement, relative_displacement
 from apex_ompl.kernel.compiled.scene_tree import is_allowed, next_obstacles
@@ -122,11 +122,16 @@ def unproved_between_bodies(t: RobotArrays, w: Workspace, q: Floats, found: Inte
             u, v = w.ball[a], w.ball[b]
             if (u[0] - v[0]) ** 2 + (u[1] - v[1]) ** 2 + (u[2] - v[2]) ** 2 > apart * apart:
                 continue
-        place_cluster(t, w, q, a)
-        place_cluster(t, w, q, b)
+            reach_a, reach_b = t.cluster_ball[a, 3] + shift, t.cluster_ball[b, 3] + shift
+            if not mark_pair(t, w, q, t.node_radius, a, b, reach_a, reach_b):
+                continue
+        else:
+            place_cluster(t, w, q, a)
         first = t.pair_bodies[p, 0]
         for k in range(first, first + t.pair_bodies[p, 1]):
             m, n = t.bodies[k, 0], t.bodies[k, 1]
+            if a != b and not (w.near[m] and w.near[n]):
+                continue
             u, v = w.root[m], w.root[n]
             apart = t.node_radius[t.body_root[m]] + t.node_radius[t.body_root[n]] + shift
             if (u[0] - v[0]) ** 2 + (u[1] - v[1]) ** 2 + (u[2] - v[2]) ** 2 > apart * apart:

@@ -30,6 +30,7 @@ class Workspace(NamedTuple):
         half_width: Half widths of the box of states around the state.
         end: A state at the end of an interval.
         pair: A pair of bodies.
+        near: Whether a body is near the cluster that its own is compared with.
     """
 
     rotation: Annotated[Floats, "joints", 3, 3]
@@ -48,6 +49,7 @@ class Workspace(NamedTuple):
     half_width: Annotated[Floats, "dof"]
     end: Annotated[Floats, "dof"]
     pair: Annotated[Integers, 1, 2]
+    near: Annotated[Integers, "bodies"]
 
 
 _view = buffer_view(Workspace, ("joints", "clusters", "bodies", "stack", "dof"))
