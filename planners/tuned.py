@@ -22,5 +22,7 @@ TUNED: Mapping[str, Mapping[str, Value]] = MappingProxyType({
     "kpiece1": {"range": 1.4, "goal_bias": 0.2},
     "informedrrtstar": {},
     "bitstar": {},
+    "gpmp": {"safety_distance": 0.08, "obstacle_sigma": 0.004, "intervals": 12, "power": 1.0},
+    "gpmp2": {"safety_distance": 0.08, "obstacle_sigma": 0.004, "intervals": 12, "power": 1.0},
 })  # fmt: skip
 """Parameters by planner, those that differ from OMPL's defaults; ranges and distances in rad."""
