@@ -135,10 +135,14 @@ def test_samples_have_the_spread_that_is_asked_for_and_keep_the_ends() -> None:
 def test_block_elimination_is_the_dense_solution(n: int, b: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
     factors = rng.normal(size=(n, b, b))
-    matrix = BlockTridiagonal(factors @ factors.transpose(0, 2, 1) + 6.0 * b * np.eye(b), rng.normal(size=(n - 1, b, b)))
+    matrix = BlockTridiagonal(
+        factors @ factors.transpose(0, 2, 1) + 6.0 * b * np.eye(b), rng.normal(size=(n - 1, b, b))
+    )
     dense, right = matrix.dense(), rng.normal(size=(n, b))
     assert np.array_equal(dense, dense.T)
-    np.testing.assert_allclose(matrix.solve(right).ravel(), np.linalg.solve(dense, right.ravel()), rtol=1e-8, atol=1e-10)
+    np.testing.assert_allclose(
+        matrix.solve(right).ravel(), np.linalg.solve(dense, right.ravel()), rtol=1e-8, atol=1e-10
+    )
     damped = matrix.damped(0.25).dense()
     np.testing.assert_allclose(np.diag(damped), 1.25 * np.diag(dense))
     np.testing.assert_allclose(damped - np.diag(np.diag(damped)), dense - np.diag(np.diag(dense)))
