@@ -154,21 +154,18 @@ def test_the_termination_condition_is_honoured_inside_iterations(name: str, robo
         assert sum(one.iterations for one in planner.optima) <= max(most, 1) and planner.report.reason
 
 
-def test_several_goals_are_tried_in_turn(robot: Robot) -> None:
-    """The nearest goal is behind bars; a farther one is not."""
-    hopeless = problems.load(HOPELESS)
-    setup = assemble(hopeless, robot)
-    names = robot.joint_names
-    away = setup.start.copy()
-    away[[0, 7]] += 0.3 * np.sign(0.5 * (robot.limits.lower + robot.limits.upper) - away)[[0, 7]]
-    goals = [dict(zip(names, q.tolist(), strict=True)) for q in (*setup.valid_goals[:1], away)]
-    both = assemble(hopeless.model_copy(update={"goal": Goal(joints=tuple(goals))}), robot)
-    planner = planner_of(both, "gpmp2")
-    both.simple_setup.solve(ob.timedPlannerTerminationCondition(20.0))
-    assert 1 <= planner.report.candidates <= len(both.valid_goals)
-    starts = [one.supports[-1, 0] for one in planner.optima]
-    far = [float(np.linalg.norm(q - both.start)) for q in starts]
-    assert far == sorted(far)
+def test_several_goals_are_tried_in_turn(problem: Problem, robot: Robot) -> None:
+    """With a sigma that lets obstacles count for nothing the nearer goal, behind the post, is not reached."""
+    far = dict(problem.start, right_joint1=problem.start["right_joint1"] - 1.5, right_joint6=1.0)
+    for goals in ((*problem.goal.joints, far), (far, *problem.goal.joints)):
+        setup = assemble(problem.model_copy(update={"goal": Goal(joints=goals)}), robot)
+        planner = planner_of(setup, "gpmp2", obstacle_sigma=10.0)
+        status = setup.simple_setup.solve(ob.timedPlannerTerminationCondition(20.0))
+        assert status.getStatus() == ob.PlannerStatus.EXACT_SOLUTION and planner.report.candidates == 2
+        ends = [one.supports[-1, 0] for one in planner.optima]
+        assert np.linalg.norm(ends[0] - setup.start) < np.linalg.norm(ends[1] - setup.start)
+        names = robot.joint_names
+        assert planner.report.best_path.states[-1, names.index("right_joint1")] == far["right_joint1"]
 
 
 def test_restarts_are_drawn_by_the_seed() -> None:
