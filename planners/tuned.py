@@ -26,4 +26,4 @@ TUNED: Mapping[str, Mapping[str, Value]] = MappingProxyType({
     "gpmp": {"safety_distance": 0.08, "obstacle_sigma": 0.0016, "intervals": 12, "power": 1.0},
     "gpmp2": {"safety_distance": 0.08, "obstacle_sigma": 0.0016, "intervals": 12, "power": 1.0},
 })  # fmt: skip
-"""Parameters by planner, those that differ from OMPL's defaults, or that were tuned; ranges and distances in rad, those of gpmp and gpmp2 in m."""
+"""Parameters by planner, those that differ from OMPL's defaults; ranges in rad, distances and sigmas of gpmp in m."""
