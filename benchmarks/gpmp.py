@@ -1,4 +1,4 @@
-"""GPMP and GPMP2 on static validation problems of each level.
+"""GPMP and GPMP2 on static validation problems of each level, and with restarts, not part of the method, on easy ones.
 
 They are local methods: they end without a path when they have nothing left to begin from. Open scenes are those
 without obstacles, with small cubes, and the easy levels; each level is in the result.
@@ -24,7 +24,11 @@ from apex_ompl.util.validation import one_or_more
 DEPENDS = ("@benchmark", "benchmarks/head_to_head.py")
 FOLDER = Path(__file__).parent / "runs" / "gpmp"
 TIMEOUT = 10.0  # [s]
-ROWS = (Row("gpmp", "gpmp"), Row("gpmp2", "gpmp2"))
+ROWS = (
+    Row("gpmp", "gpmp"),
+    Row("gpmp2", "gpmp2"),
+    Row("gpmp2, 8 restarts", "gpmp2", {"restarts": 8}, levels=("/free", "/small", "/easy")),
+)
 
 
 def groups(levels: list[str]) -> dict[str, list[str]]:
