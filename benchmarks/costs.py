@@ -27,6 +27,7 @@ from apex_ompl.loop.charges import TABLE, Charges
 from apex_ompl.loop.dynamic_rrt import Clearances, DynamicRRT
 from apex_ompl.loop.following import Following
 from apex_ompl.loop.goal_tree import GoalTree
+from apex_ompl.loop.gpmp2 import CHARGE, IncrementalGPMP2
 from apex_ompl.loop.mppi import PathIntegral, softmax
 from apex_ompl.loop.paper import OneProposal
 from apex_ompl.loop.potential_field import PotentialField
@@ -140,6 +141,12 @@ def controls(name: str, found: dict[str, list[float]]) -> None:
     )
     reflex = PotentialField()
     found["force"].append(seconds(lambda: reflex.controls(search, horizon)) / reflex.steps)
+    factors = IncrementalGPMP2()
+    _, guess = next(factors.guesses(search))
+    graph = factors.graph(search, guess.duration)
+    begun = factors.supports(search, guess, guess.duration)
+    count = graph.maximum(begun, factors.iterations, 0.0).evaluations * len(graph.times)
+    found[CHARGE].append(seconds(lambda: graph.maximum(begun, factors.iterations, 0.0)) / count)
     tree = GoalTree(ready.goals, DynamicRRT.step, SEARCH_RESOLUTION, 200)
     while not tree.full:
         q = search.rng.uniform(ready.limits.lower, ready.limits.upper)

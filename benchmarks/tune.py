@@ -9,7 +9,10 @@ unsolved one counts as 2. Paths are not simplified. The candidate of the lowest 
 chosen; planners/tuned.py keeps it.
 Each run is stored in benchmarks/runs/tune when it ends; the command resumes where it was stopped.
 
-Usage: python benchmarks/tune.py [--jobs 1]    (needs the extra "peers")
+With --baselines the paper's baselines are tuned in the same way on the easy and medium levels instead, since local
+methods fail on hard ones whatever their parameters are (results tune_baselines, and runs in a folder of that name).
+
+Usage: python benchmarks/tune.py [--baselines] [--jobs 1]    (needs the extra "peers" without --baselines)
 """
 
 from __future__ import annotations
@@ -23,7 +26,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import peers
 import record
 
 from apex_ompl import planners
@@ -36,11 +38,12 @@ from apex_ompl.util.validation import one_or_more
 DEPENDS = (
     "@checking", "apex_ompl/apex", "apex_ompl/api.py", "apex_ompl/benchmark", "apex_ompl/diffusion",
     "apex_ompl/ompl_adapter", "apex_ompl/planning", "apex_ompl/result.py", "apex_ompl/tasks", "apex_ompl/trajopt",
-    "benchmarks/peers.py", "planners/apex.py", "planners/apex_parameters.py", "planners/polish.py",
+    "benchmarks/peers.py", "planners/apex.py", "planners/apex_parameters.py", "planners/gpmp.py", "planners/polish.py",
     "planners/registry.py", "planners/sampling.py", "problems",
 )  # fmt: skip
 # All that plans but planners/tuned.py, which follows from the result: candidates name each parameter that is tuned.
 FOLDER = Path(__file__).parent / "runs" / "tune"
+BASELINES_FOLDER = FOLDER.with_name("tune_baselines")
 ROBOPLAN = "roboplan"
 TIMEOUT = 2.0  # [s]
 UNSOLVED_TIME, UNSOLVED_LENGTH = 2.0 * TIMEOUT, 2.0  # [s], times the shortest
@@ -56,6 +59,13 @@ def ranges(*steps: float, **others: Any) -> list[dict[str, Any]]:
 def batches(*sizes: int, **others: Any) -> list[dict[str, Any]]:
     """Return a candidate for each number of samples in a batch of BIT*."""
     return [{"samples_per_batch": size, "rewire_factor": 1.1, "use_k_nearest": True} | others for size in sizes]
+
+
+def supports(safety_distance: float, obstacle_sigma: float, intervals: int, power: float) -> dict[str, Any]:
+    """Return a candidate for GPMP or GPMP2."""
+    return {
+        "safety_distance": safety_distance, "obstacle_sigma": obstacle_sigma, "intervals": intervals, "power": power
+    }  # fmt: skip
 
 
 CANDIDATES: dict[str, list[dict[str, Any]]] = {
@@ -102,6 +112,20 @@ CANDIDATES: dict[str, list[dict[str, Any]]] = {
     ],
 }
 """Candidates of each planner, the default first."""
+
+GAUSSIAN_PROCESS = [
+    supports(0.2, 0.02, 10, 8.0),  # of the size of the authors' examples for arms
+    supports(0.08, 0.004, 12, 1.0),
+    supports(0.12, 0.006, 12, 1.0),
+    supports(0.12, 0.0024, 12, 1.0),
+    supports(0.08, 0.0016, 12, 1.0),
+    supports(0.12, 0.006, 8, 1.0),
+    supports(0.12, 0.006, 20, 1.0),
+    supports(0.12, 0.006, 12, 10.0),
+]
+
+BASELINES: dict[str, list[dict[str, Any]]] = {"gpmp": GAUSSIAN_PROCESS, "gpmp2": GAUSSIAN_PROCESS}
+"""Candidates of the baselines of the paper, values of the size of the authors' examples first."""
 
 
 @dataclass(frozen=True)
@@ -159,10 +183,19 @@ def levels() -> list[str]:
     return [level for level in record.static_levels([]) if level.endswith(("/hard", "/large"))]
 
 
+def easier_levels() -> list[str]:
+    """Return the other static levels but the extreme ones."""
+    return [level for level in record.static_levels([]) if level not in levels() and not level.endswith("/extreme")]
+
+
 def rows_of(planner: str) -> list[Row]:
     """Return a row of each candidate."""
-    runner = peers.RUNNER if planner == ROBOPLAN else ""
-    return [Row.of(planner, params, runner=runner) for params in CANDIDATES[planner]]
+    runner = ""
+    if planner == ROBOPLAN:
+        import peers  # which needs RoboPlan
+
+        runner = peers.RUNNER
+    return [Row.of(planner, params, runner=runner) for params in (CANDIDATES | BASELINES)[planner]]
 
 
 def scores(planner: str, results: Results, rows: Sequence[Row], problems: int) -> list[Score]:
@@ -183,11 +216,12 @@ def scores(planner: str, results: Results, rows: Sequence[Row], problems: int) -
 def rungs_of(planner: str, jobs: int) -> list[list[Score]]:
     """Run the candidates of a planner that are missing, and return their scores in each rung, the best first."""
     rows, found = rows_of(planner), list[list[Score]]()
+    where, folder = (easier_levels(), BASELINES_FOLDER) if planner in BASELINES else (levels(), FOLDER)
     best = [row.label for row in rows]
     for keep, problems in RUNGS:
         left = [row for row in rows if row == rows[0] or row.label in best[:keep]]
         results = bench(
-            levels(), left, FOLDER, runs=problems, timeout=TIMEOUT, split="validation", simplify=False,
+            where, left, folder, runs=problems, timeout=TIMEOUT, split="validation", simplify=False,
             workers=Workers(jobs), provenance=record.session(),
         )  # fmt: skip
         found.append(scores(planner, results, left, problems))
@@ -235,8 +269,10 @@ def main() -> None:
     """Run what is missing, and write the results."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--jobs", type=one_or_more, default=1, help="runs at a time (default: one, as they are timed)")
+    parser.add_argument("--baselines", action="store_true", help="tune the baselines of the paper instead")
     args = parser.parse_args()
-    found = {planner: rungs_of(planner, args.jobs) for planner in CANDIDATES}
+    tuned, folder = (BASELINES, BASELINES_FOLDER) if args.baselines else (CANDIDATES, FOLDER)
+    found = {planner: rungs_of(planner, args.jobs) for planner in tuned}
     data = {
         "planners": {
             planner: {
@@ -247,10 +283,13 @@ def main() -> None:
         }
     }  # fmt: skip
     most = [f"{keep + (k > 0)} candidates on {count} problems of a level" for k, (keep, count) in enumerate(RUNGS)]
+    about: dict[str, Any] = {"levels": len(easier_levels() if args.baselines else levels())}
+    if not args.baselines:
+        about["roboplan"] = version(ROBOPLAN)
     record.write(
-        "tune", data, table(found), split="validation", limit=f"{TIMEOUT:g} s", budget=f"at most {', '.join(most)}",
-        levels=len(levels()), seeds="number of the problem modulo 1000", roboplan=version("roboplan"),
-        **record.made_with(Results.load(FOLDER)),
+        folder.name, data, table(found), split="validation", limit=f"{TIMEOUT:g} s",
+        budget=f"at most {', '.join(most)}", seeds="number of the problem modulo 1000",
+        **about, **record.made_with(Results.load(folder)),
     )  # fmt: skip
 
 

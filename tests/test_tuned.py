@@ -17,14 +17,16 @@ from apex_ompl import planners
 from apex_ompl.benchmark import Results, Row
 from apex_ompl.benchmark.rows import Job
 
-RESULT = json.loads((ROOT / "benchmarks" / "results" / "tune.json").read_text())
-OWN = ("apex", "rrtconnect+polish")
+RESULTS = [
+    json.loads((ROOT / "benchmarks" / "results" / f"{name}.json").read_text()) for name in ("tune", "tune_baselines")
+]
+TUNED = {name: result for one in RESULTS for name, result in one["planners"].items()}
+OWN = ("apex", "rrtconnect+polish", "gpmp", "gpmp2")
 PLANNER, FIRST_PROBLEM = "rrt", 800_000
 
 
 @pytest.fixture(scope="module")
 def tune() -> Iterator[ModuleType]:
-    pytest.importorskip("roboplan")
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(ROOT / "benchmarks"))
         yield importlib.import_module("tune")
@@ -32,8 +34,8 @@ def tune() -> Iterator[ModuleType]:
 
 def test_tuned_parameters_are_those_that_the_tuning_chose() -> None:
     """Those chosen have the least score of the last problems; what TUNED leaves out is as by default."""
-    assert RESULT["about"]["split"] == "validation" and set(planners.TUNED) == set(RESULT["planners"])
-    for name, result in RESULT["planners"].items():
+    assert all(one["about"]["split"] == "validation" for one in RESULTS) and set(planners.TUNED) == set(TUNED)
+    for name, result in TUNED.items():
         last = result["rungs"][-1]
         best = Row.of(name, result["chosen"]).label
         assert last[best]["score"] == min(one["score"] for one in last.values()), name
@@ -126,7 +128,9 @@ def test_scores_are_means(tune: ModuleType) -> None:
 
 
 def test_every_planner_has_as_many_candidates_the_default_first(tune: ModuleType) -> None:
-    for name, candidates in tune.CANDIDATES.items():
+    for name, candidates in (tune.CANDIDATES | tune.BASELINES).items():
+        if name == tune.ROBOPLAN:
+            pytest.importorskip("roboplan")
         labels = [row.label for row in tune.rows_of(name)]
         assert len(set(labels)) == len(candidates) == tune.RUNGS[0][0], name
         if name not in (*OWN, tune.ROBOPLAN):

@@ -8,6 +8,7 @@ from typing import Any
 
 from apex_ompl.errors import UnknownNameError
 from apex_ompl.loop.dynamic_rrt import DynamicRRT
+from apex_ompl.loop.gpmp2 import IncrementalGPMP2
 from apex_ompl.loop.mppi import PathIntegral
 from apex_ompl.loop.paper import OneProposal
 from apex_ompl.loop.portfolio import Portfolio
@@ -67,6 +68,7 @@ METHODS = {
         lambda: Portfolio([Route(), Lines(), Proposals(), Lines(bumps=3)], evades=False), {**BLIND, "monitored": False},
         "a plan among obstacles where they were seen at first, followed blindly",
     ),
+    "gpmp2": Method(IncrementalGPMP2, {}, "GPMP2 from the moving robot, warm from the last motion (as iGPMP2)"),
     "mppi": Method(PathIntegral, {}, "model predictive path integral control"),
     "potential-field": Method(PotentialField, {}, "a reflex down an artificial potential"),
     "dynamic-rrt": Method(

@@ -15,11 +15,10 @@ import math
 from typing import NamedTuple
 
 from apex_ompl.kernel.compiled.arrays import RobotArrays, SceneArrays, robot_view, scene_view
-from apex_ompl.kernel.compiled.clearance import gradient_to_obstacle, nearest_to_obstacle
-from apex_ompl.kernel.compiled.clearance_cost import add_violation, state_cost
+from apex_ompl.kernel.compiled.clearance_cost import state_cost
 from apex_ompl.kernel.compiled.compilation import entry_point, inlined
 from apex_ompl.kernel.compiled.layout import Floats, Integers, Singles
-from apex_ompl.kernel.compiled.movers import MoverArrays, margin_at, movers_view, place_movers, scene_of_movers
+from apex_ompl.kernel.compiled.movers import MoverArrays, movers_view, scene_of_movers
 from apex_ompl.kernel.compiled.path_cost import (
     Buffers,
     CostSettings,
@@ -33,6 +32,7 @@ from apex_ompl.kernel.compiled.path_cost import (
 )
 from apex_ompl.kernel.compiled.path_optimization import descend
 from apex_ompl.kernel.compiled.separation import tables_hold
+from apex_ompl.kernel.compiled.state_costs import add_movers
 from apex_ompl.kernel.compiled.workspace import Workspace, workspace_view
 
 ORDERS = 3  # of derivatives that have limits
@@ -126,20 +126,10 @@ def evaluate_motion(
         cost, scene, own = state_cost(
             t, s, w, q, margin, settings.own_margin, b.row, b.state_gradient, b.state_gram, scene, own,
         )  # fmt: skip
-        place_movers(movers, problem.times[k], problem.placed.offset)
-        for c in range(len(t.cluster_joint)):
-            if not t.cluster_meets_scene[c]:
-                continue
-            for o in range(len(movers.kind)):
-                grown = margin_at(movers, o, problem.times[k])
-                near = nearest_to_obstacle(t, problem.placed, w, q, c, o, (margin + grown, -1, -1, -1, -1))
-                if near[1] >= 0:
-                    clearance = near[0] - grown
-                    scene = min(scene, clearance)
-                    for i in range(dof):
-                        b.row[i] = 0.0
-                    gradient_to_obstacle(t, problem.placed, w, near, b.row)
-                    cost += add_violation(clearance, margin, b.row, b.state_gradient, b.state_gram)
+        moving, scene = add_movers(
+            t, movers, problem.placed, w, q, problem.times[k], margin, b.row, b.state_gradient, b.state_gram, scene
+        )
+        cost += moving
         if cost > 0.0:
             total += share * cost
             add_sample(share, weights[k], first[k], pinned, free, b.state_gradient, b.state_gram, gradient, gram)
