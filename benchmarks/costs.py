@@ -17,16 +17,14 @@ from typing import Any
 
 import numpy as np
 import record
-from numpy.typing import NDArray
 
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.live.movers import Movers, clearance_in_time, curve_of, prove_motion
 from apex_ompl.live.retime import retime
 from apex_ompl.live.timed_spline import MotionOptimizer, Start, TimedSpline
 from apex_ompl.loop.charges import TABLE, Charges
-from apex_ompl.loop.dynamic_rrt import Clearances, DynamicRRT
+from apex_ompl.loop.drrt import Clearances, KeptTree
 from apex_ompl.loop.following import Following
-from apex_ompl.loop.goal_tree import GoalTree
 from apex_ompl.loop.mppi import PathIntegral, softmax
 from apex_ompl.loop.paper import OneProposal
 from apex_ompl.loop.potential_field import PotentialField
@@ -40,12 +38,12 @@ from apex_ompl.loop.snapshot import Snapshot
 from apex_ompl.ompl_adapter.process import quiet_ompl
 from apex_ompl.ompl_adapter.setup import assemble
 from apex_ompl.problems import worlds
+from apex_ompl.roadmaps.goal_tree import GoalTree
 from apex_ompl.trajectory import time_path
 from apex_ompl.trajopt.optimizer import Optimizer
-from apex_ompl.types import Array
+from apex_ompl.types import Array, Flags
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.files import write_atomically
-from apex_ompl.util.resolution import SEARCH_RESOLUTION
 from apex_ompl.util.validation import one_or_more
 
 DEPENDS = ("@planning", "apex_ompl/live", "apex_ompl/loop", "apex_ompl/trajectory")
@@ -140,20 +138,22 @@ def controls(name: str, found: dict[str, list[float]]) -> None:
     )
     reflex = PotentialField()
     found["force"].append(seconds(lambda: reflex.controls(search, horizon)) / reflex.steps)
-    tree = GoalTree(ready.goals, DynamicRRT.step, SEARCH_RESOLUTION, 200)
+    step = KeptTree().search.step
+    tree = GoalTree(ready.goals, step, 200)
     while not tree.full:
         q = search.rng.uniform(ready.limits.lower, ready.limits.upper)
-        tree.extend(tree.nearest(q), q, lambda states: np.ones(len(states), bool))
-    tree.trim(lambda states: np.arange(len(states)) < len(states) - 1)
-    clear, q = Clearances(search), search.start.position
-    before, counts = seconds(lambda: clear(tree.edges[0])), len(tree.edges[0])
+        tree.extend(tree.nearest(q), q, lambda first, last: np.ones(len(first), bool))
+    tree.trim(lambda first, last: np.arange(len(first)) < len(first) - 1)
+    clear, q = Clearances(search, step), search.start.position
+    first, last = (ends[:1] for ends in tree.edges)
+    before, counts = seconds(lambda: clear.edges(first, last)), clear.count
     each = max(before - counts * (moving / len(states) + own / len(some)), 0.0)
     found["extension of a tree"].append(each + seconds(lambda: tree.extend(tree.nearest(q), q, refused)))
 
 
-def refused(states: Array) -> NDArray[np.bool_]:
-    """Return that no state is clear."""
-    return np.zeros(len(states), bool)
+def refused(first: Array, last: Array) -> Flags:
+    """Return that no motion is clear."""
+    return np.zeros(len(first), bool)
 
 
 def trees() -> dict[str, float]:

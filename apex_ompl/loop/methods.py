@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from apex_ompl.errors import UnknownNameError
-from apex_ompl.loop.dynamic_rrt import DynamicRRT
+from apex_ompl.loop.drrt import KeptTree
 from apex_ompl.loop.mppi import PathIntegral
 from apex_ompl.loop.paper import OneProposal
 from apex_ompl.loop.portfolio import Portfolio
@@ -69,8 +69,8 @@ METHODS = {
     ),
     "mppi": Method(PathIntegral, {}, "model predictive path integral control"),
     "potential-field": Method(PotentialField, {}, "a reflex down an artificial potential"),
-    "dynamic-rrt": Method(
-        DynamicRRT, FROM_REST, "stops where the way is blocked; a tree from the goal that is kept and repaired"
+    "drrt": Method(
+        KeptTree, FROM_REST, "dynamic RRT: stops where the way is blocked; a tree from the goal, kept and repaired"
     ),
 }  # fmt: skip
 
