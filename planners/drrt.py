@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from ompl import base as ob
@@ -14,7 +15,7 @@ from apex_ompl.apex.start_goal import read_goals, read_starts
 from apex_ompl.collision.changes import may_have_become_blocked
 from apex_ompl.kernel import Kernel
 from apex_ompl.ompl_adapter.report import SolveReport
-from apex_ompl.ompl_adapter.space import array_to_path, forget_states
+from apex_ompl.ompl_adapter.space import array_to_path, forget_states, motions_free
 from apex_ompl.ompl_adapter.validity import MotionValidator, StateValidityChecker
 from apex_ompl.planners.registry import Parameters, bounded, register
 from apex_ompl.roadmaps.dynamic_rrt import DynamicRRT
@@ -70,15 +71,6 @@ class DRRT(ob.Planner):
             status = Status.CRASH
         return Status(status)
 
-    def free(self, first: Array, last: Array) -> Flags:
-        """Return whether straight motions are free by the motion validator, between states of shape (N, dof)."""
-        si, found = self.getSpaceInformation(), []
-        a, b = si.allocState(), si.allocState()
-        for p, q in zip(first.tolist(), last.tolist(), strict=True):
-            a[0 : len(p)], b[0 : len(q)] = p, q
-            found.append(si.checkMotion(a, b))
-        return np.array(found, bool)
-
     def _solve(self, ptc: ob.PlannerTerminationCondition) -> ob.PlannerStatus:
         si, begin = self.getSpaceInformation(), time.perf_counter()
         dof, inputs = int(si.getStateDimension()), self.getPlannerInputStates()
@@ -98,7 +90,7 @@ class DRRT(ob.Planner):
             self._trim(tree)
         with self.report.timed("grow"):
             path = self.search.grow(
-                tree, np.stack(starts), lambda: rng.uniform(lower, upper), rng=rng, free=self.free,
+                tree, np.stack(starts), lambda: rng.uniform(lower, upper), rng=rng, free=partial(motions_free, si),
                 stop=lambda: bool(ptc()),
             )  # fmt: skip
         if path is None:
@@ -126,7 +118,7 @@ class DRRT(ob.Planner):
                 suspect = np.flatnonzero(may_have_become_blocked(before, now, first, last))
             else:
                 suspect = np.arange(len(first))
-            found[suspect] = self.free(first[suspect], last[suspect])
+            found[suspect] = motions_free(si, first[suspect], last[suspect])
             return found
 
         self.removed = tree.trim(free)

@@ -1,4 +1,4 @@
-"""Make the manifolds of the planner ``damon``: an autoencoder of states of the training paths, and its graph, for each dimension.
+"""Make the manifolds of the planner ``damon``: autoencoders of states of the training paths, and their graphs.
 
 Each dimension takes some minutes on one core; folders that are there already are left as they are, so that the command
 goes on where it was stopped.
@@ -17,18 +17,26 @@ import numpy as np
 from apex_ompl.datasets.store import load
 from apex_ompl.kernel import Kernel, RobotTables
 from apex_ompl.kernel.scene_builder import scene_tables
-from apex_ompl.roadmaps.latent_graph import StateSample, chosen_nodes, consecutive, edges
+from apex_ompl.roadmaps.latent_graph import chosen_nodes, consecutive, edges
 from apex_ompl.roadmaps.manifold import (
-    BASELINES, CONFIG, DECODED, MOST_NODES, SCHEMA, STORED, Manifold, ManifoldConfig, halved, save_manifold,
+    BASELINES,
+    CONFIG,
+    DECODED,
+    MOST_NODES,
+    SCHEMA,
+    STORED,
+    Manifold,
+    ManifoldConfig,
+    halved,
+    save_manifold,
 )  # fmt: skip
 from apex_ompl.roadmaps.sampling import sample_states, split_sample
 from apex_ompl.roadmaps.state_autoencoder import StateAutoencoder
+from apex_ompl.robot import load_robot
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import one_or_more
 
 ROOT = Path(__file__).resolve().parents[1]
-HANDS = ("left_hand_synergy", "right_hand_synergy")
-CLOSED = 0.1  # of hands while edges are checked for self-collision
 
 
 def make(args: argparse.Namespace, dim: int) -> None:
@@ -40,7 +48,9 @@ def make(args: argparse.Namespace, dim: int) -> None:
 
     begin = time.perf_counter()
     tables = RobotTables.load(args.data / "robot.npz")
-    joints = np.array([k for k, name in enumerate(tables.joint_names) if name not in HANDS])
+    robot = load_robot(tables.name)
+    hands = {hand.synergy for hand in robot.hands.values()}  # they stay as at the start of a query
+    joints = np.array([k for k, name in enumerate(tables.joint_names) if name not in hands])
     lower, upper = tables.arrays.lower[joints], tables.arrays.upper[joints]
     every = sample_states(load(args.data / "paths.zip"), joints, args.states, args.along, args.seed)
     sample, held_out = split_sample(every)
@@ -61,11 +71,11 @@ def make(args: argparse.Namespace, dim: int) -> None:
     nodes = chosen_nodes(sample, autoencoder, args.nodes)
     stored = np.clip(sample.states[nodes].astype(np.float16).astype(float), lower, upper)
     latent = autoencoder.encode(stored).astype(np.float16).astype(float)
-    whole, kernel = np.full(len(tables.joint_names), CLOSED), Kernel(tables, scene_tables([]))
+    kernel = Kernel(tables, scene_tables([]))
     along = consecutive(sample.paths[nodes])
     pairs = {}
     for kind, states in ((DECODED, autoencoder.decode(latent)), (STORED, stored)):
-        near = edges(latent, states, kernel, whole, joints, args.neighbours)
+        near = edges(latent, states, args.neighbours, kernel=kernel, whole=robot.home, joints=joints)
         pairs[kind] = np.unique(np.concatenate([near, along]), axis=0)
     config = ManifoldConfig(
         schema_=SCHEMA, robot=tables.name, joints=tuple(tables.joint_names[k] for k in joints), dim=dim,
@@ -95,7 +105,7 @@ def main() -> None:
     parser.add_argument("--nodes", type=one_or_more, default=20_000, help="nodes (default: %(default)s)")
     parser.add_argument("--neighbours", type=one_or_more, default=12, help="of a node (default: %(default)s)")
     parser.add_argument("--beta", type=float, default=1e-3, help="weight of the divergence (default: %(default)s)")
-    parser.add_argument("--epochs", type=one_or_more, default=60, help="passes (default: %(default)s)")
+    parser.add_argument("--epochs", type=one_or_more, default=20, help="passes (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=0, help="of all random choices (default: %(default)s)")
     parser.add_argument("--again", action="store_true", help="make folders anew that are there")
     args = parser.parse_args()

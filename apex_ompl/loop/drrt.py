@@ -99,12 +99,17 @@ class Clearances:
 
     def __call__(self, states: Array) -> Flags:
         """Return whether each state, shape (N, dof), is clear of all."""
-        clear, ready = self.of_movers(states), self.search.ready
-        left = np.flatnonzero(clear)
-        own = ready.kernel.clearance(states[left], SEEN).min(axis=1)
-        self.search.charges.charge("near clearance", len(left))
-        clear[left] = own > 0.0
-        close = left[(own <= 0.0) & (own > -DEEP)]
+        clear = self.of_movers(states)
+        clear[clear] = self.of_still(states[clear])
+        return clear
+
+    def of_still(self, states: Array) -> Flags:
+        """Return whether each state, shape (N, dof), is clear of what stands still, and of the robot itself."""
+        ready = self.search.ready
+        own = ready.kernel.clearance(states, SEEN).min(axis=1)
+        self.search.charges.charge("near clearance", len(states))
+        clear: Flags = own > 0.0
+        close = np.flatnonzero(~clear & (own > -DEEP))
         clear[close] = ready.checker.are_free(states[close])
         self.search.charges.charge("exact proof", len(close))
         return clear
@@ -126,7 +131,7 @@ class Clearances:
         shares = np.linspace(0.0, 1.0, self.count + 1)[1:, None]
         states = first[:, None] + shares * (last - first)[:, None]
         states[:, -1] = last
-        found: Flags = clear(states.reshape(-1, states.shape[2])).reshape(states.shape[:2]).all(axis=1)
+        found: Flags = np.all(clear(states.reshape(-1, states.shape[2])).reshape(states.shape[:2]), axis=1)
         return found
 
     def of_movers(self, states: Array) -> Flags:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from apex_ompl.errors import UnknownNameError
+from apex_ompl.loop.damon import ManifoldGraph
 from apex_ompl.loop.drrt import KeptTree
 from apex_ompl.loop.mppi import PathIntegral
 from apex_ompl.loop.paper import OneProposal
@@ -71,6 +72,9 @@ METHODS = {
     "potential-field": Method(PotentialField, {}, "a reflex down an artificial potential"),
     "drrt": Method(
         KeptTree, FROM_REST, "dynamic RRT: stops where the way is blocked; a tree from the goal, kept and repaired"
+    ),
+    "damon": Method(
+        ManifoldGraph, FROM_REST, "DAMON: stops where the way is blocked; A* over a graph on a learned manifold"
     ),
 }  # fmt: skip
 

@@ -100,7 +100,7 @@ def free_of_self_collision(kernel: Kernel, first: Array, last: Array) -> Flags:
             shares = np.linspace(0.0, 1.0, count)[:, None]
             states = first[some, None] + shares * (last - first)[some, None]
             clear = kernel.clearance(states.reshape(-1, states.shape[2]), 0.01)[:, 1] > 0.0
-            found[some] = clear.reshape(len(some), count).all(axis=1)
+            found[some] = np.all(clear.reshape(len(some), count), axis=1)
     return found
 
 
@@ -114,16 +114,18 @@ def consecutive(paths: Indices) -> Indices:
     return np.stack([k, k + 1], axis=1)
 
 
-def edges(latent: Array, states: Array, kernel: Kernel, whole: Array, joints: Indices, count: int) -> Indices:
+def edges(
+    latent: Array, states: Array, count: int, *, kernel: Kernel, whole: Array, joints: Indices
+) -> Indices:  # fmt: skip
     """Return the pairs of neighbours whose straight motion is free of self-collision, the smaller number first.
 
     Args:
         latent: Latent vectors of the nodes, shape (N, d).
         states: Their states, shape (N, J).
+        count: Number of neighbours of a node.
         kernel: The robot.
         whole: A state of all joints, shape (dof,), for those that the graph has no values of.
         joints: Which joints the graph has values of, shape (J,).
-        count: Number of neighbours of a node.
 
     Returns:
         Shape (M, 2).

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -52,6 +53,15 @@ class Graph:
         return np.repeat(np.arange(len(self.states)), np.diff(self.begins))
 
 
+class _Found(NamedTuple):
+    """A path by numbers: of its start, of its nodes, of its edges, and of its goal."""
+
+    start: int
+    nodes: list[int]
+    edges: list[int]
+    goal: int
+
+
 class LazySearch:
     """A* whose edges are checked where the shortest path uses them, until one is free (Bohlin and Kavraki 2000).
 
@@ -78,7 +88,8 @@ class LazySearch:
         self._entry, self._leave = np.full((len(starts), count), np.inf), np.full((len(goals), count), np.inf)
         away = [np.linalg.norm(graph.states - goal, axis=1) for goal in goals]
         self._heuristic = np.min(away, axis=0)
-        self._buffers = np.empty(count), np.empty(count, np.int64), np.empty(count + edges), np.empty(count + edges, int)
+        room = count + edges
+        self._buffers = np.empty(count), np.empty(count, np.int64), np.empty(room), np.empty(room, np.int64)
         self._free_ends: set[tuple[bool, int, int]] = set()
 
     def connect(self, start: int | None = None, goal: int | None = None, *, nodes: Indices) -> None:
@@ -101,13 +112,13 @@ class LazySearch:
             searched()
             if found is None:
                 return None
-            start, nodes, edges, goal = found
-            if self._check(start, nodes, edges, goal, free, stop):
-                return np.concatenate([self._starts[[start]], self.graph.states[nodes], self._goals[[goal]]])
+            if self._check(found, free, stop):
+                nodes = self.graph.states[found.nodes]
+                return np.concatenate([self._starts[[found.start]], nodes, self._goals[[found.goal]]])
         return None
 
-    def _search(self) -> tuple[int, list[int], list[int], int] | None:
-        """Return the start, nodes, edges and goal of the shortest path, or None."""
+    def _search(self) -> _Found | None:
+        """Return the shortest path, or None."""
         self.searches += 1
         graph, (cost, parent, keys, heap) = self.graph, self._buffers
         node = int(shortest_path(
@@ -121,15 +132,13 @@ class LazySearch:
             edge = int(parent[nodes[-1]])
             edges.append(edge)
             nodes.append(int(graph.ends[graph.twins[edge]]))
-        return int(np.argmin(self._entry[:, nodes[-1]])), nodes[::-1], edges[::-1], goal
+        return _Found(int(np.argmin(self._entry[:, nodes[-1]])), nodes[::-1], edges[::-1], goal)
 
-    def _check(
-        self, start: int, nodes: list[int], edges: list[int], goal: int, free: AreFree, stop: Callable[[], bool]
-    ) -> bool:
+    def _check(self, found: _Found, free: AreFree, stop: Callable[[], bool]) -> bool:
         """Check what is unknown of a path, the longest motion first; the first that is blocked is not used again."""
         states, graph = self.graph.states, self.graph
-        inner = [e for e in edges if not self._known[e]]
-        for at_start, row, k in ((True, start, nodes[0]), (False, goal, nodes[-1])):
+        inner = [e for e in found.edges if not self._known[e]]
+        for at_start, row, k in ((True, found.start, found.nodes[0]), (False, found.goal, found.nodes[-1])):
             if (at_start, row, k) in self._free_ends:
                 continue
             if stop():

@@ -49,7 +49,7 @@ class StateNetwork(nn.Module):
 
 
 def train(
-    states: Array, lower: Array, upper: Array, *, dim: int, hidden: int = 64, beta: float = 1e-3, epochs: int = 60,
+    states: Array, lower: Array, upper: Array, *, dim: int, hidden: int = 64, beta: float = 1e-3, epochs: int = 20,
     seed: int = 0, progress: Callable[[int, float], None] = lambda epoch, loss: None,
 ) -> dict[str, NDArray[np.float32]]:  # fmt: skip
     """Return the weights of a network trained on states, by Adam with a rate that falls to zero as a cosine.
@@ -75,10 +75,10 @@ def train(
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
     for epoch in range(epochs):
         total = 0.0
-        for which in torch.randperm(len(x), generator=generator).split(BATCH):
+        for which in torch.split(torch.randperm(len(x), generator=generator), BATCH):
             loss = network.loss(x[which], torch.randn(len(which), dim, generator=generator), beta)
             optimizer.zero_grad()
-            loss.backward()
+            loss.backward()  # type: ignore[no-untyped-call]
             optimizer.step()
             schedule.step()
             total += float(loss.detach()) * len(which)
