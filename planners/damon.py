@@ -26,6 +26,8 @@ from apex_ompl.types import Array, Flags
 NAME = "damon"
 LOG = logging.getLogger("apex_ompl")
 Status = ob.PlannerStatus
+DEEP = 0.03  # overlap of spheres beyond which a node counts as in contact without a look at exact shapes [m]
+SEEN = 0.001  # clearances beyond this are not told apart [m]
 
 
 class DAMON(ob.Planner):
@@ -43,7 +45,7 @@ class DAMON(ob.Planner):
         """Plan in the space of ``si``, whose validity checker is ``checker``."""
         super().__init__(si, NAME)
         self.damon, self.report = damon, SolveReport()
-        self._checker, self._hit = checker, dict[bytes, tuple[Kernel, Flags]]()
+        self._checker, self._hit = checker, dict[bytes, tuple[Kernel, tuple[Flags, Flags]]]()
 
     def clear(self) -> None:
         """Forget which nodes obstacles hit."""
@@ -73,10 +75,12 @@ class DAMON(ob.Planner):
             return Status.TIMEOUT if ptc() else Status.INVALID_GOAL
         with self.report.timed("nodes"):
             states = self.damon.states(starts[0])
-            usable = self._usable(states)
-        search = self.damon.search(states, usable, np.stack(starts), np.stack(goals))
+            usable, free_nodes = self._nodes(states)
+        ends = np.stack(starts), np.stack(goals)
+        search = self.damon.search(states, usable, *ends, free_nodes=free_nodes)
         with self.report.timed("search"):
-            path = search.run(partial(motions_free, self.getSpaceInformation()), lambda: bool(ptc()))
+            free = partial(motions_free, self.getSpaceInformation())
+            path = search.run(free, lambda: bool(ptc()), nodes_free=self._checker.checker.are_free)
         self.report.candidates = search.searches
         if path is None:
             used = f"{int(usable.sum())} of {len(usable)} nodes"
@@ -90,17 +94,25 @@ class DAMON(ob.Planner):
         self.getProblemDefinition().addSolutionPath(array_to_path(si, path), False, 0.0, NAME)
         return Status.EXACT_SOLUTION
 
-    def _usable(self, states: Array) -> Flags:
-        """Return which nodes are inside the bounds and free, shape (N,); the same until the scene changes."""
+    def _nodes(self, states: Array) -> tuple[Flags, Flags]:
+        """Return which nodes may be used, and which of them are free for sure, each of shape (N,).
+
+        By the sphere cover, which proves the second. Of nodes that it does not prove free, those deep in contact are
+        not used; the others are checked when a path uses them. The same until the scene changes.
+        """
         checker = self._checker.checker
         box, key = self.getSpaceInformation().getStateSpace().getBounds(), states[0].tobytes()
-        kernel, usable = self._hit.get(key, (None, None))
-        if usable is None or kernel is not checker.kernel:
-            inside: Flags = np.all((states >= np.array(box.low)) & (states <= np.array(box.high)), axis=1)
-            inside[inside] = checker.are_free(states[inside])
-            usable = inside
-            self._hit[key] = checker.kernel, usable
-        return usable
+        kernel, known = self._hit.get(key, (None, None))
+        if known is None or kernel is not checker.kernel:
+            kernel = checker.kernel
+            inside = np.all((states >= np.array(box.low)) & (states <= np.array(box.high)), axis=1)
+            free = inside & (kernel.unproved(states)[1] == 0)
+            left = np.flatnonzero(inside & ~free)
+            usable = free.copy()
+            usable[left] = kernel.clearance(states[left], SEEN).min(axis=1) > -DEEP
+            known = usable, free
+            self._hit[key] = kernel, known
+        return known
 
 
 @register(NAME)
@@ -116,7 +128,7 @@ class DAMONParameters(Parameters):
     """
 
     smooth: ClassVar[bool] = False
-    model: str = "damon-2"
+    model: str = "damon-8"
     nodes: str = one_of("decoded", "stored")
     connections: int = bounded(100, 1, 10_000)
 

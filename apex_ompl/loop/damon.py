@@ -13,6 +13,7 @@ from apex_ompl.loop.request import Answer, Request
 from apex_ompl.loop.search import Search
 from apex_ompl.planners.registry import parameters
 from apex_ompl.roadmaps.damon import Damon
+from apex_ompl.roadmaps.lazy_search import Motion
 from apex_ompl.roadmaps.manifold import load_manifold
 from apex_ompl.types import Array, Flags
 from apex_ompl.util.resolution import SEARCH_RESOLUTION
@@ -38,6 +39,8 @@ class ManifoldGraph:
     damon: Damon | None = None
     _usable: dict[bytes, Flags] = field(default_factory=dict, repr=False)
     _clear_of_still: dict[bytes, bool] = field(default_factory=dict, repr=False)
+    _blocked: set[Motion] = field(default_factory=set, repr=False)
+    _start: bytes = b""
 
     def prepare(self, ready: Ready) -> None:
         """Load the graph, and find the nodes that are free of what stands still.
@@ -53,12 +56,15 @@ class ManifoldGraph:
         self.damon = Damon.of(manifold, robot.joint_names, kind, connections)
         self._usable.clear()
         self._clear_of_still.clear()
+        self._blocked.clear()
         self._free_of_still(ready, self.damon.states(ready.setup.start), Charges(np.inf))
 
     def replan(self, ready: Ready, request: Request, charges: Charges) -> Answer:
         """Return a motion from rest along a path of the graph, or none."""
         if not request.following.at_rest(request.join) or not len(ready.goals):
             return Answer(None, "", charges)
+        if self.damon is None:
+            self.prepare(ready)
         assert self.damon is not None
         search = Search(ready, request, charges)
         clear, start = Clearances(search, SEARCH_RESOLUTION), search.start.position
@@ -68,14 +74,28 @@ class ManifoldGraph:
         paths = self.damon.search(states, usable, start[None], ready.goals)
         charges.charge("query of a graph")
 
-        def free(first: Array, last: Array) -> Flags:
-            return np.array([self._is_free(clear, *ends) for ends in zip(first, last, strict=True)], bool)
+        blocked = self._blocked_from(start)
+        for one in blocked:
+            paths.block(one)
 
-        path = paths.run(free, charges.over, lambda: charges.charge("search of a graph"))
+        def free(first: Array, last: Array) -> Flags:
+            found = self._is_free(clear, first[0], last[0])
+            if self._clear_of_still.get(first.tobytes() + last.tobytes()) is False:
+                blocked.add(paths.motion)
+            return np.array([found])
+
+        path = paths.run(free, charges.over, lambda reached: charges.charge("node of a graph", reached))
         motion = None if path is None else timed(search, path, clear)
         if motion is None or not ready.clear_of_still(motion, charges):
             return Answer(None, "", charges)
         return Answer(search.following(motion) if search.accepts(motion) else None, "graph", charges)
+
+    def _blocked_from(self, start: Array) -> set[Motion]:
+        """Return the motions that what stands still is known to block; those from other starts are forgotten."""
+        key = start.tobytes()
+        if key != self._start:
+            self._start, self._blocked = key, {one for one in self._blocked if one[0] != "start"}
+        return self._blocked
 
     def _is_free(self, clear: Clearances, first: Array, last: Array) -> bool:
         """Whether a straight motion is clear behind its first state; of what stands still it is checked once."""

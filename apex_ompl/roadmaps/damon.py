@@ -26,9 +26,9 @@ class Damon:
     neighbours (of the five times as many nodes that are nearest in the latent space the 12 nearest in joint space, as
     far as a sphere cover proves the straight motion between free of self-collision, and nodes that follow each other
     along a training path); lengths (Euclidean, in joint space); when edges are checked (where the shortest path uses
-    one, as in lazy PRM, Bohlin and Kavraki 2000); how a start and a goal that are not on the manifold are reached (by
-    straight motions from the nearest nodes, chosen as neighbours are); hands (no part of the manifold; they stay as at
-    the start until the last motion).
+    one, as in lazy PRM; nodes, too, that spheres neither prove free nor see deep in contact); how a start and a goal
+    that are not on the manifold are reached (by straight motions from the nearest nodes, chosen as neighbours are);
+    hands (no part of the manifold; they stay as at the start until the last motion).
 
     Attributes:
         manifold: The manifold.
@@ -56,7 +56,9 @@ class Damon:
         states[:, self.joints] = self.graph.states
         return states
 
-    def search(self, states: Array, usable: Flags, starts: Array, goals: Array) -> LazySearch:
+    def search(
+        self, states: Array, usable: Flags, starts: Array, goals: Array, *, free_nodes: Flags | None = None
+    ) -> LazySearch:  # fmt: skip
         """Return a search for paths from starts to goals.
 
         Args:
@@ -64,8 +66,9 @@ class Damon:
             usable: Which nodes may be used, shape (N,).
             starts: Shape (S, dof).
             goals: Shape (G, dof).
+            free_nodes: Which nodes are known to be free, shape (N,); by default those that may be used.
         """
-        search = LazySearch(replace(self.graph, states=states), usable, starts, goals)
+        search = LazySearch(replace(self.graph, states=states), usable, starts, goals, free_nodes=free_nodes)
         left = np.flatnonzero(usable)
         if len(left):
             latent, nodes = self.manifold.latent[left], self.graph.states[left]

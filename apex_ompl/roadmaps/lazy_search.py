@@ -62,35 +62,46 @@ class _Found(NamedTuple):
     goal: int
 
 
+Motion = tuple[str, int, int]
+"""A motion of a search: ``start`` or ``goal``, its number, and a node; or ``edge``, its number, and its twin's."""
+
+
 class LazySearch:
-    """A* whose edges are checked where the shortest path uses them, until one is free (Bohlin and Kavraki 2000).
+    """A* whose nodes and edges are checked where the shortest path uses them, until it is free.
+
+    As in lazy PRM (Bohlin and Kavraki 2000, "Path planning using lazy PRM"): nodes of a path are checked before its
+    motions, these from the longest on; what is blocked is not used again.
 
     Attributes:
         graph: The graph.
         searches: Number of searches so far.
         checked: Number of motions that were checked.
+        motion: The motion that is being checked.
     """
 
-    def __init__(self, graph: Graph, open_nodes: Flags, starts: Array, goals: Array) -> None:
+    def __init__(
+        self, graph: Graph, usable: Flags, starts: Array, goals: Array, *, free_nodes: Flags | None = None
+    ) -> None:  # fmt: skip
         """Begin with all edges between nodes that may be used.
 
         Args:
             graph: The graph.
-            open_nodes: Which nodes may be used, shape (N,).
+            usable: Which nodes may be used, shape (N,).
             starts: Start states, shape (S, dof).
             goals: Goal states, shape (G, dof).
+            free_nodes: Which nodes are known to be free, shape (N,); by default those that may be used.
         """
-        self.graph, self.searches, self.checked = graph, 0, 0
+        self.graph, self.searches, self.checked, self.motion = graph, 0, 0, ("edge", 0, 0)
         self._starts, self._goals = starts, goals
-        self._usable = (open_nodes[graph.ends] & open_nodes[graph.firsts]).astype(np.int64)
-        self._known = np.zeros(len(graph.ends), bool)
+        self._usable = (usable[graph.ends] & usable[graph.firsts]).astype(np.int64)
+        self._free_nodes = (usable if free_nodes is None else free_nodes).copy()
+        self._free: set[Motion] = set()
         count, edges = len(graph.states), len(graph.ends)
         self._entry, self._leave = np.full((len(starts), count), np.inf), np.full((len(goals), count), np.inf)
         away = [np.linalg.norm(graph.states - goal, axis=1) for goal in goals]
         self._heuristic = np.min(away, axis=0)
         room = count + edges
         self._buffers = np.empty(count), np.empty(count, np.int64), np.empty(room), np.empty(room, np.int64)
-        self._free_ends: set[tuple[bool, int, int]] = set()
 
     def connect(self, start: int | None = None, goal: int | None = None, *, nodes: Indices) -> None:
         """Let the path enter the graph from a start, or leave it for a goal, given by number, over some nodes."""
@@ -99,20 +110,32 @@ class LazySearch:
         )  # fmt: skip
         row[nodes] = np.linalg.norm(self.graph.states[nodes] - q, axis=1)
 
-    def run(self, free: AreFree, stop: Callable[[], bool], searched: Callable[[], None] = lambda: None) -> Array | None:
+    def block(self, motion: Motion) -> None:
+        """Use a motion no more."""
+        kind, first, second = motion
+        if kind == "edge":
+            self._usable[[first, second]] = 0
+        else:
+            (self._entry if kind == "start" else self._leave)[first, second] = np.inf
+
+    def run(
+        self, free: AreFree, stop: Callable[[], bool], searched: Callable[[int], None] = lambda reached: None,
+        nodes_free: Callable[[Array], Flags] = lambda states: np.ones(len(states), bool),
+    ) -> Array | None:  # fmt: skip
         """Return the shortest path whose motions are free, shape (L, dof), or None.
 
         Args:
             free: Whether straight motions are free.
             stop: Asked before each search and each check whether to give up.
-            searched: Called after each search.
+            searched: Called after each search with the number of nodes that it reached.
+            nodes_free: Whether states, shape (N, dof), are free; asked for nodes that are not known to be.
         """
         while not stop():
             found = self._search()
-            searched()
+            searched(int(np.isfinite(self._buffers[0]).sum()))
             if found is None:
                 return None
-            if self._check(found, free, stop):
+            if self._check_nodes(found, nodes_free) and self._check_motions(found, free, stop):
                 nodes = self.graph.states[found.nodes]
                 return np.concatenate([self._starts[[found.start]], nodes, self._goals[[found.goal]]])
         return None
@@ -134,28 +157,39 @@ class LazySearch:
             nodes.append(int(graph.ends[graph.twins[edge]]))
         return _Found(int(np.argmin(self._entry[:, nodes[-1]])), nodes[::-1], edges[::-1], goal)
 
-    def _check(self, found: _Found, free: AreFree, stop: Callable[[], bool]) -> bool:
-        """Check what is unknown of a path, the longest motion first; the first that is blocked is not used again."""
+    def _check_nodes(self, found: _Found, nodes_free: Callable[[Array], Flags]) -> bool:
+        """Check the nodes of a path that are not known to be free; those that are not are not used again."""
+        left = np.array([k for k in found.nodes if not self._free_nodes[k]], np.int64)
+        if not len(left):
+            return True
+        free = nodes_free(self.graph.states[left])
+        self._free_nodes[left[free]] = True
+        for k in left[~free]:
+            self._entry[:, k] = self._leave[:, k] = np.inf
+            out = np.arange(self.graph.begins[k], self.graph.begins[k + 1])
+            self._usable[out] = self._usable[self.graph.twins[out]] = 0
+        return bool(free.all())
+
+    def _check_motions(self, found: _Found, free: AreFree, stop: Callable[[], bool]) -> bool:
+        """Check the motions of a path that are not known to be free, the longest first, up to one that is blocked."""
         states, graph = self.graph.states, self.graph
-        inner = [e for e in found.edges if not self._known[e]]
-        for at_start, row, k in ((True, found.start, found.nodes[0]), (False, found.goal, found.nodes[-1])):
-            if (at_start, row, k) in self._free_ends:
+        first, last = found.nodes[0], found.nodes[-1]
+        motions: list[tuple[float, Motion, Array, Array]] = [
+            (self._entry[found.start, first], ("start", found.start, first), self._starts[found.start], states[first]),
+            (self._leave[found.goal, last], ("goal", found.goal, last), states[last], self._goals[found.goal]),
+        ]
+        for edge in found.edges:
+            twin, length = int(graph.twins[edge]), graph.lengths[edge]
+            key = ("edge", min(edge, twin), max(edge, twin))
+            motions.append((length, key, states[graph.ends[twin]], states[graph.ends[edge]]))
+        for _, motion, a, b in sorted(motions, key=lambda one: -one[0]):
+            if motion in self._free:
                 continue
             if stop():
                 return False
-            ends = (self._starts[row], states[k]) if at_start else (states[k], self._goals[row])
-            self.checked += 1
-            if not free(ends[0][None], ends[1][None])[0]:
-                (self._entry if at_start else self._leave)[row, k] = np.inf
+            self.checked, self.motion = self.checked + 1, motion
+            if not free(a[None], b[None])[0]:
+                self.block(motion)
                 return False
-            self._free_ends.add((at_start, row, k))
-        for e in sorted(inner, key=lambda e: -float(graph.lengths[e])):
-            if stop():
-                return False
-            twin = int(graph.twins[e])
-            self.checked += 1
-            if not free(states[[graph.ends[twin]]], states[[graph.ends[e]]])[0]:
-                self._usable[[e, twin]] = 0
-                return False
-            self._known[[e, twin]] = True
+            self._free.add(motion)
         return True
