@@ -96,22 +96,31 @@ def test_paths_are_the_shortest_of_the_free_ones(seed: int, count: int) -> None:
     def free(first: Array, last: Array) -> Flags:
         return np.asarray(np.sin(40.0 * (first + last).sum(axis=1)) > -0.5)  # the same both ways
 
-    search = LazySearch(graph, usable, starts, goals)
+    known = rng.random(count) < 0.5  # of the others it is found when a path uses them that some are blocked
+    hidden = ~known & (rng.random(count) < 0.3)
+
+    def nodes_free(states: Array) -> Flags:
+        places = [int(np.flatnonzero((graph.states == q).all(axis=1))[0]) for q in states]
+        assert not known[places].any()
+        return np.asarray(~hidden[places])
+
+    search = LazySearch(graph, usable, starts, goals, free_nodes=usable & known)
+    before, usable = usable, usable & ~hidden
     matrix = np.zeros((count + 4, count + 4))
     open_edges = free(graph.states[firsts], graph.states[graph.ends]) & usable[firsts] & usable[graph.ends]
     matrix[firsts[open_edges], graph.ends[open_edges]] = graph.lengths[open_edges]
     for k, (row, which) in enumerate(((0, "start"), (1, "start"), (0, "goal"), (1, "goal"))):
         q = starts[row] if which == "start" else goals[row]
-        nodes = np.flatnonzero(usable & (rng.random(count) < 0.3))
+        nodes = np.flatnonzero(before & (rng.random(count) < 0.3))
         search.connect(**{which: row}, nodes=nodes)
-        good = nodes[free(np.repeat(q[None], len(nodes), axis=0), graph.states[nodes])]
+        good = nodes[free(np.repeat(q[None], len(nodes), axis=0), graph.states[nodes]) & usable[nodes]]
         ways = np.linalg.norm(graph.states[good] - q, axis=1)
         if which == "start":
             matrix[count + k, good] = ways
         else:
             matrix[good, count + k] = ways
     away = dijkstra(csr_array(matrix), indices=[count, count + 1])[:, [count + 2, count + 3]].min()
-    path = search.run(free, lambda: False)
+    path = search.run(free, lambda: False, nodes_free=nodes_free)
     if path is None:
         assert np.isinf(away)
         return

@@ -1,4 +1,4 @@
-"""Controls of the closed loop: path integrals, a potential field, and a tree that is kept."""
+"""Controls of the closed loop: path integrals, a potential field, a tree that is kept, and a graph."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from apex_ompl.loop.run import run
 from apex_ompl.loop.short_horizon import Horizon
 from apex_ompl.scene.bodies import Obstacle
 
-CONTROLS = ("mppi", "potential-field", "drrt")
+CONTROLS = ("mppi", "potential-field", "drrt", "damon")
 MOVING = "vertical/moving-medium-0.1/800000"
 
 
@@ -35,7 +35,7 @@ def test_nothing_is_touched_while_the_robot_moves(name: str) -> None:
     assert found.outcome is Outcome.REACHED and found.metrics["broken_steps"] == 0.0, found.reason
     assert found.metrics["limit_use"] <= 1.0 + 1e-9
     parts = {event.data["part"] for event in found.events if event.kind == "accepted"}
-    assert parts <= {"mppi", "field", "finish", "tree"}
+    assert parts <= {"mppi", "field", "finish", "tree", "graph"}
     if name == "potential-field":
         assert run(MOVING, name).events == found.events
 
