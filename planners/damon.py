@@ -19,7 +19,7 @@ from apex_ompl.ompl_adapter.space import array_to_path, forget_states, motions_f
 from apex_ompl.ompl_adapter.validity import StateValidityChecker
 from apex_ompl.planners.registry import Parameters, bounded, one_of, register
 from apex_ompl.roadmaps.damon import Damon
-from apex_ompl.roadmaps.manifold import load_manifold
+from apex_ompl.roadmaps.manifold import shared_manifold
 from apex_ompl.trajopt.path import Path
 from apex_ompl.types import Array, Flags
 
@@ -145,5 +145,5 @@ class DAMONParameters(Parameters):
             expected = "apex_ompl's StateValidityChecker, as apex_ompl.setup sets it"
             raise ParameterError(f"state validity checker for {NAME}", type(validity_checker).__name__, expected)
         robot = validity_checker.checker.robot
-        manifold = load_manifold(self.model, robot.name)
+        manifold = shared_manifold(self.model, robot.name)
         return DAMON(si, validity_checker, Damon.of(manifold, robot.joint_names, self.nodes, self.connections))

@@ -13,6 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from ompl import base as ob
+from planning import solved
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 from support import DATA, ROOT
@@ -25,11 +26,10 @@ from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError
 from apex_ompl.kernel import Kernel, RobotTables
 from apex_ompl.kernel.scene_builder import scene_tables
 from apex_ompl.ompl_adapter.setup import PlanningSetup, assemble
-from apex_ompl.ompl_adapter.space import path_to_array
 from apex_ompl.problems import load as load_problem
-from apex_ompl.roadmaps.latent_graph import consecutive, farthest_points, free_of_self_collision, neighbours
+from apex_ompl.roadmaps.latent_graph import farthest_points, free_of_self_collision, neighbours
 from apex_ompl.roadmaps.lazy_search import Graph, LazySearch
-from apex_ompl.roadmaps.manifold import BASELINES, load_manifold
+from apex_ompl.roadmaps.manifold import BASELINES, load_manifold, shared_manifold
 from apex_ompl.roadmaps.sampling import sample_states, split_sample
 from apex_ompl.robot import Robot
 from apex_ompl.types import Array, Flags
@@ -72,10 +72,6 @@ def test_neighbours_are_the_nearest(count: int) -> None:
         pool = [j for j in np.argsort(away)[: 5 * count + 1] if j != k]
         wanted = sorted(pool, key=lambda j: float(np.linalg.norm(states[j] - states[k])))[:count]
         assert found[k].tolist() == wanted
-
-
-def test_nodes_that_follow_each_other_along_paths_are_joined() -> None:
-    assert consecutive(np.array([0, 0, 3, 4, 4, 4])).tolist() == [[0, 1], [3, 4], [4, 5]]
 
 
 def random_graph(rng: np.random.Generator, count: int) -> Graph:
@@ -198,16 +194,6 @@ def test_edges_of_a_graph_are_free_of_self_collision(models: Path, robot: Robot)
         assert np.quantile(kernel.clearance(middle, 0.01)[:, 1], 0.01) > 0.0
 
 
-def solved(setup: PlanningSetup, planner: ob.Planner, seconds: float = 20.0) -> Array | None:
-    pdef = setup.simple_setup.getProblemDefinition()
-    pdef.clearSolutionPaths()
-    planner.setProblemDefinition(pdef)
-    status = planner.solve(ob.timedPlannerTerminationCondition(seconds))
-    assert setup.motion_validator.fault is None and setup.validity_checker.fault is None
-    found = status.getStatus() == ob.PlannerStatus.EXACT_SOLUTION
-    return path_to_array(pdef.getSolutionPath(), setup.robot.dof) if found else None
-
-
 def free_by_meshes(setup: PlanningSetup, path: Array) -> bool:
     """Whether a path is free by exact shapes alone, in a checker made anew, at the resolution of the search."""
     problem = setup.problem
@@ -299,6 +285,14 @@ def test_shipped_models_are_small_and_sound() -> None:
         manifold = load_manifold(name, "dual_panda_softhand")
         assert manifold.config.dim == int(name.removeprefix("damon-")) and len(manifold.latent) == 20_000
         assert not list((BASELINES / name).glob("*.p*t*")) and (BASELINES / name / "README.md").is_file()
+
+
+def test_a_manifold_is_read_once_until_it_changes(models: Path, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(models / "damon-2", tmp_path / "copy"))
+    first = shared_manifold(str(copy))
+    assert shared_manifold(str(copy)) is first and first.graph("stored") is first.graph("stored")
+    shutil.copytree(models / "damon-8", copy, dirs_exist_ok=True, copy_function=shutil.copyfile)
+    assert shared_manifold(str(copy)).config.dim == 8
 
 
 def test_it_solves_what_is_easy() -> None:

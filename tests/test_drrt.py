@@ -9,13 +9,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from ompl import base as ob
+from planning import solved
 
 from apex_ompl import plan, planners
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.changes import may_have_become_blocked
 from apex_ompl.collision.discretization import sample_path
 from apex_ompl.ompl_adapter.setup import PlanningSetup, assemble
-from apex_ompl.ompl_adapter.space import path_to_array, to_state
+from apex_ompl.ompl_adapter.space import to_state
 from apex_ompl.planners.drrt import DRRT
 from apex_ompl.problems import load as load_problem
 from apex_ompl.roadmaps.dynamic_rrt import DynamicRRT
@@ -116,18 +117,6 @@ def test_without_a_last_path_it_is_rrt() -> None:
     assert np.array_equal(found[0], start) and np.array_equal(found[-1], goal)
 
 
-def solved(setup: PlanningSetup, seconds: float = 20.0) -> Array | None:
-    pdef = setup.simple_setup.getProblemDefinition()
-    pdef.clearSolutionPaths()
-    planner = setup.simple_setup.getPlanner()
-    planner.setProblemDefinition(pdef)
-    status = planner.solve(ob.timedPlannerTerminationCondition(seconds))
-    assert setup.motion_validator.fault is None and setup.validity_checker.fault is None
-    if status.getStatus() != ob.PlannerStatus.EXACT_SOLUTION:
-        return None
-    return path_to_array(pdef.getSolutionPath(), setup.robot.dof)
-
-
 def planner_of(setup: PlanningSetup, **values: float) -> DRRT:
     planner = planners.make("drrt", setup.simple_setup.getSpaceInformation(), **{"seed": 1, "range": 0.3, **values})
     setup.simple_setup.setPlanner(planner)
@@ -158,14 +147,14 @@ def put_in_the_way(setup: PlanningSetup, path: Array) -> Obstacle:
 def test_the_tree_is_kept_where_it_is_still_free() -> None:
     setup = assemble(load_problem(EASY))
     planner = planner_of(setup)
-    first = solved(setup)
+    first = solved(setup, planner)
     tree = planner.search.tree
     assert first is not None and tree is not None and planner.removed == 0
     assert np.array_equal(first[0], setup.start) and np.array_equal(first[-1], setup.valid_goals[0])
     before, states = len(tree), {row.tobytes() for row in tree.states}
     moved = put_in_the_way(setup, first)
     assert not free_by_meshes(setup, moved, first[:-1], first[1:])
-    second = solved(setup)
+    second = solved(setup, planner)
     assert planner.search.tree is tree and 0 < planner.removed < before
     left = before - planner.removed
     assert left > tree.roots and {row.tobytes() for row in tree.states[:left]} <= states
@@ -180,14 +169,16 @@ def test_nodes_that_the_tree_has_already_are_no_new_search() -> None:
     """The robot is on its way along the path: what is kept holds the rest of it."""
     setup = assemble(load_problem(EASY))
     planner = planner_of(setup)
-    first = solved(setup)
+    first = solved(setup, planner)
     assert first is not None and planner.search.tree is not None
     size = len(planner.search.tree)
     pdef = setup.simple_setup.getProblemDefinition()
     pdef.clearStartStates()
     pdef.addStartState(to_state(setup.simple_setup.getSpaceInformation(), first[1]))
     planner.clearQuery()
-    assert np.array_equal(solved(setup), first[1:]) and len(planner.search.tree) == size and planner.removed == 0
+    assert (
+        np.array_equal(solved(setup, planner), first[1:]) and len(planner.search.tree) == size and planner.removed == 0
+    )
 
 
 def test_what_is_proved_clear_of_a_change_is_free(robot: Robot, post: Obstacle) -> None:

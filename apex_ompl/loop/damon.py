@@ -14,7 +14,7 @@ from apex_ompl.loop.search import Search
 from apex_ompl.planners.registry import parameters
 from apex_ompl.roadmaps.damon import Damon
 from apex_ompl.roadmaps.lazy_search import Motion
-from apex_ompl.roadmaps.manifold import load_manifold
+from apex_ompl.roadmaps.manifold import shared_manifold
 from apex_ompl.types import Array, Flags
 from apex_ompl.util.resolution import SEARCH_RESOLUTION
 
@@ -51,7 +51,7 @@ class ManifoldGraph:
         """
         values = parameters(PLANNER)
         robot = ready.setup.robot
-        manifold = load_manifold(str(getattr(values, "model")), robot.name)  # noqa: B009 - of a subclass
+        manifold = shared_manifold(str(getattr(values, "model")), robot.name)  # noqa: B009 - of a subclass
         kind, connections = getattr(values, "nodes"), getattr(values, "connections")  # noqa: B009
         self.damon = Damon.of(manifold, robot.joint_names, kind, connections)
         self._usable.clear()

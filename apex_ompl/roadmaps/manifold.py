@@ -7,6 +7,7 @@ import json
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -79,7 +80,7 @@ class Manifold:
 
     def graph(self, kind: str) -> Graph:
         """Return the graph of the nodes of a kind, ``decoded`` or ``stored``."""
-        return Graph.of(self.states(kind), self.pairs[kind])
+        return _graph(self, kind)
 
 
 def halved(weights: Mapping[str, NDArray[np.float32]]) -> dict[str, NDArray[np.float32]]:
@@ -171,6 +172,28 @@ def load_manifold(name: str, robot: str | None = None) -> Manifold:
     autoencoder = StateAutoencoder(weights, arrays["lower"].astype(float), arrays["upper"].astype(float))
     pairs = {kind: arrays[f"edges.{kind}"].astype(np.int64) for kind in (DECODED, STORED)}
     return Manifold(config, autoencoder, arrays["latent"].astype(float), arrays["stored"].astype(float), pairs)
+
+
+def shared_manifold(name: str, robot: str | None = None) -> Manifold:
+    """Return a manifold from a cache; it is read again when its files change.
+
+    Raises:
+        ApexError: As :func:`load_manifold` does.
+    """
+    files = [folder_of(name) / file for file in (CONFIG, WEIGHTS)]
+    stamp = tuple(file.stat().st_mtime_ns for file in files if is_file(file))
+    return _shared(str(files[0].parent.absolute()), robot, stamp)
+
+
+@lru_cache(maxsize=4)
+def _shared(folder: str, robot: str | None, stamp: tuple[int, ...]) -> Manifold:
+    del stamp
+    return load_manifold(folder, robot)
+
+
+@lru_cache(maxsize=4)
+def _graph(manifold: Manifold, kind: str) -> Graph:
+    return Graph.of(manifold.states(kind), manifold.pairs[kind])
 
 
 def _fault(arrays: Mapping[str, NDArray[Any]], config: ManifoldConfig) -> str:
