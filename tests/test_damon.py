@@ -27,7 +27,7 @@ from apex_ompl.kernel import Kernel, RobotTables
 from apex_ompl.kernel.scene_builder import scene_tables
 from apex_ompl.ompl_adapter.setup import PlanningSetup, assemble
 from apex_ompl.problems import load as load_problem
-from apex_ompl.roadmaps.latent_graph import farthest_points, free_of_self_collision, neighbours
+from apex_ompl.roadmaps.latent_graph import consecutive, farthest_points, free_of_self_collision, neighbours
 from apex_ompl.roadmaps.lazy_search import Graph, LazySearch
 from apex_ompl.roadmaps.manifold import BASELINES, load_manifold, shared_manifold
 from apex_ompl.roadmaps.sampling import sample_states, split_sample
@@ -63,7 +63,7 @@ def test_farthest_points_are_spread(seed: int, count: int, dim: int) -> None:
 
 @pytest.mark.parametrize("count", [3, 12])
 def test_neighbours_are_the_nearest(count: int) -> None:
-    """As by brute force: of the nearest in latent space, the nearest in joint space."""
+    """As by brute force: of the nearest in latent space, the nearest in joint space; and nodes along paths follow."""
     rng = np.random.default_rng(count)
     latent, states = rng.normal(size=(700, 2)), rng.normal(size=(700, 5))
     found = neighbours(latent, states, count)
@@ -72,6 +72,7 @@ def test_neighbours_are_the_nearest(count: int) -> None:
         pool = [j for j in np.argsort(away)[: 5 * count + 1] if j != k]
         wanted = sorted(pool, key=lambda j: float(np.linalg.norm(states[j] - states[k])))[:count]
         assert found[k].tolist() == wanted
+    assert consecutive(np.array([0, 0, 3, 4, 4, 4])).tolist() == [[0, 1], [3, 4], [4, 5]]
 
 
 def random_graph(rng: np.random.Generator, count: int) -> Graph:
