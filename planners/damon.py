@@ -120,6 +120,8 @@ class DAMON(ob.Planner):
 class DAMONParameters(Parameters):
     """DAMON (arXiv 2203.13282): A* over a graph on a learned manifold of states, reimplemented.
 
+    The number of connections is what ``python benchmarks/roadmaps.py --tune`` chose on the validation split.
+
     Attributes:
         model: Name of a folder of the tree's ``benchmarks/baselines``, or a path; it has the dimension of the manifold.
         nodes: ``decoded``, nodes are what the decoder makes of their latent vectors, as the paper has it, or
@@ -130,7 +132,7 @@ class DAMONParameters(Parameters):
     smooth: ClassVar[bool] = False
     model: str = "damon-8"
     nodes: str = one_of("decoded", "stored")
-    connections: int = bounded(100, 1, 10_000)
+    connections: int = bounded(1000, 1, 10_000)
 
     def build(self, si: ob.SpaceInformation) -> ob.Planner:
         """Return the planner.
