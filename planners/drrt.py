@@ -129,8 +129,8 @@ class DRRT(ob.Planner):
 class DRRTParameters(Parameters):
     """Dynamic RRT (Ferguson, Kalra and Stentz 2006): a tree from the goal, kept between calls of ``solve``.
 
-    Range and bias are what ``python benchmarks/roadmaps.py --tune`` chose on the validation split; the share of
-    way-points, which a static scene does not need, is 0.6 as in the way-point cache of Bruce and Veloso (2002).
+    Range and goal bias are what ``python benchmarks/roadmaps.py --tune`` chose on the validation split; the share of
+    way-points, which are used from the second call of ``solve`` on, was not tuned.
 
     Attributes:
         range: Longest step of the tree, by the largest change of a joint.
