@@ -13,20 +13,20 @@ import json
 import time
 from collections import defaultdict
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import record
-from numpy.typing import NDArray
 
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.live.movers import Movers, clearance_in_time, curve_of, prove_motion
 from apex_ompl.live.retime import retime
 from apex_ompl.live.timed_spline import MotionOptimizer, Start, TimedSpline
 from apex_ompl.loop.charges import TABLE, Charges
-from apex_ompl.loop.dynamic_rrt import Clearances, DynamicRRT
+from apex_ompl.loop.damon import ManifoldGraph
+from apex_ompl.loop.drrt import Clearances, KeptTree
 from apex_ompl.loop.following import Following
-from apex_ompl.loop.goal_tree import GoalTree
 from apex_ompl.loop.gpmp2 import CHARGE, IncrementalGPMP2
 from apex_ompl.loop.mppi import PathIntegral, softmax
 from apex_ompl.loop.paper import OneProposal
@@ -41,15 +41,16 @@ from apex_ompl.loop.snapshot import Snapshot
 from apex_ompl.ompl_adapter.process import quiet_ompl
 from apex_ompl.ompl_adapter.setup import assemble
 from apex_ompl.problems import worlds
+from apex_ompl.roadmaps.goal_tree import GoalTree
+from apex_ompl.roadmaps.lazy_search import LazySearch
 from apex_ompl.trajectory import time_path
 from apex_ompl.trajopt.optimizer import Optimizer
-from apex_ompl.types import Array
+from apex_ompl.types import Array, Flags
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.files import write_atomically
-from apex_ompl.util.resolution import SEARCH_RESOLUTION
 from apex_ompl.util.validation import one_or_more
 
-DEPENDS = ("@planning", "apex_ompl/live", "apex_ompl/loop", "apex_ompl/trajectory")
+DEPENDS = ("@planning", "apex_ompl/live", "apex_ompl/loop", "apex_ompl/roadmaps", "apex_ompl/trajectory")
 REPEATS = 5
 
 
@@ -147,20 +148,37 @@ def controls(name: str, found: dict[str, list[float]]) -> None:
     begun = factors.supports(search, guess, guess.duration)
     count = graph.maximum(begun, factors.iterations, 0.0).evaluations * len(graph.times)
     found[CHARGE].append(seconds(lambda: graph.maximum(begun, factors.iterations, 0.0)) / count)
-    tree = GoalTree(ready.goals, DynamicRRT.step, SEARCH_RESOLUTION, 200)
+    step = KeptTree().search.step
+    tree = GoalTree(ready.goals, step, 200)
     while not tree.full:
         q = search.rng.uniform(ready.limits.lower, ready.limits.upper)
-        tree.extend(tree.nearest(q), q, lambda states: np.ones(len(states), bool))
-    tree.trim(lambda states: np.arange(len(states)) < len(states) - 1)
-    clear, q = Clearances(search), search.start.position
-    before, counts = seconds(lambda: clear(tree.edges[0])), len(tree.edges[0])
+        tree.extend(tree.nearest(q), q, lambda first, last: np.ones(len(first), bool))
+    tree.trim(lambda first, last: np.arange(len(first)) < len(first) - 1)
+    clear, q = Clearances(search, step), search.start.position
+    first, last = (ends[:1] for ends in tree.edges)
+    before, counts = seconds(lambda: clear.edges(first, last)), clear.count
     each = max(before - counts * (moving / len(states) + own / len(some)), 0.0)
     found["extension of a tree"].append(each + seconds(lambda: tree.extend(tree.nearest(q), q, refused)))
 
 
-def refused(states: Array) -> NDArray[np.bool_]:
-    """Return that no state is clear."""
-    return np.zeros(len(states), bool)
+def graph(name: str, found: dict[str, list[float]]) -> None:
+    """Add what a query of DAMON's graph costs before it searches, and each node that a search reaches."""
+    setup = assemble(worlds.load(name).problem.still)
+    ready, source = Ready(setup, setup.robot.limits, setup.robot.limits, LoopSettings()), ManifoldGraph()
+    source.prepare(ready)
+    damon = source.damon
+    states, start = damon.states(setup.start), setup.start[None]
+    usable = np.ones(len(states), bool)
+    found["query of a graph"].append(seconds(lambda: damon.search(states, usable, start, ready.goals)))
+    search, reached = LazySearch(replace(damon.graph, states=states), usable, start, ready.goals), list[int]()
+    search.connect(start=0, nodes=np.arange(100))  # and no goal: all that can be reached is
+    taken = seconds(lambda: search.run(refused, lambda: False, reached.append))
+    found["node of a graph"].append(taken / max(reached[0], 1))
+
+
+def refused(first: Array, last: Array) -> Flags:
+    """Return that no motion is clear."""
+    return np.zeros(len(first), bool)
 
 
 def trees() -> dict[str, float]:
@@ -213,6 +231,7 @@ def main() -> None:
     for name in worlds.ids("moving", "validation", args.n):
         measured(name, found)
         controls(name, found)
+        graph(name, found)
     table = {kind: float(np.median(values)) for kind, values in found.items()} | network() | trees()
     rows = [["kind of work", "us a unit"], ["---", "---:"], *([kind, f"{1e6 * v:.3g}"] for kind, v in table.items())]
     if args.write:

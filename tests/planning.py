@@ -11,6 +11,7 @@ from ompl import base as ob
 from ompl import geometric as og
 
 from apex_ompl import problems
+from apex_ompl.ompl_adapter.setup import PlanningSetup
 from apex_ompl.ompl_adapter.space import path_to_array
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.scene.problem import Problem
@@ -32,6 +33,16 @@ def cached_problem(name: str) -> Problem:
 
 def states(setup: og.SimpleSetup) -> np.ndarray:
     return path_to_array(setup.getSolutionPath(), robot().dof)
+
+
+def solved(setup: PlanningSetup, planner: ob.Planner, seconds: float = 20.0) -> np.ndarray | None:
+    """The path that a planner finds, solving alone and not anew, or None."""
+    pdef = setup.simple_setup.getProblemDefinition()
+    pdef.clearSolutionPaths()
+    planner.setProblemDefinition(pdef)
+    status = planner.solve(within(seconds)).getStatus()
+    setup.raise_faults()
+    return path_to_array(pdef.getSolutionPath(), setup.robot.dof) if status == EXACT else None
 
 
 # Parameters of apex that turn its other stages off.

@@ -17,6 +17,7 @@ LAYERS = [
     {"trajopt"},
     {"collision"},
     {"tasks", "trajectory", "datasets"},
+    {"roadmaps"},
     {"diffusion", "ompl_adapter"},
     {"apex"},
     {"planners", "problems"},

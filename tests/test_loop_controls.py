@@ -1,4 +1,4 @@
-"""Controls of the closed loop: path integrals, a potential field, and a tree that is kept."""
+"""Controls of the closed loop: path integrals, a potential field, a tree that is kept, and a graph."""
 
 from __future__ import annotations
 
@@ -7,11 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from loops import PROBLEM, crossing, go, setup_of
-from numpy.typing import NDArray
 
 from apex_ompl.live.movers import Movers
 from apex_ompl.live.timed_spline import Start
-from apex_ompl.loop.goal_tree import GoalTree
 from apex_ompl.loop.methods import METHODS
 from apex_ompl.loop.mppi import softmax
 from apex_ompl.loop.potential_field import Field, PotentialField, repulsive
@@ -20,7 +18,7 @@ from apex_ompl.loop.run import run
 from apex_ompl.loop.short_horizon import Horizon
 from apex_ompl.scene.bodies import Obstacle
 
-CONTROLS = ("mppi", "potential-field", "dynamic-rrt")
+CONTROLS = ("mppi", "potential-field", "drrt", "damon")
 MOVING = "vertical/moving-medium-0.1/800000"
 
 
@@ -37,7 +35,7 @@ def test_nothing_is_touched_while_the_robot_moves(name: str) -> None:
     assert found.outcome is Outcome.REACHED and found.metrics["broken_steps"] == 0.0, found.reason
     assert found.metrics["limit_use"] <= 1.0 + 1e-9
     parts = {event.data["part"] for event in found.events if event.kind == "accepted"}
-    assert parts <= {"mppi", "field", "finish", "tree"}
+    assert parts <= {"mppi", "field", "finish", "tree", "graph"}
     if name == "potential-field":
         assert run(MOVING, name).events == found.events
 
@@ -107,38 +105,3 @@ def test_repulsion_has_no_step_where_it_goes_on_as_a_tangent() -> None:
     values = [repulsive(share) for share in shares.tolist()]
     assert np.allclose(values[0], values[1], rtol=1e-6) and values[2] == (0.0, 0.0)
     assert repulsive(-1.0)[0] > repulsive(0.0)[0] > repulsive(0.25)[0]
-
-
-def test_a_trimmed_tree_keeps_what_is_clear_and_nothing_else() -> None:
-    rng = np.random.default_rng(2)
-
-    def free(states: np.ndarray) -> NDArray[np.bool_]:
-        return np.ones(len(states), bool)
-
-    tree = GoalTree(np.array([[0.0, 0.0], [1.0, 1.0]]), 0.2, 0.03, 300)
-    for _ in range(300):
-        q = rng.uniform(-1.0, 2.0, 2)
-        tree.extend(tree.nearest(q), q, free)
-    assert len(tree) == 302 and tree.full
-    states, parents, edges = tree.states.copy(), tree.parents.copy(), tree.edges.copy()
-    assert np.abs(np.diff(edges, axis=1)).max() <= 0.03 and np.array_equal(edges[:, -1], states[2:])
-    centre = np.array([0.7, 0.3])
-
-    def clear(some: np.ndarray) -> NDArray[np.bool_]:
-        return np.asarray(np.linalg.norm(some - centre, axis=1) > 0.3)
-
-    def connected(k: int) -> bool:
-        while parents[k] >= 0:
-            if not clear(edges[k - 2]).all():
-                return False
-            k = int(parents[k])
-        return True
-
-    wanted = np.array([connected(k) for k in range(302)])
-    tree.trim(clear)
-    assert 2 < wanted.sum() < 302 and np.array_equal(tree.states, states[wanted])
-    assert clear(tree.edges.reshape(-1, 2)).all()
-    for k in range(len(tree)):
-        path = tree.path(k)
-        assert np.array_equal(path[0], tree.states[k]) and tree.at(path[-1]) in (0, 1)
-        assert np.abs(np.diff(path, axis=0)).max(initial=0.0) <= 0.2 + 1e-12

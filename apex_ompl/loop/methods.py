@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from apex_ompl.errors import UnknownNameError
-from apex_ompl.loop.dynamic_rrt import DynamicRRT
+from apex_ompl.loop.damon import ManifoldGraph
+from apex_ompl.loop.drrt import KeptTree
 from apex_ompl.loop.gpmp2 import IncrementalGPMP2
 from apex_ompl.loop.mppi import PathIntegral
 from apex_ompl.loop.paper import OneProposal
@@ -71,8 +72,11 @@ METHODS = {
     "gpmp2": Method(IncrementalGPMP2, {}, "GPMP2 from the moving robot, warm from the last motion (as iGPMP2)"),
     "mppi": Method(PathIntegral, {}, "model predictive path integral control"),
     "potential-field": Method(PotentialField, {}, "a reflex down an artificial potential"),
-    "dynamic-rrt": Method(
-        DynamicRRT, FROM_REST, "stops where the way is blocked; a tree from the goal that is kept and repaired"
+    "drrt": Method(
+        KeptTree, FROM_REST, "dynamic RRT: stops where the way is blocked; a tree from the goal, kept and repaired"
+    ),
+    "damon": Method(
+        ManifoldGraph, FROM_REST, "DAMON: stops where the way is blocked; A* over a graph on a learned manifold"
     ),
 }  # fmt: skip
 

@@ -14,7 +14,7 @@ from ompl import base as ob
 from ompl import geometric as og
 
 from apex_ompl.robot import Robot
-from apex_ompl.types import Array
+from apex_ompl.types import Array, Flags
 from apex_ompl.util.resolution import SEARCH_RESOLUTION
 
 Bounds = tuple[Array, Array]
@@ -82,6 +82,21 @@ def array_to_path(si: ob.SpaceInformation, states: Array) -> og.PathGeometric:
         state[0 : len(q)] = [float(v) for v in q]
         path.append(state)  # a copy
     return path
+
+
+def motions_free(si: ob.SpaceInformation, first: Array, last: Array) -> Flags:
+    """Return whether straight motions are free by the motion validator of ``si``, shape (N,).
+
+    Args:
+        si: OMPL's space information.
+        first: States that they begin at, taken to be free, shape (N, dof).
+        last: States that they end at, shape (N, dof).
+    """
+    a, b, found = si.allocState(), si.allocState(), []
+    for p, q in zip(first.tolist(), last.tolist(), strict=True):
+        a[0 : len(p)], b[0 : len(q)] = p, q
+        found.append(bool(si.checkMotion(a, b)))
+    return np.array(found, bool)
 
 
 def forget_states(error: BaseException) -> None:
