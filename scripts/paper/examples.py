@@ -16,7 +16,9 @@ from paper.rows import FAITHFUL, MOVING, TASKS, UNGUIDED
 
 from apex_ompl.benchmark.runs import Run
 from apex_ompl.benchmark.summary import Table
+from apex_ompl.loop.referee import judge
 from apex_ompl.loop.result import Outcome, RunResult
+from apex_ompl.problems.suite_robot import robot
 from apex_ompl.trajectory import Trajectory
 
 STRIP_LEVELS = {"small": f"{TASKS[1]}/moving-small-0.1", "large": f"{TASKS[1]}/moving-huge-0.1"}
@@ -66,7 +68,7 @@ def failures(args: Namespace) -> Made:
     labels = list(dict.fromkeys(label for kind in KINDS.values() for label in kind.labels))
     _, results = loop_runs(args, labels=labels)
     found = {name: first_failure(results.runs, kind) for name, kind in KINDS.items()}
-    notes, commits = of_runs(results)
+    notes, commits = of_runs(results, planned=False)
     rule = "; ".join(f"{name}: {', '.join(map(str, kind.outcomes))} by {', else '.join(kind.labels)}"
                      for name, kind in KINDS.items())  # fmt: skip
     notes.append(("Rule", f"the first world of the test split that fails so, of the first method that has one: {rule}"))
@@ -77,7 +79,7 @@ def strips(args: Namespace) -> Made:
     """Return a run with and one without guidance, by a small and by a large cube."""
     levels, labels = list(STRIP_LEVELS.values()), (FAITHFUL, UNGUIDED)
     _, results = loop_runs(args, levels, labels)
-    notes, commits = of_runs(results)
+    notes, commits = of_runs(results, planned=False)
     found: dict[str, Run | None] = {}
     for size, level in STRIP_LEVELS.items():
         of = {label: {r["seed"]: r for r in results.runs if (r["experiment"], r["label"]) == (level, label)}
@@ -131,9 +133,10 @@ def strip(result: RunResult) -> np.ndarray:
 
     from apex_ompl.viz.render import render
 
-    contact = [event.time for event in result.events if event.kind == "contact"]
-    if contact and contact[0] < result.trajectory.duration:
-        result = replace(result, trajectory=until(result.trajectory, contact[0] + AFTER))
+    report = judge(robot(), result.problem, result.trajectory)
+    contacts = [hit.time for hit in (report.contact, report.still_contact) if hit is not None]
+    if contacts:
+        result = replace(result, trajectory=until(result.trajectory, min(contacts) + AFTER))
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "strip.png"
         render(result, file, PICTURE)

@@ -58,7 +58,7 @@ def fid(args: Any) -> Made:
         axis.set_title(f"FID, {name} features (dots: floor)")
         axis.set_xticks(range(len(rows)), [row.label for row in rows], rotation=40, fontsize=7, ha="right")
     head = ["features", "paths", "N", "d", "FID", "95 %", "floor", "KID", "CPU ms a path"]
-    notes, commits = of_runs(results)
+    notes, commits = of_runs(results, planned=False)
     notes += [
         ("Real", f"solutions of {len(real)} validation problems, one each, of {', '.join(LEVELS)}"),
         ("Made", f"one path for each: of the models one proposal, valid or not, of apex by its own sampling, of "

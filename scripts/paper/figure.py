@@ -83,15 +83,22 @@ def ratio_cells(cell: Mapping[str, Any]) -> list[str]:
     return [str(cell["N"]), f"{cell['R_f']:.1f}", f"{low:.1f} to {high:.1f}"]
 
 
-def of_runs(results: Results) -> tuple[Notes, str]:
-    """Return the provenance of runs, with warnings for a reader of the times, and their commits."""
+def of_runs(results: Results, *, planned: bool = True) -> tuple[Notes, str]:
+    """Return the provenance of runs, and their commits.
+
+    Args:
+        results: The runs.
+        planned: Whether the runs were planned by OMPL's Benchmark, so that its notes and warnings are of interest.
+    """
     commits = record.made_with(results)["run_commits"]
     sessions = results.sessions()
-    short = [pair for pair in about(results) if pair[0] != "Command"]
+    wanted = {"Hardware", "Versions", "Split and first seed", *(("Spacing of states",) if planned else ())}
+    short = [pair for pair in about(results) if pair[0] in wanted]
     commands = dict.fromkeys(f"{one['command']} ({one['jobs']} at a time)" for one in sessions)
     dates = sorted(one["date"][:10] for one in sessions)
     made = [("Commands", "; ".join(commands)), ("Dates", f"{dates[0]} to {dates[-1]}")]
-    return [*made, *short, ("Commits of the runs", commits), *(("Note", w) for w in warnings(results))], commits
+    notes = [("Note", warning) for warning in warnings(results)] if planned else []
+    return [*made, *short, ("Commits of the runs", commits), *notes], commits
 
 
 def number(value: float | None, digits: int = 2) -> str:

@@ -89,7 +89,7 @@ def dynamic(args: Namespace) -> Made:
         sweeps.append(["large", row.label, *cells(cell)])
     head = ["N", "R_f %", "95 %"]
     more = [*head, "causes", "S_r rad", "time to goal s", "replans"]
-    notes, commits = of_runs(results)
+    notes, commits = of_runs(results, planned=False)
     notes += [
         ("Loop", f"{LIMIT:g} s at most, {PACE:g} of the velocity limits, replans charged by the table of costs, "
                  f"version {cost_table()['version']}; ideal: its answer is known at once"),
