@@ -82,7 +82,8 @@ def denoising(args: Namespace) -> Made:
             at = axes[row, column]
             outlines(at, ready, first, second)
             for body, line in palm_positions(kernel, snapshots[moment]).items():
-                at.plot(line[:, first], line[:, second], color=HANDS[body], lw=1.2)
+                hand = body.partition("_palm")[0].replace("_", " ")
+                at.plot(line[:, first], line[:, second], color=HANDS[body], lw=1.2, label=hand)
                 at.plot(*line[0, [first, second]], "P", color=HANDS[body], ms=7)
                 at.plot(*line[-1, [first, second]], "v", color=HANDS[body], ms=7)
             at.set_aspect("equal")
@@ -91,6 +92,7 @@ def denoising(args: Namespace) -> Made:
         axes[1, column].set_xlabel("x m")
     axes[0, 0].set_ylabel("y m")
     axes[1, 0].set_ylabel("z m")
+    axes[0, -1].legend(loc="lower right", fontsize=8)
     lengths = {str(moment): path_length(snapshots[moment]) for moment in moments}
     table = Table("Denoising", ["t", "model", "S_r rad"], [[t, DENOISER, f"{x:.2f}"] for t, x in lengths.items()])
     notes = [("Problem", DENOISED), ("Seed", SEED), ("Sampling", f"DDPM, {steps} steps, guided in the last quarter")]
