@@ -1,7 +1,7 @@
 """All comparisons with other planners, one command after the other; each resumes where it was stopped.
 
-benchmarks/head_to_head.py, standing.py, time_to_quality.py and peers.py. The reference lengths of time_to_quality.py are
-made only where they are missing. The paper's figures have a command of their own, scripts/reproduce.py.
+benchmarks/head_to_head.py, standing.py, time_to_quality.py and peers.py. The reference lengths of time_to_quality.py
+are made only where they are missing. The paper's figures have a command of their own, scripts/reproduce.py.
 
 Usage: python benchmarks/comparisons.py [--jobs 1]    (needs the extras "bench" and "peers")
 """
