@@ -52,9 +52,10 @@ def fid(args: Any) -> Made:
             measured = [str(r.dimension), f"{r.fid:.2f}", ends, f"{r.floor:.2f}", f"{r.kid:.4f}", f"{took:.1f}"]
             lines.append([name, row.label, f"{r.made} of {len(mine)}", *measured])
             axis.bar(k, r.fid, color=colour(row.label))
-            axis.plot([k, k], r.interval, color="black", linewidth=1)
+            axis.plot([k, k], np.maximum(r.interval, 1e-2), color="black", linewidth=1)
             floor = max(floor, r.floor)
         axis.axhline(floor, color="grey", linestyle=":")
+        axis.set_yscale("log")
         axis.set_title(f"FID, {name} features (dots: floor)")
         axis.set_xticks(range(len(rows)), [row.label for row in rows], rotation=40, fontsize=7, ha="right")
     head = ["features", "paths", "N", "d", "FID", "95 %", "floor", "KID", "CPU ms a path"]
