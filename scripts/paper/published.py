@@ -43,7 +43,7 @@ PICTURES = {
 }
 """Pictures of the page, by result."""
 
-STILL = "N and sizes are not given: ours are one to three cubes of 6 to 30 cm"
+STILL = "N and sizes are not given: ours are one to three cubes of 6 to 30 cm, with 10 s for each problem"
 CUBE = "one cube, three speeds; replans are charged"
 LARGEST = "cubes of 30 cm; the models were trained with edges up to 15 cm, `apex-paper` sees one point of them"
 
@@ -107,7 +107,7 @@ class Rival:
 
 
 RIVALS = (
-    Rival("APEX", "5.57, 8.95", "2.36", "apex-paper", "apex-paper", "the system as the paper has it"),
+    Rival("APEX", "5.57, 8.95", "2.36", "apex-paper", "apex-paper", "in 10 s: about two rounds of eight proposals"),
     Rival("APEX", "", "", "apex", "apex", "this planner: network, trees, repair, full check"),
     Rival("RRT", "48.12", "8.72", "rrt", "", "OMPL's, 10 s, simplified; the paper's source is not named"),
     Rival("RRT", "", "", "drrt", "drrt", "a tree from the goal that is kept and repaired"),
@@ -119,4 +119,6 @@ RIVALS = (
     Rival("IL", "", "", "il, repaired", "", "a control: the same, then trajectory optimization"),
     Rival("DAMON", "32.65", "6.25", "damon, decoded", "damon", "made from its abstract; states decoded from a plane"),
     Rival("DAMON", "", "", "damon, stored", "", "the same with the states that the plane was learned from"),
+    Rival("DAMON", "", "", "damon, decoded, 4 dimensions", "", "the same with four dimensions"),
+    Rival("DAMON", "", "", "damon, decoded, 8 dimensions", "", "the same with eight"),
 )

@@ -36,6 +36,8 @@ PLANNERS = (
     Row("il-paper", "il-paper"),
     Row("damon, decoded", "damon", {"nodes": "decoded"}),
     Row("damon, stored", "damon", {"nodes": "stored"}),
+    Row("damon, decoded, 4 dimensions", "damon", {"nodes": "decoded", "model": "damon-4"}),
+    Row("damon, decoded, 8 dimensions", "damon", {"nodes": "decoded", "model": "damon-8"}),
 )
 """Planners, as the benchmark runs them. ``apex's model alone`` has neither trees nor repair, as ``apex-paper``."""
 
