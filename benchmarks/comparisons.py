@@ -1,9 +1,9 @@
 """All comparisons with other planners, one command after the other; each resumes where it was stopped.
 
-benchmarks/head_to_head.py, standing.py, time_to_quality.py and peers.py, then the paper's figures by
-scripts/reproduce.py. The reference lengths of time_to_quality.py are made only where they are missing.
+benchmarks/head_to_head.py, standing.py, time_to_quality.py and peers.py. The reference lengths of time_to_quality.py
+are made only where they are missing. The paper's figures have a command of their own, scripts/reproduce.py.
 
-Usage: python benchmarks/comparisons.py [--jobs 1]    (needs the extras "bench", "data" and "peers")
+Usage: python benchmarks/comparisons.py [--jobs 1]    (needs the extras "bench" and "peers")
 """
 
 from __future__ import annotations
@@ -19,14 +19,13 @@ from apex_ompl.util.validation import one_or_more
 
 ROOT = Path(__file__).resolve().parents[1]
 REFERENCE = ROOT / "benchmarks" / "reference_lengths.json"
-NEEDED = ("matplotlib", "ray", "roboplan")
+NEEDED = ("roboplan",)
 COMMANDS = (
     ("benchmarks/head_to_head.py",),
     ("benchmarks/standing.py",),
     *(() if REFERENCE.is_file() else (("benchmarks/time_to_quality.py", "--reference"),)),
     ("benchmarks/time_to_quality.py",),
     ("benchmarks/peers.py",),
-    *(("scripts/reproduce.py", figure) for figure in ("failure", "size", "fid")),
 )
 
 
@@ -37,7 +36,7 @@ def main() -> None:
     args = parser.parse_args()
     missing = [name for name in NEEDED if importlib.util.find_spec(name) is None]
     if missing:  # reported now, not after hours
-        parser.error(f"no {', '.join(missing)}, expected: pip install 'apex-ompl[bench,data,peers]'")
+        parser.error(f"no {', '.join(missing)}, expected: pip install 'apex-ompl[bench,peers]'")
     for command in COMMANDS:
         given = [*command, "--jobs", str(args.jobs)]
         print("$ python", *given, flush=True)

@@ -28,7 +28,7 @@ from apex_ompl.tasks.grasp import HandObjects
 from apex_ompl.types import Array
 
 SIZES = {"small": 0.06, "medium": 0.10, "large": 0.15, "xlarge": 0.20, "huge": 0.30}  # edges of the cubes [m]
-STATIC = ("small", "medium", "large", "extreme")
+STATIC = ("small", "medium", "large", "xlarge", "huge", "extreme")
 SPEEDS = (0.1, 0.2, 0.4)  # [m/s]
 MAX_CUBES = 3
 EXTREME_CUBES = {"vertical": 100, "horizontal": 70}

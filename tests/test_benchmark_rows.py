@@ -30,7 +30,8 @@ def test_rows_are_read_and_checked() -> None:
 
 
 def test_suites_stand_for_their_static_levels() -> None:
-    assert list(experiments(["vertical"])) == [f"vertical/{v}" for v in ("free", "small", "medium", "large", "extreme")]
+    levels = ("free", "small", "medium", "large", "xlarge", "huge", "extreme")
+    assert list(experiments(["vertical"])) == [f"vertical/{v}" for v in levels]
     assert experiments(["shelf/hard", "shelf_swap", "cage/easy/800001"]) == {
         "shelf/hard": True, "shelf_swap": False, "cage/easy/800001": False,
     }  # fmt: skip

@@ -28,7 +28,7 @@ from apex_ompl.trajopt.path import resample
 FOLDER = ROOT / "problems" / "frozen"
 SUITE_LEVELS = [(suite, level) for suite, levels in problems.suites().items() for level in levels]
 # Published results refer to these problems. With other frozen problems they have to be measured again.
-FROZEN = "435880ac795df4bd153c05c1a691bca194a43a03559c0c72ffc5522299784f94"
+FROZEN = "18f009f65003a2d8cce547f7a92e9a38930c12fab024fdcf57697ea2b234c6bd"
 MOVING = [pair for pair in SUITE_LEVELS if pair[1].startswith("moving-")]
 STATIC = [pair for pair in SUITE_LEVELS if pair not in MOVING]
 

@@ -52,7 +52,7 @@ def test_the_suites_and_levels_are_those_of_the_contract() -> None:
         assert suites[suite] == ("easy", "medium", "hard", *(("extreme",) if suite in EXTREME else ()))
     moving = {f"moving-{size}-{speed}" for size in alignment.SIZES for speed in ("0.1", "0.2", "0.4")}
     for suite in ("vertical", "horizontal"):
-        assert set(suites[suite]) == {"free", "small", "medium", "large", "extreme"} | moving and len(moving) == 15
+        assert set(suites[suite]) == {"free", *alignment.SIZES, "extreme"} | moving and len(moving) == 15
 
 
 @settings(max_examples=150)

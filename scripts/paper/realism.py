@@ -1,4 +1,4 @@
-"""Paths of the models beside solutions of the same problems, for FID and KID in ``reproduce.py fid``."""
+"""Paths of models and planners beside solutions of the same problems, for FID and KID in ``reproduce.py fid``."""
 
 from __future__ import annotations
 
@@ -13,8 +13,11 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from apex_ompl import problems
+from apex_ompl import plan, problems
 from apex_ompl.apex.query import make_query
+from apex_ompl.benchmark import Row
+from apex_ompl.benchmark.rows import Job
+from apex_ompl.benchmark.runs import Run
 from apex_ompl.datasets.engine import EngineOptions
 from apex_ompl.datasets.records import SOURCES, Paths
 from apex_ompl.datasets.store import Store
@@ -24,7 +27,6 @@ from apex_ompl.diffusion.guidance import Guidance
 from apex_ompl.diffusion.proposals import Sampling
 from apex_ompl.generation.solving import solve_unit
 from apex_ompl.generation.units import plan_units
-from apex_ompl.ompl_adapter.process import quiet_ompl
 from apex_ompl.ompl_adapter.setup import assemble
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.trajopt.spline import Spline
@@ -33,19 +35,49 @@ from apex_ompl.util.cluster import spread
 
 MODELS = ("apex", "apex-paper")
 STEPS = 8  # of DDIM, for apex-paper, whose own 256 would take hours
-BATCH = 50  # problems of a job
+DIGITS = 6  # of the control points that are stored
+PROPOSED, PLANNED = "paper.realism:proposed", "paper.realism:planned"
 
 load = cache(load_model)  # once in a process
 
 
-def variants() -> dict[str, tuple[str, Sampling]]:
-    """Return the variants by label: a model and its sampling, guided and unguided."""
-    own = {"apex": load("apex").sampling, "apex-paper": Sampling("ddim", STEPS)}
-    return {
-        f"{name}{'' if guided else ', unguided'}": (name, replace(own[name], guidance=Guidance(gamma=float(guided))))
-        for name in MODELS
-        for guided in (True, False)
-    }
+def proposing(model: str, *, guided: bool) -> Row:
+    """Return the row of the paths that a model proposes, one a problem, valid or not."""
+    label = model if guided else f"{model}, unguided"
+    return Row(label, model, {"gamma": float(guided)}, runner=PROPOSED)
+
+
+def planning(row: Row) -> Row:
+    """Return the row of the paths that a planner finds, as it is benchmarked elsewhere, valid ones only."""
+    return replace(row, runner=PLANNED)
+
+
+def proposed(job: Job) -> Run:
+    """Return one path of a model for a problem, as control points, and its CPU time [s]."""
+    torch.set_num_threads(1)
+    model = load(job.planner)
+    own = {"apex": load("apex").sampling, "apex-paper": Sampling("ddim", STEPS)}[job.planner]
+    sampling = replace(own, guidance=Guidance(gamma=job.params["gamma"]))
+    ready = assemble(problems.load(job.problem), robot())
+    query = make_query(ready.checker, ready.start, ready.goals[0])
+    begin = time.process_time()  # other work on the machine does not count
+    with torch.no_grad():
+        generator = np.random.default_rng(job.seed)
+        made = model.propose(query, ready.checker.kernel, 1, sampling=sampling, generator=generator)
+    took = time.process_time() - begin
+    return {"solved": True, "total": took, "control": np.round(made.control[0], DIGITS).tolist()}
+
+
+def planned(job: Job) -> Run:
+    """Return the path that a planner finds for a problem, as control points, and its CPU time [s]."""
+    begin = time.process_time()
+    result = plan(job.problem, job.planner, timeout=job.timeout, seed=job.seed, params=job.params, timing=False,
+                  simplify=job.simplify)  # fmt: skip
+    took = time.process_time() - begin
+    control = None
+    if result and result.path is not None:
+        control = np.round(Spline().fit(result.path.states).control, DIGITS).tolist()
+    return {"solved": control is not None, "reason": result.reason, "total": took, "control": control}
 
 
 def solutions(folder: Path, count: int, levels: Sequence[str], workers: int) -> list[Paths]:
@@ -64,50 +96,15 @@ def solutions(folder: Path, count: int, levels: Sequence[str], workers: int) -> 
         return list(store)
 
 
-def made_for(
-    units: Sequence[Paths], count: int, workers: int
-) -> tuple[list[Array], dict[str, list[Array]], dict[str, float]]:
-    """Return the first solution of each of ``count`` problems, and the paths of each variant for the same problems.
-
-    Returns:
-        The solutions, those of all levels in turn; by variant, paths in the same order, as control points; and the CPU
-        time of each variant [s].
-    """
+def one_each(units: Sequence[Paths], count: int) -> dict[str, Array]:
+    """Return the first solution of each of ``count`` problems as control points, by problem, the levels in turn."""
     by_level: dict[str, list[tuple[str, Array]]] = {}
     for unit in units:
         for k in first_of_each(unit):
             name = unit.problem_name(int(unit.arrays["problem"][k]))
             by_level.setdefault(name.rsplit("/", 1)[0], []).append((name, unit.control(slice(k, k + 1))[0]))
     in_turn = (one for some in zip_longest(*by_level.values()) for one in some if one is not None)
-    picked = list(islice(in_turn, count))
-    jobs = {str(k): (picked[k : k + BATCH], k) for k in range(0, len(picked), BATCH)}
-    found = dict(tqdm(spread(propose, jobs, workers=workers, address=None), total=len(jobs), unit="part"))
-    paths: dict[str, list[Array]] = {label: [] for label in variants()}
-    seconds = dict.fromkeys(paths, 0.0)
-    for part in (found[name] for name in jobs):
-        for label, (made, took) in part.items():
-            paths[label] += made
-            seconds[label] += took
-    return [control for _, control in picked], paths, seconds
-
-
-def propose(part: Sequence[tuple[str, Array]], seed: int) -> dict[str, tuple[list[Array], float]]:
-    """Return the paths of each variant for some problems, from their ends, and the CPU time that they took [s]."""
-    generator = np.random.default_rng(seed)
-    torch.set_num_threads(1)
-    sampled = variants()
-    made: dict[str, list[Array]] = {label: [] for label in sampled}
-    seconds = dict.fromkeys(made, 0.0)
-    with quiet_ompl(), torch.no_grad():
-        for problem, control in part:
-            checker = assemble(problems.load(problem), robot()).checker
-            query = make_query(checker, control[0], control[-1])
-            for label, (name, sampling) in sampled.items():
-                begin = time.process_time()  # other work on the machine does not count
-                found = load(name).propose(query, checker.kernel, 1, sampling=sampling, generator=generator)
-                seconds[label] += time.process_time() - begin
-                made[label].append(found.control[0])
-    return {label: (made[label], seconds[label]) for label in made}
+    return dict(islice(in_turn, count))
 
 
 def first_of_each(paths: Paths) -> list[int]:

@@ -1,22 +1,22 @@
-"""Draw how a model denoises a trajectory, and how diverse its trajectories are, as the paper's figures do.
+"""How a model denoises a trajectory, and how diverse its trajectories are, drawn as the paper's figures are.
 
-``denoising.png`` shows the paths of both hands at t = 0, 64, 128 and 256 of the reverse process (section IV-A), from
-above and from the side, the obstacles as grey outlines. ``diversity.png`` shows valid trajectories of one problem: x
-and y of both hands over the path, from start to goal (section IV-D).
-
-Usage: python scripts/draw_model.py [--model apex-paper] [--problem NAME] [--folder docs/pictures]
+``denoising`` shows the paths of both hands at t = 0, 64, 128 and 256 of the reverse process (section IV-A), from above
+and from the side, the obstacles as grey outlines. ``diversity`` shows valid trajectories of one problem: x and y of
+both hands over the path, from start to goal (section IV-D).
 """
 
 from __future__ import annotations
 
-import argparse
-from pathlib import Path
+from argparse import Namespace
 from typing import Any
 
 import numpy as np
+from paper.figure import Made, blank
 
 from apex_ompl import load_model, load_problem
 from apex_ompl.apex.query import make_query
+from apex_ompl.benchmark.metrics import diversity as mean_distance
+from apex_ompl.benchmark.summary import Table
 from apex_ompl.diffusion.guidance import Guidance
 from apex_ompl.diffusion.proposals import Sampling
 from apex_ompl.kernel import Kernel
@@ -26,10 +26,12 @@ from apex_ompl.ompl_adapter.validity import full_check
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.trajopt.candidates import first_valid
 from apex_ompl.trajopt.optimizer import Optimizer
-from apex_ompl.util.entry_point import run_script
-from apex_ompl.util.files import make_folder
-from apex_ompl.util.validation import whole_number
+from apex_ompl.trajopt.path import path_length
 
+DENOISED, DENOISER = "horizontal/large/900003", "apex-paper"
+MANY, PROPOSER = "posts/hard/900004", "apex"
+SEED = 0
+TRIES = 4  # proposals for each path wanted
 MOMENTS = (0.0, 0.25, 0.5, 1.0)  # as shares of the reverse process
 HANDS = {"left_hand_palm_0": "tab:blue", "right_hand_palm_0": "tab:orange"}
 GUIDED = Guidance(1.0, "noise", active_below=0.25)
@@ -57,13 +59,11 @@ def outlines(axes: Any, ready: PlanningSetup, first: int, second: int) -> None:
         axes.add_patch(Rectangle(tuple(corner), *sides, facecolor="0.92", edgecolor="0.6", lw=0.6, zorder=0))
 
 
-def denoising(name: str, ready: PlanningSetup, seed: int, file: Path) -> None:
-    """Draw the decoded samples at some steps of the reverse process."""
-    import matplotlib.pyplot as plt
-
-    model, kernel = load_model(name), ready.checker.kernel
+def denoising(args: Namespace) -> Made:
+    """Return the decoded samples at some steps of the reverse process."""
+    ready, model = assemble(load_problem(DENOISED), robot()), load_model(DENOISER)
+    kernel, steps = ready.checker.kernel, model.schedule.steps
     snapshots, ends = {}, (ready.start[None], ready.goals[0][None])
-    steps = model.schedule.steps
     moments = [round(share * steps) for share in MOMENTS]
 
     def keep(t: int, sample: Any, estimate: Any) -> None:
@@ -71,17 +71,19 @@ def denoising(name: str, ready: PlanningSetup, seed: int, file: Path) -> None:
         if steps - 1 - t in moments:
             snapshots[steps - 1 - t] = model.spline.path(model.control(sample, ends))[0]
 
-    query, generator = make_query(ready.checker, ready.start, ready.goals[0]), np.random.default_rng(seed)
+    query, generator = make_query(ready.checker, ready.start, ready.goals[0]), np.random.default_rng(SEED)
     sampling = Sampling("ddpm", steps, guidance=GUIDED)
     made = model.propose(query, kernel, 1, sampling=sampling, generator=generator, callback=keep)
     snapshots[steps] = model.spline.path(model.control(made.latent, ends))[0]
-    figure, axes = plt.subplots(2, len(MOMENTS), figsize=(12, 6.2), sharex=True, sharey="row", layout="constrained")
+    picture = blank(12, 6.2)
+    axes = picture.subplots(2, len(MOMENTS), sharex=True, sharey="row")
     for column, moment in enumerate(moments):
         for row, (first, second) in enumerate(((0, 1), (0, 2))):
             at = axes[row, column]
             outlines(at, ready, first, second)
             for body, line in palm_positions(kernel, snapshots[moment]).items():
-                at.plot(line[:, first], line[:, second], color=HANDS[body], lw=1.2)
+                hand = body.partition("_palm")[0].replace("_", " ")
+                at.plot(line[:, first], line[:, second], color=HANDS[body], lw=1.2, label=hand)
                 at.plot(*line[0, [first, second]], "P", color=HANDS[body], ms=7)
                 at.plot(*line[-1, [first, second]], "v", color=HANDS[body], ms=7)
             at.set_aspect("equal")
@@ -90,30 +92,33 @@ def denoising(name: str, ready: PlanningSetup, seed: int, file: Path) -> None:
         axes[1, column].set_xlabel("x m")
     axes[0, 0].set_ylabel("y m")
     axes[1, 0].set_ylabel("z m")
-    figure.savefig(file, dpi=110)
-    plt.close(figure)
+    axes[0, -1].legend(loc="lower right", fontsize=8)
+    lengths = {str(moment): path_length(snapshots[moment]) for moment in moments}
+    table = Table("Denoising", ["t", "model", "S_r rad"], [[t, DENOISER, f"{x:.2f}"] for t, x in lengths.items()])
+    notes = [("Problem", DENOISED), ("Seed", SEED), ("Sampling", f"DDPM, {steps} steps, guided in the last quarter")]
+    return Made({"S_r": lengths, "problem": DENOISED}, [table], notes, picture)
 
 
-def diversity(name: str, ready: PlanningSetup, seed: int, file: Path, wanted: int = 12) -> int:
-    """Draw valid trajectories of one problem; return how many there are."""
-    import matplotlib.pyplot as plt
-
-    model, kernel = load_model(name), ready.checker.kernel
-    optimizer = Optimizer(model.spline)
+def diversity(args: Namespace) -> Made:
+    """Return valid trajectories of one problem, and how far they are apart."""
+    ready, model = assemble(load_problem(MANY), robot()), load_model(PROPOSER)
+    kernel, optimizer = ready.checker.kernel, Optimizer(model.spline)
     query, found = make_query(ready.checker, ready.start, ready.goals[0]), []
 
     def is_valid(path: np.ndarray) -> bool:
         return bool(full_check(ready.checker, path, ready.start, [ready.goals[0]]))
 
-    generator = np.random.default_rng(seed)
+    generator, tried = np.random.default_rng(SEED), 0
     sampling = Sampling("ddim", 8, guidance=Guidance(1.0))
-    for control in model.propose(query, kernel, 4 * wanted, sampling=sampling, generator=generator).control:
-        if len(found) == wanted:
+    for control in model.propose(query, kernel, TRIES * args.n, sampling=sampling, generator=generator).control:
+        if len(found) == args.n:
             break
+        tried += 1
         repaired = first_valid(optimizer, kernel, control[None], is_valid)
         if repaired is not None:
             found.append(optimizer.spline.path(repaired))
-    figure, axes = plt.subplots(2, 2, figsize=(9, 5.5), sharex=True, layout="constrained")
+    picture = blank(9, 5.5)
+    axes = picture.subplots(2, 2, sharex=True)
     share = np.linspace(0.0, 1.0, optimizer.spline.states)
     for path in found:
         for column, line in enumerate(palm_positions(kernel, path).values()):
@@ -126,27 +131,12 @@ def diversity(name: str, ready: PlanningSetup, seed: int, file: Path, wanted: in
         axes[1, column].set_xlabel("share of the path")
     axes[0, 0].set_ylabel("x m")
     axes[1, 0].set_ylabel("y m")
-    figure.savefig(file, dpi=110)
-    plt.close(figure)
-    return len(found)
-
-
-def main() -> None:
-    """Draw both."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--model", default="apex-paper", help="for the denoising (default: %(default)s)")
-    parser.add_argument("--diverse", default="apex", help="for the diversity (default: %(default)s)")
-    parser.add_argument("--problem", default="horizontal/large/900003")
-    parser.add_argument("--many", default="posts/hard/900004", help="problem of the diversity (default: %(default)s)")
-    parser.add_argument("--seed", type=whole_number, default=0)
-    parser.add_argument("--folder", type=Path, default=Path("docs/pictures"))
-    args = parser.parse_args()
-    make_folder(args.folder)
-    one, many = (assemble(load_problem(name), robot()) for name in (args.problem, args.many))
-    denoising(args.model, one, args.seed, args.folder / "denoising.png")
-    count = diversity(args.diverse, many, args.seed, args.folder / "diversity.png")
-    print(f"{args.folder}: denoising.png, diversity.png with {count} valid trajectories of {args.many}")
-
-
-if __name__ == "__main__":
-    run_script(main, "data")
+    apart = mean_distance(found) if found else None
+    data = {"valid": len(found), "proposals": tried, "mean distance rad": apart, "problem": MANY}
+    cells = [MANY, PROPOSER, str(tried), str(len(found)), "-" if apart is None else f"{apart:.2f}"]
+    table = Table("Diversity", ["problem", "model", "proposals", "valid", "mean distance rad"], [cells])
+    notes = [
+        ("Seed", SEED),
+        ("Sampling", "DDIM, 8 steps, guided; each proposal is repaired by trajectory optimization"),
+    ]
+    return Made(data, [table], notes, picture)

@@ -1,0 +1,106 @@
+"""What a figure is made of, how its shares are counted, and how it is written."""
+
+from __future__ import annotations
+
+import io
+from argparse import Namespace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import record
+
+from apex_ompl.benchmark import Results
+from apex_ompl.benchmark.metrics import failure_ratio
+from apex_ompl.benchmark.summary import Table, about, warnings
+from apex_ompl.util.files import write_atomically
+from apex_ompl.util.statistics import share_interval
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Notes = list[tuple[str, Any]]
+DPI = 120
+
+
+@dataclass(frozen=True, eq=False)
+class Made:
+    """A figure of the paper, measured.
+
+    Attributes:
+        data: Its numbers by name, ready for JSON.
+        tables: Tables of them.
+        notes: How they were made, as pairs of a name and a text.
+        picture: The picture, if there is one.
+        commits: Commits of the runs, where they are stored with the runs.
+    """
+
+    data: Mapping[str, Any]
+    tables: Sequence[Table]
+    notes: Notes
+    picture: Figure | None = None
+    commits: str = ""
+    settings: Mapping[str, Any] = field(default_factory=dict)
+
+    def write(self, name: str, args: Namespace) -> None:
+        """Write ``paper_NAME.json``, ``.md`` and ``.png``."""
+        text = [
+            *(table.markdown() for table in self.tables),
+            "\n".join(f"- {key}: {value}" for key, value in self.notes),
+        ]
+        of_runs = {"run_commits": self.commits} if self.commits else {}
+        notes = [list(pair) for pair in self.notes]
+        settings = {"N": args.n, **self.settings, **of_runs}
+        record.write(f"paper_{name}", {"notes": notes, **self.data}, "\n\n".join(text), args.out, **settings)
+        if self.picture is not None:
+            drawn = io.BytesIO()
+            self.picture.savefig(drawn, format="png", dpi=DPI)
+            write_atomically(args.out / f"paper_{name}.png", drawn.getvalue())
+
+
+def blank(width: float, height: float) -> Figure:
+    """Return an empty picture, of a size in inches."""
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+def ratio(solved: Iterable[bool]) -> dict[str, Any]:
+    """Return N, R_f and Wilson's interval of it [%], of tasks that were solved or not.
+
+    Raises:
+        ParameterError: No task is given.
+    """
+    outcomes = list(solved)
+    found = failure_ratio(outcomes)
+    ends = share_interval(len(outcomes) - sum(outcomes), len(outcomes))
+    return {"N": len(outcomes), "R_f": found, "interval": [100.0 * end for end in ends]}
+
+
+def ratio_cells(cell: Mapping[str, Any]) -> list[str]:
+    """Return N, R_f and its interval as the tables have them."""
+    low, high = cell["interval"]
+    return [str(cell["N"]), f"{cell['R_f']:.1f}", f"{low:.1f} to {high:.1f}"]
+
+
+def of_runs(results: Results, *, planned: bool = True) -> tuple[Notes, str]:
+    """Return the provenance of runs, and their commits.
+
+    Args:
+        results: The runs.
+        planned: Whether the runs were planned by OMPL's Benchmark, so that its notes and warnings are of interest.
+    """
+    commits = record.made_with(results)["run_commits"]
+    sessions = results.sessions()
+    wanted = {"Hardware", "Versions", "Split and first seed", *(("Spacing of states",) if planned else ())}
+    short = [pair for pair in about(results) if pair[0] in wanted]
+    commands = dict.fromkeys(f"{one['command']} ({one['jobs']} at a time)" for one in sessions)
+    dates = sorted(one["date"][:10] for one in sessions)
+    made = [("Commands", "; ".join(commands)), ("Dates", f"{dates[0]} to {dates[-1]}")]
+    notes = [("Note", warning) for warning in warnings(results)] if planned else []
+    return [*made, *short, ("Commits of the runs", commits), *notes], commits
+
+
+def number(value: float | None, digits: int = 2) -> str:
+    """Return a number as the tables have it, a dash where there is none."""
+    return "-" if value is None else f"{value:.{digits}f}"
