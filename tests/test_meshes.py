@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
+import coal
 import numpy as np
 import pytest
+import trimesh
 from support import CUBE_OBJ
 
 from apex_ompl.collision import CollisionChecker
@@ -11,6 +15,7 @@ from apex_ompl.collision.shapes import coal_geometry, convex_hull, hull_planes, 
 from apex_ompl.errors import FileFormatError
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import Obstacle
+from apex_ompl.scene.meshes import binary_stl
 
 FLAT = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\nf 1 2 3\nf 2 4 3\n"
 
@@ -86,3 +91,20 @@ def test_a_hull_of_too_many_neighbours_is_replaced_by_a_little_larger_one(robot:
     checker.move("cones", tuple(robot.link_pose(robot.home, "left_link7")[:3, 3]))
     assert not checker.is_free(robot.home)
     assert coal_geometry(obstacle) is shape  # loaded once
+
+
+def test_binary_stl_is_read_as_by_coal_and_trimesh(tmp_path: Path) -> None:
+    mesh = trimesh.creation.annulus(0.1, 0.2, 0.3, sections=16)
+    mesh.export(tmp_path / "ring.stl")
+    content = (tmp_path / "ring.stl").read_bytes()
+    found = binary_stl(content)
+    assert found is not None
+    vertices, faces = found
+    loaded = coal.MeshLoader(coal.BV_AABB).load(str(tmp_path / "ring.stl"), np.ones(3))
+    assert (
+        (len(vertices), len(faces)) == (loaded.num_vertices, loaded.num_tris) == (len(mesh.vertices), len(mesh.faces))
+    )
+    assert vertices[faces] == pytest.approx(mesh.triangles, abs=1e-7)
+    assert trimesh.Trimesh(vertices, faces, process=False).is_watertight
+    assert binary_stl(content[:-1]) is None and binary_stl(mesh.export(file_type="stl_ascii").encode()) is None
+    assert binary_stl(b"") is None

@@ -18,7 +18,7 @@ from apex_ompl.collision.clouds import PointCloud, cloud_geometry
 from apex_ompl.errors import FileFormatError
 from apex_ompl.scene.bodies import Body, GridFile, MeshFile, PointFile
 from apex_ompl.scene.grids import parse_surface
-from apex_ompl.scene.meshes import extent_fault, hole_fault, orientation_fault, surface_note, triangles
+from apex_ompl.scene.meshes import binary_stl, extent_fault, hole_fault, orientation_fault, surface_note, triangles
 from apex_ompl.scene.points import parse_points
 from apex_ompl.types import Array
 from apex_ompl.util.files import read_file
@@ -254,7 +254,10 @@ def _read_triangles(file: str, content: bytes, scale: Array) -> tuple[Array, NDA
     """Return the vertices, shape (V, 3) [m], and the triangles, shape (T, 3), of a mesh file; of all that it holds."""
     if not content.strip():
         raise ValueError("an empty file")
-    if Path(file).suffix.lower() in LOADED_BY_COAL:
+    suffix = Path(file).suffix.lower()
+    if suffix == ".stl" and (binary := binary_stl(content)) is not None:
+        return binary[0] * scale, binary[1]
+    if suffix in LOADED_BY_COAL:
         # Trees of oriented boxes, which collisions need, are made of sound vertices only: Coal prints many lines else.
         return triangles(coal.MeshLoader(coal.BV_AABB).load(file, scale))
     import trimesh

@@ -8,15 +8,14 @@ or as voxels. Nothing is proved by them.
 
 from __future__ import annotations
 
-import itertools
 import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apex_ompl.diffusion.geometry import signed_distances
-from apex_ompl.kernel.compiled.arrays import BOX, CYLINDER, SPHERE
+from apex_ompl.diffusion.solid_fit import THINNEST, Solid, solids_like, turned_to
+from apex_ompl.kernel.compiled.arrays import BOX, CYLINDER
 from apex_ompl.kernel.compiled.grid_regions import OCCUPIED, OUTSIDE, add_up, best_box, label_regions
 from apex_ompl.kernel.compiled.layout import Integers
 from apex_ompl.kernel.distance_grid import BAND, SLACK, DistanceGrid
@@ -30,18 +29,14 @@ MOST_SHAPES = 48  # of a grid
 ALIKE = 0.7  # volume of the intersection of a region and its primitive over that of their union, at least
 HOLE = 0.03  # nodes of a primitive and not of its region are at most so far from the surface [m]
 FEW = 8  # nodes of a region that is a box whatever its form
+RIM = 300  # nodes of a border by which a primitive is judged
 SAMPLES = 1500  # nodes by which a region and a primitive are compared
-POINTS = 300  # nodes of a region by which its orientation is found
 BOXY = 1.25  # by which a box must fit better than a round solid, which voxels make look like a box
 LEAST_GAIN = 0.02  # side of a cube that has the volume of what the next box must hold at least [m]
 RING = 0.006  # around a box there is no other to be looked for [m]
 LONG = 3.0  # sides of a bar, at least
 LAYER = 0.96  # share of a layer of nodes that must be occupied for a box to grow by it
 SEEDS = 16  # nodes from which boxes grow
-THINNEST = 0.002  # least half side or radius [m]
-TURNS = np.radians(np.arange(0.0, 90.0, 5.0))
-ORDERS = [list(order) for order in itertools.permutations(range(3))]
-FINE_TURNS = np.radians(np.arange(-4.0, 4.5, 1.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,21 +54,6 @@ class FittedShapes:
     rotation: Array
     position: Array
     size: Array
-
-
-@dataclass(frozen=True, eq=False)
-class _Fit:
-    """One primitive, in metres from the first node."""
-
-    kind: int
-    rotation: Array
-    position: Array
-    size: Array
-
-    def distances(self, places: Array) -> Array:
-        """Return signed distances of places, shape (N, 3) [m]."""
-        rows = (np.array([self.kind]), self.position[None], self.rotation[None], self.size[None])
-        return np.asarray(signed_distances(*rows, places[None])[0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,7 +113,7 @@ def fitted_shapes(grid: DistanceGrid) -> FittedShapes:
     order = np.argsort(labels, kind="stable")
     parts = np.split(places[order], np.flatnonzero(np.diff(labels[order])) + 1) if len(places) else []
     parts.sort(key=len, reverse=True)
-    found: list[_Fit] = []
+    found: list[Solid] = []
     left = np.zeros_like(nodes.label)
     for part in parts:
         fit = _one_shape(nodes, border, part) if len(found) < MOST_SHAPES else None
@@ -150,7 +130,7 @@ def fitted_shapes(grid: DistanceGrid) -> FittedShapes:
     )
 
 
-def _one_shape(nodes: _Nodes, border: Flags, part: Integers) -> _Fit | None:
+def _one_shape(nodes: _Nodes, border: Flags, part: Integers) -> Solid | None:
     """Return the primitive that looks like connected nodes, shape (N, 3), or None.
 
     Of solids with the same second moments, that do not close a hole, it is the one from whose surface the nodes at the
@@ -168,10 +148,10 @@ def _one_shape(nodes: _Nodes, border: Flags, part: Integers) -> _Fit | None:
     places = nodes.spacing * (np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3) + low)
     wanted, apart = region[thin].ravel(), nodes.gap[box][thin].ravel()
     rim = np.argwhere(border[box] & region) + low
-    rim = rim[:: max(1, len(rim) // POINTS)]
+    rim = rim[:: max(1, len(rim) // RIM)]
     gaps, rim_places = nodes.gap[tuple(rim.T)], nodes.spacing * rim
-    best: tuple[float, _Fit | None] = (math.inf, None)
-    for fit in _solids_like(nodes, part):
+    best: tuple[float, Solid | None] = (math.inf, None)
+    for fit in solids_like(nodes.spacing * part.astype(float), nodes.spacing, nodes.reach):
         inside = fit.distances(places) <= nodes.reach
         alike = (inside & wanted).sum() / max((inside | wanted).sum(), 1)
         if alike < ALIKE or (apart[inside & ~wanted] > HOLE + nodes.reach).any():
@@ -184,76 +164,14 @@ def _one_shape(nodes: _Nodes, border: Flags, part: Integers) -> _Fit | None:
     return best[1]
 
 
-def _solids_like(nodes: _Nodes, part: Integers) -> list[_Fit]:
-    """Return boxes, a ball and cylinders with the second moments of nodes, shape (N, 3), less the nodes' reach."""
-    places = nodes.spacing * part[:: max(1, len(part) // (10 * POINTS))]
-    middle = places.mean(axis=0)
-    spread = np.cov(places.T) + nodes.spacing**2 / 12.0 * np.eye(3)
-    variances, axes = np.linalg.eigh(spread)
-
-    def fit(kind: int, rotation: Array, *size: float) -> _Fit:
-        row = np.zeros(3)
-        row[: len(size)] = np.maximum(np.array(size) - nodes.reach, THINNEST)
-        return _Fit(kind, rotation, middle, row)
-
-    fits = [
-        fit(BOX, np.eye(3), *np.sqrt(3.0 * np.diag(spread))),
-        fit(SPHERE, np.eye(3), math.sqrt(5.0 * variances.mean())),
-    ]
-    some = places[:: max(1, len(places) // POINTS)] - middle
-    for z in range(3):
-        x, y = (z + 1) % 3, (z + 2) % 3
-        frame = np.stack([axes[:, x], axes[:, y], axes[:, z]], axis=1)
-        frame[:, 0] *= np.sign(np.linalg.det(frame))
-        radius = math.sqrt(2.0 * (variances[x] + variances[y]))
-        fits.append(fit(CYLINDER, _turned_to(frame[:, 2]), radius, math.sqrt(3.0 * variances[z])))
-        turned = _nearest_axes(frame @ _smallest_rectangle(some @ frame))
-        fits.append(fit(BOX, turned, *np.sqrt(3.0 * np.diag(turned.T @ spread @ turned))))
-    return fits
-
-
-def _turned_to(axis: Array) -> Array:
-    """Return the smallest rotation, shape (3, 3), that takes the z axis to an axis or its opposite."""
-    x, y, z = axis if axis[2] >= 0.0 else -axis
-    return np.array(
-        [
-            [1.0 - x * x / (1.0 + z), -x * y / (1.0 + z), x],
-            [-x * y / (1.0 + z), 1.0 - y * y / (1.0 + z), y],
-            [-x, -y, z],
-        ]
-    )
-
-
-def _nearest_axes(rotation: Array) -> Array:
-    """Return the rotation nearest to none of those that have the same axes, in another order or opposite."""
-    order = max(ORDERS, key=lambda some: float(np.abs(np.diag(rotation[:, some])).sum()))
-    found = rotation[:, order]
-    found = found * np.where(np.diag(found) < 0.0, -1.0, 1.0)
-    if np.linalg.det(found) < 0.0:
-        found[:, int(np.abs(np.diag(found)).argmin())] *= -1.0
-    return found
-
-
-def _smallest_rectangle(local: Array) -> Array:
-    """Return the rotation about z, shape (3, 3), after which the rectangle around points, shape (N, 3), is smallest."""
-    best = 0.0
-    for turns in (TURNS, FINE_TURNS):
-        angles = best + turns
-        axes = np.stack([np.cos(angles), np.sin(angles)])
-        sides = np.ptp(local[:, :2] @ axes, axis=0) * np.ptp(local[:, :2] @ np.stack([-axes[1], axes[0]]), axis=0)
-        best = float(angles[sides.argmin()])
-    c, s = math.cos(best), math.sin(best)
-    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-
-
-def _boxes(nodes: _Nodes, border: Flags, left: Integers, most: int) -> list[_Fit]:
+def _boxes(nodes: _Nodes, border: Flags, left: Integers, most: int) -> list[Solid]:
     """Return boxes along the axes that hold nearly all nodes that are not zero; ``left`` is used up."""
     least, ring = max(FEW, (LEAST_GAIN / nodes.spacing) ** 3), max(1, round(RING / nodes.spacing))
     sums = np.zeros(tuple(n + 1 for n in left.shape), np.int64)
     add_up(left, sums)
     box, best = np.empty((2, 3), np.int64), np.empty((2, 3), np.int64)
     rng = np.random.default_rng(0)
-    found: list[_Fit] = []
+    found: list[Solid] = []
     remaining, uncovered = np.argwhere(left), left != 0
     while len(found) < most and len(remaining) > least:
         seeds = remaining[rng.integers(len(remaining), size=SEEDS)]
@@ -277,7 +195,7 @@ def _open_part(uncovered: Flags, box: Integers) -> Integers:
     return np.array(ends, np.int64).T
 
 
-def _box_or_bar(nodes: _Nodes, border: Flags, box: Integers) -> _Fit:
+def _box_or_bar(nodes: _Nodes, border: Flags, box: Integers) -> Solid:
     """Return the box of nodes from the first row of ``box``, shape (2, 3), to before the second, or a cylinder.
 
     A long box of nearly square section may have grown inside of a round bar. In the middle of its length the nodes at
@@ -299,8 +217,8 @@ def _box_or_bar(nodes: _Nodes, border: Flags, box: Integers) -> _Fit:
     places, gaps = nodes.spacing * rim, nodes.gap[tuple(rim.T)]
     spread = nodes.spacing**2 * (np.cov(part.T)[[x, y], [x, y]] + 1.0 / 12.0)
     direction = np.eye(3)[axis]
-    round_one = _Fit(
-        CYLINDER, _turned_to(direction), np.where(direction > 0.0, found.position, nodes.spacing * part.mean(axis=0)),
+    round_one = Solid(
+        CYLINDER, turned_to(direction), np.where(direction > 0.0, found.position, nodes.spacing * part.mean(axis=0)),
         np.array([math.sqrt(2.0 * spread.sum()) - nodes.reach, found.size[axis], 0.0]),
     )  # fmt: skip
     as_box, as_cylinder = (one.distances(places) - gaps for one in (found, round_one))
@@ -310,7 +228,7 @@ def _box_or_bar(nodes: _Nodes, border: Flags, box: Integers) -> _Fit:
     return replace(round_one, size=np.array([radius, found.size[axis], 0.0]))
 
 
-def _box_of(nodes: _Nodes, low: Integers, high: Integers) -> _Fit:
+def _box_of(nodes: _Nodes, low: Integers, high: Integers) -> Solid:
     """Return the box whose outermost nodes are given, its sides put where the surface is, by the nodes' distances."""
     inside = tuple(slice(int(a), int(b) + 1) for a, b in zip(low, high, strict=True))
     ends = nodes.spacing * np.stack([low, high]).astype(float)
@@ -325,4 +243,4 @@ def _box_of(nodes: _Nodes, low: Integers, high: Integers) -> _Fit:
             gaps = nodes.gap[tuple(layer)][open_nodes]
             ends[side, axis] -= sign * float(np.median(gaps) if len(gaps) else 0.0)
     half = np.maximum((ends[1] - ends[0]) / 2.0, THINNEST)
-    return _Fit(BOX, np.eye(3), ends.mean(axis=0), half)
+    return Solid(BOX, np.eye(3), ends.mean(axis=0), half)
