@@ -132,7 +132,9 @@ def evaluate_motion(
         cost += moving
         if cost > 0.0:
             total += share * cost
-            add_sample(share, weights[k], first[k], pinned, free, b.state_gradient, b.state_gram, gradient, gram)
+            add_sample(
+                share, weights[k], first[k], pinned, free, b.state_gradient, b.state_gram, gradient, gram, b.room
+            )
     rest = add_speed(settings.stiffness, problem.speed_gram, pinned, control, gradient, gram)
     rest += _add_limits(problem.limits, problem.limit_weight, pinned, control, gradient, gram)
     return PathCost(total + rest, total, scene, own)

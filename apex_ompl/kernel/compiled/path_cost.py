@@ -90,6 +90,7 @@ class Buffers(NamedTuple):
         row: Gradient of one clearance at a sample.
         state_gradient: Gradient of the clearance cost of a sample.
         state_gram: Lower half of its Gauss-Newton matrix.
+        room: Room for a row of it times the weights of a sample.
         held: Whether an unknown stays at its limit.
     """
 
@@ -102,6 +103,7 @@ class Buffers(NamedTuple):
     row: Annotated[Floats, "dof"]
     state_gradient: Annotated[Floats, "dof"]
     state_gram: Annotated[Floats, "dof", "dof"]
+    room: Annotated[Floats, "unknowns"]
     held: Annotated[Integers, "unknowns"]
 
 
@@ -128,30 +130,36 @@ def set_sample(
 @inlined
 def add_sample(
     share: float, weights: Floats, first: int, pinned: int, free: int, here: Floats, matrix: Floats, gradient: Floats,
-    gram: Floats,
+    gram: Floats, room: Floats,
 ) -> None:  # fmt: skip
     """Add the gradient ``here`` of a sample's cost and its ``matrix``, mapped to the control points.
 
-    Of the matrix the lower half is read; the upper one becomes its image.
+    Of the matrix the lower half is read; the upper one becomes its image. ``room`` is memory as long as the gradient.
     """
     dof = len(here)
     for d in range(dof):
         for e in range(d):
             matrix[e, d] = matrix[d, e]
-    for m in range(len(weights)):
-        i = first + m - pinned
-        if i < 0 or i >= free:
-            continue
-        f = share * weights[m]
+    begin, end = max(0, pinned - first), min(len(weights), free + pinned - first)
+    for m in range(begin, end):
+        i, f = first + m - pinned, share * weights[m]
         for d in range(dof):
             gradient[i * dof + d] += f * here[d]
-        for k in range(m, min(len(weights), free + pinned - first)):
-            g, at = f * weights[k], (first + k - pinned) * dof
-            for d in range(dof):
-                if matrix[d, d] > 0.0:  # else the joint moves nothing that is near
-                    target, source = gram[i * dof + d], matrix[d]
-                    for e in range(dof):
-                        target[at + e] += g * source[e]
+    for d in range(dof):
+        if not matrix[d, d] > 0.0:  # the joint moves nothing that is near
+            continue
+        source = matrix[d]
+        for k in range(begin, end):
+            scaled = room[(k - begin) * dof : (k - begin + 1) * dof]
+            for n in range(dof):
+                scaled[n] = weights[k] * source[n]
+        at = (first + begin - pinned) * dof
+        for m in range(begin, end):
+            i, f = first + m - pinned, share * weights[m]
+            shift, behind = (m - begin) * dof, (end - begin) * dof
+            target, scaled = gram[i * dof + d, at + shift : at + behind], room[shift:behind]
+            for j in range(len(target)):
+                target[j] += f * scaled[j]
 
 
 @inlined
@@ -218,7 +226,9 @@ def evaluate_path(
         )  # fmt: skip
         if cost > 0.0:
             total += share * cost
-            add_sample(share, weights[k], first[k], pinned, free, b.state_gradient, b.state_gram, gradient, gram)
+            add_sample(
+                share, weights[k], first[k], pinned, free, b.state_gradient, b.state_gram, gradient, gram, b.room
+            )
     speed = add_speed(settings.stiffness, problem.speed_gram, pinned, control, gradient, gram)
     return PathCost(total + speed, total, scene, own)
 

@@ -31,7 +31,7 @@ from apex_ompl.kernel.compiled.path_cost import (
 from apex_ompl.kernel.compiled.workspace import Workspace, workspace_view
 
 LEAST_DAMPING, MOST_DAMPING = 1e-9, 1e9
-BLOCK = 4  # rows of a Cholesky factor that are made together
+BLOCK = 8  # rows of a Cholesky factor that are made together
 
 Evaluate = Callable[..., PathCost]
 Problem = Any
@@ -40,15 +40,15 @@ Problem = Any
 @inlined
 def _eliminate(factor: Floats, first: int, last: int, k: int, end: int) -> bool:
     """Finish row ``k`` of a Cholesky factor: take away what rows ``first`` to ``last`` have in it."""
-    source = factor[k]
+    source = factor[k, k:end]
     for m in range(first, last):
-        f, row = factor[m, k], factor[m]
-        for j in range(k, end):
+        f, row = factor[m, k], factor[m, k:end]
+        for j in range(len(source)):
             source[j] -= f * row[j]
-    if not source[k] > 0.0:
+    if not source[0] > 0.0:
         return False
-    root = 1.0 / math.sqrt(source[k])
-    for j in range(k, end):
+    root = 1.0 / math.sqrt(source[0])
+    for j in range(len(source)):
         source[j] *= root
     return True
 
@@ -57,7 +57,7 @@ def _eliminate(factor: Floats, first: int, last: int, k: int, end: int) -> bool:
 def _factorise(factor: Floats, band: int) -> bool:
     """Replace a matrix by its upper Cholesky factor; both are zero beyond ``band`` from the diagonal.
 
-    Rows are taken four at a time, so that a row below is read and written once for all four.
+    Rows are taken eight at a time, so that a row below is read and written once for all of them.
     """
     n = len(factor)
     for k in range(0, n, BLOCK):
@@ -70,12 +70,14 @@ def _factorise(factor: Floats, band: int) -> bool:
                 return False
         if last < k + BLOCK:
             break
-        a, b, c, d = factor[k], factor[k + 1], factor[k + 2], factor[k + 3]
         for i in range(last, end):
-            f, g, h, r = a[i], b[i], c[i], d[i]
-            target = factor[i]
-            for j in range(i, end):
-                target[j] -= f * a[j] + g * b[j] + h * c[j] + r * d[j]
+            a, b, c, d = factor[k, i:end], factor[k + 1, i:end], factor[k + 2, i:end], factor[k + 3, i:end]
+            e, f, g, h = factor[k + 4, i:end], factor[k + 5, i:end], factor[k + 6, i:end], factor[k + 7, i:end]
+            a0, b0, c0, d0, e0, f0, g0, h0 = a[0], b[0], c[0], d[0], e[0], f[0], g[0], h[0]
+            target = factor[i, i:end]
+            for j in range(len(target)):
+                first = a0 * a[j] + b0 * b[j] + c0 * c[j] + d0 * d[j]
+                target[j] -= first + (e0 * e[j] + f0 * f[j] + g0 * g[j] + h0 * h[j])
     return True
 
 
@@ -99,12 +101,14 @@ def _newton_step(
         return False
     for i in range(n):
         step[i] /= factor[i, i]
-        for j in range(i + 1, min(n, i + band)):
-            step[j] -= step[i] * factor[i, j]
+        row, rest = factor[i, i + 1 : min(n, i + band)], step[i + 1 : min(n, i + band)]
+        for j in range(len(row)):
+            rest[j] -= step[i] * row[j]
     for i in range(n - 1, -1, -1):
         total = step[i]
-        for j in range(i + 1, min(n, i + band)):
-            total -= factor[i, j] * step[j]
+        row, rest = factor[i, i + 1 : min(n, i + band)], step[i + 1 : min(n, i + band)]
+        for j in range(len(row)):
+            total -= row[j] * rest[j]
         step[i] = total / factor[i, i]
     return True
 
