@@ -18,7 +18,7 @@ LAYERS = [
     {"collision"},
     {"tasks", "trajectory", "datasets"},
     {"diffusion", "ompl_adapter"},
-    {"apex"},
+    {"apex", "imitation"},
     {"planners", "problems"},
     {"generation", "live", "result"},
     {"planning"},
