@@ -126,8 +126,8 @@ def policy_card(config: NetworkConfig, robot: str, trained: Mapping[str, Any], w
     lines = [
         f"# An imitation policy for {robot}",
         "",
-        f"{weights / 1e6:.2f} million weights in half precision: a transformer encoder of {config.layers} layers, width "
-        f"{config.width} and {config.heads} heads over tokens of state and goal by groups of joints, and {sees}. It "
+        f"{weights / 1e6:.2f} million weights: a transformer encoder of {config.layers} layers, width {config.width} "
+        f"and {config.heads} heads over tokens of state and goal by groups of joints, and {sees}. It "
         f"predicts the next {config.chunk} states of a path of {config.clock}.",
     ]
     if {"step", "steps", "seconds", "paths", "windows", "held_out", "data", "commit"} <= trained.keys():
@@ -142,8 +142,8 @@ def policy_card(config: NetworkConfig, robot: str, trained: Mapping[str, Any], w
         ]
     lines += [
         "",
-        "What it rolls out is not valid until it is checked. The planners `il` and `il-paper` use it; the configuration "
-        "is in `config.json`.",
+        "What it rolls out is not valid until it is checked. The planners `il` and `il-paper` use such policies; "
+        "the configuration is in `config.json`.",
         "",
     ]
     return "\n".join(lines)

@@ -1,4 +1,4 @@
-"""Training windows of an imitation policy: a time of a stored path, its state with noise, and the states that follow."""
+"""Windows to train an imitation policy on: times of stored paths, their states, and the states that follow."""
 
 from __future__ import annotations
 

@@ -119,7 +119,8 @@ class ImitationTrainer:
         bfloat16 = self.config.precision == "bfloat16"
         with torch.autocast("cpu", torch.bfloat16) if bfloat16 else nullcontext():
             found = network(windows.conditions, windows.state, windows.time)
-        return (((found - windows.following) / network.scale) ** 2).mean()
+        loss: Tensor = (((found - windows.following) / network.scale) ** 2).mean()
+        return loss
 
     def run(self, seconds: float = math.inf, watch: Callable[[ImitationTrainer, float], None] | None = None) -> None:
         """Train to the end, or for some seconds; log and save at the configured intervals.
@@ -135,7 +136,7 @@ class ImitationTrainer:
             if watch is not None:
                 watch(self, losses[-1])
             if self.step % self.config.log_every == 0 or self.done:
-                row = {"phase": PHASE, "step": self.step, "loss": f"{np.mean(losses):.6f}"}
+                row: dict[str, str | int] = {"phase": PHASE, "step": self.step, "loss": f"{np.mean(losses):.6f}"}
                 row |= {"rate": f"{self._rate():.3g}", "seconds": f"{self.seconds:.1f}"}
                 if self._held_out is not None:
                     row["held_out"] = f"{self._loss_held_out(self.averaged_network()):.6f}"

@@ -8,6 +8,7 @@ from typing import Any
 
 from apex_ompl.errors import UnknownNameError
 from apex_ompl.loop.dynamic_rrt import DynamicRRT
+from apex_ompl.loop.imitation import Imitation
 from apex_ompl.loop.mppi import PathIntegral
 from apex_ompl.loop.paper import OneProposal
 from apex_ompl.loop.portfolio import Portfolio
@@ -71,6 +72,12 @@ METHODS = {
     "potential-field": Method(PotentialField, {}, "a reflex down an artificial potential"),
     "dynamic-rrt": Method(
         DynamicRRT, FROM_REST, "stops where the way is blocked; a tree from the goal that is kept and repaired"
+    ),
+    "il": Method(
+        Imitation, {**BLIND, "verified": False}, "an imitation policy as a reflex, followed unproved"
+    ),
+    "il-paper": Method(
+        lambda: Imitation("il-paper"), {**BLIND, "verified": False}, "the same, which sees one obstacle point"
     ),
 }  # fmt: skip
 
