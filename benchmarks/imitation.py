@@ -13,7 +13,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import record
@@ -27,6 +27,8 @@ from apex_ompl.ompl_adapter.setup import PlanningSetup, assemble
 from apex_ompl.planners.il import Imitation
 from apex_ompl.problems.catalogue import SPLITS
 from apex_ompl.problems.suite_robot import robot
+from apex_ompl.scene.problem import Alignment
+from apex_ompl.tasks.alignment import AlignmentGoal
 from apex_ompl.trajectory.smoothness import jerk
 from apex_ompl.trajopt.path import path_length
 from apex_ompl.util.entry_point import run_script
@@ -37,6 +39,9 @@ from apex_ompl.util.validation import one_or_more
 DEPENDS = ("@benchmark", "apex_ompl/imitation", "benchmarks/baselines/il", "benchmarks/baselines/il-paper")
 LEVELS = (*(f"{task}/{size}" for task in ("vertical", "horizontal") for size in ("free", "small", "medium", "large")),
           "shelf/easy")  # fmt: skip
+KINDS: dict[tuple[str, ...], Literal["vertical", "horizontal"]] = {
+    ("lower", "upper"): "vertical", ("cup", "ball"): "horizontal", ("block", "peg"): "horizontal",
+}  # fmt: skip
 LINE, REPAIR = "straight line", "+ repair"
 SECONDS = 60.0  # of a planner, which ends by itself
 VARIANTS = tuple({"executed": executed, "blend": blend} for executed in (4, 8, 16) for blend in (True, False))
@@ -87,8 +92,13 @@ def nearest_first(setup: PlanningSetup) -> list[np.ndarray]:
 
 
 def aligned(setup: PlanningSetup, q: np.ndarray) -> bool | None:
-    """Return whether a state aligns what the hands hold within the task's tolerance, None where nothing is asked."""
-    return None if setup.alignment is None else setup.alignment.is_satisfied(q)
+    """Return whether a state aligns what the hands hold within the tolerance of the paper's tasks, None without."""
+    held = setup.problem.attached
+    names = tuple(one.name for one in held)
+    if names not in KINDS:
+        return None
+    alignment = Alignment(kind=KINDS[names], first=names[0], second=names[1])
+    return AlignmentGoal(setup.robot, alignment, held, setup.start).is_satisfied(q)
 
 
 def rows_of(models: Sequence[str], tune: bool) -> list[tuple[str, str, dict[str, Any]]]:
