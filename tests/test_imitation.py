@@ -260,6 +260,18 @@ def test_an_interrupted_run_ends_with_the_same_weights(few: Path, tmp_path: Path
         ImitationTrainer(config(few, noise=0.5), folders[0])
 
 
+def test_a_policy_of_other_obstacles_begins_with_the_weights_of_another(saved: Path, few: Path, tmp_path: Path) -> None:
+    first, other = load_policy_network(saved)[0], lively("point").state_dict()
+    trainer = ImitationTrainer(config(few, obstacles="point", init=str(saved)), tmp_path)
+    alone = {name for name, tensor in first.state_dict().items() if other[name].shape != tensor.shape}
+    assert alone == {"obstacle.0.weight"}
+    for name, tensor in trainer.network.state_dict().items():
+        assert name in alone or torch.equal(tensor, first.state_dict()[name]), name
+    trainer.run()
+    with pytest.raises(FileFormatError, match="expected the state of a run with this configuration"):
+        ImitationTrainer(config(few, obstacles="point"), tmp_path)
+
+
 def test_the_script_trains_resumes_and_needs_no_ompl(few: Path, tmp_path: Path) -> None:
     file, script = tmp_path / "small.yaml", ROOT / "scripts" / "train_il.py"
     file.write_text(yaml.safe_dump({**SMALL, "data": str(few), "steps": 4}))

@@ -62,6 +62,7 @@ class ImitationConfig(StrictModel):
         data: Folder of a data set, or a file of paths; or several.
         robot: File of the robot's kernel tables.
         network: The transformer.
+        init: Folder of a policy whose weights are the first ones, where their shapes are the same; random by default.
         steps: Number of steps. It may be changed until ``cooldown`` steps before the end, as all before is the same.
         batch: Paths in a step.
         windows: Windows of each path in a step: times at which the policy is asked for the states that follow.
@@ -85,6 +86,7 @@ class ImitationConfig(StrictModel):
     data: str | Annotated[tuple[str, ...], Field(min_length=1)]
     robot: str
     network: NetworkConfig
+    init: str | None = None
     steps: Count = 10_000
     batch: Count = 32
     windows: Count = 8
@@ -111,7 +113,7 @@ class ImitationConfig(StrictModel):
     @property
     def determining(self) -> str:
         """Settings that determine the trained weights, as JSON: all but paths, the end, logging and saving."""
-        return self.model_dump_json(exclude={"data", "robot", "steps", "cooldown", "log_every", "save_every"})
+        return self.model_dump_json(exclude={"data", "robot", "init", "steps", "cooldown", "log_every", "save_every"})
 
     @classmethod
     def read(cls, path: str | os.PathLike[str], changes: Mapping[str, Any] | None = None) -> ImitationConfig:

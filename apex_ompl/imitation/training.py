@@ -18,7 +18,7 @@ from apex_ompl.diffusion.runlog import RunLog
 from apex_ompl.diffusion.training import MAX_SKIPPED, TrainingError
 from apex_ompl.diffusion.training_state import EXPECTED, STATE, read_state, write_state
 from apex_ompl.errors import FileFormatError
-from apex_ompl.imitation.checkpoint import save_policy
+from apex_ompl.imitation.checkpoint import load_policy_network, save_policy
 from apex_ompl.imitation.config import ImitationConfig
 from apex_ompl.imitation.data import WindowData, Windows
 from apex_ompl.imitation.network import PolicyNetwork
@@ -65,8 +65,10 @@ class ImitationTrainer:
             torch.manual_seed(config.seed)
             self.network = PolicyNetwork(config.network)
         self.data.fit(self.network)
+        first = "" if config.init is None else self._initialise(config.init)
         self.step, self.seconds, self._skipped = 0, 0.0, 0
-        self._digest = hashlib.sha256(f"{config.determining}{robot.name}{self.data.digest()}".encode()).hexdigest()
+        determining = f"{config.determining}{robot.name}{self.data.digest()}{first}"
+        self._digest = hashlib.sha256(determining.encode()).hexdigest()
         self._names = [name for name, _ in self.network.named_parameters()]
         self._parameters = [p for _, p in self.network.named_parameters()]
         self.averaged = {name: p.detach().clone() for name, p in self.network.named_parameters()}
@@ -168,7 +170,8 @@ class ImitationTrainer:
         """Return the record of the training for a checkpoint of ``network``, ready for JSON."""
         config = self.config.model_dump(mode="json", by_alias=True)
         names = [Path(source).name for source in self.config.sources]  # names only: folders are private
-        config |= {"data": names, "robot": Path(self.config.robot).name}
+        init = None if self.config.init is None else Path(self.config.init).name
+        config |= {"data": names, "robot": Path(self.config.robot).name, "init": init}
         found: dict[str, Any] = {
             "step": self.step, "steps": self.config.steps, "seconds": round(self.seconds), "data": names,
             "windows": self.step * self.config.batch * self.config.windows, "paths": len(self.data.train),
@@ -192,6 +195,15 @@ class ImitationTrainer:
     def _loss_held_out(self, network: PolicyNetwork) -> float:
         assert self._held_out is not None
         return float(self.loss(network, self._held_out))
+
+    def _initialise(self, folder: str) -> str:
+        """Take the weights of a policy, statistics among them, where shapes agree, and return the digest of its file."""
+        other, about = load_policy_network(folder, robot=self.robot)
+        mine = self.network.state_dict()
+        theirs = other.state_dict()
+        same = [name for name, tensor in mine.items() if name in theirs and theirs[name].shape == tensor.shape]
+        self.network.load_state_dict({**mine, **{name: theirs[name] for name in same}})
+        return about.digest
 
     def _load_state(self) -> None:
         state = read_state(self.folder, self._digest, CPU)
