@@ -11,7 +11,7 @@ Usage: python benchmarks/imitation.py [-n 20] [--tune] [--models NAME|FOLDER ...
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -24,6 +24,7 @@ from apex_ompl.apex.query import make_query
 from apex_ompl.imitation.policy import shared_policy
 from apex_ompl.ompl_adapter.process import quiet_ompl
 from apex_ompl.ompl_adapter.setup import PlanningSetup, assemble
+from apex_ompl.ompl_adapter.space import path_to_array
 from apex_ompl.planners.il import Imitation
 from apex_ompl.problems.catalogue import SPLITS
 from apex_ompl.problems.suite_robot import robot
@@ -50,40 +51,49 @@ Run = dict[str, Any]
 
 def of_line(setup: PlanningSetup) -> Run:
     """Return what the straight line to the nearest goal is, and whether one to any goal is a solution."""
-    start, goals = setup.start, nearest_first(setup)
-    lines = [np.stack([start, goal]) for goal in goals]
+    goals = nearest_first(setup)
+    lines = [np.stack([setup.start, goal]) for goal in goals]
     free = [bool(setup.checker.prove(line, tolerance=0.0)) for line in lines]
-    return {
-        "solved": any(free), "free": free[0], "reaches": True, "aligned": aligned(setup, goals[0]), "off": 0.0,
-        "length": path_length(lines[0]), "line": path_length(lines[0]), "jerk": 0.0,
-    }  # fmt: skip
+    return {"solved": any(free), "free": free[0], "off": 0.0, "aligned": aligned(setup, goals[0]), **numbers(lines[0])}
 
 
 def of_policy(setup: PlanningSetup, name: str, params: Mapping[str, Any]) -> Run:
-    """Return what a policy's path to the nearest goal is, and whether the planner has a solution."""
-    start, goal, checker = setup.start, nearest_first(setup)[0], setup.checker
+    """Return what a policy's path to the nearest goal is, and whether the planner has a solution.
+
+    With repair the numbers are those of the solution, and missing without one.
+    """
+    checker, goal = setup.checker, nearest_first(setup)[0]
+    solution = planned(setup, name, params)
+    if params.get("repair"):
+        return {"solved": solution is not None, **({} if solution is None else numbers(solution))}
     policy, record_of = shared_policy(name, robot=setup.robot.name), Imitation().changed(**params)
     assert isinstance(record_of, Imitation)
-    query = make_query(checker, start, goal, point=policy.sees_point)
+    query = make_query(checker, setup.start, goal, point=policy.sees_point)
     found = policy.roll_out([query], checker.kernel, executed=record_of.executed, blend=record_of.blend)
     assert found is not None
     path = found[0]
-    off, line = float(np.abs(path[-1] - goal).max()), float(np.linalg.norm(goal - start))
     return {
-        "solved": solved(setup, name, params), "free": bool(checker.prove(path, tolerance=0.0)),
-        "reaches": off <= record_of.reach, "aligned": aligned(setup, path[-1]), "off": off,
-        "length": path_length(path), "line": line, "jerk": jerk(path) / path_length(path),
+        "solved": solution is not None, "free": bool(checker.prove(path, tolerance=0.0)),
+        "off": float(np.abs(path[-1] - goal).max()), "aligned": aligned(setup, path[-1]), **numbers(path),
     }  # fmt: skip
 
 
-def solved(setup: PlanningSetup, name: str, params: Mapping[str, Any]) -> bool:
-    """Return whether the planner has an exact solution."""
+def numbers(path: np.ndarray) -> dict[str, float]:
+    """Return the length of a path, that of the line between its ends, and its jerk over a second by its length."""
+    length, line = path_length(path), float(np.linalg.norm(path[-1] - path[0]))
+    return {"length": length, "ratio": length / line, "jerk": jerk(path) / length}
+
+
+def planned(setup: PlanningSetup, name: str, params: Mapping[str, Any]) -> np.ndarray | None:
+    """Return the planner's exact solution, shape (N, dof), or None."""
     simple_setup = setup.simple_setup
     simple_setup.clear()
     simple_setup.setPlanner(planners.make("il", simple_setup.getSpaceInformation(), model=name, **params))
     status = simple_setup.solve(ob.timedPlannerTerminationCondition(SECONDS))
     setup.raise_faults()
-    return bool(status.getStatus() == ob.PlannerStatus.EXACT_SOLUTION)
+    if status.getStatus() != ob.PlannerStatus.EXACT_SOLUTION:
+        return None
+    return path_to_array(simple_setup.getSolutionPath(), setup.robot.dof)
 
 
 def nearest_first(setup: PlanningSetup) -> list[np.ndarray]:
@@ -130,20 +140,26 @@ def measure(rows: Sequence[tuple[str, str, dict[str, Any]]], count: int, first: 
 
 def cells(runs: Sequence[Run]) -> list[str]:
     """Return the numbers of some runs of a row: N, shares, and medians."""
-    count = len(runs)
-    shares = [f"{100 * np.mean([r[key] for r in runs]):.0f} %" for key in ("solved", "reaches")]
-    asked = [r["aligned"] for r in runs if r["aligned"] is not None]
-    within = f"{100 * np.mean(asked):.0f} %" if asked else "-"
-    collides = f"{100 * np.mean([not r['free'] for r in runs]):.0f} %"
-    middle = [np.median([r[key] for r in runs]) for key in ("off", "length", "line", "jerk")]
-    numbers = [f"{middle[0]:.3f}", f"{middle[1]:.2f}", f"{middle[2]:.2f}", f"{middle[3]:.0f}"]
-    low, high = share_interval(sum(r["solved"] for r in runs), count)
-    return [str(count), f"{shares[0]} ({100 * low:.0f}-{100 * high:.0f})", shares[1], within, collides, *numbers]
+
+    def share(key: str, holds: Callable[[Any], bool] = bool) -> str:
+        known = [holds(r[key]) for r in runs if r.get(key) is not None]
+        return f"{100 * np.mean(known):.0f} %" if known else "-"
+
+    def median(key: str, digits: int) -> str:
+        known = [r[key] for r in runs if key in r]
+        return f"{np.median(known):.{digits}f}" if known else "-"
+
+    low, high = share_interval(sum(r["solved"] for r in runs), len(runs))
+    return [
+        str(len(runs)), f"{share('solved')} ({100 * low:.0f}-{100 * high:.0f})",
+        share("off", lambda off: off <= Imitation().reach), share("aligned"), share("free", lambda free: not free),
+        median("off", 3), median("length", 2), median("ratio", 2), median("jerk", 0),
+    ]  # fmt: skip
 
 
 HEAD = (
-    "level", "row", "N", "solved (95 %)", "reaches the goal", "aligned", "collides", "off rad", "S_r rad", "line rad",
-    "jerk 1/s^3",
+    "level", "row", "N", "solved (95 %)", "ends at the goal", "aligned", "collides", "off rad", "S_r rad",
+    "S_r / line", "jerk / S_r 1/s^3",
 )  # fmt: skip
 
 

@@ -8,7 +8,8 @@ from typing import Any
 import torch
 from support import DATA
 
-from apex_ompl.imitation.config import ImitationConfig
+from apex_ompl.imitation.config import ImitationConfig, NetworkConfig
+from apex_ompl.imitation.network import PolicyNetwork
 from apex_ompl.imitation.training import ImitationTrainer
 
 GROUPS = [list(range(7)), list(range(7, 14)), [14, 15]]
@@ -33,3 +34,13 @@ def trained(folder: Path, data: Path, **changes: Any) -> Path:
     folder.mkdir()
     ImitationTrainer(config(data, **changes), folder).run()
     return folder / "checkpoint"
+
+
+def lively(obstacles: str = "set") -> PolicyNetwork:
+    """A network all of whose weights are random, the last layer's, too."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        network = PolicyNetwork(NetworkConfig.model_validate({**NETWORK, "obstacles": obstacles}))
+        for parameter in network.parameters():
+            torch.nn.init.normal_(parameter, std=0.2)
+    return network.eval().requires_grad_(False)

@@ -197,7 +197,7 @@ class ImitationTrainer:
         return float(self.loss(network, self._held_out))
 
     def _initialise(self, folder: str) -> str:
-        """Take the weights of a policy, statistics among them, where shapes agree, and return the digest of its file."""
+        """Take the weights and statistics of a policy where shapes agree, and return the digest of its file."""
         other, about = load_policy_network(folder, robot=self.robot)
         mine = self.network.state_dict()
         theirs = other.state_dict()
