@@ -92,7 +92,7 @@ def test_faults_name_the_thing(name: str, values: dict, error: type[Exception], 
 
 
 OURS = [
-    pytest.param(name, marks=needs("benchmarks/baselines")) if name in ("il", "il-paper") else name
+    pytest.param(name, marks=needs(f"benchmarks/baselines/{name}")) if name in ("il", "il-paper") else name
     for name in planners.names() if "bad_planners" not in type(planners.parameters(name)).__module__
 ]  # fmt: skip
 
