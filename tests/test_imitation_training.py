@@ -102,6 +102,7 @@ def test_a_policy_of_other_obstacles_begins_with_the_weights_of_another(saved: P
     for name, tensor in trainer.network.state_dict().items():
         assert name in alone or torch.equal(tensor, first.state_dict()[name]), name
     trainer.run()
+    assert "It began with the weights of `checkpoint`." in (tmp_path / "checkpoint" / "README.md").read_text()
     with pytest.raises(FileFormatError, match="expected the state of a run with this configuration"):
         ImitationTrainer(config(few, obstacles="point"), tmp_path)
 

@@ -140,6 +140,8 @@ def policy_card(config: NetworkConfig, robot: str, trained: Mapping[str, Any], w
             f"Loss on held-out problems: {trained['held_out']}, with the straight line "
             f"{trained['line']} (mean square error in standard deviations of the data, without noise).",
         ]
+    if trained.get("config", {}).get("init"):
+        lines[-1:] = [f"{lines[-1]} It began with the weights of `{trained['config']['init']}`."]
     lines += [
         "",
         "What it rolls out is not valid until it is checked. The planners `il` and `il-paper` use such policies; "
