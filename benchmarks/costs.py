@@ -28,6 +28,7 @@ from apex_ompl.loop.damon import ManifoldGraph
 from apex_ompl.loop.drrt import Clearances, KeptTree
 from apex_ompl.loop.following import Following
 from apex_ompl.loop.gpmp2 import CHARGE, IncrementalGPMP2
+from apex_ompl.loop.imitation import Imitation
 from apex_ompl.loop.mppi import PathIntegral, softmax
 from apex_ompl.loop.paper import OneProposal
 from apex_ompl.loop.potential_field import PotentialField
@@ -200,7 +201,7 @@ def trees() -> dict[str, float]:
 
 
 def network() -> dict[str, float]:
-    """Return the costs of a call of the network, and of each proposal [s]."""
+    """Return the costs of a call of the network, of each proposal, and of each chunk of the imitation policy [s]."""
     from apex_ompl.apex.query import make_query
 
     setup = assemble(worlds.load("vertical/moving-large-0.2/800000").problem.still)
@@ -208,6 +209,10 @@ def network() -> dict[str, float]:
     source.prepare(ready)
     model, checker = source.model_and_checker
     query = make_query(checker, setup.start, ready.goals[0], point=model.sees_point)
+    policy = Imitation()
+    policy.prepare(ready)
+    begin, end = setup.start, ready.goals[0]
+    chunk = seconds(lambda: policy.states(begin, end)) / (policy.steps / 8)
     taken = {}
     with model.one_thread():
         for count in (1, 8):
@@ -218,7 +223,7 @@ def network() -> dict[str, float]:
         paper = OneProposal(guided)
         paper.prepare(ready)
         paths[kind] = seconds(lambda one=paper: one.propose(setup.start, ready.goals[0], np.random.default_rng(0)))
-    return {"proposals": taken[1] - each, "proposal": each, **paths}
+    return {"proposals": taken[1] - each, "proposal": each, **paths, "chunk of a policy": chunk}
 
 
 def main() -> None:

@@ -122,7 +122,7 @@ def allocator(name: str, /, **values: Any) -> Callable[[ob.SpaceInformation], ob
 
 def _load() -> None:
     """Import the modules that register planners."""
-    from apex_ompl.planners import apex_parameters, damon, drrt, gpmp, polish, sampling  # noqa: F401
+    from apex_ompl.planners import apex_parameters, damon, drrt, gpmp, il, polish, sampling  # noqa: F401
 
 
 def _read(name: str, value: Any, default: Any, field: dataclasses.Field[Any]) -> Any:

@@ -14,11 +14,9 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.files import locked, make_folder
-from apex_ompl.util.validation import positive_number
+from apex_ompl.util.validation import key_value, positive_number
 
 
 def train(args: argparse.Namespace) -> None:
@@ -63,7 +61,7 @@ def main() -> None:
     parser.add_argument("config", metavar="CONFIG.yaml")
     parser.add_argument("--out", help="folder of the run (default: runs/CONFIG)")
     parser.add_argument(
-        "--set", type=_setting, action="append", default=[], metavar="KEY=VALUE", help="for example latent.dim=96"
+        "--set", type=key_value, action="append", default=[], metavar="KEY=VALUE", help="for example latent.dim=96"
     )
     parser.add_argument(
         "--minutes", type=positive_number, default=float("inf"), help="time limit; the same command resumes the run"
@@ -71,16 +69,6 @@ def main() -> None:
     parser.add_argument("--quiet", action="store_true", help="show no progress")
     args = parser.parse_args()
     train(args)
-
-
-def _setting(text: str) -> tuple[str, Any]:
-    key, equals, value = text.partition("=")
-    if not key or not equals:
-        raise argparse.ArgumentTypeError(f"{text!r}, expected KEY=VALUE")
-    try:
-        return key, yaml.safe_load(value)
-    except yaml.YAMLError as error:
-        raise argparse.ArgumentTypeError(f"{text!r}, expected a value in YAML") from error
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ LAYERS = [
     {"tasks", "trajectory", "datasets"},
     {"roadmaps"},
     {"diffusion", "ompl_adapter"},
-    {"apex"},
+    {"apex", "imitation"},
     {"planners", "problems"},
     {"generation", "live", "result"},
     {"planning"},

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from ompl import base as ob
 from ompl import geometric as og
+from support import needs
 
 from apex_ompl import plan, planners
 from apex_ompl.errors import ParameterError, UnknownNameError
@@ -90,7 +91,10 @@ def test_faults_name_the_thing(name: str, values: dict, error: type[Exception], 
         assert word in str(caught.value)
 
 
-OURS = [name for name in planners.names() if "bad_planners" not in type(planners.parameters(name)).__module__]
+OURS = [
+    pytest.param(name, marks=needs(f"benchmarks/baselines/{name}")) if name in ("il", "il-paper") else name
+    for name in planners.names() if "bad_planners" not in type(planners.parameters(name)).__module__
+]  # fmt: skip
 
 
 @pytest.mark.parametrize("name", OURS)

@@ -71,7 +71,7 @@ def load_model(
     """
     config, weights, source = _read(name, robot)
     if str(device) == "cpu" and is_supported(config.model):
-        _check_shapes(weights, lambda: weight_shapes(config.model), source)
+        check_shapes(weights, lambda: weight_shapes(config.model), source)
         return ArrayModel(config.model, weights, config.trained)
     return _torch_model(config, weights, source, device)
 
@@ -94,12 +94,27 @@ def _read(name: str | os.PathLike[str], robot: str | None) -> tuple[CheckpointCo
         if not is_file(folder / file):
             raise MissingFileError(str(folder / file), "file of a checkpoint")
     source = folder / WEIGHTS
-    config, content = read_config(folder), read_file(source, "file of a checkpoint")
+    config = read_config(folder)
     if robot is not None and config.model.robot != robot:
         raise FileFormatError(str(folder / CONFIG), "model.robot", config.model.robot, f"expected {robot!r}")
+    return config, read_weights(source, config.digest), source
+
+
+def read_weights(source: Path, digest: str) -> dict[str, NDArray[Any]]:
+    """Return the weights in a file of a checkpoint, by name.
+
+    Args:
+        source: The file.
+        digest: SHA-256 digest that it must have.
+
+    Raises:
+        MissingFileError: The file cannot be read.
+        FileFormatError: It is damaged, or has weights that are not finite.
+    """
+    content = read_file(source, "file of a checkpoint")
     found = hashlib.sha256(content).hexdigest()
-    if found != config.digest:
-        raise FileFormatError(str(source), "", f"SHA-256 {found[:12]}...", f"expected {config.digest[:12]}...: damaged")
+    if found != digest:
+        raise FileFormatError(str(source), "", f"SHA-256 {found[:12]}...", f"expected {digest[:12]}...: damaged")
     try:
         weights = expanded(load_arrays(content))
     except (SafetensorError, ValueError, KeyError) as error:
@@ -107,7 +122,7 @@ def _read(name: str | os.PathLike[str], robot: str | None) -> tuple[CheckpointCo
     for key, values in weights.items():
         if not np.isfinite(values).all():
             raise FileFormatError(str(source), key, "numbers that are not finite", "expected finite weights")
-    return config, weights, source
+    return weights
 
 
 def _torch_model(
@@ -122,7 +137,7 @@ def _torch_model(
         with torch.device("meta"):  # without memory for them
             return {key: tuple(value.shape) for key, value in LatentDiffusion(config.model).state_dict().items()}
 
-    _check_shapes(weights, shapes, source)
+    check_shapes(weights, shapes, source)
     with torch.random.fork_rng(devices=[]):
         network = LatentDiffusion(config.model)
     state = network.state_dict()
@@ -134,7 +149,7 @@ def _torch_model(
     return TorchModel(network, config.trained)
 
 
-def _check_shapes(
+def check_shapes(
     weights: Mapping[str, NDArray[Any]], expected: Callable[[], dict[str, tuple[int, ...]]], source: Path
 ) -> None:
     """Check that weights fit a configuration.

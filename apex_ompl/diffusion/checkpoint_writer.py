@@ -43,9 +43,6 @@ def save_model(
     Raises:
         MissingFileError: The folder cannot be written, or is not a checkpoint's.
     """
-    folder = Path(folder)
-    if folder.exists() and not is_file(folder / CONFIG):
-        raise MissingFileError(str(folder), "folder for a checkpoint", "something else is there")
     kept: dict[str, NDArray[Any]] = {
         name: (tensor.half() if bits < 32 and tensor.is_floating_point() else tensor).cpu().contiguous().numpy()
         for name, tensor in network.state_dict().items()
@@ -56,6 +53,23 @@ def save_model(
         "digest": hashlib.sha256(weights).hexdigest(), "trained": dict(trained),
     }  # fmt: skip
     card = model_card(network.config, trained, sum(p.numel() for p in network.parameters()))
+    write_checkpoint(Path(folder), config, weights, card)
+
+
+def write_checkpoint(folder: Path, config: Mapping[str, Any], weights: bytes, card: str) -> None:
+    """Write the files of a checkpoint, all of them or none; those of an existing one are replaced.
+
+    Args:
+        folder: Folder of the checkpoint.
+        config: Its configuration, ready for JSON.
+        weights: Content of the file of weights.
+        card: Its model card, Markdown.
+
+    Raises:
+        MissingFileError: The folder cannot be written, or is not a checkpoint's.
+    """
+    if folder.exists() and not is_file(folder / CONFIG):
+        raise MissingFileError(str(folder), "folder for a checkpoint", "something else is there")
     content = {WEIGHTS: weights, CARD: card.encode(), CONFIG: (json.dumps(config, indent=1) + "\n").encode()}
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)

@@ -18,7 +18,7 @@ from apex_ompl.diffusion.model_config import (
     SamplingConfig,
 )
 from apex_ompl.errors import FileFormatError
-from apex_ompl.util.schema import StrictModel, read_yaml, validate
+from apex_ompl.util.schema import StrictModel, read_yaml, replaced, validate
 
 SCHEMA = "apex-ompl/training/1"
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
@@ -144,12 +144,4 @@ class TrainingConfig(StrictModel):
         data = read_yaml(Path(path), "training configuration")
         if data.get("schema") != SCHEMA:
             raise FileFormatError(str(path), "schema", data.get("schema"), f"expected {SCHEMA!r}")
-        for key, value in (changes or {}).items():
-            *above, last = key.split(".")
-            section = data
-            for name in above:
-                section = section.setdefault(name, {})
-                if not isinstance(section, dict):
-                    raise FileFormatError(str(path), key, value, f"expected {name!r} to hold keys")
-            section[last] = value
-        return validate(cls, data, str(path))
+        return validate(cls, replaced(data, changes or {}, str(path)), str(path))

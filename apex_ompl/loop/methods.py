@@ -10,6 +10,7 @@ from apex_ompl.errors import UnknownNameError
 from apex_ompl.loop.damon import ManifoldGraph
 from apex_ompl.loop.drrt import KeptTree
 from apex_ompl.loop.gpmp2 import IncrementalGPMP2
+from apex_ompl.loop.imitation import Imitation
 from apex_ompl.loop.mppi import PathIntegral
 from apex_ompl.loop.paper import OneProposal
 from apex_ompl.loop.portfolio import Portfolio
@@ -77,6 +78,12 @@ METHODS = {
     ),
     "damon": Method(
         ManifoldGraph, FROM_REST, "DAMON: stops where the way is blocked; A* over a graph on a learned manifold"
+    ),
+    "il": Method(
+        Imitation, {**BLIND, "verified": False}, "an imitation policy as a reflex, followed unproved"
+    ),
+    "il-paper": Method(
+        lambda: Imitation("il-paper"), {**BLIND, "verified": False}, "the same, which sees one obstacle point"
     ),
 }  # fmt: skip
 

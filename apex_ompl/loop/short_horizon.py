@@ -141,11 +141,28 @@ def straight(search: Search, goal: Array) -> Trajectory | None:
     search.charges.charge("straight motion")
     if not (start.velocity.any() or start.acceleration.any()):
         return time_path(np.stack([start.position, goal]), limits, names).trajectory
-    states = np.linspace(start.position, goal, STRAIGHT)
-    spline = TimedSpline.along(states, least_duration(states, limits), start, goal)
+    return _stretched(search, np.linspace(start.position, goal, STRAIGHT), goal)
+
+
+def along(search: Search, states: Array, goal: Array) -> Trajectory | None:
+    """Return the motion whose spline has some states as control points and ends in one, or None within the limits.
+
+    Args:
+        search: The replan, which says how the motion begins.
+        states: States of the motion, evenly spaced in time, shape (N, dof).
+        goal: Where it ends, shape (dof,).
+    """
+    search.charges.charge("straight motion")
+    return _stretched(search, states, goal)
+
+
+def _stretched(search: Search, states: Array, goal: Array) -> Trajectory | None:
+    """Return the spline along states that takes as long as the limits ask for, or None where that is not found."""
+    limits = search.ready.limits
+    spline = TimedSpline.along(states, least_duration(states, limits), search.start, goal)
     for _ in range(STRETCHES):
         least = least_knot_spacing(spline.control, limits)
         if least <= spline.spacing:
-            return spline.trajectory(names)
+            return spline.trajectory(search.ready.names)
         spline = spline.lasting(max(least, SLOWER * spline.spacing))
     return None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Hashable
+from collections.abc import Hashable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar, get_args, get_origin
 
@@ -139,6 +139,23 @@ def validate(model: type[ModelT], data: dict[str, Any], source: str) -> ModelT:
             expected = str(first["ctx"]["error"])
         field = ".".join(location) if location else ""
         raise FileFormatError(source, field, value, expected) from error
+
+
+def replaced(data: dict[str, Any], changes: Mapping[str, Any], source: str) -> dict[str, Any]:
+    """Return ``data`` with some keys replaced in place: ``changes`` maps dotted keys such as ``latent.dim`` to values.
+
+    Raises:
+        FileFormatError: A key goes through something that holds no keys.
+    """
+    for key, value in changes.items():
+        *above, last = key.split(".")
+        section = data
+        for name in above:
+            section = section.setdefault(name, {})
+            if not isinstance(section, dict):
+                raise FileFormatError(source, key, value, f"expected {name!r} to hold keys")
+        section[last] = value
+    return data
 
 
 def _known_keys(model: type[BaseModel], location: tuple[int | str, ...]) -> set[str]:

@@ -10,6 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+import yaml
 from numpy.typing import ArrayLike, NDArray
 
 from apex_ompl.errors import ParameterError
@@ -228,3 +229,18 @@ def positive_number(text: str) -> float:
     if not 0.0 < value < float("inf"):
         raise argparse.ArgumentTypeError(f"{text!r}, expected a positive number")
     return value
+
+
+def key_value(text: str) -> tuple[str, Any]:
+    """Return the key and the value, read as YAML, of a text KEY=VALUE; a type of ``argparse``.
+
+    Raises:
+        ArgumentTypeError: It is not one.
+    """
+    key, equals, value = text.partition("=")
+    if not key or not equals:
+        raise argparse.ArgumentTypeError(f"{text!r}, expected KEY=VALUE")
+    try:
+        return key, yaml.safe_load(value)
+    except yaml.YAMLError as error:
+        raise argparse.ArgumentTypeError(f"{text!r}, expected a value in YAML") from error
