@@ -23,13 +23,15 @@ from apex_ompl.loop.ready import Ready
 from apex_ompl.loop.replanning import Replanning
 from apex_ompl.loop.request import Request
 from apex_ompl.loop.result import Event
+from apex_ompl.loop.search import EARLIER
 from apex_ompl.loop.tracking import Tracker
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.types import Array
 
 SAME_STATE = 1e-6  # largest jump of positions, velocities and accelerations where a motion begins
+BLIND_TIME = 0.15  # for which an obstacle may go anywhere before the robot stands [s]
+SHORTEST = 0.1  # rest of a motion for which no faster one is looked for [s]
 NEARER = 0.01  # by which an obstacle must come nearer than where a motion began, within the trigger, to stop it [m]
-FASTER = 0.9  # share of the time to a goal that a plan must have at most to replace one without a conflict
 
 
 @dataclass(eq=False)
@@ -53,6 +55,7 @@ class Executor:
         nearest: Distance of an obstacle below which the motion counts as blocked, where that goes by distance [m].
         leaving: Whether the robot leaves a place that an obstacle comes to, and goes on without a proved stop.
         lead: How long before a step it is decided, by what was seen until then [s].
+        hastened: When a faster motion was asked for last [s].
     """
 
     ready: Ready
@@ -71,6 +74,7 @@ class Executor:
     nearest: float = 0.0
     leaving: bool = False
     lead: float = 0.0
+    hastened: float = -math.inf
 
     def log(self, time: float, kind: str, **data: Any) -> None:
         """Note an event."""
@@ -231,7 +235,7 @@ class Executor:
         if unfit or not settings.verified:
             return unfit
         if not math.isfinite(self.conflict) and self.following.to_goal and found.to_goal:
-            if found.end - now > FASTER * (self.following.end - now):
+            if found.end > self.following.end - EARLIER + SAME_TIME:
                 return "it is hardly faster"
         hold = settings.hold if found.to_goal else settings.rest_hold
         conflict = self.ready.first_conflict(predicted, found, found.begin, found.end + hold)
@@ -270,7 +274,9 @@ class Executor:
             return
         join = now + settings.budget
         self.asked += 1
-        wide = predicted.larger(settings.berth)
+        if self.following.to_goal and not math.isfinite(self.conflict):
+            self.hastened = now
+        wide = predicted.larger(max(settings.berth, settings.error + BLIND_TIME * settings.fastest))
         request = Request(
             self.asked, now, join, self.following, self.route, predicted, wide, obstacles, self.conflict, self.seed
         )  # fmt: skip
@@ -289,7 +295,11 @@ class Executor:
             return False
         if math.isfinite(self.conflict) and not settings.by_distance:
             return True
-        return not self.following.to_goal
+        if not self.following.to_goal:
+            return True
+        if not settings.hastens or now + settings.budget + SHORTEST > self.following.end:
+            return False
+        return now >= self.hastened + settings.budget - SAME_TIME
 
     def done(self, now: float) -> bool:
         """Whether the robot stands at a goal."""

@@ -17,7 +17,7 @@ from apex_ompl.loop.request import Replanner
 from apex_ompl.loop.resuming import Resume
 from apex_ompl.loop.settings import LoopSettings
 from apex_ompl.loop.snapshot import Snapshot
-from apex_ompl.loop.sources import Lines, Route
+from apex_ompl.loop.sources import Faster, Lines, Route
 
 
 @dataclass(frozen=True)
@@ -35,18 +35,19 @@ class Method:
     about: str
 
 
-FROM_REST = {"from_rest": True}
-BLIND = {"prediction": "still", "guarded": False}
+ONE_PLAN = {"hastens": False}
+FROM_REST = {"from_rest": True, **ONE_PLAN}
+BLIND = {"prediction": "still", "guarded": False, **ONE_PLAN}
 PAPER = {**BLIND, "verified": False, "from_rest": True, "by_distance": True}
 
 
 def _no_network() -> Portfolio:
-    return Portfolio([Route(), Lines(), Lines(bumps=3)])
+    return Portfolio([Faster(), Route(), Lines(), Lines(bumps=3)])
 
 
 METHODS = {
     "apex": Method(
-        lambda: Portfolio([Route(), Lines(), Proposals(), Lines(bumps=3)]), {}, "all parts, the network among them"
+        lambda: Portfolio([Faster(), Route(), Lines(), Proposals(), Lines(bumps=3)]), {}, "all parts, the network among them"
     ),
     "no-network": Method(_no_network, {}, "all parts but the network's proposals"),
     "apex-paper": Method(
@@ -55,7 +56,7 @@ METHODS = {
     ),
     "apex-paper-unguided": Method(lambda: OneProposal(guided=False), PAPER, "the same without guidance"),
     "retime": Method(
-        lambda: Resume(_no_network(), retimes=True), {}, "one plan, along which the speed alone is chosen anew"
+        lambda: Resume(_no_network(), retimes=True), ONE_PLAN, "one plan, along which the speed alone is chosen anew"
     ),
     "stop-and-wait": Method(
         lambda: Resume(_no_network()), FROM_REST, "one plan; stops where it is blocked, goes on when it is clear"
@@ -67,8 +68,8 @@ METHODS = {
         lambda: Portfolio([Route(), Lines(), Proposals(), Lines(bumps=3)], evades=False), {**BLIND, "monitored": False},
         "a plan among obstacles where they were seen at first, followed blindly",
     ),
-    "mppi": Method(PathIntegral, {}, "model predictive path integral control"),
-    "potential-field": Method(PotentialField, {}, "a reflex down an artificial potential"),
+    "mppi": Method(PathIntegral, ONE_PLAN, "model predictive path integral control"),
+    "potential-field": Method(PotentialField, ONE_PLAN, "a reflex down an artificial potential"),
     "dynamic-rrt": Method(
         DynamicRRT, FROM_REST, "stops where the way is blocked; a tree from the goal that is kept and repaired"
     ),

@@ -13,8 +13,10 @@ from apex_ompl.loop.ready import Ready
 from apex_ompl.loop.request import Answer, Request
 from apex_ompl.loop.search import Search, Source
 from apex_ompl.trajectory import Trajectory
+from apex_ompl.types import Array
 
 FACTORS = (1.0, 1.8)  # durations that are tried, as multiples of what a path takes without obstacles
+GOALS = 2  # nearest goals that are tried directly
 ENOUGH = 10  # candidates at which no further source is asked
 CARRIED = 6  # candidates that are carried over to the next replan
 SHARE = 0.5  # of the time that is left, for candidates before the next source is asked
@@ -54,6 +56,10 @@ class Portfolio:
             motion = retimed(search)
             if motion is not None:
                 search.take(motion, "retime")
+        for goal in search.goals[:GOALS] if self.sources else ():
+            motion = straight(search, goal)
+            if motion is not None:
+                search.take(motion, "direct")
         if self.sources and not charges.over():
             self._optimise(search)
         return Answer(search.best, search.part, charges)
@@ -85,11 +91,14 @@ class Portfolio:
     def _ask(source: Source, search: Search, pool: MotionPool) -> None:
         """Take the motions of a source into the pool."""
         for guess in source.guesses(search):
-            for factor in FACTORS:
+            for factor in FACTORS[:1] if guess.timed else FACTORS:
                 if search.charges.over():
                     return
-                if factor * guess.duration < search.wanted():
-                    pool.add(guess.states, factor * guess.duration, guess.goal, source.name)
+                least, made = factor * guess.duration, (guess.states, guess.duration)
+                if not guess.timed and least < search.wanted():
+                    made = search.shaped(guess.states, guess.goal, least)
+                if made is not None and made[1] < search.wanted():
+                    pool.add(*made, guess.goal, source.name)
 
     @staticmethod
     def _improve(search: Search, pool: MotionPool, until: float) -> bool:
@@ -99,6 +108,24 @@ class Portfolio:
             if found is None:
                 return search.charges.spent >= until
             search.take(found[1], found[0].origin)
+
+
+def straight(search: Search, goal: Array) -> Trajectory | None:
+    """Return the direct motion to a goal, or a slower or retimed one, that is proved, or None."""
+    ready, request = search.ready, search.request
+    fastest = search.direct(goal)
+    if fastest is None or fastest.duration <= 0.0 or fastest.duration >= search.wanted():
+        return None
+    if not ready.clear_of_still(fastest, search.charges):
+        return None
+    if search.accepts(fastest):
+        return fastest
+    made = retime(ready.kernel, request.predicted, fastest, ready.limits, clock=request.join, hold=ready.settings.hold)
+    search.charges.charge("retiming")
+    slow = made.trajectory
+    if slow is not None and slow.duration < search.wanted() and search.accepts(slow):
+        return slow
+    return None
 
 
 def retimed(search: Search) -> Trajectory | None:

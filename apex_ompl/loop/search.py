@@ -16,10 +16,14 @@ from apex_ompl.loop.ready import Ready
 from apex_ompl.loop.request import Request
 from apex_ompl.robot.model import Limits
 from apex_ompl.trajectory import Trajectory
+from apex_ompl.trajectory.methods.moving_start import between
 from apex_ompl.types import Array
 
 MOTIONS = MotionSettings(samples=2)
 STATES = 64  # of a motion that splines begin from
+EARLIER = 0.02  # by which a motion must arrive before one without a conflict to replace it [s]
+CLOSE = 0.15  # begin of a motion in which it may be nearer to obstacles than the berth [s]
+NARROW = 0.4  # time that a motion without the berth must gain over one with it [s]
 BETTER = 0.97  # share of the duration of the best motion so far below which another one is worth its while
 
 
@@ -35,6 +39,7 @@ class Search:
         rng: Source of random choices.
         best: The best motion so far, or None.
         part: What found it.
+        cost: Its duration, and more where it is narrow [s].
     """
 
     ready: Ready
@@ -44,6 +49,7 @@ class Search:
     rng: np.random.Generator = field(init=False)
     best: Following | None = None
     part: str = ""
+    cost: float = np.inf
 
     def __post_init__(self) -> None:
         """Read the request."""
@@ -56,9 +62,52 @@ class Search:
         order: Array = goals[np.argsort(np.linalg.norm(goals - self.start.position, axis=1), kind="stable")]
         return order
 
+    @property
+    def hastens(self) -> bool:
+        """Whether what the robot follows leads to a goal without a conflict, so that only a faster motion is of use."""
+        return self.request.following.to_goal and not np.isfinite(self.request.conflict)
+
     def wanted(self) -> float:
         """Return the duration that a motion must be shorter than to be of use [s]."""
-        return np.inf if self.best is None else BETTER * self.best.motion.duration
+        return min(self.most, BETTER * self.cost)
+
+    @property
+    def most(self) -> float:
+        """Duration of what is followed, where only a faster motion is of use [s]."""
+        return self.request.following.end - self.request.join - EARLIER if self.hastens else np.inf
+
+    def direct(self, goal: Array, least: float = 0.0) -> Trajectory | None:
+        """Return the fastest motion to a goal, shape (dof,), in a time or more [s], whatever is in the way, or None."""
+        self.charges.charge("direct motion")
+        rest = np.zeros_like(goal)
+        q, v, a = self.start
+        return between(np.stack([[q, goal], [v, rest], [a, rest]]), self.ready.limits, self.ready.names, least)
+
+    def shaped(self, states: Array, goal: Array, least: float) -> tuple[Array, float] | None:
+        """Return a motion along about a path, as fast as the direct one or slower, or None.
+
+        What the path strays from the straight line is added to the direct motion, by how far that has come.
+
+        Args:
+            states: States of the path, shape (N, dof).
+            goal: Where it ends, shape (dof,).
+            least: Least duration [s].
+
+        Returns:
+            States evenly spaced in time, shape (STATES, dof), and the duration [s].
+        """
+        direct = self.direct(goal, least)
+        if direct is None or direct.duration <= 0.0:
+            return None
+        moved = direct(np.linspace(0.0, direct.duration, STATES))
+        way = goal - self.start.position
+        progress = np.clip((moved - self.start.position) @ way / max(way @ way, 1e-12), 0.0, 1.0)
+        arc = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(states, axis=0), axis=1)))
+        share = arc / max(arc[-1], 1e-12)
+        ends = self.start.position + share[:, None] * way
+        off = states + (1.0 - share[:, None]) * (self.start.position - states[0]) - ends
+        strays = np.stack([np.interp(progress, share, column) for column in off.T], axis=1)
+        return moved + strays, direct.duration
 
     def following(self, motion: Trajectory) -> Following:
         """Return a motion as one that is followed from the time of joining on."""
@@ -71,10 +120,20 @@ class Search:
         conflict = self.ready.first_conflict(self.request.predicted, one, one.begin, until, self.charges)
         return not np.isfinite(conflict) and self.ready.clear_of_still(motion, self.charges)
 
+    def roomy(self, motion: Trajectory) -> bool:
+        """Whether a motion passes by with the berth, but for its begin: the guard will hardly stop it."""
+        one = self.following(motion)
+        begin = min(one.begin + CLOSE, one.end)
+        return not np.isfinite(self.ready.first_conflict(self.request.wide, one, begin, one.end, self.charges))
+
     def take(self, motion: Trajectory, part: str) -> None:
-        """Keep a proved motion where it is shorter than the best."""
-        if motion.duration < self.wanted():
-            self.best, self.part = self.following(motion), part
+        """Keep a proved motion where it is shorter than the best, or about so with more room."""
+        roomy = self.roomy(motion)
+        if self.hastens and not roomy:
+            return
+        cost = motion.duration + (0.0 if roomy else NARROW)
+        if cost < self.cost and motion.duration < self.most:
+            self.best, self.part, self.cost = self.following(motion), part, cost
 
     def pool(self, berth: bool = True) -> MotionPool:
         """Return an empty pool of motions, which are optimised with a berth around obstacles or without."""
@@ -92,11 +151,13 @@ class Guess(NamedTuple):
         states: States evenly spaced in time, shape (N, dof).
         goal: Where it ends, shape (dof,).
         duration: About how long it takes without obstacles [s].
+        timed: Whether it is a motion of that duration, and no path.
     """
 
     states: Array
     goal: Array
     duration: float
+    timed: bool = False
 
 
 class Source(Protocol):
