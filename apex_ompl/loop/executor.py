@@ -173,6 +173,10 @@ class Executor:
             return
         if self.leaving or self.following.at_rest(now):
             self.stop = None
+        elif not self.following.start(now).moves:  # it did not set out yet
+            self.stop = None
+            self.follow(Following.standing(self.state(now), now, self.ready.names), now)
+            self.log(now, "stop", at=now)
         elif self.stop is None:
             self.log(now, "broken assumption", what="no stop is in hand")
         elif self.stop is not self.following:
@@ -201,8 +205,12 @@ class Executor:
         if found is None:
             self.log(now, "rejected", why=reply.failed, **took)
             return
+        if self.following.at_rest(now) and request.following is self.following and now < request.join:
+            earlier = replace(request, join=now), replace(found, begin=now)  # a robot that stands can set out at once
+            if not self._fault(now, *earlier, predicted):
+                request, found = earlier
         if self.ready.settings.from_rest and self.following.at_rest(request.join):
-            request = replace(request, join=max(request.join, now))  # a robot that stands can wait
+            request = replace(request, join=max(request.join, now))  # or wait
             found = replace(found, begin=request.join)
         why, leaving = self._fault(now, request, found, predicted), False
         if not why and reachable is not None:

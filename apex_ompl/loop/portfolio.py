@@ -15,7 +15,7 @@ from apex_ompl.loop.search import Search, Source
 from apex_ompl.trajectory import Trajectory
 from apex_ompl.types import Array
 
-FACTORS = (1.0, 1.8)  # durations that are tried, as multiples of what a path takes without obstacles
+FACTORS = ((1.3, 2.5), (1.0, 1.8))  # durations that are tried in turn, as multiples of what a path takes at least
 GOALS = 2  # nearest goals that are tried directly
 ENOUGH = 10  # candidates at which no further source is asked
 CARRIED = 6  # candidates that are carried over to the next replan
@@ -60,7 +60,7 @@ class Portfolio:
             motion = straight(search, goal)
             if motion is not None:
                 search.take(motion, "direct")
-        if self.sources and not charges.over():
+        if self.sources and not search.over():
             self._optimise(search)
         return Answer(search.best, search.part, charges)
 
@@ -73,7 +73,7 @@ class Portfolio:
         for one, begun in carried:
             pool.carry(one, search.request.join - begun)
         sources = iter(self.sources)
-        while not search.charges.over():
+        while not search.over():
             source = next(sources, None)
             if source is None and not pool.candidates:
                 break
@@ -91,7 +91,7 @@ class Portfolio:
     def _ask(source: Source, search: Search, pool: MotionPool) -> None:
         """Take the motions of a source into the pool."""
         for guess in source.guesses(search):
-            for factor in FACTORS[:1] if guess.timed else FACTORS:
+            for factor in (1.0,) if guess.timed else FACTORS[search.request.number % len(FACTORS)]:
                 if search.charges.over():
                     return
                 least, made = factor * guess.duration, (guess.states, guess.duration)
@@ -108,6 +108,8 @@ class Portfolio:
             if found is None:
                 return search.charges.spent >= until
             search.take(found[1], found[0].origin)
+            if search.over():
+                return False
 
 
 def straight(search: Search, goal: Array) -> Trajectory | None:

@@ -24,6 +24,8 @@ STATES = 64  # of a motion that splines begin from
 EARLIER = 0.02  # by which a motion must arrive before one without a conflict to replace it [s]
 CLOSE = 0.15  # begin of a motion in which it may be nearer to obstacles than the berth [s]
 NARROW = 0.4  # time that a motion without the berth must gain over one with it [s]
+GOOD = 1.2  # duration of a motion with which a replan ends, as a multiple of the direct one's
+ENOUGH_TIME = 0.4  # share of the budget behind which it ends with any motion that has room
 BETTER = 0.97  # share of the duration of the best motion so far below which another one is worth its while
 
 
@@ -40,6 +42,7 @@ class Search:
         best: The best motion so far, or None.
         part: What found it.
         cost: Its duration, and more where it is narrow [s].
+        least: Duration of the direct motion, whatever is in the way [s].
     """
 
     ready: Ready
@@ -50,6 +53,7 @@ class Search:
     best: Following | None = None
     part: str = ""
     cost: float = np.inf
+    least: float = np.inf
 
     def __post_init__(self) -> None:
         """Read the request."""
@@ -81,7 +85,10 @@ class Search:
         self.charges.charge("direct motion")
         rest = np.zeros_like(goal)
         q, v, a = self.start
-        return between(np.stack([[q, goal], [v, rest], [a, rest]]), self.ready.limits, self.ready.names, least)
+        made = between(np.stack([[q, goal], [v, rest], [a, rest]]), self.ready.limits, self.ready.names, least)
+        if made is not None:
+            self.least = min(self.least, made.duration)
+        return made
 
     def shaped(self, states: Array, goal: Array, least: float) -> tuple[Array, float] | None:
         """Return a motion along about a path, as fast as the direct one or slower, or None.
@@ -119,6 +126,14 @@ class Search:
         until = one.end + (settings.hold if one.to_goal else settings.rest_hold)
         conflict = self.ready.first_conflict(self.request.predicted, one, one.begin, until, self.charges)
         return not np.isfinite(conflict) and self.ready.clear_of_still(motion, self.charges)
+
+    def over(self) -> bool:
+        """Whether time is up, or what was found is good enough: a faster motion is looked for while it is followed."""
+        if self.charges.over():
+            return True
+        if self.cost == np.inf or self.hastens or not self.ready.settings.hastens:
+            return False
+        return self.cost <= GOOD * self.least or self.charges.spent > ENOUGH_TIME * self.charges.limit
 
     def roomy(self, motion: Trajectory) -> bool:
         """Whether a motion passes by with the berth, but for its begin: the guard will hardly stop it."""

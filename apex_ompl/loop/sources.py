@@ -48,7 +48,7 @@ class Faster:
             times = request.join - request.following.begin + np.linspace(0.0, left, STATES)
             states = request.following.motion(np.clip(times, 0.0, request.following.motion.duration))
             for factor in FASTER:
-                yield Guess(states, states[-1], factor * left, timed=True)
+                yield Guess(states, request.following.motion.positions[-1], factor * left, timed=True)
 
 
 @dataclass(frozen=True)
