@@ -9,6 +9,7 @@ from apex_ompl.live.retime import retime
 from apex_ompl.loop.charges import Charges
 from apex_ompl.loop.evasion import endangered, step_aside
 from apex_ompl.loop.motion_pool import ROUNDS, MotionCandidate, MotionPool
+from apex_ompl.loop.quickening import quickened
 from apex_ompl.loop.ready import Ready
 from apex_ompl.loop.request import Answer, Request
 from apex_ompl.loop.search import Search, Source
@@ -60,6 +61,8 @@ class Portfolio:
             motion = straight(search, goal)
             if motion is not None:
                 search.take(motion, "direct")
+        if self.sources and search.hastens:
+            quicken(search, request.following.piece(request.join, request.following.end))
         if self.sources and not search.over():
             self._optimise(search)
         return Answer(search.best, search.part, charges)
@@ -107,9 +110,17 @@ class Portfolio:
             found = pool.improve(search.wanted, until)
             if found is None:
                 return search.charges.spent >= until
-            search.take(found[1], found[0].origin)
+            if search.take(found[1], found[0].origin):
+                quicken(search, found[1])
             if search.over():
                 return False
+
+
+def quicken(search: Search, motion: Trajectory) -> None:
+    """Take a faster motion through states of one that is proved, where there is one that is proved, too."""
+    for faster in quickened(search, motion):
+        if search.accepts(faster) and search.take(faster, "quicken"):
+            return
 
 
 def straight(search: Search, goal: Array) -> Trajectory | None:

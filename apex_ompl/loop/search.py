@@ -141,14 +141,16 @@ class Search:
         begin = min(one.begin + CLOSE, one.end)
         return not np.isfinite(self.ready.first_conflict(self.request.wide, one, begin, one.end, self.charges))
 
-    def take(self, motion: Trajectory, part: str) -> None:
-        """Keep a proved motion where it is shorter than the best, or about so with more room."""
+    def take(self, motion: Trajectory, part: str) -> bool:
+        """Keep a proved motion where it is shorter than the best, or about so with more room; return whether it is."""
         roomy = self.roomy(motion)
         if self.hastens and not roomy:
-            return
+            return False
         cost = motion.duration + (0.0 if roomy else NARROW)
-        if cost < self.cost and motion.duration < self.most:
-            self.best, self.part, self.cost = self.following(motion), part, cost
+        if cost >= self.cost or motion.duration >= self.most:
+            return False
+        self.best, self.part, self.cost = self.following(motion), part, cost
+        return True
 
     def pool(self, berth: bool = True) -> MotionPool:
         """Return an empty pool of motions, which are optimised with a berth around obstacles or without."""
