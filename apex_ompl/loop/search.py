@@ -8,6 +8,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from apex_ompl.live.movers import Movers
 from apex_ompl.live.timed_spline import MotionOptimizer, MotionSettings, Start
 from apex_ompl.loop.charges import Charges
 from apex_ompl.loop.following import Following
@@ -22,8 +23,9 @@ from apex_ompl.types import Array
 MOTIONS = MotionSettings(samples=2)
 STATES = 64  # of a motion that splines begin from
 EARLIER = 0.02  # by which a motion must arrive before one without a conflict to replace it [s]
-CLOSE = 0.15  # begin of a motion in which it may be nearer to obstacles than the berth [s]
-NARROW = 0.4  # time that a motion without the berth must gain over one with it [s]
+GUARDED, AGE = 0.04, 0.08  # times between stops of a motion that are looked at, and how old what is known will be [s]
+SPREAD = 0.01  # by which places that are seen differ from those that are expected [m]
+NARROW = 1.0  # time that a motion that the guard may stop must gain over one that it will hardly stop [s]
 GOOD = 1.2  # duration of a motion with which a replan ends, as a multiple of the direct one's
 ENOUGH_TIME = 0.4  # share of the budget behind which it ends with any motion that has room
 BETTER = 0.97  # share of the duration of the best motion so far below which another one is worth its while
@@ -41,7 +43,7 @@ class Search:
         rng: Source of random choices.
         best: The best motion so far, or None.
         part: What found it.
-        cost: Its duration, and more where it is narrow [s].
+        cost: Its duration, and more where the guard may stop it [s].
         least: Duration of the direct motion, whatever is in the way [s].
     """
 
@@ -135,19 +137,25 @@ class Search:
             return False
         return self.cost <= GOOD * self.least or self.charges.spent > ENOUGH_TIME * self.charges.limit
 
-    def roomy(self, motion: Trajectory) -> bool:
-        """Whether a motion passes by with the berth, but for its begin: the guard will hardly stop it."""
-        one = self.following(motion)
-        begin = min(one.begin + CLOSE, one.end)
-        return not np.isfinite(self.ready.first_conflict(self.request.wide, one, begin, one.end, self.charges))
+    def guardable(self, motion: Trajectory) -> bool:
+        """Whether the guard will hardly stop a motion: stops from it are proved, as they will be known then."""
+        settings, one = self.ready.settings, self.following(motion)
+        if not settings.guarded:
+            return True
+        for time in np.arange(one.begin, one.end, GUARDED):
+            self.charges.charge("proved stop")
+            seen = reach(self.request.predicted, time - AGE, settings.error, settings.fastest)
+            if self.ready.proved_stop(seen, one, float(time), float(time) + settings.period) is None:
+                return False
+        return True
 
     def take(self, motion: Trajectory, part: str) -> bool:
         """Keep a proved motion where it is shorter than the best, or about so with more room; return whether it is."""
-        roomy = self.roomy(motion)
-        if self.hastens and not roomy:
+        if motion.duration >= min(self.most, self.cost):
             return False
-        cost = motion.duration + (0.0 if roomy else NARROW)
-        if cost >= self.cost or motion.duration >= self.most:
+        guardable = self.guardable(motion)
+        cost = motion.duration + (0.0 if guardable else NARROW)
+        if cost >= self.cost or (self.hastens and not guardable):
             return False
         self.best, self.part, self.cost = self.following(motion), part, cost
         return True
@@ -159,6 +167,16 @@ class Search:
         optimizer = MotionOptimizer(ready.kernel, movers, ready.limits, MOTIONS)
         beyond = ready.settings.berth if berth else 0.0
         return MotionPool(optimizer, self.start, request.join, self.charges, self.accepts, berth=beyond)
+
+
+def reach(predicted: Movers, stamp: float, error: float, fastest: float) -> Movers:
+    """Return all that obstacles can reach that are seen at a time where they are expected then [s]."""
+    found = predicted.larger(0.0)
+    arrays = found.arrays
+    arrays.place[:] += arrays.velocity * (stamp - arrays.stamp)[:, None]
+    arrays.velocity[:], arrays.stamp[:] = 0.0, stamp
+    arrays.growth[:] = error + SPREAD, fastest
+    return found
 
 
 class Guess(NamedTuple):
