@@ -18,6 +18,7 @@ import numpy as np
 
 from apex_ompl.live.movers import Movers, clearance_in_time
 from apex_ompl.loop.evasion import GAIN, SOON
+from apex_ompl.loop.fitting import misfit
 from apex_ompl.loop.following import SAME_TIME, Following
 from apex_ompl.loop.ready import Ready
 from apex_ompl.loop.replanning import Replanning
@@ -28,7 +29,6 @@ from apex_ompl.loop.tracking import Tracker
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.types import Array
 
-SAME_STATE = 1e-6  # largest jump of positions, velocities and accelerations where a motion begins
 BLIND_TIME = 0.15  # for which an obstacle may go anywhere before the robot stands [s]
 SHORTEST = 0.1  # rest of a motion for which no faster one is looked for [s]
 NEARER = 0.01  # by which an obstacle must come nearer than where a motion began, within the trigger, to stop it [m]
@@ -197,21 +197,15 @@ class Executor:
             return
         if reply is None or reply.number != request.number:
             if now > request.join + self._patience + 1e-9:
-                self.log(now, "rejected", why="no answer came in time", number=request.number, part="")
+                self.log(now, request.refused, why="no answer came in time", number=request.number, part="")
                 self.pending = None
             return
         self.pending, found, part = None, reply.answer.found, reply.answer.part
         took = {"number": request.number, "part": part, "took": reply.answer.charges.spent}
         if found is None:
-            self.log(now, "rejected", why=reply.failed, **took)
+            self.log(now, request.refused, why=reply.failed, **took)
             return
-        if self.following.at_rest(now) and request.following is self.following and now < request.join:
-            earlier = replace(request, join=now), replace(found, begin=now)  # a robot that stands can set out at once
-            if not self._fault(now, *earlier, predicted):
-                request, found = earlier
-        if self.ready.settings.from_rest and self.following.at_rest(request.join):
-            request = replace(request, join=max(request.join, now))  # or wait
-            found = replace(found, begin=request.join)
+        request, found = self._at_once(now, request, found, predicted)
         why, leaving = self._fault(now, request, found, predicted), False
         if not why and reachable is not None:
             then = found.begin + self.ready.settings.period
@@ -220,9 +214,9 @@ class Executor:
             if leaving and not may:
                 why = "no stop behind its first step is proved"
         if why:
-            self.log(now, "rejected", why=why, **took)
+            self.log(now, request.refused, why=why, **took)
             return
-        self.log(now, "accepted", **took, arrival=found.end, to_goal=found.to_goal, leaving=leaving)
+        self.log(now, request.taken, **took, arrival=found.end, to_goal=found.to_goal, leaving=leaving)
         self._answered(now, part)
         if found.to_goal:
             self.route = found
@@ -232,6 +226,20 @@ class Executor:
         if self.ready.settings.by_distance:
             self.nearest = min(self.ready.settings.trigger, self._distance(now, predicted) - NEARER)
 
+    def _at_once(
+        self, now: float, request: Request, found: Following, predicted: Movers
+    ) -> tuple[Request, Following]:
+        """Return a request and its answer, which begins now where a robot that stands can set out at once."""
+        if request.following is not self.following or abs(found.begin - request.join) > SAME_TIME:
+            return request, found
+        earlier = replace(request, join=now), replace(found, begin=now)
+        if self.following.at_rest(now) and now < request.join and not self._fault(now, *earlier, predicted):
+            return earlier
+        if self.ready.settings.from_rest and self.following.at_rest(request.join):  # or wait
+            join = max(request.join, now)
+            return replace(request, join=join), replace(found, begin=join)
+        return request, found
+
     def _fault(self, now: float, request: Request, found: Following, predicted: Movers) -> str:
         """Return why an answer is of no use any more, or nothing."""
         settings = self.ready.settings
@@ -239,7 +247,7 @@ class Executor:
             return "the robot follows another motion by now"
         if now > request.join + 1e-9:
             return "it came too late"
-        unfit = self._misfit(found, request)
+        unfit = misfit(self.ready, found, request)
         if unfit or not settings.verified:
             return unfit
         if not math.isfinite(self.conflict) and self.following.to_goal and found.to_goal:
@@ -250,25 +258,6 @@ class Executor:
         gains = self._may_leave(now, found) and conflict > self.conflict + GAIN
         if math.isfinite(conflict) and not gains:
             return "what was seen since then is in the way"
-        return ""
-
-    def _misfit(self, found: Following, request: Request) -> str:
-        """Return why a motion can never be followed behind what a request says, or nothing."""
-        motion = found.motion
-        if motion.joint_names != self.ready.names:
-            return "it is a motion of other joints"
-        behind = request.following.start(request.join)
-        states = motion.positions[0], motion.velocities[0], motion.accelerations[0]
-        off = max(float(np.abs(one - other).max()) for one, other in zip(states, behind, strict=True))
-        if abs(found.begin - request.join) > SAME_TIME or not off <= SAME_STATE:
-            return "it does not begin where the robot will be"
-        if motion.velocities[-1].any() or motion.accelerations[-1].any():
-            return "it does not end at rest"
-        if found.to_goal and not self.ready.is_goal(motion.positions[-1]):
-            return "it does not end at a goal"
-        verified = self.ready.settings.verified
-        if not (self.ready.clear_of_still(motion) if verified else self.ready.keeps_limits(motion)):
-            return "it exceeds limits, or is not proved clear of what stands still"
         return ""
 
     def _may_leave(self, now: float, found: Following) -> bool:
@@ -282,14 +271,12 @@ class Executor:
             return
         join = now + settings.budget
         self.asked += 1
-        if self.following.to_goal and not math.isfinite(self.conflict):
-            self.hastened = now
         wide = predicted.larger(max(settings.berth, settings.error + BLIND_TIME * settings.fastest))
         request = Request(
             self.asked, now, join, self.following, self.route, predicted, wide, obstacles, self.conflict, self.seed
         )  # fmt: skip
-        self.log(now, "request", number=self.asked, join=join)
-        self.pending = request
+        self.log(now, "improve" if request.hastens else "request", number=self.asked, join=join)
+        self.pending, self.hastened = request, now if request.hastens else self.hastened
         self.replanning.submit(request)
 
     def _wants(self, now: float) -> bool:

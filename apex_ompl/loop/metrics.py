@@ -18,7 +18,7 @@ from apex_ompl.util.validation import check_number
 
 COUNTED = {
     "replans_asked": "request", "replans_accepted": "accepted", "replans_rejected": "rejected",
-    "conflicts": "conflict", "evasions": "evasion", "broken_assumptions": "broken assumption",
+    "improvements_asked": "improve", "improvements": "improved", "conflicts": "conflict", "evasions": "evasion", "broken_assumptions": "broken assumption",
 }  # fmt: skip
 """Metrics that are numbers of events of a kind."""
 
@@ -31,8 +31,8 @@ def run_metrics(
     - ``time_to_goal``: time of the first ``goal`` event [s], if there is one.
     - ``rest_time``: how long the robot stood [s], and ``stops``: how often it came to rest. Where the goal was reached,
       the rest at the end of the motion counts for neither; standing at the beginning is no stop.
-    - ``replans_asked``, ``replans_accepted``, ``replans_rejected``, ``conflicts``, ``evasions`` and
-      ``broken_assumptions``: numbers of events.
+    - ``replans_asked``, ``replans_accepted``, ``replans_rejected``, ``improvements_asked``, ``improvements``,
+      ``conflicts``, ``evasions`` and ``broken_assumptions``: numbers of events.
     - ``reaction_p50`` and ``reaction_p95``: percentiles of ``seconds`` of the ``reaction`` events [s].
     - ``clearance``: the one given, if it is finite [m].
     - ``duration`` [s], ``spectral_arc_length``, and ``jerk``, root mean square over time [rad/s^3], of the motion.

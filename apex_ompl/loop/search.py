@@ -45,6 +45,7 @@ class Search:
         part: What found it.
         cost: Its duration, and more where the guard may stop it [s].
         least: Duration of the direct motion, whatever is in the way [s].
+        until: Time by the charges at which to end [s].
     """
 
     ready: Ready
@@ -56,6 +57,7 @@ class Search:
     part: str = ""
     cost: float = np.inf
     least: float = np.inf
+    until: float = np.inf
 
     def __post_init__(self) -> None:
         """Read the request."""
@@ -68,11 +70,6 @@ class Search:
         order: Array = goals[np.argsort(np.linalg.norm(goals - self.start.position, axis=1), kind="stable")]
         return order
 
-    @property
-    def hastens(self) -> bool:
-        """Whether what the robot follows leads to a goal without a conflict, so that only a faster motion is of use."""
-        return self.request.following.to_goal and not np.isfinite(self.request.conflict)
-
     def wanted(self) -> float:
         """Return the duration that a motion must be shorter than to be of use [s]."""
         return min(self.most, BETTER * self.cost)
@@ -80,7 +77,7 @@ class Search:
     @property
     def most(self) -> float:
         """Duration of what is followed, where only a faster motion is of use [s]."""
-        return self.request.following.end - self.request.join - EARLIER if self.hastens else np.inf
+        return self.request.following.end - self.request.join - EARLIER if self.request.hastens else np.inf
 
     def direct(self, goal: Array, least: float = 0.0) -> Trajectory | None:
         """Return the fastest motion to a goal, shape (dof,), in a time or more [s], whatever is in the way, or None."""
@@ -131,9 +128,9 @@ class Search:
 
     def over(self) -> bool:
         """Whether time is up, or what was found is good enough: a faster motion is looked for while it is followed."""
-        if self.charges.over():
+        if self.charges.over() or self.charges.spent >= self.until:
             return True
-        if self.cost == np.inf or self.hastens or not self.ready.settings.hastens:
+        if self.cost == np.inf or self.request.hastens or not self.ready.settings.hastens:
             return False
         return self.cost <= GOOD * self.least or self.charges.spent > ENOUGH_TIME * self.charges.limit
 
@@ -155,7 +152,7 @@ class Search:
             return False
         guardable = self.guardable(motion)
         cost = motion.duration + (0.0 if guardable else NARROW)
-        if cost >= self.cost or (self.hastens and not guardable):
+        if cost >= self.cost or (self.request.hastens and not guardable):
             return False
         self.best, self.part, self.cost = self.following(motion), part, cost
         return True

@@ -44,7 +44,7 @@ class Faster:
         """Yield the rest of the motion, where it has no conflict."""
         request = search.request
         left = request.following.end - request.join
-        if search.hastens and left > 0.0:
+        if request.hastens and left > 0.0:
             times = request.join - request.following.begin + np.linspace(0.0, left, STATES)
             states = request.following.motion(np.clip(times, 0.0, request.following.motion.duration))
             for factor in FASTER:
