@@ -20,6 +20,7 @@ from apex_ompl.problems import worlds
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.scripts import place_at
+from apex_ompl.trajectory.rests import is_at_rest
 
 MOVING = "vertical/moving-large-0.2/800001"
 NAN = float("nan")
@@ -48,6 +49,26 @@ def test_runs_in_all_worlds_are_results(kind: str, tmp_path: Path) -> None:
     if found:
         goals = found.problem.goal_states(robot().joint_names)
         assert (np.abs(goals - motion.positions[-1]).max(axis=1) < 1e-9).any()
+
+
+@pytest.mark.parametrize(
+    ("stuck", "outcome"), [(1.5, Outcome.STUCK), (9.0, Outcome.TIMEOUT)], ids=["stuck", "out-of-time"]
+)
+def test_a_goal_that_is_blocked_for_good_ends_the_run_at_rest_and_names_the_obstacle(
+    stuck: float, outcome: Outcome
+) -> None:
+    """A box comes to where a hand would be at the goal, and stays there."""
+    problem = problems.load(PROBLEM).still
+    goal = problem.goal_states(robot().joint_names)[0]
+    palm = robot().link_pose(goal, "left_hand_palm")[:3, 3]
+    rows = tuple((t, *(palm + (0.0, 0.0, z)).tolist()) for t, z in ((0.0, 0.3), (0.5, 0.0), (60.0, 0.0)))
+    box = Obstacle(name="box", box=(0.1, 0.1, 0.1), position=rows[0][1:], trajectory=rows)
+    problem = problem.model_copy(update={"scene": (*problem.scene, box)})
+    found = run(problem, "no-network", settings=LoopSettings(timeout=3.0, stuck=stuck, fastest=0.6))
+    assert found.outcome is outcome and not found
+    assert "no goal was reached" in found.reason and "box stood where the robot would be at the goal" in found.reason
+    assert is_at_rest(found.trajectory, found.trajectory.duration)
+    assert "contact" not in {event.kind for event in found.events} and found.metrics["clearance"] > 0.0
 
 
 @pytest.mark.parametrize(

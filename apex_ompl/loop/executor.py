@@ -31,6 +31,7 @@ from apex_ompl.types import Array
 
 BLIND_TIME = 0.15  # for which an obstacle may go anywhere before the robot stands [s]
 SHORTEST = 0.1  # rest of a motion for which no faster one is looked for [s]
+NEAR = 0.5  # time before a conflict from which on the robot brakes where no answer comes at once [s]
 NEARER = 0.01  # by which an obstacle must come nearer than where a motion began, within the trigger, to stop it [m]
 
 
@@ -55,6 +56,7 @@ class Executor:
         nearest: Distance of an obstacle below which the motion counts as blocked, where that goes by distance [m].
         leaving: Whether the robot leaves a place that an obstacle comes to, and goes on without a proved stop.
         lead: How long before a step it is decided, by what was seen until then [s].
+        ahead: How long before the conflict that was [s].
         hastened: When a faster motion was asked for last [s].
     """
 
@@ -74,6 +76,7 @@ class Executor:
     nearest: float = 0.0
     leaving: bool = False
     lead: float = 0.0
+    ahead: float = math.inf
     hastened: float = -math.inf
 
     def log(self, time: float, kind: str, **data: Any) -> None:
@@ -101,6 +104,7 @@ class Executor:
             if settings.from_rest:
                 self._halt(now)
         if reachable is not None:
+            self._brake(now)
             self._guard(now, reachable)
         self._ask(now, predicted, obstacles)
 
@@ -115,7 +119,7 @@ class Executor:
             found = self.ready.first_conflict(predicted, one, now, until)
         if math.isfinite(found) and not math.isfinite(self.conflict):
             self.log(now, "conflict", at=found)
-            self.endangered = now
+            self.endangered, self.ahead = now, found - now
         if not math.isfinite(found):
             self.endangered = None
         self.conflict = found
@@ -127,6 +131,13 @@ class Executor:
             self.ready.kernel, predicted, self.state(now)[None], looked, 2.0 * self.ready.settings.trigger
         )
         return float(clear.min())
+
+    def _brake(self, now: float) -> None:
+        """Stop where a conflict is near and no answer came within a step."""
+        waited = self.endangered is not None and now > self.endangered + SAME_TIME
+        if waited and self.conflict < now + NEAR and self.stop is not None and not self.following.at_rest(now):
+            if self.following.start(now).moves and self.stop is not self.following:
+                self._follow_stop(now, self.stop)
 
     def _halt(self, now: float) -> None:
         """Stop where the way to a goal is blocked."""
@@ -185,7 +196,7 @@ class Executor:
     def _answered(self, now: float, how: str) -> None:
         """Note how long after a conflict was known the command changed."""
         if self.endangered is not None:
-            self.log(now, "reaction", seconds=now - self.endangered + self.lead, how=how)
+            self.log(now, "reaction", seconds=now - self.endangered + self.lead, how=how, ahead=self.ahead)
             self.endangered = None
 
     def _answer(self, now: float, predicted: Movers, reachable: Movers | None) -> None:
@@ -226,9 +237,7 @@ class Executor:
         if self.ready.settings.by_distance:
             self.nearest = min(self.ready.settings.trigger, self._distance(now, predicted) - NEARER)
 
-    def _at_once(
-        self, now: float, request: Request, found: Following, predicted: Movers
-    ) -> tuple[Request, Following]:
+    def _at_once(self, now: float, request: Request, found: Following, predicted: Movers) -> tuple[Request, Following]:
         """Return a request and its answer, which begins now where a robot that stands can set out at once."""
         if request.following is not self.following or abs(found.begin - request.join) > SAME_TIME:
             return request, found

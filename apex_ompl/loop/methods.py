@@ -47,7 +47,8 @@ def _no_network() -> Portfolio:
 
 METHODS = {
     "apex": Method(
-        lambda: Portfolio([Faster(), Route(), Lines(), Proposals(), Lines(bumps=3)]), {}, "all parts, the network among them"
+        lambda: Portfolio([Faster(), Route(), Lines(), Proposals(), Lines(bumps=3)]), {},
+        "all parts, the network among them",
     ),
     "no-network": Method(_no_network, {}, "all parts but the network's proposals"),
     "apex-paper": Method(
