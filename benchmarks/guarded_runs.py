@@ -2,8 +2,8 @@
 
 The loop plans anew without the network, at full speed, for at most 4 s a run, in worlds of all kinds whose obstacles do
 not come out of nowhere. The referee knows what truly happened. A robot that leaves a place that an obstacle comes to
-does so without a proved stop: contacts then are counted apart. Runs are stored in benchmarks/runs/closed_loop/short when
-they end; the command resumes where it was stopped.
+does so without a proved stop: contacts then are counted apart. Runs are stored in benchmarks/runs/closed_loop/short
+when they end; the command resumes where it was stopped.
 
 Usage: python benchmarks/guarded_runs.py [-n 10000] [--jobs 1] [--split test] [--report]
 """
@@ -17,7 +17,7 @@ from dataclasses import replace
 from typing import Any
 
 import record
-from closed_loop import DEPENDS, FOLDER, LIMIT_TOLERANCE, SCRIPTED, Job, kept, stored
+from closed_loop import FOLDER, LIMIT_TOLERANCE, SCRIPTED, Job, kept, stored
 
 from apex_ompl.loop.run import default_settings, run
 from apex_ompl.loop.sensor import Sensor
@@ -26,8 +26,7 @@ from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.statistics import share_interval
 from apex_ompl.util.validation import one_or_more
 
-__all__ = ["DEPENDS"]
-
+DEPENDS = ("benchmarks/closed_loop.py", "@planning", "apex_ompl/live", "apex_ompl/loop", "apex_ompl/trajectory")
 SHORT = 4.0  # time of a run [s]
 KINDS = ("moving", "turning", "crowd", "pusher")
 HEAD = (

@@ -97,9 +97,11 @@ class Portfolio:
             for factor in (1.0,) if guess.timed else FACTORS[search.request.number % len(FACTORS)]:
                 if search.charges.over():
                     return
-                least, made = factor * guess.duration, (guess.states, guess.duration)
-                if not guess.timed and least < search.wanted():
-                    made = search.shaped(guess.states, guess.goal, least)
+                least = factor * guess.duration
+                if least >= search.wanted():
+                    continue
+                timed = guess.states, least
+                made = timed if guess.timed else search.shaped(guess.states, guess.goal, least)
                 if made is not None and made[1] < search.wanted():
                     pool.add(*made, guess.goal, source.name)
 

@@ -105,9 +105,9 @@ class Search:
             return None
         moved = direct(np.linspace(0.0, direct.duration, STATES))
         way = goal - self.start.position
-        progress = np.clip((moved - self.start.position) @ way / max(way @ way, 1e-12), 0.0, 1.0)
+        progress = np.clip((moved - self.start.position) @ way / max(float(way @ way), 1e-12), 0.0, 1.0)
         arc = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(states, axis=0), axis=1)))
-        share = arc / max(arc[-1], 1e-12)
+        share = arc / max(float(arc[-1]), 1e-12)
         ends = self.start.position + share[:, None] * way
         off = states + (1.0 - share[:, None]) * (self.start.position - states[0]) - ends
         strays = np.stack([np.interp(progress, share, column) for column in off.T], axis=1)
