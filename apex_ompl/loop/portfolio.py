@@ -19,6 +19,8 @@ from apex_ompl.types import Array
 FACTORS = ((1.3, 2.5), (1.0, 1.8))  # durations that are tried in turn, as multiples of what a path takes at least
 GOALS = 2  # nearest goals that are tried directly
 ENOUGH = 10  # candidates at which no further source is asked
+URGENT = 0.5  # time before a contact from which on a standing robot steps aside before anything else is tried [s]
+ASIDE = 0.7  # share of the budget that other parts have where it may step aside behind them
 CARRIED = 6  # candidates that are carried over to the next replan
 SHARE = 0.5  # of the time that is left, for candidates before the next source is asked
 
@@ -49,10 +51,12 @@ class Portfolio:
     def replan(self, ready: Ready, request: Request, charges: Charges) -> Answer:
         """Return a motion from the time of joining on that is proved among what is expected, or none."""
         search = Search(ready, request, charges)
-        if self.evades and endangered(request):
-            aside = step_aside(search)
-            if aside is not None:
-                return Answer(search.following(aside), "evade", charges)
+        aside = self.evades and endangered(request)
+        urgent = request.conflict < request.join + URGENT
+        if aside and urgent and self._step_aside(search):
+            return Answer(search.best, search.part, charges)
+        if aside and not urgent:
+            search.until = ASIDE * charges.limit  # some time is left for a step aside
         if self.retimes:
             motion = retimed(search)
             if motion is not None:
@@ -65,7 +69,17 @@ class Portfolio:
             quicken(search, request.following.piece(request.join, request.following.end))
         if self.sources and not search.over():
             self._optimise(search)
+        if aside and not urgent and search.best is None:
+            self._step_aside(search)
         return Answer(search.best, search.part, charges)
+
+    @staticmethod
+    def _step_aside(search: Search) -> bool:
+        """Take a step aside; return whether there is one."""
+        aside = step_aside(search)
+        if aside is not None:
+            search.best, search.part = search.following(aside), "evade"
+        return aside is not None
 
     def _optimise(self, search: Search) -> None:
         """Improve motions in space and time while there is time."""
@@ -84,7 +98,7 @@ class Portfolio:
                 self._ask(source, search, pool)
             left = search.charges.limit - search.charges.spent
             until = search.charges.spent + (SHARE * left if source is not None else left)
-            if not self._improve(search, pool, until) and source is None:
+            if not self._improve(search, pool, min(until, search.until)) and source is None:
                 break
         open_ones = [one for one in pool.candidates if not one.given_up and one.rounds < ROUNDS]
         open_ones.sort(key=lambda one: one.priority)

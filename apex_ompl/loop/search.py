@@ -45,6 +45,7 @@ class Search:
         part: What found it.
         cost: Its duration, and more where the guard may stop it [s].
         least: Duration of the direct motion, whatever is in the way [s].
+        until: Time by the charges at which to end [s].
     """
 
     ready: Ready
@@ -56,6 +57,7 @@ class Search:
     part: str = ""
     cost: float = np.inf
     least: float = np.inf
+    until: float = np.inf
 
     def __post_init__(self) -> None:
         """Read the request."""
@@ -126,7 +128,7 @@ class Search:
 
     def over(self) -> bool:
         """Whether time is up, or what was found is good enough: a faster motion is looked for while it is followed."""
-        if self.charges.over():
+        if self.charges.over() or self.charges.spent >= self.until:
             return True
         if self.cost == np.inf or self.request.hastens or not self.ready.settings.hastens:
             return False
