@@ -12,7 +12,7 @@ from apex_ompl.loop.mppi import PathIntegral
 from apex_ompl.loop.paper import OneProposal
 from apex_ompl.loop.portfolio import Portfolio
 from apex_ompl.loop.potential_field import PotentialField
-from apex_ompl.loop.proposals import Proposals
+from apex_ompl.loop.proposals import Proposals, Renoised
 from apex_ompl.loop.request import Replanner
 from apex_ompl.loop.resuming import Resume
 from apex_ompl.loop.settings import LoopSettings
@@ -51,6 +51,10 @@ METHODS = {
         "all parts, the network among them",
     ),
     "no-network": Method(_no_network, {}, "all parts but the network's proposals"),
+    "apex-renoise": Method(
+        lambda: Portfolio([Faster(), Route(), Lines(), Renoised(), Proposals(), Lines(bumps=3)]), {},
+        "all parts, and what is left of the motion noised and denoised again",
+    ),
     "apex-paper": Method(
         lambda: OneProposal(guided=True), PAPER,
         "the paper's loop: stop near an obstacle, one guided proposal from rest, followed unproved",
