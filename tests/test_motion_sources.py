@@ -106,3 +106,12 @@ def test_the_rest_of_the_motion_noised_and_denoised_again_strays_from_it(ready: 
     assert np.abs(guesses[0].states - guesses[1].states).max() > 1e-3
     again = list(source.guesses(search_of(ready, conflict=0.6)))
     assert all(np.array_equal(one.states, other.states) for one, other in zip(guesses, again, strict=True))
+
+
+def test_looking_at_stops_ends_with_the_time(ready: Ready) -> None:
+    """Of a long motion it would take more than the budget, and the answer would come too late each time."""
+    short, long = search_of(ready), search_of(ready, slower=20.0)
+    for search in (short, long):
+        rest = search.request.following.piece(search.request.join, search.request.following.end)
+        assert search.guardable(rest) == (search is short)
+    assert long.charges.limit <= long.charges.spent < long.charges.limit + 1e-3

@@ -135,11 +135,13 @@ class Search:
         return self.cost <= GOOD * self.least or self.charges.spent > ENOUGH_TIME * self.charges.limit
 
     def guardable(self, motion: Trajectory) -> bool:
-        """Whether the guard will hardly stop a motion: stops from it are proved, as they will be known then."""
+        """Whether the guard will hardly stop a motion: stops from it are proved in time, as they will be known then."""
         settings, one = self.ready.settings, self.following(motion)
         if not settings.guarded:
             return True
         for time in np.arange(one.begin, one.end, GUARDED):
+            if self.charges.over():
+                return False
             self.charges.charge("proved stop")
             seen = reach(self.request.predicted, time - AGE, settings.error, settings.fastest)
             if self.ready.proved_stop(seen, one, float(time), float(time) + settings.period) is None:
