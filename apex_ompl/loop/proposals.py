@@ -7,10 +7,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from apex_ompl.apex.query import Query, make_query
+from apex_ompl.apex.query import make_query
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.diffusion.checkpoint import shared_model
 from apex_ompl.diffusion.proposals import TrajectoryModel
+from apex_ompl.diffusion.query import Query
 from apex_ompl.live.movers import clearance_in_time
 from apex_ompl.loop.placing import fresh_checker, place
 from apex_ompl.loop.ready import Ready
