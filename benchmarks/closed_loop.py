@@ -15,9 +15,10 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -29,7 +30,7 @@ from apex_ompl import plan, problems
 from apex_ompl.loop.charges import cost_table
 from apex_ompl.loop.methods import METHODS
 from apex_ompl.loop.referee import LIMIT_TOLERANCE
-from apex_ompl.loop.result import Outcome
+from apex_ompl.loop.result import Outcome, RunResult
 from apex_ompl.loop.run import run
 from apex_ompl.problems import worlds
 from apex_ompl.trajectory.timing import Timing
@@ -41,8 +42,10 @@ from apex_ompl.util.validation import one_or_more
 DEPENDS = ("@planning", "apex_ompl/live", "apex_ompl/loop", "apex_ompl/trajectory")
 FOLDER = record.RESULTS.parent / "runs" / "closed_loop"
 SPEEDS = (1.0, 0.25)
-KEPT = ("time_to_goal", "rest_time", "stops", "reaction_p95", "clearance", "limit_use", "broken_steps")
-
+KEPT = (
+    "time_to_goal", "rest_time", "stops", "reaction_p95", "near_reaction_p95", "clearance", "limit_use", "broken_steps",
+    "improvements",
+)  # fmt: skip
 
 CLAIRVOYANT = "clairvoyant"
 SEARCHED = 10.0  # [s]
@@ -66,12 +69,22 @@ def made(job: Job) -> dict[str, Any]:
     """Run once, and return what is kept."""
     if job.method == CLAIRVOYANT:
         return offline(job)
-    result = run(job.world, job.method, speed=job.speed, seed=0)
-    replans = [event.data["took"] for event in result.events if event.kind in ("accepted", "rejected")]
-    moving = result.outcome is Outcome.HIT_MOVING
+    return kept(job, run(job.world, job.method, speed=job.speed, seed=0))
+
+
+def kept(job: Job, result: RunResult) -> dict[str, Any]:
+    """Return what is kept of a run."""
+    taken = [event for event in result.events if event.kind in ("accepted", "improved")]
+    timed = {
+        name: [event.data["took"] for event in result.events if event.kind in some and "took" in event.data]
+        for name, some in (("replans", ("accepted", "rejected")), ("plans", ("accepted",)))
+    }
+    expected = result.outcome is Outcome.HIT_MOVING and not result.metrics["broken_steps"]
+    contact = next((event.time for event in result.events if event.kind == "contact"), math.inf)
+    leaving = [event.data["leaving"] for event in taken if event.time <= contact][-1:]
     return {
         **job._asdict(), "outcome": str(result.outcome), "reason": result.reason, "costs": cost_table()["version"],
-        "hit_while_expected": moving and not result.metrics["broken_steps"], "replans": replans,
+        "hit_while_expected": expected, "hit_while_leaving": expected and leaving == [True], **timed,
         **{name: result.metrics[name] for name in KEPT if name in result.metrics},
     }  # fmt: skip
 
@@ -89,7 +102,7 @@ def offline(job: Job) -> dict[str, Any]:
     )
     return {
         **job._asdict(), "outcome": str(Outcome.REACHED if found else Outcome.TIMEOUT), "hit_while_expected": False,
-        "seeds": seed, "replans": [], **reached,
+        "seeds": seed, "replans": [], "plans": [], **reached,
     }  # fmt: skip
 
 
@@ -118,21 +131,30 @@ def summary(some: Sequence[dict[str, Any]], best: Sequence[dict[str, Any]] = ())
             causes[one["outcome"]] = causes.get(one["outcome"], 0) + 1
     times = [one["time_to_goal"] for one in good]
     compared, replans = ratios(some, best), [took for one in some for took in one["replans"]]
+    plans, near = [took for one in some for took in one["plans"]], column(some, "near_reaction_p95")
     levels: dict[str, list[bool]] = {}
     for one in some:
         levels.setdefault(one["world"].rpartition("/")[0], []).append(one["outcome"] != "reached")
-    reactions = [one["reaction_p95"] for one in some if "reaction_p95" in one]
+    reactions = column(some, "reaction_p95")
     return {
         "n": len(some), "failed": failed / len(some), "interval": list(share_interval(failed, len(some))),
         "causes": causes, "hits_while_expected": sum(one["hit_while_expected"] for one in some),
         "time_to_goal_s": record.percentiles(times, 50, 95) if times else [None, None],
         "by_clairvoyant": record.percentiles(compared, 50, 95) if compared else [None, None], "compared": len(compared),
         "replan_s": record.percentiles(replans, 50, 95) if replans else [None, None], "replans": len(replans),
+        "plan_s": record.percentiles(plans, 50, 95) if plans else [None, None],
+        "near_reaction_p95_s": record.percentiles(near, 50, 95) if near else [None, None],
+        "levels": {level: [sum(row), len(row)] for level, row in levels.items()},
         "worst_level": max(sum(row) / len(row) for row in levels.values()),
         "stops": sum(one["stops"] for one in some) / len(some),
         "reaction_p95_s": record.percentiles(reactions, 50, 95) if reactions else [None, None],
         "over_limits": sum(one["limit_use"] > 1.0 + LIMIT_TOLERANCE for one in some),
     }  # fmt: skip
+
+
+def column(some: Sequence[dict[str, Any]], name: str) -> list[float]:
+    """Return a number of some runs, those that have it."""
+    return [one[name] for one in some if name in one]
 
 
 def shown(value: float | None, unit: float = 1.0) -> str:
@@ -163,18 +185,37 @@ def table(rows: dict[str, dict[str, Any]]) -> str:
     """Return the Markdown table of rows."""
     head = ["", "N", "failed", "95 % interval", "causes", "hit while moving, as assumed", "time to goal s p50", "p95",
             "by clairvoyant's p50", "p95", "stops",
-            "replan ms p50", "p95", "reaction ms p95", "over limits"]  # fmt: skip
+            "worst level %", "plan ms p50", "p95", "reaction ms p95", "near ms p95", "over limits"]  # fmt: skip
     lines = [head, ["---", *["---:"] * (len(head) - 1)]]
     for name, s in rows.items():
         low, high = s["interval"]
         causes = ", ".join(f"{count} {cause}" for cause, count in sorted(s["causes"].items())) or "-"
         times = [shown(v) for v in (*s["time_to_goal_s"], *s["by_clairvoyant"])]
-        replans = [shown(v, 1e3) for v in (*s["replan_s"], s["reaction_p95_s"][1])]
+        replans = [
+            shown(v, 1e3) for v in (*s["plan_s"], s["reaction_p95_s"][1], s["near_reaction_p95_s"][1])
+        ]  # fmt: skip
         lines.append([
             name, s["n"], f"{100 * s['failed']:.1f} %", f"{100 * low:.1f} to {100 * high:.1f}", causes,
-            s["hits_while_expected"], *times, f"{s['stops']:.2g}", *replans, s["over_limits"],
+            s["hits_while_expected"], *times, f"{s['stops']:.2g}", f"{100 * s['worst_level']:.3g}", *replans,
+            s["over_limits"],
         ])  # fmt: skip
     return "\n".join(record.row(line) for line in lines)
+
+
+def stored(jobs: Sequence[Job], args: argparse.Namespace, make: Callable[[Job], dict[str, Any]]) -> None:
+    """Make and store what is missing."""
+    args.store.mkdir(parents=True, exist_ok=True)
+    missing = [job for job in jobs if not (args.store / job.file).exists()]
+    if not missing or args.report:
+        return
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    with ProcessPoolExecutor(args.jobs) as pool:
+        pending = {pool.submit(make, job): job for job in missing}
+        for future in tqdm(as_completed(pending), total=len(pending)):
+            if future.exception() is not None:
+                pool.shutdown(cancel_futures=True)
+            text = json.dumps(future.result(), indent=1)
+            write_atomically(args.store / pending[future].file, text.encode())
 
 
 def main() -> None:
@@ -198,17 +239,7 @@ def main() -> None:
         ]
         for kind in args.kinds
     }
-    args.store.mkdir(parents=True, exist_ok=True)
-    missing = [job for some in jobs.values() for job in some if not (args.store / job.file).exists()]
-    if missing and not args.report:
-        os.environ.setdefault("OMP_NUM_THREADS", "1")
-        with ProcessPoolExecutor(args.jobs) as pool:
-            pending = {pool.submit(made, job): job for job in missing}
-            for future in tqdm(as_completed(pending), total=len(pending)):
-                if future.exception() is not None:
-                    pool.shutdown(cancel_futures=True)
-                text = json.dumps(future.result(), indent=1)
-                write_atomically(args.store / pending[future].file, text.encode())
+    stored([job for some in jobs.values() for job in some], args, made)
     rows: dict[tuple[str, float, str], list[dict[str, Any]]] = {}
     for kind, some in jobs.items():
         for job in some:

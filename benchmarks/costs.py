@@ -35,7 +35,7 @@ from apex_ompl.loop.potential_field import PotentialField
 from apex_ompl.loop.proposals import Proposals
 from apex_ompl.loop.ready import Ready
 from apex_ompl.loop.request import Request
-from apex_ompl.loop.search import MOTIONS, Search
+from apex_ompl.loop.search import MOTIONS, Search, reach
 from apex_ompl.loop.settings import LoopSettings
 from apex_ompl.loop.short_horizon import Horizon
 from apex_ompl.loop.snapshot import Snapshot
@@ -45,6 +45,7 @@ from apex_ompl.problems import worlds
 from apex_ompl.roadmaps.goal_tree import GoalTree
 from apex_ompl.roadmaps.lazy_search import LazySearch
 from apex_ompl.trajectory import time_path
+from apex_ompl.trajectory.methods.moving_start import between
 from apex_ompl.trajopt.optimizer import Optimizer
 from apex_ompl.types import Array, Flags
 from apex_ompl.util.entry_point import run_script
@@ -88,6 +89,12 @@ def measured(name: str, found: dict[str, list[float]]) -> None:
     ends = np.stack([setup.start, goal])
     found["straight motion"].append(seconds(lambda: time_path(ends, limits, ready.names)))
     motion = time_path(ends, limits, ready.names).trajectory
+    still = np.zeros_like(ends)
+    found["direct motion"].append(seconds(lambda: between(np.stack([ends, still, still]), limits, ready.names)))
+    one, half = Following(motion, 0.0), 0.5 * motion.duration
+    found["proved stop"].append(
+        seconds(lambda: ready.proved_stop(reach(movers, half, 0.024, 0.2), one, half, half + ready.settings.period))
+    )
     curve = curve_of(motion)
     rate = interval_of_proof(ready)
     found["proof interval"].append(rate)

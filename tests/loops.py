@@ -76,7 +76,7 @@ def ready_of(name: str, *, speed: float = 1.0, **parameters: Any) -> Ready:
     limits = Timing(velocity_scale=speed).limits(setup.robot.limits, setup.robot.joint_names)
     kinds = ("velocity", "acceleration", "jerk")
     limits = replace(limits, **{kind: share * getattr(limits, kind) for kind in kinds})
-    return Ready(setup, limits, limits, LoopSettings(**{"timeout": 3.0, **parameters}))
+    return Ready(setup, limits, limits, LoopSettings(**{"timeout": 3.0, "hastens": False, **parameters}))
 
 
 def world_of(name: str, *obstacles: Obstacle) -> World:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,7 @@ from apex_ompl.loop.ready import Ready
 from apex_ompl.loop.referee import RefereeReport
 from apex_ompl.loop.request import Answer, Request
 from apex_ompl.loop.run import run
+from apex_ompl.loop.search import EARLIER
 from apex_ompl.loop.sensor import Sensor
 from apex_ompl.loop.settings import LoopSettings
 from apex_ompl.scene.bodies import Obstacle
@@ -64,15 +66,21 @@ def touched(obstacles: list[Obstacle], motion: Trajectory) -> list[float]:
 
 
 @settings(max_examples=10)
-@given(st.integers(0, 10**6), st.sampled_from([0.2, 0.4, 0.8]), st.sampled_from(["still", "cv"]), st.booleans())
-def test_the_robot_touches_nothing_while_it_moves(seed: int, fastest: float, prediction: str, monitored: bool) -> None:
+@given(
+    st.integers(0, 10**6), st.sampled_from([0.2, 0.4, 0.8]), st.sampled_from(["still", "cv"]), st.booleans(),
+    st.booleans(),
+)  # fmt: skip
+def test_the_robot_touches_nothing_while_it_moves(
+    seed: int, fastest: float, prediction: str, monitored: bool, hastens: bool
+) -> None:
     """But where it leaves a place that a box comes to, which is said in the event."""
     some = boxes(seed, fastest)
-    parameters = {"fastest": fastest, "prediction": prediction, "monitored": monitored}
+    parameters = {"fastest": fastest, "prediction": prediction, "monitored": monitored, "hastens": hastens}
     done, report = go(ByHand(line), *some, sensor=Sensor(seed=seed), **parameters)
     assert done.broken == 0 and report.still_contact is None
     check_limits(report)
-    accepted = [event for event in done.events if event.kind == "accepted"]
+    assert not any(event.kind == "broken assumption" for event in done.events)
+    accepted = [event for event in done.events if event.kind in ("accepted", "improved")]
     assert monitored or not any(event.data["leaving"] for event in accepted)
     hits = touched(some, done.trajectory)
     if report.contact is not None and report.contact.moved:
@@ -96,6 +104,26 @@ def test_the_straight_line_is_followed_where_nothing_is_in_the_way() -> None:
     done, report = go(ByHand(line))
     assert done.reached and report.at_goal and report.at_rest and not report.faults
     assert [event.kind for event in done.events] == ["request", "accepted", "goal"]
+    check_limits(report)
+
+
+def slow_at_first(ready: Ready, request: Request) -> Following:
+    """The straight line, three times as slow in the first answer."""
+    found = line(ready, request)
+    return replace(found, motion=found.motion.slower(3.0)) if request.number == 1 else found
+
+
+def test_a_faster_motion_replaces_one_without_a_conflict() -> None:
+    fast, _ = go(ByHand(line))
+    slow, _ = go(ByHand(slow_at_first), timeout=6.0)
+    hastened, report = go(ByHand(slow_at_first, seconds=0.01), timeout=6.0, hastens=True)
+    ends = [done.events[-1].time for done in (fast, hastened, slow)]
+    assert all(done.reached for done in (fast, slow, hastened)) and ends[0] < ends[1] < ends[2]
+    improved = [event for event in hastened.events if event.kind == "improved"]
+    assert improved and "kept" in kinds(hastened) and "improved" not in kinds(slow)
+    arrivals = [event.data["arrival"] for event in hastened.events if event.kind in ("accepted", "improved")]
+    assert all(after <= before - EARLIER + 1e-9 for before, after in pairwise(arrivals))
+    assert report.at_goal and not report.faults
     check_limits(report)
 
 

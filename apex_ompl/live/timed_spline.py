@@ -67,6 +67,11 @@ class Start(NamedTuple):
         """Return rest at a state, shape (dof,)."""
         return cls(q, np.zeros_like(q), np.zeros_like(q))
 
+    @property
+    def moves(self) -> bool:
+        """Whether it has a velocity or an acceleration."""
+        return bool(self.velocity.any() or self.acceleration.any())
+
 
 class TimedSpline(NamedTuple):
     """A uniform cubic B-spline in time, which begins in a given way and ends at rest.
@@ -91,8 +96,9 @@ class TimedSpline(NamedTuple):
         """Return the spline whose control points are states of a motion, evenly spaced in time.
 
         Args:
-            states: States of the motion, evenly spaced in time, shape (N, dof).
-            duration: Its duration [s]; the spline takes two knot spacings longer, since it rounds both ends.
+            states: States of the motion, evenly spaced in time, shape (N, dof); from a moving start they begin as that.
+            duration: Its duration [s]; the spline takes a knot spacing longer, since it rounds the end, and another one
+                from rest.
             start: How the spline begins.
             goal: Where it ends, shape (dof,).
 
@@ -105,7 +111,8 @@ class TimedSpline(NamedTuple):
         spacing = float(duration / count)
         given, wanted = np.linspace(0.0, 1.0, len(states)), np.linspace(0.0, 1.0, count + 1)
         states = np.stack([np.interp(wanted, given, column) for column in states.T], axis=1)
-        control = np.concatenate([states[:1], states[:1], states, states[-1:], states[-1:]])
+        before = 1 if start.moves else 2  # at rest the first three control points are one
+        control = np.concatenate([np.repeat(states[:1], before, axis=0), states, states[-1:], states[-1:]])
         control[-PINNED:] = goal
         return cls(control, spacing, start).lasting(spacing)
 
@@ -113,7 +120,7 @@ class TimedSpline(NamedTuple):
         """Return the spline with another knot spacing [s] and the same begin."""
         control = self.control.copy()
         control[:PINNED] = start_points(self.start, spacing)
-        if not (self.start.velocity.any() or self.start.acceleration.any()):
+        if not self.start.moves:
             control[:PINNED] = self.start.position
         return TimedSpline(control, spacing, self.start)
 

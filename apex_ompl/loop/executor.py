@@ -18,18 +18,21 @@ import numpy as np
 
 from apex_ompl.live.movers import Movers, clearance_in_time
 from apex_ompl.loop.evasion import GAIN, SOON
+from apex_ompl.loop.fitting import misfit
 from apex_ompl.loop.following import SAME_TIME, Following
 from apex_ompl.loop.ready import Ready
 from apex_ompl.loop.replanning import Replanning
 from apex_ompl.loop.request import Request
 from apex_ompl.loop.result import Event
+from apex_ompl.loop.search import EARLIER
 from apex_ompl.loop.tracking import Tracker
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.types import Array
 
-SAME_STATE = 1e-6  # largest jump of positions, velocities and accelerations where a motion begins
+BLIND_TIME = 0.15  # for which an obstacle may go anywhere before the robot stands [s]
+SHORTEST = 0.1  # rest of a motion for which no faster one is looked for [s]
+NEAR = 0.5  # time before a conflict from which on the robot brakes where no answer comes at once [s]
 NEARER = 0.01  # by which an obstacle must come nearer than where a motion began, within the trigger, to stop it [m]
-FASTER = 0.9  # share of the time to a goal that a plan must have at most to replace one without a conflict
 
 
 @dataclass(eq=False)
@@ -53,6 +56,8 @@ class Executor:
         nearest: Distance of an obstacle below which the motion counts as blocked, where that goes by distance [m].
         leaving: Whether the robot leaves a place that an obstacle comes to, and goes on without a proved stop.
         lead: How long before a step it is decided, by what was seen until then [s].
+        ahead: How long before the conflict that was [s].
+        hastened: When a faster motion was asked for last [s].
     """
 
     ready: Ready
@@ -71,6 +76,8 @@ class Executor:
     nearest: float = 0.0
     leaving: bool = False
     lead: float = 0.0
+    ahead: float = math.inf
+    hastened: float = -math.inf
 
     def log(self, time: float, kind: str, **data: Any) -> None:
         """Note an event."""
@@ -97,6 +104,7 @@ class Executor:
             if settings.from_rest:
                 self._halt(now)
         if reachable is not None:
+            self._brake(now)
             self._guard(now, reachable)
         self._ask(now, predicted, obstacles)
 
@@ -111,7 +119,7 @@ class Executor:
             found = self.ready.first_conflict(predicted, one, now, until)
         if math.isfinite(found) and not math.isfinite(self.conflict):
             self.log(now, "conflict", at=found)
-            self.endangered = now
+            self.endangered, self.ahead = now, found - now
         if not math.isfinite(found):
             self.endangered = None
         self.conflict = found
@@ -123,6 +131,13 @@ class Executor:
             self.ready.kernel, predicted, self.state(now)[None], looked, 2.0 * self.ready.settings.trigger
         )
         return float(clear.min())
+
+    def _brake(self, now: float) -> None:
+        """Stop where a conflict is near and no answer came within a step."""
+        waited = self.endangered is not None and now > self.endangered + SAME_TIME
+        if waited and self.conflict < now + NEAR and self.stop is not None and not self.following.at_rest(now):
+            if self.following.start(now).moves and self.stop is not self.following:
+                self._follow_stop(now, self.stop)
 
     def _halt(self, now: float) -> None:
         """Stop where the way to a goal is blocked."""
@@ -169,6 +184,10 @@ class Executor:
             return
         if self.leaving or self.following.at_rest(now):
             self.stop = None
+        elif not self.following.start(now).moves:  # it did not set out yet
+            self.stop = None
+            self.follow(Following.standing(self.state(now), now, self.ready.names), now)
+            self.log(now, "stop", at=now)
         elif self.stop is None:
             self.log(now, "broken assumption", what="no stop is in hand")
         elif self.stop is not self.following:
@@ -177,7 +196,7 @@ class Executor:
     def _answered(self, now: float, how: str) -> None:
         """Note how long after a conflict was known the command changed."""
         if self.endangered is not None:
-            self.log(now, "reaction", seconds=now - self.endangered + self.lead, how=how)
+            self.log(now, "reaction", seconds=now - self.endangered + self.lead, how=how, ahead=self.ahead)
             self.endangered = None
 
     def _answer(self, now: float, predicted: Movers, reachable: Movers | None) -> None:
@@ -189,17 +208,15 @@ class Executor:
             return
         if reply is None or reply.number != request.number:
             if now > request.join + self._patience + 1e-9:
-                self.log(now, "rejected", why="no answer came in time", number=request.number, part="")
+                self.log(now, request.refused, why="no answer came in time", number=request.number, part="")
                 self.pending = None
             return
         self.pending, found, part = None, reply.answer.found, reply.answer.part
         took = {"number": request.number, "part": part, "took": reply.answer.charges.spent}
         if found is None:
-            self.log(now, "rejected", why=reply.failed, **took)
+            self.log(now, request.refused, why=reply.failed, **took)
             return
-        if self.ready.settings.from_rest and self.following.at_rest(request.join):
-            request = replace(request, join=max(request.join, now))  # a robot that stands can wait
-            found = replace(found, begin=request.join)
+        request, found = self._at_once(now, request, found, predicted)
         why, leaving = self._fault(now, request, found, predicted), False
         if not why and reachable is not None:
             then = found.begin + self.ready.settings.period
@@ -208,9 +225,9 @@ class Executor:
             if leaving and not may:
                 why = "no stop behind its first step is proved"
         if why:
-            self.log(now, "rejected", why=why, **took)
+            self.log(now, request.refused, why=why, **took)
             return
-        self.log(now, "accepted", **took, arrival=found.end, to_goal=found.to_goal, leaving=leaving)
+        self.log(now, request.taken, **took, arrival=found.end, to_goal=found.to_goal, leaving=leaving)
         self._answered(now, part)
         if found.to_goal:
             self.route = found
@@ -220,6 +237,18 @@ class Executor:
         if self.ready.settings.by_distance:
             self.nearest = min(self.ready.settings.trigger, self._distance(now, predicted) - NEARER)
 
+    def _at_once(self, now: float, request: Request, found: Following, predicted: Movers) -> tuple[Request, Following]:
+        """Return a request and its answer, which begins now where a robot that stands can set out at once."""
+        if request.following is not self.following or abs(found.begin - request.join) > SAME_TIME:
+            return request, found
+        earlier = replace(request, join=now), replace(found, begin=now)
+        if self.following.at_rest(now) and now < request.join and not self._fault(now, *earlier, predicted):
+            return earlier
+        if self.ready.settings.from_rest and self.following.at_rest(request.join):  # or wait
+            join = max(request.join, now)
+            return replace(request, join=join), replace(found, begin=join)
+        return request, found
+
     def _fault(self, now: float, request: Request, found: Following, predicted: Movers) -> str:
         """Return why an answer is of no use any more, or nothing."""
         settings = self.ready.settings
@@ -227,36 +256,17 @@ class Executor:
             return "the robot follows another motion by now"
         if now > request.join + 1e-9:
             return "it came too late"
-        unfit = self._misfit(found, request)
+        unfit = misfit(self.ready, found, request)
         if unfit or not settings.verified:
             return unfit
         if not math.isfinite(self.conflict) and self.following.to_goal and found.to_goal:
-            if found.end - now > FASTER * (self.following.end - now):
+            if found.end > self.following.end - EARLIER + SAME_TIME:
                 return "it is hardly faster"
         hold = settings.hold if found.to_goal else settings.rest_hold
         conflict = self.ready.first_conflict(predicted, found, found.begin, found.end + hold)
         gains = self._may_leave(now, found) and conflict > self.conflict + GAIN
         if math.isfinite(conflict) and not gains:
             return "what was seen since then is in the way"
-        return ""
-
-    def _misfit(self, found: Following, request: Request) -> str:
-        """Return why a motion can never be followed behind what a request says, or nothing."""
-        motion = found.motion
-        if motion.joint_names != self.ready.names:
-            return "it is a motion of other joints"
-        behind = request.following.start(request.join)
-        states = motion.positions[0], motion.velocities[0], motion.accelerations[0]
-        off = max(float(np.abs(one - other).max()) for one, other in zip(states, behind, strict=True))
-        if abs(found.begin - request.join) > SAME_TIME or not off <= SAME_STATE:
-            return "it does not begin where the robot will be"
-        if motion.velocities[-1].any() or motion.accelerations[-1].any():
-            return "it does not end at rest"
-        if found.to_goal and not self.ready.is_goal(motion.positions[-1]):
-            return "it does not end at a goal"
-        verified = self.ready.settings.verified
-        if not (self.ready.clear_of_still(motion) if verified else self.ready.keeps_limits(motion)):
-            return "it exceeds limits, or is not proved clear of what stands still"
         return ""
 
     def _may_leave(self, now: float, found: Following) -> bool:
@@ -270,12 +280,12 @@ class Executor:
             return
         join = now + settings.budget
         self.asked += 1
-        wide = predicted.larger(settings.berth)
+        wide = predicted.larger(max(settings.berth, settings.error + BLIND_TIME * settings.fastest))
         request = Request(
             self.asked, now, join, self.following, self.route, predicted, wide, obstacles, self.conflict, self.seed
         )  # fmt: skip
-        self.log(now, "request", number=self.asked, join=join)
-        self.pending = request
+        self.log(now, "improve" if request.hastens else "request", number=self.asked, join=join)
+        self.pending, self.hastened = request, now if request.hastens else self.hastened
         self.replanning.submit(request)
 
     def _wants(self, now: float) -> bool:
@@ -289,7 +299,11 @@ class Executor:
             return False
         if math.isfinite(self.conflict) and not settings.by_distance:
             return True
-        return not self.following.to_goal
+        if not self.following.to_goal:
+            return True
+        if not settings.hastens or now + settings.budget + SHORTEST > self.following.end:
+            return False
+        return now >= self.hastened + settings.budget - SAME_TIME
 
     def done(self, now: float) -> bool:
         """Whether the robot stands at a goal."""

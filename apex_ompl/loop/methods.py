@@ -15,12 +15,12 @@ from apex_ompl.loop.mppi import PathIntegral
 from apex_ompl.loop.paper import OneProposal
 from apex_ompl.loop.portfolio import Portfolio
 from apex_ompl.loop.potential_field import PotentialField
-from apex_ompl.loop.proposals import Proposals
+from apex_ompl.loop.proposals import Proposals, Renoised
 from apex_ompl.loop.request import Replanner
 from apex_ompl.loop.resuming import Resume
 from apex_ompl.loop.settings import LoopSettings
 from apex_ompl.loop.snapshot import Snapshot
-from apex_ompl.loop.sources import Lines, Route
+from apex_ompl.loop.sources import Faster, Lines, Route
 
 
 @dataclass(frozen=True)
@@ -38,27 +38,33 @@ class Method:
     about: str
 
 
-FROM_REST = {"from_rest": True}
-BLIND = {"prediction": "still", "guarded": False}
+ONE_PLAN = {"hastens": False}
+FROM_REST = {"from_rest": True, **ONE_PLAN}
+BLIND = {"prediction": "still", "guarded": False, **ONE_PLAN}
 PAPER = {**BLIND, "verified": False, "from_rest": True, "by_distance": True}
 
 
 def _no_network() -> Portfolio:
-    return Portfolio([Route(), Lines(), Lines(bumps=3)])
+    return Portfolio([Faster(), Route(), Lines(), Lines(bumps=3)])
 
 
 METHODS = {
     "apex": Method(
-        lambda: Portfolio([Route(), Lines(), Proposals(), Lines(bumps=3)]), {}, "all parts, the network among them"
+        lambda: Portfolio([Faster(), Route(), Lines(), Proposals(), Lines(bumps=3)]), {},
+        "all parts, the network among them",
     ),
     "no-network": Method(_no_network, {}, "all parts but the network's proposals"),
+    "apex-renoise": Method(
+        lambda: Portfolio([Faster(), Route(), Lines(), Renoised(), Proposals(), Lines(bumps=3)]), {},
+        "all parts, and what is left of the motion noised and denoised again",
+    ),
     "apex-paper": Method(
         lambda: OneProposal(guided=True), PAPER,
         "the paper's loop: stop near an obstacle, one guided proposal from rest, followed unproved",
     ),
     "apex-paper-unguided": Method(lambda: OneProposal(guided=False), PAPER, "the same without guidance"),
     "retime": Method(
-        lambda: Resume(_no_network(), retimes=True), {}, "one plan, along which the speed alone is chosen anew"
+        lambda: Resume(_no_network(), retimes=True), ONE_PLAN, "one plan, along which the speed alone is chosen anew"
     ),
     "stop-and-wait": Method(
         lambda: Resume(_no_network()), FROM_REST, "one plan; stops where it is blocked, goes on when it is clear"
@@ -70,9 +76,9 @@ METHODS = {
         lambda: Portfolio([Route(), Lines(), Proposals(), Lines(bumps=3)], evades=False), {**BLIND, "monitored": False},
         "a plan among obstacles where they were seen at first, followed blindly",
     ),
-    "gpmp2": Method(IncrementalGPMP2, {}, "GPMP2 from the moving robot, warm from the last motion (as iGPMP2)"),
-    "mppi": Method(PathIntegral, {}, "model predictive path integral control"),
-    "potential-field": Method(PotentialField, {}, "a reflex down an artificial potential"),
+    "gpmp2": Method(IncrementalGPMP2, ONE_PLAN, "GPMP2 from the moving robot, warm from the last motion (as iGPMP2)"),
+    "mppi": Method(PathIntegral, ONE_PLAN, "model predictive path integral control"),
+    "potential-field": Method(PotentialField, ONE_PLAN, "a reflex down an artificial potential"),
     "drrt": Method(
         KeptTree, FROM_REST, "dynamic RRT: stops where the way is blocked; a tree from the goal, kept and repaired"
     ),

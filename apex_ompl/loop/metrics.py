@@ -16,8 +16,10 @@ from apex_ompl.trajectory.rests import rests
 from apex_ompl.util.statistics import share_interval
 from apex_ompl.util.validation import check_number
 
+NEAR = 0.5  # time before a conflict from which on it counts as near [s]
 COUNTED = {
     "replans_asked": "request", "replans_accepted": "accepted", "replans_rejected": "rejected",
+    "improvements_asked": "improve", "improvements": "improved",
     "conflicts": "conflict", "evasions": "evasion", "broken_assumptions": "broken assumption",
 }  # fmt: skip
 """Metrics that are numbers of events of a kind."""
@@ -31,9 +33,11 @@ def run_metrics(
     - ``time_to_goal``: time of the first ``goal`` event [s], if there is one.
     - ``rest_time``: how long the robot stood [s], and ``stops``: how often it came to rest. Where the goal was reached,
       the rest at the end of the motion counts for neither; standing at the beginning is no stop.
-    - ``replans_asked``, ``replans_accepted``, ``replans_rejected``, ``conflicts``, ``evasions`` and
-      ``broken_assumptions``: numbers of events.
-    - ``reaction_p50`` and ``reaction_p95``: percentiles of ``seconds`` of the ``reaction`` events [s].
+    - ``replans_asked``, ``replans_accepted``, ``replans_rejected``, ``improvements_asked``, ``improvements``,
+      ``conflicts``, ``evasions`` and ``broken_assumptions``: numbers of events.
+    - ``reaction_p50`` and ``reaction_p95``: percentiles of ``seconds`` of the ``reaction`` events [s]: how long after a
+      conflict was first predicted, wherever on the rest of the motion, the command changed.
+    - ``near_reaction_p50`` and ``near_reaction_p95``: those of conflicts that were less than half a second ahead.
     - ``clearance``: the one given, if it is finite [m].
     - ``duration`` [s], ``spectral_arc_length``, and ``jerk``, root mean square over time [rad/s^3], of the motion.
     - ``position_use``, ``velocity_use``, ``acceleration_use`` and ``jerk_use``: largest shares of the limits, and
@@ -70,15 +74,17 @@ def run_metrics(
 
 
 def _reactions(events: Iterable[Event]) -> dict[str, float]:
-    seconds = []
+    seconds, near = [], []
     for event in events:
         if event.kind == "reaction":
             check_number(event.data.get("seconds", float("nan")), "reaction.seconds", 0.0)
             seconds.append(float(event.data["seconds"]))
-    if not seconds:
-        return {}
-    middle, high = np.percentile(seconds, [50.0, 95.0]).tolist()
-    return {"reaction_p50": middle, "reaction_p95": high}
+            near += seconds[-1:] if event.data.get("ahead", np.inf) < NEAR else []
+    found = {}
+    for name, some in (("reaction", seconds), ("near_reaction", near)):
+        if some:
+            found[f"{name}_p50"], found[f"{name}_p95"] = np.percentile(some, [50.0, 95.0]).tolist()
+    return found
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from typing import Any
 from apex_ompl.errors import ApexError
 from apex_ompl.loop.planner_process import WallTime, Work
 from apex_ompl.loop.ready import Ready
-from apex_ompl.loop.replanning import SHARE, answered
+from apex_ompl.loop.replanning import SHARE, allowed, answered
 from apex_ompl.ompl_adapter.process import quiet_ompl, seed_ompl
 from apex_ompl.ompl_adapter.setup import assemble
 from apex_ompl.util.threads import one_torch_thread
@@ -38,7 +38,9 @@ def serve(connection: Connection[Any, Any]) -> None:
         while True:
             data = connection.recv_bytes()
             charges = WallTime(SHARE * work.settings.budget)
-            connection.send(answered(replanner, ready, pickle.loads(data), charges))
+            request = pickle.loads(data)
+            charges.limit = allowed(request, work.settings.budget)
+            connection.send(answered(replanner, ready, request, charges))
 
 
 def main() -> None:

@@ -9,13 +9,18 @@ from apex_ompl.live.retime import retime
 from apex_ompl.loop.charges import Charges
 from apex_ompl.loop.evasion import endangered, step_aside
 from apex_ompl.loop.motion_pool import ROUNDS, MotionCandidate, MotionPool
+from apex_ompl.loop.quickening import quickened
 from apex_ompl.loop.ready import Ready
 from apex_ompl.loop.request import Answer, Request
 from apex_ompl.loop.search import Search, Source
 from apex_ompl.trajectory import Trajectory
+from apex_ompl.types import Array
 
-FACTORS = (1.0, 1.8)  # durations that are tried, as multiples of what a path takes without obstacles
+FACTORS = ((1.3, 2.5), (1.0, 1.8))  # durations that are tried in turn, as multiples of what a path takes at least
+GOALS = 2  # nearest goals that are tried directly
 ENOUGH = 10  # candidates at which no further source is asked
+URGENT = 0.5  # time before a contact from which on a standing robot steps aside before anything else is tried [s]
+ASIDE = 0.7  # share of the budget that other parts have where it may step aside behind them
 CARRIED = 6  # candidates that are carried over to the next replan
 SHARE = 0.5  # of the time that is left, for candidates before the next source is asked
 
@@ -46,17 +51,35 @@ class Portfolio:
     def replan(self, ready: Ready, request: Request, charges: Charges) -> Answer:
         """Return a motion from the time of joining on that is proved among what is expected, or none."""
         search = Search(ready, request, charges)
-        if self.evades and endangered(request):
-            aside = step_aside(search)
-            if aside is not None:
-                return Answer(search.following(aside), "evade", charges)
+        aside = self.evades and endangered(request)
+        urgent = request.conflict < request.join + URGENT
+        if aside and urgent and self._step_aside(search):
+            return Answer(search.best, search.part, charges)
+        if aside and not urgent:
+            search.until = ASIDE * charges.limit  # some time is left for a step aside
         if self.retimes:
             motion = retimed(search)
             if motion is not None:
                 search.take(motion, "retime")
-        if self.sources and not charges.over():
+        for goal in search.goals[:GOALS] if self.sources else ():
+            motion = straight(search, goal)
+            if motion is not None:
+                search.take(motion, "direct")
+        if self.sources and search.request.hastens:
+            quicken(search, request.following.piece(request.join, request.following.end))
+        if self.sources and not search.over():
             self._optimise(search)
+        if aside and not urgent and search.best is None:
+            self._step_aside(search)
         return Answer(search.best, search.part, charges)
+
+    @staticmethod
+    def _step_aside(search: Search) -> bool:
+        """Take a step aside; return whether there is one."""
+        aside = step_aside(search)
+        if aside is not None:
+            search.best, search.part = search.following(aside), "evade"
+        return aside is not None
 
     def _optimise(self, search: Search) -> None:
         """Improve motions in space and time while there is time."""
@@ -67,7 +90,7 @@ class Portfolio:
         for one, begun in carried:
             pool.carry(one, search.request.join - begun)
         sources = iter(self.sources)
-        while not search.charges.over():
+        while not search.over():
             source = next(sources, None)
             if source is None and not pool.candidates:
                 break
@@ -75,7 +98,7 @@ class Portfolio:
                 self._ask(source, search, pool)
             left = search.charges.limit - search.charges.spent
             until = search.charges.spent + (SHARE * left if source is not None else left)
-            if not self._improve(search, pool, until) and source is None:
+            if not self._improve(search, pool, min(until, search.until)) and source is None:
                 break
         open_ones = [one for one in pool.candidates if not one.given_up and one.rounds < ROUNDS]
         open_ones.sort(key=lambda one: one.priority)
@@ -85,11 +108,16 @@ class Portfolio:
     def _ask(source: Source, search: Search, pool: MotionPool) -> None:
         """Take the motions of a source into the pool."""
         for guess in source.guesses(search):
-            for factor in FACTORS:
+            for factor in (1.0,) if guess.timed else FACTORS[search.request.number % len(FACTORS)]:
                 if search.charges.over():
                     return
-                if factor * guess.duration < search.wanted():
-                    pool.add(guess.states, factor * guess.duration, guess.goal, source.name)
+                least = factor * guess.duration
+                if least >= search.wanted():
+                    continue
+                timed = guess.states, least
+                made = timed if guess.timed else search.shaped(guess.states, guess.goal, least)
+                if made is not None and made[1] < search.wanted():
+                    pool.add(*made, guess.goal, source.name)
 
     @staticmethod
     def _improve(search: Search, pool: MotionPool, until: float) -> bool:
@@ -98,7 +126,35 @@ class Portfolio:
             found = pool.improve(search.wanted, until)
             if found is None:
                 return search.charges.spent >= until
-            search.take(found[1], found[0].origin)
+            if search.take(found[1], found[0].origin):
+                quicken(search, found[1])
+            if search.over():
+                return False
+
+
+def quicken(search: Search, motion: Trajectory) -> None:
+    """Take a faster motion through states of one that is proved, where there is one that is proved, too."""
+    for faster in quickened(search, motion):
+        if search.accepts(faster) and search.take(faster, "quicken"):
+            return
+
+
+def straight(search: Search, goal: Array) -> Trajectory | None:
+    """Return the direct motion to a goal, or a slower or retimed one, that is proved, or None."""
+    ready, request = search.ready, search.request
+    fastest = search.direct(goal)
+    if fastest is None or fastest.duration <= 0.0 or fastest.duration >= search.wanted():
+        return None
+    if not ready.clear_of_still(fastest, search.charges):
+        return None
+    if search.accepts(fastest):
+        return fastest
+    made = retime(ready.kernel, request.predicted, fastest, ready.limits, clock=request.join, hold=ready.settings.hold)
+    search.charges.charge("retiming")
+    slow = made.trajectory
+    if slow is not None and slow.duration < search.wanted() and search.accepts(slow):
+        return slow
+    return None
 
 
 def retimed(search: Search) -> Trajectory | None:

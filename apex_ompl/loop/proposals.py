@@ -11,10 +11,12 @@ from apex_ompl.apex.query import make_query
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.diffusion.checkpoint import shared_model
 from apex_ompl.diffusion.proposals import TrajectoryModel
+from apex_ompl.diffusion.query import Query
 from apex_ompl.live.movers import clearance_in_time
 from apex_ompl.loop.placing import fresh_checker, place
 from apex_ompl.loop.ready import Ready
 from apex_ompl.loop.search import Guess, Search, least_duration
+from apex_ompl.loop.sources import rest_of_route
 from apex_ompl.types import Array
 
 LOOKS = 16  # at the straight line, to see where an obstacle comes nearest
@@ -65,18 +67,24 @@ class Proposals:
         goal = goals[0]
         self._place(checker, search, goal)
         query = make_query(checker, search.start.position, goal, point=model.sees_point)
-        temperature = TEMPERATURES[search.request.number % len(TEMPERATURES)]
-        sampling = model.sampling
         with model.one_thread():
-            made = model.propose(
-                query, checker.kernel, self.count, generator=search.rng,
-                sampling=type(sampling)(sampling.sampler, sampling.steps, temperature, sampling.guidance),
-            )  # fmt: skip
-        search.charges.charge("proposals")
-        search.charges.charge("proposal", self.count)
-        for control in made.control:
+            controls = self._made(search, query)
+        for control in controls:
             states = model.spline.path(control)
             yield Guess(states, goal, least_duration(states, search.ready.limits))
+
+    def _made(self, search: Search, query: Query) -> Array:
+        """Return control points of proposals, shape (B, points, dof)."""
+        model, checker = self.model_and_checker
+        temperature = TEMPERATURES[search.request.number % len(TEMPERATURES)]
+        sampling = model.sampling
+        made = model.propose(
+            query, checker.kernel, self.count, generator=search.rng,
+            sampling=type(sampling)(sampling.sampler, sampling.steps, temperature, sampling.guidance),
+        )  # fmt: skip
+        search.charges.charge("proposals")
+        search.charges.charge("proposal", self.count)
+        return made.control
 
     @staticmethod
     def _place(checker: CollisionChecker, search: Search, goal: Array) -> None:
@@ -91,3 +99,32 @@ class Proposals:
         for o in request.obstacles:
             way = np.multiply(o.velocity or (0.0, 0.0, 0.0), nearest - request.asked)
             place(checker, o, np.add(o.position, way))
+
+
+@dataclass(eq=False)
+class Renoised(Proposals):
+    """What is left of the last motion to a goal, noised and denoised again: the paper's resampling, in flight.
+
+    Attributes:
+        noises: How far it is noised, as shares of the schedule, in one replan after the other.
+    """
+
+    name: str = "renoise"
+    noises: tuple[float, ...] = (0.15, 0.4)
+
+    def _made(self, search: Search, query: Query) -> Array:
+        rest = rest_of_route(search)
+        model, checker = self.model_and_checker
+        if rest is None:
+            return np.empty((0, 0, 0))
+        rest = rest + (search.start.position - rest[0]) * np.linspace(1.0, 0.0, len(rest))[:, None]
+        limits = search.ready.limits
+        control = model.spline.fit(rest, limits.lower, limits.upper).control
+        noise = self.noises[search.request.number % len(self.noises)]
+        made = model.renoise(
+            query, checker.kernel, np.repeat(control[None], self.count, axis=0),
+            max(0, round(noise * model.schedule.steps) - 1), generator=search.rng,
+        )  # fmt: skip
+        search.charges.charge("proposals")
+        search.charges.charge("proposal", self.count)
+        return made.control

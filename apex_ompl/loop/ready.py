@@ -19,6 +19,8 @@ from apex_ompl.robot.model import Limits
 from apex_ompl.trajectory import Trajectory
 from apex_ompl.types import Array
 
+GRAZING = 1e-4  # distance from still things and own parts, such as held objects, below which a motion is not taken [m]
+
 
 @dataclass(eq=False)
 class Ready:
@@ -66,14 +68,23 @@ class Ready:
         return bool(len(self.goals)) and bool((np.abs(self.goals - q).max(axis=1) == 0.0).any())
 
     def clear_of_still(self, motion: Trajectory, charges: Charges | None = None) -> bool:
-        """Whether a motion is proved free of what stands still and of itself, and keeps the limits."""
+        """Whether a motion is proved free of what stands still and of itself, and keeps the limits.
+
+        It does not graze either, but where it begins like that: pieces of it are proved again where they are joined.
+        """
         if not self.keeps_limits(motion):
             return False
         proof = self.checker.prove(curve_of(motion), tolerance=0.0)
         if charges is not None:
             charges.charge("proof interval", proof.intervals)
             charges.charge("exact proof", int(proof.by_spheres < 1.0))
-        return bool(proof)
+        return bool(proof) and (proof.clearance >= GRAZING or self._touches(motion.positions[0]))
+
+    def _touches(self, q: Array) -> bool:
+        """Whether what stands still or the robot's own parts are nearer than a graze at a state, shape (dof,)."""
+        states, still = np.stack([q, q]), np.zeros((2, len(q)))
+        proof = self.checker.prove(Curve.cubic(np.array([0.0, 1.0]), states, still, still), tolerance=0.0)
+        return not proof or proof.clearance < GRAZING
 
     def keeps_limits(self, motion: Trajectory) -> bool:
         """Whether a motion keeps the limits."""
@@ -142,4 +153,6 @@ class Ready:
         curve = Curve.cubic(
             made.trajectory.times, made.trajectory.positions, made.trajectory.velocities, made.trajectory.accelerations
         )
-        return Following(made.trajectory, then) if self.checker.prove(curve, tolerance=0.0) else None
+        proof = self.checker.prove(curve, tolerance=0.0)
+        clear = proof and (proof.clearance >= GRAZING or self._touches(made.trajectory.positions[0]))
+        return Following(made.trajectory, then) if clear else None

@@ -10,6 +10,7 @@ from apex_ompl.loop.ready import Ready
 from apex_ompl.loop.request import Answer, Replanner, Request
 
 SHARE = 0.85  # of the budget after which nothing new is begun
+IMPROVING = 0.4  # of that, for faster motions: what endangers meanwhile does not wait for long
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +37,11 @@ def answered(replanner: Replanner, ready: Ready, request: Request, charges: Char
     except Exception as error:  # whatever a way of replanning does, the robot goes on or stops
         return Reply(request.number, Answer(None, "", charges), f"{type(error).__name__}: {error}")
     return Reply(request.number, answer)
+
+
+def allowed(request: Request, budget: float) -> float:
+    """Return the time that a replan may take until nothing new is begun, of its budget [s]."""
+    return SHARE * budget * (IMPROVING if request.hastens else 1.0)
 
 
 class Replanning(Protocol):
@@ -68,7 +74,7 @@ class AtOnce:
     def submit(self, request: Request) -> None:
         """Make a replan."""
         settings = self.ready.settings
-        charges = Charges(SHARE * settings.budget)
+        charges = Charges(allowed(request, settings.budget))
         self._reply = answered(self.replanner, self.ready, request, charges)
         self._known = request.asked + (charges.spent if settings.latency < 0.0 else settings.latency)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -41,6 +42,21 @@ class Request:
     obstacles: tuple[Obstacle, ...]
     conflict: float
     seed: int
+
+    @property
+    def hastens(self) -> bool:
+        """Whether what the robot follows leads to a goal without a conflict, so that only a faster motion is of use."""
+        return self.following.to_goal and not math.isfinite(self.conflict)
+
+    @property
+    def taken(self) -> str:
+        """Kind of the event of an answer that is followed."""
+        return "improved" if self.hastens else "accepted"
+
+    @property
+    def refused(self) -> str:
+        """Kind of the event of an answer that is not."""
+        return "kept" if self.hastens else "rejected"
 
     @property
     def rng(self) -> np.random.Generator:

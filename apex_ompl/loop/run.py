@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import UnknownNameError
 from apex_ompl.loop.charges import cost_table
 from apex_ompl.loop.cycle import RunRecord
@@ -30,6 +31,7 @@ from apex_ompl.problems.worlds import World
 from apex_ompl.robot.identity import digest
 from apex_ompl.robot.model import Limits
 from apex_ompl.scene.problem import Problem
+from apex_ompl.scene.scripts import obstacle_at
 from apex_ompl.trajectory import Timing, Trajectory
 from apex_ompl.util.validation import check_seed
 
@@ -149,12 +151,22 @@ class _Made:
             ended = {"stuck": Outcome.STUCK, "timeout": Outcome.TIMEOUT}
             outcome = Outcome.MISALIGNED if done.reached else ended[done.ended]
             if not done.reached:
-                reason = f"no goal was reached in {done.trajectory.duration:.3g} s"
+                time = done.trajectory.duration
+                reason = f"no goal was reached in {time:.3g} s{self.blocked(time)}"
         if report.contact is not None:
             one = report.contact
             told = Event(one.time, "contact", {"first": one.first, "second": one.second, "moved": one.moved})
             done = replace(done, events=tuple(sorted((*done.events, told), key=lambda event: event.time)))
         return self.result(done, outcome, reason, report.clearance)
+
+    def blocked(self, time: float) -> str:
+        """Return which obstacles that move are where the robot would be at every goal at a time [s], or nothing."""
+        there = [obstacle_at(o, time) for o in self.world.script() if o.appears <= time]
+        checker, names = CollisionChecker(self.ready.setup.robot, there), {o.name for o in there}
+        met = [names & {name for c in checker.contacts(q) for name in (c.first, c.second)} for q in self.ready.goals]
+        if not all(met):
+            return ""
+        return f"; {', '.join(sorted(set().union(*met)))} stood where the robot would be at the goal"
 
     def problem(self) -> Problem:
         """Return the problem with what obstacles did."""

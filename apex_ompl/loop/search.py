@@ -8,6 +8,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from apex_ompl.live.movers import Movers
 from apex_ompl.live.timed_spline import MotionOptimizer, MotionSettings, Start
 from apex_ompl.loop.charges import Charges
 from apex_ompl.loop.following import Following
@@ -16,10 +17,17 @@ from apex_ompl.loop.ready import Ready
 from apex_ompl.loop.request import Request
 from apex_ompl.robot.model import Limits
 from apex_ompl.trajectory import Trajectory
+from apex_ompl.trajectory.methods.moving_start import between
 from apex_ompl.types import Array
 
 MOTIONS = MotionSettings(samples=2)
 STATES = 64  # of a motion that splines begin from
+EARLIER = 0.02  # by which a motion must arrive before one without a conflict to replace it [s]
+GUARDED, AGE = 0.04, 0.08  # times between stops of a motion that are looked at, and how old what is known will be [s]
+SPREAD = 0.01  # by which places that are seen differ from those that are expected [m]
+NARROW = 1.0  # time that a motion that the guard may stop must gain over one that it will hardly stop [s]
+GOOD = 1.2  # duration of a motion with which a replan ends, as a multiple of the direct one's
+ENOUGH_TIME = 0.4  # share of the budget behind which it ends with any motion that has room
 BETTER = 0.97  # share of the duration of the best motion so far below which another one is worth its while
 
 
@@ -35,6 +43,9 @@ class Search:
         rng: Source of random choices.
         best: The best motion so far, or None.
         part: What found it.
+        cost: Its duration, and more where the guard may stop it [s].
+        least: Duration of the direct motion, whatever is in the way [s].
+        until: Time by the charges at which to end [s].
     """
 
     ready: Ready
@@ -44,6 +55,9 @@ class Search:
     rng: np.random.Generator = field(init=False)
     best: Following | None = None
     part: str = ""
+    cost: float = np.inf
+    least: float = np.inf
+    until: float = np.inf
 
     def __post_init__(self) -> None:
         """Read the request."""
@@ -58,7 +72,48 @@ class Search:
 
     def wanted(self) -> float:
         """Return the duration that a motion must be shorter than to be of use [s]."""
-        return np.inf if self.best is None else BETTER * self.best.motion.duration
+        return min(self.most, BETTER * self.cost)
+
+    @property
+    def most(self) -> float:
+        """Duration of what is followed, where only a faster motion is of use [s]."""
+        return self.request.following.end - self.request.join - EARLIER if self.request.hastens else np.inf
+
+    def direct(self, goal: Array, least: float = 0.0) -> Trajectory | None:
+        """Return the fastest motion to a goal, shape (dof,), in a time or more [s], whatever is in the way, or None."""
+        self.charges.charge("direct motion")
+        rest = np.zeros_like(goal)
+        q, v, a = self.start
+        made = between(np.stack([[q, goal], [v, rest], [a, rest]]), self.ready.limits, self.ready.names, least)
+        if made is not None:
+            self.least = min(self.least, made.duration)
+        return made
+
+    def shaped(self, states: Array, goal: Array, least: float) -> tuple[Array, float] | None:
+        """Return a motion along about a path, as fast as the direct one or slower, or None.
+
+        What the path strays from the straight line is added to the direct motion, by how far that has come.
+
+        Args:
+            states: States of the path, shape (N, dof).
+            goal: Where it ends, shape (dof,).
+            least: Least duration [s].
+
+        Returns:
+            States evenly spaced in time, shape (STATES, dof), and the duration [s].
+        """
+        direct = self.direct(goal, least)
+        if direct is None or direct.duration <= 0.0:
+            return None
+        moved = direct(np.linspace(0.0, direct.duration, STATES))
+        way = goal - self.start.position
+        progress = np.clip((moved - self.start.position) @ way / max(float(way @ way), 1e-12), 0.0, 1.0)
+        arc = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(states, axis=0), axis=1)))
+        share = arc / max(float(arc[-1]), 1e-12)
+        ends = self.start.position + share[:, None] * way
+        off = states + (1.0 - share[:, None]) * (self.start.position - states[0]) - ends
+        strays = np.stack([np.interp(progress, share, column) for column in off.T], axis=1)
+        return moved + strays, direct.duration
 
     def following(self, motion: Trajectory) -> Following:
         """Return a motion as one that is followed from the time of joining on."""
@@ -71,10 +126,38 @@ class Search:
         conflict = self.ready.first_conflict(self.request.predicted, one, one.begin, until, self.charges)
         return not np.isfinite(conflict) and self.ready.clear_of_still(motion, self.charges)
 
-    def take(self, motion: Trajectory, part: str) -> None:
-        """Keep a proved motion where it is shorter than the best."""
-        if motion.duration < self.wanted():
-            self.best, self.part = self.following(motion), part
+    def over(self) -> bool:
+        """Whether time is up, or what was found is good enough: a faster motion is looked for while it is followed."""
+        if self.charges.over() or self.charges.spent >= self.until:
+            return True
+        if self.cost == np.inf or self.request.hastens or not self.ready.settings.hastens:
+            return False
+        return self.cost <= GOOD * self.least or self.charges.spent > ENOUGH_TIME * self.charges.limit
+
+    def guardable(self, motion: Trajectory) -> bool:
+        """Whether the guard will hardly stop a motion: stops from it are proved in time, as they will be known then."""
+        settings, one = self.ready.settings, self.following(motion)
+        if not settings.guarded:
+            return True
+        for time in np.arange(one.begin, one.end, GUARDED):
+            if self.charges.over():
+                return False
+            self.charges.charge("proved stop")
+            seen = reach(self.request.predicted, time - AGE, settings.error, settings.fastest)
+            if self.ready.proved_stop(seen, one, float(time), float(time) + settings.period) is None:
+                return False
+        return True
+
+    def take(self, motion: Trajectory, part: str) -> bool:
+        """Keep a proved motion where it is shorter than the best, or about so with more room; return whether it is."""
+        if motion.duration >= min(self.most, self.cost):
+            return False
+        guardable = self.guardable(motion)
+        cost = motion.duration + (0.0 if guardable else NARROW)
+        if cost >= self.cost or (self.request.hastens and not guardable):
+            return False
+        self.best, self.part, self.cost = self.following(motion), part, cost
+        return True
 
     def pool(self, berth: bool = True) -> MotionPool:
         """Return an empty pool of motions, which are optimised with a berth around obstacles or without."""
@@ -85,6 +168,16 @@ class Search:
         return MotionPool(optimizer, self.start, request.join, self.charges, self.accepts, berth=beyond)
 
 
+def reach(predicted: Movers, stamp: float, error: float, fastest: float) -> Movers:
+    """Return all that obstacles can reach that are seen at a time where they are expected then [s]."""
+    found = predicted.larger(0.0)
+    arrays = found.arrays
+    arrays.place[:] += arrays.velocity * (stamp - arrays.stamp)[:, None]
+    arrays.velocity[:], arrays.stamp[:] = 0.0, stamp
+    arrays.growth[:] = error + SPREAD, fastest
+    return found
+
+
 class Guess(NamedTuple):
     """A motion to start from.
 
@@ -92,11 +185,13 @@ class Guess(NamedTuple):
         states: States evenly spaced in time, shape (N, dof).
         goal: Where it ends, shape (dof,).
         duration: About how long it takes without obstacles [s].
+        timed: Whether it is a motion of that duration, and no path.
     """
 
     states: Array
     goal: Array
     duration: float
+    timed: bool = False
 
 
 class Source(Protocol):

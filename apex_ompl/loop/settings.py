@@ -35,6 +35,7 @@ class LoopSettings:
         by_distance: Whether a motion counts as blocked where an obstacle is nearer than ``trigger``, instead of where a
             conflict is predicted; once motion began nearer than that, where one comes nearer still.
         trigger: That distance, lambda_obs of the paper's Algorithm 1 [m].
+        hastens: Whether a faster motion is looked for while one without a conflict is followed.
         hold: Time for which the goal must stay clear from the arrival on [s].
         rest_hold: Time for which a robot that stands elsewhere looks ahead [s].
         margin: Distance that is kept from obstacles that move [m].
@@ -56,6 +57,7 @@ class LoopSettings:
     from_rest: bool = False
     by_distance: bool = False
     trigger: float = 0.05
+    hastens: bool = True
     hold: float = 0.1
     rest_hold: float = 1.5
     margin: float = 0.005

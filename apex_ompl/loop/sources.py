@@ -12,6 +12,8 @@ from apex_ompl.loop.search import STATES, Guess, Search, least_duration
 from apex_ompl.trajopt.optimizer import Optimizer
 from apex_ompl.types import Array
 
+FASTER = (0.92, 0.8)  # shares of the duration of a motion in which a faster one is looked for
+
 
 @dataclass(frozen=True)
 class Route:
@@ -27,6 +29,26 @@ class Route:
         rest = rest_of_route(search)
         if rest is not None:
             yield Guess(rest, rest[-1], least_duration(rest, search.ready.limits))
+
+
+@dataclass(frozen=True)
+class Faster:
+    """The motion that is followed, faster."""
+
+    name: str = "faster"
+
+    def prepare(self, ready: Ready) -> None:
+        """Nothing is needed."""
+
+    def guesses(self, search: Search) -> Iterator[Guess]:
+        """Yield the rest of the motion, where it has no conflict."""
+        request = search.request
+        left = request.following.end - request.join
+        if request.hastens and left > 0.0:
+            times = request.join - request.following.begin + np.linspace(0.0, left, STATES)
+            states = request.following.motion(np.clip(times, 0.0, request.following.motion.duration))
+            for factor in FASTER:
+                yield Guess(states, request.following.motion.positions[-1], factor * left, timed=True)
 
 
 @dataclass(frozen=True)

@@ -42,10 +42,11 @@ RUN_COLOURS = {
     "true": "#c8553d", "observed": "#e9a03b", "predicted": "#8e44ad", "committed": "#2b9348", "stop": "#e0101b",
 }  # fmt: skip
 EVENT_COLOURS = {
-    "conflict": "#e9a03b", "request": "#1f6fb4", "accepted": "#2b9348", "rejected": "#8a8f98", "stop": "#d97a1a",
+    "conflict": "#e9a03b", "request": "#1f6fb4", "accepted": "#2b9348", "rejected": "#8a8f98",
+    "improve": "#9db4c8", "improved": "#7fb069", "kept": "#c4c7cc", "stop": "#d97a1a",
     "evasion": "#8e44ad", "broken assumption": "#6b2d20", "contact": "#e0101b", "goal": "#0b6e4f",
 }  # fmt: skip
-SILENT_EVENTS = ("observation", "reaction")  # too many for words
+SILENT_EVENTS = ("observation", "reaction", "improve", "kept")  # too many for words
 RUN_OPACITIES = {"true": 0.9, "observed": 0.5, "predicted": 0.22}
 SOLID, PLATE = 0.9, 0.14  # opacities of obstacles; thin plates show what is behind them
 ARROW_LENGTH = 0.12  # [m]

@@ -28,24 +28,41 @@ def from_moving_start(
         limits: Limits of the joints.
         minimum_duration: Least duration of the whole motion [s].
     """
-    solver, query = ruckig.Ruckig(motion.dof), ruckig.InputParameter(motion.dof)
-    query.current_position, query.current_velocity = motion.positions[0].tolist(), velocity.tolist()
-    query.current_acceleration = acceleration.tolist()
-    query.max_jerk = (JERK_SHARE * limits.jerk).tolist()
     for time in np.linspace(0.0, motion.duration, JOIN_TIMES + 1) if motion.duration else [0.0]:
         left = motion.duration - time
-        target = [motion(time, order) for order in range(3)]
-        query.target_position, query.target_velocity, query.target_acceleration = (x.tolist() for x in target)
-        for name, *at in (("velocity", velocity, target[1]), ("acceleration", acceleration, target[2])):
-            least = LIMITS_MARGIN * np.abs(at).max(axis=0)  # which Ruckig takes the ends with
-            setattr(query, f"max_{name}", np.maximum(LIMITS_SHARE * getattr(limits, name), least).tolist())
-        query.minimum_duration = max(minimum_duration - left, 0.0) or None
-        solution = ruckig.Trajectory(motion.dof)
-        try:
-            calculate(solver, query, solution)
-        except ruckig.RuckigError:  # that state cannot be reached from this velocity within the limits
-            continue
-        states = np.stack([[motion.positions[0], velocity, acceleration], target], axis=1)
-        head = joined(Profiles.of([solution]), states, motion.joint_names)
-        if max(head.use(limits).values()) <= 1.0 + ROUNDING:  # Ruckig may exceed a limit that the velocity is near to
+        states = np.stack(
+            [[motion.positions[0], motion(time)], [velocity, motion(time, 1)], [acceleration, motion(time, 2)]]
+        )
+        head = between(states, limits, motion.joint_names, minimum_duration - left)
+        if head is not None:
             yield concatenate([head, motion.after(time)]), head.duration
+
+
+def between(
+    states: Array, limits: Limits, joint_names: tuple[str, ...], minimum_duration: float = 0.0
+) -> Trajectory | None:
+    """Return Ruckig's motion between two states, the fastest in which all joints arrive together, or None.
+
+    Args:
+        states: Positions, velocities and accelerations at begin and end, shape (3, 2, dof).
+        limits: Limits of the joints. Ruckig does not know those of positions, but a motion beyond them is none.
+        joint_names: Names of the joints.
+        minimum_duration: Least duration [s].
+    """
+    dof = states.shape[2]
+    solver, query, solution = ruckig.Ruckig(dof), ruckig.InputParameter(dof), ruckig.Trajectory(dof)
+    (query.current_position, query.target_position), (query.current_velocity, query.target_velocity), (
+        query.current_acceleration, query.target_acceleration
+    ) = states.tolist()  # fmt: skip
+    query.max_jerk = (JERK_SHARE * limits.jerk).tolist()
+    for name, at in (("velocity", states[1]), ("acceleration", states[2])):
+        least = LIMITS_MARGIN * np.abs(at).max(axis=0)  # which Ruckig takes the ends with
+        setattr(query, f"max_{name}", np.maximum(LIMITS_SHARE * getattr(limits, name), least).tolist())
+    query.minimum_duration = max(minimum_duration, 0.0) or None
+    try:
+        calculate(solver, query, solution)
+    except ruckig.RuckigError:  # that state cannot be reached from this velocity within the limits
+        return None
+    motion = joined(Profiles.of([solution]), states, joint_names)
+    # Ruckig may exceed a limit that the velocity is near to
+    return motion if max(motion.use(limits).values()) <= 1.0 + ROUNDING else None
