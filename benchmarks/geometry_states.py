@@ -18,6 +18,7 @@ from pathlib import Path
 import geometry
 import numpy as np
 import record
+from geometry_versions import version
 from tqdm import tqdm
 
 from apex_ompl import load_problem, problems
@@ -27,7 +28,7 @@ from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import one_or_more
 
-DEPENDS = ("@checking", "benchmarks/geometry.py")
+DEPENDS = ("@checking", "benchmarks/geometry.py", "benchmarks/geometry_versions.py")
 KINDS = ("meshes", "points", "voxels", "large")
 EACH = 4000  # states of a scene
 
@@ -46,7 +47,7 @@ def count_states(kind: str, number: int) -> tuple[int, int, int]:
             place = tuple(rng.uniform([0.35, -0.3, 0.3], [0.7, 0.3, 0.8]).tolist())
             scene = (Obstacle(name="large", mesh={"file": str(Path(folder) / "large.stl")}, position=place),)
         else:
-            scene = geometry.version(problem, kind, Path(folder)).scene
+            scene = version(problem, kind, Path(folder)).scene
         checker = CollisionChecker(robot(), scene, problem.attached)
         _, counts = checker.kernel.unproved(states)
         proved = states[counts == 0]
