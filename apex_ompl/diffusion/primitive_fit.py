@@ -22,7 +22,8 @@ from apex_ompl.kernel.distance_grid import BAND, SLACK, DistanceGrid
 from apex_ompl.types import Array, Flags
 from apex_ompl.util.weak_cache import weakly_cached
 
-MOST_NODES = 1_000_000  # that are looked at; of finer grids every other
+MOST_NODES, MOST_NODES_OF_SOLIDS = 1_000_000, 250_000  # that are looked at; of finer grids every other or third
+INSIDE = 3.0  # distance inside of a surface, in spacings, by which it is known to enclose a solid
 CLOSE = 0.008  # nodes are at least so far from each other among points, which are to be one surface [m]
 MORE = 1.15  # distance in spacings up to which nodes count as occupied where distances are not exact
 MOST_SHAPES = 48  # of a grid
@@ -32,11 +33,11 @@ FEW = 8  # nodes of a region that is a box whatever its form
 RIM = 300  # nodes of a border by which a primitive is judged
 SAMPLES = 1500  # nodes by which a region and a primitive are compared
 BOXY = 1.25  # by which a box must fit better than a round solid, which voxels make look like a box
-LEAST_GAIN = 0.02  # side of a cube that has the volume of what the next box must hold at least [m]
+LEAST_GAIN = 0.03  # side of a cube that has the volume of what the next box must hold at least [m]
 RING = 0.006  # around a box there is no other to be looked for [m]
 LONG = 3.0  # sides of a bar, at least
 LAYER = 0.96  # share of a layer of nodes that must be occupied for a box to grow by it
-SEEDS = 16  # nodes from which boxes grow
+SEEDS = 10  # nodes from which boxes grow
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +80,11 @@ class _Nodes:
             block = max(1, math.ceil(CLOSE / grid.spacing))
             reach = max((SLACK if block == 1 else MORE) * block * grid.spacing - grid.radius, 0.0)
         else:
-            block = 1 if grid.values.size <= MOST_NODES else 2
+            inside = (
+                float(grid.values.min()) < -INSIDE * grid.spacing
+            )  # else it is a surface, in which nodes leave gaps
+            most = MOST_NODES_OF_SOLIDS if inside else MOST_NODES
+            block = min(math.ceil((grid.values.size / most) ** (1.0 / 3.0)), 3 if inside else 2)
             reach = min(SLACK * block, BAND) * grid.spacing
         slack, band = np.float32(SLACK * grid.spacing), (1.0 if grid.radius > 0.0 else BAND) - 1e-3
         gap = grid.values[::block, ::block, ::block] + slack
