@@ -246,7 +246,8 @@ def test_popups_appear_before_a_hand_and_clear_of_the_robot(suite: str, size: st
         now, before = (robot().link_pose(state(motion, t), link)[:3, 3] for t in (appears, appears - 2 * STEP))
         ahead = np.dot(np.subtract(made.position, now), now - before) > 0.0
         fronts.append(np.linalg.norm(np.subtract(made.position, now)) - SIZES[size] / 2 if ahead else np.inf)
-    assert 0.12 < min(fronts) < 0.7  # a cube on the tables is lifted, and hands go on between two steps
+    # A cube on the tables is lifted, and hands go on between two steps; the other hand may be nearer.
+    assert any(0.15 < front < 0.7 for front in fronts)
     if not any(made.velocity or ()):
         assert exact(world, made).obstacle_distance(motion.positions[-1:]) >= 0.03
 

@@ -22,7 +22,7 @@ from apex_ompl.kernel.compiled.compilation import CompiledFunction, cache_folder
 from apex_ompl.util.files import locked
 
 LOG = logging.getLogger("apex_ompl")
-TYPICAL_SECONDS = 30
+TYPICAL_SECONDS = 60
 
 ROBOT = "i8[::1], f8[::1], "
 WORKSPACE = BUFFERS = ROBOT

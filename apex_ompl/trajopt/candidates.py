@@ -13,7 +13,7 @@ from apex_ompl.types import Array
 
 ROUND, ROUNDS = 4, 12  # optimiser steps in a round of repair, and rounds a candidate has at most
 SOFT_ROUNDS = 2  # the last rounds, with still less weight on the speed term
-SLACK = 0.3  # factor on the settings' weight of the speed term: clear comes before short
+REPAIR_STIFFNESS = 0.3  # factor on the settings' stiffness: clear comes before short
 PENALTY = 3.0  # factor on the priority of a candidate for every round spent on it
 STEPS_PER_PATH = 16  # on average
 CLEAR = 0.005  # clearance at the samples at which a round ends early [m]
@@ -118,7 +118,7 @@ class CandidatePool:
             optimizer = self._fine if chosen.fine else self._optimizer
             improved = optimizer.improve(
                 self._kernel, chosen.control[None], steps=ROUND, damping=chosen.damping, enough=CLEAR,
-                stiffness=(LAST_RESORT if soft else SLACK) * settings.stiffness,
+                stiffness=(LAST_RESORT if soft else REPAIR_STIFFNESS) * settings.stiffness,
             )  # fmt: skip
             chosen.control, chosen.clearance_cost = improved.control[0], float(improved.clearance_cost[0])
             chosen.clearance, chosen.damping = float(improved.clearance[0].min()), float(improved.damping[0])
