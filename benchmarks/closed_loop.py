@@ -8,7 +8,7 @@ The row ``clairvoyant`` is no loop: ``plan`` knows from the beginning how everyt
 gives the shortest motion of what it finds in 10 s with as many seeds as fit. Times to the goal are compared with its,
 over the runs that both end at the goal. (It is made where motions are independent of the robot's, in moving worlds.)
 
-Usage: python benchmarks/closed_loop.py [-n 60] [--jobs 1] [--split test] [--kinds moving popup] [--report]
+Usage: python benchmarks/closed_loop.py [-n 60] [--jobs 1] [--split test] [--kinds moving popup] [--clairvoyant 60] [--report]
 """
 
 from __future__ import annotations
@@ -227,6 +227,7 @@ def main() -> None:
     parser.add_argument("--kinds", nargs="+", default=list(worlds.kinds()), choices=worlds.kinds())
     parser.add_argument("--methods", nargs="+", default=list(METHODS), choices=list(METHODS))
     parser.add_argument("--speeds", nargs="+", type=float, default=list(SPEEDS))
+    parser.add_argument("--clairvoyant", type=int, default=60, help="moving worlds with its row (default: %(default)s)")
     parser.add_argument("--store", type=Path, default=FOLDER, help="folder of the runs")
     parser.add_argument("--report", action="store_true", help="run nothing; write the results of the stored runs")
     args = parser.parse_args()
@@ -234,11 +235,14 @@ def main() -> None:
         kind: [
             Job(world, method, speed)
             for world in worlds.ids(kind, args.split, args.n)
-            for method in (*args.methods, *[CLAIRVOYANT] * (kind == SCRIPTED))
+            for method in args.methods
             for speed in args.speeds
         ]
         for kind in args.kinds
     }
+    if SCRIPTED in jobs:
+        known = worlds.ids(SCRIPTED, args.split, min(args.n, args.clairvoyant))
+        jobs[SCRIPTED] += [Job(world, CLAIRVOYANT, speed) for world in known for speed in args.speeds]
     stored([job for some in jobs.values() for job in some], args, made)
     rows: dict[tuple[str, float, str], list[dict[str, Any]]] = {}
     for kind, some in jobs.items():
