@@ -8,7 +8,8 @@ The row ``clairvoyant`` is no loop: ``plan`` knows from the beginning how everyt
 gives the shortest motion of what it finds in 10 s with as many seeds as fit. Times to the goal are compared with its,
 over the runs that both end at the goal. (It is made where motions are independent of the robot's, in moving worlds.)
 
-Usage: python benchmarks/closed_loop.py [-n 60] [--jobs 1] [--split test] [--kinds moving popup] [--clairvoyant 60] [--report]
+Usage: python benchmarks/closed_loop.py [-n 60] [--jobs 1] [--split test] [--kinds moving popup] [--report]
+       [--clairvoyant 60]
 """
 
 from __future__ import annotations
