@@ -275,10 +275,11 @@ class _Search:
 
     def _with_head(self, wait: float, end: float, times: Array, states: Array) -> Trajectory:
         """Return the motion that waits, goes on along the given one up to a place, and then otherwise."""
-        inner = (self.motion.times > self.time) & (self.motion.times < end)
-        head = np.append(self.time, self.motion.times[inner]) if end > self.time else np.empty(0)
+        knots, lead = self.motion.times, end - self.time
+        inner = (knots > self.time + SAME_TIME) & (knots < end - SAME_TIME)
+        head = np.append(self.time, knots[inner]) if lead > SAME_TIME else np.empty(0)
         first = np.stack([self.motion(head, order) for order in range(3)])
-        moments = np.concatenate([head - self.time, times + (end - self.time)]) + wait
+        moments = np.concatenate([head - self.time, times + (lead if len(head) else 0.0)]) + wait
         rows = np.concatenate([first, states], axis=1)
         if wait > 0.0:
             moments, rows = np.append(0.0, moments), np.concatenate([rows[:, :1], rows], axis=1)
