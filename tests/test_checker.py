@@ -82,6 +82,22 @@ def test_broadphase_agrees_with_a_plain_loop(robot: Robot) -> None:
     assert ours == [naive.is_free(q) for q in states]
 
 
+@pytest.mark.parametrize("proofs", [True, False])
+def test_the_quick_test_finds_collisions_only_where_there_are_some(robot: Robot, proofs: bool) -> None:
+    rng, found, colliding = np.random.default_rng(3), 0, 0
+    for _ in range(6):
+        checker = CollisionChecker(robot, clutter(rng, 4), proofs=proofs)
+        for _ in range(6):
+            states = states_around_home(robot, rng, 8, 0.5)
+            there, quick = not checker.are_free(states).all(), checker.collides_at(states)
+            assert there or not quick
+            found, colliding = found + quick, colliding + there
+    assert colliding > 10 and found >= 0.9 * colliding
+    assert not CollisionChecker(robot, proofs=proofs).collides_at(robot.home[None])
+    with pytest.raises(ParameterError):
+        checker.collides_at(np.zeros((2, 3)))
+
+
 def test_home_is_free_and_nan_never(robot: Robot, baxter: Robot) -> None:
     for some in (robot, baxter):
         checker = CollisionChecker(some)

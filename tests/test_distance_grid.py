@@ -13,11 +13,18 @@ from scipy.spatial.transform import Rotation
 
 from apex_ompl.collision.shapes import mesh_geometry
 from apex_ompl.collision.tabulate import primitives
+from apex_ompl.kernel import distance_grid
 from apex_ompl.kernel.compiled.arrays import GRID, SceneArrays, scene_view
 from apex_ompl.kernel.compiled.compilation import entry_point
 from apex_ompl.kernel.compiled.layout import Floats, Integers, Singles
-from apex_ompl.kernel.compiled.signed_distance import direction, distance
-from apex_ompl.kernel.distance_grid import SLACK, DistanceGrid, grid_of_points, grid_of_triangles
+from apex_ompl.kernel.compiled.signed_distance import ball_apart, direction, distance
+from apex_ompl.kernel.distance_grid import (
+    SLACK,
+    DistanceGrid,
+    grid_of_points,
+    grid_of_triangles,
+    grid_of_triangles_beside,
+)
 from apex_ompl.kernel.scene_builder import Primitive, Solids, moved, primitive, scene_tables
 from apex_ompl.scene.meshes import winding_number
 
@@ -35,6 +42,23 @@ def evaluated(grid: DistanceGrid, pose: np.ndarray, points: np.ndarray) -> tuple
     found = np.empty((len(points), 4))
     _evaluate(*tables.packed, np.ascontiguousarray(points), found)
     return found[:, 3], found[:, :3]
+
+
+@entry_point
+def _balls_apart(si: Integers, sf: Floats, sg: Singles, balls: Floats, found: Floats) -> None:
+    s = scene_view(si, sf, sg)
+    for k in range(len(balls)):
+        x, y, z, radius = balls[k, 0], balls[k, 1], balls[k, 2], balls[k, 3]
+        found[k, 0] = ball_apart(s, 0, x, y, z, radius)
+        found[k, 1] = distance(s, 0, x, y, z, radius)
+
+
+def apart(grid: DistanceGrid, pose: np.ndarray, points: np.ndarray, radii: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Whether balls are proved apart, and bounds of their centres' distances that suffice for their radii."""
+    tables = scene_tables([(0, Primitive(GRID, pose, (), grid))])
+    found = np.empty((len(points), 2))
+    _balls_apart(*tables.packed, np.column_stack([points, radii]), found)
+    return found[:, 0] > 0.0, found[:, 1]
 
 
 def random_pose(rng: np.random.Generator) -> np.ndarray:
@@ -102,6 +126,54 @@ def test_a_grid_of_points_is_a_near_lower_bound(seed: int, count: int, radius: f
     assert (true - found)[inside].max() <= 4.0 * SLACK * grid.spacing + 1e-5
 
 
+@settings(max_examples=25)
+@given(seed=st.integers(0, 10**6), count=st.integers(1, 3000), radius=st.floats(0.0005, 0.05))
+def test_balls_are_apart_from_points_as_by_brute_force(seed: int, count: int, radius: float) -> None:
+    rng = np.random.default_rng(seed)
+    cloud = rng.normal(size=(count, 3)) * rng.uniform(0.0, 0.3, 3)
+    pose, places, radii = random_pose(rng), rng.uniform(-0.6, 0.6, (300, 3)), rng.uniform(0.005, 0.2, 300)
+    true = cKDTree(cloud).query(places)[0] - radius
+    radii[:150] = np.maximum(true[:150] + rng.choice([-1e-4, 1e-4], 150), 1e-3)  # at the border
+    found, bounds = apart(grid_of_points(cloud, radius), pose, places @ pose[:3, :3].T + pose[:3, 3], radii)
+    assert not found[true < radii].any() and found[true > radii + 1e-5].all()
+    assert (bounds <= true + 1e-9).all()
+
+
+@settings(max_examples=20)
+@given(seed=st.integers(0, 10**6), rows=st.integers(4, 20), waves=st.floats(0.0, 0.4))
+def test_balls_are_apart_from_a_solid_as_by_brute_force(seed: int, rows: int, waves: float) -> None:
+    rng = np.random.default_rng(seed)
+    vertices, faces = bumpy_sphere(rows, 0.15, waves)
+    corners, pose = vertices[faces], random_pose(rng)
+    places, radii = rng.uniform(-0.25, 0.25, (200, 3)), rng.uniform(0.01, 0.1, 200)
+    inside = np.array([abs(winding_number(p, corners)) > 0.5 for p in places])
+    true = np.where(inside, -1.0, 1.0) * surface_distance(corners, places)
+    radii[:100] = np.maximum(true[:100] + rng.choice([-1e-4, 1e-4], 100), 1e-2)
+    found, bounds = apart(grid_of_triangles(corners, solid=True), pose, places @ pose[:3, :3].T + pose[:3, 3], radii)
+    assert not found[true < radii].any() and found[true > radii + 1e-5].all()
+    assert (bounds <= true + 1e-9).all()
+
+
+def test_a_ball_deep_inside_of_a_solid_is_not_apart_though_no_triangle_is_near() -> None:
+    vertices, faces = bumpy_sphere(20, 0.3, 0.0)
+    grid = grid_of_triangles(vertices[faces], solid=True)
+    assert not apart(grid, np.eye(4), np.zeros((1, 3)), np.array([0.02]))[0].any()
+    assert not apart(grid, np.eye(4), np.full((1, 3), np.nan), np.array([0.02]))[0].any()
+
+
+def test_a_grid_made_beside_is_the_one_that_is_asked_for() -> None:
+    vertices, faces = bumpy_sphere(10, 0.12, 0.1)
+    corners = vertices[faces]
+    with grid_of_triangles_beside(corners, solid=True):
+        pass
+    grid = grid_of_triangles(corners, solid=True)
+    with grid_of_triangles_beside(corners, solid=True):
+        assert grid_of_triangles(corners, solid=True) is grid
+    distance_grid._kept.clear()
+    alone = grid_of_triangles(corners, solid=True)
+    assert alone is not grid and np.array_equal(alone.block, grid.block)
+
+
 def test_gradients_are_those_of_finite_differences() -> None:
     rng = np.random.default_rng(2)
     vertices, faces = bumpy_sphere(12, 0.15, 0.3)
@@ -132,7 +204,7 @@ def test_scenes_share_values_and_follow_moves() -> None:
     poses = [random_pose(rng) for _ in range(3)]
     solids = [Primitive(GRID, pose, (), one) for pose, one in zip(poses, (grid, other, grid), strict=True)]
     tables = scene_tables(list(enumerate(solids)))
-    assert tables.arrays.values.size == grid.values.size + other.values.size
+    assert tables.arrays.values.size == len(grid.block) + len(other.block)
     for k, owner in enumerate(tables.arrays.owner):
         again = primitive(tables, k)
         assert again.grid is solids[owner].grid and again.pose == pytest.approx(solids[owner].pose)

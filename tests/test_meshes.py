@@ -8,10 +8,12 @@ import coal
 import numpy as np
 import pytest
 import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from support import CUBE_OBJ
 
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.collision.shapes import coal_geometry, convex_hull, hull_planes, mesh_note
+from apex_ompl.collision.shapes import _farthest, coal_geometry, convex_hull, hull_planes, mesh_note
 from apex_ompl.errors import FileFormatError
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import Obstacle
@@ -91,6 +93,17 @@ def test_a_hull_of_too_many_neighbours_is_replaced_by_a_little_larger_one(robot:
     checker.move("cones", tuple(robot.link_pose(robot.home, "left_link7")[:3, 3]))
     assert not checker.is_free(robot.home)
     assert coal_geometry(obstacle) is shape  # loaded once
+
+
+@settings(max_examples=25)
+@given(seed=st.integers(0, 10**6), count=st.integers(1, 3000), flat=st.booleans())
+def test_farthest_points_are_those_of_brute_force(seed: int, count: int, flat: bool) -> None:
+    rng = np.random.default_rng(seed)
+    points = rng.normal(size=(count, 3)) * ([1.0, 1.0, 0.0] if flat else [1.0, 0.3, 0.1])
+    directions = np.concatenate([rng.normal(size=(20, 3)), np.eye(3), -np.eye(3)])
+    found, reach = _farthest(directions, points)
+    assert reach == pytest.approx((points @ directions.T).max(axis=0), abs=1e-12)
+    assert np.einsum("ij,ij->i", points[found], directions) == pytest.approx(reach, abs=1e-12)
 
 
 def test_binary_stl_is_read_as_by_coal_and_trimesh(tmp_path: Path) -> None:

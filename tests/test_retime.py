@@ -133,7 +133,9 @@ def test_a_motion_that_meets_nothing_stays_as_it_is(
         assert_kept(robot, swing, time, made.trajectory, 0.0)
 
 
-def test_a_place_next_to_a_knot_gives_one_knot(kernel: Kernel, robot: Robot, swing: Trajectory, quarter: Limits) -> None:
+def test_a_place_next_to_a_knot_gives_one_knot(
+    kernel: Kernel, robot: Robot, swing: Trajectory, quarter: Limits
+) -> None:
     movers = Movers([Obstacle(name="mover", box=(0.1, 0.1, 0.1), position=(0.0, 0.0, 3.0), velocity=(0.1, 0.0, 0.0))])
     for knot in swing.times[1:-1]:
         made = retime(kernel, movers, swing, quarter, time=float(np.nextafter(knot, 0.0)))

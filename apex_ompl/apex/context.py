@@ -95,7 +95,7 @@ class SolveContext:
 
     def new_pool(self) -> CandidatePool:
         """Return an empty pool of candidates."""
-        return CandidatePool(self.optimizer, self.kernel, self.is_valid, self.accepts_distance)
+        return CandidatePool(self.optimizer, self.kernel, self.is_valid, self.accepts_distance, self.validator.collides)
 
     def path_of(self, candidate: Candidate) -> Path:
         """Return the path of a candidate's control points."""

@@ -15,11 +15,13 @@ from apex_ompl.collision.path_proof import TOLERANCE, Curve, PathProof, PathProv
 from apex_ompl.collision.scene_bodies import SceneBodies
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel import Kernel
+from apex_ompl.kernel.kernel import MOST_PAIRS
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import AttachedObject, Obstacle
 from apex_ompl.types import Array, Flags
 from apex_ompl.util.validation import check_states, shape_error
 
+DOUBTFUL = 3  # states at which a quick test looks for a collision by the meshes
 NO_POINT = (0.0, 0.0, -1.0)
 """Obstacle point of a scene without obstacles, 1 m below the table tops, farther away than any obstacle [m]."""
 
@@ -112,6 +114,22 @@ class CollisionChecker(SceneBodies):
         for k, unproved in self._spheres.unproved_among(states, self.check_counts):
             free[k] = self._free_by_meshes(states[k], unproved)
         return free
+
+    def collides_at(self, states: Array) -> bool:
+        """Whether a collision is found at some of the states, shape (N, dof), the most doubtful ones; a quick test.
+
+        Only the few states with the most pairs that the spheres leave are looked at by the meshes.
+
+        Raises:
+            ParameterError: Another shape.
+        """
+        states = np.asarray(states, float)
+        check_states(states, self.robot.dof)
+        if not self._two_stages:
+            return any(not self._free_by_meshes(q) for q in states)
+        left = self._spheres.unproved_among(states, self.check_counts)
+        doubtful = sorted(left, key=lambda one: len(one[1].pairs) if one[1].pairs else MOST_PAIRS, reverse=True)
+        return any(not self._free_by_meshes(states[k], unproved) for k, unproved in doubtful[:DOUBTFUL])
 
     def first_collision(self, path: Array, resolution: float, start: bool = True) -> Collision | None:
         """Return a colliding state along a path, or None when the path is free.

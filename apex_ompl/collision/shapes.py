@@ -6,6 +6,7 @@ import hashlib
 import io
 import logging
 import threading
+from contextlib import AbstractContextManager, nullcontext
 from itertools import product
 from pathlib import Path
 from weakref import WeakValueDictionary
@@ -16,9 +17,20 @@ from numpy.typing import NDArray
 
 from apex_ompl.collision.clouds import PointCloud, cloud_geometry
 from apex_ompl.errors import FileFormatError
+from apex_ompl.kernel.compiled.farthest_points import farthest_points
+from apex_ompl.kernel.distance_grid import grid_of_triangles_beside
 from apex_ompl.scene.bodies import Body, GridFile, MeshFile, PointFile
 from apex_ompl.scene.grids import parse_surface
-from apex_ompl.scene.meshes import binary_stl, extent_fault, hole_fault, orientation_fault, surface_note, triangles
+from apex_ompl.scene.meshes import (
+    binary_stl,
+    capped,
+    edges_of,
+    extent_fault,
+    hole_fault,
+    orientation_fault,
+    surface_note,
+    triangles,
+)
 from apex_ompl.scene.points import parse_points
 from apex_ompl.types import Array
 from apex_ompl.util.files import read_file
@@ -29,6 +41,7 @@ THICKNESS = 1e-6  # by which hulls of surfaces are larger [m]
 KEPT_MESHES = 32  # meshes that were loaded last and are kept for the next problem
 DIRECTIONS = (400, 60)  # in which hulls of too many vertices are sampled; fewer where Coal takes no more
 CELLS = 24  # along the longest side of a grid over vertices
+LARGE = 50_000  # triangles of a mesh from which on its grid of distances is made while its tree is
 MANY_TRIANGLES = 200_000  # which take seconds
 MOST_VERTICES = 50_000  # of a mesh whose hull is not sampled
 
@@ -178,14 +191,11 @@ def _farthest(directions: Array, points: Array) -> tuple[NDArray[np.intp], Array
     cells = np.ravel_multi_index(tuple(((points - low) / side).astype(np.int64).T), (CELLS + 1,) * 3)
     order = np.argsort(cells, kind="stable")
     first = np.flatnonzero(np.diff(cells[order], prepend=-1))
-    last, points = np.append(first[1:], len(order)), points[order]
+    points = np.ascontiguousarray(points[order])
     middles = low + side * (np.floor((points[first] - low) / side) + 0.5)
-    found = np.empty(len(directions), np.intp)
-    for k, direction in enumerate(directions):
-        reach = middles @ direction + (0.5 + 1e-6) * side * np.abs(direction).sum()
-        among = np.flatnonzero(reach >= (points[first] @ direction).max())
-        some = np.concatenate([np.arange(first[n], last[n]) for n in among])
-        found[k] = some[(points[some] @ direction).argmax()]
+    found = np.empty(len(directions), np.int64)
+    half, directions = (0.5 + 1e-6) * side, np.ascontiguousarray(directions)
+    farthest_points(directions, points, np.append(first, len(order)), middles, half, found)
     return order[found], np.einsum("ij,ij->i", directions, points[found])
 
 
@@ -238,10 +248,22 @@ def _parse_mesh(role: str, shape: MeshFile, content: bytes) -> coal.CollisionGeo
     if fault:
         wanted = "finite triangles" if alone else "a closed mesh of consistently oriented triangles"
         raise FileFormatError(file, "", fault, f"expected {wanted} ({role})")
-    mesh = mesh_geometry(vertices, faces)
+    with _grid_beside(vertices, faces, alone):
+        mesh = mesh_geometry(vertices, faces)
     if alone:
         is_surface.keep(mesh, True)
     return mesh
+
+
+def _grid_beside(vertices: Array, faces: NDArray[np.int64], alone: bool) -> AbstractContextManager[None]:
+    """Return a block during which the grid of distances of a large mesh is made, as the kernel will ask for it."""
+    if len(faces) < LARGE:
+        return nullcontext()
+    if alone:
+        return grid_of_triangles_beside(vertices[faces], solid=False)
+    edges = edges_of(vertices, faces)
+    closed = not len(edges.open) and not edges.balance.any()
+    return grid_of_triangles_beside(capped(vertices, faces), solid=True) if closed else nullcontext()
 
 
 @weakly_cached

@@ -11,22 +11,17 @@ import hashlib
 import math
 import threading
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
-from apex_ompl.kernel.compiled.grid_building import (
-    FAR,
-    lower_bounds,
-    mark_crossings,
-    negate_inside,
-    raster_points,
-    raster_triangles,
-    split_near,
-    transform_lines,
-)
-from apex_ompl.kernel.compiled.layout import Singles
+from apex_ompl.kernel.compiled.grid_building import tabulate_points, tabulate_triangles
+from apex_ompl.kernel.compiled.item_tree import BUCKET, HALF, fill_boxes, order_items
+from apex_ompl.kernel.compiled.layout import Integers, Singles
 from apex_ompl.types import Array
 
 MOST_NODES = 6_000_000
@@ -35,27 +30,74 @@ FINEST = 0.003  # spacing [m]
 PADDING = 2.5  # nodes around the box of what is tabulated
 BAND = 1.5  # distance up to which nodes are looked at for each triangle, in spacings
 SLACK = math.sqrt(3.0) / 2.0  # largest error of interpolation, and of the nearest node, in spacings
+SEED = SLACK**2 + 1e-3  # the node nearest to the closest point of a surface is within the slack of it, squared
 ROUNDING = 1e-6  # [m]
 KEPT_NODES = 40_000_000  # of grids that are kept by content
 
 
+class ItemTree(NamedTuple):
+    """Sizes of a tree of boxes over points or triangles, see :mod:`apex_ompl.kernel.compiled.item_tree`.
+
+    Attributes:
+        levels: Levels below the root.
+        number: Number of items.
+        width: Numbers of each.
+    """
+
+    levels: int
+    number: int
+    width: int
+
+    @classmethod
+    def over(cls, items: Array) -> ItemTree:
+        """Return the sizes of a tree over points or triangles, shape (N, 1 or 3, 3)."""
+        count, corners = items.shape[:2]
+        return cls(max(0, math.ceil(math.log2(count / BUCKET))), count, 3 * corners)
+
+    @property
+    def boxes(self) -> int:
+        """Numbers of the boxes, which are before the items."""
+        return 6 * ((2 << self.levels) - 1)
+
+    @property
+    def size(self) -> int:
+        """Numbers of boxes and items."""
+        return self.boxes + self.number * self.width
+
+    def fill(self, items: Array, low: Array, values: Singles) -> None:
+        """Write the boxes and items, given in a frame where that of the grid is at ``low`` (3,) [m], in its frame."""
+        ordered, extent = values[self.boxes :].reshape(self.number, -1), float((items.max(axis=(0, 1)) - low).max())
+        keys, counts = np.empty((2, self.number), np.int64), np.empty(1 << HALF, np.int64)
+        order_items(items, low, extent, keys, counts, ordered)
+        fill_boxes(ordered, self.levels, values[: self.boxes].reshape(-1, 6))
+
+
 @dataclass(frozen=True, eq=False)
 class DistanceGrid:
-    """Lower bounds of a signed distance on a grid.
+    """Lower bounds of a signed distance on a grid, and a tree over what it is about.
 
     Attributes:
         low: Place of the first node, shape (3,) [m].
         spacing: Distance of neighbouring nodes [m].
-        values: Lower bounds at the nodes that hold between them too, shape (nx, ny, nz) [m].
+        shape: Number of nodes along the axes.
+        tree: Sizes of the tree.
+        block: The bounds at the nodes, that hold between them too [m], then boxes and items of the tree [m].
         box: Least and largest corner of what is tabulated, shape (2, 3) [m].
         radius: Of the balls around points, 0 for a surface [m].
     """
 
     low: Array
     spacing: float
-    values: Singles
+    shape: tuple[int, int, int]
+    tree: ItemTree
+    block: Singles
     box: Array
     radius: float = 0.0
+
+    @cached_property
+    def values(self) -> Singles:
+        """The bounds at the nodes, shape (nx, ny, nz) [m]."""
+        return self.block[: math.prod(self.shape)].reshape(self.shape)
 
 
 _kept: OrderedDict[bytes, DistanceGrid] = OrderedDict()
@@ -71,6 +113,29 @@ def grid_of_triangles(corners: Array, solid: bool) -> DistanceGrid:
     """
     corners = np.ascontiguousarray(corners, float)
     return _shared(corners.tobytes() + bytes([solid]), lambda: _of_triangles(corners, solid))
+
+
+@contextmanager
+def grid_of_triangles_beside(corners: Array, solid: bool) -> Iterator[None]:
+    """Make the grid of a surface in a thread of its own during a block that holds the interpreter's lock.
+
+    The thread needs that lock no more when the block begins. Afterwards :func:`grid_of_triangles` has the grid.
+    """
+    corners, at_work = np.ascontiguousarray(corners, float), threading.Event()
+
+    def work() -> None:
+        try:
+            _shared(corners.tobytes() + bytes([solid]), lambda: _of_triangles(corners, solid, at_work.set))
+        finally:
+            at_work.set()
+
+    thread = threading.Thread(target=work, daemon=True)
+    thread.start()
+    at_work.wait()
+    try:
+        yield
+    finally:
+        thread.join()
 
 
 def grid_of_points(points: Array, radius: float) -> DistanceGrid:
@@ -91,32 +156,41 @@ def _shared(content: bytes, make: Callable[[], DistanceGrid]) -> DistanceGrid:
         return _kept[key]
 
 
-def _of_triangles(corners: Array, solid: bool) -> DistanceGrid:
+def _of_triangles(corners: Array, solid: bool, at_work: Callable[[], None] = lambda: None) -> DistanceGrid:
     box = np.stack([corners.min(axis=(0, 1)), corners.max(axis=(0, 1))])
-    low, spacing, shape = _lattice(box, 0.0, MOST_NODES)
-    scaled = (corners - low) / spacing
-    squared = np.full(shape, FAR, np.float32)
-    raster_triangles(scaled, BAND, squared)
-    values = _bounds(squared, BAND, spacing, ROUNDING)
-    if solid:
-        turns = np.zeros(shape, np.float32)
-        mark_crossings(scaled, turns)
-        negate_inside(turns, values, BAND, SLACK, spacing, ROUNDING)
-    return DistanceGrid(low, spacing, values, box)
+    grid = _empty(box, corners, 0.0, MOST_NODES)
+    scaled, room = (corners - grid.low) / grid.spacing, _room(grid)
+    at_work()
+    tabulate_triangles(scaled, solid, BAND, SEED, SLACK, grid.spacing, ROUNDING, *room)
+    return grid
 
 
 def _of_points(points: Array, radius: float) -> DistanceGrid:
-    box = np.stack([points.min(axis=0), points.max(axis=0)])
-    low, spacing, shape = _lattice(box, radius, MOST_NODES_OF_POINTS)
-    squared = np.full(shape, FAR, np.float32)
-    raster_points((points - low) / spacing, squared)
-    values = _bounds(squared, 1.0, spacing, radius + ROUNDING)
-    return DistanceGrid(low, spacing, values, box + [[-radius], [radius]], radius)
+    box = np.stack([points.min(axis=0) - radius, points.max(axis=0) + radius])
+    grid = _empty(box, points[:, None], radius, MOST_NODES_OF_POINTS)
+    scaled = (points - grid.low) / grid.spacing
+    tabulate_points(scaled, SEED, SLACK, grid.spacing, radius + ROUNDING, *_room(grid))
+    return grid
 
 
-def _lattice(box: Array, radius: float, most: int) -> tuple[Array, float, tuple[int, int, int]]:
+def _empty(box: Array, items: Array, radius: float, most: int) -> DistanceGrid:
+    """Return a grid over a box, shape (2, 3) [m], of at most so many nodes, whose bounds are still to be filled in."""
+    low, spacing, shape = _lattice(box, most)
+    tree, nodes = ItemTree.over(items), math.prod(shape)
+    block = np.empty(nodes + tree.size, np.float32)
+    tree.fill(items, low, block[nodes:])
+    return DistanceGrid(low, spacing, shape, tree, block, box, radius)
+
+
+def _room(grid: DistanceGrid) -> tuple[Singles, Singles, Array, Integers, Array]:
+    """Return the arrays in which a grid is tabulated; the second has its values."""
+    n = max(grid.shape)
+    return np.empty(grid.shape, np.float32), grid.values, np.empty(3 * n), np.empty(n, np.int64), np.empty(n)
+
+
+def _lattice(box: Array, most: int) -> tuple[Array, float, tuple[int, int, int]]:
     """Return the first node, the spacing and at most so many nodes along the axes of a box, shape (2, 3) [m]."""
-    sides = box[1] - box[0] + 2.0 * radius
+    sides = box[1] - box[0]
     spacing = FINEST
     while True:
         shape = np.ceil(sides / spacing + 2.0 * PADDING).astype(int) + 1
@@ -126,17 +200,3 @@ def _lattice(box: Array, radius: float, most: int) -> tuple[Array, float, tuple[
     middle = box.mean(axis=0)
     nx, ny, nz = shape.tolist()
     return middle - spacing * (shape - 1) / 2.0, spacing, (nx, ny, nz)
-
-
-def _bounds(squared: Singles, band: float, spacing: float, less: float) -> Singles:
-    """Return lower bounds from squared distances that are exact up to ``band`` [spacings], less a length [m]."""
-    near = np.empty_like(squared)
-    # The node nearest to the closest point of the surface is within the slack of it.
-    split_near(squared, band, SLACK**2 + 1e-3, near)
-    longest = max(squared.shape)
-    room = np.empty(3 * longest), np.empty(longest, np.int64), np.empty(longest)
-    nx, ny, nz = squared.shape  # along one axis after the other (Felzenszwalb and Huttenlocher 2012)
-    for lines in ((nx * ny, nz, 1), (nx, ny, nz), (1, nx, ny * nz)):
-        transform_lines(squared.reshape(lines), *room)
-    lower_bounds(squared, near, band, SLACK, spacing, less)
-    return near

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from apex_ompl.kernel.compiled.arrays import BOX, CAPSULE, HALF_SPACE, SPHERE, SceneArrays
+from apex_ompl.kernel.compiled.arrays import BOX, CAPSULE, GRID_ROW, HALF_SPACE, SPHERE, SceneArrays
 from apex_ompl.kernel.compiled.layout import Floats, Integers, Singles
 from apex_ompl.kernel.distance_grid import SLACK, DistanceGrid
 from apex_ompl.kernel.tables import SceneTables
@@ -63,7 +63,7 @@ class Solids(NamedTuple):
             if p.kind == HALF_SPACE:
                 rotation[k], offset[k], size[k, 0] = np.eye(3), p.size[:3], p.size[3]
             elif p.grid is not None:
-                rotation[k], size[k] = p.pose[:3, :3], (p.grid.spacing, SLACK * p.grid.spacing, 0.0)
+                rotation[k], size[k] = p.pose[:3, :3], (p.grid.spacing, SLACK * p.grid.spacing, p.grid.radius)
                 offset[k] = p.pose[:3, :3] @ p.grid.low + p.pose[:3, 3]
             else:
                 rotation[k], offset[k], size[k, : len(p.size)] = p.pose[:3, :3], p.pose[:3, 3], p.size
@@ -195,15 +195,16 @@ def grid_columns(grids: Sequence[DistanceGrid | None]) -> dict[str, Any]:
     distinct = {id(grid): grid for grid in grids if grid is not None}
     places, end = {}, 0
     for key, grid in distinct.items():
-        places[key] = (end, *grid.values.shape)
-        end += grid.values.size
-    rows = [(0, 0, 0, 0) if grid is None else places[id(grid)] for grid in grids]
-    return {"grid": np.array(rows, np.int64).reshape(-1, 4), "values": _all_values(tuple(distinct.values()))}
+        places[key] = (end, *grid.values.shape, end + grid.values.size, *grid.tree)
+        end += len(grid.block)
+    rows = [(0,) * GRID_ROW if grid is None else places[id(grid)] for grid in grids]
+    return {"grid": np.array(rows, np.int64).reshape(-1, GRID_ROW), "values": _all_values(tuple(distinct.values()))}
 
 
 @lru_cache(maxsize=4)
 def _all_values(grids: tuple[DistanceGrid, ...]) -> Singles:
-    return np.concatenate([np.empty(0, np.float32), *(grid.values.ravel() for grid in grids)])
+    blocks = [grid.block for grid in grids]
+    return blocks[0] if len(blocks) == 1 else np.concatenate([np.empty(0, np.float32), *blocks])
 
 
 def moved(tables: SceneTables, owner: int, solids: Solids) -> SceneTables:

@@ -65,6 +65,7 @@ class CandidatePool:
     def __init__(
         self, optimizer: Optimizer, kernel: Kernel, is_valid: Check,
         is_wanted: Callable[[Candidate, Array], bool] = lambda candidate, path: True,
+        collides: Check = lambda path: False,
     ) -> None:  # fmt: skip
         """Start an empty pool.
 
@@ -73,9 +74,11 @@ class CandidatePool:
             kernel: The robot among its obstacles.
             is_valid: Full check; called with the states of a path.
             is_wanted: Further condition on valid candidates; those that fail it are given up.
+            collides: Quick test of candidates that are not clear at their samples: whether they are surely not valid.
         """
         self._optimizer, self._kernel, self._is_valid, self._is_wanted = optimizer, kernel, is_valid, is_wanted
-        self._fine = optimizer.finer()
+        self._collides = collides
+        self._fine, self._coarse = optimizer.finer(), optimizer.coarser()
         self.candidates: list[Candidate] = []
         self.steps = 0
 
@@ -85,7 +88,7 @@ class CandidatePool:
         Raises:
             ParameterError: Control points of another shape.
         """
-        improved = self._optimizer.improve(self._kernel, control, steps=0)
+        improved = self._coarse.improve(self._kernel, control, steps=0)
         numbers = zip(
             improved.control, improved.clearance_cost, improved.clearance.min(axis=1), improved.damping, strict=True
         )
@@ -133,6 +136,8 @@ class CandidatePool:
 
     def _passes(self, candidate: Candidate) -> bool:
         path = self._optimizer.spline.path(candidate.control)
+        if candidate.clearance < MIN_CLEARANCE and self._collides(path):
+            return False
         if not self._is_valid(path):
             return False
         candidate.given_up = not self._is_wanted(candidate, path)

@@ -35,6 +35,7 @@ STIFFNESSES = (25.0, 5.0, 1.0, 0.1)  # factors on the stiffness in shortening, u
 STIFFEST = 125.0  # factor in the round after the first of these
 PART = 4  # steps between two looks at the clock
 FINER = 2  # factor on the number of samples for paths that are clear at them and yet not valid
+COARSER = 2  # divisor of the number of samples by which fresh candidates are ranked
 LAST_RESORT = 0.1  # factor on the stiffness where nothing came out valid
 
 
@@ -84,6 +85,10 @@ class Optimizer:
     def finer(self) -> Optimizer:
         """Return an optimiser with more samples."""
         return Optimizer(self.spline, replace(self.settings, samples=FINER * self.settings.samples))
+
+    def coarser(self) -> Optimizer:
+        """Return an optimiser with fewer samples."""
+        return Optimizer(self.spline, replace(self.settings, samples=max(1, self.settings.samples // COARSER)))
 
     def starts(self, start: Array, goal: Array, count: int, rng: np.random.Generator, size: float = 1.0) -> Array:
         """Return the straight line, and bumped ones: count paths from a state to another, shape (count, points, dof).

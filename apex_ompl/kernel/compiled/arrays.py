@@ -13,6 +13,7 @@ from apex_ompl.kernel.compiled.layout import Floats, Integers, Singles, table_vi
 
 FIXED, REVOLUTE, PRISMATIC = 0, 1, 2
 BOX, SPHERE, CYLINDER, CAPSULE, HALF_SPACE = range(5)
+GRID_ROW = 8  # numbers of a grid's row
 GRID = 6  # of distances; 5 is a hull, among the exact shapes
 LIMIT_SLACK = 1e-9  # by which clusters' balls hold beyond the limits: motions are bounded with rounding [rad]
 
@@ -78,8 +79,10 @@ class SceneArrays(NamedTuple):
 
     ``kind`` is one of BOX ... HALF_SPACE or GRID, ``owner`` the number of the obstacle that a solid is part of.
     ``size`` holds half edges, or radius and half length; a half-space has its unit normal in ``offset`` and its
-    distance in ``size``. A grid has its first node at ``offset``, and in ``size`` its spacing and by how much its
-    values were lowered; ``grid`` says which of ``values`` are its own: the first, and how many along each axis.
+    distance in ``size``. A grid has its first node at ``offset``, and in ``size`` its spacing, by how much its values
+    were lowered, and the radius of the balls around points. ``grid`` says which of ``values`` are its own: the first,
+    and how many along each axis; then where the tree over its points or triangles begins, its levels, and the number
+    of these and of the numbers of each, see :mod:`apex_ompl.kernel.compiled.item_tree`.
     Nodes of the tree are in depth-first order: ``tree_skip`` is the next node outside of a node's subtree,
     ``tree_range`` first obstacle and number of them (0 for inner nodes). The last ``open`` (1,) obstacles are
     half-spaces, which no box holds. ``allowed`` are pairs of a body and an owner that may touch.
@@ -96,7 +99,7 @@ class SceneArrays(NamedTuple):
     size: Vectors
     tree_low: Vectors
     tree_high: Vectors
-    grid: Annotated[Integers, 4]
+    grid: Annotated[Integers, GRID_ROW]
     values: Singles
 
 

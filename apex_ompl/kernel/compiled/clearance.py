@@ -26,7 +26,10 @@ def nearest_to_obstacle(
     t: RobotArrays, s: SceneArrays, w: Workspace, q: Floats, c: int, o: int, best: Nearest
 ) -> Nearest:
     """Return the nearer of ``best`` and the leaf of a cluster that is nearest to an obstacle."""
-    if distance(s, o, w.ball[c, 0], w.ball[c, 1], w.ball[c, 2]) - t.cluster_outer[c] >= best[0]:
+    # A coarser bound is less than half a cell's diagonal above the interpolated one, by which values were lowered.
+    slack = s.size[o, 1]
+    outer = t.cluster_outer[c]
+    if distance(s, o, w.ball[c, 0], w.ball[c, 1], w.ball[c, 2], best[0] + outer + slack) - outer >= best[0]:
         return best
     place_cluster(t, w, q, c)
     first = t.cluster_bodies[c, 0]
@@ -37,7 +40,7 @@ def nearest_to_obstacle(
             top -= 1
             n = w.stack[top]
             x, y, z = node_position(t, w, j, n)
-            d = distance(s, o, x, y, z)
+            d = distance(s, o, x, y, z, best[0] + t.node_outer[n] + slack)
             if d - t.node_outer[n] >= best[0]:
                 continue
             if t.node_count[n] == 0:

@@ -18,40 +18,48 @@ def _place(u: float, nodes: int) -> Place:
 
 
 @outlined
-def grid_distance(grid: Integers, values: Singles, spacing: float, a: float, b: float, c: float) -> float:
+def grid_distance(
+    grid: Integers, values: Singles, spacing: float, a: float, b: float, c: float, enough: float
+) -> float:  # fmt: skip
     """Return a lower bound of the distance of a point in the grid's frame [m].
 
     Outside of the grid, of which the solid is inside, it is the distance of two legs of a right-angled triangle: the
-    one to the nearest point of the grid, and the one from there.
+    one to the nearest point of the grid, and the one from there. Values at nodes hold up to half a cell's diagonal
+    around them; where the one at the nearest node is ``enough``, it is taken as it is, without a look at the others.
 
     Args:
-        grid: First value, and number of nodes along each axis, shape (4,).
+        grid: First value, and number of nodes along each axis, and more, shape (GRID_ROW,).
         values: Values of all grids.
         spacing: Of the nodes [m].
         a: Place of the point [m].
         b: The same.
         c: The same.
+        enough: Bound that suffices [m]; infinite for the interpolated one.
     """
     nx, ny, nz = grid[1], grid[2], grid[3]
-    a, b, c = a / spacing, b / spacing, c / spacing
+    scale = 1.0 / spacing
+    a, b, c = a * scale, b * scale, c * scale
     x, y, z = min(max(a, 0.0), nx - 1.0), min(max(b, 0.0), ny - 1.0), min(max(c, 0.0), nz - 1.0)
     if not math.isfinite(a + b + c):
         return math.nan
+    outside = (a - x) ** 2 + (b - y) ** 2 + (c - z) ** 2
+    if outside > 0.0:
+        if outside * spacing * spacing > enough * enough and enough > 0.0:
+            return float(math.sqrt(outside) * spacing)
+    else:
+        nearest = values[grid[0] + (int(x + 0.5) * ny + int(y + 0.5)) * nz + int(z + 0.5)]
+        if nearest > enough:
+            return float(nearest)
     i, u = _place(x, nx)
     j, v = _place(y, ny)
     k, w = _place(z, nz)
-    n = grid[0] + (i * ny + j) * nz + k
     row, slab = nz, ny * nz
-    near = (values[n] * (1.0 - w) + values[n + 1] * w) * (1.0 - v) + (
-        values[n + row] * (1.0 - w) + values[n + row + 1] * w
-    ) * v
-    n += slab
-    far = (values[n] * (1.0 - w) + values[n + 1] * w) * (1.0 - v) + (
-        values[n + row] * (1.0 - w) + values[n + row + 1] * w
-    ) * v
-    found = near * (1.0 - u) + far * u
-    a, b, c = a - x, b - y, c - z
-    outside = a * a + b * b + c * c
+    n = grid[0] + (i * ny + j) * nz + k
+    near = values[n : n + row + 2]
+    far = values[n + slab : n + slab + row + 2]
+    left = (near[0] * (1.0 - w) + near[1] * w) * (1.0 - v) + (near[row] * (1.0 - w) + near[row + 1] * w) * v
+    right = (far[0] * (1.0 - w) + far[1] * w) * (1.0 - v) + (far[row] * (1.0 - w) + far[row + 1] * w) * v
+    found = left * (1.0 - u) + right * u
     if outside > 0.0:
         return float(math.sqrt(outside * spacing * spacing + max(found, 0.0) ** 2))
     return float(found)

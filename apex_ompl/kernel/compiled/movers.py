@@ -21,6 +21,7 @@ import math
 from typing import Annotated, NamedTuple
 
 from apex_ompl.kernel.compiled.arrays import (
+    GRID_ROW,
     Pairs,
     RobotArrays,
     Rotations,
@@ -58,7 +59,7 @@ class MoverArrays(NamedTuple):
 
     kind: Integers
     owner: Integers
-    grid: Annotated[Integers, 4]
+    grid: Annotated[Integers, GRID_ROW]
     allowed: Pairs
     rotation: Rotations
     place: Vectors

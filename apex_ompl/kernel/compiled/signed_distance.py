@@ -7,6 +7,7 @@ import math
 from apex_ompl.kernel.compiled.arrays import BOX, CAPSULE, CYLINDER, GRID, HALF_SPACE, SPHERE, SceneArrays
 from apex_ompl.kernel.compiled.compilation import inlined
 from apex_ompl.kernel.compiled.grid_distance import grid_direction, grid_distance
+from apex_ompl.kernel.compiled.item_tree import items_apart
 from apex_ompl.kernel.compiled.layout import Floats
 
 
@@ -41,8 +42,11 @@ def primitive_distance(kind: int, size: Floats, a: float, b: float, c: float) ->
 
 
 @inlined
-def distance(s: SceneArrays, o: int, x: float, y: float, z: float) -> float:
-    """Return the signed distance of a point of the world to an obstacle [m], negative inside; a bound of a grid's."""
+def distance(s: SceneArrays, o: int, x: float, y: float, z: float, enough: float = math.inf) -> float:
+    """Return the signed distance of a point of the world to an obstacle [m], negative inside; a bound of a grid's.
+
+    Of a grid, a coarser bound is given where that is ``enough``.
+    """
     kind, size = s.kind[o], s.size[o]
     if kind == HALF_SPACE:
         n = s.offset[o]
@@ -52,8 +56,25 @@ def distance(s: SceneArrays, o: int, x: float, y: float, z: float) -> float:
         return float(math.sqrt((x - p[0]) ** 2 + (y - p[1]) ** 2 + (z - p[2]) ** 2) - size[0])
     a, b, c = local_point(s, o, x, y, z)
     if kind == GRID:
-        return float(grid_distance(s.grid[o], s.values, size[0], a, b, c))
+        return float(grid_distance(s.grid[o], s.values, size[0], a, b, c, enough))
     return primitive_distance(kind, size, a, b, c)
+
+
+@inlined
+def ball_apart(s: SceneArrays, o: int, x: float, y: float, z: float, radius: float) -> bool:
+    """Whether a ball around a point of the world is proved apart from an obstacle, exactly where a grid is too coarse.
+
+    A point inside of a solid has a distance, and so a bound, below minus the one to the surface: a ball whose bound is
+    above minus its radius, and which meets no part of the surface, is outside. Balls around points have no inside.
+    """
+    if s.kind[o] != GRID:
+        return distance(s, o, x, y, z) > radius
+    a, b, c = local_point(s, o, x, y, z)
+    bound = grid_distance(s.grid[o], s.values, s.size[o, 0], a, b, c, radius)
+    if bound > radius:
+        return True
+    points = s.size[o, 2]
+    return (points > 0.0 or bound > -radius) and items_apart(s.grid[o], s.values, a, b, c, radius + points)
 
 
 @inlined

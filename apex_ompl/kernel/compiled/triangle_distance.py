@@ -7,9 +7,11 @@ import math
 from apex_ompl.kernel.compiled.compilation import entry_point, inlined
 from apex_ompl.kernel.compiled.layout import Floats, Integers
 
+Corner = Floats | tuple[float, float, float]
+
 
 @inlined
-def squared_distance(a: Floats, b: Floats, c: Floats, x: float, y: float, z: float) -> float:
+def squared_distance(a: Corner, b: Corner, c: Corner, x: float, y: float, z: float) -> float:
     """Return the squared distance of a point to a triangle with given corners, shape (3,) (Ericson 2005, 5.1.5)."""
     ax, ay, az = a[0], a[1], a[2]
     ux, uy, uz = b[0] - ax, b[1] - ay, b[2] - az
