@@ -27,6 +27,7 @@ from apex_ompl.kernel.distance_grid import (
 )
 from apex_ompl.kernel.scene_builder import Primitive, Solids, moved, primitive, scene_tables
 from apex_ompl.scene.meshes import winding_number
+from apex_ompl.util.boxes import bounding_box
 
 
 @entry_point
@@ -159,6 +160,13 @@ def test_a_ball_deep_inside_of_a_solid_is_not_apart_though_no_triangle_is_near()
     grid = grid_of_triangles(vertices[faces], solid=True)
     assert not apart(grid, np.eye(4), np.zeros((1, 3)), np.array([0.02]))[0].any()
     assert not apart(grid, np.eye(4), np.full((1, 3), np.nan), np.array([0.02]))[0].any()
+
+
+@given(seed=st.integers(0, 10**6), rows=st.integers(1, 50), corners=st.integers(1, 3))
+def test_bounding_boxes_are_those_of_numpy(seed: int, rows: int, corners: int) -> None:
+    points = np.random.default_rng(seed).normal(size=(rows, corners, 3))
+    assert np.array_equal(bounding_box(points), [points.min(axis=(0, 1)), points.max(axis=(0, 1))])
+    assert np.array_equal(bounding_box(points[:, 0]), [points[:, 0].min(axis=0), points[:, 0].max(axis=0)])
 
 
 def test_a_grid_made_beside_is_the_one_that_is_asked_for() -> None:

@@ -13,6 +13,7 @@ import coal
 import numpy as np
 
 from apex_ompl.types import Array
+from apex_ompl.util.boxes import bounding_box
 from apex_ompl.util.weak_cache import weakly_cached
 
 
@@ -31,7 +32,8 @@ class PointCloud:
     @cached_property
     def box(self) -> Array:
         """Box around the balls, shape (2, 3) [m]."""
-        return np.stack([self.points.min(axis=0) - self.radius, self.points.max(axis=0) + self.radius])
+        found: Array = bounding_box(self.points) + np.array([[-self.radius], [self.radius]])
+        return found
 
 
 @weakly_cached

@@ -17,6 +17,7 @@ from apex_ompl.collision.shapes import convex_hull, hull_corners, hull_planes, i
 from apex_ompl.kernel.compiled.triangle_mesh import encloses
 from apex_ompl.scene.meshes import capped, edges_of, is_watertight, piece_points, triangles
 from apex_ompl.types import Array
+from apex_ompl.util.boxes import bounding_box
 from apex_ompl.util.weak_cache import weakly_cached
 
 ANCHOR_RADIUS = 1e-6  # [m]
@@ -56,7 +57,7 @@ class EnclosingMesh:
         corners, edges = np.ascontiguousarray(capped(vertices, faces)), edges_of(vertices, faces)
         closed = not len(edges.open)
         convex = closed and _is_convex(vertices[faces].mean(axis=1), hull)
-        box = np.stack([corners.min(axis=(0, 1)), corners.max(axis=(0, 1))])
+        box = bounding_box(corners)
         watertight = not edges.balance.any() if closed else is_watertight(corners)
         return EnclosingMesh(hull, convex, corners, watertight, box)
 

@@ -33,6 +33,7 @@ from apex_ompl.scene.meshes import (
 )
 from apex_ompl.scene.points import parse_points
 from apex_ompl.types import Array
+from apex_ompl.util.boxes import bounding_box
 from apex_ompl.util.files import read_file
 from apex_ompl.util.weak_cache import weakly_cached
 
@@ -186,7 +187,8 @@ def _farthest(directions: Array, points: Array) -> tuple[NDArray[np.intp], Array
 
     Of the points of a grid's cells only those are looked at whose cell may reach farther than any first point of one.
     """
-    low, wide = points.min(axis=0), float(np.ptp(points, axis=0).max())
+    low, high = bounding_box(points)
+    wide = float((high - low).max())
     side = max(wide / CELLS, 1e-12)
     cells = np.ravel_multi_index(tuple(((points - low) / side).astype(np.int64).T), (CELLS + 1,) * 3)
     order = np.argsort(cells, kind="stable")

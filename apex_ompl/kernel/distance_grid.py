@@ -23,6 +23,7 @@ from apex_ompl.kernel.compiled.grid_building import tabulate_points, tabulate_tr
 from apex_ompl.kernel.compiled.item_tree import BUCKET, HALF, fill_boxes, order_items
 from apex_ompl.kernel.compiled.layout import Integers, Singles
 from apex_ompl.types import Array
+from apex_ompl.util.boxes import bounding_box
 
 MOST_NODES = 6_000_000
 MOST_NODES_OF_POINTS = 1_000_000  # which are made anew with every image
@@ -66,7 +67,7 @@ class ItemTree(NamedTuple):
 
     def fill(self, items: Array, low: Array, values: Singles) -> None:
         """Write the boxes and items, given in a frame where that of the grid is at ``low`` (3,) [m], in its frame."""
-        ordered, extent = values[self.boxes :].reshape(self.number, -1), float((items.max(axis=(0, 1)) - low).max())
+        ordered, extent = values[self.boxes :].reshape(self.number, -1), float((bounding_box(items)[1] - low).max())
         keys, counts = np.empty((2, self.number), np.int64), np.empty(1 << HALF, np.int64)
         order_items(items, low, extent, keys, counts, ordered)
         fill_boxes(ordered, self.levels, values[: self.boxes].reshape(-1, 6))
@@ -157,7 +158,7 @@ def _shared(content: bytes, make: Callable[[], DistanceGrid]) -> DistanceGrid:
 
 
 def _of_triangles(corners: Array, solid: bool, at_work: Callable[[], None] = lambda: None) -> DistanceGrid:
-    box = np.stack([corners.min(axis=(0, 1)), corners.max(axis=(0, 1))])
+    box = bounding_box(corners)
     grid = _empty(box, corners, 0.0, MOST_NODES)
     scaled, room = (corners - grid.low) / grid.spacing, _room(grid)
     at_work()
@@ -166,7 +167,7 @@ def _of_triangles(corners: Array, solid: bool, at_work: Callable[[], None] = lam
 
 
 def _of_points(points: Array, radius: float) -> DistanceGrid:
-    box = np.stack([points.min(axis=0) - radius, points.max(axis=0) + radius])
+    box = bounding_box(points) + [[-radius], [radius]]
     grid = _empty(box, points[:, None], radius, MOST_NODES_OF_POINTS)
     scaled = (points - grid.low) / grid.spacing
     tabulate_points(scaled, SEED, SLACK, grid.spacing, radius + ROUNDING, *_room(grid))

@@ -33,9 +33,8 @@ def parse_points(file: str, content: bytes) -> Array:
     if points.ndim != 2 or points.shape[1] < 3 or not len(points):
         raise FileFormatError(file, "", f"an array of shape {points.shape}", "expected one point or more, shape (N, 3)")
     points = np.ascontiguousarray(points[:, :3])
-    sound = np.isfinite(points).all(axis=1) & (np.abs(points).max(axis=1) < LARGEST)
-    if not sound.all():
-        k = int(np.argmin(sound))
+    if not np.abs(points).max() < LARGEST:  # nor where one is no number
+        k = int(np.argmin(np.isfinite(points).all(axis=1) & (np.abs(points).max(axis=1) < LARGEST)))
         raise FileFormatError(file, f"point {k}", points[k].tolist(), f"expected finite numbers below {LARGEST:g} m")
     return points
 
