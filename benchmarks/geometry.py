@@ -42,7 +42,7 @@ from apex_ompl.util.validation import one_or_more
 DEPENDS = ("@planning", "apex_ompl/trajectory", "apex_ompl/session", "benchmarks/geometry_versions.py")
 LEVELS = ("shelf/medium", "bins/medium", "cage/medium", "posts/medium", "wall/medium", "clutter/medium")
 WARM = 200  # triangles and points of a first one, which compiles what is not compiled yet
-COUNTS = (100, 1_000, 10_000, 100_000, 1_000_000)
+COUNTS = (100, 1_000, 10_000, 100_000, 200_000, 1_000_000)
 TIMEOUT = 10.0  # [s]
 PROPOSALS = 8
 
@@ -193,7 +193,7 @@ def sizes() -> tuple[list[str], dict[str, Any]]:
             for number, count in enumerate((WARM, *COUNTS)):
                 file = Path(folder) / f"{kind}{count}.{'stl' if kind == 'mesh' else 'npy'}"
                 if kind == "mesh":
-                    rings = max(4, int(np.sqrt(count / 4.0)))
+                    rings = max(4, int(np.sqrt(count / 8.0)))
                     trimesh.creation.uv_sphere(0.35, [rings, 2 * rings]).export(file)
                 else:
                     direction = rng.normal(size=(count, 3))
