@@ -228,7 +228,7 @@ def main() -> None:
     parser.add_argument("--kinds", nargs="+", default=list(worlds.kinds()), choices=worlds.kinds())
     parser.add_argument("--methods", nargs="+", default=list(METHODS), choices=list(METHODS))
     parser.add_argument("--speeds", nargs="+", type=float, default=list(SPEEDS))
-    parser.add_argument("--clairvoyant", type=one_or_more, default=60, help="moving worlds with its row (default: %(default)s)")
+    parser.add_argument("--clairvoyant", type=one_or_more, default=60, help="its worlds (default: %(default)s)")
     parser.add_argument("--store", type=Path, default=FOLDER, help="folder of the runs")
     parser.add_argument("--report", action="store_true", help="run nothing; write the results of the stored runs")
     args = parser.parse_args()

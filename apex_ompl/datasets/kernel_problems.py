@@ -25,7 +25,7 @@ from apex_ompl.datasets.path_finder import PathFinder
 from apex_ompl.datasets.records import SHAPES, ObstacleRecord, Paths
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError
 from apex_ompl.kernel import Kernel, RobotTables
-from apex_ompl.kernel.compiled.arrays import SceneArrays
+from apex_ompl.kernel.compiled.arrays import GRID_ROW, SceneArrays
 from apex_ompl.kernel.table_checks import scene_fault
 from apex_ompl.kernel.tables import SceneTables
 from apex_ompl.trajopt.spline import Spline
@@ -168,7 +168,7 @@ def _scenes(arrays: dict[str, NDArray[Any]], count: int) -> list[SceneTables]:
     made = []
     for i in range(count):  # problems of data sets have neither grids nor bodies that may touch
         own = {name: np.ascontiguousarray(values[i]) for name, values in columns.items()}
-        grids = np.zeros((len(own["kind"]), 4), np.int64)
+        grids = np.zeros((len(own["kind"]), GRID_ROW), np.int64)
         made.append(SceneArrays(**own, allowed=np.empty((0, 2), np.int64), grid=grids, values=np.empty(0, np.float32)))
     for scene in made:
         fault = scene_fault(scene)
