@@ -2,8 +2,8 @@
 
 Each process keeps its planner, has planned once before, and is given the problems in turn, so that what else the
 machine does falls on both. Times are of whole calls, of ``solve``, of the first path and of its stages; lengths are
-compared where both solve a problem. Levels are the hard ones of the suites, of the split that is asked for, and those
-of the suite of kinds of scenes that no training data are of, which is for validation alone.
+compared where both solve a problem. Levels are the hard ones of the suites, or those that are asked for, as
+``unseen/truss``, of a suite of scenes that no training data are of, which is for validation alone.
 
 Usage: python benchmarks/before_after.py FOLDER [-n 8] [--seeds 2] [--split validation] [--levels LEVEL ...]
 FOLDER is another checkout, ``git worktree add FOLDER COMMIT`` makes one.
@@ -21,15 +21,16 @@ from typing import Any, Self
 
 import numpy as np
 import record
+from apex_profile import HARD
 from tqdm import tqdm
 
 from apex_ompl import problems
+from apex_ompl.result import FIRST, INSIDE
 from apex_ompl.util import provenance
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import one_or_more
 
-DEPENDS = ("@planning", "apex_ompl/trajectory", "apex_ompl/session")
-HARD = tuple(f"{suite}/hard" for suite in ("shelf", "bins", "cage", "posts", "wall", "swap", "clutter"))
+DEPENDS = ("@planning", "apex_ompl/trajectory", "apex_ompl/session", "benchmarks/apex_profile.py")
 TIMEOUT = 10.0  # [s]
 STAGES = ("call", "solve", "first path", "propose", "repair", "polish", "verify", "timing")
 WORKER = """
@@ -76,8 +77,8 @@ class Worker:
         print(json.dumps([name, seed, TIMEOUT]), file=self.process.stdin, flush=True)
         solved, length, call, times = json.loads(self._answer())
         found = {"solved": float(solved), "length": length, "call": call, "solve": times.get("solve", 0.0)}
-        found["first path"] = times.get("line", 0.0) + times.get("solve: first", times.get("solve", 0.0))
-        inner = {name: times.get(f"solve: {name}", times.get(name, 0.0)) for name in STAGES[3:]}
+        found["first path"] = times.get("line", 0.0) + times.get(FIRST, times.get("solve", 0.0))
+        inner = {name: times.get(INSIDE + name, times.get(name, 0.0)) for name in STAGES[3:]}
         return found | inner | ({} if solved else {"first path": np.inf, "solve": np.inf, "call": np.inf})
 
     def _answer(self) -> str:

@@ -21,7 +21,7 @@ import numpy as np
 import pinocchio as pin
 from scipy.optimize import minimize
 
-from apex_ompl.collision.shapes import convex_hull
+from apex_ompl.collision.hulls import convex_hull
 from apex_ompl.robot import Robot
 from apex_ompl.robot.assets import DATA
 from apex_ompl.robot.config import PAIRS_SCHEMA, RobotConfig, read_config

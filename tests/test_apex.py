@@ -198,6 +198,8 @@ def test_another_checker_decides_and_is_reported_once(caplog: pytest.LogCaptureF
     assert full_check(ready.checker, states(setup), ready.start, ready.goals)
     assert setup.solve(within(30.0)).getStatus() == EXACT
     assert sum("is not apex_ompl's" in record.message for record in caplog.records) == 1
+    crossed = np.stack([ready.start, np.zeros_like(ready.start), ready.goals[0]])
+    assert ready.checker.collides_along(crossed) and not planner.validator.collides(crossed)
 
 
 def test_the_example_with_a_checker_of_its_own_runs(capsys: pytest.CaptureFixture[str]) -> None:

@@ -7,6 +7,7 @@ import pytest
 from support import states_around_home
 
 from apex_ompl.collision import CollisionChecker
+from apex_ompl.collision.checker import LOOKED_AT
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError, SceneError, UnknownNameError
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import AttachedObject, Obstacle
@@ -88,14 +89,15 @@ def test_the_quick_test_finds_collisions_only_where_there_are_some(robot: Robot,
     for _ in range(6):
         checker = CollisionChecker(robot, clutter(rng, 4), proofs=proofs)
         for _ in range(6):
-            states = states_around_home(robot, rng, 8, 0.5)
-            there, quick = not checker.are_free(states).all(), checker.collides_at(states)
+            path = states_around_home(robot, rng, 2, 0.5)
+            states = path[0] + np.linspace(0.0, 1.0, LOOKED_AT)[:, None] * (path[1] - path[0])
+            there, quick = not checker.are_free(states).all(), checker.collides_along(path)
             assert there or not quick
             found, colliding = found + quick, colliding + there
     assert colliding > 10 and found >= 0.9 * colliding
-    assert not CollisionChecker(robot, proofs=proofs).collides_at(robot.home[None])
+    assert not CollisionChecker(robot, proofs=proofs).collides_along(robot.home[None])
     with pytest.raises(ParameterError):
-        checker.collides_at(np.zeros((2, 3)))
+        checker.collides_along(np.zeros((2, 3)))
 
 
 def test_home_is_free_and_nan_never(robot: Robot, baxter: Robot) -> None:

@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from support import CUBE_OBJ
 
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.collision.shapes import _farthest, coal_geometry, convex_hull, hull_planes, mesh_note
+from apex_ompl.collision.hulls import _farthest, convex_hull, hull_planes
+from apex_ompl.collision.shapes import coal_geometry, mesh_note
 from apex_ompl.errors import FileFormatError
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import Obstacle

@@ -19,7 +19,6 @@ from apex_ompl.ompl_adapter.setup import assemble
 from apex_ompl.planners import APEX
 from apex_ompl.planners.apex_parameters import ApexParameters
 from apex_ompl.planning import PlanRun, solve, straight_line
-from apex_ompl.planning.solving import LOOKED_AT
 from apex_ompl.trajopt.path import Path
 from apex_ompl.trajopt.spline import Spline
 from apex_ompl.util.deadline import Deadline
@@ -88,20 +87,20 @@ def test_the_straight_line_is_tried_once(monkeypatch: pytest.MonkeyPatch) -> Non
     """Before ``solve`` in a plan, inside of it for users of OMPL."""
     ready = assemble(cached_problem(HARD))
     line, lines = np.stack([ready.start, ready.goals[0]]), 0
-    prove, collides_at = CollisionChecker.prove, CollisionChecker.collides_at
+    prove, collides_along = CollisionChecker.prove, CollisionChecker.collides_along
 
     def counting(self: CollisionChecker, path: np.ndarray | Curve, **options: object) -> object:
         nonlocal lines
         lines += np.array_equal(path.states if isinstance(path, Curve) else path, line)
         return prove(self, path, **options)  # type: ignore[arg-type]
 
-    def counting_quick(self: CollisionChecker, states: np.ndarray) -> bool:
+    def counting_quick(self: CollisionChecker, path: np.ndarray) -> bool:
         nonlocal lines
-        lines += np.array_equal(states, np.linspace(*line, LOOKED_AT))
-        return collides_at(self, states)
+        lines += np.array_equal(path, line)
+        return collides_along(self, path)
 
     monkeypatch.setattr(CollisionChecker, "prove", counting)
-    monkeypatch.setattr(CollisionChecker, "collides_at", counting_quick)
+    monkeypatch.setattr(CollisionChecker, "collides_along", counting_quick)
     run = PlanRun(ready, "apex", ApexParameters(sprint=0), 0, Deadline(20.0))
     assert straight_line(run) is None and lines == 1
     assert solve(run, True) and lines == 1

@@ -19,8 +19,6 @@ from apex_ompl.types import Array
 
 Stop = Callable[[], bool]
 
-LOOKED_AT = 16  # states of a path at which a collision is looked for first
-
 LOG = logging.getLogger("apex_ompl")
 PLAIN = (ob.MotionValidator, MotionValidator)  # OMPL's own, and this project's
 
@@ -91,12 +89,8 @@ class PathValidator:
         return bool(self._si.isValid(to_state(self._si, q)))
 
     def collides(self, path: Array) -> bool:
-        """Whether a quick test finds a collision at some states of a path, shape (N, dof); one that has none may be.
-
-        Obstacles that are not known are not looked at.
-        """
-        places = np.linspace(0, len(path) - 1, min(len(path), LOOKED_AT)).round().astype(int)
-        return self.checker.collides_at(path[places])
+        """Whether a quick test finds that a path, shape (N, dof), is not valid; with another checker none does."""
+        return self.knows_obstacles and self.checker.collides_along(path)
 
     def is_valid(self, path: Array, stop: Stop = lambda: False) -> bool:
         """Whether a path, shape (N, dof), is valid; with another checker, not when it is told to stop meanwhile."""

@@ -21,7 +21,7 @@ from apex_ompl.scene.bodies import AttachedObject, Obstacle
 from apex_ompl.types import Array, Flags
 from apex_ompl.util.validation import check_states, shape_error
 
-DOUBTFUL = 3  # states at which a quick test looks for a collision by the meshes
+LOOKED_AT, DOUBTFUL = 16, 3  # states of a path in a quick test, and those of them that the meshes look at
 NO_POINT = (0.0, 0.0, -1.0)
 """Obstacle point of a scene without obstacles, 1 m below the table tops, farther away than any obstacle [m]."""
 
@@ -115,18 +115,21 @@ class CollisionChecker(SceneBodies):
             free[k] = self._free_by_meshes(states[k], unproved)
         return free
 
-    def collides_at(self, states: Array) -> bool:
-        """Whether a collision is found at some of the states, shape (N, dof), the most doubtful ones; a quick test.
+    def collides_along(self, path: Array) -> bool:
+        """Whether a quick test finds a collision along a path, shape (N, dof); one without any found may have some.
 
-        Only the few states with the most pairs that the spheres leave are looked at by the meshes.
+        Of a few states, spread evenly over the path's, those with the most pairs that the spheres leave are looked at
+        by the meshes.
 
         Raises:
             ParameterError: Another shape.
         """
-        states = np.asarray(states, float)
-        check_states(states, self.robot.dof)
+        path = np.asarray(path, float)
+        check_states(path, self.robot.dof, "path", least=1)
+        places = np.linspace(0.0, len(path) - 1.0, LOOKED_AT)
+        states = np.stack([np.interp(places, np.arange(len(path)), column) for column in path.T], axis=1)
         if not self._two_stages:
-            return any(not self._free_by_meshes(q) for q in states)
+            return not self.are_free(states).all()
         left = self._spheres.unproved_among(states, self.check_counts)
         doubtful = sorted(left, key=lambda one: len(one[1].pairs) if one[1].pairs else MOST_PAIRS, reverse=True)
         return any(not self._free_by_meshes(states[k], unproved) for k, unproved in doubtful[:DOUBTFUL])

@@ -12,7 +12,8 @@ from numpy.typing import ArrayLike
 from apex_ompl.collision.clouds import PointCloud, cloud_of
 from apex_ompl.collision.containment import EnclosingMesh
 from apex_ompl.collision.exact_shapes import Mesh, PlacedShape, ball_tree, mesh_of, tree_order
-from apex_ompl.collision.shapes import coal_geometry, hull_planes, is_shell, is_surface
+from apex_ompl.collision.hulls import hull_planes
+from apex_ompl.collision.shapes import coal_geometry, is_shell, is_surface
 from apex_ompl.collision.solids import Solid, world_boxes
 from apex_ompl.kernel.compiled.cloud_distance import any_inside, near_mesh, near_primitive, primitive_distances
 from apex_ompl.kernel.compiled.triangle_distance import surface_distances

@@ -13,7 +13,8 @@ from dataclasses import dataclass
 import coal
 import numpy as np
 
-from apex_ompl.collision.shapes import convex_hull, hull_corners, hull_planes, is_shell
+from apex_ompl.collision.hulls import convex_hull, hull_corners, hull_planes
+from apex_ompl.collision.shapes import is_shell
 from apex_ompl.kernel.compiled.triangle_mesh import encloses
 from apex_ompl.scene.meshes import capped, edges_of, is_watertight, piece_points, triangles
 from apex_ompl.types import Array

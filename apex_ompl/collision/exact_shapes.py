@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from apex_ompl.collision.clouds import cloud_of
 from apex_ompl.collision.cover.spheres import shape_key
-from apex_ompl.collision.shapes import convex_hull, hull_planes, is_shell
+from apex_ompl.collision.hulls import convex_hull, hull_planes
+from apex_ompl.collision.shapes import is_shell
 from apex_ompl.kernel.compiled.arrays import BOX, CAPSULE, CYLINDER, HALF_SPACE, SPHERE
 from apex_ompl.kernel.compiled.ball_tree import median_order, node_balls
 from apex_ompl.kernel.compiled.layout import Integers

@@ -1,4 +1,4 @@
-"""Coal geometry of the shapes of a problem, exact or as convex hulls."""
+"""Coal geometry of the shapes of a problem."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import io
 import logging
 import threading
 from contextlib import AbstractContextManager, nullcontext
-from itertools import product
 from pathlib import Path
 from weakref import WeakValueDictionary
 
@@ -17,7 +16,6 @@ from numpy.typing import NDArray
 
 from apex_ompl.collision.clouds import PointCloud, cloud_geometry
 from apex_ompl.errors import FileFormatError
-from apex_ompl.kernel.compiled.farthest_points import farthest_points
 from apex_ompl.kernel.distance_grid import grid_of_triangles_beside
 from apex_ompl.scene.bodies import Body, GridFile, MeshFile, PointFile
 from apex_ompl.scene.grids import parse_surface
@@ -33,18 +31,13 @@ from apex_ompl.scene.meshes import (
 )
 from apex_ompl.scene.points import parse_points
 from apex_ompl.types import Array
-from apex_ompl.util.boxes import bounding_box
 from apex_ompl.util.files import read_file
 from apex_ompl.util.weak_cache import weakly_cached
 
 LOADED_BY_COAL = (".stl", ".obj")  # which takes half a second less than the other library's import
-THICKNESS = 1e-6  # by which hulls of surfaces are larger [m]
 KEPT_MESHES = 32  # meshes that were loaded last and are kept for the next problem
-DIRECTIONS = (400, 60)  # in which hulls of too many vertices are sampled; fewer where Coal takes no more
-CELLS = 24  # along the longest side of a grid over vertices
 LARGE = 50_000  # triangles of a mesh from which on its grid of distances is made while its tree is
 MANY_TRIANGLES = 200_000  # which take seconds
-MOST_VERTICES = 50_000  # of a mesh whose hull is not sampled
 
 LOG = logging.getLogger("apex_ompl")
 
@@ -104,101 +97,6 @@ def _half_space(normal: Array, offset: float) -> coal.Halfspace:
 def is_shell(geometry: coal.CollisionGeometry) -> bool:
     """Whether the geometry is a triangle mesh, which collides by its surface and not by its inside."""
     return bool(geometry.getObjectType() == coal.OT_BVH)
-
-
-def convex_hull(geometry: coal.CollisionGeometry) -> coal.CollisionGeometry:
-    """Return the convex hull of a mesh, or the geometry itself when it is convex already.
-
-    That of a surface without an inside, which may be flat, is the box around it. Coal takes at most 255 neighbours of a
-    vertex. Where a hull has more, and of meshes of more than ``MOST_VERTICES``,
-    which take seconds, a slightly larger body with fewer vertices is returned.
-    """
-    if not is_shell(geometry):
-        return geometry
-    return geometry.convex if geometry.convex is not None and not is_surface(geometry) else _hull_of_mesh(geometry)
-
-
-@weakly_cached
-def _hull_of_mesh(mesh: coal.BVHModelBase) -> coal.Convex:
-    vertices = np.array(mesh.vertices())
-    if is_surface(mesh):
-        low, high = vertices.min(axis=0) - THICKNESS, vertices.max(axis=0) + THICKNESS
-        return _hull_of(np.array(list(product(*np.stack([low, high], axis=1)))))
-    if len(vertices) > MOST_VERTICES:
-        return _larger_hull(vertices)
-    try:
-        with _loading:
-            mesh.buildConvexHull(True, "Qt")
-    except RuntimeError:
-        return _larger_hull(vertices)
-    return mesh.convex
-
-
-def hull_corners(hull: coal.Convex) -> Array:
-    """Return the corners of the triangles of a convex hull, shape (T, 3, 3) [m]."""
-    rows = [(row[0], row[1], row[2]) for row in map(hull.polygons, range(hull.num_polygons))]
-    corners: Array = np.array(hull.points())[np.array(rows)]
-    return corners
-
-
-def hull_planes(hull: coal.Convex) -> tuple[Array, Array]:
-    """Return outward unit normals n, shape (planes, 3), and offsets o, shape (planes,) [m]: n . x <= o in the hull."""
-    corners = hull_corners(hull)
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    long = np.linalg.norm(normals, axis=1)
-    sound = long > 1e-14
-    normals = normals[sound] / long[sound, None]
-    offsets = np.einsum("ij,ij->i", normals, corners[sound, 0])
-    sign = np.sign(offsets - normals @ corners.mean(axis=(0, 1)))
-    return normals * sign[:, None], offsets * sign
-
-
-def _larger_hull(vertices: Array) -> coal.Convex:
-    """Return a convex body of few vertices that contains the given ones, shape (V, 3) [m].
-
-    It is the hull of those that are farthest in some direction, stretched about its centre until it contains all.
-    """
-    for count in DIRECTIONS:
-        rise = 1.0 - (2.0 * np.arange(count) + 1.0) / count
-        turn = np.pi * (1.0 + 5.0**0.5) * np.arange(count)
-        flat = np.sqrt(1.0 - rise**2)
-        directions = np.stack([flat * np.cos(turn), flat * np.sin(turn), rise], axis=1)
-        chosen = vertices[np.unique(_farthest(directions, vertices)[0])]
-        try:
-            normals, offsets = hull_planes(_hull_of(chosen))
-            centre = chosen.mean(axis=0)
-            room = offsets - normals @ centre
-            wide = room > 1e-6 * room.max()  # planes of slivers may be turned by rounding
-            reach = _farthest(normals[wide], vertices - centre)[1]
-            return _hull_of(centre + (1.0 + 1e-6) * max(1.0, float((reach / room[wide]).max())) * (chosen - centre))
-        except RuntimeError:
-            continue
-    raise AssertionError("a hull of few vertices has few neighbours")
-
-
-def _hull_of(points: Array) -> coal.Convex:
-    found = coal.StdVec_Vec3s()
-    found.extend(list(points))
-    return coal.Convex.convexHull(found, True, "Qt")
-
-
-def _farthest(directions: Array, points: Array) -> tuple[NDArray[np.intp], Array]:
-    """Return the point that is farthest in each direction, shape (D,), and how far it is, shape (D,) [m].
-
-    Of the points of a grid's cells only those are looked at whose cell may reach farther than any first point of one.
-    """
-    low, high = bounding_box(points)
-    wide = float((high - low).max())
-    side = max(wide / CELLS, 1e-12)
-    cells = np.ravel_multi_index(tuple(((points - low) / side).astype(np.int64).T), (CELLS + 1,) * 3)
-    order = np.argsort(cells, kind="stable")
-    first = np.flatnonzero(np.diff(cells[order], prepend=-1))
-    points = np.ascontiguousarray(points[order])
-    middles = low + side * (np.floor((points[first] - low) / side) + 0.5)
-    found = np.empty(len(directions), np.int64)
-    half, directions = (0.5 + 1e-6) * side, np.ascontiguousarray(directions)
-    farthest_points(directions, points, np.append(first, len(order)), middles, half, found)
-    return order[found], np.einsum("ij,ij->i", directions, points[found])
 
 
 def mesh_note(body: Body) -> str:
@@ -293,7 +191,7 @@ def _read_triangles(file: str, content: bytes, scale: Array) -> tuple[Array, NDA
 def mesh_geometry(vertices: Array, faces: NDArray[np.int64]) -> coal.BVHModelOBBRSS:
     """Return the geometry of triangles, given by vertices, shape (V, 3) [m], and indices, shape (T, 3)."""
     if len(faces) > MANY_TRIANGLES:
-        LOG.warning("apex_ompl prepares %d triangles (about %d s, once)", len(faces), len(faces) * 1e-5)
+        LOG.warning("apex_ompl prepares %d triangles (about %d s, once)", len(faces), len(faces) * 6e-6)
     mesh = coal.BVHModelOBBRSS()
     mesh.beginModel(len(faces), len(vertices))
     mesh.addVertices(vertices)

@@ -10,7 +10,7 @@ import coal
 import numpy as np
 import pinocchio as pin
 
-from apex_ompl.collision.shapes import convex_hull
+from apex_ompl.collision.hulls import convex_hull
 from apex_ompl.types import Array, Flags
 
 BOX_MARGIN = 1e-6  # by which boxes are larger than their solids [m]

@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from apex_ompl.kernel.compiled.grid_building import tabulate_points, tabulate_triangles
+from apex_ompl.kernel.compiled.grid_tabulation import tabulate_points, tabulate_triangles
 from apex_ompl.kernel.compiled.item_tree import BUCKET, HALF, fill_boxes, order_items
 from apex_ompl.kernel.compiled.layout import Integers, Singles
 from apex_ompl.types import Array
@@ -105,15 +105,16 @@ _kept: OrderedDict[bytes, DistanceGrid] = OrderedDict()
 _lock = threading.Lock()  # of these
 
 
-def grid_of_triangles(corners: Array, solid: bool) -> DistanceGrid:
+def grid_of_triangles(corners: Array, solid: bool, at_work: Callable[[], None] = lambda: None) -> DistanceGrid:
     """Return the grid of a surface; grids of the same surface are shared.
 
     Args:
         corners: Corners of the triangles, shape (T, 3, 3) [m].
         solid: Whether points inside have negative distances; the surface must be watertight then.
+        at_work: Called before compiled code that needs no lock of the interpreter, where the grid is not known.
     """
     corners = np.ascontiguousarray(corners, float)
-    return _shared(corners.tobytes() + bytes([solid]), lambda: _of_triangles(corners, solid))
+    return _shared(corners.tobytes() + bytes([solid]), lambda: _of_triangles(corners, solid, at_work))
 
 
 @contextmanager
@@ -122,11 +123,11 @@ def grid_of_triangles_beside(corners: Array, solid: bool) -> Iterator[None]:
 
     The thread needs that lock no more when the block begins. Afterwards :func:`grid_of_triangles` has the grid.
     """
-    corners, at_work = np.ascontiguousarray(corners, float), threading.Event()
+    at_work = threading.Event()
 
     def work() -> None:
         try:
-            _shared(corners.tobytes() + bytes([solid]), lambda: _of_triangles(corners, solid, at_work.set))
+            grid_of_triangles(corners, solid, at_work.set)
         finally:
             at_work.set()
 
@@ -157,7 +158,7 @@ def _shared(content: bytes, make: Callable[[], DistanceGrid]) -> DistanceGrid:
         return _kept[key]
 
 
-def _of_triangles(corners: Array, solid: bool, at_work: Callable[[], None] = lambda: None) -> DistanceGrid:
+def _of_triangles(corners: Array, solid: bool, at_work: Callable[[], None]) -> DistanceGrid:
     box = bounding_box(corners)
     grid = _empty(box, corners, 0.0, MOST_NODES)
     scaled, room = (corners - grid.low) / grid.spacing, _room(grid)

@@ -24,7 +24,6 @@ from apex_ompl.util.stopwatch import timed
 
 STRAIGHT_LINE = "straight line"
 NOT_PROVED = "a path was found but not proved in time"
-LOOKED_AT = 24  # states of a straight line at which a collision is looked for first
 REPAIR_SHARE = 0.5  # of the time left, for the repair of one path
 
 Execute = Callable[[PlanRun, ob.Planner, float], PlanStatus]
@@ -65,7 +64,7 @@ def straight_line(run: PlanRun) -> PlanResult | None:
             if run.deadline.expired:
                 return _out_of_time(run)
             line = np.stack([setup.start, goal])
-            if setup.checker.collides_at(np.linspace(setup.start, goal, LOOKED_AT)):
+            if setup.checker.collides_along(line):
                 run.rejected_lines.append(line)
                 continue
             check = full_check(setup.checker, line, setup.start, setup.goals, deadline=run.deadline.at)

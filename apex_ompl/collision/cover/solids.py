@@ -18,7 +18,8 @@ import numpy as np
 
 from apex_ompl.collision.containment import EnclosingMesh
 from apex_ompl.collision.cover.convex_parts import Part, Polytope, RoundBody, triangle_points
-from apex_ompl.collision.shapes import convex_hull, is_shell
+from apex_ompl.collision.hulls import convex_hull
+from apex_ompl.collision.shapes import is_shell
 from apex_ompl.errors import ParameterError
 from apex_ompl.scene.meshes import capped, triangles, winding_number
 from apex_ompl.types import Array, Flags

@@ -115,7 +115,7 @@ def items_apart(grid: Integers, values: Singles, a: float, b: float, c: float, r
 
     Args:
         grid: Row of the grid: from its fifth number on the place of the boxes in ``values``, levels, number of items
-            and numbers of each. Without a tree nothing is proved.
+            and numbers of each.
         values: Values of all grids and trees.
         a: Place of the point [m].
         b: The same.
@@ -123,8 +123,6 @@ def items_apart(grid: Integers, values: Singles, a: float, b: float, c: float, r
         reach: The distance [m].
     """
     place, levels, count, width = grid[4], grid[5], grid[6], grid[7]
-    if count == 0:
-        return False
     leaves, squared = 1 << levels, (reach + ROUNDING) ** 2
     items, n = place + 6 * (2 * leaves - 1), 0
     while True:
