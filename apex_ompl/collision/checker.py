@@ -30,8 +30,8 @@ class CollisionChecker(SceneBodies):
     """Checks states of a robot in a scene for collision, in two stages.
 
     The first stage is conservative: sphere covers that contain the solids prove most free states, and long stretches
-    of motions, to be free. What they cannot prove is checked by the second stage, Coal's meshes pair by
-    pair. Only the second stage reports a collision, so the result is that of the second stage alone.
+    of motions, to be free, and balls inside of the robot's solids, which obstacles meet, prove most other states to
+    collide. What neither proves is checked by the second stage, Coal's meshes pair by pair; both give the same result.
 
     Meshes collide by their triangles, primitives as solids, and a solid that lies entirely inside a mesh counts as a
     collision. Bodies that never move, such as the robot's base, are not checked against each other. A state with a
@@ -131,6 +131,10 @@ class CollisionChecker(SceneBodies):
         if not self._two_stages:
             return not self.are_free(states).all()
         left = self._spheres.unproved_among(states, self.check_counts)
+        colliding = sum(unproved.collides for _, unproved in left)
+        if colliding:
+            self.check_counts.colliding += colliding
+            return True
         doubtful = sorted(left, key=lambda one: len(one[1].pairs) if one[1].pairs else MOST_PAIRS, reverse=True)
         return any(not self._free_by_meshes(states[k], unproved) for k, unproved in doubtful[:DOUBTFUL])
 
@@ -239,6 +243,9 @@ class CollisionChecker(SceneBodies):
 
     def _free_by_meshes(self, q: Array, unproved: UnprovedPairs | None = None) -> bool:
         """Check a state by the meshes: the pairs that are unproved first, and all pairs unless these are complete."""
+        if unproved is not None and unproved.collides:
+            self.check_counts.colliding += 1
+            return False
         self.check_counts.meshes += 1
         order = self.robot.to_pinocchio(q)
         if not np.isfinite(order).all():

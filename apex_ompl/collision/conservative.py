@@ -1,4 +1,4 @@
-"""First stage of the collision checker: proofs by sphere covers that states and motions are free."""
+"""First stage of the collision checker: proofs by balls that states and motions are free, and that states collide."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from apex_ompl.collision.robot_covers import covers_of
 from apex_ompl.collision.tabulate import primitives, tabulate
 from apex_ompl.kernel.ahead_of_time import compile_ahead
 from apex_ompl.kernel.compiled import motion_proof, queries
+from apex_ompl.kernel.compiled.separation import COLLIDES
 from apex_ompl.kernel.kernel import MOST_PAIRS, Kernel
 from apex_ompl.kernel.scene_builder import Solids, moved, tables_of
 from apex_ompl.kernel.tables import RobotTables, SceneTables
@@ -30,10 +31,12 @@ class UnprovedPairs(NamedTuple):
     Attributes:
         pairs: Pairs of geometries that are not proved to be apart.
         complete: Whether all others are proved to be apart.
+        collides: Whether the state is proved to collide, so that nothing is left to the meshes.
     """
 
     pairs: list[tuple[int, int]]
     complete: bool
+    collides: bool = False
 
 
 MOST_TABLES = 64  # kept for each robot: one for each set of held objects
@@ -49,6 +52,7 @@ class CheckCounts:
     Attributes:
         proved: States that the spheres proved free.
         meshes: States that the meshes checked.
+        colliding: States that balls inside of bodies proved to collide.
         intervals: Intervals of motions that the spheres tried to prove as a whole.
         proved_intervals: Those that they proved.
         steps: Steps between the states of motions.
@@ -57,6 +61,7 @@ class CheckCounts:
 
     proved: int = 0
     meshes: int = 0
+    colliding: int = 0
     intervals: int = 0
     proved_intervals: int = 0
     steps: int = 0
@@ -65,7 +70,7 @@ class CheckCounts:
     @property
     def states(self) -> int:
         """States that were checked one by one."""
-        return self.proved + self.meshes
+        return self.proved + self.meshes + self.colliding
 
 
 def _numbered(tables: RobotTables, before: Sequence[int], now: Sequence[int]) -> RobotTables:
@@ -196,7 +201,7 @@ class ConservativeChecker:
     def _left(self, found: NDArray[np.int64], count: int) -> UnprovedPairs:
         numbers = self.kernel.robot.numbers
         pairs = [(numbers[a], numbers[b] if b >= 0 else -1 - b) for a, b in found[: max(count, 0)].tolist()]
-        return UnprovedPairs(pairs, 0 < count < MOST_PAIRS)
+        return UnprovedPairs(pairs, 0 < count < MOST_PAIRS, count == COLLIDES)
 
     def first_collision(
         self,

@@ -39,6 +39,7 @@ class EnclosingMesh:
         convex: Whether the hull represents the solid.
         corners: Corners of the triangles, shape (T, 3, 3) [m], with holes closed by
             :func:`apex_ompl.scene.meshes.capped`.
+        closed: Whether it has no holes.
         watertight: Whether its winding numbers are whole numbers.
         box: Bounding box, shape (2, 3) [m].
     """
@@ -46,6 +47,7 @@ class EnclosingMesh:
     hull: coal.CollisionGeometry
     convex: bool
     corners: Array
+    closed: bool
     watertight: bool
     box: Array
 
@@ -60,7 +62,7 @@ class EnclosingMesh:
         convex = closed and _is_convex(vertices[faces].mean(axis=1), hull)
         box = bounding_box(corners)
         watertight = not edges.balance.any() if closed else is_watertight(corners)
-        return EnclosingMesh(hull, convex, corners, watertight, box)
+        return EnclosingMesh(hull, convex, corners, closed, watertight, box)
 
     @property
     def boundary(self) -> Array:

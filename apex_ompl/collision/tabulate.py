@@ -12,6 +12,7 @@ from apex_ompl.collision.clouds import cloud_of
 from apex_ompl.collision.containment import EnclosingMesh
 from apex_ompl.collision.cover.boxes import bounding_boxes
 from apex_ompl.collision.cover.proof import Cover
+from apex_ompl.collision.inner_balls import inner_balls
 from apex_ompl.collision.shapes import is_surface
 from apex_ompl.collision.solids import Solid
 from apex_ompl.errors import RobotError
@@ -19,7 +20,7 @@ from apex_ompl.kernel.compiled.arrays import BOX, CAPSULE, CYLINDER, GRID, HALF_
 from apex_ompl.kernel.distance_grid import grid_of_points, grid_of_triangles
 from apex_ompl.kernel.joint_tree import JointTree
 from apex_ompl.kernel.robot_builder import robot_tables
-from apex_ompl.kernel.robot_specs import BodySpec, JointSpec
+from apex_ompl.kernel.robot_specs import BodySpec, JointSpec, no_balls
 from apex_ompl.kernel.scene_builder import Primitive
 from apex_ompl.kernel.tables import RobotTables
 from apex_ompl.robot import Robot
@@ -103,7 +104,7 @@ def tabulate(
     bodies = [
         BodySpec(
             solid.part or solid.name, solid.joint, solid.placement.homogeneous, cover.centres, cover.radii,
-            cover.first, cover.count, meets,
+            cover.first, cover.count, inner_balls(solid.shape) if meets else no_balls(), meets,
         )
         for solid, cover, meets in zip(solids, covers, meets_scene, strict=True)
     ]  # fmt: skip
@@ -141,10 +142,10 @@ def primitives(shape: coal.CollisionGeometry, pose: Array) -> list[Primitive]:
         return [Primitive(GRID, pose, (), grid_of_triangles(vertices[faces], solid=False))]
     mesh = EnclosingMesh.of(shape)
     if mesh.watertight:
-        return [Primitive(GRID, pose, (), grid_of_triangles(mesh.corners, solid=True))]
+        return [Primitive(GRID, pose, (), grid_of_triangles(mesh.corners, solid=True), exact=mesh.closed)]
     found = []
     for low, high in bounding_boxes(mesh.boundary):
         centre = np.eye(4)
         centre[:3, 3] = (low + high) / 2.0
-        found.append(Primitive(BOX, pose @ centre, tuple((high - low) / 2.0)))
+        found.append(Primitive(BOX, pose @ centre, tuple((high - low) / 2.0), exact=False))
     return found

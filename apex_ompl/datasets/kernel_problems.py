@@ -33,7 +33,7 @@ from apex_ompl.types import Array
 from apex_ompl.util.files import is_file, make_folder, write_atomically
 
 SCHEMA = "apex-ompl/cases/1"
-STORED = tuple(name for name in SceneArrays._fields if name not in {"allowed", "grid", "values"})
+STORED = tuple(name for name in SceneArrays._fields if name not in {"exact", "allowed", "grid", "values"})
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,8 +168,9 @@ def _scenes(arrays: dict[str, NDArray[Any]], count: int) -> list[SceneTables]:
     made = []
     for i in range(count):  # problems of data sets have neither grids nor bodies that may touch
         own = {name: np.ascontiguousarray(values[i]) for name, values in columns.items()}
-        grids = np.zeros((len(own["kind"]), GRID_ROW), np.int64)
-        made.append(SceneArrays(**own, allowed=np.empty((0, 2), np.int64), grid=grids, values=np.empty(0, np.float32)))
+        count = len(own["kind"])
+        other = {"exact": np.zeros(count, np.int64), "grid": np.zeros((count, GRID_ROW), np.int64)}
+        made.append(SceneArrays(**own, **other, allowed=np.empty((0, 2), np.int64), values=np.empty(0, np.float32)))
     for scene in made:
         fault = scene_fault(scene)
         if fault:

@@ -56,7 +56,8 @@ class Kernel:
 
         Returns:
             Pairs, shape (N, K, 2): two bodies, or a body and -1 - obstacle; and their number, shape (N,): 0 where
-            the state is proved free, K where there may be more than K, -1 where the tables do not hold for the state.
+            the state is proved free, K where there may be more than K; -1 where the tables do not hold for the state,
+            -2 where it is proved to collide.
         """
         states = self.states(q)
         found = np.empty((len(states), MOST_PAIRS, 2), np.int64)

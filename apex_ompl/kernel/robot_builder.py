@@ -57,6 +57,12 @@ class _Builder:
             transformed(tree.turns[b.joint].T @ np.asarray(b.placement, float), np.asarray(b.centres, float))
             for b in self.bodies
         ]
+        self.inner = [
+            np.column_stack(
+                [transformed(tree.turns[b.joint].T @ np.asarray(b.placement, float), b.inner[:, :3]), b.inner[:, 3]]
+            )
+            for b in self.bodies
+        ]
         self.lazy = [tree.inner(j) for j, _ in self.clusters]
 
     def _key(self, body: BodySpec, number: int) -> tuple[int, int]:
@@ -107,6 +113,8 @@ class _Builder:
             node_centre=np.concatenate([np.empty((0, 3)), *self.centres]),
             node_radius=np.concatenate([np.empty(0), *trees]),
             node_outer=np.concatenate([np.empty(0), *outer]),
+            body_inner=_spans([len(balls) for balls in self.inner]),
+            inner_ball=np.concatenate([np.empty((0, 4)), *self.inner]),
         )
         return RobotTables(name, joint_names, tuple(b.name for b in bodies), tuple(numbers[b] for b in rows), arrays)
 

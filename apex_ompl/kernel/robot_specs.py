@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from apex_ompl.kernel.compiled.arrays import FIXED
 from apex_ompl.types import Array
+
+
+def no_balls() -> Array:
+    """Return no balls, shape (0, 4)."""
+    return np.empty((0, 4))
 
 
 @dataclass(frozen=True)
@@ -46,6 +51,7 @@ class BodySpec:
         radii: Shape (n,) [m].
         first: First child of each node, shape (n,).
         count: Number of children of each node, 0 for leaves, shape (n,).
+        inner: Centres and radii of balls inside of the solid, in the frame of the spheres, shape (k, 4) [m].
         meets_scene: Whether it is checked against obstacles.
     """
 
@@ -56,4 +62,5 @@ class BodySpec:
     radii: Array
     first: NDArray[np.int64]
     count: NDArray[np.int64]
+    inner: Array = field(default_factory=no_balls)
     meets_scene: bool = True

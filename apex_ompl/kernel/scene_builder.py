@@ -28,12 +28,14 @@ class Primitive(NamedTuple):
         size: Half edges of a box; radius and half length along z; radius; or (unit normal, distance) of a half-space,
             the points x with normal . x <= distance [m]. Empty for a grid.
         grid: Distances from a surface or points in the frame of ``pose``.
+        exact: Whether it is the shape of what it stands for, and not only contains it.
     """
 
     kind: int
     pose: Floats
     size: tuple[float, ...]
     grid: DistanceGrid | None = None
+    exact: bool = True
 
 
 class Solids(NamedTuple):
@@ -41,6 +43,7 @@ class Solids(NamedTuple):
 
     Attributes:
         kind: Shape (n,).
+        exact: Shape (n,).
         rotation: Shape (n, 3, 3).
         offset: Shape (n, 3) [m].
         size: Shape (n, 3) [m].
@@ -49,6 +52,7 @@ class Solids(NamedTuple):
     """
 
     kind: Integers
+    exact: Integers
     rotation: Floats
     offset: Floats
     size: Floats
@@ -72,7 +76,8 @@ class Solids(NamedTuple):
         for k, p in enumerate(primitives):
             if p.grid is not None:
                 boxes[k] = _box_of_grid(p.grid, p.pose)
-        return cls(kind, rotation, offset, size, boxes, tuple(p.grid for p in primitives))
+        exact = np.array([p.exact for p in primitives], np.int64)
+        return cls(kind, exact, rotation, offset, size, boxes, tuple(p.grid for p in primitives))
 
 
 def _box_of_grid(grid: DistanceGrid, pose: Floats) -> Floats:
@@ -176,6 +181,7 @@ def tables_of(solids: Mapping[int, Solids]) -> SceneTables:
     arrays = SceneArrays(
         kind=rows.kind[chosen],
         owner=owner[chosen],
+        exact=rows.exact[chosen],
         tree_skip=tree.skip,
         tree_range=np.stack([np.where(tree.members, tree.span[:, 0], 0), tree.members], axis=1),
         open=np.array([len(chosen) - len(closed)], np.int64),
@@ -237,22 +243,22 @@ def moved(tables: SceneTables, owner: int, solids: Solids) -> SceneTables:
 def primitive(tables: SceneTables, k: int) -> Primitive:
     """Return solid ``k`` of a scene's tables."""
     arrays = tables.arrays
-    kind, grid = int(arrays.kind[k]), tables.grids[k]
+    kind, grid, exact = int(arrays.kind[k]), tables.grids[k], bool(arrays.exact[k])
     if kind == HALF_SPACE:
         return Primitive(kind, np.eye(4), (*arrays.offset[k].tolist(), float(arrays.size[k, 0])))
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = arrays.rotation[k], arrays.offset[k]
     if grid is not None:
         pose[:3, 3] -= pose[:3, :3] @ grid.low
-        return Primitive(kind, pose, (), grid)
-    return Primitive(kind, pose, tuple(arrays.size[k].tolist()))
+        return Primitive(kind, pose, (), grid, exact)
+    return Primitive(kind, pose, tuple(arrays.size[k].tolist()), exact=exact)
 
 
 def joined(parts: Iterable[Solids]) -> Solids:
     """Return solids one behind the other."""
     rows = list(parts) or [Solids.of(())]
-    kind, rotation, offset, size, box = (np.concatenate(c) for c in zip(*(row[:-1] for row in rows), strict=True))
-    return Solids(kind, rotation, offset, size, box, tuple(grid for row in rows for grid in row.grids))
+    columns = (np.concatenate(c) for c in zip(*(row[:-1] for row in rows), strict=True))
+    return Solids(*columns, tuple(grid for row in rows for grid in row.grids))
 
 
 def _boxes_of(tree: _Structure, boxes: Floats) -> tuple[Floats, Floats]:

@@ -21,6 +21,7 @@ from apex_ompl.util.files import is_file, write_atomically
 from apex_ompl.util.validation import check_indices
 
 SCHEMA = "apex-ompl/kernel-tables/1"
+STORED = tuple(name for name in RobotArrays._fields if name not in {"body_inner", "inner_ball"})
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +101,7 @@ class RobotTables:
         return RobotTables(self.name, self.joint_names, self.body_names, self.numbers, arrays)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the tables as a NumPy ``.npz`` file, under a temporary name first.
+        """Write the tables as a NumPy ``.npz`` file, under a temporary name first; balls inside of bodies are left out.
 
         Raises:
             MissingFileError: The folder is missing or cannot be written.
@@ -113,7 +114,8 @@ class RobotTables:
             "numbers": self.numbers,
         }
         stream = io.BytesIO()
-        np.savez_compressed(stream, about=np.array(json.dumps(head)), **self.arrays._asdict())
+        stored = {name: getattr(self.arrays, name) for name in STORED}
+        np.savez_compressed(stream, about=np.array(json.dumps(head)), **stored)
         write_atomically(Path(path), stream.getvalue())
 
     @classmethod
@@ -130,9 +132,11 @@ class RobotTables:
         try:
             with np.load(path, allow_pickle=False) as data:
                 head = json.loads(str(data["about"]))
-                arrays = {name: np.ascontiguousarray(data[name]) for name in RobotArrays._fields}
+                arrays = {name: np.ascontiguousarray(data[name]) for name in STORED}
         except Exception as error:  # NumPy and zipfile let many kinds through
             raise FileFormatError(str(path), "", type(error).__name__, "expected kernel tables (.npz)") from error
+        arrays["body_inner"] = np.zeros((len(arrays["body_joint"]), 2), np.int64)
+        arrays["inner_ball"] = np.empty((0, 4))
         found = head.get("schema") if isinstance(head, dict) else head
         if found != SCHEMA:
             raise FileFormatError(str(path), "schema", found, f"expected {SCHEMA!r}")

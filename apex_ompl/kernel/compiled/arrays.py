@@ -38,7 +38,8 @@ class RobotArrays(NamedTuple):
     of such a centre in that frame, per unit of ``q[cluster_dof]``.
 
     A node is a sphere (``node_centre`` in the frame of its body's joint, ``node_radius``) around the part of the solid
-    that the leaves below cover; ``node_outer`` is a radius around the leaves themselves.
+    that the leaves below cover; ``node_outer`` is a radius around the leaves themselves. ``body_inner`` says which of
+    ``inner_ball`` are inside of a body's solid, in the frame of its joint.
     """
 
     joint_parent: Integers
@@ -72,6 +73,8 @@ class RobotArrays(NamedTuple):
     node_centre: Vectors
     node_radius: Floats
     node_outer: Floats
+    body_inner: Spans
+    inner_ball: Balls
 
 
 class SceneArrays(NamedTuple):
@@ -79,10 +82,11 @@ class SceneArrays(NamedTuple):
 
     ``kind`` is one of BOX ... HALF_SPACE or GRID, ``owner`` the number of the obstacle that a solid is part of.
     ``size`` holds half edges, or radius and half length; a half-space has its unit normal in ``offset`` and its
-    distance in ``size``. A grid has its first node at ``offset``, and in ``size`` its spacing, by how much its values
-    were lowered, and the radius of the balls around points. ``grid`` says which of ``values`` are its own: the first,
-    and how many along each axis; then where the tree over its points or triangles begins, its levels, and the number
-    of these and of the numbers of each, see :mod:`apex_ompl.kernel.compiled.item_tree`.
+    distance in ``size``. ``exact`` says whether it is the shape of that part and not only contains it. A grid has its
+    first node at ``offset``, and in ``size`` its spacing, by how much its values were lowered, and the radius of the
+    balls around points. ``grid`` says which of ``values`` are its own: the first, and how many along each axis; then
+    where the tree over its points or triangles begins, its levels, and the number of these and of the numbers of each,
+    see :mod:`apex_ompl.kernel.compiled.item_tree`.
     Nodes of the tree are in depth-first order: ``tree_skip`` is the next node outside of a node's subtree,
     ``tree_range`` first obstacle and number of them (0 for inner nodes). The last ``open`` (1,) obstacles are
     half-spaces, which no box holds. ``allowed`` are pairs of a body and an owner that may touch.
@@ -90,6 +94,7 @@ class SceneArrays(NamedTuple):
 
     kind: Integers
     owner: Integers
+    exact: Integers
     tree_skip: Integers
     tree_range: Spans
     open: Integers

@@ -47,14 +47,20 @@ def place_robot(t: RobotArrays, w: Workspace, q: Floats) -> None:
 
 
 @inlined
-def node_position(t: RobotArrays, w: Workspace, j: int, n: int) -> tuple[float, float, float]:
-    """Return the centre of node ``n``, fixed to joint ``j``, in the world [m]."""
-    r, o, c = w.rotation[j], w.origin[j], t.node_centre[n]
+def point_position(w: Workspace, j: int, c: Floats) -> tuple[float, float, float]:
+    """Return the place in the world of a point, whose place in the frame of joint ``j`` is in ``c``, shape (3,) [m]."""
+    r, o = w.rotation[j], w.origin[j]
     return (
         o[0] + r[0, 0] * c[0] + r[0, 1] * c[1] + r[0, 2] * c[2],
         o[1] + r[1, 0] * c[0] + r[1, 1] * c[1] + r[1, 2] * c[2],
         o[2] + r[2, 0] * c[0] + r[2, 1] * c[1] + r[2, 2] * c[2],
     )
+
+
+@inlined
+def node_position(t: RobotArrays, w: Workspace, j: int, n: int) -> tuple[float, float, float]:
+    """Return the centre of node ``n``, fixed to joint ``j``, in the world [m]."""
+    return point_position(w, j, t.node_centre[n])
 
 
 @inlined

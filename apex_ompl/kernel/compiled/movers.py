@@ -77,7 +77,7 @@ movers_view = table_view(MoverArrays)
 def scene_of_movers(m: MoverArrays, offset: Floats) -> SceneArrays:
     """Return movers as a scene without a tree, at the places in ``offset`` (M, 3)."""
     return SceneArrays(
-        m.kind, m.owner, m.kind[:0], m.allowed[:0], m.kind[:0], m.allowed, m.rotation, offset, m.size,
+        m.kind, m.owner, m.kind[:0], m.kind[:0], m.allowed[:0], m.kind[:0], m.allowed, m.rotation, offset, m.size,
         m.place[:0], m.place[:0], m.grid, m.values,
     )  # fmt: skip
 

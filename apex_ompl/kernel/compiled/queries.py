@@ -28,7 +28,8 @@ def check_states(
 ) -> None:  # fmt: skip
     """Find for each state, shape (N, dof), the pairs that are not proved apart.
 
-    ``found`` (N, K, 2) gets the pairs, ``counts`` (N,) their number, or -1 where the tables do not hold for the state.
+    ``found`` (N, K, 2) gets the pairs, ``counts`` (N,) their number or what stands for it, see
+    :func:`apex_ompl.kernel.compiled.separation.unproved_at_state`.
     """
     t, s = robot_view(ri, rf), scene_view(si, sf, sg)
     w = workspace_view(t, wi, wf)

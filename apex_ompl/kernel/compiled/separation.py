@@ -14,9 +14,12 @@ from apex_ompl.kernel.compiled.compilation import inlined
 from apex_ompl.kernel.compiled.kinematics import mark_pair, node_position, place_cluster, place_robot
 from apex_ompl.kernel.compiled.layout import Floats, Integers
 from apex_ompl.kernel.compiled.motion_bound import cluster_displacement, relative_displacement
+from apex_ompl.kernel.compiled.penetration import collides
 from apex_ompl.kernel.compiled.scene_tree import is_allowed, next_obstacles
 from apex_ompl.kernel.compiled.signed_distance import ball_apart, distance
 from apex_ompl.kernel.compiled.workspace import Workspace
+
+UNKNOWN, COLLIDES = -1, -2  # in place of the number of pairs at a state
 
 # Every comparison is of the form "distance > bound", which is false for NaN: such a state is never proved free.
 
@@ -182,12 +185,13 @@ def unproved_at_state(t: RobotArrays, s: SceneArrays, w: Workspace, q: Floats, f
     """Place the robot at a state and put the pairs that are not proved apart into ``found``, see :func:`unproved`.
 
     Returns:
-        The number of pairs, or -1 where the tables do not hold for the state.
+        The number of pairs, UNKNOWN where the tables do not hold for the state, COLLIDES where it is proved to collide.
     """
     for k in range(len(q)):
         w.half_width[k] = 0.0
     if not tables_hold(t, q, w.half_width):
-        return -1
+        return UNKNOWN
     place_robot(t, w, q)
     w.moving[0] = 0
-    return unproved(t, s, w, q, found)
+    count = unproved(t, s, w, q, found)
+    return COLLIDES if count > 0 and collides(t, s, w, found, count) else count
