@@ -19,6 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from apex_ompl.kernel.compiled.grid_distance import SLACK
 from apex_ompl.kernel.compiled.grid_tabulation import tabulate_points, tabulate_triangles
 from apex_ompl.kernel.compiled.item_tree import BUCKET, HALF, fill_boxes, order_items
 from apex_ompl.kernel.compiled.layout import Integers, Singles
@@ -30,7 +31,6 @@ MOST_NODES_OF_POINTS = 1_000_000  # which are made anew with every image
 FINEST = 0.003  # spacing [m]
 PADDING = 2.5  # nodes around the box of what is tabulated
 BAND = 1.5  # distance up to which nodes are looked at for each triangle, in spacings
-SLACK = math.sqrt(3.0) / 2.0  # largest error of interpolation, and of the nearest node, in spacings
 SEED = SLACK**2 + 1e-3  # the node nearest to the closest point of a surface is within the slack of it, squared
 ROUNDING = 1e-6  # [m]
 KEPT_NODES = 40_000_000  # of grids that are kept by content

@@ -9,6 +9,10 @@ from apex_ompl.kernel.compiled.layout import Integers, Singles
 
 Place = tuple[int, float]
 
+SLACK = math.sqrt(3.0) / 2.0  # largest error of interpolation, by which values at nodes are lowered, in spacings
+LOWERED = 4.0 * SLACK  # by which they are lowered, at most
+FARTHER, OPEN, NEARER = 1, 0, -1
+
 
 @inlined
 def _place(u: float, nodes: int) -> Place:
@@ -63,6 +67,39 @@ def grid_distance(
     if outside > 0.0:
         return float(math.sqrt(outside * spacing * spacing + max(found, 0.0) ** 2))
     return float(found)
+
+
+@outlined
+def compare(grid: Integers, values: Singles, spacing: float, a: float, b: float, c: float, reach: float) -> int:
+    """Compare the distance of a point in the grid's frame from what the grid is about with ``reach`` [m].
+
+    A distance changes by at most the way: the one at the nearest node, before it was lowered, less the way to that node
+    is a bound that mostly is better than the interpolated one, of which it spares the look at the other nodes.
+
+    Args:
+        grid: See :func:`grid_distance`.
+        values: See there.
+        spacing: Of the nodes [m].
+        a: Place of the point [m].
+        b: The same.
+        c: The same.
+        reach: The distance, which may be negative [m].
+
+    Returns:
+        FARTHER where that is proved, NEARER where it surely is not the case, else OPEN.
+    """
+    nx, ny, nz = grid[1], grid[2], grid[3]
+    scale = 1.0 / spacing
+    x, y, z = a * scale, b * scale, c * scale
+    if 0.0 <= x <= nx - 1.0 and 0.0 <= y <= ny - 1.0 and 0.0 <= z <= nz - 1.0:
+        i, j, k = int(x + 0.5), int(y + 0.5), int(z + 0.5)
+        nearest = values[grid[0] + (i * ny + j) * nz + k]
+        way = math.sqrt((x - i) ** 2 + (y - j) ** 2 + (z - k) ** 2)
+        if nearest + spacing * (SLACK - way) > reach:
+            return FARTHER
+        if nearest + spacing * (LOWERED + way) < reach:
+            return NEARER
+    return FARTHER if grid_distance(grid, values, spacing, a, b, c, reach) > reach else OPEN
 
 
 @outlined

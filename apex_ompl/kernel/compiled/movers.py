@@ -37,7 +37,7 @@ from apex_ompl.kernel.compiled.layout import Floats, Integers, Singles, table_vi
 from apex_ompl.kernel.compiled.motion_bound import bound_displacements
 from apex_ompl.kernel.compiled.scene_tree import is_allowed
 from apex_ompl.kernel.compiled.separation import body_clear, tables_hold
-from apex_ompl.kernel.compiled.signed_distance import direction, distance
+from apex_ompl.kernel.compiled.signed_distance import apart, direction
 from apex_ompl.kernel.compiled.workspace import Workspace, workspace_view
 
 LONGER = 1.6  # factor from an interval that was proved at once to the next
@@ -111,12 +111,12 @@ def relative_shift(m: MoverArrays, w: Workspace, c: int, o: int, half: float, en
 def _cluster_clear(t: RobotArrays, s: SceneArrays, w: Workspace, q: Floats, c: int, o: int, shift: float) -> int:
     """Return -1 where a cluster is proved apart from a mover, or the first of its bodies that is not."""
     # Every comparison is of the form "distance > bound", which is false for NaN.
-    if distance(s, o, w.ball[c, 0], w.ball[c, 1], w.ball[c, 2]) > t.cluster_ball[c, 3] + shift:
+    if apart(s, o, w.ball[c, 0], w.ball[c, 1], w.ball[c, 2], t.cluster_ball[c, 3] + shift):
         return -1
     place_cluster(t, w, q, c)
     first = t.cluster_bodies[c, 0]
     for b in range(first, first + t.cluster_bodies[c, 1]):
-        if distance(s, o, w.root[b, 0], w.root[b, 1], w.root[b, 2]) > t.node_radius[t.body_root[b]] + shift:
+        if apart(s, o, w.root[b, 0], w.root[b, 1], w.root[b, 2], t.node_radius[t.body_root[b]] + shift):
             continue
         if not body_clear(t, s, w, b, o, shift) and not is_allowed(s, b, o):
             return int(b)

@@ -18,7 +18,8 @@ from apex_ompl.kernel.compiled.relative_motion import (
 from apex_ompl.kernel.compiled.shapes import HULL, MOST_NODES, POINT, TRIANGLE, PairBuffers, ShapeArrays, corners_of
 from apex_ompl.kernel.compiled.triangle_distance import squared_distance
 
-MOST_LEAVES = 64  # pairs of triangles whose motion is looked at
+MOST_LEAVES = 16  # pairs of triangles whose motion is looked at
+FAR, FAST = 0.005, 2.0  # distance [m], and displacement relative to it, from which a motion is to be halved at once
 
 
 @inlined
@@ -280,9 +281,11 @@ def _pair_bound(f: Frames, h: ShapeArrays, a: int, b: int, g: PairBuffers, need:
         if bound + below < need <= distance + below:  # they move too far, meshes or hulls
             return bound, math.inf
     if h.root[b] >= 0:
-        later, _ = _mesh_bound(h, g, -1, h.root[b], arc, need, True)
+        later, least = _mesh_bound(h, g, -1, h.root[b], arc, need, True)
         if later >= need:
             return later, math.inf
+        if FAR < least < FAST * arc:
+            return -math.inf, math.inf
         place_shape(f, h, b, g, 1)
     now, upper = _mesh_bound(h, g, h.root[a], h.root[b], arc, need, False)
     if now >= need or not 0.0 < arc < upper or h.root[a] < 0:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from apex_ompl.kernel.compiled.arrays import GRID, RobotArrays, SceneArrays
 from apex_ompl.kernel.compiled.compilation import inlined
-from apex_ompl.kernel.compiled.grid_distance import grid_distance
+from apex_ompl.kernel.compiled.grid_distance import FARTHER, compare
 from apex_ompl.kernel.compiled.item_tree import items_apart
 from apex_ompl.kernel.compiled.kinematics import point_position
 from apex_ompl.kernel.compiled.layout import Integers
@@ -25,7 +25,7 @@ def ball_meets(s: SceneArrays, o: int, x: float, y: float, z: float, radius: flo
     if s.kind[o] != GRID:
         return distance(s, o, x, y, z) < reach
     a, b, c = local_point(s, o, x, y, z)
-    if grid_distance(s.grid[o], s.values, s.size[o, 0], a, b, c, reach) >= reach:
+    if compare(s.grid[o], s.values, s.size[o, 0], a, b, c, reach) == FARTHER:
         return False
     reach += s.size[o, 2]
     return reach > 0.0 and not items_apart(s.grid[o], s.values, a, b, c, reach)

@@ -16,7 +16,7 @@ from apex_ompl.kernel.compiled.layout import Floats, Integers
 from apex_ompl.kernel.compiled.motion_bound import cluster_displacement, relative_displacement
 from apex_ompl.kernel.compiled.penetration import collides
 from apex_ompl.kernel.compiled.scene_tree import is_allowed, next_obstacles
-from apex_ompl.kernel.compiled.signed_distance import ball_apart, distance
+from apex_ompl.kernel.compiled.signed_distance import apart, ball_apart
 from apex_ompl.kernel.compiled.workspace import Workspace
 
 UNKNOWN, COLLIDES = -1, -2  # in place of the number of pairs at a state
@@ -37,7 +37,7 @@ def body_clear(t: RobotArrays, s: SceneArrays, w: Workspace, b: int, o: int, shi
             if not ball_apart(s, o, x, y, z, t.node_radius[n] + shift):
                 return False
             continue
-        if distance(s, o, x, y, z, t.node_radius[n] + shift) > t.node_radius[n] + shift:
+        if apart(s, o, x, y, z, t.node_radius[n] + shift):
             continue
         for k in range(t.node_first[n], t.node_first[n] + t.node_count[n]):
             w.stack[top] = k
@@ -79,13 +79,13 @@ def cluster_against(
     """Add to ``found`` a cluster's bodies that are not proved apart from an obstacle; return the number of pairs."""
     shift = cluster_displacement(w, c)
     reach = t.cluster_ball[c, 3] + shift
-    if distance(s, o, w.ball[c, 0], w.ball[c, 1], w.ball[c, 2], reach) > reach:
+    if apart(s, o, w.ball[c, 0], w.ball[c, 1], w.ball[c, 2], reach):
         return count
     place_cluster(t, w, q, c)
     first = t.cluster_bodies[c, 0]
     for b in range(first, first + t.cluster_bodies[c, 1]):
         reach = t.node_radius[t.body_root[b]] + shift
-        if distance(s, o, w.root[b, 0], w.root[b, 1], w.root[b, 2], reach) > reach:
+        if apart(s, o, w.root[b, 0], w.root[b, 1], w.root[b, 2], reach):
             continue
         if not body_clear(t, s, w, b, o, shift) and not is_allowed(s, b, o):
             found[count, 0], found[count, 1] = b, -1 - s.owner[o]

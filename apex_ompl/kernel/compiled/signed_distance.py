@@ -6,7 +6,7 @@ import math
 
 from apex_ompl.kernel.compiled.arrays import BOX, CAPSULE, CYLINDER, GRID, HALF_SPACE, SPHERE, SceneArrays
 from apex_ompl.kernel.compiled.compilation import inlined
-from apex_ompl.kernel.compiled.grid_distance import grid_direction, grid_distance
+from apex_ompl.kernel.compiled.grid_distance import FARTHER, OPEN, compare, grid_direction, grid_distance
 from apex_ompl.kernel.compiled.item_tree import items_apart
 from apex_ompl.kernel.compiled.layout import Floats
 
@@ -61,6 +61,15 @@ def distance(s: SceneArrays, o: int, x: float, y: float, z: float, enough: float
 
 
 @inlined
+def apart(s: SceneArrays, o: int, x: float, y: float, z: float, reach: float) -> bool:
+    """Whether a point of the world is proved to be farther than ``reach`` [m] from an obstacle."""
+    if s.kind[o] != GRID:
+        return distance(s, o, x, y, z) > reach
+    a, b, c = local_point(s, o, x, y, z)
+    return compare(s.grid[o], s.values, s.size[o, 0], a, b, c, reach) == FARTHER
+
+
+@inlined
 def ball_apart(s: SceneArrays, o: int, x: float, y: float, z: float, radius: float) -> bool:
     """Whether a ball around a point of the world is proved apart from an obstacle, exactly where a grid is too coarse.
 
@@ -70,11 +79,12 @@ def ball_apart(s: SceneArrays, o: int, x: float, y: float, z: float, radius: flo
     if s.kind[o] != GRID:
         return distance(s, o, x, y, z) > radius
     a, b, c = local_point(s, o, x, y, z)
-    bound = grid_distance(s.grid[o], s.values, s.size[o, 0], a, b, c, radius)
-    if bound > radius:
-        return True
-    points = s.size[o, 2]
-    return (points > 0.0 or bound > -radius) and items_apart(s.grid[o], s.values, a, b, c, radius + points)
+    grid, spacing, points = s.grid[o], s.size[o, 0], s.size[o, 2]
+    compared = compare(grid, s.values, spacing, a, b, c, radius)
+    if compared != OPEN:
+        return compared == FARTHER
+    outside = points > 0.0 or compare(grid, s.values, spacing, a, b, c, -radius) == FARTHER
+    return outside and items_apart(grid, s.values, a, b, c, radius + points)
 
 
 @inlined
