@@ -51,9 +51,9 @@ def test_what_is_written_is_read(cases: list[KernelProblem], tmp_path: Path) -> 
         assert len(new.record.obstacles) == len(old.record.obstacles)
         for mine, theirs in ((new.start, old.start), (new.goal, old.goal), (new.points, old.points)):
             assert np.array_equal(mine, theirs)
-        packed = [(*case.scene.packed, *case.robot.packed) for case in (new, old)]
-        for mine, theirs in zip(*packed, strict=True):
-            assert np.array_equal(mine, theirs)
+        for mine, theirs in ((new.scene.arrays, old.scene.arrays), (new.robot.arrays, old.robot.arrays)):
+            for name in set(mine._fields) - {"exact", "body_inner", "inner_ball"}:  # which only exact checks need
+                assert np.array_equal(getattr(mine, name), getattr(theirs, name)), name
 
 
 def test_they_are_solved_without_pinocchio_coal_and_ompl(cases: list[KernelProblem], tmp_path: Path) -> None:

@@ -11,8 +11,12 @@ import pytest
 from support import states_around_home
 
 from apex_ompl.collision import CollisionChecker
+from apex_ompl.collision.containment import EnclosingMesh
 from apex_ompl.collision.discretization import sample_path
+from apex_ompl.collision.inner_balls import inner_balls
+from apex_ompl.collision.shapes import coal_geometry
 from apex_ompl.errors import ParameterError
+from apex_ompl.kernel.compiled.separation import COLLIDES
 from apex_ompl.ompl_adapter.validity import full_check
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import AttachedObject, MeshFile, Obstacle
@@ -84,6 +88,9 @@ def test_both_stages_agree_with_the_meshes(
     states = np.concatenate([wide, robot.random_state(rng, 300), towards_contact(meshes, wide[:500])])
     expected = meshes.are_free(states)
     assert np.array_equal(both.are_free(states), expected)
+    counts = both.kernel.unproved(states)[1]
+    assert not expected[counts == COLLIDES].any()
+    assert (counts == COLLIDES).sum() > 0.5 * (~meshes.are_free(wide)).sum()
     proved = both.kernel.unproved(states)[1] == 0
     assert not (proved & ~expected).any()
     assert 0.3 < expected.mean() < 0.9 and proved.sum() > 0.5 * expected.sum()
@@ -272,3 +279,26 @@ def test_the_kernel_alone_proves_what_the_spheres_prove(checker: CollisionChecke
     for path, resolution in ((robot.home[None], 0.01), (np.stack([robot.home] * 2), 0.0)):
         with pytest.raises(ParameterError, match="path|resolution"):
             checker.kernel.proves(path, resolution)
+
+
+def test_balls_inside_of_solids_are_inside(robot: Robot, baxter: Robot, tmp_path: Path) -> None:
+    (tmp_path / "step.obj").write_text(STEP)
+    held_step = Obstacle(name="step", mesh=MeshFile(file=str(tmp_path / "step.obj")))
+    shapes = [item.geometry for some in (robot, baxter) for item in some.geometry.geometryObjects]
+    request, there, found = coal.CollisionRequest(), coal.Transform3s.Identity(), 0
+    for shape in [*shapes, coal_geometry(held_step)]:
+        balls = inner_balls(shape)
+        found += len(balls)
+        shell = isinstance(shape, coal.BVHModelBase)
+        for x, y, z, radius in balls:
+            place = coal.Transform3s(np.eye(3), np.array([x, y, z]))
+            if shell:  # the surface is outside of the ball, and the ball inside of the surface
+                ball = coal.Sphere(0.999 * radius)
+                assert not coal.collide(shape, there, ball, place, request, coal.CollisionResult())
+                assert EnclosingMesh.of(shape).contains(np.array([x, y, z]))
+            else:
+                turns = np.random.default_rng(0).normal(size=(50, 3))
+                for turn in turns / np.linalg.norm(turns, axis=1)[:, None]:
+                    dot = coal.Transform3s(np.eye(3), np.array([x, y, z]) + 0.999 * radius * turn)
+                    assert coal.collide(shape, there, coal.Sphere(1e-6), dot, request, coal.CollisionResult())
+    assert found > 3 * len(shapes)

@@ -76,7 +76,7 @@ def _depths(geometry: coal.CollisionGeometry, points: Array) -> Array:
     if kind == coal.GEOM_CAPSULE:
         return np.asarray(geometry.radius - np.hypot(np.hypot(x, y), np.maximum(z - geometry.halfLength, 0.0)))
     if kind == coal.GEOM_CYLINDER:
-        return np.minimum(geometry.radius - np.hypot(x, y), geometry.halfLength - z)
+        return np.asarray(np.minimum(geometry.radius - np.hypot(x, y), geometry.halfLength - z))
     if kind == coal.GEOM_BOX:
         return np.asarray((geometry.halfSide - np.abs(points)).min(axis=1))
     if not is_shell(geometry):

@@ -169,8 +169,9 @@ def _scenes(arrays: dict[str, NDArray[Any]], count: int) -> list[SceneTables]:
     for i in range(count):  # problems of data sets have neither grids nor bodies that may touch
         own = {name: np.ascontiguousarray(values[i]) for name, values in columns.items()}
         count = len(own["kind"])
-        other = {"exact": np.zeros(count, np.int64), "grid": np.zeros((count, GRID_ROW), np.int64)}
-        made.append(SceneArrays(**own, **other, allowed=np.empty((0, 2), np.int64), values=np.empty(0, np.float32)))
+        other: dict[str, Any] = {"exact": np.zeros(count, np.int64), "grid": np.zeros((count, GRID_ROW), np.int64)}
+        other |= {"allowed": np.empty((0, 2), np.int64), "values": np.empty(0, np.float32)}
+        made.append(SceneArrays(**own, **other))
     for scene in made:
         fault = scene_fault(scene)
         if fault:

@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 
 from apex_ompl.diffusion.solid_fit import THINNEST, Solid, solids_like, turned_to
 from apex_ompl.kernel.compiled.arrays import BOX, CYLINDER
+from apex_ompl.kernel.compiled.grid_distance import SLACK
 from apex_ompl.kernel.compiled.grid_regions import OCCUPIED, OUTSIDE, add_up, best_box, label_regions
 from apex_ompl.kernel.compiled.layout import Integers
-from apex_ompl.kernel.distance_grid import BAND, SLACK, DistanceGrid
+from apex_ompl.kernel.distance_grid import BAND, DistanceGrid
 from apex_ompl.types import Array, Flags
 from apex_ompl.util.weak_cache import weakly_cached
 

@@ -97,7 +97,8 @@ class ObstacleSet:
         position, rotation, size = (np.asarray(v, float) for v in (self.position, self.rotation, self.size))
         kind = np.asarray(self.shape, np.int64)
         boxes = boxes_around(kind, rotation, position, size)
-        return tables_of({0: Solids(kind, rotation, position, size, boxes, (None,) * len(kind))})
+        exact = np.ones(len(kind), np.int64)
+        return tables_of({0: Solids(kind, exact, rotation, position, size, boxes, (None,) * len(kind))})
 
 
 def _rotation_to(normal: Array) -> Array:

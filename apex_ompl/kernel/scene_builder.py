@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apex_ompl.kernel.compiled.arrays import BOX, CAPSULE, GRID_ROW, HALF_SPACE, SPHERE, SceneArrays
+from apex_ompl.kernel.compiled.grid_distance import SLACK
 from apex_ompl.kernel.compiled.layout import Floats, Integers, Singles
-from apex_ompl.kernel.distance_grid import SLACK, DistanceGrid
+from apex_ompl.kernel.distance_grid import DistanceGrid
 from apex_ompl.kernel.tables import SceneTables
 
 LEAF = 1  # obstacles in a leaf of the tree
@@ -257,8 +258,9 @@ def primitive(tables: SceneTables, k: int) -> Primitive:
 def joined(parts: Iterable[Solids]) -> Solids:
     """Return solids one behind the other."""
     rows = list(parts) or [Solids.of(())]
-    columns = (np.concatenate(c) for c in zip(*(row[:-1] for row in rows), strict=True))
-    return Solids(*columns, tuple(grid for row in rows for grid in row.grids))
+    kind, exact, *floats = (np.concatenate(c) for c in zip(*(row[:-1] for row in rows), strict=True))
+    rotation, offset, size, box = floats
+    return Solids(kind, exact, rotation, offset, size, box, tuple(grid for row in rows for grid in row.grids))
 
 
 def _boxes_of(tree: _Structure, boxes: Floats) -> tuple[Floats, Floats]:

@@ -47,9 +47,10 @@ def scene_of(parts: Sequence[Part], swelling: float = 0.0) -> SceneTables:
     found = dict(enumerate(_fixtures()))
     kind, rotation, offset, size = kernel_columns(parts, swelling)
     around = boxes_around(kind, rotation, offset, size) if parts else np.empty((0, 2, 3))
+    exact = np.array([swelling == 0.0], np.int64)
     for k in range(len(parts)):
         one = slice(k, k + 1)
-        found[len(found)] = Solids(kind[one], rotation[one], offset[one], size[one], around[one], (None,))
+        found[len(found)] = Solids(kind[one], exact, rotation[one], offset[one], size[one], around[one], (None,))
     return tables_of(found)
 
 
