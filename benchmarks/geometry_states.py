@@ -1,9 +1,9 @@
-"""States that the kernel proves free among meshes, points and voxels, checked by Coal's triangles and point by point.
+"""States that the kernel decides among meshes, points and voxels, checked by Coal's triangles and point by point.
 
-Scenes are those of ``geometry.py``: validation problems with their obstacles as meshes, points or voxels, and scenes
-of a large mesh that is not convex. States are drawn around starts and goals, where few are far from obstacles. Those
-that the kernel proves free are given to the second stage alone: triangles by Coal's trees, each point's ball against
-each link's triangles by trees of their own (which the tests compare with Coal ball by ball).
+Scenes are those of ``geometry.py``: validation problems with their obstacles as meshes, points or voxels, and scenes of
+a large mesh that is not convex. States are drawn around starts and goals, where few are far from obstacles. Those that
+the kernel proves free, or to collide, are given to the second stage alone: triangles by Coal's trees, each point's ball
+against each link's triangles by trees of their own (which the tests compare with Coal ball by ball).
 
 Usage: python benchmarks/geometry_states.py [--states 1000000] [--jobs 2]
 """
@@ -23,6 +23,7 @@ from tqdm import tqdm
 
 from apex_ompl import load_problem, problems
 from apex_ompl.collision import CollisionChecker
+from apex_ompl.kernel.compiled.separation import COLLIDES
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.util.entry_point import run_script
@@ -33,8 +34,8 @@ KINDS = ("meshes", "points", "voxels", "large")
 EACH = 4000  # states of a scene
 
 
-def count_states(kind: str, number: int) -> tuple[int, int, int]:
-    """Return how many states of a scene are proved free, how many of them collide, and how many are free at all."""
+def count_states(kind: str, number: int) -> tuple[int, int, int, int, int]:
+    """Return numbers of a scene's states: proved free, of these colliding, free, proved to collide, of these free."""
     names = [n for level in geometry.LEVELS for n in problems.frozen_names(*level.split("/"), "validation")]
     rng = np.random.default_rng(number)
     problem = load_problem(names[number % len(names)])
@@ -52,7 +53,9 @@ def count_states(kind: str, number: int) -> tuple[int, int, int]:
         _, counts = checker.kernel.unproved(states)
         proved = states[counts == 0]
         wrong = sum(checker.meshes.collides(robot().to_pinocchio(q)) for q in proved)
-        return len(proved), wrong, int(checker.are_free(states).sum())
+        colliding = states[counts == COLLIDES]
+        free = sum(not checker.meshes.collides(robot().to_pinocchio(q)) for q in colliding)
+        return len(proved), wrong, int(checker.are_free(states).sum()), len(colliding), free
 
 
 def main() -> None:
@@ -62,14 +65,19 @@ def main() -> None:
     parser.add_argument("--jobs", type=one_or_more, default=2, help="processes (default: %(default)s)")
     args = parser.parse_args()
     scenes = -(-args.states // EACH)
-    head = ("kind", "scenes", "states", "free", "proved free by the kernel", "of these in collision")
+    head = (
+        "kind", "scenes", "states", "free", "proved free by the kernel", "of these in collision",
+        "proved to collide by the kernel", "of these free",
+    )  # fmt: skip
     rows, figures = [record.row([*head]), record.row(["---", *["---:"] * (len(head) - 1)])], {}
     with ProcessPoolExecutor(args.jobs) as pool:
         for kind in KINDS:
             done = pool.map(count_states, [kind] * scenes, range(scenes))
-            proved, wrong, free = np.array(list(tqdm(done, total=scenes, desc=kind))).sum(axis=0).tolist()
-            rows.append(record.row([kind, scenes, scenes * EACH, free, proved, wrong]))
+            counts = np.array(list(tqdm(done, total=scenes, desc=kind))).sum(axis=0).tolist()
+            proved, wrong, free, colliding, wrong_colliding = counts
+            rows.append(record.row([kind, scenes, scenes * EACH, free, proved, wrong, colliding, wrong_colliding]))
             figures[kind] = {"states": scenes * EACH, "free": free, "proved": proved, "wrong": wrong}
+            figures[kind] |= {"colliding": colliding, "wrong_colliding": wrong_colliding}
             record.write("geometry_states", figures, "\n".join(rows), split="validation", seed="number of the scene")
 
 

@@ -12,6 +12,12 @@ from apex_ompl.robot import Robot
 ROOT = Path(__file__).resolve().parent.parent
 DATA = ROOT / "tests" / "data" / "dual_panda_softhand"  # drawn by scripts/make_test_data.py
 
+STEP = """\
+v 0 0 0\nv 0.3 0 0\nv 0.3 0.1 0\nv 0.1 0.1 0\nv 0.1 0.3 0\nv 0 0.3 0
+v 0 0 0.2\nv 0.3 0 0.2\nv 0.3 0.1 0.2\nv 0.1 0.1 0.2\nv 0.1 0.3 0.2\nv 0 0.3 0.2
+f 4 3 2\nf 4 2 1\nf 6 5 4\nf 6 4 1\nf 10 8 9\nf 10 7 8\nf 12 10 11\nf 12 7 10
+f 1 2 8\nf 1 8 7\nf 2 3 9\nf 2 9 8\nf 3 4 10\nf 3 10 9\nf 4 5 11\nf 4 11 10\nf 5 6 12\nf 5 12 11\nf 6 1 7\nf 6 7 12
+"""
 CUBE_OBJ = """v 0 0 0
 v 1 0 0
 v 1 1 0

@@ -8,26 +8,16 @@ from pathlib import Path
 import coal
 import numpy as np
 import pytest
-from support import states_around_home
+from support import STEP, states_around_home
 
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.collision.containment import EnclosingMesh
 from apex_ompl.collision.discretization import sample_path
-from apex_ompl.collision.inner_balls import inner_balls
-from apex_ompl.collision.shapes import coal_geometry
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel.compiled.separation import COLLIDES
 from apex_ompl.ompl_adapter.validity import full_check
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import AttachedObject, MeshFile, Obstacle
 from apex_ompl.util.resolution import FINE_RESOLUTION
-
-STEP = """\
-v 0 0 0\nv 0.3 0 0\nv 0.3 0.1 0\nv 0.1 0.1 0\nv 0.1 0.3 0\nv 0 0.3 0
-v 0 0 0.2\nv 0.3 0 0.2\nv 0.3 0.1 0.2\nv 0.1 0.1 0.2\nv 0.1 0.3 0.2\nv 0 0.3 0.2
-f 4 3 2\nf 4 2 1\nf 6 5 4\nf 6 4 1\nf 10 8 9\nf 10 7 8\nf 12 10 11\nf 12 7 10
-f 1 2 8\nf 1 8 7\nf 2 3 9\nf 2 9 8\nf 3 4 10\nf 3 10 9\nf 4 5 11\nf 4 11 10\nf 5 6 12\nf 5 12 11\nf 6 1 7\nf 6 7 12
-"""
 
 
 def clutter(rng: np.random.Generator, mesh: Path) -> list[Obstacle]:
@@ -279,26 +269,3 @@ def test_the_kernel_alone_proves_what_the_spheres_prove(checker: CollisionChecke
     for path, resolution in ((robot.home[None], 0.01), (np.stack([robot.home] * 2), 0.0)):
         with pytest.raises(ParameterError, match="path|resolution"):
             checker.kernel.proves(path, resolution)
-
-
-def test_balls_inside_of_solids_are_inside(robot: Robot, baxter: Robot, tmp_path: Path) -> None:
-    (tmp_path / "step.obj").write_text(STEP)
-    held_step = Obstacle(name="step", mesh=MeshFile(file=str(tmp_path / "step.obj")))
-    shapes = [item.geometry for some in (robot, baxter) for item in some.geometry.geometryObjects]
-    request, there, found = coal.CollisionRequest(), coal.Transform3s.Identity(), 0
-    for shape in [*shapes, coal_geometry(held_step)]:
-        balls = inner_balls(shape)
-        found += len(balls)
-        shell = isinstance(shape, coal.BVHModelBase)
-        for x, y, z, radius in balls:
-            place = coal.Transform3s(np.eye(3), np.array([x, y, z]))
-            if shell:  # the surface is outside of the ball, and the ball inside of the surface
-                ball = coal.Sphere(0.999 * radius)
-                assert not coal.collide(shape, there, ball, place, request, coal.CollisionResult())
-                assert EnclosingMesh.of(shape).contains(np.array([x, y, z]))
-            else:
-                turns = np.random.default_rng(0).normal(size=(50, 3))
-                for turn in turns / np.linalg.norm(turns, axis=1)[:, None]:
-                    dot = coal.Transform3s(np.eye(3), np.array([x, y, z]) + 0.999 * radius * turn)
-                    assert coal.collide(shape, there, coal.Sphere(1e-6), dot, request, coal.CollisionResult())
-    assert found > 3 * len(shapes)

@@ -97,9 +97,9 @@ class CollisionChecker(SceneBodies):
         if q.shape != (self.robot.dof,):
             raise shape_error(q, (self.robot.dof,), "state")
         if not self._two_stages:
-            return self._free_by_meshes(q)
+            return self._is_free_given(q)
         left = self._spheres.unproved_at(q, self.check_counts)
-        return left is None or self._free_by_meshes(q, left)
+        return left is None or self._is_free_given(q, left)
 
     def are_free(self, states: Array) -> Flags:
         """Whether each of the states, shape (N, dof), collides with nothing; shape (N,).
@@ -110,10 +110,10 @@ class CollisionChecker(SceneBodies):
         states = np.asarray(states, float)
         check_states(states, self.robot.dof)
         if not self._two_stages:
-            return np.array([self._free_by_meshes(q) for q in states], bool)
+            return np.array([self._is_free_given(q) for q in states], bool)
         free = np.ones(len(states), bool)
         for k, unproved in self._spheres.unproved_among(states, self.check_counts):
-            free[k] = self._free_by_meshes(states[k], unproved)
+            free[k] = self._is_free_given(states[k], unproved)
         return free
 
     def collides_along(self, path: Array) -> bool:
@@ -142,7 +142,7 @@ class CollisionChecker(SceneBodies):
                 return True
             left += [(first + k, one) for k, one in unproved]
         doubtful = sorted(left, key=lambda one: len(one[1].pairs) if one[1].pairs else MOST_PAIRS, reverse=True)
-        return any(not self._free_by_meshes(states[k], unproved) for k, unproved in doubtful[:DOUBTFUL])
+        return any(not self._is_free_given(states[k], unproved) for k, unproved in doubtful[:DOUBTFUL])
 
     def first_collision(self, path: Array, resolution: float, start: bool = True) -> Collision | None:
         """Return a colliding state along a path, or None when the path is free.
@@ -168,7 +168,7 @@ class CollisionChecker(SceneBodies):
         if self._two_stages:
             try:
                 first = self._spheres
-                hit = first.first_collision(path, resolution, start, self.check_counts, self._free_by_meshes)
+                hit = first.first_collision(path, resolution, start, self.check_counts, self._is_free_given)
                 return None if hit is None else Collision(*hit)
             except NoGridError:  # a state is not finite, or there are too many steps
                 pass
@@ -247,8 +247,12 @@ class CollisionChecker(SceneBodies):
             return proof.clearance
         return -max((contact.depth for contact in self.contacts(q)), default=0.0)
 
-    def _free_by_meshes(self, q: Array, unproved: UnprovedPairs | None = None) -> bool:
-        """Check a state by the meshes: the pairs that are unproved first, and all pairs unless these are complete."""
+    def _is_free_given(self, q: Array, unproved: UnprovedPairs | None = None) -> bool:
+        """Whether a state is free, given what the balls left of it.
+
+        Unless they proved that it collides, the meshes check the pairs that are unproved, and all unless these are
+        complete.
+        """
         if unproved is not None and unproved.collides:
             self.check_counts.colliding += 1
             return False

@@ -53,15 +53,13 @@ class _Builder:
         self.number = {b: k for k, b in enumerate(order)}  # body as given -> row
         self.bodies = [bodies[b] for b in order]
         self.cluster_of = [self.clusters.index(keys[b]) for b in order]
+        frames = [tree.turns[b.joint].T @ np.asarray(b.placement, float) for b in self.bodies]
         self.centres = [
-            transformed(tree.turns[b.joint].T @ np.asarray(b.placement, float), np.asarray(b.centres, float))
-            for b in self.bodies
+            transformed(frame, np.asarray(b.centres, float)) for frame, b in zip(frames, self.bodies, strict=True)
         ]
         self.inner = [
-            np.column_stack(
-                [transformed(tree.turns[b.joint].T @ np.asarray(b.placement, float), b.inner[:, :3]), b.inner[:, 3]]
-            )
-            for b in self.bodies
+            np.column_stack([transformed(frame, b.inner[:, :3]), b.inner[:, 3]])
+            for frame, b in zip(frames, self.bodies, strict=True)
         ]
         self.lazy = [tree.inner(j) for j, _ in self.clusters]
 
