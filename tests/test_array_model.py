@@ -27,6 +27,8 @@ from models import (
 )
 
 from apex_ompl.diffusion.array_model import ArrayModel, is_supported, weight_shapes
+from apex_ompl.diffusion.checkpoint import load_model, load_torch_model
+from apex_ompl.diffusion.eight_bits import expanded, quantized
 from apex_ompl.diffusion.guidance import Guidance
 from apex_ompl.diffusion.model import LatentDiffusion
 from apex_ompl.diffusion.model_config import ConditionConfig, DenoiserConfig, LatentConfig, NoiseConfig
@@ -53,7 +55,8 @@ def both(**parts: Any) -> tuple[ArrayModel, TorchModel]:
     """The same weights as arrays and as modules; limits are those of the robot, so that features are of size one."""
     net, limits = network(**parts), kernel().robot.arrays
     net.encoder.set_limits(*(torch.tensor(v, dtype=torch.float32) for v in (limits.lower, limits.upper)))
-    weights = {name: tensor.numpy() for name, tensor in net.state_dict().items()}
+    weights = quantized({name: tensor.numpy() for name, tensor in net.state_dict().items()})
+    net.load_state_dict({name: torch.from_numpy(values) for name, values in expanded(weights).items()})
     return ArrayModel(net.config, weights, {}), TorchModel(net, {})
 
 
@@ -121,13 +124,27 @@ def test_what_numpy_cannot_evaluate_is_said() -> None:
         weight_shapes(config(latent=LatentConfig(dim=12 * DOF + 1)))
 
 
+@pytest.mark.parametrize("after", [1, 36, 37])
 @pytest.mark.parametrize("count", [1, 2, 3, 4, 5, 8, 11])
-def test_a_dense_layer_is_a_matrix_product(count: int) -> None:
+def test_a_dense_layer_is_a_matrix_product(count: int, after: int) -> None:
     rng = np.random.default_rng(count)
-    weight, bias, rows = (rng.normal(size=s).astype(np.float32) for s in ((37, 53), (37,), (count, 53)))
-    out = np.full((count, 37), np.nan, np.float32)
-    dense_layer(weight, bias, rows, out)
-    np.testing.assert_allclose(out, rows.astype(float) @ weight.astype(float).T + bias, atol=1e-4)
+    weight = rng.integers(-127, 128, (after, 53)).astype(np.int8)
+    scale, bias, rows = (rng.normal(size=s).astype(np.float32) for s in ((after,), (after,), (count, 53)))
+    out = np.full((count, after), np.nan, np.float32)
+    dense_layer(weight, scale, bias, rows, out)
+    wanted = rows.astype(float) @ (weight * scale[:, None].astype(float)).T + bias
+    np.testing.assert_allclose(out, wanted, rtol=1e-5, atol=1e-3)
+
+
+def test_eight_bits_propose_what_half_precision_does() -> None:
+    """The paths of the shipped model move by far less than they differ from each other."""
+    models = load_model("apex"), load_torch_model("apex")
+    assert models[0].weights["denoiser.blocks.0.first.weight"].dtype == np.int8
+    mine, theirs = (
+        m.propose(query(), kernel(WALL, POST), 16, generator=np.random.default_rng(0)).control for m in models
+    )
+    spread = np.sqrt(((theirs - theirs.mean(axis=0)) ** 2).mean())
+    assert 0.0 < np.sqrt(((mine - theirs) ** 2).mean()) < 0.15 * spread
 
 
 def test_a_plan_needs_no_torch() -> None:

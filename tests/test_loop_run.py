@@ -13,6 +13,7 @@ from runs import motion_between
 from apex_ompl import problems
 from apex_ompl.errors import ApexError
 from apex_ompl.loop.cycle import RunRecord
+from apex_ompl.loop.following import Following
 from apex_ompl.loop.referee import LIMIT_TOLERANCE
 from apex_ompl.loop.result import Outcome, RunResult
 from apex_ompl.loop.run import _Made, run
@@ -21,6 +22,7 @@ from apex_ompl.problems import worlds
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.scripts import place_at
+from apex_ompl.trajectory import time_path
 from apex_ompl.trajectory.rests import is_at_rest
 
 MOVING = "vertical/moving-large-0.2/800001"
@@ -101,6 +103,17 @@ def test_a_robot_that_leaves_is_not_held_by_a_stop_before_it_has_set_out(name: s
     first = next(event for event in found.events if event.kind == "accepted")
     assert first.data["part"] == "evade" and first.data["leaving"]
     assert found.outcome is Outcome.REACHED and found.metrics["clearance"] > 0.0
+
+
+def test_a_stop_that_ends_at_a_goal_is_one_to_the_goal() -> None:
+    """Such a run has reached the goal, though what is followed last is a stop."""
+    ready = ready_of(PROBLEM)
+    goal = ready.goals[0]
+    motion = time_path(np.stack([ready.setup.start, goal]), ready.limits, ready.names).trajectory
+    one = Following(motion, 0.0, to_goal=True)
+    stops = [ready.unproved_stop(one, time) for time in np.linspace(0.0, one.end, 100)]
+    there = [bool(np.abs(stop.motion.positions[-1] - goal).max() <= 1e-6) for stop in stops]
+    assert [stop.to_goal for stop in stops] == there and 0 < sum(there) < len(there)
 
 
 def test_candidates_that_no_duration_makes_possible_are_not_carried_on() -> None:

@@ -1,7 +1,8 @@
 """A trained model evaluated by NumPy: ready without torch, which takes longer to import than most problems to solve.
 
-It computes what torch does for models of a linear latent space and an MLP denoiser; names of weights are those of
-:class:`apex_ompl.diffusion.model.LatentDiffusion`, where the layers are explained.
+It computes what torch does for models of a linear latent space and an MLP denoiser, with large matrices of weights in
+eight bits; names of weights are those of :class:`apex_ompl.diffusion.model.LatentDiffusion`, where the layers are
+explained.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apex_ompl.datasets.records import SHAPES
+from apex_ompl.diffusion.eight_bits import SUFFIX, quantized
 from apex_ompl.diffusion.geometry import signed_distances
 from apex_ompl.diffusion.guidance import Guidance, collision_cost
 from apex_ompl.diffusion.model_config import OBSTACLE_SCENES, ModelConfig, key_shapes
@@ -40,15 +42,19 @@ class ArrayModel(TrajectoryModel):
     """Trained model whose networks NumPy evaluates, in single precision as torch does.
 
     Attributes:
-        weights: Weights by their names in the checkpoint.
+        weights: Weights by their names in the checkpoint: matrices in eight bits with ``NAME.scale``, others in single
+            precision.
     """
 
     def __init__(self, config: ModelConfig, weights: Mapping[str, NDArray[Any]], about: Mapping[str, Any]) -> None:
-        """Use weights that fit a configuration, see :func:`is_supported`."""
+        """Use weights that fit a configuration, see :func:`is_supported`, in any precision."""
         joint, offset = weights["probe_joint"], np.asarray(weights["probe_offset"], float)
         probes = Probes(np.asarray(joint, np.int64), offset, config.condition.along)
         super().__init__(config, about, probes, {name: weights[name] for name in key_shapes(config)})
-        self.weights = {k: np.ascontiguousarray(v, np.float32) for k, v in weights.items()}
+        self.weights = {
+            k: np.ascontiguousarray(v, np.int8 if v.dtype == np.int8 else np.float32)
+            for k, v in quantized(weights).items()
+        }
         half = STEP_SIZE // 2
         self._frequencies = np.exp(np.float32(-math.log(10_000.0)) * np.arange(half, dtype=np.float32) / half)
         self._mean = self.weights["autoencoder.mean"]
@@ -149,9 +155,12 @@ class ArrayModel(TrajectoryModel):
         return np.concatenate(parts)
 
     def _linear(self, name: str, values: Single) -> Single:
-        weight = self.weights[f"{name}.weight"]
+        weight, bias = self.weights[f"{name}.weight"], self.weights[f"{name}.bias"]
+        if weight.dtype != np.int8:
+            return np.asarray(values @ weight.T + bias)
         found = np.empty((len(values), len(weight)), np.float32)
-        dense_layer(weight, self.weights[f"{name}.bias"], np.ascontiguousarray(values, np.float32), found)
+        scale = self.weights[f"{name}.weight{SUFFIX}"]
+        dense_layer(weight, scale, bias, np.ascontiguousarray(values, np.float32), found)
         return found
 
 

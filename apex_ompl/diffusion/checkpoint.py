@@ -17,7 +17,7 @@ from safetensors import SafetensorError
 from safetensors.numpy import load as load_arrays
 
 from apex_ompl.diffusion.array_model import ArrayModel, is_supported, weight_shapes
-from apex_ompl.diffusion.eight_bits import expanded
+from apex_ompl.diffusion.eight_bits import check_scales, expanded, is_scale
 from apex_ompl.diffusion.model_config import ModelConfig
 from apex_ompl.diffusion.proposals import TrajectoryModel
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError, UnknownNameError
@@ -101,7 +101,7 @@ def _read(name: str | os.PathLike[str], robot: str | None) -> tuple[CheckpointCo
 
 
 def read_weights(source: Path, digest: str) -> dict[str, NDArray[Any]]:
-    """Return the weights in a file of a checkpoint, by name.
+    """Return the weights in a file of a checkpoint by name, matrices in eight bits with their scales.
 
     Args:
         source: The file.
@@ -116,11 +116,12 @@ def read_weights(source: Path, digest: str) -> dict[str, NDArray[Any]]:
     if found != digest:
         raise FileFormatError(str(source), "", f"SHA-256 {found[:12]}...", f"expected {digest[:12]}...: damaged")
     try:
-        weights = expanded(load_arrays(content))
+        weights = load_arrays(content)
+        check_scales(weights)
     except (SafetensorError, ValueError, KeyError) as error:
         raise FileFormatError(str(source), "", str(error), "expected safetensors") from error
     for key, values in weights.items():
-        if not np.isfinite(values).all():
+        if values.dtype != np.int8 and not np.isfinite(values).all():
             raise FileFormatError(str(source), key, "numbers that are not finite", "expected finite weights")
     return weights
 
@@ -140,8 +141,8 @@ def _torch_model(
     check_shapes(weights, shapes, source)
     with torch.random.fork_rng(devices=[]):
         network = LatentDiffusion(config.model)
-    state = network.state_dict()
-    network.load_state_dict({key: torch.from_numpy(values).to(state[key].dtype) for key, values in weights.items()})
+    state, values = network.state_dict(), expanded(weights)
+    network.load_state_dict({key: torch.from_numpy(values[key]).to(one.dtype) for key, one in state.items()})
     try:
         network.to(device)
     except (RuntimeError, AssertionError) as error:
@@ -162,7 +163,7 @@ def check_shapes(
     except (*BROKEN, ParameterError) as error:
         can_be_made = "expected the configuration of a model that can be made"
         raise FileFormatError(str(source.parent / CONFIG), "model", str(error), can_be_made) from error
-    shapes = {key: tuple(values.shape) for key, values in weights.items()}
+    shapes = {key: tuple(values.shape) for key, values in weights.items() if not is_scale(key, weights)}
     wrong = sorted(set(wanted.items()) ^ set(shapes.items()))
     if wrong:
         fits = f"expected weights that fit {CONFIG}"

@@ -17,6 +17,7 @@ from apex_ompl.loop.settings import LoopSettings
 from apex_ompl.ompl_adapter.setup import PlanningSetup
 from apex_ompl.robot.model import Limits
 from apex_ompl.trajectory import Trajectory
+from apex_ompl.trajectory.checks import SAME_STATE
 from apex_ompl.types import Array
 
 GRAZING = 1e-4  # distance from still things and own parts, such as held objects, below which a motion is not taken [m]
@@ -64,8 +65,8 @@ class Ready:
         return [self.names.index(hand.synergy) for hand in self.setup.robot.hands.values()]
 
     def is_goal(self, q: Array) -> bool:
-        """Whether a state, shape (dof,), is a goal."""
-        return bool(len(self.goals)) and bool((np.abs(self.goals - q).max(axis=1) == 0.0).any())
+        """Whether a state, shape (dof,), is a goal, as the referee sees it: stops may end that near to one."""
+        return bool(len(self.goals)) and bool((np.abs(self.goals - q).max(axis=1) <= SAME_STATE).any())
 
     def clear_of_still(self, motion: Trajectory, charges: Charges | None = None) -> bool:
         """Whether a motion is proved free of what stands still and of itself, and keeps the limits.
@@ -135,7 +136,7 @@ class Ready:
     def unproved_stop(self, following: Following, then: float) -> Following:
         """Return a stop from a motion along its path from a time of the clock on [s]."""
         made = stop_along(following.motion, then - following.begin, self.stopping)
-        return Following(made.trajectory, then)
+        return Following(made.trajectory, then, self.is_goal(made.trajectory.positions[-1]))
 
     def _stop(self, following: Following, then: float, along: bool) -> Following | None:
         """Return a stop from a motion along its path, or else joint by joint, that meets nothing that stands still."""
@@ -155,4 +156,4 @@ class Ready:
         )
         proof = self.checker.prove(curve, tolerance=0.0)
         clear = proof and (proof.clearance >= GRAZING or self._touches(made.trajectory.positions[0]))
-        return Following(made.trajectory, then) if clear else None
+        return Following(made.trajectory, then, self.is_goal(made.trajectory.positions[-1])) if clear else None

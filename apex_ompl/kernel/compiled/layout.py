@@ -20,6 +20,7 @@ from apex_ompl.kernel.compiled.compilation import ir_inlined
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
+Bytes = NDArray[np.int8]
 Integers = NDArray[np.int64]
 
 
