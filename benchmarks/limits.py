@@ -2,10 +2,10 @@
 
 The least time of a stage is that of its arithmetic at the rate of products of 64 x 64 matrices on one core, or that of
 its bytes at the rate at which one core reads memory, whichever is longer. Operations are counted from sizes: of a
-network the products with its weights; of a Cholesky factor the products inside its band; of kinematics 108 for a joint
-(a rotation by a rotation, a vector by a rotation, a turn, sine and cosine as 20 each). What tests of distances do
-depends on the scene and is not counted: rows without a least time. Times are those of one thread, the least of
-repetitions.
+network the products with its weights, a byte each; of a Cholesky factor the products inside its band; of kinematics
+108 for a joint (a rotation by a rotation, a vector by a rotation, a turn, sine and cosine as 20 each). What tests of
+distances do depends on the scene and is not counted: rows without a least time. Times are those of one thread, the
+least of repetitions.
 
 Usage: python benchmarks/limits.py [--repeat 15]
 """
@@ -114,11 +114,11 @@ def stages(repeat: int) -> list[tuple[str, float, float, str, float]]:
     products = 2.0 * (once + PROPOSALS * (denoiser - once))
     rows = [
         (
-            "condition", 2.0 * (encoder + token * len(query.obstacles)), 4.0 * (encoder + token), "single",
+            "condition", 2.0 * (encoder + token * len(query.obstacles)), float(encoder + token), "single",
             least(lambda: model.condition([query], kernel), repeat),
         ),
         (
-            f"denoising step of {PROPOSALS}", products, 4.0 * denoiser, "single",
+            f"denoising step of {PROPOSALS}", products, float(denoiser), "single",
             least(lambda: model.denoise(noise, 100, condition), repeat),
         ),
     ]  # fmt: skip

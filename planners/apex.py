@@ -18,11 +18,13 @@ from apex_ompl.apex.stages import Anytime, Shorten
 from apex_ompl.diffusion.checkpoint import shared_model
 from apex_ompl.diffusion.proposals import TrajectoryModel
 from apex_ompl.errors import ParameterError
+from apex_ompl.kernel.trees import TreePair
 from apex_ompl.ompl_adapter.report import SolveReport
 from apex_ompl.ompl_adapter.space import forget_states
 from apex_ompl.planners.apex_parameters import NAME, ApexParameters
 from apex_ompl.trajopt.optimizer import Optimizer
 from apex_ompl.types import Array
+from apex_ompl.util.resolution import SEARCH_RESOLUTION
 
 Status = ob.PlannerStatus
 _warm_models: WeakSet[TrajectoryModel] = WeakSet()  # that have proposed something in this process
@@ -79,6 +81,8 @@ class APEX(ob.Planner):
         checker = self.validator.checker
         self.optimizer.prepare(checker.kernel)
         home = checker.robot.home
+        ends = home[None], home[None]
+        TreePair(self.validator.kernel, *ends, 1.0, SEARCH_RESOLUTION, np.random.default_rng(0)).grow(1)
         if self.model not in _warm_models:
             query = make_query(checker, home, home, point=self.model.sees_point)
             sampling = self.parameters.sampling(self.model.sampling)
@@ -133,7 +137,7 @@ class APEX(ob.Planner):
         context = SolveContext(
             self.getSpaceInformation(), self.getProblemDefinition(), ptc, validator=self.validator, sampler=sampler,
             optimizer=self.optimizer, report=self.report, experience=self.experience,
-            rejected_lines=self.rejected_lines, lambda_obs=parameters.lambda_obs,
+            rejected_lines=self.rejected_lines, lambda_obs=parameters.lambda_obs, rng=generator.spawn(1)[0],
         )  # fmt: skip
         shorten = Shorten() if parameters.polish else None
         inputs = self.getPlannerInputStates()

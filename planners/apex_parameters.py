@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
@@ -20,6 +21,8 @@ if TYPE_CHECKING:
 NAME = "apex"
 WITHOUT_MODEL = "rrtconnect+polish"
 TURN_CALLS = 1_000  # of the termination condition of a bridge where rounds and trees take turns
+QUICK_CALLS = 1500  # iterations of a bridge between rounds of proposals
+AGAIN = 8
 SPRINT_FACTORS = (1, 32, 128)  # on the iterations of the sprints before each round of proposals
 CHECKPOINTS = Path(diffusion.__path__[0]) / "checkpoints"
 
@@ -119,10 +122,11 @@ class ApexParameters(Parameters):
         """Return the stages of ``solve`` up to the first valid path, in their order."""
         from apex_ompl.apex import stages
 
-        def proposal_round(count: int, temperature: float = 1.0) -> list[Stage]:
+        def proposal_round(count: int, temperature: float = 1.0, between: Sequence[Stage] = ()) -> list[Stage]:
             return stages.proposal_round(
-                count, repair=self.repair, resample=self.resample, noise=self.noise, temperature=temperature
-            )
+                count, repair=self.repair, resample=self.resample, noise=self.noise, temperature=temperature,
+                between=between,
+            )  # fmt: skip
 
         found: list[Stage] = [stages.KnownCandidates(self.line)]
         for number, count in enumerate(self.batches or (0,)):
@@ -130,7 +134,11 @@ class ApexParameters(Parameters):
                 found.append(stages.Sprint(self.sprint * SPRINT_FACTORS[number], self.range))
             if number == 0:
                 found.append(stages.CheckKnown())
-            found += proposal_round(count)
+            again = number == 0 and self.sprints
+            between = [stages.Sprint(self.sprint * AGAIN, self.range)] if again else []
+            found += proposal_round(count, between=between)
+            if self.bridge and self.lambda_obs == 0.0 and number < len(self.batches) - 1:
+                found.append(stages.Bridging(self.range, QUICK_CALLS))
         found.append(stages.Farthest())
         if self.bridge:
             found.append(stages.Bridging(self.range))

@@ -90,7 +90,7 @@ def test_the_algorithm_of_the_paper_alone_runs(ready: PlanningSetup) -> None:
 
 def test_valid_paths_that_pass_too_near_are_resampled(ready: PlanningSetup) -> None:
     validator = PathValidator(ready.simple_setup.getSpaceInformation(), "")
-    plain = plan(cached_problem(HARD), timeout=20.0, params={"polish": False})
+    plain = plan(cached_problem(HARD), timeout=20.0, params={"polish": False, "sprint": 0})
     wary = plan(cached_problem(HARD), timeout=20.0, params={"polish": False, "lambda_obs": 0.5})
     assert plain and wary
     gaps = [validator.obstacle_distance(result.path.states) for result in (plain, wary)]

@@ -8,14 +8,18 @@ import numpy as np
 from ompl import base as ob
 from ompl import geometric as og
 
-from apex_ompl.apex.context import stop_after
+from apex_ompl.apex.context import SolveContext
 from apex_ompl.apex.path_validator import PathValidator
+from apex_ompl.kernel.trees import TreePair
 from apex_ompl.ompl_adapter.space import path_to_array, to_state
 from apex_ompl.types import Array
+from apex_ompl.util.resolution import SEARCH_RESOLUTION
 
 Stop = Callable[[], bool]
 
-MAX_CALLS = 4_000  # of the termination condition of one bridge
+MAX_CALLS = 4_000  # iterations of one bridge
+LESS = 4  # iterations of compiled trees for one of OMPL's, which are tried where these find nothing
+OMPL_RANGE = 0.2  # OMPL's choice of the longest step, as a share of the extent of the space
 STRIDE = 2  # of the states of a path that are checked to find its blocked stretches
 
 
@@ -29,20 +33,24 @@ def make_tree(si: ob.SpaceInformation, pdef: ob.ProblemDefinition, tree_range: f
     return tree
 
 
+def compiled_trees(context: SolveContext, starts: Array, goals: Array, tree_range: float) -> TreePair:
+    """Return trees in compiled code from starts to goals, each of shape (N, dof); a range of 0 is OMPL's choice."""
+    longest = tree_range if tree_range > 0.0 else OMPL_RANGE * context.si.getStateSpace().getMaximumExtent()
+    return TreePair(context.kernel, starts, goals, longest, SEARCH_RESOLUTION, context.rng.spawn(1)[0])
+
+
 def bridge_blocked(
-    si: ob.SpaceInformation, validator: PathValidator, states: Array, stop: Stop, tree_range: float = 0.0,
-    *, calls: int = MAX_CALLS,
+    context: SolveContext, states: Array, tree_range: float, *, calls: int = MAX_CALLS
 ) -> Array | None:  # fmt: skip
-    """Return a valid path whose blocked stretches are planned anew by RRTConnect, or None.
+    """Return a valid path whose blocked stretches are planned anew by RRT-Connect, or None.
 
     Args:
-        si: OMPL's space information.
-        validator: Decides what is blocked.
+        context: Shared by the stages.
         states: Path with free ends, shape (N, dof).
-        stop: Asked often whether to give up.
         tree_range: Longest step of the trees; 0 lets OMPL choose [rad].
-        calls: Of the termination condition of one bridge, at most.
+        calls: Iterations of one bridge, at most.
     """
+    validator, stop = context.validator, context.stop
     free = np.array([not stop() and validator.is_free(q) for q in states])
     if stop() or not (free[0] and free[-1]):
         return None
@@ -52,7 +60,7 @@ def bridge_blocked(
         if following == k + 1 and validator.is_valid(states[[k, following]], stop):
             pieces.append(states[following : following + 1])
         else:
-            bridge = _bridge(si, states[k], states[following], stop_after(calls, stop), tree_range)
+            bridge = _bridge(context, states[k], states[following], tree_range, calls)
             if bridge is None:
                 return None
             pieces.append(bridge[1:])
@@ -78,13 +86,16 @@ def every_other(states: Array) -> Array:
     return np.concatenate([states[:-1:STRIDE], states[-1:]])
 
 
-def _bridge(
-    si: ob.SpaceInformation, a: Array, b: Array, ptc: ob.PlannerTerminationCondition, tree_range: float
-) -> Array | None:
-    """Return RRTConnect's path between two free states, or None."""
-    pdef = ob.ProblemDefinition(si)
-    pdef.setStartAndGoalStates(to_state(si, a), to_state(si, b))
-    status = make_tree(si, pdef, tree_range).solve(ptc).getStatus()
+def _bridge(context: SolveContext, a: Array, b: Array, tree_range: float, calls: int) -> Array | None:
+    """Return a path of RRT-Connect between two free states, or None."""
+    if context.validator.exclusive:
+        found = compiled_trees(context, a[None], b[None], tree_range).grow(calls, context.stop)
+        if found is not None:
+            return found
+        calls //= LESS
+    pdef = ob.ProblemDefinition(context.si)
+    pdef.setStartAndGoalStates(to_state(context.si, a), to_state(context.si, b))
+    status = make_tree(context.si, pdef, tree_range).solve(context.counted(calls)).getStatus()
     if status != ob.PlannerStatus.EXACT_SOLUTION:
         return None
     inner = path_to_array(pdef.getSolutionPath(), len(a))

@@ -22,6 +22,7 @@ from apex_ompl.types import Array
 if TYPE_CHECKING:
     from apex_ompl.apex.sampler import ProposalSampler
     from apex_ompl.diffusion.query import Query
+    from apex_ompl.kernel.trees import TreePair
 
 MIN_GAIN = 1e-3  # least decrease of length that counts as an improvement [rad]
 CLEARANCE_SPACING = 0.1  # of a path's states whose distance from obstacles is compared [rad, max-norm]
@@ -49,14 +50,17 @@ class SolveContext:
         set_aside: Valid candidates nearer to obstacles than ``lambda_obs``, each with its distance [m].
         best: Shortest valid path, or None.
         nearest: Path that ends near a goal and its distance from it [rad], or None.
-        trees: RRTConnect that a sprint began and its problem definition, or None.
-        all_trees: RRTConnect for all starts and goals and its problem definition, or None.
+        rng: Source of the generators of compiled trees.
+        pair_trees: Compiled trees that a sprint began, or None.
+        all_pair_trees: Compiled trees for all starts and goals, or None.
+        trees: OMPL's RRTConnect that a sprint began and its problem definition, or None.
+        all_trees: OMPL's RRTConnect for all starts and goals and its problem definition, or None.
     """
 
     def __init__(
         self, si: ob.SpaceInformation, pdef: ob.ProblemDefinition, ptc: ob.PlannerTerminationCondition, *,
         validator: PathValidator, sampler: ProposalSampler, optimizer: Optimizer, report: SolveReport,
-        experience: list[Array], rejected_lines: list[Array], lambda_obs: float,
+        experience: list[Array], rejected_lines: list[Array], lambda_obs: float, rng: np.random.Generator,
     ) -> None:  # fmt: skip
         """Share what is given; starts and goals are read before the stages run."""
         self.begin = time.perf_counter()
@@ -72,6 +76,9 @@ class SolveContext:
         self.set_aside: list[tuple[float, Candidate]] = []
         self.best: Path | None = None
         self.nearest: tuple[Path, float] | None = None
+        self.rng = rng
+        self.pair_trees: TreePair | None = None
+        self.all_pair_trees: TreePair | None = None
         self.trees: tuple[og.RRTConnect, ob.ProblemDefinition] | None = None
         self.all_trees: tuple[og.RRTConnect, ob.ProblemDefinition] | None = None
         self._queries: list[Query] = []

@@ -51,7 +51,7 @@ class ArrayModel(TrajectoryModel):
         joint, offset = weights["probe_joint"], np.asarray(weights["probe_offset"], float)
         probes = Probes(np.asarray(joint, np.int64), offset, config.condition.along)
         super().__init__(config, about, probes, {name: weights[name] for name in key_shapes(config)})
-        self.weights = {
+        self.weights: dict[str, NDArray[Any]] = {
             k: np.ascontiguousarray(v, np.int8 if v.dtype == np.int8 else np.float32)
             for k, v in quantized(weights).items()
         }

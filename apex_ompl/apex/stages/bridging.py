@@ -18,7 +18,7 @@ class Bridging:
 
     Attributes:
         tree_range: Longest step of the trees; 0 lets OMPL choose [rad].
-        calls: Of the termination condition of one bridge, at most.
+        calls: Iterations of one bridge, at most.
     """
 
     tree_range: float
@@ -31,9 +31,7 @@ class Bridging:
                 return None
             with context.report.timed("bridge"):
                 states = every_other(context.path_of(candidate).states)
-                found = bridge_blocked(
-                    context.si, context.validator, states, context.stop, self.tree_range, calls=self.calls
-                )
+                found = bridge_blocked(context, states, self.tree_range, calls=self.calls)
             if found is not None:
                 return Solution(Path(found), "apex+bridge")
         return None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,10 +15,13 @@ from apex_ompl.types import Array
 PROPOSED, RESAMPLED = "apex", "apex+resample"
 BATCH = 8  # proposals between two looks at the clock
 MIN_REPAIR_STEPS = 48  # of repair in a round
+SHORT_REPAIR_STEPS = 24  # of a short repair before it
 MAX_RESAMPLED = 4  # candidates that are resampled in a round
 
 
-def proposal_round(count: int, *, repair: bool, resample: int, noise: float, temperature: float = 1.0) -> list[Stage]:
+def proposal_round(
+    count: int, *, repair: bool, resample: int, noise: float, temperature: float = 1.0, between: Sequence[Stage] = ()
+) -> list[Stage]:
     """Return the stages of a round of proposals.
 
     Args:
@@ -26,8 +30,12 @@ def proposal_round(count: int, *, repair: bool, resample: int, noise: float, tem
         resample: How often colliding candidates are resampled.
         noise: How far they are noised for that, as a share of the schedule.
         temperature: Factor on the standard deviation of the proposals' initial noise.
+        between: Stages that follow on a short repair, which most candidates need no more than, before the long one.
     """
     stages: list[Stage] = [Propose(count, temperature)]
+    if repair and between:
+        stages.append(Repair(SHORT_REPAIR_STEPS, 0))
+    stages += between
     if repair:
         stages.append(Repair(MIN_REPAIR_STEPS, STEPS_PER_PATH * count))
     for _ in range(resample):

@@ -14,7 +14,7 @@ from apex_ompl.kernel.compiled.layout import Bytes, Singles
 
 @inlined
 def _four_rows(weight: Bytes, scale: Singles, bias: Singles, rows: Singles, b: int, out: Singles) -> None:
-    """Put four rows from ``b`` on into place; two rows of weights at a time make as many sums as there are registers."""
+    """Put four rows from ``b`` on into place, by two rows of weights at a time: eight sums stay in registers."""
     zero = np.float32(0.0)
     x0, x1, x2, x3 = rows[b], rows[b + 1], rows[b + 2], rows[b + 3]
     for first in range(0, len(weight), 2):

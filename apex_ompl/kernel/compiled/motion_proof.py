@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
-from apex_ompl.kernel.compiled.arrays import robot_view, scene_view
-from apex_ompl.kernel.compiled.compilation import entry_point, inlined
+from apex_ompl.kernel.compiled.arrays import RobotArrays, SceneArrays, robot_view, scene_view
+from apex_ompl.kernel.compiled.compilation import entry_point, inlined, outlined
 from apex_ompl.kernel.compiled.curve import piece_of
 from apex_ompl.kernel.compiled.layout import Floats, Integers, Singles
 from apex_ompl.kernel.compiled.motion_bound import bound_displacements
@@ -17,16 +17,9 @@ DONE = -1
 MOST_STEPS = 50_000_000
 
 
-@entry_point
-def lay_grid(path: Floats, resolution: float, starts: Integers) -> int:
-    """Lay a grid of states over a path, shape (N, dof), at most ``resolution`` apart [max-norm].
-
-    ``starts`` (N,) gets the numbers of the given states in the grid; from each to the next there are as many steps as
-    are needed, at least one.
-
-    Returns:
-        The number of the last state, or -1 for a path with numbers that are not finite, or with too many steps.
-    """
+@inlined
+def grid_over(path: Floats, resolution: float, starts: Integers) -> int:
+    """Lay a grid over a path, see :func:`lay_grid`."""
     starts[0] = 0
     for k in range(len(path) - 1):
         largest = 0.0
@@ -40,6 +33,19 @@ def lay_grid(path: Floats, resolution: float, starts: Integers) -> int:
             return -1
         starts[k + 1] = starts[k] + max(1, int(math.ceil(steps)))
     return int(starts[len(path) - 1])
+
+
+@entry_point
+def lay_grid(path: Floats, resolution: float, starts: Integers) -> int:
+    """Lay a grid of states over a path, shape (N, dof), at most ``resolution`` apart [max-norm].
+
+    ``starts`` (N,) gets the numbers of the given states in the grid; from each to the next there are as many steps as
+    are needed, at least one.
+
+    Returns:
+        The number of the last state, or -1 for a path with numbers that are not finite, or with too many steps.
+    """
+    return int(grid_over(path, resolution, starts))
 
 
 @inlined
@@ -88,28 +94,12 @@ def _set_motion(path: Floats, starts: Integers, a: int, b: int, middle: Floats, 
         w.deviation[i] += 1e-12
 
 
-@entry_point
-def prove_path(
-    ri: Integers, rf: Floats, si: Integers, sf: Floats, sg: Singles, wi: Integers, wf: Floats,
-    path: Floats, starts: Integers,
-    queue: Integers, ends: Integers, state: Floats, found: Integers, counts: Integers,
+@outlined
+def prove_grid(
+    t: RobotArrays, s: SceneArrays, w: Workspace, path: Floats, starts: Integers, queue: Integers, ends: Integers,
+    state: Floats, found: Integers, counts: Integers,
 ) -> int:  # fmt: skip
-    """Prove a path free, up to the first state that is not proved.
-
-    The path, shape (N, dof), carries a grid: vertex k is state ``starts[k]`` of it, shape (N,), with evenly spaced
-    states between. The grid is bisected breadth first. ``queue`` holds the open intervals, entries ``ends[0]`` to
-    ``ends[1]``; an interval (k, k) stands for state k alone. For each, the state in the middle is checked, then the
-    motion over the whole interval by the bounds on displacements; if that is not proved, its two halves are appended.
-
-    ``counts`` (5,) counts in the order of PROVED_STATES ... PROVED_STEPS.
-
-    Returns:
-        DONE, or the number of the state that is not proved: it is in ``state``, its pairs in ``found`` (K, 2) and
-        their number in ``ends[2]``, as in :func:`apex_ompl.kernel.compiled.queries.check_states`. Another call goes on
-        behind it.
-    """
-    t, s = robot_view(ri, rf), scene_view(si, sf, sg)
-    w = workspace_view(t, wi, wf)
+    """Prove a path free, up to the first state that is not proved, see :func:`prove_path`."""
     while ends[0] < ends[1]:
         a, b = queue[ends[0], 0], queue[ends[0], 1]
         ends[0] += 1
@@ -137,3 +127,28 @@ def prove_path(
             counts[OPEN_STATES] += 1
             return int(middle)
     return DONE
+
+
+@entry_point
+def prove_path(
+    ri: Integers, rf: Floats, si: Integers, sf: Floats, sg: Singles, wi: Integers, wf: Floats,
+    path: Floats, starts: Integers,
+    queue: Integers, ends: Integers, state: Floats, found: Integers, counts: Integers,
+) -> int:  # fmt: skip
+    """Prove a path free, up to the first state that is not proved.
+
+    The path, shape (N, dof), carries a grid: vertex k is state ``starts[k]`` of it, shape (N,), with evenly spaced
+    states between. The grid is bisected breadth first. ``queue`` holds the open intervals, entries ``ends[0]`` to
+    ``ends[1]``; an interval (k, k) stands for state k alone. For each, the state in the middle is checked, then the
+    motion over the whole interval by the bounds on displacements; if that is not proved, its two halves are appended.
+
+    ``counts`` (5,) counts in the order of PROVED_STATES ... PROVED_STEPS.
+
+    Returns:
+        DONE, or the number of the state that is not proved: it is in ``state``, its pairs in ``found`` (K, 2) and
+        their number in ``ends[2]``, as in :func:`apex_ompl.kernel.compiled.queries.check_states`. Another call goes on
+        behind it.
+    """
+    t, s = robot_view(ri, rf), scene_view(si, sf, sg)
+    w = workspace_view(t, wi, wf)
+    return int(prove_grid(t, s, w, path, starts, queue, ends, state, found, counts))

@@ -1,0 +1,92 @@
+"""Trees of states that grow towards each other in compiled code."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+from apex_ompl.kernel.compiled import tree_search
+from apex_ompl.kernel.kernel import Kernel
+from apex_ompl.types import Array
+
+AT_ONCE = 256  # random states between two looks at the clock
+ROOM = 1024  # nodes of a tree to begin with
+
+
+class TreePair:
+    """RRT-Connect on what a kernel proves, from some starts to some goals; it goes on where it stopped.
+
+    States that the kernel cannot prove free count as blocked (:mod:`apex_ompl.kernel.compiled.tree_search`).
+    """
+
+    def __init__(
+        self, kernel: Kernel, starts: Array, goals: Array, longest: float, resolution: float, rng: np.random.Generator
+    ) -> None:  # fmt: skip
+        """Plant the trees.
+
+        Args:
+            kernel: The robot among its obstacles, with the limits of the states.
+            starts: Roots of one tree, shape (N, dof); they are taken to be free.
+            goals: Roots of the other, shape (N, dof).
+            longest: Longest step [rad].
+            resolution: Largest spacing of the states that are checked along a step [rad, max-norm].
+            rng: Source of the random states.
+        """
+        self._kernel, self._longest, self._resolution, self._rng = kernel, longest, resolution, rng
+        dof, most = kernel.robot.dof, max(len(starts), len(goals))
+        self._sizes = np.array([len(starts), len(goals), 0], np.int64)
+        room = max(ROOM, 2 * most)
+        self._states, self._parents = np.zeros((2, dof, room)), np.full((2, room), -1, np.int64)
+        for tree, roots in enumerate((starts, goals)):
+            self._states[tree, :, : len(roots)] = roots.T
+        steps = math.ceil(longest / resolution) + 1
+        self._memory = (
+            np.empty(dof), np.empty((2, dof)), np.empty(2, np.int64), np.empty((2 * steps + 4, 2), np.int64),
+            np.empty(3, np.int64), np.empty(dof), np.empty((1, 2), np.int64), np.zeros(5, np.int64),
+        )  # fmt: skip
+        self._met, self._workspace = np.empty(2, np.int64), kernel.workspace()
+
+    @property
+    def size(self) -> int:
+        """Number of nodes."""
+        return int(self._sizes[:2].sum())
+
+    def grow(self, iterations: int, stop: Callable[[], bool] = lambda: False) -> Array | None:
+        """Return a path from a start to a goal, shape (N, dof), or None where the trees did not meet.
+
+        Args:
+            iterations: Number of random states.
+            stop: Asked from time to time whether to give up.
+        """
+        limits = self._kernel.robot.arrays
+        while iterations > 0 and not stop():
+            samples = self._rng.uniform(limits.lower, limits.upper, (min(iterations, AT_ONCE), len(limits.lower)))
+            iterations -= len(samples)
+            while len(samples):
+                used = tree_search.grow_trees(
+                    *self._kernel.packed, *self._workspace, samples, self._longest, self._resolution, self._states,
+                    self._parents, self._sizes, self._met, np.empty(self._states.shape[2]), *self._memory,
+                )  # fmt: skip
+                if self._met[0] >= 0:
+                    return self._path()
+                samples = samples[used:]
+                if len(samples):
+                    self._make_room()
+        return None
+
+    def _make_room(self) -> None:
+        self._states = np.ascontiguousarray(np.concatenate([self._states, np.zeros_like(self._states)], axis=2))
+        self._parents = np.ascontiguousarray(np.concatenate([self._parents, np.full_like(self._parents, -1)], axis=1))
+
+    def _path(self) -> Array:
+        """Return the path through the nodes at which the trees met."""
+        halves = []
+        for tree in range(2):
+            node, nodes = int(self._met[tree]), list[int]()
+            while node >= 0:
+                nodes.append(node)
+                node = int(self._parents[tree, node])
+            halves.append(self._states[tree][:, nodes].T)
+        return np.ascontiguousarray(np.concatenate([halves[0][::-1], halves[1][1:]]))
