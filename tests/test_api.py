@@ -190,7 +190,7 @@ def test_a_broken_checker_is_a_crash_status(problem: Problem, monkeypatch: pytes
         return honest(self, *arguments, **options)
 
     monkeypatch.setattr(CollisionChecker, "first_collision", breaks)
-    result = plan(problem, timeout=0.5)
+    result = plan(problem, "rrtconnect", timeout=0.5)
     assert result.status is PlanStatus.CRASH and "broken on purpose" in result.reason
 
 

@@ -39,6 +39,13 @@ def compiled_trees(context: SolveContext, starts: Array, goals: Array, tree_rang
     return TreePair(context.kernel, starts, goals, longest, SEARCH_RESOLUTION, context.rng.spawn(1)[0])
 
 
+def grow(context: SolveContext, trees: TreePair, iterations: int) -> Array | None:
+    """Return the path of compiled trees after some more iterations, or None; count what they looked at."""
+    found = trees.grow(iterations, context.stop)
+    context.count(trees.take_counts())
+    return found
+
+
 def bridge_blocked(
     context: SolveContext, states: Array, tree_range: float, *, calls: int = MAX_CALLS
 ) -> Array | None:  # fmt: skip
@@ -89,7 +96,7 @@ def every_other(states: Array) -> Array:
 def _bridge(context: SolveContext, a: Array, b: Array, tree_range: float, calls: int) -> Array | None:
     """Return a path of RRT-Connect between two free states, or None."""
     if context.validator.exclusive:
-        found = compiled_trees(context, a[None], b[None], tree_range).grow(calls, context.stop)
+        found = grow(context, compiled_trees(context, a[None], b[None], tree_range), calls)
         if found is not None:
             return found
         calls //= LESS

@@ -22,6 +22,7 @@ from apex_ompl.types import Array
 if TYPE_CHECKING:
     from apex_ompl.apex.sampler import ProposalSampler
     from apex_ompl.diffusion.query import Query
+    from apex_ompl.kernel.search_buffers import SearchCounts
     from apex_ompl.kernel.trees import TreePair
 
 MIN_GAIN = 1e-3  # least decrease of length that counts as an improvement [rad]
@@ -91,6 +92,14 @@ class SolveContext:
             with self.report.timed("query"):
                 self._queries = [make_query(self.validator.checker, a, b, point=point) for a, b in self.pairs]
         return self._queries
+
+    def count(self, looked: SearchCounts) -> None:
+        """Add what a search in compiled code looked at to the checker's counts."""
+        counts = self.validator.checker.check_counts
+        counts.proved += looked.proved
+        counts.blocked += looked.blocked
+        counts.intervals += looked.intervals
+        counts.proved_intervals += looked.proved_intervals
 
     def stop(self) -> bool:
         """Whether time is up."""

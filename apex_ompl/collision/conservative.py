@@ -53,6 +53,7 @@ class CheckCounts:
         proved: States that the spheres proved free.
         meshes: States that the meshes checked.
         colliding: States that balls inside of bodies proved to collide.
+        blocked: States that the spheres do not prove free, which searches in compiled code take for blocked.
         intervals: Intervals of motions that the spheres tried to prove as a whole.
         proved_intervals: Those that they proved.
         steps: Steps between the states of motions.
@@ -62,6 +63,7 @@ class CheckCounts:
     proved: int = 0
     meshes: int = 0
     colliding: int = 0
+    blocked: int = 0
     intervals: int = 0
     proved_intervals: int = 0
     steps: int = 0
@@ -70,7 +72,7 @@ class CheckCounts:
     @property
     def states(self) -> int:
         """States that were checked one by one."""
-        return self.proved + self.meshes + self.colliding
+        return self.proved + self.meshes + self.colliding + self.blocked
 
 
 def _numbered(tables: RobotTables, before: Sequence[int], now: Sequence[int]) -> RobotTables:

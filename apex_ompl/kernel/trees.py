@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 
 import numpy as np
 
 from apex_ompl.kernel.compiled import tree_search
 from apex_ompl.kernel.kernel import Kernel
+from apex_ompl.kernel.search_buffers import SearchBuffers, SearchCounts
 from apex_ompl.types import Array
 
 AT_ONCE = 256  # random states between two looks at the clock
@@ -41,17 +41,17 @@ class TreePair:
         self._states, self._parents = np.zeros((2, dof, room)), np.full((2, room), -1, np.int64)
         for tree, roots in enumerate((starts, goals)):
             self._states[tree, :, : len(roots)] = roots.T
-        steps = math.ceil(longest / resolution) + 1
-        self._memory = (
-            np.empty(dof), np.empty((2, dof)), np.empty(2, np.int64), np.empty((2 * steps + 4, 2), np.int64),
-            np.empty(3, np.int64), np.empty(dof), np.empty((1, 2), np.int64), np.zeros(5, np.int64),
-        )  # fmt: skip
-        self._met, self._workspace = np.empty(2, np.int64), kernel.workspace()
+        self._buffers = SearchBuffers(kernel, longest, resolution)
+        self._met, self._target = np.empty(2, np.int64), np.empty(dof)
 
     @property
     def size(self) -> int:
         """Number of nodes."""
         return int(self._sizes[:2].sum())
+
+    def take_counts(self) -> SearchCounts:
+        """Return what was looked at since the last call."""
+        return self._buffers.take_counts()
 
     def grow(self, iterations: int, stop: Callable[[], bool] = lambda: False) -> Array | None:
         """Return a path from a start to a goal, shape (N, dof), or None where the trees did not meet.
@@ -66,8 +66,9 @@ class TreePair:
             iterations -= len(samples)
             while len(samples):
                 used = tree_search.grow_trees(
-                    *self._kernel.packed, *self._workspace, samples, self._longest, self._resolution, self._states,
-                    self._parents, self._sizes, self._met, np.empty(self._states.shape[2]), *self._memory,
+                    *self._kernel.packed, *self._buffers.workspace, samples, self._longest, self._resolution,
+                    self._states, self._parents, self._sizes, self._met, np.empty(self._states.shape[2]), self._target,
+                    *self._buffers.proof,
                 )  # fmt: skip
                 if self._met[0] >= 0:
                     return self._path()

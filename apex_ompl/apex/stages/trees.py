@@ -13,7 +13,7 @@ import numpy as np
 from ompl import base as ob
 from ompl import geometric as og
 
-from apex_ompl.apex.bridge import bridge_blocked, compiled_trees, make_tree
+from apex_ompl.apex.bridge import bridge_blocked, compiled_trees, grow, make_tree
 from apex_ompl.apex.context import SolveContext
 from apex_ompl.apex.stages.stage import Solution
 from apex_ompl.ompl_adapter.space import path_to_array, to_state
@@ -51,7 +51,7 @@ class Sprint:
         if context.pair_trees is None:
             start, goal = context.pairs[0]
             context.pair_trees = compiled_trees(context, start[None], goal[None], self.tree_range)
-        states = context.pair_trees.grow(self.iterations, context.stop)
+        states = grow(context, context.pair_trees, self.iterations)
         if states is not None:
             context.pair_trees = None
         return states
@@ -97,7 +97,7 @@ class GrowTrees:
             trees = compiled_trees(context, np.array(context.starts), np.array(context.goals), self.tree_range)
         context.all_pair_trees = trees
         with context.report.timed("rrtconnect"):
-            states = trees.grow(iterations, context.stop)
+            states = grow(context, trees, iterations)
         if states is None:
             return None
         context.all_pair_trees = None

@@ -129,6 +129,23 @@ def prove_grid(
     return DONE
 
 
+@inlined
+def is_motion_proved(
+    t: RobotArrays, s: SceneArrays, w: Workspace, motion: Floats, resolution: float, starts: Integers, queue: Integers,
+    ends: Integers, state: Floats, found: Integers, counts: Integers,
+) -> bool:  # fmt: skip
+    """Whether a straight motion, shape (2, dof), is proved free behind its first state, its last state first.
+
+    Buffers are those of :func:`prove_path`; a motion of more states than there is room for is not proved.
+    """
+    last = grid_over(motion, resolution, starts)
+    if last < 0 or len(queue) < 2 * last + 4:
+        return False
+    queue[0, 0] = queue[0, 1] = queue[1, 1] = last
+    queue[1, 0], ends[0], ends[1] = 0, 0, 2
+    return bool(prove_grid(t, s, w, motion, starts, queue, ends, state, found, counts) == DONE)
+
+
 @entry_point
 def prove_path(
     ri: Integers, rf: Floats, si: Integers, sf: Floats, sg: Singles, wi: Integers, wf: Floats,

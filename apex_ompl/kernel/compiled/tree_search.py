@@ -12,11 +12,11 @@ from __future__ import annotations
 
 import math
 
-from apex_ompl.kernel.compiled.arrays import RobotArrays, SceneArrays, robot_view, scene_view
+from apex_ompl.kernel.compiled.arrays import robot_view, scene_view
 from apex_ompl.kernel.compiled.compilation import entry_point, inlined
 from apex_ompl.kernel.compiled.layout import Floats, Integers, Singles
-from apex_ompl.kernel.compiled.motion_proof import DONE, grid_over, prove_grid
-from apex_ompl.kernel.compiled.workspace import Workspace, workspace_view
+from apex_ompl.kernel.compiled.motion_proof import is_motion_proved
+from apex_ompl.kernel.compiled.workspace import workspace_view
 
 
 @inlined
@@ -35,20 +35,6 @@ def _nearest(states: Floats, count: int, q: Floats, squares: Floats) -> int:
         if room[n] < room[best]:
             best = n
     return best
-
-
-@inlined
-def _is_proved(
-    t: RobotArrays, s: SceneArrays, w: Workspace, motion: Floats, resolution: float, starts: Integers, queue: Integers,
-    ends: Integers, state: Floats, found: Integers, counts: Integers,
-) -> bool:  # fmt: skip
-    """Whether a straight motion, shape (2, dof), is proved free behind its first state."""
-    last = grid_over(motion, resolution, starts)
-    if last < 0 or len(queue) < 2 * last + 4:
-        return False
-    queue[0, 0] = queue[0, 1] = queue[1, 1] = last
-    queue[1, 0], ends[0], ends[1] = 0, 0, 2
-    return bool(prove_grid(t, s, w, motion, starts, queue, ends, state, found, counts) == DONE)
 
 
 @entry_point
@@ -110,7 +96,7 @@ def grow_trees(
             share = 1.0 if square <= longest * longest else longest / math.sqrt(square)
             for i in range(dof):
                 motion[1, i] = target[i] if share == 1.0 else motion[0, i] + share * (target[i] - motion[0, i])
-            if not _is_proved(t, s, w, motion, resolution, starts, queue, ends, state, found, counts):
+            if not is_motion_proved(t, s, w, motion, resolution, starts, queue, ends, state, found, counts):
                 break
             node = sizes[tree]
             for i in range(dof):
