@@ -23,7 +23,7 @@ from apex_ompl.kernel import Kernel
 from apex_ompl.kernel.compiled.arrays import robot_view, scene_view
 from apex_ompl.kernel.scene_builder import scene_tables
 from apex_ompl.kernel.tables import RobotTables
-from apex_ompl.robot import Robot
+from apex_ompl.robot import Robot, load_robot
 from apex_ompl.scene.bodies import Obstacle
 
 
@@ -175,3 +175,29 @@ def test_a_pair_can_be_left_out(robot: Robot) -> None:
         whole.robot.without_pair("no_such_body", a)
     with pytest.raises(ParameterError, match="joints"):
         whole.robot.restricted_to([99])
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 10**6), st.sampled_from(["dual_panda_softhand", "baxter"]))
+def test_balls_of_pairs_hold_the_bodies_that_they_are_about(seed: int, name: str) -> None:
+    robot, rng = load_robot(name), np.random.default_rng(seed)
+    tables = CollisionChecker(robot).kernel.robot
+    a, kernel = tables.arrays, CollisionChecker(robot).kernel
+    q = rng.uniform(a.lower, a.upper)[None]
+    rotation, origin = (frames[0] for frames in kernel.joint_frames(q))
+    ends = np.append(a.body_root, len(a.node_first))
+    smaller = 0
+    for p, clusters in enumerate(a.pair_clusters):
+        first, count = a.pair_bodies[p]
+        for side, cluster in enumerate(clusters):
+            joint = a.cluster_joint[cluster]
+            centre = rotation[joint] @ a.pair_ball[p, side, :3] + origin[joint]
+            smaller += a.pair_ball[p, side, 3] < 0.9 * a.cluster_ball[cluster, 3]
+            for body in np.unique(a.bodies[first : first + count, side]):
+                nodes = np.arange(ends[body], ends[body + 1])
+                where = a.node_centre[nodes] @ rotation[a.body_joint[body]].T + origin[a.body_joint[body]]
+                away = np.linalg.norm(where - centre, axis=1)
+                assert away[0] + a.node_radius[nodes[0]] <= a.pair_ball[p, side, 3]
+                leaves = a.node_count[nodes] == 0
+                assert (away + a.node_radius[nodes])[leaves].max() <= a.pair_outer[p, side]
+    assert smaller > 0 or name == "baxter"

@@ -127,8 +127,9 @@ def obstacles_alone(kernel: Kernel, chosen: Flags) -> Kernel:
     """Return a kernel that checks a robot against some obstacles, shape (obstacles,), and not against itself."""
     bodies, scene = kernel.robot.arrays, kernel.scene.arrays
     bodies = bodies._replace(
-        pair_clusters=bodies.pair_clusters[:0], pair_common=bodies.pair_common[:0], pair_bodies=bodies.pair_bodies[:0]
-    )
+        pair_clusters=bodies.pair_clusters[:0], pair_common=bodies.pair_common[:0], pair_bodies=bodies.pair_bodies[:0],
+        pair_ball=bodies.pair_ball[:0], pair_outer=bodies.pair_outer[:0],
+    )  # fmt: skip
     robot = replace(kernel.robot, arrays=bodies)
     solids = [(int(scene.owner[k]), primitive(kernel.scene, int(k))) for k in np.flatnonzero(chosen)]
     tables = scene_tables(solids)

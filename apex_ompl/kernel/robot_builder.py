@@ -14,6 +14,9 @@ from apex_ompl.kernel.robot_specs import BodySpec
 from apex_ompl.kernel.tables import RobotTables
 from apex_ompl.types import Array
 
+PairRow = tuple[tuple[int, int], int, list[tuple[int, int]]]
+"""Two clusters, their lowest common joint, and the pairs of their bodies."""
+
 
 def robot_tables(
     name: str,
@@ -79,6 +82,7 @@ class _Builder:
         outer = [self.tree.outer_radii(c, b) for c, b in zip(self.centres, bodies, strict=True)]
         balls = [self._ball(c, outer) for c in range(len(self.clusters))]
         pair_rows = self._pairs(pairs)
+        pair_balls = self._pair_balls(pair_rows, balls, outer)
         arrays = RobotArrays(
             joint_parent=_ints([j.parent for j in joints]),
             joint_kind=_ints([j.kind for j in joints]),
@@ -113,6 +117,8 @@ class _Builder:
             node_outer=np.concatenate([np.empty(0), *outer]),
             body_inner=_spans([len(balls) for balls in self.inner]),
             inner_ball=np.concatenate([np.empty((0, 4)), *self.inner]),
+            pair_ball=np.array([[[*b.centre, b.radius] for b in two] for two in pair_balls]).reshape(-1, 2, 4),
+            pair_outer=np.array([[b.outer for b in two] for two in pair_balls]).reshape(-1, 2),
         )
         return RobotTables(name, joint_names, tuple(b.name for b in bodies), tuple(numbers[b] for b in rows), arrays)
 
@@ -121,7 +127,7 @@ class _Builder:
         sources = [joint.source for joint in joints if joint.kind != FIXED]
         return sources[0] if sources else -1
 
-    def _pairs(self, pairs: Sequence[tuple[int, int]]) -> list[tuple[tuple[int, int], int, list[tuple[int, int]]]]:
+    def _pairs(self, pairs: Sequence[tuple[int, int]]) -> list[PairRow]:
         """Return pairs of clusters with their lowest common joint and the pairs of bodies."""
         rows: dict[tuple[int, int], list[tuple[int, int]]] = {}
         for a, b in pairs:
@@ -134,11 +140,31 @@ class _Builder:
             found.append(((c, d), common, sorted(members)))
         return found
 
-    def _ball(self, cluster: int, outer: Sequence[Array]) -> ClusterBall:
+    def _pair_balls(
+        self, pairs: Sequence[PairRow], balls: Sequence[ClusterBall], outer: Sequence[Array]
+    ) -> list[list[ClusterBall]]:
+        """Return for each pair of clusters balls around the bodies that it is about, of rigid clusters their own."""
+        known: dict[frozenset[int], ClusterBall] = {}
+        found = []
+        for clusters, _, members in pairs:
+            two = []
+            for cluster, rows in zip(clusters, zip(*members, strict=True), strict=True):
+                some = frozenset(rows)
+                if not self.lazy[cluster] or len(some) == self.cluster_of.count(cluster):
+                    two.append(balls[cluster])
+                    continue
+                if some not in known:
+                    known[some] = self._ball(cluster, outer, some)
+                two.append(known[some])
+            found.append(two)
+        return found
+
+    def _ball(self, cluster: int, outer: Sequence[Array], some: frozenset[int] | None = None) -> ClusterBall:
+        """Return the ball around a cluster, or some bodies of it."""
         members = [
             Member(b.joint, self.centres[k], np.asarray(b.radii, float), outer[k])
             for k, b in enumerate(self.bodies)
-            if self.cluster_of[k] == cluster
+            if self.cluster_of[k] == cluster and (some is None or k in some)
         ]
         dof = self._dof(cluster)
         limits = None if dof < 0 else (float(self.lower[dof]) - LIMIT_SLACK, float(self.upper[dof]) + LIMIT_SLACK)

@@ -21,7 +21,8 @@ from apex_ompl.util.files import is_file, write_atomically
 from apex_ompl.util.validation import check_indices
 
 SCHEMA = "apex-ompl/kernel-tables/1"
-STORED = tuple(name for name in RobotArrays._fields if name not in {"body_inner", "inner_ball"})
+MADE = {"body_inner", "inner_ball", "pair_ball", "pair_outer"}  # which make the checks faster, and are not stored
+STORED = tuple(name for name in RobotArrays._fields if name not in MADE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,6 +81,8 @@ class RobotTables:
             pair_clusters=a.pair_clusters[pairs],
             pair_common=a.pair_common[pairs],
             pair_bodies=a.pair_bodies[pairs],
+            pair_ball=a.pair_ball[pairs],
+            pair_outer=a.pair_outer[pairs],
         )
         return RobotTables(self.name, self.joint_names, self.body_names, self.numbers, arrays)
 
@@ -101,7 +104,7 @@ class RobotTables:
         return RobotTables(self.name, self.joint_names, self.body_names, self.numbers, arrays)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the tables as a NumPy ``.npz`` file, under a temporary name first; balls inside of bodies are left out.
+        """Write the tables as a NumPy ``.npz`` file, under a temporary name first; MADE are left out.
 
         Raises:
             MissingFileError: The folder is missing or cannot be written.
@@ -137,6 +140,8 @@ class RobotTables:
             raise FileFormatError(str(path), "", type(error).__name__, "expected kernel tables (.npz)") from error
         arrays["body_inner"] = np.zeros((len(arrays["body_joint"]), 2), np.int64)
         arrays["inner_ball"] = np.empty((0, 4))
+        pairs = len(arrays["pair_clusters"])
+        arrays |= {"pair_ball": np.zeros((pairs, 2, 4)), "pair_outer": np.zeros((pairs, 2))}
         found = head.get("schema") if isinstance(head, dict) else head
         if found != SCHEMA:
             raise FileFormatError(str(path), "schema", found, f"expected {SCHEMA!r}")
@@ -151,6 +156,8 @@ class RobotTables:
         if fault:
             raise FileFormatError(str(path), fault, "values that do not fit", "expected tables that fit each other")
         joints, bodies, numbers = (tuple(head[key]) for key in ("joints", "bodies", "numbers"))
+        clusters = arrays["pair_clusters"]
+        arrays |= {"pair_ball": arrays["cluster_ball"][clusters], "pair_outer": arrays["cluster_outer"][clusters]}
         return cls(head["name"], joints, bodies, numbers, RobotArrays(**arrays))
 
 

@@ -40,6 +40,10 @@ class RobotArrays(NamedTuple):
     A node is a sphere (``node_centre`` in the frame of its body's joint, ``node_radius``) around the part of the solid
     that the leaves below cover; ``node_outer`` is a radius around the leaves themselves. ``body_inner`` says which of
     ``inner_ball`` are inside of a body's solid, in the frame of its joint.
+
+    ``pair_ball`` holds, for both clusters of a pair, what ``cluster_ball`` does, around the bodies alone that the pair
+    is about, ``pair_outer`` the radius around their leaf spheres: fingers are checked against a wrist, the palm, which
+    is fixed to it, is not.
     """
 
     joint_parent: Integers
@@ -75,6 +79,8 @@ class RobotArrays(NamedTuple):
     node_outer: Floats
     body_inner: Spans
     inner_ball: Balls
+    pair_ball: Annotated[Floats, 2, 4]
+    pair_outer: Annotated[Floats, 2]
 
 
 class SceneArrays(NamedTuple):

@@ -68,8 +68,8 @@ def _nearest_of_pair(t: RobotArrays, w: Workspace, q: Floats, p: int, margin: fl
     if a == b:
         place_cluster(t, w, q, a)
     else:
-        reach_a, reach_b = t.cluster_outer[a] + margin, t.cluster_outer[b] + margin
-        if apart - t.cluster_outer[b] >= reach_a or not mark_pair(t, w, q, t.node_outer, a, b, reach_a, reach_b):
+        far = apart - t.cluster_outer[b] >= t.cluster_outer[a] + margin
+        if far or not mark_pair(t, w, q, True, p, margin):
             return near
     first = t.pair_bodies[p, 0]
     for k in range(first, first + t.pair_bodies[p, 1]):

@@ -78,10 +78,11 @@ def place_cluster(t: RobotArrays, w: Workspace, q: Floats, c: int) -> None:
 
 
 @inlined
-def is_near_ball(t: RobotArrays, w: Workspace, radii: Floats, b: int, c: int, reach: float) -> bool:
-    """Whether leaves of a body, as spheres of ``radii``, are within ``reach`` of the centre of a cluster's ball."""
+def is_near_ball(
+    t: RobotArrays, w: Workspace, radii: Floats, b: int, u: float, v: float, r: float, reach: float
+) -> bool:
+    """Whether leaves of a body, as spheres of ``radii``, are within ``reach`` of a point of the world."""
     j, top = t.body_joint[b], 1
-    u, v, r = w.ball[c, 0], w.ball[c, 1], w.ball[c, 2]
     w.stack[0] = t.body_root[b]
     while top > 0:
         top -= 1
@@ -99,8 +100,10 @@ def is_near_ball(t: RobotArrays, w: Workspace, radii: Floats, b: int, c: int, re
 
 
 @inlined
-def mark_near(t: RobotArrays, w: Workspace, q: Floats, radii: Floats, c: int, other: int, reach: float) -> bool:
-    """Mark the bodies of a cluster that are within ``reach`` of the centre of another's ball; whether there are any.
+def mark_near(
+    t: RobotArrays, w: Workspace, q: Floats, radii: Floats, c: int, u: float, v: float, r: float, reach: float
+) -> bool:
+    """Mark the bodies of a cluster that are within ``reach`` of a point of the world; whether there are any.
 
     A body of a cluster of several is looked at as its root sphere alone. What is not a number counts as near.
     """
@@ -108,9 +111,8 @@ def mark_near(t: RobotArrays, w: Workspace, q: Floats, radii: Floats, c: int, ot
     first, count = t.cluster_bodies[c, 0], t.cluster_bodies[c, 1]
     if count == 1:
         w.near[first] = 1
-        return is_near_ball(t, w, radii, first, other, reach)
+        return is_near_ball(t, w, radii, first, u, v, r, reach)
     found = False
-    u, v, r = w.ball[other, 0], w.ball[other, 1], w.ball[other, 2]
     for b in range(first, first + count):
         apart = radii[t.body_root[b]] + reach
         far = (w.root[b, 0] - u) ** 2 + (w.root[b, 1] - v) ** 2 + (w.root[b, 2] - r) ** 2 > apart * apart
@@ -120,23 +122,31 @@ def mark_near(t: RobotArrays, w: Workspace, q: Floats, radii: Floats, c: int, ot
 
 
 @inlined
-def mark_pair(
-    t: RobotArrays, w: Workspace, q: Floats, radii: Floats, a: int, b: int, reach_a: float, reach_b: float
-) -> bool:
-    """Mark the bodies of two clusters that are near the other's ball; False where no two can be.
+def mark_pair(t: RobotArrays, w: Workspace, q: Floats, leaves: bool, p: int, reach: float) -> bool:
+    """Mark the bodies of a pair of clusters that are near the ball around the other's; False where no two can be.
 
-    A cluster with inner joints is placed last, and only where the other is near its ball.
+    A cluster with inner joints is placed last, and only where the other is near the ball around those of its bodies
+    that the pair is about.
 
     Args:
         t: The robot.
         w: Workspace.
         q: The state.
-        radii: Radius of each node that counts [m].
-        a: A cluster.
-        b: Another cluster.
-        reach_a: Radius around the first one's ball within which the spheres of the second are near [m].
-        reach_b: Radius around the second one's ball [m].
+        leaves: Whether the balls are those around leaf spheres, else those around the solids.
+        p: The pair.
+        reach: Distance of spheres within which they are near [m].
     """
-    if t.cluster_lazy[a, 1] > t.cluster_lazy[b, 1]:
-        return mark_near(t, w, q, radii, b, a, reach_a) and mark_near(t, w, q, radii, a, b, reach_b)
-    return mark_near(t, w, q, radii, a, b, reach_b) and mark_near(t, w, q, radii, b, a, reach_a)
+    first = 0 if t.cluster_lazy[t.pair_clusters[p, 0], 1] <= t.cluster_lazy[t.pair_clusters[p, 1], 1] else 1
+    a, b = t.pair_clusters[p, first], t.pair_clusters[p, 1 - first]
+    radii = t.node_outer if leaves else t.node_radius
+    x, y, z = w.ball[b, 0], w.ball[b, 1], w.ball[b, 2]
+    if t.cluster_lazy[b, 1] > 0:
+        x, y, z = point_position(w, t.cluster_joint[b], t.pair_ball[p, 1 - first])
+    radius = t.pair_outer[p, 1 - first] if leaves else t.pair_ball[p, 1 - first, 3]
+    if not mark_near(t, w, q, radii, a, x, y, z, radius + reach):
+        return False
+    x, y, z = w.ball[a, 0], w.ball[a, 1], w.ball[a, 2]
+    if t.cluster_lazy[a, 1] > 0:
+        x, y, z = point_position(w, t.cluster_joint[a], t.pair_ball[p, first])
+    radius = t.pair_outer[p, first] if leaves else t.pair_ball[p, first, 3]
+    return mark_near(t, w, q, radii, b, x, y, z, radius + reach)

@@ -129,8 +129,7 @@ def unproved_between_bodies(t: RobotArrays, w: Workspace, q: Floats, found: Inte
             u, v = w.ball[a], w.ball[b]
             if (u[0] - v[0]) ** 2 + (u[1] - v[1]) ** 2 + (u[2] - v[2]) ** 2 > apart * apart:
                 continue
-            reach_a, reach_b = t.cluster_ball[a, 3] + shift, t.cluster_ball[b, 3] + shift
-            if not mark_pair(t, w, q, t.node_radius, a, b, reach_a, reach_b):
+            if not mark_pair(t, w, q, False, p, shift):
                 continue
         else:
             place_cluster(t, w, q, a)

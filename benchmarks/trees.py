@@ -1,0 +1,98 @@
+"""Trees in compiled code beside OMPL's RRTConnect: the same problems, step, resolution and time, nodes a second.
+
+OMPL's asks this project's validator for each motion, as it does in every comparison with ``rrtconnect``. Compiled trees
+take for blocked what the spheres do not prove free; how many of their paths pass the full proof as they are is a column
+for both.
+
+Usage: python benchmarks/trees.py [-n 6] [--seeds 2]
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from typing import Any
+
+import numpy as np
+import record
+from apex_profile import HARD
+from ompl import base as ob
+from tqdm import tqdm
+
+from apex_ompl import problems
+from apex_ompl.apex.bridge import make_tree
+from apex_ompl.kernel.trees import TreePair
+from apex_ompl.ompl_adapter.process import quiet_ompl, seed_ompl
+from apex_ompl.ompl_adapter.setup import PlanningSetup, assemble
+from apex_ompl.ompl_adapter.space import path_to_array, to_state
+from apex_ompl.planners.tuned import TUNED
+from apex_ompl.types import Array
+from apex_ompl.util.entry_point import run_script
+from apex_ompl.util.resolution import SEARCH_RESOLUTION
+from apex_ompl.util.validation import one_or_more
+
+DEPENDS = ("@planning",)
+TIMEOUT = 5.0  # [s]
+RANGE = TUNED["apex"]["range"]
+KINDS = ("OMPL's", "compiled")
+
+
+def of_ompl(ready: PlanningSetup, seed: int) -> tuple[Array | None, int]:
+    """Return the path of OMPL's trees, or None, and their number of nodes."""
+    seed_ompl(seed)
+    si = ready.simple_setup.getSpaceInformation()
+    pdef = ob.ProblemDefinition(si)
+    pdef.setStartAndGoalStates(to_state(si, ready.start), to_state(si, ready.valid_goals[0]))
+    tree = make_tree(si, pdef, RANGE)
+    solved = tree.solve(TIMEOUT).getStatus() == ob.PlannerStatus.EXACT_SOLUTION
+    data = ob.PlannerData(si)
+    tree.getPlannerData(data)
+    return (path_to_array(pdef.getSolutionPath(), len(ready.start)) if solved else None), data.numVertices()
+
+
+def compiled(ready: PlanningSetup, seed: int) -> tuple[Array | None, int]:
+    """Return the path of compiled trees, or None, and their number of nodes."""
+    began = time.perf_counter()
+    ends = ready.start[None], ready.valid_goals[:1]
+    trees = TreePair(ready.checker.kernel, *ends, RANGE, SEARCH_RESOLUTION, np.random.default_rng(seed))
+    found = trees.grow(10**9, lambda: time.perf_counter() - began > TIMEOUT)
+    return found, trees.size
+
+
+def main() -> None:
+    """Measure, and write the results."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("-n", type=one_or_more, default=6, help="problems of a level (default: %(default)s)")
+    parser.add_argument("--seeds", type=one_or_more, default=2, help="seeds of each (default: %(default)s)")
+    args = parser.parse_args()
+    names = [n for level in HARD for n in problems.frozen_names(*level.split("/"), "validation")[: args.n]]
+    found: dict[str, list[dict[str, Any]]] = {kind: [] for kind in KINDS}
+    with quiet_ompl():
+        for name in tqdm(names, unit="problem"):
+            ready = assemble(problems.load(name), seed=0)
+            ready.checker.prepare()
+            for seed in range(args.seeds):
+                for kind, grow in zip(KINDS, (of_ompl, compiled), strict=True):
+                    began = time.perf_counter()
+                    path, nodes = grow(ready, seed + 1)
+                    took = time.perf_counter() - began
+                    whole = path is not None and bool(ready.checker.prove(path, tolerance=0.0))
+                    found[kind].append({"solved": path is not None, "whole": whole, "nodes": nodes, "seconds": took})
+    head = ["trees", "N", "solved", "paths proved as they are", "ms p50", "p95", "mean", "nodes", "nodes a second"]
+    rows: list[list[Any]] = [head, ["---", *["---:"] * (len(head) - 1)]]
+    rates = {}
+    for kind, runs in found.items():
+        seconds = [run["seconds"] for run in runs]
+        nodes = sum(run["nodes"] for run in runs)
+        rates[kind] = nodes / sum(seconds)
+        p50, p95 = record.percentiles(seconds, 50, 95)
+        shares = [f"{np.mean([run[key] for run in runs]):.3f}" for key in ("solved", "whole")]
+        times = [f"{1e3 * v:.0f}" for v in (p50, p95, float(np.mean(seconds)))]
+        rows.append([kind, len(runs), *shares, *times, nodes, f"{rates[kind]:.0f}"])
+    text = "\n".join(record.row(row) for row in rows)
+    text += f"\n\n{rates['compiled'] / rates[KINDS[0]]:.1f} times as many nodes a second."
+    record.write("trees", found, text, split="validation", range=RANGE, resolution=SEARCH_RESOLUTION)
+
+
+if __name__ == "__main__":
+    run_script(main)

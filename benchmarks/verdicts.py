@@ -1,0 +1,92 @@
+"""Answers of this checkout's checker beside another one's: the same states and motions, answer by answer.
+
+States are drawn over the limits, and around starts and goals of validation problems. Compared are whether each is free
+(the kernel, and Coal's meshes for what it leaves), and the share that the kernel alone proves free; of short motions,
+the share that it proves.
+
+Usage: python benchmarks/verdicts.py FOLDER [--states 1000000]
+FOLDER is another checkout, ``git worktree add FOLDER COMMIT`` makes one.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import record
+
+from apex_ompl.util import provenance
+from apex_ompl.util.entry_point import run_script
+from apex_ompl.util.validation import one_or_more
+
+DEPENDS = ("@checking",)
+SUITES, LEVELS, SEEDS = ("shelf", "bins", "cage", "posts", "wall", "clutter", "swap"), ("medium", "hard"), (0, 1, 2)
+MOTIONS = 1000  # of a problem
+ANSWERS = """
+import sys
+import numpy as np
+from apex_ompl import problems
+from apex_ompl.collision import CollisionChecker
+from apex_ompl.problems.suite_robot import robot
+out, each, motions, names = sys.argv[1], int(sys.argv[2]), int(sys.argv[3]), sys.argv[4:]
+limits, dof = robot().limits, robot().dof
+free, proved, moves = [], 0, 0
+for seed, name in enumerate(names):
+    problem, rng = problems.load(name), np.random.default_rng(seed)
+    checker = CollisionChecker(robot(), problem.scene, problem.attached)
+    ends = problem.start_state(robot().joint_names), problem.goal_states(robot().joint_names)[0]
+    drawn = [rng.uniform(limits.lower, limits.upper, (each - 2 * (each // 4), dof))]
+    drawn += [end + 0.3 * rng.normal(size=(each // 4, dof)) for end in ends]
+    states = np.clip(np.concatenate(drawn), limits.lower, limits.upper)
+    rng.shuffle(states)
+    free.append(checker.are_free(states))
+    proved += int((checker.kernel.unproved(states)[1] == 0).sum())
+    for a, b in zip(states[:motions], states[1:motions + 1]):
+        moves += checker.kernel.proves(np.stack([a, a + 0.1 * (b - a)]), 0.031)
+np.savez(out, free=np.concatenate(free), proved=proved, moves=moves)
+"""
+
+
+def main() -> None:
+    """Compare, and write the results."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("folder", type=Path, help="another checkout, which is 'before'")
+    parser.add_argument("--states", type=one_or_more, default=1_000_000, help="(default: %(default)s)")
+    args = parser.parse_args()
+    if not (args.folder / "apex_ompl" / "__init__.py").is_file():
+        parser.error(f"{args.folder} is no checkout of this project: expected a folder with apex_ompl/__init__.py")
+    names = [f"{suite}/{level}/80000{k}" for suite in SUITES for level in LEVELS for k in SEEDS]
+    each = -(-args.states // len(names))
+    with tempfile.TemporaryDirectory() as made:
+        running = []
+        for label, folder in (("before", args.folder.resolve()), ("after", record.ROOT)):
+            command = [sys.executable, "-c", ANSWERS, str(Path(made) / f"{label}.npz"), str(each), str(MOTIONS), *names]
+            environment = os.environ | {"PYTHONPATH": str(folder), "OMP_NUM_THREADS": "1"}
+            running.append(subprocess.Popen(command, cwd=folder, env=environment, stderr=subprocess.DEVNULL))
+        if any([process.wait() for process in running]):
+            raise SystemExit("a process has failed: is the folder a checkout of this project?")
+        before, after = (dict(np.load(Path(made) / f"{label}.npz")) for label in ("before", "after"))
+    states, moves = len(after["free"]), MOTIONS * len(names)
+    other = int((before["free"] != after["free"]).sum())
+    head = ["", "N", "before", "after", "answered differently"]
+    rows = [head, ["---", *["---:"] * 4]]
+    rows.append(["free states", states, int(before["free"].sum()), int(after["free"].sum()), other])
+    rows.append(["of these proved by the kernel", states, int(before["proved"]), int(after["proved"]), ""])
+    rows.append(["short motions proved by the kernel", moves, int(before["moves"]), int(after["moves"]), ""])
+    figures = {"states": states, "different": other, "motions": moves}
+    figures |= {
+        f"{k} {label}": int(v[k]) for label, v in (("before", before), ("after", after)) for k in ("proved", "moves")
+    }
+    record.write(
+        "verdicts", figures, "\n".join(record.row(row) for row in rows), split="validation", problems=len(names),
+        before=provenance.commit(args.folder.resolve(), ["apex_ompl"]),
+    )  # fmt: skip
+
+
+if __name__ == "__main__":
+    run_script(main)
