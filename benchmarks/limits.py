@@ -23,10 +23,10 @@ import record
 from apex_ompl import load_model, problems
 from apex_ompl.apex.query import make_query
 from apex_ompl.kernel.compiled.arrays import robot_view
-from apex_ompl.kernel.compiled.compilation import entry_point
+from apex_ompl.kernel.compiled.compilation import entry_point, reassociating_entry_point
 from apex_ompl.kernel.compiled.kinematics import place_cluster, place_robot
 from apex_ompl.kernel.compiled.layout import Floats, Integers
-from apex_ompl.kernel.compiled.path_cost import add_sample
+from apex_ompl.kernel.compiled.path_cost import PANEL, add_sample
 from apex_ompl.kernel.compiled.path_optimization import _factorise
 from apex_ompl.kernel.compiled.workspace import workspace_view
 from apex_ompl.ompl_adapter.setup import assemble
@@ -59,16 +59,16 @@ def place(tables: tuple[Integers, Floats], work: tuple[Integers, Floats], states
     return total
 
 
-@entry_point
-def factorise(matrix: Floats, factor: Floats, band: int) -> bool:
+@reassociating_entry_point
+def factorise(matrix: Floats, factor: Floats, band: int, panel: Floats) -> bool:
     """Copy a banded matrix and factorise it."""
     for i in range(len(matrix)):
         for j in range(i, min(len(matrix), i + band)):
             factor[i, j] = matrix[i, j]
-    return _factorise(factor, band)
+    return _factorise(factor, band, panel)
 
 
-@entry_point
+@reassociating_entry_point
 def add_samples(weights: Floats, first: Integers, matrix: Floats, gram: Floats, room: Floats) -> None:
     """Add one matrix at all samples of a path."""
     for k in range(len(weights)):
@@ -141,9 +141,9 @@ def stages(repeat: int) -> list[tuple[str, float, float, str, float]]:
     took = least(lambda: add_samples(*grid[:2], matrix, gram, room), repeat)
     rows.append(("all samples into the matrix of a step", count, 8.0 * n * band, "double", took))
     banded = np.where(np.abs(np.subtract.outer(np.arange(n), np.arange(n))) < band, 0.01, 0.0) + 10.0 * np.eye(n)
-    factor = np.zeros((n, n))
+    factor, panel = np.zeros((n, n)), np.zeros(PANEL)
     count = float(sum(min(band, n - k) ** 2 for k in range(n)))
-    took = least(lambda: factorise(banded, factor, band), repeat)
+    took = least(lambda: factorise(banded, factor, band, panel), repeat)
     rows.append(("Cholesky factor of a step", count, 8.0 * n * band, "double", took))
     took = least(lambda: optimizer.improve(kernel, near, steps=0), repeat, len(near))
     rows.append(("cost of a path, with gradient and matrix", np.nan, 0.0, "double", took))

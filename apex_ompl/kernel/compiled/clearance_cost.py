@@ -46,14 +46,17 @@ class StateCost(NamedTuple):
 @inlined
 def add_violation(clearance: float, margin: float, row: Floats, gradient: Floats, gram: Floats) -> float:
     """Add the square of a violation whose clearance has the gradient ``row``, which is scaled; return its cost."""
+    first, last, scale = len(row), -1, 1.0 / margin  # joints that move it: those of one arm mostly
     for i in range(len(row)):
-        row[i] /= margin
+        if row[i] != 0.0:
+            row[i] *= scale
+            first, last = min(first, i), i
     violation = (margin - clearance) / margin
-    for i in range(len(row)):
+    for i in range(first, last + 1):
         u = row[i]
         if u != 0.0:
             gradient[i] -= violation * u
-            for k in range(i + 1):
+            for k in range(first, i + 1):
                 gram[i, k] += u * row[k]
     return 0.5 * violation * violation
 

@@ -15,10 +15,13 @@ from typing import Annotated, NamedTuple
 
 from apex_ompl.kernel.compiled.arrays import RobotArrays, SceneArrays, robot_view, scene_view
 from apex_ompl.kernel.compiled.clearance_cost import state_cost
-from apex_ompl.kernel.compiled.compilation import entry_point, inlined
+from apex_ompl.kernel.compiled.compilation import inlined, reassociating_entry_point
 from apex_ompl.kernel.compiled.layout import Floats, Integers, Singles, buffer_sizes, buffer_view
 from apex_ompl.kernel.compiled.separation import tables_hold
 from apex_ompl.kernel.compiled.workspace import Workspace, workspace_view
+
+BLOCK, STRIDE = 8, 128  # rows of a Cholesky factor that are made together, and numbers of each that are used at a time
+PANEL = BLOCK * STRIDE
 
 
 class CostSettings(NamedTuple):
@@ -83,6 +86,7 @@ class Buffers(NamedTuple):
     Attributes:
         gram: Upper halves of the Gauss-Newton matrices, of the path and of the trial.
         factor: Upper Cholesky factor.
+        panel: Pieces of rows of it, side by side.
         gradient: Gradients of the path and of the trial.
         step: Right-hand side, then step.
         trial: Control points of the trial.
@@ -96,6 +100,7 @@ class Buffers(NamedTuple):
 
     gram: Annotated[Floats, 2, "unknowns", "unknowns"]
     factor: Annotated[Floats, "unknowns", "unknowns"]
+    panel: Annotated[Floats, PANEL]
     gradient: Annotated[Floats, 2, "unknowns"]
     step: Annotated[Floats, "unknowns"]
     trial: Annotated[Floats, "points", "dof"]
@@ -233,7 +238,7 @@ def evaluate_path(
     return PathCost(total + speed, total, scene, own)
 
 
-@entry_point
+@reassociating_entry_point
 def path_cost(
     ri: Integers, rf: Floats, si: Integers, sf: Floats, sg: Singles, wi: Integers, wf: Floats,
     weights: Floats, first: Integers,

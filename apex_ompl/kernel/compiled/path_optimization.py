@@ -15,10 +15,14 @@ import math
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
+
 from apex_ompl.kernel.compiled.arrays import RobotArrays, SceneArrays, robot_view, scene_view
-from apex_ompl.kernel.compiled.compilation import entry_point, inlined
+from apex_ompl.kernel.compiled.compilation import inlined, reassociating_entry_point
 from apex_ompl.kernel.compiled.layout import Floats, Integers, Singles
 from apex_ompl.kernel.compiled.path_cost import (
+    BLOCK,
+    STRIDE,
     Buffers,
     CostSettings,
     Numbers,
@@ -31,7 +35,7 @@ from apex_ompl.kernel.compiled.path_cost import (
 from apex_ompl.kernel.compiled.workspace import Workspace, workspace_view
 
 LEAST_DAMPING, MOST_DAMPING = 1e-9, 1e9
-BLOCK = 8  # rows of a Cholesky factor that are made together
+S1, S2, S3, S4, S5, S6, S7 = (np.uint64(r * STRIDE) for r in range(1, BLOCK))
 
 Evaluate = Callable[..., PathCost]
 Problem = Any
@@ -54,10 +58,33 @@ def _eliminate(factor: Floats, first: int, last: int, k: int, end: int) -> bool:
 
 
 @inlined
-def _factorise(factor: Floats, band: int) -> bool:
+def _take_away(factor: Floats, k: int, last: int, end: int, panel: Floats) -> None:
+    """Take away what the BLOCK rows from ``k`` on have in the rows below, up to ``end``.
+
+    Pieces of the rows are copied next to each other: between rows whose distance is a constant no test is needed of
+    whether they overlap, nor, with indices that cannot be negative, of where they begin.
+    """
+    for first in range(last, end, STRIDE):
+        length = min(STRIDE, end - first)
+        for r in range(BLOCK):
+            source, room = factor[k + r, first : first + length], panel[r * STRIDE : r * STRIDE + length]
+            for j in range(length):
+                room[j] = source[j]
+        for i in range(last, first + length):
+            a, b, c, d = factor[k, i], factor[k + 1, i], factor[k + 2, i], factor[k + 3, i]
+            e, f, g, h = factor[k + 4, i], factor[k + 5, i], factor[k + 6, i], factor[k + 7, i]
+            target = factor[i, first : first + length]
+            for j in range(np.uint64(max(i - first, 0)), np.uint64(length)):
+                left = a * panel[j] + b * panel[j + S1] + c * panel[j + S2] + d * panel[j + S3]
+                target[j] -= left + (e * panel[j + S4] + f * panel[j + S5] + g * panel[j + S6] + h * panel[j + S7])
+
+
+@inlined
+def _factorise(factor: Floats, band: int, panel: Floats) -> bool:
     """Replace a matrix by its upper Cholesky factor; both are zero beyond ``band`` from the diagonal.
 
-    Rows are taken eight at a time, so that a row below is read and written once for all of them.
+    Rows are taken eight at a time, so that a row below is read and written once for all of them; ``panel`` (PANEL,) is
+    memory.
     """
     n = len(factor)
     for k in range(0, n, BLOCK):
@@ -70,21 +97,14 @@ def _factorise(factor: Floats, band: int) -> bool:
                 return False
         if last < k + BLOCK:
             break
-        for i in range(last, end):
-            a, b, c, d = factor[k, i:end], factor[k + 1, i:end], factor[k + 2, i:end], factor[k + 3, i:end]
-            e, f, g, h = factor[k + 4, i:end], factor[k + 5, i:end], factor[k + 6, i:end], factor[k + 7, i:end]
-            a0, b0, c0, d0, e0, f0, g0, h0 = a[0], b[0], c[0], d[0], e[0], f[0], g[0], h[0]
-            target = factor[i, i:end]
-            for j in range(len(target)):
-                first = a0 * a[j] + b0 * b[j] + c0 * c[j] + d0 * d[j]
-                target[j] -= first + (e0 * e[j] + f0 * f[j] + g0 * g[j] + h0 * h[j])
+        _take_away(factor, k, last, end, panel)
     return True
 
 
 @inlined
 def _newton_step(
     gram: Floats, speed_gram: Floats, damping: float, pinned: int, dof: int, held: Integers, band: int, factor: Floats,
-    step: Floats,
+    panel: Floats, step: Floats,
 ) -> bool:  # fmt: skip
     """Solve (gram + damping A) x = step in place, with x = 0 for ``held`` unknowns; False if not positive definite."""
     n = len(step)
@@ -97,7 +117,7 @@ def _newton_step(
                 factor[i, k] += damping * speed_gram[a + pinned, (k - d) // dof + pinned]
         if held[i]:
             factor[i, i], step[i] = 1.0, 0.0
-    if not _factorise(factor, band):
+    if not _factorise(factor, band, panel):
         return False
     for i in range(n):
         step[i] /= factor[i, i]
@@ -169,7 +189,9 @@ def descend(
         taken += 1
         new = cost
         _hold(t, control, pinned, b.gradient[now], b.held, b.step)
-        better = _newton_step(b.gram[now], speed_gram, damping, pinned, dof, b.held, band, b.factor, b.step)
+        better = _newton_step(
+            b.gram[now], speed_gram, damping, pinned, dof, b.held, band, b.factor, b.panel, b.step
+        )  # fmt: skip
         if better:
             _add_step(t, control, pinned, b.step, b.trial)
             new = evaluate(problem, t, s, w, pinned, b.trial, settings, b, b.gradient[1 - now], b.gram[1 - now])
@@ -190,7 +212,7 @@ def descend(
     return cost, taken, damping
 
 
-@entry_point
+@reassociating_entry_point
 def optimize_path(
     ri: Integers, rf: Floats, si: Integers, sf: Floats, sg: Singles, wi: Integers, wf: Floats,
     weights: Floats, first: Integers,
