@@ -74,9 +74,11 @@ def run_variant(job: Job) -> Run:
         return planner
 
     factors = apex_parameters.SPRINT_FACTORS if later_sprints else (1, 0, 0)
+    again = apex_parameters.AGAIN if later_sprints else 0
     with (
         mock.patch.object(ApexParameters, "build", build_variant),
         mock.patch.object(apex_parameters, "SPRINT_FACTORS", factors),
+        mock.patch.object(apex_parameters, "AGAIN", again),
     ):
         return runs.columns(*runs.planned(replace(job, params=params, runner="")))
 

@@ -9,6 +9,8 @@
 2. Scenes of one large mesh that is not convex, up to 40 000 triangles, of the benchmark's own making: arches, rings and
    bumpy balls; starts and goals are the validation problems', free in the scene, and the straight line is not.
 3. Proofs of states by the kernel against the number of triangles and points; set-up, and memory.
+4. New clouds in a world that is kept: points of a wall with bumps as a camera sees it, each in place of the one before,
+   with the first query among them, whether the home state is free.
 
 Usage: python benchmarks/geometry.py [-n 60] [--states 2000]
 """
@@ -41,6 +43,7 @@ from apex_ompl.util.validation import one_or_more
 
 DEPENDS = ("@planning", "apex_ompl/trajectory", "apex_ompl/session", "benchmarks/geometry_versions.py")
 LEVELS = ("shelf/medium", "bins/medium", "cage/medium", "posts/medium", "wall/medium", "clutter/medium")
+CLOUD, CLOUDS, POINT_RADIUS = 100_000, 25, 0.005  # points of a new cloud, how many, and the radius of points [m]
 WARM = 200  # triangles and points of a first one, which compiles what is not compiled yet
 COUNTS = (100, 1_000, 10_000, 100_000, 200_000, 1_000_000)
 TIMEOUT = 10.0  # [s]
@@ -226,6 +229,26 @@ def sizes() -> tuple[list[str], dict[str, Any]]:
     return rows, {"sizes": figures}
 
 
+def updates() -> tuple[list[str], dict[str, Any]]:
+    """Measure new clouds in a world that is kept; return rows and figures."""
+    rng, took = np.random.default_rng(0), []
+    with quiet_ompl(), MotionPlanner() as planner:
+        for k in range(CLOUDS + 3):
+            side, height = rng.uniform(-0.6, 0.6, CLOUD), rng.uniform(0.1, 1.1, CLOUD)
+            depth = 0.95 + 0.05 * np.sin(7.0 * side + k) * np.cos(5.0 * height) + 0.002 * rng.normal(size=CLOUD)
+            points = np.column_stack([depth, side, height])
+            began = time.perf_counter()
+            planner.world.set_points("seen", points, radius=POINT_RADIUS)
+            planner.is_free(planner.robot.home)
+            took.append(time.perf_counter() - began)
+    took = took[3:]  # the first ones load and compile
+    p50, p95 = record.percentiles(took, 50, 95)
+    head = ("new cloud of", "N", "ms p50", "p95")
+    rows = [record.row([*head]), record.row(["---", *["---:"] * 3])]
+    rows.append(record.row([f"{CLOUD} points", CLOUDS, f"{1e3 * p50:.0f}", f"{1e3 * p95:.0f}"]))
+    return rows, {"updates": took}
+
+
 def main() -> None:
     """Measure, and write the results."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -233,7 +256,7 @@ def main() -> None:
     parser.add_argument("--states", type=one_or_more, default=2000, help="states of a problem (default: %(default)s)")
     args = parser.parse_args()
     rows, figures = sizes()
-    for more, found in (versions(args.n, args.states), large(args.n)):
+    for more, found in (updates(), versions(args.n, args.states), large(args.n)):
         rows += ["", *more]
         figures |= found
     record.write("geometry", figures, "\n".join(rows), split="validation", seed="0", trimesh=trimesh.__version__)

@@ -100,7 +100,7 @@ def test_nothing_is_found_where_the_goal_is_walled_in_or_time_is_up() -> None:
 
 
 @settings(max_examples=30, deadline=None)
-@given(st.integers(0, 10**6), st.sampled_from([0.1, 0.7, 3.0]), st.sampled_from([0.01, 0.1, 5.0]))
+@given(st.integers(0, 10**6), st.sampled_from([0.1, 0.7, 3.0, 1e9]), st.sampled_from([0.01, 0.1, 5.0]))
 def test_paths_in_the_open_are_found_whatever_the_steps(seed: int, longest: float, resolution: float) -> None:
     checker, start, goals = of_problem("vertical/free/1")
     pair = TreePair(checker.kernel, start, goals, longest, resolution, np.random.default_rng(seed))

@@ -34,6 +34,8 @@ class TreePair:
             resolution: Largest spacing of the states that are checked along a step [rad, max-norm].
             rng: Source of the random states.
         """
+        limits = kernel.robot.arrays
+        longest = min(longest, float(np.linalg.norm(limits.upper - limits.lower)))  # no step is longer
         self._kernel, self._longest, self._resolution, self._rng = kernel, longest, resolution, rng
         dof, most = kernel.robot.dof, max(len(starts), len(goals))
         self._sizes = np.array([len(starts), len(goals), 0], np.int64)

@@ -11,7 +11,7 @@ import math
 
 from apex_ompl.kernel.compiled.arrays import FIXED, REVOLUTE, RobotArrays, SceneArrays
 from apex_ompl.kernel.compiled.compilation import inlined
-from apex_ompl.kernel.compiled.kinematics import node_position, place_cluster
+from apex_ompl.kernel.compiled.kinematics import mark_pair, node_position, place_cluster
 from apex_ompl.kernel.compiled.layout import Floats
 from apex_ompl.kernel.compiled.scene_tree import is_allowed, next_obstacles
 from apex_ompl.kernel.compiled.signed_distance import direction, distance
@@ -80,11 +80,16 @@ def nearest_bodies(t: RobotArrays, w: Workspace, q: Floats, limit: float) -> Nea
         apart = math.sqrt((u[0] - v[0]) ** 2 + (u[1] - v[1]) ** 2 + (u[2] - v[2]) ** 2)
         if a != b and apart - t.cluster_outer[a] - t.cluster_outer[b] >= best[0]:
             continue
+        marked = a != b and best[0] < math.inf
+        if marked and not mark_pair(t, w, q, True, p, best[0]):
+            continue
         place_cluster(t, w, q, a)
         place_cluster(t, w, q, b)
         first = t.pair_bodies[p, 0]
         for k in range(first, first + t.pair_bodies[p, 1]):
-            best = nearest_leaves(t, w, t.bodies[k, 0], t.bodies[k, 1], best)
+            m, n = t.bodies[k, 0], t.bodies[k, 1]
+            if not marked or (w.near[m] and w.near[n]):
+                best = nearest_leaves(t, w, m, n, best)
     return best
 
 
