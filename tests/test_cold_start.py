@@ -57,6 +57,7 @@ from apex_ompl import plan
 from apex_ompl.kernel.ahead_of_time import BESIDE, HERE, _function
 
 assert plan("shelf/hard/800000", timeout=30.0)
+assert plan("vertical/large/800000", timeout=30.0, params={"line": False}).solved_by == "sprint"
 for name, (types, _) in (HERE | BESIDE).items():
     found = _function(name).dispatcher.signatures
     assert found == [normalize_signature(f"({types},)")[0]], (name, found)
