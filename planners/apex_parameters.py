@@ -22,8 +22,8 @@ NAME = "apex"
 WITHOUT_MODEL = "rrtconnect+polish"
 TURN_CALLS = 1_000  # of the termination condition of a bridge where rounds and trees take turns
 QUICK_CALLS = 1500  # iterations of a bridge between rounds of proposals
-AGAIN = 16  # factor on the iterations of the sprint behind the short repair of the first round
-SPRINT_FACTORS = (1, 64, 256)  # on those of the sprints before each round of proposals
+AGAIN = 8  # factor on the iterations of the sprint behind the short repair of the first round
+SPRINT_FACTORS = (1, 32, 128)  # on those of the sprints before each round of proposals
 CHECKPOINTS = Path(diffusion.__path__[0]) / "checkpoints"
 
 
@@ -48,7 +48,8 @@ class ApexParameters(Parameters):
         device: Where the network runs.
         line: Whether the straight line is a candidate.
         sprint: Iterations that RRT-Connect has before proposals, where it is the fallback and ``lambda_obs`` is 0;
-            behind a short repair it has 16 times as many, before the second and third round 64 and 256 times.
+            behind a short repair it has 8 times as many, before the second and third round 32 and 128 times.
+            Trees in compiled code have twice as many everywhere.
         sampler: ``ddim``, ``dpm_solver`` or ``ddpm``; ``model`` takes that of the checkpoint.
         denoising_steps: Number of denoising steps; 0 takes that of the checkpoint: 2 for apex, all 256 for apex-paper.
         temperature: Standard deviation of the noise to begin with.

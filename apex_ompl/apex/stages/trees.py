@@ -32,7 +32,7 @@ class Sprint:
     In open scenes it is done sooner than proposals are made.
 
     Attributes:
-        iterations: Number of iterations.
+        iterations: Number of iterations; compiled trees have MORE times as many.
         tree_range: Longest step of the trees; 0 lets OMPL choose [rad].
     """
 
@@ -51,7 +51,7 @@ class Sprint:
         if context.pair_trees is None:
             start, goal = context.pairs[0]
             context.pair_trees = compiled_trees(context, start[None], goal[None], self.tree_range)
-        states = grow(context, context.pair_trees, self.iterations)
+        states = grow(context, context.pair_trees, MORE * self.iterations)
         if states is not None:
             context.pair_trees = None
         return states
