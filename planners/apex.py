@@ -18,6 +18,7 @@ from apex_ompl.apex.stages import Anytime, Shorten
 from apex_ompl.diffusion.checkpoint import shared_model
 from apex_ompl.diffusion.proposals import TrajectoryModel
 from apex_ompl.errors import ParameterError
+from apex_ompl.kernel.shortcuts import shortcut
 from apex_ompl.kernel.trees import TreePair
 from apex_ompl.ompl_adapter.report import SolveReport
 from apex_ompl.ompl_adapter.space import forget_states
@@ -82,7 +83,9 @@ class APEX(ob.Planner):
         self.optimizer.prepare(checker.kernel)
         home = checker.robot.home
         ends = home[None], home[None]
-        TreePair(self.validator.kernel, *ends, 1.0, SEARCH_RESOLUTION, np.random.default_rng(0)).grow(1)
+        rng = np.random.default_rng(0)
+        TreePair(self.validator.kernel, *ends, 1.0, SEARCH_RESOLUTION, rng).grow(1)
+        shortcut(self.validator.kernel, np.stack([home] * 3), 1, SEARCH_RESOLUTION, rng)
         if self.model not in _warm_models:
             query = make_query(checker, home, home, point=self.model.sees_point)
             sampling = self.parameters.sampling(self.model.sampling)

@@ -1,9 +1,9 @@
 """Compilation of the kernel by numba, cached on disk where there is a writable place.
 
 numba renews cached code when the one file that it was written in changes. The functions of this folder are compiled
-into each other, so their cache is a folder named after a digest of all its files, of the versions of Python and numba,
-and of the processor. It lies in ``$NUMBA_CACHE_DIR`` when that is set, or in the user's cache folder; where neither can
-be written, the code is compiled anew in every process, and a warning says so.
+into each other, so their cache is a folder named after a digest of all its files and their place, of the versions of
+Python and numba, and of the processor. It lies in ``$NUMBA_CACHE_DIR`` when that is set, or in the user's cache folder;
+where neither can be written, the code is compiled anew in every process, and a warning says so.
 """
 
 from __future__ import annotations
@@ -48,7 +48,8 @@ def _digest() -> str:
     for path in sorted(Path(__file__).parent.glob("*.py")):
         digest.update(path.read_bytes())
     processor = f"{platform.machine()} {llvm.get_host_cpu_name()}"
-    digest.update(f"{sys.version_info[:3]} {numba.__version__} {processor}".encode())
+    place = Path(__file__).resolve().parent  # numba finds its code again for the same files alone
+    digest.update(f"{sys.version_info[:3]} {numba.__version__} {processor} {place}".encode())
     return digest.hexdigest()[:16]
 
 
