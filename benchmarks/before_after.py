@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -22,15 +21,17 @@ from typing import Any, Self
 import numpy as np
 import record
 from apex_profile import HARD
+from checkouts import add_checkout, commit, environment
 from tqdm import tqdm
 
 from apex_ompl import problems
 from apex_ompl.result import FIRST, INSIDE
-from apex_ompl.util import provenance
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import one_or_more
 
-DEPENDS = ("@planning", "apex_ompl/trajectory", "apex_ompl/session", "benchmarks/apex_profile.py")
+DEPENDS = (
+    "@planning", "apex_ompl/trajectory", "apex_ompl/session", "benchmarks/apex_profile.py", "benchmarks/checkouts.py",
+)  # fmt: skip
 TIMEOUT = 10.0  # [s]
 STAGES = ("call", "solve", "first path", "propose", "repair", "polish", "verify", "timing")
 WORKER = """
@@ -55,9 +56,8 @@ class Worker:
 
     def __init__(self, folder: Path) -> None:
         """Start it, and wait until it has planned once."""
-        about = {"PYTHONPATH": str(folder), "OMP_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1"}
         self.process = subprocess.Popen(
-            [sys.executable, "-c", WORKER], cwd=folder, env=os.environ | about, stdin=subprocess.PIPE,
+            [sys.executable, "-c", WORKER], cwd=folder, env=environment(folder), stdin=subprocess.PIPE,
             stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True,
         )  # fmt: skip
         self._answer()
@@ -102,18 +102,16 @@ def table(before: list[dict[str, float]], after: list[dict[str, float]]) -> list
 def main() -> None:
     """Measure, and write the results."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("folder", type=Path, help="another checkout, which is 'before'")
+    add_checkout(parser)
     parser.add_argument("-n", type=one_or_more, default=8, help="problems of a level (default: %(default)s)")
     parser.add_argument("--seeds", type=one_or_more, default=2, help="seeds of each (default: %(default)s)")
     parser.add_argument("--split", default="validation", choices=("validation", "test"))
     parser.add_argument("--levels", nargs="+", default=list(HARD), metavar="LEVEL", help="(default: the hard ones)")
     args = parser.parse_args()
-    if not (args.folder / "apex_ompl" / "__init__.py").is_file():
-        parser.error(f"{args.folder} is no checkout of this project: expected a folder with apex_ompl/__init__.py")
     names = [n for level in args.levels for n in problems.frozen_names(*level.split("/"), args.split)[: args.n]]
     jobs = [(name, seed) for name in names for seed in range(args.seeds)]
     found: tuple[list[dict[str, float]], list[dict[str, float]]] = ([], [])
-    with Worker(args.folder.resolve()) as before, Worker(record.ROOT) as after:
+    with Worker(args.folder) as before, Worker(record.ROOT) as after:
         workers = (before, after)
         for k, (name, seed) in enumerate(tqdm(jobs, unit="problem")):
             for side in (0, 1) if k % 2 == 0 else (1, 0):
@@ -127,7 +125,7 @@ def main() -> None:
     text = "\n".join(record.row(row) for row in rows)
     record.write(
         "before_after", {"jobs": jobs, "before": found[0], "after": found[1]}, text, split=args.split, n=len(jobs),
-        seeds=args.seeds, before=provenance.commit(args.folder.resolve(), ["apex_ompl"]),
+        seeds=args.seeds, before=commit(args.folder),
     )  # fmt: skip
 
 

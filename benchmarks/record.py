@@ -59,6 +59,11 @@ def script() -> Path:
     return Path(sys.argv[0]).resolve()
 
 
+def _shown(argument: str) -> str:
+    """Return an argument as results name it: of a place on this machine the name alone."""
+    return Path(argument).name if Path(argument).is_absolute() else argument
+
+
 def session() -> dict[str, str]:
     """Return what a session of ``bench`` records besides its own provenance: the commit of what it depends on."""
     return {"commit": provenance.commit(ROOT, dependencies(script()))}
@@ -78,7 +83,7 @@ def write(
     """
     depends = dependencies(script())
     about = {
-        "command": " ".join(["python", script().relative_to(ROOT).as_posix(), *sys.argv[1:]]),
+        "command": " ".join(["python", script().relative_to(ROOT).as_posix(), *map(_shown, sys.argv[1:])]),
         "date": datetime.now(UTC).strftime("%Y-%m-%d"),
         "commit": provenance.commit(ROOT, depends),
         "hardware": provenance.hardware(),

@@ -20,11 +20,11 @@ from ompl import base as ob
 from tqdm import tqdm
 
 from apex_ompl import problems
-from apex_ompl.apex.bridge import make_tree
+from apex_ompl.apex.trees import ompl_trees
 from apex_ompl.kernel.trees import TreePair
 from apex_ompl.ompl_adapter.process import quiet_ompl, seed_ompl
 from apex_ompl.ompl_adapter.setup import PlanningSetup, assemble
-from apex_ompl.ompl_adapter.space import path_to_array, to_state
+from apex_ompl.ompl_adapter.space import path_to_array
 from apex_ompl.planners.tuned import TUNED
 from apex_ompl.types import Array
 from apex_ompl.util.entry_point import run_script
@@ -41,9 +41,7 @@ def of_ompl(ready: PlanningSetup, seed: int) -> tuple[Array | None, int]:
     """Return the path of OMPL's trees, or None, and their number of nodes."""
     seed_ompl(seed)
     si = ready.simple_setup.getSpaceInformation()
-    pdef = ob.ProblemDefinition(si)
-    pdef.setStartAndGoalStates(to_state(si, ready.start), to_state(si, ready.valid_goals[0]))
-    tree = make_tree(si, pdef, RANGE)
+    tree, pdef = ompl_trees(si, [ready.start], ready.valid_goals[0], RANGE)
     solved = tree.solve(TIMEOUT).getStatus() == ob.PlannerStatus.EXACT_SOLUTION
     data = ob.PlannerData(si)
     tree.getPlannerData(data)

@@ -11,7 +11,6 @@ FOLDER is another checkout, ``git worktree add FOLDER COMMIT`` makes one.
 from __future__ import annotations
 
 import argparse
-import os
 import subprocess
 import sys
 import tempfile
@@ -19,12 +18,12 @@ from pathlib import Path
 
 import numpy as np
 import record
+from checkouts import add_checkout, commit, environment
 
-from apex_ompl.util import provenance
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import one_or_more
 
-DEPENDS = ("@checking",)
+DEPENDS = ("@checking", "benchmarks/checkouts.py")
 SUITES, LEVELS, SEEDS = ("shelf", "bins", "cage", "posts", "wall", "clutter", "swap"), ("medium", "hard"), (0, 1, 2)
 MOTIONS = 1000  # of a problem
 ANSWERS = """
@@ -55,19 +54,16 @@ np.savez(out, free=np.concatenate(free), proved=proved, moves=moves)
 def main() -> None:
     """Compare, and write the results."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("folder", type=Path, help="another checkout, which is 'before'")
+    add_checkout(parser)
     parser.add_argument("--states", type=one_or_more, default=1_000_000, help="(default: %(default)s)")
     args = parser.parse_args()
-    if not (args.folder / "apex_ompl" / "__init__.py").is_file():
-        parser.error(f"{args.folder} is no checkout of this project: expected a folder with apex_ompl/__init__.py")
     names = [f"{suite}/{level}/80000{k}" for suite in SUITES for level in LEVELS for k in SEEDS]
     each = -(-args.states // len(names))
     with tempfile.TemporaryDirectory() as made:
         running = []
-        for label, folder in (("before", args.folder.resolve()), ("after", record.ROOT)):
+        for label, folder in (("before", args.folder), ("after", record.ROOT)):
             command = [sys.executable, "-c", ANSWERS, str(Path(made) / f"{label}.npz"), str(each), str(MOTIONS), *names]
-            environment = os.environ | {"PYTHONPATH": str(folder), "OMP_NUM_THREADS": "1"}
-            running.append(subprocess.Popen(command, cwd=folder, env=environment, stderr=subprocess.DEVNULL))
+            running.append(subprocess.Popen(command, cwd=folder, env=environment(folder), stderr=subprocess.DEVNULL))
         if any([process.wait() for process in running]):
             raise SystemExit("a process has failed: is the folder a checkout of this project?")
         before, after = (dict(np.load(Path(made) / f"{label}.npz")) for label in ("before", "after"))
@@ -84,7 +80,7 @@ def main() -> None:
     }
     record.write(
         "verdicts", figures, "\n".join(record.row(row) for row in rows), split="validation", problems=len(names),
-        before=provenance.commit(args.folder.resolve(), ["apex_ompl"]),
+        before=commit(args.folder),
     )  # fmt: skip
 
 

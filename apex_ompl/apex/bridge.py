@@ -6,44 +6,18 @@ from collections.abc import Callable
 
 import numpy as np
 from ompl import base as ob
-from ompl import geometric as og
 
 from apex_ompl.apex.context import SolveContext
 from apex_ompl.apex.path_validator import PathValidator
-from apex_ompl.kernel.trees import TreePair
-from apex_ompl.ompl_adapter.space import path_to_array, to_state
+from apex_ompl.apex.trees import compiled_trees, grow, ompl_trees
+from apex_ompl.ompl_adapter.space import path_to_array
 from apex_ompl.types import Array
-from apex_ompl.util.resolution import SEARCH_RESOLUTION
 
 Stop = Callable[[], bool]
 
 MAX_CALLS = 4_000  # iterations of one bridge
-LESS = 4  # iterations of compiled trees for one of OMPL's, which are tried where these find nothing
-OMPL_RANGE = 0.2  # OMPL's choice of the longest step, as a share of the extent of the space
+OMPL_SHARE = 0.25  # of the iterations, for OMPL's trees where compiled ones have found nothing
 STRIDE = 2  # of the states of a path that are checked to find its blocked stretches
-
-
-def make_tree(si: ob.SpaceInformation, pdef: ob.ProblemDefinition, tree_range: float) -> og.RRTConnect:
-    """Return RRTConnect for a problem definition; a range of 0 lets OMPL choose the longest step [rad]."""
-    tree = og.RRTConnect(si)
-    if tree_range > 0.0:
-        tree.setRange(tree_range)
-    tree.setProblemDefinition(pdef)
-    tree.setup()
-    return tree
-
-
-def compiled_trees(context: SolveContext, starts: Array, goals: Array, tree_range: float) -> TreePair:
-    """Return trees in compiled code from starts to goals, each of shape (N, dof); a range of 0 is OMPL's choice."""
-    longest = tree_range if tree_range > 0.0 else OMPL_RANGE * context.si.getStateSpace().getMaximumExtent()
-    return TreePair(context.kernel, starts, goals, longest, SEARCH_RESOLUTION, context.rng.spawn(1)[0])
-
-
-def grow(context: SolveContext, trees: TreePair, iterations: int) -> Array | None:
-    """Return the path of compiled trees after some more iterations, or None; count what they looked at."""
-    found = trees.grow(iterations, context.stop)
-    context.count(trees.take_counts())
-    return found
 
 
 def bridge_blocked(
@@ -96,14 +70,12 @@ def every_other(states: Array) -> Array:
 def _bridge(context: SolveContext, a: Array, b: Array, tree_range: float, calls: int) -> Array | None:
     """Return a path of RRT-Connect between two free states, or None."""
     if context.validator.exclusive:
-        found = grow(context, compiled_trees(context, a[None], b[None], tree_range), calls)
+        found = grow(context, compiled_trees(context, [a], [b], tree_range), calls)
         if found is not None:
             return found
-        calls //= LESS
-    pdef = ob.ProblemDefinition(context.si)
-    pdef.setStartAndGoalStates(to_state(context.si, a), to_state(context.si, b))
-    status = make_tree(context.si, pdef, tree_range).solve(context.counted(calls)).getStatus()
-    if status != ob.PlannerStatus.EXACT_SOLUTION:
+        calls = round(OMPL_SHARE * calls)
+    tree, pdef = ompl_trees(context.si, [a], b, tree_range)
+    if tree.solve(context.counted(calls)).getStatus() != ob.PlannerStatus.EXACT_SOLUTION:
         return None
     inner = path_to_array(pdef.getSolutionPath(), len(a))
     return np.concatenate([a[None], inner[1:-1], b[None]])

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from ompl import base as ob
-from ompl import geometric as og
 
 from apex_ompl.apex.path_validator import PathValidator
 from apex_ompl.apex.query import make_query
@@ -21,6 +19,7 @@ from apex_ompl.types import Array
 
 if TYPE_CHECKING:
     from apex_ompl.apex.sampler import ProposalSampler
+    from apex_ompl.apex.trees import OmplTrees
     from apex_ompl.diffusion.query import Query
     from apex_ompl.kernel.search_buffers import SearchCounts
     from apex_ompl.kernel.trees import TreePair
@@ -52,10 +51,10 @@ class SolveContext:
         best: Shortest valid path, or None.
         nearest: Path that ends near a goal and its distance from it [rad], or None.
         rng: Source of the generators of compiled trees.
-        pair_trees: Compiled trees that a sprint began, or None.
-        all_pair_trees: Compiled trees for all starts and goals, or None.
-        trees: OMPL's RRTConnect that a sprint began and its problem definition, or None.
-        all_trees: OMPL's RRTConnect for all starts and goals and its problem definition, or None.
+        sprint_trees: Compiled trees that a sprint began, or None.
+        sprint_ompl_trees: OMPL's, where another checker decides, or None.
+        all_trees: Compiled trees for all starts and goals, or None.
+        all_ompl_trees: OMPL's for all starts and goals, or None.
     """
 
     def __init__(
@@ -78,10 +77,10 @@ class SolveContext:
         self.best: Path | None = None
         self.nearest: tuple[Path, float] | None = None
         self.rng = rng
-        self.pair_trees: TreePair | None = None
-        self.all_pair_trees: TreePair | None = None
-        self.trees: tuple[og.RRTConnect, ob.ProblemDefinition] | None = None
-        self.all_trees: tuple[og.RRTConnect, ob.ProblemDefinition] | None = None
+        self.sprint_trees: TreePair | None = None
+        self.sprint_ompl_trees: OmplTrees | None = None
+        self.all_trees: TreePair | None = None
+        self.all_ompl_trees: OmplTrees | None = None
         self._queries: list[Query] = []
 
     @property
@@ -93,7 +92,7 @@ class SolveContext:
                 self._queries = [make_query(self.validator.checker, a, b, point=point) for a, b in self.pairs]
         return self._queries
 
-    def count(self, looked: SearchCounts) -> None:
+    def note_search(self, looked: SearchCounts) -> None:
         """Add what a search in compiled code looked at to the checker's counts."""
         counts = self.validator.checker.check_counts
         counts.proved += looked.proved
@@ -169,14 +168,9 @@ class SolveContext:
         return True
 
     def counted(self, calls: int) -> ob.PlannerTerminationCondition:
-        """Return a termination condition that also holds after some calls."""
-        return stop_after(calls, self.stop)
-
-
-def stop_after(calls: int, stop: Callable[[], bool]) -> Any:
-    """Return OMPL's termination condition that holds when ``stop`` does, or after some calls."""
-    left = iter(range(calls))
-    return ob.PlannerTerminationCondition(lambda: stop() or next(left, None) is None)
+        """Return OMPL's termination condition that holds when time is up, or after some calls."""
+        left = iter(range(calls))
+        return ob.PlannerTerminationCondition(lambda: self.stop() or next(left, None) is None)
 
 
 def joins(control: Array, query: Query) -> bool:

@@ -1,4 +1,4 @@
-"""Compilation of the functions that every plan needs, once on a machine, in two processes with a progress bar.
+"""Compilation of the functions that every plan needs, once for an installation, in two processes with a progress bar.
 
 What they are compiled for is said here, as numba writes types: ``f8[:, ::1]`` is an array of shape (N, M).
 """

@@ -33,7 +33,7 @@ class Shorten:
         with context.report.timed("simplify"):
             if context.validator.exclusive:
                 states, looked = shortcut(context.kernel, path.states, DRAWS, RESOLUTION, context.rng.spawn(1)[0])
-                context.count(looked)
+                context.note_search(looked)
             else:  # one attempt at a time: foreign checkers may be slow
                 states = simplify(og.PathSimplifier(context.si), context.si, path.states, context.stop, 1)
             short = Path(states)
