@@ -6,6 +6,7 @@ import pytest
 from apex_ompl import problems
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ParameterError
+from apex_ompl.kernel import Kernel, scene_tables
 from apex_ompl.ompl_adapter.setup import PlanningSetup, assemble
 from apex_ompl.ompl_adapter.validity import full_check
 from apex_ompl.robot import Robot
@@ -136,6 +137,31 @@ def test_valid_paths_are_taken_as_they_are(robot: Robot) -> None:
     pool = CandidatePool(optimizer, kernel, lambda path: ready.checker.first_collision(path, FINE_RESOLUTION) is None)
     found = pool.add(line[None], "line")
     assert found is not None and np.array_equal(found.control, line) and pool.steps == 0
+
+
+@pytest.mark.parametrize("alike", [True, False])
+def test_repair_begins_among_what_looks_like_the_obstacles(ready: PlanningSetup, alike: bool) -> None:
+    """The first rounds are among other obstacles; whatever these are, the full check decides, and repair goes on."""
+    optimizer, kernel, asked = Optimizer(), ready.checker.kernel, []
+    other = Kernel(kernel.robot, kernel.scene if alike else scene_tables([]))
+
+    def rough() -> Kernel:
+        asked.append(1)
+        return other
+
+    def is_valid(path: np.ndarray) -> bool:
+        return bool(full_check(ready.checker, path, ready.start, ready.goals))
+
+    pools = CandidatePool(optimizer, kernel, is_valid), CandidatePool(optimizer, kernel, is_valid, rough=rough)
+    assert not asked
+    starts = optimizer.starts(ready.start, ready.goals[0], 4, np.random.default_rng(1))
+    found = [pool.add(starts) or pool.improve(200) for pool in pools]
+    assert len(asked) == 1 and found[0] is not None and found[1] is not None
+    assert is_valid(optimizer.spline.path(found[1].control))
+    if alike:
+        assert np.array_equal(found[0].control, found[1].control)
+    else:
+        assert found[1].exact and not found[0].exact
 
 
 def test_it_gives_up_when_told(ready: PlanningSetup) -> None:

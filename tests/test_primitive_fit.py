@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 
 import coal
@@ -18,10 +19,12 @@ import apex_ompl
 from apex_ompl.apex.query import make_query
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.cloud_contact import signed_distances
-from apex_ompl.diffusion.primitive_fit import FittedShapes, fitted_shapes
-from apex_ompl.kernel.compiled.arrays import BOX, CYLINDER, SPHERE
+from apex_ompl.diffusion.primitive_fit import FittedShapes, fitted_shapes, scene_of_primitives
+from apex_ompl.kernel import Primitive, scene_tables
+from apex_ompl.kernel.compiled.arrays import BOX, CYLINDER, GRID, HALF_SPACE, SPHERE
 from apex_ompl.kernel.compiled.grid_regions import OCCUPIED, OUTSIDE, add_up, best_box, label_regions
 from apex_ompl.kernel.distance_grid import grid_of_points, grid_of_triangles
+from apex_ompl.kernel.scene_builder import primitive
 from apex_ompl.problems import load
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.scene.bodies import Obstacle
@@ -108,6 +111,28 @@ def test_the_number_of_primitives_is_limited() -> None:
     rng = np.random.default_rng(0)
     found = fitted_shapes(grid_of_points(rng.uniform(size=(400, 3)), 0.02))
     assert 0 < len(found.kind) <= 48 and np.isfinite(found.size).all() and (found.size[:, 0] > 0.0).all()
+
+
+def test_a_scene_of_primitives_keeps_all_but_grids() -> None:
+    """Owners, places and what may touch are those of the scene; a mesh becomes what it looks like, where it stands."""
+    rng = np.random.default_rng(3)
+    pose, ball = np.eye(4), np.eye(4)
+    pose[:3, :3], pose[:3, 3], ball[:3, 3] = Rotation.random(random_state=rng).as_matrix(), [0.4, 0.1, 0.6], [0, 0.5, 0]
+    grid = grid_of_triangles(trimesh.creation.box([0.2, 0.3, 0.4]).triangles, solid=True)
+    plane = Primitive(HALF_SPACE, np.eye(4), (0.0, 0.0, 1.0, -0.1))
+    solids = [(4, Primitive(GRID, pose, (), grid)), (7, Primitive(SPHERE, ball, (0.1,))), (9, plane)]
+    tables = scene_tables(solids)
+    tables = replace(tables, arrays=tables.arrays._replace(allowed=np.array([[2, 7]], np.int64)))
+    found = scene_of_primitives(tables)
+    assert found is not None and scene_of_primitives(found) is None and scene_of_primitives(tables) is found
+    by_owner = {int(owner): primitive(found, k) for k, owner in enumerate(found.arrays.owner)}
+    assert found.arrays.allowed.tolist() == [[2, 7]] and sorted(by_owner) == [4, 7, 9]
+    assert by_owner[4].kind == BOX and by_owner[7].kind == SPHERE and by_owner[9].kind == HALF_SPACE
+    assert by_owner[7].pose == pytest.approx(ball) and by_owner[7].size[0] == 0.1
+    near = pose[:3, 3] + rng.uniform(-0.4, 0.4, (300, 3))
+    likeness = [(coal.Box(2.0 * np.array(by_owner[4].size)), by_owner[4].pose[:3, :3], by_owner[4].pose[:3, 3])]
+    gap = union_distance(likeness, near) - union_distance([(coal.Box(0.2, 0.3, 0.4), pose[:3, :3], pose[:3, 3])], near)
+    assert np.sqrt((gap**2).mean()) < 0.006
 
 
 @settings(max_examples=30)

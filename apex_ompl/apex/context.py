@@ -9,7 +9,7 @@ import numpy as np
 from ompl import base as ob
 
 from apex_ompl.apex.path_validator import PathValidator
-from apex_ompl.apex.query import make_query
+from apex_ompl.apex.query import make_query, rough_kernel
 from apex_ompl.ompl_adapter.report import SolveReport
 from apex_ompl.ompl_adapter.space import array_to_path
 from apex_ompl.trajopt.candidates import Candidate, CandidatePool
@@ -110,7 +110,10 @@ class SolveContext:
 
     def new_pool(self) -> CandidatePool:
         """Return an empty pool of candidates."""
-        return CandidatePool(self.optimizer, self.kernel, self.is_valid, self.accepts_distance, self.validator.collides)
+        return CandidatePool(
+            self.optimizer, self.kernel, self.is_valid, self.accepts_distance, collides=self.validator.collides,
+            rough=lambda: rough_kernel(self.kernel),
+        )  # fmt: skip
 
     def path_of(self, candidate: Candidate) -> Path:
         """Return the path of a candidate's control points."""

@@ -1,4 +1,4 @@
-"""Queries of the trajectory model: what it is conditioned on."""
+"""Queries of the trajectory model: what it is conditioned on; and primitives in place of meshes, points and voxels."""
 
 from __future__ import annotations
 
@@ -6,7 +6,9 @@ import numpy as np
 
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.checker import NO_POINT
+from apex_ompl.diffusion.primitive_fit import scene_of_primitives
 from apex_ompl.diffusion.query import ObstacleSet, Query
+from apex_ompl.kernel import Kernel
 from apex_ompl.types import Array
 
 
@@ -27,3 +29,9 @@ def make_query(checker: CollisionChecker, start: Array, goal: Array, *, point: b
     nearest = checker.obstacle_point(start) if point else np.array(NO_POINT)
     ends = np.asarray(start, float), np.asarray(goal, float)
     return Query(*ends, nearest, obstacles, (scene, movable), checker.held_extents)
+
+
+def rough_kernel(kernel: Kernel) -> Kernel | None:
+    """Return the robot among primitives that look like its obstacles; None where these are primitives themselves."""
+    scene = scene_of_primitives(kernel.scene)
+    return None if scene is None else Kernel(kernel.robot, scene)

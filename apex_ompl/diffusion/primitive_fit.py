@@ -1,5 +1,7 @@
 """Primitives that together look like a grid of distances: what a model that sees shapes sees of meshes and points.
 
+Repair begins among them, too: distances from them are smooth where those from voxels are rough.
+
 The nodes near a surface, and those that it encloses, are taken apart into connected regions. A region that looks like a
 box, ball or cylinder becomes that; in the others boxes along the axes of the grid grow from nodes until nearly all are
 in one. So the same furniture gives much the same shapes whether it comes as boxes, as a mesh, as points on its surface
@@ -20,6 +22,8 @@ from apex_ompl.kernel.compiled.grid_distance import SLACK
 from apex_ompl.kernel.compiled.grid_regions import OCCUPIED, OUTSIDE, add_up, best_box, label_regions
 from apex_ompl.kernel.compiled.layout import Integers
 from apex_ompl.kernel.distance_grid import BAND, DistanceGrid
+from apex_ompl.kernel.scene_builder import Primitive, primitive, scene_tables
+from apex_ompl.kernel.tables import SceneTables
 from apex_ompl.types import Array, Flags
 from apex_ompl.util.weak_cache import weakly_cached
 
@@ -134,6 +138,29 @@ def fitted_shapes(grid: DistanceGrid) -> FittedShapes:
         grid.low + np.array([one.position for one in found]).reshape(-1, 3),
         np.array([one.size for one in found]).reshape(-1, 3),
     )
+
+
+def primitives_like(solid: Primitive) -> list[Primitive]:
+    """Return primitives that together look like a grid at a pose; one that is no grid as it is."""
+    if solid.grid is None:
+        return [solid]
+    fit, found = fitted_shapes(solid.grid), []
+    for kind, rotation, position, size in zip(fit.kind, fit.rotation, fit.position, fit.size, strict=True):
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = rotation, position
+        found.append(Primitive(int(kind), solid.pose @ pose, tuple(size.tolist())))
+    return found
+
+
+@weakly_cached
+def scene_of_primitives(tables: SceneTables) -> SceneTables | None:
+    """Return a scene in which primitives stand for grids; None where there are no grids."""
+    if all(grid is None for grid in tables.grids):
+        return None
+    owners = tables.arrays.owner.tolist()
+    solids = [(owner, one) for k, owner in enumerate(owners) for one in primitives_like(primitive(tables, k))]
+    found = scene_tables(solids)
+    return replace(found, arrays=found.arrays._replace(allowed=tables.arrays.allowed))
 
 
 def _one_shape(nodes: _Nodes, border: Flags, part: Integers) -> Solid | None:

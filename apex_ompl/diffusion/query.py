@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from apex_ompl.datasets.records import HeldExtent, ObstacleRecord
 from apex_ompl.diffusion.geometry import rotation_matrices
-from apex_ompl.diffusion.primitive_fit import fitted_shapes
+from apex_ompl.diffusion.primitive_fit import primitives_like
 from apex_ompl.kernel import Kernel, RobotTables
 from apex_ompl.kernel.compiled.arrays import BOX, GRID, HALF_SPACE
 from apex_ompl.kernel.scene_builder import Solids, boxes_around, primitive, tables_of
@@ -81,11 +81,9 @@ class ObstacleSet:
             rotation[k] = _rotation_to(normal)
             shape[k], position[k], size[k] = BOX, (distance - HALF_SPACE_BOX[2]) * normal, HALF_SPACE_BOX
         rows = [(shape, position, rotation, size)]
-        for k in grids:
-            solid = primitive(tables, int(k))
-            if solid.grid is not None:
-                fit, turn = fitted_shapes(solid.grid), solid.pose[:3, :3]
-                rows.append((fit.kind, fit.position @ turn.T + solid.pose[:3, 3], turn @ fit.rotation, fit.size))
+        for place in grids.tolist():
+            alike = Solids.of(primitives_like(primitive(tables, place)))
+            rows.append((alike.kind, alike.offset, alike.rotation, alike.size))
         return cls(*(np.concatenate(column) for column in zip(*rows, strict=True)))
 
     def __len__(self) -> int:

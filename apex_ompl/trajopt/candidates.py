@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 from numpy.typing import ArrayLike
 
@@ -13,6 +14,7 @@ from apex_ompl.types import Array
 
 ROUND, ROUNDS = 4, 12  # optimiser steps in a round of repair, and rounds a candidate has at most
 SOFT_ROUNDS = 2  # the last rounds, with still less weight on the speed term
+ROUGH_ROUNDS = 2  # of these, the first, among primitives that look like the obstacles
 REPAIR_STIFFNESS = 0.3  # factor on the settings' stiffness: clear comes before short
 PENALTY = 3.0  # factor on the priority of a candidate for every round spent on it
 STEPS_PER_PATH = 16  # on average
@@ -31,6 +33,7 @@ class Candidate:
         clearance: Smallest clearance at the samples [m].
         damping: Damping of the next step.
         rounds: Number of rounds of repair that it had.
+        exact: Whether it is repaired among the obstacles themselves, and not what looks like them.
         fine: Whether it is sampled more densely.
         given_up: Whether repair has nothing left to try on it.
     """
@@ -41,6 +44,7 @@ class Candidate:
     clearance: float
     damping: float
     rounds: int = 0
+    exact: bool = False
     fine: bool = False
     given_up: bool = False
 
@@ -56,6 +60,8 @@ class CandidatePool:
     Candidates are checked when they are added. Repair improves the one with the least priority value by a few
     optimiser steps, and checks it again as soon as it is nearly clear at its samples. A candidate that is clear at the
     samples and still invalid is sampled more densely. In the last rounds of a candidate the speed term counts less.
+    Where there are primitives that look like the obstacles, first costs and rounds of repair are among these; what is
+    clear there, or still is not after ``ROUGH_ROUNDS``, goes on among the obstacles.
 
     Attributes:
         candidates: All candidates.
@@ -64,8 +70,8 @@ class CandidatePool:
 
     def __init__(
         self, optimizer: Optimizer, kernel: Kernel, is_valid: Check,
-        is_wanted: Callable[[Candidate, Array], bool] = lambda candidate, path: True,
-        collides: Check = lambda path: False,
+        is_wanted: Callable[[Candidate, Array], bool] = lambda candidate, path: True, *,
+        collides: Check = lambda path: False, rough: Callable[[], Kernel | None] = lambda: None,
     ) -> None:  # fmt: skip
         """Start an empty pool.
 
@@ -75,12 +81,18 @@ class CandidatePool:
             is_valid: Full check; called with the states of a path.
             is_wanted: Further condition on valid candidates; those that fail it are given up.
             collides: Quick test of candidates that are not clear at their samples: whether they are surely not valid.
+            rough: Returns the robot among primitives that look like its obstacles, if there are any; asked once, when
+                there are candidates.
         """
         self._optimizer, self._kernel, self._is_valid, self._is_wanted = optimizer, kernel, is_valid, is_wanted
-        self._collides = collides
+        self._collides, self._make_rough = collides, rough
         self._fine, self._coarse = optimizer.finer(), optimizer.coarser()
         self.candidates: list[Candidate] = []
         self.steps = 0
+
+    @cached_property
+    def _rough(self) -> Kernel | None:
+        return self._make_rough()
 
     def add(self, control: ArrayLike, origin: str = "", stop: Callable[[], bool] = lambda: False) -> Candidate | None:
         """Add paths, control points of shape (B, points, dof), and return the first that is valid as it is.
@@ -88,7 +100,7 @@ class CandidatePool:
         Raises:
             ParameterError: Control points of another shape.
         """
-        improved = self._coarse.improve(self._kernel, control, steps=0)
+        improved = self._coarse.improve(self._rough or self._kernel, control, steps=0)
         numbers = zip(
             improved.control, improved.clearance_cost, improved.clearance.min(axis=1), improved.damping, strict=True
         )
@@ -119,8 +131,9 @@ class CandidatePool:
                 break
             soft = chosen.rounds >= ROUNDS - SOFT_ROUNDS
             optimizer = self._fine if chosen.fine else self._optimizer
+            rough = None if chosen.exact or chosen.rounds >= ROUGH_ROUNDS else self._rough
             improved = optimizer.improve(
-                self._kernel, chosen.control[None], steps=ROUND, damping=chosen.damping, enough=CLEAR,
+                rough or self._kernel, chosen.control[None], steps=ROUND, damping=chosen.damping, enough=CLEAR,
                 stiffness=(LAST_RESORT if soft else REPAIR_STIFFNESS) * settings.stiffness,
             )  # fmt: skip
             chosen.control, chosen.clearance_cost = improved.control[0], float(improved.clearance_cost[0])
@@ -130,7 +143,9 @@ class CandidatePool:
             self.steps += int(improved.steps[0])
             if chosen.clearance >= MIN_CLEARANCE and self._passes(chosen):
                 return chosen
-            if not improved.steps[0]:  # no sample violates a margin, and yet the path is invalid
+            if rough is not None:
+                chosen.exact = chosen.clearance >= MIN_CLEARANCE or not improved.steps[0]
+            elif not improved.steps[0]:  # no sample violates a margin, and yet the path is invalid
                 chosen.given_up, chosen.fine = chosen.fine, True
         return None
 
