@@ -13,6 +13,7 @@ Usage: python benchmarks/limits.py [--repeat 15]
 from __future__ import annotations
 
 import argparse
+import os
 import time
 from collections.abc import Callable
 from typing import Any
@@ -133,6 +134,9 @@ def stages(repeat: int) -> list[tuple[str, float, float, str, float]]:
         rows.append((name, float(joints), 0.0, "double", took))
     took = least(lambda: kernel.unproved(states), repeat, len(states))
     rows.append(("proof of a state", np.nan, 0.0, "double", took))
+    many, threads = np.tile(states, (8, 1)), os.cpu_count() or 1
+    took = least(lambda: kernel.unproved(many, threads), repeat, len(many))
+    rows.append((f"the same of many, by {threads} threads", np.nan, 0.0, "double", took))
     grid, dof = _grid(optimizer.spline, optimizer.settings.samples), len(limits.lower)
     n, band = optimizer.spline.free * dof, grid[0].shape[1] * dof
     matrix = np.eye(dof) + 1.0

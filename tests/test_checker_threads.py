@@ -5,7 +5,12 @@ from __future__ import annotations
 import sys
 import threading
 
+import numpy as np
+import pytest
+
 from apex_ompl.collision import CollisionChecker
+from apex_ompl.errors import ParameterError
+from apex_ompl.problems import load
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import Obstacle
 
@@ -26,6 +31,24 @@ def test_first_questions_from_several_threads_leave_one_scene(robot: Robot) -> N
             assert not checker.is_free(robot.home)
     finally:
         sys.setswitchinterval(interval)
+
+
+def test_batches_by_several_threads_get_the_same_answers(robot: Robot) -> None:
+    problem = load("shelf/medium/800001")
+    checker = CollisionChecker(robot, problem.scene, problem.attached)
+    rng = np.random.default_rng(1)
+    states = rng.uniform(robot.limits.lower, robot.limits.upper, (1111, robot.dof))
+    kernel = checker.kernel
+    assert np.array_equal(checker.are_free(states), checker.are_free(states, threads=3))
+    assert np.array_equal(kernel.clearance(states, 0.2), kernel.clearance(states, 0.2, threads=3))
+    for one, other in zip(kernel.clearance_gradient(states), kernel.clearance_gradient(states, threads=2), strict=True):
+        assert np.array_equal(one, other)
+    (pairs, counts), (others, same) = kernel.unproved(states), kernel.unproved(states, threads=2)
+    assert np.array_equal(counts, same) and (counts > 0).any() and (counts == 0).any()
+    for one, other, count in zip(pairs, others, counts, strict=True):
+        assert np.array_equal(one[: max(count, 0)], other[: max(count, 0)])
+    with pytest.raises(ParameterError, match="threads"):
+        checker.are_free(states, threads=0)
 
 
 def test_threads_that_ask_for_all_pairs_and_for_some_do_not_mix(robot: Robot) -> None:

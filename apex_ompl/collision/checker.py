@@ -101,18 +101,22 @@ class CollisionChecker(SceneBodies):
         left = self._spheres.unproved_at(q, self.check_counts)
         return left is None or self._is_free_given(q, left)
 
-    def are_free(self, states: Array) -> Flags:
+    def are_free(self, states: Array, threads: int = 1) -> Flags:
         """Whether each of the states, shape (N, dof), collides with nothing; shape (N,).
 
+        Args:
+            states: The states.
+            threads: Number of threads that share what the kernel does, of many states; the meshes know but one.
+
         Raises:
-            ParameterError: Another shape.
+            ParameterError: Another shape, or the number of threads is no positive whole number.
         """
         states = np.asarray(states, float)
         check_states(states, self.robot.dof)
         if not self._two_stages:
             return np.array([self._is_free_given(q) for q in states], bool)
         free = np.ones(len(states), bool)
-        for k, unproved in self._spheres.unproved_among(states, self.check_counts):
+        for k, unproved in self._spheres.unproved_among(states, self.check_counts, threads):
             free[k] = self._is_free_given(states[k], unproved)
         return free
 

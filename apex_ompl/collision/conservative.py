@@ -193,9 +193,11 @@ class ConservativeChecker:
             return None
         return self._left(buffers.found, count)
 
-    def unproved_among(self, states: Array, check_counts: CheckCounts) -> list[tuple[int, UnprovedPairs]]:
+    def unproved_among(
+        self, states: Array, check_counts: CheckCounts, threads: int = 1
+    ) -> list[tuple[int, UnprovedPairs]]:  # fmt: skip
         """Return the states, shape (N, dof), that are not proved free, by number, and the pairs left."""
-        found, counts = self.kernel.unproved(states)
+        found, counts = self.kernel.unproved(states, threads)
         opened = np.flatnonzero(counts)
         check_counts.proved += len(states) - len(opened)
         return [(int(k), self._left(found[k], int(counts[k]))) for k in opened]

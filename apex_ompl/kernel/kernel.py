@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -13,9 +16,25 @@ from apex_ompl.kernel.compiled import motion_proof, queries
 from apex_ompl.kernel.compiled.workspace import workspace_sizes
 from apex_ompl.kernel.tables import RobotTables, SceneTables
 from apex_ompl.types import Array
-from apex_ompl.util.validation import shape_error
+from apex_ompl.util.validation import check_integer, shape_error
 
 MOST_PAIRS = 16  # pairs that are listed for one state
+PART = 256  # states, fewer than which are not worth a thread of their own
+
+
+def _in_parts(count: int, threads: int, call: Callable[[slice], None]) -> None:
+    """Call with slices that together are all of some rows, several at once in threads.
+
+    Raises:
+        ParameterError: The number of threads is no positive whole number.
+    """
+    parts = min(check_integer(threads, "threads", 1), max(count // PART, 1))
+    if parts == 1:
+        call(slice(count))
+        return
+    edges = np.linspace(0, count, parts + 1).astype(int).tolist()
+    with ThreadPoolExecutor(parts) as pool:
+        list(pool.map(call, (slice(first, end) for first, end in pairwise(edges))))
 
 
 class Kernel:
@@ -51,8 +70,12 @@ class Kernel:
             raise shape_error(states, ("N", self.robot.dof), "states")
         return states
 
-    def unproved(self, q: ArrayLike) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def unproved(self, q: ArrayLike, threads: int = 1) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return the pairs that the spheres do not prove to be apart at states, shape (N, dof).
+
+        Args:
+            q: States.
+            threads: Number of threads that share many states; the result is the same.
 
         Returns:
             Pairs, shape (N, K, 2): two bodies, or a body and -1 - obstacle; and their number, shape (N,): 0 where
@@ -62,29 +85,36 @@ class Kernel:
         states = self.states(q)
         found = np.empty((len(states), MOST_PAIRS, 2), np.int64)
         counts = np.empty(len(states), np.int64)
-        queries.check_states(*self.packed, *self.workspace(), states, found, counts)
+
+        def check(rows: slice) -> None:
+            queries.check_states(*self.packed, *self.workspace(), states[rows], found[rows], counts[rows])
+
+        _in_parts(len(states), threads, check)
         return found, counts
 
-    def clearance(self, q: ArrayLike, limit: float = np.inf) -> Array:
+    def clearance(self, q: ArrayLike, limit: float = np.inf, threads: int = 1) -> Array:
         """Return the signed clearance of the sphere cover at states, shape (N, dof).
 
         Args:
             q: States.
             limit: Larger clearances are given as this [m]; a small one is faster.
+            threads: Number of threads that share many states; the result is the same.
 
         Returns:
             Shape (N, 2) [m]: to the obstacles, and between bodies that may touch. The true clearances are at least as
             large where these are positive. NaN where a state is not finite, or a hand is outside its limits.
         """
         states = self.states(q)
-        values = np.empty((len(states), 2))
-        queries.clearances(
-            *self.packed, *self.workspace(), states, float(limit), values, np.empty((0, 2, states.shape[1]))
-        )
+        values, none = np.empty((len(states), 2)), np.empty((0, 2, states.shape[1]))
+
+        def measure(rows: slice) -> None:
+            queries.clearances(*self.packed, *self.workspace(), states[rows], float(limit), values[rows], none)
+
+        _in_parts(len(states), threads, measure)
         return values
 
-    def clearance_gradient(self, q: ArrayLike, limit: float = np.inf) -> tuple[Array, Array]:
-        """Return :meth:`clearance` and its gradient with respect to the states.
+    def clearance_gradient(self, q: ArrayLike, limit: float = np.inf, threads: int = 1) -> tuple[Array, Array]:
+        """Return :meth:`clearance`, whose arguments it has, and its gradient with respect to the states.
 
         Returns:
             Values, shape (N, 2) [m], and gradients, shape (N, 2, dof) [m/rad]; zero where a value is ``limit``. Where
@@ -93,7 +123,13 @@ class Kernel:
         states = self.states(q)
         values = np.empty((len(states), 2))
         gradients = np.empty((len(states), 2, states.shape[1]))
-        queries.clearances(*self.packed, *self.workspace(), states, float(limit), values, gradients)
+
+        def measure(rows: slice) -> None:
+            queries.clearances(
+                *self.packed, *self.workspace(), states[rows], float(limit), values[rows], gradients[rows]
+            )
+
+        _in_parts(len(states), threads, measure)
         return values, gradients
 
     def joint_frames(self, q: ArrayLike) -> tuple[Array, Array]:
