@@ -31,6 +31,8 @@ class Faulty:
             os.kill(os.getpid(), signal.SIGKILL)
         if fault == "never":
             time.sleep(3600.0)
+        while fault == "busy" and not charges.over():
+            time.sleep(0.001)
         if fault == "late":
             time.sleep(0.2)
         if fault == "raises":

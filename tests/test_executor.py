@@ -22,6 +22,7 @@ from apex_ompl.loop.cycle import RunRecord
 from apex_ompl.loop.following import Following
 from apex_ompl.loop.ready import Ready
 from apex_ompl.loop.referee import RefereeReport
+from apex_ompl.loop.replanning import NOTICED
 from apex_ompl.loop.request import Answer, Request
 from apex_ompl.loop.run import run
 from apex_ompl.loop.search import EARLIER
@@ -247,6 +248,27 @@ def test_a_way_of_replanning_that_never_answers_is_asked_again() -> None:
     assert stood(never) and reasons(never) == {"no answer came in time"}
     times = [event.time for event in never.events if event.kind == "request"]
     assert len(times) > 3 and np.diff(times).max() < 0.1
+
+
+def test_what_comes_to_a_standing_robot_does_not_wait_for_an_answer_that_knows_nothing_of_it() -> None:
+    """A box comes into being before a hand: the replan under way is given up, and the next one knows of the box."""
+    setup = setup_of(PROBLEM)
+    palm = setup.robot.link_pose(setup.start, "left_hand_palm")[:3, 3]
+    box = Obstacle(
+        name="box", box=(0.1, 0.1, 0.1), position=tuple(palm + (0.0, 0.0, 0.3)), velocity=(0.0, 0.0, -0.4), appears=0.53
+    )
+    replanner = ByHand(lambda ready, request: None, seconds=0.042)
+    done, _ = go(replanner, box, timeout=1.0)
+    given_up = [event for event in done.events if event.data.get("why") == "an obstacle comes"]
+    assert len(given_up) == 1
+    known = next(event.time for event in done.events if event.kind == "conflict")
+    assert given_up[0].time == known
+    number = given_up[0].data["number"]
+    before, after = (next(one for one in replanner.asked if one.number == number + k) for k in (0, 1))
+    assert before.asked < known < before.asked + 0.042 and np.isinf(before.conflict)
+    assert after.asked == known and np.isfinite(after.conflict)
+    answered = next(e.time for e in done.events if e.kind == "rejected" and e.data["number"] == after.number)
+    assert 0.042 + NOTICED <= answered - known + 1e-9 <= 0.042 + NOTICED + LoopSettings.period + 1e-9
 
 
 def test_a_goal_that_is_reached_ends_the_run_whatever_is_under_way() -> None:

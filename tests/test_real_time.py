@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import pickle
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,11 +17,13 @@ from loops import BLOCKED, PROBLEM, crossing, ready_of, setup_of, world_of
 from apex_ompl.errors import PlannerProcessError
 from apex_ompl.live.movers import Movers, clearance_in_time
 from apex_ompl.loop.cycle import RunRecord
+from apex_ompl.loop.following import Following
 from apex_ompl.loop.methods import replanner_of
 from apex_ompl.loop.observation import Observation
 from apex_ompl.loop.planner_process import PlannerProcess, Work
 from apex_ompl.loop.real_time import run_in_real_time
 from apex_ompl.loop.referee import RefereeReport, judge
+from apex_ompl.loop.request import Request
 from apex_ompl.loop.result import Outcome, RunResult
 from apex_ompl.loop.run import run
 from apex_ompl.loop.sensor import Sensor, SensorStream
@@ -106,6 +110,24 @@ def test_a_process_that_dies_while_it_is_made_ready_is_a_sentence() -> None:
     with pytest.raises(PlannerProcessError, match="died"), process:
         pass
     assert process.process.poll() is not None
+
+
+def test_a_request_ends_what_the_process_is_busy_with() -> None:
+    """Each of two requests has ten seconds; the second one is answered at once, and ends the first."""
+    ready, world = ready_of(PROBLEM, budget=10.0), world_of(PROBLEM)
+    work = Work(world.problem.still, ready.limits, ready.stopping, ready.settings, Faulty, ("busy", ""), 0)
+    standing = Following.standing(ready.setup.start, 0.0, ready.names)
+    begun, spent = time.monotonic(), []
+    with PlannerProcess(work) as process:
+        for number in (1, 2, 3):
+            none = Movers([])
+            process.submit(Request(number, 0.0, 1.0, standing, None, none, none, (), math.inf, 0))
+            while number != 2 and (not spent or spent[-1].number != number):
+                assert time.monotonic() < begun + 60.0
+                reply = process.reply(0.0)
+                spent += [] if reply is None else [reply]
+    assert [one.number for one in spent] in ([1, 2, 3], [1, 3])
+    assert all(one.answer.found is not None for one in spent) and spent[-2].answer.charges.spent < 8.0
 
 
 def test_movers_travel_between_processes() -> None:

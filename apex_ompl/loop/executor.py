@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from apex_ompl.live.movers import Movers, clearance_in_time
-from apex_ompl.loop.evasion import GAIN, SOON
+from apex_ompl.loop.evasion import GAIN, SOON, URGENT
 from apex_ompl.loop.fitting import misfit
 from apex_ompl.loop.following import SAME_TIME, Following
 from apex_ompl.loop.ready import Ready
@@ -276,6 +276,9 @@ class Executor:
     def _ask(self, now: float, predicted: Movers, obstacles: tuple[Obstacle, ...]) -> None:
         """Ask for a replan where one is of use."""
         settings = self.ready.settings
+        if self._overtaken(now) and self.pending is not None:
+            self.log(now, self.pending.refused, why="an obstacle comes", number=self.pending.number, part="")
+            self.pending = None
         if self.pending is not None or not self._wants(now):
             return
         join = now + settings.budget
@@ -287,6 +290,17 @@ class Executor:
         self.log(now, "improve" if request.hastens else "request", number=self.asked, join=join)
         self.pending, self.hastened = request, now if request.hastens else self.hastened
         self.replanning.submit(request)
+
+    def _overtaken(self, now: float) -> bool:
+        """Whether a contact where the robot stands is near, of which what was asked for does not know.
+
+        Then it is to step aside at once, and not when that has been answered.
+        """
+        settings, request = self.ready.settings, self.pending
+        if request is None or settings.from_rest or not settings.guarded or math.isfinite(request.conflict):
+            return False
+        join = now + settings.budget
+        return self.conflict < join + URGENT and self.following.at_rest(join)
 
     def _wants(self, now: float) -> bool:
         """Whether the robot needs another motion."""

@@ -24,17 +24,31 @@ from apex_ompl.robot.model import Limits
 from apex_ompl.scene.problem import Problem
 
 STARTED = 120.0  # time that the process has to make itself ready [s]
+SENT = 2  # requests at most that are not answered yet
 HUNG = 10.0  # time without an answer after which the process is made anew [s]
 ENDED = 2.0  # time that it has to end [s]
+
+
+def _never() -> bool:
+    return False
 
 
 class WallTime(Charges):
     """Charges by the clock on the wall, from when they are made."""
 
-    def __init__(self, limit: float) -> None:
-        """Begin now, with a limit [s]."""
+    def __init__(self, limit: float, overtaken: Callable[[], object] = _never) -> None:
+        """Begin now, with a limit [s].
+
+        Args:
+            limit: Time that the work may take [s].
+            overtaken: Whether it is of no use any more.
+        """
         super().__init__(limit)
-        self._begun = time.perf_counter()
+        self._begun, self._overtaken = time.perf_counter(), overtaken
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what travels with an answer: its numbers."""
+        return {**vars(self), "_overtaken": _never}
 
     def charge(self, kind: str, count: int = 1) -> None:
         """Count units of work, and look at the clock."""
@@ -44,7 +58,7 @@ class WallTime(Charges):
     def over(self) -> bool:
         """Whether the time is used up."""
         self.spent = time.perf_counter() - self._begun
-        return super().over()
+        return super().over() or bool(self._overtaken())
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +115,7 @@ class PlannerProcess:
         other.close()
         self._connection: Connection[Any, Any] = mine
         self._ready = False
-        self._asked: float | None = None
+        self._asked: list[float] = []
         first = sys.path, self._core, pickle.dumps(self._work)
         threading.Thread(target=_sent, args=(mine, first), daemon=True).start()
 
@@ -133,16 +147,16 @@ class PlannerProcess:
         self._ready = True
 
     def submit(self, request: Request) -> None:
-        """Send a request; it is lost where the process is not there, or busy with another one.
+        """Send a request, which ends what the process is busy with; it is lost where the process is not there.
 
-        A process that has been busy for ``HUNG`` is made anew.
+        It is lost, too, where one waits already; a process that has been busy for ``HUNG`` is made anew.
         """
-        if self._asked is not None and time.monotonic() > self._asked + HUNG:
+        if self._asked and time.monotonic() > self._asked[0] + HUNG:
             self._replace("did not answer")
-        if self._ready and self._asked is None:
+        if self._ready and len(self._asked) < SENT:
             try:
                 self._connection.send_bytes(pickle.dumps(request))
-                self._asked = time.monotonic()
+                self._asked.append(time.monotonic())
             except OSError:
                 self._replace("died")
 
@@ -156,7 +170,8 @@ class PlannerProcess:
                 if isinstance(said, str):
                     self._take(said)
                 else:
-                    newest, self._asked = said, None
+                    newest = said
+                    del self._asked[:1]
         except (EOFError, OSError):
             self._replace("died")
         except PlannerProcessError as error:

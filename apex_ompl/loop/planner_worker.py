@@ -37,7 +37,7 @@ def serve(connection: Connection[Any, Any]) -> None:
     with quiet_ompl(), one_torch_thread():
         while True:
             data = connection.recv_bytes()
-            charges = WallTime(SHARE * work.settings.budget)
+            charges = WallTime(SHARE * work.settings.budget, connection.poll)
             request = pickle.loads(data)
             charges.limit = allowed(request, work.settings.budget)
             connection.send(answered(replanner, ready, request, charges))

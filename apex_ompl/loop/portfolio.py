@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 from apex_ompl.live.retime import retime
 from apex_ompl.loop.charges import Charges
-from apex_ompl.loop.evasion import endangered, step_aside
+from apex_ompl.loop.evasion import URGENT, endangered, step_aside
 from apex_ompl.loop.motion_pool import ROUNDS, MotionCandidate, MotionPool
 from apex_ompl.loop.quickening import quickened
 from apex_ompl.loop.ready import Ready
@@ -19,7 +19,6 @@ from apex_ompl.types import Array
 FACTORS = ((1.3, 2.5), (1.0, 1.8))  # durations that are tried in turn, as multiples of what a path takes at least
 GOALS = 2  # nearest goals that are tried directly
 ENOUGH = 10  # candidates at which no further source is asked
-URGENT = 0.5  # time before a contact from which on a standing robot steps aside before anything else is tried [s]
 ASIDE = 0.7  # share of the budget that other parts have where it may step aside behind them
 CARRIED = 6  # candidates that are carried over to the next replan
 SHARE = 0.5  # of the time that is left, for candidates before the next source is asked

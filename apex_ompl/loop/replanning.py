@@ -11,6 +11,7 @@ from apex_ompl.loop.request import Answer, Replanner, Request
 
 SHARE = 0.85  # of the budget after which nothing new is begun
 IMPROVING = 0.4  # of that, for faster motions: what endangers meanwhile does not wait for long
+NOTICED = 0.003  # time after which a replan that another one has overtaken ends [s]
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +75,8 @@ class AtOnce:
     def submit(self, request: Request) -> None:
         """Make a replan."""
         settings = self.ready.settings
-        charges = Charges(allowed(request, settings.budget))
+        busy = self._reply is not None and request.asked < self._known - 1e-9
+        charges = Charges(allowed(request, settings.budget), NOTICED if busy else 0.0)
         self._reply = answered(self.replanner, self.ready, request, charges)
         self._known = request.asked + (charges.spent if settings.latency < 0.0 else settings.latency)
 
