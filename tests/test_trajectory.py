@@ -232,3 +232,16 @@ def test_extremes_are_those_of_dense_samples(seed: int, pieces: int, still: bool
     slow = motion.slower(2.0).use(limits)
     again = Trajectory(2.0 * times, rows[0], rows[1] / 2.0, rows[2] / 4.0, tuple("abcd")).use(limits)
     assert slow == pytest.approx(again, rel=1e-12)
+
+
+@pytest.mark.parametrize("begin", [0.0, 1.2, 29.0])
+def test_rounding_between_knots_that_nearly_meet_is_no_jerk(begin: float) -> None:
+    """One joint of constant jerk 5000, with knots 1e-10 s apart, which its clock's time rounds: no limit is passed."""
+    wide = np.array([1e4])
+    limits = Limits(-wide, wide, wide, wide, np.array([5000.0]))
+    gaps = np.cumsum(np.random.default_rng(1).uniform(1e-10, 2e-10, 20))
+    since = np.concatenate([[0.0, 0.002], 0.002 + gaps, [0.01]])[:, None]
+    states = np.stack([5000.0 * since**3 / 6.0, 5000.0 * since**2 / 2.0, 5000.0 * since])
+    motion = Trajectory.unchecked((begin + since)[:, 0], states, ("joint",))
+    assert 1.0 - 1e-9 <= motion.use(limits)["jerk"] <= 1.0 + 1e-9
+    assert motion.jerks.max() > 5000.0 * (1.0 + 2e-9)

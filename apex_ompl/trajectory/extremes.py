@@ -8,9 +8,15 @@ import numpy as np
 
 from apex_ompl.types import Array
 
+ULPS = 4.0  # units in the last place by which times and accelerations of knots may be rounded, each several times
+
 
 class Extremes(NamedTuple):
-    """Least and largest positions, largest velocities, accelerations and jerks of a motion, each of shape (dof,)."""
+    """Least and largest positions, largest velocities, accelerations and jerks of a motion, each of shape (dof,).
+
+    Jerks are the least that the knots can be said to have: between knots 1e-10 s apart, as several joints' own make
+    them, the rounding of times and accelerations alone is worth 1e-6 of a jerk and more.
+    """
 
     low: Array
     high: Array
@@ -52,7 +58,7 @@ class Extremes(NamedTuple):
         fastest = np.abs(velocities).max(axis=0)
         if len(inner):
             fastest = np.maximum(fastest, np.maximum(largest.max(axis=0), -least.min(axis=0)))
-        return cls(low, high, fastest, *(np.abs(x).max(axis=0, initial=0.0) for x in (accelerations, jerks)))
+        return cls(low, high, fastest, np.abs(accelerations).max(axis=0), _least_jerk(times, accelerations))
 
     def slower(self, factor: float) -> Self:
         """Return the extremes of the same motion in a time that is ``factor`` times as long."""
@@ -63,3 +69,11 @@ class Extremes(NamedTuple):
 def _inside(times: Array, length: Array) -> Array:
     """Return times inside of pieces, 0 to ``length``; an end where there is no such time."""
     return np.fmax(np.fmin(times, length), 0.0)
+
+
+def _least_jerk(times: Array, accelerations: Array) -> Array:
+    """Return the largest jerk of each joint, shape (dof,), less what the rounding of knots can be worth."""
+    a, lengths = accelerations, np.diff(times) + ULPS * np.spacing(times[1:])
+    change = np.abs(np.diff(a, axis=0)) - ULPS * np.spacing(np.maximum(np.abs(a[1:]), np.abs(a[:-1])))
+    found: Array = (np.maximum(change, 0.0) / lengths[:, None]).max(axis=0, initial=0.0)
+    return found
