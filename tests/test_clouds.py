@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support import states_around_home
 
-from apex_ompl import MotionPlanner, filter_points, points_from_depth
+from apex_ompl import MotionPlanner, filter_points, points_from_depth, scene
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.cloud_contact import signed_distances, touches
 from apex_ompl.collision.clouds import PointCloud, cloud_geometry
@@ -257,6 +257,7 @@ def test_depth_images_become_points() -> None:
     pose = np.eye(4)
     pose[:3, :3] = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
     pose[:3, 3] = 0.1, 0.2, 1.5
+    assert points_from_depth is scene.points_from_depth
     points = points_from_depth(depth, (50.0, 52.0, 29.5, 19.5), pose)
     assert points.shape == (40 * 60 - 3, 3)
     local = (points - pose[:3, 3]) @ pose[:3, :3]

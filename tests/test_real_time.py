@@ -113,7 +113,7 @@ def test_a_process_that_dies_while_it_is_made_ready_is_a_sentence() -> None:
 
 
 def test_a_request_ends_what_the_process_is_busy_with() -> None:
-    """Each of two requests has ten seconds; the second one is answered at once, and ends the first."""
+    """The second of three requests takes its ten seconds; the third is answered at once, and ends it."""
     ready, world = ready_of(PROBLEM, budget=10.0), world_of(PROBLEM)
     work = Work(world.problem.still, ready.limits, ready.stopping, ready.settings, Faulty, ("busy", ""), 0)
     standing = Following.standing(ready.setup.start, 0.0, ready.names)

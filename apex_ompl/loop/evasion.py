@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from apex_ompl.live.movers import clearance_in_time
-from apex_ompl.loop.request import Request
+from apex_ompl.loop.following import Following
 from apex_ompl.loop.search import Search
 from apex_ompl.trajectory import Trajectory, time_path
 
@@ -19,9 +19,16 @@ GAIN = 0.2  # time that a step aside that is touched in the end must gain [s]
 NEARNESS = 0.05  # clearance that a step shorter by 1 rad is worth [m]
 
 
-def endangered(request: Request) -> bool:
-    """Whether the robot stands and an obstacle is about to touch it."""
-    return request.following.at_rest(request.join) and request.conflict < request.join + SOON
+def endangered(following: Following, at: float, conflict: float, within: float = SOON) -> bool:
+    """Whether a robot stands at a time, and an obstacle is to touch it within some time from then.
+
+    Args:
+        following: What the robot follows.
+        at: Time of the clock [s].
+        conflict: That of the first conflict of what it follows [s], infinite without one.
+        within: The time from ``at`` on [s].
+    """
+    return following.at_rest(at) and conflict < at + within
 
 
 def step_aside(search: Search) -> Trajectory | None:

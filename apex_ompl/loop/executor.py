@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from apex_ompl.live.movers import Movers, clearance_in_time
-from apex_ompl.loop.evasion import GAIN, SOON, URGENT
+from apex_ompl.loop.evasion import GAIN, SOON, URGENT, endangered
 from apex_ompl.loop.fitting import misfit
 from apex_ompl.loop.following import SAME_TIME, Following
 from apex_ompl.loop.ready import Ready
@@ -276,9 +276,7 @@ class Executor:
     def _ask(self, now: float, predicted: Movers, obstacles: tuple[Obstacle, ...]) -> None:
         """Ask for a replan where one is of use."""
         settings = self.ready.settings
-        if self._overtaken(now) and self.pending is not None:
-            self.log(now, self.pending.refused, why="an obstacle comes", number=self.pending.number, part="")
-            self.pending = None
+        self._give_up(now)
         if self.pending is not None or not self._wants(now):
             return
         join = now + settings.budget
@@ -291,16 +289,17 @@ class Executor:
         self.pending, self.hastened = request, now if request.hastens else self.hastened
         self.replanning.submit(request)
 
-    def _overtaken(self, now: float) -> bool:
-        """Whether a contact where the robot stands is near, of which what was asked for does not know.
+    def _give_up(self, now: float) -> None:
+        """Give up a request that knows nothing of what is about to touch the robot where it stands.
 
-        Then it is to step aside at once, and not when that has been answered.
+        So that it steps aside at once, and not when that has been answered.
         """
         settings, request = self.ready.settings, self.pending
         if request is None or settings.from_rest or not settings.guarded or math.isfinite(request.conflict):
-            return False
-        join = now + settings.budget
-        return self.conflict < join + URGENT and self.following.at_rest(join)
+            return
+        if endangered(self.following, now + settings.budget, self.conflict, URGENT):
+            self.log(now, request.refused, why="an obstacle comes", number=request.number, part="")
+            self.pending = None
 
     def _wants(self, now: float) -> bool:
         """Whether the robot needs another motion."""

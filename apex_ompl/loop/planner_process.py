@@ -36,7 +36,7 @@ def _never() -> bool:
 class WallTime(Charges):
     """Charges by the clock on the wall, from when they are made."""
 
-    def __init__(self, limit: float, overtaken: Callable[[], object] = _never) -> None:
+    def __init__(self, limit: float, overtaken: Callable[[], bool] = _never) -> None:
         """Begin now, with a limit [s].
 
         Args:
@@ -58,7 +58,7 @@ class WallTime(Charges):
     def over(self) -> bool:
         """Whether the time is used up."""
         self.spent = time.perf_counter() - self._begun
-        return super().over() or bool(self._overtaken())
+        return super().over() or self._overtaken()
 
 
 @dataclass(frozen=True, eq=False)

@@ -50,8 +50,8 @@ class Portfolio:
     def replan(self, ready: Ready, request: Request, charges: Charges) -> Answer:
         """Return a motion from the time of joining on that is proved among what is expected, or none."""
         search = Search(ready, request, charges)
-        aside = self.evades and endangered(request)
-        urgent = request.conflict < request.join + URGENT
+        danger = request.following, request.join, request.conflict
+        aside, urgent = self.evades and endangered(*danger), endangered(*danger, URGENT)
         if aside and urgent and self._step_aside(search):
             return Answer(search.best, search.part, charges)
         if aside and not urgent:

@@ -33,7 +33,7 @@ class Candidate:
         clearance: Smallest clearance at the samples [m].
         damping: Damping of the next step.
         rounds: Number of rounds of repair that it had.
-        exact: Whether it is repaired among the obstacles themselves, and not what looks like them.
+        exact: Whether repair among what looks like the obstacles is over.
         fine: Whether it is sampled more densely.
         given_up: Whether repair has nothing left to try on it.
     """
@@ -131,7 +131,7 @@ class CandidatePool:
                 break
             soft = chosen.rounds >= ROUNDS - SOFT_ROUNDS
             optimizer = self._fine if chosen.fine else self._optimizer
-            rough = None if chosen.exact or chosen.rounds >= ROUGH_ROUNDS else self._rough
+            rough = None if chosen.exact else self._rough
             improved = optimizer.improve(
                 rough or self._kernel, chosen.control[None], steps=ROUND, damping=chosen.damping, enough=CLEAR,
                 stiffness=(LAST_RESORT if soft else REPAIR_STIFFNESS) * settings.stiffness,
@@ -144,7 +144,8 @@ class CandidatePool:
             if chosen.clearance >= MIN_CLEARANCE and self._passes(chosen):
                 return chosen
             if rough is not None:
-                chosen.exact = chosen.clearance >= MIN_CLEARANCE or not improved.steps[0]
+                clear = chosen.clearance >= MIN_CLEARANCE or not improved.steps[0]
+                chosen.exact = clear or chosen.rounds >= ROUGH_ROUNDS
             elif not improved.steps[0]:  # no sample violates a margin, and yet the path is invalid
                 chosen.given_up, chosen.fine = chosen.fine, True
         return None
