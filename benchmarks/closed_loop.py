@@ -1,5 +1,7 @@
-"""The closed loop among moving obstacles, on the simulated clock: failure ratios by kind of world, speed and method.
+"""The closed loop among moving obstacles: failure ratios by kind of world, speed and method.
 
+The clock is simulated, or with ``--clock real`` that on the wall, one run at a time on a machine that does nothing
+else; runs on both clocks in the same worlds stand beside each other in a table of their own.
 Every run is judged by the referee at samples 1 ms apart with what truly happened. The sensor has its default settings
 (30 Hz, 50 ms late, errors of 8 mm, 2 % missed), and obstacles were observed for 0.3 s before a run begins. Each run is
 stored in benchmarks/runs/closed_loop when it ends; the command resumes where it was stopped.
@@ -8,8 +10,11 @@ The row ``clairvoyant`` is no loop: ``plan`` knows from the beginning how everyt
 gives the shortest motion of what it finds in 10 s with as many seeds as fit. Times to the goal are compared with its,
 over the runs that both end at the goal. (It is made where motions are independent of the robot's, in moving worlds.)
 
+Reactions are those of all runs of a row: the time from the look at which a conflict was first predicted, wherever on
+the rest of the motion, until the command changed; near ones are of conflicts less than half a second ahead.
+
 Usage: python benchmarks/closed_loop.py [-n 60] [--jobs 1] [--split test] [--kinds moving popup] [--report]
-       [--clairvoyant 60]
+       [--clock sim] [--clairvoyant 60]
 """
 
 from __future__ import annotations
@@ -30,9 +35,10 @@ from tqdm import tqdm
 from apex_ompl import plan, problems
 from apex_ompl.loop.charges import cost_table
 from apex_ompl.loop.methods import METHODS
+from apex_ompl.loop.metrics import NEAR
 from apex_ompl.loop.referee import LIMIT_TOLERANCE
 from apex_ompl.loop.result import Outcome, RunResult
-from apex_ompl.loop.run import run
+from apex_ompl.loop.run import CLOCKS, run
 from apex_ompl.problems import worlds
 from apex_ompl.trajectory.timing import Timing
 from apex_ompl.util.entry_point import run_script
@@ -44,33 +50,36 @@ DEPENDS = ("@planning", "apex_ompl/live", "apex_ompl/loop", "apex_ompl/trajector
 FOLDER = record.RESULTS.parent / "runs" / "closed_loop"
 SPEEDS = (1.0, 0.25)
 KEPT = (
-    "time_to_goal", "rest_time", "stops", "reaction_p95", "near_reaction_p95", "clearance", "limit_use", "broken_steps",
-    "improvements",
+    "time_to_goal", "rest_time", "stops", "clearance", "limit_use", "broken_steps", "improvements", "tick_p50",
+    "tick_p99", "tick_worst", "deadline_misses",
 )  # fmt: skip
 
 CLAIRVOYANT = "clairvoyant"
 SEARCHED = 10.0  # [s]
+SIMULATED, REAL = CLOCKS
 SCRIPTED = "moving"  # kind of the worlds whose obstacles go their way whatever the robot does
 
 
 class Job(NamedTuple):
-    """A run: name of the world, way of replanning, and share of the velocity limits."""
+    """A run: name of the world, way of replanning, share of the velocity limits, and clock."""
 
     world: str
     method: str
     speed: float
+    clock: str = SIMULATED
 
     @property
     def file(self) -> str:
         """Name of the file of the run."""
-        return f"{self.world.replace('/', '_')}-{self.method}-{self.speed:g}.json"
+        clock = "" if self.clock == SIMULATED else f"-{self.clock}"
+        return f"{self.world.replace('/', '_')}-{self.method}-{self.speed:g}{clock}.json"
 
 
 def made(job: Job) -> dict[str, Any]:
     """Run once, and return what is kept."""
     if job.method == CLAIRVOYANT:
         return offline(job)
-    return kept(job, run(job.world, job.method, speed=job.speed, seed=0))
+    return kept(job, run(job.world, job.method, speed=job.speed, seed=0, clock=job.clock))
 
 
 def kept(job: Job, result: RunResult) -> dict[str, Any]:
@@ -83,9 +92,11 @@ def kept(job: Job, result: RunResult) -> dict[str, Any]:
     expected = result.outcome is Outcome.HIT_MOVING and not result.metrics["broken_steps"]
     contact = next((event.time for event in result.events if event.kind == "contact"), math.inf)
     leaving = [event.data["leaving"] for event in taken if event.time <= contact][-1:]
+    reactions = [(event.data["seconds"], event.data["ahead"]) for event in result.events if event.kind == "reaction"]
     return {
         **job._asdict(), "outcome": str(result.outcome), "reason": result.reason, "costs": cost_table()["version"],
         "hit_while_expected": expected, "hit_while_leaving": expected and leaving == [True], **timed,
+        "reactions": reactions,
         **{name: result.metrics[name] for name in KEPT if name in result.metrics},
     }  # fmt: skip
 
@@ -103,7 +114,7 @@ def offline(job: Job) -> dict[str, Any]:
     )
     return {
         **job._asdict(), "outcome": str(Outcome.REACHED if found else Outcome.TIMEOUT), "hit_while_expected": False,
-        "seeds": seed, "replans": [], "plans": [], **reached,
+        "seeds": seed, "reactions": [], "replans": [], "plans": [], **reached,
     }  # fmt: skip
 
 
@@ -132,25 +143,30 @@ def summary(some: Sequence[dict[str, Any]], best: Sequence[dict[str, Any]] = ())
             causes[one["outcome"]] = causes.get(one["outcome"], 0) + 1
     times = [one["time_to_goal"] for one in good]
     compared, replans = ratios(some, best), [took for one in some for took in one["replans"]]
-    plans, near = [took for one in some for took in one["plans"]], column(some, "near_reaction_p95")
+    plans, reactions = [took for one in some for took in one["plans"]], [r for one in some for r in one["reactions"]]
     levels: dict[str, list[bool]] = {}
     for one in some:
         levels.setdefault(one["world"].rpartition("/")[0], []).append(one["outcome"] != "reached")
-    reactions = column(some, "reaction_p95")
+    ticks = {name: column(some, name) for name in ("tick_p50", "tick_p99", "tick_worst", "deadline_misses")}
     return {
         "n": len(some), "failed": failed / len(some), "interval": list(share_interval(failed, len(some))),
         "causes": causes, "hits_while_expected": sum(one["hit_while_expected"] for one in some),
-        "time_to_goal_s": record.percentiles(times, 50, 95) if times else [None, None],
-        "by_clairvoyant": record.percentiles(compared, 50, 95) if compared else [None, None], "compared": len(compared),
-        "replan_s": record.percentiles(replans, 50, 95) if replans else [None, None], "replans": len(replans),
-        "plan_s": record.percentiles(plans, 50, 95) if plans else [None, None],
-        "near_reaction_p95_s": record.percentiles(near, 50, 95) if near else [None, None],
+        "time_to_goal_s": of_all(times), "by_clairvoyant": of_all(compared), "compared": len(compared),
+        "replan_s": of_all(replans), "replans": len(replans), "plan_s": of_all(plans),
         "levels": {level: [sum(row), len(row)] for level, row in levels.items()},
         "worst_level": max(sum(row) / len(row) for row in levels.values()),
         "stops": sum(one["stops"] for one in some) / len(some),
-        "reaction_p95_s": record.percentiles(reactions, 50, 95) if reactions else [None, None],
+        "reaction_s": of_all([took for took, _ in reactions]), "reactions": len(reactions),
+        "near_reaction_s": of_all([took for took, ahead in reactions if ahead < NEAR]),
+        **{f"{name}_s": max(values) for name, values in ticks.items() if values and name.startswith("tick")},
+        **({"deadline_misses": sum(ticks["deadline_misses"])} if ticks["deadline_misses"] else {}),
         "over_limits": sum(one["limit_use"] > 1.0 + LIMIT_TOLERANCE for one in some),
     }  # fmt: skip
+
+
+def of_all(values: Sequence[float]) -> list[float | None]:
+    """Return the 50th and the 95th percentile, or nothing of no values."""
+    return list(record.percentiles(list(values), 50, 95)) if values else [None, None]
 
 
 def column(some: Sequence[dict[str, Any]], name: str) -> list[float]:
@@ -182,6 +198,43 @@ def by_size(runs: Sequence[dict[str, Any]]) -> tuple[str, dict[str, Any]]:
     return "\n".join(record.row(line) for line in lines), numbers
 
 
+def named(row: tuple[str, float, str]) -> str:
+    """Return the name of a row: kind of worlds, speed, and method."""
+    kind, speed, method = row
+    return f"{kind}, speed {speed:g}, {method}"
+
+
+def by_clock(
+    rows: dict[tuple[str, float, str], list[dict[str, Any]]], timed: dict[tuple[str, float, str], list[dict[str, Any]]]
+) -> tuple[str, dict[str, Any]]:
+    """Return the table of the runs on the real clock beside those on the simulated one in the same worlds."""
+    head = ["both clocks", "clock", "N", "failed", "95 % interval", "causes", "time to goal s p50", "p95",
+            "plan ms p50", "p95", "reaction ms p50", "p95", "near ms p95", "stops", "step ms p99", "worst",
+            "steps late"]  # fmt: skip
+    lines, numbers = [head, ["---", "---", *["---:"] * (len(head) - 2)]], {}
+    for row, real in timed.items():
+        there = {one["world"] for one in real}
+        simulated = [one for one in rows.get(row, ()) if one["world"] in there]
+        for clock, some in ((SIMULATED, simulated), (REAL, real)):
+            if not some:
+                continue
+            s = numbers[f"{named(row)}, {clock}"] = summary(some)
+            times = [shown(v) for v in s["time_to_goal_s"]]
+            times += [shown(v, 1e3) for v in (*s["plan_s"], *s["reaction_s"], s["near_reaction_s"][1])]
+            steps = [shown(s.get("tick_p99_s"), 1e3), shown(s.get("tick_worst_s"), 1e3), s.get("deadline_misses", "-")]
+            low, high = s["interval"]
+            lines.append([
+                named(row), clock, s["n"], f"{100 * s['failed']:.1f} %", f"{100 * low:.1f} to {100 * high:.1f}",
+                causes_of(s), *times, f"{s['stops']:.2g}", *steps,
+            ])  # fmt: skip
+    return "\n".join(record.row(line) for line in lines), numbers
+
+
+def causes_of(s: dict[str, Any]) -> str:
+    """Return the causes of failures of a row."""
+    return ", ".join(f"{count} {cause}" for cause, count in sorted(s["causes"].items())) or "-"
+
+
 def table(rows: dict[str, dict[str, Any]]) -> str:
     """Return the Markdown table of rows."""
     head = ["", "N", "failed", "95 % interval", "causes", "hit while moving, as assumed", "time to goal s p50", "p95",
@@ -190,13 +243,10 @@ def table(rows: dict[str, dict[str, Any]]) -> str:
     lines = [head, ["---", *["---:"] * (len(head) - 1)]]
     for name, s in rows.items():
         low, high = s["interval"]
-        causes = ", ".join(f"{count} {cause}" for cause, count in sorted(s["causes"].items())) or "-"
         times = [shown(v) for v in (*s["time_to_goal_s"], *s["by_clairvoyant"])]
-        replans = [
-            shown(v, 1e3) for v in (*s["plan_s"], s["reaction_p95_s"][1], s["near_reaction_p95_s"][1])
-        ]  # fmt: skip
+        replans = [shown(v, 1e3) for v in (*s["plan_s"], s["reaction_s"][1], s["near_reaction_s"][1])]
         lines.append([
-            name, s["n"], f"{100 * s['failed']:.1f} %", f"{100 * low:.1f} to {100 * high:.1f}", causes,
+            name, s["n"], f"{100 * s['failed']:.1f} %", f"{100 * low:.1f} to {100 * high:.1f}", causes_of(s),
             s["hits_while_expected"], *times, f"{s['stops']:.2g}", f"{100 * s['worst_level']:.3g}", *replans,
             s["over_limits"],
         ])  # fmt: skip
@@ -228,38 +278,44 @@ def main() -> None:
     parser.add_argument("--kinds", nargs="+", default=list(worlds.kinds()), choices=worlds.kinds())
     parser.add_argument("--methods", nargs="+", default=list(METHODS), choices=list(METHODS))
     parser.add_argument("--speeds", nargs="+", type=float, default=list(SPEEDS))
+    parser.add_argument("--clock", default=SIMULATED, choices=CLOCKS, help="of runs that are made (default: sim)")
     parser.add_argument("--clairvoyant", type=one_or_more, default=60, help="its worlds (default: %(default)s)")
     parser.add_argument("--store", type=Path, default=FOLDER, help="folder of the runs")
     parser.add_argument("--report", action="store_true", help="run nothing; write the results of the stored runs")
     args = parser.parse_args()
+    if args.clock == REAL and args.jobs > 1:
+        parser.error("runs on the real clock go one at a time, expected --jobs 1")
     jobs = {
-        kind: [
-            Job(world, method, speed)
+        (kind, clock): [
+            Job(world, method, speed, clock)
             for world in worlds.ids(kind, args.split, args.n)
             for method in args.methods
             for speed in args.speeds
         ]
         for kind in args.kinds
+        for clock in CLOCKS
     }
-    if SCRIPTED in jobs:
+    if SCRIPTED in args.kinds:
         known = worlds.ids(SCRIPTED, args.split, min(args.n, args.clairvoyant))
-        jobs[SCRIPTED] += [Job(world, CLAIRVOYANT, speed) for world in known for speed in args.speeds]
-    stored([job for some in jobs.values() for job in some], args, made)
+        jobs[SCRIPTED, SIMULATED] += [Job(world, CLAIRVOYANT, speed) for world in known for speed in args.speeds]
+    stored([job for (_, clock), some in jobs.items() for job in some if clock == args.clock], args, made)
     rows: dict[tuple[str, float, str], list[dict[str, Any]]] = {}
-    for kind, some in jobs.items():
+    timed: dict[tuple[str, float, str], list[dict[str, Any]]] = {}
+    for (kind, clock), some in jobs.items():
         for job in some:
             if (args.store / job.file).exists():
-                row = kind, job.speed, job.method
-                rows.setdefault(row, []).append(json.loads((args.store / job.file).read_text()))
-    found = {
-        f"{kind}, speed {speed:g}, {method}": summary(some, rows.get((kind, speed, CLAIRVOYANT), ()))
-        for (kind, speed, method), some in rows.items()
-    }
+                of = rows if clock == SIMULATED else timed
+                one = json.loads((args.store / job.file).read_text())
+                of.setdefault((kind, job.speed, job.method), []).append(one)
+    found = {named(row): summary(some, rows.get((row[0], row[1], CLAIRVOYANT), ())) for row, some in rows.items()}
     text, data = table(found), {"rows": found}
     moving = [one for (kind, _, _), some in rows.items() if kind == SCRIPTED for one in some]
     if moving:
         sizes, data["by_size"] = by_size(moving)
         text = f"{text}\n\n{sizes}"
+    if timed:
+        clocks, data["by_clock"] = by_clock(rows, timed)
+        text = f"{text}\n\n{clocks}"
     record.write("closed_loop", data, text, split=args.split, n=args.n, seed=0)
 
 

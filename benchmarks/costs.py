@@ -39,6 +39,8 @@ from apex_ompl.loop.search import MOTIONS, Search, reach
 from apex_ompl.loop.settings import LoopSettings
 from apex_ompl.loop.short_horizon import Horizon
 from apex_ompl.loop.snapshot import Snapshot
+from apex_ompl.loop.sprint import CHARGE as SPRINT
+from apex_ompl.loop.sprint import Sprint
 from apex_ompl.ompl_adapter.process import quiet_ompl
 from apex_ompl.ompl_adapter.setup import assemble
 from apex_ompl.problems import worlds
@@ -190,21 +192,32 @@ def refused(first: Array, last: Array) -> Flags:
 
 
 def trees() -> dict[str, float]:
-    """Return what a motion of RRTConnect's trees costs, with all that it does else among obstacles that stand [s]."""
-    spent, motions = 0.0, 0
+    """Return what a motion of OMPL's trees costs, and a state of compiled ones, with all that is done else [s]."""
+    spent, motions, sprinted, states = 0.0, 0, 0.0, 0
     for name in worlds.ids("moving", "validation", 30):
         world = worlds.load(name)
         setup, present = assemble(world.problem.still), tuple(world.present(0.0))
         ready, source = Ready(setup, setup.robot.limits, setup.robot.limits, LoopSettings()), Snapshot()
         source.prepare(ready)
         movers, standing = Movers(present), Following.standing(setup.start, 0.0, ready.names)
-        search = Search(ready, Request(1, 0.0, 0.05, standing, None, movers, movers, present, np.inf, 0), Charges(0.1))
+        search = Search(ready, Request(2, 0.0, 0.05, standing, None, movers, movers, present, np.inf, 0), Charges(0.1))
         with quiet_ompl():
             begin = time.perf_counter()
             source.path(search)
             spent += time.perf_counter() - begin
         motions += search.charges.counts["motion of a tree"]
-    return {"motion of a tree": spent / motions}
+        sprint = Sprint()
+        sprint.prepare(ready)
+        first = anew(search)
+        list(sprint.guesses(first))
+        sprinted += seconds(lambda one=sprint, of=search: list(one.guesses(anew(of))))
+        states += first.charges.counts[SPRINT]
+    return {"motion of a tree": spent / motions, SPRINT: sprinted / states}
+
+
+def anew(search: Search) -> Search:
+    """Return the same replan, begun anew."""
+    return Search(search.ready, search.request, Charges(search.charges.limit))
 
 
 def network() -> dict[str, float]:

@@ -8,6 +8,7 @@ from apex_ompl.live.movers import clearance_in_time
 from apex_ompl.loop.following import Following
 from apex_ompl.loop.search import Search
 from apex_ompl.trajectory import Trajectory, time_path
+from apex_ompl.types import Array
 
 SOON = 0.8  # time before a contact from which on a step aside is looked for [s]
 URGENT = 0.5  # time before one from which on that comes before anything else [s]
@@ -16,6 +17,7 @@ ASCENTS, STRIDE = 3, 0.25  # steps of these away from obstacles, and their lengt
 LOOKS, SEEN = 4, 0.3  # moments at which such a state is looked at, and distances that are told apart [m]
 DURATION = 0.35  # about how long a step aside takes [s]
 GAIN = 0.2  # time that a step aside that is touched in the end must gain [s]
+BACK = 6  # states of the last motion to a goal, and the start of the run, that it may go to as well
 NEARNESS = 0.05  # clearance that a step shorter by 1 rad is worth [m]
 
 
@@ -32,7 +34,10 @@ def endangered(following: Following, at: float, conflict: float, within: float =
 
 
 def step_aside(search: Search) -> Trajectory | None:
-    """Return the straight motion to a state nearby that stays clear, or else clear for longest, or None."""
+    """Return the straight motion to a state nearby that stays clear, or else clear for longest, or None.
+
+    Besides states around, the robot may go back: to states of its last motion to a goal, and to where it began.
+    """
     request, ready = search.request, search.ready
     q, limits, hold = search.start.position, ready.setup.robot.limits, ready.settings.rest_hold
     size = np.repeat(STRAYS, AROUND // len(STRAYS))[:, None]
@@ -50,6 +55,13 @@ def step_aside(search: Search) -> Trajectory | None:
         if turn < ASCENTS:  # away from what comes nearest
             slope = slopes[rows, clear.argmin(axis=1)]
             states = states + STRIDE * slope / np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), 1e-6)
+    back = _back(search)
+    if len(back):
+        other, _ = clearance_in_time(
+            ready.kernel, request.predicted, np.repeat(back, LOOKS, axis=0), np.tile(looks, len(back)), SEEN
+        )
+        search.charges.charge("clearance in time", len(other))
+        states, clear = np.concatenate([states, back]), np.concatenate([clear, other.reshape(-1, LOOKS)])
     near = np.minimum(clear.min(axis=1), ready.kernel.clearance(states, SEEN).min(axis=1))
     search.charges.charge("clearance in time", len(states))
     size = np.abs(states - q).max(axis=1)
@@ -66,3 +78,12 @@ def step_aside(search: Search) -> Trajectory | None:
             if np.isinf(conflict):
                 break
     return best
+
+
+def _back(search: Search) -> Array:
+    """Return the states that a robot may go back to, shape (N, dof)."""
+    ready, route = search.ready, search.request.route
+    begun = ready.setup.start[None]
+    if route is None:
+        return begun
+    return np.concatenate([begun, route.motion(np.linspace(0.0, route.motion.duration, BACK))])

@@ -21,6 +21,7 @@ from apex_ompl.loop.resuming import Resume
 from apex_ompl.loop.settings import LoopSettings
 from apex_ompl.loop.snapshot import Snapshot
 from apex_ompl.loop.sources import Faster, Lines, Route
+from apex_ompl.loop.sprint import Sprint
 
 
 @dataclass(frozen=True)
@@ -44,8 +45,8 @@ BLIND = {"prediction": "still", "guarded": False, **ONE_PLAN}
 PAPER = {**BLIND, "verified": False, "from_rest": True, "by_distance": True}
 
 
-def _no_network() -> Portfolio:
-    return Portfolio([Faster(), Route(), Lines(), Lines(bumps=3)])
+def _no_network(*, waits: bool = True) -> Portfolio:
+    return Portfolio([Faster(), Route(), Lines(), Lines(bumps=3)], waits=waits)
 
 
 METHODS = {
@@ -58,22 +59,29 @@ METHODS = {
         lambda: Portfolio([Faster(), Route(), Lines(), Renoised(), Proposals(), Lines(bumps=3)]), {},
         "all parts, and what is left of the motion noised and denoised again",
     ),
+    "apex-sprint": Method(
+        lambda: Portfolio([Faster(), Route(), Lines(), Sprint(), Proposals(), Lines(bumps=3)]), {},
+        "all parts, and a sprint of trees where the robot stands",
+    ),
     "apex-paper": Method(
         lambda: OneProposal(guided=True), PAPER,
         "the paper's loop: stop near an obstacle, one guided proposal from rest, followed unproved",
     ),
     "apex-paper-unguided": Method(lambda: OneProposal(guided=False), PAPER, "the same without guidance"),
     "retime": Method(
-        lambda: Resume(_no_network(), retimes=True), ONE_PLAN, "one plan, along which the speed alone is chosen anew"
+        lambda: Resume(_no_network(waits=False), retimes=True), ONE_PLAN,
+        "one plan, along which the speed alone is chosen anew",
     ),
     "stop-and-wait": Method(
-        lambda: Resume(_no_network()), FROM_REST, "one plan; stops where it is blocked, goes on when it is clear"
+        lambda: Resume(_no_network(waits=False)), FROM_REST,
+        "one plan; stops where it is blocked, goes on when it is clear",
     ),
     "rrtconnect": Method(
         Snapshot, FROM_REST, "stops where the way is blocked; RRTConnect from rest, among obstacles where they are seen"
     ),
     "blind": Method(
-        lambda: Portfolio([Route(), Lines(), Proposals(), Lines(bumps=3)], evades=False), {**BLIND, "monitored": False},
+        lambda: Portfolio([Route(), Lines(), Proposals(), Lines(bumps=3)], evades=False, waits=False),
+        {**BLIND, "monitored": False},
         "a plan among obstacles where they were seen at first, followed blindly",
     ),
     "gpmp2": Method(IncrementalGPMP2, ONE_PLAN, "GPMP2 from the moving robot, warm from the last motion (as iGPMP2)"),

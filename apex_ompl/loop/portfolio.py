@@ -13,6 +13,7 @@ from apex_ompl.loop.quickening import quickened
 from apex_ompl.loop.ready import Ready
 from apex_ompl.loop.request import Answer, Request
 from apex_ompl.loop.search import Search, Source
+from apex_ompl.loop.waiting import wait_nearer
 from apex_ompl.trajectory import Trajectory
 from apex_ompl.types import Array
 
@@ -20,6 +21,7 @@ FACTORS = ((1.3, 2.5), (1.0, 1.8))  # durations that are tried in turn, as multi
 GOALS = 2  # nearest goals that are tried directly
 ENOUGH = 10  # candidates at which no further source is asked
 ASIDE = 0.7  # share of the budget that other parts have where it may step aside behind them
+WAITING = 0.85  # and where a robot that stands may go nearer to a goal
 CARRIED = 6  # candidates that are carried over to the next replan
 SHARE = 0.5  # of the time that is left, for candidates before the next source is asked
 
@@ -34,11 +36,13 @@ class Portfolio:
         sources: Where motions to start from come from, those that gain most for their time first.
         retimes: Whether the speed along the rest of the motion is chosen anew.
         evades: Whether a robot that stands where an obstacle comes steps aside.
+        waits: Whether one that stands, while no way to a goal is found, goes nearer to it.
     """
 
     sources: Sequence[Source]
     retimes: bool = True
     evades: bool = True
+    waits: bool = True
     carried: list[tuple[MotionCandidate, float]] = field(default_factory=list)
 
     def prepare(self, ready: Ready) -> None:
@@ -54,8 +58,9 @@ class Portfolio:
         aside, urgent = self.evades and endangered(*danger), endangered(*danger, URGENT)
         if aside and urgent and self._step_aside(search):
             return Answer(search.best, search.part, charges)
-        if aside and not urgent:
-            search.until = ASIDE * charges.limit  # some time is left for a step aside
+        waits = self.waits and not aside and not request.hastens and request.following.at_rest(request.join)
+        if (aside and not urgent) or waits:
+            search.until = (WAITING if waits else ASIDE) * charges.limit  # some time is left for that
         if self.retimes:
             motion = retimed(search)
             if motion is not None:
@@ -70,6 +75,10 @@ class Portfolio:
             self._optimise(search)
         if aside and not urgent and search.best is None:
             self._step_aside(search)
+        if waits and search.best is None:
+            nearer = wait_nearer(search)
+            if nearer is not None:
+                search.best, search.part = search.following(nearer), "wait"
         return Answer(search.best, search.part, charges)
 
     @staticmethod

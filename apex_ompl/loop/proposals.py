@@ -12,14 +12,12 @@ from apex_ompl.collision import CollisionChecker
 from apex_ompl.diffusion.checkpoint import shared_model
 from apex_ompl.diffusion.proposals import TrajectoryModel
 from apex_ompl.diffusion.query import Query
-from apex_ompl.live.movers import clearance_in_time
-from apex_ompl.loop.placing import fresh_checker, place
+from apex_ompl.loop.placing import fresh_checker, place_nearest
 from apex_ompl.loop.ready import Ready
 from apex_ompl.loop.search import Guess, Search, least_duration
 from apex_ompl.loop.sources import rest_of_route
 from apex_ompl.types import Array
 
-LOOKS = 16  # at the straight line, to see where an obstacle comes nearest
 TEMPERATURES = (1.0, 1.6)  # of the noise, in one replan after the other
 
 
@@ -65,7 +63,7 @@ class Proposals:
         if not len(goals):
             return
         goal = goals[0]
-        self._place(checker, search, goal)
+        place_nearest(checker, search, goal)
         query = make_query(checker, search.start.position, goal, point=model.sees_point)
         with model.one_thread():
             controls = self._made(search, query)
@@ -85,20 +83,6 @@ class Proposals:
         search.charges.charge("proposals")
         search.charges.charge("proposal", self.count)
         return made.control
-
-    @staticmethod
-    def _place(checker: CollisionChecker, search: Search, goal: Array) -> None:
-        """Place each obstacle where it comes nearest to the straight line in time."""
-        request = search.request
-        line = np.linspace(search.start.position, goal, LOOKS)
-        duration = least_duration(line, search.ready.limits)
-        times = request.join + np.linspace(0.0, duration, LOOKS)
-        clear, _ = clearance_in_time(search.ready.kernel, request.predicted, line, times)
-        nearest = float(times[int(np.argmin(clear))])
-        search.charges.charge("clearance in time", LOOKS)
-        for o in request.obstacles:
-            way = np.multiply(o.velocity or (0.0, 0.0, 0.0), nearest - request.asked)
-            place(checker, o, np.add(o.position, way))
 
 
 @dataclass(eq=False)
