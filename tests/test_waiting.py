@@ -1,8 +1,9 @@
-"""What a robot does while no way to a goal is found: it waits near it, goes back, or searches by trees."""
+"""What a robot does while no way to a goal is found: it waits near it, goes back, leaves, or searches by trees."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -16,6 +17,8 @@ from apex_ompl.loop.following import Following
 from apex_ompl.loop.portfolio import Portfolio
 from apex_ompl.loop.ready import Ready
 from apex_ompl.loop.request import Request
+from apex_ompl.loop.result import Outcome
+from apex_ompl.loop.run import run
 from apex_ompl.loop.search import Search
 from apex_ompl.loop.sprint import CHARGE, Sprint
 from apex_ompl.loop.waiting import wait_nearer
@@ -157,3 +160,21 @@ def test_trees_stop_when_time_is_up() -> None:
     sprint.prepare(ready)
     search = search_of(ready, FAR, budget=1e-4)
     assert not list(sprint.guesses(search)) and search.charges.over()
+
+
+def test_a_robot_that_leaves_takes_only_what_the_guard_will_hardly_stop(
+    ready: Ready, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for leaving, guardable in product((False, True), repeat=2):
+        search = search_of(ready, FAR)
+        search = Search(ready, replace(search.request, leaving=leaving), Charges(0.05))
+        monkeypatch.setattr(search, "guardable", lambda motion, answer=guardable: answer)
+        motion = search.direct(ready.goals[0])
+        assert motion is not None and search.take(motion, "direct") == (guardable or not leaving)
+
+
+def test_a_robot_that_leaves_does_not_stop_where_it_is_touched_soon() -> None:
+    """It began to leave, then stopped as soon as a stop was proved, and stood where the cube came."""
+    result = run("vertical/moving-xlarge-0.2/800001", seed=0)
+    assert any(event.kind == "accepted" and event.data["leaving"] for event in result.events)
+    assert result.outcome is Outcome.REACHED, result.reason

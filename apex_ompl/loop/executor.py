@@ -4,8 +4,8 @@ At every step the robot goes on only where the next step and a stop behind it ar
 bounded speed can reach; else it follows the stop that was proved a step before. By induction it is at rest whenever it
 is touched, as long as no obstacle is faster than was assumed, and each was seen, within the error assumed, not longer
 ago than what was known when the stop was proved. The one exception is a robot that leaves a place that an obstacle
-comes to: it goes on without a proved stop until there is one again. (A fail-safe manoeuvre that is verified online,
-Althoff and Dolan 2014; Pereira and Althoff 2015.)
+comes to: it goes on without a proved stop until there is one again behind which it is not touched soon. (A fail-safe
+manoeuvre that is verified online, Althoff and Dolan 2014; Pereira and Althoff 2015.)
 """
 
 from __future__ import annotations
@@ -104,8 +104,8 @@ class Executor:
             if settings.from_rest:
                 self._halt(now)
         if reachable is not None:
-            self._brake(now)
-            self._guard(now, reachable)
+            self._brake(now, predicted)
+            self._guard(now, reachable, predicted)
         self._ask(now, predicted, obstacles)
 
     def _look(self, now: float, predicted: Movers) -> None:
@@ -132,12 +132,19 @@ class Executor:
         )
         return float(clear.min())
 
-    def _brake(self, now: float) -> None:
-        """Stop where a conflict is near and no answer came within a step."""
-        waited = self.endangered is not None and now > self.endangered + SAME_TIME
-        if waited and self.conflict < now + NEAR and self.stop is not None and not self.following.at_rest(now):
-            if self.following.start(now).moves and self.stop is not self.following:
-                self._follow_stop(now, self.stop)
+    def _brake(self, now: float, predicted: Movers) -> None:
+        """Stop where a conflict is near and no answer came within a step, if it is not touched as soon there."""
+        waited, stop = self.endangered is not None and now > self.endangered + SAME_TIME, self.stop
+        if not waited or self.conflict >= now + NEAR or stop is None or self.following.at_rest(now):
+            return
+        if self.following.start(now).moves and stop is not self.following:
+            if self._until(stop, now, predicted) > self.conflict + GAIN:
+                self._follow_stop(now, stop)
+
+    def _until(self, one: Following, now: float, predicted: Movers) -> float:
+        """Return the time of the first conflict of a motion, or of standing where it ends [s], or infinity."""
+        hold = self.ready.settings.hold if one.to_goal else self.ready.settings.rest_hold
+        return self.ready.first_conflict(predicted, one, now, max(one.end, now) + hold)
 
     def _halt(self, now: float) -> None:
         """Stop where the way to a goal is blocked."""
@@ -174,13 +181,15 @@ class Executor:
         if following is not self.following:
             self.follow(following, time)
 
-    def _guard(self, now: float, reachable: Movers) -> None:
+    def _guard(self, now: float, reachable: Movers, predicted: Movers) -> None:
         """Go on with a proved stop behind the next step, or stop."""
         then = now + self.ready.settings.period
         found = self.ready.proved_stop(reachable, self.following, now, then)
         if found is not None:
-            waits = not self.following.start(now).velocity.any()  # a stop in place is not what it leaves for
-            self.stop, self.leaving = found, self.leaving and waits
+            if self.leaving:  # a stop in place is not what it leaves for, nor one where it would be touched as well
+                waits = not self.following.start(now).velocity.any()
+                self.leaving = waits or self._until(found, now, predicted) < now + NEAR
+            self.stop = found
             return
         if self.leaving or self.following.at_rest(now):
             self.stop = None
@@ -283,7 +292,8 @@ class Executor:
         self.asked += 1
         wide = predicted.larger(max(settings.berth, settings.error + BLIND_TIME * settings.fastest))
         request = Request(
-            self.asked, now, join, self.following, self.route, predicted, wide, obstacles, self.conflict, self.seed
+            self.asked, now, join, self.following, self.route, predicted, wide, obstacles, self.conflict, self.seed,
+            leaving=self.leaving and not self.following.at_rest(join),
         )  # fmt: skip
         self.log(now, "improve" if request.hastens else "request", number=self.asked, join=join)
         self.pending, self.hastened = request, now if request.hastens else self.hastened

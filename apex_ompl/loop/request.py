@@ -30,6 +30,8 @@ class Request:
         obstacles: Their records, where they are expected to be when the new motion begins, with velocities.
         conflict: Time of the clock of the first conflict of what the robot follows [s], infinite without one.
         seed: The run's.
+        leaving: Whether the robot will be leaving a place that an obstacle comes to: another motion is of use only
+            where the guard will hardly stop it, since that would be there.
     """
 
     number: int
@@ -42,6 +44,7 @@ class Request:
     obstacles: tuple[Obstacle, ...]
     conflict: float
     seed: int
+    leaving: bool = False
 
     @property
     def hastens(self) -> bool:

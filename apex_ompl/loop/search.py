@@ -154,7 +154,7 @@ class Search:
             return False
         guardable = self.guardable(motion)
         cost = motion.duration + (0.0 if guardable else NARROW)
-        if cost >= self.cost or (self.request.hastens and not guardable):
+        if cost >= self.cost or ((self.request.hastens or self.request.leaving) and not guardable):
             return False
         self.best, self.part, self.cost = self.following(motion), part, cost
         return True
