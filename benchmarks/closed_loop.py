@@ -241,9 +241,9 @@ def causes_of(s: dict[str, Any]) -> str:
 
 def table(rows: dict[str, dict[str, Any]]) -> str:
     """Return the Markdown table of rows."""
-    head = ["", "N", "failed", "95 % interval", "causes", "hit while moving, as assumed", "leaving", "time to goal s p50",
-            "p95", "by clairvoyant's p50", "p95", "stops",
-            "worst level %", "plan ms p50", "p95", "reaction ms p95", "near ms p95", "over limits"]  # fmt: skip
+    head = ["", "N", "failed", "95 % interval", "causes", "hit while moving, as assumed", "leaving",
+            "time to goal s p50", "p95", "by clairvoyant's p50", "p95", "stops", "worst level %",
+            "plan ms p50", "p95", "reaction ms p95", "near ms p95", "over limits"]  # fmt: skip
     lines = [head, ["---", *["---:"] * (len(head) - 1)]]
     for name, s in rows.items():
         low, high = s["interval"]
