@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import math
+import multiprocessing
+import os
 import pickle
 import time
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +19,7 @@ from loops import BLOCKED, PROBLEM, crossing, ready_of, setup_of, world_of
 
 from apex_ompl.errors import PlannerProcessError
 from apex_ompl.live.movers import Movers, clearance_in_time
+from apex_ompl.loop import planner_process
 from apex_ompl.loop.cycle import RunRecord
 from apex_ompl.loop.following import Following
 from apex_ompl.loop.methods import replanner_of
@@ -110,6 +114,27 @@ def test_a_process_that_dies_while_it_is_made_ready_is_a_sentence() -> None:
     with pytest.raises(PlannerProcessError, match="died"), process:
         pass
     assert process.process.poll() is not None
+
+
+@pytest.mark.parametrize("late", [0.3, 3.0])
+def test_what_is_sent_late_goes_to_no_other_process(monkeypatch: pytest.MonkeyPatch, late: float) -> None:
+    """The number of a connection is another's as soon as it is closed."""
+    sent = []
+
+    def slow(connection: Any, message: object) -> None:
+        number = connection.fileno()
+        time.sleep(late)
+        with suppress(OSError):
+            os.write(number, b"stale")
+        sent.append(message)
+
+    monkeypatch.setattr(planner_process, "_sent", slow)
+    ready, world = ready_of(PROBLEM), world_of(PROBLEM)
+    process = PlannerProcess(Work(world.problem.still, ready.limits, ready.stopping, ready.settings, Faulty, (), 0))
+    process.close()
+    assert sent and process.process.poll() is not None
+    mine, other = multiprocessing.Pipe()
+    assert not mine.poll(0.1) and not other.poll(0.1)
 
 
 def test_a_request_ends_what_the_process_is_busy_with() -> None:

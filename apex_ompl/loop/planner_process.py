@@ -117,7 +117,8 @@ class PlannerProcess:
         self._ready = False
         self._asked: list[float] = []
         first = sys.path, self._core, pickle.dumps(self._work)
-        threading.Thread(target=_sent, args=(mine, first), daemon=True).start()
+        self._sender = threading.Thread(target=_sent, args=(mine, first), daemon=True)
+        self._sender.start()
 
     def __enter__(self) -> Self:
         """Wait until it is ready.
@@ -193,7 +194,11 @@ class PlannerProcess:
     def close(self, wait: float = ENDED) -> None:
         """End the process, by force where it goes on for some time [s]."""
         self._ready = False
-        self._connection.close()
+        self._sender.join(wait)
+        if self._sender.is_alive():
+            self.process.kill()
+            self._sender.join()
+        self._connection.close()  # not before: what is still being sent would go to whatever gets its number
         try:
             self.process.wait(wait)
         except subprocess.TimeoutExpired:
