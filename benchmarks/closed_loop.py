@@ -115,7 +115,7 @@ def offline(job: Job) -> dict[str, Any]:
     )
     return {
         **job._asdict(), "outcome": str(Outcome.REACHED if found else Outcome.TIMEOUT), "hit_while_expected": False,
-        "seeds": seed, "reactions": [], "replans": [], "plans": [], **reached,
+        "hit_while_leaving": False, "seeds": seed, "reactions": [], "replans": [], "plans": [], **reached,
     }  # fmt: skip
 
 
@@ -148,7 +148,7 @@ def summary(some: Sequence[dict[str, Any]], best: Sequence[dict[str, Any]] = ())
     levels: dict[str, list[bool]] = {}
     for one in some:
         levels.setdefault(one["world"].rpartition("/")[0], []).append(one["outcome"] != "reached")
-    leaving = sum(one.get("hit_while_leaving", False) for one in some)
+    leaving = sum(one["hit_while_leaving"] for one in some)
     ticks = {name: column(some, name) for name in ("tick_p50", "tick_p99", "tick_worst", "deadline_misses")}
     return {
         "n": len(some), "failed": failed / len(some), "interval": list(share_interval(failed, len(some))),

@@ -47,21 +47,12 @@ def step_aside(search: Search) -> Trajectory | None:
     for turn in range(ASCENTS + 1):
         states = np.clip(states, limits.lower, limits.upper)
         states[:, ready.fingers] = q[ready.fingers]
-        clear, slopes = clearance_in_time(
-            ready.kernel, request.predicted, np.repeat(states, LOOKS, axis=0), np.tile(looks, len(states)), SEEN
-        )
-        search.charges.charge("clearance in time", len(clear))
-        clear, slopes = clear.reshape(-1, LOOKS), slopes.reshape(len(states), LOOKS, -1)[:, :, :-1]
+        clear, slopes = _looked(search, states, looks)
         if turn < ASCENTS:  # away from what comes nearest
             slope = slopes[rows, clear.argmin(axis=1)]
             states = states + STRIDE * slope / np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), 1e-6)
     back = _back(search)
-    if len(back):
-        other, _ = clearance_in_time(
-            ready.kernel, request.predicted, np.repeat(back, LOOKS, axis=0), np.tile(looks, len(back)), SEEN
-        )
-        search.charges.charge("clearance in time", len(other))
-        states, clear = np.concatenate([states, back]), np.concatenate([clear, other.reshape(-1, LOOKS)])
+    states, clear = np.concatenate([states, back]), np.concatenate([clear, _looked(search, back, looks)[0]])
     near = np.minimum(clear.min(axis=1), ready.kernel.clearance(states, SEEN).min(axis=1))
     search.charges.charge("clearance in time", len(states))
     size = np.abs(states - q).max(axis=1)
@@ -78,6 +69,16 @@ def step_aside(search: Search) -> Trajectory | None:
             if np.isinf(conflict):
                 break
     return best
+
+
+def _looked(search: Search, states: Array, looks: Array) -> tuple[Array, Array]:
+    """Return clearances of states at some times, shape (N, times) [m], and their gradients, shape (N, times, dof)."""
+    clear, slopes = clearance_in_time(
+        search.ready.kernel, search.request.predicted, np.repeat(states, len(looks), axis=0),
+        np.tile(looks, len(states)), SEEN,
+    )  # fmt: skip
+    search.charges.charge("clearance in time", len(clear))
+    return clear.reshape(len(states), -1), slopes.reshape(len(states), len(looks), -1)[:, :, :-1]
 
 
 def _back(search: Search) -> Array:

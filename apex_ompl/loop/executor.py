@@ -110,13 +110,10 @@ class Executor:
 
     def _look(self, now: float, predicted: Movers) -> None:
         """Find the first conflict of what is followed."""
-        settings, one = self.ready.settings, self.following
-        hold = settings.hold if one.to_goal else settings.rest_hold
-        until = max(one.end, now) + hold
-        if settings.by_distance:
+        if self.ready.settings.by_distance:
             found = now if self._distance(now, predicted) < self.nearest else math.inf
         else:
-            found = self.ready.first_conflict(predicted, one, now, until)
+            found = self._first_conflict(self.following, now, predicted)
         if math.isfinite(found) and not math.isfinite(self.conflict):
             self.log(now, "conflict", at=found)
             self.endangered, self.ahead = now, found - now
@@ -138,10 +135,10 @@ class Executor:
         if not waited or self.conflict >= now + NEAR or stop is None or self.following.at_rest(now):
             return
         if self.following.start(now).moves and stop is not self.following:
-            if self._until(stop, now, predicted) > self.conflict + GAIN:
+            if self._first_conflict(stop, now, predicted) > self.conflict + GAIN:
                 self._follow_stop(now, stop)
 
-    def _until(self, one: Following, now: float, predicted: Movers) -> float:
+    def _first_conflict(self, one: Following, now: float, predicted: Movers) -> float:
         """Return the time of the first conflict of a motion, or of standing where it ends [s], or infinity."""
         hold = self.ready.settings.hold if one.to_goal else self.ready.settings.rest_hold
         return self.ready.first_conflict(predicted, one, now, max(one.end, now) + hold)
@@ -188,7 +185,7 @@ class Executor:
         if found is not None:
             if self.leaving:  # a stop in place is not what it leaves for, nor one where it would be touched as well
                 waits = not self.following.start(now).velocity.any()
-                self.leaving = waits or self._until(found, now, predicted) < now + NEAR
+                self.leaving = waits or self._first_conflict(found, now, predicted) < now + NEAR
             self.stop = found
             return
         if self.leaving or self.following.at_rest(now):
@@ -271,8 +268,7 @@ class Executor:
         if not math.isfinite(self.conflict) and self.following.to_goal and found.to_goal:
             if found.end > self.following.end - EARLIER + SAME_TIME:
                 return "it is hardly faster"
-        hold = settings.hold if found.to_goal else settings.rest_hold
-        conflict = self.ready.first_conflict(predicted, found, found.begin, found.end + hold)
+        conflict = self._first_conflict(found, found.begin, predicted)
         gains = self._may_leave(now, found) and conflict > self.conflict + GAIN
         if math.isfinite(conflict) and not gains:
             return "what was seen since then is in the way"

@@ -22,7 +22,7 @@ CHARGE = "state of a tree"
 
 @dataclass(eq=False)
 class Sprint:
-    """RRT-Connect in compiled code, for a robot that stands where it is while an earlier replan found no way to a goal.
+    """RRT-Connect in compiled code, for a robot that stands, from the second replan of a run on.
 
     Its paths are longer than those that other sources begin from, so that they are no way to begin a run.
     Each obstacle that moves stands where it comes nearest to the straight line in time; where it will touch the robot
