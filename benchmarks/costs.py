@@ -1,9 +1,12 @@
 """Costs of work in the closed loop: the table by which the simulated clock charges it, measured on this machine.
 
-Each kind of work is timed in worlds of the validation split; it costs the median over the worlds of the least of five
-calls. With --write the table becomes that of the package, under the next version number.
+Each kind of work is timed in worlds of the validation split: the median over the worlds of the least of five calls.
+That is too little for what replans take, where nothing is in the caches and there is work of no kind besides. So runs
+on the simulated clock are timed as well, of each way of replanning in turn: what their replans took in sum, by what
+they were charged, is a factor on the kinds of work that no way before used. With --write the table becomes that of the
+package, under the next version number.
 
-Usage: python benchmarks/costs.py [-n 12] [--write]
+Usage: python benchmarks/costs.py [-n 12] [--runs 12] [--write]
 """
 
 from __future__ import annotations
@@ -11,8 +14,8 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from collections import defaultdict
-from collections.abc import Callable
+from collections import Counter, defaultdict
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -29,25 +32,31 @@ from apex_ompl.loop.drrt import Clearances, KeptTree
 from apex_ompl.loop.following import Following
 from apex_ompl.loop.gpmp2 import CHARGE, IncrementalGPMP2
 from apex_ompl.loop.imitation import Imitation
+from apex_ompl.loop.methods import adapted, method
 from apex_ompl.loop.mppi import PathIntegral, softmax
 from apex_ompl.loop.paper import OneProposal
 from apex_ompl.loop.potential_field import PotentialField
 from apex_ompl.loop.proposals import Proposals
 from apex_ompl.loop.ready import Ready
-from apex_ompl.loop.request import Request
+from apex_ompl.loop.rehearsal import rehearse
+from apex_ompl.loop.request import Answer, Replanner, Request
+from apex_ompl.loop.run import default_settings
 from apex_ompl.loop.search import MOTIONS, Search, reach
+from apex_ompl.loop.sensor import Sensor, SensorStream
 from apex_ompl.loop.settings import LoopSettings
 from apex_ompl.loop.short_horizon import Horizon
+from apex_ompl.loop.simulation import simulate
 from apex_ompl.loop.snapshot import Snapshot
 from apex_ompl.loop.sprint import CHARGE as SPRINT
 from apex_ompl.loop.sprint import Sprint
-from apex_ompl.ompl_adapter.process import quiet_ompl
+from apex_ompl.ompl_adapter.process import quiet_ompl, seed_ompl
 from apex_ompl.ompl_adapter.setup import assemble
 from apex_ompl.problems import worlds
 from apex_ompl.roadmaps.goal_tree import GoalTree
 from apex_ompl.roadmaps.lazy_search import LazySearch
 from apex_ompl.trajectory import time_path
-from apex_ompl.trajectory.methods.moving_start import between
+from apex_ompl.trajectory.methods.moving_start import between, through
+from apex_ompl.trajectory.timing import Timing
 from apex_ompl.trajopt.optimizer import Optimizer
 from apex_ompl.types import Array, Flags
 from apex_ompl.util.entry_point import run_script
@@ -56,6 +65,12 @@ from apex_ompl.util.validation import one_or_more
 
 DEPENDS = ("@planning", "apex_ompl/live", "apex_ompl/loop", "apex_ompl/roadmaps", "apex_ompl/trajectory")
 REPEATS = 5
+PLANNERS = (
+    "apex", "no-network", "retime", "apex-sprint", "rrtconnect", "potential-field", "mppi", "gpmp2", "drrt", "damon",
+    "il", "apex-paper", "apex-paper-unguided",
+)  # fmt: skip
+LEAST_FACTOR = 0.5
+LEAST_SHARE = 0.1  # of what replans took that work of new kinds must be charged for, to be scaled
 
 
 def seconds(call: Callable[[], Any]) -> float:
@@ -93,6 +108,10 @@ def measured(name: str, found: dict[str, list[float]]) -> None:
     motion = time_path(ends, limits, ready.names).trajectory
     still = np.zeros_like(ends)
     found["direct motion"].append(seconds(lambda: between(np.stack([ends, still, still]), limits, ready.names)))
+    pieces = motion.states(np.array([0.0, 0.5 * motion.duration, motion.duration]))
+    piece = seconds(lambda: through(pieces, limits, ready.names, 0.0))  # the first one is too long
+    found["piece of a motion"].append(piece)
+    found["joined motion"].append(seconds(lambda: through(pieces, limits, ready.names)) - 2.0 * piece)
     one, half = Following(motion, 0.0), 0.5 * motion.duration
     found["proved stop"].append(
         seconds(lambda: ready.proved_stop(reach(movers, half, 0.024, 0.2), one, half, half + ready.settings.period))
@@ -246,10 +265,71 @@ def network() -> dict[str, float]:
     return {"proposals": taken[1] - each, "proposal": each, **paths, "chunk of a policy": chunk}
 
 
+class Timed:
+    """A way of replanning whose replans are timed.
+
+    Attributes:
+        seconds: What they took [s].
+        counts: What they were charged, in units by kind.
+        replans: Their number.
+    """
+
+    def __init__(self, replanner: Replanner) -> None:
+        """Wrap a way of replanning."""
+        self._replanner = replanner
+        self.seconds, self.replans, self.counts = 0.0, 0, Counter[str]()
+
+    def prepare(self, ready: Ready) -> None:
+        """Prepare it."""
+        self._replanner.prepare(ready)
+        rehearse(self._replanner, ready)
+
+    def replan(self, ready: Ready, request: Request, charges: Charges) -> Answer:
+        """Replan, and note what it took."""
+        begin = time.perf_counter()
+        answer = self._replanner.replan(ready, request, charges)
+        self.seconds += time.perf_counter() - begin
+        self.counts += answer.charges.counts
+        self.replans += 1
+        return answer
+
+
+def timed_runs(planner: str, names: Sequence[str]) -> Timed:
+    """Return what replans took in runs of a way of replanning on the simulated clock."""
+    timed = Timed(method(planner).make())
+    for name in names:
+        world, sensor = worlds.load(name), Sensor()
+        setup = assemble(world.problem.still)
+        settings = adapted(default_settings(world, sensor), method(planner))
+        limits = Timing().limits(setup.robot.limits, setup.robot.joint_names)
+        ready = Ready(setup, limits, setup.robot.limits, settings)
+        with quiet_ompl():
+            seed_ompl(0)
+            timed.prepare(ready)
+            simulate(world, ready, timed, SensorStream(sensor, world, settings.watched), 0)
+    return timed
+
+
+def in_replans(alone: Mapping[str, float], names: Sequence[str]) -> tuple[dict[str, float], dict[str, dict[str, Any]]]:
+    """Return what kinds of work cost in replans [s], of what they cost alone, and factors by way of replanning."""
+    costs, known, about = dict(alone), set[str](), {}
+    for planner in PLANNERS:
+        timed = timed_runs(planner, names)
+        new = [kind for kind in timed.counts if kind not in known]
+        charged = sum(costs[kind] * timed.counts[kind] for kind in new)
+        rest = timed.seconds - sum(costs[kind] * count for kind, count in timed.counts.items() if kind in known)
+        factor = max(rest / charged, LEAST_FACTOR) if charged > LEAST_SHARE * timed.seconds else 1.0
+        costs |= {kind: factor * costs[kind] for kind in new}
+        known |= set(new)
+        about[planner] = {"factor": factor, "replans": timed.replans, "seconds": timed.seconds}
+    return costs, about
+
+
 def main() -> None:
     """Measure, and write the results."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("-n", type=one_or_more, default=30, help="worlds (default: %(default)s)")
+    parser.add_argument("--runs", type=one_or_more, default=30, help="of each way (default: %(default)s)")
     parser.add_argument("--write", action="store_true", help="write the table of the package, too")
     args = parser.parse_args()
     found: dict[str, list[float]] = defaultdict(list)
@@ -257,13 +337,19 @@ def main() -> None:
         measured(name, found)
         controls(name, found)
         graph(name, found)
-    table = {kind: float(np.median(values)) for kind, values in found.items()} | network() | trees()
-    rows = [["kind of work", "us a unit"], ["---", "---:"], *([kind, f"{1e6 * v:.3g}"] for kind, v in table.items())]
+    alone = {kind: float(np.median(values)) for kind, values in found.items()} | network() | trees()
+    table, about = in_replans(alone, worlds.ids("moving", "validation", args.runs))
+    rows = [["kind of work", "us a unit alone", "in replans"], ["---", "---:", "---:"]]
+    rows += [[kind, f"{1e6 * alone[kind]:.3g}", f"{1e6 * v:.3g}"] for kind, v in table.items()]
+    text = "\n".join(map(record.row, rows))
+    rows = [["replans of", "N", "s", "factor on kinds of their own"], ["---", "---:", "---:", "---:"]]
+    rows += [[name, one["replans"], f"{one['seconds']:.2f}", f"{one['factor']:.2f}"] for name, one in about.items()]
+    text += "\n\n" + "\n".join(map(record.row, rows))
     if args.write:
         version = json.loads(TABLE.read_text())["version"]
         content = {"version": version + 1, "seconds": {kind: float(f"{v:.3g}") for kind, v in table.items()}}
         write_atomically(TABLE, (json.dumps(content, indent=1) + "\n").encode())
-    record.write("costs", {"seconds": table}, "\n".join(map(record.row, rows)), seed=0, n=args.n)
+    record.write("costs", {"alone": alone, "seconds": table, "replans": about}, text, seed=0, n=args.n)
 
 
 if __name__ == "__main__":

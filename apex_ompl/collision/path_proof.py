@@ -16,6 +16,7 @@ from apex_ompl.collision.mesh_stage import MeshStage
 from apex_ompl.collision.solids import Solid
 from apex_ompl.collision.tabulate import joint_tree
 from apex_ompl.kernel.compiled import curve_proof
+from apex_ompl.kernel.compiled.cubic_pieces import cubic_rates
 from apex_ompl.kernel.compiled.layout import Floats, Integers, new_buffers, pack
 from apex_ompl.kernel.compiled.shapes import PairBuffers, ShapeArrays
 from apex_ompl.kernel.kernel import Kernel
@@ -73,15 +74,11 @@ class Curve:
 
         The acceleration is linear between knots.
         """
-        q, v, a, t = positions, velocities, accelerations, times
-        if len(t) == 1:
-            return cls.polyline(q)
-        dt = np.diff(t)[:, None]
-        missed = np.abs(q[:-1] + dt * (v[:-1] + dt * (2.0 * a[:-1] + a[1:]) / 6.0) - q[1:])
-        missed_speed = np.abs(v[:-1] + dt * (a[:-1] + a[1:]) / 2.0 - v[1:])
-        slack = float(missed.max(axis=1).sum() + missed_speed.max(axis=1).sum() * t[-1])
-        rates = np.require(np.concatenate([v, a], axis=1), float, ["C", "W"])
-        return cls(np.require(t, float, ["C", "W"]), np.require(q, float, ["C", "W"]), rates, slack)
+        if len(times) == 1:
+            return cls.polyline(positions)
+        t, q, v, a = (np.require(x, float, ["C", "W"]) for x in (times, positions, velocities, accelerations))
+        rates = np.empty((len(t), 2 * q.shape[1]))
+        return cls(t, q, rates, cubic_rates(t, q, v, a, rates))
 
 
 @dataclass(frozen=True)

@@ -49,7 +49,7 @@ class Following:
         at = min(max(time - self.begin, 0.0), self.motion.duration)
         if at >= self.motion.duration - SAME_TIME:
             return Start.at_rest(self.motion.positions[-1].copy())
-        return Start(self.motion(at), self.motion(at, 1), self.motion(at, 2))
+        return Start(*self.motion.states(np.array([at]))[:, 0])
 
     def state(self, time: float) -> Array:
         """Return the robot's state at a time of the clock, shape (dof,)."""
@@ -72,8 +72,7 @@ class Following:
         first, times = begin - self.begin, self.motion.times
         inner = times[(times > first + SAME_TIME) & (times < last - SAME_TIME)]
         at = np.concatenate([[max(first, 0.0)], inner, [last]])
-        q, v, a = (self.motion(at, order) for order in range(3))
-        moving = Trajectory(at - at[0], q, v, a, self.motion.joint_names)
+        moving = Trajectory(at - at[0], *self.motion.states(at), self.motion.joint_names)
         if end - self.end <= SAME_TIME:
             return moving
         return concatenate([moving, self.piece(self.end, end)])

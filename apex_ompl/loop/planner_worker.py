@@ -11,6 +11,7 @@ from typing import Any
 from apex_ompl.errors import ApexError
 from apex_ompl.loop.planner_process import WallTime, Work
 from apex_ompl.loop.ready import Ready
+from apex_ompl.loop.rehearsal import rehearse
 from apex_ompl.loop.replanning import SHARE, allowed, answered
 from apex_ompl.ompl_adapter.process import quiet_ompl, seed_ompl
 from apex_ompl.ompl_adapter.setup import assemble
@@ -30,6 +31,7 @@ def serve(connection: Connection[Any, Any]) -> None:
             ready = Ready(assemble(work.problem, seed=work.seed), work.limits, work.stopping, work.settings)
             replanner = work.make(*work.arguments)
             replanner.prepare(ready)
+            rehearse(replanner, ready)
     except ApexError as error:
         connection.send(str(error))
         return

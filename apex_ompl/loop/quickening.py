@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 
 import numpy as np
 
 from apex_ompl.loop.search import Search
 from apex_ompl.trajectory import Trajectory
-from apex_ompl.trajectory.methods.moving_start import between
-from apex_ompl.trajectory.trajectory import concatenate
+from apex_ompl.trajectory.methods.moving_start import through
 
 TRIES = ((2, 1.25), (3, 1.25), (2, 1.0), (4, 1.1), (3, 1.0))  # numbers of pieces, and factors on the speed between them
 SHARE = 0.98  # of the limits that speeds and accelerations between pieces have at most
@@ -26,20 +26,15 @@ def quickened(search: Search, motion: Trajectory) -> Iterator[Trajectory]:
         motion: The motion.
     """
     limits, names, duration = search.ready.limits, search.ready.names, motion.duration
+    solve = partial(search.charges.charge, "piece of a motion")
     for pieces, factor in TRIES:
         if search.over() or duration <= 0.0:
             return
-        states = np.stack([motion(np.linspace(0.0, duration, pieces + 1), order) for order in range(3)])
+        states = motion.states(np.linspace(0.0, duration, pieces + 1))
         for order, most in ((1, limits.velocity), (2, limits.acceleration)):
             states[order] = np.clip(factor**order * states[order], -SHARE * most, SHARE * most)
         states[:, 0], states[:, -1] = search.start, (motion.positions[-1], 0.0 * most, 0.0 * most)
-        found, left = [], search.wanted()
-        for k in range(pieces):
-            search.charges.charge("direct motion")
-            one = between(states[:, k : k + 2], limits, names)
-            if one is None or one.duration >= left:
-                break
-            found.append(one)
-            left -= one.duration
-        else:
-            yield concatenate([one for one in found if one.duration > 0.0])
+        faster = through(states, limits, names, search.wanted(), solve)
+        if faster is not None and faster.duration > 0.0:
+            search.charges.charge("joined motion")
+            yield faster

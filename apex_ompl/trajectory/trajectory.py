@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from apex_ompl.errors import FileFormatError, ParameterError
+from apex_ompl.kernel.compiled.cubic_pieces import relative_gap, sample_motion
 from apex_ompl.robot.model import Limits
 from apex_ompl.trajectory.extremes import Extremes
 from apex_ompl.trajectory.files import STATES, SUFFIXES, decode, encode
@@ -85,6 +86,8 @@ class Trajectory:
         check_times(self.times)
         for name in STATES:
             check_array(getattr(self, name), (len(self.times), len(names)), name)
+        if relative_gap(*self.knots) <= CONTINUITY_TOLERANCE:
+            return
         q, v, a, t = self.positions, self.velocities, self.accelerations, np.diff(self.times)[:, None]
         reached = q[:-1] + t * (v[:-1] + t * (2.0 * a[:-1] + a[1:]) / 6.0), v[:-1] + t * (a[:-1] + a[1:]) / 2.0
         for name, integrated, given in zip(STATES, reached, (q[1:], v[1:]), strict=False):
@@ -101,6 +104,11 @@ class Trajectory:
         for name, value in zip(("times", *STATES, "joint_names"), values, strict=True):
             object.__setattr__(motion, name, value)
         return motion
+
+    @property
+    def knots(self) -> tuple[Array, Array, Array, Array]:
+        """Times, positions, velocities and accelerations, as compiled code takes them."""
+        return self.times, self.positions, self.velocities, self.accelerations
 
     @property
     def duration(self) -> float:
@@ -134,24 +142,16 @@ class Trajectory:
         given = finite_array(time, "time")
         if given.ndim > 1:
             raise ParameterError("time", given.shape, "one time, or several of shape (N,)")
-        times = np.atleast_1d(given)
-        if len(self.times) == 1:
-            values = np.repeat(self.positions if order == 0 else np.zeros((1, self.dof)), len(times), axis=0)
-        else:
-            piece = np.clip(np.searchsorted(self.times, times, side="right") - 1, 0, len(self.times) - 2)
-            since = np.clip(times, 0.0, self.duration)[:, None] - self.times[piece, None]
-            q, v, a, j = self.positions[piece], self.velocities[piece], self.accelerations[piece], self.jerks[piece]
-            values = (
-                q + since * (v + since * (a / 2.0 + since * j / 6.0)),
-                v + since * (a + since * j / 2.0),
-                a + since * j,
-                j,
-            )[order]
-            if order < len(STATES):  # without rounding at the end
-                values[times >= self.duration] = (self.positions, self.velocities, self.accelerations)[order][-1]
-            if order > 0:
-                values[(times < 0.0) | (times > self.duration)] = 0.0
-        return values[0] if given.ndim == 0 else values
+        out = np.empty((1, given.size, self.dof))
+        sample_motion(*self.knots, np.atleast_1d(given), order, out)
+        values: Array = out[0, 0] if given.ndim == 0 else out[0]
+        return values
+
+    def states(self, times: Array) -> Array:
+        """Return positions, velocities and accelerations at finite times, shape (N,) [s], in one, shape (3, N, dof)."""
+        out = np.empty((len(STATES), len(times), self.dof))
+        sample_motion(*self.knots, times, 0, out)
+        return out
 
     def sample(self, spacing: float) -> Sample:
         """Return states at a spacing in time, and at the end.
@@ -163,7 +163,7 @@ class Trajectory:
         if self.duration / spacing > MAX_SAMPLES:
             raise ParameterError("spacing", spacing, f"at most {MAX_SAMPLES} samples")
         times = np.append(spacing * np.arange(max(0, np.ceil(self.duration / spacing - 1e-9))), self.duration)
-        return Sample(times, self(times), self(times, 1), self(times, 2))
+        return Sample(times, *self.states(times))
 
     def stream(self, rate: float = 1000.0) -> Iterator[Sample]:
         """Return the states at the rate of a controller one by one, the end last.
@@ -182,7 +182,7 @@ class Trajectory:
         for begin in range(0, count + 1, BLOCK):
             which = np.arange(begin, min(begin + BLOCK, count + 1))
             times = np.where(which == count, self.duration, which / rate)
-            states = self(times), self(times, 1), self(times, 2)
+            states = self.states(times)
             for k, time in enumerate(times.tolist()):
                 yield Sample(time, states[0][k], states[1][k], states[2][k])
 
@@ -207,7 +207,7 @@ class Trajectory:
 
     @cached_property
     def _extremes(self) -> Extremes:
-        return Extremes.of(self.times, self.positions, self.velocities, self.accelerations, self.jerks)
+        return Extremes.of(*self.knots)
 
     @property
     def jerk(self) -> float:

@@ -87,13 +87,13 @@ def _shown(bound: float) -> str:
 
 
 def finite_array(given: ArrayLike, name: str) -> Array:
-    """Return a copy of finite numbers as an array.
+    """Return a copy of finite numbers as an array, in C's order.
 
     Raises:
         ParameterError: One is no finite number.
     """
     try:
-        found = np.array(given, dtype=float)
+        found = np.array(given, dtype=float, order="C")
     except (TypeError, ValueError, OverflowError) as error:
         raise ParameterError(name, given, "finite numbers") from error
     if not np.isfinite(found).all():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import ruckig
@@ -49,6 +49,36 @@ def between(
         joint_names: Names of the joints.
         minimum_duration: Least duration [s].
     """
+    solution = _solved(states, limits, minimum_duration)
+    return None if solution is None else _within_limits([solution], states, limits, joint_names)
+
+
+def through(
+    states: Array, limits: Limits, joint_names: tuple[str, ...], longest: float = np.inf,
+    solving: Callable[[], None] = lambda: None,
+) -> Trajectory | None:  # fmt: skip
+    """Return Ruckig's motions between some states one after the other, or None.
+
+    Args:
+        states: Positions, velocities and accelerations, shape (3, N, dof).
+        limits: As in :func:`between`.
+        joint_names: Names of the joints.
+        longest: Duration that it must be shorter than [s].
+        solving: Called before each of the N - 1 problems.
+    """
+    solutions, left = [], longest
+    for k in range(states.shape[1] - 1):
+        solving()
+        one = _solved(states[:, k : k + 2], limits)
+        if one is None or one.duration >= left:
+            return None
+        solutions.append(one)
+        left -= one.duration
+    return _within_limits(solutions, states, limits, joint_names)
+
+
+def _solved(states: Array, limits: Limits, minimum_duration: float = 0.0) -> ruckig.Trajectory | None:
+    """Return Ruckig's solution between two states, shape (3, 2, dof), or None."""
     dof = states.shape[2]
     solver, query, solution = ruckig.Ruckig(dof), ruckig.InputParameter(dof), ruckig.Trajectory(dof)
     (query.current_position, query.target_position), (query.current_velocity, query.target_velocity), (
@@ -63,6 +93,12 @@ def between(
         calculate(solver, query, solution)
     except ruckig.RuckigError:  # that state cannot be reached from this velocity within the limits
         return None
-    motion = joined(Profiles.of([solution]), states, joint_names)
-    # Ruckig may exceed a limit that the velocity is near to
-    return motion if max(motion.use(limits).values()) <= 1.0 + ROUNDING else None
+    return solution
+
+
+def _within_limits(
+    solutions: list[ruckig.Trajectory], states: Array, limits: Limits, joint_names: tuple[str, ...]
+) -> Trajectory | None:
+    """Return solutions as one motion, if it keeps the limits: Ruckig may exceed one that the velocity is near to."""
+    made = joined(Profiles.of(solutions), states, joint_names)
+    return made if max(made.use(limits).values()) <= 1.0 + ROUNDING else None

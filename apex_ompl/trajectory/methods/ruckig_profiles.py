@@ -95,5 +95,4 @@ def joined(profiles: Profiles, states: Array, joint_names: tuple[str, ...]) -> T
     times = np.empty(math.prod(shape) + 1)
     at = np.empty((3, len(times), dof))
     found = join_profiles(profiles.phases, profiles.jerks, starts, np.ascontiguousarray(states), *room, times, at)
-    q, v, a = (values[:found].copy() for values in at)
-    return Trajectory(times[:found].copy(), q, v, a, joint_names)
+    return Trajectory.unchecked(times[:found].copy(), at[:, :found].copy(), joint_names)
