@@ -8,6 +8,8 @@ from timings import LIMITS, NAMES, RATE, paths, timed
 
 from apex_ompl.errors import TimingError
 from apex_ompl.trajectory import Timing, time_path
+from apex_ompl.trajectory.methods.moving_start import between, through
+from apex_ompl.trajectory.trajectory import concatenate
 
 
 @settings(max_examples=30)
@@ -43,3 +45,22 @@ def test_a_moving_start_is_no_slower_than_rest_where_the_path_goes_its_way() -> 
     assert moving.duration < timed(path).trajectory.duration - 0.05
     late = timed(path, Timing(start_velocity=(1.5, 0.0, 0.0), minimum_duration=4.0)).trajectory
     assert late.duration >= 4.0 - 1e-6 and late(0.0, 1)[0] == pytest.approx(1.5)
+
+
+@settings(max_examples=30)
+@given(seed=st.integers(0, 9999), pieces=st.integers(1, 4))
+def test_motions_through_states_are_the_motions_between_them(seed: int, pieces: int) -> None:
+    rng = np.random.default_rng(seed)
+    states = rng.uniform(-1.0, 1.0, (3, pieces + 1, 3)) * np.array([1.5, 0.3, 0.1])[:, None, None]
+    states[1:, -1] = 0.0
+    each, solved = [between(states[:, k : k + 2], LIMITS, NAMES) for k in range(pieces)], list[int]()
+    made = through(states, LIMITS, NAMES, solving=lambda: solved.append(1))
+    if made is None:
+        assert any(one is None for one in each)
+        return
+    wanted = concatenate([one for one in each if one is not None])
+    assert len(solved) == pieces and made.duration == pytest.approx(wanted.duration, abs=1e-8)
+    np.testing.assert_allclose(made.states(wanted.times), wanted.states(wanted.times), atol=1e-4)
+    np.testing.assert_array_equal(made.positions[-1], states[0, -1])
+    assert through(states, LIMITS, NAMES, 0.999 * made.duration) is None, "it is too long"
+    assert through(states, LIMITS, NAMES, 1.001 * made.duration) is not None

@@ -20,14 +20,18 @@ from loops import BLOCKED, PROBLEM, crossing, ready_of, setup_of, world_of
 from apex_ompl.errors import PlannerProcessError
 from apex_ompl.live.movers import Movers, clearance_in_time
 from apex_ompl.loop import planner_process
+from apex_ompl.loop.charges import Charges
 from apex_ompl.loop.cycle import RunRecord
 from apex_ompl.loop.following import Following
 from apex_ompl.loop.methods import replanner_of
 from apex_ompl.loop.observation import Observation
 from apex_ompl.loop.planner_process import PlannerProcess, Work
+from apex_ompl.loop.ready import Ready
 from apex_ompl.loop.real_time import run_in_real_time
 from apex_ompl.loop.referee import RefereeReport, judge
-from apex_ompl.loop.request import Request
+from apex_ompl.loop.rehearsal import rehearse
+from apex_ompl.loop.replanning import answered
+from apex_ompl.loop.request import Answer, Request
 from apex_ompl.loop.result import Outcome, RunResult
 from apex_ompl.loop.run import run
 from apex_ompl.loop.sensor import Sensor, SensorStream
@@ -97,6 +101,35 @@ def test_a_run_by_name_is_a_result(tmp_path: Path) -> None:
     assert {"tick_p50", "tick_p99", "tick_worst", "deadline_misses"} <= found.metrics.keys()
     found.save(tmp_path / "run.npz")
     assert RunResult.load(tmp_path / "run.npz").as_dict() == found.as_dict()
+
+
+def test_a_rehearsal_asks_for_all_sorts_of_replans_and_is_forgotten() -> None:
+    ready, asked = ready_of(PROBLEM), list[Request | str]()
+
+    class Noting:
+        def prepare(self, ready: Ready) -> None:
+            asked.append("prepared")
+
+        def replan(self, ready: Ready, request: Request, charges: Charges) -> Answer:
+            asked.append(request)
+            raise ValueError("a bad number")
+
+    rehearse(Noting(), ready)
+    some = [one for one in asked if isinstance(one, Request)]
+    assert asked[-1] == "prepared" and len(some) == len(asked) - 1
+    assert {(one.following.at_rest(0.0), math.isfinite(one.conflict)) for one in some} == {
+        (True, True), (True, False), (False, True), (False, False),
+    }  # fmt: skip
+    assert [one.hastens for one in some].count(True) == 1
+    for one in some:  # the straight line is blocked
+        line = next(other.following for other in some if not other.following.at_rest(0.0))
+        assert math.isfinite(ready.first_conflict(one.predicted, line, 0.0, line.end))
+    replanner = replanner_of("apex")
+    replanner.prepare(ready)
+    before = answered(replanner, ready, some[2], Charges(0.05))
+    rehearse(replanner, ready)
+    after = answered(replanner, ready, some[2], Charges(0.05))
+    assert before.answer.charges.counts == after.answer.charges.counts
 
 
 def test_a_process_that_cannot_be_made_ready_is_a_sentence() -> None:

@@ -72,7 +72,8 @@ class Following:
         first, times = begin - self.begin, self.motion.times
         inner = times[(times > first + SAME_TIME) & (times < last - SAME_TIME)]
         at = np.concatenate([[max(first, 0.0)], inner, [last]])
-        moving = Trajectory(at - at[0], *self.motion.states(at), self.motion.joint_names)
+        q, v, a = self.motion.states(at)
+        moving = Trajectory(at - at[0], q, v, a, self.motion.joint_names)
         if end - self.end <= SAME_TIME:
             return moving
         return concatenate([moving, self.piece(self.end, end)])

@@ -79,6 +79,7 @@ class Work:
         make: Makes the way of replanning; a function or class of a module.
         arguments: Its arguments.
         seed: Of random choices.
+        rehearses: Whether it makes replans of all sorts before it is ready, so that no code is loaded later.
     """
 
     problem: Problem
@@ -88,6 +89,7 @@ class Work:
     make: Callable[..., Replanner]
     arguments: tuple[Any, ...]
     seed: int
+    rehearses: bool = False
 
 
 class PlannerProcess:

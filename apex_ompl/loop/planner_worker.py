@@ -31,7 +31,8 @@ def serve(connection: Connection[Any, Any]) -> None:
             ready = Ready(assemble(work.problem, seed=work.seed), work.limits, work.stopping, work.settings)
             replanner = work.make(*work.arguments)
             replanner.prepare(ready)
-            rehearse(replanner, ready)
+            if work.rehearses:
+                rehearse(replanner, ready)
     except ApexError as error:
         connection.send(str(error))
         return

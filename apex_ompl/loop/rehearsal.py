@@ -16,11 +16,11 @@ from apex_ompl.scene.bodies import Obstacle, Sphere
 from apex_ompl.trajectory import time_path
 
 RADIUS, VELOCITY = 0.06, (0.02, 0.0, 0.0)  # of the obstacle in the way [m, m/s]
-LONG = 0.25  # that a rehearsed replan may take by the table of costs [s]
+LONG = 1.0  # that a rehearsed replan may take by the table of costs [s]
 
 
 def requests(ready: Ready) -> tuple[Request, ...]:
-    """Return requests of all sorts among an obstacle in the middle of the straight line to a goal, of which there is one.
+    """Return requests of all sorts among an obstacle in the middle of the straight line to the first goal.
 
     The robot stands; stands where it is about to be touched; moves towards the obstacle; and is to be made faster.
     """

@@ -88,7 +88,9 @@ def run(
             return made.result(done, outcome, done.ended)
         eyes = SensorStream(sensor, world, used.watched)
         if clock == "real":
-            work = Work(world.problem.still, ready.limits, ready.stopping, used, replanner_of, (planner,), seed)
+            work = Work(
+                world.problem.still, ready.limits, ready.stopping, used, replanner_of, (planner,), seed, rehearses=True
+            )
             with PlannerProcess(work, cores()[1]) as process:
                 done = run_in_real_time(world, ready, process, eyes, seed)
         else:

@@ -73,9 +73,7 @@ def sample_motion(
 
 
 @inlined
-def _piece_extremes(
-    q: float, v: float, a: float, w: float, b: float, length: float, i: int, out: Floats
-) -> None:
+def _piece_extremes(q: float, v: float, a: float, w: float, b: float, length: float, i: int, out: Floats) -> None:
     """Take a piece of a joint into the extremes of positions and velocities; at its end these are w and b."""
     least, largest = min(v, w), max(v, w)
     if (a < 0.0) != (b < 0.0):
@@ -93,9 +91,7 @@ def _piece_extremes(
 
 
 @entry_point
-def motion_extremes(
-    knots: Floats, positions: Floats, velocities: Floats, accelerations: Floats, out: Floats
-) -> None:
+def motion_extremes(knots: Floats, positions: Floats, velocities: Floats, accelerations: Floats, out: Floats) -> None:
     """Find the extremes of a motion, which are those between knots, too.
 
     Velocities are largest at knots or where the acceleration is 0, positions where a joint turns round. Jerks are the
@@ -138,9 +134,7 @@ def relative_gap(knots: Floats, positions: Floats, velocities: Floats, accelerat
 
 
 @entry_point
-def cubic_rates(
-    knots: Floats, positions: Floats, velocities: Floats, accelerations: Floats, rates: Floats
-) -> float:
+def cubic_rates(knots: Floats, positions: Floats, velocities: Floats, accelerations: Floats, rates: Floats) -> float:
     """Return what the pieces of a motion miss each other by, in all, for proofs along them [rad].
 
     Args:
@@ -162,4 +156,4 @@ def cubic_rates(
                 missed = max(missed, abs(q + t * (v + t * (2.0 * a + b) / 6.0) - positions[k + 1, i]))
                 missed_speed = max(missed_speed, abs(v + t * (a + b) / 2.0 - velocities[k + 1, i]))
         places, speeds = places + missed, speeds + missed_speed
-    return places + speeds * knots[count - 1]
+    return float(places + speeds * knots[count - 1])
