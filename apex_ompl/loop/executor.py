@@ -296,14 +296,18 @@ class Executor:
         self.replanning.submit(request)
 
     def _give_up(self, now: float) -> None:
-        """Give up a request that knows nothing of what is about to touch the robot where it stands.
+        """Give up a request that knows nothing of what is in the way by now.
 
-        So that it steps aside at once, and not when that has been answered.
+        It is one for a faster motion, or one of a robot that is about to be touched where it stands, so that it steps
+        aside at once.
         """
         settings, request = self.ready.settings, self.pending
         if request is None or settings.from_rest or not settings.guarded or math.isfinite(request.conflict):
             return
-        if endangered(self.following, now + settings.budget, self.conflict, URGENT):
+        if request.hastens and math.isfinite(self.conflict):
+            self.log(now, request.refused, why="something is in the way", number=request.number, part="")
+            self.pending = None
+        elif endangered(self.following, now + settings.budget, self.conflict, URGENT):
             self.log(now, request.refused, why="an obstacle comes", number=request.number, part="")
             self.pending = None
 

@@ -12,7 +12,7 @@ from apex_ompl.errors import ApexError
 from apex_ompl.loop.planner_process import WallTime, Work
 from apex_ompl.loop.ready import Ready
 from apex_ompl.loop.rehearsal import rehearse
-from apex_ompl.loop.replanning import SHARE, allowed, answered
+from apex_ompl.loop.replanning import SHARE, answered
 from apex_ompl.ompl_adapter.process import quiet_ompl, seed_ompl
 from apex_ompl.ompl_adapter.setup import assemble
 from apex_ompl.util.threads import one_torch_thread
@@ -42,7 +42,6 @@ def serve(connection: Connection[Any, Any]) -> None:
             data = connection.recv_bytes()
             charges = WallTime(SHARE * work.settings.budget, connection.poll)
             request = pickle.loads(data)
-            charges.limit = allowed(request, work.settings.budget)
             connection.send(answered(replanner, ready, request, charges))
 
 

@@ -30,7 +30,8 @@ SHARE = 0.5  # of the time that is left, for candidates before the next source i
 class Portfolio:
     """Retiming, and a pool of motions in space and time from several sources; what arrives first is taken.
 
-    Candidates of a replan that failed are carried over to the next one of the same run.
+    Candidates of a replan that failed are carried over to the next one of the same run. Where only a faster motion is
+    of use, none are, and each replan begins with another source.
 
     Attributes:
         sources: Where motions to start from come from, those that gain most for their time first.
@@ -94,10 +95,13 @@ class Portfolio:
         pool, goals = search.pool(), search.goals
         if not len(goals):
             return
-        carried, self.carried = self.carried, []
-        for one, begun in carried:
-            pool.carry(one, search.request.join - begun)
-        sources = iter(self.sources)
+        hastens = search.request.hastens
+        if not hastens:
+            carried, self.carried = self.carried, []
+            for one, begun in carried:
+                pool.carry(one, search.request.join - begun)
+        turn = search.request.number % len(self.sources) if hastens else 0
+        sources = iter([*self.sources[turn:], *self.sources[:turn]])
         while not search.over():
             source = next(sources, None)
             if source is None and not pool.candidates:
@@ -108,6 +112,8 @@ class Portfolio:
             until = search.charges.spent + (SHARE * left if source is not None else left)
             if not self._improve(search, pool, min(until, search.until)) and source is None:
                 break
+        if hastens:
+            return
         open_ones = [one for one in pool.candidates if not one.given_up and one.rounds < ROUNDS]
         open_ones.sort(key=lambda one: one.priority)
         self.carried = [(one, search.request.join) for one in open_ones[:CARRIED]]

@@ -10,7 +10,6 @@ from apex_ompl.loop.ready import Ready
 from apex_ompl.loop.request import Answer, Replanner, Request
 
 SHARE = 0.85  # of the budget after which nothing new is begun
-IMPROVING = 0.4  # of that, for faster motions: what endangers meanwhile does not wait for long
 NOTICED = 0.003  # time after which a replan that another one has overtaken ends [s]
 
 
@@ -38,11 +37,6 @@ def answered(replanner: Replanner, ready: Ready, request: Request, charges: Char
     except Exception as error:  # whatever a way of replanning does, the robot goes on or stops
         return Reply(request.number, Answer(None, "", charges), f"{type(error).__name__}: {error}")
     return Reply(request.number, answer)
-
-
-def allowed(request: Request, budget: float) -> float:
-    """Return the time that a replan may take until nothing new is begun, of its budget [s]."""
-    return SHARE * budget * (IMPROVING if request.hastens else 1.0)
 
 
 class Replanning(Protocol):
@@ -76,7 +70,7 @@ class AtOnce:
         """Make a replan."""
         settings = self.ready.settings
         busy = self._reply is not None and request.asked < self._known - 1e-9
-        charges = Charges(allowed(request, settings.budget), NOTICED if busy else 0.0)
+        charges = Charges(SHARE * settings.budget, NOTICED if busy else 0.0)
         self._reply = answered(self.replanner, self.ready, request, charges)
         self._known = request.asked + (charges.spent if settings.latency < 0.0 else settings.latency)
 

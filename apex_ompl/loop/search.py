@@ -27,7 +27,7 @@ GUARDED, AGE = 0.04, 0.08  # times between stops of a motion that are looked at,
 SPREAD = 0.01  # by which places that are seen differ from those that are expected [m]
 NARROW = 1.0  # time that a motion that the guard may stop must gain over one that it will hardly stop [s]
 GOOD = 1.2  # duration of a motion with which a replan ends, as a multiple of the direct one's
-ENOUGH_TIME = 0.4  # share of the budget behind which it ends with any motion that has room
+ENOUGH_TIME = 0.2  # share of the budget behind which it ends with any motion that has room
 BETTER = 0.97  # share of the duration of the best motion so far below which another one is worth its while
 
 
