@@ -30,6 +30,7 @@ SCENE = ROBOT + "f4[::1], "
 TREES = "f8[:, ::1], f8, f8, f8[:, :, ::1], i8[:, ::1], i8[::1], i8[::1], f8[::1], f8[::1], "
 PROOF = "f8[:, ::1], i8[::1], i8[:, ::1], i8[::1], f8[::1], i8[:, ::1], i8[::1]"
 CURVE = "f8[::1], f8[:, ::1], f8[:, ::1], f8, f8, f8, i8"
+KNOTS = "f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1]"
 SETTINGS = "Tuple((f8, f8, f8, f8, f8, f8, i8))"
 
 HERE: dict[str, tuple[str, int]] = {
@@ -56,6 +57,10 @@ BESIDE: dict[str, tuple[str, int]] = {
         "f8[:, :, ::1]",
         2,
     ),
+    "cubic_pieces.sample_motion": (KNOTS + ", f8[::1], i8, f8[:, :, ::1]", 1),
+    "cubic_pieces.motion_extremes": (KNOTS + ", f8[:, ::1]", 1),
+    "cubic_pieces.relative_gap": (KNOTS, 1),
+    "cubic_pieces.cubic_rates": (KNOTS + ", f8[:, ::1]", 1),
     "polyline_distance.max_distance": ("f8[:, ::1], f8[::1], f8[:, ::1], f8[::1], f8", 1),
     "time_parameterization.max_path_speeds": ("f8[:, ::1], f8[:, ::1], f8[::1], f8[::1], f8, f8[::1]", 1),
     "time_parameterization.sample_times": ("f8[::1], f8, f8, f8[::1]", 1),

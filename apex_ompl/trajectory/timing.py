@@ -10,11 +10,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from apex_ompl.errors import ParameterError, TimingError, TimingStoppedError, UnknownNameError
+from apex_ompl.kernel.compiled.cubic_pieces import cubic_rates, relative_gap
 from apex_ompl.kernel.compiled.polyline_distance import max_distance
 from apex_ompl.kernel.compiled.time_parameterization import max_path_speeds, sample_times
 from apex_ompl.robot.model import Limits
 from apex_ompl.trajectory.curve import SAME_STATE, Polyline
 from apex_ompl.trajectory.deviation import deviation_bound
+from apex_ompl.trajectory.extremes import Extremes
 from apex_ompl.trajectory.methods import DEFAULT_METHOD, METHODS
 from apex_ompl.trajectory.methods.moving_start import from_moving_start
 from apex_ompl.trajectory.methods.ruckig import stops
@@ -291,4 +293,9 @@ def warm_up() -> None:
     max_path_speeds(np.ones((3, 1)), np.zeros((3, 1)), np.ones(1), np.ones(1), 1.0, x)
     sample_times(x, 1.0, 1.0, np.empty(1))
     max_distance(np.zeros((1, 1)), np.zeros(1), np.array([[0.0], [1.0]]), np.array([0.0, 1.0]), 1.0)
-    joined(Profiles(np.ones((1, 1, 1)), np.zeros((1, 1, 1)), np.ones(1), brakes=False), np.zeros((3, 2, 1)), ("joint",))
+    still = Profiles(np.ones((1, 1, 1)), np.zeros((1, 1, 1)), np.ones(1), brakes=False)
+    motion = joined(still, np.zeros((3, 2, 1)), ("joint",))
+    motion.states(motion.times)
+    Extremes.of(*motion.knots)
+    relative_gap(*motion.knots)
+    cubic_rates(*motion.knots, np.empty((len(motion.times), 2)))
