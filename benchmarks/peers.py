@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 import record
 
+from apex_ompl.api import load_problem
 from apex_ompl.benchmark import Results, Row, Workers, bench
 from apex_ompl.benchmark.accounting import first_path_proof
 from apex_ompl.benchmark.rows import Job
@@ -35,8 +36,6 @@ from apex_ompl.ompl_adapter.setup import PlanningSetup, assemble
 from apex_ompl.ompl_adapter.validity import full_check
 from apex_ompl.planners.tuned import TUNED
 from apex_ompl.planning import NOT_PROVED
-from apex_ompl.problems import load
-from apex_ompl.problems.suite_robot import robot
 from apex_ompl.robot import Robot
 from apex_ompl.robot.geometry import link_of
 from apex_ompl.scene.bodies import Body, pose_matrix
@@ -157,10 +156,10 @@ def plan_with_roboplan(job: Job) -> Run:
 
     Parameters of the job are those of ``RRTOptions``, whose defaults hold otherwise.
     """
-    problem = load(job.problem)
+    problem = load_problem(job.problem)
     if not representable(problem):
         return {"solved": False, "status": NO_PROBLEM, "reason": "it has shapes that RoboPlan has not"}
-    ready = assemble(problem, robot())
+    ready = assemble(problem)
     scene = roboplan_scene(ready)
     same = agreement(ready, scene, np.random.default_rng(job.seed))
     names = list(scene.getJointNames())

@@ -154,12 +154,19 @@ def test_moveits_matrix_is_read(robot: Robot) -> None:
     pairs, unknown = read(matrix([*links, "box"], few), ["box"])
     assert pairs == [("box", "left_link5"), ("left_link5", "right_link5")], "links that are never checked are left out"
     assert unknown == ["camera"]
+    bare = matrix([*links, "box"], few)
+    bare["entry_values"] = [row["enabled"] for row in bare["entry_values"]]
+    assert read(bare, ["box"]) == (pairs, unknown), "rows without a key, as MotionBenchMaker writes them"
     pairs, _ = read(matrix(["tool", "rack"], [("tool", "rack")]), ["rack/0", "rack/1"])
     assert pairs == [("left_hand_palm", "rack/0"), ("left_hand_palm", "rack/1")]
     pairs, _ = read(matrix(["rug", "left_link5"], [], rug=True), ["rug", "box"])
     assert ("box", "rug") in pairs and ("left_link4", "rug") in pairs and ("left_link5", "rug") not in pairs
     broken = matrix(["a", "b"], [])
     broken["entry_values"].pop()
+    mixed = matrix(["a", "b"], [])
+    mixed["entry_values"][0] = [False, False]
+    with pytest.raises(FileFormatError, match=r"entry_values\.0: expected a mapping"):
+        read(mixed, [])
     with pytest.raises(FileFormatError, match="expected 2 rows of 2 values"):
         read(broken, [])
     with pytest.raises(FileFormatError, match="default_entry_values"):

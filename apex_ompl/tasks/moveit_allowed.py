@@ -34,10 +34,14 @@ def allowed_pairs(
         FileFormatError: The matrix is not square, or has other faults.
     """
     entries = [str(name) for name in reader.entries(matrix, "entry_names", MATRIX)]
-    rows = [
-        reader.entries(row, "enabled", f"{MATRIX}.entry_values.{k}")
-        for k, row in enumerate(reader.messages(matrix, "entry_values", MATRIX))
-    ]
+    given = reader.entries(matrix, "entry_values", MATRIX)
+    if given and all(isinstance(row, list) for row in given):  # as MotionBenchMaker writes them
+        rows = given
+    else:
+        rows = [
+            reader.entries(row, "enabled", f"{MATRIX}.entry_values.{k}")
+            for k, row in enumerate(reader.messages(matrix, "entry_values", MATRIX))
+        ]
     if [len(row) for row in rows] != [len(entries)] * len(entries):
         expected = f"expected {len(entries)} rows of {len(entries)} values, one for each of entry_names"
         raise reader.fail(f"{MATRIX}.entry_values", len(rows), expected)
