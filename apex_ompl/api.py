@@ -12,7 +12,7 @@ from ompl import geometric as og
 from apex_ompl import planners, problems
 from apex_ompl.errors import ParameterError
 from apex_ompl.ompl_adapter.setup import assemble
-from apex_ompl.planners.apex_parameters import default_planner
+from apex_ompl.planners.apex_parameters import NAME
 from apex_ompl.result import PlanResult
 from apex_ompl.scene.problem import Problem
 from apex_ompl.session import check_arguments, kept_planner
@@ -52,7 +52,7 @@ def setup(problem: Problem | str | os.PathLike[str]) -> og.SimpleSetup:
     loaded = problem if isinstance(problem, Problem) else load_problem(problem)
     ready = assemble(loaded)
     simple_setup = ready.simple_setup
-    simple_setup.setPlannerAllocator(planners.allocator(default_planner(ready.robot.name)))
+    simple_setup.setPlannerAllocator(planners.allocator(NAME))
     return simple_setup
 
 
@@ -76,8 +76,8 @@ def plan(
 
     Args:
         problem: A problem, its name, or its file.
-        planner: Name of a planner, see ``apex_ompl.planners.names()``; by default apex, or rrtconnect+polish for a
-            robot that no model ships for.
+        planner: Name of a planner, see ``apex_ompl.planners.names()``; by default apex, which does without a
+            network for a robot that no model ships for.
         timeout: Seconds for all that follows the set-up of problem and planner. The search ends a tenth of it before,
             from 0.05 to 0.5 s and at most half of it, so that its path can be proved and timed.
         seed: Seed of all random numbers, 0 or more. The same seed gives the same path for planners that are

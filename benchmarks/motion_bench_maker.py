@@ -1,8 +1,8 @@
-"""VAMP and RoboPlan beside rrtconnect on MotionBenchMaker's problems of Baxter with both arms at a bookshelf.
+"""VAMP and RoboPlan beside apex and rrtconnect on MotionBenchMaker's problems of Baxter with both arms at a bookshelf.
 
 The problems (Chamzas et al. 2022) are those that VAMP's source package ships, ``resources/baxter/problems.tar.bz2``
 unpacked: ``pip download --no-binary :all: --no-deps vamp-planner``. Baxter's fingers are as far open as the problems
-say. VAMP (Thomason, Kingston and Kavraki 2024) checks spheres and capsules of its own in single precision, and has no
+say. No model ships for Baxter: random bumps take the place of apex's proposals. VAMP (Thomason, Kingston and Kavraki 2024) checks spheres and capsules of its own in single precision, and has no
 time limit but a number of iterations; RoboPlan checks the meshes. Whatever they find is looked at by the full check
 here, with the real meshes and the limits, and repaired where it fails, as rrtconnect's paths are: ``own`` is the share
 that a planner solves by its own check, ``failed at first`` counts paths that failed the full one. The last line says
@@ -57,6 +57,8 @@ SETS = ("easy", "medium", "hard")
 OPEN = 0.05  # place of the fingers in the problems [m]
 RANGE, ITERATIONS = 0.5, 1_000_000  # of VAMP's RRT-Connect for Baxter, by its own package
 ROWS = (
+    Row("apex", "apex"),
+    Row("apex without proposals", "apex", {"first": 0, "second": 0, "third": 0, "resample": 0}),
     Row("rrtconnect", "rrtconnect"),
     Row.of("rrtconnect", TUNED["rrtconnect"]),
     Row("rrtconnect+polish", "rrtconnect+polish"),

@@ -9,13 +9,14 @@ import numpy as np
 from ompl import base as ob
 from ompl import util as ou
 
+from apex_ompl.apex.bumps import BumpModel
 from apex_ompl.apex.context import SolveContext
+from apex_ompl.apex.models import trajectory_model
 from apex_ompl.apex.path_validator import PathValidator
 from apex_ompl.apex.query import make_query
 from apex_ompl.apex.sampler import ProposalSampler
 from apex_ompl.apex.solver import LOG, solve
 from apex_ompl.apex.stages import Anytime, Shorten
-from apex_ompl.diffusion.checkpoint import shared_model
 from apex_ompl.diffusion.proposals import TrajectoryModel
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel.shortcuts import shortcut
@@ -28,7 +29,7 @@ from apex_ompl.types import Array
 from apex_ompl.util.resolution import SEARCH_RESOLUTION
 
 Status = ob.PlannerStatus
-_warm_models: WeakSet[TrajectoryModel] = WeakSet()  # that have proposed something in this process
+_warm_models: WeakSet[TrajectoryModel | BumpModel] = WeakSet()  # that have proposed something in this process
 
 
 class APEX(ob.Planner):
@@ -58,7 +59,7 @@ class APEX(ob.Planner):
         self.parameters = parameters or ApexParameters()
         self.validator = PathValidator(si, self.parameters.robot)
         robot = self.validator.checker.robot.name
-        self.model = shared_model(self.parameters.model, device=self.parameters.device, robot=robot)
+        self.model = trajectory_model(self.parameters.model, robot, self.parameters.device)
         steps, most = self.parameters.denoising_steps, self.model.schedule.steps
         if steps > most:
             raise ParameterError("parameter 'denoising_steps'", steps, f"at most {most}, those of the checkpoint")

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from ompl import base as ob
 
-from apex_ompl import diffusion
 from apex_ompl.planners.registry import Parameters, bounded, one_of, register
 from apex_ompl.planners.tuned import TUNED
 
@@ -19,22 +16,10 @@ if TYPE_CHECKING:
     from apex_ompl.diffusion.proposals import Sampling
 
 NAME = "apex"
-WITHOUT_MODEL = "rrtconnect+polish"
 TURN_CALLS = 1_000  # of the termination condition of a bridge where rounds and trees take turns
 QUICK_CALLS = 1500  # iterations of a bridge between rounds of proposals
 AGAIN = 8  # factor on the iterations of the sprint behind the short repair of the first round
 SPRINT_FACTORS = (1, 32, 128)  # on those of the sprints before each round of proposals
-CHECKPOINTS = Path(diffusion.__path__[0]) / "checkpoints"
-
-
-def default_planner(robot: str) -> str:
-    """Return the default planner for a robot: apex where a model ships for it, else rrtconnect+polish."""
-    try:
-        config = json.loads((CHECKPOINTS / ApexParameters.model / "config.json").read_text(encoding="utf-8"))
-        there = config["model"]["robot"] == robot
-    except (OSError, ValueError, KeyError):
-        there = False
-    return NAME if there else WITHOUT_MODEL
 
 
 @register(NAME)
@@ -43,7 +28,8 @@ class ApexParameters(Parameters):
     """Proposals of a latent diffusion model, repaired, bridged, and completed by RRTConnect.
 
     Attributes:
-        model: Name or folder of a checkpoint.
+        model: Name or folder of a checkpoint; ``auto`` takes the one that ships for the robot, or ``none`` where there
+            is none: random bumps of straight lines.
         robot: The robot, where the validity checker is not this project's.
         device: Where the network runs.
         line: Whether the straight line is a candidate.
@@ -75,7 +61,7 @@ class ApexParameters(Parameters):
     """
 
     smooth: ClassVar[bool] = True
-    model: str = "apex"
+    model: str = "auto"
     robot: str = "dual_panda_softhand"
     device: str = "cpu"
     line: bool = True

@@ -50,7 +50,7 @@ def test_faulty_parameters_are_named(tmp_path: Path) -> None:
         plan(cached_problem(HARD), params={"model": str(tmp_path / "empty")})
     with pytest.raises(ApexError, match="expected 'baxter'"):
         setup = apex_ompl.setup(Problem.load(ROOT / "examples" / "baxter_table.yaml"))
-        APEX(setup.getSpaceInformation())
+        APEX(setup.getSpaceInformation(), ApexParameters(model="apex"))
 
 
 def test_start_at_the_goal_is_a_path(ready: PlanningSetup) -> None:

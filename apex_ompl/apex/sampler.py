@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from apex_ompl.apex.bumps import BumpModel
 from apex_ompl.diffusion.geometry import Numbers
 from apex_ompl.diffusion.proposals import Proposals, Sampling, TrajectoryModel
 from apex_ompl.diffusion.query import Query
@@ -31,8 +32,8 @@ class ProposalSampler:
     """
 
     def __init__(
-        self, model: TrajectoryModel, kernel: Kernel, sampling: Sampling, *, generator: np.random.Generator, stop: Stop,
-        report: SolveReport,
+        self, model: TrajectoryModel | BumpModel, kernel: Kernel, sampling: Sampling, *,
+        generator: np.random.Generator, stop: Stop, report: SolveReport,
     ) -> None:  # fmt: skip
         """Sample from ``model``.
 

@@ -7,9 +7,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from apex_ompl.apex.bumps import BumpModel
+from apex_ompl.apex.models import trajectory_model
 from apex_ompl.apex.query import make_query
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.diffusion.checkpoint import shared_model
 from apex_ompl.diffusion.proposals import TrajectoryModel
 from apex_ompl.diffusion.query import Query
 from apex_ompl.loop.placing import fresh_checker, place_nearest
@@ -29,14 +30,14 @@ class Proposals:
     to the straight line in time.
 
     Attributes:
-        model: Name or folder of the checkpoint.
+        model: Name or folder of the checkpoint, see :func:`apex_ompl.apex.models.trajectory_model`.
         count: Number of proposals.
     """
 
-    model: str = "apex"
+    model: str = "auto"
     count: int = 4
     name: str = "proposals"
-    _loaded: TrajectoryModel | None = field(default=None, repr=False)
+    _loaded: TrajectoryModel | BumpModel | None = field(default=None, repr=False)
     _checker: CollisionChecker | None = field(default=None, repr=False)
 
     def prepare(self, ready: Ready) -> None:
@@ -46,13 +47,13 @@ class Proposals:
             ApexError: The checkpoint cannot be loaded, or is of another robot.
         """
         setup = ready.setup
-        self._loaded, self._checker = shared_model(self.model, robot=setup.robot.name), fresh_checker(ready)
+        self._loaded, self._checker = trajectory_model(self.model, setup.robot.name), fresh_checker(ready)
         query = make_query(self._checker, setup.start, setup.start, point=self._loaded.sees_point)
         with self._loaded.one_thread():
             self._loaded.propose(query, self._checker.kernel, self.count)
 
     @property
-    def model_and_checker(self) -> tuple[TrajectoryModel, CollisionChecker]:
+    def model_and_checker(self) -> tuple[TrajectoryModel | BumpModel, CollisionChecker]:
         """The model and the obstacles that it is shown, after :meth:`prepare`."""
         assert self._loaded is not None and self._checker is not None
         return self._loaded, self._checker

@@ -61,8 +61,9 @@ class Ready:
 
     @property
     def fingers(self) -> list[int]:
-        """Indices of the joints that close hands, which stay where there is nothing to be grasped."""
-        return [self.names.index(hand.synergy) for hand in self.setup.robot.hands.values()]
+        """Indices of the planned joints that close hands, which stay where there is nothing to be grasped."""
+        synergies = (hand.synergy for hand in self.setup.robot.hands.values())
+        return [self.names.index(name) for name in synergies if name in self.names]
 
     def is_goal(self, q: Array) -> bool:
         """Whether a state, shape (dof,), is a goal, as the referee sees it: stops may end that near to one."""

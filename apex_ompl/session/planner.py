@@ -12,6 +12,7 @@ from typing import Any, Self
 from ompl import geometric as og
 
 from apex_ompl import planners
+from apex_ompl.apex.models import has_model
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.conservative import CheckCounts
 from apex_ompl.collision.mesh_stage import Contact
@@ -19,7 +20,7 @@ from apex_ompl.errors import ParameterError
 from apex_ompl.ompl_adapter.interrupt import Interrupt
 from apex_ompl.ompl_adapter.process import quiet_ompl, seed_ompl
 from apex_ompl.ompl_adapter.setup import assemble, state_fault
-from apex_ompl.planners.apex_parameters import WITHOUT_MODEL, default_planner
+from apex_ompl.planners.apex_parameters import NAME
 from apex_ompl.planning import PlanRun, find_path, finish, parameterize, plan_among_movers
 from apex_ompl.planning.among_movers import warm_up as warm_up_among_movers
 from apex_ompl.planning.departure import LARGEST_DEPTH, find_departure, with_departure
@@ -203,7 +204,7 @@ class MotionPlanner:
             ApexError: The start or the goal is faulty.
         """
         ready = assemble(self.problem(start, goal), self.robot, checker=self._checker)
-        ready.simple_setup.setPlannerAllocator(planners.allocator(default_planner(self.robot.name)))
+        ready.simple_setup.setPlannerAllocator(planners.allocator(NAME))
         return ready.simple_setup
 
     def _plan(
@@ -221,9 +222,9 @@ class MotionPlanner:
             seed_ompl(seed)
             notes = snapshot_notes(problem) if snapshot else []
             if planner is None:
-                planner = default_planner(self.robot.name)
-                if planner == WITHOUT_MODEL:
-                    notes.append(f"no model of {self.robot.name} ships, so {planner} plans")
+                planner = NAME
+                if not has_model(self.robot.name):
+                    notes.append(f"no model of {self.robot.name} ships, so random bumps take the place of proposals")
             parameters = planners.parameters(planner, **self._parameters(planner, params))
             if how is not None:
                 start = how.start(how.limits(self.robot.limits, self.robot.joint_names))  # whether it fits the robot

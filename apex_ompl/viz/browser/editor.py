@@ -12,7 +12,7 @@ import numpy as np
 
 from apex_ompl import planners
 from apex_ompl.errors import ApexError, ParameterError
-from apex_ompl.planners.apex_parameters import default_planner
+from apex_ompl.planners.apex_parameters import NAME
 from apex_ompl.scene.bodies import pose_fields
 from apex_ompl.scene.problem import PoseTarget, Problem
 from apex_ompl.session import MotionPlanner
@@ -61,8 +61,7 @@ class Editor:
             self._state = gui.add_markdown("")
             add, remove = gui.add_button("add a box"), gui.add_button("remove the obstacle")
         with gui.add_folder("plan"):
-            chosen = default_planner(robot.name)
-            self._planner = gui.add_dropdown("planner", planners.names(), initial_value=chosen)
+            self._planner = gui.add_dropdown("planner", planners.names(), initial_value=NAME)
             self._seed = gui.add_number("seed", initial_value=0, min=0, step=1)
             self._limit = gui.add_number("time limit s", initial_value=5.0, min=0.1, max=LONGEST)
             run = gui.add_button("plan")

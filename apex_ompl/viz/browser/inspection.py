@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 
+from apex_ompl.apex.models import DEFAULT, has_model
 from apex_ompl.apex.query import make_query
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.diffusion.checkpoint import shared_model
 from apex_ompl.diffusion.guidance import Guidance
 from apex_ompl.diffusion.proposals import Sampling, TrajectoryModel
 from apex_ompl.errors import ApexError
-from apex_ompl.planners.apex_parameters import NAME, ApexParameters, default_planner
 from apex_ompl.scene.scripts import problem_at
 from apex_ompl.trajopt.optimizer import Optimizer
 from apex_ompl.trajopt.spline import Spline
@@ -37,7 +37,7 @@ class Inspection:
         self._player, self._editor, self._nodes = player, editor, dict[str, Any]()
         self._estimates: list[Array] = []
         self._model: TrajectoryModel | None = None
-        if default_planner(player.sources[0].setup.robot.name) != NAME:
+        if not has_model(player.sources[0].setup.robot.name):
             return  # no model of this robot ships
         with server.gui.add_folder("proposals", expand_by_default=False):
             self._count = server.gui.add_slider("number", min=1, max=64, step=1, initial_value=8)
@@ -74,7 +74,7 @@ class Inspection:
         problem = problem_at(editor.problem(), 0.0)
         checker = CollisionChecker(robot, problem.scene, problem.attached, problem.allowed)
         if self._model is None:
-            self._model = shared_model(ApexParameters().model, device="cpu", robot=robot.name)
+            self._model = shared_model(DEFAULT, device="cpu", robot=robot.name)
         model, kernel = self._model, checker.kernel
         query = make_query(checker, editor.start, editor.goal, point=model.sees_point)
         count, seed = int(self._count.value), int(self._seed.value)
