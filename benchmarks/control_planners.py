@@ -17,6 +17,7 @@ from controls import Bumps, Shuffled, drawn
 from neighbours import Neighbours
 from ompl import base as ob
 
+from apex_ompl.apex.models import AUTO, DEFAULT
 from apex_ompl.datasets.records import Paths, held_extents
 from apex_ompl.diffusion.array_model import ArrayModel
 from apex_ompl.diffusion.checkpoint import load_torch_model
@@ -72,7 +73,7 @@ class RandomWeightsParameters(ControlParameters):
 
     def replaced(self, model: ArrayModel) -> TrajectoryModel:
         """Return a model like the given one."""
-        return _drawn(self.model)
+        return _drawn(DEFAULT if self.model == AUTO else self.model)
 
 
 @cache
