@@ -57,6 +57,7 @@ DATA = record.ROOT / "apex_ompl" / "robot" / "data"
 SETS = ("easy", "medium", "hard")
 OPEN = 0.05  # place of the fingers in the problems [m]
 RANGE, ITERATIONS = 0.5, 1_000_000  # of VAMP's RRT-Connect for Baxter, by its own package
+RUNNER = "motion_bench_maker:plan_with_vamp"
 ROWS = (
     Row("apex", "apex"),
     Row("apex without proposals", "apex", {"first": 0, "second": 0, "third": 0, "resample": 0}),
@@ -65,7 +66,8 @@ ROWS = (
     Row("rrtconnect+polish", "rrtconnect+polish"),
     Row("roboplan", "roboplan", runner=peers.RUNNER),
     Row.of("roboplan", TUNED["roboplan"], runner=peers.RUNNER),
-    Row("vamp", "vamp", runner="motion_bench_maker:plan_with_vamp"),
+    Row("vamp", "vamp", runner=RUNNER),
+    Row.of("vamp", {"dynamic_domain": False}, runner=RUNNER),
 )
 
 
@@ -97,12 +99,17 @@ def agreement(ready: PlanningSetup, made: Any, rng: np.random.Generator) -> list
 
 
 def plan_with_vamp(job: Job) -> Run:
-    """Return the columns of a run of VAMP; ``own`` is whether it found a path by its own check."""
+    """Return the columns of a run of VAMP; ``own`` is whether it found a path by its own check.
+
+    Parameters of the job are those of its ``RRTCSettings``, whose defaults hold otherwise.
+    """
     problem = load_problem(job.problem)
     ready, made = assemble(problem), environment(problem)
     same = agreement(ready, made, np.random.default_rng(job.seed))
-    settings, rng = vamp.RRTCSettings(), vamp.baxter.xorshift()
+    settings, rng = vamp.RRTCSettings(), vamp.baxter.halton()
     settings.range, settings.max_iterations, settings.max_samples = RANGE, ITERATIONS, ITERATIONS
+    for name, value in job.params.items():
+        setattr(settings, name, value)
     for _ in range(job.seed):
         rng.next()
     start, goal = (q.astype(np.float32) for q in (ready.start, ready.goals[0]))
