@@ -2,7 +2,7 @@
 
 The run's folder receives ``checkpoint``, ``log.csv``, TensorBoard event files, and ``state.pt``, from which the run is
 resumed. When the training is complete, ``--save`` copies the checkpoint to the folder in which the planners look for
-it. Neither Pinocchio nor OMPL is needed; torch computes by one thread.
+it. Neither Pinocchio nor OMPL is needed; torch computes on a GPU where there is one, else by one thread.
 
 Usage: python scripts/train_il.py scripts/configs/il.yaml [--out FOLDER] [--set KEY=VALUE ...] [--minutes M] [--save]
 """
@@ -22,6 +22,7 @@ SAVED = Path(__file__).resolve().parents[1] / "benchmarks" / "baselines"
 
 def train(args: argparse.Namespace) -> None:
     """Train to the end, or to the time limit."""
+    import torch
     from tqdm import tqdm
 
     from apex_ompl.imitation.checkpoint import save_policy
@@ -33,7 +34,7 @@ def train(args: argparse.Namespace) -> None:
     config = ImitationConfig.read(args.config, dict(args.set))
     folder = make_folder(args.out or Path("runs") / name, "folder of a training run")
     with locked(folder), one_torch_thread():
-        trainer = ImitationTrainer(config, folder)
+        trainer = ImitationTrainer(config, folder, torch.device("cuda" if torch.cuda.is_available() else "cpu"))
         bar: Any = tqdm(total=config.steps, initial=trainer.step, unit="step", disable=args.quiet)
 
         def watch(at: ImitationTrainer, loss: float) -> None:

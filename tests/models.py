@@ -93,6 +93,7 @@ VARIATIONAL = {
 REGRESSION = {"denoiser": DenoiserConfig(kind="regression", width=32, blocks=2)}
 HANDS = ("left_hand_palm", "right_hand_palm")
 CLEARANCES = {"condition": ConditionConfig(scene="clearances", width=16, out=32, along=3, keys=24, hands=HANDS)}
+REFINED = {"condition": CLEARANCES["condition"].model_copy(update={"refined": True})}
 WALL = ("box", (0.45, 0.0, 0.6), (0.05, 0.4, 0.3))
 POST = ("cylinder", (0.4, 0.3, 0.5), (0.05, 0.3))
 

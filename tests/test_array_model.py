@@ -16,6 +16,7 @@ from models import (
     DOF,
     HANDS,
     POST,
+    REFINED,
     REGRESSION,
     VARIATIONAL,
     WALL,
@@ -47,6 +48,7 @@ SCENES: list[dict[str, Any]] = [
     {"noise": NoiseConfig(prediction="clean")},
     REGRESSION,
     CLEARANCES,
+    REFINED,
 ]
 EMPTY = Query(query().start, query().goal, np.zeros(3), ObstacleSet.from_rows([]))
 
@@ -61,7 +63,7 @@ def both(**parts: Any) -> tuple[ArrayModel, TorchModel]:
 
 
 @pytest.mark.parametrize(
-    "parts", SCENES, ids=["distances", "set", "point", "noise", "clean", "regression", "clearances"]
+    "parts", SCENES, ids=["distances", "set", "point", "noise", "clean", "regression", "clearances", "refined"]
 )
 @pytest.mark.parametrize("queries", [query(), [query(1), query(2), EMPTY]], ids=["one", "three"])
 def test_numpy_proposes_what_torch_does(parts: dict[str, Any], queries: Any) -> None:

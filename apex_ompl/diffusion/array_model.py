@@ -95,11 +95,11 @@ class ArrayModel(TrajectoryModel):
             probes = self.probes.positions(kernel, start, goal)
             features = [self._obstacle_features(q.obstacles, points) for q, points in zip(queries, probes, strict=True)]
             parts.append(np.array(features, np.float32))
-        found, *rest = (f"encoder.phi.{k}" for k in ((0, 2, 4) if self.sight is not None else (0, 2)))
-        encoded = self._linear(found, np.concatenate(parts, axis=1))
-        for name in rest:
-            encoded = self._linear(name, _silu(encoded))
-        return encoded
+        return self._layers("encoder.phi", 3 if self.sight is not None else 2, np.concatenate(parts, axis=1))
+
+    def refine(self, condition: Single, along: Single) -> Single:
+        """Return encoded conditions with what lies along estimates of paths, features of shape (B, F)."""
+        return condition + self._layers("encoder.psi", 3, along)
 
     def denoise(self, latent: Single, t: int, condition: Single) -> Single:
         """Return the denoiser's output for latent vectors at a step, each with its condition, or one for all."""
@@ -154,6 +154,12 @@ class ArrayModel(TrajectoryModel):
         parts += [tokens.sum(axis=0) / np.float32(max(1, len(obstacles))), tokens.max(axis=0, initial=0.0)]
         return np.concatenate(parts)
 
+    def _layers(self, name: str, count: int, values: Single) -> Single:
+        """Return the output of an MLP of ``count`` layers."""
+        for k in range(count):
+            values = self._linear(f"{name}.{2 * k}", _silu(values) if k else values)
+        return values
+
     def _linear(self, name: str, values: Single) -> Single:
         weight, bias = self.weights[f"{name}.weight"], self.weights[f"{name}.bias"]
         if weight.dtype != np.int8:
@@ -194,6 +200,9 @@ def weight_shapes(config: ModelConfig) -> dict[str, tuple[int, ...]]:
         layers += [("encoder.phi.2", hidden, hidden), ("encoder.phi.4", hidden, condition.out)]
     else:
         layers.append(("encoder.phi.2", hidden, condition.out))
+    if condition.refined:
+        layers += [("encoder.psi.0", config.along_size, hidden), ("encoder.psi.2", hidden, hidden)]
+        layers.append(("encoder.psi.4", hidden, condition.out))
     width = denoiser.width
     layers += [("denoiser.step.1", STEP_SIZE, condition.out), ("denoiser.enter", dim, width)]
     layers += [("denoiser.leave", width, dim)]

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from apex_ompl.datasets.records import Paths, held_extents
+from apex_ompl.datasets.records import Paths
 from apex_ompl.diffusion.geometry import rotation_matrices, signed_distances
-from apex_ompl.diffusion.query import HALVES, ObstacleSet, Probes, Query
+from apex_ompl.diffusion.obstacles import Obstacles
+from apex_ompl.diffusion.query import HALVES, Probes, Query
 from apex_ompl.diffusion.sight import Sight
 from apex_ompl.kernel import Kernel
 
@@ -31,6 +32,7 @@ class Conditions:
         size: Half edges; radius; or radius and half length along z, shape (B, M, 3) [m].
         mask: True for an obstacle, False for padding, shape (B, M).
         seen: Features of a :class:`Sight`, shape (B, F). Where there are any, obstacles and probe points are left out.
+        among: The obstacles of such conditions, where a model is trained that looks at them again.
     """
 
     start: Tensor
@@ -43,17 +45,21 @@ class Conditions:
     size: Tensor
     mask: Tensor
     seen: Tensor
+    among: Obstacles | None = field(default=None, kw_only=True)
 
     def to(self, device: torch.device | str) -> Conditions:
-        """Return a copy on a device."""
-        return Conditions(*(getattr(self, f.name).to(device) for f in fields(self)))
+        """Return a copy on a device; those of ``among`` stay where they are."""
+        columns = (getattr(self, f.name).to(device) for f in fields(self) if f.name != "among")
+        return Conditions(*columns, among=self.among)
 
     @classmethod
     def concatenate(cls, batches: Sequence[Conditions]) -> Conditions:
-        """Return several batches as one, padded to the largest number of obstacles."""
+        """Return batches as one, padded to the largest number of obstacles; ``among`` of several is left out."""
+        if len(batches) == 1:
+            return batches[0]
         most = max(batch.mask.shape[1] for batch in batches)
         columns = []
-        for f in fields(cls):
+        for f in fields(cls)[:-1]:
             tensors = [getattr(batch, f.name) for batch in batches]
             if f.name in ("shape", "position", "rotation", "size", "mask"):
                 tensors = [_zero_padded(tensor, most) for tensor in tensors]
@@ -101,7 +107,7 @@ def batch_queries(queries: Sequence[Query], eyes: Probes | Sight, kernel: Kernel
     if isinstance(eyes, Sight):
         rows = (np.stack([getattr(q, name) for q in queries]) for name in ("start", "goal", "point"))
         ends = (torch.tensor(row, dtype=torch.float32) for row in rows)
-        return _of_features(torch.from_numpy(eyes.features(queries, kernel)), *ends)
+        return conditions_of_features(torch.from_numpy(eyes.features(queries, kernel)), *ends)
     most = max((len(q.obstacles) for q in queries), default=0)
     count = len(queries)
     shape, mask = np.zeros((count, most), np.int64), np.zeros((count, most), bool)
@@ -118,21 +124,28 @@ def batch_queries(queries: Sequence[Query], eyes: Probes | Sight, kernel: Kernel
     return Conditions(*[*columns, torch.empty(count, 0)])
 
 
-def _of_features(seen: Tensor, start: Tensor, goal: Tensor, point: Tensor) -> Conditions:
-    """Return conditions with the features of a sight, shape (B, F), and without obstacles."""
+def conditions_of_features(
+    seen: Tensor, start: Tensor, goal: Tensor, point: Tensor, *, among: Obstacles | None = None
+) -> Conditions:
+    """Return conditions with the features of a sight, shape (B, F), and without obstacles but those of ``among``."""
     count, none = len(start), start.new_empty(len(start), 0, 3)
-    shape, mask = torch.zeros(count, 0, dtype=torch.int64), torch.zeros(count, 0, dtype=torch.bool)
+    shape, mask = (start.new_zeros(count, 0, dtype=kind) for kind in (torch.int64, torch.bool))
     turns = start.new_empty(count, 0, 3, 3)
-    return Conditions(start, goal, point, turns, shape, none, turns, none, mask, seen)
+    return Conditions(start, goal, point, turns, shape, none, turns, none, mask, seen, among=among)
 
 
 class ConditionTable:
-    """Conditions of the paths of a data set, from which batches are taken by index."""
+    """Conditions of the paths of a data set, from which batches are taken by index.
+
+    Attributes:
+        control: Control points of the paths, shape (N, points, dof), float32 [rad].
+    """
 
     def __init__(self, paths: Paths, probes: Probes, kernel: Kernel) -> None:
         """Compute the conditions of all paths; of the kernel only the robot's kinematics are used, not its scene."""
         a = paths.arrays
         start, goal = paths.start, paths.goal
+        self.control = torch.tensor(paths.control(), dtype=torch.float32)
         self.start, self.goal = (torch.tensor(v, dtype=torch.float32) for v in (start, goal))
         self.point = torch.from_numpy(np.asarray(a["point"], np.float32))
         self.probes = torch.from_numpy(probes.positions(kernel, start, goal))
@@ -145,8 +158,9 @@ class ConditionTable:
         self.count = torch.from_numpy(a["things"].astype(np.int64))
         self.first = torch.cumsum(self.count, 0) - self.count
 
-    def batch(self, which: Tensor) -> Conditions:
-        """Return the conditions of some paths by their indices, shape (B,)."""
+    def batch(self, which: Tensor, generator: torch.Generator) -> tuple[Tensor, Conditions]:
+        """Return control points (B, points, dof) and conditions of paths by their indices, shape (B,), as they are."""
+        del generator
         problem = self.problem[which]
         count, first = self.count[problem], self.first[problem]
         most = int(count.max()) if len(which) else 0
@@ -154,46 +168,4 @@ class ConditionTable:
         at = torch.where(mask, first[:, None] + torch.arange(most), 0)
         columns = [table[which] for table in (self.start, self.goal, self.point, self.probes)]
         columns += [table[at] for table in (self.shape, self.position, self.rotation, self.size)]
-        return Conditions(*[*columns, mask, torch.empty(len(which), 0)])
-
-
-class SightTable:
-    """Conditions of the paths of a data set by a sight: features are computed once, and kept in half precision."""
-
-    def __init__(self, paths: Paths, sight: Sight, kernel: Kernel) -> None:
-        """Compute the features of all paths; of the kernel only the robot's kinematics are used, not its scene.
-
-        Raises:
-            DatasetError: Held objects have no extents.
-        """
-        a, start, goal = paths.arrays, paths.start, paths.goal
-        self.start, self.goal = (torch.tensor(v, dtype=torch.float32) for v in (start, goal))
-        self.point = torch.from_numpy(np.asarray(a["point"], np.float32))
-        self.problem = torch.from_numpy(a["problem"].astype(np.int64))
-        held = [sight.held(held_extents(text)) for text in paths.names["held"]]
-        first, balls = np.concatenate([[0], np.cumsum(a["things"])]).astype(int), sight.balls(kernel)
-        at_keys = np.empty((paths.problems, len(balls)), np.float16)
-        along = np.empty((len(paths), sight.along_size), np.float16)
-        order = np.argsort(a["problem"], kind="stable")
-        owners, begins = np.unique(a["problem"][order], return_index=True)
-        for p, which in zip(owners, np.split(order, begins[1:]), strict=True):
-            columns = (a[name][first[p] : first[p + 1]] for name in ("shape", "position", "orientation", "size"))
-            scene = ObstacleSet.from_rows(list(zip(*columns, strict=True))).tables()
-            at_keys[p] = sight.at_keys(balls, scene, None)
-            for k, points in zip(which, sight.probes.positions(kernel, start[which], goal[which]), strict=True):
-                along[k] = sight.along(points, scene, None)
-        self._at_keys, self._along = torch.from_numpy(at_keys), torch.from_numpy(along)
-        self._held = torch.from_numpy(np.array(held, np.float32).reshape(len(held), -1)[a["held"]])
-
-    def batch(self, which: Tensor) -> Conditions:
-        """Return the conditions of some paths by their indices, shape (B,)."""
-        problem = self.problem[which]
-        parts = (self._at_keys[problem].float(), self._along[which].float(), self._held[problem])
-        return _of_features(torch.cat(parts, dim=1), self.start[which], self.goal[which], self.point[which])
-
-
-def condition_table(paths: Paths, eyes: Probes | Sight, kernel: Kernel) -> ConditionTable | SightTable:
-    """Return the conditions of paths as a model with these eyes sees them."""
-    if isinstance(eyes, Sight):
-        return SightTable(paths, eyes, kernel)
-    return ConditionTable(paths, eyes, kernel)
+        return self.control[which], Conditions(*[*columns, mask, torch.empty(len(which), 0)])

@@ -79,6 +79,9 @@ class TrainingConfig(StrictModel):
         weights: Relative frequency of paths in training, by patterns of ``suite/level``; the first that matches
             counts, 1 where none does.
         mirror: Mirror symmetry of the robot, by which the data are augmented.
+        parts: Share of the paths of which a part is taken, for a scene ``clearances``, as ``mixed`` is, see
+            :class:`apex_ompl.diffusion.sight_data.Augmentation`.
+        mixed: Share of the paths among whose obstacles are put some of another scene that leave it free.
         held_out: Share of the problems kept for the validation loss.
         units: Number of units of a data set in memory at the same time; all by default.
         log_every: Steps between two lines of the log.
@@ -109,6 +112,8 @@ class TrainingConfig(StrictModel):
     seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
     weights: dict[str, Annotated[float, Field(ge=0.0)]] = {}
     mirror: MirrorConfig | None = None
+    parts: Share = 0.0
+    mixed: Share = 0.0
     held_out: Share = 0.02
     units: Count = 1_000_000
     log_every: Count = 100

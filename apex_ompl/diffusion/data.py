@@ -14,11 +14,13 @@ from torch import Tensor
 
 from apex_ompl.datasets.records import SPLINE, Paths
 from apex_ompl.datasets.store import Store, load
-from apex_ompl.diffusion.conditions import Conditions, condition_table
+from apex_ompl.diffusion.conditions import Conditions, ConditionTable
 from apex_ompl.diffusion.config import TrainingConfig
 from apex_ompl.diffusion.mirror import Mirror
 from apex_ompl.diffusion.query import Probes
 from apex_ompl.diffusion.sight import Sight, key_states
+from apex_ompl.diffusion.sight_data import Augmentation, SightTable
+from apex_ompl.diffusion.torch_sight import TorchSight
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel import Kernel, RobotTables
 from apex_ompl.kernel.scene_builder import scene_tables
@@ -28,6 +30,7 @@ from apex_ompl.util.files import is_file
 KEY_PATHS = 5_000  # paths of whose states key states are chosen
 STATISTICS_PATHS = 100_000  # most paths from which the statistics of the latent space are computed
 VALIDATION_SHARE = 0.02  # most of all problems on which the validation loss is taken
+CPU = torch.device("cpu")
 PASSES, UNLIMITED = 4, 2**40  # passes over a shard before the next; steps where there is only one shard
 
 
@@ -41,13 +44,13 @@ class Shard:
     """Paths in memory, from which batches are sampled.
 
     Attributes:
-        control: Control points, shape (N, points, dof), float32 [rad].
         cumulated: Cumulated sampling weights, shape (N,).
     """
 
     def __init__(
-        self, sets: Sequence[Paths], eyes: Probes | Sight, kernel: Kernel, weights: Mapping[str, float]
-    ) -> None:
+        self, sets: Sequence[Paths], eyes: Probes | TorchSight, kernel: Kernel, weights: Mapping[str, float],
+        augmentation: Augmentation | None = None,
+    ) -> None:  # fmt: skip
         """Compute the tensors of paths.
 
         Args:
@@ -55,22 +58,33 @@ class Shard:
             eyes: Probe points of the robot, or what a model of scene ``clearances`` sees.
             kernel: The robot.
             weights: Sampling weight of each path, by patterns of ``suite/level``; the first that matches counts.
+            augmentation: How paths are varied, for a scene ``clearances``; not at all by default.
 
         Raises:
             ParameterError: There are no paths, or all weights are 0.
         """
         sets = [paths for paths in sets if len(paths)]
-        self._tables = [condition_table(paths, eyes, kernel) for paths in sets]
-        self.control = torch.cat([torch.tensor(paths.control(), dtype=torch.float32) for paths in sets] or [_EMPTY])
         found = [_weights(paths, weights) for paths in sets]
-        self._ends = np.cumsum([len(paths) for paths in sets])
         self.cumulated = np.cumsum(np.concatenate(found or [np.zeros(0)]))
         if not len(self.cumulated) or not self.cumulated[-1] > 0.0:
             raise ParameterError("training data", len(self.cumulated), "paths, some of them with a positive weight")
+        self._tables: list[ConditionTable | SightTable]
+        if isinstance(eyes, TorchSight):
+            self._tables = [SightTable(Paths.concatenate(sets), eyes, augmentation)]
+            self._ends = np.array([len(self.cumulated)])
+            return
+        self._tables = [ConditionTable(paths, eyes, kernel) for paths in sets]
+        self._ends = np.cumsum([len(paths) for paths in sets])
 
     def __len__(self) -> int:
         """Return the number of paths."""
-        return len(self.control)
+        return len(self.cumulated)
+
+    @property
+    def control(self) -> Tensor:
+        """Control points of all paths, shape (N, points, dof), float32 [rad]."""
+        controls = [table.control for table in self._tables]
+        return controls[0] if len(controls) == 1 else torch.cat(controls)
 
     def sample(self, count: int, generator: torch.Generator) -> NDArray[np.int64]:
         """Return sorted indices of paths, sampled with replacement in proportion to their weights."""
@@ -78,18 +92,21 @@ class Shard:
         found = np.searchsorted(self.cumulated, uniform * self.cumulated[-1], side="right")
         return np.sort(np.minimum(found, len(self) - 1))
 
-    def batch(self, which: NDArray[np.int64]) -> tuple[Tensor, Conditions]:
-        """Return control points (B, points, dof) and conditions of paths by their sorted indices."""
+    def batch(self, which: NDArray[np.int64], generator: torch.Generator) -> tuple[Tensor, Conditions]:
+        """Return control points (B, points, dof) and conditions of paths by their sorted indices.
+
+        Args:
+            which: Shape (B,).
+            generator: Source of the augmentation.
+        """
         bounds = np.searchsorted(which, np.concatenate([[0], self._ends]))
         pieces = [
-            table.batch(torch.from_numpy(which[a:b] - (end - len(table.start))))
+            table.batch(torch.from_numpy(which[a:b] - (end - len(table.control))), generator)
             for table, a, b, end in zip(self._tables, bounds[:-1], bounds[1:], self._ends, strict=True)
             if b > a
         ]
-        return self.control[torch.from_numpy(which)], Conditions.concatenate(pieces)
-
-
-_EMPTY = torch.zeros(0, 1, 1)
+        controls, conditions = zip(*pieces, strict=True)
+        return torch.cat(controls), Conditions.concatenate(conditions)
 
 
 def _weights(paths: Paths, weights: Mapping[str, float]) -> Array:
@@ -152,13 +169,13 @@ class TrainingData:
         left: Number of steps before the next shard.
     """
 
-    def __init__(self, config: TrainingConfig, robot: RobotTables) -> None:
-        """Read the first shard.
+    def __init__(self, config: TrainingConfig, robot: RobotTables, device: torch.device = CPU) -> None:
+        """Read the first shard; features of a scene ``clearances`` are computed on ``device``.
 
         Raises:
             ApexError: The data cannot be read, or are those of another robot.
         """
-        self._config, self._kernel = config, Kernel(robot, scene_tables([]))
+        self._config, self._kernel, self._device = config, Kernel(robot, scene_tables([])), device
         self.probes = Probes.from_robot(robot, config.condition.along)
         self._mirror: Mirror | None = None
         if config.mirror is not None:
@@ -167,6 +184,7 @@ class TrainingData:
             self._mirror = Mirror(**config.mirror.model_dump())
         self.validation: Shard | None = None
         self.sight: Sight | None = None
+        self._eyes: TorchSight | None = None
         self.number = self.left = 0
         self.shard = self._read(0)
         self._reset_steps()
@@ -175,11 +193,11 @@ class TrainingData:
         """Return control points from which to compute the statistics of a latent space, sampled as in training."""
         generator = torch.Generator().manual_seed(self._config.seed)
         count = min(STATISTICS_PATHS, 8 * len(self.shard))  # with replacement: e^-8 of the paths are left out
-        return self.shard.control[torch.from_numpy(self.shard.sample(count, generator))]
+        return self.shard.control[torch.from_numpy(self.shard.sample(count, generator))].cpu()
 
     def digest(self) -> str:
         """Return the SHA-256 digest of the first shard's control points."""
-        return hashlib.sha256(self.shard.control.numpy().tobytes()).hexdigest()
+        return hashlib.sha256(self.shard.control.cpu().numpy().tobytes()).hexdigest()
 
     def count_step(self) -> None:
         """Count a training step; read the next shard when none are left for this one."""
@@ -211,9 +229,17 @@ class TrainingData:
             control = train.control(np.sort(rng.integers(len(train), size=min(KEY_PATHS, len(train)))))
             keys = key_states(robot, train.spline.path(control).reshape(-1, robot.dof), config.condition.keys, rng)
             self.sight = Sight(keys, self.probes, config.condition.hands)
-        eyes = self.sight or self.probes
+            self._eyes = TorchSight(self.sight, self._kernel, self._device)
+            self._looked_at = self._eyes.tensor(train.spline.basis(self.probes.shares))
+        eyes = self._eyes or self.probes
         if self.validation is None:
             few = split(paths, min(config.held_out, VALIDATION_SHARE))[1]  # the same problems for every larger share
             self.validation = Shard([few], eyes, self._kernel, {}) if len(few) else None
         sets = [train] if self._mirror is None else [train, self._mirror.paths(train, self._kernel)]
-        return Shard(sets, eyes, self._kernel, config.weights)
+        return Shard(sets, eyes, self._kernel, config.weights, Augmentation(config.parts, config.mixed))
+
+    def look(self, control: Tensor, conditions: Conditions) -> Tensor:
+        """Return what a model of scene ``clearances`` sees along paths, control points (B, points, dof): (B, F)."""
+        assert self._eyes is not None
+        assert conditions.among is not None
+        return self._eyes.along(self._looked_at @ control, conditions.among)

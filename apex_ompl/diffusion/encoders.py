@@ -31,8 +31,9 @@ class ConditionEncoder(nn.Module):
     centre: Tensor
 
     def __init__(
-        self, dof: int, *, out: int, width: int, scene: str, point: bool, probes: int, along: int, seen: int = 0
-    ) -> None:
+        self, dof: int, *, out: int, width: int, scene: str, point: bool, probes: int, along: int, seen: int = 0,
+        refined: int = 0,
+    ) -> None:  # fmt: skip
         """Make an encoder.
 
         Args:
@@ -44,6 +45,7 @@ class ConditionEncoder(nn.Module):
             probes: Number P of probe points.
             along: Number L of states of the straight line at which they are placed.
             seen: Number of features of ``clearances``.
+            refined: Number of features along an estimate that :meth:`refine` sees; 0 where there are none.
         """
         super().__init__()
         self.scene, self.point, self.along = scene, point, along
@@ -64,6 +66,14 @@ class ConditionEncoder(nn.Module):
             size += seen
             inner = [nn.Linear(2 * width, 2 * width), nn.SiLU()]
         self.phi = nn.Sequential(nn.Linear(size, 2 * width), nn.SiLU(), *inner, nn.Linear(2 * width, out))
+        if refined:
+            layers = nn.Linear(refined, 2 * width), nn.SiLU(), nn.Linear(2 * width, 2 * width), nn.SiLU()
+            self.psi = nn.Sequential(*layers, nn.Linear(2 * width, out))
+
+    def refine(self, encoded: Tensor, along: Tensor) -> Tensor:
+        """Return encoded conditions, (B, out) or (1, out), with what lies along estimates, features (B, refined)."""
+        refined: Tensor = encoded + self.psi(along)
+        return refined
 
     def set_limits(self, lower: Tensor, upper: Tensor) -> None:
         """Set the robot's limits, shape (dof,) [rad], by which states are scaled to -1..1."""

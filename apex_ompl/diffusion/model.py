@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import torch
 from torch import Tensor, nn
@@ -14,6 +15,9 @@ from apex_ompl.diffusion.encoders import ConditionEncoder
 from apex_ompl.diffusion.model_config import ModelConfig, key_shapes
 from apex_ompl.diffusion.schedule import NoiseSchedule
 from apex_ompl.trajopt.spline import Spline
+
+Look = Callable[[Tensor, Conditions], Tensor]
+"""Returns what a model sees along paths, control points of shape (B, points, dof) [rad], features of shape (B, F)."""
 
 
 class LatentDiffusion(nn.Module):
@@ -51,6 +55,7 @@ class LatentDiffusion(nn.Module):
         self.encoder = ConditionEncoder(
             dof, out=condition.out, width=condition.width, scene=condition.scene, point=condition.point,
             probes=config.probes, along=condition.along, seen=config.seen,
+            refined=config.along_size if condition.refined else 0,
         )  # fmt: skip
         latent_shape, net = self.autoencoder.latent, config.denoiser
         if net.kind == "unet":
@@ -92,21 +97,40 @@ class LatentDiffusion(nn.Module):
         out = self.denoiser(latent, t, encoded)
         return out
 
-    def loss(self, clean: Tensor, noise: Tensor, t: Tensor, conditions: Conditions) -> Tensor:
+    def loss(self, clean: Tensor, noise: Tensor, t: Tensor, conditions: Conditions, look: Look | None = None) -> Tensor:
         """Return the mean square error of the denoiser (equation 5 of the paper).
 
         loss = mean((f(sqrt(abar_t) z_0 + sqrt(1 - abar_t) epsilon, t, g) - target)^2), where the target is epsilon,
-        the velocity or z_0, see :meth:`NoiseSchedule.target`.
+        the velocity or z_0, see :meth:`NoiseSchedule.target`. A denoiser that sees its own last estimate is evaluated
+        at a noisier step first, without one; the loss is the mean of both.
 
         Args:
             clean: Latent vectors z_0 of data, shape (B, *latent).
             noise: Standard normal epsilon, of the same shape.
             t: Steps, shape (B,).
             conditions: Conditions g.
+            look: Where the denoiser sees its own estimate, returns the features along paths.
         """
         encoded = self.encoder(conditions)
         if self.is_regression:
             return nn.functional.mse_loss(self.denoise(torch.zeros_like(clean), torch.zeros_like(t), encoded), clean)
-        output = self.denoise(self.schedule.add_noise(clean, noise, t), t, encoded)
-        target = self.schedule.target(self.config.noise.prediction, clean, noise, t)
-        return nn.functional.mse_loss(output.float(), target)
+        if not self.config.condition.refined:
+            return self._error(clean, noise, t, encoded)[0]
+        assert look is not None
+        first, estimate = self._error(clean, noise, torch.maximum(t, t.roll(1)), encoded)
+        with torch.no_grad(), torch.autocast(clean.device.type, enabled=False):  # half precision is coarse
+            control = self.autoencoder.control(estimate, conditions.start, conditions.goal)
+            along = look(torch.maximum(torch.minimum(control, self.encoder.upper), self.encoder.lower), conditions)
+        return 0.5 * (first + self._error(clean, noise, t, self.encoder.refine(encoded, along))[0])
+
+    def _error(self, clean: Tensor, noise: Tensor, t: Tensor, encoded: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the mean square error of the denoiser at steps t, and its estimate of the latent vectors."""
+        prediction = self.config.noise.prediction
+        sample = self.schedule.add_noise(clean, noise, t)
+        output = self.denoise(sample, t, encoded).float()
+        error = nn.functional.mse_loss(output, self.schedule.target(prediction, clean, noise, t))
+        signal, sigma = self.schedule.scales(t, clean)
+        if prediction == "clean":
+            return error, output.detach()
+        found = (sample - sigma * output) / signal if prediction == "noise" else signal * sample - sigma * output
+        return error, found.detach()

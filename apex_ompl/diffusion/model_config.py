@@ -55,6 +55,7 @@ class ConditionConfig(StrictModel):
         along: Number of states of the straight line at which the probe points are placed.
         keys: Number of key states of ``clearances``.
         hands: Links whose held objects ``clearances`` sees.
+        refined: Whether the denoiser of ``clearances`` also sees the obstacles along its own last estimate of the path.
     """
 
     scene: Literal["none", "set", "distances", "clearances"] = "distances"
@@ -64,6 +65,13 @@ class ConditionConfig(StrictModel):
     along: Annotated[Size, Field(ge=2)] = 7
     keys: Size = 512
     hands: tuple[str, ...] = ()
+    refined: bool = False
+
+    @model_validator(mode="after")
+    def _sees_clearances(self) -> Self:
+        if self.refined and self.scene != "clearances":
+            raise ValueError("expected refined for the scene 'clearances' alone")
+        return self
 
 
 class DenoiserConfig(StrictModel):
@@ -145,16 +153,21 @@ class ModelConfig(StrictModel):
         condition = self.condition
         if condition.scene != "clearances":
             return 0
-        return feature_count(condition.keys, self.arms[0], condition.along, self.probes, len(condition.hands))
+        return condition.keys * self.arms[0] + self.along_size + HELD_FEATURES * len(condition.hands)
+
+    @property
+    def along_size(self) -> int:
+        """Number of features along a path, of a scene ``clearances``."""
+        return self.condition.along * along_features(self.probes, len(self.joints))
 
 
 PIECES = 4  # balls of a cluster of bodies that moves together, at key states
 HELD_FEATURES = 7  # of a hand: whether it holds something, the centre and the half edges of a box around it
 
 
-def feature_count(keys: int, arms: int, along: int, probes: int, hands: int) -> int:
-    """Return the number of features of K key states of A arms, P probe points at L states, and H hands."""
-    return keys * arms + 7 * along * probes + HELD_FEATURES * hands
+def along_features(probes: int, dof: int) -> int:
+    """Return the number of features of a state, of P probe points and ``dof`` joints."""
+    return 7 * probes + dof
 
 
 def key_shapes(config: ModelConfig) -> dict[str, tuple[int, ...]]:

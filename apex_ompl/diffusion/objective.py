@@ -7,16 +7,22 @@ from torch import Tensor, nn
 
 from apex_ompl.diffusion.autoencoder import VariationalLatent
 from apex_ompl.diffusion.conditions import Conditions
-from apex_ompl.diffusion.model import LatentDiffusion
+from apex_ompl.diffusion.model import LatentDiffusion, Look
 
 
 class Objective(nn.Module):
     """Loss of a phase: the negative ELBO of the autoencoder, or the mean square error of the denoiser."""
 
-    def __init__(self, network: LatentDiffusion, divergence: float) -> None:
-        """Train ``network``; ``divergence`` is the weight of the autoencoder's Kullback-Leibler divergence."""
+    def __init__(self, network: LatentDiffusion, divergence: float, look: Look | None = None) -> None:
+        """Train a model.
+
+        Args:
+            network: The model.
+            divergence: Weight of the autoencoder's Kullback-Leibler divergence.
+            look: Returns what lies along paths, for a model that sees its own estimate.
+        """
         super().__init__()
-        self.network, self.divergence = network, divergence
+        self.network, self.divergence, self._look = network, divergence, look
 
     def forward(self, phase: str, control: Tensor, conditions: Conditions, noise: Tensor, t: Tensor) -> Tensor:
         """Return the loss of a batch of paths.
@@ -32,6 +38,6 @@ class Objective(nn.Module):
         if phase == "autoencoder":
             assert isinstance(autoencoder, VariationalLatent)
             return autoencoder.loss(control, noise, self.divergence)[0]
-        with torch.no_grad():
+        with torch.no_grad(), torch.autocast(control.device.type, enabled=False):
             clean = autoencoder.encode(control)
-        return self.network.loss(clean, noise, t, conditions)
+        return self.network.loss(clean, noise, t, conditions, self._look)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
@@ -94,6 +94,7 @@ class TrajectoryModel(ABC):
         self.schedule = NoiseSchedule(config.noise.steps, config.noise.schedule)
         self.sight = Sight(KeyStates.of(**keys), probes, config.condition.hands) if keys else None
         self.sampling = Sampling(**config.sampling.model_dump())
+        self._looked_at = self.spline.basis(probes.shares)
 
     @property
     def sees_point(self) -> bool:
@@ -115,6 +116,10 @@ class TrajectoryModel(ABC):
     @abstractmethod
     def condition(self, queries: Sequence[Query], kernel: Kernel) -> Numbers:
         """Return the encoded conditions of Q queries, shape (Q, out)."""
+
+    @abstractmethod
+    def refine(self, condition: Numbers, along: NDArray[np.float32]) -> Numbers:
+        """Return encoded conditions with what lies along estimates of paths, features of shape (B, F)."""
 
     @abstractmethod
     def denoise(self, latent: Numbers, t: int, condition: Numbers) -> Numbers:
@@ -184,7 +189,9 @@ class TrajectoryModel(ABC):
         clean = self.encode(control)
         first = self.schedule.add_noise(clean, noise_like(clean, generator), step)
         sampling = replace(sampling, steps=min(sampling.steps, step + 1))
-        return self._denoised([query], kernel, first, step, sampling=sampling, generator=generator, callback=callback)
+        return self._denoised(
+            [query], kernel, first, step, sampling=sampling, generator=generator, callback=callback, known=clean
+        )
 
     def _check(self, queries: Sequence[Query], kernel: Kernel) -> None:
         """Check that queries are of the model's robot.
@@ -205,9 +212,12 @@ class TrajectoryModel(ABC):
 
     def _denoised(
         self, queries: Sequence[Query], kernel: Kernel, first: Numbers, top: int, *, sampling: Sampling,
-        generator: np.random.Generator, callback: Callback | None,
+        generator: np.random.Generator, callback: Callback | None, known: Numbers | None = None,
     ) -> Proposals:  # fmt: skip
-        """Return the paths that the reverse process makes of noisy latent vectors ``first`` at step ``top``."""
+        """Return the paths that the reverse process makes of noisy latent vectors ``first`` at step ``top``.
+
+        A model that sees its own estimate sees the paths of ``known`` latent vectors at first, if there are any.
+        """
         self._check(queries, kernel)
         clock, each = _StageClock(), len(first) // len(queries)
         start, goal = (np.array([getattr(q, name) for q in queries], float) for name in ("start", "goal"))
@@ -224,7 +234,12 @@ class TrajectoryModel(ABC):
                 with clock.within("guidance"):
                     return self.score(clean, kernel, ends, sampling.guidance)
 
-            predict = guided(self._predict(condition), score, self.schedule, sampling.guidance, self.config.noise.most)
+            def look(clean: Numbers) -> Numbers:
+                return self.refine(condition, self._along(queries, kernel, self.control(clean, ends)))
+
+            seen = look if self.config.condition.refined else None
+            predict = self._predict(condition, seen, known)
+            predict = guided(predict, score, self.schedule, sampling.guidance, self.config.noise.most)
             times = self.schedule.timesteps(sampling.steps, top)
             extra: dict[str, Any] = {} if callback is None else {"callback": callback}
             if sampling.sampler == "ddpm":
@@ -238,13 +253,32 @@ class TrajectoryModel(ABC):
         clock.lap("decode")
         return Proposals(control, latent, clock.seconds)
 
-    def _predict(self, condition: Numbers) -> Predict:
-        """Return the denoiser as samplers call it."""
-        noise = self.config.noise
+    def _along(self, queries: Sequence[Query], kernel: Kernel, control: Array) -> NDArray[np.float32]:
+        """Return what the model sees along paths of queries, as many of each: shape (B, features)."""
+        assert self.sight is not None
+        limits, each = kernel.robot.arrays, len(control) // len(queries)
+        paths = self._looked_at @ np.clip(control, limits.lower, limits.upper)
+        rows = [
+            self.sight.along(kernel, paths[k * each : (k + 1) * each], *query.seen()) for k, query in enumerate(queries)
+        ]
+        return np.concatenate(rows)
+
+    def _predict(self, condition: Numbers, look: Callable[[Numbers], Numbers] | None, known: Numbers | None) -> Predict:
+        """Return the denoiser as samplers call it.
+
+        Args:
+            condition: Encoded conditions.
+            look: For a model that sees its estimates, returns encoded conditions with what lies along their paths.
+            known: Clean samples that are seen at first.
+        """
+        noise, last = self.config.noise, known
 
         def predict(sample: Numbers, t: int) -> Estimate:
-            output = self.denoise(sample, t, condition)
+            nonlocal last
+            seen = condition if look is None or last is None else look(last)
+            output = self.denoise(sample, t, seen)
             estimate = self.schedule.estimate(noise.prediction, sample, output, t)
+            last = estimate.clean
             return self.schedule.clipped(estimate, sample, t, noise.most)
 
         return predict

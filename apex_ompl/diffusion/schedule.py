@@ -6,9 +6,9 @@ q(z_t | z_0) = N(sqrt(abar_t) z_0, (1 - abar_t) I), so z_t = sqrt(abar_t) z_0 + 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -52,6 +52,7 @@ class NoiseSchedule:
 
     steps: int = 256
     kind: str = "cosine"
+    _known: dict[Any, Tensor] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         """Check the numbers.
@@ -81,9 +82,15 @@ class NoiseSchedule:
 
     def scales(self, t: Tensor, like: Tensor) -> tuple[Tensor, Tensor]:
         """Return sqrt(abar_t) and sqrt(1 - abar_t) at steps (B,), in a shape that multiplies tensors like ``like``."""
-        alpha_bar = self.alpha_bar[t.cpu().numpy()]
-        alpha_bar = alpha_bar.reshape(*alpha_bar.shape, *[1] * (like.ndim - alpha_bar.ndim))
-        return like.new_tensor(np.sqrt(alpha_bar)), like.new_tensor(np.sqrt(1.0 - alpha_bar))
+        if like.device not in self._known:
+            known = np.sqrt(np.stack([self.alpha_bar, 1.0 - self.alpha_bar]))
+            self._known[like.device] = like.double().new_tensor(known)
+        signal, sigma = (
+            self._known[like.device][:, t.to(like.device)]
+            .to(like.dtype)
+            .reshape(2, *t.shape, *[1] * (like.ndim - t.ndim))
+        )
+        return signal, sigma
 
     def scale(self, t: int) -> tuple[float, float]:
         """Return sqrt(abar_t) and sqrt(1 - abar_t) at one step."""

@@ -4,7 +4,8 @@ The vector of features of a query is, one behind the other:
 
 - the clearance of each arm from the obstacles at K key states, shape (K, A), after PRESTO (arXiv 2409.16012);
 - positions of the P probe points at L states along the straight line from start to goal, shape (L, P, 3), their signed
-  distances from the nearest obstacle, shape (L, P), and the gradients of these, shape (L, P, 3);
+  distances from the nearest obstacle, shape (L, P), the gradients of these, shape (L, P, 3), and how they push the
+  joints, shape (L, dof), see :mod:`apex_ompl.diffusion.pushes`;
 - a box around what each hand holds, in the frame of the link that holds it, shape (H, 7): whether there is one, its
   centre and its half edges.
 
@@ -22,7 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apex_ompl.datasets.records import HeldExtent
-from apex_ompl.diffusion.model_config import HELD_FEATURES, PIECES, feature_count
+from apex_ompl.diffusion.model_config import HELD_FEATURES, PIECES, along_features
+from apex_ompl.diffusion.pushes import Chains, pushes
 from apex_ompl.diffusion.query import MAX_DISTANCE, WORKSPACE_CENTRE, Probes, Query
 from apex_ompl.kernel import Kernel, RobotTables
 from apex_ompl.kernel.point_distances import group_clearances, nearest_points
@@ -154,28 +156,23 @@ class Sight:
     probes: Probes
     hands: Sequence[str]
     _placed: dict[str, tuple[tuple[Array, Array], Array]] = field(default_factory=dict, init=False)
+    _chains: dict[str, tuple[tuple[NDArray[Any], ...], Chains]] = field(default_factory=dict, init=False)
 
-    @property
-    def size(self) -> int:
-        """Number of features."""
-        along, points = len(self.probes.shares), len(self.probes.joint)
-        return feature_count(len(self.keys.state), len(self.keys.joint), along, points, len(self.hands))
-
-    @property
-    def along_size(self) -> int:
-        """Number of features of the straight line."""
-        return 7 * len(self.probes.shares) * len(self.probes.joint)
+    def size(self, dof: int) -> int:
+        """Return the number of features of a robot with ``dof`` joints."""
+        along = len(self.probes.shares) * along_features(len(self.probes.joint), dof)
+        return len(self.keys.state) * len(self.keys.joint) + along + HELD_FEATURES * len(self.hands)
 
     def features(self, queries: Sequence[Query], kernel: Kernel) -> NDArray[np.float32]:
         """Return the features of Q queries, shape (Q, size); of the kernel only the kinematics are used."""
-        balls = self.balls(kernel)
-        start, goal = (np.array([getattr(q, name) for q in queries], float) for name in ("start", "goal"))
-        points = self.probes.positions(kernel, start, goal)
+        balls, shares = self.balls(kernel), self.probes.shares[:, None]
         rows = []
-        for query, p in zip(queries, points, strict=True):
+        for query in queries:
             scene, seen = query.seen()
-            rows.append([self.at_keys(balls, scene, seen), self.along(p, scene, seen), self.held(query.held)])
-        return np.array([np.concatenate(row) for row in rows], np.float32)
+            line = query.start + shares * (np.asarray(query.goal) - query.start)
+            along = self.along(kernel, line[None], scene, seen)[0]
+            rows.append(np.concatenate([self.at_keys(balls, scene, seen), along, self.held(query.held)]))
+        return np.array(rows, np.float32)
 
     def balls(self, kernel: Kernel) -> Array:
         """Return the balls of :meth:`KeyStates.placed`, kept while the kernel's joints are where they were."""
@@ -191,13 +188,30 @@ class Sight:
         found = group_clearances(scene, balls, KEY_RANGE, seen)
         return (np.maximum(found, -KEY_RANGE) / KEY_RANGE).astype(np.float32)
 
-    @staticmethod
-    def along(points: NDArray[np.float32], scene: SceneTables, seen: Flags | None) -> NDArray[np.float32]:
-        """Return the features of probe points along a straight line, shape (L, P, 3) [m]: shape (L * P * 7,)."""
+    def along(self, kernel: Kernel, paths: Array, scene: SceneTables, seen: Flags | None) -> NDArray[np.float32]:
+        """Return the features along paths of L states each, shape (B, L, dof) [rad]: shape (B, features).
+
+        Of the kernel only the kinematics are used.
+        """
+        count, probes, chains = len(paths), self.probes, self._above(kernel.robot)
+        rotation, origin = kernel.joint_frames(paths.reshape(-1, paths.shape[-1]))
+        points = np.einsum("npij,pj->npi", rotation[:, probes.joint], probes.offset) + origin[:, probes.joint]
         distances, gradients = nearest_points(scene, points.reshape(-1, 3), MAX_DISTANCE, seen)
-        distances = np.maximum(distances, -MAX_DISTANCE) / MAX_DISTANCE
-        places = points - np.array(WORKSPACE_CENTRE, np.float32)
-        return np.concatenate([places.ravel(), distances, gradients.ravel()]).astype(np.float32)
+        distances, gradients = distances.reshape(points.shape[:2]), gradients.reshape(points.shape)
+        frames = rotation[:, chains.joint][..., 2], origin[:, chains.joint]
+        pushed = pushes((chains.below, chains.revolute, chains.to_state), frames, points, distances, gradients)
+        near = np.maximum(distances, -MAX_DISTANCE) / MAX_DISTANCE
+        parts = (points - np.array(WORKSPACE_CENTRE), near, gradients, pushed)
+        return np.concatenate([part.reshape(count, -1) for part in parts], axis=1).astype(np.float32)
+
+    def _above(self, robot: RobotTables) -> Chains:
+        """Return the joints above the probe points, kept for robots whose joints follow each other alike."""
+        a = robot.arrays
+        tree = (a.joint_parent, a.joint_kind, a.joint_source, a.joint_ratio)
+        kept = self._chains.get("last")
+        if kept is None or not all(map(np.array_equal, tree, kept[0])):
+            kept = self._chains["last"] = tree, Chains.of(robot, self.probes.joint)
+        return kept[1]
 
     def held(self, extents: Sequence[HeldExtent]) -> NDArray[np.float32]:
         """Return the features of held objects, shape (H * HELD_FEATURES,); objects of one hand are in one box."""

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from apex_ompl.diffusion.conditions import batch_queries
@@ -61,6 +62,11 @@ class TorchModel(TrajectoryModel):
         return found
 
     @torch.no_grad()
+    def refine(self, condition: Tensor, along: NDArray[np.float32]) -> Tensor:
+        """Return encoded conditions with what lies along estimates of paths, features of shape (B, F)."""
+        return self.network.encoder.refine(condition, self._tensor(along))
+
+    @torch.no_grad()
     def denoise(self, latent: Tensor, t: int, condition: Tensor) -> Tensor:
         """Return the denoiser's output for latent vectors at a step, each with its condition, or one for all."""
         return self.network.denoise(latent, torch.full((1,), t, device=latent.device), condition)
@@ -79,5 +85,5 @@ class TorchModel(TrajectoryModel):
         """Return control points, shape (B, points, dof) [rad], of latent vectors between starts and goals."""
         return self.network.autoencoder.control(latent, *map(self._tensor, ends)).cpu().double().numpy()
 
-    def _tensor(self, values: Array) -> Tensor:
+    def _tensor(self, values: NDArray[Any]) -> Tensor:
         return torch.tensor(np.asarray(values), dtype=torch.float32, device=self.device)

@@ -81,7 +81,7 @@ class Trainer:
         self.config, self.folder, self.process, self.problems, self._report = config, folder, process, problems, report
         check_writable(folder / STATE)
         robot = RobotTables.load(config.robot)
-        self.data = TrainingData(config, robot)
+        self.data = TrainingData(config, robot, process.device)
         self.network = initial_network(config, self.data, robot).to(process.device)
         self.phase = self._first_phase
         self.step, self.seconds, self._skipped = 0, 0.0, 0
@@ -90,7 +90,7 @@ class Trainer:
         if is_file(folder / STATE):
             self._load_state()
         self._runlog = RunLog(folder, self.progress) if process.rank == 0 else None
-        objective = Objective(self.network, config.autoencoder.divergence)
+        objective = Objective(self.network, config.autoencoder.divergence, self.data.look)
         self._objective: nn.Module = objective
         if process.world_size > 1:
             self._objective = nn.parallel.DistributedDataParallel(objective, find_unused_parameters=True)
@@ -202,7 +202,7 @@ class Trainer:
                 {"params": [p for p in self._parameters if p.ndim > 1], "weight_decay": self.config.decay},
                 {"params": [p for p in self._parameters if p.ndim <= 1], "weight_decay": 0.0},
             ],
-            lr=self._rate(), betas=(0.9, 0.99),
+            lr=self._rate(), betas=(0.9, 0.99), fused=self.process.device.type == "cuda",
         )  # fmt: skip
 
     def _end_autoencoder(self) -> None:
@@ -227,7 +227,8 @@ class Trainer:
         numbers = [config.seed, PHASES.index(self.phase), self.step, process.rank]
         generator = torch.Generator().manual_seed(int(np.random.SeedSequence(numbers).generate_state(1)[0]))
         shard = self.data.shard
-        control, conditions = shard.batch(shard.sample(max(1, config.batch // process.world_size), generator))
+        which = shard.sample(max(1, config.batch // process.world_size), generator)
+        control, conditions = shard.batch(which, generator)
         noise = self._noise(len(control), generator)
         return self._evaluate(self._objective, control, conditions, noise)
 
@@ -258,8 +259,8 @@ class Trainer:
         if validation is not None:
             generator = torch.Generator().manual_seed(self.config.seed)
             which = torch.randperm(len(validation), generator=generator)[:VALIDATION_PATHS].sort().values
-            control, conditions = validation.batch(which.numpy())
-            objective = Objective(network, self.config.autoencoder.divergence)
+            control, conditions = validation.batch(which.numpy(), generator)
+            objective = Objective(network, self.config.autoencoder.divergence, self.data.look)
             with torch.no_grad():
                 held_out = self._evaluate(objective, control, conditions, self._noise(len(control), generator))
             row["held_out"] = f"{float(held_out):.6f}"

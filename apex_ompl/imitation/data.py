@@ -47,6 +47,11 @@ class Windows:
     time: Tensor
     following: Tensor
 
+    def to(self, device: torch.device) -> Windows:
+        """Return a copy on a device."""
+        state, time, following = (tensor.to(device) for tensor in (self.state, self.time, self.following))
+        return Windows(self.conditions.to(device), state, time, following)
+
 
 class WindowData:
     """Data of a training run, all in memory.
@@ -113,7 +118,7 @@ class WindowData:
             generator: Source of the times and of the noise.
         """
         network, count = self._config.network, self._config.windows
-        control, conditions = shard.batch(which)
+        control, conditions = shard.batch(which, generator)
         uniform = torch.rand(len(which), count, generator=generator)
         time = ((torch.arange(count) + uniform) * ((network.clock - 1) / count)).long().clamp(max=network.clock - 2)
         states = self.states(control, time)

@@ -48,15 +48,16 @@ class ImitationTrainer:
         averaged: Exponential moving average of its weights, by name.
         step: Number of steps done.
         seconds: Time of all steps [s].
+        device: Device of torch's that the network is on.
     """
 
-    def __init__(self, config: ImitationConfig, folder: Path) -> None:
-        """Make a network, or load the state of the run in ``folder``, which must exist.
+    def __init__(self, config: ImitationConfig, folder: Path, device: torch.device = CPU) -> None:
+        """Make a network on a device, or load the state of the run in ``folder``, which must exist.
 
         Raises:
             ApexError: Data, tables or state cannot be read or do not fit.
         """
-        self.config, self.folder = config, folder
+        self.config, self.folder, self.device = config, folder, device
         check_writable(folder / STATE)
         robot = RobotTables.load(config.robot)
         self.robot, self._commit = robot.name, commit(ROOT, ("apex_ompl", "scripts"))
@@ -66,6 +67,7 @@ class ImitationTrainer:
             self.network = PolicyNetwork(config.network)
         self.data.fit(self.network)
         first = "" if config.init is None else self._initialise(config.init)
+        self.network.to(device)
         self.step, self.seconds, self._skipped = 0, 0.0, 0
         determining = f"{config.determining}{robot.name}{self.data.digest()}{first}"
         self._digest = hashlib.sha256(determining.encode()).hexdigest()
@@ -82,7 +84,8 @@ class ImitationTrainer:
         if is_file(folder / STATE):
             self._load_state()
         self._runlog = RunLog(folder, {PHASE: self.step})
-        self._held_out = self.data.held_out(HELD_OUT_PATHS)
+        held_out = self.data.held_out(HELD_OUT_PATHS)
+        self._held_out = None if held_out is None else held_out.to(device)
 
     @property
     def done(self) -> bool:
@@ -98,7 +101,7 @@ class ImitationTrainer:
         started = time.perf_counter()
         for group in self._optimizer.param_groups:
             group["lr"] = self._rate()
-        loss = self.loss(self.network, self.data.batch(self.step))
+        loss = self.loss(self.network, self.data.batch(self.step).to(self.device))
         self._optimizer.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]
         norm = nn.utils.clip_grad_norm_(self._parameters, self.config.clip)
@@ -119,7 +122,7 @@ class ImitationTrainer:
     def loss(self, network: PolicyNetwork, windows: Windows) -> Tensor:
         """Return the mean square error of the predicted next states, in standard deviations of the data."""
         bfloat16 = self.config.precision == "bfloat16"
-        with torch.autocast("cpu", torch.bfloat16) if bfloat16 else nullcontext():
+        with torch.autocast(self.device.type, torch.bfloat16) if bfloat16 else nullcontext():
             found = network(windows.conditions, windows.state, windows.time)
         loss: Tensor = (((found - windows.following) / network.scale) ** 2).mean()
         return loss
@@ -164,7 +167,7 @@ class ImitationTrainer:
         with torch.random.fork_rng(devices=[]):
             network = PolicyNetwork(self.config.network)
         network.load_state_dict({**self.network.state_dict(), **self.averaged})
-        return network.eval()
+        return network.to(self.device).eval()
 
     def about(self, network: PolicyNetwork) -> dict[str, Any]:
         """Return the record of the training for a checkpoint of ``network``, ready for JSON."""
@@ -206,7 +209,7 @@ class ImitationTrainer:
         return about.digest
 
     def _load_state(self) -> None:
-        state = read_state(self.folder, self._digest, CPU)
+        state = read_state(self.folder, self._digest, self.device)
         try:
             self.network.load_state_dict(state["network"])
             self.step, self.seconds = state["step"], state["seconds"]

@@ -1,0 +1,82 @@
+"""How obstacles push a robot's joints: forces on its probe points away from the nearest obstacles, as torques."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apex_ompl.diffusion.geometry import Numbers, array_module
+from apex_ompl.kernel import RobotTables
+from apex_ompl.kernel.compiled.arrays import FIXED, REVOLUTE
+from apex_ompl.types import Array
+
+REACH = 0.2  # distance of a probe point from an obstacle at which it is pushed no more [m]
+
+
+@dataclass(frozen=True, eq=False)
+class Chains:
+    """Joints above probe points.
+
+    Attributes:
+        joint: The J joints that move and carry a probe point, parents before children, shape (J,).
+        below: 1 where a joint moves a probe point, shape (J, P).
+        revolute: Whether a joint turns, shape (J,).
+        to_state: Rate of each joint's value by the planned ones, shape (J, dof).
+    """
+
+    joint: NDArray[np.int64]
+    below: Array
+    revolute: NDArray[np.bool_]
+    to_state: Array
+
+    @classmethod
+    def of(cls, robot: RobotTables, probe_joint: NDArray[np.int64]) -> Chains:
+        """Return the joints of a robot above probe points, which are fixed to joints of shape (P,)."""
+        a = robot.arrays
+        chains = []
+        for carrier in probe_joint.tolist():
+            chain, joint = [], carrier
+            while joint > 0:
+                chain.append(joint)
+                joint = int(a.joint_parent[joint])
+            chains.append(chain)
+        moving = sorted({j for chain in chains for j in chain if a.joint_kind[j] != FIXED})
+        below = np.array([[float(j in chain) for chain in chains] for j in moving]).reshape(len(moving), -1)
+        to_state = np.zeros((len(moving), robot.dof))
+        to_state[np.arange(len(moving)), a.joint_source[moving]] = a.joint_ratio[moving]
+        return cls(np.array(moving, np.int64), below, a.joint_kind[moving] == REVOLUTE, to_state)
+
+
+def pushes(
+    chains: tuple[Numbers, Numbers, Numbers], frames: tuple[Numbers, Numbers], points: Numbers, distances: Numbers,
+    gradients: Numbers,
+) -> Numbers:  # fmt: skip
+    """Return generalized forces of the nearest obstacles at N states, shape (N, dof) [m].
+
+    A point p at distance d is pushed by f = max(0, 1 - d / REACH) along the gradient of its distance. A joint of axis z
+    through o gets the sum of z . ((p - o) x f) over the points that it moves, or of z . f where it slides: the
+    transposed Jacobians times the forces.
+
+    Args:
+        chains: ``below``, ``revolute`` and ``to_state`` of :class:`Chains`, all arrays or all tensors.
+        frames: Axes, shape (N, J, 3), and origins, shape (N, J, 3) [m], of its joints.
+        points: Probe points, shape (N, P, 3) [m].
+        distances: Their signed distances from the nearest obstacles, shape (N, P) [m].
+        gradients: The gradients of these, shape (N, P, 3).
+    """
+    below, revolute, to_state = chains
+    axes, origins = frames
+    xp = array_module(points)
+    force = (1.0 - distances / REACH).clip(min=0.0)[..., None] * gradients
+    total, moment = (xp.einsum("jp,npi->nji", below, v) for v in (force, _cross(xp, points, force)))
+    torque = moment - _cross(xp, origins, total)
+    along = (axes * xp.where(revolute[:, None], torque, total)).sum(-1)
+    return along @ to_state
+
+
+def _cross(xp: object, a: Numbers, b: Numbers) -> Numbers:
+    """Return the cross products of vectors, shape (..., 3)."""
+    rolled = [(a[..., i] * b[..., j] - a[..., j] * b[..., i]) for i, j in ((1, 2), (2, 0), (0, 1))]
+    return xp.stack(rolled, -1)  # type: ignore[attr-defined]
