@@ -1,8 +1,8 @@
 """APEX with other proposals, as planners: importing this module registers them.
 
-``bumps``: random bumps of the straight line. ``random weights``: a network like the model's, not trained. ``shuffled
-conditions``: the model, which sees a training problem drawn at random and not the one at hand. ``nearest paths``:
-training paths of the most similar conditions, moved to the ends at hand.
+``random weights``: a network like the model's, not trained. ``shuffled conditions``: the model, which sees a training
+problem drawn at random and not the one at hand. ``nearest paths``: training paths of the most similar conditions, moved
+to the ends at hand. Random bumps in the place of proposals are apex's own, by its parameter ``model`` of "none".
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from controls import Bumps, Shuffled, drawn
+from controls import Shuffled, drawn
 from neighbours import Neighbours
 from ompl import base as ob
 
@@ -54,16 +54,6 @@ class ControlParameters(ApexParameters):
             raise ParameterError("parameter 'model'", self.model, "a model that NumPy evaluates, as of kind mlp")
         planner.model = self.replaced(planner.model)
         return planner
-
-
-@register("bumps")
-@dataclass(frozen=True)
-class BumpsParameters(ControlParameters):
-    """APEX with random bumps instead of proposals."""
-
-    def replaced(self, model: ArrayModel) -> TrajectoryModel:
-        """Return random bumps."""
-        return Bumps(model.config, model.weights, {})
 
 
 @register("random weights")

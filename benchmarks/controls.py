@@ -1,4 +1,4 @@
-"""Controls of the model in comparisons: random bumps, random weights, another problem's conditions.
+"""Controls of the model in comparisons: random weights, another problem's conditions.
 
 :mod:`control_planners` makes planners of them.
 """
@@ -20,22 +20,6 @@ from apex_ompl.diffusion.proposals import Proposals
 from apex_ompl.diffusion.query import Query
 from apex_ompl.ompl_adapter.setup import assemble
 from apex_ompl.problems.suite_robot import robot
-from apex_ompl.trajopt.optimizer import Optimizer
-
-
-class Bumps(ArrayModel):
-    """Random bumps instead of proposals."""
-
-    def propose(self, query: Any, kernel: Any, count: int, **options: Any) -> Proposals:
-        """Return bumps on the straight lines of queries."""
-        queries = [query] if isinstance(query, Query) else list(query)
-        rng = options.get("generator") or np.random.default_rng(0)
-        found = np.concatenate([Optimizer(self.spline).starts(q.start, q.goal, count + 1, rng)[1:] for q in queries])
-        return Proposals(found, np.empty(0), {})
-
-    def renoise(self, query: Query, kernel: Any, control: Any, step: int, **options: Any) -> Proposals:
-        """Return other bumps: a path is not resampled."""
-        return self.propose(query, kernel, len(control), **options)
 
 
 class Shuffled(ArrayModel):

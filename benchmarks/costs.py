@@ -14,13 +14,14 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import record
+from replan_times import replan_times
 
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.live.movers import Movers, clearance_in_time, curve_of, prove_motion
@@ -32,31 +33,25 @@ from apex_ompl.loop.drrt import Clearances, KeptTree
 from apex_ompl.loop.following import Following
 from apex_ompl.loop.gpmp2 import CHARGE, IncrementalGPMP2
 from apex_ompl.loop.imitation import Imitation
-from apex_ompl.loop.methods import adapted, method
 from apex_ompl.loop.mppi import PathIntegral, softmax
 from apex_ompl.loop.paper import OneProposal
 from apex_ompl.loop.potential_field import PotentialField
 from apex_ompl.loop.proposals import Proposals
 from apex_ompl.loop.ready import Ready
-from apex_ompl.loop.rehearsal import rehearse
-from apex_ompl.loop.request import Answer, Replanner, Request
-from apex_ompl.loop.run import default_settings
+from apex_ompl.loop.request import Request
 from apex_ompl.loop.search import MOTIONS, Search, reach
-from apex_ompl.loop.sensor import Sensor, SensorStream
 from apex_ompl.loop.settings import LoopSettings
 from apex_ompl.loop.short_horizon import Horizon
-from apex_ompl.loop.simulation import simulate
 from apex_ompl.loop.snapshot import Snapshot
 from apex_ompl.loop.sprint import CHARGE as SPRINT
 from apex_ompl.loop.sprint import Sprint
-from apex_ompl.ompl_adapter.process import quiet_ompl, seed_ompl
+from apex_ompl.ompl_adapter.process import quiet_ompl
 from apex_ompl.ompl_adapter.setup import assemble
 from apex_ompl.problems import worlds
 from apex_ompl.roadmaps.goal_tree import GoalTree
 from apex_ompl.roadmaps.lazy_search import LazySearch
 from apex_ompl.trajectory import time_path
 from apex_ompl.trajectory.methods.moving_start import between, through
-from apex_ompl.trajectory.timing import Timing
 from apex_ompl.trajopt.optimizer import Optimizer
 from apex_ompl.types import Array, Flags
 from apex_ompl.util.entry_point import run_script
@@ -265,63 +260,19 @@ def network() -> dict[str, float]:
     return {"proposals": taken[1] - each, "proposal": each, **paths, "chunk of a policy": chunk}
 
 
-class Timed:
-    """A way of replanning whose replans are timed.
-
-    Attributes:
-        seconds: What they took [s].
-        counts: What they were charged, in units by kind.
-        replans: Their number.
-    """
-
-    def __init__(self, replanner: Replanner) -> None:
-        """Wrap a way of replanning."""
-        self._replanner = replanner
-        self.seconds, self.replans, self.counts = 0.0, 0, Counter[str]()
-
-    def prepare(self, ready: Ready) -> None:
-        """Prepare it."""
-        self._replanner.prepare(ready)
-        rehearse(self._replanner, ready)
-
-    def replan(self, ready: Ready, request: Request, charges: Charges) -> Answer:
-        """Replan, and note what it took."""
-        begin = time.perf_counter()
-        answer = self._replanner.replan(ready, request, charges)
-        self.seconds += time.perf_counter() - begin
-        self.counts += answer.charges.counts
-        self.replans += 1
-        return answer
-
-
-def timed_runs(planner: str, names: Sequence[str]) -> Timed:
-    """Return what replans took in runs of a way of replanning on the simulated clock."""
-    timed = Timed(method(planner).make())
-    for name in names:
-        world, sensor = worlds.load(name), Sensor()
-        setup = assemble(world.problem.still)
-        settings = adapted(default_settings(world, sensor), method(planner))
-        limits = Timing().limits(setup.robot.limits, setup.robot.joint_names)
-        ready = Ready(setup, limits, setup.robot.limits, settings)
-        with quiet_ompl():
-            seed_ompl(0)
-            timed.prepare(ready)
-            simulate(world, ready, timed, SensorStream(sensor, world, settings.watched), 0)
-    return timed
-
-
 def in_replans(alone: Mapping[str, float], names: Sequence[str]) -> tuple[dict[str, float], dict[str, dict[str, Any]]]:
     """Return what kinds of work cost in replans [s], of what they cost alone, and factors by way of replanning."""
     costs, known, about = dict(alone), set[str](), {}
+    package = json.loads(TABLE.read_text())["seconds"]
     for planner in PLANNERS:
-        timed = timed_runs(planner, names)
-        new = [kind for kind in timed.counts if kind not in known]
-        charged = sum(costs[kind] * timed.counts[kind] for kind in new)
-        rest = timed.seconds - sum(costs[kind] * count for kind, count in timed.counts.items() if kind in known)
+        timed = replan_times(planner, names)
+        new, old = ([kind for kind in timed.counts if (kind in known) == there] for there in (False, True))
+        charged, rest = timed.charged(costs, new), timed.seconds - timed.charged(costs, old)
         factor = max(rest / charged, LEAST_FACTOR) if charged > LEAST_SHARE * timed.seconds else 1.0
         costs |= {kind: factor * costs[kind] for kind in new}
         known |= set(new)
         about[planner] = {"factor": factor, "replans": timed.replans, "seconds": timed.seconds}
+        about[planner]["by_package"] = timed.seconds / timed.charged(package)
     return costs, about
 
 
@@ -342,8 +293,10 @@ def main() -> None:
     rows = [["kind of work", "us a unit alone", "in replans"], ["---", "---:", "---:"]]
     rows += [[kind, f"{1e6 * alone[kind]:.3g}", f"{1e6 * v:.3g}"] for kind, v in table.items()]
     text = "\n".join(map(record.row, rows))
-    rows = [["replans of", "N", "s", "factor on kinds of their own"], ["---", "---:", "---:", "---:"]]
-    rows += [[name, one["replans"], f"{one['seconds']:.2f}", f"{one['factor']:.2f}"] for name, one in about.items()]
+    head = ["replans of", "N", "s", "factor on kinds of their own", "took by charged by the package's table"]
+    rows = [head, ["---", "---:", "---:", "---:", "---:"]]
+    for name, one in about.items():
+        rows.append([name, one["replans"], f"{one['seconds']:.2f}", f"{one['factor']:.2f}", f"{one['by_package']:.2f}"])
     text += "\n\n" + "\n".join(map(record.row, rows))
     if args.write:
         version = json.loads(TABLE.read_text())["version"]

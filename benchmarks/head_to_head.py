@@ -55,8 +55,8 @@ ROWS = (
     Row("straight line + repair", "apex", {**TREELESS, "first": 0, "second": 0, "third": 0, "resample": 0}, 2.0),
     Row(
         "8 bumps + repair",
-        "bumps",
-        {**TREELESS, "line": False, "first": 8, "second": 0, "third": 0, "resample": 0},
+        "apex",
+        {**TREELESS, "model": "none", "line": False, "first": 8, "second": 0, "third": 0, "resample": 0},
         2.0,
     ),
     Row("rrtconnect+polish", "rrtconnect+polish"),

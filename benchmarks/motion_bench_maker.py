@@ -16,7 +16,6 @@ Usage: python benchmarks/motion_bench_maker.py FOLDER [-n 30] [--jobs 1]    (nee
 from __future__ import annotations
 
 import argparse
-import re
 import sys
 from collections.abc import Sequence
 from importlib.metadata import version
@@ -43,6 +42,7 @@ from apex_ompl.trajopt.path import path_length
 from apex_ompl.util.deadline import Deadline
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.files import write_atomically
+from apex_ompl.util.schema import dump_yaml, read_yaml
 from apex_ompl.util.stopwatch import timed
 from apex_ompl.util.validation import one_or_more
 
@@ -135,13 +135,12 @@ def plan_with_vamp(job: Job) -> Run:
 def converted(folder: Path, count: int) -> list[Path]:
     """Return problem files of the first requests of each set, which are made where they are missing."""
     FOLDER.mkdir(parents=True, exist_ok=True)
-    text, place = (DATA / "baxter.robot.yaml").read_text(), FOLDER / "baxter_open.robot.yaml"
+    data, place = read_yaml(DATA / "baxter.robot.yaml", "file of a robot"), FOLDER / "baxter_open.robot.yaml"
     for side in "lr":
         for finger, sign in (("l", 1.0), ("r", -1.0)):
-            joint = f"{side}_gripper_{finger}_finger_joint"
-            text = text.replace(f"{joint}: 0.0", f"{joint}: {sign * OPEN}")
-    text = re.sub("covers: (.*)", lambda found: f"covers: {DATA / found[1]}", text)
-    write_atomically(place, text.encode())
+            data["locked"][f"{side}_gripper_{finger}_finger_joint"] = sign * OPEN
+    data["covers"] = str(DATA / data["covers"])
+    write_atomically(place, dump_yaml(data).encode())
     robot, files = load_robot(place), list[Path]()
     for kind in SETS:
         there = sorted(folder.rglob(f"bookshelf_tall_both_arms_{kind}_baxter/request*.yaml"))[:count]

@@ -31,7 +31,7 @@ class Neighbours:
         for paths in several:
             table = ConditionTable(paths, self._probes, kernel)
             parts = (torch.arange(k, min(k + 2048, len(paths))) for k in range(0, len(paths), 2048))
-            rows += [features(table.batch(part)) for part in parts]
+            rows += [features(table.conditions(part)) for part in parts]
             control = paths.control()
             rests.append((control - self.spline.line(control[:, 0], control[:, -1])).astype(np.float32))
         self._features, self._residual = np.concatenate(rows), np.concatenate(rests)

@@ -30,7 +30,7 @@ NO_PROPOSALS = {"first": 0, "second": 0, "third": 0, "resample": 0}
 TREES = ("rrtconnect+polish", Row.of("rrtconnect", TUNED["rrtconnect"]).label)
 ROWS = (
     *(row for row in head_to_head.ROWS if row.label in ("apex", "apex without trees")),
-    Row("apex, bumps for proposals", "bumps"),
+    Row("apex, bumps for proposals", "apex", {"model": "none"}),
     Row("apex without proposals", "apex", NO_PROPOSALS),
     *(row for row in head_to_head.ROWS if row.label in TREES),
 )

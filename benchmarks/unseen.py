@@ -57,6 +57,8 @@ def rows(names: Sequence[str], model: Path | None) -> list[Row]:
     for name in names:
         if name == "apex":
             found += [Row("apex", "apex"), *([Row(f"apex{mark}", "apex", params)] if mark else [])]
+        elif name == "bumps":
+            found.append(Row(name, "apex", {"model": "none"}))
         elif name in CONTROLS:
             own = name in OF_A_MODEL
             found.append(Row(name + mark * own, name, params if own else {}))

@@ -9,15 +9,13 @@ import numpy as np
 from ompl import base as ob
 from ompl import util as ou
 
-from apex_ompl.apex.bumps import BumpModel
 from apex_ompl.apex.context import SolveContext
-from apex_ompl.apex.models import trajectory_model
+from apex_ompl.apex.models import Model, trajectory_model
 from apex_ompl.apex.path_validator import PathValidator
 from apex_ompl.apex.query import make_query
 from apex_ompl.apex.sampler import ProposalSampler
 from apex_ompl.apex.solver import LOG, solve
 from apex_ompl.apex.stages import Anytime, Shorten
-from apex_ompl.diffusion.proposals import TrajectoryModel
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel.shortcuts import shortcut
 from apex_ompl.kernel.trees import TreePair
@@ -29,7 +27,7 @@ from apex_ompl.types import Array
 from apex_ompl.util.resolution import SEARCH_RESOLUTION
 
 Status = ob.PlannerStatus
-_warm_models: WeakSet[TrajectoryModel | BumpModel] = WeakSet()  # that have proposed something in this process
+_warm_models: WeakSet[Model] = WeakSet()  # that have proposed something in this process
 
 
 class APEX(ob.Planner):

@@ -183,7 +183,7 @@ def test_conditions_of_stored_paths_are_those_of_their_problems() -> None:
     paths = some_paths()
     probes = Probes.from_robot(kernel().robot, 3)
     which = np.arange(0, len(paths), 37)
-    _, found = ConditionTable(paths, probes, kernel()).batch(torch.from_numpy(which), torch.Generator())
+    found = ConditionTable(paths, probes, kernel()).conditions(torch.from_numpy(which))
     a = paths.arrays
     first = np.concatenate([[0], np.cumsum(a["things"])])
     queries = []

@@ -15,6 +15,8 @@ from apex_ompl.kernel import Kernel
 from apex_ompl.trajopt.optimizer import Optimizer
 from apex_ompl.types import Array
 
+SIZE = 0.6  # how far bumps stray [rad]
+
 
 class BumpModel:
     """Proposes straight lines with random bumps, for any robot, by the interface of a trajectory model.
@@ -55,5 +57,3 @@ class BumpModel:
         """Return other bumps in place of given paths; see ``TrajectoryModel.renoise``."""
         return self.propose(query, kernel, len(control), sampling=sampling, generator=generator)
 
-
-SIZE = 0.6  # how far bumps stray [rad]

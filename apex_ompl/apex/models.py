@@ -2,26 +2,39 @@
 
 from __future__ import annotations
 
-import json
+from functools import cache
 
 from apex_ompl.apex.bumps import BumpModel
-from apex_ompl.diffusion.checkpoint import CONFIG, SHIPPED, shared_model
+from apex_ompl.diffusion.checkpoint import SHIPPED, read_config, shared_model
 from apex_ompl.diffusion.proposals import TrajectoryModel
+from apex_ompl.errors import MissingFileError
 
 DEFAULT = "apex"  # checkpoint that ships
 AUTO, NONE = "auto", "none"  # names in the place of a checkpoint's
 
+Model = TrajectoryModel | BumpModel
+"""What makes proposals."""
+
 
 def has_model(robot: str) -> bool:
-    """Whether a trained model ships for a robot."""
+    """Whether a trained model ships for a robot.
+
+    Raises:
+        FileFormatError: The configuration of the checkpoint that ships is damaged.
+    """
+    return _robot_of_default() == robot
+
+
+@cache
+def _robot_of_default() -> str | None:
+    """Return the name of the robot of the checkpoint that ships, None where there is none."""
     try:
-        config = json.loads((SHIPPED / DEFAULT / CONFIG).read_text(encoding="utf-8"))
-        return bool(config["model"]["robot"] == robot)
-    except (OSError, ValueError, KeyError):
-        return False
+        return read_config(SHIPPED / DEFAULT).model.robot
+    except MissingFileError:
+        return None
 
 
-def trajectory_model(name: str, robot: str, device: str = "cpu") -> TrajectoryModel | BumpModel:
+def trajectory_model(name: str, robot: str, device: str = "cpu") -> Model:
     """Return a checkpoint's model for a robot, or random bumps.
 
     Args:

@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from apex_ompl.apex.bumps import BumpModel
+from apex_ompl.apex.models import Model
 from apex_ompl.diffusion.geometry import Numbers
-from apex_ompl.diffusion.proposals import Proposals, Sampling, TrajectoryModel
+from apex_ompl.diffusion.proposals import Proposals, Sampling
 from apex_ompl.diffusion.query import Query
 from apex_ompl.diffusion.schedule import Estimate
 from apex_ompl.kernel import Kernel
@@ -32,7 +32,7 @@ class ProposalSampler:
     """
 
     def __init__(
-        self, model: TrajectoryModel | BumpModel, kernel: Kernel, sampling: Sampling, *,
+        self, model: Model, kernel: Kernel, sampling: Sampling, *,
         generator: np.random.Generator, stop: Stop, report: SolveReport,
     ) -> None:  # fmt: skip
         """Sample from ``model``.

@@ -161,6 +161,10 @@ class ConditionTable:
     def batch(self, which: Tensor, generator: torch.Generator) -> tuple[Tensor, Conditions]:
         """Return control points (B, points, dof) and conditions of paths by their indices, shape (B,), as they are."""
         del generator
+        return self.control[which], self.conditions(which)
+
+    def conditions(self, which: Tensor) -> Conditions:
+        """Return the conditions of some paths by their indices, shape (B,)."""
         problem = self.problem[which]
         count, first = self.count[problem], self.first[problem]
         most = int(count.max()) if len(which) else 0
@@ -168,4 +172,4 @@ class ConditionTable:
         at = torch.where(mask, first[:, None] + torch.arange(most), 0)
         columns = [table[which] for table in (self.start, self.goal, self.point, self.probes)]
         columns += [table[at] for table in (self.shape, self.position, self.rotation, self.size)]
-        return self.control[which], Conditions(*[*columns, mask, torch.empty(len(which), 0)])
+        return Conditions(*[*columns, mask, torch.empty(len(which), 0)])

@@ -155,7 +155,7 @@ class _Search:
             ) for p in where
         )  # fmt: skip
         self.states = np.stack([motion.positions, motion.velocities, motion.accelerations])
-        self.rates = np.stack([motion(edges, 1), motion(edges, 2)])
+        self.rates = motion.states(edges)[1:]
         self.rests = not np.any(self.rates[:, 0])
 
     def result(self) -> Retimed:
@@ -278,7 +278,7 @@ class _Search:
         knots, lead = self.motion.times, end - self.time
         inner = (knots > self.time + SAME_TIME) & (knots < end - SAME_TIME)
         head = np.append(self.time, knots[inner]) if lead > SAME_TIME else np.empty(0)
-        first = np.stack([self.motion(head, order) for order in range(3)])
+        first = self.motion.states(head)
         moments = np.concatenate([head - self.time, times + (lead if len(head) else 0.0)]) + wait
         rows = np.concatenate([first, states], axis=1)
         if wait > 0.0:

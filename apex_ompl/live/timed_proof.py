@@ -120,7 +120,7 @@ class TimedProver:
             exact.move(o.name, obstacle_at(o, 0.5 * (begin + end)).position)
         inner = motion.times[(motion.times > begin) & (motion.times < end)]
         knots = np.unique(np.concatenate([[begin], inner, [min(end, max(motion.duration, begin))]]))
-        curve = Curve.cubic(knots, motion(knots), motion(knots, 1), motion(knots, 2))
+        curve = Curve.cubic(knots, *motion.states(knots))
         return exact.prove(curve, tolerance=0.0).reason
 
     def _exact_among(self, length: float) -> CollisionChecker:

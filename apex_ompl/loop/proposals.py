@@ -7,11 +7,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from apex_ompl.apex.bumps import BumpModel
-from apex_ompl.apex.models import trajectory_model
+from apex_ompl.apex.models import Model, trajectory_model
 from apex_ompl.apex.query import make_query
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.diffusion.proposals import TrajectoryModel
 from apex_ompl.diffusion.query import Query
 from apex_ompl.loop.placing import fresh_checker, place_nearest
 from apex_ompl.loop.ready import Ready
@@ -37,7 +35,7 @@ class Proposals:
     model: str = "auto"
     count: int = 4
     name: str = "proposals"
-    _loaded: TrajectoryModel | BumpModel | None = field(default=None, repr=False)
+    _loaded: Model | None = field(default=None, repr=False)
     _checker: CollisionChecker | None = field(default=None, repr=False)
 
     def prepare(self, ready: Ready) -> None:
@@ -53,7 +51,7 @@ class Proposals:
             self._loaded.propose(query, self._checker.kernel, self.count)
 
     @property
-    def model_and_checker(self) -> tuple[TrajectoryModel | BumpModel, CollisionChecker]:
+    def model_and_checker(self) -> tuple[Model, CollisionChecker]:
         """The model and the obstacles that it is shown, after :meth:`prepare`."""
         assert self._loaded is not None and self._checker is not None
         return self._loaded, self._checker

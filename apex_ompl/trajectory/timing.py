@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from apex_ompl.errors import ParameterError, TimingError, TimingStoppedError, UnknownNameError
-from apex_ompl.kernel.compiled.cubic_pieces import cubic_rates, relative_gap
+from apex_ompl.kernel.compiled.cubic_pieces import cubic_rates
 from apex_ompl.kernel.compiled.polyline_distance import max_distance
 from apex_ompl.kernel.compiled.time_parameterization import max_path_speeds, sample_times
 from apex_ompl.robot.model import Limits
@@ -295,7 +295,6 @@ def warm_up() -> None:
     max_distance(np.zeros((1, 1)), np.zeros(1), np.array([[0.0], [1.0]]), np.array([0.0, 1.0]), 1.0)
     still = Profiles(np.ones((1, 1, 1)), np.zeros((1, 1, 1)), np.ones(1), brakes=False)
     motion = joined(still, np.zeros((3, 2, 1)), ("joint",))
-    motion.states(motion.times)
+    Trajectory(*motion.knots, ("joint",)).states(motion.times)
     Extremes.of(*motion.knots)
-    relative_gap(*motion.knots)
     cubic_rates(*motion.knots, np.empty((len(motion.times), 2)))

@@ -249,7 +249,8 @@ class Trajectory:
         if not later.any():
             q, v, a = (values[-1:] for values in knots)
             return Trajectory(np.zeros(1), q, v, a, self.joint_names)
-        q, v, a = (np.concatenate([self(time, k)[None], values[later]]) for k, values in enumerate(knots))
+        now = self.states(np.array([time], float))
+        q, v, a = (np.concatenate([here, values[later]]) for here, values in zip(now, knots, strict=True))
         return Trajectory(np.append(0.0, self.times[later] - time), q, v, a, self.joint_names)
 
     def save(self, path: str | os.PathLike[str], controllers: Mapping[str, Sequence[str]] | None = None) -> None:

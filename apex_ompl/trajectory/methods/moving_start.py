@@ -30,9 +30,8 @@ def from_moving_start(
     """
     for time in np.linspace(0.0, motion.duration, JOIN_TIMES + 1) if motion.duration else [0.0]:
         left = motion.duration - time
-        states = np.stack(
-            [[motion.positions[0], motion(time)], [velocity, motion(time, 1)], [acceleration, motion(time, 2)]]
-        )
+        now = np.stack([motion.positions[0], velocity, acceleration])
+        states = np.stack([now, motion.states(np.array([time]))[:, 0]], axis=1)
         head = between(states, limits, motion.joint_names, minimum_duration - left)
         if head is not None:
             yield concatenate([head, motion.after(time)]), head.duration
