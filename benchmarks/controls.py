@@ -49,12 +49,12 @@ class Shuffled(ArrayModel):
 
 
 def drawn(trained: LatentDiffusion) -> ArrayModel:
-    """Return a model like a trained one with random weights; its latent space and its limits are those."""
+    """Return a model like a trained one with random weights; its latent space, what it sees and its limits are those."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         network = LatentDiffusion(trained.config)
         torch.nn.init.kaiming_uniform_(network.denoiser.leave.weight)  # it would begin at zero
-    kept = {k: v for k, v in trained.state_dict().items() if k.startswith(("autoencoder", "probe"))}
+    kept = {k: v for k, v in trained.state_dict().items() if k.startswith(("autoencoder", "probe", "key_"))}
     kept |= {k: v for k, v in trained.state_dict().items() if k in ("encoder.lower", "encoder.upper")}
     return ArrayModel(trained.config, {k: v.numpy() for k, v in (network.state_dict() | kept).items()}, {})
 
