@@ -49,7 +49,7 @@ class Shuffled(ArrayModel):
 
 
 def drawn(trained: LatentDiffusion) -> ArrayModel:
-    """Return a model like a trained one with random weights; its latent space, what it sees and its limits are those."""
+    """Return a model like a trained one with random weights; latent space, limits and what it sees are the same."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         network = LatentDiffusion(trained.config)

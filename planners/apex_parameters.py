@@ -38,7 +38,7 @@ class ApexParameters(Parameters):
             Trees in compiled code have twice as many everywhere.
         sampler: ``ddim``, ``dpm_solver`` or ``ddpm``; ``model`` takes that of the checkpoint.
         denoising_steps: Number of denoising steps; 0 takes that of the checkpoint: 2 for apex, all 256 for apex-paper.
-        temperature: Standard deviation of the noise to begin with.
+        temperature: Factor on the standard deviation of the noise to begin with, that of the checkpoint.
         first: Proposals for each pair of start and goal in the first round.
         second: In the second.
         third: In the third.
@@ -103,7 +103,8 @@ class ApexParameters(Parameters):
 
         guidance = Guidance(gamma=self.gamma if self.guidance else 0.0)
         sampler = default.sampler if self.sampler == "model" else self.sampler
-        return proposals.Sampling(sampler, self.denoising_steps or default.steps, self.temperature, guidance)
+        steps, temperature = self.denoising_steps or default.steps, self.temperature * default.temperature
+        return proposals.Sampling(sampler, steps, temperature, guidance)
 
     def stages(self) -> list[Stage]:
         """Return the stages of ``solve`` up to the first valid path, in their order."""

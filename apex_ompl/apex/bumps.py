@@ -56,4 +56,3 @@ class BumpModel:
     ) -> Proposals:  # fmt: skip
         """Return other bumps in place of given paths; see ``TrajectoryModel.renoise``."""
         return self.propose(query, kernel, len(control), sampling=sampling, generator=generator)
-

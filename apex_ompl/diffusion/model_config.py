@@ -112,6 +112,7 @@ class SamplingConfig(StrictModel):
 
     sampler: Literal["ddpm", "ddim", "dpm_solver"] = "ddim"
     steps: Size = 2
+    temperature: Annotated[float, Field(ge=0.0)] = 1.0
 
 
 class ModelConfig(StrictModel):
