@@ -135,7 +135,7 @@ def policy_card(config: NetworkConfig, robot: str, trained: Mapping[str, Any], w
             "",
             f"Trained by `scripts/train_il.py` at commit {trained['commit']} on {', '.join(trained['data'])}, split by "
             f"problem: {trained['paths']} paths (mirror images counted), step {trained['step']} of {trained['steps']}, "
-            f"{trained['windows']} windows, {trained['seconds'] / 60:.0f} min by one thread on {trained['hardware']}.",
+            f"{trained['windows']} windows, {trained['seconds'] / 60:.0f} min on {trained['hardware']}.",
             "",
             f"Loss on held-out problems: {trained['held_out']}, with the straight line "
             f"{trained['line']} (mean square error in standard deviations of the data, without noise).",

@@ -178,7 +178,7 @@ class ImitationTrainer:
         found: dict[str, Any] = {
             "step": self.step, "steps": self.config.steps, "seconds": round(self.seconds), "data": names,
             "windows": self.step * self.config.batch * self.config.windows, "paths": len(self.data.train),
-            "torch": torch.__version__, "commit": self._commit, "hardware": hardware(),
+            "torch": torch.__version__, "commit": self._commit, "hardware": self._hardware,
             "held_out": None, "line": None,
         }  # fmt: skip
         if self._held_out is not None:
@@ -187,6 +187,13 @@ class ImitationTrainer:
             off = (((straight - held_out.following) / network.scale) ** 2).mean()
             found |= {"held_out": round(self._loss_held_out(network), 4), "line": round(float(off), 4)}
         return {**found, "config": config}
+
+    @property
+    def _hardware(self) -> str:
+        """What the training runs on."""
+        if self.device.type == "cuda":
+            return torch.cuda.get_device_name(self.device)
+        return f"one thread of {hardware()}"
 
     def _rate(self) -> float:
         """Return the learning rate: rate min(1, (step + 1) / warmup, (steps - step) / cooldown)."""
