@@ -282,7 +282,8 @@ def test_the_policies_of_a_clone_are_there_and_small(name: str, free: Problem) -
     assert sum(file.stat().st_size for file in folder.iterdir()) < 5 * 2**20
     policy = shared_policy(name, robot="dual_panda_softhand")
     trained = policy.config.trained
-    assert trained["held_out"] < trained["line"] and trained["step"] == trained["steps"]
+    assert trained["held_out"] < 0.6 * trained["line"], "a third better than the straight line and more"
+    assert trained["step"] > 0.95 * trained["steps"], "its learning rate had all but come to 0"
     assert policy.sees_point == (name == "il-paper")
     result = plan(free, name, timeout=20.0)
     assert result.solved_by in ("straight line", name)

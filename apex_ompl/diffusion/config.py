@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -122,6 +122,12 @@ class TrainingConfig(StrictModel):
     proposals: Count = 8
     validation_sampling: SamplingConfig = Field(SamplingConfig(), alias="judged")
     sampling: SamplingConfig = SamplingConfig()
+
+    @model_validator(mode="after")
+    def _varies_what_can_be_varied(self) -> Self:
+        if (self.parts or self.mixed) and (self.condition.scene != "clearances" or self.condition.point):
+            raise ValueError("expected parts and mixed for the scene 'clearances' without an obstacle point alone")
+        return self
 
     @property
     def sources(self) -> tuple[str, ...]:
