@@ -49,8 +49,8 @@ def trained(name: str, args: argparse.Namespace) -> Path:
     settings = {"steps": args.steps, "validate_every": 10**9, "log_every": 500, "cases": "null", **VARIANTS[name]}
     if args.data is not None:
         settings["data"] = args.data
-    command = [sys.executable, str(ROOT / "scripts" / "train.py"), str(ROOT / "scripts" / "configs" / "apex.yaml")]
-    command += ["--out", str(folder), "--quiet"]
+    config = ROOT / "scripts" / "configs" / "apex-distances.yaml"
+    command = [sys.executable, str(ROOT / "scripts" / "train.py"), str(config), "--out", str(folder), "--quiet"]
     for key, value in settings.items():
         command += ["--set", f"{key}={value}"]
     environment = {**os.environ, "OMP_NUM_THREADS": str(args.threads)}

@@ -3,7 +3,7 @@
 Rows: apex; the same planner with random bumps, a network of random weights, another problem's conditions, or the
 nearest training paths in the place of proposals; rrtconnect+polish; rrtconnect as OMPL has it and tuned; the straight
 line and its repair, which ends by itself. With --model, apex with another checkpoint stands beside the one that ships,
-under the checkpoint's digest, and controls of a network are those of this checkpoint.
+under the checkpoint's digest; controls of a network are those of the one that ships.
 Each run is stored in benchmarks/runs/unseen when it ends; the command resumes where it was stopped.
 
 Usage: python benchmarks/unseen.py [LEVEL ...] [-n 36] [--rows NAME ...] [--model FOLDER] [--jobs 1] [--report]
@@ -37,33 +37,22 @@ TIMEOUT = 10.0  # [s]
 FROZEN = 36  # problems of a level
 SUITE = "unseen"
 CONTROLS = ("bumps", "random weights", "shuffled conditions", "nearest paths")
-OF_A_MODEL = ("random weights", "shuffled conditions")
 TREES = ("rrtconnect+polish", "rrtconnect", Row.of("rrtconnect", TUNED["rrtconnect"]).label, "straight line + repair")
 NAMES = ("apex", *CONTROLS, *TREES)
 
 
 def rows(names: Sequence[str], model: Path | None) -> list[Row]:
-    """Return the rows of some names; those of a checkpoint are labelled with its digest.
+    """Return the rows of some names, and of apex with a checkpoint, labelled with its digest.
 
     Raises:
         ApexError: The checkpoint cannot be read.
     """
     known = {row.label: row for row in ROWS if row.label in TREES}
-    params, mark = {}, ""
+    known |= {name: Row(name, name) for name in CONTROLS} | {"bumps": Row("bumps", "apex", {"model": "none"})}
+    found = [known.get(name, Row("apex", "apex")) for name in names]
     if model is not None:
         read_config(model)
-        params, mark = {"model": str(model.resolve())}, f", {checkpoint_digest(model)}"
-    found = []
-    for name in names:
-        if name == "apex":
-            found += [Row("apex", "apex"), *([Row(f"apex{mark}", "apex", params)] if mark else [])]
-        elif name == "bumps":
-            found.append(Row(name, "apex", {"model": "none"}))
-        elif name in CONTROLS:
-            own = name in OF_A_MODEL
-            found.append(Row(name + mark * own, name, params if own else {}))
-        else:
-            found.append(known[name])
+        found.append(Row(f"apex, {checkpoint_digest(model)}", "apex", {"model": str(model.resolve())}))
     return found
 
 

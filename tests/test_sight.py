@@ -10,7 +10,7 @@ import pytest
 import torch
 import yaml
 from geometry_files import bumpy_sphere
-from models import CLEARANCES, DOF, HANDS, kernel, keys, query, some_paths
+from models import CLEARANCES, HANDS, kernel, keys, query, some_paths
 from models import config as model_config
 from support import ROOT
 from trainings import HERE, config, query_from_path
@@ -74,7 +74,7 @@ def test_key_states_are_apart_and_survive_half_precision() -> None:
 def test_features_along_the_line_are_distances_of_the_probes(sight: Sight) -> None:
     mine = query(3)
     found = sight.features([mine], kernel())[0]
-    assert found.shape == (sight.size(DOF),)
+    assert found.shape == (model_config(**CLEARANCES).seen,)
     points = sight.probes.positions(kernel(), mine.start[None], mine.goal[None])[0].reshape(-1, 3)
     scene, _ = mine.seen()
     count, keyed = len(points), keys().state.shape[0] * 2
@@ -170,10 +170,7 @@ def test_features_of_a_table_are_those_of_queries(sight: Sight) -> None:
         extents = [held_extents(some.names["held"][h]) for h in held]
         asked = [replace(query_from_path(some, int(k)), held=e) for k, e in zip(which, extents, strict=True)]
         wanted = batch_queries(asked, sight, kernel())
-        off = np.abs(found.seen.numpy() - wanted.seen.numpy())
-        keyed = 2 * len(keys().state)
-        assert off[:, keyed:].max() < 1e-4
-        assert np.quantile(off[:, :keyed], 0.99) < 1e-3 and off.max() < 0.2, "balls stick out of those around them"
+        np.testing.assert_allclose(found.seen.numpy(), wanted.seen.numpy(), atol=3e-4)
         np.testing.assert_allclose(found.start.numpy(), wanted.start.numpy(), atol=1e-6)
 
 

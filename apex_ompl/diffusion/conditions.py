@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from apex_ompl.datasets.records import Paths
-from apex_ompl.diffusion.geometry import rotation_matrices, signed_distances
+from apex_ompl.diffusion.geometry import rotation_matrices
 from apex_ompl.diffusion.obstacles import Obstacles
 from apex_ompl.diffusion.query import HALVES, Probes, Query
 from apex_ompl.diffusion.sight import Sight
@@ -49,8 +49,7 @@ class Conditions:
 
     def to(self, device: torch.device | str) -> Conditions:
         """Return a copy on a device; those of ``among`` stay where they are."""
-        columns = (getattr(self, f.name).to(device) for f in fields(self) if f.name != "among")
-        return Conditions(*columns, among=self.among)
+        return Conditions(*(getattr(self, name).to(device) for name in COLUMNS), among=self.among)
 
     @classmethod
     def concatenate(cls, batches: Sequence[Conditions]) -> Conditions:
@@ -59,23 +58,27 @@ class Conditions:
             return batches[0]
         most = max(batch.mask.shape[1] for batch in batches)
         columns = []
-        for f in fields(cls)[:-1]:
-            tensors = [getattr(batch, f.name) for batch in batches]
-            if f.name in ("shape", "position", "rotation", "size", "mask"):
+        for name in COLUMNS:
+            tensors = [getattr(batch, name) for batch in batches]
+            if name in ("shape", "position", "rotation", "size", "mask"):
                 tensors = [_zero_padded(tensor, most) for tensor in tensors]
             columns.append(torch.cat(tensors))
         return cls(*columns)
 
-    def obstacles(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return shape (T,), position (T, 3), rotation (T, 3, 3) and size (T, 3) of all T obstacles of the batch."""
+    def obstacles(self) -> Obstacles:
+        """Return all T obstacles of the batch."""
         mask = self.mask
-        return self.shape[mask], self.position[mask], self.rotation[mask], self.size[mask]
+        columns = self.shape[mask], self.position[mask], self.rotation[mask], self.size[mask]
+        return Obstacles(*columns, mask.nonzero()[:, 0])
 
     def probe_distances(self) -> Tensor:
         """Return the signed distances from each of the T obstacles to its query's probe points, (T, L * P) [m]."""
-        owner = self.mask.nonzero()[:, 0]
-        found: Tensor = signed_distances(*self.obstacles(), self.probes.flatten(1, 2)[owner])
-        return found
+        obstacles = self.obstacles()
+        return obstacles.distances(self.probes.flatten(1, 2)[obstacles.owner])
+
+
+COLUMNS = tuple(f.name for f in fields(Conditions) if f.name != "among")
+"""Names of the tensors of conditions, one row for each query."""
 
 
 def pad_obstacles(values: Tensor, mask: Tensor, fill: float) -> Tensor:

@@ -95,9 +95,9 @@ class ConditionEncoder(nn.Module):
     def _obstacle_features(self, conditions: Conditions) -> list[Tensor]:
         """Return features of the obstacles, tensors of shape (B, features)."""
         mask = conditions.mask
-        shape, position, rotation, size = conditions.obstacles()
-        kinds = nn.functional.one_hot(shape, len(SHAPES)).to(position)
-        inputs = [kinds, position - self.centre, rotation.flatten(1), size]
+        o = conditions.obstacles()
+        kinds = nn.functional.one_hot(o.shape, len(SHAPES)).to(o.position)
+        inputs = [kinds, o.position - self.centre, o.rotation.flatten(1), o.size]
         parts: list[Tensor] = []
         if self.scene == "distances":
             along, probes = conditions.probes.shape[1:3]

@@ -159,16 +159,11 @@ class ModelConfig(StrictModel):
     @property
     def along_size(self) -> int:
         """Number of features along a path, of a scene ``clearances``."""
-        return self.condition.along * along_features(self.probes, len(self.joints))
+        return self.condition.along * (7 * self.probes + len(self.joints))
 
 
 PIECES = 4  # balls of a cluster of bodies that moves together, at key states
 HELD_FEATURES = 7  # of a hand: whether it holds something, the centre and the half edges of a box around it
-
-
-def along_features(probes: int, dof: int) -> int:
-    """Return the number of features of a state, of P probe points and ``dof`` joints."""
-    return 7 * probes + dof
 
 
 def key_shapes(config: ModelConfig) -> dict[str, tuple[int, ...]]:

@@ -70,13 +70,7 @@ def pushes(
     axes, origins = frames
     xp = array_module(points)
     force = (1.0 - distances / REACH).clip(min=0.0)[..., None] * gradients
-    total, moment = (xp.einsum("jp,npi->nji", below, v) for v in (force, _cross(xp, points, force)))
-    torque = moment - _cross(xp, origins, total)
+    total, moment = (xp.einsum("jp,npi->nji", below, v) for v in (force, xp.linalg.cross(points, force)))
+    torque = moment - xp.linalg.cross(origins, total)
     along = (axes * xp.where(revolute[:, None], torque, total)).sum(-1)
     return along @ to_state
-
-
-def _cross(xp: object, a: Numbers, b: Numbers) -> Numbers:
-    """Return the cross products of vectors, shape (..., 3)."""
-    rolled = [(a[..., i] * b[..., j] - a[..., j] * b[..., i]) for i, j in ((1, 2), (2, 0), (0, 1))]
-    return xp.stack(rolled, -1)  # type: ignore[attr-defined]

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apex_ompl.datasets.records import HeldExtent
-from apex_ompl.diffusion.model_config import HELD_FEATURES, PIECES, along_features
+from apex_ompl.diffusion.model_config import HELD_FEATURES, PIECES
 from apex_ompl.diffusion.pushes import Chains, pushes
 from apex_ompl.diffusion.query import MAX_DISTANCE, WORKSPACE_CENTRE, Probes, Query
 from apex_ompl.kernel import Kernel, RobotTables
@@ -130,8 +130,8 @@ def _pieces(robot: RobotTables, kernel: Kernel, cluster: int) -> Array:
     for _ in range(ROUNDS):
         part = np.linalg.norm(points[:, None] - seeds, axis=2).argmin(axis=1)
         seeds = np.stack([points[part == k].mean(axis=0) if (part == k).any() else seeds[k] for k in range(PIECES)])
-    pieces = [_ball(points[part == k], sizes[part == k]) for k in np.unique(part)]
-    return np.stack([_ball(points, sizes), *(pieces[k % len(pieces)] for k in range(PIECES))])
+    pieces = np.stack([_ball(points[part == k], sizes[part == k]) for k in np.unique(part)])
+    return np.stack([_ball(pieces[:, :3], pieces[:, 3]), *(pieces[k % len(pieces)] for k in range(PIECES))])
 
 
 def _ball(points: Array, radii: Array) -> Array:
@@ -157,11 +157,6 @@ class Sight:
     hands: Sequence[str]
     _placed: dict[str, tuple[tuple[Array, Array], Array]] = field(default_factory=dict, init=False)
     _chains: dict[str, tuple[tuple[NDArray[Any], ...], Chains]] = field(default_factory=dict, init=False)
-
-    def size(self, dof: int) -> int:
-        """Return the number of features of a robot with ``dof`` joints."""
-        along = len(self.probes.shares) * along_features(len(self.probes.joint), dof)
-        return len(self.keys.state) * len(self.keys.joint) + along + HELD_FEATURES * len(self.hands)
 
     def features(self, queries: Sequence[Query], kernel: Kernel) -> NDArray[np.float32]:
         """Return the features of Q queries, shape (Q, size); of the kernel only the kinematics are used."""

@@ -113,11 +113,7 @@ class TorchSight:
         return torch.cat([part.reshape(count, -1) for part in parts], dim=1)
 
     def at_keys(self, obstacles: Obstacles) -> Tensor:
-        """Return the features of key states by each obstacle alone, shape (T, K * A); a scene's are the least of them.
-
-        Its balls need not be inside the ball around their cluster, which :meth:`Sight.at_keys` looks at first, so that
-        a few numbers are smaller here.
-        """
+        """Return the features of key states by each obstacle alone, shape (T, K * A); a scene has the least of them."""
         pieces = self.balls[:, :, 1:]
         centres, radii = pieces[..., :3].reshape(-1, 3), pieces[..., 3].flatten()
         groups, step = len(pieces), max(1, pairs_at_a_time(centres.device) // len(centres))
