@@ -9,15 +9,20 @@ unsolved one counts as 2. Paths are not simplified. The candidate of the lowest 
 chosen; planners/tuned.py keeps it.
 Each run is stored in benchmarks/runs/tune when it ends; the command resumes where it was stopped.
 
+Levels are the hard and large ones of the suites and every second validation kind of ``unseen``. Where planners are
+named only these are tuned, and the rest of the result stays; each planner has the number of levels and the commit of
+its runs beside its scores.
+
 With --baselines the paper's baselines are tuned in the same way on the easy and medium levels instead, since local
 methods fail on hard ones whatever their parameters are (results tune_baselines, and runs in a folder of that name).
 
-Usage: python benchmarks/tune.py [--baselines] [--jobs 1]    (needs the extra "peers" without --baselines)
+Usage: python benchmarks/tune.py [PLANNER ...] [--baselines] [--jobs 1]    (RoboPlan needs the extra "peers")
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -32,6 +37,7 @@ from apex_ompl import planners
 from apex_ompl.benchmark import Results, Row, Workers, bench
 from apex_ompl.benchmark.runs import NO_PROBLEM, Run
 from apex_ompl.benchmark.summary import Statistics
+from apex_ompl.problems.catalogue import VALIDATION
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import one_or_more
 
@@ -75,10 +81,9 @@ CANDIDATES: dict[str, list[dict[str, Any]]] = {
     ],
     "rrtconnect+polish": ranges(0.0, 0.3, 0.5, 0.7, 0.85, 1.0, 1.4, 2.0),
     "apex": [
-        *ranges(0.0, 0.5, 0.7, 1.0, 1.4, sprint=40, first=4),
-        *ranges(0.7, sprint=20, first=4),
-        *ranges(0.7, sprint=160, first=4),
-        *ranges(0.7, sprint=40, first=2),
+        *ranges(0.0, 0.5, 0.7, 1.0, sprint=400, first=4),
+        *(row for sprint in (40, 160, 640) for row in ranges(0.7, sprint=sprint, first=4)),
+        *ranges(0.7, sprint=400, first=2),
     ],
     ROBOPLAN: [
         *({"max_connection_distance": step} for step in (3.0, 0.3, 0.5, 0.7, 1.0, 1.4, 2.0)),
@@ -179,8 +184,9 @@ class Score:
 
 
 def levels() -> list[str]:
-    """Return the hardest static levels of all suites."""
-    return [level for level in record.static_levels([]) if level.endswith(("/hard", "/large"))]
+    """Return the hardest static levels of all suites, and every second kind of scenes that is not trained for."""
+    hardest = [level for level in record.static_levels([]) if level.endswith(("/hard", "/large"))]
+    return [*hardest, *(f"unseen/{kind}" for kind in VALIDATION["unseen"][::2])]
 
 
 def easier_levels() -> list[str]:
@@ -234,26 +240,24 @@ def chosen(planner: str, last: Sequence[Score]) -> dict[str, Any]:
     return next(dict(row.params) for row in rows_of(planner) if row.label == last[0].label)
 
 
-def table(found: dict[str, list[list[Score]]]) -> str:
+def table(found: dict[str, Any]) -> str:
     """Return the Markdown tables: the last rung of each planner, then all rungs of all candidates."""
     head = ["planner", "N", "solved", "first path p50 ms", "p95", "geometric mean ms", "mean ms", "length"]
     head += ["score ms"]
     lines = [record.row(head), record.row(["---", *["---:"] * (len(head) - 1)])]
-    for planner, rungs in found.items():
-        default = rows_of(planner)[0].label
-        for one in rungs[-1]:
-            name = f"**{one.label}**" if one is rungs[-1][0] else one.label
-            lines.append(record.row([f"{name}{', default' if one.label == default else ''}", *_cells(one.figures())]))
+    for one in found.values():
+        for place, (label, figures) in enumerate(one["rungs"][-1].items()):
+            name = label if place else f"**{label}**"
+            lines.append(record.row([f"{name}{', default' if label == one['default'] else ''}", *_cells(figures)]))
     problems = [f"{count} of each level" for _, count in RUNGS]
-    head = ["candidate, score in ms (rank) on", *problems]
-    lines += ["", record.row(head), record.row(["---", *["---:"] * len(problems)])]
-    for planner, rungs in found.items():
-        for row in rows_of(planner):
-            ranks = [[one.label for one in rung] for rung in rungs]
-            places = [rank.index(row.label) if row.label in rank else None for rank in ranks]
-            both = zip(rungs, places, strict=True)
-            cells = ("" if k is None else f"{1e3 * rung[k].score:.0f} ({k + 1})" for rung, k in both)
-            lines.append(record.row([row.label, *cells]))
+    head = ["candidate, score in ms (rank) on", *problems, "levels", "runs of commit"]
+    lines += ["", record.row(head), record.row(["---", *["---:"] * (len(head) - 1)])]
+    for one in found.values():
+        for label in one["rungs"][0]:
+            places = [list(rung).index(label) if label in rung else None for rung in one["rungs"]]
+            both = zip(one["rungs"], places, strict=True)
+            cells = ["" if k is None else f"{1e3 * rung[label]['score']:.0f} ({k + 1})" for rung, k in both]
+            lines.append(record.row([label, *cells, one["levels"], one["commit"]]))
     return "\n".join(lines)
 
 
@@ -270,24 +274,27 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--jobs", type=one_or_more, default=1, help="runs at a time (default: one, as they are timed)")
     parser.add_argument("--baselines", action="store_true", help="tune the baselines of the paper instead")
+    parser.add_argument("planners", nargs="*", metavar="PLANNER", help="only these; the others' results stay")
     args = parser.parse_args()
-    tuned, folder = (BASELINES, BASELINES_FOLDER) if args.baselines else (CANDIDATES, FOLDER)
-    found = {planner: rungs_of(planner, args.jobs) for planner in tuned}
+    known, folder = (BASELINES, BASELINES_FOLDER) if args.baselines else (CANDIDATES, FOLDER)
+    if not set(args.planners) <= set(known):
+        parser.error(f"expected planners of {', '.join(known)}")
+    tuned = {name: rungs_of(name, args.jobs) for name in args.planners or known}
+    levels_of = len(easier_levels() if args.baselines else levels())
+    commits = record.made_with(Results.load(folder))["run_commits"]
+    kept = json.loads((record.RESULTS / f"{folder.name}.json").read_text())["planners"] if args.planners else {}
     data = {
-        "planners": {
-            planner: {
-                "default": rows_of(planner)[0].label, "chosen": chosen(planner, rungs[-1]),
-                "rungs": [{one.label: one.figures() for one in rung} for rung in rungs],
-            }
-            for planner, rungs in found.items()
+        planner: kept[planner] if planner not in tuned else {
+            "default": rows_of(planner)[0].label, "chosen": chosen(planner, tuned[planner][-1]), "levels": levels_of,
+            "commit": commits,
+            "rungs": [{one.label: one.figures() for one in rung} for rung in tuned[planner]],
         }
+        for planner in known
     }  # fmt: skip
     most = [f"{keep + (k > 0)} candidates on {count} problems of a level" for k, (keep, count) in enumerate(RUNGS)]
-    about: dict[str, Any] = {"levels": len(easier_levels() if args.baselines else levels())}
-    if not args.baselines:
-        about["roboplan"] = version(ROBOPLAN)
+    about = {} if args.baselines else {"roboplan": version(ROBOPLAN)}
     record.write(
-        folder.name, data, table(found), split="validation", limit=f"{TIMEOUT:g} s",
+        folder.name, {"planners": data}, table(data), split="validation", limit=f"{TIMEOUT:g} s",
         budget=f"at most {', '.join(most)}", seeds="number of the problem modulo 1000",
         **about, **record.made_with(Results.load(folder)),
     )  # fmt: skip

@@ -71,7 +71,7 @@ def test_ompls_benchmark_runs_it(ready: PlanningSetup, tmp_path: Path, monkeypat
 
 def test_it_solves_again_and_keeps_what_is_shorter(ready: PlanningSetup) -> None:
     setup = ready.simple_setup
-    planner = APEX(setup.getSpaceInformation(), ApexParameters(seed=0))
+    planner = APEX(setup.getSpaceInformation(), ApexParameters(seed=0, sprint=0))
     setup.setPlanner(planner)
     assert setup.solve(within(20.0)).getStatus() == EXACT
     first, by = states(setup), planner.report.solved_by

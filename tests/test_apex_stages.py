@@ -36,7 +36,7 @@ pytestmark = pytest.mark.usefixtures("quiet")
             ("apex", "apex+bridge"),
         ),
         (
-            {"line": False, "first": 0, "second": 0, "third": 0, "bridge": False, "fallback": True},
+            {"line": False, "first": 0, "second": 0, "third": 0, "bridge": False, "fallback": True, "sprint": 1},
             ("rrtconnect",),
         ),
     ],

@@ -10,9 +10,8 @@ from hypothesis import strategies as st
 from models import DOF, HANDS, POST, REFINED, WALL, kernel, keys, network, query, some_paths
 
 from apex_ompl.diffusion.obstacles import Obstacles
-from apex_ompl.diffusion.pushes import REACH, Chains, pushes
 from apex_ompl.diffusion.query import ObstacleSet, Probes
-from apex_ompl.diffusion.sight import Sight
+from apex_ompl.diffusion.sight import REACH, Sight
 from apex_ompl.diffusion.sight_data import Augmentation, SightTable
 from apex_ompl.diffusion.torch_model import TorchModel
 from apex_ompl.diffusion.torch_sight import TorchSight
@@ -81,10 +80,8 @@ def test_features_along_paths_are_those_of_numpy() -> None:
 
 def test_pushes_are_virtual_work() -> None:
     """The rate of a joint times its push is the power of the forces: f . dp/dq, by finite differences."""
-    probes, robot = SIGHT.probes, kernel().robot
-    chains = Chains.of(robot, probes.joint)
+    probes, state = SIGHT.probes, query(4).start
     rng = np.random.default_rng(2)
-    state = query(4).start
 
     def points(q: Array) -> Array:
         rotation, origin = kernel().joint_frames(q[None])
@@ -92,10 +89,8 @@ def test_pushes_are_virtual_work() -> None:
 
     distances, gradients = rng.uniform(-0.1, 2 * REACH, 14), rng.normal(size=(14, 3))
     force = np.maximum(0.0, 1.0 - distances / REACH)[:, None] * gradients
-    rotation, origin = kernel().joint_frames(state[None])
-    frames = rotation[:, chains.joint][..., 2], origin[:, chains.joint]
-    constants = chains.below, chains.revolute, chains.to_state
-    found = pushes(constants, frames, points(state)[None], distances[None], gradients[None])[0]
+    near = distances[None], gradients[None]
+    found = kernel().joint_pushes(kernel().joint_frames(state), probes.joint, points(state)[None], near, REACH)[0]
     step = 1e-6
     wanted = [(force * (points(state + d) - points(state - d))).sum() / (2 * step) for d in step * np.eye(DOF)]
     np.testing.assert_allclose(found, wanted, atol=1e-6)

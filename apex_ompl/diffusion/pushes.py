@@ -1,18 +1,18 @@
-"""How obstacles push a robot's joints: forces on its probe points away from the nearest obstacles, as torques."""
+"""How obstacles push a robot's joints, by torch, as trainings need it; see also ``Kernel.joint_pushes``."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
-from apex_ompl.diffusion.geometry import Numbers, array_module
+from apex_ompl.diffusion.sight import REACH
 from apex_ompl.kernel import RobotTables
 from apex_ompl.kernel.compiled.arrays import FIXED, REVOLUTE
 from apex_ompl.types import Array
-
-REACH = 0.2  # distance of a probe point from an obstacle at which it is pushed no more [m]
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,17 +50,13 @@ class Chains:
 
 
 def pushes(
-    chains: tuple[Numbers, Numbers, Numbers], frames: tuple[Numbers, Numbers], points: Numbers, distances: Numbers,
-    gradients: Numbers,
-) -> Numbers:  # fmt: skip
+    chains: tuple[Tensor, Tensor, Tensor], frames: tuple[Tensor, Tensor], points: Tensor, distances: Tensor,
+    gradients: Tensor,
+) -> Tensor:  # fmt: skip
     """Return generalized forces of the nearest obstacles at N states, shape (N, dof) [m].
 
-    A point p at distance d is pushed by f = max(0, 1 - d / REACH) along the gradient of its distance. A joint of axis z
-    through o gets the sum of z . ((p - o) x f) over the points that it moves, or of z . f where it slides: the
-    transposed Jacobians times the forces.
-
     Args:
-        chains: ``below``, ``revolute`` and ``to_state`` of :class:`Chains`, all arrays or all tensors.
+        chains: ``below``, ``revolute`` and ``to_state`` of :class:`Chains`.
         frames: Axes, shape (N, J, 3), and origins, shape (N, J, 3) [m], of its joints.
         points: Probe points, shape (N, P, 3) [m].
         distances: Their signed distances from the nearest obstacles, shape (N, P) [m].
@@ -68,9 +64,8 @@ def pushes(
     """
     below, revolute, to_state = chains
     axes, origins = frames
-    xp = array_module(points)
     force = (1.0 - distances / REACH).clip(min=0.0)[..., None] * gradients
-    total, moment = (xp.einsum("jp,npi->nji", below, v) for v in (force, xp.linalg.cross(points, force)))
-    torque = moment - xp.linalg.cross(origins, total)
-    along = (axes * xp.where(revolute[:, None], torque, total)).sum(-1)
+    total, moment = (torch.einsum("jp,npi->nji", below, v) for v in (force, torch.linalg.cross(points, force)))
+    torque = moment - torch.linalg.cross(origins, total)
+    along = (axes * torch.where(revolute[:, None], torque, total)).sum(-1)
     return along @ to_state

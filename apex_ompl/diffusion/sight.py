@@ -5,7 +5,7 @@ The vector of features of a query is, one behind the other:
 - the clearance of each arm from the obstacles at K key states, shape (K, A), after PRESTO (arXiv 2409.16012);
 - positions of the P probe points at L states along the straight line from start to goal, shape (L, P, 3), their signed
   distances from the nearest obstacle, shape (L, P), the gradients of these, shape (L, P, 3), and how they push the
-  joints, shape (L, dof), see :mod:`apex_ompl.diffusion.pushes`;
+  joints, shape (L, dof), see :meth:`apex_ompl.kernel.Kernel.joint_pushes`;
 - a box around what each hand holds, in the frame of the link that holds it, shape (H, 7): whether there is one, its
   centre and its half edges.
 
@@ -24,7 +24,6 @@ from numpy.typing import NDArray
 
 from apex_ompl.datasets.records import HeldExtent
 from apex_ompl.diffusion.model_config import HELD_FEATURES, PIECES
-from apex_ompl.diffusion.pushes import Chains, pushes
 from apex_ompl.diffusion.query import MAX_DISTANCE, WORKSPACE_CENTRE, Probes, Query
 from apex_ompl.kernel import Kernel, RobotTables
 from apex_ompl.kernel.point_distances import group_clearances, nearest_points
@@ -34,6 +33,7 @@ from apex_ompl.types import Array, Flags
 
 ROUNDS = 10  # of Lloyd's algorithm, which divides a cluster's spheres among its pieces
 KEY_RANGE = 0.3  # clearances at key states are clipped here [m]
+REACH = 0.2  # distance of a probe point from an obstacle at which it is pushed no more [m]
 HELD_SIZE = 0.2  # scale of held objects [m]
 HALF = 2.0**-11  # relative rounding of half precision, in which checkpoints store balls
 CANDIDATES = 8  # states from which a key state is chosen
@@ -156,7 +156,6 @@ class Sight:
     probes: Probes
     hands: Sequence[str]
     _placed: dict[str, tuple[tuple[Array, Array], Array]] = field(default_factory=dict, init=False)
-    _chains: dict[str, tuple[tuple[NDArray[Any], ...], Chains]] = field(default_factory=dict, init=False)
 
     def features(self, queries: Sequence[Query], kernel: Kernel) -> NDArray[np.float32]:
         """Return the features of Q queries, shape (Q, size); of the kernel only the kinematics are used."""
@@ -188,25 +187,15 @@ class Sight:
 
         Of the kernel only the kinematics are used.
         """
-        count, probes, chains = len(paths), self.probes, self._above(kernel.robot)
-        rotation, origin = kernel.joint_frames(paths.reshape(-1, paths.shape[-1]))
+        count, probes = len(paths), self.probes
+        frames = rotation, origin = kernel.joint_frames(paths.reshape(-1, paths.shape[-1]))
         points = np.einsum("npij,pj->npi", rotation[:, probes.joint], probes.offset) + origin[:, probes.joint]
         distances, gradients = nearest_points(scene, points.reshape(-1, 3), MAX_DISTANCE, seen)
-        distances, gradients = distances.reshape(points.shape[:2]), gradients.reshape(points.shape)
-        frames = rotation[:, chains.joint][..., 2], origin[:, chains.joint]
-        pushed = pushes((chains.below, chains.revolute, chains.to_state), frames, points, distances, gradients)
+        found = distances.reshape(points.shape[:2]), gradients.reshape(points.shape)
+        pushed = kernel.joint_pushes(frames, probes.joint, points, found, REACH)
         near = np.maximum(distances, -MAX_DISTANCE) / MAX_DISTANCE
         parts = (points - np.array(WORKSPACE_CENTRE), near, gradients, pushed)
-        return np.concatenate([part.reshape(count, -1) for part in parts], axis=1).astype(np.float32)
-
-    def _above(self, robot: RobotTables) -> Chains:
-        """Return the joints above the probe points, kept for robots whose joints follow each other alike."""
-        a = robot.arrays
-        tree = (a.joint_parent, a.joint_kind, a.joint_source, a.joint_ratio)
-        kept = self._chains.get("last")
-        if kept is None or not all(map(np.array_equal, tree, kept[0])):
-            kept = self._chains["last"] = tree, Chains.of(robot, self.probes.joint)
-        return kept[1]
+        return np.concatenate([part.reshape(count, -1) for part in parts], axis=1, dtype=np.float32, casting="unsafe")
 
     def held(self, extents: Sequence[HeldExtent]) -> NDArray[np.float32]:
         """Return the features of held objects, shape (H * HELD_FEATURES,); objects of one hand are in one box."""

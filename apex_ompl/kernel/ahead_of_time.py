@@ -66,6 +66,10 @@ BESIDE: dict[str, tuple[str, int]] = {
     "time_parameterization.sample_times": ("f8[::1], f8, f8, f8[::1]", 1),
     "point_distance.nearest_points": (SCENE + "i8[::1], f8[:, ::1], f8, f8[::1], f8[:, ::1]", 2),
     "point_distance.group_clearances": (SCENE + "i8[::1], f8[:, :, :, ::1], f8, f8[::1]", 1),
+    "joint_push.joint_pushes": (
+        ROBOT + "f8[:, :, :, ::1], f8[:, :, ::1], i8[::1], f8[:, :, ::1], f8[:, ::1], f8[:, :, ::1], f8, f8[:, ::1]",
+        1,
+    ),
     "dense_layer.dense_layer": ("i1[:, ::1], f4[::1], f4[::1], f4[:, ::1], f4[:, ::1]", 1),
 }
 """Functions that a second process compiles at the same time."""

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from apex_ompl.errors import ParameterError
-from apex_ompl.kernel.compiled import motion_proof, queries
+from apex_ompl.kernel.compiled import joint_push, motion_proof, queries
 from apex_ompl.kernel.compiled.workspace import workspace_sizes
 from apex_ompl.kernel.tables import RobotTables, SceneTables
 from apex_ompl.types import Array
@@ -139,6 +139,23 @@ class Kernel:
         rotation, origin = np.empty((len(states), joints, 3, 3)), np.empty((len(states), joints, 3))
         queries.joint_frames(*self.robot.packed, *self.workspace(), states, rotation, origin)
         return rotation, origin
+
+    def joint_pushes(
+        self, frames: tuple[Array, Array], carriers: NDArray[np.int64], points: Array, found: tuple[Array, Array],
+        reach: float,
+    ) -> Array:  # fmt: skip
+        """Return generalized forces on points of the robot away from the nearest obstacles, shape (N, dof) [m].
+
+        Args:
+            frames: What :meth:`joint_frames` returns for N states.
+            carriers: Joints that carry P points, shape (P,).
+            points: The points in the world, shape (N, P, 3) [m].
+            found: Their signed distances from the obstacles, shape (N, P) [m], and the gradients, shape (N, P, 3).
+            reach: A force falls from 1 at an obstacle to 0 at this distance [m].
+        """
+        pushed = np.empty((len(points), self.robot.dof))
+        joint_push.joint_pushes(*self.robot.packed, *frames, carriers, points, *found, float(reach), pushed)
+        return pushed
 
     def proves(self, path: ArrayLike, resolution: float) -> bool:
         """Whether the spheres alone prove a path free, its states at most ``resolution`` apart [rad, max-norm].

@@ -9,12 +9,12 @@ import numpy as np
 
 from apex_ompl.apex.context import SolveContext, joins
 from apex_ompl.apex.stages.stage import Solution, Stage, solution_of
-from apex_ompl.trajopt.candidates import STEPS_PER_PATH
 from apex_ompl.types import Array
 
 PROPOSED, RESAMPLED = "apex", "apex+resample"
 BATCH = 8  # proposals between two looks at the clock
 MIN_REPAIR_STEPS = 48  # of repair in a round
+STEPS_PER_PROPOSAL = 8  # likewise, on average
 SHORT_REPAIR_STEPS = 24  # of a short repair before it
 MAX_RESAMPLED = 4  # candidates that are resampled in a round
 
@@ -37,11 +37,11 @@ def proposal_round(
         stages.append(Repair(SHORT_REPAIR_STEPS, 0))
     stages += between
     if repair:
-        stages.append(Repair(MIN_REPAIR_STEPS, STEPS_PER_PATH * count))
+        stages.append(Repair(MIN_REPAIR_STEPS, STEPS_PER_PROPOSAL * count))
     for _ in range(resample):
         stages.append(Resample(noise))
         if repair:
-            stages.append(Repair(STEPS_PER_PATH * MAX_RESAMPLED, 0))
+            stages.append(Repair(STEPS_PER_PROPOSAL * MAX_RESAMPLED, 0))
     return stages
 
 

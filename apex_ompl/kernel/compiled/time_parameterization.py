@@ -5,8 +5,8 @@ Along a curve q(s), with x = (ds/dt)^2 and u = d^2s/dt^2, the limits are
     |q'| sqrt(x) <= v   and   |q' u + q'' x| <= a,
 
 the second linear in x and u. On a grid, x[i + 1] = x[i] + 2 step u[i]. A backward pass finds at each point the largest
-x from which the next point's set can be reached, a forward pass takes the largest u that stays inside these sets. From
-rest every set holds 0, so that the sets are intervals [0, x].
+x from which the next point's set can be reached, by Newton's method, and a forward pass takes the largest u that stays
+inside these sets. From rest every set holds 0, so that the sets are intervals [0, x].
 """
 
 from __future__ import annotations
@@ -16,25 +16,30 @@ import math
 from apex_ompl.kernel.compiled.compilation import entry_point, inlined
 from apex_ompl.kernel.compiled.layout import Floats
 
-HALVINGS = 40
+MOST_STEPS = 64  # of Newton's method; few are needed
 STILL = 1e-10  # |q'| below which a joint does not move along the curve
 
 
 @inlined
 def _u_range(
-    first: Floats, second: Floats, limit: Floats, i: int, x: float, low: float, high: float
-) -> tuple[float, float]:
-    """Return the least and largest u in [low, high] with |q' u + q'' x| <= a at point ``i``; 1, -1 for none."""
+    first: Floats, second: Floats, limit: Floats, i: int, x: float, after: float, step: float
+) -> tuple[float, float, float]:
+    """Return the least and largest u at point ``i``, and the rate of the least minus the largest by x.
+
+    With |q' u + q'' x| <= a, and with an x at the next point that is at least 0 and at most ``after``.
+    """
+    by_next = -0.5 / step
+    low, low_rate, high, high_rate = by_next * x, by_next, by_next * (x - after), by_next
     for j in range(limit.shape[0]):
-        slope, rest = first[i, j], second[i, j] * x
+        slope = first[i, j]
         if abs(slope) < STILL:
-            if abs(rest) > limit[j]:
-                return 1.0, -1.0
             continue
-        one, other = (-limit[j] - rest) / slope, (limit[j] - rest) / slope
-        low = max(low, min(one, other))
-        high = min(high, max(one, other))
-    return low, high
+        rate, reach = -second[i, j] / slope, limit[j] / abs(slope)
+        if rate * x - reach > low:
+            low, low_rate = rate * x - reach, rate
+        if rate * x + reach < high:
+            high, high_rate = rate * x + reach, rate
+    return low, high, low_rate - high_rate
 
 
 @entry_point
@@ -55,29 +60,27 @@ def max_path_speeds(
     for i in range(n):
         most = 1e12
         for j in range(dof):
-            slope = abs(first[i, j])
+            slope, bend = abs(first[i, j]), abs(second[i, j])
             if slope > STILL:
                 most = min(most, (velocity[j] / slope) ** 2)
+            elif bend > 0.0:
+                most = min(most, acceleration[j] / bend)
         x[i] = most
     x[n - 1] = 0.0
     for i in range(n - 2, -1, -1):
-        low, high = 0.0, x[i]
-        for k in range(HALVINGS):
-            at = high if k == 0 else 0.5 * (low + high)
-            least, most = _u_range(first, second, acceleration, i, at, -at / (2 * step), (x[i + 1] - at) / (2 * step))
-            if least <= most:
-                low = at
-                if k == 0:
-                    break
-            else:
-                high = at
-        x[i] = low
+        at = x[i]
+        for _ in range(MOST_STEPS):  # least minus largest u is convex in x and not positive at 0: from the right, exact
+            least, most, rate = _u_range(first, second, acceleration, i, at, x[i + 1], step)
+            nearer = max(0.0, at - (least - most) / rate) if rate > 0.0 else 0.0
+            if least <= most or not nearer < at:
+                break
+            at = nearer
+        x[i] = at
     x[0] = 0.0
     for i in range(n - 1):
-        at = x[i]
-        least, most = _u_range(first, second, acceleration, i, at, -at / (2 * step), (x[i + 1] - at) / (2 * step))
-        if least <= most:  # rounding may leave an empty interval
-            x[i + 1] = max(0.0, min(x[i + 1], at + 2 * step * most))
+        least, most, _ = _u_range(first, second, acceleration, i, x[i], x[i + 1], step)
+        u = most if least <= most else 0.5 * (least + most)  # rounding may leave an empty interval
+        x[i + 1] = max(0.0, min(x[i + 1], x[i] + 2 * step * u))
 
 
 @entry_point
