@@ -52,9 +52,11 @@ def test_runs_take_problems_and_seeds_in_turn() -> None:
     assert [(j.problem, j.seed) for j in jobs(["shelf_swap"], rows[:1], **options)] == [
         ("shelf_swap", 7), ("shelf_swap", 8), ("shelf_swap", 9),
     ]  # fmt: skip
+    later = jobs(["wall/hard"], rows[:1], first=4, **options)
+    assert [(j.problem, j.seed) for j in later] == [(f"wall/hard/{900_000 + k}", 7 + k) for k in (4, 5, 6)]
     with pytest.raises(ParameterError, match="each once"):
         jobs(["wall/hard"], [rows[0], rows[0]], **options)
-    for more in ({"runs": 100_001}, {"seed": 2**31 - 2}):
+    for more in ({"runs": 100_001}, {"seed": 2**31 - 2}, {"first": 100_000}):
         with pytest.raises(ParameterError, match="runs: expected at most"):
             jobs(["wall/hard"], rows, **{**options, **more})
     with pytest.raises(UnknownNameError, match="split"):

@@ -30,7 +30,7 @@ from apex_ompl.util.validation import check_integer
 def bench(
     suites: Sequence[str], rows: Sequence[Row | str], out: str | os.PathLike[str], *, runs: int = 100,
     timeout: float = 5.0, seed: int = 0, split: str = "test", simplify: bool = True, workers: Workers | None = None,
-    keep: bool = False, quiet: bool = False, provenance: Mapping[str, Any] | None = None,
+    keep: bool = False, quiet: bool = False, provenance: Mapping[str, Any] | None = None, first: int = 0,
 ) -> Results:  # fmt: skip
     """Run planners on problems through OMPL's Benchmark, with the same space, checker and resolution.
 
@@ -43,13 +43,14 @@ def bench(
         out: Folder of the results, which is made or resumed.
         runs: Number of runs of each row on a level, each on another problem, or on a single problem.
         timeout: Time limit of a run [s].
-        seed: Seed of the first run; the k-th run has ``seed + k``.
+        seed: Seed of the run on the first problem of a level; that on the k-th one has ``seed + k``.
         split: Split of the problems.
         simplify: Whether paths are simplified; those of smooth planners are not.
         workers: Where runs are made; by default one at a time, in a process of this machine.
         keep: Whether to store the result of each run that is made by ``plan``, for ``PlanResult.load``.
         quiet: Whether to show no progress.
         provenance: Further entries of the session, as the commit of the code.
+        first: Number of problems of each level that are left out before.
 
     Returns:
         The results in the folder.
@@ -64,7 +65,7 @@ def bench(
     for module in workers.modules:
         importlib.import_module(module)
     parsed = [row if isinstance(row, Row) else Row.parse(row) for row in rows]
-    wanted = jobs(suites, parsed, runs=runs, timeout=timeout, seed=seed, split=split, simplify=simplify)
+    wanted = jobs(suites, parsed, runs=runs, timeout=timeout, seed=seed, split=split, simplify=simplify, first=first)
     folder = make_folder(out)
     with locked(folder):
         if (folder / RUNS).exists() and not (folder / ABOUT).exists():

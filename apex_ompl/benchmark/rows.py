@@ -16,7 +16,7 @@ from apex_ompl import planners, problems
 from apex_ompl.api import load_problem
 from apex_ompl.errors import ParameterError, UnknownNameError
 from apex_ompl.problems.catalogue import SPLITS, VALIDATION
-from apex_ompl.util.validation import check_positive
+from apex_ompl.util.validation import check_integer, check_positive
 
 RUNNER = re.compile(r"[\w.]+:\w+")
 ROW = re.compile(r"(?P<planner>[^\[\]]+?)(\[(?P<params>[^\[\]]*)\])?")
@@ -199,12 +199,13 @@ def experiments(suites: Sequence[str]) -> dict[str, bool]:
 
 
 def jobs(
-    suites: Sequence[str], rows: Sequence[Row], *, runs: int, timeout: float, seed: int, split: str, simplify: bool
-) -> list[Job]:
+    suites: Sequence[str], rows: Sequence[Row], *, runs: int, timeout: float, seed: int, split: str, simplify: bool,
+    first: int = 0,
+) -> list[Job]:  # fmt: skip
     """Return the runs of a benchmark in their order: all rows on a problem, the first problems of all levels first.
 
-    The k-th run on a level is on the k-th problem of the split, with the seed ``seed + k``; a single problem is that of
-    all its runs.
+    Runs on a level are on the k-th problems of the split with the seeds ``seed + k``, k from ``first`` on; a single
+    problem is that of all its runs.
 
     Raises:
         ApexError: A suite, planner, parameter or split is unknown, a suite has no such split, or two rows have the same
@@ -212,8 +213,9 @@ def jobs(
     """
     if split not in SPLITS:
         raise UnknownNameError("split", split, SPLITS)
-    if runs > len(SPLITS[split]) or seed + runs > 2**31:
-        most = min(len(SPLITS[split]), 2**31 - seed)
+    check_integer(first, "first", 0)
+    most = min(len(SPLITS[split]), 2**31 - seed) - first
+    if runs > most:
         raise ParameterError("runs", runs, f"at most {most}, for there are no more problems of the split, or seeds")
     labels = [row.label for row in rows]
     if len(set(labels)) < len(labels) or not labels:
@@ -228,7 +230,7 @@ def jobs(
         if is_level and suite in VALIDATION and split != "validation":
             raise ParameterError("split", split, f"validation, the only one of {suite}")
         for row in rows:
-            for k in range(min(runs, row.runs or runs) if row.runs_on(experiment) else 0):
+            for k in range(first, first + (min(runs, row.runs or runs) if row.runs_on(experiment) else 0)):
                 problem = f"{experiment}/{SPLITS[split].start + k}" if is_level else experiment
                 limit = row.timeout or timeout
                 about = (experiment, problem, row.label, row.planner, row.params, seed + k, limit, simplify)
