@@ -4,9 +4,9 @@ Each planner has eight candidates, the first its default; OMPL's and RoboPlan's 
 on the first problem of each level, the best four and the default on the first two, the best two of them and the
 default on the first four; 2 s a run. Problems and seeds are the same for all. The score is the mean over the problems
 of the time to the first path that passed the full check, where an unsolved one counts as 4 s (PAR2); for planners that
-go on improving, times the mean of the length at the end over the shortest of the planner's candidates, where an
-unsolved one counts as 2. Paths are not simplified. The candidate of the lowest score on the last problems is
-chosen; planners/tuned.py keeps it.
+go on improving or shorten their path, times the mean of the length at the end over the shortest of the planner's
+candidates, where an unsolved one counts as 2. Paths are not simplified. The candidate of the lowest score on the last
+problems is chosen; planners/tuned.py keeps it.
 Each run is stored in benchmarks/runs/tune when it ends; the command resumes where it was stopped.
 
 Levels are the hard and large ones of the suites and every second validation kind of ``unseen``. Where planners are
@@ -141,7 +141,7 @@ class Score:
         label: Label of the candidate.
         runs: Its runs.
         shortest: Length of the shortest path of the planner's candidates by problem, for planners that go on improving
-            [rad].
+            or shorten it [rad].
     """
 
     label: str
@@ -160,7 +160,7 @@ class Score:
 
     @property
     def length(self) -> float:
-        """Mean of the lengths over the shortest; 1 for planners that end with their first path."""
+        """Mean of the lengths over the shortest; 1 for planners that neither improve nor shorten their first path."""
         if self.shortest is None:
             return 1.0
         known = [(run, self.shortest[run["problem"]]) for run in self.runs if run["problem"] in self.shortest]
@@ -210,7 +210,7 @@ def scores(planner: str, results: Results, rows: Sequence[Row], problems: int) -
     runs = [run for run in results.runs if run["label"] in labels and run["seed"] < problems]
     runs = [run for run in runs if run["status"] != NO_PROBLEM]
     shortest: dict[str, float] | None = None
-    if planner != ROBOPLAN and planners.parameters(planner).optimizing:
+    if planner != ROBOPLAN and (planners.parameters(planner).optimizing or planners.parameters(planner).smooth):
         shortest = {}
         for run in runs:
             if run["solved"]:
