@@ -96,9 +96,9 @@ def test_features_are_those_of_the_mirror_image() -> None:
     mine = replace(query(5), held=())
     flip = np.array([1.0, -1.0, 1.0])
     rows = [(s, tuple(flip * p), (-q[0], q[1], -q[2], q[3]), size) for s, p, q, size in ROWS]
-    theirs = replace(mine, obstacles=ObstacleSet.from_rows(rows), start=MIRROR.states(mine.start))
+    theirs = replace(mine, known=ObstacleSet.from_rows(rows), start=MIRROR.states(mine.start))
     theirs = replace(theirs, goal=MIRROR.states(mine.goal))
-    found = sight.features([replace(mine, obstacles=ObstacleSet.from_rows(ROWS))], kernel())[0]
+    found = sight.features([replace(mine, known=ObstacleSet.from_rows(ROWS))], kernel())[0]
     there = replace(sight, keys=image).features([theirs], kernel())[0]
     keyed, points = 2 * len(keys().state), ALONG * 14
 

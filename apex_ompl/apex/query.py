@@ -7,7 +7,7 @@ import numpy as np
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.checker import NO_POINT
 from apex_ompl.diffusion.primitive_fit import scene_of_primitives
-from apex_ompl.diffusion.query import ObstacleSet, Query
+from apex_ompl.diffusion.query import Query
 from apex_ompl.kernel import Kernel
 from apex_ompl.types import Array
 
@@ -15,8 +15,7 @@ from apex_ompl.types import Array
 def make_query(checker: CollisionChecker, start: Array, goal: Array, *, point: bool = True) -> Query:
     """Return the query of going from a state to another, among the obstacles of now.
 
-    Fixtures of the robot are left out. As ``obstacles``, meshes and points are the primitives that
-    they look like.
+    Fixtures of the robot are left out. As ``obstacles``, meshes and points are the primitives that they look like.
 
     Args:
         checker: The robot among obstacles.
@@ -25,10 +24,9 @@ def make_query(checker: CollisionChecker, start: Array, goal: Array, *, point: b
         point: Whether the obstacle point is looked for; models that do not see it can do without.
     """
     scene, movable = checker.kernel.scene, checker.movable
-    obstacles = ObstacleSet.from_scene(scene, movable)
     nearest = checker.obstacle_point(start) if point else np.array(NO_POINT)
     ends = np.asarray(start, float), np.asarray(goal, float)
-    return Query(*ends, nearest, obstacles, (scene, movable), checker.held_extents)
+    return Query(*ends, nearest, None, (scene, movable), checker.held_extents)
 
 
 def rough_kernel(kernel: Kernel) -> Kernel | None:

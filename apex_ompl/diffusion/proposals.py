@@ -205,8 +205,8 @@ class TrajectoryModel(ABC):
         for query in queries:
             for name, state in (("start", query.start), ("goal", query.goal)):
                 check_array(np.asarray(state, float), (len(config.joints),), name, finite=True)
-            obstacles = query.obstacles
-            numbers = (query.point, obstacles.position, obstacles.rotation, obstacles.size)
+            given = query.known  # a kernel's scene is checked where it is made
+            numbers = (query.point, *(() if given is None else (given.position, given.rotation, given.size)))
             if not all(np.isfinite(values).all() for values in numbers):
                 raise ParameterError("obstacles", "NaN or infinity", "finite positions, rotations and sizes")
 

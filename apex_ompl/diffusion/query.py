@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,7 +62,7 @@ class ObstacleSet:
         return cls(shape, position, rotation_matrices(orientation).astype(float), size * HALVES[shape])
 
     @classmethod
-    def from_scene(cls, tables: SceneTables, chosen: NDArray[np.bool_]) -> ObstacleSet:
+    def from_scene(cls, tables: SceneTables, chosen: Flags | None) -> ObstacleSet:
         """Return some obstacles of a kernel scene; a half-space becomes a box larger than the workspace.
 
         A grid of distances becomes primitives that look like what it is about, see
@@ -69,9 +70,10 @@ class ObstacleSet:
 
         Args:
             tables: The scene.
-            chosen: Which of its obstacles to take, shape (all obstacles,).
+            chosen: Which of its obstacles to take, shape (all obstacles,), None for all.
         """
         scene = tables.arrays
+        chosen = np.ones(len(scene.kind), bool) if chosen is None else chosen
         grids = np.flatnonzero(chosen & (scene.kind == GRID))
         chosen = chosen & (scene.kind != GRID)
         shape, position = scene.kind[chosen].copy(), scene.offset[chosen].copy()
@@ -114,7 +116,7 @@ class Query:
         start: Shape (dof,) [rad].
         goal: Shape (dof,) [rad].
         point: Obstacle point nearest to the robot at the start, shape (3,) [m].
-        obstacles: The obstacles without fixtures such as tables.
+        known: The obstacles as primitives, None where they follow from ``scene``.
         scene: The same as tables of the kernel, where there are any, and which of their solids are no fixtures.
         held: Links that hold something, and the corners of boxes around it in their frames, each of shape (2, 3) [m].
     """
@@ -122,13 +124,20 @@ class Query:
     start: Array
     goal: Array
     point: Array
-    obstacles: ObstacleSet
+    known: ObstacleSet | None
     scene: tuple[SceneTables, Flags] | None = None
     held: Sequence[HeldExtent] = ()
 
+    @cached_property
+    def obstacles(self) -> ObstacleSet:
+        """The obstacles without fixtures such as tables; made where something asks for them."""
+        return ObstacleSet.from_scene(*self.seen()) if self.known is None else self.known
+
     def seen(self) -> tuple[SceneTables, Flags | None]:
         """Return tables of the obstacles, and which of their solids are obstacles, None for all."""
-        return (self.obstacles.tables(), None) if self.scene is None else self.scene
+        if self.scene is not None:
+            return self.scene
+        return (ObstacleSet.from_rows([]) if self.known is None else self.known).tables(), None
 
 
 class Probes:
