@@ -85,9 +85,7 @@ def test_the_order_of_the_obstacles_does_not_matter_and_each_of_them_does(few: P
 
     def answer(which: np.ndarray) -> torch.Tensor:
         obstacles = replace(query.obstacles, **{name: getattr(query.obstacles, name)[which] for name in columns})
-        found: torch.Tensor = network(
-            batch_queries([replace(query, known=obstacles)], NO_PROBES, kernel), state, time
-        )
+        found: torch.Tensor = network(batch_queries([replace(query, known=obstacles)], NO_PROBES, kernel), state, time)
         return found
 
     whole = answer(np.arange(count))
