@@ -189,7 +189,8 @@ class Sight:
         """
         count, probes = len(paths), self.probes
         frames = rotation, origin = kernel.joint_frames(paths.reshape(-1, paths.shape[-1]))
-        points = np.einsum("npij,pj->npi", rotation[:, probes.joint], probes.offset) + origin[:, probes.joint]
+        points = np.einsum("npij,pj->npi", rotation[:, probes.joint], probes.offset, order="C")
+        points += origin[:, probes.joint]
         distances, gradients = nearest_points(scene, points.reshape(-1, 3), MAX_DISTANCE, seen)
         found = distances.reshape(points.shape[:2]), gradients.reshape(points.shape)
         pushed = kernel.joint_pushes(frames, probes.joint, points, found, REACH)

@@ -153,8 +153,8 @@ class Kernel:
             found: Their signed distances from the obstacles, shape (N, P) [m], and the gradients, shape (N, P, 3).
             reach: A force falls from 1 at an obstacle to 0 at this distance [m].
         """
-        pushed = np.empty((len(points), self.robot.dof))
-        joint_push.joint_pushes(*self.robot.packed, *frames, carriers, points, *found, float(reach), pushed)
+        pushed, arrays = np.empty((len(points), self.robot.dof)), map(np.ascontiguousarray, (points, *found))
+        joint_push.joint_pushes(*self.robot.packed, *frames, carriers, *arrays, float(reach), pushed)
         return pushed
 
     def proves(self, path: ArrayLike, resolution: float) -> bool:
