@@ -74,7 +74,7 @@ def main() -> None:
     parser.add_argument("--report", action="store_true", help="run nothing; write the results of the stored runs")
     args = parser.parse_args()
     if not 0 <= args.first <= FROZEN - args.n or not set(args.levels) <= set(VALIDATION[SUITE]):
-        parser.error(f"expected up to {FROZEN} problems of the levels {', '.join(VALIDATION[SUITE])}")
+        parser.error(f"expected --first and -n of {FROZEN} at most together, levels {', '.join(VALIDATION[SUITE])}")
     levels = [f"{SUITE}/{level}" for level in args.levels or VALIDATION[SUITE]]
     wanted, workers = rows(args.rows, args.model), Workers(args.jobs, modules=("control_planners",))
     if not args.report:
