@@ -10,8 +10,8 @@ problems is chosen; planners/tuned.py keeps it.
 Each run is stored in benchmarks/runs/tune when it ends; the command resumes where it was stopped.
 
 Levels are the hard and large ones of the suites and every second validation kind of ``unseen``. Where planners are
-named only these are tuned, and the rest of the result stays; each planner has the number of levels and the commit of
-its runs beside its scores.
+named only these are tuned, and the rest of the result stays: beside its scores each planner has the number of levels,
+and how its runs were made.
 
 With --baselines the paper's baselines are tuned in the same way on the easy and medium levels instead, since local
 methods fail on hard ones whatever their parameters are (results tune_baselines, and runs in a folder of that name).
@@ -250,14 +250,14 @@ def table(found: dict[str, Any]) -> str:
             name = label if place else f"**{label}**"
             lines.append(record.row([f"{name}{', default' if label == one['default'] else ''}", *_cells(figures)]))
     problems = [f"{count} of each level" for _, count in RUNGS]
-    head = ["candidate, score in ms (rank) on", *problems, "levels", "runs of commit"]
+    head = ["candidate, score in ms (rank) on", *problems, "levels", "jobs; hardware; commits"]
     lines += ["", record.row(head), record.row(["---", *["---:"] * (len(head) - 1)])]
     for one in found.values():
         for label in one["rungs"][0]:
             places = [list(rung).index(label) if label in rung else None for rung in one["rungs"]]
             both = zip(one["rungs"], places, strict=True)
             cells = ["" if k is None else f"{1e3 * rung[label]['score']:.0f} ({k + 1})" for rung, k in both]
-            lines.append(record.row([label, *cells, one["levels"], one["commit"]]))
+            lines.append(record.row([label, *cells, one["levels"], "; ".join(one["made_with"].values())]))
     return "\n".join(lines)
 
 
@@ -281,12 +281,12 @@ def main() -> None:
         parser.error(f"expected planners of {', '.join(known)}")
     tuned = {name: rungs_of(name, args.jobs) for name in args.planners or known}
     levels_of = len(easier_levels() if args.baselines else levels())
-    commits = record.made_with(Results.load(folder))["run_commits"]
+    made_with = record.made_with(Results.load(folder))
     kept = json.loads((record.RESULTS / f"{folder.name}.json").read_text())["planners"] if args.planners else {}
     data = {
         planner: kept[planner] if planner not in tuned else {
             "default": rows_of(planner)[0].label, "chosen": chosen(planner, tuned[planner][-1]), "levels": levels_of,
-            "commit": commits,
+            "made_with": made_with,
             "rungs": [{one.label: one.figures() for one in rung} for rung in tuned[planner]],
         }
         for planner in known
@@ -296,7 +296,7 @@ def main() -> None:
     record.write(
         folder.name, {"planners": data}, table(data), split="validation", limit=f"{TIMEOUT:g} s",
         budget=f"at most {', '.join(most)}", seeds="number of the problem modulo 1000",
-        **about, **record.made_with(Results.load(folder)),
+        **about, **made_with,
     )  # fmt: skip
 
 

@@ -58,7 +58,7 @@ def test_ompls_benchmark_runs_it(ready: PlanningSetup, tmp_path: Path, monkeypat
     monkeypatch.chdir(tmp_path)  # OMPL writes a console file there
     setup = ready.simple_setup
     benchmark = ot.Benchmark(setup, "hard")
-    benchmark.addPlanner(APEX(setup.getSpaceInformation(), ApexParameters(seed=1)))
+    benchmark.addPlanner(APEX(setup.getSpaceInformation(), ApexParameters(seed=1, sprint=0)))
     request = ot.Request(20.0, 4096.0, 3)
     request.displayProgress = False
     benchmark.benchmark(request)

@@ -100,9 +100,11 @@ def test_valid_paths_that_pass_too_near_are_resampled(ready: PlanningSetup) -> N
     assert by_hand - 2e-3 < gaps[1] <= min(by_hand, ready.checker.distance(wary.path[-1]).value) + 1e-5
 
 
-def test_the_same_seed_gives_the_same_path_also_in_threads() -> None:
+@pytest.mark.parametrize(("sprint", "by"), [(0, "apex"), (ApexParameters().sprint, "sprint")])
+def test_the_same_seed_gives_the_same_path_also_in_threads(sprint: int, by: str) -> None:
     def length(_: int) -> list[float]:
-        result = plan(cached_problem(HARD), timeout=60.0, params={"seed": 5})
+        result = plan(cached_problem(HARD), timeout=60.0, params={"seed": 5, "sprint": sprint})
+        assert result.solved_by.startswith(by)
         return [result.length, *result.path[100]]
 
     threads = torch.get_num_threads()
@@ -110,20 +112,20 @@ def test_the_same_seed_gives_the_same_path_also_in_threads() -> None:
     with ThreadPoolExecutor(2) as pool:
         assert all(found == alone for found in pool.map(length, range(2)))
     assert torch.get_num_threads() == threads
-    assert plan(cached_problem(HARD), timeout=60.0, params={"seed": 6}).length != alone[0]
+    assert plan(cached_problem(HARD), timeout=60.0, params={"seed": 6, "sprint": sprint}).length != alone[0]
 
 
 def test_with_time_left_paths_only_get_shorter(ready: PlanningSetup) -> None:
     setup = ready.simple_setup
     si = setup.getSpaceInformation()
     setup.setOptimizationObjective(ob.PathLengthOptimizationObjective(si))
-    planner = APEX(si, ApexParameters(seed=0))
+    planner = APEX(si, ApexParameters(seed=0, sprint=0))
     setup.setPlanner(planner)
     setup.setup()
     assert setup.solve(within(3.0)).getStatus() == EXACT
     found = setup.getProblemDefinition().getSolutionCount()
     assert "improve" in planner.report.times
-    once = plan(cached_problem(HARD), timeout=20.0, params={"seed": 0})
+    once = plan(cached_problem(HARD), timeout=20.0, params={"seed": 0, "sprint": 0})
     assert found >= 1 + planner.report.improved
     assert path_length(states(setup)) <= once.length + 1e-9
     assert full_check(ready.checker, states(setup), ready.start, ready.goals)

@@ -58,6 +58,27 @@ def coal_distance(shape: coal.CollisionGeometry, at: np.ndarray, point: np.ndarr
 
 @settings(max_examples=25)
 @given(seed=st.integers(0, 10**6))
+def test_pushes_of_random_trees_are_virtual_work(seed: int) -> None:
+    """The rate of a joint times its push is the power of the forces: f . dp/dq, for joints of all kinds."""
+    tables, rng = random_robot(seed)[0], np.random.default_rng(seed)
+    kernel, reach, step = Kernel(tables, scene_tables([])), 0.2, 1e-6
+    carriers, offsets = rng.integers(0, len(tables.arrays.joint_parent), 6), rng.normal(size=(6, 3))
+    state = rng.uniform(-1.0, 1.0, tables.dof)
+
+    def points(q: np.ndarray) -> np.ndarray:
+        rotation, origin = (values[0][carriers] for values in kernel.joint_frames(q))
+        return np.einsum("pij,pj->pi", rotation, offsets) + origin
+
+    distances, gradients = rng.uniform(-0.1, 2 * reach, 6), rng.normal(size=(6, 3))
+    near = distances[None], gradients[None]
+    found = kernel.joint_pushes(kernel.joint_frames(state), carriers, points(state)[None], near, reach)[0]
+    force = np.maximum(0.0, 1.0 - distances / reach)[:, None] * gradients
+    wanted = [(force * (points(state + d) - points(state - d))).sum() / (2 * step) for d in step * np.eye(tables.dof)]
+    np.testing.assert_allclose(found, wanted, atol=1e-6)
+
+
+@settings(max_examples=25)
+@given(seed=st.integers(0, 10**6))
 def test_clearance_of_random_trees_is_that_of_all_spheres(seed: int) -> None:
     tables, specs, bodies, pairs = random_robot(seed)
     rng = np.random.default_rng(seed)

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -23,6 +22,7 @@ from apex_ompl.errors import ParameterError, UnknownNameError
 from apex_ompl.kernel import Kernel
 from apex_ompl.trajopt.spline import Spline
 from apex_ompl.types import Array
+from apex_ompl.util.stopwatch import StageClock
 from apex_ompl.util.validation import check_array, check_integer, check_number
 
 UNGUIDED = Guidance(gamma=0.0)
@@ -219,7 +219,7 @@ class TrajectoryModel(ABC):
         A model that sees its own estimate sees the paths of ``known`` latent vectors at first, if there are any.
         """
         self._check(queries, kernel)
-        clock, each = _StageClock(), len(first) // len(queries)
+        clock, each = StageClock("condition", "network", "guidance", "decode"), len(first) // len(queries)
         start, goal = (np.array([getattr(q, name) for q in queries], float) for name in ("start", "goal"))
         ends = np.repeat(start, each, axis=0), np.repeat(goal, each, axis=0)
         condition = self.condition(queries, kernel)
@@ -282,26 +282,3 @@ class TrajectoryModel(ABC):
             return self.schedule.clipped(estimate, sample, t, noise.most)
 
         return predict
-
-
-class _StageClock:
-    """Seconds by stage."""
-
-    def __init__(self) -> None:
-        self.seconds = {"condition": 0.0, "network": 0.0, "guidance": 0.0, "decode": 0.0}
-        self._last, self._inside = time.perf_counter(), 0.0
-
-    def lap(self, stage: str) -> None:
-        """Add the time since the last lap to a stage, less what :meth:`within` added to others."""
-        now = time.perf_counter()
-        self.seconds[stage] += now - self._last - self._inside
-        self._last, self._inside = now, 0.0
-
-    @contextmanager
-    def within(self, stage: str) -> Iterator[None]:
-        """Add the time of a block to a stage, and not to the one that the next lap ends."""
-        started = time.perf_counter()
-        yield
-        passed = time.perf_counter() - started
-        self.seconds[stage] += passed
-        self._inside += passed

@@ -62,7 +62,7 @@ class ObstacleSet:
         return cls(shape, position, rotation_matrices(orientation).astype(float), size * HALVES[shape])
 
     @classmethod
-    def from_scene(cls, tables: SceneTables, chosen: Flags | None) -> ObstacleSet:
+    def from_scene(cls, tables: SceneTables, chosen: Flags) -> ObstacleSet:
         """Return some obstacles of a kernel scene; a half-space becomes a box larger than the workspace.
 
         A grid of distances becomes primitives that look like what it is about, see
@@ -70,10 +70,9 @@ class ObstacleSet:
 
         Args:
             tables: The scene.
-            chosen: Which of its obstacles to take, shape (all obstacles,), None for all.
+            chosen: Which of its obstacles to take, shape (all obstacles,).
         """
         scene = tables.arrays
-        chosen = np.ones(len(scene.kind), bool) if chosen is None else chosen
         grids = np.flatnonzero(chosen & (scene.kind == GRID))
         chosen = chosen & (scene.kind != GRID)
         shape, position = scene.kind[chosen].copy(), scene.offset[chosen].copy()
@@ -116,8 +115,8 @@ class Query:
         start: Shape (dof,) [rad].
         goal: Shape (dof,) [rad].
         point: Obstacle point nearest to the robot at the start, shape (3,) [m].
-        known: The obstacles as primitives, None where they follow from ``scene``.
-        scene: The same as tables of the kernel, where there are any, and which of their solids are no fixtures.
+        known: The obstacles as primitives, or None where there is a scene.
+        scene: The same as tables of the kernel, or None, and which of their solids are no fixtures.
         held: Links that hold something, and the corners of boxes around it in their frames, each of shape (2, 3) [m].
     """
 
@@ -131,13 +130,14 @@ class Query:
     @cached_property
     def obstacles(self) -> ObstacleSet:
         """The obstacles without fixtures such as tables; made where something asks for them."""
-        return ObstacleSet.from_scene(*self.seen()) if self.known is None else self.known
+        if self.known is not None:
+            return self.known
+        assert self.scene is not None
+        return ObstacleSet.from_scene(*self.scene)
 
     def seen(self) -> tuple[SceneTables, Flags | None]:
         """Return tables of the obstacles, and which of their solids are obstacles, None for all."""
-        if self.scene is not None:
-            return self.scene
-        return (ObstacleSet.from_rows([]) if self.known is None else self.known).tables(), None
+        return (self.obstacles.tables(), None) if self.scene is None else self.scene
 
 
 class Probes:

@@ -20,7 +20,7 @@ from apex_ompl.types import Array
 
 SPACING = 0.1  # of states on a tree's path whose blocked stretches are bridged [rad, max-norm]
 COMPILED = 2  # iterations of compiled trees, which are several times as fast, for one of OMPL's
-SLOWER = 4  # and of a sprint for one of OMPL's, whose checker may be anyone's
+OMPL_SHARE = 0.25  # of a sprint's iterations that OMPL's trees have, whose checker may be anyone's
 EXACT, APPROXIMATE = ob.PlannerStatus.EXACT_SOLUTION, ob.PlannerStatus.APPROXIMATE_SOLUTION
 
 
@@ -31,7 +31,7 @@ class Sprint:
     In open scenes it is done sooner than proposals are made.
 
     Attributes:
-        iterations: Number of iterations; compiled trees have COMPILED times as many, OMPL's a SLOWER-th.
+        iterations: Number of iterations; compiled trees have COMPILED times as many, OMPL's OMPL_SHARE of it.
         tree_range: Longest step of the trees; 0 lets OMPL choose [rad].
     """
 
@@ -57,7 +57,7 @@ class Sprint:
     def _of_ompl(self, context: SolveContext) -> Array | None:
         trees, (start, goal) = context.sprint_ompl_trees, context.pairs[0]
         tree, pdef = context.sprint_ompl_trees = trees or ompl_trees(context.si, [start], goal, self.tree_range)
-        if tree.solve(context.counted(math.ceil(self.iterations / SLOWER))).getStatus() != EXACT:
+        if tree.solve(context.counted(math.ceil(OMPL_SHARE * self.iterations))).getStatus() != EXACT:
             return None
         context.sprint_ompl_trees = None
         return path_to_array(pdef.getSolutionPath(), context.kernel.robot.dof)
