@@ -81,9 +81,9 @@ CANDIDATES: dict[str, list[dict[str, Any]]] = {
     ],
     "rrtconnect+polish": ranges(0.0, 0.3, 0.5, 0.7, 0.85, 1.0, 1.4, 2.0),
     "apex": [
-        *ranges(0.0, 0.5, 0.7, 1.0, sprint=400, first=4),
-        *(row for sprint in (40, 160, 640) for row in ranges(0.7, sprint=sprint, first=4)),
-        *ranges(0.7, sprint=400, first=2),
+        *ranges(0.7, 0.0, 0.85, 1.0, 1.4, sprint=2000, first=4),
+        *(row for sprint in (800, 5000) for row in ranges(1.0, sprint=sprint, first=4)),
+        *ranges(1.0, sprint=2000, first=2),
     ],
     ROBOPLAN: [
         *({"max_connection_distance": step} for step in (3.0, 0.3, 0.5, 0.7, 1.0, 1.4, 2.0)),

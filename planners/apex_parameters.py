@@ -35,7 +35,7 @@ class ApexParameters(Parameters):
         line: Whether the straight line is a candidate.
         sprint: Iterations that RRT-Connect has before proposals, where it is the fallback and ``lambda_obs`` is 0;
             behind a short repair it has twice as many, before the second and third round 8 and 32 times as many.
-            Trees in compiled code have twice as many everywhere, OMPL's a quarter in sprints.
+            That is for trees in compiled code; OMPL's have an eighth.
         sampler: ``ddim``, ``dpm_solver`` or ``ddpm``; ``model`` takes that of the checkpoint.
         denoising_steps: Number of denoising steps; 0 takes that of the checkpoint: 2 for apex, all 256 for apex-paper.
         temperature: Factor on the standard deviation of the noise to begin with, that of the checkpoint.

@@ -1,4 +1,4 @@
-"""Shortcuts in compiled code: never longer, always proved, the same for the same seed."""
+"""Shortcuts in compiled code: never longer, proved at the resolution, the same for the same seed."""
 
 from __future__ import annotations
 
@@ -33,20 +33,32 @@ def tree_path(name: str, seed: int) -> tuple[CollisionChecker, Array]:
     return checker, path
 
 
+def longest_blocked(checker: CollisionChecker, path: Array) -> float:
+    """Return the longest stretch of a path whose states collide [rad, max-norm].
+
+    What is left of a motion in which a shortcut begins or ends was checked at other states than are sampled here, and
+    where it begins the states on both sides were: an obstacle may reach in between them.
+    """
+    states, _ = sample_path(path, RESOLUTION)
+    free = checker.are_free(states)
+    assert free[0] and free[-1]
+    last = np.maximum.accumulate(np.where(free, np.arange(len(states)), 0))
+    return float(np.abs(states - states[np.minimum(last + 1, len(states) - 1)]).max(axis=1)[~free].max(initial=0.0))
+
+
 @settings(max_examples=25, deadline=None)
 @given(
     st.sampled_from(["shelf/hard/800003", "cage/hard/800001", "bins/hard/800001"]), st.integers(0, 3),
     st.integers(0, 200), st.integers(0, 10**6),
 )  # fmt: skip
-def test_a_path_is_no_longer_and_its_states_are_all_proved(name: str, tree: int, draws: int, seed: int) -> None:
+def test_a_path_is_no_longer_and_as_free(name: str, tree: int, draws: int, seed: int) -> None:
     checker, path = tree_path(name, tree)
     before = path.copy()
     short, looked = shortcut(checker.kernel, path, draws, RESOLUTION, np.random.default_rng(seed))
     assert np.array_equal(path, before), "the caller's array is left alone"
     assert np.array_equal(short[0], path[0]) and np.array_equal(short[-1], path[-1])
     assert path_length(short) <= path_length(path) + 1e-9 and len(short) <= len(path) + 16
-    states, _ = sample_path(short, RESOLUTION)
-    assert checker.are_free(states).all()
+    assert longest_blocked(checker, short) < 2 * RESOLUTION
     assert looked.proved > 0 and min(looked) >= 0 and looked.proved_intervals <= looked.intervals
     again, _ = shortcut(checker.kernel, path, draws, RESOLUTION, np.random.default_rng(seed))
     assert np.array_equal(short, again)

@@ -13,6 +13,8 @@ from apex_ompl.types import Array
 
 AT_ONCE = 256  # random states between two looks at the clock
 ROOM = 1024  # nodes of a tree to begin with
+NEAR = 0.5  # share of random states that lie around a straight line between a start and a goal
+SPREAD = 2.0  # of these about the line, at most [rad]
 
 
 class TreePair:
@@ -38,6 +40,7 @@ class TreePair:
         longest = min(longest, float(np.linalg.norm(limits.upper - limits.lower)))  # no step is longer
         self._kernel, self._longest, self._resolution, self._rng = kernel, longest, resolution, rng
         dof, most = kernel.robot.dof, max(len(starts), len(goals))
+        self._starts, self._goals = starts, goals
         self._sizes = np.array([len(starts), len(goals), 0], np.int64)
         room = max(ROOM, 2 * most)
         self._states, self._parents = np.zeros((2, dof, room)), np.full((2, room), -1, np.int64)
@@ -62,9 +65,8 @@ class TreePair:
             iterations: Number of random states.
             stop: Asked from time to time whether to give up.
         """
-        limits = self._kernel.robot.arrays
         while iterations > 0 and not stop():
-            samples = self._rng.uniform(limits.lower, limits.upper, (min(iterations, AT_ONCE), len(limits.lower)))
+            samples = self._random_states(min(iterations, AT_ONCE))
             iterations -= len(samples)
             while len(samples):
                 used = tree_search.grow_trees(
@@ -78,6 +80,18 @@ class TreePair:
                 if len(samples):
                     self._make_room()
         return None
+
+    def _random_states(self, count: int) -> Array:
+        """Return states of which some are uniform in the limits, and some lie around lines from starts to goals."""
+        limits, rng = self._kernel.robot.arrays, self._rng
+        states = rng.uniform(limits.lower, limits.upper, (count, len(limits.lower)))
+        near = np.flatnonzero(rng.random(count) < NEAR)
+        starts = self._starts[rng.integers(len(self._starts), size=len(near))]
+        goals = self._goals[rng.integers(len(self._goals), size=len(near))]
+        along, spread = rng.random((2, len(near), 1))
+        around = starts + along * (goals - starts) + SPREAD * spread * rng.standard_normal(starts.shape)
+        states[near] = np.clip(around, limits.lower, limits.upper)
+        return states
 
     def _make_room(self) -> None:
         self._states = np.ascontiguousarray(np.concatenate([self._states, np.zeros_like(self._states)], axis=2))

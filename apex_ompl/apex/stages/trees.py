@@ -19,8 +19,7 @@ from apex_ompl.trajopt.path import Path
 from apex_ompl.types import Array
 
 SPACING = 0.1  # of states on a tree's path whose blocked stretches are bridged [rad, max-norm]
-COMPILED = 2  # iterations of compiled trees, which are several times as fast, for one of OMPL's
-OMPL_SHARE = 0.25  # of a sprint's iterations that OMPL's trees have, whose checker may be anyone's
+OMPL_SHARE = 0.125  # of the iterations of compiled trees that OMPL's have, which take several times as long for one
 EXACT, APPROXIMATE = ob.PlannerStatus.EXACT_SOLUTION, ob.PlannerStatus.APPROXIMATE_SOLUTION
 
 
@@ -31,7 +30,7 @@ class Sprint:
     In open scenes it is done sooner than proposals are made.
 
     Attributes:
-        iterations: Number of iterations; compiled trees have COMPILED times as many, OMPL's OMPL_SHARE of it.
+        iterations: Number of iterations of compiled trees; OMPL's have OMPL_SHARE of it.
         tree_range: Longest step of the trees; 0 lets OMPL choose [rad].
     """
 
@@ -49,7 +48,7 @@ class Sprint:
     def _compiled(self, context: SolveContext) -> Array | None:
         trees, (start, goal) = context.sprint_trees, context.pairs[0]
         trees = context.sprint_trees = trees or compiled_trees(context, [start], [goal], self.tree_range)
-        states = grow(context, trees, COMPILED * self.iterations)
+        states = grow(context, trees, self.iterations)
         if states is not None:
             context.sprint_trees = None
         return states
@@ -79,12 +78,12 @@ class GrowTrees:
     approximate: bool
 
     def run(self, context: SolveContext, iterations: int) -> Solution | None:
-        """Return the path of the trees after some more iterations, or None."""
+        """Return the path of the trees after some more iterations, of which OMPL's have OMPL_SHARE, or None."""
         if context.validator.exclusive:
-            found = self._compiled(context, COMPILED * iterations)
+            found = self._compiled(context, iterations)
             if found is not None:
                 return found
-        return self._of_ompl(context, iterations)
+        return self._of_ompl(context, math.ceil(OMPL_SHARE * iterations))
 
     def _compiled(self, context: SolveContext, iterations: int) -> Solution | None:
         trees = context.all_trees or (context.sprint_trees if len(context.pairs) == 1 else None)

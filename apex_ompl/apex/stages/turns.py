@@ -12,7 +12,7 @@ from apex_ompl.apex.stages.trees import GrowTrees
 
 TEMPERATURES = (1.6, 2.0, 2.4)
 """Factors on the temperature of proposals in one round after the other: those of the model's own spread have failed."""
-ITERATIONS, GROWTH = 2_560, 1.25  # of RRTConnect in the first turn, and factor from turn to turn
+ITERATIONS, GROWTH = 20_480, 1.25  # of compiled trees in the first turn, and factor from turn to turn
 
 
 @dataclass(frozen=True)

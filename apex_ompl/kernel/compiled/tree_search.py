@@ -1,7 +1,9 @@
 """RRT-Connect (Kuffner and LaValle, 2000) in compiled code, on what the spheres prove.
 
-Two trees of states, one of starts and one of goals, grow in turn: the node that is nearest to a random state makes a
-step of at most a given length towards it, and the other tree then goes straight for the new node as far as it can.
+Of two trees of states, one of starts and one of goals, the smaller grows: its node that is nearest to a random state
+makes a step of at most a given length towards it, and the other tree then goes straight for the new node as far as it
+can. (Trees that grow in turn, as published, take twice as long where one of them has to find its way out of a narrow
+place.)
 
 Motions are checked as elsewhere in a search: states of a grid over them, and intervals as a whole where the bounds on
 displacements suffice. A state that the spheres do not prove free counts as blocked, whether it collides or not, so that
@@ -59,7 +61,7 @@ def grow_trees(
         resolution: Largest spacing of the states that are checked [rad, max-norm].
         states: Nodes of the trees as columns, shape (2, dof, M).
         parents: Their parents, -1 for roots, shape (2, M).
-        sizes: Numbers of nodes, and of the tree whose turn it is, shape (3,).
+        sizes: Numbers of nodes, and of the tree whose turn it is where they are equal, shape (3,).
         met: Gets the nodes at which the trees met, shape (2,).
         squares: Memory, shape (M,).
         target: Memory, shape (dof,).
@@ -79,7 +81,7 @@ def grow_trees(
     dof, room = states.shape[1], states.shape[2]
     met[0] = met[1] = -1
     for k in range(len(samples)):
-        first = sizes[2]
+        first = sizes[2] if sizes[0] == sizes[1] else int(sizes[1] < sizes[0])
         sizes[2] = 1 - first
         tree, new, near = first, -1, -1
         for i in range(dof):
