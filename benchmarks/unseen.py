@@ -7,7 +7,7 @@ under the checkpoint's digest; controls of a network are those of the one that s
 Planners are tuned on the first 16 problems of a level, which are left out by default.
 Each run is stored in benchmarks/runs/unseen when it ends; the command resumes where it was stopped.
 
-Usage: python benchmarks/unseen.py [LEVEL ...] [-n 20] [--first 16] [--rows NAME ...] [--model FOLDER] [--jobs 1]
+Usage: python benchmarks/unseen.py [LEVEL ...] [-n 34] [--first 16] [--rows NAME ...] [--model FOLDER] [--jobs 1]
        [--report]
 """
 
@@ -36,7 +36,7 @@ DEPENDS = (
 )  # fmt: skip
 FOLDER = record.RESULTS.parent / "runs" / "unseen"
 TIMEOUT = 10.0  # [s]
-FROZEN = 36  # problems of a level
+FROZEN = 50  # problems of a level
 TUNED_ON = 16  # the first of these
 SUITE = "unseen"
 CONTROLS = ("bumps", "random weights", "shuffled conditions", "nearest paths")

@@ -15,7 +15,7 @@ Value = bool | int | float
 TUNED: Mapping[str, Mapping[str, Value]] = MappingProxyType({
     "rrtconnect": {"range": 1.0},
     "rrtconnect+polish": {"range": 0.85},
-    "apex": {"range": 1.0, "sprint": 2000, "first": 4},
+    "apex": {"range": 1.0, "sprint": 2000, "first": 2},
     "roboplan": {"max_connection_distance": 0.7},
     "aorrtc": {"range": 1.4},
     "rrt": {},

@@ -36,7 +36,7 @@ FOLDER = Path(__file__).parent / "frozen"
 SUMS = "SHA256SUMS"
 SCHEMA = "apex-ompl/frozen/1"
 COUNTS = {
-    "validation": {"static": 30, "extreme": 20, "moving": 10, "unseen": 36},
+    "validation": {"static": 30, "extreme": 20, "moving": 10, "unseen": 50},
     "test": {"static": 100, "extreme": 30, "moving": 20, "unseen": 0},
 }  # problems of a level of each kind
 FROZEN = {**LEVELS, **VALIDATION}

@@ -1,7 +1,7 @@
 """Draw the frozen validation and test problems of the suites, find a witness for each, and write their files.
 
-Draws for which no witness is found are dropped and drawn anew. Files that exist are left alone, since results refer
-to them; --replace draws them again.
+Draws for which no witness is found are dropped and drawn anew. Problems that exist are left alone, since results refer
+to them, and missing ones are added; --replace draws all again.
 --mend finds new witnesses for the problems named, which stay as they are.
 
 Witnesses among obstacles that stand still are found by rrtconnect, and on ``extreme`` by apex, or else by rrtconnect
@@ -169,14 +169,25 @@ def _ways_aside(problem: Problem, line: Array) -> Iterator[tuple[Array, Array]]:
             yield np.concatenate([away, on]), np.concatenate([first, second])
 
 
-def freeze(level: tuple[str, str]) -> tuple[dict[int, FrozenProblem], int, float]:
-    """Return the frozen problems of a suite and level by seed, how many draws had no witness, and the time taken."""
-    found: dict[int, FrozenProblem] = {}
-    dropped, begin = 0, time.perf_counter()
-    for split in frozen.COUNTS:
-        for seed in frozen.frozen_seeds(*level, split):
-            found[seed], failures = freeze_problem(ProblemId(*level, seed))
-            dropped += failures
+def seeds(level: tuple[str, str]) -> set[int]:
+    """Return the seeds of the problems of a suite and level that are to be frozen."""
+    return {seed for split in frozen.COUNTS for seed in frozen.frozen_seeds(*level, split)}
+
+
+def is_complete(level: tuple[str, str]) -> bool:
+    """Whether all problems of a suite and level are frozen."""
+    return frozen.exists(*level) and set(frozen.load_level(*level)[0]) == seeds(level)
+
+
+def freeze(level: tuple[str, str], anew: bool) -> tuple[dict[int, FrozenProblem], int, float]:
+    """Return the frozen problems of a suite and level by seed, how many draws had no witness, and the time taken.
+
+    Those that exist are kept, unless all are to be drawn anew.
+    """
+    begin, (found, dropped) = time.perf_counter(), ({}, 0) if anew else frozen.load_level(*level)
+    for seed in sorted(seeds(level) - set(found)):
+        found[seed], failures = freeze_problem(ProblemId(*level, seed))
+        dropped += failures
     return found, dropped, time.perf_counter() - begin
 
 
@@ -218,7 +229,7 @@ def main() -> None:
     """Freeze the levels named, or all that are missing."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("levels", nargs="*", metavar="SUITE/LEVEL")
-    parser.add_argument("--replace", action="store_true", help="draw levels again whose files exist")
+    parser.add_argument("--replace", action="store_true", help="draw problems again that exist")
     parser.add_argument("--mend", action="store_true", help="find new witnesses for the problems named")
     parser.add_argument("--jobs", type=one_or_more, default=2)
     args = parser.parse_args()
@@ -229,17 +240,17 @@ def main() -> None:
         if name not in every:
             raise SystemExit(f"unknown level {name!r}; known: {', '.join(every)}")
     wanted = [every[name] for name in args.levels or every]
-    todo = [pair for pair in wanted if args.replace or not frozen.exists(*pair)]
+    todo = [pair for pair in wanted if args.replace or not is_complete(pair)]
     todo.sort(key=lambda pair: pair[1] not in ("extreme", "hard", "medium"))  # the slowest levels first
     failed = 0
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(args.jobs, mp_context=context) as pool:
-        jobs = {pool.submit(freeze, pair): pair for pair in todo}
+        jobs = {pool.submit(freeze, pair, args.replace or not frozen.exists(*pair)): pair for pair in todo}
         for job in as_completed(jobs):
             name = "/".join(jobs[job])
             try:
                 found, dropped, spent = job.result()
-                size = frozen.save(*jobs[job], found, dropped, replace=args.replace)
+                size = frozen.save(*jobs[job], found, dropped, replace=True)
             except Exception as error:  # the other levels go on
                 failed += 1
                 print(f"{name}: {error!r}", flush=True)

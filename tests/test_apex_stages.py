@@ -103,7 +103,7 @@ def test_valid_paths_that_pass_too_near_are_resampled(ready: PlanningSetup) -> N
 @pytest.mark.parametrize(("sprint", "by"), [(0, "apex"), (ApexParameters().sprint, "sprint")])
 def test_the_same_seed_gives_the_same_path_also_in_threads(sprint: int, by: str) -> None:
     def length(_: int) -> list[float]:
-        result = plan(cached_problem(HARD), timeout=60.0, params={"seed": 5, "sprint": sprint})
+        result = plan(cached_problem(HARD), timeout=60.0, params={"seed": 7, "sprint": sprint})
         assert result.solved_by.startswith(by)
         return [result.length, *result.path[100]]
 

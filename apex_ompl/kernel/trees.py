@@ -38,9 +38,10 @@ class TreePair:
         """
         limits = kernel.robot.arrays
         longest = min(longest, float(np.linalg.norm(limits.upper - limits.lower)))  # no step is longer
-        self._kernel, self._longest, self._resolution, self._rng = kernel, longest, resolution, rng
+        self._kernel, self._longest, self._resolution = kernel, longest, resolution
         dof, most = kernel.robot.dof, max(len(starts), len(goals))
         self._starts, self._goals = starts, goals
+        self._rng, self._normal_rng = rng, rng.spawn(1)[0]
         self._sizes = np.array([len(starts), len(goals), 0], np.int64)
         room = max(ROOM, 2 * most)
         self._states, self._parents = np.zeros((2, dof, room)), np.full((2, room), -1, np.int64)
@@ -82,14 +83,18 @@ class TreePair:
         return None
 
     def _random_states(self, count: int) -> Array:
-        """Return states of which some are uniform in the limits, and some lie around lines from starts to goals."""
-        limits, rng = self._kernel.robot.arrays, self._rng
-        states = rng.uniform(limits.lower, limits.upper, (count, len(limits.lower)))
-        near = np.flatnonzero(rng.random(count) < NEAR)
-        starts = self._starts[rng.integers(len(self._starts), size=len(near))]
-        goals = self._goals[rng.integers(len(self._goals), size=len(near))]
-        along, spread = rng.random((2, len(near), 1))
-        around = starts + along * (goals - starts) + SPREAD * spread * rng.standard_normal(starts.shape)
+        """Return states of which some are uniform in the limits, and some lie around lines from starts to goals.
+
+        They are the same however many are drawn at once.
+        """
+        limits, dof = self._kernel.robot.arrays, self._starts.shape[1]
+        share, normal = self._rng.random((count, dof + 5)), self._normal_rng.standard_normal((count, dof))
+        states = limits.lower + share[:, :dof] * (limits.upper - limits.lower)
+        near = np.flatnonzero(share[:, dof] < NEAR)
+        which, along, spread = share[near, dof + 1 : dof + 3], share[near, dof + 3, None], share[near, dof + 4, None]
+        starts = self._starts[(which[:, 0] * len(self._starts)).astype(int)]
+        goals = self._goals[(which[:, 1] * len(self._goals)).astype(int)]
+        around = starts + along * (goals - starts) + SPREAD * spread * normal[near]
         states[near] = np.clip(around, limits.lower, limits.upper)
         return states
 
