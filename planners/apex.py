@@ -141,6 +141,6 @@ class APEX(ob.Planner):
             optimizer=self.optimizer, report=self.report, experience=self.experience,
             rejected_lines=self.rejected_lines, lambda_obs=parameters.lambda_obs, rng=generator.spawn(1)[0],
         )  # fmt: skip
-        shorten = Shorten() if parameters.polish else None
+        shorten = Shorten(parameters.range if parameters.fallback else None) if parameters.polish else None
         inputs = self.getPlannerInputStates()
         return solve(context, inputs, parameters.stages(), shorten, Anytime(parameters.anytime))

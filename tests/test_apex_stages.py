@@ -13,7 +13,7 @@ from planning import DIFFUSION_ONLY, EXACT, HARD, TIMEOUT, cached_problem, state
 
 from apex_ompl import plan, planners
 from apex_ompl.apex.path_validator import PathValidator
-from apex_ompl.apex.stages import Propose, TakeTurns
+from apex_ompl.apex.stages import Propose, TakeTurns, shorten
 from apex_ompl.apex.stages.turns import ITERATIONS
 from apex_ompl.ompl_adapter.setup import PlanningSetup
 from apex_ompl.ompl_adapter.validity import full_check
@@ -113,6 +113,23 @@ def test_the_same_seed_gives_the_same_path_also_in_threads(sprint: int, by: str)
         assert all(found == alone for found in pool.map(length, range(2)))
     assert torch.get_num_threads() == threads
     assert plan(cached_problem(HARD), timeout=60.0, params={"seed": 6, "sprint": sprint}).length != alone[0]
+
+
+def test_a_long_way_round_is_taken_where_other_trees_find_no_shorter_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    def lengths(others: int) -> list[float]:
+        monkeypatch.setattr(shorten, "OTHERS", others)
+        found = []
+        for seed in range(6):
+            params = {"model": "none", "line": False, "seed": seed, "polish": True}
+            result = plan(cached_problem("cage/hard/800004"), timeout=20.0, params=params)
+            assert result and result.solved_by == "sprint"
+            found.append(result.length)
+        return found
+
+    monkeypatch.setattr(shorten, "DETOUR", 1.2)
+    once, again = lengths(0), lengths(3)
+    assert sum(again) < 0.97 * sum(once)
+    assert once == lengths(0), "the same seeds, the same paths"
 
 
 def test_with_time_left_paths_only_get_shorter(ready: PlanningSetup) -> None:

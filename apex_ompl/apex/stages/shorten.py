@@ -7,18 +7,29 @@ from dataclasses import dataclass
 from ompl import geometric as og
 
 from apex_ompl.apex.context import SolveContext
+from apex_ompl.apex.trees import compiled_trees, grow
 from apex_ompl.kernel.shortcuts import shortcut
 from apex_ompl.ompl_adapter.simplify import simplify
-from apex_ompl.trajopt.path import Path
+from apex_ompl.trajopt.path import Path, path_length
 from apex_ompl.types import Array
 
+DETOUR, OTHERS = 2.2, 2  # times the straight line's length, beyond which so many other trees are tried
+ITERATIONS = 2_000  # of each of these
 DRAWS = 100  # shortcuts that are tried
 RESOLUTION = 0.01  # of the states along them [rad, max-norm]
 
 
 @dataclass(frozen=True)
 class Shorten:
-    """Shorten the best path; a polyline is cut short, and fitted by a spline, before it is optimised."""
+    """Shorten the best path; a polyline is cut short, and fitted by a spline, before it is optimised.
+
+    A polyline that stays far longer than the straight line goes a long way round: others are looked for by trees.
+
+    Attributes:
+        tree_range: Longest step of these trees; 0 lets OMPL choose, None is for no trees [rad].
+    """
+
+    tree_range: float | None = None
 
     def run(self, context: SolveContext) -> None:
         """Accept what is shorter."""
@@ -27,19 +38,31 @@ class Shorten:
         control = context.best.control
         self._optimize(context, self._simplified(context, context.best) if control is None else control)
 
-    @staticmethod
-    def _simplified(context: SolveContext, path: Path) -> Array:
+    def _simplified(self, context: SolveContext, path: Path) -> Array:
         """Return control points of the simplified path, which is accepted where it is valid and shorter."""
         with context.report.timed("simplify"):
             if context.validator.exclusive:
-                states, looked = shortcut(context.kernel, path.states, DRAWS, RESOLUTION, context.rng.spawn(1)[0])
-                context.note_search(looked)
+                found = self._cut_short(context, path.states)
             else:  # one attempt at a time: foreign checkers may be slow
-                states = simplify(og.PathSimplifier(context.si), context.si, path.states, context.stop, 1)
-            short = Path(states)
-            if short.length < path.length and context.is_valid(states):
-                context.accept(short)
-        return context.fit(states)
+                found = [simplify(og.PathSimplifier(context.si), context.si, path.states, context.stop, 1)]
+            for states in found:
+                short = Path(states)
+                if short.length < path.length and context.is_valid(states):
+                    context.accept(short)
+                    return context.fit(states)
+        return context.fit(found[0])
+
+    def _cut_short(self, context: SolveContext, states: Array) -> list[Array]:
+        """Return a polyline, and others in its place where it goes a long way round, cut short; the shortest first."""
+        found = [_shortcut(context, states)]
+        for _ in range(0 if self.tree_range is None else OTHERS):
+            if context.stop() or path_length(found[0]) <= DETOUR * path_length(states[[0, -1]]):
+                break
+            assert self.tree_range is not None
+            other = grow(context, compiled_trees(context, [states[0]], [states[-1]], self.tree_range), ITERATIONS)
+            found += [] if other is None else [_shortcut(context, other)]
+            found.sort(key=path_length)
+        return found
 
     @staticmethod
     def _optimize(context: SolveContext, control: Array) -> None:
@@ -49,3 +72,10 @@ class Shorten:
             better = context.optimizer.shorten(context.kernel, control, context.is_valid, context.stop)
         if better is not None:
             context.accept_if_shorter(better)
+
+
+def _shortcut(context: SolveContext, states: Array) -> Array:
+    """Return a polyline cut short."""
+    short, looked = shortcut(context.kernel, states, DRAWS, RESOLUTION, context.rng.spawn(1)[0])
+    context.note_search(looked)
+    return short
