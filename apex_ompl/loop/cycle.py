@@ -10,7 +10,7 @@ import numpy as np
 
 from apex_ompl.live.movers import Movers
 from apex_ompl.loop.executor import Executor
-from apex_ompl.loop.following import Following, executed
+from apex_ompl.loop.following import SAME_TIME, Following, executed
 from apex_ompl.loop.observation import Observation
 from apex_ompl.loop.ready import Ready
 from apex_ompl.loop.replanning import Replanning
@@ -19,6 +19,8 @@ from apex_ompl.loop.tracking import Tracker, as_they_are
 from apex_ompl.problems.worlds import World
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.trajectory import Trajectory
+
+LONGEST_STOP = 5.0  # behind which a run ends that does not come to rest when the time is up [s]
 
 
 class Eyes(Protocol):
@@ -102,17 +104,20 @@ class Loop:
             soon = now + np.array([0.0, 1.0, 2.0]) * settings.budget
             tracker.eased(predicted, executor.state(now), soon)
             records = _records(tracker, predicted, now)
+        if now >= settings.timeout - SAME_TIME and not executor.done(now):
+            executor.close(now)
         executor.step(now, predicted, records)
         if not self._begun and executor.route is not None:
             self._world.begin(executor.route.motion, max(executor.route.begin, now))
             self._begun = True
-        if executor.done(now):
+        if executor.done(now) and not executor.closed:
             executor.log(now, "goal")
             return self._ended(now, True, "")
         self._rest = self._rest + settings.period if executor.following.at_rest(now) else 0.0
         if self._rest > settings.stuck:
             return self._ended(now, False, "stuck")
-        return self._ended(now, False, "timeout") if now >= settings.timeout - 1e-9 else None
+        over = executor.closed and (executor.following.at_rest(now) or now >= settings.timeout + LONGEST_STOP)
+        return self._ended(now, False, "timeout") if over else None
 
     def _ended(self, now: float, reached: bool, why: str) -> RunRecord:
         trajectory = executed(self.executor.followed, now)

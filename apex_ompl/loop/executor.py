@@ -54,6 +54,7 @@ class Executor:
         conflict: Time of the first conflict of what is followed [s], or infinity.
         endangered: Since when a conflict is known that the command does not answer yet [s], or None.
         nearest: Distance of an obstacle below which the motion counts as blocked, where that goes by distance [m].
+        closed: Whether the time is up: no motion is asked for or taken any more.
         leaving: Whether the robot leaves a place that an obstacle comes to, and goes on without a proved stop.
         lead: How long before a step it is decided, by what was seen until then [s].
         ahead: How long before the conflict that was [s].
@@ -66,6 +67,7 @@ class Executor:
     seed: int
     following: Following
     stop: Following | None = None
+    closed: bool = False
     followed: list[tuple[float, Following]] = field(default_factory=list)
     events: list[Event] = field(default_factory=list)
     route: Following | None = None
@@ -98,7 +100,8 @@ class Executor:
         """
         settings = self.ready.settings
         reachable = self.tracker.reachable(settings.error, settings.fastest) if settings.guarded else None
-        self._answer(now, predicted, reachable)
+        if not self.closed:
+            self._answer(now, predicted, reachable)
         if settings.monitored:
             self._look(now, predicted)
             if settings.from_rest:
@@ -106,7 +109,23 @@ class Executor:
         if reachable is not None:
             self._brake(now, predicted)
             self._guard(now, reachable, predicted)
-        self._ask(now, predicted, obstacles)
+        if not self.closed:
+            self._ask(now, predicted, obstacles)
+
+    def close(self, now: float) -> None:
+        """Come to rest, since the time is up: follow the stop in hand. To be called before the step of a time.
+
+        Args:
+            now: Time of the clock [s].
+        """
+        if self.closed:
+            return
+        self.closed, self.pending = True, None
+        if self.following.at_rest(now):
+            return
+        stop = self.stop if self.ready.settings.guarded else self.ready.unproved_stop(self.following, now)
+        if stop is not None and stop is not self.following:
+            self._follow_stop(now, stop)
 
     def _look(self, now: float, predicted: Movers) -> None:
         """Find the first conflict of what is followed."""

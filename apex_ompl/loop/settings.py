@@ -42,7 +42,7 @@ class LoopSettings:
         berth: Distance beyond it at which motions are optimised to pass by, where there is room [m].
         error: Largest error of an observed place, for the guarantee [m].
         fastest: Largest speed of any obstacle, for the guarantee [m/s].
-        timeout: Time after which a run ends [s].
+        timeout: Time after which a run ends [s]; a robot that moves then stops first.
         stuck: Time of rest after which a run ends [s].
     """
 
