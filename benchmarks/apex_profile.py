@@ -40,7 +40,7 @@ TIMEOUT, SEED = 5.0, 1  # [s]
 TREELESS = {"fallback": False, "bridge": False}
 HARD = tuple(f"{suite}/hard" for suite in ("shelf", "bins", "cage", "posts", "wall", "swap", "clutter"))
 OPEN = ("vertical/free", "vertical/small", "horizontal/small", "bins/easy", "wall/easy")
-SPRINTS = (0, 40, 160, 400, 640)  # iterations
+SPRINTS = (0, 200, 800, 2000, 5000)  # iterations of compiled trees
 RUNNER = "apex_profile:run_variant"
 VARIANTS: dict[str, tuple[dict[str, Any], int | None]] = {
     "as it is": ({}, None),

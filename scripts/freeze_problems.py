@@ -184,7 +184,8 @@ def freeze(level: tuple[str, str], anew: bool) -> tuple[dict[int, FrozenProblem]
 
     Those that exist are kept, unless all are to be drawn anew.
     """
-    begin, (found, dropped) = time.perf_counter(), ({}, 0) if anew else frozen.load_level(*level)
+    begin, kept = time.perf_counter(), frozen.exists(*level) and not anew
+    found, dropped = frozen.load_level(*level) if kept else ({}, 0)
     for seed in sorted(seeds(level) - set(found)):
         found[seed], failures = freeze_problem(ProblemId(*level, seed))
         dropped += failures
@@ -245,7 +246,7 @@ def main() -> None:
     failed = 0
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(args.jobs, mp_context=context) as pool:
-        jobs = {pool.submit(freeze, pair, args.replace or not frozen.exists(*pair)): pair for pair in todo}
+        jobs = {pool.submit(freeze, pair, args.replace): pair for pair in todo}
         for job in as_completed(jobs):
             name = "/".join(jobs[job])
             try:

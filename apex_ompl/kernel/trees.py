@@ -14,12 +14,14 @@ from apex_ompl.types import Array
 AT_ONCE = 256  # random states between two looks at the clock
 ROOM = 1024  # nodes of a tree to begin with
 NEAR = 0.5  # share of random states that lie around a straight line between a start and a goal
-SPREAD = 2.0  # of these about the line, at most [rad]
+SPREAD = 2.0  # standard deviation of these from the line, at most [rad]
 
 
 class TreePair:
     """RRT-Connect on what a kernel proves, from some starts to some goals; it goes on where it stopped.
 
+    A share NEAR of the random states is normally distributed around straight lines from starts to goals; the others are
+    uniform in the limits.
     States that the kernel cannot prove free count as blocked (:mod:`apex_ompl.kernel.compiled.tree_search`).
     """
 

@@ -121,9 +121,7 @@ class Executor:
         if self.closed:
             return
         self.closed, self.pending = True, None
-        if self.following.at_rest(now):
-            return
-        stop = self.stop if self.ready.settings.guarded else self.ready.unproved_stop(self.following, now)
+        stop = None if self.following.at_rest(now) else self._stop_at(now)
         if stop is not None and stop is not self.following:
             self._follow_stop(now, stop)
 
@@ -166,10 +164,13 @@ class Executor:
         """Stop where the way to a goal is blocked."""
         if not (math.isfinite(self.conflict) and self.following.to_goal) or self.following.at_rest(now):
             return
-        guarded = self.ready.settings.guarded
-        stop = self.stop if guarded else self.ready.unproved_stop(self.following, now)
+        stop = self._stop_at(now)
         if stop is not None and not stop.to_goal:
             self._follow_stop(now, stop)
+
+    def _stop_at(self, now: float) -> Following | None:
+        """Return the stop in hand, or one that is not proved where none is wanted; None where there is none."""
+        return self.stop if self.ready.settings.guarded else self.ready.unproved_stop(self.following, now)
 
     def _follow_stop(self, now: float, stop: Following) -> None:
         self.log(now, "stop", at=stop.end)

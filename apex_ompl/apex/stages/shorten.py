@@ -55,10 +55,11 @@ class Shorten:
     def _cut_short(self, context: SolveContext, states: Array) -> list[Array]:
         """Return a polyline, and others in its place where it goes a long way round, cut short; the shortest first."""
         found = [_shortcut(context, states)]
-        for _ in range(0 if self.tree_range is None else OTHERS):
+        if self.tree_range is None:
+            return found
+        for _ in range(OTHERS):
             if context.stop() or path_length(found[0]) <= DETOUR * path_length(states[[0, -1]]):
                 break
-            assert self.tree_range is not None
             other = grow(context, compiled_trees(context, [states[0]], [states[-1]], self.tree_range), ITERATIONS)
             found += [] if other is None else [_shortcut(context, other)]
             found.sort(key=path_length)

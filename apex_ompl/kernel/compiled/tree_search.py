@@ -2,8 +2,8 @@
 
 Of two trees of states, one of starts and one of goals, the smaller grows: its node that is nearest to a random state
 makes a step of at most a given length towards it, and the other tree then goes straight for the new node as far as it
-can. (Trees that grow in turn, as published, take twice as long where one of them has to find its way out of a narrow
-place.)
+can. (Balanced trees, LaValle, Planning Algorithms, 2006, section 5.5.3. Where trees grow in turn, the one in the open
+fills the room while the other is still in a narrow place.)
 
 Motions are checked as elsewhere in a search: states of a grid over them, and intervals as a whole where the bounds on
 displacements suffice. A state that the spheres do not prove free counts as blocked, whether it collides or not, so that
