@@ -129,8 +129,20 @@ GAUSSIAN_PROCESS = [
     supports(0.12, 0.006, 12, 10.0),
 ]
 
-BASELINES: dict[str, list[dict[str, Any]]] = {"gpmp": GAUSSIAN_PROCESS, "gpmp2": GAUSSIAN_PROCESS}
-"""Candidates of the baselines of the paper, values of the size of the authors' examples first."""
+BASELINES: dict[str, list[dict[str, Any]]] = {
+    "gpmp": GAUSSIAN_PROCESS,
+    "gpmp2": GAUSSIAN_PROCESS,
+    "drrt": [
+        *ranges(0.7, 0.3, 1.0, 1.4, 2.0, 3.0, goal_bias=0.1),
+        *ranges(1.4, 2.0, goal_bias=0.3),
+    ],
+    "damon": [
+        *({"model": "damon-8", "nodes": "decoded", "connections": count} for count in (100, 300, 1000, 3000, 10_000)),
+        *({"model": "damon-8", "nodes": "stored", "connections": count} for count in (1000, 3000)),
+        {"model": "damon-4", "nodes": "decoded", "connections": 1000},
+    ],
+}
+"""Candidates of the baselines of the paper: values of the size of the authors' examples, or usual ones, first."""
 
 
 @dataclass(frozen=True)

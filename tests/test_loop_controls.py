@@ -15,6 +15,7 @@ from apex_ompl.loop.mppi import softmax
 from apex_ompl.loop.potential_field import Field, PotentialField, repulsive
 from apex_ompl.loop.result import Outcome
 from apex_ompl.loop.run import run
+from apex_ompl.loop.sensor import Sensor
 from apex_ompl.loop.short_horizon import Horizon
 from apex_ompl.scene.bodies import Obstacle
 
@@ -48,6 +49,16 @@ def test_a_box_that_crosses_is_not_run_into(name: str) -> None:
     if report.contact is not None and report.contact.moved:  # only a robot that leaves a place that the box comes to
         accepted = [event for event in done.events if event.kind == "accepted" and event.time <= report.contact.time]
         assert accepted[-1].data["leaving"]
+
+
+def test_without_the_guard_more_is_risked_and_what_is_foreseen_is_not_seen() -> None:
+    guarded, risked = run(MOVING, "apex"), run(MOVING, "apex-unguarded")
+    assert guarded.settings["loop"] | {"guarded": False} == risked.settings["loop"]
+    told, again = (run(MOVING, "apex-foreseeing", sensor=Sensor(seed=seed)) for seed in (0, 1))
+    assert told.outcome is Outcome.REACHED and told.prediction == "truth"
+    assert np.array_equal(told.trajectory.positions, again.trajectory.positions)
+    seen = run(MOVING, "apex-unguarded", sensor=Sensor(seed=1))
+    assert not np.array_equal(risked.trajectory.positions, seen.trajectory.positions)
 
 
 @pytest.mark.parametrize("seed", range(20))

@@ -49,10 +49,18 @@ def _no_network(*, waits: bool = True) -> Portfolio:
     return Portfolio([Faster(), Route(), Lines(), Lines(bumps=3)], waits=waits)
 
 
+def _all_parts() -> Portfolio:
+    return Portfolio([Faster(), Route(), Lines(), Proposals(), Lines(bumps=3)])
+
+
 METHODS = {
-    "apex": Method(
-        lambda: Portfolio([Faster(), Route(), Lines(), Proposals(), Lines(bumps=3)]), {},
-        "all parts, the network among them",
+    "apex": Method(_all_parts, {}, "all parts, the network among them"),
+    "apex-unguarded": Method(
+        _all_parts, {"guarded": False}, "all parts, without a proved stop in hand: what the guarantee costs"
+    ),
+    "apex-foreseeing": Method(
+        _all_parts, {"guarded": False, "prediction": "truth"},
+        "the same, told where obstacles are and how they move: what better eyes could gain",
     ),
     "no-network": Method(_no_network, {}, "all parts but the network's proposals"),
     "apex-renoise": Method(

@@ -19,7 +19,7 @@ from apex_ompl.problems.catalogue import SPLITS
 
 LEVELS = tuple(level for level in STATIC if level.endswith(("/small", "/medium", "/large")))
 """Levels that the models know from training."""
-PLANNED = ("rrt", "rrtconnect", "drrt", "gpmp", "gpmp2", "il", "damon, decoded", "damon, stored")
+PLANNED = ("rrt", "rrtconnect", "drrt", "gpmp", "gpmp2", "il", "damon", "damon, stored")
 LIMIT = 2.0  # of a planner [s]
 LEAST = 4  # paths of a row, for an interval
 

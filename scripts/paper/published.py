@@ -117,8 +117,7 @@ RIVALS = (
     Rival("IL", "25.79", "5.23", "il", "il", "a transformer that sees all cubes; rolled out, unrepaired"),
     Rival("IL", "", "", "il-paper", "", "the same with one obstacle point, as the paper's condition"),
     Rival("IL", "", "", "il, repaired", "", "a control: the same, then trajectory optimization"),
-    Rival("DAMON", "32.65", "6.25", "damon, decoded", "damon", "made from its abstract; states decoded from a plane"),
-    Rival("DAMON", "", "", "damon, stored", "", "the same with the states that the plane was learned from"),
-    Rival("DAMON", "", "", "damon, decoded, 4 dimensions", "", "the same with four dimensions"),
-    Rival("DAMON", "", "", "damon, decoded, 8 dimensions", "", "the same with eight"),
-)
+    Rival("DAMON", "32.65", "6.25", "damon", "damon", "made from its abstract; states decoded from eight dimensions"),
+    Rival("DAMON", "", "", "damon, 2 dimensions", "", "the same from a plane"),
+    Rival("DAMON", "", "", "damon, 4 dimensions", "", "the same from four"),
+    Rival("DAMON", "", "", "damon, stored", "", "the states that were encoded, and none decoded"),

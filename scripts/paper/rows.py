@@ -34,10 +34,10 @@ PLANNERS = (
     Row("il", "il", {"repair": False}),
     Row("il, repaired", "il", {"repair": True}),
     Row("il-paper", "il-paper"),
-    Row("damon, decoded", "damon", {"nodes": "decoded"}),
-    Row("damon, stored", "damon", {"nodes": "stored"}),
-    Row("damon, decoded, 4 dimensions", "damon", {"nodes": "decoded", "model": "damon-4"}),
-    Row("damon, decoded, 8 dimensions", "damon", {"nodes": "decoded", "model": "damon-8"}),
+    Row("damon", "damon", {"model": "damon-8", "nodes": "decoded"}),
+    Row("damon, 2 dimensions", "damon", {"model": "damon-2", "nodes": "decoded"}),
+    Row("damon, 4 dimensions", "damon", {"model": "damon-4", "nodes": "decoded"}),
+    Row("damon, stored", "damon", {"model": "damon-8", "nodes": "stored"}),
 )
 """Planners, as the benchmark runs them. ``apex's model alone`` has neither trees nor repair, as ``apex-paper``."""
 
@@ -82,7 +82,7 @@ COLOURS = {
     OURS: "#0b6e4f", "apex, unguided": "#9fc8b7", FAITHFUL: "#3d5a80", UNGUIDED: "#98b6d8",
     "apex's model alone": "#7a5195", "apex's model alone, unguided": "#c9a6d6", "rrt": "#c8553d",
     "rrtconnect": "#e0a458", "drrt": "#a3443b", "gpmp": "#6a994e", "gpmp2": "#386641", "il": "#bc6c25",
-    "il, repaired": "#dda15e", "il-paper": "#7f5539", "damon": "#5f0f40", "damon, decoded": "#5f0f40",
+    "il, repaired": "#dda15e", "il-paper": "#7f5539", "damon": "#5f0f40",
     "damon, stored": "#9a348e", "no-network": "#4f9d7f", "stop-and-wait": "#8d99ae", "blind": "#555555",
 }  # fmt: skip
 
