@@ -121,3 +121,4 @@ RIVALS = (
     Rival("DAMON", "", "", "damon, 2 dimensions", "", "the same from a plane"),
     Rival("DAMON", "", "", "damon, 4 dimensions", "", "the same from four"),
     Rival("DAMON", "", "", "damon, stored", "", "the states that were encoded, and none decoded"),
+)
