@@ -136,10 +136,10 @@ BASELINES: dict[str, list[dict[str, Any]]] = {
         *ranges(0.7, 0.3, 1.0, 1.4, 2.0, 3.0, goal_bias=0.1),
         *ranges(1.4, 2.0, goal_bias=0.3),
     ],
-    "damon": [
-        *({"model": "damon-8", "nodes": "decoded", "connections": count} for count in (100, 300, 1000, 3000, 10_000)),
-        *({"model": "damon-8", "nodes": "stored", "connections": count} for count in (1000, 3000)),
-        {"model": "damon-4", "nodes": "decoded", "connections": 1000},
+    "damon": [  # with nodes that are decoded, as the paper has it
+        *({"model": "damon-8", "connections": count} for count in (100, 300, 1000, 3000, 10_000)),
+        *({"model": f"damon-{dimensions}", "connections": 1000} for dimensions in (4, 2)),
+        {"model": "damon-4", "connections": 3000},
     ],
 }
 """Candidates of the baselines of the paper: values of the size of the authors' examples, or usual ones, first."""
