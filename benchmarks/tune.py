@@ -133,9 +133,9 @@ BASELINES: dict[str, list[dict[str, Any]]] = {
     "gpmp": GAUSSIAN_PROCESS,
     "gpmp2": GAUSSIAN_PROCESS,
     "drrt": [
-        *ranges(0.7, 1.4, 2.0, 3.0, 4.5, goal_bias=0.1),
-        *ranges(2.0, 3.0, goal_bias=0.3),
-        *ranges(3.0, goal_bias=0.05),
+        *ranges(0.7, 1.4, 3.0, 4.5, 6.5, goal_bias=0.1),  # the last is the widest of a joint
+        *ranges(4.5, 6.5, goal_bias=0.05),
+        *ranges(4.5, goal_bias=0.3),
     ],
     "damon": [  # with nodes that are decoded, as the paper has it
         *({"model": "damon-8", "connections": count} for count in (100, 300, 1000, 3000, 10_000)),
