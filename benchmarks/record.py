@@ -15,10 +15,15 @@ from typing import Any
 import numpy as np
 
 from apex_ompl import problems
-from apex_ompl.benchmark import Results
-from apex_ompl.benchmark.metrics import next_percentile
 from apex_ompl.util import provenance
 from apex_ompl.util.files import write_atomically
+
+try:
+    from apex_ompl.benchmark import Results
+    from apex_ompl.benchmark.metrics import next_percentile
+except ImportError as missing:
+    expected = "pip install -c constraints.txt -e '.[bench]'"
+    sys.exit(f"{Path(sys.argv[0]).stem}: error: no {missing.name}, expected: {expected}")
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results"

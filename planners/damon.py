@@ -18,6 +18,7 @@ from apex_ompl.ompl_adapter.report import SolveReport
 from apex_ompl.ompl_adapter.space import array_to_path, forget_states, motions_free
 from apex_ompl.ompl_adapter.validity import StateValidityChecker
 from apex_ompl.planners.registry import Parameters, bounded, one_of, register
+from apex_ompl.planners.tuned import TUNED
 from apex_ompl.roadmaps.damon import Damon
 from apex_ompl.roadmaps.manifold import shared_manifold
 from apex_ompl.trajopt.path import Path
@@ -66,7 +67,8 @@ class DAMON(ob.Planner):
 
     def _solve(self, ptc: ob.PlannerTerminationCondition) -> ob.PlannerStatus:
         begin, inputs, dof = time.perf_counter(), self.getPlannerInputStates(), self._checker.dof
-        starts, goals = read_starts(inputs, dof), read_goals(inputs, dof, ptc)
+        starts = read_starts(inputs, dof)
+        goals = read_goals(inputs, dof, ptc, self.getProblemDefinition().getGoal())
         if not starts:
             self.report.reason = "no start state is valid"
             return Status.INVALID_START
@@ -120,7 +122,7 @@ class DAMON(ob.Planner):
 class DAMONParameters(Parameters):
     """DAMON (arXiv 2203.13282): A* over a graph on a learned manifold of states, reimplemented.
 
-    The number of connections is what ``python benchmarks/roadmaps.py --tune`` chose on the validation split.
+    Manifold and number of connections are what ``python benchmarks/tune.py --baselines`` chose on the validation split.
 
     Attributes:
         model: Name of a folder of the tree's ``benchmarks/baselines``, or a path; it has the dimension of the manifold.
@@ -132,7 +134,7 @@ class DAMONParameters(Parameters):
     smooth: ClassVar[bool] = False
     model: str = "damon-8"
     nodes: str = one_of("decoded", "stored")
-    connections: int = bounded(1000, 1, 10_000)
+    connections: int = bounded(TUNED[NAME]["connections"], 1, 10_000)
 
     def build(self, si: ob.SpaceInformation) -> ob.Planner:
         """Return the planner.

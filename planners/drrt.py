@@ -18,6 +18,7 @@ from apex_ompl.ompl_adapter.report import SolveReport
 from apex_ompl.ompl_adapter.space import array_to_path, forget_states, motions_free
 from apex_ompl.ompl_adapter.validity import MotionValidator, StateValidityChecker
 from apex_ompl.planners.registry import Parameters, bounded, register
+from apex_ompl.planners.tuned import TUNED
 from apex_ompl.roadmaps.dynamic_rrt import DynamicRRT
 from apex_ompl.roadmaps.goal_tree import GoalTree
 from apex_ompl.trajopt.path import Path
@@ -74,7 +75,8 @@ class DRRT(ob.Planner):
     def _solve(self, ptc: ob.PlannerTerminationCondition) -> ob.PlannerStatus:
         si, begin = self.getSpaceInformation(), time.perf_counter()
         dof, inputs = int(si.getStateDimension()), self.getPlannerInputStates()
-        starts, goals = read_starts(inputs, dof), read_goals(inputs, dof, ptc)
+        starts = read_starts(inputs, dof)
+        goals = read_goals(inputs, dof, ptc, self.getProblemDefinition().getGoal())
         if not starts:
             self.report.reason = "no start state is valid"
             return Status.INVALID_START
@@ -129,7 +131,7 @@ class DRRT(ob.Planner):
 class DRRTParameters(Parameters):
     """Dynamic RRT (Ferguson, Kalra and Stentz 2006): a tree from the goal, kept between calls of ``solve``.
 
-    Range and goal bias are what ``python benchmarks/roadmaps.py --tune`` chose on the validation split; the share of
+    Range and goal bias are what ``python benchmarks/tune.py --baselines`` chose on the validation split; the share of
     way-points, which are used from the second call of ``solve`` on, was not tuned.
 
     Attributes:
@@ -139,8 +141,8 @@ class DRRTParameters(Parameters):
         seed: Of the random choices; -1 takes one that follows from OMPL's.
     """
 
-    range: float = bounded(1.4, 1e-3, unit="rad")
-    goal_bias: float = bounded(0.1, 0.0, 1.0)
+    range: float = bounded(TUNED[NAME]["range"], 1e-3, unit="rad")
+    goal_bias: float = bounded(TUNED[NAME]["goal_bias"], 0.0, 1.0)
     waypoint_bias: float = bounded(0.6, 0.0, 1.0)
     seed: int = bounded(-1, -1)
 

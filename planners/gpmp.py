@@ -226,7 +226,8 @@ class GaussianProcessPlanner(ob.Planner):
     def _solve(self, ptc: ob.PlannerTerminationCondition) -> Any:
         begin, report, checker, inputs = time.perf_counter(), self.report, self._checker, self.getPlannerInputStates()
         lower, upper = bounds_of(self.getSpaceInformation(), checker.robot)
-        starts, goals = read_starts(inputs, len(lower)), read_goals(inputs, len(lower), ptc)
+        starts = read_starts(inputs, len(lower))
+        goals = read_goals(inputs, len(lower), ptc, self.getProblemDefinition().getGoal())
         if not starts or not goals:
             report.reason = "no valid start" if not starts else "no valid goal"
             return Status.INVALID_START if not starts else Status.INVALID_GOAL

@@ -86,7 +86,7 @@ class ImitationPlanner(ob.Planner):
         if not starts:
             report.reason = "there is no valid start"
             return Status(Status.INVALID_START)
-        goals = read_goals(inputs, dof, ptc)
+        goals = read_goals(inputs, dof, ptc, self.getProblemDefinition().getGoal())
         if not goals:
             report.reason = "there is no valid goal"
             return Status(Status.INVALID_GOAL)

@@ -10,6 +10,7 @@ against itself and its own arm), never one arm against the other. Three findings
   search from the closest samples finds; that distance is stated.
 
 Usage: python scripts/derive_disabled_pairs.py dual_panda_softhand --soft left_hand --soft right_hand
+       python scripts/derive_disabled_pairs.py my.robot.yaml    (name the file as ``disabled_pairs`` in it then)
 """
 
 from __future__ import annotations
@@ -19,7 +20,6 @@ from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
-from scipy.optimize import minimize
 
 from apex_ompl.collision.hulls import convex_hull
 from apex_ompl.robot import Robot
@@ -95,6 +95,8 @@ def derive(
     robot: Robot, pairs: list[tuple[int, int]], *, samples: int, margin: float, seed: int
 ) -> dict[tuple[int, int], str]:
     """Return pair -> reason for the pairs that always or never collide."""
+    from scipy.optimize import minimize
+
     rng = np.random.default_rng(seed)
     model = PairModel(robot, pairs)
     hits = sum(model.colliding(q).astype(int) for q in robot.random_state(rng, 500))
@@ -133,13 +135,14 @@ def derive(
 def main() -> None:
     """Derive and write the pairs of one robot."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("robot")
+    parser.add_argument("robot", help="one that ships, by name, or a robot file")
     parser.add_argument("--soft", action="append", default=[], metavar="PART")
     parser.add_argument("--samples", type=one_or_more, default=200_000)
     parser.add_argument("--margin", type=float, default=0.02, help="metres")
     parser.add_argument("--seed", type=whole_number, default=0)
     args = parser.parse_args()
-    path = DATA / f"{args.robot}.robot.yaml"
+    ships = DATA / f"{args.robot}.robot.yaml"
+    path = ships if ships.is_file() else Path(args.robot).resolve()
     config = read_config(path)
     robot = build_robot(config.model_copy(update={"disabled_pairs": None}), path)
     items = robot.geometry.geometryObjects
@@ -157,10 +160,10 @@ def main() -> None:
     rows.sort(key=lambda row: row["links"])
     lines = [f"schema: {PAIRS_SCHEMA}", f"# made by scripts/derive_disabled_pairs.py, seed {args.seed}", "pairs:"]
     lines += [f'  - {{links: [{", ".join(r["links"])}], reason: "{r["reason"]}"}}' for r in rows]
-    target = path.parent / (config.disabled_pairs or f"{args.robot}.pairs.yaml")
+    target = path.parent / (config.disabled_pairs or f"{path.name.split('.')[0]}.pairs.yaml")
     write_atomically(Path(target), ("\n".join(lines) + "\n").encode())
     print(f"{len(rows)} of {len(pairs)} pairs disabled -> {target}")
 
 
 if __name__ == "__main__":
-    run_script(main)
+    run_script(main, "bench")

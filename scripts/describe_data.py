@@ -138,4 +138,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    run_script(main, "data")
+    run_script(main, "data,viz")

@@ -15,6 +15,7 @@ from planning import EASY, EXACT, HARD, UserValidityChecker, cached_problem, sta
 from support import ROOT
 
 from apex_ompl import plan, planners
+from apex_ompl.apex.start_goal import read_goals
 from apex_ompl.diffusion.proposals import TrajectoryModel
 from apex_ompl.ompl_adapter.setup import PlanningSetup, assemble
 from apex_ompl.ompl_adapter.space import path_to_array, state_space, to_state
@@ -149,6 +150,40 @@ def test_several_starts_and_goals_of_all_kinds(kind: str, ready: PlanningSetup) 
     wanted = [ready.start] if kind == "region" else [ready.goals[0], far]  # the region holds the start itself
     assert any(np.array_equal(path[-1], one) for one in wanted)
     assert full_check(ready.checker, path)
+
+
+def test_all_states_of_a_goal_are_read_and_a_few_of_a_region(ready: PlanningSetup) -> None:
+    si, rng = ready.simple_setup.getSpaceInformation(), np.random.default_rng(0)
+    around = ready.goals[0] + np.append(0.002 * rng.normal(size=(40, 14)), np.zeros((40, 2)), axis=1)
+    around = around[[ready.checker.is_free(q) for q in around]]
+    assert len(around) > 8
+    found = []
+    for goal in (ob.GoalStates(si), Region(si, around)):
+        if isinstance(goal, ob.GoalStates):
+            for q in around:
+                goal.addState(to_state(si, q))
+        pdef = ob.ProblemDefinition(si)
+        pdef.addStartState(to_state(si, ready.start))
+        pdef.setGoal(goal)
+        planner = APEX(si, ApexParameters(seed=0))
+        planner.setProblemDefinition(pdef)
+        found.append(read_goals(planner.getPlannerInputStates(), len(ready.start), within(1.0), goal))
+    assert np.array_equal(np.stack(found[0]), around) and len(found[1]) == 8
+
+
+def test_more_of_a_region_is_drawn_where_the_first_goal_cannot_be_reached() -> None:
+    """With a checker of the user's: one that lets nobody through between two halves of the first joint."""
+    ready = assemble(cached_problem(EASY), robot())
+    setup = og.SimpleSetup(state_space(robot()))
+    si, beyond = setup.getSpaceInformation(), ready.goals[0].copy()
+    beyond[0] = 2.0
+    setup.setStateValidityChecker(UserValidityChecker(si, lambda q: not 1.4 < q[0] < 1.6))
+    setup.setStartState(to_state(si, ready.start))
+    goal = Region(si, np.stack([*[beyond] * 40, ready.goals[0]]))
+    setup.setGoal(goal)
+    setup.setPlanner(APEX(si, ApexParameters(seed=0, line=False, model="none")))
+    assert setup.solve(within(20.0)).getStatus() == EXACT
+    assert np.array_equal(states(setup)[-1], ready.goals[0]) and goal.count > 40
 
 
 def test_a_goal_that_cannot_be_sampled_is_refused(ready: PlanningSetup) -> None:

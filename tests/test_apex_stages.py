@@ -100,6 +100,20 @@ def test_valid_paths_that_pass_too_near_are_resampled(ready: PlanningSetup) -> N
     assert by_hand - 2e-3 < gaps[1] <= min(by_hand, ready.checker.distance(wary.path[-1]).value) + 1e-5
 
 
+def test_paths_of_trees_are_not_cut_nearer_to_obstacles_than_is_wanted(ready: PlanningSetup) -> None:
+    validator, cut = PathValidator(ready.simple_setup.getSpaceInformation(), ""), 0
+    for seed in range(8):
+        params = {"lambda_obs": 0.05, "line": False, "first": 0, "second": 0, "third": 0}
+        found = [
+            plan(cached_problem(HARD), timeout=20.0, seed=seed, simplify=False, params={**params, "polish": polish})
+            for polish in (False, True)
+        ]
+        first, last = (validator.obstacle_distance(result.path.states) for result in found)
+        assert last >= min(0.05, first) - 5e-3  # the first one's is taken at states 0.1 rad apart
+        cut += found[1].length < found[0].length
+    assert cut >= 4
+
+
 @pytest.mark.parametrize(("sprint", "by"), [(0, "apex"), (ApexParameters().sprint, "sprint")])
 def test_the_same_seed_gives_the_same_path_also_in_threads(sprint: int, by: str) -> None:
     def length(_: int) -> list[float]:

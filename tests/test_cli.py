@@ -50,6 +50,12 @@ def test_json_goes_to_standard_output_alone_and_out_writes_the_same(apex_cli, ea
     assert set(names) <= set(printed)
 
 
+def test_parameters_of_a_file_have_names(apex_cli, easy: Path, tmp_path: Path) -> None:
+    (tmp_path / "params.yaml").write_text("no: true\n")  # which YAML reads as a truth value
+    done = apex_cli("plan", easy, "--params", tmp_path / "params.yaml")
+    assert done.returncode == 2 and one_sentence(done.stderr) and "params.yaml" in done.stderr, done.stderr
+
+
 @pytest.mark.parametrize("suffix", [".npz", ".csv", ".yaml"])
 def test_out_writes_by_suffix(apex_cli, easy: Path, tmp_path: Path, suffix: str) -> None:
     done = apex_cli("plan", easy, "--timeout", 30, "--out", tmp_path / f"r{suffix}")

@@ -10,7 +10,7 @@ from apex_ompl.kernel import Kernel, scene_tables
 from apex_ompl.ompl_adapter.setup import PlanningSetup, assemble
 from apex_ompl.ompl_adapter.validity import full_check
 from apex_ompl.robot import Robot
-from apex_ompl.trajopt.candidates import CandidatePool, first_valid
+from apex_ompl.trajopt.candidates import Candidate, CandidatePool, first_valid
 from apex_ompl.trajopt.optimizer import Optimizer
 from apex_ompl.trajopt.path import path_length
 from apex_ompl.trajopt.settings import OptimizerSettings
@@ -162,6 +162,22 @@ def test_repair_begins_among_what_looks_like_the_obstacles(ready: PlanningSetup,
         assert np.array_equal(found[0].control, found[1].control)
     else:
         assert found[1].exact and not found[0].exact
+
+
+@pytest.mark.parametrize("alike", [True, False])
+def test_what_is_valid_and_not_wanted_is_given_up_for_good(ready: PlanningSetup, alike: bool) -> None:
+    optimizer, kernel, refused = Optimizer(), ready.checker.kernel, []
+    other = Kernel(kernel.robot, kernel.scene if alike else scene_tables([]))
+
+    def is_wanted(candidate: Candidate, path: np.ndarray) -> bool:
+        refused.append((candidate, candidate.control.copy()))
+        return False
+
+    pool = CandidatePool(optimizer, kernel, lambda path: True, is_wanted, rough=lambda: other)
+    starts = optimizer.starts(ready.start, ready.goals[0], 4, np.random.default_rng(1))
+    assert pool.add(starts) is None and pool.improve(400) is None
+    assert len(refused) == len({id(candidate) for candidate, _ in refused}) > 0
+    assert all(one.given_up and np.array_equal(one.control, control) for one, control in refused)
 
 
 def test_it_gives_up_when_told(ready: PlanningSetup) -> None:

@@ -85,6 +85,21 @@ def test_corners_in_the_open_are_left_out() -> None:
     assert np.array_equal(short, np.array(ends))
 
 
+def test_what_is_cut_so_far_is_returned_when_time_is_up() -> None:
+    checker, path = tree_path("bins/hard/800001", 1)
+    dense, _ = sample_path(path, 0.1)  # many corners
+    lengths = []
+    for times in (0, 1, 3, 10, 10_000):
+        left = iter([False] * times)
+        stop = lambda left=left: next(left, True)  # noqa: E731
+        short, _ = shortcut(checker.kernel, dense, 50, RESOLUTION, np.random.default_rng(0), stop)
+        assert np.array_equal(short[[0, -1]], dense[[0, -1]]) and longest_blocked(checker, short) < 2 * RESOLUTION
+        lengths.append(path_length(short))
+    whole, _ = shortcut(checker.kernel, dense, 50, RESOLUTION, np.random.default_rng(0))
+    assert lengths[0] == path_length(dense) and lengths == sorted(lengths, reverse=True)
+    assert lengths[-1] == path_length(whole) < lengths[1] < lengths[0]
+
+
 @pytest.mark.parametrize("count", [1, 2])
 def test_there_is_nothing_to_cut_in_a_state_or_a_motion(count: int) -> None:
     checker, path = tree_path("shelf/hard/800003", 0)

@@ -100,6 +100,17 @@ def test_nothing_is_found_where_the_goal_is_walled_in_or_time_is_up() -> None:
     assert free.grow(10_000) is not None
 
 
+@pytest.mark.parametrize("longest", [0.0, 1e-300, 1e-17, 1e-3])
+def test_the_shortest_steps_end_too_and_ask_for_the_time(longest: float) -> None:
+    checker, start, goals = of_problem(BLOCKED)
+    pair, asked = TreePair(checker.kernel, start, goals, longest, RESOLUTION, np.random.default_rng(0)), []
+    assert pair.grow(40, lambda: bool(asked.append(pair.size))) is None
+    assert len(asked) >= 20 and 2 < pair.size < 40 * 4000
+    left = iter([False, False, False])
+    before = pair.size
+    assert pair.grow(1_000, lambda: next(left, True)) is None and before <= pair.size < before + 3 * 4000
+
+
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 10**6), st.sampled_from([0.1, 0.7, 3.0, 1e9]), st.sampled_from([0.01, 0.1, 5.0]))
 def test_paths_in_the_open_are_found_whatever_the_steps(seed: int, longest: float, resolution: float) -> None:

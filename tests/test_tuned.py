@@ -21,7 +21,7 @@ RESULTS = [
     json.loads((ROOT / "benchmarks" / "results" / f"{name}.json").read_text()) for name in ("tune", "tune_baselines")
 ]
 TUNED = {name: result for one in RESULTS for name, result in one["planners"].items()}
-OWN = ("apex", "rrtconnect+polish", "gpmp", "gpmp2")
+OWN = ("apex", "rrtconnect+polish", "gpmp", "gpmp2", "drrt", "damon")
 PLANNER, FIRST_PROBLEM = "rrt", 800_000
 
 

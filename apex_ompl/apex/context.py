@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -115,9 +116,9 @@ class SolveContext:
             rough=lambda: rough_kernel(self.kernel),
         )  # fmt: skip
 
-    def path_of(self, candidate: Candidate) -> Path:
-        """Return the path of a candidate's control points."""
-        return Path.on(self.optimizer.spline, candidate.control)
+    def spline_path(self, control: Array) -> Path:
+        """Return the path of control points, shape (points, dof)."""
+        return Path.on(self.optimizer.spline, control)
 
     def fit(self, states: Array) -> Array:
         """Return control points of the spline nearest to a polyline, shape (points, dof)."""
@@ -131,7 +132,7 @@ class SolveContext:
         with self.report.timed("distance"):
             distance = self.validator.obstacle_distance(states)
         if distance < self.lambda_obs:
-            self.set_aside.append((distance, candidate))
+            self.set_aside.append((distance, replace(candidate)))  # as it is now
         return distance >= self.lambda_obs
 
     def farthest(self) -> Candidate | None:
@@ -148,16 +149,12 @@ class SolveContext:
         self.best = self.report.best_path = path
         self.pdef.addSolutionPath(array_to_path(self.si, path.states), False, 0.0, "apex")
 
-    def accept_if_shorter(self, control: Array) -> bool:
+    def accept_if_shorter(self, path: Path) -> bool:
         """Accept a valid path if it is shorter, and no nearer to obstacles than is wanted, or than the best path.
-
-        Args:
-            control: Control points, shape (points, dof).
 
         Returns:
             Whether it was accepted.
         """
-        path = Path.on(self.optimizer.spline, control)
         if self.best is not None:
             if path.length > self.best.length - MIN_GAIN:
                 return False

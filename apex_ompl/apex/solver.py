@@ -62,7 +62,7 @@ def _read_query(context: SolveContext, inputs: Any) -> tuple[Any, str]:
         if goal is not None and not goal.hasType(ob.GOAL_SAMPLEABLE_REGION):
             reason = "the goal cannot be sampled, expected a goal state, goal states or a sampleable region"
             return Status.UNRECOGNIZED_GOAL_TYPE, reason
-        context.goals = [] if goal is None else read_goals(inputs, dof, context.ptc)
+        context.goals = [] if goal is None else read_goals(inputs, dof, context.ptc, goal)
         if not context.starts:
             return Status.INVALID_START, "no start state is valid"
         if not context.goals:

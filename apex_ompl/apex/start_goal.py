@@ -11,7 +11,8 @@ from ompl import base as ob
 from apex_ompl.ompl_adapter.space import to_array
 from apex_ompl.types import Array
 
-MAX_GOALS, GOAL_ATTEMPTS = 8, 32  # goals that are read, and samples that are drawn for them
+MAX_GOALS, GOAL_ATTEMPTS = 8, 32  # goals that are read of a region, and samples that are drawn for them
+MAX_STATES = 256  # states of a goal that has no more, all of which are read
 MAX_PAIRS = 8  # pairs of start and goal that proposals are made for
 
 
@@ -32,20 +33,24 @@ def read_starts(inputs: Any, dof: int) -> list[Array]:
     return _distinct(found)
 
 
-def read_goals(inputs: Any, dof: int, ptc: ob.PlannerTerminationCondition) -> list[Array]:
-    """Return valid goal states, each of shape (dof,), a few where the goal is a region.
+def read_goals(inputs: Any, dof: int, ptc: ob.PlannerTerminationCondition, goal: Any) -> list[Array]:
+    """Return the valid goal states, each of shape (dof,), or a few where there are many, or the goal is a region.
 
     Args:
         inputs: The planner's ``getPlannerInputStates()``.
         dof: Number of joints.
         ptc: Ends the sampling of a region.
+        goal: The goal.
     """
     found = []
+    sampled = goal is not None and goal.hasType(ob.GOAL_SAMPLEABLE_REGION)
+    count = goal.maxSampleCount() if sampled else 0
+    most, attempts = (count, count) if MAX_GOALS < count <= MAX_STATES else (MAX_GOALS, GOAL_ATTEMPTS)
     state = inputs.nextGoal(ptc)  # waits for one
-    for _ in range(GOAL_ATTEMPTS):
+    for _ in range(attempts):
         if state is not None:
             found.append(to_array(state, dof))
-        if len(found) == MAX_GOALS or ptc() or not inputs.haveMoreGoalStates():
+        if len(found) == most or ptc() or not inputs.haveMoreGoalStates():
             break
         state = inputs.nextGoal()  # None where the next sample is invalid
     return _distinct(found)

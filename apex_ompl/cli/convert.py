@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from pathlib import Path
 
 from apex_ompl.cli.options import name_value_pairs
 from apex_ompl.errors import ParameterError
@@ -17,7 +18,9 @@ def run(parsed: argparse.Namespace) -> int:
         raise ParameterError("output", str(parsed.out), "a file name ending in .yaml")
     joints, frames = name_value_pairs("--joint", parsed.joint), name_value_pairs("--frame", parsed.frame)
     converted = convert(parsed.scene, parsed.request, load_robot(parsed.robot), joints, frames)
-    converted.problem.save(parsed.out)
+    is_file = parsed.robot.endswith((".yaml", ".yml"))
+    robot = str(Path(parsed.robot).resolve()) if is_file else parsed.robot
+    converted.problem.model_copy(update={"robot": robot}).save(parsed.out)
     for note in converted.notes:
         print(f"apex-ompl: note: {note}", file=sys.stderr)
     print(parsed.out)

@@ -33,6 +33,9 @@ def run(parsed: argparse.Namespace) -> int:
         suffix_of(parsed.out, SUFFIXES)
         check_writable(parsed.out)
     params = {} if parsed.params is None else read_yaml(parsed.params, "file of planner parameters")
+    unnamed = [key for key in params if not isinstance(key, str)]
+    if unnamed:
+        raise ParameterError(str(parsed.params), unnamed[0], "names of parameters, in quotes where YAML reads others")
     params |= {name.replace("-", "_"): value for name, value in name_value_pairs("--set", parsed.set).items()}
     if parsed.controllers and (parsed.out is None or not parsed.out.name.endswith(MESSAGES)):
         raise ParameterError("--controllers", str(parsed.out), f"--out with a name ending in {' or '.join(MESSAGES)}")

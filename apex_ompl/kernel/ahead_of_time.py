@@ -36,7 +36,7 @@ SETTINGS = "Tuple((f8, f8, f8, f8, f8, f8, i8))"
 HERE: dict[str, tuple[str, int]] = {
     "motion_proof.prove_path": (ROBOT + SCENE + WORKSPACE + PROOF, 8),
     "tree_search.grow_trees": (ROBOT + SCENE + WORKSPACE + TREES + PROOF, 6),
-    "shortcutting.shortcut_path": (ROBOT + SCENE + WORKSPACE + "f8[:, ::1], f8, f8[:, ::1], i8, " + PROOF, 6),
+    "shortcutting.shortcut_path": (ROBOT + SCENE + WORKSPACE + "f8[:, ::1], f8, f8[:, ::1], i8[::1], " + PROOF, 6),
     "queries.check_states": (ROBOT + SCENE + WORKSPACE + "f8[:, ::1], i8[:, :, ::1], i8[::1]", 2),
     "queries.clearances": (ROBOT + SCENE + WORKSPACE + "f8[:, ::1], f8, f8[:, ::1], f8[:, :, ::1]", 6),
     "path_optimization.optimize_path": (

@@ -11,7 +11,8 @@ from apex_ompl.kernel.kernel import Kernel
 from apex_ompl.kernel.search_buffers import SearchBuffers, SearchCounts
 from apex_ompl.types import Array
 
-AT_ONCE = 256  # random states between two looks at the clock
+AT_ONCE = 256  # random states between two looks at the clock, where steps are 1 rad and longer
+LEAST_STEP = 0.01  # longest steps may not be shorter: as many are made for each random state [rad]
 ROOM = 1024  # nodes of a tree to begin with
 NEAR = 0.5  # share of random states that lie around a straight line between a start and a goal
 SPREAD = 2.0  # standard deviation of these from the line, at most [rad]
@@ -34,13 +35,14 @@ class TreePair:
             kernel: The robot among its obstacles, with the limits of the states.
             starts: Roots of one tree, shape (N, dof); they are taken to be free.
             goals: Roots of the other, shape (N, dof).
-            longest: Longest step [rad].
+            longest: Longest step; one below LEAST_STEP counts as that [rad].
             resolution: Largest spacing of the states that are checked along a step [rad, max-norm].
             rng: Source of the random states.
         """
         limits = kernel.robot.arrays
-        longest = min(longest, float(np.linalg.norm(limits.upper - limits.lower)))  # no step is longer
+        longest = min(max(longest, LEAST_STEP), float(np.linalg.norm(limits.upper - limits.lower)))  # no step is longer
         self._kernel, self._longest, self._resolution = kernel, longest, resolution
+        self._at_once = max(int(AT_ONCE * min(longest, 1.0)), 1)  # short steps are many for each random state
         dof, most = kernel.robot.dof, max(len(starts), len(goals))
         self._starts, self._goals = starts, goals
         self._rng, self._normal_rng = rng, rng.spawn(1)[0]
@@ -69,9 +71,9 @@ class TreePair:
             stop: Asked from time to time whether to give up.
         """
         while iterations > 0 and not stop():
-            samples = self._random_states(min(iterations, AT_ONCE))
+            samples = self._random_states(min(iterations, self._at_once))
             iterations -= len(samples)
-            while len(samples):
+            while len(samples) and not stop():
                 used = tree_search.grow_trees(
                     *self._kernel.packed, *self._buffers.workspace, samples, self._longest, self._resolution,
                     self._states, self._parents, self._sizes, self._met, np.empty(self._states.shape[2]), self._target,

@@ -146,7 +146,7 @@ class CandidatePool:
             if rough is not None:
                 clear = chosen.clearance >= MIN_CLEARANCE or not improved.steps[0]
                 chosen.exact = clear or chosen.rounds >= ROUGH_ROUNDS
-            elif not improved.steps[0]:  # no sample violates a margin, and yet the path is invalid
+            elif not chosen.given_up and not improved.steps[0]:  # no sample violates a margin, and yet it is invalid
                 chosen.given_up, chosen.fine = chosen.fine, True
         return None
 

@@ -45,7 +45,7 @@ class Anytime:
                 if found is None or context.stop():
                     continue
                 better = context.optimizer.shorten(context.kernel, found.control, context.is_valid, context.stop)
-                accepted = context.accept_if_shorter(found.control if better is None else better)
+                accepted = context.accept_if_shorter(context.spline_path(found.control if better is None else better))
                 context.report.improved += accepted
 
     @staticmethod

@@ -30,7 +30,7 @@ class Bridging:
             if context.stop():
                 return None
             with context.report.timed("bridge"):
-                states = every_other(context.path_of(candidate).states)
+                states = every_other(context.spline_path(candidate.control).states)
                 found = bridge_blocked(context, states, self.tree_range, calls=self.calls)
             if found is not None:
                 return Solution(Path(found), "apex+bridge")

@@ -21,7 +21,7 @@ class NearestToGoal:
         """Set ``context.nearest``; return None, since an approximate path solves nothing."""
         with context.report.timed("approximate"):
             for candidate in sorted(context.pool.candidates, key=lambda one: one.clearance_cost)[:MAX_BRIDGED]:
-                states = valid_prefix(context.validator, context.path_of(candidate).states, context.stop)
+                states = valid_prefix(context.validator, context.spline_path(candidate.control).states, context.stop)
                 distance = min(float(np.linalg.norm(goal - states[-1])) for goal in context.goals)
                 if len(states) > 1 and (context.nearest is None or distance < context.nearest[1]):
                     context.nearest = Path(states), distance

@@ -47,8 +47,7 @@ class Shorten:
                 found = [simplify(og.PathSimplifier(context.si), context.si, path.states, context.stop, 1)]
             for states in found:
                 short = Path(states)
-                if short.length < path.length and context.is_valid(states):
-                    context.accept(short)
+                if short.length < path.length and context.is_valid(states) and context.accept_if_shorter(short):
                     return context.fit(states)
         return context.fit(found[0])
 
@@ -72,11 +71,11 @@ class Shorten:
         with context.report.timed("polish"):
             better = context.optimizer.shorten(context.kernel, control, context.is_valid, context.stop)
         if better is not None:
-            context.accept_if_shorter(better)
+            context.accept_if_shorter(context.spline_path(better))
 
 
 def _shortcut(context: SolveContext, states: Array) -> Array:
     """Return a polyline cut short."""
-    short, looked = shortcut(context.kernel, states, DRAWS, RESOLUTION, context.rng.spawn(1)[0])
+    short, looked = shortcut(context.kernel, states, DRAWS, RESOLUTION, context.rng.spawn(1)[0], context.stop)
     context.note_search(looked)
     return short

@@ -32,4 +32,4 @@ def solution_of(candidate: Candidate | None, context: SolveContext) -> Solution 
     """Return the solution that a valid candidate is, or None where there is none."""
     if candidate is None:
         return None
-    return Solution(context.path_of(candidate), candidate.origin + ("+repair" if candidate.rounds else ""))
+    return Solution(context.spline_path(candidate.control), candidate.origin + ("+repair" if candidate.rounds else ""))

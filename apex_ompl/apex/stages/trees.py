@@ -66,8 +66,8 @@ class Sprint:
 class GrowTrees:
     """RRT-Connect for all starts and goals; it goes on where it stopped before.
 
-    The trees of sprints go on where there is only one pair of start and goal. Compiled trees go to the goals that were
-    read before; OMPL's draw more of a region.
+    The trees of sprints go on where there is only one pair of start and goal, and OMPL's where no more goals can come.
+    Compiled trees go to the goals that were read before; OMPL's draw more of a region.
 
     Attributes:
         tree_range: Longest step of the trees; 0 lets OMPL choose [rad].
@@ -97,8 +97,10 @@ class GrowTrees:
         return verified(context, states, "rrtconnect", self)
 
     def _of_ompl(self, context: SolveContext, iterations: int) -> Solution | None:
-        trees = context.all_ompl_trees or (context.sprint_ompl_trees if len(context.pairs) == 1 else None)
-        trees = trees or ompl_trees(context.si, context.starts, context.pdef.getGoal(), self.tree_range)
+        goal = context.pdef.getGoal()
+        whole = len(context.pairs) == 1 and goal.hasType(ob.GOAL_STATE)  # a region may have others
+        trees = context.all_ompl_trees or (context.sprint_ompl_trees if whole else None)
+        trees = trees or ompl_trees(context.si, context.starts, goal, self.tree_range)
         context.sprint_ompl_trees, context.all_ompl_trees = None, trees
         tree, pdef = trees
         with context.report.timed("rrtconnect"):

@@ -26,11 +26,19 @@ def _apart(path: Floats, i: int, j: int) -> float:
 def _leave_out(
     t: RobotArrays, s: SceneArrays, w: Workspace, path: Floats, count: int, resolution: float, motion: Floats,
     starts: Integers, queue: Integers, ends: Integers, state: Floats, found: Integers, counts: Integers,
-) -> int:  # fmt: skip
-    """Leave out corners between which the straight motion is proved, most at a time; return how many are left."""
-    dof, i = path.shape[1], 0
-    while i < count - 2:
+    first: int, tries: int,
+) -> tuple[int, int]:  # fmt: skip
+    """Leave out corners between which the straight motion is proved, most at a time, from a corner on.
+
+    It ends behind the corner at which it has tried ``tries`` motions or more.
+
+    Returns:
+        How many corners are left, and the corner from which to go on.
+    """
+    dof, i = path.shape[1], first
+    while i < count - 2 and tries > 0:
         for j in range(count - 1, i + 1, -1):
+            tries -= 1
             for d in range(dof):
                 motion[0, d], motion[1, d] = path[i, d], path[j, d]
             if is_motion_proved(t, s, w, motion, resolution, starts, queue, ends, state, found, counts):
@@ -40,7 +48,7 @@ def _leave_out(
                 count -= j - i - 1
                 break
         i += 1
-    return count
+    return count, i
 
 
 @inlined
@@ -57,41 +65,13 @@ def _point_at(path: Floats, count: int, along: float, out: Floats) -> int:
     return count - 2
 
 
-@entry_point
-def shortcut_path(
-    ri: Integers, rf: Floats, si: Integers, sf: Floats, sg: Singles, wi: Integers, wf: Floats,
-    draws: Floats, resolution: float, path: Floats, count: int,
+@inlined
+def _cut(
+    t: RobotArrays, s: SceneArrays, w: Workspace, draws: Floats, path: Floats, count: int, resolution: float,
     motion: Floats, starts: Integers, queue: Integers, ends: Integers, state: Floats, found: Integers, counts: Integers,
 ) -> int:  # fmt: skip
-    """Shorten a path by straight motions between two states of it, its corners first, then any.
-
-    Args:
-        ri: Robot, packed; see :func:`apex_ompl.kernel.compiled.layout.pack`.
-        rf: Robot.
-        si: Scene, packed.
-        sf: Scene.
-        sg: Scene.
-        wi: Workspace, see :func:`apex_ompl.kernel.compiled.workspace.workspace_sizes`.
-        wf: Workspace.
-        draws: Where shortcuts begin and end, as shares of the length, shape (N, 2).
-        resolution: Largest spacing of the states that are checked [rad, max-norm].
-        path: Corners of the path, shape (M, dof), with room for more.
-        count: Their number.
-        motion: Memory, shape (2, dof).
-        starts: Memory, shape (2,).
-        queue: Memory, twice as many rows as the longest motion has states, and 4.
-        ends: Memory, shape (3,).
-        state: Memory, shape (dof,).
-        found: Memory, shape (1, 2).
-        counts: Gets numbers of what was proved, see :func:`apex_ompl.kernel.compiled.motion_proof.prove_path`.
-
-    Returns:
-        The number of corners that are left.
-    """
-    t, s = robot_view(ri, rf), scene_view(si, sf, sg)
-    w = workspace_view(t, wi, wf)
+    """Put straight motions between drawn places of a path in place, where they are proved; return how many corners."""
     dof = path.shape[1]
-    count = _leave_out(t, s, w, path, count, resolution, motion, starts, queue, ends, state, found, counts)
     for n in range(len(draws)):
         if count < 3:
             break
@@ -116,4 +96,46 @@ def shortcut_path(
         for d in range(dof):
             path[i + 1, d], path[i + 2, d] = motion[0, d], motion[1, d]
         count = size
-    return int(_leave_out(t, s, w, path, count, resolution, motion, starts, queue, ends, state, found, counts))
+    return count
+
+
+@entry_point
+def shortcut_path(
+    ri: Integers, rf: Floats, si: Integers, sf: Floats, sg: Singles, wi: Integers, wf: Floats,
+    draws: Floats, resolution: float, path: Floats, progress: Integers,
+    motion: Floats, starts: Integers, queue: Integers, ends: Integers, state: Floats, found: Integers, counts: Integers,
+) -> None:  # fmt: skip
+    """Shorten a path by straight motions between two states of it: draws, or without any, between its corners.
+
+    Args:
+        ri: Robot, packed; see :func:`apex_ompl.kernel.compiled.layout.pack`.
+        rf: Robot.
+        si: Scene, packed.
+        sf: Scene.
+        sg: Scene.
+        wi: Workspace, see :func:`apex_ompl.kernel.compiled.workspace.workspace_sizes`.
+        wf: Workspace.
+        draws: Where shortcuts begin and end, as shares of the length, shape (N, 2).
+        resolution: Largest spacing of the states that are checked [rad, max-norm].
+        path: Corners of the path, shape (M, dof), with room for more.
+        progress: Their number, the corner from which corners are left out, and for how many motions that is tried,
+            shape (3,). The first two get what they are afterwards.
+        motion: Memory, shape (2, dof).
+        starts: Memory, shape (2,).
+        queue: Memory, twice as many rows as the longest motion has states, and 4.
+        ends: Memory, shape (3,).
+        state: Memory, shape (dof,).
+        found: Memory, shape (1, 2).
+        counts: Gets numbers of what was proved, see :func:`apex_ompl.kernel.compiled.motion_proof.prove_path`.
+    """
+    t, s = robot_view(ri, rf), scene_view(si, sf, sg)
+    w = workspace_view(t, wi, wf)
+    count = progress[0]
+    if len(draws) == 0:
+        count, progress[1] = _leave_out(
+            t, s, w, path, count, resolution, motion, starts, queue, ends, state, found, counts, progress[1],
+            progress[2],
+        )  # fmt: skip
+    else:
+        count = _cut(t, s, w, draws, path, count, resolution, motion, starts, queue, ends, state, found, counts)
+    progress[0] = count
