@@ -26,6 +26,7 @@ import os
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -47,7 +48,10 @@ from apex_ompl.util.files import write_atomically
 from apex_ompl.util.statistics import share_interval
 from apex_ompl.util.validation import one_or_more
 
-DEPENDS = ("@planning", "apex_ompl/live", "apex_ompl/loop", "apex_ompl/trajectory")
+DEPENDS = (
+    "@planning", "apex_ompl/imitation", "apex_ompl/live", "apex_ompl/loop", "apex_ompl/roadmaps",
+    "apex_ompl/trajectory", "benchmarks/baselines",
+)  # fmt: skip
 FOLDER = record.RESULTS.parent / "runs" / "closed_loop"
 SPEEDS = (1.0, 0.25)
 KEPT = (
@@ -76,6 +80,20 @@ class Job(NamedTuple):
         return f"{self.world.replace('/', '_')}-{self.method}-{self.speed:g}{clock}.json"
 
 
+@cache
+def made_with() -> dict[str, Any]:
+    """Return what a run is to be compared by: commit, hardware, and version of the table of costs."""
+    session = record.session()
+    return {"commit": session["commit"], "hardware": session["hardware"], "costs": cost_table()["version"]}
+
+
+def made_by(runs: Sequence[dict[str, Any]]) -> dict[str, str]:
+    """Return the commits, hardware and tables of costs of some runs, as results say them."""
+    found = {name: sorted({str(run.get(name, "unknown")) for run in runs}) for name in ("commit", "hardware", "costs")}
+    return {"run_commits": "; ".join(found["commit"]), "run_hardware": "; ".join(found["hardware"]),
+            "costs": "; ".join(found["costs"])}  # fmt: skip
+
+
 def made(job: Job) -> dict[str, Any]:
     """Run once, and return what is kept."""
     if job.method == CLAIRVOYANT:
@@ -95,7 +113,7 @@ def kept(job: Job, result: RunResult) -> dict[str, Any]:
     leaving = [event.data["leaving"] for event in taken if event.time <= contact][-1:]
     reactions = [(event.data["seconds"], event.data["ahead"]) for event in result.events if event.kind == "reaction"]
     return {
-        **job._asdict(), "outcome": str(result.outcome), "reason": result.reason, "costs": cost_table()["version"],
+        **job._asdict(), **made_with(), "outcome": str(result.outcome), "reason": result.reason,
         "hit_while_expected": expected, "hit_while_leaving": expected and leaving == [True], **timed,
         "reactions": reactions,
         **{name: result.metrics[name] for name in KEPT if name in result.metrics},
@@ -114,7 +132,8 @@ def offline(job: Job) -> dict[str, Any]:
         {"time_to_goal": min(found), "stops": 0.0, "limit_use": 1.0} if found else {"stops": 0.0, "limit_use": 0.0}
     )
     return {
-        **job._asdict(), "outcome": str(Outcome.REACHED if found else Outcome.TIMEOUT), "hit_while_expected": False,
+        **job._asdict(), **made_with(), "outcome": str(Outcome.REACHED if found else Outcome.TIMEOUT),
+        "hit_while_expected": False,
         "hit_while_leaving": False, "seeds": seed, "reactions": [], "replans": [], "plans": [], **reached,
     }  # fmt: skip
 
@@ -320,7 +339,8 @@ def main() -> None:
     if timed:
         clocks, data["by_clock"] = by_clock(rows, timed)
         text = f"{text}\n\n{clocks}"
-    record.write("closed_loop", data, text, split=args.split, n=args.n, seed=0)
+    every = [one for some in (*rows.values(), *timed.values()) for one in some]
+    record.write("closed_loop", data, text, split=args.split, n=args.n, seed=0, **made_by(every))
 
 
 if __name__ == "__main__":

@@ -13,13 +13,12 @@ import argparse
 import time
 from dataclasses import replace
 from pathlib import Path
-from unittest import mock
 
 import numpy as np
 import record
 from collision_checker import around_home, boxes, microseconds, of_batch
 
-from apex_ompl import api, plan
+from apex_ompl import MotionPlanner, problems
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.cover.spheres import quality, read_covers, shape_key
 from apex_ompl.robot import load_robot
@@ -63,9 +62,10 @@ def measure(path: Path, states: int, seeds: int) -> dict[str, float]:
     found |= {"proved_of_free": float(np.mean(proved)), "proof_us": float(np.mean(kernel_us))}
     found |= {"two_stages_free_us": float(np.mean(free_us))}
     found |= {"free_motion_search_ms": float(np.median(search_ms)), "free_motion_full_ms": float(np.median(full_ms))}
-    with mock.patch.object(api, "load_robot", lambda *_: robot):
+    with MotionPlanner(robot) as planner:
         for name in PROBLEMS:
-            runs = [plan(name, "rrtconnect", timeout=10.0, seed=seed) for seed in range(seeds)]
+            problem = problems.load(name)
+            runs = [planner.plan_problem(problem, "rrtconnect", timeout=10.0, seed=seed) for seed in range(seeds)]
             found[f"{name}_solve_ms"] = float(np.median([r.times["solve"] for r in runs])) * 1e3
     return found
 

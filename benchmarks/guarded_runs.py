@@ -18,7 +18,7 @@ from dataclasses import replace
 from typing import Any
 
 import record
-from closed_loop import FOLDER, LIMIT_TOLERANCE, SCRIPTED, Job, kept, stored
+from closed_loop import FOLDER, LIMIT_TOLERANCE, SCRIPTED, Job, kept, made_by, stored
 
 from apex_ompl.loop.run import default_settings, run
 from apex_ompl.loop.sensor import Sensor
@@ -78,7 +78,8 @@ def main() -> None:
     rows.append(row("all", runs))
     lines = [HEAD, ["---", *["---:"] * (len(HEAD) - 1)], *rows]
     text = "\n".join(record.row(list(line)) for line in lines)
-    record.write("guarded_runs", {"rows": rows, "columns": HEAD}, text, split=args.split, n=len(runs), seed=0)
+    data = {"rows": rows, "columns": HEAD}
+    record.write("guarded_runs", data, text, split=args.split, n=len(runs), seed=0, **made_by(runs))
 
 
 if __name__ == "__main__":

@@ -36,7 +36,7 @@ from apex_ompl.benchmark.rows import Job
 from apex_ompl.benchmark.runs import NO_PROBLEM, Run
 from apex_ompl.diffusion.checkpoint import SHIPPED, load_torch_model, read_config
 from apex_ompl.diffusion.data import shard_paths
-from apex_ompl.diffusion.guidance import Guidance
+from apex_ompl.diffusion.guidance import EQUATION_7, Guidance
 from apex_ompl.diffusion.mirror import Mirror
 from apex_ompl.diffusion.proposals import Sampling, TrajectoryModel
 from apex_ompl.kernel import Kernel, RobotTables
@@ -57,7 +57,7 @@ DEPENDS = ("@benchmark", "benchmarks/controls.py", "benchmarks/neighbours.py")
 COUNTS = (1, 8, 32)
 GUIDED = Guidance(gamma=1.0)
 PAPER = Sampling("ddpm", 256)
-GUIDED_PAPER = Sampling("ddpm", 256, guidance=Guidance(1.0, "noise", active_below=0.25))
+GUIDED_PAPER = Sampling("ddpm", 256, guidance=EQUATION_7)
 METHODS: dict[str, tuple[int, ...]] = {
     "line": (1,),
     "bumps": (8, 32),

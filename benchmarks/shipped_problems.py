@@ -59,12 +59,12 @@ def label(planner: str, checker: str) -> str:
 def statistics(planner: str, problem: str, made: Sequence[Run]) -> dict[str, Any]:
     """Return the statistics of a planner on a problem with both checkers; times in ms."""
     by = {name: {r["seed"]: r for r in made if r["label"] == label(planner, name)} for name in CHECKERS}
-    two, meshes = by.values()
+    two, meshes = ({seed: run.get("path") for seed, run in some.items()} for some in by.values())
     solved = {name: [run for run in some.values() if run["solved"]] for name, some in by.items()}
     proven = solved["two stages"]
     return {
         "planner": planner, "problem": problem,
-        "same_path": sum(bool(run["path"]) and run["path"] == meshes[seed]["path"] for seed, run in two.items()),
+        "same_path": sum(bool(path) and path == meshes[seed] for seed, path in two.items()),
         "passed_first_time": [sum(run["by"] == planner for run in proven), len(proven)],
         "search": {name: [1e3 * run["times"]["solve"] for run in some] for name, some in solved.items()},
         "all": {name: [1e3 * run["total"] for run in some] for name, some in solved.items()},

@@ -43,8 +43,9 @@ from apex_ompl.util.validation import one_or_more
 
 DEPENDS = (
     "@checking", "apex_ompl/apex", "apex_ompl/api.py", "apex_ompl/benchmark", "apex_ompl/diffusion",
-    "apex_ompl/ompl_adapter", "apex_ompl/planning", "apex_ompl/result.py", "apex_ompl/tasks", "apex_ompl/trajopt",
-    "benchmarks/peers.py", "planners/apex.py", "planners/apex_parameters.py", "planners/gpmp.py", "planners/polish.py",
+    "apex_ompl/ompl_adapter", "apex_ompl/planning", "apex_ompl/result.py", "apex_ompl/roadmaps", "apex_ompl/tasks",
+    "apex_ompl/trajopt", "benchmarks/baselines", "benchmarks/peers.py", "planners/apex.py",
+    "planners/apex_parameters.py", "planners/damon.py", "planners/drrt.py", "planners/gpmp.py", "planners/polish.py",
     "planners/registry.py", "planners/sampling.py", "problems",
 )  # fmt: skip
 # All that plans but planners/tuned.py, which follows from the result: candidates name each parameter that is tuned.

@@ -44,6 +44,8 @@ class ApexParameters(Parameters):
         third: In the third.
         guidance: Whether paths are drawn away from obstacles while they are denoised.
         gamma: Scale of the guidance.
+        scaling: What it changes of a sample: ``clean``, the path that is expected of it, or ``noise``, as equation 7 of
+            the paper has it.
         resample: How often colliding candidates are resampled in each round.
         noise: How far they are noised for that, as a share of the schedule.
         lambda_obs: Valid paths that come nearer to an obstacle than this are resampled too; the one that keeps most
@@ -74,6 +76,7 @@ class ApexParameters(Parameters):
     third: int = bounded(24, 0, 1024)
     guidance: bool = False
     gamma: float = bounded(1.0, 0.0, 1e3)
+    scaling: str = one_of("clean", "noise")
     resample: int = bounded(1, 0, 100)
     noise: float = bounded(0.4, 0.0, 1.0)
     lambda_obs: float = bounded(0.0, 0.0, 1.0, unit="m")
@@ -101,7 +104,7 @@ class ApexParameters(Parameters):
         from apex_ompl.diffusion import proposals
         from apex_ompl.diffusion.guidance import Guidance
 
-        guidance = Guidance(gamma=self.gamma if self.guidance else 0.0)
+        guidance = Guidance(gamma=self.gamma if self.guidance else 0.0, scaling=self.scaling)
         sampler = default.sampler if self.sampler == "model" else self.sampler
         steps, temperature = self.denoising_steps or default.steps, self.temperature * default.temperature
         return proposals.Sampling(sampler, steps, temperature, guidance)

@@ -2,7 +2,8 @@
 
 OMPL's planners keep OMPL's defaults under their names; their tuned forms are rows of the benchmarks. The planners of
 this package have the tuned values as defaults. ``roboplan`` is RoboPlan's RRT-Connect as benchmarks/peers.py runs it.
-The baselines of the paper, gpmp, gpmp2, drrt and damon, are tuned by ``python benchmarks/tune.py --baselines``, on easier levels.
+The baselines of the paper, gpmp, gpmp2, drrt and damon, are tuned by ``python benchmarks/tune.py --baselines``, on
+easier levels.
 """
 
 from __future__ import annotations

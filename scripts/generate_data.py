@@ -32,6 +32,7 @@ from apex_ompl.util.files import check_writable, make_folder
 from apex_ompl.util.provenance import versions
 from apex_ompl.util.validation import one_or_more, whole_number
 
+LATEST = 800_000  # from this seed on problems are not of the training split
 # Pinocchio, Coal and OMPL are imported where problems are drawn: --cases needs none of them.
 
 LIBRARIES = ("apex-ompl", "ompl", "pin", "coal", "numba", "numpy", "zarr")
@@ -141,12 +142,15 @@ def _read_units(args: argparse.Namespace) -> tuple[Solve, dict[str, Any], dict[s
     """Return the solving function, the units of --cases, the robot for the manifest, and its tables where known.
 
     Raises:
-        ParameterError: Suites are named as well.
+        ParameterError: Suites are named as well, or problems are not to be trained with.
     """
     if args.levels:
         raise ParameterError("SUITE[/LEVEL]", " ".join(args.levels), "none beside --cases")
     units: dict[str, Any] = {}
     problems = load_kernel_problems(args.cases)
+    others = [p.record.seed for p in problems if p.record.seed >= LATEST]
+    if others:
+        raise ParameterError(str(args.cases), others[0], f"problems to train with, whose seeds are below {LATEST}")
     for problem in problems:
         units.setdefault(problem.unit, []).append(problem)
     first, tables = problems[0], next((p.robot for p in problems if json.loads(p.record.held) == []), None)

@@ -6,10 +6,12 @@ from pathlib import Path
 
 import pytest
 
-from apex_ompl import benchmark
+from apex_ompl import benchmark, planners
 from apex_ompl.benchmark import Row, bench
-from apex_ompl.benchmark.rows import experiments, jobs
+from apex_ompl.benchmark.rows import PAPER, experiments, jobs
 from apex_ompl.cli.parser import main
+from apex_ompl.diffusion.guidance import EQUATION_7, Guidance
+from apex_ompl.diffusion.proposals import Sampling
 from apex_ompl.errors import ApexError, ParameterError, UnknownNameError
 
 LEVEL = "swap/easy"
@@ -118,3 +120,12 @@ def test_faulty_commands_get_a_sentence(
     assert main(arguments) == 2
     said = capsys.readouterr().err
     assert words in said and said.count("\n") == 1 and not list(tmp_path.iterdir())
+
+
+def test_the_papers_rows_are_guided_by_equation_7() -> None:
+    """And the planner's own model by what is best for it."""
+    own = Sampling("ddpm", 256)
+    faithful = planners.parameters("apex", **PAPER, guidance=True).sampling(own)
+    assert faithful.guidance == EQUATION_7 and EQUATION_7.scaling == "noise" and EQUATION_7.gamma == 1.0
+    assert planners.parameters("apex", **PAPER).sampling(own).guidance.gamma == 0.0
+    assert planners.parameters("apex", guidance=True).sampling(own).guidance == Guidance(scaling="clean")

@@ -13,6 +13,7 @@ from geometry_files import bumpy_sphere
 from support import states_around_home
 
 from apex_ompl.collision import CollisionChecker
+from apex_ompl.collision.shapes import coal_geometry
 from apex_ompl.errors import FileFormatError
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import Obstacle
@@ -46,6 +47,15 @@ def box_of(checker: CollisionChecker, name: str) -> np.ndarray:
     scene = checker.kernel.scene
     (row,) = np.flatnonzero(scene.arrays.owner == checker.meshes.scene[name])
     return np.asarray(scene.boxes[row])
+
+
+@pytest.mark.parametrize("unknown", [-3.4028235e38, -1e20, 1e20])
+def test_a_number_that_stands_for_no_height_is_no_height(tmp_path: Path, unknown: float) -> None:
+    heights = np.full((4, 4), 0.5, np.float32)
+    heights[1, 2] = unknown
+    field = grid_obstacle(tmp_path, "voxels", heights=heights, resolution=0.05, origin=[0.4, -0.1, 0.2])
+    with pytest.raises(FileFormatError, match="voxels.npz.*heights"):
+        coal_geometry(field)
 
 
 def test_cells_are_seen_as_their_boxes(robot: Robot, tmp_path: Path) -> None:

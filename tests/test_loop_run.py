@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,8 @@ from apex_ompl.loop.cycle import RunRecord
 from apex_ompl.loop.following import Following
 from apex_ompl.loop.referee import LIMIT_TOLERANCE
 from apex_ompl.loop.result import Outcome, RunResult
-from apex_ompl.loop.run import _Made, run
+from apex_ompl.loop.run import _Made, default_settings, load_world, run
+from apex_ompl.loop.sensor import Sensor
 from apex_ompl.loop.settings import LoopSettings
 from apex_ompl.problems import worlds
 from apex_ompl.problems.suite_robot import robot
@@ -69,6 +71,24 @@ def test_a_goal_that_is_blocked_for_good_ends_the_run_at_rest_and_names_the_obst
     assert "no goal was reached" in found.reason and "box stood where the robot would be at the goal" in found.reason
     assert is_at_rest(found.trajectory, found.trajectory.duration)
     assert "contact" not in {event.kind for event in found.events} and found.metrics["clearance"] > 0.0
+
+
+def test_a_robot_that_stands_at_the_goal_is_there() -> None:
+    problem = problems.load(PROBLEM)
+    there = problem.model_copy(update={"start": dict(problem.goal.joints[0])})
+    found = run(there, "no-network")
+    assert found.outcome is Outcome.REACHED and found.metrics["time_to_goal"] == 0.0 == found.metrics["rest_time"]
+    assert not [event for event in found.events if event.kind == "request"]
+
+
+def test_whoever_is_late_and_comes_to_rest_at_the_goal_has_reached_it() -> None:
+    whole = run(MOVING, "no-network")
+    arrival, usual = whole.metrics["time_to_goal"], default_settings(load_world(MOVING), Sensor())
+    for early in (0.01, 0.02, 0.03):
+        found = run(MOVING, "no-network", settings=replace(usual, timeout=arrival - early))
+        assert ("time_to_goal" in found.metrics) == (found.outcome is Outcome.REACHED)
+        if found:
+            assert found.metrics["time_to_goal"] <= arrival + 0.1
 
 
 @pytest.mark.parametrize(

@@ -47,6 +47,17 @@ def test_meshes_that_bound_no_solid_are_refused(robot: Robot, tmp_path, capfd, t
     assert capfd.readouterr() == ("", "")  # Coal prints lines of its own for numbers that are not finite
 
 
+@pytest.mark.parametrize("solid", [None, True, False])
+@pytest.mark.parametrize("index", [-1, 4, 99_999_999])
+def test_faces_without_their_vertices_are_refused(tmp_path: Path, index: int, solid: bool | None) -> None:
+    corners = "0 0 0\n1 0 0\n0 1 0\n0 0 1\n"
+    head = "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
+    head += "element face 4\nproperty list uchar int vertex_indices\nend_header\n"
+    (tmp_path / "t.ply").write_text(f"{head}{corners}3 0 2 1\n3 0 1 3\n3 1 2 3\n3 0 3 {index}\n")
+    with pytest.raises(FileFormatError, match="t.ply"):
+        coal_geometry(Obstacle(name="o", mesh={"file": str(tmp_path / "t.ply"), "solid": solid}))
+
+
 def test_meshes_that_are_no_proper_solids_are_noted(robot: Robot, tmp_path) -> None:
     def noted(text: str) -> tuple[str, bool]:
         file = tmp_path / "m.obj"

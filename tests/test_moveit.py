@@ -8,7 +8,7 @@ from moveit_files import REQUEST, SCENE
 from scipy.spatial.transform import Rotation
 from support import CUBE_OBJ
 
-from apex_ompl import problems
+from apex_ompl import load_problem
 from apex_ompl.errors import ApexError, FileFormatError
 from apex_ompl.robot import Robot, load_robot
 from apex_ompl.robot.assets import DATA
@@ -149,6 +149,6 @@ def test_the_command_converts_and_what_it_writes_plans(apex_cli, robot: Robot, t
     assert planned.returncode == 0, planned.stdout + planned.stderr
     by_file = apex_cli(*arguments, "--robot", DATA / "dual_panda_softhand.robot.yaml")
     assert by_file.returncode == 0, by_file.stderr
-    assert load_robot(problems.load(tmp_path / "p.yaml").robot).joint_names == robot.joint_names
+    assert load_robot(load_problem(tmp_path / "p.yaml").robot).joint_names == robot.joint_names
     wrong = apex_cli(*arguments[:3], "-o", tmp_path / "q.txt")
     assert wrong.returncode == 2 and "ending in .yaml" in wrong.stderr

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickle
 import threading
+from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
@@ -14,6 +15,7 @@ from apex_ompl import Alignment, MotionPlanner, PlanStatus, PoseTarget, load_pro
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ApexError, ParameterError, UnknownNameError
 from apex_ompl.ompl_adapter.validity import full_check
+from apex_ompl.result import PlanResult
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Goal, Problem
@@ -198,6 +200,24 @@ def test_a_group_moves_while_the_other_joints_stay(name: str, planner: MotionPla
     assert np.abs(result.trajectory.positions[:, stays] - start[stays]).max() < 1e-12
     assert result.held_joints == tuple(robot.joint_names[k] for k in stays)
     assert full_check(CollisionChecker(robot, [Obstacle(**POST)]), result.path, start)
+
+
+def test_a_start_a_little_outside_of_its_limits_stays_where_it_is_moved_to(
+    planner: MotionPlanner, robot: Robot, tmp_path: Path
+) -> None:
+    start = robot.home.copy()
+    start[14] = -0.0005
+    goal = start.copy()
+    goal[0] += 0.3
+    moved = {joint: float(goal[k]) for k, joint in enumerate(robot.joint_names) if joint.startswith("left_joint")}
+    palm = robot.link_pose(np.maximum(goal, robot.limits.lower), "left_hand_palm")[:3, 3]
+    pose = PoseTarget(frame="left_hand_palm", position=tuple(palm))
+    for wanted, group in ((moved, "left_arm"), (goal, "left_arm"), (pose, "left_arm"), (pose, None)):
+        result = planner.plan(start, wanted, group=group, timeout=20.0)
+        assert result, result.reason
+        assert (result.path.states[:, 14] == 0.0).all() or group is None
+        result.save(tmp_path / "r.npz")
+        assert PlanResult.load(tmp_path / "r.npz")
 
 
 def test_both_arms_are_a_group_without_the_hands(planner: MotionPlanner, robot: Robot) -> None:

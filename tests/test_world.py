@@ -125,6 +125,22 @@ def test_an_edit_that_fails_changes_nothing(robot: Robot, tmp_path: Path) -> Non
         assert dict(world.obstacles) == known and not world.held, said
 
 
+def test_what_was_allowed_and_held_stays_where_an_edit_fails(robot: Robot) -> None:
+    world, _ = world_of(robot)
+    palm = robot.link_pose(robot.home, "left_hand_palm")
+    world.add(name="wall", box=(0.4, 0.4, 0.02), position=tuple(palm[:3, 3]))
+    world.add(name="table", box=(0.4, 0.4, 0.02), position=(0.5, 0.0, 0.3))
+    world.allow("wall", "table")
+    with pytest.raises(ApexError):
+        world.attach("wall", "left_hand_palm", at=robot.home, touch_links=("thumb",))
+    assert [set(pair) for pair in world.allowed] == [{"wall", "table"}]
+    world.attach({**BAR, "position": (0.0, 0.02, -0.03)})
+    for state in (robot.home[:-1], np.full(robot.dof, np.nan)):
+        with pytest.raises(ApexError):
+            world.detach("bar", at=state)
+        assert list(world.held) == ["bar"] and "bar" not in world.obstacles
+
+
 def test_views_are_read_only_and_clear_leaves_the_fixtures(robot: Robot) -> None:
     world, checker = world_of(robot)
     fixtures = {name for name in checker.meshes.scene}

@@ -23,7 +23,7 @@ ROW = re.compile(r"(?P<planner>[^\[\]]+?)(\[(?P<params>[^\[\]]*)\])?")
 
 PAPER = {
     "model": "apex-paper", "line": False, "repair": False, "bridge": False, "fallback": False, "polish": False,
-    "first": 8, "second": 8, "third": 16, "resample": 2,
+    "first": 8, "second": 8, "third": 16, "resample": 2, "scaling": "noise",
 }  # fmt: skip
 """Parameters of apex that leave only the paper's algorithm, without guidance: ancestral sampling with all steps, and
 collision-triggered resampling."""

@@ -21,6 +21,8 @@ LEAST = 0.01  # share of the places inside that a further ball must add
 POINT = 1e-9  # radius of the ball that stands for a point [m]
 
 
+MOST_KEPT = 1024  # shapes whose balls are kept
+
 _known: dict[str, Array] = {}  # by shape key
 
 
@@ -34,7 +36,10 @@ def inner_balls(geometry: coal.CollisionGeometry) -> Array:
     """
     key = shape_key(geometry)
     if key not in _known:
-        _known[key] = _chosen(geometry)
+        balls = _chosen(geometry)
+        if len(_known) >= MOST_KEPT:
+            _known.pop(next(iter(_known)), None)
+        _known[key] = balls
     return _known[key]
 
 

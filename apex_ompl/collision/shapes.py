@@ -185,7 +185,10 @@ def _read_triangles(file: str, content: bytes, scale: Array) -> tuple[Array, NDA
     import trimesh
 
     loaded = trimesh.load_mesh(io.BytesIO(content), file_type=Path(file).suffix[1:].lower(), process=False)
-    return np.array(loaded.vertices, float) * scale, np.array(loaded.faces, np.int64)
+    vertices, faces = np.array(loaded.vertices, float) * scale, np.array(loaded.faces, np.int64)
+    if len(faces) and not 0 <= faces.min() <= faces.max() < len(vertices):
+        raise ValueError("a face names a vertex that is not there")
+    return vertices, faces
 
 
 def mesh_geometry(vertices: Array, faces: NDArray[np.int64]) -> coal.BVHModelOBBRSS:

@@ -64,6 +64,10 @@ class Guidance:
         return np.linspace(0, count - 1, self.samples).round().astype(np.int64)
 
 
+EQUATION_7 = Guidance(scaling="noise")
+"""Guidance as the paper has it, of the model apex-paper."""
+
+
 def collision_cost(kernel: Kernel, paths: Array, margin: float) -> tuple[Array, Array]:
     """Return the collision cost of paths, shape (B,), and its gradient, shape (B, N, dof) [1/rad].
 

@@ -74,7 +74,8 @@ class Loop:
         self._world, self._ready, self._eyes = world, ready, eyes
         self._allowed = tuple(ready.setup.problem.allowed)
         self._tracker = Tracker(ready.kernel, allowed=self._allowed)
-        standing = Following.standing(ready.setup.start, 0.0, ready.names)
+        start = ready.setup.start
+        standing = Following.standing(start, 0.0, ready.names, to_goal=ready.is_goal(start))
         self.executor = Executor(
             ready, replanning, self._tracker, seed, standing, followed=[(0.0, standing)], lead=lead
         )  # fmt: skip
@@ -110,7 +111,7 @@ class Loop:
         if not self._begun and executor.route is not None:
             self._world.begin(executor.route.motion, max(executor.route.begin, now))
             self._begun = True
-        if executor.done(now) and not executor.closed:
+        if executor.done(now):
             executor.log(now, "goal")
             return self._ended(now, True, "")
         self._rest = self._rest + settings.period if executor.following.at_rest(now) else 0.0

@@ -228,9 +228,14 @@ class Executor:
     def _answer(self, now: float, predicted: Movers, reachable: Movers | None) -> None:
         """Take the answer of a replan that is known by now, where it is of use."""
         reply, request = self.replanning.reply(now), self.pending
-        for fault in self.replanning.faults():
+        faults = self.replanning.faults()
+        for fault in faults:
             self.log(now, "planner fault", what=fault)
         if request is None:
+            return
+        if faults and reply is None:  # it was lost
+            self.log(now, request.refused, why="the planner was lost", number=request.number, part="")
+            self.pending = None
             return
         if reply is None or reply.number != request.number:
             if now > request.join + self._patience + 1e-9:
@@ -311,9 +316,9 @@ class Executor:
             self.asked, now, join, self.following, self.route, predicted, wide, obstacles, self.conflict, self.seed,
             leaving=self.leaving and not self.following.at_rest(join),
         )  # fmt: skip
-        self.log(now, "improve" if request.hastens else "request", number=self.asked, join=join)
-        self.pending, self.hastened = request, now if request.hastens else self.hastened
-        self.replanning.submit(request)
+        if self.replanning.submit(request):
+            self.log(now, "improve" if request.hastens else "request", number=self.asked, join=join)
+            self.pending, self.hastened = request, now if request.hastens else self.hastened
 
     def _give_up(self, now: float) -> None:
         """Give up a request that knows nothing of what is in the way by now.

@@ -20,7 +20,7 @@ NEAR = 0.5  # time before a conflict from which on it counts as near [s]
 COUNTED = {
     "replans_asked": "request", "replans_accepted": "accepted", "replans_rejected": "rejected",
     "improvements_asked": "improve", "improvements": "improved",
-    "conflicts": "conflict", "evasions": "evasion", "broken_assumptions": "broken assumption",
+    "conflicts": "conflict", "broken_assumptions": "broken assumption",
 }  # fmt: skip
 """Metrics that are numbers of events of a kind."""
 
@@ -63,6 +63,7 @@ def run_metrics(
         "rest_time": float((stood[:, 1] - stood[:, 0]).sum()),
         "stops": float((stood[:, 0] > 0.0).sum()),
         **{name: float(kinds[kind]) for name, kind in COUNTED.items()},
+        "evasions": float(sum(e.kind == "accepted" and e.data.get("part") == "evade" for e in events)),
         **_reactions(events),
         **({"clearance": float(clearance)} if np.isfinite(clearance) else {}),
         "duration": trajectory.duration,

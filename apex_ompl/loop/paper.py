@@ -9,7 +9,7 @@ import numpy as np
 from apex_ompl.apex.query import make_query
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.diffusion.checkpoint import shared_model
-from apex_ompl.diffusion.guidance import Guidance
+from apex_ompl.diffusion.guidance import EQUATION_7
 from apex_ompl.diffusion.proposals import TrajectoryModel
 from apex_ompl.loop.charges import Charges
 from apex_ompl.loop.placing import fresh_checker, place
@@ -66,7 +66,7 @@ class OneProposal:
         assert self._loaded is not None and self._checker is not None
         model, kernel = self._loaded, self._checker.kernel
         query = make_query(self._checker, start, goal, point=model.sees_point)
-        sampling = replace(model.sampling, guidance=Guidance(gamma=1.0 if self.guided else 0.0))
+        sampling = replace(model.sampling, guidance=replace(EQUATION_7, gamma=1.0 if self.guided else 0.0))
         with model.one_thread():
             made = model.propose(query, kernel, 1, sampling=sampling, generator=rng)
         return model.spline.path(made.control[0])

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from typing import Any, Self
 
-from apex_ompl.errors import ApexError, PlannerProcessError
+from apex_ompl.errors import PlannerProcessError
 from apex_ompl.loop.charges import Charges
 from apex_ompl.loop.replanning import Reply
 from apex_ompl.loop.request import Replanner, Request
@@ -141,7 +141,7 @@ class PlannerProcess:
         except (EOFError, OSError) as error:
             self.close()
             raise PlannerProcessError("the planner process died while it was made ready") from error
-        except ApexError:
+        except BaseException:  # Ctrl-C among them
             self.close()
             raise
         return self
@@ -155,10 +155,11 @@ class PlannerProcess:
             raise PlannerProcessError(f"the planner process could not be made ready: {said}")
         self._ready = True
 
-    def submit(self, request: Request) -> None:
-        """Send a request, which ends what the process is busy with; it is lost where the process is not there.
+    def submit(self, request: Request) -> bool:
+        """Send a request, which ends what the process is busy with; return whether it was sent.
 
-        It is lost, too, where one waits already; a process that has been busy for ``HUNG`` is made anew.
+        It is not where the process is not there, or one waits already; a process that has been busy for ``HUNG`` is
+        made anew.
         """
         if self._asked and time.monotonic() > self._asked[0] + HUNG:
             self._replace("did not answer")
@@ -166,8 +167,10 @@ class PlannerProcess:
             try:
                 self._connection.send_bytes(pickle.dumps(request))
                 self._asked.append(time.monotonic())
+                return True
             except OSError:
                 self._replace("died")
+        return False
 
     def reply(self, now: float) -> Reply | None:
         """Return the newest answer that has come, if any."""

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 from apex_ompl.loop.charges import Charges
+from apex_ompl.loop.following import Following
 from apex_ompl.loop.ready import Ready
 from apex_ompl.loop.request import Answer, Replanner, Request
 
@@ -31,9 +32,9 @@ class Reply:
 def answered(replanner: Replanner, ready: Ready, request: Request, charges: Charges) -> Reply:
     """Return what a way of replanning answers; whatever it raises is a reason."""
     try:
-        answer = replanner.replan(ready, request, charges)
-        if not isinstance(answer, Answer):
-            raise TypeError(f"{type(answer).__name__} is no answer")
+        answer: Any = replanner.replan(ready, request, charges)
+        if not isinstance(answer, Answer) or not isinstance(answer.found, Following | None):
+            raise TypeError(f"{type(getattr(answer, 'found', answer)).__name__} is no answer")
     except Exception as error:  # whatever a way of replanning does, the robot goes on or stops
         return Reply(request.number, Answer(None, "", charges), f"{type(error).__name__}: {error}")
     return Reply(request.number, answer)
@@ -42,8 +43,8 @@ def answered(replanner: Replanner, ready: Ready, request: Request, charges: Char
 class Replanning(Protocol):
     """Who makes replans."""
 
-    def submit(self, request: Request) -> None:
-        """Begin a replan; what was asked for before is of no use any more."""
+    def submit(self, request: Request) -> bool:
+        """Begin a replan, and return whether it was; what was asked for before is of no use any more."""
 
     def reply(self, now: float) -> Reply | None:
         """Return what is known by a time of the clock [s], once."""
@@ -66,13 +67,14 @@ class AtOnce:
     _known: float = 0.0
     _reply: Reply | None = None
 
-    def submit(self, request: Request) -> None:
+    def submit(self, request: Request) -> bool:
         """Make a replan."""
         settings = self.ready.settings
         busy = self._reply is not None and request.asked < self._known - 1e-9
         charges = Charges(SHARE * settings.budget, NOTICED if busy else 0.0)
         self._reply = answered(self.replanner, self.ready, request, charges)
         self._known = request.asked + (charges.spent if settings.latency < 0.0 else settings.latency)
+        return True
 
     def reply(self, now: float) -> Reply | None:
         """Return the answer when it is known."""

@@ -15,6 +15,7 @@ import numpy as np
 from apex_ompl.errors import FileFormatError, ParameterError
 from apex_ompl.scene.problem import Problem
 from apex_ompl.trajectory import Trajectory
+from apex_ompl.trajectory.checks import START_TOLERANCE
 from apex_ompl.trajectory.files import KNOTS
 from apex_ompl.types import Array
 from apex_ompl.util.archives import pack_archive, read_archive
@@ -27,7 +28,6 @@ SUFFIXES = (".npz", ".json")
 ARCHIVE, ROLE = "run", "run file"  # name of the text in a NumPy archive, and what errors call the file
 TEXTS = ("reason", "robot", "method", "prediction", "clock")
 JSON_NAMES = {"str": "text", "list": "list", "dict": "mapping"}
-START_TOLERANCE = 2e-3  # from the problem's start, whose joints may be moved to their limits [rad]
 
 
 class Outcome(StrEnum):
@@ -54,7 +54,7 @@ class Event:
     Attributes:
         time: When [s].
         kind: ``observation``, ``conflict``, ``stop``, ``request``, ``accepted``, ``rejected``, ``reaction``,
-            ``evasion``, ``goal``, ``broken assumption`` or ``contact``.
+            ``goal``, ``broken assumption`` or ``contact``.
         data: What there is to say of it: texts and numbers, JSON's.
     """
 

@@ -163,8 +163,9 @@ class _Made:
 
     def blocked(self, time: float) -> str:
         """Return which obstacles that move are where the robot would be at every goal at a time [s], or nothing."""
+        held = self.world.problem.still.attached
         there = [obstacle_at(o, time) for o in self.world.script() if o.appears <= time]
-        checker, names = CollisionChecker(self.ready.setup.robot, there), {o.name for o in there}
+        checker, names = CollisionChecker(self.ready.setup.robot, there, held), {o.name for o in there}
         met = [names & {name for c in checker.contacts(q) for name in (c.first, c.second)} for q in self.ready.goals]
         if not all(met):
             return ""

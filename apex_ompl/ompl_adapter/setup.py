@@ -101,10 +101,13 @@ def assemble(
         ApexError: The robot, a mesh or a joint of the problem is unknown or faulty.
     """
     robot = robot or load_robot(problem.robot)
-    start, start_notes = within_limits(robot, problem.start_state(robot.joint_names))
-    goals = problem.goal_states(robot.joint_names)
     names = robot.joint_names
+    asked = problem.start_state(names)
+    start, start_notes = within_limits(robot, asked)
+    goals = problem.goal_states(names)
     held = np.array([k for k, name in enumerate(names) if moving is not None and name not in moving], np.intp)
+    stays = goals[:, held] == asked[held]
+    goals[:, held] = np.where(stays, start[held], goals[:, held])  # where it is moved to
     lower, upper = bounds = _bounds(robot, start, held)
     limits = replace(robot.limits, lower=lower, upper=upper)
     sampled = workspace_goal(replace(robot, limits=limits) if len(held) else robot, problem)

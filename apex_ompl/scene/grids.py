@@ -91,9 +91,11 @@ def _occupied(file: str, name: str, values: Array, side: float) -> Flags:
         return np.asarray(values != 0)
     if name == "distances":
         return np.asarray(values <= 0.5 * np.sqrt(3.0) * side)
+    most = (float(values.max()) - float(values.min())) / side + 1.0
+    if most * values.size > MOST_CELLS:  # also where a number stands for a height that is not known
+        found = f"heights from {values.min():.3g} to {values.max():.3g} m, {most * values.size:.3g} cells"
+        raise FileFormatError(file, name, found, f"expected at most {MOST_CELLS} cells")
     levels = np.ceil((values - values.min()) / side - 1e-9).astype(np.int64) + 1
-    if levels.max() * values.size > MOST_CELLS:
-        raise FileFormatError(file, name, f"{levels.max() * values.size} cells", f"expected at most {MOST_CELLS}")
     return np.asarray(np.arange(levels.max()) < levels[:, :, None])
 
 

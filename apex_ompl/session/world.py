@@ -166,6 +166,7 @@ class World:
             wanted = self._read(AttachedObject, held, "held object")
             changes = {"link": link, "touch_links": None if touch_links is None else tuple(touch_links)}
             wanted = wanted.model_copy(update={key: value for key, value in changes.items() if value is not None})
+            pairs = [] if taken is None else [pair for pair in self.allowed if taken.name in pair]
             if taken is not None:
                 self._checker.remove(taken.name)
             try:
@@ -177,6 +178,8 @@ class World:
                     self._checker.detach(wanted.name)
                 if taken is not None:
                     self._checker.add(taken)
+                for pair in pairs:
+                    self._checker.allow(*pair)
                 raise
 
     def detach(self, name: str, *, at: ArrayLike | None = None) -> None:
@@ -186,12 +189,13 @@ class World:
             SceneError: There is no such held object.
         """
         with self._lock:
-            held = self.held.get(name)
-            self._checker.detach(name)
+            held, left = self.held.get(name), []
             if at is not None and held is not None:
                 pose = self._checker.robot.link_pose(np.asarray(at, float), held.link) @ held.pose
                 shape = held.model_dump(exclude_none=True, exclude={"link", "touch_links", "contact"})
-                self._add([self._read(Obstacle, {**shape, **pose_fields(pose)}, "obstacle")])
+                left = [self._read(Obstacle, {**shape, **pose_fields(pose)}, "obstacle")]
+            self._checker.detach(name)
+            self._add(left)
 
     @property
     def allowed(self) -> tuple[tuple[str, str], ...]:

@@ -28,6 +28,7 @@ from apex_ompl.types import Array
 from apex_ompl.util.schema import read_yaml, validate
 
 PRIMITIVES = {1: "box", 2: "sphere", 3: "cylinder", 4: "cone"}
+ADD, REMOVE = 0, 1  # operations of moveit_msgs/CollisionObject
 WORLD_FRAMES = ("", "world", "map")
 HARMLESS = ("workspace_parameters", "planner_id", "num_planning_attempts", "allowed_planning_time", "pipeline_id")
 
@@ -189,6 +190,9 @@ def convert(
     allowed, unknown = allowed_pairs(at_scene, at_scene.section(scene_data, MATRIX), robot, bodies, frame_map or {})
     if unknown:
         notes.append(f"{MATRIX}: neither links nor objects here, so left out: {', '.join(unknown)}")
+    for key, usual in (("link_padding", 0.0), ("link_scale", 1.0)):
+        if any(item.get(key.removeprefix("link_"), usual) != usual for item in at_scene.messages(scene_data, key)):
+            notes.append(f"{key}: not used, the robot has its own size")
     goals = _goals(at_request, request_data, start)
     for key in HARMLESS:
         if request_data.get(key):
@@ -211,6 +215,12 @@ def _obstacles(reader: _Reader, data: Mapping[str, Any], start: Array) -> list[O
     found: list[Obstacle] = []
     for k, item in enumerate(reader.messages(world, "collision_objects")):
         where = f"collision_objects.{k}"
+        operation = item.get("operation", ADD)
+        if operation == REMOVE:
+            reader.notes.append(f"{where}: removed, so left out")
+            continue
+        if operation != ADD:
+            raise reader.fail(f"{where}.operation", operation, f"expected {ADD} to add an object, or {REMOVE}")
         base = reader.frame(str(reader.section(item, "header", where).get("frame_id", "")), start, where)
         for label, shape, pose in _bodies(reader, item, where):
             placed = base @ pose

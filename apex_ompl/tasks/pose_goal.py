@@ -57,7 +57,7 @@ class PoseGoal:
         """
         self.robot = robot
         self.poses = tuple(poses)
-        self.start = np.asarray(start, float)
+        self.start = np.clip(start, robot.limits.lower, robot.limits.upper)  # to which plans move it
         held = {a.name: a for a in attached}
         self.frames = tuple(frame_of(robot, pose.frame, held) for pose in self.poses)
         self._numbers = [robot.link_frame(frame.link) for frame in self.frames]

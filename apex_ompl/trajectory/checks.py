@@ -16,6 +16,7 @@ from apex_ompl.util.validation import check_array
 EXACT, APPROXIMATE = "EXACT_SOLUTION", "APPROXIMATE_SOLUTION"
 WITH_PATH = (EXACT, APPROXIMATE, "TIMING_FAILED")
 SAME_STATE = 1e-6  # files of motions and of goals may be rounded [rad]
+START_TOLERANCE = 2e-3  # from the problem's start, whose joints may be moved to their limits [rad]
 LIMIT_TOLERANCE = 1e-6  # share by which a motion in a file may exceed a limit, as times are rounded
 
 
@@ -55,18 +56,19 @@ def check_plan(
         raise ParameterError("trajectory", f"{len(motion.times)} knots", f"none, as the status is {status}")
     starts, goals = problem.start_state(joint_names)[None], problem.goal_states(joint_names)
     for name, states in (("path", path), *((("trajectory", motion.positions),) if motion is not None else ())):
-        _check_end(name, states[0], starts, "start")
+        _check_end(name, states[0], starts, "start", START_TOLERANCE)
         if status != APPROXIMATE and len(goals):
-            _check_end(name, states[-1], goals, "goal")
+            wanted = np.where(goals == starts, states[0], goals)  # joints that stay do so where they were moved to
+            _check_end(name, states[-1], wanted, "goal", SAME_STATE)
     known = _load(problem.robot, robot)
     if known is not None:
         _check_limits(known, joint_names, path, motion)
 
 
-def _check_end(name: str, state: Array, wanted: Array, what: str) -> None:
-    """Check that a state is one of the wanted ones, shape (n, dof)."""
+def _check_end(name: str, state: Array, wanted: Array, what: str, tolerance: float) -> None:
+    """Check that a state is within a tolerance of one of the wanted ones, shape (n, dof) [rad]."""
     off = float(np.abs(wanted - state).max(axis=1).min())
-    if off > SAME_STATE:
+    if off > tolerance:
         raise ParameterError(name, f"one {off:.3g} rad away from it", f"states that include the problem's {what}")
 
 

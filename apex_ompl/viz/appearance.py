@@ -44,7 +44,7 @@ RUN_COLOURS = {
 EVENT_COLOURS = {
     "conflict": "#e9a03b", "request": "#1f6fb4", "accepted": "#2b9348", "rejected": "#8a8f98",
     "improve": "#9db4c8", "improved": "#7fb069", "kept": "#c4c7cc", "stop": "#d97a1a",
-    "evasion": "#8e44ad", "broken assumption": "#6b2d20", "contact": "#e0101b", "goal": "#0b6e4f",
+    "broken assumption": "#6b2d20", "contact": "#e0101b", "goal": "#0b6e4f",
 }  # fmt: skip
 SILENT_EVENTS = ("observation", "reaction", "improve", "kept")  # too many for words
 RUN_OPACITIES = {"true": 0.9, "observed": 0.5, "predicted": 0.22}

@@ -58,7 +58,7 @@ def first_failure(runs: Sequence[Run], kind: Kind) -> Run | None:
     """Return the first run that fails so: of the first method that has one, the first world of the test split."""
     for label in kind.labels:
         for run in in_order(run for run in runs if run["label"] == label):
-            if run["outcome"] in kind.outcomes:
+            if run.get("outcome") in kind.outcomes:
                 return run
     return None
 
@@ -99,7 +99,7 @@ def telling(of: dict[str, dict[int, Run]], *, contact: bool) -> tuple[int, int]:
         of: Runs by seed, of the guided and of the unguided method.
         contact: Whether the unguided run is to touch something, or else to reach the goal.
     """
-    wanted: Callable[[Run], bool] = (lambda r: r["outcome"] in HITS) if contact else (lambda r: bool(r["solved"]))
+    wanted: Callable[[Run], bool] = (lambda r: r.get("outcome") in HITS) if contact else (lambda r: bool(r["solved"]))
     seeds = [seed for seed in sorted(of[FAITHFUL]) if of[FAITHFUL][seed]["solved"] and wanted(of[UNGUIDED][seed])]
     return (seeds or sorted(of[FAITHFUL]))[0], len(seeds)
 

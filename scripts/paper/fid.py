@@ -46,7 +46,7 @@ def fid(args: Any) -> Made:
                 print(f"{row.label}: left out, {len(paths)} paths of {len(mine)}", flush=True)
                 continue
             r = metrics.realism(truth, features(paths))
-            took = 1e3 * float(np.mean([run["total"] for run in mine]))
+            took = 1e3 * float(np.mean([run["total"] for run in mine if run["total"] is not None]))
             data[f"{name}, {row.label}"] = {**asdict(r), "of": len(mine), "CPU ms a path": took}
             ends = f"{r.interval[0]:.2f} to {r.interval[1]:.2f}"
             measured = [str(r.dimension), f"{r.fid:.2f}", ends, f"{r.floor:.2f}", f"{r.kid:.4f}", f"{took:.1f}"]

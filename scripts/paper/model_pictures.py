@@ -17,7 +17,7 @@ from apex_ompl import load_model, load_problem
 from apex_ompl.apex.query import make_query
 from apex_ompl.benchmark.metrics import diversity as mean_distance
 from apex_ompl.benchmark.summary import Table
-from apex_ompl.diffusion.guidance import Guidance
+from apex_ompl.diffusion.guidance import EQUATION_7, Guidance
 from apex_ompl.diffusion.proposals import Sampling
 from apex_ompl.kernel import Kernel
 from apex_ompl.kernel.compiled.arrays import BOX, HALF_SPACE, SPHERE
@@ -34,7 +34,6 @@ SEED = 0
 TRIES = 4  # proposals for each path wanted
 MOMENTS = (0.0, 0.25, 0.5, 1.0)  # as shares of the reverse process
 HANDS = {"left_hand_palm_0": "tab:blue", "right_hand_palm_0": "tab:orange"}
-GUIDED = Guidance(1.0, "noise", active_below=0.25)
 
 
 def palm_positions(kernel: Kernel, path: np.ndarray) -> dict[str, np.ndarray]:
@@ -72,7 +71,7 @@ def denoising(args: Namespace) -> Made:
             snapshots[steps - 1 - t] = model.spline.path(model.control(sample, ends))[0]
 
     query, generator = make_query(ready.checker, ready.start, ready.goals[0]), np.random.default_rng(SEED)
-    sampling = Sampling("ddpm", steps, guidance=GUIDED)
+    sampling = Sampling("ddpm", steps, guidance=EQUATION_7)
     made = model.propose(query, kernel, 1, sampling=sampling, generator=generator, callback=keep)
     snapshots[steps] = model.spline.path(model.control(made.latent, ends))[0]
     picture = blank(12, 6.2)

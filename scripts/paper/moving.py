@@ -90,9 +90,10 @@ def dynamic(args: Namespace) -> Made:
     head = ["N", "R_f %", "95 %"]
     more = [*head, "causes", "S_r rad", "time to goal s", "replans"]
     notes, commits = of_runs(results, planned=False)
+    versions = "; ".join(sorted({str(run["costs"]) for run in results.runs if "costs" in run}))
     notes += [
         ("Loop", f"{LIMIT:g} s at most, {PACE:g} of the velocity limits, replans charged by the table of costs, "
-                 f"version {cost_table()['version']}; ideal: its answer is known at once"),
+                 f"version {versions}; ideal: its answer is known at once"),
         ("Sensor", "30 Hz, 50 ms late, errors of 8 mm, 2 % missed"),
     ]  # fmt: skip
     tables = [
@@ -105,8 +106,8 @@ def dynamic(args: Namespace) -> Made:
 
 def told(runs: Sequence[Run]) -> dict[str, Any]:
     """Return the numbers of some runs of one row."""
-    causes = Counter(run["outcome"] for run in runs if not run["solved"])
-    replans = [run["replans_asked"] for run in runs if run["replans_asked"] is not None]
+    causes = Counter(run.get("outcome", "crash") for run in runs if not run["solved"])
+    replans = [run["replans_asked"] for run in runs if run.get("replans_asked") is not None]
     return ratio(run["solved"] for run in runs) | {
         "causes": dict(causes.most_common()), "S_r": median(runs, "length"),
         "time_to_goal_s": median(runs, "time_to_goal"), "replans": float(np.mean(replans)) if replans else None,

@@ -9,6 +9,7 @@ from collections.abc import Collection, Sequence
 
 from apex_ompl.benchmark import Row
 from apex_ompl.benchmark.rows import PAPER
+from apex_ompl.planners.tuned import TUNED
 from apex_ompl.problems.alignment import SIZES, SPEEDS
 
 TASKS = ("vertical", "horizontal")
@@ -18,7 +19,7 @@ STATIC = {f"{task}/{size}": edge for task in TASKS for size, edge in {"free": 0.
 MOVING = {f"{task}/moving-{size}-{speed}": size for task in TASKS for size in SIZES for speed in SPEEDS}
 """Levels with a moving cube, with the size of it."""
 FAITHFUL, UNGUIDED, OURS = "apex-paper", "apex-paper, unguided", "apex"
-ALONE = {**PAPER, "model": "apex"}
+ALONE = {**PAPER, "model": "apex", "scaling": "clean"}
 
 PLANNERS = (
     Row(OURS, "apex"),
@@ -27,7 +28,8 @@ PLANNERS = (
     Row("apex's model alone", "apex", {**ALONE, "guidance": True}),
     Row("apex's model alone, unguided", "apex", ALONE),
     Row("rrt", "rrt"),
-    Row("rrtconnect", "rrtconnect"),
+    Row("rrtconnect", "rrtconnect", TUNED["rrtconnect"]),
+    Row("rrtconnect, OMPL's range", "rrtconnect"),
     Row("drrt", "drrt"),
     Row("gpmp", "gpmp"),
     Row("gpmp2", "gpmp2"),

@@ -43,7 +43,7 @@ def runs_of(
 
 def median(runs: Sequence[Run], column: str) -> float | None:
     """Return the median of a column over the solved runs that have it."""
-    values = [run[column] for run in runs if run["solved"] and run[column] is not None]
+    values = [run[column] for run in runs if run["solved"] and run.get(column) is not None]
     return float(np.median(values)) if values else None
 
 

@@ -27,6 +27,7 @@ SHARES = ((1.0, 0.7), (0.9, 0.4), (0.6, 0.2), (0.3, 0.1))  # of accelerations, a
 DELAYS = (0.0, 0.004, 0.008, 0.016, 0.032, 0.064, 0.128)  # of going on [s]
 CURVING = 0.6  # deviation of a spline per h^2 and acceleration: up to 1/3 at knots, and 1/4 in between
 STILL = 1e-12  # motion of a joint in a step that does not count [rad]
+SAME_TIME = 1e-9  # [s]
 RESTING = 1e-6  # step, in parts of h, that is the last
 LEAST_STEPS, SHORTEST = 6, 2e-3  # of a stop, and their length [s]
 
@@ -94,7 +95,7 @@ def _copy(knots: Floats, states: Floats, begin: float, end: float, times: Floats
     """Put the knots of a motion from ``begin`` to before ``end`` into place; return their number."""
     piece = path_piece(knots, begin, 0)
     count, time = 0, begin
-    while time < end:
+    while time < end - SAME_TIME:
         times[count] = time - begin
         for i in range(out.shape[2]):
             values = path_value(knots, states, piece, i, time)
