@@ -21,7 +21,7 @@ from apex_ompl.collision.cloud_contact import signed_distances, touches
 from apex_ompl.collision.clouds import PointCloud, cloud_geometry
 from apex_ompl.collision.cover.spheres import shape_key
 from apex_ompl.collision.shapes import is_shell, is_surface, mesh_geometry
-from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError, SceneError
+from apex_ompl.errors import ApexError, FileFormatError, MissingFileError, ParameterError, SceneError
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import AttachedObject, Obstacle
 from apex_ompl.scene.meshes import triangles, winding_number
@@ -244,7 +244,7 @@ def test_clouds_of_a_world_are_replaced(robot: Robot, tmp_path: Path) -> None:
             with pytest.raises(error, match=words):
                 world.set_points(*arguments)
         assert world.obstacles["seen"] is before
-        folder = Path(world._clouds._next()).parent
+        folder = Path(world._clouds.path(None)).parent
     del planner, world
     gc.collect()
     assert not folder.exists()
@@ -298,3 +298,21 @@ def test_points_on_the_robot_are_left_out(robot: Robot) -> None:
         filter_points(points, robot, q, -1.0)
     with pytest.raises(ParameterError, match="state"):
         filter_points(points, robot, q[:3])
+
+
+def test_files_of_clouds_that_are_there_stay_and_faulty_clouds_write_none(robot: Robot, tmp_path: Path) -> None:
+    with MotionPlanner(robot) as planner:
+        world, far = planner.world, np.array([[0.0, 0.0, 3.0]])
+        world.set_points("first", far, 0.01)
+        for k in range(30):
+            world.set_points("seen", far + 0.1 + 0.01 * k, 0.01)
+        files = [Path(world.obstacles[name].points.file) for name in ("first", "seen")]
+        assert all(file.is_file() for file in files) and len(list(files[0].parent.iterdir())) < 20
+        kept = tmp_path / "scan.npy"
+        world.set_points("scan", far, 0.01, file=kept)
+        world.add(name="box", box=(0.1, 0.1, 0.1), position=(0.0, 0.0, 3.0))
+        before = kept.read_bytes()
+        for name, points, radius in (("scan", far, -1.0), ("scan", np.empty((0, 3)), 0.01), ("box", far + 1.0, 0.01)):
+            with pytest.raises(ApexError):
+                world.set_points(name, points, radius, file=kept)
+            assert kept.read_bytes() == before

@@ -58,6 +58,15 @@ def test_a_number_that_stands_for_no_height_is_no_height(tmp_path: Path, unknown
         coal_geometry(field)
 
 
+@pytest.mark.parametrize(("side", "origin"), [(1e300, 0.0), (1e4, 0.0), (0.1, 1e300), (0.1, -1e4)])
+def test_grids_beyond_all_bounds_are_refused(tmp_path: Path, side: float, origin: float) -> None:
+    cells = grid_obstacle(
+        tmp_path, "voxels", occupied=np.ones((2, 2, 2), bool), resolution=side, origin=[origin, 0.0, 0.0]
+    )
+    with pytest.raises(FileFormatError, match="voxels.npz.*(resolution|origin)"):
+        coal_geometry(cells)
+
+
 def test_cells_are_seen_as_their_boxes(robot: Robot, tmp_path: Path) -> None:
     rng = np.random.default_rng(1)
     occupied = rng.random((6, 8, 6)) < 0.15

@@ -188,6 +188,24 @@ def test_a_request_ends_what_the_process_is_busy_with() -> None:
     assert all(one.answer.found is not None for one in spent) and spent[-2].answer.charges.spent < 8.0
 
 
+def test_a_process_that_reads_nothing_holds_nobody_up() -> None:
+    ready, world = ready_of(PROBLEM), world_of(PROBLEM)
+    work = Work(world.problem.still, ready.limits, ready.stopping, ready.settings, Faulty, ("never",), 0)
+    standing = Following.standing(ready.setup.start, 0.0, ready.names)
+    large = Movers([]).larger(0.0)
+    first = Request(1, 0.0, 0.05, standing, None, large, large, (), np.inf, 0)
+    with PlannerProcess(work) as process:
+        assert process.submit(first)
+        while process.reply(0.0) is None:
+            time.sleep(0.001)
+        assert process.submit(replace(first, number=2))  # which is never answered
+        time.sleep(0.1)
+        heavy = replace(first, number=3, obstacles=(np.zeros(4_000_000),))  # more than a pipe holds
+        assert process.submit(heavy) and not process.submit(heavy)
+        assert process.reply(0.0) is None
+    assert process.process.poll() is not None
+
+
 def test_movers_travel_between_processes() -> None:
     setup, box = setup_of(PROBLEM), crossing(setup_of(PROBLEM))
     movers = Movers([box])

@@ -5,13 +5,14 @@ from __future__ import annotations
 import pickle
 import threading
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
 import pytest
 from planning import EXACT, within
 
-from apex_ompl import Alignment, MotionPlanner, PlanStatus, PoseTarget, load_problem, plan
+from apex_ompl import Alignment, MotionPlanner, PlanStatus, PoseTarget, load_problem, plan, points_from_depth
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ApexError, ParameterError, UnknownNameError
 from apex_ompl.ompl_adapter.validity import full_check
@@ -218,6 +219,27 @@ def test_a_start_a_little_outside_of_its_limits_stays_where_it_is_moved_to(
         assert (result.path.states[:, 14] == 0.0).all() or group is None
         result.save(tmp_path / "r.npz")
         assert PlanResult.load(tmp_path / "r.npz")
+
+
+@pytest.mark.parametrize(
+    "asked",
+    [
+        lambda planner, home: planner.plan(home, home, name="my world"),
+        lambda planner, home: planner.plan(home, home, group=3),
+        lambda planner, home: planner.check({"left_joint1": [0.1, 0.2]}),
+        lambda planner, home: planner.world.move("post", 0.5),
+        lambda planner, home: planner.world.set_velocity("post", 0.3),
+        lambda planner, home: planner.world.add("post"),
+        lambda planner, home: planner.world.add(None),
+        lambda planner, home: planner.world.attach("post", "left_hand_palm", at={"left_joint1": 0.0}),
+        lambda planner, home: points_from_depth(np.ones((2, 2)), (1.0, 1.0, 0.5, 0.5), np.eye(4), range=5),
+    ],
+)
+def test_what_is_no_such_thing_is_an_error_of_this_package(planner: MotionPlanner, robot: Robot, asked: Any) -> None:
+    planner.world.add(**POST)
+    with pytest.raises(ApexError):
+        asked(planner, robot.home)
+    assert planner.world.obstacles["post"].position == POST["position"]
 
 
 def test_both_arms_are_a_group_without_the_hands(planner: MotionPlanner, robot: Robot) -> None:

@@ -107,7 +107,7 @@ class SceneBodies:
         turn = old.orientation if orientation is None else orientation
         kept = {key: value for key, value in old.model_dump().items() if key != "trajectory"}
         new = validate(
-            type(old), {**kept, "position": tuple(position), "orientation": tuple(turn)}, f"obstacle {name!r}"
+            type(old), {**kept, "position": _sequence(position), "orientation": _sequence(turn)}, f"obstacle {name!r}"
         )
         if isinstance(old, Obstacle) and old.trajectory is not None:
             new = moved_to(old, new.position).model_copy(update={"orientation": new.orientation})
@@ -128,7 +128,7 @@ class SceneBodies:
             FileFormatError: The velocity is not valid.
         """
         old = self._find(self.obstacles, name, "obstacle")
-        fields = {**standing(old).model_dump(), "velocity": None if velocity is None else tuple(velocity)}
+        fields = {**standing(old).model_dump(), "velocity": None if velocity is None else _sequence(velocity)}
         self._obstacles[name] = validate(Obstacle, fields, f"obstacle {name!r}")
 
     def remove(self, name: str) -> None:
@@ -216,3 +216,8 @@ class SceneBodies:
         if name not in bodies:
             raise SceneError(f"no {kind} {name!r}; there are: {', '.join(bodies) or 'none'}")
         return bodies[name]
+
+
+def _sequence(given: Any) -> Any:
+    """Return a sequence as a tuple, and anything else as it is, which is refused behind it."""
+    return tuple(given) if isinstance(given, Iterable) else given

@@ -27,6 +27,7 @@ STARTED = 120.0  # time that the process has to make itself ready [s]
 SENT = 2  # requests at most that are not answered yet
 HUNG = 10.0  # time without an answer after which the process is made anew [s]
 ASKED = 5e-4  # between two looks whether a request is overtaken, which cost 20 us each [s]
+WRITTEN = 1e-3  # time that is waited for the request before to be written [s]
 ENDED = 2.0  # time that it has to end [s]
 
 
@@ -158,24 +159,25 @@ class PlannerProcess:
     def submit(self, request: Request) -> bool:
         """Send a request, which ends what the process is busy with; return whether it was sent.
 
-        It is not where the process is not there, or one waits already; a process that has been busy for ``HUNG`` is
-        made anew.
+        It is not where the process is not there, or one waits already.
         """
-        if self._asked and time.monotonic() > self._asked[0] + HUNG:
-            self._replace("did not answer")
-        if self._ready and len(self._asked) < SENT:
-            try:
-                self._connection.send_bytes(pickle.dumps(request))
-                self._asked.append(time.monotonic())
-                return True
-            except OSError:
-                self._replace("died")
-        return False
+        if not self._ready or len(self._asked) >= SENT:
+            return False
+        self._sender.join(WRITTEN)
+        if self._sender.is_alive():
+            return False
+        message = self._connection, pickle.dumps(request)  # a process that does not read holds up who writes
+        self._sender = threading.Thread(target=_sent_bytes, args=message, daemon=True)
+        self._sender.start()
+        self._asked.append(time.monotonic())
+        return True
 
     def reply(self, now: float) -> Reply | None:
-        """Return the newest answer that has come, if any."""
+        """Return the newest answer that has come, if any; a process that has been busy for ``HUNG`` is made anew."""
         del now
         newest = None
+        if self._asked and time.monotonic() > self._asked[0] + HUNG:
+            self._replace("did not answer")
         try:
             while self._connection.poll():
                 said = self._connection.recv()
@@ -215,6 +217,12 @@ class PlannerProcess:
         except subprocess.TimeoutExpired:
             self.process.kill()
             self.process.wait()
+
+
+def _sent_bytes(connection: Connection[Any, Any], message: bytes) -> None:
+    """Send bytes to a process that may not read them; where it has died, the next look at its answers says so."""
+    with suppress(OSError):
+        connection.send_bytes(message)
 
 
 def _sent(connection: Connection[Any, Any], message: object) -> None:

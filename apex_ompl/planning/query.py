@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -38,7 +38,11 @@ def joint_values(robot: Robot, state: State, name: str) -> dict[str, float]:
         ParameterError: It has not the robot's shape, or a number that is not finite.
     """
     if isinstance(state, Mapping):
-        return {str(joint): float(finite_array(value, f"{name}.{joint}")) for joint, value in state.items()}
+        given = {str(joint): finite_array(value, f"{name}.{joint}") for joint, value in state.items()}
+        for joint, value in given.items():
+            if value.ndim:
+                raise ParameterError(f"{name}.{joint}", value.shape, "a number")
+        return {joint: float(value) for joint, value in given.items()}
     values = finite_array(state, name)
     if values.shape != (robot.dof,):
         raise ParameterError(name, values.shape, f"a state of shape ({robot.dof},), or values by joint name")
@@ -105,6 +109,8 @@ def planned_joints(robot: Robot, group: Group) -> tuple[str, ...]:
         ParameterError: No joint is left.
     """
     wanted: set[str] = set()
+    if not isinstance(group, Iterable):
+        raise ParameterError("group", group, "the name of a group or joint, or several of them")
     for name in [group] if isinstance(group, str) else group:
         if name in robot.groups:
             wanted |= {robot.joint_names[k] for k in robot.groups[name]}

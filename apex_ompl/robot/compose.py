@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree as ET
@@ -51,12 +52,13 @@ def compose(config: RobotConfig, folder: Path) -> Composition:
     part_links: dict[str, tuple[str, ...]] = {}
     for part in config.parts:
         rename = _renamer(part)
-        tree = _parse(resolve(part.urdf, folder, f"URDF of part {part.name!r}"))
+        urdf = resolve(part.urdf, folder, f"URDF of part {part.name!r}")
+        tree = _parse(urdf)
         _prune(tree, part)
         names = []
         for element in [*tree.findall("link"), *tree.findall("joint")]:
             _rename_element(element, rename)
-            _locate_meshes(element, folder, part)
+            _locate_meshes(element, (urdf.parent, folder), part)
             if element.tag == "link":
                 names.append(element.get("name", ""))
             root.append(element)
@@ -129,18 +131,25 @@ def _rename_element(element: ET.Element, rename: Callable[[str], str]) -> None:
             inner.set(key, rename(inner.get(key, "")))
 
 
-def _locate_meshes(element: ET.Element, folder: Path, part: Part) -> None:
+def _locate_meshes(element: ET.Element, folders: tuple[Path, Path], part: Part) -> None:
+    """Put the paths of mesh files into place: they start at the URDF's folder, else at the robot file's."""
     for kind in ("visual", "collision"):
         for holder in element.findall(kind):
             for mesh in holder.iter("mesh"):
                 role = f"{kind} mesh of link {element.get('name')!r}"
                 try:
-                    mesh.set("filename", str(resolve(mesh.get("filename", ""), folder, role)))
+                    mesh.set("filename", str(_resolved(mesh.get("filename", ""), folders, role)))
                 except MissingFileError:
                     if kind == "collision":
                         raise
                     element.remove(holder)
                     break
+
+
+def _resolved(name: str, folders: tuple[Path, Path], role: str) -> Path:
+    with suppress(MissingFileError):
+        return resolve(name, folders[0], role)
+    return resolve(name, folders[1], role)
 
 
 def _mount(root: ET.Element, part: Part, child: str) -> None:

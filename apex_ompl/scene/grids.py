@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apex_ompl.errors import FileFormatError
+from apex_ompl.scene.meshes import LARGEST
 from apex_ompl.scene.octomap import parse_octomap
 from apex_ompl.types import Array, Flags
 from apex_ompl.util.files import BROKEN
@@ -57,10 +58,10 @@ def parse_surface(file: str, content: bytes) -> tuple[Array, NDArray[np.int64]]:
     except BROKEN as error:
         raise FileFormatError(file, "", str(error)[:80], "expected an .npz file of NumPy") from error
     side = float(resolution) if resolution.ndim == 0 and is_number(resolution[()]) else np.nan
-    if not 0.0 < side < np.inf:
-        raise FileFormatError(file, "resolution", str(resolution)[:40], "expected a positive number of metres")
-    if origin.shape != (3,) or not np.isfinite(origin).all():
-        raise FileFormatError(file, "origin", str(origin)[:40], "expected three finite numbers of metres")
+    if not 0.0 < side < LARGEST:
+        raise FileFormatError(file, "resolution", str(resolution)[:40], f"expected metres from 0 to {LARGEST:g}")
+    if origin.shape != (3,) or not (np.abs(origin) < LARGEST).all():
+        raise FileFormatError(file, "origin", str(origin)[:40], f"expected three numbers of metres, below {LARGEST:g}")
     if not np.isfinite(values).all():
         raise FileFormatError(file, name, "numbers that are not finite", "expected finite ones")
     occupied = _occupied(file, name, values, side)

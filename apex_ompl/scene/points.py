@@ -145,7 +145,9 @@ def points_from_depth(
         raise ParameterError("intrinsics", (focal_x, focal_y), "positive focal lengths")
     if isinstance(stride, bool) or not isinstance(stride, (int, np.integer)) or stride < 1:
         raise ParameterError("stride", stride, "a whole number from 1")
-    near, far = range
+    ends = finite_array(range, "range")
+    check_array(ends, (2,), "range")
+    near, far = ends.tolist()
     if not 0.0 < near < far:
         raise ParameterError("range", range, "two positive depths, the least first")
     rows, columns = np.mgrid[0 : image.shape[0] : stride, 0 : image.shape[1] : stride]

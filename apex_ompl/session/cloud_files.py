@@ -6,16 +6,18 @@ import io
 import os
 import tempfile
 from collections import deque
+from collections.abc import Container
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from apex_ompl.errors import ParameterError
+from apex_ompl.types import Array
 from apex_ompl.util.files import write_atomically
 from apex_ompl.util.validation import finite_array
 
-KEPT = 10  # temporary files
+KEPT = 8  # temporary files that no obstacle has any more
 
 
 class CloudFiles:
@@ -27,33 +29,50 @@ class CloudFiles:
         self._files: deque[Path] = deque()
         self._count = 0
 
-    def write(self, points: ArrayLike, file: str | os.PathLike[str] | None) -> Path:
-        """Write points, shape (N, 3) [m], to a file or to a temporary one, and return its path.
+    def path(self, file: str | os.PathLike[str] | None) -> Path:
+        """Return the path of a file that is named, or of the next temporary one.
 
         Raises:
-            ParameterError: The points have another shape, or are not finite, or the file is no ``.npy``.
-            MissingFileError: The file cannot be written.
+            ParameterError: The file is no ``.npy``.
         """
-        cloud = finite_array(points, "points")
-        if cloud.ndim != 2 or cloud.shape[1] != 3:
-            raise ParameterError("points", cloud.shape, "an array of shape (N, 3)")
-        if file is None:
-            path = self._next()
-        else:
-            path = Path(file)
-            if path.suffix != ".npy":
+        if file is not None:
+            if Path(file).suffix != ".npy":
                 raise ParameterError("file", str(file), "a file name ending in .npy")
-        content = io.BytesIO()
-        np.save(content, cloud.astype(np.float32))
-        write_atomically(path, content.getvalue())
-        return path
-
-    def _next(self) -> Path:
+            return Path(file)
         if self._folder is None:
             self._folder = tempfile.TemporaryDirectory(prefix="apex_ompl-")
         self._count += 1
-        path = Path(self._folder.name) / f"cloud-{self._count}.npy"
-        self._files.append(path)
-        while len(self._files) > KEPT:
-            self._files.popleft().unlink(missing_ok=True)
-        return path
+        return Path(self._folder.name) / f"cloud-{self._count}.npy"
+
+    def write(self, cloud: Array, path: Path, used: Container[str]) -> None:
+        """Write points, shape (N, 3) [m], to one of the paths that :meth:`path` returns.
+
+        Args:
+            cloud: The points.
+            path: Where to.
+            used: Files that obstacles have, which are kept.
+
+        Raises:
+            MissingFileError: The file cannot be written.
+        """
+        content = io.BytesIO()
+        np.save(content, cloud.astype(np.float32))
+        write_atomically(path, content.getvalue())
+        if self._folder is not None and path.parent == Path(self._folder.name):
+            self._files.append(path)
+        free = [one for one in self._files if str(one) not in used and one != path]
+        for one in free[: max(len(free) - KEPT, 0)]:
+            self._files.remove(one)
+            one.unlink(missing_ok=True)
+
+
+def cloud_of(points: ArrayLike) -> Array:
+    """Return points as an array of shape (N, 3) [m].
+
+    Raises:
+        ParameterError: They have another shape, or are not finite.
+    """
+    cloud = finite_array(points, "points")
+    if cloud.ndim != 2 or cloud.shape[1] != 3:
+        raise ParameterError("points", cloud.shape, "an array of shape (N, 3)")
+    return cloud

@@ -34,6 +34,7 @@ from apex_ompl.scene.scripts import problem_at
 from apex_ompl.session.world import World
 from apex_ompl.trajectory import Timing, warm_up
 from apex_ompl.util.deadline import Deadline
+from apex_ompl.util.schema import validate
 from apex_ompl.util.validation import check_number, check_positive, check_seed
 
 
@@ -97,11 +98,12 @@ class MotionPlanner:
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what another process needs to make the same planner."""
-        obstacles, held = tuple(self.world.obstacles.values()), tuple(self.world.held.values())
-        return {
-            "robot": self.robot_file, "model": self.model, "obstacles": obstacles, "held": held,
-            "allowed": self.world.allowed,
-        }  # fmt: skip
+        with self._lock:
+            obstacles, held = tuple(self.world.obstacles.values()), tuple(self.world.held.values())
+            return {
+                "robot": self.robot_file, "model": self.model, "obstacles": obstacles, "held": held,
+                "allowed": self.world.allowed,
+            }  # fmt: skip
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Make the planner anew."""
@@ -169,10 +171,12 @@ class MotionPlanner:
         moving = self.robot.joint_names if group is None else planned_joints(self.robot, group)
         wanted = goal_record(self.robot, goal, {joint: v for joint, v in begin.items() if joint not in moving})
         with self._lock:
-            return Problem(
-                name=name, robot=self.robot_file, scene=tuple(self.world.obstacles.values()),
-                attached=tuple(self.world.held.values()), allowed=self.world.allowed, start=begin, goal=wanted,
-            )  # fmt: skip
+            fields = {
+                "name": name, "robot": self.robot_file, "scene": tuple(self.world.obstacles.values()),
+                "attached": tuple(self.world.held.values()), "allowed": self.world.allowed, "start": begin,
+                "goal": wanted,
+            }  # fmt: skip
+        return validate(Problem, fields, "problem")
 
     def is_free(self, state: State) -> bool:
         """Whether a state is inside the limits and free in the world as it is now; :meth:`check` says why it is not.
@@ -203,7 +207,8 @@ class MotionPlanner:
         Raises:
             ApexError: The start or the goal is faulty.
         """
-        ready = assemble(self.problem(start, goal), self.robot, checker=self._checker)
+        with self._lock:
+            ready = assemble(self.problem(start, goal), self.robot, checker=self._checker)
         ready.simple_setup.setPlannerAllocator(planners.allocator(NAME))
         return ready.simple_setup
 

@@ -14,12 +14,13 @@ from numpy.typing import ArrayLike
 
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.shapes import coal_geometry
-from apex_ompl.errors import SceneError
+from apex_ompl.errors import FileFormatError, SceneError
 from apex_ompl.scene.bodies import MOTION, AttachedObject, Obstacle, pose_fields
 from apex_ompl.scene.problem import Problem
-from apex_ompl.session.cloud_files import CloudFiles
+from apex_ompl.session.cloud_files import CloudFiles, cloud_of
 from apex_ompl.types import Array
 from apex_ompl.util.schema import validate
+from apex_ompl.util.validation import finite_array
 
 
 class World:
@@ -85,15 +86,19 @@ class World:
             FileFormatError: The radius is not positive, or there are no points.
             MissingFileError: The file cannot be written.
         """
-        path = self._clouds.write(points, file)
-        wanted = self._read(Obstacle, {"name": name, "points": {"file": str(path), "radius": radius}}, "obstacle")
+        cloud = cloud_of(points)
         with self._lock:
+            path = self._clouds.path(file)
+            wanted = self._read(Obstacle, {"name": name, "points": {"file": str(path), "radius": radius}}, "obstacle")
             old = self.obstacles.get(name)
+            if old is not None and old.points is None:
+                raise SceneError(f"the name {name!r} is taken by an obstacle that is no cloud of points")
+            if not len(cloud):
+                raise FileFormatError(str(path), "points", "none", "expected one point or more")
+            self._clouds.write(cloud, path, {o.points.file for o in self.obstacles.values() if o.points is not None})
             if old is None:
                 self._add([wanted])
                 return
-            if old.points is None:
-                raise SceneError(f"the name {name!r} is taken by an obstacle that is no cloud of points")
             coal_geometry(wanted)  # what is wrong with it shows before anything is changed
             allowed = [pair for pair in self.allowed if name in pair]
             self._checker.remove(name)
@@ -162,7 +167,7 @@ class World:
                         f"to attach the obstacle {held!r}, give the link and the state at which it is taken"
                     )
                 taken = self._obstacle(held)
-                held = self._as_held(taken, link, np.asarray(at, float))
+                held = self._as_held(taken, link, finite_array(at, "at"))
             wanted = self._read(AttachedObject, held, "held object")
             changes = {"link": link, "touch_links": None if touch_links is None else tuple(touch_links)}
             wanted = wanted.model_copy(update={key: value for key, value in changes.items() if value is not None})
@@ -172,7 +177,7 @@ class World:
             try:
                 self._checker.attach(wanted)
                 if at is not None:
-                    self._check_grasp(wanted.name, np.asarray(at, float))
+                    self._check_grasp(wanted.name, finite_array(at, "at"))
             except Exception:
                 if wanted.name in self.held and (taken is not None or self.held[wanted.name] is wanted):
                     self._checker.detach(wanted.name)
@@ -191,7 +196,7 @@ class World:
         with self._lock:
             held, left = self.held.get(name), []
             if at is not None and held is not None:
-                pose = self._checker.robot.link_pose(np.asarray(at, float), held.link) @ held.pose
+                pose = self._checker.robot.link_pose(finite_array(at, "at"), held.link) @ held.pose
                 shape = held.model_dump(exclude_none=True, exclude={"link", "touch_links", "contact"})
                 left = [self._read(Obstacle, {**shape, **pose_fields(pose)}, "obstacle")]
             self._checker.detach(name)
@@ -271,4 +276,5 @@ class World:
 
     @staticmethod
     def _read(kind: Any, given: Any, role: str) -> Any:
-        return given if isinstance(given, kind) else validate(kind, dict(given), role)
+        plain = dict(given) if isinstance(given, Mapping) else given
+        return given if isinstance(given, kind) else validate(kind, plain, role)
