@@ -16,16 +16,16 @@ from pathlib import Path
 
 import record
 from head_to_head import together
+from tune import TUNED_ON
 
 from apex_ompl.benchmark import Results, Row, Workers, bench
 from apex_ompl.benchmark.summary import statistics, warnings
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import one_or_more
 
-DEPENDS = ("@benchmark", "benchmarks/head_to_head.py")
+DEPENDS = ("@benchmark", "benchmarks/head_to_head.py", "benchmarks/tune.py")
 FOLDER = Path(__file__).parent / "runs" / "gpmp"
 TIMEOUT = 10.0  # [s]
-TUNED_ON = 4  # problems of a level, counted from the first, that the table keeps away from
 ROWS = (
     Row("gpmp", "gpmp"),
     Row("gpmp2", "gpmp2"),

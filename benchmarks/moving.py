@@ -23,7 +23,7 @@ import record
 from apex_ompl import problems
 from apex_ompl.benchmark import Results, Row, Workers, bench, runs
 from apex_ompl.benchmark.rows import Job
-from apex_ompl.benchmark.runs import NO_PROBLEM, Run
+from apex_ompl.benchmark.runs import Run
 from apex_ompl.live.moving import check_timed_path
 from apex_ompl.planning.among_movers import RETIMED, SPACE_TIME, STAGES
 from apex_ompl.problems.alignment import SIZES, SPEEDS, VELOCITY_SCALE
@@ -133,7 +133,7 @@ def main() -> None:
     results = Results.load(args.store)
     made = [
         run for run in results.runs
-        if run["experiment"] in LEVELS and run["seed"] < args.n and run["status"] != NO_PROBLEM
+        if run["experiment"] in LEVELS and run["seed"] < args.n and run["status"] != runs.NO_PROBLEM
     ]  # fmt: skip
     by_row = {name: summary([run for run in made if run["label"] == name]) for name in ROWS}
     first = next(iter(ROWS))

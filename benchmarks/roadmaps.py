@@ -14,6 +14,7 @@ from dataclasses import replace
 from typing import Any
 
 import record
+from tune import TUNED_ON
 
 from apex_ompl.benchmark import Results, Row, Workers, bench
 from apex_ompl.benchmark.runs import NO_PROBLEM
@@ -22,12 +23,12 @@ from apex_ompl.util.statistics import share_interval
 from apex_ompl.util.validation import one_or_more
 
 DEPENDS = (
-    "@planning", "apex_ompl/benchmark", "apex_ompl/roadmaps", "benchmarks/baselines", "scripts/train_damon.py",
+    "@planning", "apex_ompl/benchmark", "apex_ompl/roadmaps", "benchmarks/baselines", "benchmarks/tune.py",
+    "scripts/train_damon.py",
 )  # fmt: skip
 FOLDER = record.ROOT / "benchmarks" / "runs" / "roadmaps"
 LEVELS = ("vertical/free", "vertical/small", "horizontal/free", "horizontal/small", "shelf/easy")
 TIMEOUT = 10.0  # [s]
-TUNED_ON = 4  # problems of a level, counted from the first, that the table keeps away from
 
 ROWS = [
     *(Row.of("damon", {"model": f"damon-{dim}", "nodes": kind}) for kind in ("decoded", "stored") for dim in (2, 4, 8)),

@@ -56,6 +56,7 @@ TIMEOUT = 2.0  # [s]
 UNSOLVED_TIME, UNSOLVED_LENGTH = 2.0 * TIMEOUT, 2.0  # [s], times the shortest
 RUNGS = ((8, 1), (4, 2), (2, 4))
 """Candidates that are left besides the default, and problems of a level."""
+TUNED_ON = RUNGS[-1][1]  # first problems of a level that planners are tuned on
 
 
 def ranges(*steps: float, **others: Any) -> list[dict[str, Any]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar
 
 from ompl import base as ob
@@ -102,9 +102,9 @@ class ApexParameters(Parameters):
     def sampling(self, default: Sampling) -> Sampling:
         """Return how proposals are denoised; ``default`` is the checkpoint's own sampling."""
         from apex_ompl.diffusion import proposals
-        from apex_ompl.diffusion.guidance import Guidance
+        from apex_ompl.diffusion.guidance import GUIDANCES
 
-        guidance = Guidance(gamma=self.gamma if self.guidance else 0.0, scaling=self.scaling)
+        guidance = replace(GUIDANCES[self.scaling], gamma=self.gamma if self.guidance else 0.0)
         sampler = default.sampler if self.sampler == "model" else self.sampler
         steps, temperature = self.denoising_steps or default.steps, self.temperature * default.temperature
         return proposals.Sampling(sampler, steps, temperature, guidance)

@@ -121,3 +121,10 @@ def test_motions_shorter_than_a_tick() -> None:
     assert still.end == 1.0 and still.at_rest(1.0) and np.array_equal(still.piece(1.0, 1.01).positions, [home, home])
     nothing = executed([(0.0, still)], 0.0)
     assert nothing.duration == 0.0 and np.array_equal(nothing.positions, [home])
+
+
+@pytest.mark.parametrize("time", [0.0, BEGIN, BEGIN + 50.0])
+def test_a_piece_of_no_length_is_a_state(time: float) -> None:
+    piece = one().piece(time, time)
+    assert piece.duration == 0.0 and np.array_equal(piece.positions, [values(one(), time)[0]])
+    assert not piece.velocities.any() and not piece.accelerations.any()

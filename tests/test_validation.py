@@ -8,6 +8,7 @@ import pytest
 
 from apex_ompl.errors import ParameterError
 from apex_ompl.util import validation as v
+from apex_ompl.util.bounded_cache import kept
 
 
 @pytest.mark.parametrize(
@@ -61,3 +62,12 @@ def test_integers_on_a_command_line(text: str) -> None:
         with pytest.raises(argparse.ArgumentTypeError, match="expected a whole number"):
             read(text)
     assert v.whole_number("0") == 0 and v.one_or_more("7") == 7
+
+
+def test_results_are_kept_up_to_a_number_and_the_oldest_are_dropped() -> None:
+    made: list[str] = []
+    results: dict[str, str] = {}
+    for key in "abacadaeb":
+        assert kept(results, key, lambda key=key: made.append(key) or key.upper(), 3) == key.upper()
+        assert len(results) <= 3
+    assert "".join(made) == "abcdaeb" and list(results) == ["a", "e", "b"]

@@ -25,8 +25,8 @@ PAPER = {
     "model": "apex-paper", "line": False, "repair": False, "bridge": False, "fallback": False, "polish": False,
     "first": 8, "second": 8, "third": 16, "resample": 2, "scaling": "noise",
 }  # fmt: skip
-"""Parameters of apex that leave only the paper's algorithm, without guidance: ancestral sampling with all steps, and
-collision-triggered resampling."""
+"""Parameters of apex that leave only the paper's algorithm: ancestral sampling with all steps, and collision-triggered
+resampling. It is without guidance, which is that of equation 7 where ``guidance`` is added."""
 
 RunnerFunction = Callable[["Job"], Mapping[str, Any]]
 

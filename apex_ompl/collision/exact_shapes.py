@@ -21,6 +21,7 @@ from apex_ompl.kernel.compiled.layout import Integers
 from apex_ompl.kernel.compiled.shapes import HULL, POINT, TRIANGLE, ShapeArrays
 from apex_ompl.scene.meshes import triangles
 from apex_ompl.types import Array
+from apex_ompl.util.bounded_cache import kept
 from apex_ompl.util.weak_cache import weakly_cached
 
 CONVEX_TOLERANCE = 1e-7  # a mesh is its hull when its triangles' centres are no deeper than this below it [m]
@@ -118,12 +119,7 @@ def mesh_of(geometry: coal.CollisionGeometry) -> Mesh:
     """
     if cloud_of(geometry) is not None:
         return _analysed(geometry)
-    key = shape_key(geometry)
-    if key not in _meshes:
-        while len(_meshes) >= MOST_MESHES:
-            _meshes.pop(next(iter(_meshes)), None)
-        _meshes[key] = _analysed(geometry)
-    return _meshes[key]
+    return kept(_meshes, shape_key(geometry), lambda: _analysed(geometry), MOST_MESHES)
 
 
 def _analysed(geometry: coal.CollisionGeometry) -> Mesh:

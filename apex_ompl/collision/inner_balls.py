@@ -14,13 +14,12 @@ from apex_ompl.collision.cover.spheres import shape_key
 from apex_ompl.collision.hulls import convex_hull, hull_planes
 from apex_ompl.collision.shapes import is_shell, is_surface
 from apex_ompl.types import Array
+from apex_ompl.util.bounded_cache import kept
 
 PLACES = 60  # at which the depth is looked at, about
 MOST = 12  # balls of a solid
 LEAST = 0.01  # share of the places inside that a further ball must add
 POINT = 1e-9  # radius of the ball that stands for a point [m]
-
-
 MOST_KEPT = 1024  # shapes whose balls are kept
 
 _known: dict[str, Array] = {}  # by shape key
@@ -34,13 +33,7 @@ def inner_balls(geometry: coal.CollisionGeometry) -> Array:
     Raises:
         ParameterError: The kind of geometry has no balls.
     """
-    key = shape_key(geometry)
-    if key not in _known:
-        balls = _chosen(geometry)
-        if len(_known) >= MOST_KEPT:
-            _known.pop(next(iter(_known)), None)
-        _known[key] = balls
-    return _known[key]
+    return kept(_known, shape_key(geometry), lambda: _chosen(geometry), MOST_KEPT)
 
 
 def _chosen(geometry: coal.CollisionGeometry) -> Array:

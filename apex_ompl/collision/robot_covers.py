@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 import coal
 
@@ -12,8 +13,10 @@ from apex_ompl.collision.cover.rough import rough_cover
 from apex_ompl.collision.cover.spheres import make_cover, read_covers, shape_key
 from apex_ompl.collision.shapes import is_shell
 from apex_ompl.robot import Robot
+from apex_ompl.util.bounded_cache import kept
 from apex_ompl.util.weak_cache import weakly_cached
 
+MOST_KEPT = 1024  # covers made at run time that are kept
 QUICK_GAPS, LEAVES = (0.02, 0.005), 32  # of covers made at run time
 
 _quick: dict[str, Cover] = {}  # by shape key
@@ -33,9 +36,7 @@ def covers_of(robot: Robot, shapes: Sequence[coal.CollisionGeometry]) -> list[Co
     found = []
     for shape in shapes:
         key = shape_key(shape)
-        if key not in given and key not in _quick:
-            _quick[key] = _quick_cover(shape)
-        found.append(given[key] if key in given else _quick[key])
+        found.append(given[key] if key in given else kept(_quick, key, partial(_quick_cover, shape), MOST_KEPT))
     return found
 
 

@@ -64,8 +64,11 @@ class Guidance:
         return np.linspace(0, count - 1, self.samples).round().astype(np.int64)
 
 
-EQUATION_7 = Guidance(scaling="noise")
-"""Guidance as the paper has it, of the model apex-paper."""
+EQUATION_7 = Guidance(scaling="noise", active_below=0.25)
+"""Guidance as the paper has it, of the model apex-paper, in the last quarter of the steps: acting for longer it solves
+less (8, 5 and 2 of 20 validation problems with 0.25, 0.6 and 1, in 10 s)."""
+GUIDANCES = {"clean": Guidance(), "noise": EQUATION_7}
+"""What is used of each scaling."""
 
 
 def collision_cost(kernel: Kernel, paths: Array, margin: float) -> tuple[Array, Array]:

@@ -12,7 +12,7 @@ from apex_ompl.kernel.search_buffers import SearchBuffers, SearchCounts
 from apex_ompl.types import Array
 
 AT_ONCE = 256  # random states between two looks at the clock, where steps are 1 rad and longer
-LEAST_STEP = 0.01  # longest steps may not be shorter: as many are made for each random state [rad]
+LEAST_STEP = 0.01  # least longest step: one random state may cost as many as there are across the limits [rad]
 ROOM = 1024  # nodes of a tree to begin with
 NEAR = 0.5  # share of random states that lie around a straight line between a start and a goal
 SPREAD = 2.0  # standard deviation of these from the line, at most [rad]

@@ -62,10 +62,9 @@ class Following:
     def piece(self, begin: float, end: float) -> Trajectory:
         """Return what the robot does between two times of the clock [s]."""
         if self.at_rest(begin) or end <= self.begin + SAME_TIME:
-            q, still = self.motion.positions[[-1 if self.at_rest(begin) else 0]], np.zeros((2, self.motion.dof))
-            return Trajectory(
-                np.array([0.0, end - begin]), np.repeat(q, 2, axis=0), still, still, self.motion.joint_names
-            )
+            times = np.array([0.0, end - begin] if end > begin else [0.0])
+            q = np.repeat(self.motion.positions[[-1 if self.at_rest(begin) else 0]], len(times), axis=0)
+            return Trajectory(times, q, np.zeros_like(q), np.zeros_like(q), self.motion.joint_names)
         if begin < self.begin - SAME_TIME:
             return concatenate([self.piece(begin, self.begin), self.piece(self.begin, end)])
         last = min(end, self.end) - self.begin

@@ -125,9 +125,7 @@ class PlannerProcess:
         self._connection: Connection[Any, Any] = mine
         self._ready = False
         self._asked: list[float] = []
-        first = sys.path, self._core, pickle.dumps(self._work)
-        self._sender = threading.Thread(target=_sent, args=(mine, first), daemon=True)
-        self._sender.start()
+        self._send((sys.path, self._core, pickle.dumps(self._work)))
 
     def __enter__(self) -> Self:
         """Wait until it is ready.
@@ -166,11 +164,14 @@ class PlannerProcess:
         self._sender.join(WRITTEN)
         if self._sender.is_alive():
             return False
-        message = self._connection, pickle.dumps(request)  # a process that does not read holds up who writes
-        self._sender = threading.Thread(target=_sent_bytes, args=message, daemon=True)
-        self._sender.start()
+        self._send(request)
         self._asked.append(time.monotonic())
         return True
+
+    def _send(self, message: object) -> None:
+        """Send a message as it is now from a thread: a process that does not read holds up who writes."""
+        self._sender = threading.Thread(target=_sent, args=(self._connection, pickle.dumps(message)), daemon=True)
+        self._sender.start()
 
     def reply(self, now: float) -> Reply | None:
         """Return the newest answer that has come, if any; a process that has been busy for ``HUNG`` is made anew."""
@@ -219,13 +220,7 @@ class PlannerProcess:
             self.process.wait()
 
 
-def _sent_bytes(connection: Connection[Any, Any], message: bytes) -> None:
-    """Send bytes to a process that may not read them; where it has died, the next look at its answers says so."""
+def _sent(connection: Connection[Any, Any], message: bytes) -> None:
+    """Send a message to a process that may not read it; where it has died, the next look at its answers says so."""
     with suppress(OSError):
         connection.send_bytes(message)
-
-
-def _sent(connection: Connection[Any, Any], message: object) -> None:
-    """Send a message to a process that may not read it."""
-    with suppress(OSError):
-        connection.send(message)

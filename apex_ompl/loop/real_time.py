@@ -66,7 +66,7 @@ def warm_up(ready: Ready, world: World, seed: int) -> None:
     ready.proved_stop(tracker.reachable(0.0, 0.0), line, half, half + ready.settings.period)
     ready.clear_of_still(motion)
     request = Request(1, 0.0, 0.05, line, line, predicted, predicted.larger(0.01), present, np.inf, seed)
-    pickle.loads(pickle.dumps((request, line.piece(half, line.end) if half else motion)))
+    pickle.loads(pickle.dumps((request, line.piece(half, line.end))))
 
 
 def run_in_real_time(world: World, ready: Ready, planner: PlannerProcess, eyes: Eyes, seed: int) -> RunRecord:

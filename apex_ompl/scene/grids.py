@@ -92,10 +92,10 @@ def _occupied(file: str, name: str, values: Array, side: float) -> Flags:
         return np.asarray(values != 0)
     if name == "distances":
         return np.asarray(values <= 0.5 * np.sqrt(3.0) * side)
-    most = (float(values.max()) - float(values.min())) / side + 1.0
+    most = math.ceil((float(values.max()) - float(values.min())) / side - 1e-9) + 1
     if most * values.size > MOST_CELLS:  # also where a number stands for a height that is not known
-        found = f"heights from {values.min():.3g} to {values.max():.3g} m, {most * values.size:.3g} cells"
-        raise FileFormatError(file, name, found, f"expected at most {MOST_CELLS} cells")
+        found = f"{most * values.size:.3g} cells, for heights from {values.min():.3g} to {values.max():.3g} m"
+        raise FileFormatError(file, name, found, f"expected at most {MOST_CELLS}")
     levels = np.ceil((values - values.min()) / side - 1e-9).astype(np.int64) + 1
     return np.asarray(np.arange(levels.max()) < levels[:, :, None])
 

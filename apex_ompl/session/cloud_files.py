@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import os
 import tempfile
-from collections import deque
 from collections.abc import Container
 from pathlib import Path
 
@@ -26,7 +25,7 @@ class CloudFiles:
     def __init__(self) -> None:
         """Make no folder yet."""
         self._folder: tempfile.TemporaryDirectory[str] | None = None
-        self._files: deque[Path] = deque()
+        self._files: list[Path] = []
         self._count = 0
 
     def path(self, file: str | os.PathLike[str] | None) -> Path:
@@ -61,7 +60,7 @@ class CloudFiles:
         if self._folder is not None and path.parent == Path(self._folder.name):
             self._files.append(path)
         free = [one for one in self._files if str(one) not in used and one != path]
-        for one in free[: max(len(free) - KEPT, 0)]:
+        for one in free[:-KEPT]:
             self._files.remove(one)
             one.unlink(missing_ok=True)
 

@@ -23,7 +23,7 @@ from apex_ompl.datasets.records import SOURCES, Paths
 from apex_ompl.datasets.store import Store
 from apex_ompl.diffusion.autoencoder import Autoencoder
 from apex_ompl.diffusion.checkpoint import load_model, load_torch_model
-from apex_ompl.diffusion.guidance import EQUATION_7, Guidance
+from apex_ompl.diffusion.guidance import GUIDANCES
 from apex_ompl.diffusion.proposals import Sampling
 from apex_ompl.generation.solving import solve_unit
 from apex_ompl.generation.units import plan_units
@@ -57,7 +57,7 @@ def proposed(job: Job) -> Run:
     torch.set_num_threads(1)
     model = load(job.planner)
     own = {"apex": load("apex").sampling, "apex-paper": Sampling("ddim", STEPS)}[job.planner]
-    guidance = {"apex": Guidance(), "apex-paper": EQUATION_7}[job.planner]
+    guidance = GUIDANCES["noise" if job.planner == "apex-paper" else "clean"]
     sampling = replace(own, guidance=replace(guidance, gamma=job.params["gamma"]))
     ready = assemble(problems.load(job.problem), robot())
     query = make_query(ready.checker, ready.start, ready.goals[0])
