@@ -37,12 +37,12 @@ DEPENDS = (
 )  # fmt: skip
 FIGURES = {
     "time": ("static", 20, "problems of a task"),
-    "failure": ("static", 40, "problems of a level"),
-    "size": ("static", 40, "problems of a level"),
-    "dynamic": ("moving", 10, "worlds of a level"),
-    "strips": ("examples", 10, "worlds of a level"),
-    "failures": ("examples", 10, "worlds of a level"),
-    "fid": ("fid", 2000, "problems in all"),
+    "failure": ("static", 20, "problems of a level"),
+    "size": ("static", 20, "problems of a level"),
+    "dynamic": ("moving", 5, "worlds of a level"),
+    "strips": ("examples", 5, "worlds of a level"),
+    "failures": ("examples", 5, "worlds of a level"),
+    "fid": ("fid", 400, "problems in all"),
     "denoising": ("model_pictures", 1, "problems"),
     "diversity": ("model_pictures", 12, "trajectories"),
 }

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 SIZE = (720, 440)
-TRIES, PAUSE = 6, 0.4  # [s]
+TRIES, PAUSE = 18, 0.4  # [s]
 BROWSER, DRIVER = shutil.which("chromium"), shutil.which("chromedriver")
 needs_browser = pytest.mark.skipif(
     BROWSER is None or DRIVER is None, reason="no browser: apt-get install chromium chromium-driver"
@@ -47,7 +47,7 @@ def browser() -> Iterator[Any]:
         driver.quit()
 
 
-def until(condition: Callable[[], Any], what: str, seconds: float = 60.0) -> Any:
+def until(condition: Callable[[], Any], what: str, seconds: float = 240.0) -> Any:
     """Wait until a condition holds, and return what it gave."""
     end = time.monotonic() + seconds
     while time.monotonic() < end:

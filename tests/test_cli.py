@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -189,24 +190,35 @@ def cpu_time(pid: int) -> float:
     return (int(user) + int(system)) / os.sysconf("SC_CLK_TCK")
 
 
+@pytest.fixture(scope="module")
+def set_up() -> float:
+    """CPU time of imports and set-up [s], by this machine as it is loaded now."""
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    command = [sys.executable, "-m", "apex_ompl.cli", "plan", "shelf_swap", "--planner", "rrtstar", "--timeout", "0.01"]
+    subprocess.run(command, check=False, capture_output=True, timeout=300)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+
+
 @pytest.mark.parametrize(
     ("planner", "settings"),
     [("rrtconnect", ["range=0.001"]), ("prm", ["max_nearest_neighbors=1"]), ("prmstar", []), ("rrtstar", [])],
 )
-def test_ctrl_c_ends_a_plan_with_its_exit_code_and_no_output(planner: str, settings: list[str], tmp_path: Path) -> None:
+def test_ctrl_c_ends_a_plan_with_its_exit_code_and_no_output(
+    planner: str, settings: list[str], set_up: float, tmp_path: Path
+) -> None:
     """Planners that run until the time limit: asymptotically optimal ones, or slowed down by a parameter."""
     command = [sys.executable, "-m", "apex_ompl.cli", "plan", "shelf_swap", "--planner", planner]
     command += [word for setting in settings for word in ("--set", setting)]
-    command += ["--timeout", "60", "--out", str(tmp_path / "r.npz")]
+    command += ["--timeout", "600", "--out", str(tmp_path / "r.npz")]
     running = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    while running.poll() is None and cpu_time(running.pid) < 2.5:  # imports and set-up take 1.4 s of it
+    while running.poll() is None and cpu_time(running.pid) < 1.5 * set_up + 0.5:
         time.sleep(0.05)
     assert running.poll() is None, running.communicate()
-    sent = time.perf_counter()
     running.send_signal(signal.SIGINT)
-    out, err = running.communicate(timeout=30)
-    assert time.perf_counter() - sent < 10.0
-    assert running.returncode == 130 and out == "" and "interrupted" in err and "Traceback" not in err
+    out, err = running.communicate(timeout=120)  # a fifth of the time limit
+    assert running.returncode == 130, (running.returncode, out, err)
+    assert out == "" and "interrupted" in err and "Traceback" not in err
     assert not (tmp_path / "r.npz").exists()
 
 

@@ -312,7 +312,8 @@ def test_files_of_clouds_that_are_there_stay_and_faulty_clouds_write_none(robot:
         world.set_points("scan", far, 0.01, file=kept)
         world.add(name="box", box=(0.1, 0.1, 0.1), position=(0.0, 0.0, 3.0))
         before = kept.read_bytes()
-        for name, points, radius in (("scan", far, -1.0), ("scan", np.empty((0, 3)), 0.01), ("box", far + 1.0, 0.01)):
+        wrong = ("scan", far, -1.0), ("scan", far[:0], 0.01), ("box", far + 1.0, 0.01), ("left_link3", far + 1.0, 0.01)
+        for name, points, radius in wrong:
             with pytest.raises(ApexError):
                 world.set_points(name, points, radius, file=kept)
             assert kept.read_bytes() == before

@@ -188,6 +188,21 @@ def test_answers_that_do_not_fit_are_rejected_and_the_robot_stands(find: Find, n
     assert report.contact is None and report.still_contact is None
 
 
+@pytest.mark.parametrize(("fault", "why"), [(0.1, "constant jerk before knot"), (np.nan, "finite")])
+def test_answers_that_are_no_motion_are_rejected(fault: float, why: str) -> None:
+    """As another process may send them."""
+
+    def torn(ready: Ready, request: Request) -> Following:
+        found = line(ready, request)
+        times, positions, *others = found.motion.knots
+        positions = positions.copy()
+        positions[len(times) // 2, 0] += fault
+        return replace(found, motion=Trajectory.unchecked(times, (positions, *others), ready.names))
+
+    done, _ = go(ByHand(torn), timeout=0.5)
+    assert stood(done) and {"it is no motion" in reason and why in reason for reason in reasons(done)} == {True}
+
+
 def first_line_then(find: Find) -> Find:
     """The straight line at first, and then something else."""
     return lambda ready, request: line(ready, request) if request.number == 1 else find(ready, request)

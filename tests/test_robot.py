@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
@@ -7,11 +8,13 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+from apex_ompl import PlanStatus, plan
 from apex_ompl.errors import ApexError, FileFormatError, MissingFileError, RobotError, UnknownNameError
 from apex_ompl.robot import Robot, load_robot, robot_names
 from apex_ompl.robot.assets import DATA, resolve
 from apex_ompl.robot.config import read_config
 from apex_ompl.robot.model import build_robot
+from apex_ompl.scene.problem import Problem
 
 PANDA = "package://example-robot-data/robots/panda_description/urdf/panda.urdf"
 ARM = [f"joint{k}" for k in range(1, 8)]
@@ -172,6 +175,27 @@ def test_any_urdf_loads_from_a_short_file(tmp_path: Path) -> None:
     small = load_robot(write_small(tmp_path))
     assert small.joint_names == ("shoulder",)
     assert small.home.tolist() == [0.1]
+
+
+def test_a_robot_names_the_files_that_it_was_read_from(robot: Robot, tmp_path: Path) -> None:
+    path = write_small(tmp_path)
+    assert load_robot(path).files == (path, tmp_path / "small.urdf")
+    endings = {file.suffix for file in robot.files}
+    assert all(file.is_file() for file in robot.files) and {".yaml", ".urdf", ".srdf"} < endings and len(endings) > 4
+
+
+def test_plan_makes_a_robot_anew_whose_files_have_changed(tmp_path: Path) -> None:
+    path = write_small(tmp_path, '<sphere radius="0.05"/>')
+    wall = {"name": "wall", "box": [0.1, 0.1, 0.1], "position": [0.0, 0.0, 0.4]}
+    fields = {"name": "swing", "robot": str(path), "scene": [wall], "start": {"shoulder": 0.1}}
+    problem = Problem(**fields, goal={"joints": [{"shoulder": 0.5}]})
+    assert plan(problem) and plan(problem)
+    write_small(tmp_path, '<sphere radius="0.5"/>')
+    os.utime(tmp_path / "small.urdf", ns=(0, 1))  # a clock that is too coarse to see it changes nothing
+    assert plan(problem).status is PlanStatus.INVALID_START
+    (tmp_path / "small.urdf").unlink()
+    with pytest.raises(MissingFileError, match=r"small\.urdf"):
+        plan(problem)
 
 
 def test_faulty_robot_files_say_what_is_wrong(tmp_path: Path) -> None:

@@ -33,6 +33,20 @@ def ends(problem: Problem, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
     return problem.start_state(robot.joint_names), problem.goal_states(robot.joint_names)[0]
 
 
+def test_what_is_yet_to_appear_is_not_there(planner: MotionPlanner, problem: Problem, robot: Robot) -> None:
+    start, goal = ends(problem, robot)
+    later = {"name": "later", "sphere": {"radius": 0.3}, "position": (0.0, 0.3, 0.4)}
+    planner.world.add(**later, appears=1.0)
+    planner.world.add(**POST)
+    assert planner.is_free(start) and planner.check(start) and not planner.check(start).contacts
+    assert planner.simple_setup(start, goal).solve(within(20.0)).getStatus() == EXACT
+    assert "later" in planner.world.obstacles
+    assert {o.name for o in planner.plan(start, goal, snapshot=True).problem.scene} == {"later", "post"}
+    planner.world.remove("later")
+    planner.world.add(**later)
+    assert not planner.is_free(start) and "later" in planner.check(start).reason
+
+
 def test_plans_follow_the_world(planner: MotionPlanner, problem: Problem, robot: Robot) -> None:
     start, goal = ends(problem, robot)
     empty = planner.plan(start, goal)

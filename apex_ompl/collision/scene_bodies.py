@@ -89,7 +89,7 @@ class SceneBodies:
             SceneError: The name is taken already.
             MissingFileError, FileFormatError: Its mesh file is missing, or holds no triangles.
         """
-        self._claim(obstacle.name)
+        self.check_name(obstacle.name)
         self.meshes.add(obstacle.name, *world_geometry(obstacle))
         self._obstacles[obstacle.name] = obstacle
         self._obstacles_changed()
@@ -152,7 +152,7 @@ class SceneBodies:
             MissingFileError: Its mesh file is missing.
             FileFormatError: Its mesh file holds no triangles.
         """
-        self._claim(held.name)
+        self.check_name(held.name)
         for link in (held.link, *(held.touch_links or ())):
             self.robot.link_frame(link)
         geometry = coal_geometry(held)
@@ -207,7 +207,12 @@ class SceneBodies:
             if any(not pair & self._obstacles.keys() for pair in changed):
                 self._held_changed()
 
-    def _claim(self, name: str) -> None:
+    def check_name(self, name: str) -> None:
+        """Check that a body may get a name.
+
+        Raises:
+            SceneError: The name is taken already.
+        """
         if name in self._obstacles or name in self._attached or self.robot.model.existBodyName(name):
             raise SceneError(f"the name {name!r} is taken by an obstacle, a held object, a fixture or a link")
 

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
+from apex_ompl.errors import ParameterError
 from apex_ompl.loop.following import SAME_TIME, Following
 from apex_ompl.loop.ready import Ready
 from apex_ompl.loop.request import Request
@@ -20,6 +23,10 @@ def misfit(ready: Ready, found: Following, request: Request) -> str:
         request: What was asked for.
     """
     motion = found.motion
+    try:
+        replace(motion)  # it may come from another process, and be none at all
+    except ParameterError as error:
+        return f"it is no motion: {error}"
     if motion.joint_names != ready.names:
         return "it is a motion of other joints"
     behind = request.following.start(request.join)

@@ -31,6 +31,7 @@ class Composition:
     urdf: str
     disabled_pairs: list[tuple[str, str]]
     part_links: dict[str, tuple[str, ...]]
+    files: tuple[Path, ...]
 
 
 def compose(config: RobotConfig, folder: Path) -> Composition:
@@ -50,9 +51,11 @@ def compose(config: RobotConfig, folder: Path) -> Composition:
     links = {"world"}
     disabled: list[tuple[str, str]] = []
     part_links: dict[str, tuple[str, ...]] = {}
+    files: list[Path] = []
     for part in config.parts:
         rename = _renamer(part)
         urdf = resolve(part.urdf, folder, f"URDF of part {part.name!r}")
+        files.append(urdf)
         tree = _parse(urdf)
         _prune(tree, part)
         names = []
@@ -75,12 +78,14 @@ def compose(config: RobotConfig, folder: Path) -> Composition:
         links.update(names)
         part_links[part.name] = tuple(names)
         if part.srdf:
-            srdf = _parse(resolve(part.srdf, folder, f"SRDF of part {part.name!r}"))
-            pairs = [(rename(e.get("link1", "")), rename(e.get("link2", ""))) for e in srdf.iter("disable_collisions")]
+            files.append(resolve(part.srdf, folder, f"SRDF of part {part.name!r}"))
+            found = _parse(files[-1]).iter("disable_collisions")
+            pairs = [(rename(e.get("link1", "")), rename(e.get("link2", ""))) for e in found]
             disabled += [(a, b) for a, b in pairs if a in names and b in names]
     for name, value in config.locked.items():
         _lock(root, name, value)
-    return Composition(ET.tostring(root, encoding="unicode"), disabled, part_links)
+    files += [Path(mesh.get("filename", "").removeprefix("file://")) for mesh in root.iter("mesh")]
+    return Composition(ET.tostring(root, encoding="unicode"), disabled, part_links, tuple(dict.fromkeys(files)))
 
 
 def _parse(path: Path) -> ET.Element:

@@ -57,6 +57,7 @@ class Robot:
         part_links: Part name -> names of its links.
         urdf: The composed URDF with absolute mesh paths.
         covers: File of the links' sphere covers, or None.
+        files: Files that the robot was read from, meshes among them.
     """
 
     name: str
@@ -71,6 +72,7 @@ class Robot:
     part_links: Mapping[str, tuple[str, ...]]
     urdf: str = field(repr=False)
     covers: Path | None = field(repr=False)
+    files: tuple[Path, ...] = field(repr=False)
     _order: NDArray[np.intp] = field(repr=False)
 
     @property
@@ -211,11 +213,14 @@ def build_robot(config: RobotConfig, path: Path) -> Robot:
         raise RobotError(f"{path}: Pinocchio cannot read the composed URDF ({error})") from error
     check_geometry(model, geometry, composition.urdf, path)
     order = _state_order(config, model, path)
-    disabled = list(composition.disabled_pairs)
+    disabled, files = list(composition.disabled_pairs), [path, *composition.files]
     if config.disabled_pairs:
-        disabled += read_disabled_pairs(resolve(config.disabled_pairs, path.parent, "file of disabled pairs"))
+        files.append(resolve(config.disabled_pairs, path.parent, "file of disabled pairs"))
+        disabled += read_disabled_pairs(files[-1])
     pair_up(model, geometry, disabled)
     covers = resolve(config.covers, path.parent, "file of sphere covers") if config.covers else None
+    files += [covers] if covers else []
+    files += [Path(body.mesh.file) for body in config.fixtures if body.mesh is not None]
     names = tuple(config.joints)
     for hand in config.hands.values():
         if not model.existBodyName(hand.palm):
@@ -233,7 +238,7 @@ def build_robot(config: RobotConfig, path: Path) -> Robot:
     return Robot(
         name=config.name, joint_names=names, limits=limits, home=home, groups=groups, hands=config.hands, model=model,
         geometry=geometry, fixtures=config.fixtures, part_links=composition.part_links,
-        urdf=composition.urdf, covers=covers, _order=order,
+        urdf=composition.urdf, covers=covers, files=tuple(files), _order=order,
     )  # fmt: skip
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Set
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
@@ -30,7 +30,7 @@ from apex_ompl.result import PlanResult
 from apex_ompl.robot import Robot, load_robot
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Problem
-from apex_ompl.scene.scripts import problem_at
+from apex_ompl.scene.scripts import is_there
 from apex_ompl.session.world import World
 from apex_ompl.trajectory import Timing, warm_up
 from apex_ompl.util.deadline import Deadline
@@ -181,34 +181,36 @@ class MotionPlanner:
     def is_free(self, state: State) -> bool:
         """Whether a state is inside the limits and free in the world as it is now; :meth:`check` says why it is not.
 
+        Obstacles that are yet to appear are not there.
+
         Raises:
             ParameterError: The state has not the robot's joints.
         """
         q = state_array(self.robot, state, "state")
         with self._lock:
-            return self.robot.limit_fault(q) is None and self._checker.is_free(q)
+            return self.robot.limit_fault(q) is None and self._checker_now().is_free(q)
 
     def check(self, state: State) -> StateCheck:
-        """Check a state in the world as it is now.
+        """Check a state in the world as it is now, without obstacles that are yet to appear.
 
         Raises:
             ParameterError: The state has not the robot's joints.
         """
         q = state_array(self.robot, state, "state")
         with self._lock:
-            contacts = tuple(self._checker.contacts(q))
-            return StateCheck(state_fault(self._checker, q), self._checker.clearance(q), contacts)
+            checker = self._checker_now()
+            return StateCheck(state_fault(checker, q), checker.clearance(q), tuple(checker.contacts(q)))
 
     def simple_setup(self, start: State, goal: Target) -> og.SimpleSetup:
         """Return OMPL's SimpleSetup in the world as it is now, for planners and tools of OMPL's own.
 
-        Edits of the world change what its checkers say.
+        Edits of the world change what its checkers say, unless an obstacle is yet to appear: that one is left out.
 
         Raises:
             ApexError: The start or the goal is faulty.
         """
         with self._lock:
-            ready = assemble(self.problem(start, goal), self.robot, checker=self._checker)
+            ready = assemble(self.problem(start, goal), self.robot, checker=self._checker_now())
         ready.simple_setup.setPlannerAllocator(planners.allocator(NAME))
         return ready.simple_setup
 
@@ -236,7 +238,7 @@ class MotionPlanner:
                 if start is not None and leave_contact:
                     raise ParameterError("leave_contact", leave_contact, "0 for a start that moves")
             moving = None if group is None else planned_joints(self.robot, group)
-            checker = self._checker_of(problem, bool(movers))
+            checker = self._checker_without({mover.name for mover in movers}) if movers else self._checker_now()
             checker.check_counts = CheckCounts()
             given = ready = assemble(problem, self.robot, seed=seed, checker=checker, moving=moving)
             departure = find_departure(ready, leave_contact, seed) if leave_contact and ready.start_fault else None
@@ -262,12 +264,17 @@ class MotionPlanner:
                 result = with_departure(result, given, departure, how)
             return finish(run, result, started)
 
-    def _checker_of(self, problem: Problem, among_movers: bool) -> CollisionChecker:
-        """Return a checker of what stands still in a problem, or of what is there at time 0."""
-        seen = problem.still if among_movers else problem_at(problem, 0.0)
-        if len(seen.scene) == len(problem.scene):
+    def _checker_now(self) -> CollisionChecker:
+        """Return a checker of what is there at time 0."""
+        return self._checker_without({o.name for o in self.world.obstacles.values() if not is_there(o, 0.0)})
+
+    def _checker_without(self, names: Set[str]) -> CollisionChecker:
+        """Return a checker of the world without some obstacles, which is the world's own where there are none."""
+        if not names:
             return self._checker
-        return CollisionChecker(self.robot, seen.scene, seen.attached, seen.allowed)
+        left = [one for one in self.world.obstacles.values() if one.name not in names]
+        pairs = [pair for pair in self.world.allowed if names.isdisjoint(pair)]
+        return CollisionChecker(self.robot, left, tuple(self.world.held.values()), pairs)
 
     def _parameters(self, planner: str, params: Mapping[str, Any] | None) -> dict[str, Any]:
         given = dict(params or {})

@@ -2,41 +2,44 @@
 
 from __future__ import annotations
 
+import os
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 
 from apex_ompl.session.planner import MotionPlanner
 
-_idle: dict[str, list[MotionPlanner]] = {}
-_idle_lock = threading.Lock()
 MOST_IDLE = 4  # planners of a robot that are kept
+_Stamps = tuple[int, ...]
+_idle: dict[str, list[tuple[MotionPlanner, _Stamps]]] = {}
+_idle_lock = threading.Lock()
 
 
 @contextmanager
 def kept_planner(robot: str) -> Iterator[MotionPlanner]:
     """Lend a planner of a robot, by name or file, that no other thread uses; it is made where there is none.
 
+    One of whose files, meshes among them, one has changed by then is not lent any more.
+
     Raises:
         ApexError: The robot is unknown, or one of its files is faulty.
     """
-    key = _key(robot)
+    key = os.path.abspath(robot) if robot.endswith((".yaml", ".yml")) else robot
     with _idle_lock:
-        planner = _idle[key].pop() if _idle.get(key) else None
-    planner = planner or MotionPlanner(robot)
+        idle = _idle.get(key, [])
+        found = idle.pop() if idle else None
+    if found is None or found[1] != _stamps(found[0]):
+        planner = MotionPlanner(robot)
+        found = planner, _stamps(planner)
     try:
-        yield planner
+        yield found[0]
     finally:
         with _idle_lock:
             mine = _idle.setdefault(key, [])
             if len(mine) < MOST_IDLE:
-                mine.append(planner)
+                mine.append(found)
 
 
-def _key(robot: str) -> str:
-    """Return a text that differs for robot files of another content."""
-    path = Path(robot)
-    if path.suffix in (".yaml", ".yml") and path.exists():
-        return f"{path.resolve()} {path.stat().st_mtime_ns}"
-    return robot
+def _stamps(planner: MotionPlanner) -> _Stamps:
+    """Return when the files of a planner's robot were written, 0 for one that is gone [ns]."""
+    return tuple(file.stat().st_mtime_ns if file.exists() else 0 for file in planner.robot.files)

@@ -91,7 +91,9 @@ class World:
             path = self._clouds.path(file)
             wanted = self._read(Obstacle, {"name": name, "points": {"file": str(path), "radius": radius}}, "obstacle")
             old = self.obstacles.get(name)
-            if old is not None and old.points is None:
+            if old is None:
+                self._checker.check_name(name)
+            elif old.points is None:
                 raise SceneError(f"the name {name!r} is taken by an obstacle that is no cloud of points")
             if not len(cloud):
                 raise FileFormatError(str(path), "points", "none", "expected one point or more")

@@ -15,12 +15,14 @@ from paper.rows import BOTH, PLANNERS, STATIC, TASKS, colour, installed
 from apex_ompl import planners
 from apex_ompl.benchmark import Results, Row, Workers, bench
 from apex_ompl.benchmark.metrics import next_percentile
+from apex_ompl.benchmark.rows import jobs as jobs_of
 from apex_ompl.benchmark.runs import NO_PROBLEM, Run
 from apex_ompl.benchmark.summary import Table
 
 TIMEOUT = 10.0  # [s]
 OVER_SIZE = 5  # the first so many rows are those of the figure over size: apex, and each model guided and not
 TIMED = "large"
+FEW = 8  # timed runs of a planner that has a time limit of its own, on a level
 
 
 def runs_of(
@@ -32,13 +34,9 @@ def runs_of(
         levels, rows, args.keep / folder, runs=args.n, timeout=timeout, workers=Workers(jobs),
         split=split, provenance=record.session(),
     )  # fmt: skip
-    labels = {row.label for row in rows}
-    mine = [
-        run for run in found.runs
-        if run["experiment"] in levels and run["label"] in labels and run["seed"] < args.n
-        and run["status"] != NO_PROBLEM
-    ]  # fmt: skip
-    return replace(found, runs=mine)
+    wanted = jobs_of(levels, rows, runs=args.n, timeout=timeout, seed=0, split=split, simplify=True)
+    keys = {job.key for job in wanted}  # a folder may have runs with parameters of an earlier day, too
+    return replace(found, runs=[run for run in found.runs if run["key"] in keys and run["status"] != NO_PROBLEM])
 
 
 def median(runs: Sequence[Run], column: str) -> float | None:
@@ -121,7 +119,7 @@ def size(args: Namespace) -> Made:
 
 def time(args: Namespace) -> Made:
     """Return planning times; whatever is asked for, one run goes at a time."""
-    rows = installed(PLANNERS, planners.names())
+    rows = [replace(row, runs=FEW) if row.timeout else row for row in installed(PLANNERS, planners.names())]
     results = runs_of(args, [f"{task}/{TIMED}" for task in TASKS], rows, "paper_times", jobs=1)
     data: dict[str, Any] = {}
     lines = []
