@@ -22,7 +22,7 @@ from apex_ompl.benchmark.summary import Table
 TIMEOUT = 10.0  # [s]
 OVER_SIZE = 5  # the first so many rows are those of the figure over size: apex, and each model guided and not
 TIMED = "large"
-FEW = 8  # timed runs of a planner that has a time limit of its own, on a level
+FEW = 4  # timed runs of a planner that has a time limit of its own, on a level
 
 
 def runs_of(
