@@ -13,7 +13,7 @@ from paper.fid import LIMIT as FID_LIMIT
 from paper.moving import LIMIT
 from paper.published import ENTRIES, PICTURES, RIVALS, Entry, Rival, Where
 from paper.realism import STEPS
-from paper.rows import PACE, TO_THE_END
+from paper.rows import PACE, PATIENCE
 from paper.static import TIMEOUT
 
 from apex_ompl.loop.charges import cost_table
@@ -169,7 +169,7 @@ def text(results: Results, to: str) -> str:
     return TEMPLATE.read_text("utf-8").format(
         entries=entries(results), rivals=rivals(results), sweeps=sweeps(results), distances=distances(results),
         pictures=pictures(results, to), made_with=made_with(results, to), trigger=f"{loop.trigger:g}",
-        stuck=f"{loop.stuck:g}", limit=f"{LIMIT:g}", timeout=f"{TIMEOUT:g}", to_the_end=f"{TO_THE_END:g}", pace=f"{PACE:g}", steps=STEPS,
+        stuck=f"{loop.stuck:g}", limit=f"{LIMIT:g}", timeout=f"{TIMEOUT:g}", patience=f"{PATIENCE:g}", pace=f"{PACE:g}", steps=STEPS,
         fid_limit=f"{FID_LIMIT:g}", guided=f"{seconds['guided path of the paper']:.2g} s",
         unguided=f"{seconds['path of the paper']:.2g} s",
     )  # fmt: skip
