@@ -169,7 +169,8 @@ def text(results: Results, to: str) -> str:
     return TEMPLATE.read_text("utf-8").format(
         entries=entries(results), rivals=rivals(results), sweeps=sweeps(results), distances=distances(results),
         pictures=pictures(results, to), made_with=made_with(results, to), trigger=f"{loop.trigger:g}",
-        stuck=f"{loop.stuck:g}", limit=f"{LIMIT:g}", timeout=f"{TIMEOUT:g}", patience=f"{PATIENCE:g}", pace=f"{PACE:g}", steps=STEPS,
+        stuck=f"{loop.stuck:g}", limit=f"{LIMIT:g}", timeout=f"{TIMEOUT:g}", patience=f"{PATIENCE:g}",
+        pace=f"{PACE:g}", steps=STEPS,
         fid_limit=f"{FID_LIMIT:g}", guided=f"{seconds['guided path of the paper']:.2g} s",
         unguided=f"{seconds['path of the paper']:.2g} s",
     )  # fmt: skip
