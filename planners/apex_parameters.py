@@ -43,7 +43,7 @@ class ApexParameters(Parameters):
         second: In the second.
         third: In the third.
         guidance: Whether paths are drawn away from obstacles while they are denoised.
-        gamma: Scale of the guidance.
+        gamma: Factor on the scale of the guidance that was chosen for its scaling.
         scaling: What it changes of a sample: ``clean``, the path that is expected of it, or ``noise``, as equation 7 of
             the paper has it.
         resample: How often colliding candidates are resampled in each round.
@@ -104,7 +104,8 @@ class ApexParameters(Parameters):
         from apex_ompl.diffusion import proposals
         from apex_ompl.diffusion.guidance import GUIDANCES
 
-        guidance = replace(GUIDANCES[self.scaling], gamma=self.gamma if self.guidance else 0.0)
+        chosen = GUIDANCES[self.scaling]
+        guidance = replace(chosen, gamma=self.gamma * chosen.gamma if self.guidance else 0.0)
         sampler = default.sampler if self.sampler == "model" else self.sampler
         steps, temperature = self.denoising_steps or default.steps, self.temperature * default.temperature
         return proposals.Sampling(sampler, steps, temperature, guidance)

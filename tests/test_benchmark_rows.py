@@ -126,6 +126,8 @@ def test_the_papers_rows_are_guided_by_equation_7() -> None:
     """And the planner's own model by what is best for it."""
     own = Sampling("ddpm", 256)
     faithful = planners.parameters("apex", **PAPER, guidance=True).sampling(own)
-    assert faithful.guidance == EQUATION_7 and EQUATION_7.scaling == "noise" and EQUATION_7.gamma == 1.0
+    assert faithful.guidance == EQUATION_7 and EQUATION_7.scaling == "noise"
     assert planners.parameters("apex", **PAPER).sampling(own).guidance.gamma == 0.0
+    half = planners.parameters("apex", **PAPER, guidance=True, gamma=0.5).sampling(own)
+    assert half.guidance.gamma == 0.5 * EQUATION_7.gamma > 0.0
     assert planners.parameters("apex", guidance=True).sampling(own).guidance == Guidance(scaling="clean")

@@ -66,7 +66,8 @@ class OneProposal:
         assert self._loaded is not None and self._checker is not None
         model, kernel = self._loaded, self._checker.kernel
         query = make_query(self._checker, start, goal, point=model.sees_point)
-        sampling = replace(model.sampling, guidance=replace(EQUATION_7, gamma=1.0 if self.guided else 0.0))
+        guidance = EQUATION_7 if self.guided else replace(EQUATION_7, gamma=0.0)
+        sampling = replace(model.sampling, guidance=guidance)
         with model.one_thread():
             made = model.propose(query, kernel, 1, sampling=sampling, generator=rng)
         return model.spline.path(made.control[0])

@@ -58,7 +58,7 @@ def proposed(job: Job) -> Run:
     model = load(job.planner)
     own = {"apex": load("apex").sampling, "apex-paper": Sampling("ddim", STEPS)}[job.planner]
     guidance = GUIDANCES["noise" if job.planner == "apex-paper" else "clean"]
-    sampling = replace(own, guidance=replace(guidance, gamma=job.params["gamma"]))
+    sampling = replace(own, guidance=replace(guidance, gamma=job.params["gamma"] * guidance.gamma))
     ready = assemble(problems.load(job.problem), robot())
     query = make_query(ready.checker, ready.start, ready.goals[0])
     begin = time.process_time()  # other work on the machine does not count
