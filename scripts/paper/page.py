@@ -16,6 +16,7 @@ from paper.realism import STEPS
 from paper.rows import PACE, PATIENCE
 from paper.static import TIMEOUT
 
+from apex_ompl.diffusion.guidance import EQUATION_7
 from apex_ompl.loop.charges import cost_table
 from apex_ompl.loop.settings import LoopSettings
 from apex_ompl.util.files import write_atomically
@@ -170,7 +171,7 @@ def text(results: Results, to: str) -> str:
         entries=entries(results), rivals=rivals(results), sweeps=sweeps(results), distances=distances(results),
         pictures=pictures(results, to), made_with=made_with(results, to), trigger=f"{loop.trigger:g}",
         stuck=f"{loop.stuck:g}", limit=f"{LIMIT:g}", timeout=f"{TIMEOUT:g}", patience=f"{PATIENCE:g}",
-        pace=f"{PACE:g}", steps=STEPS,
+        pace=f"{PACE:g}", steps=STEPS, gamma=EQUATION_7.gamma, active=EQUATION_7.active_below,
         fid_limit=f"{FID_LIMIT:g}", guided=f"{seconds['guided path of the paper']:.2g} s",
         unguided=f"{seconds['path of the paper']:.2g} s",
     )  # fmt: skip
