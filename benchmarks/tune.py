@@ -92,11 +92,6 @@ CANDIDATES: dict[str, list[dict[str, Any]]] = {
         {"max_connection_distance": 1.0, "collision_check_use_bisection": False},
     ],
     "aorrtc": ranges(0.0, 0.3, 0.5, 0.7, 1.0, 1.4, 2.0, 3.0),
-    "rrt": [
-        *ranges(0.0, 0.3, 0.7, 1.4, 2.5, goal_bias=0.05),
-        *ranges(0.7, 1.4, goal_bias=0.2),
-        *ranges(0.7, goal_bias=0.5),
-    ],
     "lbkpiece1": [
         *ranges(0.0, 0.3, 0.5, 0.7, 1.0, 1.4, 2.0, border_fraction=0.9),
         *ranges(0.7, border_fraction=0.5),
@@ -134,6 +129,11 @@ GAUSSIAN_PROCESS = [
 BASELINES: dict[str, list[dict[str, Any]]] = {
     "gpmp": GAUSSIAN_PROCESS,
     "gpmp2": GAUSSIAN_PROCESS,
+    "rrt": [  # steps up to the longest distance in the space, 17 rad; 0 lets OMPL choose a fifth of it
+        *ranges(0.0, 0.7, 2.5, 7.0, 17.0, goal_bias=0.05),
+        *ranges(2.5, 17.0, goal_bias=0.2),
+        *ranges(7.0, goal_bias=0.1),
+    ],
     "drrt": [
         *ranges(0.7, 1.4, 3.0, 4.5, 6.5, goal_bias=0.1),  # the last is the widest of a joint
         *ranges(4.5, 6.5, goal_bias=0.05),

@@ -137,7 +137,8 @@ class ApexParameters(Parameters):
         if self.approximate:
             found.append(stages.NearestToGoal())
         largest = max(self.batches, default=0)
-        rounds = [proposal_round(largest, temperature) for temperature in stages.TEMPERATURES if largest]
+        temperatures = stages.TEMPERATURES if self.repair else (1.0,)  # a wider spread is worse where nothing mends it
+        rounds = [proposal_round(largest, temperature) for temperature in temperatures if largest]
         ends: list[Stage] = [stages.Farthest(), *([stages.Bridging(self.range, TURN_CALLS)] if self.bridge else [])]
         trees = stages.GrowTrees(self.range, self.approximate) if self.fallback else None
         found.append(stages.TakeTurns(trees, tuple((*one, *ends) for one in rounds)))

@@ -23,10 +23,10 @@ ROW = re.compile(r"(?P<planner>[^\[\]]+?)(\[(?P<params>[^\[\]]*)\])?")
 
 PAPER = {
     "model": "apex-paper", "line": False, "repair": False, "bridge": False, "fallback": False, "polish": False,
-    "first": 8, "second": 8, "third": 16, "resample": 2, "scaling": "noise",
+    "first": 1, "second": 1, "third": 1, "resample": 2, "scaling": "noise",
 }  # fmt: skip
-"""Parameters of apex that leave only the paper's algorithm: ancestral sampling with all steps, and collision-triggered
-resampling. It is without guidance, which is that of equation 7 where ``guidance`` is added."""
+"""Parameters of apex that leave only the paper's algorithm: ancestral sampling with all steps, one path after the other,
+and collision-triggered resampling. It is without guidance, which is that of equation 7 where ``guidance`` is added."""
 
 RunnerFunction = Callable[["Job"], Mapping[str, Any]]
 
