@@ -133,8 +133,8 @@ class DAMONParameters(Parameters):
         model: Name of a folder of the tree's ``benchmarks/baselines``, or a path; it has the dimension of the manifold.
         nodes: ``decoded``, nodes are what the decoder makes of their latent vectors, as the paper has it, or
             ``stored``, the states that these were encoded from.
-        connections: Number of nodes over which paths may leave each start, and reach each goal, at first: three times as
-            many where these lead to none.
+        connections: Number of nodes over which paths may leave each start, and reach each goal, at first; three times
+            as many where these lead to none.
     """
 
     smooth: ClassVar[bool] = False

@@ -2,7 +2,7 @@
 
 OMPL's planners keep OMPL's defaults under their names; their tuned forms are rows of the benchmarks. The planners of
 this package have the tuned values as defaults. ``roboplan`` is RoboPlan's RRT-Connect as benchmarks/peers.py runs it.
-The baselines of the paper, gpmp, gpmp2, drrt and damon, are tuned by ``python benchmarks/tune.py --baselines``, on
+The baselines of the paper, rrt, gpmp, gpmp2, drrt and damon, are tuned by ``python benchmarks/tune.py --baselines``, on
 easier levels.
 """
 
@@ -27,6 +27,6 @@ TUNED: Mapping[str, Mapping[str, Value]] = MappingProxyType({
     "gpmp": {"safety_distance": 0.08, "obstacle_sigma": 0.0016, "intervals": 12, "power": 1.0},
     "gpmp2": {"safety_distance": 0.08, "obstacle_sigma": 0.0016, "intervals": 12, "power": 1.0},
     "drrt": {"range": 6.5, "goal_bias": 0.1},
-    "damon": {"connections": 300},
+    "damon": {"connections": 100},
 })  # fmt: skip
 """Parameters by planner, those that differ from OMPL's defaults; ranges in rad, distances and sigmas of gpmp in m."""

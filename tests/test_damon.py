@@ -6,6 +6,7 @@ import json
 import shutil
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from ompl import base as ob
-from planning import solved
+from planning import EXACT, solved, within
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 from support import DATA, ROOT
@@ -26,7 +27,9 @@ from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError
 from apex_ompl.kernel import Kernel, RobotTables
 from apex_ompl.kernel.scene_builder import scene_tables
 from apex_ompl.ompl_adapter.setup import PlanningSetup, assemble
+from apex_ompl.ompl_adapter.space import motions_free
 from apex_ompl.problems import load as load_problem
+from apex_ompl.roadmaps.damon import Damon
 from apex_ompl.roadmaps.latent_graph import consecutive, farthest_points, free_of_self_collision, neighbours
 from apex_ompl.roadmaps.lazy_search import Graph, LazySearch
 from apex_ompl.roadmaps.manifold import BASELINES, load_manifold, shared_manifold
@@ -299,3 +302,23 @@ def test_a_manifold_is_read_once_until_it_changes(models: Path, tmp_path: Path) 
 def test_it_solves_what_is_easy() -> None:
     found = plan("vertical/small/800001", "damon", timeout=20.0, params={"model": "damon-8"})
     assert found and found.solved_by == "damon"
+
+
+def test_more_connections_are_tried_where_the_first_lead_to_no_path() -> None:
+    """One node beside the start and the goal is not enough, and is not all."""
+    setup = assemble(load_problem("vertical/small/800001"))
+    planner = planners.make("damon", setup.simple_setup.getSpaceInformation(), connections=1)
+    narrow = planner.damon.search(*(args := _query(planner.damon, setup)))
+    free = partial(motions_free, setup.simple_setup.getSpaceInformation())
+    nodes_free = setup.checker.are_free
+    assert narrow.run(free, lambda: False, nodes_free=nodes_free) is None
+    planner.damon.connect(narrow, *args[1:], 1000, known=1)
+    assert narrow.run(free, lambda: False, nodes_free=nodes_free) is not None
+    setup.simple_setup.setPlanner(planner)
+    assert setup.simple_setup.solve(within(30.0)).getStatus() == EXACT and planner.report.candidates > 1
+
+
+def _query(damon: Damon, setup: PlanningSetup) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Arguments of a search: states of the nodes, those that are free, the start and the goals."""
+    states = damon.states(setup.start)
+    return states, setup.checker.are_free(states), setup.start[None], setup.goals

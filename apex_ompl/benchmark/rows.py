@@ -25,8 +25,8 @@ PAPER = {
     "model": "apex-paper", "line": False, "repair": False, "bridge": False, "fallback": False, "polish": False,
     "first": 1, "second": 1, "third": 1, "resample": 2, "scaling": "noise",
 }  # fmt: skip
-"""Parameters of apex that leave only the paper's algorithm: ancestral sampling with all steps, one path after the other,
-and collision-triggered resampling. It is without guidance, which is that of equation 7 where ``guidance`` is added."""
+"""Parameters of apex that leave only the paper's algorithm: ancestral sampling with all steps, of one path after the
+other, and collision-triggered resampling; with ``guidance`` added it is guided by equation 7."""
 
 RunnerFunction = Callable[["Job"], Mapping[str, Any]]
 

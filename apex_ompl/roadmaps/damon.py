@@ -73,7 +73,7 @@ class Damon:
         return search
 
     def connect(
-        self, search: LazySearch, usable: Flags, starts: Array, goals: Array, count: int, known: int = 0
+        self, search: LazySearch, usable: Flags, starts: Array, goals: Array, count: int, *, known: int = 0
     ) -> None:  # fmt: skip
         """Let paths of a search leave each start, and reach each goal, over more of the nodes that are nearest to it.
 

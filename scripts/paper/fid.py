@@ -38,14 +38,15 @@ def fid(args: Any) -> Made:
     data: dict[str, Any] = {}
     lines, picture = [], blank(10, 4.6)
     for axis, (name, features) in zip(picture.subplots(1, 2), realism.feature_spaces().items(), strict=True):
-        truth, floor = features(list(real.values())), 0.0
+        truth, floor = dict(zip(real, features(list(real.values())), strict=True)), 0.0
         for k, row in enumerate(rows):
             mine = [run for run in results.runs if run["label"] == row.label and run["problem"] in real]
-            paths = [np.array(run["control"]) for run in mine if run["solved"]]
+            solved = [run for run in mine if run["solved"]]
+            paths = [np.array(run["control"]) for run in solved]
             if len(paths) < LEAST:
                 print(f"{row.label}: left out, {len(paths)} paths of {len(mine)}", flush=True)
                 continue
-            r = metrics.realism(truth, features(paths))
+            r = metrics.realism(np.stack([truth[run["problem"]] for run in solved]), features(paths))
             took = 1e3 * float(np.mean([run["total"] for run in mine if run["total"] is not None]))
             data[f"{name}, {row.label}"] = {**asdict(r), "of": len(mine), "CPU ms a path": took}
             ends = f"{r.interval[0]:.2f} to {r.interval[1]:.2f}"
@@ -62,8 +63,8 @@ def fid(args: Any) -> Made:
     notes, commits = of_runs(results, planned=False)
     notes += [
         ("Real", f"solutions of {len(real)} validation problems, one each, of {', '.join(LEVELS)}"),
-        ("Made", f"one path for each: of the models one proposal, valid or not, of apex by its own sampling, of "
-                 f"apex-paper by {realism.STEPS} steps of DDIM; of planners what they find in {LIMIT:g} s"),
+        ("Made", f"one path for each: of the models one proposal by their own sampling, valid or not; of planners what "
+                 f"they find in {LIMIT:g} s, beside the solutions of the problems that they solve"),
         ("Floor", "FID between two halves of the real set, of other problems each: larger than it would be for all"),
     ]  # fmt: skip
     return Made(data, [Table("FID and KID", head, lines)], notes, picture, commits)

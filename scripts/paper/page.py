@@ -12,7 +12,6 @@ import record
 from paper.fid import LIMIT as FID_LIMIT
 from paper.moving import LIMIT
 from paper.published import ENTRIES, PICTURES, RIVALS, Entry, Rival, Where
-from paper.realism import STEPS
 from paper.rows import PACE, PATIENCE
 from paper.static import TIMEOUT
 
@@ -171,7 +170,7 @@ def text(results: Results, to: str) -> str:
         entries=entries(results), rivals=rivals(results), sweeps=sweeps(results), distances=distances(results),
         pictures=pictures(results, to), made_with=made_with(results, to), trigger=f"{loop.trigger:g}",
         stuck=f"{loop.stuck:g}", limit=f"{LIMIT:g}", timeout=f"{TIMEOUT:g}", patience=f"{PATIENCE:g}",
-        pace=f"{PACE:g}", steps=STEPS, gamma=EQUATION_7.gamma, active=EQUATION_7.active_below,
+        pace=f"{PACE:g}", gamma=EQUATION_7.gamma, active=EQUATION_7.active_below,
         fid_limit=f"{FID_LIMIT:g}", guided=f"{seconds['guided path of the paper']:.2g} s",
         unguided=f"{seconds['path of the paper']:.2g} s",
     )  # fmt: skip

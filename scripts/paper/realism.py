@@ -1,4 +1,4 @@
-"""Paths of models and planners beside solutions of the same problems, for FID and KID in ``reproduce.py fid``."""
+"""Paths of models and planners beside solutions of the same problems, for FID and KID, and single samples of models."""
 
 from __future__ import annotations
 
@@ -13,28 +13,29 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from apex_ompl import plan, problems
+from apex_ompl import problems
 from apex_ompl.apex.query import make_query
 from apex_ompl.benchmark import Row
 from apex_ompl.benchmark.rows import Job
 from apex_ompl.benchmark.runs import Run
+from apex_ompl.benchmark.runs import planned as planned_run
 from apex_ompl.datasets.engine import EngineOptions
 from apex_ompl.datasets.records import SOURCES, Paths
 from apex_ompl.datasets.store import Store
 from apex_ompl.diffusion.autoencoder import Autoencoder
 from apex_ompl.diffusion.checkpoint import load_model, load_torch_model
-from apex_ompl.diffusion.guidance import GUIDANCES
-from apex_ompl.diffusion.proposals import Sampling
+from apex_ompl.diffusion.guidance import GUIDANCES, Guidance
 from apex_ompl.generation.solving import solve_unit
 from apex_ompl.generation.units import plan_units
-from apex_ompl.ompl_adapter.setup import assemble
+from apex_ompl.ompl_adapter.setup import PlanningSetup, assemble
+from apex_ompl.ompl_adapter.validity import full_check
 from apex_ompl.problems.suite_robot import robot
+from apex_ompl.trajopt.path import path_length
 from apex_ompl.trajopt.spline import Spline
 from apex_ompl.types import Array
 from apex_ompl.util.cluster import spread
 
 MODELS = ("apex", "apex-paper")
-STEPS = 8  # of DDIM, for apex-paper, whose own 256 would take hours
 DIGITS = 6  # of the control points that are stored
 PROPOSED, PLANNED = "paper.realism:proposed", "paper.realism:planned"
 
@@ -44,7 +45,7 @@ load = cache(load_model)  # once in a process
 def proposing(model: str, *, guided: bool) -> Row:
     """Return the row of the paths that a model proposes, one a problem, valid or not."""
     label = model if guided else f"{model}, unguided"
-    return Row(label, model, {"gamma": float(guided)}, runner=PROPOSED)
+    return Row(label, model, {"gamma": _chosen(model).gamma if guided else 0.0}, runner=PROPOSED)
 
 
 def planning(row: Row) -> Row:
@@ -54,26 +55,42 @@ def planning(row: Row) -> Row:
 
 def proposed(job: Job) -> Run:
     """Return one path of a model for a problem, as control points, and its CPU time [s]."""
+    _, control, took = sample(job.planner, job.params["gamma"], job)
+    return {"solved": True, "total": took, "control": np.round(control, DIGITS).tolist()}
+
+
+def sample(model: str, gamma: float, job: Job) -> tuple[PlanningSetup, Array, float]:
+    """Return a problem, one path that a model proposes for it, as control points, and the CPU time of that [s]."""
     torch.set_num_threads(1)
-    model = load(job.planner)
-    own = {"apex": load("apex").sampling, "apex-paper": Sampling("ddim", STEPS)}[job.planner]
-    guidance = GUIDANCES["noise" if job.planner == "apex-paper" else "clean"]
-    sampling = replace(own, guidance=replace(guidance, gamma=job.params["gamma"] * guidance.gamma))
+    loaded = load(model)
+    sampling = replace(loaded.sampling, guidance=replace(_chosen(model), gamma=gamma))
     ready = assemble(problems.load(job.problem), robot())
     query = make_query(ready.checker, ready.start, ready.goals[0])
     begin = time.process_time()  # other work on the machine does not count
     with torch.no_grad():
         generator = np.random.default_rng(job.seed)
-        made = model.propose(query, ready.checker.kernel, 1, sampling=sampling, generator=generator)
-    took = time.process_time() - begin
-    return {"solved": True, "total": took, "control": np.round(made.control[0], DIGITS).tolist()}
+        made = loaded.propose(query, ready.checker.kernel, 1, sampling=sampling, generator=generator)
+    return ready, made.control[0], time.process_time() - begin
+
+
+def _chosen(model: str) -> Guidance:
+    """Return the guidance of a model's paths."""
+    return GUIDANCES["noise" if model == "apex-paper" else "clean"]
+
+
+def one_sample(job: Job) -> Run:
+    """Return the run of one path of apex-paper for a problem: nothing is drawn again where it is invalid."""
+    ready, control, took = sample("apex-paper", job.params["gamma"], job)
+    path = load("apex-paper").spline.path(control)
+    valid = bool(full_check(ready.checker, path, ready.start, list(ready.goals)))
+    length = path_length(path) if valid else None
+    return {"solved": valid, "total": took, "length": length, "raw_length": length}
 
 
 def planned(job: Job) -> Run:
     """Return the path that a planner finds for a problem, as control points, and its CPU time [s]."""
     begin = time.process_time()
-    result = plan(job.problem, job.planner, timeout=job.timeout, seed=job.seed, params=job.params, timing=False,
-                  simplify=job.simplify)  # fmt: skip
+    _, _, result = planned_run(job)
     took = time.process_time() - begin
     control = None
     if result and result.path is not None:

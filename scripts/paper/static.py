@@ -20,7 +20,7 @@ from apex_ompl.benchmark.runs import NO_PROBLEM, Run
 from apex_ompl.benchmark.summary import Table
 
 TIMEOUT = 10.0  # [s]
-OVER_SIZE = 5  # the first so many rows are those of the figure over size: apex, and each model guided and not
+OVER_SIZE = 7  # the first so many rows are those of the figure over size: apex, and each model guided and not
 TIMED = "large"
 FEW = 4  # timed runs of a planner that has a time limit of its own, on a level
 
