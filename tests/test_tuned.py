@@ -22,7 +22,7 @@ RESULTS = [
 ]
 TUNED = {name: result for one in RESULTS for name, result in one["planners"].items()}
 OWN = ("apex", "rrtconnect+polish", "gpmp", "gpmp2", "drrt", "damon")
-PLANNER, FIRST_PROBLEM = "rrt", 800_000
+PLANNER, FIRST_PROBLEM = "lbkpiece1", 800_000
 
 
 @pytest.fixture(scope="module")

@@ -23,7 +23,7 @@ FAITHFUL, UNGUIDED, OURS = "apex-paper", "apex-paper, unguided", "apex"
 ONE, ONE_SAMPLE = ", one sample", "paper.realism:one_sample"
 PATIENCE = 60.0
 """Time limit of ``apex-paper`` [s]: it samples until a path is valid, each in a second or two."""
-ALONE = {**PAPER, "model": "apex", "scaling": "clean"}
+ALONE = {**PAPER, "model": "apex", "scaling": "clean", "first": 8, "second": 8, "third": 16}
 
 PLANNERS = (
     Row(OURS, "apex"),
