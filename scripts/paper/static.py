@@ -22,7 +22,7 @@ from apex_ompl.benchmark.summary import Table
 TIMEOUT = 10.0  # [s]
 OVER_SIZE = 7  # the first so many rows are those of the figure over size: apex, and each model guided and not
 TIMED = "large"
-FEW = 4  # timed runs of a planner that has a time limit of its own, on a level
+FEW, SHARE = 4, 4  # of a planner that is so slow that it has a time limit of its own: least runs on a level, and divisor
 
 
 def runs_of(
@@ -30,6 +30,7 @@ def runs_of(
     split: str = "test",
 ) -> Results:  # fmt: skip
     """Return the runs of some rows on the first problems of some levels, made where they are missing."""
+    rows = [replace(row, runs=max(FEW, args.n // SHARE)) if row.timeout else row for row in rows]
     found = bench(
         levels, rows, args.keep / folder, runs=args.n, timeout=timeout, workers=Workers(jobs),
         split=split, provenance=record.session(),
@@ -119,7 +120,7 @@ def size(args: Namespace) -> Made:
 
 def time(args: Namespace) -> Made:
     """Return planning times; whatever is asked for, one run goes at a time."""
-    rows = [replace(row, runs=FEW) if row.timeout else row for row in installed(PLANNERS, planners.names())]
+    rows = installed(PLANNERS, planners.names())
     results = runs_of(args, [f"{task}/{TIMED}" for task in TASKS], rows, "paper_times", jobs=1)
     data: dict[str, Any] = {}
     lines = []
