@@ -22,7 +22,7 @@ from apex_ompl.benchmark.summary import Table
 TIMEOUT = 10.0  # [s]
 OVER_SIZE = 7  # the first so many rows are those of the figure over size: apex, and each model guided and not
 TIMED = "large"
-FEW, SHARE = 4, 4  # of a planner that is so slow that it has a time limit of its own: least runs on a level, and divisor
+FEW, SHARE = 4, 4  # of planners that are so slow that they have their own time limit: least runs on a level, and divisor
 
 
 def runs_of(
