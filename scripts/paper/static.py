@@ -22,7 +22,7 @@ from apex_ompl.benchmark.summary import Table
 TIMEOUT = 10.0  # [s]
 OVER_SIZE = 7  # the first so many rows are those of the figure over size: apex, and each model guided and not
 TIMED = "large"
-FEW, SHARE = 4, 4  # of planners that are so slow that they have their own time limit: least runs, and divisor of runs
+FEW, SHARE = 2, 4  # of planners that are so slow that they have their own time limit: least runs, and divisor of runs
 
 
 def runs_of(
