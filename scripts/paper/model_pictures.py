@@ -94,7 +94,8 @@ def denoising(args: Namespace) -> Made:
     axes[0, -1].legend(loc="lower right", fontsize=8)
     lengths = {str(moment): path_length(snapshots[moment]) for moment in moments}
     table = Table("Denoising", ["t", "model", "S_r rad"], [[t, DENOISER, f"{x:.2f}"] for t, x in lengths.items()])
-    notes = [("Problem", DENOISED), ("Seed", SEED), ("Sampling", f"DDPM, {steps} steps, guided in the last quarter")]
+    how = f"DDPM, {steps} steps, guided in the last {EQUATION_7.active_below:.0%} of them"
+    notes = [("Problem", DENOISED), ("Seed", SEED), ("Sampling", how)]
     return Made({"S_r": lengths, "problem": DENOISED}, [table], notes, picture)
 
 
