@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 SIZE = (720, 440)
-TRIES, PAUSE = 18, 0.4  # [s]
+TRIES, PAUSE = 6, 0.4  # [s]
 BROWSER, DRIVER = shutil.which("chromium"), shutil.which("chromedriver")
 needs_browser = pytest.mark.skipif(
     BROWSER is None or DRIVER is None, reason="no browser: apt-get install chromium chromium-driver"
@@ -48,10 +48,15 @@ def browser() -> Iterator[Any]:
 
 
 def until(condition: Callable[[], Any], what: str, seconds: float = 240.0) -> Any:
-    """Wait until a condition holds, and return what it gave."""
+    """Wait until a condition holds, and return what it gave; a browser that is busy is asked again."""
+    from selenium.common.exceptions import TimeoutException
+
     end = time.monotonic() + seconds
     while time.monotonic() < end:
-        found = condition()
+        try:
+            found = condition()
+        except TimeoutException:
+            found = None
         if found is not None and found is not False and np.size(found):
             return found
         time.sleep(PAUSE)

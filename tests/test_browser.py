@@ -54,7 +54,7 @@ def is_drawn(driver: Any, columns: slice, reds: int = 100) -> bool:
 
 
 def with_a_cloud(problem: Problem, folder: Path) -> Problem:
-    points = np.random.default_rng(0).uniform((0.5, -0.1, 0.2), (0.6, 0.1, 0.5), (400, 3))
+    points = np.random.default_rng(0).uniform((0.5, -0.1, 0.2), (0.6, 0.1, 0.5), (60, 3))
     np.save(folder / "cloud.npy", points)
     cloud = Obstacle(name="cloud", points={"file": str(folder / "cloud.npy"), "radius": 0.01})
     return problem.model_copy(update={"scene": (cloud,)})
