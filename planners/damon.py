@@ -28,7 +28,6 @@ NAME = "damon"
 LOG = logging.getLogger("apex_ompl")
 Status = ob.PlannerStatus
 DEEP = 0.03  # overlap of spheres beyond which a node counts as in contact without a look at exact shapes [m]
-WIDER = 3  # factor on the number of connections where none of them leads to a path
 SEEN = 0.001  # clearances beyond this are not told apart [m]
 
 
@@ -83,11 +82,7 @@ class DAMON(ob.Planner):
         search = self.damon.search(states, usable, *ends, free_nodes=free_nodes)
         with self.report.timed("search"):
             free = partial(motions_free, self.getSpaceInformation())
-            run = partial(search.run, free, lambda: bool(ptc()), nodes_free=self._checker.checker.are_free)
-            path, count = run(), self.damon.connections
-            while path is None and not ptc() and count < usable.sum():  # obstacles may block the nearest connections
-                self.damon.connect(search, usable, *ends, WIDER * count, known=count)
-                path, count = run(), WIDER * count
+            path = search.run(free, lambda: bool(ptc()), nodes_free=self._checker.checker.are_free)
         self.report.candidates = search.searches
         if path is None:
             used = f"{int(usable.sum())} of {len(usable)} nodes"

@@ -308,12 +308,13 @@ def test_more_connections_are_tried_where_the_first_lead_to_no_path() -> None:
     """One node beside the start and the goal is not enough, and is not all."""
     setup = assemble(load_problem("vertical/small/800001"))
     planner = planners.make("damon", setup.simple_setup.getSpaceInformation(), connections=1)
-    narrow = planner.damon.search(*(args := _query(planner.damon, setup)))
+    narrow = planner.damon.search(*(query := _query(planner.damon, setup)))
     free = partial(motions_free, setup.simple_setup.getSpaceInformation())
     nodes_free = setup.checker.are_free
+    narrow.more = lambda: False
     assert narrow.run(free, lambda: False, nodes_free=nodes_free) is None
-    planner.damon.connect(narrow, *args[1:], 1000, known=1)
-    assert narrow.run(free, lambda: False, nodes_free=nodes_free) is not None
+    wide = planner.damon.search(*query)
+    assert wide.run(free, lambda: False, nodes_free=nodes_free) is not None
     setup.simple_setup.setPlanner(planner)
     assert setup.simple_setup.solve(within(30.0)).getStatus() == EXACT and planner.report.candidates > 1
 

@@ -73,8 +73,7 @@ class ManifoldGraph:
         usable[usable] = clear.of_movers(states[usable])
         paths = self.damon.search(states, usable, start[None], ready.goals)
         charges.charge("query of a graph")
-
-        blocked = self._blocked_from(start)
+        connect, blocked = paths.more, self._blocked_from(start)
         for one in blocked:
             paths.block(one)
 
@@ -84,6 +83,11 @@ class ManifoldGraph:
                 blocked.add(paths.motion)
             return np.array([found])
 
+        def more() -> bool:
+            charges.charge("query of a graph")
+            return connect()
+
+        paths.more = more
         path = paths.run(free, charges.over, lambda reached: charges.charge("node of a graph", reached))
         motion = None if path is None else timed(search, path, clear)
         if motion is None or not ready.clear_of_still(motion, charges):

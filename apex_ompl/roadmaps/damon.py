@@ -12,6 +12,8 @@ from apex_ompl.roadmaps.lazy_search import Graph, LazySearch
 from apex_ompl.roadmaps.manifold import Manifold
 from apex_ompl.types import Array, Flags, Indices
 
+WIDER = 3  # factor on the number of connections where they lead to no path
+
 
 @dataclass(frozen=True, eq=False)
 class Damon:
@@ -35,7 +37,8 @@ class Damon:
         kind: ``decoded``, or ``stored``, for nodes that are training states: not the paper's, but more generous.
         graph: The graph of its nodes of that kind.
         joints: Which joints of the robot it has values of, shape (J,).
-        connections: Number of nodes over which paths may leave each start, and reach each goal, at first.
+        connections: Number of nodes over which paths may leave each start, and reach each goal, at first; three times
+            as many each time that these lead to no path.
     """
 
     manifold: Manifold
@@ -69,30 +72,24 @@ class Damon:
             free_nodes: Which nodes are known to be free, shape (N,); by default those that may be used.
         """
         search = LazySearch(replace(self.graph, states=states), usable, starts, goals, free_nodes=free_nodes)
-        self.connect(search, usable, starts, goals, self.connections)
+        left, count = np.flatnonzero(usable), 0
+
+        def connect() -> bool:
+            """Connect the nearest nodes, and then three times as many each time, as long as there are more."""
+            nonlocal count
+            known, count = count, WIDER * count or self.connections
+            if known >= len(left):
+                return False
+            latent, nodes = self.manifold.latent[left], self.graph.states[left]
+            for rows, which in ((starts, "start"), (goals, "goal")):
+                for k, q in enumerate(rows[:, self.joints]):
+                    z = self.manifold.autoencoder.encode(q[None])[0]
+                    near = nearest_nodes(latent, nodes, z, q, count)
+                    if known:
+                        near = np.setdiff1d(near, nearest_nodes(latent, nodes, z, q, known))
+                    search.connect(**{which: k}, nodes=left[near])
+            return True
+
+        connect()
+        search.more = connect
         return search
-
-    def connect(
-        self, search: LazySearch, usable: Flags, starts: Array, goals: Array, count: int, *, known: int = 0
-    ) -> None:  # fmt: skip
-        """Let paths of a search leave each start, and reach each goal, over more of the nodes that are nearest to it.
-
-        Args:
-            search: What :meth:`search` returned.
-            usable: Which nodes may be used, shape (N,).
-            starts: Shape (S, dof).
-            goals: Shape (G, dof).
-            count: Number of nodes.
-            known: For how many this was done before.
-        """
-        left = np.flatnonzero(usable)
-        if not len(left):
-            return
-        latent, nodes = self.manifold.latent[left], self.graph.states[left]
-        for rows, which in ((starts, "start"), (goals, "goal")):
-            for k, q in enumerate(rows[:, self.joints]):
-                z = self.manifold.autoencoder.encode(q[None])[0]
-                found = nearest_nodes(latent, nodes, z, q, count)
-                if known:
-                    found = np.setdiff1d(found, nearest_nodes(latent, nodes, z, q, known))
-                search.connect(**{which: k}, nodes=left[found])

@@ -77,6 +77,7 @@ class LazySearch:
         searches: Number of searches so far.
         checked: Number of motions that were checked.
         motion: The motion that is being checked.
+        more: Asked, where no path is left, to connect more nodes; returns whether there were any.
     """
 
     def __init__(
@@ -92,6 +93,7 @@ class LazySearch:
             free_nodes: Which nodes are known to be free, shape (N,); by default those that may be used.
         """
         self.graph, self.searches, self.checked, self.motion = graph, 0, 0, ("edge", 0, 0)
+        self.more: Callable[[], bool] = lambda: False
         self._starts, self._goals = starts, goals
         self._usable = (usable[graph.ends] & usable[graph.firsts]).astype(np.int64)
         self._free_nodes = (usable if free_nodes is None else free_nodes).copy()
@@ -134,7 +136,9 @@ class LazySearch:
             found = self._search()
             searched(int(np.isfinite(self._buffers[0]).sum()))
             if found is None:
-                return None
+                if not self.more():
+                    return None
+                continue
             if self._check_nodes(found, nodes_free) and self._check_motions(found, free, stop):
                 nodes = self.graph.states[found.nodes]
                 return np.concatenate([self._starts[[found.start]], nodes, self._goals[[found.goal]]])
