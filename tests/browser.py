@@ -26,6 +26,24 @@ FLAGS = (
     "--disable-component-update", "--disable-sync", "--hide-scrollbars", "--enable-unsafe-swiftshader",
     "--use-angle=swiftshader", "--disable-dev-shm-usage", f"--window-size={SIZE[0]},{SIZE[1]}",
 )  # fmt: skip
+UNHURRIED = """
+(function () {
+  const contexts = [], getContext = HTMLCanvasElement.prototype.getContext;
+  HTMLCanvasElement.prototype.getContext = function (kind, attributes) {
+    if (!kind.startsWith("webgl")) return getContext.call(this, kind, attributes);
+    const context = getContext.call(this, kind, Object.assign({}, attributes, {antialias: false}));
+    if (context && !contexts.includes(context)) contexts.push(context);
+    return context;
+  };
+  const request = window.requestAnimationFrame.bind(window), pixel = new Uint8Array(4);
+  window.requestAnimationFrame = (callback) => setTimeout(() => request((time) => {
+    callback(time);
+    for (const one of contexts) one.readPixels(0, 0, 1, 1, one.RGBA, one.UNSIGNED_BYTE, pixel);
+  }), 200);
+})();
+"""
+"""Each frame waits until the one before is drawn: without a graphics card, a page on a busy machine would ask for
+frames faster than they can be drawn, and a picture of it would wait behind all of them."""
 HARMLESS = ("GPU stall due to ReadPixels", "favicon")
 
 
@@ -42,6 +60,7 @@ def browser() -> Iterator[Any]:
     driver = webdriver.Chrome(options, webdriver.ChromeService(str(DRIVER)))
     try:
         driver.set_window_size(*SIZE)
+        driver.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", {"source": UNHURRIED})
         yield driver
     finally:
         driver.quit()
