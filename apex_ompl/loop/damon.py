@@ -67,7 +67,7 @@ class ManifoldGraph:
             self.prepare(ready)
         assert self.damon is not None
         search = Search(ready, request, charges)
-        clear, start = Clearances(search, SEARCH_RESOLUTION), search.start.position
+        clear, start = Clearances(search), search.start.position
         states = self.damon.states(start)
         usable = self._free_of_still(ready, states, charges).copy()
         usable[usable] = clear.of_movers(states[usable])

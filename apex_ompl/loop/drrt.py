@@ -35,6 +35,7 @@ class KeptTree:
     of parameters were tried in 5 to 20 worlds of each of the kinds ``moving``, ``popup`` and ``interceptor`` of the
     validation split. Longer steps, which are better where obstacles stand, are no better here: at a quarter of the
     velocity limits runs with steps of 0.3, 0.7 and 1.4 rad fail in 7, 9 and 8 of the same 23 worlds ``moving``.
+    Proved as if obstacles stood, its motions reach a goal in 10 of 24 other worlds; among what is predicted, in 9.
 
     Attributes:
         search: The tree, and how it grows.
@@ -51,7 +52,7 @@ class KeptTree:
         if not request.following.at_rest(request.join) or not len(ready.goals):
             return Answer(None, "", charges)
         search = Search(ready, request, charges)
-        tree, clear = self.search.begin(ready.goals), Clearances(search, self.search.step)
+        tree, clear = self.search.begin(ready.goals), Clearances(search)
         tree.trim(clear.edges_of_movers)
         path = self._grown(search, tree, clear)
         motion = None if path is None else timed(search, path, clear)
@@ -92,11 +93,9 @@ class Clearances:
 
     Attributes:
         search: The replan.
-        step: Largest length of an edge of the tree [rad, max-norm].
     """
 
     search: Search
-    step: float
 
     def __call__(self, states: Array) -> Flags:
         """Return whether each state, shape (N, dof), is clear of all."""
@@ -123,17 +122,16 @@ class Clearances:
         """Return whether straight motions are clear of obstacles where they are at joining behind their first state."""
         return self._along(first, last, self.of_movers)
 
-    @property
-    def count(self) -> int:
-        """Number of states that are looked at along a motion."""
-        return int(np.ceil(self.step / SEARCH_RESOLUTION))
-
     def _along(self, first: Array, last: Array, clear: Callable[[Array], Flags]) -> Flags:
-        shares = np.linspace(0.0, 1.0, self.count + 1)[1:, None]
-        states = first[:, None] + shares * (last - first)[:, None]
-        states[:, -1] = last
-        found: Flags = np.all(clear(states.reshape(-1, states.shape[2])).reshape(states.shape[:2]), axis=1)
-        return found
+        if not len(first):
+            return np.ones(0, bool)
+        counts = np.maximum(np.ceil(np.abs(last - first).max(axis=1) / SEARCH_RESOLUTION), 1).astype(np.int64)
+        ends = np.cumsum(counts)
+        which = np.repeat(np.arange(len(first)), counts)
+        shares = (np.arange(ends[-1]) - (ends - counts)[which] + 1) / counts[which]
+        states = first[which] + shares[:, None] * (last - first)[which]
+        states[ends - 1] = last
+        return np.asarray(np.logical_and.reduceat(clear(states), ends - counts))
 
     def of_movers(self, states: Array) -> Flags:
         """Return whether each state, shape (N, dof), is clear of obstacles where they are at joining."""

@@ -46,7 +46,11 @@ def charged(validator: MotionValidator, charges: Charges) -> Iterator[None]:
 
 @dataclass(eq=False)
 class Snapshot:
-    """OMPL's RRTConnect, with the range that is tuned on validation, among obstacles where they are seen now."""
+    """OMPL's RRTConnect, with the range that is tuned on validation, among obstacles where they are seen now.
+
+    What it finds is followed if it is proved among obstacles as they are predicted. As if they stood is no better: of
+    24 worlds ``moving`` of the validation split, at a quarter of the velocity limits, 12 are solved as it is, 11 so.
+    """
 
     _setup: PlanningSetup | None = field(default=None, repr=False)
 
@@ -70,7 +74,7 @@ class Snapshot:
         for obstacle in search.request.obstacles:
             place(setup.checker, obstacle, obstacle.position)
         goals = [goal for goal in search.goals if setup.checker.is_free(goal)]
-        if not goals:
+        if not goals or not setup.checker.is_free(search.start.position):
             return None
         simple_setup = setup.simple_setup
         si = simple_setup.getSpaceInformation()
