@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from apex_ompl.collision.path_proof import Curve
 from apex_ompl.loop.charges import Charges
 from apex_ompl.loop.drrt import Clearances, timed
 from apex_ompl.loop.ready import Ready
@@ -16,7 +17,6 @@ from apex_ompl.roadmaps.damon import Damon
 from apex_ompl.roadmaps.lazy_search import Motion
 from apex_ompl.roadmaps.manifold import shared_manifold
 from apex_ompl.types import Array, Flags
-from apex_ompl.util.resolution import SEARCH_RESOLUTION
 
 PLANNER = "damon"
 
@@ -102,14 +102,13 @@ class ManifoldGraph:
         return self._blocked
 
     def _is_free(self, clear: Clearances, first: Array, last: Array) -> bool:
-        """Whether a straight motion is clear behind its first state; of what stands still it is checked once."""
-        count = max(int(np.ceil(np.abs(last - first).max() / SEARCH_RESOLUTION)), 1)
-        states = first + np.linspace(0.0, 1.0, count + 1)[1:, None] * (last - first)
+        """Whether a straight motion is clear behind its first state; that is proved once of what stands still."""
         key = first.tobytes() + last.tobytes()
-        if not self._clear_of_still.get(key, True) or not clear.of_movers(states).all():
+        if not self._clear_of_still.get(key, True) or not clear.edges_of_movers(first[None], last[None])[0]:
             return False
         if key not in self._clear_of_still:
-            self._clear_of_still[key] = bool(clear.of_still(states).all())
+            ready, ends = clear.search.ready, np.stack([first, last])
+            self._clear_of_still[key] = ready.is_clear(Curve.polyline(ends), first, clear.search.charges)
         return self._clear_of_still[key]
 
     def _free_of_still(self, ready: Ready, states: Array, charges: Charges) -> Flags:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from apex_ompl.collision.path_proof import Curve
 from apex_ompl.live.movers import clearance_in_time
 from apex_ompl.loop.charges import Charges, cost_table
 from apex_ompl.loop.ready import Ready
@@ -118,6 +119,12 @@ class Clearances:
         """Return whether straight motions, between states of shape (N, dof), are clear behind their first state."""
         return self._along(first, last, self)
 
+    def line(self, first: Array, last: Array) -> bool:
+        """Whether a straight motion is proved clear of what stands still, and looked at in steps, of obstacles."""
+        ends = np.stack([first, last])
+        seen = self.edges_of_movers(first[None], last[None])[0]
+        return bool(seen) and self.search.ready.is_clear(Curve.polyline(ends), first, self.search.charges)
+
     def edges_of_movers(self, first: Array, last: Array) -> Flags:
         """Return whether straight motions are clear of obstacles where they are at joining behind their first state."""
         return self._along(first, last, self.of_movers)
@@ -148,9 +155,7 @@ def shortened(path: Array, clear: Clearances) -> Array:
     while at < len(path) - 1:
         low, high, tried = at + 1, len(path), len(path) - 1
         while high - low > 1 and not clear.search.charges.over():
-            way = path[tried] - path[at]
-            count = int(np.ceil(np.abs(way).max() / SEARCH_RESOLUTION)) + 1
-            good = clear(path[at] + np.linspace(0.0, 1.0, count)[1:-1, None] * way).all()
+            good = clear.line(path[at], path[tried])
             low, high = (tried, high) if good else (low, tried)
             tried = (low + high) // 2
         at = low

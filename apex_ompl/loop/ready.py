@@ -70,17 +70,19 @@ class Ready:
         return bool(len(self.goals)) and bool((np.abs(self.goals - q).max(axis=1) <= SAME_STATE).any())
 
     def clear_of_still(self, motion: Trajectory, charges: Charges | None = None) -> bool:
-        """Whether a motion is proved free of what stands still and of itself, and keeps the limits.
+        """Whether a motion keeps the limits, and is proved as by :meth:`is_clear`."""
+        return self.keeps_limits(motion) and self.is_clear(curve_of(motion), motion.positions[0], charges)
+
+    def is_clear(self, curve: Curve, start: Array, charges: Charges | None = None) -> bool:
+        """Whether a curve from a state, shape (dof,), is proved free of what stands still and of the robot itself.
 
         It does not graze either, but where it begins like that: pieces of it are proved again where they are joined.
         """
-        if not self.keeps_limits(motion):
-            return False
-        proof = self.checker.prove(curve_of(motion), tolerance=0.0)
+        proof = self.checker.prove(curve, tolerance=0.0)
         if charges is not None:
             charges.charge("proof interval", proof.intervals)
             charges.charge("exact proof", int(proof.by_spheres < 1.0))
-        return bool(proof) and (proof.clearance >= GRAZING or self._touches(motion.positions[0]))
+        return bool(proof) and (proof.clearance >= GRAZING or self._touches(start))
 
     def _touches(self, q: Array) -> bool:
         """Whether what stands still or the robot's own parts are nearer than a graze at a state, shape (dof,)."""
@@ -155,6 +157,6 @@ class Ready:
         curve = Curve.cubic(
             made.trajectory.times, made.trajectory.positions, made.trajectory.velocities, made.trajectory.accelerations
         )
-        proof = self.checker.prove(curve, tolerance=0.0)
-        clear = proof and (proof.clearance >= GRAZING or self._touches(made.trajectory.positions[0]))
-        return Following(made.trajectory, then, self.is_goal(made.trajectory.positions[-1])) if clear else None
+        if not self.is_clear(curve, made.trajectory.positions[0]):
+            return None
+        return Following(made.trajectory, then, self.is_goal(made.trajectory.positions[-1]))
