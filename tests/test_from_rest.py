@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.loop.methods import METHODS
 from apex_ompl.loop.result import Outcome, RunResult
-from apex_ompl.loop.run import run
+from apex_ompl.loop.run import default_settings, run
+from apex_ompl.loop.sensor import Sensor
 from apex_ompl.loop.settings import LoopSettings
 from apex_ompl.problems import worlds
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.scene.scripts import problem_at
 
+GRAZING = "vertical/moving-xlarge-0.4/900000"
 CROSSED = "vertical/moving-large-0.4/800000"  # a world in which the way is blocked for a while
 
 
@@ -36,6 +40,13 @@ def test_plans_begin_at_rest(name: str, waited: RunResult) -> None:
             begins = np.array([event.time, joins[event.data["number"]]])
             assert np.abs(found.trajectory(begins, 1)).max(axis=1).min() < 1e-6
     assert max(found.trajectory.use(robot().limits).values()) <= 1.0 + 1e-9
+
+
+def test_what_steps_find_free_and_no_proof_does_is_no_reason_to_wait_for_ever() -> None:
+    """At the goal two held objects meet: here the straight way to it touches between two steps of a search."""
+    world = worlds.load(GRAZING)
+    settings = replace(default_settings(world, Sensor()), timeout=12.0)
+    assert run(world, "rrtconnect", speed=0.25, settings=settings).outcome is Outcome.REACHED
 
 
 def test_who_waits_stays_on_the_first_plan(waited: RunResult) -> None:
