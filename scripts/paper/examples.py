@@ -43,7 +43,7 @@ class Kind:
 
 KINDS = {
     "collision": Kind((Outcome.HIT_MOVING, Outcome.HIT_STILL), ("il", UNGUIDED)),
-    "stuck": Kind((Outcome.STUCK, Outcome.TIMEOUT), ("drrt", "rrtconnect", FAITHFUL)),
+    "stuck": Kind((Outcome.STUCK, Outcome.TIMEOUT), ("drrt", "rrtconnect", "damon", FAITHFUL)),
     "misaligned": Kind((Outcome.MISALIGNED,), ("damon", "il", FAITHFUL)),
 }
 
