@@ -126,7 +126,7 @@ def test_a_link_is_seen_where_forward_kinematics_says(driver: Any, problem: Prob
         def red() -> Any:
             seen = picture(driver)
             hue = (seen[..., 0] > 90) & (seen[..., 0] > 2.2 * seen[..., 1]) & (seen[..., 0] > 2.2 * seen[..., 2])
-            hue[:, :330] = hue[:, 870:] = False  # what the browser says of itself; the panel
+            hue[:, :330] = hue[:, 870:] = False  # the browser's warning, and red before there is a scene; the panel
             return np.argwhere(hue)[:, ::-1] if hue.sum() > 50 else None
 
         seen = until(red, "a red link")

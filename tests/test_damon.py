@@ -131,6 +131,29 @@ def test_paths_are_the_shortest_of_the_free_ones(seed: int, count: int) -> None:
     assert any(np.array_equal(path[0], q) for q in starts) and any(np.array_equal(path[-1], q) for q in goals)
 
 
+@pytest.mark.parametrize("how", ["motion", "node"])
+def test_what_is_blocked_stays_so_where_more_nodes_are_connected(how: str) -> None:
+    graph = Graph.of(np.array([[0.5, 0.5], [1.0, 0.0]]), np.array([[0, 1]]))
+    starts, goals, usable = np.array([[0.0, 1.0]]), np.array([[1.0, 1.0]]), np.ones(2, bool)
+    search = LazySearch(graph, usable, starts, goals, free_nodes=np.array([how == "motion", True]))
+
+    def found() -> Array | None:
+        clear, hit = (lambda a, b: np.ones(len(a), bool)), (lambda states: np.zeros(len(states), bool))
+        return search.run(clear, lambda: False, nodes_free=hit)
+
+    if how == "motion":
+        search.block(("start", 0, 0))
+    search.connect(start=0, nodes=np.array([0]))
+    search.connect(goal=0, nodes=np.array([0]))
+    assert found() is None
+    before = search.searches
+    search.connect(start=0, nodes=np.array([0, 1]))
+    search.connect(goal=0, nodes=np.array([0, 1]))
+    path = found()
+    assert path is not None and np.array_equal(path, [[0.0, 1.0], [1.0, 0.0], [1.0, 1.0]])
+    assert search.searches == before + 1, "nothing that is blocked was tried again"
+
+
 def test_a_search_ends_when_it_is_told_to() -> None:
     rng = np.random.default_rng(0)
     graph = random_graph(rng, 50)

@@ -17,7 +17,7 @@ from apex_ompl.problems import worlds
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.scene.scripts import problem_at
 
-GRAZING = "vertical/moving-xlarge-0.4/900000"
+GRAZING = "vertical/moving-xlarge-0.4/900000"  # the straight way to the goal touches between two steps
 CROSSED = "vertical/moving-large-0.4/800000"  # a world in which the way is blocked for a while
 
 
@@ -43,7 +43,7 @@ def test_plans_begin_at_rest(name: str, waited: RunResult) -> None:
 
 
 def test_what_steps_find_free_and_no_proof_does_is_no_reason_to_wait_for_ever() -> None:
-    """At the goal two held objects meet: here the straight way to it touches between two steps of a search."""
+    """Two held objects meet at the goal; a search that looks in steps finds the same straight way to it each time."""
     world = worlds.load(GRAZING)
     settings = replace(default_settings(world, Sensor()), timeout=12.0)
     assert run(world, "rrtconnect", speed=0.25, settings=settings).outcome is Outcome.REACHED

@@ -6,7 +6,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from apex_ompl.collision.path_proof import Curve
 from apex_ompl.loop.charges import Charges
 from apex_ompl.loop.drrt import Clearances, timed
 from apex_ompl.loop.ready import Ready
@@ -107,8 +106,7 @@ class ManifoldGraph:
         if not self._clear_of_still.get(key, True) or not clear.edges_of_movers(first[None], last[None])[0]:
             return False
         if key not in self._clear_of_still:
-            ready, ends = clear.search.ready, np.stack([first, last])
-            self._clear_of_still[key] = ready.is_clear(Curve.polyline(ends), first, clear.search.charges)
+            self._clear_of_still[key] = clear.search.ready.line_is_clear(first, last, clear.search.charges)
         return self._clear_of_still[key]
 
     def _free_of_still(self, ready: Ready, states: Array, charges: Charges) -> Flags:

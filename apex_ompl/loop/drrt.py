@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from apex_ompl.collision.path_proof import Curve
 from apex_ompl.live.movers import clearance_in_time
 from apex_ompl.loop.charges import Charges, cost_table
 from apex_ompl.loop.ready import Ready
@@ -16,6 +15,7 @@ from apex_ompl.loop.search import Search
 from apex_ompl.roadmaps.dynamic_rrt import DynamicRRT
 from apex_ompl.roadmaps.goal_tree import GoalTree
 from apex_ompl.trajectory import Timing, Trajectory, time_path
+from apex_ompl.trajopt.path import states_between
 from apex_ompl.types import Array, Flags
 from apex_ompl.util.resolution import SEARCH_RESOLUTION
 
@@ -121,9 +121,8 @@ class Clearances:
 
     def line(self, first: Array, last: Array) -> bool:
         """Whether a straight motion is proved clear of what stands still, and looked at in steps, of obstacles."""
-        ends = np.stack([first, last])
         seen = self.edges_of_movers(first[None], last[None])[0]
-        return bool(seen) and self.search.ready.is_clear(Curve.polyline(ends), first, self.search.charges)
+        return bool(seen) and self.search.ready.line_is_clear(first, last, self.search.charges)
 
     def edges_of_movers(self, first: Array, last: Array) -> Flags:
         """Return whether straight motions are clear of obstacles where they are at joining behind their first state."""
@@ -132,13 +131,11 @@ class Clearances:
     def _along(self, first: Array, last: Array, clear: Callable[[Array], Flags]) -> Flags:
         if not len(first):
             return np.ones(0, bool)
-        counts = np.maximum(np.ceil(np.abs(last - first).max(axis=1) / SEARCH_RESOLUTION), 1).astype(np.int64)
-        ends = np.cumsum(counts)
-        which = np.repeat(np.arange(len(first)), counts)
-        shares = (np.arange(ends[-1]) - (ends - counts)[which] + 1) / counts[which]
-        states = first[which] + shares[:, None] * (last - first)[which]
-        states[ends - 1] = last
-        return np.asarray(np.logical_and.reduceat(clear(states), ends - counts))
+        pieces = [
+            np.concatenate([states_between(a, b, SEARCH_RESOLUTION), b[None]]) for a, b in zip(first, last, strict=True)
+        ]
+        begins = np.cumsum([0] + [len(piece) for piece in pieces[:-1]])
+        return np.asarray(np.logical_and.reduceat(clear(np.concatenate(pieces)), begins))
 
     def of_movers(self, states: Array) -> Flags:
         """Return whether each state, shape (N, dof), is clear of obstacles where they are at joining."""

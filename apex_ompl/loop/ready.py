@@ -71,10 +71,10 @@ class Ready:
 
     def clear_of_still(self, motion: Trajectory, charges: Charges | None = None) -> bool:
         """Whether a motion keeps the limits, and is proved as by :meth:`is_clear`."""
-        return self.keeps_limits(motion) and self.is_clear(curve_of(motion), motion.positions[0], charges)
+        return self.keeps_limits(motion) and self.is_clear(curve_of(motion), charges)
 
-    def is_clear(self, curve: Curve, start: Array, charges: Charges | None = None) -> bool:
-        """Whether a curve from a state, shape (dof,), is proved free of what stands still and of the robot itself.
+    def is_clear(self, curve: Curve, charges: Charges | None = None) -> bool:
+        """Whether a curve is proved free of what stands still and of the robot itself.
 
         It does not graze either, but where it begins like that: pieces of it are proved again where they are joined.
         """
@@ -82,7 +82,11 @@ class Ready:
         if charges is not None:
             charges.charge("proof interval", proof.intervals)
             charges.charge("exact proof", int(proof.by_spheres < 1.0))
-        return bool(proof) and (proof.clearance >= GRAZING or self._touches(start))
+        return bool(proof) and (proof.clearance >= GRAZING or self._touches(curve.states[0]))
+
+    def line_is_clear(self, first: Array, last: Array, charges: Charges | None = None) -> bool:
+        """Whether the straight motion between two states, shape (dof,), is proved as by :meth:`is_clear`."""
+        return self.is_clear(Curve.polyline(np.stack([first, last])), charges)
 
     def _touches(self, q: Array) -> bool:
         """Whether what stands still or the robot's own parts are nearer than a graze at a state, shape (dof,)."""
@@ -157,6 +161,6 @@ class Ready:
         curve = Curve.cubic(
             made.trajectory.times, made.trajectory.positions, made.trajectory.velocities, made.trajectory.accelerations
         )
-        if not self.is_clear(curve, made.trajectory.positions[0]):
+        if not self.is_clear(curve):
             return None
         return Following(made.trajectory, then, self.is_goal(made.trajectory.positions[-1]))

@@ -10,7 +10,6 @@ import numpy as np
 from ompl import base as ob
 from ompl import geometric as og
 
-from apex_ompl.collision.path_proof import Curve
 from apex_ompl.loop.charges import Charges
 from apex_ompl.loop.placing import fresh_checker, place
 from apex_ompl.loop.ready import Ready
@@ -36,9 +35,7 @@ def charged(validator: MotionValidator, ready: Ready, charges: Charges, proved: 
 
     def counted(first: Array, second: Array) -> bool:
         charges.charge("motion of a tree")
-        if not check(first, second):
-            return False
-        return not proved or ready.is_clear(Curve.polyline(np.stack([first, second])), first, charges)
+        return check(first, second) and (not proved or ready.line_is_clear(first, second, charges))
 
     validator.check = counted
     try:

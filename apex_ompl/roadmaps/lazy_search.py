@@ -98,6 +98,8 @@ class LazySearch:
         self._usable = (usable[graph.ends] & usable[graph.firsts]).astype(np.int64)
         self._free_nodes = (usable if free_nodes is None else free_nodes).copy()
         self._free: set[Motion] = set()
+        self._blocked: set[Motion] = set()
+        self._hit = np.zeros(len(graph.states), bool)
         count, edges = len(graph.states), len(graph.ends)
         self._entry, self._leave = np.full((len(starts), count), np.inf), np.full((len(goals), count), np.inf)
         away = [np.linalg.norm(graph.states - goal, axis=1) for goal in goals]
@@ -106,14 +108,21 @@ class LazySearch:
         self._buffers = np.empty(count), np.empty(count, np.int64), np.empty(room), np.empty(room, np.int64)
 
     def connect(self, start: int | None = None, goal: int | None = None, *, nodes: Indices) -> None:
-        """Let the path enter the graph from a start, or leave it for a goal, given by number, over some nodes."""
+        """Let the path enter the graph from a start, or leave it for a goal, given by number, over some nodes.
+
+        Nodes and motions that are known to be blocked stay unused.
+        """
         row, q = (self._entry[start], self._starts[start]) if start is not None else (
             self._leave[goal], self._goals[goal]
         )  # fmt: skip
-        row[nodes] = np.linalg.norm(self.graph.states[nodes] - q, axis=1)
+        row[nodes] = np.where(self._hit[nodes], np.inf, np.linalg.norm(self.graph.states[nodes] - q, axis=1))
+        for kind, number, node in self._blocked:
+            if (kind, number) in (("start", start), ("goal", goal)):
+                row[node] = np.inf
 
     def block(self, motion: Motion) -> None:
         """Use a motion no more."""
+        self._blocked.add(motion)
         kind, first, second = motion
         if kind == "edge":
             self._usable[[first, second]] = 0
@@ -168,6 +177,7 @@ class LazySearch:
             return True
         free = nodes_free(self.graph.states[left])
         self._free_nodes[left[free]] = True
+        self._hit[left[~free]] = True
         for k in left[~free]:
             self._entry[:, k] = self._leave[:, k] = np.inf
             out = np.arange(self.graph.begins[k], self.graph.begins[k + 1])

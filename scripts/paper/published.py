@@ -79,7 +79,7 @@ ENTRIES = (
     Entry("10b", "FID, guided", "21.51", ("fid", "VAE, apex-paper"), ("fid", "VAE, apex"), "fid",
           "N, dimension and features of the paper are not given, so that values cannot be compared, only their order"),
     Entry("10b", "FID, unguided", "48.63", ("fid", "VAE, apex-paper, unguided"), ("fid", "VAE, apex, unguided"), "fid",
-          "the other way round: our guidance moves paths away from obstacles, and so away from solutions as they are"),
+          "the other way round; our guidance makes paths longer (`benchmarks/results/guidance.md`)"),
     Entry("IV-D", "time of a plan s, guided", "8.36", ("time", "apex-paper"), ("time", "apex"), "time_s",
           "median; CPU, the paper's a GPU; `apex-paper` samples one path after the other in 256 steps each"),
     Entry("IV-D", "time of a plan s, unguided", "19.63", ("time", "apex-paper, unguided"),
