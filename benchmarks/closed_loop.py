@@ -43,6 +43,7 @@ from apex_ompl.loop.result import Outcome, RunResult
 from apex_ompl.loop.run import CLOCKS, run
 from apex_ompl.problems import worlds
 from apex_ompl.trajectory.timing import Timing
+from apex_ompl.util import provenance
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.files import write_atomically
 from apex_ompl.util.statistics import share_interval
@@ -83,8 +84,7 @@ class Job(NamedTuple):
 @cache
 def made_with() -> dict[str, Any]:
     """Return what a run is to be compared by: commit, hardware, and version of the table of costs."""
-    session = record.session()
-    return {"commit": session["commit"], "hardware": session["hardware"], "costs": cost_table()["version"]}
+    return {**record.session(), "hardware": provenance.hardware(), "costs": cost_table()["version"]}
 
 
 def made_by(runs: Sequence[dict[str, Any]]) -> dict[str, str]:
