@@ -13,7 +13,7 @@ from ompl import util as ou
 from support import ROOT
 
 import apex_ompl
-from apex_ompl import PlanStatus, load_problem, plan, planners, planning
+from apex_ompl import MotionPlanner, PlanStatus, load_problem, plan, planners, planning
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import FileFormatError, ParameterError, UnknownNameError
 from apex_ompl.ompl_adapter.process import seed_ompl
@@ -52,22 +52,41 @@ def test_shipped_problems_are_solved_and_proved(name: str | Path) -> None:
     )
 
 
-@pytest.mark.parametrize(
-    ("planner", "params"),
-    [
-        ("rrtconnect", {}), ("kpiece1", {}), ("bkpiece1", {}), ("lbkpiece1", {}),
-        ("fmt", {"num_samples": 300}), ("bfmt", {"num_samples": 300}),
-    ],
-)  # fmt: skip
-def test_the_same_seed_gives_the_same_path_in_one_process(planner: str, params: dict, problem: Problem) -> None:
-    raw = [plan(problem, planner, timeout=300.0, seed=seed, params=params, simplify=False) for seed in (5, 5, 6)]
-    pairs = [raw[:2]]
-    if planner == "rrtconnect":  # simplification is the same for all
-        pairs.append([plan(problem, planner, timeout=300.0, seed=5) for _ in range(2)])
-    for first, second in pairs:
+def test_the_same_seed_gives_the_same_path_in_one_process(problem: Problem) -> None:
+    raw = [plan(problem, "rrtconnect", timeout=300.0, seed=seed, simplify=False) for seed in (5, 5, 6)]
+    simplified = [plan(problem, "rrtconnect", timeout=300.0, seed=5) for _ in range(2)]
+    for first, second in (raw[:2], simplified):
         assert first and second
         assert np.array_equal(first.path, second.path)
     assert not np.array_equal(raw[0].path, raw[2].path), "the seed must matter, or this test shows nothing"
+
+
+@pytest.mark.parametrize(
+    ("planner", "params"),
+    [
+        ("kpiece1", {}), ("bkpiece1", {}), ("lbkpiece1", {}),
+        ("fmt", {"num_samples": 300}), ("bfmt", {"num_samples": 300}),
+    ],
+)  # fmt: skip
+def test_the_same_seed_gives_one_arm_the_same_path(planner: str, params: dict, problem: Problem) -> None:
+    with MotionPlanner(problem.robot) as session:
+        session.world.add(*problem.scene)
+        first, second, other = (
+            session.plan(
+                problem.start,
+                problem.goal.joints[0],
+                planner,
+                timeout=60.0,
+                seed=seed,
+                params=params,
+                simplify=False,
+                group="left_arm",
+            )  # fmt: skip
+            for seed in (5, 5, 6)
+        )
+    assert first and second and other
+    assert np.array_equal(first.path, second.path)
+    assert not np.array_equal(first.path, other.path), "the seed must matter, or this test shows nothing"
 
 
 def test_the_same_seed_gives_the_same_tree_for_rrt(problem: Problem) -> None:

@@ -286,23 +286,33 @@ print(compilation.cache_folder())
 """
 
 
+def called(script: Path, cache: Path) -> subprocess.CompletedProcess[str]:
+    env = {"PATH": "", "NUMBA_CACHE_DIR": str(cache), "XDG_CACHE_HOME": str(cache), "PYTHONPATH": str(ROOT)}
+    done = subprocess.run([sys.executable, script], check=False, env=env, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    return done
+
+
 @pytest.mark.parametrize("writable", [True, False])
 def test_code_is_kept_where_it_can_be(tmp_path: Path, writable: bool) -> None:
     (tmp_path / "file").write_text("not a folder")
     home = tmp_path / "cache" if writable else tmp_path / "file"
     script = tmp_path / "call.py"
     script.write_text(CALL)
-    env = {"PATH": "", "NUMBA_CACHE_DIR": str(home), "XDG_CACHE_HOME": str(home), "PYTHONPATH": str(ROOT)}
-
-    def run() -> subprocess.CompletedProcess[str]:
-        return subprocess.run(
-            [sys.executable, script], check=False, env=env, capture_output=True, text=True, timeout=120
-        )
-
-    first, second = run(), run()
-    assert first.returncode == second.returncode == 0, first.stderr + second.stderr
+    first, second = called(script, home), called(script, home)
     assert "compiles" in first.stderr
     if writable:
         assert str(home) in first.stdout and "compiles" not in second.stderr
     else:
         assert first.stdout.strip() == "None" and "no cache folder" in first.stderr and "compiles" in second.stderr
+
+
+def test_the_same_code_at_another_place_is_not_compiled_again(tmp_path: Path) -> None:
+    """Another environment of the same version shares the cache; an edited file does not."""
+    scripts = [tmp_path / place / "call.py" for place in ("here", "there", "edited")]
+    for script in scripts:
+        script.parent.mkdir()
+        script.write_text(CALL if script.parent.name != "edited" else CALL.replace("2.0", "3.0").replace("1.0", "2.0"))
+    here, there, edited = (called(script, tmp_path / "cache") for script in scripts)
+    assert here.stdout == there.stdout == edited.stdout
+    assert "compiles" in here.stderr and "compiles" not in there.stderr

@@ -1,9 +1,10 @@
 """Compilation of the kernel by numba, cached on disk where there is a writable place.
 
 numba renews cached code when the one file that it was written in changes. The functions of this folder are compiled
-into each other, so their cache is a folder named after a digest of all its files and their place, of the versions of
-Python and numba, and of the processor. It lies in ``$NUMBA_CACHE_DIR`` when that is set, or in the user's cache folder;
-where neither can be written, the code is compiled anew in every process, and a warning says so.
+into each other and import nothing else, so their cache is a folder named after a digest of all its files, of the
+versions of Python and numba, and of the processor: installations of the same files share it, wherever they lie. It is
+in ``$NUMBA_CACHE_DIR`` when that is set, or in the user's cache folder; where neither can be written, the code is
+compiled anew in every process, and a warning says so.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from typing import Any, TypeVar
 
 import numba
 from llvmlite import binding as llvm
-from numba.core import config
+from numba.core.caching import CompileResultCacheImpl, FunctionCache, InTreeCacheLocator
 from numba.core.sigutils import normalize_signature
 
 from apex_ompl.kernel.compiled.linking import InnerCompiler
@@ -48,8 +49,7 @@ def _digest() -> str:
     for path in sorted(Path(__file__).parent.glob("*.py")):
         digest.update(path.read_bytes())
     processor = f"{platform.machine()} {llvm.get_host_cpu_name()}"
-    place = Path(__file__).resolve().parent  # numba finds its code again for the same files alone
-    digest.update(f"{sys.version_info[:3]} {numba.__version__} {processor} {place}".encode())
+    digest.update(f"{sys.version_info[:3]} {numba.__version__} {processor}".encode())
     return digest.hexdigest()[:16]
 
 
@@ -101,14 +101,28 @@ def reassociating_entry_point(function: Callable[..., Any]) -> CompiledFunction:
     return _entry_point(function, fastmath={"reassoc", "contract"})
 
 
+class _Locator(InTreeCacheLocator):  # type: ignore[misc]
+    """Where numba keeps code: in one folder, whatever the place and the date of the file that a function stands in."""
+
+    def get_cache_path(self) -> str:
+        return str(cache_folder())
+
+    def get_source_stamp(self) -> str:
+        return hashlib.sha256(Path(self._py_file).read_bytes()).hexdigest()
+
+
+class _CacheFiles(CompileResultCacheImpl):  # type: ignore[misc]
+    _locator_classes = (_Locator,)
+
+
+class _Cache(FunctionCache):  # type: ignore[misc]
+    _impl_class = _CacheFiles
+
+
 def _entry_point(function: Callable[..., Any], **options: Any) -> CompiledFunction:
-    folder = cache_folder()
-    with _lock:
-        before, config.CACHE_DIR = config.CACHE_DIR, str(folder or "")
-        try:
-            dispatcher = numba.njit(**OPTIONS, cache=folder is not None, **options)(function)
-        finally:
-            config.CACHE_DIR = before
+    dispatcher = numba.njit(**OPTIONS, **options)(function)
+    if cache_folder() is not None:
+        dispatcher._cache = _Cache(function)
     return CompiledFunction(dispatcher, function.__name__)
 
 
