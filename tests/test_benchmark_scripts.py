@@ -20,13 +20,17 @@ SCRIPTS = sorted((ROOT / "benchmarks").glob("*.py"))
 RESULTS = sorted((ROOT / "benchmarks" / "results").glob("*.json"))
 
 
-@pytest.fixture(scope="module")
-def freshness() -> ModuleType:
+def script_named(name: str) -> ModuleType:
     sys.path.append(str(ROOT / "benchmarks"))
     try:
-        return importlib.import_module("freshness")
+        return importlib.import_module(name)
     finally:
         sys.path.remove(str(ROOT / "benchmarks"))
+
+
+@pytest.fixture(scope="module")
+def freshness() -> ModuleType:
+    return script_named("freshness")
 
 
 def names_in(script: Path) -> set[str]:
@@ -148,3 +152,17 @@ def test_the_command_fails_where_a_quoted_result_is_stale(
             freshness.main()
         shown = capsys.readouterr().out
         assert "fresh   new" in shown and "stale   old: the commit" in shown
+
+
+@pytest.mark.parametrize("name", ["closed_loop", "guarded_runs"])
+def test_runs_of_the_closed_loop_are_made_and_make_a_row(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    module, loop = script_named(name), script_named("closed_loop")
+    monkeypatch.setattr(loop.record, "script", lambda: ROOT / "benchmarks" / f"{name}.py")
+    loop.made_with.cache_clear()
+    method = "blind" if name == "closed_loop" else "no-network"
+    made = module.made(loop.Job("vertical/moving-small-0.1/900000", method, 1.0))
+    assert json.loads(json.dumps(made)) and made["costs"] == loop.cost_table()["version"]
+    summary = loop.summary([made])
+    assert summary["n"] == 1 and summary["over_limits"] == 0 and sum(summary["causes"].values()) == summary["failed"]
+    assert loop.made_by([made])["run_hardware"] == made["hardware"]
+    assert name in loop.table({name: summary})
