@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import importlib
+import sys
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -39,6 +42,15 @@ f 3 8 7
 f 4 1 5
 f 4 5 8
 """
+
+
+def benchmark_script(name: str) -> ModuleType:
+    """A module of the folder of benchmarks, whose modules import each other."""
+    sys.path.append(str(ROOT / "benchmarks"))
+    try:
+        return importlib.import_module(name)
+    finally:
+        sys.path.remove(str(ROOT / "benchmarks"))
 
 
 def states_around_home(robot: Robot, rng: np.random.Generator, count: int, spread: float = 0.4) -> np.ndarray:

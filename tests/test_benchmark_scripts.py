@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import importlib
 import json
 import re
 import shutil
@@ -14,23 +13,15 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
-from support import ROOT
+from support import ROOT, benchmark_script
 
 SCRIPTS = sorted((ROOT / "benchmarks").glob("*.py"))
 RESULTS = sorted((ROOT / "benchmarks" / "results").glob("*.json"))
 
 
-def script_named(name: str) -> ModuleType:
-    sys.path.append(str(ROOT / "benchmarks"))
-    try:
-        return importlib.import_module(name)
-    finally:
-        sys.path.remove(str(ROOT / "benchmarks"))
-
-
 @pytest.fixture(scope="module")
 def freshness() -> ModuleType:
-    return script_named("freshness")
+    return benchmark_script("freshness")
 
 
 def names_in(script: Path) -> set[str]:
@@ -156,7 +147,7 @@ def test_the_command_fails_where_a_quoted_result_is_stale(
 
 @pytest.mark.parametrize("name", ["closed_loop", "guarded_runs"])
 def test_runs_of_the_closed_loop_are_made_and_make_a_row(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    module, loop = script_named(name), script_named("closed_loop")
+    module, loop = benchmark_script(name), benchmark_script("closed_loop")
     monkeypatch.setattr(loop.record, "script", lambda: ROOT / "benchmarks" / f"{name}.py")
     loop.made_with.cache_clear()
     method = "blind" if name == "closed_loop" else "no-network"

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
@@ -11,7 +9,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 from models import kernel, query
-from support import DATA, ROOT
+from support import DATA, ROOT, benchmark_script
 
 from apex_ompl import load_model, plan, planners, problems
 from apex_ompl.benchmark.rows import Row, jobs
@@ -25,14 +23,10 @@ def controls() -> Iterator[ModuleType]:
     """The module, with few training paths."""
     if not (ROOT / "benchmarks").is_dir():
         pytest.skip("there are no benchmarks")
-    sys.path.append(str(ROOT / "benchmarks"))
-    try:
-        found = importlib.import_module("control_planners")
-        before, found.DATA = found.DATA, DATA
-        yield found
-        found.DATA = before
-    finally:
-        sys.path.remove(str(ROOT / "benchmarks"))
+    found = benchmark_script("control_planners")
+    before, found.DATA = found.DATA, DATA
+    yield found
+    found.DATA = before
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -70,7 +64,7 @@ def test_the_suite_for_validation_is_benchmarked_on_its_split_alone() -> None:
 
 
 def test_a_checkpoint_stands_beside_the_one_that_ships(controls: ModuleType, tmp_path: Path) -> None:
-    unseen = importlib.import_module("unseen")
+    unseen = benchmark_script("unseen")
     folder = ROOT / "apex_ompl" / "diffusion" / "checkpoints" / "apex"
     labels = [row.label for row in unseen.rows(unseen.NAMES, folder)]
     assert len(set(labels)) == len(labels) == len(unseen.NAMES) + 1

@@ -121,7 +121,7 @@ def script(*arguments: object, **options: object) -> subprocess.CompletedProcess
     return subprocess.run(command, check=False, capture_output=True, text=True, timeout=240, **options)
 
 
-SMALL = ("vertical/small", "wall/easy", "broad/free", "--problems", 30, "--parts", 1, "--quiet")
+SMALL = ("vertical/small", "wall/easy", "broad/free", "--problems", 60, "--parts", 1, "--quiet")
 
 
 def test_a_killed_run_goes_on_and_ends_as_one_that_was_not(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import subprocess
 import sys
 import threading
@@ -316,3 +317,15 @@ def test_the_same_code_at_another_place_is_not_compiled_again(tmp_path: Path) ->
     here, there, edited = (called(script, tmp_path / "cache") for script in scripts)
     assert here.stdout == there.stdout == edited.stdout
     assert "compiles" in here.stderr and "compiles" not in there.stderr
+
+
+def test_compiled_functions_take_nothing_from_outside_their_folder() -> None:
+    """Copies with the same files share compiled code, so that nothing else may be compiled into it."""
+    folder = Path(queries.__file__).parent
+    for file in folder.glob("*.py"):
+        for node in ast.walk(ast.parse(file.read_text())):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("apex_ompl"):
+                inside = node.module.startswith("apex_ompl.kernel.compiled")
+                assert inside or (file.stem, node.module) == ("compilation", "apex_ompl.util.cache"), file.name
+            elif isinstance(node, ast.Import):
+                assert not any(alias.name.startswith("apex_ompl") for alias in node.names), file.name

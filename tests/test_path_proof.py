@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from pathlib import Path
 from types import ModuleType
@@ -13,7 +12,7 @@ import pytest
 import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support import ROOT, states_around_home
+from support import benchmark_script, states_around_home
 
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.exact_shapes import ball_tree, mesh_of
@@ -26,12 +25,7 @@ from apex_ompl.trajectory import time_path
 
 @pytest.fixture(scope="module")
 def grazing() -> ModuleType:
-    sys.path.append(str(ROOT / "benchmarks"))
-    try:
-        import grazing
-    finally:
-        sys.path.remove(str(ROOT / "benchmarks"))
-    return grazing
+    return benchmark_script("grazing")
 
 
 @pytest.fixture(scope="module", params=["dual_panda_softhand", "baxter"])
@@ -96,9 +90,9 @@ def limits(robot: Robot) -> tuple[np.ndarray, np.ndarray]:
 def test_grazing_paths_are_proved_only_where_coal_finds_them_free(
     grazing: ModuleType, robot: Robot, tmp_path: Path
 ) -> None:
-    count = grazing.grazing_paths(robot, np.random.default_rng(7), 20, tmp_path, per_scene=10)
-    assert count.paths == 20 and count.false_free == count.refused == count.off == 0
-    assert count.colliding > 3 and count.clear > 2 and len(count.pairs) > 2
+    count = grazing.grazing_paths(robot, np.random.default_rng(7), 30, tmp_path, per_scene=10)
+    assert count.paths == 30 and count.false_free == count.refused == count.off == 0
+    assert count.colliding > 3 and count.clear > 3 and len(count.pairs) > 2
 
 
 def test_clearance_along_a_path_has_a_closed_form() -> None:
