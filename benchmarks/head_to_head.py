@@ -2,8 +2,10 @@
 
 Rows: apex; apex without trees after its proposals; the straight line and its repair, which ends by itself; rounds of
 eight random bumps instead of proposals, with the same repair, for 2 s; rrtconnect+polish; rrtconnect as OMPL has it and
-tuned. On the hard and large levels alone: apex with guidance; and, on 20 problems of each, the paper's algorithm alone
-(``apex-paper``), and tuned, 5 s, rrt, lbkpiece1 and planners that use their whole time limit.
+tuned; and the baselines of the paper, with their defaults, which are tuned: drrt, gpmp, gpmp2, damon, and the policies
+il and il-paper, which are rolled out once. On the hard and large levels alone: apex with guidance; and, on 20 problems
+of each, the paper's algorithm alone (``apex-paper``), and tuned, 5 s, rrt, lbkpiece1 and planners that use their whole
+time limit.
 Labels of tuned rows name the parameters that benchmarks/tune.py chose; those without any do best with OMPL's defaults.
 apex and rrtconnect+polish have theirs as defaults.
 Each run is stored in benchmarks/runs/head_to_head when it ends, with OMPL's logs and the database for Planner Arena;
@@ -33,7 +35,10 @@ from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.statistics import share_interval
 from apex_ompl.util.validation import one_or_more
 
-DEPENDS = ("@benchmark", "benchmarks/controls.py", "benchmarks/control_planners.py", "benchmarks/neighbours.py")
+DEPENDS = (
+    "@benchmark", "apex_ompl/imitation", "apex_ompl/roadmaps", "benchmarks/baselines", "benchmarks/controls.py",
+    "benchmarks/control_planners.py", "benchmarks/neighbours.py",
+)  # fmt: skip
 FOLDER = Path(__file__).parent / "runs" / "head_to_head"
 TIMEOUT = 10.0  # [s]
 SLOW = 20  # problems of a level for rows that take long
@@ -46,6 +51,7 @@ GROUPS = {
     "all": ("free", "easy", "small", "medium", "hard", "large", "extreme"),
 }
 HARD = ("/hard", "/large")
+BASELINES = ("drrt", "gpmp", "gpmp2", "damon", "il", "il-paper")  # of the paper, or what came of them
 TREELESS = {"fallback": False, "bridge": False}
 ROWS = (
     Row("apex", "apex"),
@@ -62,6 +68,7 @@ ROWS = (
     Row("rrtconnect+polish", "rrtconnect+polish"),
     Row("rrtconnect", "rrtconnect"),
     Row.of("rrtconnect", TUNED["rrtconnect"]),
+    *(Row(name, name) for name in BASELINES),
     *(
         Row.of(name, TUNED[name], timeout=5.0, runs=SLOW, levels=HARD)
         for name in ("rrt", "lbkpiece1", "aorrtc", "informedrrtstar", "bitstar")
