@@ -50,11 +50,13 @@ class World(ABC):
         name: Its name, such as ``popup/12``.
         problem: What stands still, start and goal, and what is held.
         fastest: Largest speed of its obstacles [m/s].
+        ran: Whether a run was made in it: each is good for one.
     """
 
     name: str
     problem: Problem
     fastest: float
+    ran: bool = False
 
     def begin(self, motion: Trajectory, time: float) -> None:  # noqa: B027 - most worlds do not care
         """Take the first motion that the robot is to follow, and when it begins [s]."""

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -14,6 +13,7 @@ from planning import HARD, cached_problem
 from support import DATA
 
 from apex_ompl import plan
+from apex_ompl.cli import main
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.datasets.records import Paths
 from apex_ompl.datasets.store import load, save
@@ -66,13 +66,30 @@ def problem(robot: Robot, post: Obstacle) -> Problem:
 
 
 @pytest.fixture
-def apex_cli():
+def apex_cli(capfd: pytest.CaptureFixture[str]):
+    """Run the command line in this process; returns exit code, standard output and standard error."""
+
+    def run(*arguments: object) -> subprocess.CompletedProcess[str]:
+        capfd.readouterr()
+        stdout = sys.stdout
+        try:
+            code = main([str(one) for one in arguments])
+        except SystemExit as ended:
+            code = int(ended.code or 0)
+        finally:
+            sys.stdout = stdout
+        return subprocess.CompletedProcess(arguments, code, *capfd.readouterr())
+
+    return run
+
+
+@pytest.fixture
+def apex_process():
     """Run the command line in a new process; returns exit code, standard output and standard error."""
 
-    def run(*arguments: object, **options: object) -> subprocess.CompletedProcess[str]:
+    def run(*arguments: object) -> subprocess.CompletedProcess[str]:
         command = [sys.executable, "-m", "apex_ompl.cli", *map(str, arguments)]
-        settings = {"capture_output": True, "text": True, "timeout": 120, "env": os.environ, **options}
-        return subprocess.run(command, check=False, **settings)
+        return subprocess.run(command, check=False, capture_output=True, text=True, timeout=120)
 
     return run
 

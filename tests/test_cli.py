@@ -41,8 +41,8 @@ def test_plan_prints_status_time_and_length(apex_cli, easy: Path) -> None:
     assert lines[5].startswith("  motion     ") and ", jerk " in lines[6]
 
 
-def test_json_goes_to_standard_output_alone_and_out_writes_the_same(apex_cli, easy: Path, tmp_path: Path) -> None:
-    done = apex_cli("plan", easy, "--timeout", 30, "--json", "--set", "range=1.5", "--out", tmp_path / "r.json")
+def test_json_goes_to_standard_output_alone_and_out_writes_the_same(apex_process, easy: Path, tmp_path: Path) -> None:
+    done = apex_process("plan", easy, "--timeout", 30, "--json", "--set", "range=1.5", "--out", tmp_path / "r.json")
     assert done.returncode == 0, done.stderr
     printed = json.loads(done.stdout)
     assert printed["status"] == "EXACT_SOLUTION"
@@ -176,6 +176,15 @@ def test_each_fault_is_one_sentence_and_an_exit_code(apex_cli, tmp_path: Path, c
         assert word in output, output
     leftovers = {p.name for p in tmp_path.iterdir()} - {"edited.yaml", "r.npz"}
     assert not leftovers
+
+
+@pytest.mark.parametrize("case", ["no plan", "wrong version", "start in collision", "approximate"])
+def test_exit_codes_are_those_of_the_process(apex_process, tmp_path: Path, case: str) -> None:
+    arguments, code, words = FAULTS[case]
+    done = apex_process(*arguments(tmp_path))
+    assert done.returncode == code and "Traceback" not in done.stderr
+    output, other = (done.stderr, done.stdout) if code == 2 else (done.stdout, done.stderr)
+    assert all(word in output for word in words) and (code != 2 or not other)
 
 
 def test_an_output_that_cannot_be_written_is_reported(apex_cli, easy: Path) -> None:

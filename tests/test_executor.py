@@ -265,7 +265,8 @@ def test_a_way_of_replanning_that_never_answers_is_asked_again() -> None:
     assert len(times) > 3 and np.diff(times).max() < 0.1
 
 
-def test_what_comes_to_a_standing_robot_does_not_wait_for_an_answer_that_knows_nothing_of_it() -> None:
+@pytest.mark.parametrize("guarded", [True, False])
+def test_what_comes_to_a_standing_robot_does_not_wait_for_an_answer_that_knows_nothing_of_it(guarded: bool) -> None:
     """A box comes into being before a hand: the replan under way is given up, and the next one knows of the box."""
     setup = setup_of(PROBLEM)
     palm = setup.robot.link_pose(setup.start, "left_hand_palm")[:3, 3]
@@ -273,7 +274,7 @@ def test_what_comes_to_a_standing_robot_does_not_wait_for_an_answer_that_knows_n
         name="box", box=(0.1, 0.1, 0.1), position=tuple(palm + (0.0, 0.0, 0.3)), velocity=(0.0, 0.0, -0.4), appears=0.53
     )
     replanner = ByHand(lambda ready, request: None, seconds=0.042)
-    done, _ = go(replanner, box, timeout=1.0)
+    done, _ = go(replanner, box, timeout=1.0, guarded=guarded, hastens=not guarded)
     given_up = [event for event in done.events if event.data.get("why") == "an obstacle comes"]
     assert len(given_up) == 1
     known = next(event.time for event in done.events if event.kind == "conflict")

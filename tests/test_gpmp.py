@@ -223,7 +223,7 @@ def test_the_replanner_begins_as_the_robot_moves() -> None:
 
     def ask(following: Following, route: Following | None, join: float) -> tuple[Following, Charges]:
         charges = Charges(0.2)
-        request = Request(1, join - 0.05, join, following, route, movers, movers, (), np.inf, 0)
+        request = Request(1, join - 0.05, join, following, route, movers, 0.0, (), np.inf, 0)
         found = replanner.replan(ready, request, charges).found
         assert found is not None and found.to_goal and ready.clear_of_still(found.motion)
         return found, charges
@@ -237,7 +237,7 @@ def test_the_replanner_begins_as_the_robot_moves() -> None:
     for order in range(3):
         np.testing.assert_allclose(second.motion(0.0, order), behind[order], atol=1e-9)
     assert second.motion.duration < first.motion.duration
-    assert replanner.replan(ready, Request(1, 0.0, 0.05, standing, None, movers, movers, (), np.inf, 0), Charges(0.0))
+    assert replanner.replan(ready, Request(1, 0.0, 0.05, standing, None, movers, 0.0, (), np.inf, 0), Charges(0.0))
 
 
 def test_the_loop_reaches_its_goal_with_it() -> None:

@@ -260,7 +260,7 @@ def test_a_replan_begins_as_the_robot_moves_and_is_charged_by_chunks(straight: P
     for number in range(1, 5):
         join, charges = begin + 0.1, Charges(SHARE * ready.settings.budget)
         nothing = Movers(())
-        request = Request(number, begin, join, moving, None, nothing, nothing, (), np.inf, 0)
+        request = Request(number, begin, join, moving, None, nothing, 0.0, (), np.inf, 0)
         answer = method.replan(ready, request, charges)
         assert answer.found is not None
         motion, expected = answer.found.motion, moving.start(join)

@@ -27,7 +27,7 @@ def search_of(ready: Ready, *, slower: float = 1.5, conflict: float = np.inf) ->
     """A replan 0.3 s behind the begin of the straight motion to the goal, made slower."""
     motion = line_from(ready, Start.at_rest(ready.setup.start), ready.goals[0]).slower(slower)
     one, movers = Following(motion, 0.0, to_goal=True), Movers([FAR])
-    request = Request(1, 0.25, 0.3, one, one, movers, movers, (FAR,), conflict, 0)
+    request = Request(1, 0.25, 0.3, one, one, movers, 0.0, (FAR,), conflict, 0)
     return Search(ready, request, Charges(0.05))
 
 

@@ -132,6 +132,19 @@ def test_a_rehearsal_asks_for_all_sorts_of_replans_and_is_forgotten() -> None:
     assert before.answer.charges.counts == after.answer.charges.counts
 
 
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="processes are not kept to cores here")
+def test_the_process_keeps_to_its_core_from_the_beginning() -> None:
+    """Though it was started by a thread that keeps to another one, while the executor runs."""
+    ready, world, core = ready_of(PROBLEM), world_of(PROBLEM), max(os.sched_getaffinity(0))
+    work = Work(world.problem.still, ready.limits, ready.stopping, ready.settings, Faulty, (), 0)
+    process = PlannerProcess(work, core)
+    try:
+        assert os.sched_getaffinity(process.process.pid) == {core}
+    finally:
+        process.process.kill()
+        process.close()
+
+
 def test_a_process_that_cannot_be_made_ready_is_a_sentence() -> None:
     ready, world = ready_of(PROBLEM), world_of(PROBLEM)
     work = Work(world.problem.still, ready.limits, ready.stopping, ready.settings, replanner_of, ("apx",), 0)
@@ -179,7 +192,7 @@ def test_a_request_ends_what_the_process_is_busy_with() -> None:
     with PlannerProcess(work) as process:
         for number in (1, 2, 3):
             none = Movers([])
-            process.submit(Request(number, 0.0, 1.0, standing, None, none, none, (), math.inf, 0))
+            process.submit(Request(number, 0.0, 1.0, standing, None, none, 0.0, (), math.inf, 0))
             while number != 2 and (not spent or spent[-1].number != number):
                 assert time.monotonic() < begun + 60.0
                 reply = process.reply(0.0)

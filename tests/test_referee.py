@@ -147,6 +147,17 @@ def test_contacts_of_a_robot_that_moves_and_of_one_that_stands(robot: Robot, the
     assert report.clearance_time >= 0.1
 
 
+def test_what_may_move_counts_as_moving_though_it_stood(robot: Robot, there_and_stay: Trajectory) -> None:
+    """As a script whose first piece stands, and a run that ended within it."""
+    motion = there_and_stay
+    ball = Obstacle(name="ball", sphere={"radius": 0.03}, position=tuple(hand_at(robot, motion, motion.duration)))
+    problem = problem_of(robot, motion, ball)
+    assert judge(robot, problem, motion).outcome is Outcome.HIT_STILL
+    report = judge(robot, problem, motion, movers=["ball"])
+    assert report.outcome is Outcome.HIT_MOVING and report.contact is not None and report.still_contact is None
+    assert report.contact.second == "ball" and np.isfinite(report.clearance)
+
+
 def test_behind_its_end_the_robot_stands_and_may_be_hit(robot: Robot, there_and_stay: Trajectory) -> None:
     motion = there_and_stay
     last = hand_at(robot, motion, motion.duration)

@@ -44,7 +44,7 @@ def search_of(
     """A replan of a robot that stands, at the start unless elsewhere, and for which none was found before."""
     standing = Following.standing(ready.setup.start if at is None else at, 0.0, ready.names)
     movers = Movers(obstacles)
-    request = Request(2, 0.0, 0.05, standing, None, movers, movers, obstacles, conflict, 0)
+    request = Request(2, 0.0, 0.05, standing, None, movers, 0.0, obstacles, conflict, 0)
     return Search(ready, request, Charges(budget))
 
 

@@ -15,9 +15,11 @@ from apex_ompl.loop.observation import Observation
 from apex_ompl.loop.ready import Ready
 from apex_ompl.loop.replanning import Replanning
 from apex_ompl.loop.result import Event
-from apex_ompl.loop.tracking import Tracker, as_they_are
+from apex_ompl.loop.sensor import CUT
+from apex_ompl.loop.tracking import Tracker, TrackSettings, as_they_are
 from apex_ompl.problems.worlds import World
 from apex_ompl.scene.bodies import Obstacle
+from apex_ompl.scene.scripts import vector
 from apex_ompl.trajectory import Trajectory
 
 LONGEST_STOP = 5.0  # behind which a run ends that does not come to rest when the time is up [s]
@@ -73,7 +75,8 @@ class Loop:
         """
         self._world, self._ready, self._eyes = world, ready, eyes
         self._allowed = tuple(ready.setup.problem.allowed)
-        self._tracker = Tracker(ready.kernel, allowed=self._allowed)
+        tracking = TrackSettings(noise=ready.settings.error / CUT)
+        self._tracker = Tracker(ready.kernel, tracking, self._allowed)
         start = ready.setup.start
         standing = Following.standing(start, 0.0, ready.names, to_goal=ready.is_goal(start))
         self.executor = Executor(
@@ -82,6 +85,7 @@ class Loop:
         self._waiting: list[Observation] = []
         self._begun, self._rest, self._broken = False, 0.0, 0
         self._present: tuple[Obstacle, ...] = ()
+        self._looked = 0.0
 
     def observe(self, now: float) -> None:
         """Let the world move on to a time [s], and take the observations that have arrived by then."""
@@ -91,26 +95,23 @@ class Loop:
         for observation in [one for one in self._waiting if one.received <= now + 1e-9]:
             self._tracker.take(observation)
         self._waiting = [one for one in self._waiting if one.received > now + 1e-9]
-        self._present = tuple(self._world.present(now))
+        self._present, self._looked = tuple(self._world.present(now)), now
         self._broken += unexpected(self._tracker, self._present, now, settings.error, settings.fastest)
 
     def step(self, now: float) -> RunRecord | None:
         """Decide what the robot does from a time on [s], and return what came of the run where it is over."""
         settings, tracker, executor = self._ready.settings, self._tracker, self.executor
         if settings.prediction == "truth":
-            predicted = as_they_are(self._ready.kernel, self._present, now, self._allowed)
-            records = self._present
+            predicted = as_they_are(self._ready.kernel, self._present, self._looked, self._allowed)
+            records = tuple(_moved_on(o, now - self._looked) for o in self._present)
         else:
             predicted = tracker.predicted(settings.margin, settings.prediction)
             soon = now + np.array([0.0, 1.0, 2.0]) * settings.budget
             tracker.eased(predicted, executor.state(now), soon)
-            records = _records(tracker, predicted, now)
+            records = _records(tracker, predicted, now, moving=settings.prediction != "still")
         if now >= settings.timeout - SAME_TIME and not executor.done(now):
             executor.close(now)
         executor.step(now, predicted, records)
-        if not self._begun and executor.route is not None:
-            self._world.begin(executor.route.motion, max(executor.route.begin, now))
-            self._begun = True
         if executor.done(now):
             executor.log(now, "goal")
             return self._ended(now, True, "")
@@ -119,6 +120,13 @@ class Loop:
             return self._ended(now, False, "stuck")
         over = executor.closed and (executor.following.at_rest(now) or now >= settings.timeout + LONGEST_STOP)
         return self._ended(now, False, "timeout") if over else None
+
+    def set_out(self, now: float) -> None:
+        """Tell the world of the first motion, where there is one by a time [s], that of the last step."""
+        route = self.executor.route
+        if not self._begun and route is not None:
+            self._world.begin(route.motion, max(route.begin, now))
+            self._begun = True
 
     def _ended(self, now: float, reached: bool, why: str) -> RunRecord:
         trajectory = executed(self.executor.followed, now)
@@ -137,12 +145,20 @@ def unexpected(tracker: Tracker, present: Iterable[Obstacle], now: float, error:
     return False
 
 
-def _records(tracker: Tracker, predicted: Movers, now: float) -> tuple[Obstacle, ...]:
-    """Return the tracked obstacles where they are expected to be now, with their velocities."""
+def _moved_on(obstacle: Obstacle, seconds: float) -> Obstacle:
+    """Return an obstacle where it is some time later [s]."""
+    if not seconds:
+        return obstacle
+    way = np.multiply(obstacle.velocity or (0.0, 0.0, 0.0), seconds)
+    return obstacle.model_copy(update={"position": vector(np.add(obstacle.position, way))})
+
+
+def _records(tracker: Tracker, predicted: Movers, now: float, moving: bool) -> tuple[Obstacle, ...]:
+    """Return the tracked obstacles where they are expected to be now, with their velocities, or as if they stood."""
     places = predicted.at(now)
     return tuple(
         track.shape.model_copy(
-            update={"position": tuple(places[name].tolist()), "velocity": tuple(track.velocity.tolist())}
+            update={"position": vector(places[name]), "velocity": vector(track.velocity if moving else np.zeros(3))}
         )
         for name, track in tracker.tracks.items()
     )

@@ -11,6 +11,7 @@ manoeuvre that is verified online, Althoff and Dolan 2014; Pereira and Althoff 2
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -33,6 +34,32 @@ BLIND_TIME = 0.15  # for which an obstacle may go anywhere before the robot stan
 SHORTEST = 0.1  # rest of a motion for which no faster one is looked for [s]
 NEAR = 0.5  # time before a conflict from which on the robot brakes where no answer comes at once [s]
 NEARER = 0.01  # by which an obstacle must come nearer than where a motion began, within the trigger, to stop it [m]
+TAKEN = {"accepted": "rejected", "improved": "kept"}  # kinds of events of answers, and of those that came to nothing
+DECISIONS = ("stop", "reaction", "conflict")  # kinds of events that are undone with a step
+
+
+@dataclass(frozen=True, eq=False)
+class Decided:
+    """What an executor had decided before a step, so that the step can be undone.
+
+    Attributes:
+        following: What the robot followed.
+        stop: The stop in hand.
+        events: Number of events.
+        others: Other attributes of the executor by name.
+    """
+
+    following: Following
+    stop: Following | None
+    events: int
+    others: Mapping[str, Any]
+
+    @classmethod
+    def of(cls, executor: Executor) -> Decided:
+        """Return what an executor has decided so far."""
+        names = ("route", "leaving", "sets_out", "nearest", "ending", "conflict", "endangered", "ahead")
+        others = {name: getattr(executor, name) for name in names}
+        return cls(executor.following, executor.stop, len(executor.events), others)
 
 
 @dataclass(eq=False)
@@ -55,7 +82,9 @@ class Executor:
         endangered: Since when a conflict is known that the command does not answer yet [s], or None.
         nearest: Distance of an obstacle below which the motion counts as blocked, where that goes by distance [m].
         closed: Whether the time is up: no motion is asked for or taken any more.
+        ending: Whether the robot follows the stop that ends the run.
         leaving: Whether the robot leaves a place that an obstacle comes to, and goes on without a proved stop.
+        sets_out: When it does [s].
         lead: How long before a step it is decided, by what was seen until then [s].
         ahead: How long before the conflict that was [s].
         hastened: When a faster motion was asked for last [s].
@@ -68,6 +97,7 @@ class Executor:
     following: Following
     stop: Following | None = None
     closed: bool = False
+    ending: bool = False
     followed: list[tuple[float, Following]] = field(default_factory=list)
     events: list[Event] = field(default_factory=list)
     route: Following | None = None
@@ -77,6 +107,7 @@ class Executor:
     endangered: float | None = None
     nearest: float = 0.0
     leaving: bool = False
+    sets_out: float = -math.inf
     lead: float = 0.0
     ahead: float = math.inf
     hastened: float = -math.inf
@@ -113,16 +144,17 @@ class Executor:
             self._ask(now, predicted, obstacles)
 
     def close(self, now: float) -> None:
-        """Come to rest, since the time is up: follow the stop in hand. To be called before the step of a time.
+        """Come to rest, since the time is up: follow the stop in hand. To be called before each step from then on.
 
         Args:
             now: Time of the clock [s].
         """
-        if self.closed:
-            return
         self.closed, self.pending = True, None
-        stop = None if self.following.at_rest(now) else self._stop_at(now)
-        if stop is not None and stop is not self.following:
+        stop = None if self.ending or self.following.at_rest(now) else self._stop_at(now)
+        if stop is None:  # where there is none in hand yet, there may be one at the next step
+            return
+        self.ending = True
+        if stop is not self.following:
             self._follow_stop(now, stop)
 
     def _look(self, now: float, predicted: Movers) -> None:
@@ -183,20 +215,31 @@ class Executor:
         settings = self.ready.settings
         return settings.stuck if settings.from_rest else settings.period
 
-    def late(self, time: float, following: Following, stop: Following | None) -> None:
-        """Follow from a time on what a driver has: nothing was decided for it in time.
+    def late(self, time: float, before: Decided) -> None:
+        """Follow from a time on what a driver has, and undo what was decided since: that was not in time.
 
         Args:
             time: Time of the clock [s].
-            following: What was followed until then.
-            stop: The proved stop that begins then, if there is one.
+            before: What had been decided; its stop, if there is one, begins at that time.
         """
+        undone = self.events[before.events :]
+        del self.events[before.events :]
+        for event in undone:
+            if event.kind in TAKEN:
+                said = {name: event.data[name] for name in ("number", "part", "took")}
+                self.log(event.time, TAKEN[event.kind], why="the step that took it came too late", **said)
+            elif event.kind not in DECISIONS:
+                self.events.append(event)
         self.log(time, "late")
-        if stop is not None and not following.at_rest(time):
-            following = stop
-        self.pending, self.stop = None, stop
-        if following is not self.following:
-            self.follow(following, time)
+        for name, value in before.others.items():
+            setattr(self, name, value)
+        self.stop, self.following = before.stop, before.following
+        if self.stop is not None and not self.following.at_rest(time):
+            self.following = self.stop
+        if self.following is not self.followed[-1][1]:
+            self.follow(self.following, time)
+        if self.pending is not None and self.pending.following is not self.following:
+            self.pending = None
 
     def _guard(self, now: float, reachable: Movers, predicted: Movers) -> None:
         """Go on with a proved stop behind the next step, or stop."""
@@ -204,7 +247,7 @@ class Executor:
         found = self.ready.proved_stop(reachable, self.following, now, then)
         if found is not None:
             if self.leaving:  # a stop in place is not what it leaves for, nor one where it would be touched as well
-                waits = not self.following.start(now).velocity.any()
+                waits = now <= self.sets_out or not self.following.start(now).velocity.any()
                 self.leaving = waits or self._first_conflict(found, now, predicted) < now + NEAR
             self.stop = found
             return
@@ -264,7 +307,7 @@ class Executor:
             self.route = found
         head = self.following.piece(now, request.join) if request.join > now + 1e-9 else None
         self.follow(found if head is None else found.behind(head, now), now)
-        self.leaving, self.stop = leaving, None if leaving else self.stop
+        self.leaving, self.sets_out, self.stop = leaving, found.begin, None if leaving else self.stop
         if self.ready.settings.by_distance:
             self.nearest = min(self.ready.settings.trigger, self._distance(now, predicted) - NEARER)
 
@@ -311,9 +354,9 @@ class Executor:
             return
         join = now + settings.budget
         self.asked += 1
-        wide = predicted.larger(max(settings.berth, settings.error + BLIND_TIME * settings.fastest))
+        berth = max(settings.berth, settings.error + BLIND_TIME * settings.fastest)
         request = Request(
-            self.asked, now, join, self.following, self.route, predicted, wide, obstacles, self.conflict, self.seed,
+            self.asked, now, join, self.following, self.route, predicted, berth, obstacles, self.conflict, self.seed,
             leaving=self.leaving and not self.following.at_rest(join),
         )  # fmt: skip
         if self.replanning.submit(request):
@@ -327,7 +370,9 @@ class Executor:
         aside at once.
         """
         settings, request = self.ready.settings, self.pending
-        if request is None or settings.from_rest or not settings.guarded or math.isfinite(request.conflict):
+        if request is None or settings.from_rest or math.isfinite(request.conflict):
+            return
+        if not (settings.guarded or settings.hastens):  # a reflex, or one plan that is followed blindly
             return
         if request.hastens and math.isfinite(self.conflict):
             self.log(now, request.refused, why="something is in the way", number=request.number, part="")

@@ -11,7 +11,7 @@ from apex_ompl.loop.following import SAME_TIME, Following
 from apex_ompl.loop.ready import Ready
 from apex_ompl.loop.request import Request
 
-SAME_STATE = 1e-6  # largest jump of positions, velocities and accelerations where a motion begins
+SAME_STATE = 1e-7  # largest jump of positions, velocities and accelerations where a motion begins
 
 
 def misfit(ready: Ready, found: Following, request: Request) -> str:

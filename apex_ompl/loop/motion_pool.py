@@ -73,7 +73,7 @@ class MotionPool:
             clock: Time of the clock then [s].
             charges: Gets the samples that are looked at.
             accepts: The proof.
-            berth: By how much obstacles are larger for the optimiser than for the proof [m].
+            berth: How much nearer than the obstacles of the optimiser motions may come, of which a proof is tried [m].
         """
         self._optimizer, self._start, self._clock, self._charges = optimizer, start, clock, charges
         self._accepts, self._least = accepts, CLEAR - berth

@@ -122,6 +122,9 @@ class PlannerProcess:
             command, pass_fds=[other.fileno()], env=environment, stdin=subprocess.DEVNULL, start_new_session=True
         )
         other.close()
+        if self._core is not None:  # not behind its imports: it begins where this thread is kept to
+            with suppress(OSError):
+                os.sched_setaffinity(self.process.pid, {self._core})
         self._connection: Connection[Any, Any] = mine
         self._ready = False
         self._asked: list[float] = []

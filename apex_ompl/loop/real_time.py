@@ -14,6 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from apex_ompl.loop.cycle import Eyes, Loop, RunRecord
+from apex_ompl.loop.executor import Decided
 from apex_ompl.loop.following import Following
 from apex_ompl.loop.observation import Observation
 from apex_ompl.loop.planner_process import PlannerProcess
@@ -65,7 +66,7 @@ def warm_up(ready: Ready, world: World, seed: int) -> None:
     ready.first_conflict(predicted, line, 0.0, line.end)
     ready.proved_stop(tracker.reachable(0.0, 0.0), line, half, half + ready.settings.period)
     ready.clear_of_still(motion)
-    request = Request(1, 0.0, 0.05, line, line, predicted, predicted.larger(0.01), present, np.inf, seed)
+    request = Request(1, 0.0, 0.05, line, line, predicted, 0.01, present, np.inf, seed)
     pickle.loads(pickle.dumps((request, line.piece(half, line.end))))
 
 
@@ -74,7 +75,7 @@ def run_in_real_time(world: World, ready: Ready, planner: PlannerProcess, eyes: 
 
     The step at a time is decided in the period before it, by what was seen until that began. What a driver has is the
     motion until the next step and a proved stop behind it; so where a step was not decided in time, the robot follows
-    that stop.
+    that stop, and what the step had decided is undone. The clock stands while the world answers to the first motion.
 
     Args:
         world: What truly happens.
@@ -101,18 +102,22 @@ def run_in_real_time(world: World, ready: Ready, planner: PlannerProcess, eyes: 
                 time.sleep(wait)
             seen = time.perf_counter() - began
             if math.floor(seen / period) > k:  # periods went by without a step
-                executor.late((k + 1) * period, executor.following, executor.stop)
+                executor.late((k + 1) * period, Decided.of(executor))
                 missed += math.floor(seen / period) - k
                 k = math.floor(seen / period)
-            sent = executor.following, executor.stop
+            before = Decided.of(executor)
             loop.observe(k * period)
             ended = loop.step((k + 1) * period)
             took = time.perf_counter() - began - seen
             ticks.append(took)
             k += 1
             if ended is None and time.perf_counter() - began > k * period:
-                executor.late(k * period, *sent)
+                executor.late(k * period, before)
                 missed += 1
+            paused = time.perf_counter()
+            loop.set_out(k * period)
+            began += time.perf_counter() - paused
+    world.advance(k * period, executor.state(k * period))  # what the motion is judged by
     middle, high, worst = np.percentile(ticks, [50.0, 99.0, 100.0]).tolist()
     measured = {"tick_p50": middle, "tick_p99": high, "tick_worst": worst, "deadline_misses": float(missed)}
     return replace(ended, measured=measured)

@@ -7,7 +7,7 @@ robot itself, is proved apart along the motion's own cubic pieces.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -120,7 +120,7 @@ class RefereeReport:
 
 def judge(
     robot: Robot, problem: Problem, trajectory: Trajectory, *, end: float | None = None,
-    goals: ArrayLike | None = None, limits: Limits | None = None,
+    goals: ArrayLike | None = None, limits: Limits | None = None, movers: Iterable[str] = (),
 ) -> RefereeReport:  # fmt: skip
     """Find out what truly happened in a run.
 
@@ -131,6 +131,7 @@ def judge(
         end: When the run ended [s], by default with the motion.
         goals: States of which the motion is to end in one, shape (N, dof); by default the goal of the problem.
         limits: Limits that are to be kept, by default the robot's.
+        movers: Names of obstacles that count as moving, though they stood all the time.
 
     Raises:
         ParameterError: The motion is one of other joints, ``end`` is before its end, or the goals have another shape.
@@ -140,9 +141,12 @@ def judge(
         raise ParameterError("trajectory", ", ".join(trajectory.joint_names), f"the joints of {robot.name}")
     until = trajectory.duration if end is None else end
     check_number(until, "end", trajectory.duration)
-    still = problem.still
-    checker = CollisionChecker(robot, still.scene, problem.attached, still.allowed)
-    moving = [o for o in problem.scene if o.moving]
+    names = {*problem.moving, *movers}
+    still = [o for o in problem.scene if o.name not in names]
+    checker = CollisionChecker(
+        robot, still, problem.attached, [pair for pair in problem.allowed if not {*pair} & names]
+    )  # fmt: skip
+    moving = [o for o in problem.scene if o.name in names]
     scripted = ScriptedMovers(checker.kernel, moving, problem.allowed)
     times = np.append(SPACING * np.arange(np.ceil(until / SPACING - 1e-9)), until)
     clearances = scripted.clearances(trajectory, times)

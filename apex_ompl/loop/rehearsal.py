@@ -31,11 +31,10 @@ def requests(ready: Ready) -> tuple[Request, ...]:
     position = tuple(places[0, -1].tolist())
     ball = Obstacle(name="rehearsal", sphere=Sphere(radius=RADIUS), position=position, velocity=VELOCITY)
     movers, join = Movers([ball]), min(settings.budget, 0.5 * line.end)
-    wide = movers.larger(settings.berth)
     soon = join + settings.period
     cases = ((standing, math.inf), (standing, soon), (line, soon), (line, math.inf))
     return tuple(
-        Request(k, 0.0, join, following, None, movers, wide, (ball,), conflict, 0)
+        Request(k, 0.0, join, following, None, movers, settings.berth, (ball,), conflict, 0)
         for k, (following, conflict) in enumerate(cases, 1)
     )
 

@@ -26,8 +26,8 @@ class Request:
         following: What the robot follows until then.
         route: The last motion to a goal, or None.
         predicted: The obstacles as they are expected to move; what motions are proved against.
-        wide: The same, larger by a berth; what motions are optimised among.
-        obstacles: Their records, where they are expected to be when the new motion begins, with velocities.
+        berth: By how much they are larger where motions are optimised [m].
+        obstacles: Their records, where they are expected to be when it is asked, with velocities.
         conflict: Time of the clock of the first conflict of what the robot follows [s], infinite without one.
         seed: The run's.
         leaving: Whether the robot will be leaving a place that an obstacle comes to: another motion is of use only
@@ -40,7 +40,7 @@ class Request:
     following: Following
     route: Following | None
     predicted: Movers
-    wide: Movers
+    berth: float
     obstacles: tuple[Obstacle, ...]
     conflict: float
     seed: int

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.errors import UnknownNameError
+from apex_ompl.errors import ParameterError, UnknownNameError
 from apex_ompl.loop.charges import cost_table
 from apex_ompl.loop.cycle import RunRecord
 from apex_ompl.loop.methods import adapted, method, replanner_of
@@ -71,6 +71,7 @@ def run(
     sensor = sensor or Sensor(seed=seed)
     world = load_world(problem)
     used = adapted(replace(settings or default_settings(world, sensor), prediction=prediction), one)
+    world.ran = True
     with quiet_ompl():
         seed_ompl(seed)
         setup = assemble(world.problem.still, seed=seed)
@@ -113,6 +114,8 @@ def load_world(problem: Problem | World | str | os.PathLike[str]) -> World:
         ApexError: It is unknown or faulty.
     """
     if isinstance(problem, World):
+        if problem.ran:
+            raise ParameterError("problem", problem.name, "a world in which nothing ran yet: load it anew")
         return problem
     return moving_world(problem) if isinstance(problem, Problem) else worlds.load(os.fspath(problem))
 
@@ -147,7 +150,10 @@ class _Made:
 
     def judged(self, done: RunRecord) -> RunResult:
         """Return the result with what the referee says."""
-        report = judge(self.ready.setup.robot, self.problem(), done.trajectory, goals=self.ready.goals)
+        movers = [o.name for o in self.world.script()]
+        report = judge(
+            self.ready.setup.robot, self.problem(), done.trajectory, goals=self.ready.goals, movers=movers
+        )  # fmt: skip
         outcome, reason = report.outcome, "; ".join(report.faults)
         if outcome is None:
             ended = {"stuck": Outcome.STUCK, "timeout": Outcome.TIMEOUT}

