@@ -72,8 +72,9 @@ def main() -> None:
     parser.add_argument("names", nargs="+", metavar="NAME")
     args = parser.parse_args()
     for name in args.names:
-        for path in [pack(name)] if args.action == "pack" else unpack(name):
-            print(f"{path.relative_to(Path(__file__).parents[1])}: {path.stat().st_size / 1024:.0f} KiB")
+        paths = [pack(name)] if args.action == "pack" else unpack(name)
+        where = (paths[0] if args.action == "pack" else RUNS / name).relative_to(Path(__file__).parents[1])
+        print(f"{where}: {len(paths)} files, {sum(path.stat().st_size for path in paths) / 1024:.0f} KiB")
 
 
 if __name__ == "__main__":
