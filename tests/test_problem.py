@@ -17,7 +17,8 @@ from apex_ompl.errors import ApexError, FileFormatError, MissingFileError, Unkno
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import AttachedObject, MeshFile, Obstacle, pose_matrix
 from apex_ompl.scene.problem import Goal, Problem
-from apex_ompl.util.schema import parse_yaml
+from apex_ompl.util import schema
+from apex_ompl.util.schema import dump_yaml, parse_yaml
 
 FILE = """schema: apex-ompl/problem/1
 name: small
@@ -220,10 +221,19 @@ def test_a_held_half_space_is_refused_from_python_too() -> None:
 
 
 @pytest.mark.parametrize("levels", [50, 500, 50_000])
-@pytest.mark.parametrize("opening", ["[", "{b: ", "- ", "- [\n", "? ", "[']', "])
+@pytest.mark.parametrize("opening", ["[", "{b: ", "- ", "- [\n", "? ", "[']', ", "[[1, 2], "])
 def test_deep_nesting_is_a_fault_and_no_crash(levels: int, opening: str) -> None:
     with pytest.raises(FileFormatError):
         parse_yaml("a: " + opening * levels, "deep.yaml")
+
+
+def test_vectors_beside_quotes_are_read_by_libyaml(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They are not nested, however many there are; the slow reader takes half a minute for a saved result."""
+    data = {"name": "it's", "vectors": [[k + 0.5, -1e-9, float(k)] for k in range(300)], "last": "a: b"}
+    text = dump_yaml(data)
+    assert "'" in text and text.count("[") == 300
+    monkeypatch.setattr(schema, "_Loader", None)
+    assert parse_yaml(text, "vectors.yaml") == data
 
 
 @pytest.mark.parametrize(

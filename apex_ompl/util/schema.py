@@ -25,6 +25,9 @@ class StrictModel(BaseModel):
     )
 
 
+NUMBERS = re.compile(r"\[[-+.\deE,\s]*\]")  # vectors in flow style: a level each, and most of the brackets
+
+
 class _Loader(yaml.SafeLoader):
     """SafeLoader that refuses duplicate keys."""
 
@@ -35,6 +38,7 @@ class _FastLoader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignor
 
 def _shallow(text: str) -> bool:
     """Whether a bound on the nesting depth of YAML text is at most about a hundred levels."""
+    text = NUMBERS.sub("0", text)
     text = re.sub(r"(?m)^\s*#.*$", "", text)
     text = re.sub(r"""(?<=[:,] )("[^"\\\n]*"|'[^'\n]*')""", "", text)  # values that are quoted on one line
     quoted = "'" in text or '"' in text  # closing brackets may be part of text then
@@ -185,8 +189,8 @@ def _model_in(annotation: Any) -> type[BaseModel] | None:
     return None
 
 
-class _Dumper(yaml.SafeDumper):
-    """Block style for mappings, flow style for vectors of numbers."""
+class _Dumper(getattr(yaml, "CSafeDumper", yaml.SafeDumper)):  # type: ignore[misc]
+    """Block style for mappings, flow style for vectors of numbers; by libyaml where it is there."""
 
 
 def _represent_sequence(dumper: _Dumper, data: Any) -> yaml.SequenceNode:
