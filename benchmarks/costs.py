@@ -31,7 +31,7 @@ from apex_ompl.loop.charges import TABLE, Charges
 from apex_ompl.loop.damon import ManifoldGraph
 from apex_ompl.loop.drrt import Clearances, KeptTree
 from apex_ompl.loop.following import Following
-from apex_ompl.loop.gpmp2 import CHARGE, IncrementalGPMP2
+from apex_ompl.loop.gpmp import CHARGE, IncrementalGPMP2
 from apex_ompl.loop.imitation import Imitation
 from apex_ompl.loop.mppi import PathIntegral, softmax
 from apex_ompl.loop.paper import OneProposal

@@ -16,7 +16,7 @@ from apex_ompl.kernel.clearance_costs import clearance_costs
 from apex_ompl.live.movers import Movers, clearance_in_time
 from apex_ompl.loop.charges import Charges
 from apex_ompl.loop.following import Following
-from apex_ompl.loop.gpmp2 import IncrementalGPMP2
+from apex_ompl.loop.gpmp import IncrementalGPMP, IncrementalGPMP2
 from apex_ompl.loop.methods import METHODS
 from apex_ompl.loop.request import Request
 from apex_ompl.loop.run import run
@@ -213,10 +213,11 @@ def test_faults_name_the_thing(name: str, values: dict, error: type[Exception], 
         assert word in str(caught.value)
 
 
-def test_the_replanner_begins_as_the_robot_moves() -> None:
+@pytest.mark.parametrize("kind", [IncrementalGPMP, IncrementalGPMP2])
+def test_the_replanner_begins_as_the_robot_moves(kind: type[IncrementalGPMP2]) -> None:
     """From the middle of a motion: with its velocity and acceleration, proved, and charged by counts."""
     ready = ready_of(PROBLEM)
-    replanner = IncrementalGPMP2()
+    replanner = kind()
     replanner.prepare(ready)
     movers = Movers([Obstacle(name="far", box=(0.1,) * 3, position=(2.0, 2.0, 1.0))])
     standing = Following.standing(ready.setup.start, 0.0, ready.names)
@@ -240,11 +241,12 @@ def test_the_replanner_begins_as_the_robot_moves() -> None:
     assert replanner.replan(ready, Request(1, 0.0, 0.05, standing, None, movers, 0.0, (), np.inf, 0), Charges(0.0))
 
 
-def test_the_loop_reaches_its_goal_with_it() -> None:
-    done, report = go(METHODS["gpmp2"].make(), timeout=6.0, **METHODS["gpmp2"].settings)
+@pytest.mark.parametrize("name", ["gpmp", "gpmp2"])
+def test_the_loop_reaches_its_goal_with_it(name: str) -> None:
+    done, report = go(METHODS[name].make(), timeout=6.0, **METHODS[name].settings)
     assert done.reached and report.contact is None and max(report.limit_use.values()) <= 1.0 + 1e-9
     assert setup_of(PROBLEM).valid_goals.shape[1] == done.trajectory.dof
     moving = "vertical/moving-medium-0.1/800000"
-    first = run(moving, "gpmp2")
+    first = run(moving, name)
     assert {event.data["part"] for event in first.events if event.kind == "accepted"} <= {"line", "route"}
-    assert run(moving, "gpmp2").events == first.events
+    assert run(moving, name).events == first.events

@@ -9,7 +9,7 @@ from typing import Any
 from apex_ompl.errors import UnknownNameError
 from apex_ompl.loop.damon import ManifoldGraph
 from apex_ompl.loop.drrt import KeptTree
-from apex_ompl.loop.gpmp2 import IncrementalGPMP2
+from apex_ompl.loop.gpmp import IncrementalGPMP, IncrementalGPMP2
 from apex_ompl.loop.imitation import Imitation
 from apex_ompl.loop.mppi import PathIntegral
 from apex_ompl.loop.paper import OneProposal
@@ -93,6 +93,7 @@ METHODS = {
         "a plan among obstacles where they were seen at first, followed blindly",
     ),
     "gpmp2": Method(IncrementalGPMP2, ONE_PLAN, "GPMP2 from the moving robot, warm from the last motion (as iGPMP2)"),
+    "gpmp": Method(IncrementalGPMP, ONE_PLAN, "GPMP from the moving robot: steps along the functional gradient"),
     "mppi": Method(PathIntegral, ONE_PLAN, "model predictive path integral control"),
     "potential-field": Method(PotentialField, ONE_PLAN, "a reflex down an artificial potential"),
     "drrt": Method(

@@ -195,7 +195,8 @@ class _Dumper(getattr(yaml, "CSafeDumper", yaml.SafeDumper)):  # type: ignore[mi
 
 def _represent_sequence(dumper: _Dumper, data: Any) -> yaml.SequenceNode:
     flat = all(isinstance(v, (int, float)) for v in data)
-    return dumper.represent_sequence("tag:yaml.org,2002:seq", data, flow_style=flat)
+    node: yaml.SequenceNode = dumper.represent_sequence("tag:yaml.org,2002:seq", data, flow_style=flat)
+    return node
 
 
 _Dumper.add_representer(list, _represent_sequence)
