@@ -141,8 +141,8 @@ class IncrementalGPMP(IncrementalGPMP2):
     """GPMP in the same way: steps along the functional gradient, up to the first motion that is clear at its states.
 
     The paper (Mukadam, Yan and Boots, ICRA 2016) plans once; that it is begun anew from the moving robot and where the
-    last motion ended, is as in :class:`IncrementalGPMP2`. With 10, 20 or 40 iterations, and tolerances of 1e-3 or 1e-2, it
-    fails in the same 2 of 16 validation worlds.
+    last motion ended, is as in :class:`IncrementalGPMP2`. With 10, 20 or 40 iterations, and tolerances of 1e-3 or
+    1e-2, it fails in 2 of 16 validation worlds.
     """
 
     parameters: GPMP = GPMP(intervals=10, checked=4, tolerance=1e-3)

@@ -116,7 +116,7 @@ RIVALS = (
     Rival("RRT", "", "", "drrt", "drrt", "a tree from the goal that is kept and repaired"),
     Rival("RRT", "", "", "rrtconnect", "rrtconnect", "not in the paper; range 1 rad, tuned; in the loop from rest"),
     Rival("RRT", "", "", "rrtconnect, OMPL's range", "", "not in the paper"),
-    Rival("GPMP", "39.26", "6.87", "gpmp", "gpmp", "gradient descent on the Gaussian process prior, from a straight line"),
+    Rival("GPMP", "39.26", "6.87", "gpmp", "gpmp", "gradient descent on the Gaussian process prior, from a line"),
     Rival("GPMP", "", "", "gpmp2", "gpmp2", "not in the paper: its successor, least squares"),
     Rival("IL", "25.79", "5.23", "il", "il", "a transformer that sees all cubes; rolled out, unrepaired"),
     Rival("IL", "", "", "il-paper", "il-paper", "the same with one obstacle point, as the paper's condition"),
