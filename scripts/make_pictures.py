@@ -1,4 +1,4 @@
-"""Draw every ready-made problem, and the motions that README shows, into docs/pictures.
+"""Draw every ready-made problem, and the motions that README and the page of the baselines show, into docs/pictures.
 
 Usage: python scripts/make_pictures.py
 """
@@ -17,6 +17,11 @@ OUT = Path(__file__).resolve().parent.parent / "docs" / "pictures"
 SIZE = (960, 720)
 MOVING = "vertical/moving-large-0.2/900003"
 FROM_BEHIND = {"shelf_swap": 150.0}
+IMITATED = "vertical/medium/800001"  # the first problem of its level that il solves, and no straight line
+BASELINES = {
+    "gpmp2": ("gpmp2", {}), "il": ("il", {}), "damon_2": ("damon", {"model": "damon-2"}),
+    "damon_8": ("damon", {"model": "damon-8"}),
+}  # fmt: skip
 
 
 def main() -> None:
@@ -31,6 +36,10 @@ def main() -> None:
     print(OUT / "ball_in_cup_motion.png")
     render(plan(MOVING, timeout=20.0), OUT / "moving.png", (1280, 960))
     print(OUT / "moving.png")
+    for name, (planner, params) in BASELINES.items():
+        found = plan(IMITATED, planner=planner, params=params, timeout=20.0)
+        render(found, OUT / f"baseline_{name}.png", (640, 480))
+        print(OUT / f"baseline_{name}.png", found.solved_by, f"{found.length:.2f} rad")
     plot_motion(plan("shelf_swap", timeout=20.0), OUT / "shelf_swap_timing.png")
     print(OUT / "shelf_swap_timing.png")
 
