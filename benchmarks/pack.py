@@ -74,7 +74,7 @@ def main() -> None:
     for name in args.names:
         paths = [pack(name)] if args.action == "pack" else unpack(name)
         where = (paths[0] if args.action == "pack" else RUNS / name).relative_to(Path(__file__).parents[1])
-        print(f"{where}: {len(paths)} files, {sum(path.stat().st_size for path in paths) / 1024:.0f} KiB")
+        print(f"{where}: {sum(path.stat().st_size for path in paths) / 1024:.0f} KiB")
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ from loops import FAR, PROBLEM, ByHand, line, ready_of, world_of
 
 from apex_ompl.errors import ParameterError
 from apex_ompl.loop.cycle import Loop, RunRecord
-from apex_ompl.loop.executor import Decided
+from apex_ompl.loop.late_steps import Decided, undo
 from apex_ompl.loop.replanning import AtOnce
 from apex_ompl.loop.run import default_settings, run
 from apex_ompl.loop.sensor import Sensor, SensorStream
@@ -48,7 +48,7 @@ def test_a_motion_that_was_taken_too_late_is_asked_for_again(settings: dict[str,
     executor = loop.executor
     for time, before, ended in steps(loop):  # noqa: B007 - the last one is looked at behind
         if executor.route is not None and not undone:
-            executor.late(time, before)
+            undo(executor, time, before)
             assert executor.route is None and executor.following is before.following and executor.stop is before.stop
             undone += 1
     assert undone and ended is not None and ended.reached
@@ -62,7 +62,7 @@ def test_a_stop_at_the_end_that_came_too_late_is_made_at_the_next_step() -> None
     for time, before, ended in steps(loop):  # noqa: B007 - the last one is looked at behind
         if time == pytest.approx(0.3):
             assert "stop" in [event.kind for event in loop.executor.events]
-            loop.executor.late(time, before)
+            undo(loop.executor, time, before)
             assert loop.executor.following.to_goal
     assert ended is not None and not ended.reached and ended.ended == "timeout"
     assert is_at_rest(ended.trajectory, ended.trajectory.duration) and ended.trajectory.duration < 0.8
@@ -74,7 +74,7 @@ def test_an_answer_under_way_survives_a_late_step_that_changed_nothing() -> None
     loop = loop_of(replanner)
     for time, before, ended in steps(loop):  # noqa: B007 - the last one is looked at behind
         if time == pytest.approx(0.02):
-            loop.executor.late(time, before)
+            undo(loop.executor, time, before)
     assert ended is not None and ended.reached and len(replanner.asked) == 1
 
 
@@ -99,7 +99,7 @@ def test_obstacles_that_count_as_standing_are_told_without_a_velocity() -> None:
 
 
 def test_the_filter_knows_how_much_a_sensor_errs() -> None:
-    """With a third of the observations as far off as 3 standard deviations of the default, few count as turns."""
+    """With the noise of the default sensor it would take most of the errors of this one for turns, and begin anew."""
     sensor = Sensor(noise=0.03)
     error = default_settings(world_of(PROBLEM), sensor).error
     loop = loop_of(ByHand(lambda ready, request: None), sensor, error=error, timeout=1.0)

@@ -19,7 +19,7 @@ from apex_ompl.loop.sensor import CUT
 from apex_ompl.loop.tracking import Tracker, TrackSettings, as_they_are
 from apex_ompl.problems.worlds import World
 from apex_ompl.scene.bodies import Obstacle
-from apex_ompl.scene.scripts import vector
+from apex_ompl.scene.scripts import obstacle_at, vector
 from apex_ompl.trajectory import Trajectory
 
 LONGEST_STOP = 5.0  # behind which a run ends that does not come to rest when the time is up [s]
@@ -103,7 +103,7 @@ class Loop:
         settings, tracker, executor = self._ready.settings, self._tracker, self.executor
         if settings.prediction == "truth":
             predicted = as_they_are(self._ready.kernel, self._present, self._looked, self._allowed)
-            records = tuple(_moved_on(o, now - self._looked) for o in self._present)
+            records = tuple(obstacle_at(o, now - self._looked) for o in self._present)
         else:
             predicted = tracker.predicted(settings.margin, settings.prediction)
             soon = now + np.array([0.0, 1.0, 2.0]) * settings.budget
@@ -143,14 +143,6 @@ def unexpected(tracker: Tracker, present: Iterable[Obstacle], now: float, error:
         if way > error + fastest * (now - track.stamp) + 1e-9:
             return True
     return False
-
-
-def _moved_on(obstacle: Obstacle, seconds: float) -> Obstacle:
-    """Return an obstacle where it is some time later [s]."""
-    if not seconds:
-        return obstacle
-    way = np.multiply(obstacle.velocity or (0.0, 0.0, 0.0), seconds)
-    return obstacle.model_copy(update={"position": vector(np.add(obstacle.position, way))})
 
 
 def _records(tracker: Tracker, predicted: Movers, now: float, moving: bool) -> tuple[Obstacle, ...]:

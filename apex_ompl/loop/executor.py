@@ -11,7 +11,6 @@ manoeuvre that is verified online, Althoff and Dolan 2014; Pereira and Althoff 2
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -34,32 +33,6 @@ BLIND_TIME = 0.15  # for which an obstacle may go anywhere before the robot stan
 SHORTEST = 0.1  # rest of a motion for which no faster one is looked for [s]
 NEAR = 0.5  # time before a conflict from which on the robot brakes where no answer comes at once [s]
 NEARER = 0.01  # by which an obstacle must come nearer than where a motion began, within the trigger, to stop it [m]
-TAKEN = {"accepted": "rejected", "improved": "kept"}  # kinds of events of answers, and of those that came to nothing
-DECISIONS = ("stop", "reaction", "conflict")  # kinds of events that are undone with a step
-
-
-@dataclass(frozen=True, eq=False)
-class Decided:
-    """What an executor had decided before a step, so that the step can be undone.
-
-    Attributes:
-        following: What the robot followed.
-        stop: The stop in hand.
-        events: Number of events.
-        others: Other attributes of the executor by name.
-    """
-
-    following: Following
-    stop: Following | None
-    events: int
-    others: Mapping[str, Any]
-
-    @classmethod
-    def of(cls, executor: Executor) -> Decided:
-        """Return what an executor has decided so far."""
-        names = ("route", "leaving", "sets_out", "nearest", "ending", "conflict", "endangered", "ahead")
-        others = {name: getattr(executor, name) for name in names}
-        return cls(executor.following, executor.stop, len(executor.events), others)
 
 
 @dataclass(eq=False)
@@ -214,32 +187,6 @@ class Executor:
         """Time behind which a motion was to begin for which its answer is waited for [s]."""
         settings = self.ready.settings
         return settings.stuck if settings.from_rest else settings.period
-
-    def late(self, time: float, before: Decided) -> None:
-        """Follow from a time on what a driver has, and undo what was decided since: that was not in time.
-
-        Args:
-            time: Time of the clock [s].
-            before: What had been decided; its stop, if there is one, begins at that time.
-        """
-        undone = self.events[before.events :]
-        del self.events[before.events :]
-        for event in undone:
-            if event.kind in TAKEN:
-                said = {name: event.data[name] for name in ("number", "part", "took")}
-                self.log(event.time, TAKEN[event.kind], why="the step that took it came too late", **said)
-            elif event.kind not in DECISIONS:
-                self.events.append(event)
-        self.log(time, "late")
-        for name, value in before.others.items():
-            setattr(self, name, value)
-        self.stop, self.following = before.stop, before.following
-        if self.stop is not None and not self.following.at_rest(time):
-            self.following = self.stop
-        if self.following is not self.followed[-1][1]:
-            self.follow(self.following, time)
-        if self.pending is not None and self.pending.following is not self.following:
-            self.pending = None
 
     def _guard(self, now: float, reachable: Movers, predicted: Movers) -> None:
         """Go on with a proved stop behind the next step, or stop."""

@@ -14,8 +14,8 @@ from dataclasses import replace
 import numpy as np
 
 from apex_ompl.loop.cycle import Eyes, Loop, RunRecord
-from apex_ompl.loop.executor import Decided
 from apex_ompl.loop.following import Following
+from apex_ompl.loop.late_steps import Decided, undo
 from apex_ompl.loop.observation import Observation
 from apex_ompl.loop.planner_process import PlannerProcess
 from apex_ompl.loop.ready import Ready
@@ -102,7 +102,7 @@ def run_in_real_time(world: World, ready: Ready, planner: PlannerProcess, eyes: 
                 time.sleep(wait)
             seen = time.perf_counter() - began
             if math.floor(seen / period) > k:  # periods went by without a step
-                executor.late((k + 1) * period, Decided.of(executor))
+                undo(executor, (k + 1) * period, Decided.of(executor))
                 missed += math.floor(seen / period) - k
                 k = math.floor(seen / period)
             before = Decided.of(executor)
@@ -112,7 +112,7 @@ def run_in_real_time(world: World, ready: Ready, planner: PlannerProcess, eyes: 
             ticks.append(took)
             k += 1
             if ended is None and time.perf_counter() - began > k * period:
-                executor.late(k * period, before)
+                undo(executor, k * period, before)
                 missed += 1
             paused = time.perf_counter()
             loop.set_out(k * period)
