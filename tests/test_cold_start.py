@@ -53,12 +53,15 @@ def test_no_code_is_loaded_or_compiled_while_the_time_limit_runs(planner: str) -
 
 TYPES = """
 from numba.core.sigutils import normalize_signature
-from apex_ompl import plan
-from apex_ompl.kernel.ahead_of_time import BESIDE, HERE, _function
+from apex_ompl import plan, run
+from apex_ompl.loop.settings import LoopSettings
+from apex_ompl.kernel.ahead_of_time import PLANS, RUNS, _function
 
 assert plan("shelf/hard/800000", timeout=30.0)
 assert plan("vertical/large/800000", timeout=30.0, params={"line": False}).solved_by == "sprint"
-for name, (types, _) in (HERE | BESIDE).items():
+for world in ("vertical/moving-huge-0.4/800007", "turning/vertical/large/800000"):
+    run(world, settings=LoopSettings(timeout=1.5))
+for name, (types, _) in {**PLANS.functions, **RUNS.functions}.items():
     found = _function(name).dispatcher.signatures
     assert found == [normalize_signature(f"({types},)")[0]], (name, found)
 print("as declared")
@@ -76,12 +79,13 @@ import sys
 from apex_ompl.kernel import ahead_of_time as ahead
 from apex_ompl.kernel.compiled.compilation import names_in_cache
 
-ahead.HERE = {"time_parameterization.sample_times": ahead.BESIDE["time_parameterization.sample_times"]}
-ahead.BESIDE = {"motion_proof.lay_grid": ahead.BESIDE["motion_proof.lay_grid"]}
+some = ("time_parameterization.sample_times", "motion_proof.lay_grid")
+here, beside = ({name: ahead.PLANS.functions[name]} for name in some)
+group = ahead.Group("two functions", 1, here, beside)
 ahead.CHILD = sys.argv[1] or ahead.CHILD
-ahead.compile_ahead()
+ahead.compile_ahead(group)
 assert names_in_cache() == {"sample_times", "lay_grid"}, names_in_cache()
-ahead.compile_ahead()
+ahead.compile_ahead(group)
 """
 
 

@@ -19,6 +19,7 @@ from apex_ompl.kernel.kernel import MOST_PAIRS
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import AttachedObject, Obstacle
 from apex_ompl.types import Array, Flags
+from apex_ompl.util.arrays import compact
 from apex_ompl.util.validation import check_states, shape_error
 
 LOOKED_AT = np.array([8, 4, 12, 2, 6, 10, 14, 1, 3, 5, 7, 9, 11, 13, 15, 0, 16]) / 16.0  # in a quick test, by share
@@ -162,7 +163,7 @@ class CollisionChecker(SceneBodies):
         Raises:
             ParameterError: ``path`` has not the shape (N, dof), or too many steps; ``resolution`` is not positive.
         """
-        path = np.require(path, float, ["C", "W"])  # the memory layout that the kernel is compiled for
+        path = compact(path)
         if not (math.isfinite(resolution) and resolution > 0.0):
             raise ParameterError("resolution", resolution, "a positive number of radians")
         if path.ndim != 2 or path.shape[1] != self.robot.dof or len(path) == 0:

@@ -15,7 +15,7 @@ from apex_ompl.collision.cover.spheres import shape_key
 from apex_ompl.collision.mesh_stage import MeshStage
 from apex_ompl.collision.robot_covers import covers_of
 from apex_ompl.collision.tabulate import primitives, tabulate
-from apex_ompl.kernel.ahead_of_time import compile_ahead
+from apex_ompl.kernel.ahead_of_time import PLANS, compile_ahead
 from apex_ompl.kernel.compiled import motion_proof, queries
 from apex_ompl.kernel.compiled.separation import COLLIDES
 from apex_ompl.kernel.kernel import MOST_PAIRS, Kernel
@@ -109,7 +109,7 @@ class ConservativeChecker:
         """
         if self._kernel is not None and self._listed and self._held_listed and not self._moved:
             return self._kernel
-        compile_ahead()
+        compile_ahead(PLANS)
         with self._lock:
             old = self._kernel
             robot = self._robot_tables() if old is None or not self._held_listed else old.robot

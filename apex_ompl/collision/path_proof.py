@@ -23,6 +23,7 @@ from apex_ompl.kernel.kernel import Kernel
 from apex_ompl.kernel.scene_builder import primitive, scene_tables
 from apex_ompl.robot import Robot
 from apex_ompl.types import Array, Flags
+from apex_ompl.util.arrays import compact
 
 MOST_PACKED = 64  # sets of held objects that are kept for each robot
 TOUCH = 1e-5  # distance that counts as contact [m]
@@ -62,7 +63,7 @@ class Curve:
         """Return straight lines between states, shape (N, dof); their parameter is the length in the max-norm."""
         steps = np.abs(np.diff(states, axis=0)).max(axis=1)
         moves = ~(steps <= 0.0)  # with steps that are not numbers, which are refused later
-        states = np.require(states[np.append(True, moves)], float, ["C", "W"])
+        states = compact(states[np.append(True, moves)])
         knots = np.append(0.0, np.cumsum(steps[moves]))
         if len(states) == 1:
             states, knots = np.repeat(states, 2, axis=0), np.zeros(2)
@@ -76,7 +77,7 @@ class Curve:
         """
         if len(times) == 1:
             return cls.polyline(positions)
-        t, q, v, a = (np.require(x, float, ["C", "W"]) for x in (times, positions, velocities, accelerations))
+        t, q, v, a = (compact(x) for x in (times, positions, velocities, accelerations))
         rates = np.empty((len(t), 2 * q.shape[1]))
         return cls(t, q, rates, cubic_rates(t, q, v, a, rates))
 

@@ -207,7 +207,7 @@ def _boxes(nodes: _Nodes, border: Flags, left: Integers, most: int) -> list[Soli
     found: list[Solid] = []
     remaining, uncovered = np.argwhere(left), left != 0
     while len(found) < most and len(remaining) > least:
-        seeds = remaining[rng.integers(len(remaining), size=SEEDS)]
+        seeds = np.ascontiguousarray(remaining[rng.integers(len(remaining), size=SEEDS)])
         gain = int(best_box(sums, left, seeds, LAYER, box, best))
         if gain < least:
             break

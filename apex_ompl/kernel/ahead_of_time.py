@@ -1,4 +1,4 @@
-"""Compilation of the functions that every plan needs, once for an installation, in two processes with a progress bar.
+"""Compilation of the functions that plans and runs need, once for an installation, in two processes.
 
 What they are compiled for is said here, as numba writes types: ``f8[:, ::1]`` is an array of shape (N, M).
 """
@@ -13,6 +13,7 @@ import threading
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
 
@@ -22,106 +23,198 @@ from apex_ompl.kernel.compiled.compilation import CompiledFunction, cache_folder
 from apex_ompl.util.files import locked
 
 LOG = logging.getLogger("apex_ompl")
-TYPICAL_SECONDS = 60
 
 ROBOT = "i8[::1], f8[::1], "
 WORKSPACE = BUFFERS = ROBOT
-SCENE = ROBOT + "f4[::1], "
+SCENE = MOVERS = ROBOT + "f4[::1], "
 TREES = "f8[:, ::1], f8, f8, f8[:, :, ::1], i8[:, ::1], i8[::1], i8[::1], f8[::1], f8[::1], "
 PROOF = "f8[:, ::1], i8[::1], i8[:, ::1], i8[::1], f8[::1], i8[:, ::1], i8[::1]"
 CURVE = "f8[::1], f8[:, ::1], f8[:, ::1], f8, f8, f8, i8"
 KNOTS = "f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1]"
 SETTINGS = "Tuple((f8, f8, f8, f8, f8, f8, i8))"
 
-HERE: dict[str, tuple[str, int]] = {
-    "motion_proof.prove_path": (ROBOT + SCENE + WORKSPACE + PROOF, 8),
-    "tree_search.grow_trees": (ROBOT + SCENE + WORKSPACE + TREES + PROOF, 6),
-    "shortcutting.shortcut_path": (ROBOT + SCENE + WORKSPACE + "f8[:, ::1], f8, f8[:, ::1], i8[::1], " + PROOF, 6),
-    "queries.check_states": (ROBOT + SCENE + WORKSPACE + "f8[:, ::1], i8[:, :, ::1], i8[::1]", 2),
-    "queries.clearances": (ROBOT + SCENE + WORKSPACE + "f8[:, ::1], f8, f8[:, ::1], f8[:, :, ::1]", 6),
-    "path_optimization.optimize_path": (
-        ROBOT + SCENE + WORKSPACE + f"f8[:, ::1], i8[::1], f8[:, ::1], i8, f8[:, ::1], {SETTINGS}, i8[::1], f8[::1]",
-        8,
-    ),
-}
-"""Functions that this process compiles: module and name -> types of the arguments, and typical time [s]."""
+Functions = Mapping[str, tuple[str, int]]
+"""Functions: module and name -> types of the arguments, and typical time to compile [s]."""
 
-BESIDE: dict[str, tuple[str, int]] = {
-    "curve_proof.prove_curve": (ROBOT + SCENE + ROBOT + "i8[::1], " + 3 * ROBOT + CURVE, 18),
-    "queries.joint_frames": (ROBOT + WORKSPACE + "f8[:, ::1], f8[:, :, :, ::1], f8[:, :, ::1]", 2),
-    "ball_tree.median_order": ("f8[:, ::1], i8[::1], i8[:, ::1]", 1),
-    "ball_tree.node_balls": ("f8[:, :, ::1], i8[::1], i8[::1], f8[:, ::1], f8[:, ::1]", 1),
-    "motion_proof.lay_grid": ("f8[:, ::1], f8, i8[::1]", 1),
-    "jerk_profiles.join_profiles": (
-        "f8[:, :, ::1], f8[:, :, ::1], i8[::1], f8[:, :, ::1], i8[:, :, ::1], f8[:, :, :, ::1], i8[::1], f8[::1], "
-        "f8[:, :, ::1]",
-        2,
-    ),
-    "cubic_pieces.sample_motion": (KNOTS + ", f8[::1], i8, f8[:, :, ::1]", 1),
-    "cubic_pieces.motion_extremes": (KNOTS + ", f8[:, ::1]", 1),
-    "cubic_pieces.relative_gap": (KNOTS, 1),
-    "cubic_pieces.cubic_rates": (KNOTS + ", f8[:, ::1]", 1),
-    "polyline_distance.max_distance": ("f8[:, ::1], f8[::1], f8[:, ::1], f8[::1], f8", 1),
-    "time_parameterization.max_path_speeds": ("f8[:, ::1], f8[:, ::1], f8[::1], f8[::1], f8, f8[::1]", 1),
-    "time_parameterization.sample_times": ("f8[::1], f8, f8, f8[::1]", 1),
-    "point_distance.nearest_points": (SCENE + "i8[::1], f8[:, ::1], f8, f8[::1], f8[:, ::1]", 2),
-    "point_distance.group_clearances": (SCENE + "i8[::1], f8[:, :, :, ::1], f8, f8[::1]", 1),
-    "joint_push.joint_pushes": (
-        ROBOT + "f8[:, :, :, ::1], f8[:, :, ::1], i8[::1], f8[:, :, ::1], f8[:, ::1], f8[:, :, ::1], f8, f8[:, ::1]",
-        1,
-    ),
-    "dense_layer.dense_layer": ("i1[:, ::1], f4[::1], f4[::1], f4[:, ::1], f4[:, ::1]", 1),
-}
-"""Functions that a second process compiles at the same time."""
+
+@dataclass(frozen=True, eq=False)
+class Group:
+    """Functions that are needed together.
+
+    Attributes:
+        what: What they are.
+        seconds: Typical time to compile them [s].
+        here: Those that this process compiles.
+        beside: Those that a second process compiles at the same time.
+    """
+
+    what: str
+    seconds: int
+    here: Functions
+    beside: Functions
+
+    @property
+    def functions(self) -> Functions:
+        """All of them."""
+        return {**self.here, **self.beside}
+
+
+PLANS = Group(
+    "its collision kernel",
+    60,
+    here={
+        "motion_proof.prove_path": (ROBOT + SCENE + WORKSPACE + PROOF, 8),
+        "tree_search.grow_trees": (ROBOT + SCENE + WORKSPACE + TREES + PROOF, 6),
+        "shortcutting.shortcut_path": (ROBOT + SCENE + WORKSPACE + "f8[:, ::1], f8, f8[:, ::1], i8[::1], " + PROOF, 6),
+        "queries.check_states": (ROBOT + SCENE + WORKSPACE + "f8[:, ::1], i8[:, :, ::1], i8[::1]", 2),
+        "queries.clearances": (ROBOT + SCENE + WORKSPACE + "f8[:, ::1], f8, f8[:, ::1], f8[:, :, ::1]", 6),
+        "path_optimization.optimize_path": (
+            ROBOT
+            + SCENE
+            + WORKSPACE
+            + f"f8[:, ::1], i8[::1], f8[:, ::1], i8, f8[:, ::1], {SETTINGS}, i8[::1], f8[::1]",
+            8,
+        ),
+    },
+    beside={
+        "curve_proof.prove_curve": (ROBOT + SCENE + ROBOT + "i8[::1], " + 3 * ROBOT + CURVE, 18),
+        "queries.joint_frames": (ROBOT + WORKSPACE + "f8[:, ::1], f8[:, :, :, ::1], f8[:, :, ::1]", 2),
+        "ball_tree.median_order": ("f8[:, ::1], i8[::1], i8[:, ::1]", 1),
+        "ball_tree.node_balls": ("f8[:, :, ::1], i8[::1], i8[::1], f8[:, ::1], f8[:, ::1]", 1),
+        "motion_proof.lay_grid": ("f8[:, ::1], f8, i8[::1]", 1),
+        "jerk_profiles.join_profiles": (
+            "f8[:, :, ::1], f8[:, :, ::1], i8[::1], f8[:, :, ::1], i8[:, :, ::1], f8[:, :, :, ::1], i8[::1], f8[::1], "
+            "f8[:, :, ::1]",
+            2,
+        ),
+        "cubic_pieces.sample_motion": (KNOTS + ", f8[::1], i8, f8[:, :, ::1]", 1),
+        "cubic_pieces.motion_extremes": (KNOTS + ", f8[:, ::1]", 1),
+        "cubic_pieces.relative_gap": (KNOTS, 1),
+        "cubic_pieces.cubic_rates": (KNOTS + ", f8[:, ::1]", 1),
+        "polyline_distance.max_distance": ("f8[:, ::1], f8[::1], f8[:, ::1], f8[::1], f8", 1),
+        "time_parameterization.max_path_speeds": ("f8[:, ::1], f8[:, ::1], f8[::1], f8[::1], f8, f8[::1]", 1),
+        "time_parameterization.sample_times": ("f8[::1], f8, f8, f8[::1]", 1),
+        "point_distance.nearest_points": (SCENE + "i8[::1], f8[:, ::1], f8, f8[::1], f8[:, ::1]", 2),
+        "point_distance.group_clearances": (SCENE + "i8[::1], f8[:, :, :, ::1], f8, f8[::1]", 1),
+        "joint_push.joint_pushes": (
+            ROBOT
+            + "f8[:, :, :, ::1], f8[:, :, ::1], i8[::1], f8[:, :, ::1], f8[:, ::1], f8[:, :, ::1], f8, f8[:, ::1]",
+            1,
+        ),
+        "dense_layer.dense_layer": ("i1[:, ::1], f4[::1], f4[::1], f4[:, ::1], f4[:, ::1]", 1),
+    },
+)
+"""What every plan needs."""
+
+RUNS = Group(
+    "what runs among moving obstacles need",
+    50,
+    here={
+        "motion_optimization.optimize_motion": (
+            ROBOT
+            + SCENE
+            + MOVERS
+            + WORKSPACE
+            + f"f8[:, ::1], f8[:, ::1], i8[::1], f8[:, ::1], f8[::1], f8[:, ::1], f8, i8, f8[:, ::1], {SETTINGS}, "
+            "i8[::1], f8[::1], f8[::1]",
+            28,
+        ),
+        "movers.clearances_in_time": (
+            ROBOT + MOVERS + WORKSPACE + "f8[:, ::1], f8[::1], f8, f8[:, ::1], f8[::1], f8[:, ::1]",
+            6,
+        ),
+    },
+    beside={
+        "movers.first_conflict": (
+            ROBOT + MOVERS + WORKSPACE + "f8[::1], f8[:, ::1], f8[:, ::1], f8, f8, f8, f8, f8, f8[:, ::1], f8[::1], "
+            "i8[::1]",
+            10,
+        ),
+        "blocked_intervals.blocked_intervals": (
+            ROBOT + MOVERS + WORKSPACE + "f8[::1], f8[:, ::1], f8[:, ::1], f8, f8[:, ::1], f8, f8, f8[::1], "
+            "f8[:, :, ::1], i8[::1]",
+            12,
+        ),
+        "speed_search.earliest_arrivals": (
+            "f8[:, :, ::1], i8[::1], f8[:, :, ::1], i8[::1], f8[:, ::1], f8[:, ::1], f8[::1], f8, i8, b1, i8, f8, f8, "
+            "f8, f8[:, :, :, ::1], i8[:, ::1], f8[:, :, ::1], i8[::1], f8[:, ::1], f8[::1], i8[::1], f8[:, ::1]",
+            4,
+        ),
+        "speed_profile.push_bounds": (
+            "f8[:, :, ::1], f8[::1], f8[::1], f8[::1], f8, f8, f8[::1], f8[:, ::1], f8[:, ::1]",
+            1,
+        ),
+        "speed_profile.profile_places": ("f8[::1], f8, f8, i8[::1], f8[:, ::1], f8, f8, f8[::1]", 1),
+        "speed_profile.follow_profile": (
+            "f8[::1], f8[:, :, ::1], f8, f8[::1], f8, " + 5 * "f8[::1], " + "f8[:, ::1], f8[:, ::1], f8[::1], f8[::1], "
+            "f8[:, :, ::1]",
+            3,
+        ),
+        "speed_profile.first_blocked": (
+            "f8[:, ::1], f8[:, :, ::1], i8[::1], f8[::1], f8[:, :, ::1], i8[::1], f8[::1], f8, f8",
+            1,
+        ),
+        "path_stop.stop_on_path": (
+            "f8[::1], f8[:, :, ::1], f8, f8[:, ::1], " + 5 * "f8[::1], " + "f8, f8[:, ::1], f8[::1], f8[::1], f8[::1], "
+            "f8[:, :, ::1]",
+            4,
+        ),
+        "stop_profiles.stop_joints": (7 * "f8[::1], " + "f8[:, ::1], f8[:, ::1], f8[::1], f8[:, :, ::1], f8[::1]", 3),
+    },
+)
+"""What a run of the closed loop needs besides."""
 
 CHILD = "import sys; from apex_ompl.kernel.ahead_of_time import compile_named; compile_named(sys.argv[1:])"
 
-_lock, _ready = threading.Lock(), threading.Event()
+_lock = threading.Lock()
+_ready: set[str] = set()  # groups
 
 
-def compile_ahead() -> None:
+def compile_ahead(group: Group) -> None:
     """Compile what is not in the cache yet, once in a process; other processes and threads wait meanwhile.
 
     Where no cache can be written, each function is compiled when it is first called.
     """
-    if not _ready.is_set():
-        _compile_missing()
-        _ready.set()
+    if group.what not in _ready:
+        _compile_missing(group)
+        _ready.add(group.what)
 
 
-def _compile_missing() -> None:
+def _compile_missing(group: Group) -> None:
     with _lock:
         folder = cache_folder()
-        if folder is None or not _missing(HERE | BESIDE):
+        if folder is None or not _missing(group.functions):
             return
         with locked(folder, wait=True):
-            here, beside = map(_missing, (HERE, BESIDE))
+            here, beside = map(_missing, (group.here, group.beside))
             if here or beside:
-                LOG.warning("apex_ompl compiles its collision kernel (about %d s, kept in %s)", TYPICAL_SECONDS, folder)
+                LOG.warning("apex_ompl compiles %s (about %d s, kept in %s)", group.what, group.seconds, folder)
                 started = time.perf_counter()
-                _compile(here, beside)
-                LOG.warning("apex_ompl compiled its collision kernel in %.1f s", time.perf_counter() - started)
+                _compile(group, here, beside)
+                LOG.warning("apex_ompl compiled %s in %.1f s", group.what, time.perf_counter() - started)
 
 
 def compile_named(names: Iterable[str]) -> None:
     """Compile functions into the cache, and print each one's name when it is there."""
+    functions = {**PLANS.functions, **RUNS.functions}
     for name in names:
-        _function(name).compile((HERE | BESIDE)[name][0])
+        _function(name).compile(functions[name][0])
         print(name, flush=True)
 
 
-def _compile(here: list[str], beside: list[str]) -> None:
+def _compile(group: Group, here: list[str], beside: list[str]) -> None:
     """Compile functions in this process, and others in one beside it; what that one fails to is compiled here."""
-    seconds = {name: typical for name, (_, typical) in (HERE | BESIDE).items()}
+    types = {name: one for name, (one, _) in group.functions.items()}
+    seconds = {name: typical for name, (_, typical) in group.functions.items()}
     total = sum(seconds[name] for name in (*here, *beside))
     style = "{desc} {percentage:3.0f} %|{bar}| {elapsed}"
     with tqdm(total=total, desc="compiling", bar_format=style, disable=None) as bar:
         with _beside(beside, bar, seconds):
             for name in here:
-                _function(name).compile(HERE[name][0])
+                _function(name).compile(types[name])
                 bar.update(seconds[name])
         for name in _missing(beside):
-            _function(name).compile(BESIDE[name][0])
+            _function(name).compile(types[name])
 
 
 @contextmanager

@@ -12,6 +12,7 @@ from apex_ompl.kernel.compiled.movers import MoverArrays, movers_view
 from apex_ompl.kernel.compiled.state_costs import state_costs
 from apex_ompl.kernel.kernel import Kernel
 from apex_ompl.types import Array
+from apex_ompl.util.arrays import compact
 from apex_ompl.util.validation import check_array, check_positive, finite_array
 
 _NOTHING = np.empty(0)
@@ -66,7 +67,7 @@ def clearance_costs(
     for margin, name in ((scene_margin, "scene_margin"), (own_margin, "own_margin")):
         check_positive(margin, name)
     count, dof = q.shape
-    at = np.zeros(count) if times is None else np.require(finite_array(times, "times"), requirements=["C", "W"])
+    at = np.zeros(count) if times is None else compact(finite_array(times, "times"))
     check_array(at, (count,), "times")
     offset = np.empty((len(movers_view.py_func(*movers).kind), 3))  # type: ignore[attr-defined]
     values, gradient, gram = np.empty((count, 3)), np.empty((count, dof)), np.empty((count, dof, dof))

@@ -24,6 +24,7 @@ from apex_ompl.kernel.compiled.grid_tabulation import tabulate_points, tabulate_
 from apex_ompl.kernel.compiled.item_tree import BUCKET, HALF, fill_boxes, order_items
 from apex_ompl.kernel.compiled.layout import Integers, Singles
 from apex_ompl.types import Array
+from apex_ompl.util.arrays import compact
 from apex_ompl.util.boxes import bounding_box
 
 MOST_NODES = 6_000_000
@@ -69,7 +70,7 @@ class ItemTree(NamedTuple):
         """Write the boxes and items, given in a frame where that of the grid is at ``low`` (3,) [m], in its frame."""
         ordered, extent = values[self.boxes :].reshape(self.number, -1), float((bounding_box(items)[1] - low).max())
         keys, counts = np.empty((2, self.number), np.int64), np.empty(1 << HALF, np.int64)
-        order_items(items, low, extent, keys, counts, ordered)
+        order_items(compact(items), low, extent, keys, counts, ordered)
         fill_boxes(ordered, self.levels, values[: self.boxes].reshape(-1, 6))
 
 

@@ -16,6 +16,7 @@ from apex_ompl.kernel.compiled.layout import Floats, Integers, pack
 from apex_ompl.kernel.compiled.workspace import workspace_sizes
 from apex_ompl.kernel.tables import RobotTables
 from apex_ompl.types import Array
+from apex_ompl.util.arrays import compact
 from apex_ompl.util.validation import check_indices, shape_error
 
 
@@ -163,7 +164,7 @@ class IKSolver:
         Raises:
             ParameterError: Another shape.
         """
-        q = np.require(q, float, ["C", "W"])
+        q = compact(q)
         if q.shape != (self.robot.dof,):
             raise ParameterError("state", q.shape, f"an array of shape ({self.robot.dof},)")
         values, jacobian = np.empty(self.rows), np.empty((self.rows, len(q)))

@@ -16,6 +16,7 @@ from apex_ompl.kernel.compiled import joint_push, motion_proof, queries
 from apex_ompl.kernel.compiled.workspace import workspace_sizes
 from apex_ompl.kernel.tables import RobotTables, SceneTables
 from apex_ompl.types import Array
+from apex_ompl.util.arrays import compact
 from apex_ompl.util.validation import check_integer, shape_error
 
 MOST_PAIRS = 16  # pairs that are listed for one state
@@ -65,7 +66,7 @@ class Kernel:
         Raises:
             ParameterError: Another shape.
         """
-        states = np.require(np.atleast_2d(np.asarray(q, dtype=float)), requirements=["C", "W"])
+        states = compact(np.atleast_2d(np.asarray(q, dtype=float)))
         if states.ndim != 2 or states.shape[1] != self.robot.dof:
             raise shape_error(states, ("N", self.robot.dof), "states")
         return states

@@ -9,6 +9,7 @@ from apex_ompl.kernel.compiled import point_distance
 from apex_ompl.kernel.compiled.layout import Integers
 from apex_ompl.kernel.tables import SceneTables
 from apex_ompl.types import Array, Flags
+from apex_ompl.util.arrays import compact
 from apex_ompl.util.validation import shape_error
 
 
@@ -30,7 +31,7 @@ def nearest_points(
     Raises:
         ParameterError: Another shape.
     """
-    rows = np.require(points, float, ["C", "W"])
+    rows = compact(points)
     if rows.ndim != 2 or rows.shape[1] != 3:
         raise shape_error(rows, ("N", 3), "points")
     distances, gradients = np.empty(len(rows)), np.empty((len(rows), 3))
@@ -51,7 +52,7 @@ def group_clearances(scene: SceneTables, balls: ArrayLike, limit: float = np.inf
     Raises:
         ParameterError: Another shape.
     """
-    groups = np.require(balls, float, ["C", "W"])
+    groups = compact(balls)
     if groups.ndim != 4 or groups.shape[3] != 4:
         raise shape_error(groups, ("G", "C", "M", 4), "balls")
     clearances = np.empty(len(groups))

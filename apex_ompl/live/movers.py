@@ -22,6 +22,7 @@ from apex_ompl.kernel.scene_builder import Solids, grid_columns, joined
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.trajectory import Trajectory
 from apex_ompl.types import Array
+from apex_ompl.util.arrays import compact
 from apex_ompl.util.validation import check_array, check_number, finite_array
 
 SHORTEST = 1e-3  # length of an interval of time that is given up [s]
@@ -241,7 +242,7 @@ def clearance_in_time(
     Raises:
         ParameterError: Another shape, or a time that is not finite.
     """
-    q, at = kernel.states(states), np.require(finite_array(times, "times"), requirements=["C", "W"])
+    q, at = kernel.states(states), compact(finite_array(times, "times"))
     check_array(at, (len(q),), "times")
     values, gradients = np.empty(len(q)), np.empty((len(q), q.shape[1] + 1))
     clearances_in_time(

@@ -22,6 +22,7 @@ from apex_ompl.live.safe_intervals import blocked
 from apex_ompl.robot.model import Limits
 from apex_ompl.trajectory.trajectory import Trajectory
 from apex_ompl.types import Array
+from apex_ompl.util.arrays import compact
 from apex_ompl.util.validation import check_number
 
 STAGE = 0.04  # least length of a stage, in the motion's own time [s]
@@ -190,10 +191,8 @@ class _Search:
         x, points = self._levels() if attempt.hurries else SLOW, self.stages + 1
         limits, window = self.limits, PUSHING * max(attempt.window, 2.0 * SPACINGS[0])
         lowest, highest = np.empty((2, self.rates.shape[1], len(x)))
-        push_bounds(
-            self.rates, limits.velocity, attempt.share * limits.acceleration, limits.jerk, self.length / PIECES,
-            window, x, lowest, highest,
-        )  # fmt: skip
+        bounds = map(compact, (limits.velocity, attempt.share * limits.acceleration, limits.jerk))
+        push_bounds(self.rates, *bounds, self.length / PIECES, window, x, lowest, highest)
         levels, departures = np.empty(points, np.int64), np.empty((points, 2))
         found = earliest_arrivals(
             self.pieces.longer(attempt.margin), self.pieces.counts, self.stops.longer(attempt.margin),
@@ -262,10 +261,10 @@ class _Search:
         """Return times, states and deviation of the motion with places h apart in time, where it keeps the limits."""
         dof, limits, size = self.motion.dof, self.limits, len(places) + 1
         control, off, times, out = np.empty((size + 2, dof)), np.empty(dof), np.empty(size), np.empty((3, size, dof))
-        bounds = limits.lower, limits.upper, limits.velocity, limits.acceleration, limits.jerk
+        bounds = map(compact, (limits.lower, limits.upper, limits.velocity, limits.acceleration, limits.jerk))
         count = follow_profile(
-            self.motion.times, self.states, float(begin), places, h, *bounds, np.empty((3, dof)), control, off, times,
-            out,
+            compact(self.motion.times), self.states, float(begin), places, h, *bounds, np.empty((3, dof)), control, off,
+            times, out,
         )  # fmt: skip
         if not count:
             return None

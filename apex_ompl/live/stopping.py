@@ -11,6 +11,7 @@ from apex_ompl.kernel.compiled.stop_profiles import PHASES, stop_joints
 from apex_ompl.robot.model import Limits
 from apex_ompl.trajectory.trajectory import Trajectory
 from apex_ompl.types import Array
+from apex_ompl.util.arrays import compact
 
 DEVIATION = 1e-3  # of a stop from the path [rad]
 
@@ -54,8 +55,9 @@ def stop(limits: Limits, joint_names: tuple[str, ...], position: Array, velocity
     dof = len(position)
     lengths, jerks, beyond = np.empty((dof, PHASES)), np.empty((dof, PHASES)), np.empty(dof)
     times, knots = np.empty(dof * PHASES + 2), np.empty((3, dof * PHASES + 2, dof))
-    bounds = limits.lower, limits.upper, limits.acceleration, limits.jerk
-    count = stop_joints(position, velocity, acceleration, *bounds, lengths, jerks, times, knots, beyond)
+    state, bounds = (position, velocity, acceleration), (limits.lower, limits.upper, limits.acceleration, limits.jerk)
+    given = (compact(values) for values in (*state, *bounds))
+    count = stop_joints(*given, lengths, jerks, times, knots, beyond)
     return Stop(Trajectory.unchecked(times[:count], knots[:, :count], joint_names), beyond, np.inf)
 
 
@@ -76,8 +78,8 @@ def stop_along(motion: Trajectory, time: float, limits: Limits, deviation: float
     room = len(motion.times) + MOST_STEPS + 4
     start, control, work, still = np.empty((3, dof)), np.empty((MOST_STEPS + 4, dof)), np.empty((2, dof)), np.zeros(dof)
     times, knots = np.empty(room), np.empty((3, room, dof))
-    bounds = limits.lower, limits.upper, limits.velocity, limits.acceleration, limits.jerk
-    count = stop_on_path(motion.times, states, time, start, *bounds, deviation, control, *work, times, knots)
+    bounds = map(compact, (limits.lower, limits.upper, limits.velocity, limits.acceleration, limits.jerk))
+    count = stop_on_path(compact(motion.times), states, time, start, *bounds, deviation, control, *work, times, knots)
     if not count:
         return Stop(motion.after(time), still, 0.0)
     return Stop(Trajectory.unchecked(times[:count], knots[:, :count], motion.joint_names), still, float(work[1].max()))

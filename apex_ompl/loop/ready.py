@@ -9,6 +9,7 @@ import numpy as np
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.path_proof import Curve
 from apex_ompl.kernel import Kernel
+from apex_ompl.kernel.ahead_of_time import RUNS, compile_ahead
 from apex_ompl.live.movers import Movers, curve_of, prove_motion
 from apex_ompl.live.stopping import stop, stop_along
 from apex_ompl.loop.charges import Charges
@@ -38,6 +39,10 @@ class Ready:
     limits: Limits
     stopping: Limits
     settings: LoopSettings
+
+    def __post_init__(self) -> None:
+        """Compile what runs need, where that was not done yet."""
+        compile_ahead(RUNS)
 
     @property
     def checker(self) -> CollisionChecker:

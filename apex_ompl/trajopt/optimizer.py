@@ -26,6 +26,7 @@ from apex_ompl.kernel.compiled.path_optimization import optimize_path
 from apex_ompl.trajopt.settings import OptimizerSettings
 from apex_ompl.trajopt.spline import Spline
 from apex_ompl.types import Array
+from apex_ompl.util.arrays import compact
 from apex_ompl.util.validation import check_array, check_integer, check_nonnegative
 
 Check = Callable[[Array], bool]
@@ -216,7 +217,7 @@ class Optimizer:
                 return None
 
     def _control(self, kernel: Kernel, control: ArrayLike) -> Array:
-        points = np.require(control, float, ["C", "W"])
+        points = compact(control)
         if points.ndim == 2:
             points = points[None]
         check_array(points, ("B", self.spline.points, kernel.robot.dof), "control points", finite=True)
