@@ -6,7 +6,10 @@ on the simulated clock are timed as well, of each way of replanning in turn: wha
 they were charged, is a factor on the kinds of work that no way before used. With --write the table becomes that of the
 package, under the next version number.
 
-Usage: python benchmarks/costs.py [-n 12] [--runs 12] [--write]
+With --add, only kinds of work that the package's table does not have are added to it, by what they take compared with a
+kind that it has, timed side by side: the others stay, and so do runs that have no work of the new kinds.
+
+Usage: python benchmarks/costs.py [-n 30] [--runs 30] [--write] [--add "proved stop"]
 """
 
 from __future__ import annotations
@@ -24,10 +27,11 @@ import record
 from replan_times import replan_times
 
 from apex_ompl.collision import CollisionChecker
+from apex_ompl.errors import UnknownNameError
 from apex_ompl.live.movers import Movers, clearance_in_time, curve_of, prove_motion
 from apex_ompl.live.retime import retime
 from apex_ompl.live.timed_spline import MotionOptimizer, Start, TimedSpline
-from apex_ompl.loop.charges import TABLE, Charges
+from apex_ompl.loop.charges import TABLE, Charges, cost_table
 from apex_ompl.loop.damon import ManifoldGraph
 from apex_ompl.loop.drrt import Clearances, KeptTree
 from apex_ompl.loop.following import Following
@@ -39,7 +43,7 @@ from apex_ompl.loop.potential_field import PotentialField
 from apex_ompl.loop.proposals import Proposals
 from apex_ompl.loop.ready import Ready
 from apex_ompl.loop.request import Request
-from apex_ompl.loop.search import MOTIONS, Search, reach
+from apex_ompl.loop.search import AGE, GUARDED, MOTIONS, SPREAD, Search, reach
 from apex_ompl.loop.settings import LoopSettings
 from apex_ompl.loop.short_horizon import Horizon
 from apex_ompl.loop.snapshot import Snapshot
@@ -111,6 +115,12 @@ def measured(name: str, found: dict[str, list[float]]) -> None:
     found["proved stop"].append(
         seconds(lambda: ready.proved_stop(reach(movers, half, 0.024, 0.2), one, half, half + ready.settings.period))
     )
+    moments = np.arange(0.0, motion.duration, GUARDED)
+    looked, _ = ready.foreseen_stops(movers, one, moments, AGE, SPREAD)
+    if looked > 0:
+        taken = seconds(lambda: ready.foreseen_stops(movers, one, moments, AGE, SPREAD))
+        found["foreseen stop"].append(taken / min(looked + 1, len(moments)))
+    found["stop joint by joint"].append(seconds(lambda: ready.clear_stop(one, half, along=False)))
     curve = curve_of(motion)
     rate = interval_of_proof(ready)
     found["proof interval"].append(rate)
@@ -276,14 +286,43 @@ def in_replans(alone: Mapping[str, float], names: Sequence[str]) -> tuple[dict[s
     return costs, about
 
 
+def write(table: Mapping[str, float]) -> None:
+    """Write the table of the package, under the next version number."""
+    version = json.loads(TABLE.read_text())["version"]
+    content = {"version": version + 1, "seconds": {kind: float(f"{v:.3g}") for kind, v in table.items()}}
+    write_atomically(TABLE, (json.dumps(content, indent=1) + "\n").encode())
+
+
+def add(kind: str, names: Sequence[str], found: dict[str, list[float]]) -> None:
+    """Add the kinds that the table of the package lacks, by what they take compared with a kind that it has."""
+    for name in names:
+        measured(name, found)
+    alone, table = {one: float(np.median(values)) for one, values in found.items()}, cost_table()["seconds"]
+    if kind not in table or kind not in alone:
+        raise UnknownNameError("kind of work", kind, sorted(table.keys() & alone.keys()))
+    scale = table[kind] / alone[kind]
+    new = {one: scale * value for one, value in alone.items() if one not in table}
+    write({**table, **new})
+    rows = [["kind of work", "us a unit alone", "us in the table"], ["---", "---:", "---:"]]
+    shown = (kind, *new)
+    rows += [[one, f"{1e6 * alone[one]:.3g}", f"{1e6 * {**table, **new}[one]:.3g}"] for one in shown]
+    text = f"Added to the table by what they take compared with '{kind}', timed side by side.\n\n"
+    figures = {"alone": {one: alone[one] for one in shown}, "seconds": new, "scale": scale}
+    record.write("costs_added", figures, text + "\n".join(map(record.row, rows)), seed=0, n=len(names))
+
+
 def main() -> None:
     """Measure, and write the results."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("-n", type=one_or_more, default=30, help="worlds (default: %(default)s)")
     parser.add_argument("--runs", type=one_or_more, default=30, help="of each way (default: %(default)s)")
     parser.add_argument("--write", action="store_true", help="write the table of the package, too")
+    parser.add_argument("--add", metavar="KIND", help="add new kinds to the table by what they take compared with this")
     args = parser.parse_args()
     found: dict[str, list[float]] = defaultdict(list)
+    if args.add is not None:
+        add(args.add, worlds.ids("moving", "validation", args.n), found)
+        return
     for name in worlds.ids("moving", "validation", args.n):
         measured(name, found)
         controls(name, found)
@@ -299,9 +338,7 @@ def main() -> None:
         rows.append([name, one["replans"], f"{one['seconds']:.2f}", f"{one['factor']:.2f}", f"{one['by_package']:.2f}"])
     text += "\n\n" + "\n".join(map(record.row, rows))
     if args.write:
-        version = json.loads(TABLE.read_text())["version"]
-        content = {"version": version + 1, "seconds": {kind: float(f"{v:.3g}") for kind, v in table.items()}}
-        write_atomically(TABLE, (json.dumps(content, indent=1) + "\n").encode())
+        write(table)
     record.write("costs", {"alone": alone, "seconds": table, "replans": about}, text, seed=0, n=args.n)
 
 

@@ -44,12 +44,12 @@ def problem_of(
     return Problem(name="by-hand", robot=robot.name, scene=scene, start=start, goal=goals, allowed=allowed)
 
 
-def run_by_hand(robot: Robot) -> RunResult:
+def run_by_hand(robot: Robot, joint: str = "left_joint1", link: str = "left_hand_palm") -> RunResult:
     """A run that sets out, stands for half a second while a ball passes, and goes on to the goal."""
-    middle, last = moved(robot, left_joint1=-0.4), moved(robot, left_joint1=-0.9)
+    middle, last = moved(robot, **{joint: -0.4}), moved(robot, **{joint: -0.9})
     first, then = motion_between(robot, robot.home, middle), motion_between(robot, middle, last)
     motion = concatenate([first, standing(robot, middle, 0.5), then])
-    hand = robot.link_pose(middle, "left_hand_palm")[:3, 3] + (0.35, 0.0, 0.0)
+    hand = robot.link_pose(middle, link)[:3, 3] + (0.35, 0.0, 0.0)
     rows = tuple((t, *(hand + (0.0, 0.0, z))) for t, z in ((0.0, -0.4), (1.0, 0.4), (motion.duration, 0.6)))
     ball = Obstacle(name="ball", sphere={"radius": 0.08}, trajectory=rows)
     late = Obstacle(name="late", box=(0.1, 0.1, 0.1), position=(0.6, 0.0, 1.2), appears=0.5 * motion.duration)

@@ -7,6 +7,7 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 from PIL import Image, ImageSequence
+from small_arm import arm_problem
 
 from apex_ompl import plan
 from apex_ompl.errors import MissingFileError, ParameterError
@@ -36,7 +37,8 @@ def test_the_robot_is_drawn_where_it_is(problem: Problem) -> None:
     assert np.abs(first - renderer.screenshot(ready.start)).mean() < 1.0
 
 
-def test_a_result_becomes_a_strip_and_a_film(problem: Problem, tmp_path: Path) -> None:
+def test_a_result_becomes_a_strip_and_a_film(tmp_path: Path) -> None:
+    problem = arm_problem(tmp_path)
     result = plan(problem, timeout=20.0)
     for name in ("r.png", "r.gif", "r.mp4"):
         render(result, tmp_path / name, SMALL)
@@ -58,7 +60,8 @@ def test_a_result_becomes_a_strip_and_a_film(problem: Problem, tmp_path: Path) -
         render(problem, tmp_path / "no" / "p.png")
 
 
-def test_the_command_draws_problems_and_results(apex_cli, problem: Problem, tmp_path: Path) -> None:
+def test_the_command_draws_problems_and_results(apex_cli, tmp_path: Path) -> None:
+    problem = arm_problem(tmp_path)
     problem.save(tmp_path / "p.yaml")
     plan(problem, timeout=20.0).save(tmp_path / "r.json")
     for source in ("p.yaml", "r.json"):

@@ -10,13 +10,14 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 from runs import run_by_hand
+from small_arm import write_arm
 
 from apex_ompl.cli import main
 from apex_ompl.errors import ParameterError, RobotError
 from apex_ompl.loop.result import Event, Outcome, RunResult
 from apex_ompl.ompl_adapter.setup import assemble
 from apex_ompl.result import PlanResult
-from apex_ompl.robot import Robot
+from apex_ompl.robot import Robot, load_robot
 from apex_ompl.scene.scripts import place_at
 from apex_ompl.viz.browser.live_page import LivePage
 from apex_ompl.viz.browser.saved_run import SavedRun, shown_of
@@ -46,8 +47,11 @@ def red(picture: np.ndarray) -> int:
     return int(((given[..., 0] > given[..., 1] + 40) & (given[..., 0] > given[..., 2] + 40)).sum())
 
 
-def test_strips_and_films_of_runs_are_drawn(run: RunResult, tmp_path: Path) -> None:
-    short = replace(run, events=run.events[:-1])
+def test_strips_and_films_of_runs_are_drawn(tmp_path: Path) -> None:
+    file = write_arm(tmp_path)
+    run = run_by_hand(load_robot(file), "turn", "lower")
+    problem = run.problem.model_copy(update={"robot": str(file)})
+    short = replace(run, problem=problem, robot=str(file), events=run.events[:-1])
     render(short, tmp_path / "r.png", SMALL)
     strip = iio.imread(tmp_path / "r.png")
     assert strip.shape[:2] == (SMALL[1] // 2 * 2, SMALL[0] // 2 * 3)

@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image, ImageSequence
+from small_arm import arm_problem
 from test_moving import path_from_home, problem_with
 
 from apex_ompl import plan
@@ -271,8 +272,12 @@ def test_pages_show_scripts(result: PlanResult, server: Any, tmp_path: Path) -> 
     assert (tmp_path / "p.html").stat().st_size > 10_000
 
 
-def test_films_show_scripts(result: PlanResult, scripts: Problem, tmp_path: Path) -> None:
+def test_films_show_scripts(tmp_path: Path) -> None:
     """The frames before and after an obstacle appears differ by it."""
+    problem = arm_problem(tmp_path)
+    late = Obstacle(name="late", box=(0.3, 0.3, 0.3), position=(-0.5, -0.4, 0.8), appears=0.4)
+    scripts = problem.model_copy(update={"scene": (*problem.scene, late)})
+    result = replace(plan(problem, timeout=20.0), problem=scripts, movers=("late",))
 
     def red(frame: np.ndarray) -> int:
         colours = frame[..., :3].astype(int)

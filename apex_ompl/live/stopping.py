@@ -1,4 +1,4 @@
-"""Stops from any state of motion: along the path of a motion, or joint by joint."""
+"""Stops from any state of motion: along the path of a motion, or joint by joint, and their proofs in advance."""
 
 from __future__ import annotations
 
@@ -6,11 +6,14 @@ from typing import NamedTuple
 
 import numpy as np
 
+from apex_ompl.kernel import Kernel
 from apex_ompl.kernel.compiled.path_stop import MOST_STEPS, stop_on_path
 from apex_ompl.kernel.compiled.stop_profiles import PHASES, stop_joints
+from apex_ompl.kernel.compiled.stops_among_movers import first_unproved_stop
+from apex_ompl.live.movers import SHORTEST, Movers, curve_of
 from apex_ompl.robot.model import Limits
 from apex_ompl.trajectory.trajectory import Trajectory
-from apex_ompl.types import Array
+from apex_ompl.types import Array, Flags
 from apex_ompl.util.arrays import compact
 
 DEVIATION = 1e-3  # of a stop from the path [rad]
@@ -83,3 +86,44 @@ def stop_along(motion: Trajectory, time: float, limits: Limits, deviation: float
     if not count:
         return Stop(motion.after(time), still, 0.0)
     return Stop(Trajectory.unchecked(times[:count], knots[:, :count], motion.joint_names), still, float(work[1].max()))
+
+
+def stops_proved(
+    kernel: Kernel, expected: Movers, motion: Trajectory, limits: Limits, moments: Array,
+    *, clock: float, age: float, growth: tuple[float, float], period: float,
+) -> tuple[int, Flags]:  # fmt: skip
+    """Return how many of some moments of a motion, from the first on, have a proved stop, and of which kind.
+
+    At each, obstacles were seen a while ago, where they are expected then, and may have gone anywhere since. The next
+    period of the motion is proved clear of that, and the soonest stop along it behind (:func:`stop_along`), or else
+    that of each joint by itself (:func:`stop`), which are flagged, shape (N,). What stands still is not looked at: a
+    stop along the motion stays within a millimetre of it.
+
+    Args:
+        kernel: The kernel of the robot with what it holds.
+        expected: The obstacles as they are expected to move; their margins do not count.
+        motion: A motion within the limits that ends at rest.
+        limits: Limits of stops.
+        moments: Times of the motion, shape (N,) [s].
+        clock: Time of the obstacles' stamps when the motion is at 0 [s].
+        age: How long before a moment they were seen [s].
+        growth: Margin of what was seen [m], and its growth since [m/s].
+        period: Time from a moment to the stop [s].
+    """
+    dof, curve, a, seen = motion.dof, curve_of(motion), expected.arrays, expected.larger(0.0)
+    seen.arrays.growth[:] = growth
+    states = np.stack([motion.positions, motion.velocities, motion.accelerations])
+    room, movers = max(len(motion.times) + MOST_STEPS + 4, dof * PHASES + 2), len(a.kind)
+    by_joints = np.zeros(len(moments), np.int64)
+    bounds = map(compact, (limits.lower, limits.upper, limits.velocity, limits.acceleration, limits.jerk))
+    count = int(
+        first_unproved_stop(
+            *kernel.robot.packed, *seen.packed, *kernel.workspace(), a.place, a.velocity, a.stamp, float(age),
+            curve.knots, curve.states, curve.rates, curve.slack, states, *bounds, DEVIATION, compact(moments),
+            by_joints, float(period), float(clock), SHORTEST, np.empty((movers, 3)), np.empty(dof),
+            np.empty(3, np.int64), np.empty((3, dof)), np.empty((MOST_STEPS + 4, dof)), np.empty(dof), np.empty(dof),
+            np.empty((2, dof, PHASES)), np.empty(room), np.empty((3, room, dof)), np.empty((room, dof)),
+            np.empty((room, 2 * dof)),
+        )
+    )  # fmt: skip
+    return count, by_joints.astype(bool)

@@ -11,7 +11,7 @@ from apex_ompl.collision.path_proof import Curve
 from apex_ompl.kernel import Kernel
 from apex_ompl.kernel.ahead_of_time import RUNS, compile_ahead
 from apex_ompl.live.movers import Movers, curve_of, prove_motion
-from apex_ompl.live.stopping import stop, stop_along
+from apex_ompl.live.stopping import stop, stop_along, stops_proved
 from apex_ompl.loop.charges import Charges
 from apex_ompl.loop.following import Following
 from apex_ompl.loop.settings import LoopSettings
@@ -140,17 +140,45 @@ class Ready:
         if np.isfinite(self.first_conflict(reachable, following, now, then)):
             return None
         for along in (True, False):
-            found = self._stop(following, then, along)
+            found = self.clear_stop(following, then, along)
             if found is not None and np.isinf(self.first_conflict(reachable, found, then, found.end)):
                 return found
         return None
+
+    def foreseen_stops(
+        self, predicted: Movers, following: Following, moments: Array, age: float, spread: float
+    ) -> tuple[int, int]:
+        """Return behind how many times of the clock, from the first on, stops from a motion will hardly be refused.
+
+        They are proved by what will be known then, as far as can be told now (:func:`stops_proved`).
+
+        Args:
+            predicted: The obstacles.
+            following: The motion.
+            moments: Times of the clock, shape (N,) [s].
+            age: How old what is known will be [s].
+            spread: By how much more than the error assumed places will differ from those expected [m].
+
+        Returns:
+            Their number; and of how many of those looked at the stop is one of each joint by itself.
+        """
+        settings = self.settings
+        count, by_joints = stops_proved(
+            self.kernel, predicted, following.motion, self.stopping, moments - following.begin, clock=following.begin,
+            age=age, growth=(settings.error + spread, settings.fastest), period=settings.period,
+        )  # fmt: skip
+        left = np.flatnonzero(by_joints[:count])
+        for done, k in enumerate(left):
+            if self.clear_stop(following, float(moments[k]) + settings.period, along=False) is None:
+                return int(k), done + 1
+        return count, len(left)
 
     def unproved_stop(self, following: Following, then: float) -> Following:
         """Return a stop from a motion along its path from a time of the clock on [s]."""
         made = stop_along(following.motion, then - following.begin, self.stopping)
         return Following(made.trajectory, then, self.is_goal(made.trajectory.positions[-1]))
 
-    def _stop(self, following: Following, then: float, along: bool) -> Following | None:
+    def clear_stop(self, following: Following, then: float, along: bool) -> Following | None:
         """Return a stop from a motion along its path, or else joint by joint, that meets nothing that stands still."""
         at = then - following.begin
         if along:

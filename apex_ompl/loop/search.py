@@ -24,6 +24,7 @@ MOTIONS = MotionSettings(samples=2)
 STATES = 64  # of a motion that splines begin from
 EARLIER = 0.02  # by which a motion must arrive before one without a conflict to replace it [s]
 GUARDED, AGE = 0.04, 0.08  # times between stops of a motion that are looked at, and how old what is known will be [s]
+TOGETHER = 16  # such times that are looked at in one call
 SPREAD = 0.01  # by which places that are seen differ from those that are expected [m]
 NARROW = 1.0  # time that a motion that the guard may stop must gain over one that it will hardly stop [s]
 GOOD = 1.2  # duration of a motion with which a replan ends, as a multiple of the direct one's
@@ -136,16 +137,20 @@ class Search:
 
     def guardable(self, motion: Trajectory) -> bool:
         """Whether the guard will hardly stop a motion: stops from it are proved in time, as they will be known then."""
-        settings, one = self.ready.settings, self.following(motion)
+        settings, one, predicted = self.ready.settings, self.following(motion), self.request.predicted
         if not settings.guarded:
             return True
-        for time in np.arange(one.begin, one.end, GUARDED):
+        moments, begin = np.arange(one.begin, one.end, GUARDED), 0
+        while begin < len(moments):
             if self.charges.over():
                 return False
-            self.charges.charge("proved stop")
-            seen = reach(self.request.predicted, time - AGE, settings.error, settings.fastest)
-            if self.ready.proved_stop(seen, one, float(time), float(time) + settings.period) is None:
+            some = moments[begin : begin + TOGETHER]
+            proved, by_joints = self.ready.foreseen_stops(predicted, one, some, AGE, SPREAD)
+            self.charges.charge("foreseen stop", min(proved + 1, len(some)))
+            self.charges.charge("stop joint by joint", by_joints)
+            if proved < len(some):
                 return False
+            begin += len(some)
         return True
 
     def take(self, motion: Trajectory, part: str) -> bool:

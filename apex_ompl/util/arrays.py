@@ -13,5 +13,7 @@ def compact(values: ArrayLike) -> Array:
 
     Code would be compiled anew for arrays that are read-only, or laid out otherwise.
     """
+    if isinstance(values, np.ndarray) and values.dtype == float and values.flags.carray:
+        return values
     found: Array = np.require(values, float, ["C", "W"])
     return found

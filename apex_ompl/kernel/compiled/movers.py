@@ -168,6 +168,36 @@ def set_interval(
     return holds
 
 
+@inlined
+def conflict_on(
+    t: RobotArrays, m: MoverArrays, s: SceneArrays, w: Workspace, knots: Floats, states: Floats, rates: Floats,
+    slack: float, begin: float, end: float, clock: float, shortest: float, offset: Floats, state: Floats,
+    found: Integers,
+) -> float:  # fmt: skip
+    """Return the first moment of a motion that is not proved, see :func:`first_conflict`."""
+    last = knots[len(knots) - 1]
+    found[0] = found[1] = -1
+    found[2] = 0
+    a, step, halved = begin, FIRST, False
+    while a < end:
+        b = min(a + step, end)
+        if a < last < b:
+            b = last
+        found[2] += 1
+        place_movers(m, clock + 0.5 * (a + b), offset)
+        clear = set_interval(t, knots, states, rates, slack, a, b, state, w)
+        if clear:
+            clear = _interval_clear(t, m, s, w, state, 0.5 * (b - a), clock + b, found)
+        if clear:
+            step = (b - a if b < last else step) * (1.0 if halved else LONGER)
+            a, halved = b, False
+        elif b - a <= shortest:
+            return float(a)
+        else:
+            step, halved = 0.5 * (b - a), True
+    return math.inf
+
+
 @entry_point
 def first_conflict(
     ri: Integers, rf: Floats, mi: Integers, mf: Floats, ms: Singles, wi: Integers, wf: Floats,
@@ -199,27 +229,11 @@ def first_conflict(
     t, m = robot_view(ri, rf), movers_view(mi, mf, ms)
     w = workspace_view(t, wi, wf)
     s = scene_of_movers(m, offset)
-    last = knots[len(knots) - 1]
-    found[0] = found[1] = -1
-    found[2] = 0
-    a, step, halved = begin, FIRST, False
-    while a < end:
-        b = min(a + step, end)
-        if a < last < b:
-            b = last
-        found[2] += 1
-        place_movers(m, clock + 0.5 * (a + b), offset)
-        clear = set_interval(t, knots, states, rates, slack, a, b, state, w)
-        if clear:
-            clear = _interval_clear(t, m, s, w, state, 0.5 * (b - a), clock + b, found)
-        if clear:
-            step = (b - a if b < last else step) * (1.0 if halved else LONGER)
-            a, halved = b, False
-        elif b - a <= shortest:
-            return float(a)
-        else:
-            step, halved = 0.5 * (b - a), True
-    return math.inf
+    return float(
+        conflict_on(
+            t, m, s, w, knots, states, rates, slack, begin, end, clock, shortest, offset, state, found
+        )
+    )  # fmt: skip
 
 
 @inlined

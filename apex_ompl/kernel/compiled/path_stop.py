@@ -107,19 +107,67 @@ def _copy(knots: Floats, states: Floats, begin: float, end: float, times: Floats
 
 
 @inlined
+def set_place(knots: Floats, states: Floats, time: float, out: Floats) -> None:
+    """Put position, velocity and acceleration at a time of a motion into ``out`` (3, dof)."""
+    piece = path_piece(knots, time, 0)
+    for i in range(out.shape[1]):
+        out[0, i], out[1, i], out[2, i] = path_value(knots, states, piece, i, time)
+
+
+@inlined
 def _attempt(
     knots: Floats, states: Floats, begin: float, start: Floats, h: float, most: int, lower: Floats, upper: Floats,
     velocity: Floats, acceleration: Floats, jerk: Floats, shares: tuple[float, float],
     control: Floats, here: Floats, deviation: Floats,
 ) -> int:  # fmt: skip
     """Set the state at ``begin``, and brake from there; see :func:`_brake`."""
-    piece = path_piece(knots, begin, 0)
-    for i in range(start.shape[1]):
-        start[0, i], start[1, i], start[2, i] = path_value(knots, states, piece, i, begin)
+    set_place(knots, states, begin, start)
     return _brake(
         knots, states, begin, start, h, most, lower, upper, velocity, acceleration, jerk, shares, control, here,
         deviation,
     )  # fmt: skip
+
+
+@inlined
+def soonest_stop(
+    knots: Floats, states: Floats, begin: float, start: Floats, lower: Floats, upper: Floats, velocity: Floats,
+    acceleration: Floats, jerk: Floats, allowed: float, control: Floats, here: Floats, deviation: Floats,
+    times: Floats, out: Floats,
+) -> int:  # fmt: skip
+    """Find the soonest stop along the path of a motion, see :func:`stop_on_path`."""
+    dof, end, piece = start.shape[1], knots[len(knots) - 1], path_piece(knots, begin, 0)
+    widest, time = 0.0, 0.0
+    for i in range(dof):
+        widest = max(widest, acceleration[i])
+        time = max(time, abs(path_value(knots, states, piece, i, begin)[1]) / acceleration[i])
+    h = min(math.sqrt(allowed / (CURVING * widest)), max(time / LEAST_STEPS, SHORTEST))
+    best, delay_of, shares_of, last, is_laid = end - begin, -1.0, SHARES[0], 0, False
+    for shares in SHARES:
+        for delay in DELAYS:
+            most = min(int((best - delay) / h) - 1, MOST_STEPS)
+            if most < 3 or delay >= delay_of >= 0.0:
+                break
+            count = _attempt(
+                knots, states, begin + delay, start, h, most, lower, upper, velocity, acceleration, jerk, shares,
+                control, here, deviation,
+            )  # fmt: skip
+            is_laid = count > 0
+            if is_laid:
+                best, delay_of, shares_of, last = delay + (count + 1) * h, delay, shares, count
+    if delay_of < 0.0:
+        return 0
+    if not is_laid:  # another one was tried behind it
+        last = _attempt(
+            knots, states, begin + delay_of, start, h, MOST_STEPS, lower, upper, velocity, acceleration, jerk,
+            shares_of, control, here, deviation,
+        )  # fmt: skip
+    for i in range(dof):
+        curved = acceleration[i]
+        for k in range(piece, len(knots)):
+            curved = max(curved, abs(states[2, k, i]))
+        deviation[i] += h * h / 8.0 * (acceleration[i] + curved)
+    copied = _copy(knots, states, begin, begin + delay_of, times, out) if delay_of > 0.0 else 0
+    return copied + spline_knots(start, control, last, h, delay_of, times[copied:], out[:, copied:])
 
 
 @entry_point
@@ -150,34 +198,9 @@ def stop_on_path(
     Returns:
         The number of knots; 0 where no stop ends before the motion.
     """
-    dof, end, piece = start.shape[1], knots[len(knots) - 1], path_piece(knots, begin, 0)
-    widest, time = 0.0, 0.0
-    for i in range(dof):
-        widest = max(widest, acceleration[i])
-        time = max(time, abs(path_value(knots, states, piece, i, begin)[1]) / acceleration[i])
-    h = min(math.sqrt(allowed / (CURVING * widest)), max(time / LEAST_STEPS, SHORTEST))
-    best, delay_of, shares_of = end - begin, -1.0, SHARES[0]
-    for shares in SHARES:
-        for delay in DELAYS:
-            most = min(int((best - delay) / h) - 1, MOST_STEPS)
-            if most < 3 or delay >= delay_of >= 0.0:
-                break
-            count = _attempt(
-                knots, states, begin + delay, start, h, most, lower, upper, velocity, acceleration, jerk, shares,
-                control, here, deviation,
-            )  # fmt: skip
-            if count > 0:
-                best, delay_of, shares_of = delay + (count + 1) * h, delay, shares
-    if delay_of < 0.0:
-        return 0
-    count = _attempt(
-        knots, states, begin + delay_of, start, h, MOST_STEPS, lower, upper, velocity, acceleration, jerk, shares_of,
-        control, here, deviation,
+    return int(
+        soonest_stop(
+            knots, states, begin, start, lower, upper, velocity, acceleration, jerk, allowed, control, here, deviation,
+            times, out,
+        )
     )  # fmt: skip
-    for i in range(dof):
-        curved = acceleration[i]
-        for k in range(piece, len(knots)):
-            curved = max(curved, abs(states[2, k, i]))
-        deviation[i] += h * h / 8.0 * (acceleration[i] + curved)
-    copied = _copy(knots, states, begin, begin + delay_of, times, out) if delay_of > 0.0 else 0
-    return copied + spline_knots(start, control, count, h, delay_of, times[copied:], out[:, copied:])

@@ -165,6 +165,31 @@ def _sorted_times(lengths: Floats, times: Floats) -> int:
     return count
 
 
+@inlined
+def soonest_stops(
+    q: Floats, v: Floats, a: Floats, lower: Floats, upper: Floats, acceleration: Floats, jerk: Floats,
+    lengths: Floats, jerks: Floats, times: Floats, knots: Floats, beyond: Floats,
+) -> int:  # fmt: skip
+    """Stop every joint as soon as it can; see :func:`stop_joints`."""
+    for i in range(len(q)):
+        most = acceleration[i]
+        beyond[i] = _set_stop(q[i], v[i], a[i], lower[i], upper[i], most, JERK_SHARE * jerk[i], lengths[i], jerks[i])
+    count = _sorted_times(lengths, times)
+    for i in range(len(q)):
+        k, begin = 0, 0.0
+        x, y, z = q[i], v[i], a[i]
+        for p in range(PHASES):
+            while k < count and times[k] < begin + lengths[i, p]:
+                since = max(times[k] - begin, 0.0)
+                knots[0, k, i], knots[1, k, i], knots[2, k, i] = moved(x, y, z, jerks[i, p], since)
+                k += 1
+            x, y, z = moved(x, y, z, jerks[i, p], lengths[i, p])
+            begin += lengths[i, p]
+        for rest in range(k, count):
+            knots[0, rest, i], knots[1, rest, i], knots[2, rest, i] = x, 0.0, 0.0
+    return count
+
+
 @entry_point
 def stop_joints(
     q: Floats, v: Floats, a: Floats, lower: Floats, upper: Floats, acceleration: Floats, jerk: Floats,
@@ -189,20 +214,4 @@ def stop_joints(
     Returns:
         The number of knots.
     """
-    for i in range(len(q)):
-        most = acceleration[i]
-        beyond[i] = _set_stop(q[i], v[i], a[i], lower[i], upper[i], most, JERK_SHARE * jerk[i], lengths[i], jerks[i])
-    count = _sorted_times(lengths, times)
-    for i in range(len(q)):
-        k, begin = 0, 0.0
-        x, y, z = q[i], v[i], a[i]
-        for p in range(PHASES):
-            while k < count and times[k] < begin + lengths[i, p]:
-                since = max(times[k] - begin, 0.0)
-                knots[0, k, i], knots[1, k, i], knots[2, k, i] = moved(x, y, z, jerks[i, p], since)
-                k += 1
-            x, y, z = moved(x, y, z, jerks[i, p], lengths[i, p])
-            begin += lengths[i, p]
-        for rest in range(k, count):
-            knots[0, rest, i], knots[1, rest, i], knots[2, rest, i] = x, 0.0, 0.0
-    return count
+    return int(soonest_stops(q, v, a, lower, upper, acceleration, jerk, lengths, jerks, times, knots, beyond))
