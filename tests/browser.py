@@ -25,6 +25,7 @@ FLAGS = (
     "--headless=new", "--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking",
     "--disable-component-update", "--disable-sync", "--hide-scrollbars", "--enable-unsafe-swiftshader",
     "--use-angle=swiftshader", "--disable-dev-shm-usage", f"--window-size={SIZE[0]},{SIZE[1]}",
+    "--disable-features=BackForwardCache",  # a page that was left would stay connected
 )  # fmt: skip
 UNHURRIED = """
 (function () {

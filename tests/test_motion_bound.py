@@ -92,7 +92,7 @@ def check(tables: RobotTables, middle: np.ndarray, step: np.ndarray, deviation: 
     return tightest
 
 
-@settings(max_examples=40)
+@settings(max_examples=20)
 @given(seed=st.integers(0, 10**6), size=st.floats(1e-3, 1.0), curved=st.floats(0.0, 0.3))
 def test_spheres_of_random_trees_stay_within_their_bounds(seed: int, size: float, curved: float) -> None:
     tables, *_ = random_robot(seed)
@@ -104,7 +104,7 @@ def test_spheres_of_random_trees_stay_within_their_bounds(seed: int, size: float
     check(tables, rng.uniform(-inside, inside), step, deviation, seed)
 
 
-@pytest.mark.parametrize("size", [0.01, 0.1, 0.4])
+@pytest.mark.parametrize("size", [0.01, 0.4])
 @pytest.mark.parametrize("which", ["robot", "baxter"])
 def test_spheres_of_real_robots_stay_within_their_bounds(
     which: str, size: float, request: pytest.FixtureRequest

@@ -32,7 +32,7 @@ def path_from_home(robot: Robot, rng: np.random.Generator) -> tuple[np.ndarray, 
     return path, constant_velocity_times(robot, path, 0.5)
 
 
-@settings(max_examples=40)
+@settings(max_examples=20)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_valid_paths_are_free_at_all_times_and_invalid_ones_nearly_touch(robot: Robot, seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -30,8 +30,14 @@ SMALL = (320, 240)
 
 
 @pytest.fixture(scope="module")
-def run(robot: Robot) -> RunResult:
-    return run_by_hand(robot)
+def arm(tmp_path_factory: pytest.TempPathFactory) -> Robot:
+    return load_robot(write_arm(tmp_path_factory.mktemp("arm")))
+
+
+@pytest.fixture(scope="module")
+def run(arm: Robot) -> RunResult:
+    made, file = run_by_hand(arm, "turn", "lower"), str(arm.files[0])
+    return replace(made, robot=file, problem=made.problem.model_copy(update={"robot": file}))
 
 
 @pytest.fixture(scope="module")
@@ -47,11 +53,8 @@ def red(picture: np.ndarray) -> int:
     return int(((given[..., 0] > given[..., 1] + 40) & (given[..., 0] > given[..., 2] + 40)).sum())
 
 
-def test_strips_and_films_of_runs_are_drawn(tmp_path: Path) -> None:
-    file = write_arm(tmp_path)
-    run = run_by_hand(load_robot(file), "turn", "lower")
-    problem = run.problem.model_copy(update={"robot": str(file)})
-    short = replace(run, problem=problem, robot=str(file), events=run.events[:-1])
+def test_strips_and_films_of_runs_are_drawn(run: RunResult, tmp_path: Path) -> None:
+    short = replace(run, events=run.events[:-1])
     render(short, tmp_path / "r.png", SMALL)
     strip = iio.imread(tmp_path / "r.png")
     assert strip.shape[:2] == (SMALL[1] // 2 * 2, SMALL[0] // 2 * 3)
@@ -130,7 +133,7 @@ def test_the_commands_take_files_of_runs(saved: Path, run: RunResult, capsys: py
 
 
 def test_files_are_told_apart_by_what_they_hold(
-    saved: Path, run: RunResult, result: PlanResult, robot: Robot, tmp_path: Path
+    saved: Path, run: RunResult, result: PlanResult, arm: Robot, tmp_path: Path
 ) -> None:
     run.save(tmp_path / "a.npz")
     run.save(tmp_path / "b.json")
@@ -144,6 +147,6 @@ def test_files_are_told_apart_by_what_they_hold(
     assert [path.name for path in saved_in(tmp_path)] == ["a.npz", "b.json", "c.npz", "d.json", "e.yaml"]
     assert isinstance(load_saved(tmp_path / "b.json"), RunResult)
     assert isinstance(load_saved(tmp_path / "e.yaml"), PlanResult)
-    assert robot_of(run).name == robot.name
+    assert robot_of(run).name == arm.name
     with pytest.raises(RobotError, match="no longer the one"):
         robot_of(replace(run, robot_digest="0" * 16))

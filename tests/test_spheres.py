@@ -125,7 +125,7 @@ def test_shipped_covers_are_those_of_the_robot(name: str, shapes: dict) -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_no_proof_without_a_leaf_or_with_a_smaller_ball(name: str, shapes: dict) -> None:
-    for key, cover in list(read_covers(DATA / f"{name}.spheres.json").items())[:6]:
+    for key, cover in list(read_covers(DATA / f"{name}.spheres.json").items())[:3]:
         geometry = shapes[name][key]
         if len(solid_of(geometry).parts) > 1:
             continue

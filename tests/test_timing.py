@@ -20,7 +20,7 @@ from apex_ompl.trajectory.methods.ruckig import through_knots
 from apex_ompl.trajectory.methods.spline import blend
 
 
-@settings(max_examples=60)
+@settings(max_examples=40)
 @given(
     path=paths(), deviation=st.sampled_from([0.2, 0.05, 0.01]), scale=st.sampled_from([1.0, 0.3, 0.01]),
     method=st.sampled_from(list(METHODS)),
