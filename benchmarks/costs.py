@@ -43,7 +43,7 @@ from apex_ompl.loop.potential_field import PotentialField
 from apex_ompl.loop.proposals import Proposals
 from apex_ompl.loop.ready import Ready
 from apex_ompl.loop.request import Request
-from apex_ompl.loop.search import AGE, GUARDED, MOTIONS, SPREAD, Search, reach
+from apex_ompl.loop.search import AGE, GUARDED, MOTIONS, SPREAD, Search
 from apex_ompl.loop.settings import LoopSettings
 from apex_ompl.loop.short_horizon import Horizon
 from apex_ompl.loop.snapshot import Snapshot
@@ -95,6 +95,15 @@ def interval_of_proof(ready: Ready) -> float:
     raise SystemExit("no motion is proved by spheres alone, expected one of 100")
 
 
+def reachable(movers: Movers, time: float) -> Movers:
+    """Return all that obstacles can reach which were seen at a time, where they are expected then [s]."""
+    found = movers.larger(0.0)
+    arrays = found.arrays
+    arrays.place[:] += arrays.velocity * (time - arrays.stamp)[:, None]
+    arrays.velocity[:], arrays.stamp[:], arrays.growth[:] = 0.0, time, (0.034, 0.2)
+    return found
+
+
 def measured(name: str, found: dict[str, list[float]]) -> None:
     """Add what each kind of work costs a unit in a world [s]."""
     world = worlds.load(name)
@@ -112,9 +121,8 @@ def measured(name: str, found: dict[str, list[float]]) -> None:
     found["piece of a motion"].append(piece)
     found["joined motion"].append(seconds(lambda: through(pieces, limits, ready.names)) - 2.0 * piece)
     one, half = Following(motion, 0.0), 0.5 * motion.duration
-    found["proved stop"].append(
-        seconds(lambda: ready.proved_stop(reach(movers, half, 0.024, 0.2), one, half, half + ready.settings.period))
-    )
+    then = half + ready.settings.period
+    found["proved stop"].append(seconds(lambda: ready.proved_stop(reachable(movers, half), one, half, then)))
     moments = np.arange(0.0, motion.duration, GUARDED)
     looked, _ = ready.foreseen_stops(movers, one, moments, AGE, SPREAD)
     if looked > 0:

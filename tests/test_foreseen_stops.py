@@ -12,7 +12,7 @@ from apex_ompl.live.movers import Movers
 from apex_ompl.live.stopping import stops_proved
 from apex_ompl.loop.following import Following
 from apex_ompl.loop.ready import Ready
-from apex_ompl.loop.search import SPREAD, reach
+from apex_ompl.loop.search import SPREAD
 from apex_ompl.trajectory import time_path
 
 AGE, FASTEST = 0.08, 0.4
@@ -43,8 +43,10 @@ def case(seed: int) -> Case:
 
 def proved(one: Case, time: float) -> Following | None:
     """The stop that the guard would prove at a time, by what is known then."""
-    settings = one.ready.settings
-    seen = reach(one.movers, time - AGE, settings.error, settings.fastest)
+    settings, seen = one.ready.settings, one.movers.larger(0.0)
+    for name, place in one.movers.at(time - AGE).items():
+        growth = settings.error + SPREAD, settings.fastest
+        seen.update(name, place, (0.0, 0.0, 0.0), stamp=time - AGE, growth=growth)
     return one.ready.proved_stop(seen, one.following, time, time + settings.period)
 
 

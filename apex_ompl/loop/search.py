@@ -8,7 +8,6 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from apex_ompl.live.movers import Movers
 from apex_ompl.live.timed_spline import MotionOptimizer, MotionSettings, Start
 from apex_ompl.loop.charges import Charges
 from apex_ompl.loop.following import Following
@@ -176,16 +175,6 @@ class Search:
         optimizer = MotionOptimizer(ready.kernel, movers, ready.limits, MOTIONS)
         beyond = ready.settings.berth if berth else 0.0
         return MotionPool(optimizer, self.start, request.join, self.charges, self.accepts, berth=beyond)
-
-
-def reach(predicted: Movers, stamp: float, error: float, fastest: float) -> Movers:
-    """Return all that obstacles can reach that are seen at a time where they are expected then [s]."""
-    found = predicted.larger(0.0)
-    arrays = found.arrays
-    arrays.place[:] += arrays.velocity * (stamp - arrays.stamp)[:, None]
-    arrays.velocity[:], arrays.stamp[:] = 0.0, stamp
-    arrays.growth[:] = error + SPREAD, fastest
-    return found
 
 
 class Guess(NamedTuple):
