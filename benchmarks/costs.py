@@ -303,10 +303,13 @@ def write(table: Mapping[str, float]) -> None:
 
 def add(kind: str, names: Sequence[str], found: dict[str, list[float]]) -> None:
     """Add the kinds that the table of the package lacks, by what they take compared with a kind that it has."""
+    table = cost_table()["seconds"]
+    if kind not in table:
+        raise UnknownNameError("kind of work", kind, sorted(table))
     for name in names:
         measured(name, found)
-    alone, table = {one: float(np.median(values)) for one, values in found.items()}, cost_table()["seconds"]
-    if kind not in table or kind not in alone:
+    alone = {one: float(np.median(values)) for one, values in found.items()}
+    if kind not in alone:
         raise UnknownNameError("kind of work", kind, sorted(table.keys() & alone.keys()))
     scale = table[kind] / alone[kind]
     new = {one: scale * value for one, value in alone.items() if one not in table}
