@@ -27,7 +27,7 @@ import record
 from replan_times import replan_times
 
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.errors import UnknownNameError
+from apex_ompl.errors import ParameterError, UnknownNameError
 from apex_ompl.live.movers import Movers, clearance_in_time, curve_of, prove_motion
 from apex_ompl.live.retime import retime
 from apex_ompl.live.timed_spline import MotionOptimizer, Start, TimedSpline
@@ -100,7 +100,7 @@ def reachable(movers: Movers, time: float) -> Movers:
     found = movers.larger(0.0)
     arrays = found.arrays
     arrays.place[:] += arrays.velocity * (time - arrays.stamp)[:, None]
-    arrays.velocity[:], arrays.stamp[:], arrays.growth[:] = 0.0, time, (0.034, 0.2)
+    arrays.velocity[:], arrays.stamp[:], arrays.growth[:] = 0.0, time, (LoopSettings().error + SPREAD, 0.2)
     return found
 
 
@@ -313,6 +313,8 @@ def add(kind: str, names: Sequence[str], found: dict[str, list[float]]) -> None:
         raise UnknownNameError("kind of work", kind, sorted(table.keys() & alone.keys()))
     scale = table[kind] / alone[kind]
     new = {one: scale * value for one, value in alone.items() if one not in table}
+    if not new:
+        raise ParameterError("--add", kind, "a table of costs that lacks some kind of work: there is nothing to add")
     write({**table, **new})
     rows = [["kind of work", "us a unit alone", "us in the table"], ["---", "---:", "---:"]]
     shown = (kind, *new)
@@ -331,6 +333,8 @@ def main() -> None:
     parser.add_argument("--add", metavar="KIND", help="add new kinds to the table by what they take compared with this")
     args = parser.parse_args()
     found: dict[str, list[float]] = defaultdict(list)
+    if args.add is not None and args.write:
+        parser.error("--add writes the table by itself, expected no --write")
     if args.add is not None:
         add(args.add, worlds.ids("moving", "validation", args.n), found)
         return

@@ -100,7 +100,7 @@ def test_drawn_problems_keep_a_centimetre_at_both_ends(robot: Robot, suite: str,
     """By the distances of the exact shapes; aligned objects may touch each other at the goal."""
     name = name_of(suite, level, 3)
     problem = problems.load(name)
-    assert problem.name == name
+    assert problems.load(name) == problem and problem.name == name
     ends = np.stack([problem.start_state(robot.joint_names), problem.goal_states(robot.joint_names)[0]])
     primitives = problems.primitives(problem)
     assert 0 < len(primitives) <= 300

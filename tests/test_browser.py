@@ -61,7 +61,7 @@ def with_a_cloud(problem: Problem, folder: Path) -> Problem:
     return problem.model_copy(update={"scene": (cloud,)})
 
 
-@pytest.mark.parametrize("name", ["ball_in_cup", "a cloud"])
+@pytest.mark.parametrize("name", ["ball_in_cup", "shelf/hard/900012", "a cloud"])
 def test_pages_show_and_play_to_the_end(driver: Any, name: str, tmp_path: Path) -> None:
     result = plan(with_a_cloud(arm_problem(tmp_path), tmp_path) if name == "a cloud" else name, timeout=20.0)
     assert result.trajectory is not None

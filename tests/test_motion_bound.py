@@ -104,7 +104,7 @@ def test_spheres_of_random_trees_stay_within_their_bounds(seed: int, size: float
     check(tables, rng.uniform(-inside, inside), step, deviation, seed)
 
 
-@pytest.mark.parametrize("size", [0.01, 0.4])
+@pytest.mark.parametrize("size", [0.01, 0.1, 0.4])
 @pytest.mark.parametrize("which", ["robot", "baxter"])
 def test_spheres_of_real_robots_stay_within_their_bounds(
     which: str, size: float, request: pytest.FixtureRequest

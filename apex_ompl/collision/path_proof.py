@@ -77,7 +77,7 @@ class Curve:
         """
         if len(times) == 1:
             return cls.polyline(positions)
-        t, q, v, a = (compact(x) for x in (times, positions, velocities, accelerations))
+        t, q, v, a = map(compact, (times, positions, velocities, accelerations))
         rates = np.empty((len(t), 2 * q.shape[1]))
         return cls(t, q, rates, cubic_rates(t, q, v, a, rates))
 

@@ -59,8 +59,7 @@ def stop(limits: Limits, joint_names: tuple[str, ...], position: Array, velocity
     lengths, jerks, beyond = np.empty((dof, PHASES)), np.empty((dof, PHASES)), np.empty(dof)
     times, knots = np.empty(dof * PHASES + 2), np.empty((3, dof * PHASES + 2, dof))
     state, bounds = (position, velocity, acceleration), (limits.lower, limits.upper, limits.acceleration, limits.jerk)
-    given = (compact(values) for values in (*state, *bounds))
-    count = stop_joints(*given, lengths, jerks, times, knots, beyond)
+    count = stop_joints(*map(compact, (*state, *bounds)), lengths, jerks, times, knots, beyond)
     return Stop(Trajectory.unchecked(times[:count], knots[:, :count], joint_names), beyond, np.inf)
 
 

@@ -139,8 +139,8 @@ class Search:
         settings, one, predicted = self.ready.settings, self.following(motion), self.request.predicted
         if not settings.guarded:
             return True
-        moments, begin = np.arange(one.begin, one.end, GUARDED), 0
-        while begin < len(moments):
+        moments = np.arange(one.begin, one.end, GUARDED)
+        for begin in range(0, len(moments), TOGETHER):
             if self.charges.over():
                 return False
             some = moments[begin : begin + TOGETHER]
@@ -149,7 +149,6 @@ class Search:
             self.charges.charge("stop joint by joint", by_joints)
             if proved < len(some):
                 return False
-            begin += len(some)
         return True
 
     def take(self, motion: Trajectory, part: str) -> bool:
