@@ -137,6 +137,21 @@ class Movers:
         if stamp is not None:
             self.arrays.stamp[mine] = stamp
 
+    def placed(self, positions: Array, velocities: Array, growth: Array, stamps: Array) -> Movers:
+        """Return a copy in which all that is known of the obstacles is written, as by :meth:`update` but unchecked.
+
+        Args:
+            positions: Where they were at the time stamps, shape (N, 3) [m].
+            velocities: Shape (N, 3) [m/s].
+            growth: Margins at the time stamps [m], and their growth behind them [m/s], shape (N, 2).
+            stamps: Time stamps, shape (N,) [s].
+        """
+        other = self.larger(0.0)
+        a = other.arrays
+        a.place[:] = positions[a.owner] + self._from_body
+        a.velocity[:], a.stamp[:], a.growth[:] = velocities[a.owner], stamps[a.owner], growth[a.owner]
+        return other
+
     def larger(self, by: float) -> Movers:
         """Return a copy with margins that are larger by a distance [m]."""
         other = copy(self)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Protocol
 
 import numpy as np
@@ -103,15 +104,13 @@ class Loop:
         settings, tracker, executor = self._ready.settings, self._tracker, self.executor
         if settings.prediction == "truth":
             predicted = as_they_are(self._ready.kernel, self._present, self._looked, self._allowed)
-            records = tuple(obstacle_at(o, now - self._looked) for o in self._present)
         else:
             predicted = tracker.predicted(settings.margin, settings.prediction)
             soon = now + np.array([0.0, 1.0, 2.0]) * settings.budget
             tracker.eased(predicted, executor.state(now), soon)
-            records = _records(tracker, predicted, now, moving=settings.prediction != "still")
         if now >= settings.timeout - SAME_TIME and not executor.done(now):
             executor.close(now)
-        executor.step(now, predicted, records)
+        executor.step(now, predicted, partial(self._records, predicted, now))
         if executor.done(now):
             executor.log(now, "goal")
             return self._ended(now, True, "")
@@ -128,6 +127,17 @@ class Loop:
             self._world.begin(route.motion, max(route.begin, now))
             self._begun = True
 
+    def _records(self, predicted: Movers, now: float) -> tuple[Obstacle, ...]:
+        """Return the obstacles where they are expected to be now, with the velocities that are expected."""
+        prediction, tracks, places = self._ready.settings.prediction, self._tracker.tracks, predicted.at(now)
+        if prediction == "truth":
+            return tuple(obstacle_at(o, now - self._looked) for o in self._present)
+        velocities = {name: np.zeros(3) if prediction == "still" else track.velocity for name, track in tracks.items()}
+        return tuple(
+            track.shape.model_copy(update={"position": vector(places[name]), "velocity": vector(velocities[name])})
+            for name, track in tracks.items()
+        )
+
     def _ended(self, now: float, reached: bool, why: str) -> RunRecord:
         trajectory = executed(self.executor.followed, now)
         return RunRecord(trajectory, tuple(self.executor.events), reached, why, self._broken)
@@ -143,14 +153,3 @@ def unexpected(tracker: Tracker, present: Iterable[Obstacle], now: float, error:
         if way > error + fastest * (now - track.stamp) + 1e-9:
             return True
     return False
-
-
-def _records(tracker: Tracker, predicted: Movers, now: float, moving: bool) -> tuple[Obstacle, ...]:
-    """Return the tracked obstacles where they are expected to be now, with their velocities, or as if they stood."""
-    places = predicted.at(now)
-    return tuple(
-        track.shape.model_copy(
-            update={"position": vector(places[name]), "velocity": vector(track.velocity if moving else np.zeros(3))}
-        )
-        for name, track in tracker.tracks.items()
-    )

@@ -11,6 +11,7 @@ manoeuvre that is verified online, Althoff and Dolan 2014; Pereira and Althoff 2
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -94,13 +95,13 @@ class Executor:
         self.following = one
         self.followed.append((time, one))
 
-    def step(self, now: float, predicted: Movers, obstacles: tuple[Obstacle, ...]) -> None:
+    def step(self, now: float, predicted: Movers, obstacles: Callable[[], tuple[Obstacle, ...]]) -> None:
         """Decide what the robot does until the next step.
 
         Args:
             now: Time of the clock [s].
             predicted: The obstacles as they are expected to move.
-            obstacles: Their records where they are now, with velocities.
+            obstacles: Returns their records where they are now, with velocities; called where a replan is asked for.
         """
         settings = self.ready.settings
         reachable = self.tracker.reachable(settings.error, settings.fastest) if settings.guarded else None
@@ -293,7 +294,7 @@ class Executor:
         """Whether a standing robot may set out without a proved stop, since what comes would touch it where it is."""
         return self.following.at_rest(found.begin) and self.conflict < now + SOON
 
-    def _ask(self, now: float, predicted: Movers, obstacles: tuple[Obstacle, ...]) -> None:
+    def _ask(self, now: float, predicted: Movers, obstacles: Callable[[], tuple[Obstacle, ...]]) -> None:
         """Ask for a replan where one is of use."""
         settings = self.ready.settings
         self._give_up(now)
@@ -303,7 +304,7 @@ class Executor:
         self.asked += 1
         berth = max(settings.berth, settings.error + BLIND_TIME * settings.fastest)
         request = Request(
-            self.asked, now, join, self.following, self.route, predicted, berth, obstacles, self.conflict, self.seed,
+            self.asked, now, join, self.following, self.route, predicted, berth, obstacles(), self.conflict, self.seed,
             leaving=self.leaving and not self.following.at_rest(join),
         )  # fmt: skip
         if self.replanning.submit(request):

@@ -7,7 +7,7 @@ Each obstacle has a filter of its own whose state is place and velocity, with wh
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from apex_ompl.kernel import Kernel
 from apex_ompl.live.movers import Movers, allowed_rows, clearance_in_time
 from apex_ompl.loop.observation import Observation
-from apex_ompl.scene.bodies import Obstacle
+from apex_ompl.scene.bodies import Obstacle, same_solid
 from apex_ompl.types import Array
 
 GATE = 16.0  # squared Mahalanobis distance, of three axes, behind which an obstacle has turned
@@ -114,6 +114,8 @@ class Tracker:
     allowed: tuple[tuple[str, str], ...] = ()
     tracks: dict[str, Track] = field(default_factory=dict)
     last: float = -math.inf
+    _made: Movers | None = field(default=None, init=False)
+    _shapes: list[Obstacle] = field(default_factory=list, init=False)
 
     def take(self, observation: Observation) -> None:
         """Take an observation, by its stamp and not by its arrival; what is older than what is known says nothing.
@@ -134,16 +136,11 @@ class Tracker:
 
     def predicted(self, margin: float, prediction: str = "cv") -> Movers:
         """Return the obstacles as they are expected to move, larger by a margin [m] and by what is uncertain."""
-        movers = self._movers(track.shape for track in self.tracks.values())
-        for name, track in self.tracks.items():
-            if prediction == "still":
-                movers.update(name, track.shape.position, np.zeros(AXES), stamp=track.stamp, growth=(margin, 0.0))
-            else:
-                first, later = track.growth(self.settings)
-                movers.update(
-                    name, track.place, track.velocity, stamp=track.stamp, growth=(margin + first, later)
-                )  # fmt: skip
-        return movers
+        if prediction == "still":
+            return self._as_seen(margin, 0.0)
+        some = self.tracks.values()
+        growth = [(margin + first, later) for first, later in (track.growth(self.settings) for track in some)]
+        return self._placed([track.place for track in some], [track.velocity for track in some], growth)
 
     def eased(self, movers: Movers, q: Array, times: ArrayLike) -> Movers:
         """Take so much of the margins away that the robot may stand where it is, in place, and return the obstacles.
@@ -162,16 +159,25 @@ class Tracker:
 
     def reachable(self, error: float, fastest: float, margin: float = 0.0) -> Movers:
         """Return the obstacles as large as all that they can reach: seen within an error [m], no faster than [m/s]."""
-        movers = self._movers(track.shape for track in self.tracks.values())
-        for name, track in self.tracks.items():
-            movers.update(
-                name, track.shape.position, np.zeros(AXES), stamp=track.stamp, growth=(error + margin, fastest)
-            )  # fmt: skip
-        return movers
+        return self._as_seen(error + margin, fastest)
 
-    def _movers(self, shapes: Iterable[Obstacle]) -> Movers:
-        some = list(shapes)
-        return Movers(some, allowed_rows(self.kernel, self.allowed, [o.name for o in some]))
+    def _as_seen(self, margin: float, growth: float) -> Movers:
+        """Return the obstacles where they were seen last, with a margin [m] that grows [m/s]."""
+        places = [track.shape.position for track in self.tracks.values()]
+        return self._placed(places, [(0.0, 0.0, 0.0)] * len(places), [(margin, growth)] * len(places))
+
+    def _placed(
+        self, places: Sequence[ArrayLike], velocities: Sequence[ArrayLike], growth: Sequence[ArrayLike]
+    ) -> Movers:
+        """Return the obstacles at places and velocities at their stamps; solids are made anew where a shape changed."""
+        shapes = [track.shape for track in self.tracks.values()]
+        made = self._made
+        if made is None or len(shapes) != len(self._shapes) or not all(map(same_solid, shapes, self._shapes)):
+            made = self._made = Movers(shapes, allowed_rows(self.kernel, self.allowed, [o.name for o in shapes]))
+        self._shapes = shapes
+        at, along = (np.array(some, float).reshape(-1, AXES) for some in (places, velocities))
+        stamps = np.array([track.stamp for track in self.tracks.values()])
+        return made.placed(at, along, np.array(growth, float).reshape(-1, 2), stamps)
 
 
 def as_they_are(kernel: Kernel, present: Iterable[Obstacle], time: float, allowed: Iterable[tuple[str, str]]) -> Movers:

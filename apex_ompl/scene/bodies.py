@@ -152,6 +152,7 @@ class Body(StrictModel):
 
 BodyT = TypeVar("BodyT", bound=Body)
 SHAPES = ("box", "sphere", "cylinder", "capsule", "mesh", "points", "voxels", "distance_grid", "half_space")
+SOLID = ("name", *SHAPES, "orientation")  # fields of what moves
 MOTION = ("velocity", "trajectory", "appears")  # fields of how an obstacle moves
 FILES = ("mesh", "points", "voxels", "distance_grid")  # shapes that are read from files
 
@@ -193,6 +194,11 @@ class Obstacle(Body):
     def moving(self) -> bool:
         """Whether it is scripted, or has a velocity other than zero."""
         return self.scripted or any(self.velocity or ())
+
+
+def same_solid(first: Body, second: Body) -> bool:
+    """Whether two bodies differ in nothing but their positions and how they move."""
+    return first is second or all(getattr(first, field) == getattr(second, field) for field in SOLID)
 
 
 class ContactFace(StrictModel):
