@@ -126,12 +126,12 @@ def test_what_numpy_cannot_evaluate_is_said() -> None:
         weight_shapes(config(latent=LatentConfig(dim=12 * DOF + 1)))
 
 
-@pytest.mark.parametrize("after", [1, 36, 37])
+@pytest.mark.parametrize(("after", "before"), [(1, 53), (36, 64), (37, 53), (38, 3)])
 @pytest.mark.parametrize("count", [1, 2, 3, 4, 5, 8, 11])
-def test_a_dense_layer_is_a_matrix_product(count: int, after: int) -> None:
+def test_a_dense_layer_is_a_matrix_product(count: int, after: int, before: int) -> None:
     rng = np.random.default_rng(count)
-    weight = rng.integers(-127, 128, (after, 53)).astype(np.int8)
-    scale, bias, rows = (rng.normal(size=s).astype(np.float32) for s in ((after,), (after,), (count, 53)))
+    weight = rng.integers(-127, 128, (after, before)).astype(np.int8)
+    scale, bias, rows = (rng.normal(size=s).astype(np.float32) for s in ((after,), (after,), (count, before)))
     out = np.full((count, after), np.nan, np.float32)
     dense_layer(weight, scale, bias, rows, out)
     wanted = rows.astype(float) @ (weight * scale[:, None].astype(float)).T + bias

@@ -95,7 +95,10 @@ PLANS = Group(
         "time_parameterization.max_path_speeds": ("f8[:, ::1], f8[:, ::1], f8[::1], f8[::1], f8, f8[::1]", 1),
         "time_parameterization.sample_times": ("f8[::1], f8, f8, f8[::1]", 1),
         "point_distance.nearest_points": (SCENE + "i8[::1], f8[:, ::1], f8, f8[::1], f8[:, ::1]", 2),
-        "point_distance.group_clearances": (SCENE + "i8[::1], f8[:, :, :, ::1], f8, f8[::1]", 1),
+        "ball_groups.group_clearances": (
+            SCENE + "i8[::1], f8[:, :, ::1], f8[:, :, :, ::1], f8, f8[:, ::1], f8[::1]",
+            2,
+        ),
         "joint_push.joint_pushes": (
             ROBOT
             + "f8[:, :, :, ::1], f8[:, :, ::1], i8[::1], f8[:, :, ::1], f8[:, ::1], f8[:, :, ::1], f8, f8[:, ::1]",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from apex_ompl.kernel.compiled import point_distance
+from apex_ompl.kernel.compiled import ball_groups, point_distance
 from apex_ompl.kernel.compiled.layout import Integers
 from apex_ompl.kernel.tables import SceneTables
 from apex_ompl.types import Array, Flags
@@ -55,8 +55,10 @@ def group_clearances(scene: SceneTables, balls: ArrayLike, limit: float = np.inf
     groups = compact(balls)
     if groups.ndim != 4 or groups.shape[3] != 4:
         raise shape_error(groups, ("G", "C", "M", 4), "balls")
-    clearances = np.empty(len(groups))
-    point_distance.group_clearances(*scene.packed, _counted(scene, seen), groups, float(limit), clearances)
+    outer, clearances = compact(groups[:, :, 0].transpose(1, 2, 0)), np.empty(len(groups))
+    ball_groups.group_clearances(
+        *scene.packed, _counted(scene, seen), outer, groups, float(limit), np.empty(groups.shape[1::-1]), clearances
+    )
     return clearances
 
 

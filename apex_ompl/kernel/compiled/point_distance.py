@@ -1,6 +1,6 @@
-"""Signed distances of points and of groups of balls from the nearest obstacle of a scene, without a robot.
+"""Signed distances of points from the nearest obstacle of a scene, without a robot.
 
-Both leave out obstacles that are not ``seen``, shape (obstacles,), for example a robot's fixtures. Distances of grids
+They leave out obstacles that are not ``seen``, shape (obstacles,), for example a robot's fixtures. Distances of grids
 are bounds elsewhere; here they are estimates, near to what those of the same solid as a primitive are.
 """
 
@@ -36,7 +36,7 @@ def _surface_point(s: SceneArrays, o: int, x: float, y: float, z: float) -> tupl
 
 
 @outlined
-def _estimate(s: SceneArrays, o: int, x: float, y: float, z: float, bound: float) -> float:
+def estimate(s: SceneArrays, o: int, x: float, y: float, z: float, bound: float) -> float:
     """Return the signed distance of a point from a grid's solid [m], of which ``bound`` is a lower bound.
 
     On the grid it is as it was found, not lowered. Elsewhere it is that of the surface's point nearest to the grid's
@@ -70,7 +70,7 @@ def _nearest(s: SceneArrays, seen: Integers, x: float, y: float, z: float, limit
             if seen[o]:
                 d = distance(s, o, x, y, z)
                 if s.kind[o] == GRID and d < best:
-                    d = _estimate(s, o, x, y, z, d)
+                    d = estimate(s, o, x, y, z, d)
                 if d < best:
                     best, nearest = d, o
 
@@ -92,33 +92,3 @@ def nearest_points(
         gradients[k, 0] = gradients[k, 1] = gradients[k, 2] = 0.0
         if o >= 0:
             gradients[k, 0], gradients[k, 1], gradients[k, 2] = _gradient(s, o, x, y, z)
-
-
-@entry_point
-def group_clearances(
-    si: Integers, sf: Floats, sg: Singles, seen: Integers, balls: Floats, limit: float, clearances: Floats
-) -> None:
-    """Put the least signed distance of the balls of each group from the obstacles into ``clearances`` (G,) [m].
-
-    Args:
-        si: Integers of the scene.
-        sf: Floats of the scene.
-        sg: Singles of the scene.
-        seen: Which obstacles count, shape (obstacles,).
-        balls: Centres and radii, shape (G, C, 1 + M, 4) [m]: C clusters of a group with M balls each, behind a ball
-            that contains these, which is looked at first.
-        limit: Larger clearances are given as this [m].
-        clearances: Shape (G,) [m].
-    """
-    s = scene_view(si, sf, sg)
-    for g in range(len(balls)):
-        best = limit
-        for c in range(balls.shape[1]):
-            outer = balls[g, c, 0]
-            if _nearest(s, seen, outer[0], outer[1], outer[2], best + outer[3])[1] < 0:
-                continue
-            for m in range(1, balls.shape[2]):
-                ball = balls[g, c, m]
-                found = _nearest(s, seen, ball[0], ball[1], ball[2], best + ball[3])[0] - ball[3]
-                best = min(best, found)
-        clearances[g] = best

@@ -1,0 +1,118 @@
+"""Products of few rows by few rows, with the full width of the processor's vector registers.
+
+LLVM vectorises loops by half of the registers of processors with AVX-512, since wider ones may slow their clock; for
+layers of networks, which are nothing but products, the full width is half as fast again. So the vectors are written
+down here, as code of LLVM that numba puts where the function is called.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from llvmlite import binding as llvm
+from llvmlite import ir
+from numba import float32
+from numba.core import cgutils
+from numba.core.types import UniTuple  # type: ignore[attr-defined]
+from numba.extending import intrinsic
+
+BYTE, WORD, SINGLE = ir.IntType(8), ir.IntType(32), ir.FloatType()
+
+
+def _lanes() -> int:
+    """Return how many numbers of single precision are in a vector register."""
+    try:
+        features = llvm.get_host_cpu_features()
+    except RuntimeError:  # unknown to LLVM
+        return 4
+    return 16 if features.get("avx512f") else 8 if features.get("avx2") else 4
+
+
+LANES = _lanes()
+
+
+def row_products(weights: int, rows: int) -> Callable[..., Any]:
+    """Return a compiled function of some rows of weights, in eight bits, by some rows of numbers.
+
+    ``products(weight, i, x, b)``, with matrices of shapes (N, K) and (B, K), gives the sums of
+    ``weight[i + m, k] * x[b + n, k]`` over k, the last K % LANES left out, at ``rows * m + n``. For rows behind the
+    last one of a matrix that one is taken.
+    """
+
+    @intrinsic  # type: ignore[untyped-decorator]
+    def products(typing: Any, weight: Any, i: Any, x: Any, b: Any) -> Any:
+        del typing
+        signature = UniTuple(float32, weights * rows)(weight, i, x, b)
+
+        def code(context: Any, builder: Any, signature: Any, arguments: Sequence[Any]) -> Any:
+            first, second = (context.make_array(signature.args[k])(context, builder, arguments[k]) for k in (0, 2))
+            width = cgutils.unpack_tuple(builder, first.shape, 2)[1]
+            some = _addresses(builder, first, arguments[1], weights)
+            others = _addresses(builder, second, arguments[3], rows)
+            sums = _sums(builder, some, others, builder.sub(width, builder.srem(width, width.type(LANES))))
+            return context.make_tuple(builder, signature.return_type, sums)
+
+        return signature, code
+
+    return products  # type: ignore[no-any-return]
+
+
+def _addresses(builder: Any, matrix: Any, first: Any, count: int) -> list[Any]:
+    """Return where some rows of a matrix begin; behind the last row it is that one."""
+    rows, width = cgutils.unpack_tuple(builder, matrix.shape, 2)
+    last, found = builder.sub(rows, rows.type(1)), []
+    for k in range(count):
+        row = builder.add(first, rows.type(k))
+        row = builder.select(builder.icmp_signed("<", row, last), row, last)
+        found.append(builder.gep(matrix.data, [builder.mul(row, width)]))
+    return found
+
+
+def _sums(builder: Any, weights: list[Any], rows: list[Any], count: Any) -> list[Any]:
+    """Return the sums of products of bytes and numbers at some addresses, the number of which LANES divides."""
+    vector = ir.VectorType(SINGLE, LANES)
+    fused = ir.FunctionType(vector, [vector] * 3)
+    multiply_add = cgutils.get_or_insert_function(builder.module, fused, f"llvm.fma.v{LANES}f32")
+    sums = [
+        cgutils.alloca_once_value(builder, ir.Constant(vector, [0.0] * LANES)) for _ in range(len(weights) * len(rows))
+    ]
+    with cgutils.for_range_slice(builder, count.type(0), count, count.type(LANES)) as (k, _):
+        numbers = [_loaded(builder, row, k, SINGLE) for row in rows]
+        for m, weight in enumerate(weights):
+            whole = builder.sext(_loaded(builder, weight, k, BYTE), ir.VectorType(WORD, LANES))
+            factor = builder.sitofp(whole, vector)
+            for n, number in enumerate(numbers):
+                place = sums[len(rows) * m + n]
+                builder.store(builder.call(multiply_add, [factor, number, builder.load(place)]), place)
+    return _added_up(builder, [builder.load(place) for place in sums])
+
+
+def _loaded(builder: Any, address: Any, k: Any, kind: Any) -> Any:
+    """Return LANES numbers from the k-th on behind an address."""
+    place = builder.bitcast(builder.gep(address, [k]), ir.VectorType(kind, LANES).as_pointer())
+    found = builder.load(place)
+    found.align = 1
+    return found
+
+
+def _added_up(builder: Any, vectors: list[Any]) -> list[Any]:
+    """Return the sums of the numbers of vectors, the number of which is a power of 2 and at most LANES."""
+    count = len(vectors)
+    while len(vectors) > 1:
+        vectors = [_pairs_added(builder, a, b) for a, b in zip(vectors[::2], vectors[1::2], strict=True)]
+    found = vectors[0]
+    while found.type.count > count:
+        found = _pairs_added(builder, found, None)
+    return [builder.extract_element(found, WORD(k)) for k in range(count)]
+
+
+def _pairs_added(builder: Any, first: Any, second: Any) -> Any:
+    """Return the sums of neighbours in a vector, and behind them those in another one, if there is one."""
+    other = ir.Constant(first.type, ir.Undefined) if second is None else second
+    width = first.type.count * (1 if second is None else 2)
+    halves = []
+    for begin in (0, 1):
+        chosen = list(range(begin, width, 2))
+        halves.append(builder.shuffle_vector(first, other, ir.Constant(ir.VectorType(WORD, len(chosen)), chosen)))
+    return builder.fadd(*halves)
