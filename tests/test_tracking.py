@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.live.movers import Movers, clearance_in_time
+from apex_ompl.live.movers import Movers, allowed_rows, clearance_in_time
 from apex_ompl.loop.observation import Observation
 from apex_ompl.loop.tracking import LEAST, Track, Tracker, TrackSettings
 from apex_ompl.problems.suite_robot import robot as suite_robot
@@ -198,3 +200,28 @@ def test_no_margin_is_left_where_an_obstacle_touches_the_robot() -> None:
     tracker = tracked(look(0.0, palm))
     eased = tracker.eased(tracker.predicted(0.05), q, [0.0])
     assert (eased.arrays.growth[:, 0] == 0.0).all() and (eased.arrays.growth[:, 1] > 0.0).all()
+
+
+def test_obstacles_whose_shapes_change_or_appear_are_as_if_made_anew(tmp_path: Path) -> None:
+    """Solids are kept from call to call: after each look all is as in movers that were never there before."""
+    trimesh.creation.box((0.1, 0.2, 0.1)).export(tmp_path / "m.stl")
+    block = Obstacle(name="block", mesh={"file": str(tmp_path / "m.stl")}, position=(0.5, 0.0, 0.5))
+    turned = block.model_copy(update={"orientation": (0.0, 0.0, 0.5**0.5, 0.5**0.5)})
+    larger = BOX.model_copy(update={"box": (0.2, 0.1, 0.1), "position": (0.1, 0.0, 0.0)})
+    tracker = Tracker(KERNEL, allowed=(("box", "left_link7"),))
+    for k, seen in enumerate(
+        [(BOX,), (at((0.1, 0, 0)),), (at((0.2, 0, 0)), block), (larger, block), (turned,), (turned,)]
+    ):
+        tracker.take(Observation(k / RATE, k / RATE, seen))
+        found = tracker.predicted(0.02), tracker.predicted(0.02, "still"), tracker.reachable(0.01, 0.4, 0.005)
+        shapes = [track.shape for track in tracker.tracks.values()]
+        for one, kind in zip(found, ("cv", "still", "reach"), strict=True):
+            made = Movers(shapes, allowed_rows(KERNEL, tracker.allowed, list(tracker.tracks)))
+            for name, track in tracker.tracks.items():
+                first, later = track.growth(tracker.settings)
+                growth = {"cv": (0.02 + first, later), "still": (0.02, 0.0), "reach": (0.015, 0.4)}[kind]
+                place, velocity = (track.place, track.velocity) if kind == "cv" else (track.shape.position, np.zeros(3))
+                made.update(name, place, velocity, stamp=track.stamp, growth=growth)
+            assert one.names == made.names
+            for mine, wanted in zip(one.arrays, made.arrays, strict=True):
+                np.testing.assert_allclose(mine, wanted, atol=1e-12)

@@ -28,6 +28,7 @@ from apex_ompl.kernel.compiled.path_cost import (
     add_sample,
     add_speed,
     buffers_view,
+    clear,
     set_sample,
 )
 from apex_ompl.kernel.compiled.path_optimization import descend
@@ -107,16 +108,13 @@ def evaluate_motion(
     problem: MotionProblem, t: RobotArrays, s: SceneArrays, w: Workspace, pinned: int, control: Floats,
     settings: CostSettings, b: Buffers, gradient: Floats, gram: Floats,
 ) -> PathCost:  # fmt: skip
-    """Return the cost of a motion; put its gradient (n,) and the upper half of its matrix (n, n) into place.
+    """Return the cost of a motion; put its gradient (n,) and the upper band of its matrix (n, n) into place.
 
     The clearance to the scene is that to the movers, too.
     """
     weights, first, dof, movers = problem.weights, problem.first, control.shape[1], problem.movers
     free, margin = len(control) - 2 * pinned, settings.scene_margin
-    for i in range(free * dof):
-        gradient[i] = 0.0
-        for k in range(i, free * dof):
-            gram[i, k] = 0.0
+    clear(WIDTH * dof, gradient, gram)
     scene, own = margin, settings.own_margin
     total, share, q = 0.0, 1.0 / len(weights), b.state
     for k in range(len(weights)):

@@ -133,6 +133,16 @@ def set_sample(
 
 
 @inlined
+def clear(band: int, gradient: Floats, gram: Floats) -> None:
+    """Put zeros into a gradient, shape (n,), and the band of a matrix (n, n) from its diagonal on."""
+    for i in range(len(gradient)):
+        gradient[i] = 0.0
+        row = gram[i, i : i + band]
+        for k in range(len(row)):
+            row[k] = 0.0
+
+
+@inlined
 def add_sample(
     share: float, weights: Floats, first: int, pinned: int, free: int, here: Floats, matrix: Floats, gradient: Floats,
     gram: Floats, room: Floats,
@@ -210,16 +220,13 @@ def evaluate_path(
     problem: PathProblem, t: RobotArrays, s: SceneArrays, w: Workspace, pinned: int, control: Floats,
     settings: CostSettings, b: Buffers, gradient: Floats, gram: Floats,
 ) -> PathCost:  # fmt: skip
-    """Return the cost of a path; put its gradient (n,) and the upper half of its matrix (n, n) into place.
+    """Return the cost of a path; put its gradient (n,) and the upper band of its matrix (n, n) into place.
 
     The unknowns are the free control points: number i * dof + d for joint d of free point i.
     """
     weights, first, dof = problem.weights, problem.first, control.shape[1]
     free = len(control) - 2 * pinned
-    for i in range(free * dof):
-        gradient[i] = 0.0
-        for k in range(i, free * dof):
-            gram[i, k] = 0.0
+    clear(weights.shape[1] * dof, gradient, gram)
     scene, own = settings.scene_margin, settings.own_margin
     total, share, q = 0.0, 1.0 / len(weights), b.state
     for k in range(len(weights)):

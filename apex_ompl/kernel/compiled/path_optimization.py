@@ -102,21 +102,38 @@ def _factorise(factor: Floats, band: int, panel: Floats) -> bool:
 
 
 @inlined
+def _set_damped(
+    gram: Floats, speed_gram: Floats, damping: float, pinned: int, dof: int, held: Integers, band: int, factor: Floats
+) -> None:
+    """Put the upper band of gram + damping A into ``factor``, with rows and columns of the identity for ``held``."""
+    some = False
+    for i in range(len(held)):
+        some = some or held[i] != 0
+    for i in range(len(held)):
+        source, target, a = gram[i, i : i + band], factor[i, i : i + band], i // dof + pinned
+        for k in range(len(source)):
+            target[k] = source[k]
+        for k in range(0, len(target), dof):
+            target[k] += damping * speed_gram[a, a + k // dof]
+        if some:
+            for k in range(len(target)):
+                if held[i] or held[i + k]:
+                    target[k] = 0.0
+            if held[i]:
+                target[0] = 1.0
+
+
+@inlined
 def _newton_step(
     gram: Floats, speed_gram: Floats, damping: float, pinned: int, dof: int, held: Integers, band: int, factor: Floats,
     panel: Floats, step: Floats,
 ) -> bool:  # fmt: skip
     """Solve (gram + damping A) x = step in place, with x = 0 for ``held`` unknowns; False if not positive definite."""
     n = len(step)
+    _set_damped(gram, speed_gram, damping, pinned, dof, held, band, factor)
     for i in range(n):
-        for k in range(i, min(n, i + band)):
-            factor[i, k] = 0.0 if held[i] or held[k] else gram[i, k]
-        a, d = i // dof, i % dof
-        for k in range(i, min(n, i + band), dof):
-            if not held[i] and not held[k]:
-                factor[i, k] += damping * speed_gram[a + pinned, (k - d) // dof + pinned]
         if held[i]:
-            factor[i, i], step[i] = 1.0, 0.0
+            step[i] = 0.0
     if not _factorise(factor, band, panel):
         return False
     for i in range(n):
