@@ -3,8 +3,8 @@
 The loop plans anew without the network, at full speed, for at most 4 s a run, in worlds of all kinds whose obstacles do
 not come out of nowhere. In every fifth run it looks for faster motions too, which takes most of the time. The referee
 knows what truly happened. A robot that leaves a place that an obstacle comes to does so without a proved stop: contacts
-then are counted apart. Runs are stored in benchmarks/runs/closed_loop/short when they end; the command resumes where it
-was stopped.
+then are counted apart. Runs are stored in benchmarks/runs/guarded_runs when they end; the command resumes where it was
+stopped, and those of the committed table are packed (``python benchmarks/pack.py unpack guarded_runs``).
 
 Usage: python benchmarks/guarded_runs.py [-n 10000] [--jobs 1] [--split test] [--report]
 """
@@ -69,7 +69,7 @@ def main() -> None:
     parser.add_argument("--split", default="test", choices=("test", "validation"))
     parser.add_argument("--report", action="store_true", help="run nothing; write the results of the stored runs")
     args = parser.parse_args()
-    args.store = FOLDER / "short"
+    args.store = FOLDER.with_name("guarded_runs")
     each = [worlds.ids(kind, args.split, math.ceil(args.n / len(KINDS))) for kind in KINDS]
     jobs = [Job(name, "no-network", 1.0) for some in zip(*each, strict=True) for name in some][: args.n]
     stored(jobs, args, made)
