@@ -154,8 +154,8 @@ class Movers:
 
     def larger(self, by: float) -> Movers:
         """Return a copy with margins that are larger by a distance [m]."""
-        other = copy(self)
-        other._pack(tuple(array.copy() for array in self.packed))
+        other, (integers, floats, *singles) = copy(self), self.packed
+        other._pack((integers, floats.copy(), *singles))  # nothing else is written to
         other.arrays.growth[:, 0] += by
         return other
 
