@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from apex_ompl.kernel.ahead_of_time import PLANS, RUNS, Group
+
 SCRIPT = """
 import sys
 from contextlib import contextmanager
@@ -80,8 +82,8 @@ from apex_ompl.kernel import ahead_of_time as ahead
 from apex_ompl.kernel.compiled.compilation import names_in_cache
 
 some = ("time_parameterization.sample_times", "motion_proof.lay_grid")
-here, beside = ({name: ahead.PLANS.functions[name]} for name in some)
-group = ahead.Group("two functions", 1, here, beside)
+parts = tuple({name: ahead.PLANS.functions[name]} for name in some)
+group = ahead.Group("two functions", 1, parts)
 ahead.CHILD = sys.argv[1] or ahead.CHILD
 ahead.compile_ahead(group)
 assert names_in_cache() == {"sample_times", "lay_grid"}, names_in_cache()
@@ -89,8 +91,18 @@ ahead.compile_ahead(group)
 """
 
 
+@pytest.mark.parametrize("group", [PLANS, RUNS], ids=["plans", "runs"])
+@pytest.mark.parametrize("count", [1, 2, 3, 4, 9])
+def test_all_functions_are_compiled_by_as_many_processes_as_there_are_cores(group: Group, count: int) -> None:
+    shares = group.shares(count)
+    assert len(shares) == min(count, len(group.parts)) and all(shares)
+    assert [name for share in shares for name in share] == list(group.functions)
+    seconds = [sum(group.functions[name][1] for name in share) for share in shares]
+    assert max(seconds) <= 1.7 * sum(seconds) / len(shares)
+
+
 @pytest.mark.parametrize("child", ["", "raise SystemExit(1)"], ids=["beside", "alone"])
-def test_the_kernel_is_compiled_in_two_processes_or_in_one(tmp_path: Path, child: str) -> None:
+def test_the_kernel_is_compiled_in_several_processes_or_in_one(tmp_path: Path, child: str) -> None:
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
     command = [sys.executable, "-c", FEW, child]
     first, second = (
