@@ -32,6 +32,7 @@ def steps(loop: Loop) -> Iterator[tuple[float, Decided, RunRecord | None]]:
     """The time of each step, what had been decided before it, and what came of the run."""
     for k in range(2000):
         before = Decided.of(loop.executor)
+        loop.advance(k * PERIOD)
         loop.observe(k * PERIOD)
         ended = loop.step(k * PERIOD)
         yield k * PERIOD, before, ended
@@ -82,6 +83,7 @@ def test_what_is_true_is_told_as_it_is_when_the_step_is_decided_for_a_later_time
     """As on the clock on the wall, where a step is decided in the period before it."""
     replanner = ByHand(line)
     loop = loop_of(replanner, prediction="truth", guarded=False)
+    loop.advance(0.0)
     loop.observe(0.0)
     loop.step(0.1)
     asked = replanner.asked[0]

@@ -88,15 +88,18 @@ class Loop:
         self._present: tuple[Obstacle, ...] = ()
         self._looked = 0.0
 
-    def observe(self, now: float) -> None:
-        """Let the world move on to a time [s], and take the observations that have arrived by then."""
-        settings = self._ready.settings
+    def advance(self, now: float) -> None:
+        """Let the world move on to a time [s], and be looked at."""
         self._world.advance(now, self.executor.state(now))
         self._waiting += self._eyes.observations(now)
+        self._present, self._looked = tuple(self._world.present(now)), now
+
+    def observe(self, now: float) -> None:
+        """Take the observations that have arrived by a time [s], to which the world has moved on."""
+        settings = self._ready.settings
         for observation in [one for one in self._waiting if one.received <= now + 1e-9]:
             self._tracker.take(observation)
         self._waiting = [one for one in self._waiting if one.received > now + 1e-9]
-        self._present, self._looked = tuple(self._world.present(now)), now
         self._broken += unexpected(self._tracker, self._present, now, settings.error, settings.fastest)
 
     def step(self, now: float) -> RunRecord | None:

@@ -24,6 +24,7 @@ def simulate(world: World, ready: Ready, replanner: Replanner, eyes: Eyes, seed:
     loop = Loop(world, ready, AtOnce(ready, replanner), eyes, seed)
     for k in count():
         now = k * ready.settings.period
+        loop.advance(now)
         loop.observe(now)
         ended = loop.step(now)
         if ended is not None:
