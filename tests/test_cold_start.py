@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from apex_ompl.kernel.ahead_of_time import PLANS, RUNS, Group
+from apex_ompl.kernel.entry_points import PLANS, RUNS, Group
 
 SCRIPT = """
 import sys
@@ -57,7 +57,8 @@ TYPES = """
 from numba.core.sigutils import normalize_signature
 from apex_ompl import plan, run
 from apex_ompl.loop.settings import LoopSettings
-from apex_ompl.kernel.ahead_of_time import PLANS, RUNS, _function
+from apex_ompl.kernel.ahead_of_time import _function
+from apex_ompl.kernel.entry_points import PLANS, RUNS
 
 assert plan("shelf/hard/800000", timeout=30.0)
 assert plan("vertical/large/800000", timeout=30.0, params={"line": False}).solved_by == "sprint"
@@ -80,10 +81,11 @@ FEW = """
 import sys
 from apex_ompl.kernel import ahead_of_time as ahead
 from apex_ompl.kernel.compiled.compilation import names_in_cache
+from apex_ompl.kernel.entry_points import PLANS, Group
 
 some = ("time_parameterization.sample_times", "motion_proof.lay_grid")
-parts = tuple({name: ahead.PLANS.functions[name]} for name in some)
-group = ahead.Group("two functions", 1, parts)
+parts = tuple({name: PLANS.functions[name]} for name in some)
+group = Group("two functions", 1, parts)
 ahead.CHILD = sys.argv[1] or ahead.CHILD
 ahead.compile_ahead(group)
 assert names_in_cache() == {"sample_times", "lay_grid"}, names_in_cache()

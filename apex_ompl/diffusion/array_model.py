@@ -30,7 +30,6 @@ from apex_ompl.util.validation import check_integer
 
 Single = NDArray[np.float32]
 STEP_SIZE = 128  # of the embedding of a step
-WHOLE = 16  # multiples of which the rows of layers in eight bits are widened to
 EPSILON = 1e-5  # of the layer normalization, as in torch
 
 
@@ -43,8 +42,8 @@ class ArrayModel(TrajectoryModel):
     """Trained model whose networks NumPy evaluates, in single precision as torch does.
 
     Attributes:
-        weights: Weights by their names in the checkpoint: matrices in eight bits, with zeros behind their rows, and
-            ``NAME.scale``; others in single precision.
+        weights: Weights by their names in the checkpoint: matrices in eight bits with ``NAME.scale``, others in single
+            precision.
     """
 
     def __init__(self, config: ModelConfig, weights: Mapping[str, NDArray[Any]], about: Mapping[str, Any]) -> None:
@@ -53,7 +52,7 @@ class ArrayModel(TrajectoryModel):
         probes = Probes(np.asarray(joint, np.int64), offset, config.condition.along)
         super().__init__(config, about, probes, {name: weights[name] for name in key_shapes(config)})
         self.weights: dict[str, NDArray[Any]] = {
-            k: _widened(v) if v.dtype == np.int8 else np.ascontiguousarray(v, np.float32)
+            k: np.ascontiguousarray(v, np.int8 if v.dtype == np.int8 else np.float32)
             for k, v in quantized(weights).items()
         }
         half = STEP_SIZE // 2
@@ -167,7 +166,7 @@ class ArrayModel(TrajectoryModel):
             return np.asarray(values @ weight.T + bias)
         found = np.empty((len(values), len(weight)), np.float32)
         scale = self.weights[f"{name}.weight{SUFFIX}"]
-        dense_layer(weight, scale, bias, _widened(values), found)
+        dense_layer(weight, scale, bias, np.ascontiguousarray(values, np.float32), found)
         return found
 
 
@@ -214,17 +213,6 @@ def weight_shapes(config: ModelConfig) -> dict[str, tuple[int, ...]]:
     for name, before, after in layers:
         shapes |= {f"{name}.weight": (after, before), f"{name}.bias": (after,)}
     return shapes
-
-
-def _widened(rows: NDArray[Any]) -> NDArray[Any]:
-    """Return rows with zeros behind them, so that they are whole vectors of the processor; bytes, or single numbers."""
-    kind = np.int8 if rows.dtype == np.int8 else np.float32
-    missing = -rows.shape[1] % WHOLE
-    if not missing:
-        return np.ascontiguousarray(rows, kind)
-    found = np.zeros((len(rows), rows.shape[1] + missing), kind)
-    found[:, : rows.shape[1]] = rows
-    return found
 
 
 def _silu(values: Single) -> Single:

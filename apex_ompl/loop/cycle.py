@@ -132,9 +132,10 @@ class Loop:
 
     def _records(self, predicted: Movers, now: float) -> tuple[Obstacle, ...]:
         """Return the obstacles where they are expected to be now, with the velocities that are expected."""
-        prediction, tracks, places = self._ready.settings.prediction, self._tracker.tracks, predicted.at(now)
+        prediction, tracks = self._ready.settings.prediction, self._tracker.tracks
         if prediction == "truth":
             return tuple(obstacle_at(o, now - self._looked) for o in self._present)
+        places = predicted.at(now)
         velocities = {name: np.zeros(3) if prediction == "still" else track.velocity for name, track in tracks.items()}
         return tuple(
             track.shape.model_copy(update={"position": vector(places[name]), "velocity": vector(velocities[name])})

@@ -25,14 +25,13 @@ from apex_ompl.problems.worlds import World
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.scripts import standing
 from apex_ompl.trajectory import time_path
+from apex_ompl.util.cores import usable_cores
 
 
 def cores() -> tuple[int | None, int | None]:
     """Return the processor cores of the executor and of the planner, None where there is no choice."""
-    if not hasattr(os, "sched_getaffinity"):
-        return None, None
-    some = sorted(os.sched_getaffinity(0))
-    return (some[0], some[-1]) if len(some) > 1 else (None, None)
+    some = usable_cores()
+    return (some[0], some[-1]) if len(some) > 1 and hasattr(os, "sched_setaffinity") else (None, None)
 
 
 @contextmanager

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import os
 import platform
 import subprocess
 from collections.abc import Sequence
 from importlib import metadata
 from pathlib import Path
+
+from apex_ompl.util.cores import usable_cores
 
 FIGURES = ("apex-ompl", "ompl", "pin", "coal", "numba", "numpy", "torch")
 """Libraries that affect measurements."""
@@ -44,4 +45,4 @@ def hardware() -> str:
     if info.exists():
         names = [line.split(":", 1)[1].strip() for line in info.read_text().splitlines() if "model name" in line]
         name = names[0] if names else name
-    return f"{name}, {len(os.sched_getaffinity(0))} cores"
+    return f"{name}, {len(usable_cores())} cores"

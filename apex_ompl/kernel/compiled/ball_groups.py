@@ -1,7 +1,4 @@
-"""Clearances of groups of balls from the obstacles of a scene, without a robot.
-
-What primitives are from a row of balls is written so that LLVM takes several balls at a time.
-"""
+"""Clearances of groups of balls from the obstacles of a scene, without a robot."""
 
 from __future__ import annotations
 
@@ -12,79 +9,41 @@ from apex_ompl.kernel.compiled.compilation import entry_point, inlined
 from apex_ompl.kernel.compiled.layout import Floats, Integers, Singles
 from apex_ompl.kernel.compiled.point_distance import estimate
 from apex_ompl.kernel.compiled.scene_tree import next_obstacles
-from apex_ompl.kernel.compiled.signed_distance import distance
+from apex_ompl.kernel.compiled.signed_distance import distance, primitive_distance
 
 
 @inlined
-def _lower_to_box(balls: Floats, rotation: Floats, centre: Floats, size: Floats, least: Floats) -> None:
-    """Lower ``least``, shape (G,), to the signed distances of balls, shape (4, G), from a box [m]."""
+def _lower_to(kind: int, balls: Floats, rotation: Floats, centre: Floats, size: Floats, least: Floats) -> None:
+    """Lower ``least``, shape (G,), to the signed distances of balls, shape (4, G), from a primitive [m].
+
+    Its numbers are read before the loop, and its kind is to be a constant, so that several balls are taken at a time.
+    """
     x, y, z, radius = balls[0], balls[1], balls[2], balls[3]
     r00, r10, r20 = rotation[0, 0], rotation[1, 0], rotation[2, 0]
     r01, r11, r21 = rotation[0, 1], rotation[1, 1], rotation[2, 1]
     r02, r12, r22 = rotation[0, 2], rotation[1, 2], rotation[2, 2]
-    px, py, pz, hx, hy, hz = centre[0], centre[1], centre[2], size[0], size[1], size[2]
-    for n in range(len(least)):
-        dx, dy, dz = x[n] - px, y[n] - py, z[n] - pz
-        a = abs(r00 * dx + r10 * dy + r20 * dz) - hx
-        b = abs(r01 * dx + r11 * dy + r21 * dz) - hy
-        c = abs(r02 * dx + r12 * dy + r22 * dz) - hz
-        deepest = a if a > b else b
-        deepest = c if c > deepest else deepest
-        inside = deepest if deepest < 0.0 else 0.0
-        a, b, c = a if a > 0.0 else 0.0, b if b > 0.0 else 0.0, c if c > 0.0 else 0.0
-        d = math.sqrt(a * a + b * b + c * c) + inside - radius[n]
-        least[n] = d if d < least[n] else least[n]
-
-
-@inlined
-def _lower_to_cylinder(balls: Floats, rotation: Floats, centre: Floats, size: Floats, least: Floats) -> None:
-    """Lower ``least`` to the signed distances from a cylinder, likewise."""
-    x, y, z, radius = balls[0], balls[1], balls[2], balls[3]
-    r00, r10, r20 = rotation[0, 0], rotation[1, 0], rotation[2, 0]
-    r01, r11, r21 = rotation[0, 1], rotation[1, 1], rotation[2, 1]
-    r02, r12, r22 = rotation[0, 2], rotation[1, 2], rotation[2, 2]
-    px, py, pz, wide, half = centre[0], centre[1], centre[2], size[0], size[1]
+    px, py, pz, sizes = centre[0], centre[1], centre[2], (size[0], size[1], size[2])
     for n in range(len(least)):
         dx, dy, dz = x[n] - px, y[n] - py, z[n] - pz
         a = r00 * dx + r10 * dy + r20 * dz
         b = r01 * dx + r11 * dy + r21 * dz
-        along = abs(r02 * dx + r12 * dy + r22 * dz) - half
-        across = math.sqrt(a * a + b * b) - wide
-        deepest = across if across > along else along
-        inside = deepest if deepest < 0.0 else 0.0
-        across, along = across if across > 0.0 else 0.0, along if along > 0.0 else 0.0
-        d = math.sqrt(across * across + along * along) + inside - radius[n]
-        least[n] = d if d < least[n] else least[n]
-
-
-@inlined
-def _lower_to_segment(
-    balls: Floats, ax: float, ay: float, az: float, centre: Floats, wide: float, half: float, least: Floats
-) -> None:
-    """Lower ``least`` to the signed distances from a capsule along an axis, a sphere where ``half`` is 0, likewise."""
-    x, y, z, radius = balls[0], balls[1], balls[2], balls[3]
-    px, py, pz = centre[0], centre[1], centre[2]
-    for n in range(len(least)):
-        dx, dy, dz = x[n] - px, y[n] - py, z[n] - pz
-        t = ax * dx + ay * dy + az * dz
-        t = t if t > -half else -half
-        t = t if t < half else half
-        dx, dy, dz = dx - t * ax, dy - t * ay, dz - t * az
-        d = math.sqrt(dx * dx + dy * dy + dz * dz) - wide - radius[n]
+        c = r02 * dx + r12 * dy + r22 * dz
+        d = primitive_distance(kind, sizes, a, b, c) - radius[n]
         least[n] = d if d < least[n] else least[n]
 
 
 @inlined
 def _lower(s: SceneArrays, o: int, balls: Floats, least: Floats) -> None:
     """Lower ``least``, shape (G,), to the signed distances of balls, shape (4, G), from an obstacle [m]."""
-    kind, size = s.kind[o], s.size[o]
+    kind, rotation, centre, size = s.kind[o], s.rotation[o], s.offset[o], s.size[o]
     if kind == BOX:
-        _lower_to_box(balls, s.rotation[o], s.offset[o], size, least)
+        _lower_to(BOX, balls, rotation, centre, size, least)
     elif kind == CYLINDER:
-        _lower_to_cylinder(balls, s.rotation[o], s.offset[o], size, least)
-    elif kind in (CAPSULE, SPHERE):
-        r, half = s.rotation[o], size[1] if kind == CAPSULE else 0.0
-        _lower_to_segment(balls, r[0, 2], r[1, 2], r[2, 2], s.offset[o], size[0], half, least)
+        _lower_to(CYLINDER, balls, rotation, centre, size, least)
+    elif kind == CAPSULE:
+        _lower_to(CAPSULE, balls, rotation, centre, size, least)
+    elif kind == SPHERE:
+        _lower_to(SPHERE, balls, rotation, centre, size, least)
     else:
         for n in range(len(least)):
             d = distance(s, o, balls[0, n], balls[1, n], balls[2, n]) - balls[3, n]

@@ -24,7 +24,7 @@ def local_point(s: SceneArrays, o: int, x: float, y: float, z: float) -> tuple[f
 
 
 @inlined
-def primitive_distance(kind: int, size: Floats, a: float, b: float, c: float) -> float:
+def primitive_distance(kind: int, size: Floats | tuple[float, float, float], a: float, b: float, c: float) -> float:
     """Return the signed distance of a point from a box, a ball, a cylinder or a capsule, in its frame [m]."""
     if kind == BOX:
         a, b, c = abs(a) - size[0], abs(b) - size[1], abs(c) - size[2]

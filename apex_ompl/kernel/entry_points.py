@@ -1,0 +1,195 @@
+"""Compiled functions that plans and runs need, and the types of their arguments.
+
+Types are written as numba writes them: ``f8[:, ::1]`` is an array of shape (N, M).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+ROBOT = "i8[::1], f8[::1], "
+WORKSPACE = BUFFERS = ROBOT
+SCENE = MOVERS = ROBOT + "f4[::1], "
+TREES = "f8[:, ::1], f8, f8, f8[:, :, ::1], i8[:, ::1], i8[::1], i8[::1], f8[::1], f8[::1], "
+PROOF = "f8[:, ::1], i8[::1], i8[:, ::1], i8[::1], f8[::1], i8[:, ::1], i8[::1]"
+CURVE = "f8[::1], f8[:, ::1], f8[:, ::1], f8, f8, f8, i8"
+KNOTS = "f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1]"
+SETTINGS = "Tuple((f8, f8, f8, f8, f8, f8, i8))"
+
+Functions = Mapping[str, tuple[str, int]]
+"""Functions: module and name -> types of the arguments, and typical time to compile [s]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Group:
+    """Functions that are needed together.
+
+    Attributes:
+        what: What they are.
+        seconds: Typical time to compile them by two processes [s].
+        parts: Those that one process compiles, as what they call is the same: as many processes as there are parts, or
+            fewer that take several parts in turn.
+    """
+
+    what: str
+    seconds: int
+    parts: tuple[Functions, ...]
+
+    @property
+    def functions(self) -> Functions:
+        """All of them."""
+        return {name: one for part in self.parts for name, one in part.items()}
+
+    def shares(self, count: int) -> list[list[str]]:
+        """Return names of functions for at most ``count`` processes, the parts in their order."""
+        many = min(count, len(self.parts))
+        found: list[list[str]] = [[] for _ in range(many)]
+        for k, part in enumerate(self.parts):
+            found[k * many // len(self.parts)] += part
+        return found
+
+
+PLANS = Group(
+    "its collision kernel",
+    60,
+    (
+        {
+            "motion_proof.prove_path": (ROBOT + SCENE + WORKSPACE + PROOF, 8),
+            "tree_search.grow_trees": (ROBOT + SCENE + WORKSPACE + TREES + PROOF, 6),
+            "shortcutting.shortcut_path": (
+                ROBOT + SCENE + WORKSPACE + "f8[:, ::1], f8, f8[:, ::1], i8[::1], " + PROOF,
+                6,
+            ),
+        },
+        {
+            "queries.check_states": (ROBOT + SCENE + WORKSPACE + "f8[:, ::1], i8[:, :, ::1], i8[::1]", 2),
+            "queries.clearances": (ROBOT + SCENE + WORKSPACE + "f8[:, ::1], f8, f8[:, ::1], f8[:, :, ::1]", 6),
+            "path_optimization.optimize_path": (
+                ROBOT
+                + SCENE
+                + WORKSPACE
+                + f"f8[:, ::1], i8[::1], f8[:, ::1], i8, f8[:, ::1], {SETTINGS}, i8[::1], f8[::1]",
+                8,
+            ),
+        },
+        {
+            "curve_proof.prove_curve": (ROBOT + SCENE + ROBOT + "i8[::1], " + 3 * ROBOT + CURVE, 18),
+        },
+        {
+            "queries.joint_frames": (ROBOT + WORKSPACE + "f8[:, ::1], f8[:, :, :, ::1], f8[:, :, ::1]", 2),
+            "ball_tree.median_order": ("f8[:, ::1], i8[::1], i8[:, ::1]", 1),
+            "ball_tree.node_balls": ("f8[:, :, ::1], i8[::1], i8[::1], f8[:, ::1], f8[:, ::1]", 1),
+            "motion_proof.lay_grid": ("f8[:, ::1], f8, i8[::1]", 1),
+            "jerk_profiles.join_profiles": (
+                "f8[:, :, ::1], f8[:, :, ::1], i8[::1], f8[:, :, ::1], i8[:, :, ::1], f8[:, :, :, ::1], i8[::1], "
+                "f8[::1], f8[:, :, ::1]",
+                2,
+            ),
+            "cubic_pieces.sample_motion": (KNOTS + ", f8[::1], i8, f8[:, :, ::1]", 1),
+            "cubic_pieces.motion_extremes": (KNOTS + ", f8[:, ::1]", 1),
+            "cubic_pieces.relative_gap": (KNOTS, 1),
+            "cubic_pieces.cubic_rates": (KNOTS + ", f8[:, ::1]", 1),
+            "polyline_distance.max_distance": ("f8[:, ::1], f8[::1], f8[:, ::1], f8[::1], f8", 1),
+            "time_parameterization.max_path_speeds": ("f8[:, ::1], f8[:, ::1], f8[::1], f8[::1], f8, f8[::1]", 1),
+            "time_parameterization.sample_times": ("f8[::1], f8, f8, f8[::1]", 1),
+            "point_distance.nearest_points": (SCENE + "i8[::1], f8[:, ::1], f8, f8[::1], f8[:, ::1]", 2),
+            "ball_groups.group_clearances": (
+                SCENE + "i8[::1], f8[:, :, ::1], f8[:, :, :, ::1], f8, f8[:, ::1], f8[::1]",
+                2,
+            ),
+            "joint_push.joint_pushes": (
+                ROBOT
+                + "f8[:, :, :, ::1], f8[:, :, ::1], i8[::1], f8[:, :, ::1], f8[:, ::1], f8[:, :, ::1], f8, f8[:, ::1]",
+                1,
+            ),
+            "dense_layer.dense_layer": ("i1[:, ::1], f4[::1], f4[::1], f4[:, ::1], f4[:, ::1]", 1),
+        },
+    ),
+)
+"""What every plan needs."""
+
+RUNS = Group(
+    "what runs among moving obstacles need",
+    50,
+    (
+        {
+            "motion_optimization.optimize_motion": (
+                ROBOT
+                + SCENE
+                + MOVERS
+                + WORKSPACE
+                + f"f8[:, ::1], f8[:, ::1], i8[::1], f8[:, ::1], f8[::1], f8[:, ::1], f8, i8, f8[:, ::1], {SETTINGS}, "
+                "i8[::1], f8[::1], f8[::1]",
+                28,
+            ),
+        },
+        {
+            "movers.clearances_in_time": (
+                ROBOT + MOVERS + WORKSPACE + "f8[:, ::1], f8[::1], f8, f8[:, ::1], f8[::1], f8[:, ::1]",
+                6,
+            ),
+            "movers.first_conflict": (
+                ROBOT
+                + MOVERS
+                + WORKSPACE
+                + "f8[::1], f8[:, ::1], f8[:, ::1], f8, f8, f8, f8, f8, f8[:, ::1], f8[::1], "
+                "i8[::1]",
+                10,
+            ),
+        },
+        {
+            "blocked_intervals.blocked_intervals": (
+                ROBOT + MOVERS + WORKSPACE + "f8[::1], f8[:, ::1], f8[:, ::1], f8, f8[:, ::1], f8, f8, f8[::1], "
+                "f8[:, :, ::1], i8[::1]",
+                12,
+            ),
+            "stops_among_movers.first_unproved_stop": (
+                ROBOT
+                + MOVERS
+                + WORKSPACE
+                + "f8[:, ::1], f8[:, ::1], f8[::1], f8, f8[::1], f8[:, ::1], f8[:, ::1], f8, "
+                "f8[:, :, ::1], " + 5 * "f8[::1], " + "f8, f8[::1], i8[::1], f8, f8, f8, f8[:, ::1], f8[::1], i8[::1], "
+                "f8[:, ::1], f8[:, ::1], f8[::1], f8[::1], f8[:, :, ::1], f8[::1], f8[:, :, ::1], f8[:, ::1], "
+                "f8[:, ::1]",
+                10,
+            ),
+        },
+        {
+            "speed_search.earliest_arrivals": (
+                "f8[:, :, ::1], i8[::1], f8[:, :, ::1], i8[::1], f8[:, ::1], f8[:, ::1], f8[::1], f8, i8, b1, i8, f8, "
+                "f8, f8, f8[:, :, :, ::1], i8[:, ::1], f8[:, :, ::1], i8[::1], f8[:, ::1], f8[::1], i8[::1], "
+                "f8[:, ::1]",
+                4,
+            ),
+            "speed_profile.push_bounds": (
+                "f8[:, :, ::1], f8[::1], f8[::1], f8[::1], f8, f8, f8[::1], f8[:, ::1], f8[:, ::1]",
+                1,
+            ),
+            "speed_profile.profile_places": ("f8[::1], f8, f8, i8[::1], f8[:, ::1], f8, f8, f8[::1]", 1),
+            "speed_profile.follow_profile": (
+                "f8[::1], f8[:, :, ::1], f8, f8[::1], f8, "
+                + 5 * "f8[::1], "
+                + "f8[:, ::1], f8[:, ::1], f8[::1], f8[::1], "
+                "f8[:, :, ::1]",
+                3,
+            ),
+            "speed_profile.first_blocked": (
+                "f8[:, ::1], f8[:, :, ::1], i8[::1], f8[::1], f8[:, :, ::1], i8[::1], f8[::1], f8, f8",
+                1,
+            ),
+            "path_stop.stop_on_path": (
+                "f8[::1], f8[:, :, ::1], f8, f8[:, ::1], "
+                + 5 * "f8[::1], "
+                + "f8, f8[:, ::1], f8[::1], f8[::1], f8[::1], "
+                "f8[:, :, ::1]",
+                4,
+            ),
+            "stop_profiles.stop_joints": (
+                7 * "f8[::1], " + "f8[:, ::1], f8[:, ::1], f8[::1], f8[:, :, ::1], f8[::1]",
+                3,
+            ),
+        },
+    ),
+)
+"""What a run of the closed loop needs besides."""
