@@ -1,11 +1,11 @@
 """Contacts of robots that move, under the assumptions of the guarantee, over many short runs of the closed loop.
 
-The loop plans anew without the network, at full speed, for at most 4 s a run, in worlds of all kinds whose obstacles do
-not come out of nowhere. Of those with a moving cube the first 600 are frozen, with a witness; others may be such that
-no robot could evade. In every fifth run it looks for faster motions too, which takes most of the time. The referee
-knows what truly happened. A robot that leaves a place that an obstacle comes to does so without a proved stop: contacts then
-are counted apart. Runs are stored in benchmarks/runs/guarded_runs when they end; the command resumes where it was
-stopped, and those of the committed table are packed (``python benchmarks/pack.py unpack guarded_runs``).
+The loop plans anew without the network, at full speed, for at most 4 s a run, in worlds of all kinds whose obstacles
+do not come out of nowhere. Of those with a moving cube the first 600 are frozen, with a witness; others may be such
+that no robot could evade. In every fifth run it looks for faster motions too, which takes most of the time. The
+referee knows what truly happened. A robot that leaves a place that an obstacle comes to does so without a proved stop:
+contacts then are counted apart. Runs are stored in benchmarks/runs/guarded_runs when they end; the command resumes
+where it was stopped, and those of the committed table are packed (``python benchmarks/pack.py unpack guarded_runs``).
 
 Usage: python benchmarks/guarded_runs.py [-n 10000] [--jobs 1] [--split test] [--report]
 """
