@@ -28,7 +28,7 @@ from apex_ompl.util.validation import one_or_more
 
 DEPENDS = ("apex_ompl/diffusion", "apex_ompl/apex/query.py", "apex_ompl/kernel", "apex_ompl/ompl_adapter", "problems")
 PROBLEM = "shelf/hard/800003"
-COUNTS = (1, 8, 32)
+COUNTS = (1, 4, 8, 32)
 STEPS = (1, 2, 8)
 GUIDED = Guidance(gamma=1.0)
 LOAD = "import time; b = time.perf_counter(); import apex_ompl; apex_ompl.load_model({name!r}); "
