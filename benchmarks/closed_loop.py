@@ -11,7 +11,8 @@ gives the shortest motion of what it finds in 10 s with as many seeds as fit. Ti
 over the runs that both end at the goal. (It is made where motions are independent of the robot's, in moving worlds.)
 
 Reactions are those of all runs of a row: the time from the look at which a conflict was first predicted, wherever on
-the rest of the motion, until the command changed; near ones are of conflicts less than half a second ahead.
+the rest of the motion, until the command changed; near ones are of conflicts less than half a second ahead of robots
+that were on their way: those that braked already had changed their command before, and those that stood needed a plan.
 
 Usage: python benchmarks/closed_loop.py [-n 60] [--jobs 1] [--split test] [--kinds moving popup] [--report]
        [--clock sim] [--clairvoyant 60]
@@ -39,7 +40,7 @@ from apex_ompl.loop.charges import cost_table
 from apex_ompl.loop.methods import METHODS
 from apex_ompl.loop.metrics import NEAR
 from apex_ompl.loop.referee import LIMIT_TOLERANCE
-from apex_ompl.loop.result import Outcome, RunResult
+from apex_ompl.loop.result import GOING, Outcome, RunResult
 from apex_ompl.loop.run import CLOCKS, run
 from apex_ompl.problems import worlds
 from apex_ompl.trajectory.timing import Timing
@@ -111,7 +112,11 @@ def kept(job: Job, result: RunResult) -> dict[str, Any]:
     expected = result.outcome is Outcome.HIT_MOVING and not result.metrics["broken_steps"]
     contact = next((event.time for event in result.events if event.kind == "contact"), math.inf)
     leaving = [event.data["leaving"] for event in taken if event.time <= contact][-1:]
-    reactions = [(event.data["seconds"], event.data["ahead"]) for event in result.events if event.kind == "reaction"]
+    reactions = [
+        [event.data[name] for name in ("seconds", "ahead", "doing")]
+        for event in result.events
+        if event.kind == "reaction"
+    ]
     return {
         **job._asdict(), **made_with(), "outcome": str(result.outcome), "reason": result.reason,
         "hit_while_expected": expected, "hit_while_leaving": expected and leaving == [True], **timed,
@@ -178,8 +183,9 @@ def summary(some: Sequence[dict[str, Any]], best: Sequence[dict[str, Any]] = ())
         "levels": {level: [sum(row), len(row)] for level, row in levels.items()},
         "worst_level": max(sum(row) / len(row) for row in levels.values()),
         "stops": sum(one["stops"] for one in some) / len(some),
-        "reaction_s": of_all([took for took, _ in reactions]), "reactions": len(reactions),
-        "near_reaction_s": of_all([took for took, ahead in reactions if ahead < NEAR]),
+        "reaction_s": of_all([took for took, *_ in reactions]), "reactions": len(reactions),
+        "near_reaction_s": of_all([took for took, ahead, *doing in reactions if ahead < NEAR and doing == [GOING]]),
+        "near": sum(ahead < NEAR and doing == [GOING] for _, ahead, *doing in reactions),
         **{f"{name}_s": float(np.median(ticks[name])) for name in ("tick_p50", "tick_p99") if ticks[name]},
         **({"tick_worst_s": max(ticks["tick_worst"])} if ticks["tick_worst"] else {}),
         **({"deadline_misses": sum(ticks["deadline_misses"])} if ticks["deadline_misses"] else {}),

@@ -88,6 +88,13 @@ def test_the_robot_touches_nothing_while_it_moves(
         hits.append(report.contact.time)
     for time in hits:
         assert [event for event in accepted if event.time <= time][-1].data["leaving"], time
+    for reaction in (event for event in done.events if event.kind == "reaction"):
+        known = [event.time for event in done.events if event.kind == "conflict" and event.time <= reaction.time][-1]
+        stops = [
+            event for event in done.events if event.kind in ("stop", "accepted", "improved") and event.time < known
+        ]
+        doing = "braking" if stops and stops[-1].kind == "stop" else "going"
+        assert reaction.data["doing"] == ("standing" if is_at_rest(done.trajectory, known) else doing)
 
 
 def test_without_the_guard_the_robot_runs_into_it() -> None:

@@ -151,6 +151,7 @@ def test_metrics_come_from_events_and_motion(run: RunResult, robot: Robot) -> No
     assert found["rest_time"] == pytest.approx(0.5) and found["stops"] == 1.0
     assert (found["replans_asked"], found["replans_accepted"], found["replans_rejected"]) == (2.0, 1.0, 1.0)
     assert found["reaction_p50"] == pytest.approx(0.02) and found["reaction_p95"] == pytest.approx(0.029)
+    assert found["near_reaction_p95"] == 0.01, "of a robot on its way"
     assert found["clearance"] == 0.123 and found["jerk"] == motion.jerk
     assert found["spectral_arc_length"] == motion.spectral_arc_length < 0.0
     assert found["limit_use"] == max(motion.use(robot.limits).values()) and found["velocity_use"] <= 0.4 + 1e-9

@@ -24,7 +24,7 @@ from apex_ompl.loop.following import SAME_TIME, Following
 from apex_ompl.loop.ready import Ready
 from apex_ompl.loop.replanning import Replanning
 from apex_ompl.loop.request import Request
-from apex_ompl.loop.result import Event
+from apex_ompl.loop.result import BRAKING, GOING, STANDING, Event
 from apex_ompl.loop.search import EARLIER
 from apex_ompl.loop.tracking import Tracker
 from apex_ompl.scene.bodies import Obstacle
@@ -61,6 +61,7 @@ class Executor:
         sets_out: When it does [s].
         lead: How long before a step it is decided, by what was seen until then [s].
         ahead: How long before the conflict that was [s].
+        doing: What the robot did then: it was ``going``, ``braking`` already, or ``standing``.
         hastened: When a faster motion was asked for last [s].
     """
 
@@ -84,6 +85,7 @@ class Executor:
     sets_out: float = -math.inf
     lead: float = 0.0
     ahead: float = math.inf
+    doing: str = ""
     hastened: float = -math.inf
 
     def log(self, time: float, kind: str, **data: Any) -> None:
@@ -139,10 +141,16 @@ class Executor:
             found = self._first_conflict(self.following, now, predicted)
         if math.isfinite(found) and not math.isfinite(self.conflict):
             self.log(now, "conflict", at=found)
-            self.endangered, self.ahead = now, found - now
+            self.endangered, self.ahead, self.doing = now, found - now, self._doing(now)
         if not math.isfinite(found):
             self.endangered = None
         self.conflict = found
+
+    def _doing(self, now: float) -> str:
+        """Return whether the robot is going, braking, or standing."""
+        if not self.following.start(now).moves:
+            return STANDING
+        return BRAKING if self.stop is self.following else GOING
 
     def _distance(self, now: float, predicted: Movers) -> float:
         """Return how far obstacles are from the robot, at most twice the trigger [m]."""
@@ -213,7 +221,8 @@ class Executor:
     def _answered(self, now: float, how: str) -> None:
         """Note how long after a conflict was known the command changed."""
         if self.endangered is not None:
-            self.log(now, "reaction", seconds=now - self.endangered + self.lead, how=how, ahead=self.ahead)
+            took = now - self.endangered + self.lead
+            self.log(now, "reaction", seconds=took, how=how, ahead=self.ahead, doing=self.doing)
             self.endangered = None
 
     def _answer(self, now: float, predicted: Movers, reachable: Movers | None) -> None:

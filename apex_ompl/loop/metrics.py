@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from apex_ompl.errors import ParameterError
-from apex_ompl.loop.result import Event, Outcome, RunResult
+from apex_ompl.loop.result import GOING, Event, Outcome, RunResult
 from apex_ompl.robot.model import Limits
 from apex_ompl.trajectory import Trajectory
 from apex_ompl.trajectory.rests import rests
@@ -37,7 +37,8 @@ def run_metrics(
       ``conflicts``, ``evasions`` and ``broken_assumptions``: numbers of events.
     - ``reaction_p50`` and ``reaction_p95``: percentiles of ``seconds`` of the ``reaction`` events [s]: how long after a
       conflict was first predicted, wherever on the rest of the motion, the command changed.
-    - ``near_reaction_p50`` and ``near_reaction_p95``: those of conflicts that were less than half a second ahead.
+    - ``near_reaction_p50`` and ``near_reaction_p95``: those of conflicts that were less than half a second ahead of a
+      robot on its way: where it brakes already the command has changed before, and where it stands a plan is needed.
     - ``clearance``: the one given, if it is finite [m].
     - ``duration`` [s], ``spectral_arc_length``, and ``jerk``, root mean square over time [rad/s^3], of the motion.
     - ``position_use``, ``velocity_use``, ``acceleration_use`` and ``jerk_use``: largest shares of the limits, and
@@ -80,7 +81,7 @@ def _reactions(events: Iterable[Event]) -> dict[str, float]:
         if event.kind == "reaction":
             check_number(event.data.get("seconds", float("nan")), "reaction.seconds", 0.0)
             seconds.append(float(event.data["seconds"]))
-            near += seconds[-1:] if event.data.get("ahead", np.inf) < NEAR else []
+            near += seconds[-1:] if event.data.get("ahead", np.inf) < NEAR and event.data.get("doing") == GOING else []
     found = {}
     for name, some in (("reaction", seconds), ("near_reaction", near)):
         if some:

@@ -27,6 +27,7 @@ SCHEMA = "apex-ompl/run/1"
 SUFFIXES = (".npz", ".json")
 ARCHIVE, ROLE = "run", "run file"  # name of the text in a NumPy archive, and what errors call the file
 TEXTS = ("reason", "robot", "method", "prediction", "clock")
+GOING, BRAKING, STANDING = "going", "braking", "standing"  # what a robot does when a conflict is predicted
 JSON_NAMES = {"str": "text", "list": "list", "dict": "mapping"}
 
 
