@@ -20,9 +20,9 @@ from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.tabulate import joint_specs, primitives
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError, UnknownNameError
 from apex_ompl.kernel import Kernel
-from apex_ompl.kernel.compiled.arrays import robot_view, scene_view
+from apex_ompl.kernel.compiled.arrays import BINS, robot_view, scene_view
 from apex_ompl.kernel.scene_builder import scene_tables
-from apex_ompl.kernel.tables import RobotTables
+from apex_ompl.kernel.tables import RobotTables, with_pairs
 from apex_ompl.robot import Robot, load_robot
 from apex_ompl.scene.bodies import Obstacle
 
@@ -39,7 +39,7 @@ for name in ("pinocchio", "coal", "ompl"):
 from apex_ompl.kernel import Kernel
 from apex_ompl.kernel.scene_builder import Primitive, scene_tables
 from apex_ompl.kernel.compiled.arrays import BOX
-from apex_ompl.kernel.tables import RobotTables
+from apex_ompl.kernel.tables import RobotTables, with_pairs
 at = np.eye(4)
 at[:3, 3] = {list(post.position)}
 box = Primitive(BOX, at, {tuple(e / 2 for e in post.box)})
@@ -201,3 +201,61 @@ def test_balls_of_pairs_hold_the_bodies_that_they_are_about(seed: int, name: str
                 leaves = a.node_count[nodes] == 0
                 assert (away + a.node_radius[nodes])[leaves].max() <= a.pair_outer[p, side]
     assert smaller > 0 or name == "baxter"
+
+
+def check_parts(tables: RobotTables, states: np.ndarray) -> None:
+    """The spheres of each part are inside of its balls, and parts are what clusters are made of."""
+    a, kernel = tables.arrays, Kernel(tables, scene_tables([]))
+    rotation, origin = kernel.joint_frames(states)
+    for c, (first, count) in enumerate(a.cluster_parts.tolist()):
+        members = [b for p in range(first, first + count) for b in range(a.part_bodies[p, 0], sum(a.part_bodies[p]))]
+        assert members == list(range(a.cluster_bodies[c, 0], sum(a.cluster_bodies[c])))
+        top, dof = a.cluster_joint[c], a.cluster_dof[c]
+        shares = (states[:, dof] - a.lower[dof]) / (a.upper[dof] - a.lower[dof]) if dof >= 0 else np.zeros(len(states))
+        bins = np.clip(np.floor(BINS * shares), 0, BINS - 1).astype(int)
+        for p in range(first, first + count):
+            joints = set(a.lazy[a.part_lazy[p, 0] : sum(a.part_lazy[p])].tolist())
+            balls = a.part_ball[p, bins]
+            centres = np.einsum("nij,nj->ni", rotation[:, top], balls[:, :3]) + origin[:, top]
+            for b in range(a.part_bodies[p, 0], sum(a.part_bodies[p])):
+                joint, root = a.body_joint[b], a.body_root[b]
+                assert joint == top or joint in joints
+                placed = rotation[:, joint] @ a.node_centre[root] + origin[:, joint]
+                away = np.linalg.norm(placed - centres, axis=1)
+                assert (away + a.node_radius[root] <= balls[:, 3]).all()
+                assert (away + a.node_outer[root] <= a.part_outer[p, bins]).all()
+
+
+@given(st.integers(0, 10**6))
+def test_parts_of_clusters_are_inside_of_their_balls(seed: int) -> None:
+    tables, *_ = random_robot(seed, joints=14)
+    states = np.random.default_rng(seed).uniform(tables.arrays.lower, tables.arrays.upper, (40, tables.dof))
+    states[:2] = tables.arrays.lower, tables.arrays.upper
+    check_parts(tables, states)
+
+
+def test_hands_have_parts_and_loaded_tables_one_of_each_cluster(robot: Robot, tmp_path: Path) -> None:
+    tables, rng = CollisionChecker(robot, []).kernel.robot, np.random.default_rng(0)
+    states = rng.uniform(robot.limits.lower, robot.limits.upper, (400, robot.dof))
+    states[:, -2:] = np.linspace(0.0, 1.0, 400)[:, None]
+    check_parts(tables, states)
+    hands = tables.arrays.cluster_dof >= 0
+    assert tables.arrays.cluster_parts[hands, 1].tolist() == [6, 6], "the palm and five fingers"
+    narrow = tables.arrays.part_ball[tables.arrays.cluster_parts[hands, 0][0] + 1, :, 3]
+    assert (narrow < 0.6 * tables.arrays.cluster_ball[hands, 3][0]).all()
+    tables.save(tmp_path / "robot.npz")
+    loaded = RobotTables.load(tmp_path / "robot.npz")
+    check_parts(loaded, states)
+    assert (loaded.arrays.cluster_parts[:, 1] == 1).all()
+
+
+def test_runs_of_pairs_are_the_pairs(robot: Robot) -> None:
+    a = CollisionChecker(robot, []).kernel.robot.arrays
+    chosen = np.random.default_rng(0).random(len(a.pair_common)) < 0.7
+    for arrays in (a, with_pairs(a, chosen)):
+        pairs = [
+            (one, other + k, first + k) for one, other, first, count in arrays.run_pairs.tolist() for k in range(count)
+        ]
+        assert [(one, other) for one, other, _ in pairs] == [tuple(row) for row in arrays.pair_clusters.tolist()]
+        assert [k for *_, k in pairs] == list(range(len(pairs)))
+    assert len(a.run_pairs) < len(a.pair_common) / 3

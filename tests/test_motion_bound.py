@@ -13,7 +13,7 @@ from support import states_around_home
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.kernel.compiled.arrays import robot_view
 from apex_ompl.kernel.compiled.compilation import OPTIONS, outlined
-from apex_ompl.kernel.compiled.kinematics import place_joint, place_robot
+from apex_ompl.kernel.compiled.kinematics import place_joints, place_robot
 from apex_ompl.kernel.compiled.layout import new_buffers
 from apex_ompl.kernel.compiled.motion_bound import bound_displacements, cluster_displacement, relative_displacement
 from apex_ompl.kernel.compiled.workspace import Workspace, workspace_dimensions, workspace_view
@@ -27,8 +27,7 @@ def place(ri, rf, wi, wf, q):  # type: ignore[no-untyped-def]
     t = robot_view(ri, rf)
     w = workspace_view(t, wi, wf)
     place_robot(t, w, q)
-    for j in t.lazy:
-        place_joint(t, w, q, j)
+    place_joints(t, w, q, t.lazy, 0, len(t.lazy))
 
 
 @numba.njit(**OPTIONS)

@@ -21,6 +21,7 @@ from apex_ompl.kernel.compiled.layout import Floats, Integers, new_buffers, pack
 from apex_ompl.kernel.compiled.shapes import PairBuffers, ShapeArrays
 from apex_ompl.kernel.kernel import Kernel
 from apex_ompl.kernel.scene_builder import primitive, scene_tables
+from apex_ompl.kernel.tables import with_pairs
 from apex_ompl.robot import Robot
 from apex_ompl.types import Array, Flags
 from apex_ompl.util.arrays import compact
@@ -124,11 +125,7 @@ class PathProof:
 def obstacles_alone(kernel: Kernel, chosen: Flags) -> Kernel:
     """Return a kernel that checks a robot against some obstacles, shape (obstacles,), and not against itself."""
     bodies, scene = kernel.robot.arrays, kernel.scene.arrays
-    bodies = bodies._replace(
-        pair_clusters=bodies.pair_clusters[:0], pair_common=bodies.pair_common[:0], pair_bodies=bodies.pair_bodies[:0],
-        pair_ball=bodies.pair_ball[:0], pair_outer=bodies.pair_outer[:0],
-    )  # fmt: skip
-    robot = replace(kernel.robot, arrays=bodies)
+    robot = replace(kernel.robot, arrays=with_pairs(bodies, np.zeros(len(bodies.pair_common), bool)))
     solids = [(int(scene.owner[k]), primitive(kernel.scene, int(k))) for k in np.flatnonzero(chosen)]
     tables = scene_tables(solids)
     return Kernel(robot, replace(tables, arrays=tables.arrays._replace(allowed=scene.allowed)))

@@ -1,4 +1,4 @@
-"""Balls around clusters of bodies for all values of their inner joints, and around the leaves of covers."""
+"""Balls around clusters of bodies and their parts for values of their inner joints, and around the leaves of covers."""
 
 from __future__ import annotations
 
@@ -7,11 +7,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from apex_ompl.kernel.compiled.arrays import PRISMATIC, REVOLUTE
+from apex_ompl.kernel.compiled.arrays import BINS, LIMIT_SLACK, PRISMATIC, REVOLUTE
 from apex_ompl.kernel.robot_specs import BodySpec, JointSpec
 from apex_ompl.types import Array
 
 SAMPLES = 65  # values of a cluster's inner joint at which its ball is made
+OF_BIN = (SAMPLES - 1) // BINS  # steps between them in a range of values
 
 
 class ClusterBall(NamedTuple):
@@ -71,10 +72,7 @@ def cluster_ball(
     """
     low, high = limits or (0.0, 0.0)
     values = np.zeros(1) if limits is None else np.linspace(low, high, SAMPLES)
-    poses = {top: np.tile(np.eye(4), (len(values), 1, 1))}
-    for k in inner:
-        poses[k] = poses[joints[k].parent] @ placements[k] @ _motions(joints[k], values)
-    points = np.concatenate([transformed(poses[m.joint], m.centres) for m in members], axis=1)
+    points = _points(members, top, inner, joints, placements, values)
     radii = np.concatenate([m.radii for m in members])
     roots = np.concatenate([np.arange(len(m.radii)) == 0 for m in members])
     speeds = np.concatenate([_speed(m, top, joints, placements, (low, high)) for m in members])
@@ -87,6 +85,48 @@ def cluster_ball(
         centre, float((away + radii)[roots].max()) + 1e-9, float((away + leaves)[roots].max()) + 1e-9,
         float(away.max()) + 1e-9, float(speeds.max()),
     )  # fmt: skip
+
+
+def part_balls(
+    members: Sequence[Member],
+    top: int,
+    inner: Sequence[int],
+    joints: Sequence[JointSpec],
+    placements: Sequence[Array],
+    limits: tuple[float, float] | None,
+) -> tuple[Array, Array]:
+    """Return balls around a part of a cluster for each of BINS ranges of values, from the lowest limit to the highest.
+
+    Args are those of :func:`cluster_ball`; the limits are the robot's own, and hold within LIMIT_SLACK.
+
+    Returns:
+        Centres and radii around the solids, shape (BINS, 4), and radii around the leaf spheres, shape (BINS,) [m].
+    """
+    low, high = limits or (0.0, 0.0)
+    points = _points(
+        [m._replace(centres=m.centres[:1]) for m in members], top, inner, joints, placements,
+        np.linspace(low, high, SAMPLES),
+    )  # fmt: skip
+    speeds = np.concatenate([_speed(m, top, joints, placements, (low, high))[:1] for m in members])
+    slack = speeds * ((high - low) / (SAMPLES - 1) / 2.0 + LIMIT_SLACK)
+    rows = OF_BIN * np.arange(BINS)[:, None] + np.arange(OF_BIN + 1)
+    within = points[rows]  # (BINS, OF_BIN + 1, bodies, 3)
+    radii, leaves = (np.array([getattr(m, name)[0] for m in members]) for name in ("radii", "outer"))
+    wide = (radii + slack)[:, None]
+    centre = 0.5 * ((within - wide).min(axis=(1, 2)) + (within + wide).max(axis=(1, 2)))
+    away = np.linalg.norm(within - centre[:, None, None], axis=3).max(axis=1) + slack
+    return np.column_stack([centre, (away + radii).max(axis=1) + 1e-9]), (away + leaves).max(axis=1) + 1e-9
+
+
+def _points(
+    members: Sequence[Member], top: int, inner: Sequence[int], joints: Sequence[JointSpec],
+    placements: Sequence[Array], values: Array,
+) -> Array:  # fmt: skip
+    """Return the centres of all spheres at values of the inner joints, in the frame of the cluster's, (N, n, 3)."""
+    poses = {top: np.tile(np.eye(4), (len(values), 1, 1))}
+    for k in inner:
+        poses[k] = poses[joints[k].parent] @ placements[k] @ _motions(joints[k], values)
+    return np.concatenate([transformed(poses[m.joint], m.centres) for m in members], axis=1)
 
 
 def _speed(

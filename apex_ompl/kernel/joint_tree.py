@@ -7,12 +7,13 @@ from typing import TypeVar, cast
 
 import numpy as np
 
-from apex_ompl.kernel.cluster_balls import ClusterBall, Member, cluster_ball, leaf_radii
+from apex_ompl.kernel.cluster_balls import ClusterBall, Member, cluster_ball, leaf_radii, part_balls
 from apex_ompl.kernel.compiled.arrays import FIXED
 from apex_ompl.kernel.robot_specs import BodySpec, JointSpec
 from apex_ompl.types import Array
 
 MOST_KEPT = 2000  # balls and radii
+MOST_PARTS = 62  # of a cluster: bits of a number
 
 T = TypeVar("T")
 
@@ -68,6 +69,20 @@ class JointTree:
         content = tuple((m.joint, m.centres.tobytes(), m.radii.tobytes(), m.outer.tobytes()) for m in members)
         key = top, tuple(inner), limits, content
         return self._kept(key, lambda: cluster_ball(members, top, inner, self.joints, self.placements, limits))
+
+    def part_balls(
+        self, members: Sequence[Member], top: int, inner: Sequence[int], limits: tuple[float, float] | None
+    ) -> tuple[Array, Array]:
+        """Return the balls of :func:`apex_ompl.kernel.cluster_balls.part_balls`; they are kept."""
+        content = tuple((m.joint, *(array[:1].tobytes() for array in m[1:])) for m in members)
+        key = "part", top, tuple(inner), limits, content
+        return self._kept(key, lambda: part_balls(members, top, inner, self.joints, self.placements, limits))
+
+    def branch(self, joint: int, top: int) -> int:
+        """Return the joint below ``top`` that a joint is or hangs at; ``top`` itself, too, where there are many."""
+        chain = self.chains[joint]
+        below = sum(one.parent == top for one in self.joints[1:])
+        return top if below >= MOST_PARTS else chain[max(chain.index(top) - 1, 0)]
 
     def outer_radii(self, centres: Array, body: BodySpec) -> Array:
         """Return the radii of :func:`apex_ompl.kernel.cluster_balls.leaf_radii`, shape (n,); they are kept."""

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apex_ompl.kernel.cluster_balls import ClusterBall, Member, transformed
-from apex_ompl.kernel.compiled.arrays import FIXED, LIMIT_SLACK, RobotArrays
+from apex_ompl.kernel.compiled.arrays import BINS, FIXED, LIMIT_SLACK, RobotArrays
 from apex_ompl.kernel.joint_tree import JointTree
 from apex_ompl.kernel.robot_specs import BodySpec
-from apex_ompl.kernel.tables import RobotTables
+from apex_ompl.kernel.tables import RobotTables, pair_runs
 from apex_ompl.types import Array
 
 PairRow = tuple[tuple[int, int], int, list[tuple[int, int]]]
@@ -52,7 +52,8 @@ class _Builder:
         self.tree, self.lower, self.upper = tree, lower, upper
         keys = [self._key(b, k) for k, b in enumerate(bodies)]
         self.clusters = sorted(set(keys))
-        order = sorted(range(len(bodies)), key=lambda b: (self.clusters.index(keys[b]), b))
+        branches = [tree.branch(b.joint, tree.home[b.joint]) for b in bodies]
+        order = sorted(range(len(bodies)), key=lambda b: (self.clusters.index(keys[b]), branches[b], b))
         self.number = {b: k for k, b in enumerate(order)}  # body as given -> row
         self.bodies = [bodies[b] for b in order]
         self.cluster_of = [self.clusters.index(keys[b]) for b in order]
@@ -64,7 +65,11 @@ class _Builder:
             np.column_stack([transformed(frame, b.inner[:, :3]), b.inner[:, 3]])
             for frame, b in zip(frames, self.bodies, strict=True)
         ]
-        self.lazy = [tree.inner(j) for j, _ in self.clusters]
+        self.lazy = [
+            [k for _, k in sorted((tree.branch(k, top), k) for k in tree.inner(top))] for top, _ in self.clusters
+        ]
+        self.branch_of = [branches[b] for b in order]
+        self.parts = list(dict.fromkeys(zip(self.cluster_of, self.branch_of, strict=True)))
 
     def _key(self, body: BodySpec, number: int) -> tuple[int, int]:
         """Return the key of a body's cluster: the joint, and whether it meets the scene; each fixed body is its own."""
@@ -83,6 +88,7 @@ class _Builder:
         balls = [self._ball(c, outer) for c in range(len(self.clusters))]
         pair_rows = self._pairs(pairs)
         pair_balls = self._pair_balls(pair_rows, balls, outer)
+        parts = [self._part_balls(*part, outer) for part in self.parts]
         arrays = RobotArrays(
             joint_parent=_ints([j.parent for j in joints]),
             joint_kind=_ints([j.kind for j in joints]),
@@ -94,6 +100,9 @@ class _Builder:
             cluster_dof=_ints([self._dof(c) for c in range(len(self.clusters))]),
             cluster_bodies=_spans([self.cluster_of.count(c) for c in range(len(self.clusters))]),
             cluster_meets_scene=_ints([bodies[self.cluster_of.index(c)].meets_scene for c in range(len(balls))]),
+            cluster_parts=_spans([sum(c == k for c, _ in self.parts) for k in range(len(self.clusters))]),
+            part_lazy=_ints([self._part_joints(*part) for part in self.parts]).reshape(-1, 2),
+            part_bodies=_spans([sum(two == part for two in self._body_parts()) for part in self.parts]),
             body_joint=_ints([b.joint for b in bodies]),
             body_root=_ints(starts[:-1]),
             node_first=_ints([start + k for b, start in zip(bodies, starts, strict=False) for k in b.first]),
@@ -110,6 +119,8 @@ class _Builder:
             upper=np.array(self.upper, float),
             cluster_ball=np.array([[*ball.centre, ball.radius] for ball in balls]).reshape(-1, 4),
             cluster_outer=np.array([ball.outer for ball in balls]),
+            part_ball=np.array([ball for ball, _ in parts]).reshape(-1, BINS, 4),
+            part_outer=np.array([leaves for _, leaves in parts]).reshape(-1, BINS),
             cluster_spread=np.array([ball.spread for ball in balls]),
             cluster_speed=np.array([ball.speed for ball in balls]),
             node_centre=np.concatenate([np.empty((0, 3)), *self.centres]),
@@ -119,6 +130,8 @@ class _Builder:
             inner_ball=np.concatenate([np.empty((0, 4)), *self.inner]),
             pair_ball=np.array([[[*b.centre, b.radius] for b in two] for two in pair_balls]).reshape(-1, 2, 4),
             pair_outer=np.array([[b.outer for b in two] for two in pair_balls]).reshape(-1, 2),
+            pair_parts=_ints([self._pair_parts(*row) for row in pair_rows]).reshape(-1, 2),
+            run_pairs=pair_runs(_ints([key for key, _, _ in pair_rows]).reshape(-1, 2)),
         )
         return RobotTables(name, joint_names, tuple(b.name for b in bodies), tuple(numbers[b] for b in rows), arrays)
 
@@ -159,14 +172,43 @@ class _Builder:
             found.append(two)
         return found
 
-    def _ball(self, cluster: int, outer: Sequence[Array], some: frozenset[int] | None = None) -> ClusterBall:
-        """Return the ball around a cluster, or some bodies of it."""
-        members = [
+    def _body_parts(self) -> list[tuple[int, int]]:
+        """Return cluster and branch of each body."""
+        return list(zip(self.cluster_of, self.branch_of, strict=True))
+
+    def _pair_parts(self, clusters: tuple[int, int], _: int, members: list[tuple[int, int]]) -> list[int]:
+        """Return the bits of the parts of two clusters that a pair is about."""
+        found, of = [], self._body_parts()
+        for cluster, rows in zip(clusters, zip(*members, strict=True), strict=True):
+            parts = [part for part in self.parts if part[0] == cluster]
+            found.append(sum(1 << parts.index(part) for part in {of[b] for b in rows}))
+        return found
+
+    def _part_joints(self, cluster: int, branch: int) -> tuple[int, int]:
+        """Return the first of a part's joints among the lazy ones, and their number."""
+        before = sum(len(ks) for ks in self.lazy[:cluster])
+        of = [self.tree.branch(k, self.clusters[cluster][0]) for k in self.lazy[cluster]]
+        return (before + of.index(branch), of.count(branch)) if branch in of else (before, 0)
+
+    def _part_balls(self, cluster: int, branch: int, outer: Sequence[Array]) -> tuple[Array, Array]:
+        """Return the balls around a part."""
+        some = frozenset(k for k, part in enumerate(self._body_parts()) if part == (cluster, branch))
+        dof = self._dof(cluster)
+        limits = None if dof < 0 else (float(self.lower[dof]), float(self.upper[dof]))
+        joints = [k for k in self.lazy[cluster] if self.tree.branch(k, self.clusters[cluster][0]) == branch]
+        return self.tree.part_balls(self._members(cluster, outer, some), self.clusters[cluster][0], joints, limits)
+
+    def _members(self, cluster: int, outer: Sequence[Array], some: frozenset[int] | None) -> list[Member]:
+        """Return the bodies of a cluster, or some of them."""
+        return [
             Member(b.joint, self.centres[k], np.asarray(b.radii, float), outer[k])
             for k, b in enumerate(self.bodies)
             if self.cluster_of[k] == cluster and (some is None or k in some)
         ]
-        dof = self._dof(cluster)
+
+    def _ball(self, cluster: int, outer: Sequence[Array], some: frozenset[int] | None = None) -> ClusterBall:
+        """Return the ball around a cluster, or some bodies of it."""
+        members, dof = self._members(cluster, outer, some), self._dof(cluster)
         limits = None if dof < 0 else (float(self.lower[dof]) - LIMIT_SLACK, float(self.upper[dof]) + LIMIT_SLACK)
         return self.tree.ball(members, self.clusters[cluster][0], self.lazy[cluster], limits)
 

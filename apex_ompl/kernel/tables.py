@@ -13,16 +13,37 @@ from typing import Any
 import numpy as np
 
 from apex_ompl.errors import FileFormatError, MissingFileError, UnknownNameError
-from apex_ompl.kernel.compiled.arrays import RobotArrays, SceneArrays
+from apex_ompl.kernel.compiled.arrays import BINS, RUN, RobotArrays, SceneArrays
 from apex_ompl.kernel.compiled.layout import Floats, Integers, layout, pack
 from apex_ompl.kernel.distance_grid import DistanceGrid
 from apex_ompl.kernel.table_checks import head_fault, robot_fault
+from apex_ompl.types import Flags
 from apex_ompl.util.files import is_file, write_atomically
 from apex_ompl.util.validation import check_indices
 
 SCHEMA = "apex-ompl/kernel-tables/1"
-MADE = {"body_inner", "inner_ball", "pair_ball", "pair_outer"}  # which make the checks faster, and are not stored
+PAIRS = ("pair_clusters", "pair_common", "pair_bodies", "pair_ball", "pair_outer", "pair_parts")
+PARTS = ("cluster_parts", "part_lazy", "part_bodies", "part_ball", "part_outer")
+MADE = {"body_inner", "inner_ball", "pair_ball", "pair_outer", "pair_parts", "run_pairs", *PARTS}
+"""Arrays that make checks faster, and are not stored."""
 STORED = tuple(name for name in RobotArrays._fields if name not in MADE)
+
+
+def pair_runs(pairs: Integers) -> Integers:
+    """Return ``RobotArrays.run_pairs`` of pairs of clusters, shape (P, 2)."""
+    runs: list[list[int]] = []
+    for k, (a, b) in enumerate(pairs.tolist()):
+        if runs and runs[-1][0] == a and runs[-1][1] + runs[-1][3] == b and runs[-1][3] < RUN:
+            runs[-1][3] += 1
+        else:
+            runs.append([a, b, k, 1])
+    return np.array(runs, np.int64).reshape(-1, 4)
+
+
+def with_pairs(arrays: RobotArrays, chosen: Flags) -> RobotArrays:
+    """Return arrays of a robot with some of its pairs of clusters, shape (P,), alone."""
+    kept = {name: getattr(arrays, name)[chosen] for name in RobotArrays._fields if name in PAIRS}
+    return arrays._replace(**kept, run_pairs=pair_runs(arrays.pair_clusters[chosen]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,14 +97,7 @@ class RobotTables:
         clusters = [movers[j] | own for j, own in zip(a.cluster_joint, inner, strict=True)]
         meets = [bool(m) and bool(c) and c <= mine for m, c in zip(a.cluster_meets_scene, clusters, strict=True)]
         pairs = [bool(both) and both <= mine for both in (clusters[c] | clusters[d] for c, d in a.pair_clusters)]
-        arrays = a._replace(
-            cluster_meets_scene=np.array(meets, np.int64),
-            pair_clusters=a.pair_clusters[pairs],
-            pair_common=a.pair_common[pairs],
-            pair_bodies=a.pair_bodies[pairs],
-            pair_ball=a.pair_ball[pairs],
-            pair_outer=a.pair_outer[pairs],
-        )
+        arrays = with_pairs(a, np.array(pairs, bool))._replace(cluster_meets_scene=np.array(meets, np.int64))
         return RobotTables(self.name, self.joint_names, self.body_names, self.numbers, arrays)
 
     def without_pair(self, first: str, second: str) -> RobotTables:
@@ -142,6 +156,15 @@ class RobotTables:
         arrays["inner_ball"] = np.empty((0, 4))
         pairs = len(arrays["pair_clusters"])
         arrays |= {"pair_ball": np.zeros((pairs, 2, 4)), "pair_outer": np.zeros((pairs, 2))}
+        arrays |= {"pair_parts": np.ones((pairs, 2), np.int64), "run_pairs": np.empty((0, 4), np.int64)}
+        clusters = np.arange(len(arrays["cluster_joint"]))
+        arrays |= {
+            "cluster_parts": np.stack([clusters, np.ones_like(clusters)], axis=1),
+            "part_lazy": arrays["cluster_lazy"],
+            "part_bodies": arrays["cluster_bodies"],
+            "part_ball": np.repeat(arrays["cluster_ball"][:, None], BINS, axis=1),
+            "part_outer": np.repeat(arrays["cluster_outer"][:, None], BINS, axis=1),
+        }
         found = head.get("schema") if isinstance(head, dict) else head
         if found != SCHEMA:
             raise FileFormatError(str(path), "schema", found, f"expected {SCHEMA!r}")
@@ -158,6 +181,7 @@ class RobotTables:
         joints, bodies, numbers = (tuple(head[key]) for key in ("joints", "bodies", "numbers"))
         clusters = arrays["pair_clusters"]
         arrays |= {"pair_ball": arrays["cluster_ball"][clusters], "pair_outer": arrays["cluster_outer"][clusters]}
+        arrays["run_pairs"] = pair_runs(clusters)
         return cls(head["name"], joints, bodies, numbers, RobotArrays(**arrays))
 
 

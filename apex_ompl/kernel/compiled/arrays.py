@@ -15,6 +15,8 @@ FIXED, REVOLUTE, PRISMATIC = 0, 1, 2
 BOX, SPHERE, CYLINDER, CAPSULE, HALF_SPACE = range(5)
 GRID_ROW = 8  # numbers of a grid's row
 GRID = 6  # of distances; 5 is a hull, among the exact shapes
+RUN = 8  # pairs that are looked at together
+BINS = 16  # ranges of values of an inner joint that have balls of their own
 LIMIT_SLACK = 1e-9  # by which clusters' balls hold beyond the limits: motions are bounded with rounding [rad]
 
 Pairs = Annotated[Integers, 2]
@@ -25,7 +27,7 @@ Balls = Annotated[Floats, 4]  # centre and radius
 
 
 class RobotArrays(NamedTuple):
-    """Arrays of a robot: J joints (0 is the world), C clusters, B bodies, N spheres, P pairs of clusters.
+    """Arrays of a robot: J joints (0 is the world), C clusters, B bodies, N spheres, P pairs of clusters, Q parts.
 
     Joints come after their parents. ``joint_rotation`` and ``joint_offset`` place a joint in its parent; its value is
     ``joint_ratio * q[joint_source] + joint_shift`` (mimic joints share a source), about or along z. ``eager`` joints
@@ -37,13 +39,20 @@ class RobotArrays(NamedTuple):
     ``cluster_spread`` the largest distance of a sphere's centre from the ball's, ``cluster_speed`` the largest speed
     of such a centre in that frame, per unit of ``q[cluster_dof]``.
 
+    A cluster is made of parts, ``cluster_parts``: the bodies that are fixed to its joint, and each finger.
+    ``part_ball`` and ``part_outer`` are what ``cluster_ball`` and ``cluster_outer`` are, around a part alone, for each
+    of BINS ranges of equal length of values of ``q[cluster_dof]``. ``part_lazy`` are the inner joints of a part,
+    ``part_bodies`` its bodies.
+
     A node is a sphere (``node_centre`` in the frame of its body's joint, ``node_radius``) around the part of the solid
     that the leaves below cover; ``node_outer`` is a radius around the leaves themselves. ``body_inner`` says which of
     ``inner_ball`` are inside of a body's solid, in the frame of its joint.
 
     ``pair_ball`` holds, for both clusters of a pair, what ``cluster_ball`` does, around the bodies alone that the pair
     is about, ``pair_outer`` the radius around their leaf spheres: fingers are checked against a wrist, the palm, which
-    is fixed to it, is not.
+    is fixed to it, is not. ``pair_parts`` has a bit for each part of these clusters that the pair is about.
+    ``run_pairs`` are runs of at most RUN pairs of a cluster with others that follow each other: that cluster, the first
+    of the others, the first pair, and their number.
     """
 
     joint_parent: Integers
@@ -56,6 +65,9 @@ class RobotArrays(NamedTuple):
     cluster_dof: Integers
     cluster_bodies: Spans
     cluster_meets_scene: Integers
+    cluster_parts: Spans
+    part_lazy: Spans
+    part_bodies: Spans
     body_joint: Integers
     body_root: Integers
     node_first: Integers
@@ -72,6 +84,8 @@ class RobotArrays(NamedTuple):
     upper: Floats
     cluster_ball: Balls
     cluster_outer: Floats
+    part_ball: Annotated[Floats, BINS, 4]
+    part_outer: Annotated[Floats, BINS]
     cluster_spread: Floats
     cluster_speed: Floats
     node_centre: Vectors
@@ -81,6 +95,8 @@ class RobotArrays(NamedTuple):
     inner_ball: Balls
     pair_ball: Annotated[Floats, 2, 4]
     pair_outer: Annotated[Floats, 2]
+    pair_parts: Pairs
+    run_pairs: Annotated[Integers, 4]
 
 
 class SceneArrays(NamedTuple):

@@ -11,7 +11,14 @@ import math
 
 from apex_ompl.kernel.compiled.arrays import FIXED, REVOLUTE, RobotArrays, SceneArrays
 from apex_ompl.kernel.compiled.compilation import inlined
-from apex_ompl.kernel.compiled.kinematics import mark_pair, node_position, place_cluster
+from apex_ompl.kernel.compiled.kinematics import (
+    bin_of,
+    mark_pair,
+    node_position,
+    place_cluster,
+    place_part,
+    point_position,
+)
 from apex_ompl.kernel.compiled.layout import Floats
 from apex_ompl.kernel.compiled.scene_tree import is_allowed, next_obstacles
 from apex_ompl.kernel.compiled.signed_distance import direction, distance
@@ -19,6 +26,26 @@ from apex_ompl.kernel.compiled.workspace import Workspace
 
 Nearest = tuple[float, int, int, int, int]
 """Signed distance [m], a body and a leaf of it, then an obstacle and 0, or another body and a leaf; -1 for none."""
+
+
+@inlined
+def nearest_leaf(t: RobotArrays, s: SceneArrays, w: Workspace, b: int, o: int, slack: float, best: Nearest) -> Nearest:
+    """Return the nearer of ``best`` and the leaf of a body that is nearest to an obstacle."""
+    j, top = t.body_joint[b], 0 if is_allowed(s, b, o) else 1
+    w.stack[0] = t.body_root[b]
+    while top > 0:
+        top -= 1
+        n = w.stack[top]
+        x, y, z = node_position(t, w, j, n)
+        d = distance(s, o, x, y, z, best[0] + t.node_outer[n] + slack)
+        if d - t.node_outer[n] >= best[0]:
+            continue
+        if t.node_count[n] == 0:
+            best = (d - t.node_radius[n], b, n, o, 0)
+        for k in range(t.node_first[n], t.node_first[n] + t.node_count[n]):
+            w.stack[top] = k
+            top += 1
+    return best
 
 
 @inlined
@@ -31,23 +58,16 @@ def nearest_to_obstacle(
     outer = t.cluster_outer[c]
     if distance(s, o, w.ball[c, 0], w.ball[c, 1], w.ball[c, 2], best[0] + outer + slack) - outer >= best[0]:
         return best
-    place_cluster(t, w, q, c)
-    first = t.cluster_bodies[c, 0]
-    for b in range(first, first + t.cluster_bodies[c, 1]):
-        j, top = t.body_joint[b], 0 if is_allowed(s, b, o) else 1
-        w.stack[0] = t.body_root[b]
-        while top > 0:
-            top -= 1
-            n = w.stack[top]
-            x, y, z = node_position(t, w, j, n)
-            d = distance(s, o, x, y, z, best[0] + t.node_outer[n] + slack)
-            if d - t.node_outer[n] >= best[0]:
+    first, several, bin_ = t.cluster_parts[c, 0], t.cluster_parts[c, 1] > 1, bin_of(t, q, c)
+    for p in range(first, first + t.cluster_parts[c, 1]):
+        if several:
+            outer = t.part_outer[p, bin_]
+            x, y, z = point_position(w, t.cluster_joint[c], t.part_ball[p, bin_])
+            if distance(s, o, x, y, z, best[0] + outer + slack) - outer >= best[0]:
                 continue
-            if t.node_count[n] == 0:
-                best = (d - t.node_radius[n], b, n, o, 0)
-            for k in range(t.node_first[n], t.node_first[n] + t.node_count[n]):
-                w.stack[top] = k
-                top += 1
+        place_part(t, w, q, p)
+        for b in range(t.part_bodies[p, 0], t.part_bodies[p, 0] + t.part_bodies[p, 1]):
+            best = nearest_leaf(t, s, w, b, o, slack, best)
     return best
 
 
@@ -83,8 +103,9 @@ def nearest_bodies(t: RobotArrays, w: Workspace, q: Floats, limit: float) -> Nea
         marked = a != b and best[0] < math.inf
         if marked and not mark_pair(t, w, q, True, p, best[0]):
             continue
-        place_cluster(t, w, q, a)
-        place_cluster(t, w, q, b)
+        if not marked:
+            place_cluster(t, w, q, a)
+            place_cluster(t, w, q, b)
         first = t.pair_bodies[p, 0]
         for k in range(first, first + t.pair_bodies[p, 1]):
             m, n = t.bodies[k, 0], t.bodies[k, 1]

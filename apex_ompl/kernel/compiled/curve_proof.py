@@ -15,7 +15,7 @@ from typing import Annotated, NamedTuple
 from apex_ompl.kernel.compiled.arrays import RobotArrays, SceneArrays, robot_view, scene_view
 from apex_ompl.kernel.compiled.compilation import entry_point, inlined
 from apex_ompl.kernel.compiled.curve import set_motion, set_state
-from apex_ompl.kernel.compiled.kinematics import place_cluster, place_robot
+from apex_ompl.kernel.compiled.kinematics import place_part, place_robot
 from apex_ompl.kernel.compiled.layout import Floats, Integers, Singles, buffer_view
 from apex_ompl.kernel.compiled.motion_bound import bound_displacements
 from apex_ompl.kernel.compiled.pair_distance import pair_bound
@@ -78,12 +78,12 @@ def _record(p: ProofBuffers, distance: float, where: float, a: int, b: int, tole
 
 
 @inlined
-def _place_clusters(t: RobotArrays, w: Workspace, q: Floats, a: int, b: int) -> None:
-    """Place the clusters of body ``a`` and, if it is one, of body ``b``."""
-    for c in range(len(t.cluster_bodies)):
-        first, count = t.cluster_bodies[c, 0], t.cluster_bodies[c, 1]
+def _place_parts(t: RobotArrays, w: Workspace, q: Floats, a: int, b: int) -> None:
+    """Place the parts of clusters that body ``a`` and, if it is one, body ``b`` belong to."""
+    for p in range(len(t.part_bodies)):
+        first, count = t.part_bodies[p, 0], t.part_bodies[p, 1]
         if first <= a < first + count or first <= b < first + count:
-            place_cluster(t, w, q, c)
+            place_part(t, w, q, p)
 
 
 @inlined
@@ -166,7 +166,7 @@ def _by_shapes(
         x, y = p.found[m, 0], p.found[m, 1]
         if m > 0 and p.found[m - 1, 0] == x and p.found[m - 1, 1] == y:
             continue
-        _place_clusters(t, w, p.state, x, y)
+        _place_parts(t, w, p.state, x, y)
         bound, upper = _bound(f, h, rows, g, x, y, p.figures[MARGIN])
         _record(p, upper, middle, x, y, tolerance)
         if upper <= touch:

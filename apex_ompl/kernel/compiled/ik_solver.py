@@ -8,7 +8,7 @@ from typing import Annotated, NamedTuple
 from apex_ompl.kernel.compiled.arrays import RobotArrays, robot_view
 from apex_ompl.kernel.compiled.compilation import entry_point, inlined
 from apex_ompl.kernel.compiled.ik_targets import TargetArrays, linearize, targets_view
-from apex_ompl.kernel.compiled.kinematics import place_joint
+from apex_ompl.kernel.compiled.kinematics import place_joints
 from apex_ompl.kernel.compiled.layout import Floats, Integers, buffer_sizes, buffer_view
 from apex_ompl.kernel.compiled.workspace import Workspace, workspace_view
 
@@ -51,8 +51,7 @@ def _normal_equations(
     gram: Floats, gradient: Floats,
 ) -> float:  # fmt: skip
     """Put J^T J (lower half) and J^T r of all targets into ``gram`` (n, n) and ``gradient`` (n,); return |r|."""
-    for j in chain:
-        place_joint(t, w, q, j)
+    place_joints(t, w, q, chain, 0, len(chain))
     n = len(free)
     for i in range(n):
         gradient[i] = 0.0
@@ -178,8 +177,7 @@ def residual_and_jacobian(
     t, targets = robot_view(ri, rf), targets_view(ti, tf)
     w = workspace_view(t, wi, wf)
     b = _buffers(bi, bf, len(q), 0)
-    for j in chain:
-        place_joint(t, w, q, j)
+    place_joints(t, w, q, chain, 0, len(chain))
     at = 0
     for m in range(len(targets.kind)):
         count = linearize(t, w, targets, m, b.residual, b.jacobian)

@@ -32,11 +32,11 @@ from apex_ompl.kernel.compiled.arrays import (
 from apex_ompl.kernel.compiled.clearance import Nearest, gradient_to_obstacle, nearest_to_obstacle
 from apex_ompl.kernel.compiled.compilation import entry_point, inlined, ir_inlined
 from apex_ompl.kernel.compiled.curve import set_motion, set_state
-from apex_ompl.kernel.compiled.kinematics import node_position, place_cluster, place_robot
+from apex_ompl.kernel.compiled.kinematics import bin_of, node_position, place_part, place_robot
 from apex_ompl.kernel.compiled.layout import Floats, Integers, Singles, table_view
 from apex_ompl.kernel.compiled.motion_bound import bound_displacements
 from apex_ompl.kernel.compiled.scene_tree import is_allowed
-from apex_ompl.kernel.compiled.separation import body_clear, tables_hold
+from apex_ompl.kernel.compiled.separation import body_clear, part_clear, tables_hold
 from apex_ompl.kernel.compiled.signed_distance import apart, direction
 from apex_ompl.kernel.compiled.workspace import Workspace, workspace_view
 
@@ -113,13 +113,16 @@ def _cluster_clear(t: RobotArrays, s: SceneArrays, w: Workspace, q: Floats, c: i
     # Every comparison is of the form "distance > bound", which is false for NaN.
     if apart(s, o, w.ball[c, 0], w.ball[c, 1], w.ball[c, 2], t.cluster_ball[c, 3] + shift):
         return -1
-    place_cluster(t, w, q, c)
-    first = t.cluster_bodies[c, 0]
-    for b in range(first, first + t.cluster_bodies[c, 1]):
-        if apart(s, o, w.root[b, 0], w.root[b, 1], w.root[b, 2], t.node_radius[t.body_root[b]] + shift):
+    first, k = t.cluster_parts[c, 0], bin_of(t, q, c)
+    for p in range(first, first + t.cluster_parts[c, 1]):
+        if part_clear(t, s, w, c, p, k, o, shift):
             continue
-        if not body_clear(t, s, w, b, o, shift) and not is_allowed(s, b, o):
-            return int(b)
+        place_part(t, w, q, p)
+        for b in range(t.part_bodies[p, 0], t.part_bodies[p, 0] + t.part_bodies[p, 1]):
+            if apart(s, o, w.root[b, 0], w.root[b, 1], w.root[b, 2], t.node_radius[t.body_root[b]] + shift):
+                continue
+            if not body_clear(t, s, w, b, o, shift) and not is_allowed(s, b, o):
+                return int(b)
     return -1
 
 

@@ -15,7 +15,7 @@ from apex_ompl.kernel.compiled.clearance import (
     nearest_obstacle,
 )
 from apex_ompl.kernel.compiled.compilation import entry_point
-from apex_ompl.kernel.compiled.kinematics import place_joint, place_robot
+from apex_ompl.kernel.compiled.kinematics import place_joints, place_robot
 from apex_ompl.kernel.compiled.layout import Floats, Integers, Singles
 from apex_ompl.kernel.compiled.separation import tables_hold, unproved_at_state
 from apex_ompl.kernel.compiled.workspace import workspace_view
@@ -79,8 +79,7 @@ def joint_frames(
     w = workspace_view(t, wi, wf)
     for k in range(len(states)):
         place_robot(t, w, states[k])
-        for j in t.lazy:
-            place_joint(t, w, states[k], j)
+        place_joints(t, w, states[k], t.lazy, 0, len(t.lazy))
         for j in range(len(t.joint_parent)):
             for i in range(3):
                 origin[k, j, i] = w.origin[j, i]

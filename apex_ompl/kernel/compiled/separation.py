@@ -9,9 +9,17 @@ from __future__ import annotations
 
 import math
 
-from apex_ompl.kernel.compiled.arrays import LIMIT_SLACK, RobotArrays, SceneArrays
+from apex_ompl.kernel.compiled.arrays import LIMIT_SLACK, RUN, RobotArrays, SceneArrays
 from apex_ompl.kernel.compiled.compilation import inlined
-from apex_ompl.kernel.compiled.kinematics import mark_pair, node_position, place_cluster, place_robot
+from apex_ompl.kernel.compiled.kinematics import (
+    bin_of,
+    mark_pair,
+    node_position,
+    place_cluster,
+    place_part,
+    place_robot,
+    point_position,
+)
 from apex_ompl.kernel.compiled.layout import Floats, Integers
 from apex_ompl.kernel.compiled.motion_bound import cluster_displacement, relative_displacement
 from apex_ompl.kernel.compiled.penetration import collides
@@ -20,6 +28,7 @@ from apex_ompl.kernel.compiled.signed_distance import apart, ball_apart
 from apex_ompl.kernel.compiled.workspace import Workspace
 
 UNKNOWN, COLLIDES = -1, -2  # in place of the number of pairs at a state
+EVERY = (1 << RUN) - 1  # pairs of a run, as bits
 
 # Every comparison is of the form "distance > bound", which is false for NaN: such a state is never proved free.
 
@@ -73,6 +82,15 @@ def bodies_clear(t: RobotArrays, w: Workspace, a: int, b: int, shift: float) -> 
 
 
 @inlined
+def part_clear(t: RobotArrays, s: SceneArrays, w: Workspace, c: int, p: int, k: int, o: int, shift: float) -> bool:
+    """Whether part ``p`` of cluster ``c``, of several, is apart from an obstacle by its ball of range ``k``."""
+    if t.cluster_parts[c, 1] == 1:
+        return False
+    x, y, z = point_position(w, t.cluster_joint[c], t.part_ball[p, k])
+    return apart(s, o, x, y, z, t.part_ball[p, k, 3] + shift)
+
+
+@inlined
 def cluster_against(
     t: RobotArrays, s: SceneArrays, w: Workspace, q: Floats, c: int, o: int, found: Integers, count: int
 ) -> int:
@@ -81,17 +99,20 @@ def cluster_against(
     reach = t.cluster_ball[c, 3] + shift
     if apart(s, o, w.ball[c, 0], w.ball[c, 1], w.ball[c, 2], reach):
         return count
-    place_cluster(t, w, q, c)
-    first = t.cluster_bodies[c, 0]
-    for b in range(first, first + t.cluster_bodies[c, 1]):
-        reach = t.node_radius[t.body_root[b]] + shift
-        if apart(s, o, w.root[b, 0], w.root[b, 1], w.root[b, 2], reach):
+    first, k = t.cluster_parts[c, 0], bin_of(t, q, c)
+    for p in range(first, first + t.cluster_parts[c, 1]):
+        if part_clear(t, s, w, c, p, k, o, shift):
             continue
-        if not body_clear(t, s, w, b, o, shift) and not is_allowed(s, b, o):
-            found[count, 0], found[count, 1] = b, -1 - s.owner[o]
-            count += 1
-            if count == len(found):
-                break
+        place_part(t, w, q, p)
+        for b in range(t.part_bodies[p, 0], t.part_bodies[p, 0] + t.part_bodies[p, 1]):
+            reach = t.node_radius[t.body_root[b]] + shift
+            if apart(s, o, w.root[b, 0], w.root[b, 1], w.root[b, 2], reach):
+                continue
+            if not body_clear(t, s, w, b, o, shift) and not is_allowed(s, b, o):
+                found[count, 0], found[count, 1] = b, -1 - s.owner[o]
+                count += 1
+                if count == len(found):
+                    return count
     return count
 
 
@@ -118,35 +139,63 @@ def unproved_with_obstacles(
 
 
 @inlined
+def near_of_run(w: Workspace, a: int, b: int, number: int) -> int:
+    """Return the bits of those of ``number`` clusters, at most RUN, from ``b`` on, whose balls meet that of another."""
+    x, y, z, radius = w.middle[0, a], w.middle[1, a], w.middle[2, a], w.middle[3, a]
+    us, vs, ws = w.middle[0, b : b + RUN], w.middle[1, b : b + RUN], w.middle[2, b : b + RUN]
+    radii, near = w.middle[3, b : b + RUN], 0
+    for k in range(RUN):
+        apart = radius + radii[k]
+        far = (x - us[k]) ** 2 + (y - vs[k]) ** 2 + (z - ws[k]) ** 2 > apart * apart
+        near |= 0 if far or k >= number else 1 << k
+    return near
+
+
+@inlined
+def unproved_of_pair(t: RobotArrays, w: Workspace, q: Floats, p: int, found: Integers, count: int) -> int:
+    """Add to ``found`` the bodies of a pair of clusters that are not proved apart; return the number of pairs."""
+    a, b = t.pair_clusters[p, 0], t.pair_clusters[p, 1]
+    shift = relative_displacement(w, a, b, t.pair_common[p])
+    if a != b:
+        apart = t.cluster_ball[a, 3] + t.cluster_ball[b, 3] + shift
+        u, v = w.ball[a], w.ball[b]
+        if (u[0] - v[0]) ** 2 + (u[1] - v[1]) ** 2 + (u[2] - v[2]) ** 2 > apart * apart:
+            return count
+        if not mark_pair(t, w, q, False, p, shift):
+            return count
+    else:
+        place_cluster(t, w, q, a)
+    first = t.pair_bodies[p, 0]
+    for k in range(first, first + t.pair_bodies[p, 1]):
+        m, n = t.bodies[k, 0], t.bodies[k, 1]
+        if a != b and not (w.near[m] and w.near[n]):
+            continue
+        u, v = w.root[m], w.root[n]
+        apart = t.node_radius[t.body_root[m]] + t.node_radius[t.body_root[n]] + shift
+        if (u[0] - v[0]) ** 2 + (u[1] - v[1]) ** 2 + (u[2] - v[2]) ** 2 > apart * apart:
+            continue
+        if not bodies_clear(t, w, m, n, shift):
+            found[count, 0], found[count, 1] = m, n
+            count += 1
+            if count == len(found):
+                break
+    return count
+
+
+@inlined
 def unproved_between_bodies(t: RobotArrays, w: Workspace, q: Floats, found: Integers, count: int) -> int:
     """Add to ``found`` the bodies that are not proved apart from each other; return the number of pairs."""
-    for p in range(len(t.pair_common)):
-        a, b = t.pair_clusters[p, 0], t.pair_clusters[p, 1]
-        common = t.pair_common[p]
-        shift = relative_displacement(w, a, b, common)
-        if a != b:
-            apart = t.cluster_ball[a, 3] + t.cluster_ball[b, 3] + shift
-            u, v = w.ball[a], w.ball[b]
-            if (u[0] - v[0]) ** 2 + (u[1] - v[1]) ** 2 + (u[2] - v[2]) ** 2 > apart * apart:
-                continue
-            if not mark_pair(t, w, q, False, p, shift):
-                continue
-        else:
-            place_cluster(t, w, q, a)
-        first = t.pair_bodies[p, 0]
-        for k in range(first, first + t.pair_bodies[p, 1]):
-            m, n = t.bodies[k, 0], t.bodies[k, 1]
-            if a != b and not (w.near[m] and w.near[n]):
-                continue
-            u, v = w.root[m], w.root[n]
-            apart = t.node_radius[t.body_root[m]] + t.node_radius[t.body_root[n]] + shift
-            if (u[0] - v[0]) ** 2 + (u[1] - v[1]) ** 2 + (u[2] - v[2]) ** 2 > apart * apart:
-                continue
-            if not bodies_clear(t, w, m, n, shift):
-                found[count, 0], found[count, 1] = m, n
-                count += 1
+    for r in range(len(t.run_pairs)):
+        a, number = t.run_pairs[r, 0], t.run_pairs[r, 3]
+        near = near_of_run(w, a, t.run_pairs[r, 1], number) if w.moving[0] == 0 else EVERY
+        for k in range(number):
+            if not near:
+                break
+            if near & 1:
+                count = unproved_of_pair(t, w, q, t.run_pairs[r, 2] + k, found, count)
                 if count == len(found):
                     return count
+            near >>= 1
     return count
 
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import Annotated, NamedTuple
 
-from apex_ompl.kernel.compiled.arrays import RobotArrays
+from apex_ompl.kernel.compiled.arrays import RUN, RobotArrays
 from apex_ompl.kernel.compiled.compilation import ir_inlined
 from apex_ompl.kernel.compiled.layout import Floats, Integers, buffer_sizes, buffer_view
+from apex_ompl.kernel.compiled.turns import TOGETHER
 
 
 class Workspace(NamedTuple):
@@ -16,9 +17,13 @@ class Workspace(NamedTuple):
         rotation: Rotations of the joints in the world.
         origin: Origins of the joints in the world [m].
         ball: Centres of the clusters' balls in the world [m].
-        opened: Whether inner joints of a cluster and ``root`` of its bodies are those of this state.
+        middle: The same, and their radii, in rows.
+        opened: Whether inner joints of a part of a cluster and ``root`` of its bodies are those of this state.
         root: Centres of the bodies' root spheres in the world [m].
         stack: Nodes that wait in a traversal of trees of spheres.
+        angle: Values of joints that are to be placed [rad], [m].
+        cosine: Their cosines.
+        sine: Their sines.
         moving: Whether clusters move: else the bounds below are not looked at.
         margin: Distance by which pairs that move must be apart [m].
         arc_bound: Bound by lengths of arcs on the displacement of a cluster's spheres, relative to the frames of the
@@ -36,9 +41,13 @@ class Workspace(NamedTuple):
     rotation: Annotated[Floats, "joints", 3, 3]
     origin: Annotated[Floats, "joints", 3]
     ball: Annotated[Floats, "clusters", 3]
-    opened: Annotated[Integers, "clusters"]
+    middle: Annotated[Floats, 4, "lanes"]
+    opened: Annotated[Integers, "parts"]
     root: Annotated[Floats, "bodies", 3]
     stack: Annotated[Integers, "stack"]
+    angle: Annotated[Floats, "turns"]
+    cosine: Annotated[Floats, "turns"]
+    sine: Annotated[Floats, "turns"]
     moving: Annotated[Integers, 1]
     margin: Annotated[Floats, 1]
     arc_bound: Annotated[Floats, "clusters", "joints"]
@@ -52,14 +61,15 @@ class Workspace(NamedTuple):
     near: Annotated[Integers, "bodies"]
 
 
-_view = buffer_view(Workspace, ("joints", "clusters", "bodies", "stack", "dof"))
+_view = buffer_view(Workspace, ("joints", "clusters", "lanes", "parts", "bodies", "stack", "turns", "dof"))
 
 
 def workspace_dimensions(t: RobotArrays) -> dict[str, int]:
     """Return the dimensions of a robot's workspace."""
     return {
-        "joints": len(t.joint_parent), "clusters": len(t.cluster_joint), "bodies": len(t.body_joint),
-        "stack": 2 * len(t.node_first) + 2, "dof": len(t.lower),
+        "joints": len(t.joint_parent), "clusters": len(t.cluster_joint), "lanes": len(t.cluster_joint) + RUN,
+        "parts": len(t.part_lazy), "bodies": len(t.body_joint),
+        "stack": 2 * len(t.node_first) + 2, "turns": len(t.joint_parent) + TOGETHER, "dof": len(t.lower),
     }  # fmt: skip
 
 
@@ -72,7 +82,8 @@ def workspace_sizes(t: RobotArrays) -> tuple[int, int]:
 def workspace_view(t: RobotArrays, integers: Integers, floats: Floats) -> Workspace:
     """Return a workspace in buffers of the sizes that :func:`workspace_sizes` gives, for a state that is not moving."""
     joints, clusters, bodies = len(t.joint_parent), len(t.cluster_joint), len(t.body_joint)
-    w = _view(integers, floats, joints, clusters, bodies, 2 * len(t.node_first) + 2, len(t.lower))
+    stack, turns = 2 * len(t.node_first) + 2, joints + TOGETHER
+    w = _view(integers, floats, joints, clusters, clusters + RUN, len(t.part_lazy), bodies, stack, turns, len(t.lower))
     for k in range(3):
         w.origin[0, k] = 0.0
         for m in range(3):

@@ -1,0 +1,52 @@
+"""Cosines and sines of joint values, several at once."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from apex_ompl.kernel.compiled.compilation import OPTIONS
+from apex_ompl.kernel.compiled.turns import MOST, TOGETHER, set_turns
+
+
+@numba.njit(**OPTIONS)
+def turns(angles, count, cosines, sines):  # type: ignore[no-untyped-def]
+    """Call it."""
+    set_turns(angles, count, cosines, sines)
+
+
+def found(angles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return cosines and sines of some angles."""
+    room = -(-len(angles) // TOGETHER) * TOGETHER
+    buffers = np.full((3, room), np.inf)
+    buffers[0, : len(angles)] = angles
+    turns(buffers[0], len(angles), buffers[1], buffers[2])
+    return buffers[1, : len(angles)], buffers[2, : len(angles)]
+
+
+@given(st.lists(st.floats(-1.1 * MOST, 1.1 * MOST), min_size=1, max_size=3 * TOGETHER))
+def test_turns_are_those_of_the_library_in_extended_precision(angles: list[float]) -> None:
+    cosines, sines = found(np.array(angles))
+    exact = np.array(angles, np.longdouble)
+    for mine, true in ((cosines, np.cos(exact)), (sines, np.sin(exact))):
+        assert (np.abs(mine - true) <= 2.0 * np.spacing(np.abs(true.astype(float))) + 1e-16).all()
+        assert (np.abs(mine) <= 1.0).all()
+
+
+@pytest.mark.parametrize("quarter", range(-9, 10))
+def test_turns_at_whole_quarters(quarter: int) -> None:
+    at = quarter * np.pi / 2
+    near = np.array([np.nextafter(at, -np.inf), at, np.nextafter(at, np.inf)])
+    cosines, sines = found(near)
+    np.testing.assert_allclose(cosines, np.cos(near), rtol=0.0, atol=2e-16)
+    np.testing.assert_allclose(sines, np.sin(near), rtol=0.0, atol=2e-16)
+
+
+def test_what_is_no_angle_gives_no_number() -> None:
+    cosines, sines = found(np.array([np.nan, 0.5, np.inf]))
+    assert np.isnan(cosines[[0, 2]]).all() and np.isnan(sines[[0, 2]]).all()
+    assert found(np.array([np.nan]))[0].tolist() != [1.0]
+    np.testing.assert_allclose((cosines[1], sines[1]), (np.cos(0.5), np.sin(0.5)), rtol=1e-15)
