@@ -186,7 +186,7 @@ def controls(name: str, found: dict[str, list[float]]) -> None:
     found["force"].append(seconds(lambda: reflex.controls(search, horizon)) / reflex.steps)
     factors = IncrementalGPMP2()
     _, guess = next(factors.guesses(search))
-    graph = factors.graph(search, guess.duration)
+    graph = factors.problem(search, guess.duration)
     begun = factors.supports(search, guess, guess.duration)
     count = graph.maximum(begun, factors.iterations, 0.0).evaluations * len(graph.times)
     found[CHARGE].append(seconds(lambda: graph.maximum(begun, factors.iterations, 0.0)) / count)
@@ -196,10 +196,12 @@ def controls(name: str, found: dict[str, list[float]]) -> None:
         q = search.rng.uniform(ready.limits.lower, ready.limits.upper)
         tree.extend(tree.nearest(q), q, lambda first, last: np.ones(len(first), bool))
     tree.trim(lambda first, last: np.arange(len(first)) < len(first) - 1)
-    clear, q = Clearances(search, step), search.start.position
+    once, q = anew(search), search.start.position
     first, last = (ends[:1] for ends in tree.edges)
-    before, counts = seconds(lambda: clear.edges(first, last)), clear.count
-    each = max(before - counts * (moving / len(states) + own / len(some)), 0.0)
+    Clearances(once).edges(first, last)
+    looked, of_own = (once.charges.counts[kind] for kind in ("near clearance in time", "near clearance"))
+    before = seconds(lambda: Clearances(anew(search)).edges(first, last))
+    each = max(before - looked * moving / len(states) - of_own * own / len(some), 0.0)
     found["extension of a tree"].append(each + seconds(lambda: tree.extend(tree.nearest(q), q, refused)))
 
 
@@ -235,7 +237,7 @@ def trees() -> dict[str, float]:
         search = Search(ready, Request(2, 0.0, 0.05, standing, None, movers, movers, present, np.inf, 0), Charges(0.1))
         with quiet_ompl():
             begin = time.perf_counter()
-            source.path(search)
+            source.path(search, proved=False)
             spent += time.perf_counter() - begin
         motions += search.charges.counts["motion of a tree"]
         sprint = Sprint()
