@@ -169,6 +169,7 @@ def summary(some: Sequence[dict[str, Any]], best: Sequence[dict[str, Any]] = ())
     times = [one["time_to_goal"] for one in good]
     compared, replans = ratios(some, best), [took for one in some for took in one["replans"]]
     plans, reactions = [took for one in some for took in one["plans"]], [r for one in some for r in one["reactions"]]
+    near = [took for took, ahead, *doing in reactions if ahead < NEAR and doing == [GOING]]
     levels: dict[str, list[bool]] = {}
     for one in some:
         levels.setdefault(one["world"].rpartition("/")[0], []).append(one["outcome"] != "reached")
@@ -184,8 +185,7 @@ def summary(some: Sequence[dict[str, Any]], best: Sequence[dict[str, Any]] = ())
         "worst_level": max(sum(row) / len(row) for row in levels.values()),
         "stops": sum(one["stops"] for one in some) / len(some),
         "reaction_s": of_all([took for took, *_ in reactions]), "reactions": len(reactions),
-        "near_reaction_s": of_all([took for took, ahead, *doing in reactions if ahead < NEAR and doing == [GOING]]),
-        "near": sum(ahead < NEAR and doing == [GOING] for _, ahead, *doing in reactions),
+        "near_reaction_s": of_all(near), "near": len(near),
         **{f"{name}_s": float(np.median(ticks[name])) for name in ("tick_p50", "tick_p99") if ticks[name]},
         **({"tick_worst_s": max(ticks["tick_worst"])} if ticks["tick_worst"] else {}),
         **({"deadline_misses": sum(ticks["deadline_misses"])} if ticks["deadline_misses"] else {}),

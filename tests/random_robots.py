@@ -56,6 +56,39 @@ def random_robot(seed: int, joints: int = 9, dof: int = 4) -> tuple[RobotTables,
     return tables, specs, bodies, pairs
 
 
+def random_hand(seed: int) -> tuple[RobotTables, list, list, list]:
+    """The same of hands: two to six fingers that follow one joint, on a wrist or fixed to the world."""
+    rng = np.random.default_rng(seed)
+    specs = [robot_specs.JointSpec(0)]
+    if rng.random() < 0.7:
+        specs.append(robot_specs.JointSpec(0, REVOLUTE, pose(rng, 0.3), unit(rng), 0, 1.0, 0.0))
+    palm = len(specs) - 1
+    for _ in range(int(rng.integers(2, 7))):
+        parent = palm
+        for _ in range(int(rng.integers(1, 4))):
+            kind = int(rng.choice([REVOLUTE, REVOLUTE, REVOLUTE, PRISMATIC, FIXED]))
+            ratio, shift = float(rng.uniform(-1.0, 1.5)), float(rng.normal(0.0, 0.2))
+            source = -1 if kind == FIXED else 1
+            specs.append(robot_specs.JointSpec(parent, kind, pose(rng, 0.1), unit(rng), source, ratio, shift))
+            parent = len(specs) - 1
+    bodies = []
+    for k in range(len(specs)):
+        for _ in range(int(rng.integers(1, 3))):
+            meets = bool(rng.random() < 0.8)
+            bodies.append(
+                robot_specs.BodySpec(f"b{len(bodies)}", k, pose(rng, 0.03), meets_scene=meets, **balls(rng, 3))
+            )
+    count = len(bodies)
+    pairs = [
+        (a, b) for a in range(count) for b in range(a) if bodies[a].joint != bodies[b].joint and rng.random() < 0.3
+    ]
+    low, high = np.array([-1.0, -0.3]), np.array([1.0, 0.9])
+    tables = robot_builder.robot_tables(
+        "hand", ["wrist", "synergy"], lower=low, upper=high, tree=JointTree(specs), bodies=bodies, pairs=pairs
+    )
+    return tables, specs, bodies, pairs
+
+
 def frames(specs: list, q: np.ndarray) -> list[np.ndarray]:
     """Poses of the joints in the world: T = T_parent * placement * exp(axis * value), by definition."""
     poses = [np.eye(4)]

@@ -88,13 +88,27 @@ def test_the_robot_touches_nothing_while_it_moves(
         hits.append(report.contact.time)
     for time in hits:
         assert [event for event in accepted if event.time <= time][-1].data["leaving"], time
+    check_reactions(done)
+
+
+def check_reactions(done: RunRecord) -> set[str]:
+    """What reactions say that the robot did is what events and motion say; return all of it."""
+    found = set()
     for reaction in (event for event in done.events if event.kind == "reaction"):
         known = [event.time for event in done.events if event.kind == "conflict" and event.time <= reaction.time][-1]
-        stops = [
-            event for event in done.events if event.kind in ("stop", "accepted", "improved") and event.time < known
-        ]
-        doing = "braking" if stops and stops[-1].kind == "stop" else "going"
+        changes = [e for e in done.events if e.kind in ("stop", "accepted", "improved") and e.time < known]
+        doing = "braking" if changes and changes[-1].kind == "stop" else "going"
         assert reaction.data["doing"] == ("standing" if is_at_rest(done.trajectory, known) else doing)
+        found.add(reaction.data["doing"])
+    return found
+
+
+def test_reactions_say_what_the_robot_did() -> None:
+    found = set()
+    for seed in range(16):
+        done, _ = go(ByHand(line), *boxes(seed, 0.8), sensor=Sensor(seed=seed), fastest=0.8)
+        found |= check_reactions(done)
+    assert found == {"going", "braking", "standing"}
 
 
 def test_without_the_guard_the_robot_runs_into_it() -> None:

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 from pathlib import Path
+from typing import Any
 
 import coal
 import numpy as np
@@ -14,7 +15,7 @@ import pinocchio as pin
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from random_robots import frames, pose, random_robot, unit
+from random_robots import frames, pose, random_hand, random_robot, unit
 from support import ROOT, states_around_home
 
 from apex_ompl.collision import CollisionChecker
@@ -78,22 +79,27 @@ def test_pushes_of_random_trees_are_virtual_work(seed: int) -> None:
     np.testing.assert_allclose(found, wanted, atol=1e-6)
 
 
-@settings(max_examples=25)
-@given(seed=st.integers(0, 10**6))
-def test_clearance_of_random_trees_is_that_of_all_spheres(seed: int) -> None:
-    tables, specs, bodies, pairs = random_robot(seed)
+@settings(max_examples=50)
+@given(seed=st.integers(0, 10**6), make=st.sampled_from([random_robot, random_hand]))
+def test_clearance_of_random_trees_is_that_of_all_spheres(seed: int, make: Any) -> None:
+    tables, specs, bodies, pairs = make(seed)
     rng = np.random.default_rng(seed)
     shapes = [(make(rng), pose(rng)) for make in SHAPES.values() for _ in range(2)]
     scene = scene_tables([(n, p) for n, (shape, at) in enumerate(shapes) for p in primitives(shape, at)])
     kernel = Kernel(tables, scene)
-    states = rng.uniform(-1.0, 1.0, (3, tables.dof))
+    states = rng.uniform(tables.arrays.lower, tables.arrays.upper, (3, tables.dof))
     values = kernel.clearance(states)
     for q, (near, own) in zip(states, values, strict=True):
         leaves = leaves_at(specs, bodies, q)
         alone = Kernel(single_ball(), scene)
         to_scene = min(
-            alone.clearance(c[None])[0, 0] - r + 0.01 for cs, rs in leaves for c, r in zip(cs, rs, strict=True)
-        )
+            (
+                alone.clearance(c[None])[0, 0] - r + 0.01
+                for body, (cs, rs) in zip(bodies, leaves, strict=True) if body.meets_scene
+                for c, r in zip(cs, rs, strict=True)
+            ),
+            default=np.inf,
+        )  # fmt: skip
         between = np.inf
         for a, b in pairs:
             (ca, ra), (cb, rb) = leaves[a], leaves[b]
@@ -103,6 +109,9 @@ def test_clearance_of_random_trees_is_that_of_all_spheres(seed: int) -> None:
         assert own == pytest.approx(between, abs=1e-9)
     capped = kernel.clearance(states, limit=0.02)
     assert capped == pytest.approx(np.minimum(values, 0.02), abs=1e-12)
+    for narrow in (kernel, *(kernel.within(states.min(axis=0) - w, states.max(axis=0) + w) for w in (0.0, 1e-9, 0.1))):
+        assert ((narrow.unproved(states)[1] == 0) == (values.min(axis=1) > 0.0)).all()
+        np.testing.assert_array_equal(narrow.clearance(states, limit=0.02), capped)
 
 
 def single_ball() -> RobotTables:

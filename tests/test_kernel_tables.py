@@ -13,16 +13,16 @@ import pinocchio as pin
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from random_robots import frames, random_robot
+from random_robots import frames, random_hand, random_robot
 from support import ROOT, states_around_home
 
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.tabulate import joint_specs, primitives
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError, UnknownNameError
-from apex_ompl.kernel import Kernel
-from apex_ompl.kernel.compiled.arrays import BINS, robot_view, scene_view
+from apex_ompl.kernel import Kernel, joint_tree
+from apex_ompl.kernel.compiled.arrays import BINS, FIXED, RUN, robot_view, scene_view
 from apex_ompl.kernel.scene_builder import scene_tables
-from apex_ompl.kernel.tables import RobotTables, with_pairs
+from apex_ompl.kernel.tables import RobotTables, pair_runs, with_pairs
 from apex_ompl.robot import Robot, load_robot
 from apex_ompl.scene.bodies import Obstacle
 
@@ -39,7 +39,7 @@ for name in ("pinocchio", "coal", "ompl"):
 from apex_ompl.kernel import Kernel
 from apex_ompl.kernel.scene_builder import Primitive, scene_tables
 from apex_ompl.kernel.compiled.arrays import BOX
-from apex_ompl.kernel.tables import RobotTables, with_pairs
+from apex_ompl.kernel.tables import RobotTables
 at = np.eye(4)
 at[:3, 3] = {list(post.position)}
 box = Primitive(BOX, at, {tuple(e / 2 for e in post.box)})
@@ -228,7 +228,7 @@ def check_parts(tables: RobotTables, states: np.ndarray) -> None:
 
 @given(st.integers(0, 10**6))
 def test_parts_of_clusters_are_inside_of_their_balls(seed: int) -> None:
-    tables, *_ = random_robot(seed, joints=14)
+    tables, *_ = random_hand(seed)
     states = np.random.default_rng(seed).uniform(tables.arrays.lower, tables.arrays.upper, (40, tables.dof))
     states[:2] = tables.arrays.lower, tables.arrays.upper
     check_parts(tables, states)
@@ -259,3 +259,38 @@ def test_runs_of_pairs_are_the_pairs(robot: Robot) -> None:
         assert [(one, other) for one, other, _ in pairs] == [tuple(row) for row in arrays.pair_clusters.tolist()]
         assert [k for *_, k in pairs] == list(range(len(pairs)))
     assert len(a.run_pairs) < len(a.pair_common) / 3
+    row = np.stack([np.zeros(20, int), np.arange(1, 21)], axis=1)
+    assert pair_runs(row).tolist() == [[0, 1, 0, RUN], [0, 1 + RUN, RUN, RUN], [0, 1 + 2 * RUN, 2 * RUN, 4]]
+
+
+def test_what_has_too_many_fingers_is_one_part(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert (random_hand(3)[0].arrays.cluster_parts[:, 1] > 1).any()
+    monkeypatch.setattr(joint_tree, "MOST_PARTS", 1)
+    tables, *_ = random_hand(3)
+    assert (tables.arrays.cluster_parts[:, 1] == 1).all()
+    check_parts(tables, np.random.default_rng(0).uniform(tables.arrays.lower, tables.arrays.upper, (40, tables.dof)))
+
+
+def test_joint_frames_of_hands_are_those_of_the_tree() -> None:
+    for seed in range(20):
+        tables, specs, *_ = random_hand(seed)
+        states = np.random.default_rng(seed).uniform(tables.arrays.lower, tables.arrays.upper, (5, tables.dof))
+        rotation, origin = Kernel(tables, scene_tables([])).joint_frames(states)
+        for q, turned, at in zip(states, rotation, origin, strict=True):
+            wanted = frames(specs, q)
+            np.testing.assert_allclose(at, [one[:3, 3] for one in wanted], atol=1e-12)
+            axes = [one[:3, :3] @ spec.axis for one, spec in zip(wanted[1:], specs[1:], strict=True)]
+            moving = np.array([spec.kind != FIXED for spec in specs[1:]])
+            np.testing.assert_allclose(turned[1:, :, 2][moving], np.array(axes)[moving], atol=1e-12)
+
+
+def test_tables_that_name_joints_too_often_are_refused(tmp_path: Path) -> None:
+    tables, *_ = random_hand(0)
+    for name in ("eager", "cluster_lazy"):
+        array = getattr(tables.arrays, name)
+        long = np.repeat(array, 1000) if name == "eager" else np.concatenate([[[0, 99]], array[1:]])
+        RobotTables(
+            tables.name, tables.joint_names, tables.body_names, tables.numbers, tables.arrays._replace(**{name: long})
+        ).save(tmp_path / "bad.npz")
+        with pytest.raises(FileFormatError, match=name):
+            RobotTables.load(tmp_path / "bad.npz")

@@ -11,8 +11,8 @@ from apex_ompl.kernel.compiled.arrays import BINS, LIMIT_SLACK, PRISMATIC, REVOL
 from apex_ompl.kernel.robot_specs import BodySpec, JointSpec
 from apex_ompl.types import Array
 
-SAMPLES = 65  # values of a cluster's inner joint at which its ball is made
-OF_BIN = (SAMPLES - 1) // BINS  # steps between them in a range of values
+OF_BIN = 4  # steps between the values at which balls are made, in a range of values
+SAMPLES = OF_BIN * BINS + 1  # of these values
 
 
 class ClusterBall(NamedTuple):
@@ -97,21 +97,19 @@ def part_balls(
 ) -> tuple[Array, Array]:
     """Return balls around a part of a cluster for each of BINS ranges of values, from the lowest limit to the highest.
 
-    Args are those of :func:`cluster_ball`; the limits are the robot's own, and hold within LIMIT_SLACK.
+    Args are those of :func:`cluster_ball`, but for the limits, which are the robot's own and hold within LIMIT_SLACK.
 
     Returns:
         Centres and radii around the solids, shape (BINS, 4), and radii around the leaf spheres, shape (BINS,) [m].
     """
     low, high = limits or (0.0, 0.0)
-    points = _points(
-        [m._replace(centres=m.centres[:1]) for m in members], top, inner, joints, placements,
-        np.linspace(low, high, SAMPLES),
-    )  # fmt: skip
-    speeds = np.concatenate([_speed(m, top, joints, placements, (low, high))[:1] for m in members])
+    roots = [Member(m.joint, m.centres[:1], m.radii[:1], m.outer[:1]) for m in members]
+    points = _points(roots, top, inner, joints, placements, np.linspace(low, high, SAMPLES))
+    speeds = np.concatenate([_speed(m, top, joints, placements, (low, high)) for m in roots])
     slack = speeds * ((high - low) / (SAMPLES - 1) / 2.0 + LIMIT_SLACK)
     rows = OF_BIN * np.arange(BINS)[:, None] + np.arange(OF_BIN + 1)
     within = points[rows]  # (BINS, OF_BIN + 1, bodies, 3)
-    radii, leaves = (np.array([getattr(m, name)[0] for m in members]) for name in ("radii", "outer"))
+    radii, leaves = np.concatenate([m.radii for m in roots]), np.concatenate([m.outer for m in roots])
     wide = (radii + slack)[:, None]
     centre = 0.5 * ((within - wide).min(axis=(1, 2)) + (within + wide).max(axis=(1, 2)))
     away = np.linalg.norm(within - centre[:, None, None], axis=3).max(axis=1) + slack

@@ -123,6 +123,7 @@ class _Builder:
             part_outer=np.array([leaves for _, leaves in parts]).reshape(-1, BINS),
             cluster_spread=np.array([ball.spread for ball in balls]),
             cluster_speed=np.array([ball.speed for ball in balls]),
+            cluster_range=np.array([self._range(c) for c in range(len(balls))]).reshape(-1, 2),
             node_centre=np.concatenate([np.empty((0, 3)), *self.centres]),
             node_radius=np.concatenate([np.empty(0), *trees]),
             node_outer=np.concatenate([np.empty(0), *outer]),
@@ -139,6 +140,12 @@ class _Builder:
         joints = (self.tree.joints[k] for k in self.lazy[cluster])
         sources = [joint.source for joint in joints if joint.kind != FIXED]
         return sources[0] if sources else -1
+
+    def _range(self, cluster: int) -> tuple[float, float]:
+        """Return the lowest value of the joint that drives a cluster's inner ones, and ranges of values per unit."""
+        dof = self._dof(cluster)
+        low, high = (0.0, 0.0) if dof < 0 else (float(self.lower[dof]), float(self.upper[dof]))
+        return low, BINS / (high - low) if high > low else 0.0
 
     def _pairs(self, pairs: Sequence[tuple[int, int]]) -> list[PairRow]:
         """Return pairs of clusters with their lowest common joint and the pairs of bodies."""

@@ -75,6 +75,9 @@ def _range_fault(t: RobotArrays, dof: int, bodies: int) -> str:
         array = getattr(t, name)
         if array.size and not low <= array.min() <= array.max() < high:
             return name
+    for name, most in (("eager", len(t.eager)), ("cluster_lazy", t.cluster_lazy[:, 1].max(initial=0))):
+        if most >= joints:
+            return name
     for name, size in (("cluster_lazy", len(t.lazy)), ("cluster_bodies", bodies), ("pair_bodies", len(t.bodies))):
         array = getattr(t, name)
         if array.size and array.sum(axis=1).max() > size:

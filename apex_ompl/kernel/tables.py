@@ -23,7 +23,7 @@ from apex_ompl.util.validation import check_indices
 
 SCHEMA = "apex-ompl/kernel-tables/1"
 PAIRS = ("pair_clusters", "pair_common", "pair_bodies", "pair_ball", "pair_outer", "pair_parts")
-PARTS = ("cluster_parts", "part_lazy", "part_bodies", "part_ball", "part_outer")
+PARTS = ("cluster_parts", "cluster_range", "part_lazy", "part_bodies", "part_ball", "part_outer")
 MADE = {"body_inner", "inner_ball", "pair_ball", "pair_outer", "pair_parts", "run_pairs", *PARTS}
 """Arrays that make checks faster, and are not stored."""
 STORED = tuple(name for name in RobotArrays._fields if name not in MADE)
@@ -160,6 +160,7 @@ class RobotTables:
         clusters = np.arange(len(arrays["cluster_joint"]))
         arrays |= {
             "cluster_parts": np.stack([clusters, np.ones_like(clusters)], axis=1),
+            "cluster_range": np.zeros((len(clusters), 2)),
             "part_lazy": arrays["cluster_lazy"],
             "part_bodies": arrays["cluster_bodies"],
             "part_ball": np.repeat(arrays["cluster_ball"][:, None], BINS, axis=1),

@@ -62,6 +62,7 @@ class Executor:
         lead: How long before a step it is decided, by what was seen until then [s].
         ahead: How long before the conflict that was [s].
         doing: What the robot did then: it was ``going``, ``braking`` already, or ``standing``.
+        braking: The stop that was followed last, or None.
         hastened: When a faster motion was asked for last [s].
     """
 
@@ -86,6 +87,7 @@ class Executor:
     lead: float = 0.0
     ahead: float = math.inf
     doing: str = ""
+    braking: Following | None = None
     hastened: float = -math.inf
 
     def log(self, time: float, kind: str, **data: Any) -> None:
@@ -150,7 +152,7 @@ class Executor:
         """Return whether the robot is going, braking, or standing."""
         if not self.following.start(now).moves:
             return STANDING
-        return BRAKING if self.stop is self.following else GOING
+        return BRAKING if self.following is self.braking else GOING
 
     def _distance(self, now: float, predicted: Movers) -> float:
         """Return how far obstacles are from the robot, at most twice the trigger [m]."""
@@ -190,6 +192,7 @@ class Executor:
         self.log(now, "stop", at=stop.end)
         self._answered(now, "stop")
         self.follow(stop, now)
+        self.braking = stop
 
     @property
     def _patience(self) -> float:

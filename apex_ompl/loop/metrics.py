@@ -81,7 +81,8 @@ def _reactions(events: Iterable[Event]) -> dict[str, float]:
         if event.kind == "reaction":
             check_number(event.data.get("seconds", float("nan")), "reaction.seconds", 0.0)
             seconds.append(float(event.data["seconds"]))
-            near += seconds[-1:] if event.data.get("ahead", np.inf) < NEAR and event.data.get("doing") == GOING else []
+            if event.data.get("ahead", np.inf) < NEAR and event.data.get("doing") == GOING:
+                near.append(seconds[-1])
     found = {}
     for name, some in (("reaction", seconds), ("near_reaction", near)):
         if some:

@@ -16,7 +16,7 @@ BOX, SPHERE, CYLINDER, CAPSULE, HALF_SPACE = range(5)
 GRID_ROW = 8  # numbers of a grid's row
 GRID = 6  # of distances; 5 is a hull, among the exact shapes
 RUN = 8  # pairs that are looked at together
-BINS = 16  # ranges of values of an inner joint that have balls of their own
+BINS = 16  # ranges of values of a joint that drives inner ones which have balls of their own
 LIMIT_SLACK = 1e-9  # by which clusters' balls hold beyond the limits: motions are bounded with rounding [rad]
 
 Pairs = Annotated[Integers, 2]
@@ -31,18 +31,18 @@ class RobotArrays(NamedTuple):
 
     Joints come after their parents. ``joint_rotation`` and ``joint_offset`` place a joint in its parent; its value is
     ``joint_ratio * q[joint_source] + joint_shift`` (mimic joints share a source), about or along z. ``eager`` joints
-    are placed at every state, ``lazy`` ones, which are inner joints of clusters, only where a cluster's ball is not
-    enough.
+    are placed at every state, ``lazy`` ones, which are inner joints of clusters, only where balls around cluster and
+    part are not enough.
 
     ``cluster_ball`` holds centre and radius of a ball around all of a cluster's solids in the frame of
     ``cluster_joint``, for all values of its inner joints; ``cluster_outer`` is the radius around its leaf spheres,
     ``cluster_spread`` the largest distance of a sphere's centre from the ball's, ``cluster_speed`` the largest speed
     of such a centre in that frame, per unit of ``q[cluster_dof]``.
 
-    A cluster is made of parts, ``cluster_parts``: the bodies that are fixed to its joint, and each finger.
-    ``part_ball`` and ``part_outer`` are what ``cluster_ball`` and ``cluster_outer`` are, around a part alone, for each
-    of BINS ranges of equal length of values of ``q[cluster_dof]``. ``part_lazy`` are the inner joints of a part,
-    ``part_bodies`` its bodies.
+    A cluster is made of parts, ``cluster_parts``: the bodies that are fixed to its joint, and each finger, or all as
+    one. ``part_ball`` and ``part_outer`` are what ``cluster_ball`` and ``cluster_outer`` are, around a part alone, for
+    each of BINS ranges of equal length of values of ``q[cluster_dof]``; ``cluster_range`` is the lowest value, and the
+    number of ranges per unit, or 0. ``part_lazy`` are the inner joints of a part, ``part_bodies`` its bodies.
 
     A node is a sphere (``node_centre`` in the frame of its body's joint, ``node_radius``) around the part of the solid
     that the leaves below cover; ``node_outer`` is a radius around the leaves themselves. ``body_inner`` says which of
@@ -88,6 +88,7 @@ class RobotArrays(NamedTuple):
     part_outer: Annotated[Floats, BINS]
     cluster_spread: Floats
     cluster_speed: Floats
+    cluster_range: Annotated[Floats, 2]
     node_centre: Vectors
     node_radius: Floats
     node_outer: Floats

@@ -96,11 +96,11 @@ def place_cluster(t: RobotArrays, w: Workspace, q: Floats, c: int) -> None:
 
 @inlined
 def bin_of(t: RobotArrays, q: Floats, c: int) -> int:
-    """Return the range of values of a cluster's inner joint that a state is in; 0 for what is not a number."""
+    """Return the range of values of the joint that drives a cluster's inner ones that a state is in, or 0."""
     k = t.cluster_dof[c]
     if k < 0:
         return 0
-    x = BINS * (q[k] - t.lower[k]) / (t.upper[k] - t.lower[k])
+    x = (q[k] - t.cluster_range[c, 0]) * t.cluster_range[c, 1]
     if not x > 0.0:
         return 0
     return int(x) if x < BINS else BINS - 1

@@ -1,7 +1,7 @@
 """Cosines and sines of several angles at once, in code that is made of vector instructions.
 
 The angle is reduced by the nearest multiple of pi / 2 in three parts (Cody and Waite 1980), and polynomials are
-those of fdlibm (Sun Microsystems 1993): errors are below two units in the last place.
+those of fdlibm (Sun Microsystems 1993): errors are below two and a half units in the last place up to MOST.
 """
 
 from __future__ import annotations

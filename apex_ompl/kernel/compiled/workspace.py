@@ -69,7 +69,8 @@ def workspace_dimensions(t: RobotArrays) -> dict[str, int]:
     return {
         "joints": len(t.joint_parent), "clusters": len(t.cluster_joint), "lanes": len(t.cluster_joint) + RUN,
         "parts": len(t.part_lazy), "bodies": len(t.body_joint),
-        "stack": 2 * len(t.node_first) + 2, "turns": len(t.joint_parent) + TOGETHER, "dof": len(t.lower),
+        "stack": 2 * len(t.node_first) + 2, "turns": max(len(t.joint_parent), len(t.lazy)) + TOGETHER,
+        "dof": len(t.lower),
     }  # fmt: skip
 
 
@@ -82,7 +83,7 @@ def workspace_sizes(t: RobotArrays) -> tuple[int, int]:
 def workspace_view(t: RobotArrays, integers: Integers, floats: Floats) -> Workspace:
     """Return a workspace in buffers of the sizes that :func:`workspace_sizes` gives, for a state that is not moving."""
     joints, clusters, bodies = len(t.joint_parent), len(t.cluster_joint), len(t.body_joint)
-    stack, turns = 2 * len(t.node_first) + 2, joints + TOGETHER
+    stack, turns = 2 * len(t.node_first) + 2, max(joints, len(t.lazy)) + TOGETHER
     w = _view(integers, floats, joints, clusters, clusters + RUN, len(t.part_lazy), bodies, stack, turns, len(t.lower))
     for k in range(3):
         w.origin[0, k] = 0.0
