@@ -68,8 +68,8 @@ class _Builder:
         self.lazy = [
             [k for _, k in sorted((tree.branch(k, top), k) for k in tree.inner(top))] for top, _ in self.clusters
         ]
-        self.branch_of = [branches[b] for b in order]
-        self.parts = list(dict.fromkeys(zip(self.cluster_of, self.branch_of, strict=True)))
+        self.part_of = [(self.clusters.index(keys[b]), branches[b]) for b in order]  # cluster and branch of each body
+        self.parts = list(dict.fromkeys(self.part_of))
 
     def _key(self, body: BodySpec, number: int) -> tuple[int, int]:
         """Return the key of a body's cluster: the joint, and whether it meets the scene; each fixed body is its own."""
@@ -102,7 +102,7 @@ class _Builder:
             cluster_meets_scene=_ints([bodies[self.cluster_of.index(c)].meets_scene for c in range(len(balls))]),
             cluster_parts=_spans([sum(c == k for c, _ in self.parts) for k in range(len(self.clusters))]),
             part_lazy=_ints([self._part_joints(*part) for part in self.parts]).reshape(-1, 2),
-            part_bodies=_spans([sum(two == part for two in self._body_parts()) for part in self.parts]),
+            part_bodies=_spans([self.part_of.count(part) for part in self.parts]),
             body_joint=_ints([b.joint for b in bodies]),
             body_root=_ints(starts[:-1]),
             node_first=_ints([start + k for b, start in zip(bodies, starts, strict=False) for k in b.first]),
@@ -131,7 +131,7 @@ class _Builder:
             inner_ball=np.concatenate([np.empty((0, 4)), *self.inner]),
             pair_ball=np.array([[[*b.centre, b.radius] for b in two] for two in pair_balls]).reshape(-1, 2, 4),
             pair_outer=np.array([[b.outer for b in two] for two in pair_balls]).reshape(-1, 2),
-            pair_parts=_ints([self._pair_parts(*row) for row in pair_rows]).reshape(-1, 2),
+            pair_parts=_ints([self._pair_parts(clusters, rows) for clusters, _, rows in pair_rows]).reshape(-1, 2),
             run_pairs=pair_runs(_ints([key for key, _, _ in pair_rows]).reshape(-1, 2)),
         )
         return RobotTables(name, joint_names, tuple(b.name for b in bodies), tuple(numbers[b] for b in rows), arrays)
@@ -179,16 +179,12 @@ class _Builder:
             found.append(two)
         return found
 
-    def _body_parts(self) -> list[tuple[int, int]]:
-        """Return cluster and branch of each body."""
-        return list(zip(self.cluster_of, self.branch_of, strict=True))
-
-    def _pair_parts(self, clusters: tuple[int, int], _: int, members: list[tuple[int, int]]) -> list[int]:
+    def _pair_parts(self, clusters: tuple[int, int], members: list[tuple[int, int]]) -> list[int]:
         """Return the bits of the parts of two clusters that a pair is about."""
-        found, of = [], self._body_parts()
+        found = []
         for cluster, rows in zip(clusters, zip(*members, strict=True), strict=True):
             parts = [part for part in self.parts if part[0] == cluster]
-            found.append(sum(1 << parts.index(part) for part in {of[b] for b in rows}))
+            found.append(sum(1 << parts.index(part) for part in {self.part_of[b] for b in rows}))
         return found
 
     def _part_joints(self, cluster: int, branch: int) -> tuple[int, int]:
@@ -199,7 +195,7 @@ class _Builder:
 
     def _part_balls(self, cluster: int, branch: int, outer: Sequence[Array]) -> tuple[Array, Array]:
         """Return the balls around a part."""
-        some = frozenset(k for k, part in enumerate(self._body_parts()) if part == (cluster, branch))
+        some = frozenset(k for k, part in enumerate(self.part_of) if part == (cluster, branch))
         dof = self._dof(cluster)
         limits = None if dof < 0 else (float(self.lower[dof]), float(self.upper[dof]))
         joints = [k for k in self.lazy[cluster] if self.tree.branch(k, self.clusters[cluster][0]) == branch]
