@@ -110,7 +110,7 @@ def test_the_rest_of_the_motion_noised_and_denoised_again_strays_from_it(ready: 
 
 def test_looking_at_stops_ends_with_the_time(ready: Ready) -> None:
     """Of a long motion it would take more than the budget, and the answer would come too late each time."""
-    short, long = search_of(ready), search_of(ready, slower=20.0)
+    short, long = search_of(ready), search_of(ready, slower=60.0)
     for search in (short, long):
         rest = search.request.following.piece(search.request.join, search.request.following.end)
         assert search.guardable(rest) == (search is short)
