@@ -169,7 +169,7 @@ def summary(some: Sequence[dict[str, Any]], best: Sequence[dict[str, Any]] = ())
     times = [one["time_to_goal"] for one in good]
     compared, replans = ratios(some, best), [took for one in some for took in one["replans"]]
     plans, reactions = [took for one in some for took in one["plans"]], [r for one in some for r in one["reactions"]]
-    near = [took for took, ahead, *doing in reactions if ahead < NEAR and doing == [GOING]]
+    near = [took for took, ahead, doing in reactions if ahead < NEAR and doing == GOING]
     levels: dict[str, list[bool]] = {}
     for one in some:
         levels.setdefault(one["world"].rpartition("/")[0], []).append(one["outcome"] != "reached")

@@ -18,7 +18,7 @@ from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError
 from apex_ompl.generation.records import kernel_problems
 from apex_ompl.generation.units import Unit
 from apex_ompl.kernel import Kernel, RobotTables
-from apex_ompl.kernel.tables import MADE
+from apex_ompl.kernel.table_checks import MADE
 from apex_ompl.ompl_adapter.setup import assemble
 from apex_ompl.ompl_adapter.validity import full_check
 from apex_ompl.problems.suite_robot import robot

@@ -9,6 +9,10 @@ import numpy as np
 from apex_ompl.kernel.compiled.arrays import BOX, FIXED, HALF_SPACE, PRISMATIC, RobotArrays, SceneArrays
 from apex_ompl.kernel.compiled.layout import layout
 
+PARTS = ("cluster_parts", "cluster_range", "part_lazy", "part_bodies", "part_ball", "part_outer")
+MADE = {"body_inner", "inner_ball", "pair_ball", "pair_outer", "pair_parts", "run_pairs", *PARTS}
+"""Arrays of a robot that make checks faster; they are not stored."""
+
 
 def head_fault(head: dict[str, Any]) -> str:
     """Return the key of a file's head that is missing or of another type, or an empty string."""
@@ -54,7 +58,7 @@ def _length_fault(t: RobotArrays, dof: int, bodies: int) -> str:
     sizes |= {"node": len(t.node_first), "pair": len(t.pair_common), "lower": dof, "upper": dof}
     if sizes["joint"] == 0:
         return "joint_parent"
-    for name, array in t._asdict().items():
+    for name, array in ((name, array) for name, array in t._asdict().items() if name not in MADE):
         if len(array) != sizes.get(name.split("_")[0], len(array)):
             return name
         if array.dtype == np.float64 and not np.isfinite(array).all():

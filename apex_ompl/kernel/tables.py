@@ -5,27 +5,25 @@ from __future__ import annotations
 import io
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from apex_ompl.errors import FileFormatError, MissingFileError, UnknownNameError
 from apex_ompl.kernel.compiled.arrays import BINS, RUN, RobotArrays, SceneArrays
 from apex_ompl.kernel.compiled.layout import Floats, Integers, layout, pack
 from apex_ompl.kernel.distance_grid import DistanceGrid
-from apex_ompl.kernel.table_checks import head_fault, robot_fault
+from apex_ompl.kernel.table_checks import MADE, head_fault, robot_fault
 from apex_ompl.types import Flags
 from apex_ompl.util.files import is_file, write_atomically
 from apex_ompl.util.validation import check_indices
 
 SCHEMA = "apex-ompl/kernel-tables/1"
 PAIRS = ("pair_clusters", "pair_common", "pair_bodies", "pair_ball", "pair_outer", "pair_parts")
-PARTS = ("cluster_parts", "cluster_range", "part_lazy", "part_bodies", "part_ball", "part_outer")
-MADE = {"body_inner", "inner_ball", "pair_ball", "pair_outer", "pair_parts", "run_pairs", *PARTS}
-"""Arrays that make checks faster, and are not stored."""
 STORED = tuple(name for name in RobotArrays._fields if name not in MADE)
 
 
@@ -152,38 +150,37 @@ class RobotTables:
                 arrays = {name: np.ascontiguousarray(data[name]) for name in STORED}
         except Exception as error:  # NumPy and zipfile let many kinds through
             raise FileFormatError(str(path), "", type(error).__name__, "expected kernel tables (.npz)") from error
-        arrays["body_inner"] = np.zeros((len(arrays["body_joint"]), 2), np.int64)
-        arrays["inner_ball"] = np.empty((0, 4))
-        pairs = len(arrays["pair_clusters"])
-        arrays |= {"pair_ball": np.zeros((pairs, 2, 4)), "pair_outer": np.zeros((pairs, 2))}
-        arrays |= {"pair_parts": np.ones((pairs, 2), np.int64), "run_pairs": np.empty((0, 4), np.int64)}
-        clusters = np.arange(len(arrays["cluster_joint"]))
-        arrays |= {
-            "cluster_parts": np.stack([clusters, np.ones_like(clusters)], axis=1),
-            "cluster_range": np.zeros((len(clusters), 2)),
-            "part_lazy": arrays["cluster_lazy"],
-            "part_bodies": arrays["cluster_bodies"],
-            "part_ball": np.repeat(arrays["cluster_ball"][:, None], BINS, axis=1),
-            "part_outer": np.repeat(arrays["cluster_outer"][:, None], BINS, axis=1),
-        }
         found = head.get("schema") if isinstance(head, dict) else head
         if found != SCHEMA:
             raise FileFormatError(str(path), "schema", found, f"expected {SCHEMA!r}")
-        for column in layout(RobotArrays):
+        columns = {column.name: column for column in layout(RobotArrays)}
+        for column in (columns[name] for name in STORED):
             array = arrays[column.name]
             if array.dtype != column.dtype or array.shape[1:] != column.shape:
                 expected = f"expected {np.dtype(column.dtype)} in rows of shape {column.shape}"
                 raise FileFormatError(str(path), column.name, f"{array.dtype} {array.shape}", expected)
-        fault = head_fault(head) or robot_fault(RobotArrays(**arrays), len(head["joints"]), len(head["bodies"]))
+        none: dict[str, Any] = {name: np.empty((0, *columns[name].sized({})), columns[name].dtype) for name in MADE}
+        fault = head_fault(head) or robot_fault(RobotArrays(**arrays, **none), len(head["joints"]), len(head["bodies"]))
         if not fault and len(head["numbers"]) != len(head["bodies"]):
             fault = "numbers"
         if fault:
             raise FileFormatError(str(path), fault, "values that do not fit", "expected tables that fit each other")
         joints, bodies, numbers = (tuple(head[key]) for key in ("joints", "bodies", "numbers"))
-        clusters = arrays["pair_clusters"]
-        arrays |= {"pair_ball": arrays["cluster_ball"][clusters], "pair_outer": arrays["cluster_outer"][clusters]}
-        arrays["run_pairs"] = pair_runs(clusters)
-        return cls(head["name"], joints, bodies, numbers, RobotArrays(**arrays))
+        return cls(head["name"], joints, bodies, numbers, RobotArrays(**arrays, **_as_whole(arrays)))
+
+
+def _as_whole(stored: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """Return the arrays MADE of stored ones, where each cluster is one part and nothing is known inside of bodies."""
+    pairs, clusters = stored["pair_clusters"], np.arange(len(stored["cluster_joint"]))
+    ball, outer = stored["cluster_ball"], stored["cluster_outer"]
+    return {
+        "body_inner": np.zeros((len(stored["body_joint"]), 2), np.int64), "inner_ball": np.empty((0, 4)),
+        "pair_ball": ball[pairs], "pair_outer": outer[pairs], "pair_parts": np.ones_like(pairs),
+        "run_pairs": pair_runs(pairs), "cluster_parts": np.stack([clusters, np.ones_like(clusters)], axis=1),
+        "cluster_range": np.zeros((len(clusters), 2)), "part_lazy": stored["cluster_lazy"],
+        "part_bodies": stored["cluster_bodies"], "part_ball": np.repeat(ball[:, None], BINS, axis=1),
+        "part_outer": np.repeat(outer[:, None], BINS, axis=1),
+    }  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)

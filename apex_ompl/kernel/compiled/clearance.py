@@ -58,11 +58,11 @@ def nearest_to_obstacle(
     outer = t.cluster_outer[c]
     if distance(s, o, w.ball[c, 0], w.ball[c, 1], w.ball[c, 2], best[0] + outer + slack) - outer >= best[0]:
         return best
-    first, several, bin_ = t.cluster_parts[c, 0], t.cluster_parts[c, 1] > 1, bin_of(t, q, c)
+    first, k = t.cluster_parts[c, 0], bin_of(t, q, c)
     for p in range(first, first + t.cluster_parts[c, 1]):
-        if several:
-            outer = t.part_outer[p, bin_]
-            x, y, z = point_position(w, t.cluster_joint[c], t.part_ball[p, bin_])
+        if t.cluster_parts[c, 1] > 1:
+            outer = t.part_outer[p, k]
+            x, y, z = point_position(w, t.cluster_joint[c], t.part_ball[p, k])
             if distance(s, o, x, y, z, best[0] + outer + slack) - outer >= best[0]:
                 continue
         place_part(t, w, q, p)

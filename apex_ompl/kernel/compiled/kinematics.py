@@ -5,7 +5,7 @@ from __future__ import annotations
 from apex_ompl.kernel.compiled.arrays import BINS, FIXED, REVOLUTE, RobotArrays
 from apex_ompl.kernel.compiled.compilation import inlined
 from apex_ompl.kernel.compiled.layout import Floats, Integers
-from apex_ompl.kernel.compiled.turns import set_turns
+from apex_ompl.kernel.compiled.sincos import set_sines
 from apex_ompl.kernel.compiled.workspace import Workspace
 
 
@@ -16,7 +16,7 @@ def place_joints(t: RobotArrays, w: Workspace, q: Floats, joints: Integers, firs
         j = joints[first + k]
         source = t.joint_source[j]
         w.angle[k] = t.joint_ratio[j] * q[source] + t.joint_shift[j] if source >= 0 else 0.0
-    set_turns(w.angle, count, w.cosine, w.sine)
+    set_sines(w.angle, count, w.cosine, w.sine)
     for k in range(count):
         _place_joint(t, w, joints[first + k], w.angle[k], w.cosine[k], w.sine[k])
 
@@ -51,8 +51,8 @@ def place_robot(t: RobotArrays, w: Workspace, q: Floats) -> None:
         r, ball = w.rotation[j], t.cluster_ball[c]
         for i in range(3):
             w.ball[c, i] = w.origin[j, i] + r[i, 0] * ball[0] + r[i, 1] * ball[1] + r[i, 2] * ball[2]
-            w.middle[i, c] = w.ball[c, i]
-        w.middle[3, c] = ball[3]
+            w.ball_rows[i, c] = w.ball[c, i]
+        w.ball_rows[3, c] = ball[3]
     for p in range(len(t.part_lazy)):
         w.opened[p] = 0
 

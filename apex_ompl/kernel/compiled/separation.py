@@ -141,9 +141,9 @@ def unproved_with_obstacles(
 @inlined
 def near_of_run(w: Workspace, a: int, b: int, number: int) -> int:
     """Return the bits of those of ``number`` clusters, at most RUN, from ``b`` on, whose balls meet that of ``a``."""
-    x, y, z, radius = w.middle[0, a], w.middle[1, a], w.middle[2, a], w.middle[3, a]
-    us, vs, ws = w.middle[0, b : b + RUN], w.middle[1, b : b + RUN], w.middle[2, b : b + RUN]
-    radii, near = w.middle[3, b : b + RUN], 0
+    x, y, z, radius = w.ball_rows[0, a], w.ball_rows[1, a], w.ball_rows[2, a], w.ball_rows[3, a]
+    us, vs, ws = w.ball_rows[0, b : b + RUN], w.ball_rows[1, b : b + RUN], w.ball_rows[2, b : b + RUN]
+    radii, near = w.ball_rows[3, b : b + RUN], 0
     for k in range(RUN):
         apart = radius + radii[k]
         far = (x - us[k]) ** 2 + (y - vs[k]) ** 2 + (z - ws[k]) ** 2 > apart * apart

@@ -7,7 +7,7 @@ from typing import Annotated, NamedTuple
 from apex_ompl.kernel.compiled.arrays import RUN, RobotArrays
 from apex_ompl.kernel.compiled.compilation import ir_inlined
 from apex_ompl.kernel.compiled.layout import Floats, Integers, buffer_sizes, buffer_view
-from apex_ompl.kernel.compiled.turns import TOGETHER
+from apex_ompl.kernel.compiled.sincos import TOGETHER
 
 
 class Workspace(NamedTuple):
@@ -17,7 +17,7 @@ class Workspace(NamedTuple):
         rotation: Rotations of the joints in the world.
         origin: Origins of the joints in the world [m].
         ball: Centres of the clusters' balls in the world [m].
-        middle: The same, and their radii, in rows.
+        ball_rows: The same and their radii, a row each of x, y, z and radius.
         opened: Whether inner joints of a part of a cluster and ``root`` of its bodies are those of this state.
         root: Centres of the bodies' root spheres in the world [m].
         stack: Nodes that wait in a traversal of trees of spheres.
@@ -41,13 +41,13 @@ class Workspace(NamedTuple):
     rotation: Annotated[Floats, "joints", 3, 3]
     origin: Annotated[Floats, "joints", 3]
     ball: Annotated[Floats, "clusters", 3]
-    middle: Annotated[Floats, 4, "lanes"]
+    ball_rows: Annotated[Floats, 4, "lanes"]
     opened: Annotated[Integers, "parts"]
     root: Annotated[Floats, "bodies", 3]
     stack: Annotated[Integers, "stack"]
-    angle: Annotated[Floats, "turns"]
-    cosine: Annotated[Floats, "turns"]
-    sine: Annotated[Floats, "turns"]
+    angle: Annotated[Floats, "angles"]
+    cosine: Annotated[Floats, "angles"]
+    sine: Annotated[Floats, "angles"]
     moving: Annotated[Integers, 1]
     margin: Annotated[Floats, 1]
     arc_bound: Annotated[Floats, "clusters", "joints"]
@@ -61,7 +61,7 @@ class Workspace(NamedTuple):
     near: Annotated[Integers, "bodies"]
 
 
-_view = buffer_view(Workspace, ("joints", "clusters", "lanes", "parts", "bodies", "stack", "turns", "dof"))
+_view = buffer_view(Workspace, ("joints", "clusters", "lanes", "parts", "bodies", "stack", "angles", "dof"))
 
 
 def workspace_dimensions(t: RobotArrays) -> dict[str, int]:
@@ -69,7 +69,7 @@ def workspace_dimensions(t: RobotArrays) -> dict[str, int]:
     return {
         "joints": len(t.joint_parent), "clusters": len(t.cluster_joint), "lanes": len(t.cluster_joint) + RUN,
         "parts": len(t.part_lazy), "bodies": len(t.body_joint),
-        "stack": 2 * len(t.node_first) + 2, "turns": max(len(t.joint_parent), len(t.lazy)) + TOGETHER,
+        "stack": 2 * len(t.node_first) + 2, "angles": max(len(t.joint_parent), len(t.lazy)) + TOGETHER,
         "dof": len(t.lower),
     }  # fmt: skip
 
@@ -83,8 +83,8 @@ def workspace_sizes(t: RobotArrays) -> tuple[int, int]:
 def workspace_view(t: RobotArrays, integers: Integers, floats: Floats) -> Workspace:
     """Return a workspace in buffers of the sizes that :func:`workspace_sizes` gives, for a state that is not moving."""
     joints, clusters, bodies = len(t.joint_parent), len(t.cluster_joint), len(t.body_joint)
-    stack, turns = 2 * len(t.node_first) + 2, max(joints, len(t.lazy)) + TOGETHER
-    w = _view(integers, floats, joints, clusters, clusters + RUN, len(t.part_lazy), bodies, stack, turns, len(t.lower))
+    stack, angles = 2 * len(t.node_first) + 2, max(joints, len(t.lazy)) + TOGETHER
+    w = _view(integers, floats, joints, clusters, clusters + RUN, len(t.part_lazy), bodies, stack, angles, len(t.lower))
     for k in range(3):
         w.origin[0, k] = 0.0
         for m in range(3):

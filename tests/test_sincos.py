@@ -9,13 +9,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from apex_ompl.kernel.compiled.compilation import OPTIONS
-from apex_ompl.kernel.compiled.turns import MOST, TOGETHER, set_turns
+from apex_ompl.kernel.compiled.sincos import MOST, TOGETHER, set_sines
 
 
 @numba.njit(**OPTIONS)
-def turns(angles, count, cosines, sines):  # type: ignore[no-untyped-def]
+def call(angles, count, cosines, sines):  # type: ignore[no-untyped-def]
     """Call it."""
-    set_turns(angles, count, cosines, sines)
+    set_sines(angles, count, cosines, sines)
 
 
 def found(angles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -23,12 +23,12 @@ def found(angles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     room = -(-len(angles) // TOGETHER) * TOGETHER
     buffers = np.full((3, room), np.inf)
     buffers[0, : len(angles)] = angles
-    turns(buffers[0], len(angles), buffers[1], buffers[2])
+    call(buffers[0], len(angles), buffers[1], buffers[2])
     return buffers[1, : len(angles)], buffers[2, : len(angles)]
 
 
 @given(st.lists(st.floats(-1.1 * MOST, 1.1 * MOST), min_size=1, max_size=3 * TOGETHER))
-def test_turns_are_those_of_the_library_in_extended_precision(angles: list[float]) -> None:
+def test_sines_are_those_of_the_library_in_extended_precision(angles: list[float]) -> None:
     cosines, sines = found(np.array(angles))
     exact = np.array(angles, np.longdouble)
     for mine, true in ((cosines, np.cos(exact)), (sines, np.sin(exact))):
@@ -37,7 +37,7 @@ def test_turns_are_those_of_the_library_in_extended_precision(angles: list[float
 
 
 @pytest.mark.parametrize("quarter", range(-9, 10))
-def test_turns_at_whole_quarters(quarter: int) -> None:
+def test_sines_at_whole_quarters(quarter: int) -> None:
     at = quarter * np.pi / 2
     near = np.array([np.nextafter(at, -np.inf), at, np.nextafter(at, np.inf)])
     cosines, sines = found(near)

@@ -23,7 +23,7 @@ C4, C5, C6 = -2.75573143513906633035e-07, 2.08757232129817482790e-09, -1.1359647
 
 
 @outlined
-def set_turns(angles: Floats, count: int, cosines: Floats, sines: Floats) -> None:
+def set_sines(angles: Floats, count: int, cosines: Floats, sines: Floats) -> None:
     """Put the cosines and sines of the first ``count`` angles into place.
 
     The arrays have room for the next multiple of TOGETHER of them.
