@@ -22,8 +22,9 @@ from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.tabulate import primitives
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel import Kernel, robot_builder, robot_specs
-from apex_ompl.kernel.compiled import motion_proof, queries
+from apex_ompl.kernel.compiled import compilation, motion_proof, queries
 from apex_ompl.kernel.compiled.arrays import PRISMATIC
+from apex_ompl.kernel.compiled.layout import Floats
 from apex_ompl.kernel.joint_tree import JointTree
 from apex_ompl.kernel.scene_builder import scene_tables
 from apex_ompl.kernel.tables import RobotTables
@@ -338,3 +339,20 @@ def test_compiled_functions_take_nothing_from_outside_their_folder() -> None:
                 assert inside or (file.stem, node.module) == ("compilation", "apex_ompl.util.cache"), file.name
             elif isinstance(node, ast.Import):
                 assert not any(alias.name.startswith("apex_ompl") for alias in node.names), file.name
+
+
+def test_what_is_compiled_once_for_all_its_callers_is_not_inlined() -> None:
+    """Not even where the function that calls it is: numba would hand that on."""
+
+    def inner(a: Floats) -> float:
+        return float(a[0] * 2.0)
+
+    outer: Any = compilation.outlined(inner)
+
+    def between(a: Floats) -> float:
+        return outer(a) + 1.0
+
+    middle: Any = compilation.inlined(between)
+
+    middle.compile("f8(f8[::1])")
+    assert [next(iter(f.overloads.values())).fndesc.inline for f in (outer, middle)] == [False, True]

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import coal
+import numba
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -21,6 +24,9 @@ from apex_ompl.collision.tabulate import joint_specs, primitives
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError, UnknownNameError
 from apex_ompl.kernel import Kernel, joint_tree
 from apex_ompl.kernel.compiled.arrays import BINS, FIXED, RUN, robot_view, scene_view
+from apex_ompl.kernel.compiled.compilation import OPTIONS
+from apex_ompl.kernel.compiled.layout import new_buffers
+from apex_ompl.kernel.compiled.path_cost import Buffers, buffers_view
 from apex_ompl.kernel.scene_builder import scene_tables
 from apex_ompl.kernel.tables import RobotTables, pair_runs, with_pairs
 from apex_ompl.robot import Robot, load_robot
@@ -37,6 +43,9 @@ import sys, numpy as np
 for name in ("pinocchio", "coal", "ompl"):
     sys.modules[name] = None
 from apex_ompl.kernel import Kernel
+from apex_ompl.kernel.compiled.compilation import OPTIONS
+from apex_ompl.kernel.compiled.layout import new_buffers
+from apex_ompl.kernel.compiled.path_cost import Buffers, buffers_view
 from apex_ompl.kernel.scene_builder import Primitive, scene_tables
 from apex_ompl.kernel.compiled.arrays import BOX
 from apex_ompl.kernel.tables import RobotTables
@@ -99,12 +108,35 @@ def test_damaged_tables_are_faults_and_no_crash(tmp_path: Path) -> None:
         RobotTables.load(tmp_path / "plain.npy")
 
 
+def compiled_of_all(view: Any, names: Iterable[str], arguments: str, line: str) -> Any:
+    """Return a compiled function that does a line for each array ``a`` of a view, the ``K``-th."""
+    body = "".join(f"    a = seen.{name}\n    {line.replace('K', str(k))}\n" for k, name in enumerate(names))
+    made: dict[str, Any] = {"view": view, "np": np}
+    exec(f"def of_all(out, shapes, buffers, sizes):\n    seen = view({arguments})\n{body}", made)
+    return numba.njit(**OPTIONS)(made["of_all"])
+
+
 def test_arrays_come_out_of_a_pack_as_they_went_in(robot: Robot, post: Obstacle) -> None:
     kernel = CollisionChecker(robot, [post]).kernel
     for tables, view in ((kernel.robot, robot_view), (kernel.scene, scene_view)):
-        seen = view.py_func(*tables.packed)
-        for name, array in tables.arrays._asdict().items():
-            assert np.array_equal(getattr(seen, name), array), name
+        arrays = tables.arrays._asdict()
+        out = {name: np.zeros_like(array) for name, array in arrays.items()}
+        shapes = np.zeros((len(arrays), 4), np.int64)
+        line = "for i in np.ndindex(a.shape): out[K][i] = a[i]"
+        line += "\n    for i in range(a.ndim): shapes[K, i] = a.shape[i]"
+        copy = compiled_of_all(view, arrays, ", ".join(f"buffers[{k}]" for k in range(len(tables.packed))), line)
+        copy(tuple(out.values()), shapes, tables.packed, ())
+        for (name, array), shape in zip(arrays.items(), shapes, strict=True):
+            assert np.array_equal(out[name], array) and tuple(shape[: array.ndim]) == array.shape, name
+
+
+def test_compiled_code_sees_the_arrays_of_buffers_that_python_sees() -> None:
+    sizes = {"unknowns": 6, "points": 4, "dof": 3}
+    integers, floats, seen = new_buffers(Buffers, **sizes)
+    fill = compiled_of_all(buffers_view, seen._fields, "buffers[0], buffers[1], sizes", "a[...] = K + 1")
+    fill((), (), (integers, floats), tuple(sizes.values()))
+    for k, array in enumerate(seen):
+        assert array.size and np.all(array == k + 1), seen._fields[k]
 
 
 @pytest.mark.parametrize("ratio", [0.3, -1.57, 6.3, 10.0, -25.0, 40.0])

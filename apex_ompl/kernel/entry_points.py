@@ -52,14 +52,14 @@ class Group:
 
 PLANS = Group(
     "its collision kernel",
-    60,
+    40,
     (
         {
-            "motion_proof.prove_path": (ROBOT + SCENE + WORKSPACE + PROOF, 8),
-            "tree_search.grow_trees": (ROBOT + SCENE + WORKSPACE + TREES + PROOF, 6),
+            "motion_proof.prove_path": (ROBOT + SCENE + WORKSPACE + PROOF, 10),
+            "tree_search.grow_trees": (ROBOT + SCENE + WORKSPACE + TREES + PROOF, 4),
             "shortcutting.shortcut_path": (
                 ROBOT + SCENE + WORKSPACE + "f8[:, ::1], f8, f8[:, ::1], i8[::1], " + PROOF,
-                6,
+                4,
             ),
         },
         {
@@ -111,7 +111,7 @@ PLANS = Group(
 
 RUNS = Group(
     "what runs among moving obstacles need",
-    50,
+    25,
     (
         {
             "motion_optimization.optimize_motion": (
@@ -121,13 +121,13 @@ RUNS = Group(
                 + WORKSPACE
                 + f"f8[:, ::1], f8[:, ::1], i8[::1], f8[:, ::1], f8[::1], f8[:, ::1], f8, i8, f8[:, ::1], {SETTINGS}, "
                 "i8[::1], f8[::1], f8[::1]",
-                28,
+                16,
             ),
         },
         {
             "movers.clearances_in_time": (
                 ROBOT + MOVERS + WORKSPACE + "f8[:, ::1], f8[::1], f8, f8[:, ::1], f8[::1], f8[:, ::1]",
-                6,
+                2,
             ),
             "movers.first_conflict": (
                 ROBOT
@@ -135,14 +135,14 @@ RUNS = Group(
                 + WORKSPACE
                 + "f8[::1], f8[:, ::1], f8[:, ::1], f8, f8, f8, f8, f8, f8[:, ::1], f8[::1], "
                 "i8[::1]",
-                10,
+                6,
             ),
         },
         {
             "blocked_intervals.blocked_intervals": (
                 ROBOT + MOVERS + WORKSPACE + "f8[::1], f8[:, ::1], f8[:, ::1], f8, f8[:, ::1], f8, f8, f8[::1], "
                 "f8[:, :, ::1], i8[::1]",
-                12,
+                14,
             ),
             "stops_among_movers.first_unproved_stop": (
                 ROBOT
@@ -152,7 +152,7 @@ RUNS = Group(
                 "f8[:, :, ::1], " + 5 * "f8[::1], " + "f8, f8[::1], i8[::1], f8, f8, f8, f8[:, ::1], f8[::1], i8[::1], "
                 "f8[:, ::1], f8[:, ::1], f8[::1], f8[::1], f8[:, :, ::1], f8[::1], f8[:, :, ::1], f8[:, ::1], "
                 "f8[:, ::1]",
-                10,
+                8,
             ),
         },
         {

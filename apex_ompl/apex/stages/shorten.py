@@ -13,8 +13,8 @@ from apex_ompl.ompl_adapter.simplify import simplify
 from apex_ompl.trajopt.path import Path, path_length
 from apex_ompl.types import Array
 
-DETOUR, OTHERS = 2.0, 2  # times the straight line's length, beyond which so many other trees are tried
-ITERATIONS = 2_000  # of each of these
+DETOUR, OTHERS = 1.7, 2  # times the straight line's length, beyond which so many other trees are tried
+ITERATIONS = 6_000  # of each of these
 DRAWS = 100  # shortcuts that are tried
 RESOLUTION = 0.01  # of the states along them [rad, max-norm]
 

@@ -9,6 +9,7 @@ compiled anew in every process, and a warning says so.
 
 from __future__ import annotations
 
+import gc
 import hashlib
 import logging
 import os
@@ -16,7 +17,8 @@ import platform
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
@@ -74,8 +76,11 @@ def inlined(function: F) -> F:
 
 
 def outlined(function: F) -> F:
-    """Compile a function that only other compiled ones call, once for all of them."""
-    compiled: F = numba.njit(**INNER)(function)
+    """Compile a function that only other compiled ones call, once for all of them.
+
+    numba would let it have what its first caller has, so that it were inlined wherever that is.
+    """
+    compiled: F = numba.njit(**INNER, forceinline=False)(function)
     return compiled
 
 
@@ -126,6 +131,17 @@ def _entry_point(function: Callable[..., Any], **options: Any) -> CompiledFuncti
     return CompiledFunction(dispatcher, function.__name__)
 
 
+@contextmanager
+def _rare_collections() -> Iterator[None]:
+    """Look for garbage less often during a block: a tenth of numba's time goes there, and it keeps what it makes."""
+    before = gc.get_threshold()
+    gc.set_threshold(100_000, *before[1:])
+    try:
+        yield
+    finally:
+        gc.set_threshold(*before)
+
+
 class CompiledFunction:
     """A compiled function whose first call warns that it compiles, unless an earlier process left its code.
 
@@ -151,7 +167,7 @@ class CompiledFunction:
 
     def compile(self, types: str) -> None:
         """Compile the function into the cache for arguments of the given types, without a warning."""
-        with _lock:
+        with _lock, _rare_collections():
             self.dispatcher.compile(normalize_signature(f"({types},)")[0])  # the cache takes a text for another key
             self._ready = True
 
@@ -165,7 +181,8 @@ class CompiledFunction:
             else:
                 self._announce()
                 start = time.perf_counter()
-                result = self.dispatcher(*arguments)
+                with _rare_collections():
+                    result = self.dispatcher(*arguments)
                 LOG.warning("apex_ompl compiled %s in %.1f s", self.name, time.perf_counter() - start)
             self._ready = True
         return result

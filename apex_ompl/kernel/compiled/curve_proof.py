@@ -198,7 +198,7 @@ def prove_curve(
         interval got too short, or OUTSIDE at a state for which the tables do not hold.
     """
     t, s, h = robot_view(ri, rf), scene_view(si, sf, sg), shapes_view(hi, hf)
-    w, g, p = workspace_view(t, wi, wf), pair_view(gi, gf), _proof_view(pi, pf, len(t.lower))
+    w, g, p = workspace_view(t, wi, wf), pair_view(gi, gf, ()), _proof_view(pi, pf, (len(t.lower),))
     whole = knots[len(knots) - 1] - knots[0]
     shortest = SHORTEST * whole
     while p.places[0] < p.places[1] and budget > 0:

@@ -131,7 +131,7 @@ def descend(
     t, targets = robot_view(ri, rf), targets_view(ti, tf)
     w = workspace_view(t, wi, wf)
     dof, n = states.shape[1], len(free)
-    b = _buffers(bi, bf, dof, n)
+    b = _buffers(bi, bf, (dof, n))
     for s in range(len(states)):
         q, now = states[s], 0
         for i in range(n):
@@ -176,7 +176,7 @@ def residual_and_jacobian(
     """Put the residual of all targets at a state, (dof,), into ``residual`` (m,), its Jacobian into (m, dof)."""
     t, targets = robot_view(ri, rf), targets_view(ti, tf)
     w = workspace_view(t, wi, wf)
-    b = _buffers(bi, bf, len(q), 0)
+    b = _buffers(bi, bf, (len(q), 0))
     place_joints(t, w, q, chain, 0, len(chain))
     at = 0
     for m in range(len(targets.kind)):

@@ -2,7 +2,7 @@
 
 Passing two arrays to compiled code costs a tenth of passing thirty. A layout is the list of fields of a named tuple:
 each is annotated ``Integers`` or ``Floats``, or with these and a shape, ``Annotated[Floats, "joints", 3]``. From it
-come the sizes of the buffers and the source of the compiled function that slices them. A last field of ``Singles``,
+come the sizes of the buffers and the compiled function that slices them. A last field of ``Singles``,
 which may be long, is passed as it is.
 """
 
@@ -16,7 +16,7 @@ from typing import Annotated, Any, NamedTuple, get_args, get_origin, get_type_hi
 import numpy as np
 from numpy.typing import NDArray
 
-from apex_ompl.kernel.compiled.compilation import ir_inlined
+from apex_ompl.kernel.compiled.views import buffer_code, table_code
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
@@ -80,27 +80,15 @@ def pack(arrays: Any) -> tuple[Any, ...]:
 
 def table_view(cls: Any) -> Callable[..., Any]:
     """Return the compiled inverse of :func:`pack`: ``view(integers, floats[, singles])`` gives a ``cls`` of slices."""
-    slices, singles = [], [field.name for field in layout(cls) if field.single]
-    for k, field in enumerate(layout(cls)):
-        if field.single:
-            slices.append(field.name)
-            continue
-        rows = f".reshape(-1, {', '.join(map(str, field.shape))})" if field.shape else ""
-        buffer = "integers" if field.integer else "floats"
-        slices.append(f"{buffer}[integers[{2 * k}] : integers[{2 * k + 1}]]{rows}")
-    return _generated(cls, ["integers", "floats", *singles], [], slices)
+    return table_code(cls, layout(cls))
 
 
 def buffer_view(cls: Any, dimensions: Sequence[str]) -> Callable[..., Any]:
-    """Return the compiled ``view(integers, floats, *dimensions)`` that gives a ``cls`` of slices of buffers."""
-    ends, lines, slices = {"integers": "0", "floats": "0"}, [], []
-    for k, field in enumerate(layout(cls)):
-        buffer = "integers" if field.integer else "floats"
-        lines.append(f"end{k} = {ends[buffer]} + {' * '.join(map(str, field.shape))}")
-        rows = f".reshape({', '.join(map(str, field.shape))})" if len(field.shape) > 1 else ""
-        slices.append(f"{buffer}[{ends[buffer]} : end{k}]{rows}")
-        ends[buffer] = f"end{k}"
-    return _generated(cls, ["integers", "floats", *dimensions], lines, slices)
+    """Return the compiled ``view(integers, floats, sizes)`` that gives a ``cls`` of slices of buffers.
+
+    ``sizes`` is a tuple of the numbers that the names in ``dimensions`` stand for.
+    """
+    return buffer_code(cls, layout(cls), dimensions)
 
 
 @cache
@@ -122,12 +110,3 @@ def new_buffers(cls: Any, **dimensions: int) -> tuple[Integers, Floats, Any]:
         buffer = integers if field.integer else floats
         views.append(buffer[begin : ends[field.integer]].reshape(field.sized(dimensions)))
     return integers, floats, cls(*views)
-
-
-def _generated(cls: Any, arguments: list[str], lines: list[str], values: list[str]) -> Callable[..., Any]:
-    """Return the compiled function that computes ``lines`` and returns a ``cls`` of ``values``."""
-    body = "".join(f"    {line}\n" for line in lines)
-    source = f"def view({', '.join(arguments)}):\n{body}    return {cls.__name__}({', '.join(values)})\n"
-    names: dict[str, Any] = {cls.__name__: cls, "__name__": cls.__module__}
-    exec(compile(source, f"<layout of {cls.__name__}>", "exec"), names)
-    return ir_inlined(names["view"])  # type: ignore[no-any-return]

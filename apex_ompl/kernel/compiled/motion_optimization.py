@@ -157,7 +157,7 @@ def optimize_motion(
     t, s, m = robot_view(ri, rf), scene_view(si, sf, sg), movers_view(mi, mf, ms)
     w = workspace_view(t, wi, wf)
     points, dof = control.shape
-    b = buffers_view(bi, bf, (points - 2 * pinned) * dof, points, dof)
+    b = buffers_view(bi, bf, ((points - 2 * pinned) * dof, points, dof))
     problem = MotionProblem(
         weights, first, speed_gram, m, scene_of_movers(m, offset), times, limits, limit_weight
     )  # fmt: skip

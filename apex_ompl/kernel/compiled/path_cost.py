@@ -255,7 +255,7 @@ def path_cost(
     t, s = robot_view(ri, rf), scene_view(si, sf, sg)
     w = workspace_view(t, wi, wf)
     points, dof = control.shape
-    b = buffers_view(bi, bf, (points - 2 * pinned) * dof, points, dof)
+    b = buffers_view(bi, bf, ((points - 2 * pinned) * dof, points, dof))
     settings = CostSettings(*numbers)
     problem = PathProblem(weights, first, speed_gram)
     c = evaluate_path(problem, t, s, w, pinned, control, settings, b, gradient, b.gram[0])

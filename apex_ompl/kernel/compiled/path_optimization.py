@@ -260,7 +260,7 @@ def optimize_path(
     t, s = robot_view(ri, rf), scene_view(si, sf, sg)
     w = workspace_view(t, wi, wf)
     points, dof = control.shape
-    b = buffers_view(bi, bf, (points - 2 * pinned) * dof, points, dof)
+    b = buffers_view(bi, bf, ((points - 2 * pinned) * dof, points, dof))
     c, taken, damping = descend(
         evaluate_path, PathProblem(weights, first, speed_gram), t, s, w, speed_gram, pinned, control,
         CostSettings(*numbers), b, weights.shape[1],

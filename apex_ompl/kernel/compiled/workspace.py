@@ -84,7 +84,8 @@ def workspace_view(t: RobotArrays, integers: Integers, floats: Floats) -> Worksp
     """Return a workspace in buffers of the sizes that :func:`workspace_sizes` gives, for a state that is not moving."""
     joints, clusters, bodies = len(t.joint_parent), len(t.cluster_joint), len(t.body_joint)
     stack, angles = 2 * len(t.node_first) + 2, max(joints, len(t.lazy)) + TOGETHER
-    w = _view(integers, floats, joints, clusters, clusters + RUN, len(t.part_lazy), bodies, stack, angles, len(t.lower))
+    sizes = joints, clusters, clusters + RUN, len(t.part_lazy), bodies, stack, angles, len(t.lower)
+    w = _view(integers, floats, sizes)
     for k in range(3):
         w.origin[0, k] = 0.0
         for m in range(3):
