@@ -145,12 +145,8 @@ def offline(job: Job) -> dict[str, Any]:
 
 def ratios(some: Sequence[dict[str, Any]], best: Sequence[dict[str, Any]]) -> list[float]:
     """Return times to the goal by those of other runs in the same worlds, where both came there."""
-    of = {(one["world"], one["speed"]): one for one in best if one["outcome"] == "reached"}
-    return [
-        one["time_to_goal"] / of[one["world"], one["speed"]]["time_to_goal"]
-        for one in some
-        if one["outcome"] == "reached" and (one["world"], one["speed"]) in of
-    ]
+    of = reached(best)
+    return [time / of[world] for world, time in reached(some).items() if world in of]
 
 
 def summary(some: Sequence[dict[str, Any]], best: Sequence[dict[str, Any]] = ()) -> dict[str, Any]:
@@ -259,6 +255,30 @@ def by_clock(
     return "\n".join(record.row(line) for line in lines), numbers
 
 
+def by_waiting(rows: dict[tuple[str, float, str], list[dict[str, Any]]]) -> tuple[str, dict[str, Any]]:
+    """Return the table of apex's times to the goal by those of stop-and-wait, over worlds in which both come there."""
+    head = ["apex by stop-and-wait", "worlds", "ratio of times to goal p50", "of their sums"]
+    lines, numbers = [head, ["---", *["---:"] * (len(head) - 1)]], {}
+    for speed in sorted({speed for _, speed, _ in rows}, reverse=True):
+        found: dict[str, list[tuple[float, float]]] = {}
+        for kind in dict.fromkeys(kind for kind, *_ in rows):
+            own, other = (reached(rows.get((kind, speed, method), ())) for method in ("apex", "stop-and-wait"))
+            found[kind] = [(own[world], other[world]) for world in own if world in other]
+        found["all"] = [pair for pairs in found.values() for pair in pairs]
+        for kind, pairs in found.items():
+            if pairs:
+                total = [sum(times) for times in zip(*pairs, strict=True)]
+                row = [float(np.median([a / b for a, b in pairs])), total[0] / total[1]]
+                numbers[f"{kind}, speed {speed:g}"] = [len(pairs), *row]
+                lines.append([f"{kind}, speed {speed:g}", len(pairs), *(f"{v:.2f}" for v in row)])
+    return "\n".join(record.row(line) for line in lines), numbers
+
+
+def reached(some: Sequence[dict[str, Any]]) -> dict[str, float]:
+    """Return times to the goal of the runs that came there, by world [s]."""
+    return {one["world"]: one["time_to_goal"] for one in some if one["outcome"] == "reached"}
+
+
 def causes_of(s: dict[str, Any]) -> str:
     """Return the causes of failures of a row."""
     return ", ".join(f"{count} {cause}" for cause, count in sorted(s["causes"].items())) or "-"
@@ -345,6 +365,9 @@ def main() -> None:
     if timed:
         clocks, data["by_clock"] = by_clock(rows, timed)
         text = f"{text}\n\n{clocks}"
+    waiting, data["by_waiting"] = by_waiting(rows)
+    if data["by_waiting"]:
+        text = f"{text}\n\n{waiting}"
     every = [one for some in (*rows.values(), *timed.values()) for one in some]
     record.write("closed_loop", data, text, split=args.split, n=args.n, seed=0, **made_by(every))
 
