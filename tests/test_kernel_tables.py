@@ -25,7 +25,7 @@ from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError, 
 from apex_ompl.kernel import Kernel, joint_tree
 from apex_ompl.kernel.compiled.arrays import BINS, FIXED, RUN, robot_view, scene_view
 from apex_ompl.kernel.compiled.compilation import OPTIONS
-from apex_ompl.kernel.compiled.layout import new_buffers
+from apex_ompl.kernel.compiled.layout import new_buffers, unpack
 from apex_ompl.kernel.compiled.path_cost import Buffers, buffers_view
 from apex_ompl.kernel.scene_builder import scene_tables
 from apex_ompl.kernel.tables import RobotTables, pair_runs, with_pairs
@@ -44,7 +44,7 @@ for name in ("pinocchio", "coal", "ompl"):
     sys.modules[name] = None
 from apex_ompl.kernel import Kernel
 from apex_ompl.kernel.compiled.compilation import OPTIONS
-from apex_ompl.kernel.compiled.layout import new_buffers
+from apex_ompl.kernel.compiled.layout import new_buffers, unpack
 from apex_ompl.kernel.compiled.path_cost import Buffers, buffers_view
 from apex_ompl.kernel.scene_builder import Primitive, scene_tables
 from apex_ompl.kernel.compiled.arrays import BOX
@@ -126,7 +126,9 @@ def test_arrays_come_out_of_a_pack_as_they_went_in(robot: Robot, post: Obstacle)
         line += "\n    for i in range(a.ndim): shapes[K, i] = a.shape[i]"
         copy = compiled_of_all(view, arrays, ", ".join(f"buffers[{k}]" for k in range(len(tables.packed))), line)
         copy(tuple(out.values()), shapes, tables.packed, ())
+        seen = unpack(tables.arrays.__class__, *tables.packed)
         for (name, array), shape in zip(arrays.items(), shapes, strict=True):
+            assert np.array_equal(getattr(seen, name), array), name
             assert np.array_equal(out[name], array) and tuple(shape[: array.ndim]) == array.shape, name
 
 

@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from apex_ompl.kernel.compiled.layout import pack
-from apex_ompl.kernel.compiled.movers import MoverArrays, movers_view
+from apex_ompl.kernel.compiled.layout import pack, unpack
+from apex_ompl.kernel.compiled.movers import MoverArrays
 from apex_ompl.kernel.compiled.state_costs import state_costs
 from apex_ompl.kernel.kernel import Kernel
 from apex_ompl.types import Array
@@ -69,7 +69,7 @@ def clearance_costs(
     count, dof = q.shape
     at = np.zeros(count) if times is None else compact(finite_array(times, "times"))
     check_array(at, (count,), "times")
-    offset = np.empty((len(movers_view.py_func(*movers).kind), 3))  # type: ignore[attr-defined]
+    offset = np.empty((len(unpack(MoverArrays, *movers).kind), 3))
     values, gradient, gram = np.empty((count, 3)), np.empty((count, dof)), np.empty((count, dof, dof))
     state_costs(
         *kernel.packed, *movers, *kernel.workspace(), offset, q, at, float(scene_margin), float(own_margin),

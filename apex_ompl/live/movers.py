@@ -16,8 +16,8 @@ from apex_ompl.collision.shapes import world_geometry
 from apex_ompl.collision.tabulate import primitives
 from apex_ompl.errors import ParameterError, SceneError, UnknownNameError
 from apex_ompl.kernel import Kernel
-from apex_ompl.kernel.compiled.layout import pack
-from apex_ompl.kernel.compiled.movers import MoverArrays, clearances_in_time, first_conflict, movers_view
+from apex_ompl.kernel.compiled.layout import pack, unpack
+from apex_ompl.kernel.compiled.movers import MoverArrays, clearances_in_time, first_conflict
 from apex_ompl.kernel.scene_builder import Solids, grid_columns, joined
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.trajectory import Trajectory
@@ -88,7 +88,7 @@ class Movers:
 
     def _pack(self, packed: tuple[Array, ...]) -> None:
         self.packed = packed
-        self.arrays: MoverArrays = movers_view.py_func(*packed)  # type: ignore[attr-defined]
+        self.arrays: MoverArrays = unpack(MoverArrays, *packed)
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the state without views of its arrays."""

@@ -78,8 +78,20 @@ def pack(arrays: Any) -> tuple[Any, ...]:
     return np.concatenate([np.array(places, np.int64), *parts[True]]), np.concatenate(parts[False]), *singles
 
 
+def unpack(cls: Any, integers: Any, floats: Any, *singles: Any) -> Any:
+    """Return the inverse of :func:`pack` for Python: a ``cls`` of slices."""
+    places, rest, values = iter(integers.tolist()), iter(singles), []
+    for field in layout(cls):
+        if field.single:
+            values.append(next(rest))
+            continue
+        array = (integers if field.integer else floats)[next(places) : next(places)]
+        values.append(array.reshape(-1, *field.shape) if field.shape else array)
+    return cls(*values)
+
+
 def table_view(cls: Any) -> Callable[..., Any]:
-    """Return the compiled inverse of :func:`pack`: ``view(integers, floats[, singles])`` gives a ``cls`` of slices."""
+    """Return :func:`unpack` for compiled code: ``view(integers, floats[, singles])`` gives a ``cls`` of slices."""
     return table_code(cls, layout(cls))
 
 
