@@ -16,7 +16,6 @@ from numba.extending import intrinsic
 from numba.np.arrayobj import make_array, populate_array
 
 INT = ir.IntType(64)
-Shape = tuple[int | str, ...]
 
 
 def table_code(cls: Any, fields: Sequence[Any]) -> Callable[..., Any]:
@@ -89,6 +88,7 @@ def _arrays(cls: Any, fields: Sequence[Any], buffers: Sequence[Any], whole: bool
 
 
 def _sources(context: Any, builder: Any, signature: Any, arguments: Sequence[Any]) -> list[Any]:
+    """Return the buffers of integers and of floats."""
     return [make_array(signature.args[k])(context, builder, arguments[k]) for k in (0, 1)]
 
 
