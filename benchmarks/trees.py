@@ -1,4 +1,4 @@
-"""Trees in compiled code beside OMPL's RRTConnect: the same problems, step, resolution and time, nodes a second.
+"""Trees in compiled code beside OMPL's RRTConnect: the same problems, step, resolution and time, steps a second.
 
 OMPL's asks this project's validator for each motion, as it does in every comparison with ``rrtconnect``. Compiled trees
 take for blocked what the spheres do not prove free; how many of their paths pass the full proof as they are is a column
@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from itertools import count
 from typing import Any
 
 import numpy as np
@@ -37,24 +38,29 @@ RANGE = TUNED["apex"]["range"]
 KINDS = ("OMPL's", "compiled")
 
 
-def of_ompl(ready: PlanningSetup, seed: int) -> tuple[Array | None, int]:
-    """Return the path of OMPL's trees, or None, and their number of nodes."""
+def of_ompl(ready: PlanningSetup, seed: int) -> tuple[Array | None, int, int]:
+    """Return the path of OMPL's trees, or None, their number of nodes, and that of the steps that were tried."""
     seed_ompl(seed)
     si = ready.simple_setup.getSpaceInformation()
+    validator, steps = si.getMotionValidator(), count()
+    check = validator.check
+    validator.check = lambda a, b: next(steps) >= 0 and check(a, b)
     tree, pdef = ompl_trees(si, [ready.start], ready.valid_goals[0], RANGE)
     solved = tree.solve(TIMEOUT).getStatus() == ob.PlannerStatus.EXACT_SOLUTION
+    validator.check = check
     data = ob.PlannerData(si)
     tree.getPlannerData(data)
-    return (path_to_array(pdef.getSolutionPath(), len(ready.start)) if solved else None), data.numVertices()
+    path = path_to_array(pdef.getSolutionPath(), len(ready.start)) if solved else None
+    return path, data.numVertices(), next(steps)
 
 
-def compiled(ready: PlanningSetup, seed: int) -> tuple[Array | None, int]:
-    """Return the path of compiled trees, or None, and their number of nodes."""
+def compiled(ready: PlanningSetup, seed: int) -> tuple[Array | None, int, int]:
+    """Return the path of compiled trees, or None, their number of nodes, and that of the steps that were tried."""
     began = time.perf_counter()
     ends = ready.start[None], ready.valid_goals[:1]
     trees = TreePair(ready.checker.kernel, *ends, RANGE, SEARCH_RESOLUTION, np.random.default_rng(seed))
     found = trees.grow(10**9, lambda: time.perf_counter() - began > TIMEOUT)
-    return found, trees.size
+    return found, trees.size, trees.steps
 
 
 def main() -> None:
@@ -72,25 +78,38 @@ def main() -> None:
             for seed in range(args.seeds):
                 for kind, grow in zip(KINDS, (of_ompl, compiled), strict=True):
                     began = time.perf_counter()
-                    path, nodes = grow(ready, seed + 1)
+                    path, nodes, steps = grow(ready, seed + 1)
                     took = time.perf_counter() - began
                     whole = path is not None and bool(ready.checker.prove(path, tolerance=0.0))
-                    found[kind].append({"solved": path is not None, "whole": whole, "nodes": nodes, "seconds": took})
-    head = ["trees", "N", "solved", "paths proved as they are", "ms p50", "p95", "mean", "nodes", "nodes a second"]
+                    found[kind].append({
+                        "solved": path is not None, "whole": whole, "nodes": nodes, "steps": steps, "seconds": took,
+                    })  # fmt: skip
+    head = [
+        "trees",
+        "N",
+        "solved",
+        "paths proved as they are",
+        "ms p50",
+        "p95",
+        "mean",
+        "nodes",
+        "steps tried",
+        "steps a second",
+    ]
     rows: list[list[Any]] = [head, ["---", *["---:"] * (len(head) - 1)]]
     rates, means = {}, {}
     for kind, runs in found.items():
         seconds = [run["seconds"] for run in runs]
-        nodes = sum(run["nodes"] for run in runs)
-        rates[kind] = nodes / sum(seconds)
+        nodes, steps = (sum(run[key] for run in runs) for key in ("nodes", "steps"))
+        rates[kind] = steps / sum(seconds)
         means[kind] = float(np.mean(seconds))
         p50, p95 = record.percentiles(seconds, 50, 95)
         shares = [f"{np.mean([run[key] for run in runs]):.3f}" for key in ("solved", "whole")]
         times = [f"{1e3 * v:.0f}" for v in (p50, p95, means[kind])]
-        rows.append([kind, len(runs), *shares, *times, nodes, f"{rates[kind]:.0f}"])
+        rows.append([kind, len(runs), *shares, *times, nodes, steps, f"{rates[kind]:.0f}"])
     text = "\n".join(record.row(row) for row in rows)
     faster, more = means[KINDS[0]] / means["compiled"], rates["compiled"] / rates[KINDS[0]]
-    text += f"\n\n{faster:.1f} times as fast on average, {more:.1f} times as many nodes a second."
+    text += f"\n\n{faster:.1f} times as fast on average, {more:.1f} times as many steps a second."
     record.write("trees", found, text, split="validation", range=RANGE, resolution=SEARCH_RESOLUTION)
 
 

@@ -94,9 +94,9 @@ def test_nothing_is_found_where_the_goal_is_walled_in_or_time_is_up() -> None:
     ]
     walled = CollisionChecker(robot(), balls)
     pair = TreePair(walled.kernel, start, goals, LONGEST, RESOLUTION, np.random.default_rng(0))
-    assert pair.grow(200) is None
+    assert pair.grow(200) is None and pair.steps == pair.size - 2 + 200  # nodes, and one that fails for each state
     free = TreePair(checker.kernel, start, goals, LONGEST, RESOLUTION, np.random.default_rng(0))
-    assert free.grow(10_000, lambda: True) is None and free.size == 2
+    assert free.grow(10_000, lambda: True) is None and free.size == 2 and free.steps == 0
     assert free.grow(10_000) is not None
 
 
