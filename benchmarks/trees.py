@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import time
 from itertools import count
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -42,16 +43,20 @@ def of_ompl(ready: PlanningSetup, seed: int) -> tuple[Array | None, int, int]:
     """Return the path of OMPL's trees, or None, their number of nodes, and that of the steps that were tried."""
     seed_ompl(seed)
     si = ready.simple_setup.getSpaceInformation()
-    validator, steps = si.getMotionValidator(), count()
-    check = validator.check
+    validity, validator = si.getStateValidityChecker(), si.getMotionValidator()
+    checker, check, steps, blocked = validity.checker, validator.check, count(), count()
+    # a step is asked for as a whole, or not where its end is blocked
     validator.check = lambda a, b: next(steps) >= 0 and check(a, b)
-    tree, pdef = ompl_trees(si, [ready.start], ready.valid_goals[0], RANGE)
-    solved = tree.solve(TIMEOUT).getStatus() == ob.PlannerStatus.EXACT_SOLUTION
-    validator.check = check
+    validity.checker = SimpleNamespace(is_free=lambda q: checker.is_free(q) or next(blocked) < 0)
+    try:
+        tree, pdef = ompl_trees(si, [ready.start], ready.valid_goals[0], RANGE)
+        solved = tree.solve(TIMEOUT).getStatus() == ob.PlannerStatus.EXACT_SOLUTION
+    finally:
+        validity.checker, validator.check = checker, check
     data = ob.PlannerData(si)
     tree.getPlannerData(data)
     path = path_to_array(pdef.getSolutionPath(), len(ready.start)) if solved else None
-    return path, data.numVertices(), next(steps)
+    return path, data.numVertices(), next(steps) + next(blocked)
 
 
 def compiled(ready: PlanningSetup, seed: int) -> tuple[Array | None, int, int]:

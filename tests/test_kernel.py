@@ -342,7 +342,7 @@ def test_compiled_functions_take_nothing_from_outside_their_folder() -> None:
 
 
 def test_what_is_compiled_once_for_all_its_callers_is_not_inlined() -> None:
-    """Not even where the function that calls it is: numba would hand that on."""
+    """Not even where the function that calls it is: numba would hand that on, and how sums may be taken."""
 
     def inner(a: Floats) -> float:
         return float(a[0] * 2.0)
@@ -352,7 +352,9 @@ def test_what_is_compiled_once_for_all_its_callers_is_not_inlined() -> None:
     def between(a: Floats) -> float:
         return outer(a) + 1.0
 
-    middle: Any = compilation.inlined(between)
+    middle: Any = compilation.reassociating_inlined(between)
 
     middle.compile("f8(f8[::1])")
     assert [next(iter(f.overloads.values())).fndesc.inline for f in (outer, middle)] == [False, True]
+    codes = [str(next(iter(f.overloads.values())).library._final_module) for f in (outer, middle)]
+    assert "fmul double" in codes[0] and "fadd reassoc contract double" in codes[1]

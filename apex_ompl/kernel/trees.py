@@ -53,7 +53,7 @@ class TreePair:
             self._states[tree, :, : len(roots)] = roots.T
         self._buffers = SearchBuffers(kernel, longest, resolution)
         self._met, self._target = np.full(2, -1, np.int64), np.empty(dof)
-        self._used = 0  # random states
+        self._failed = 0  # steps
 
     @property
     def size(self) -> int:
@@ -63,7 +63,7 @@ class TreePair:
     @property
     def steps(self) -> int:
         """Number of steps that were tried: each random state ends with one that fails, but where the trees meet."""
-        return self.size - len(self._starts) - len(self._goals) + self._used - int(self._met[0] >= 0)
+        return self.size - len(self._starts) - len(self._goals) + self._failed
 
     def take_counts(self) -> SearchCounts:
         """Return what was looked at since the last call."""
@@ -85,7 +85,7 @@ class TreePair:
                     self._states, self._parents, self._sizes, self._met, np.empty(self._states.shape[2]), self._target,
                     *self._buffers.proof,
                 )  # fmt: skip
-                self._used += used
+                self._failed += used - int(self._met[0] >= 0)
                 if self._met[0] >= 0:
                     return self._path()
                 samples = samples[used:]

@@ -22,7 +22,7 @@ from apex_ompl.kernel.compiled.clearance import (
     nearest_leaves,
     nearest_to_obstacle,
 )
-from apex_ompl.kernel.compiled.compilation import inlined
+from apex_ompl.kernel.compiled.compilation import reassociating_inlined
 from apex_ompl.kernel.compiled.kinematics import mark_pair, place_cluster, place_robot
 from apex_ompl.kernel.compiled.layout import Floats
 from apex_ompl.kernel.compiled.scene_tree import next_obstacles
@@ -43,7 +43,7 @@ class StateCost(NamedTuple):
     own: float
 
 
-@inlined
+@reassociating_inlined
 def add_violation(clearance: float, margin: float, row: Floats, gradient: Floats, gram: Floats) -> float:
     """Add the square of a violation whose clearance has the gradient ``row``, which is scaled; return its cost."""
     first, last, scale = len(row), -1, 1.0 / margin  # joints that move it: those of one arm mostly
@@ -61,7 +61,7 @@ def add_violation(clearance: float, margin: float, row: Floats, gradient: Floats
     return 0.5 * violation * violation
 
 
-@inlined
+@reassociating_inlined
 def _nearest_of_pair(t: RobotArrays, w: Workspace, q: Floats, p: int, margin: float) -> Nearest:
     """Return the nearest leaves of pair ``p`` of clusters, if they are less than ``margin`` apart."""
     near: Nearest = (margin, -1, -1, -1, -1)
@@ -82,7 +82,7 @@ def _nearest_of_pair(t: RobotArrays, w: Workspace, q: Floats, p: int, margin: fl
     return near
 
 
-@inlined
+@reassociating_inlined
 def state_cost(
     t: RobotArrays, s: SceneArrays, w: Workspace, q: Floats, scene_margin: float, own_margin: float, row: Floats,
     gradient: Floats, gram: Floats, scene: float, own: float,

@@ -39,8 +39,10 @@ LOG = logging.getLogger("apex_ompl")
 # compiled code may allocate nothing.
 OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "_nrt": False, "no_cfunc_wrapper": True}
 
-# Functions that only compiled ones call need no code that unpacks Python's arguments, which takes long to compile.
-INNER: dict[str, Any] = {**OPTIONS, "no_cpython_wrapper": True, "pipeline_class": InnerCompiler}
+# Functions that only compiled ones call need no code that unpacks Python's arguments, which takes long to compile. What
+# is not said here numba takes from the function that is being compiled when it comes to this one.
+INNER: dict[str, Any] = {**OPTIONS, "no_cpython_wrapper": True, "pipeline_class": InnerCompiler, "fastmath": False}
+REASSOCIATING = {"reassoc", "contract"}
 
 _lock = threading.RLock()
 
@@ -75,11 +77,14 @@ def inlined(function: F) -> F:
     return compiled
 
 
-def outlined(function: F) -> F:
-    """Compile a function that only other compiled ones call, once for all of them.
+def reassociating_inlined(function: F) -> F:
+    """Compile a function as :func:`inlined` does, in which sums may be taken in any order, several at a time."""
+    compiled: F = numba.njit(**INNER | {"fastmath": REASSOCIATING}, forceinline=True)(function)
+    return compiled
 
-    numba would let it have what its first caller has, so that it were inlined wherever that is.
-    """
+
+def outlined(function: F) -> F:
+    """Compile a function that only other compiled ones call, once for all; LLVM inlines it where it is short."""
     compiled: F = numba.njit(**INNER, forceinline=False)(function)
     return compiled
 
@@ -103,7 +108,7 @@ def entry_point(function: Callable[..., Any]) -> CompiledFunction:
 
 def reassociating_entry_point(function: Callable[..., Any]) -> CompiledFunction:
     """Compile a function as :func:`entry_point` does, in which sums may be taken in any order, several at a time."""
-    return _entry_point(function, fastmath={"reassoc", "contract"})
+    return _entry_point(function, fastmath=REASSOCIATING)
 
 
 class _Locator(InTreeCacheLocator):  # type: ignore[misc]
@@ -135,7 +140,8 @@ def _entry_point(function: Callable[..., Any], **options: Any) -> CompiledFuncti
 def _rare_collections() -> Iterator[None]:
     """Look for garbage less often during a block: a tenth of numba's time goes there, and it keeps what it makes."""
     before = gc.get_threshold()
-    gc.set_threshold(100_000, *before[1:])
+    if before[0]:  # else there are none
+        gc.set_threshold(max(before[0], 100_000), *before[1:])
     try:
         yield
     finally:

@@ -15,7 +15,7 @@ from typing import Annotated, NamedTuple
 
 from apex_ompl.kernel.compiled.arrays import RobotArrays, SceneArrays, robot_view, scene_view
 from apex_ompl.kernel.compiled.clearance_cost import state_cost
-from apex_ompl.kernel.compiled.compilation import inlined, reassociating_entry_point
+from apex_ompl.kernel.compiled.compilation import reassociating_entry_point, reassociating_inlined
 from apex_ompl.kernel.compiled.layout import Floats, Integers, Singles, buffer_sizes, buffer_view
 from apex_ompl.kernel.compiled.separation import tables_hold
 from apex_ompl.kernel.compiled.workspace import Workspace, workspace_view
@@ -120,7 +120,7 @@ def optimization_buffer_sizes(unknowns: int, points: int, dof: int) -> tuple[int
     return buffer_sizes(Buffers, unknowns=unknowns, points=points, dof=dof)
 
 
-@inlined
+@reassociating_inlined
 def set_sample(
     weights: Floats, first: Integers, k: int, control: Floats, lower: Floats, upper: Floats, q: Floats
 ) -> None:
@@ -132,7 +132,7 @@ def set_sample(
         q[i] = min(max(total, lower[i]), upper[i])
 
 
-@inlined
+@reassociating_inlined
 def clear(band: int, gradient: Floats, gram: Floats) -> None:
     """Put zeros into a gradient, shape (n,), and the band of a matrix (n, n) from its diagonal on."""
     for i in range(len(gradient)):
@@ -142,7 +142,7 @@ def clear(band: int, gradient: Floats, gram: Floats) -> None:
             row[k] = 0.0
 
 
-@inlined
+@reassociating_inlined
 def add_sample(
     share: float, weights: Floats, first: int, pinned: int, free: int, here: Floats, matrix: Floats, gradient: Floats,
     gram: Floats, room: Floats,
@@ -177,7 +177,7 @@ def add_sample(
                 target[j] += f * scaled[j]
 
 
-@inlined
+@reassociating_inlined
 def add_speed(
     stiffness: float, speed_gram: Floats, pinned: int, control: Floats, gradient: Floats, gram: Floats
 ) -> float:
@@ -215,7 +215,7 @@ class PathProblem(NamedTuple):
     speed_gram: Floats
 
 
-@inlined
+@reassociating_inlined
 def evaluate_path(
     problem: PathProblem, t: RobotArrays, s: SceneArrays, w: Workspace, pinned: int, control: Floats,
     settings: CostSettings, b: Buffers, gradient: Floats, gram: Floats,

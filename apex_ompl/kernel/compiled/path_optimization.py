@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from apex_ompl.kernel.compiled.arrays import RobotArrays, SceneArrays, robot_view, scene_view
-from apex_ompl.kernel.compiled.compilation import inlined, reassociating_entry_point
+from apex_ompl.kernel.compiled.compilation import reassociating_entry_point, reassociating_inlined
 from apex_ompl.kernel.compiled.layout import Floats, Integers, Singles
 from apex_ompl.kernel.compiled.path_cost import (
     BLOCK,
@@ -41,7 +41,7 @@ Evaluate = Callable[..., PathCost]
 Problem = Any
 
 
-@inlined
+@reassociating_inlined
 def _eliminate(factor: Floats, first: int, last: int, k: int, end: int) -> bool:
     """Finish row ``k`` of a Cholesky factor: take away what rows ``first`` to ``last`` have in it."""
     source = factor[k, k:end]
@@ -57,7 +57,7 @@ def _eliminate(factor: Floats, first: int, last: int, k: int, end: int) -> bool:
     return True
 
 
-@inlined
+@reassociating_inlined
 def _take_away(factor: Floats, k: int, last: int, end: int, panel: Floats) -> None:
     """Take away what the BLOCK rows from ``k`` on have in the rows below, up to ``end``.
 
@@ -79,7 +79,7 @@ def _take_away(factor: Floats, k: int, last: int, end: int, panel: Floats) -> No
                 target[j] -= left + (e * panel[j + S4] + f * panel[j + S5] + g * panel[j + S6] + h * panel[j + S7])
 
 
-@inlined
+@reassociating_inlined
 def _factorise(factor: Floats, band: int, panel: Floats) -> bool:
     """Replace a matrix by its upper Cholesky factor; both are zero beyond ``band`` from the diagonal.
 
@@ -101,7 +101,7 @@ def _factorise(factor: Floats, band: int, panel: Floats) -> bool:
     return True
 
 
-@inlined
+@reassociating_inlined
 def _set_damped(
     gram: Floats, speed_gram: Floats, damping: float, pinned: int, dof: int, held: Integers, band: int, factor: Floats
 ) -> None:
@@ -123,7 +123,7 @@ def _set_damped(
                 target[0] = 1.0
 
 
-@inlined
+@reassociating_inlined
 def _newton_step(
     gram: Floats, speed_gram: Floats, damping: float, pinned: int, dof: int, held: Integers, band: int, factor: Floats,
     panel: Floats, step: Floats,
@@ -150,7 +150,7 @@ def _newton_step(
     return True
 
 
-@inlined
+@reassociating_inlined
 def _hold(t: RobotArrays, control: Floats, pinned: int, gradient: Floats, held: Integers, step: Floats) -> None:
     """List the unknowns that the gradient would push beyond their limits, and begin a step with -gradient."""
     dof = control.shape[1]
@@ -161,7 +161,7 @@ def _hold(t: RobotArrays, control: Floats, pinned: int, gradient: Floats, held: 
         step[i] = -g
 
 
-@inlined
+@reassociating_inlined
 def _add_step(t: RobotArrays, control: Floats, pinned: int, step: Floats, trial: Floats) -> None:
     """Put the control points after a step, clipped to the limits, into ``trial``."""
     dof = control.shape[1]
@@ -170,7 +170,7 @@ def _add_step(t: RobotArrays, control: Floats, pinned: int, step: Floats, trial:
         trial[a, d] = min(max(control[a, d] + step[i], t.lower[d]), t.upper[d])
 
 
-@inlined
+@reassociating_inlined
 def descend(
     evaluate: Evaluate, problem: Problem, t: RobotArrays, s: SceneArrays, w: Workspace, speed_gram: Floats, pinned: int,
     control: Floats, settings: CostSettings, b: Buffers, width: int,

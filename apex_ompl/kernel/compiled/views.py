@@ -1,6 +1,7 @@
 """Named tuples of arrays that lie in buffers, as code of LLVM that numba puts where a view is asked for.
 
-The same slices, written in Python, take numba a second for a robot and its workspace in each function that asks.
+The same slices, written in Python, take numba a second for a robot and its workspace in each function that asks. Arrays
+are not counted (``_nrt=False``), so that those of a view may be used in compiled code alone.
 """
 
 from __future__ import annotations
@@ -10,7 +11,9 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from llvmlite import ir
+from numba import float32, float64, int64
 from numba.core import cgutils
+from numba.core.errors import TypingError
 from numba.core.types import Array, NamedTuple  # type: ignore[attr-defined]
 from numba.extending import intrinsic
 from numba.np.arrayobj import make_array, populate_array
@@ -20,6 +23,8 @@ INT = ir.IntType(64)
 
 def table_code(cls: Any, fields: Sequence[Any]) -> Callable[..., Any]:
     """Return the compiled ``view(integers, floats[, singles])`` of a table, see :func:`.layout.table_view`."""
+    if any(field.single for field in fields[:-1]):
+        raise ValueError(f"singles of {cls.__name__} are not its last field")
 
     def typed(*buffers: Any) -> Any:
         signature = _arrays(cls, fields, buffers)(*buffers)
@@ -32,7 +37,7 @@ def table_code(cls: Any, fields: Sequence[Any]) -> Callable[..., Any]:
                     values.append(arguments[2])
                     continue
                 first, last = (builder.load(builder.gep(places, [INT(2 * k + n)])) for n in (0, 1))
-                row = math.prod(n for n in field.shape if isinstance(n, int))
+                row = math.prod(field.shape)
                 sizes = [builder.sdiv(builder.sub(last, first), INT(row)), *map(INT, field.shape)]
                 array = signature.return_type.types[k]
                 values.append(_slice(context, builder, array, sources[not field.integer], first, sizes))
@@ -79,9 +84,12 @@ def buffer_code(cls: Any, fields: Sequence[Any], dimensions: Sequence[str]) -> C
 
 def _arrays(cls: Any, fields: Sequence[Any], buffers: Sequence[Any], whole: bool = False) -> Any:
     """Return numba's type of the named tuple; ``whole`` says that shapes are those of arrays and not of rows."""
-    rest, types = iter(buffers[2:]), []
+    wanted = [Array(number, 1, "C", readonly=not b.mutable) for number, b in zip((int64, float64, float32), buffers)]  # noqa: B905
+    if list(buffers) != wanted:
+        raise TypingError(f"buffers of {cls.__name__} are {buffers}, expected {wanted}")
+    types = []
     for field in fields:
-        source = next(rest) if field.single else buffers[not field.integer]
+        source = buffers[2 if field.single else not field.integer]
         axes = 1 if field.single else len(field.shape) + (not whole)
         types.append(Array(source.dtype, axes, "C", readonly=not source.mutable))
     return NamedTuple(types, cls)
