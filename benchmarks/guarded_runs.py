@@ -19,8 +19,9 @@ from dataclasses import replace
 from typing import Any
 
 import record
-from closed_loop import FOLDER, LIMIT_TOLERANCE, SCRIPTED, Job, kept, made_by, stored
+from closed_loop import FOLDER, SCRIPTED, Job, kept, made_by, stored
 
+from apex_ompl.loop.referee import LIMIT_TOLERANCE
 from apex_ompl.loop.run import default_settings, run
 from apex_ompl.loop.sensor import Sensor
 from apex_ompl.problems import worlds

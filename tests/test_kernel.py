@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import ast
-import subprocess
-import sys
 import threading
-from pathlib import Path
 from typing import Any
 
 import coal
@@ -16,15 +12,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from random_robots import frames, pose, random_hand, random_robot, unit
-from support import ROOT, states_around_home
+from support import states_around_home
 
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.tabulate import primitives
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel import Kernel, robot_builder, robot_specs
-from apex_ompl.kernel.compiled import compilation, motion_proof, queries
+from apex_ompl.kernel.compiled import motion_proof, queries
 from apex_ompl.kernel.compiled.arrays import PRISMATIC
-from apex_ompl.kernel.compiled.layout import Floats
 from apex_ompl.kernel.joint_tree import JointTree
 from apex_ompl.kernel.scene_builder import scene_tables
 from apex_ompl.kernel.tables import RobotTables
@@ -282,79 +277,3 @@ def test_threads_do_not_disturb_each_other(robot: Robot, post: Obstacle) -> None
     for thread in threads:
         thread.join()
     assert all(np.array_equal(a, b) for a, b in zip(expected, found, strict=True))
-
-
-CALL = """
-import numpy as np
-from apex_ompl.kernel.compiled import compilation
-
-def plus(a):
-    return a[0] + 1.0
-
-f = compilation.entry_point(plus)
-assert f(np.ones(1)) == f(np.ones(1)) == 2.0
-print(compilation.cache_folder())
-"""
-
-
-def called(script: Path, cache: Path) -> subprocess.CompletedProcess[str]:
-    env = {"PATH": "", "NUMBA_CACHE_DIR": str(cache), "XDG_CACHE_HOME": str(cache), "PYTHONPATH": str(ROOT)}
-    done = subprocess.run([sys.executable, script], check=False, env=env, capture_output=True, text=True, timeout=120)
-    assert done.returncode == 0, done.stderr
-    return done
-
-
-@pytest.mark.parametrize("writable", [True, False])
-def test_code_is_kept_where_it_can_be(tmp_path: Path, writable: bool) -> None:
-    (tmp_path / "file").write_text("not a folder")
-    home = tmp_path / "cache" if writable else tmp_path / "file"
-    script = tmp_path / "call.py"
-    script.write_text(CALL)
-    first, second = called(script, home), called(script, home)
-    assert "compiles" in first.stderr
-    if writable:
-        assert str(home) in first.stdout and "compiles" not in second.stderr
-    else:
-        assert first.stdout.strip() == "None" and "no cache folder" in first.stderr and "compiles" in second.stderr
-
-
-def test_the_same_code_at_another_place_is_not_compiled_again(tmp_path: Path) -> None:
-    """Another environment of the same version shares the cache; an edited file does not."""
-    scripts = [tmp_path / place / "call.py" for place in ("here", "there", "edited")]
-    for script in scripts:
-        script.parent.mkdir()
-        script.write_text(CALL if script.parent.name != "edited" else CALL.replace("2.0", "3.0").replace("1.0", "2.0"))
-    here, there, edited = (called(script, tmp_path / "cache") for script in scripts)
-    assert here.stdout == there.stdout == edited.stdout
-    assert "compiles" in here.stderr and "compiles" not in there.stderr
-
-
-def test_compiled_functions_take_nothing_from_outside_their_folder() -> None:
-    """Copies with the same files share compiled code, so that nothing else may be compiled into it."""
-    folder = Path(queries.__file__).parent
-    for file in folder.glob("*.py"):
-        for node in ast.walk(ast.parse(file.read_text())):
-            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("apex_ompl"):
-                inside = node.module.startswith("apex_ompl.kernel.compiled")
-                assert inside or (file.stem, node.module) == ("compilation", "apex_ompl.util.cache"), file.name
-            elif isinstance(node, ast.Import):
-                assert not any(alias.name.startswith("apex_ompl") for alias in node.names), file.name
-
-
-def test_what_is_compiled_once_for_all_its_callers_is_not_inlined() -> None:
-    """Not even where the function that calls it is: numba would hand that on, and how sums may be taken."""
-
-    def inner(a: Floats) -> float:
-        return float(a[0] * 2.0)
-
-    outer: Any = compilation.outlined(inner)
-
-    def between(a: Floats) -> float:
-        return outer(a) + 1.0
-
-    middle: Any = compilation.reassociating_inlined(between)
-
-    middle.compile("f8(f8[::1])")
-    assert [next(iter(f.overloads.values())).fndesc.inline for f in (outer, middle)] == [False, True]
-    codes = [str(next(iter(f.overloads.values())).library._final_module) for f in (outer, middle)]
-    assert "fmul double" in codes[0] and "fadd reassoc contract double" in codes[1]

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Iterable
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import coal
-import numba
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -23,10 +20,7 @@ from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.tabulate import joint_specs, primitives
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError, UnknownNameError
 from apex_ompl.kernel import Kernel, joint_tree
-from apex_ompl.kernel.compiled.arrays import BINS, FIXED, RUN, robot_view, scene_view
-from apex_ompl.kernel.compiled.compilation import OPTIONS
-from apex_ompl.kernel.compiled.layout import new_buffers, unpack
-from apex_ompl.kernel.compiled.path_cost import Buffers, buffers_view
+from apex_ompl.kernel.compiled.arrays import BINS, FIXED, RUN
 from apex_ompl.kernel.scene_builder import scene_tables
 from apex_ompl.kernel.tables import RobotTables, pair_runs, with_pairs
 from apex_ompl.robot import Robot, load_robot
@@ -103,53 +97,6 @@ def test_damaged_tables_are_faults_and_no_crash(tmp_path: Path) -> None:
     np.save(tmp_path / "plain.npy", np.zeros(3))
     with pytest.raises(FileFormatError, match="kernel tables"):
         RobotTables.load(tmp_path / "plain.npy")
-
-
-def compiled_of_all(view: Any, names: Iterable[str], arguments: str, line: str) -> Any:
-    """Return a compiled function that notes shape and strides of each array ``a`` of a view, and does a line for it.
-
-    Its arguments are memory for the ``K``-th of them, for shapes and strides, shape (N, 2, 4), buffers and sizes.
-    """
-    note = "for i in range(a.ndim): seen[K, 0, i], seen[K, 1, i] = a.shape[i], a.strides[i]"
-    body = "".join(
-        f"    a = found.{name}\n    {note}\n    for i in np.ndindex(a.shape): {line}\n".replace("K", str(k))
-        for k, name in enumerate(names)
-    )
-    made: dict[str, Any] = {"view": view, "np": np}
-    exec(f"def of_all(out, seen, buffers, sizes):\n    found = view({arguments})\n{body}", made)
-    return numba.njit(**OPTIONS)(made["of_all"])
-
-
-def laid_out(seen: Any, array: Any) -> bool:
-    """Whether the shape and the strides that were noted are those of an array."""
-    n = array.ndim
-    return bool(tuple(seen[0, :n]) == array.shape and (array.size == 0 or tuple(seen[1, :n]) == array.strides))
-
-
-def test_arrays_come_out_of_a_pack_as_they_went_in(robot: Robot, post: Obstacle) -> None:
-    kernel = CollisionChecker(robot, [post]).kernel
-    for tables, view in ((kernel.robot, robot_view), (kernel.scene, scene_view)):
-        arrays = tables.arrays._asdict()
-        out, seen = {name: np.zeros_like(a) for name, a in arrays.items()}, np.zeros((len(arrays), 2, 4), np.int64)
-        buffers = ", ".join(f"buffers[{k}]" for k in range(len(tables.packed)))
-        compiled_of_all(view, arrays, buffers, "out[K][i] = a[i]")(tuple(out.values()), seen, tables.packed, ())
-        sliced = unpack(tables.arrays.__class__, *tables.packed)
-        for k, (name, array) in enumerate(arrays.items()):
-            assert np.array_equal(getattr(sliced, name), array), name
-            assert np.array_equal(out[name], array) and laid_out(seen[k], array), name
-
-
-def test_compiled_code_sees_the_arrays_of_buffers_that_python_sees() -> None:
-    sizes = {"unknowns": 6, "points": 4, "dof": 3}
-    integers, floats, arrays = new_buffers(Buffers, **sizes)
-    integers[:], floats[:] = np.arange(len(integers)), np.arange(len(floats))
-    out, seen = tuple(np.zeros_like(a) for a in arrays), np.zeros((len(arrays), 2, 4), np.int64)
-    copy = compiled_of_all(buffers_view, arrays._fields, "buffers[0], buffers[1], sizes", "out[K][i] = a[i]")
-    copy(out, seen, (integers, floats), tuple(sizes.values()))
-    for k, (name, array) in enumerate(arrays._asdict().items()):
-        assert array.size and np.array_equal(out[k], array) and laid_out(seen[k], array), name
-    with pytest.raises(numba.TypingError, match="buffers of Buffers are"):
-        copy(out, seen, (integers, floats[::2]), tuple(sizes.values()))
 
 
 @pytest.mark.parametrize("ratio", [0.3, -1.57, 6.3, 10.0, -25.0, 40.0])

@@ -84,7 +84,8 @@ def buffer_code(cls: Any, fields: Sequence[Any], dimensions: Sequence[str]) -> C
 
 def _arrays(cls: Any, fields: Sequence[Any], buffers: Sequence[Any], whole: bool = False) -> Any:
     """Return numba's type of the named tuple; ``whole`` says that shapes are those of arrays and not of rows."""
-    wanted = [Array(number, 1, "C", readonly=not b.mutable) for number, b in zip((int64, float64, float32), buffers)]  # noqa: B905
+    numbers = int64, float64, float32
+    wanted = [Array(n, 1, "C", readonly=not buffer.mutable) for n, buffer in zip(numbers, buffers, strict=False)]
     if list(buffers) != wanted:
         raise TypingError(f"buffers of {cls.__name__} are {buffers}, expected {wanted}")
     types = []
