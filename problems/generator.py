@@ -43,17 +43,23 @@ def draw(problem_id: ProblemId, number: int) -> DrawnProblem | None:
 
 
 @lru_cache(maxsize=64)
-def first_drawn(problem_id: ProblemId, after: int = -1) -> tuple[int, DrawnProblem]:
-    """Return the number and the problem of the first draw after ``after`` that has a start and a goal, as it is drawn.
-
-    Raises:
-        SuiteError: None of the first ``MAX_DRAWS`` draws has.
-    """
+def _first_drawn(problem_id: ProblemId, after: int) -> tuple[int, DrawnProblem]:
     for number in range(after + 1, MAX_DRAWS):
         drawn = draw(problem_id, number)
         if drawn is not None:
             return number, drawn
     raise SuiteError(f"problem {problem_id}: none of {MAX_DRAWS} draws has a start and a goal")
+
+
+def first_drawn(problem_id: ProblemId, after: int = -1) -> tuple[int, DrawnProblem]:
+    """Return the number and the problem of the first draw after ``after`` that has a start and a goal, as it is drawn.
+
+    The last ones are kept.
+
+    Raises:
+        SuiteError: None of the first ``MAX_DRAWS`` draws has.
+    """
+    return _first_drawn(problem_id, after)  # one spelling of the arguments, by which the cache knows them
 
 
 def first_draw(problem_id: ProblemId, after: int = -1) -> tuple[int, Problem]:

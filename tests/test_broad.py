@@ -18,6 +18,7 @@ from apex_ompl.errors import ParameterError
 from apex_ompl.generation.records import problem_record
 from apex_ompl.generation.units import Unit, plan_units
 from apex_ompl.kernel import Kernel
+from apex_ompl.problems import generator
 from apex_ompl.problems.broad import compounds, shapes
 from apex_ompl.problems.broad.composition import site
 from apex_ompl.problems.broad.difficulty import difficulty, sprint
@@ -174,6 +175,12 @@ def test_classes_of_difficulty_are_in_order(robot: Robot) -> None:
     found = [difficulty(walls, ends, np.random.default_rng(1), wanted) for wanted in range(4)]
     assert found == sorted(found) and all(value <= wanted for wanted, value in enumerate(found))
     assert found == [difficulty(walls, ends, np.random.default_rng(1), wanted) for wanted in range(4)]
+
+
+def test_obstacles_of_a_problem_as_primitives_are_not_drawn_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem = problems.load("broad/boulders/7")
+    monkeypatch.setattr(generator, "draw", None)
+    assert len(problems.primitives(problem, enclosing=True)) > 0
 
 
 def test_held_objects_are_of_all_kinds_and_free_of_the_fingers(robot: Robot) -> None:

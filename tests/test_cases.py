@@ -71,9 +71,26 @@ def test_they_are_solved_without_pinocchio_coal_and_ompl(cases: list[KernelProbl
         for k, control in enumerate(paths.control()):
             ready = assemble(problems.load(paths.problem_name(int(paths.arrays["problem"][k]))), robot())
             assert full_check(ready.checker, spline.path(control), paths.start[k], [paths.goal[k]])
-            assert SOURCES[paths.arrays["source"][k]] in ("line", "bumps", "reversed")
+            assert SOURCES[paths.arrays["source"][k]] in ("line", "bumps", "rrtconnect", "reversed")
             seen += 1
     assert seen >= 8
+
+
+def test_trees_search_in_the_kernel_and_the_seed_decides(cases: list[KernelProblem]) -> None:
+    spline, found = Spline(), 0
+    for case in cases:
+        finder = PathFinder(Kernel(case.robot, case.scene), case.start, case.goal, Optimizer(spline))
+        control = finder.search(1)
+        if control is None:
+            continue
+        found += 1
+        assert np.array_equal(control[[0, -1]], np.stack([case.start, case.goal]))
+        assert np.array_equal(control, finder.search(1))
+        shorter = finder.shorten(control)
+        assert shorter is None or finder.is_valid(spline.path(shorter))
+    assert found >= 5
+    finder.iterations = 0
+    assert finder.search(1) is None
 
 
 def test_parts_of_paths_are_valid_where_the_straight_line_is_not(cases: list[KernelProblem]) -> None:

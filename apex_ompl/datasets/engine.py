@@ -27,11 +27,11 @@ RESTS = 0.5  # share of the parts that end where their path does
 DUPLICATE_DISTANCE = 0.1  # a path nearer to another one is not kept [rad, max-norm]
 STRATEGIES = {
     "open": (("bumps", "bumps"), ("rrtconnect", "many bumps")),
-    "broad": (("bumps", "rrtconnect"), ("many bumps", "rrtconnect")),
+    "broad": (("rrtconnect", "rrtconnect"), ("many bumps", "rrtconnect")),
     "easy": (("rrtconnect", "rrtconnect"), ("many bumps", "rrtconnect")),
     "medium": (("rrtconnect", "rrtconnect"), ("many bumps", "rrtconnect")),
-    "hard": (("rrtconnect", "bumps"), ("many bumps", "rrtconnect")),
-    "extreme": (("rrtconnect", "bumps"), ("many bumps", "rrtconnect")),
+    "hard": (("rrtconnect", "rrtconnect"), ("many bumps", "rrtconnect")),
+    "extreme": (("rrtconnect", "rrtconnect"), ("many bumps", "rrtconnect")),
 }
 """Methods by which paths are searched, for the levels of the hard suites, for open scenes and for broad ones: the first
 ones in turn, and, where none finds a path, the second ones until one does. Chosen by the yield of each method."""

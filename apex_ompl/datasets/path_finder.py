@@ -1,4 +1,4 @@
-"""Paths for one problem by optimization, checked by the kernel alone: without Pinocchio, Coal and OMPL."""
+"""Paths for one problem by trees and by optimization, all in the kernel: without Pinocchio, Coal and OMPL."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ import numpy as np
 
 from apex_ompl.datasets.records import to_half
 from apex_ompl.kernel import Kernel
+from apex_ompl.kernel.shortcuts import shortcut
+from apex_ompl.kernel.trees import TreePair
 from apex_ompl.trajopt.candidates import first_valid
 from apex_ompl.trajopt.optimizer import Optimizer
 from apex_ompl.types import Array
@@ -18,6 +20,9 @@ BUMP_SIZE = (0.4, 1.2)  # range of the amplitude of random bumps [rad]
 PART_STEPS = 12  # optimizer steps for a part of a path
 COMPARED_STATES = 12  # number of states at which two paths are compared
 CLEARANCE_RANGE = 0.2  # clearances are measured up to here [m]
+TREE_RANGE = 1.0  # longest step of trees [rad]
+TREE_ITERATIONS = 30_000  # of trees, at most
+CUTS, CUT_RESOLUTION = 100, 0.01  # shortcuts that are tried along a tree's path, and the states along them [rad]
 
 
 class PathFinder:
@@ -28,6 +33,7 @@ class PathFinder:
         start: Shape (dof,) [rad].
         goal: Shape (dof,) [rad].
         optimizer: Optimizer of the paths' splines.
+        iterations: Of trees, at most.
         points: Obstacle points nearest to the robot, shape (3,) [m], by the bytes of the state.
         proposer: Returns proposals of a model, control points of shape (count, points, dof), for a count and a seed;
             None where there is no model.
@@ -39,6 +45,7 @@ class PathFinder:
         """Find paths from ``start`` to ``goal``, shape (dof,) [rad]."""
         self.kernel, self.start, self.goal, self.optimizer = kernel, start, goal, optimizer
         self.lower, self.upper = kernel.robot.arrays.lower, kernel.robot.arrays.upper
+        self.iterations = TREE_ITERATIONS
         self.points: dict[bytes, Array] = {}
 
     def is_valid(self, states: Array) -> bool:
@@ -51,9 +58,14 @@ class PathFinder:
         return self.kernel.proves(line, SEARCH_RESOLUTION)
 
     def search(self, seed: int) -> Array | None:
-        """Return the control points of a spline fitted to a planner's path, or None; this class has no planner."""
-        del seed
-        return None
+        """Return the control points of a spline fitted to a path of RRT-Connect that is cut short, or None."""
+        rng = np.random.default_rng(seed)
+        ends = self.start[None], self.goal[None]
+        states = TreePair(self.kernel, *ends, TREE_RANGE, SEARCH_RESOLUTION, rng).grow(self.iterations)
+        if states is None:
+            return None
+        path, _ = shortcut(self.kernel, states, CUTS, CUT_RESOLUTION, rng)
+        return self.optimizer.spline.fit(path, self.lower, self.upper).control
 
     def optimize_proposals(self, seed: int) -> Array | None:
         """Return the control points of a valid path, optimized from a model's proposals, or None."""
