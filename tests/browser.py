@@ -45,6 +45,7 @@ UNHURRIED = """
 """
 """Each frame waits until the one before is drawn: without a graphics card, a page on a busy machine would ask for
 frames faster than they can be drawn, and a picture of it would wait behind all of them."""
+BUTTON = "//button[.//*[text()='{0}'] or text()='{0}']"
 HARMLESS = ("GPU stall due to ReadPixels", "favicon")
 
 
@@ -81,6 +82,23 @@ def until(condition: Callable[[], Any], what: str, seconds: float = 240.0) -> An
             return found
         time.sleep(PAUSE)
     raise AssertionError(f"not within {seconds:g} s: {what}")
+
+
+def press(driver: Any, label: str) -> None:
+    """Press a button; while the page moves, another element may lie over it, or it may be made anew."""
+    from selenium.common.exceptions import ElementClickInterceptedException, StaleElementReferenceException
+
+    def is_pressed() -> bool:
+        for button in driver.find_elements("xpath", BUTTON.format(label)):
+            driver.execute_script("arguments[0].scrollIntoView({block: 'center'})", button)
+            try:
+                button.click()
+            except (ElementClickInterceptedException, StaleElementReferenceException):
+                return False
+            return True
+        return False
+
+    until(is_pressed, f"a button {label!r} to press")
 
 
 def picture(driver: Any) -> NDArray[np.int64]:

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from browser import SIZE, address, browser, errors, needs_browser, picture, until
+from browser import SIZE, address, browser, errors, needs_browser, picture, press, until
 from small_arm import arm_problem
 
 from apex_ompl import plan
@@ -28,7 +28,6 @@ from apex_ompl.viz.view import view
 
 pytestmark = needs_browser
 VIEW = (sys.executable, "-c", "import sys; from apex_ompl.cli import main; sys.exit(main())", "view")
-BUTTON = "//button[.//*[text()='{0}'] or text()='{0}']"
 
 
 @pytest.fixture(scope="module")
@@ -162,10 +161,10 @@ def test_editing_in_the_page_changes_the_scene_and_plan_answers(driver: Any, tmp
         opened(driver, where)
         until(lambda: is_drawn(driver, LIVE), "a picture")
         before = picture(driver)
-        until(lambda: driver.find_elements("xpath", BUTTON.format("add a box")), "a button")[0].click()
+        press(driver, "add a box")
         until(lambda: "box_1" in driver.page_source, "a box")
         until(lambda: (np.abs(picture(driver) - before)[:, LIVE].max(axis=2) > 40).sum() > 100, "another picture")
-        driver.find_element("xpath", BUTTON.format("plan")).click()
+        press(driver, "plan")
         until(lambda: "ms in all" in driver.page_source, "a plan")
         assert errors(driver) == []
         driver.get("about:blank")
