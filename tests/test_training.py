@@ -30,7 +30,7 @@ from apex_ompl.diffusion.runlog import read_log
 from apex_ompl.diffusion.torch_model import TorchModel
 from apex_ompl.diffusion.training import Trainer, TrainingError
 from apex_ompl.diffusion.validation import query_from_problem, success_rates
-from apex_ompl.errors import ApexError, FileFormatError, MissingFileError
+from apex_ompl.errors import ApexError, FileFormatError, MissingFileError, ParameterError
 from apex_ompl.kernel import Kernel, RobotTables
 from apex_ompl.kernel.scene_builder import scene_tables
 from apex_ompl.trajopt.candidates import first_valid
@@ -210,6 +210,28 @@ def test_success_rates_are_those_of_repair_and_proof(few: Path, tmp_path: Path) 
     assert {f"{problem.suite}/{problem.level}" for problem in problems} <= rates.keys()
 
 
+CLEARANCES = {"scene": "clearances", "width": 32, "out": 64, "along": 3, "keys": 16, "refined": True}
+
+
+@pytest.mark.parametrize("condition", [SMALL["condition"], CLEARANCES])
+def test_a_run_begins_with_the_weights_of_a_checkpoint(
+    condition: dict[str, Any], few: Path, paths: Paths, tmp_path: Path
+) -> None:
+    first, others = tmp_path / "first", tmp_path / "others.zip"
+    first.mkdir()
+    Trainer(config(few, condition=condition), first, HERE).run()
+    save(others, paths.subset(np.arange(40, 90)))
+    wanted = load_torch_model(first / "checkpoint").network.state_dict()
+    again = {"condition": condition, "initial": str(first / "checkpoint"), "rate": 1e-9}
+    second = Trainer(config(others, **again), tmp_path, HERE)
+    assert_same(second.network.state_dict(), wanted)
+    if second.data.sight is not None:
+        assert np.array_equal(second.data.sight.keys.state, wanted["key_state"].numpy()), "it sees what it saw"
+    second.advance()
+    moved = [float((p - wanted[name]).abs().max()) for name, p in second.network.named_parameters()]
+    assert 0.0 < max(moved) < 1e-6, "it is trained"
+
+
 # Configurations
 
 
@@ -221,6 +243,7 @@ def test_success_rates_are_those_of_repair_and_proof(few: Path, tmp_path: Path) 
         ({"steps": 0}, "steps: input should be greater than or equal to 1, got 0"),
         ({"latent": {"kind": "quadratic"}}, "latent.kind: input should be 'linear' or 'variational'"),
         ({"rate": float("nan")}, "rate: input should be a finite number"),
+        ({"initial": "apex", "latent": {"kind": "variational"}}, "expected a linear latent space with initial"),
         ({"mirror": {"order": [0, 0], "sign": [1, 1], "shift": [0, 0]}}, "mirror: expected every joint's number once"),
     ],
 )
@@ -239,12 +262,18 @@ def test_faulty_configurations_are_named(change: dict[str, Any], message: str, f
         ({"robot": "/no/such.npz"}, "file of kernel tables '/no/such.npz': no such file"),
         ({"latent": {"dim": 500}}, "dimension of the latent space: expected a whole number from 1 to 192, got 500"),
         ({"mirror": {"order": [0], "sign": [1], "shift": [0]}}, "mirror: expected 16 joints, got 1"),
+        ({"initial": "apix"}, "unknown checkpoint 'apix', did you mean 'apex'? known: apex, apex-paper"),
     ],
 )
 def test_what_does_not_fit_is_named(change: dict[str, Any], message: str, few: Path, tmp_path: Path) -> None:
     with pytest.raises(ApexError) as caught:
         Trainer(config(**{"data": few, **change}), tmp_path, HERE)
     assert str(caught.value) == message
+
+
+def test_a_checkpoint_of_another_architecture_is_named(few: Path, tmp_path: Path) -> None:
+    with pytest.raises(ParameterError, match=r"initial: expected a checkpoint with the latent of this run, .*dim=32"):
+        Trainer(config(few, initial="apex", condition={**CLEARANCES, "along": 12, "keys": 512}), tmp_path, HERE)
 
 
 def test_dotted_keys_change_a_configuration() -> None:

@@ -62,6 +62,8 @@ class TrainingConfig(StrictModel):
         data: Folder of a data set, or a file of paths; or several.
         robot: File of the robot's kernel tables.
         cases: Folder of validation problems, as ``generate_data.py --write-cases`` writes them; none by default.
+        initial: Checkpoint whose weights the training begins with, by name or folder; its latent space and key states
+            are kept. Random weights by default.
         latent: Latent space.
         condition: Encoder of conditions.
         denoiser: Denoising network.
@@ -96,6 +98,7 @@ class TrainingConfig(StrictModel):
     data: str | Annotated[tuple[str, ...], Field(min_length=1)]
     robot: str
     cases: str | None = None
+    initial: str | None = None
     latent: LatentConfig = LatentConfig()
     condition: ConditionConfig = ConditionConfig()
     denoiser: DenoiserConfig = DenoiserConfig()
@@ -127,6 +130,12 @@ class TrainingConfig(StrictModel):
     def _varies_what_can_be_varied(self) -> Self:
         if (self.parts or self.mixed) and (self.condition.scene != "clearances" or self.condition.point):
             raise ValueError("expected parts and mixed for the scene 'clearances' without an obstacle point alone")
+        return self
+
+    @model_validator(mode="after")
+    def _begins_with_a_latent_space(self) -> Self:
+        if self.initial is not None and self.latent.kind != "linear":
+            raise ValueError("expected a linear latent space with initial: a variational one is trained anew")
         return self
 
     @property

@@ -14,11 +14,13 @@ from torch import Tensor
 
 from apex_ompl.datasets.records import SPLINE, Paths
 from apex_ompl.datasets.store import Store, load
+from apex_ompl.diffusion.checkpoint import load_torch_model
 from apex_ompl.diffusion.conditions import Conditions, ConditionTable
 from apex_ompl.diffusion.config import TrainingConfig
 from apex_ompl.diffusion.mirror import Mirror
+from apex_ompl.diffusion.model_config import key_shapes
 from apex_ompl.diffusion.query import Probes
-from apex_ompl.diffusion.sight import Sight, key_states
+from apex_ompl.diffusion.sight import KeyStates, Sight, key_states
 from apex_ompl.diffusion.sight_data import Augmentation, SightTable
 from apex_ompl.diffusion.torch_sight import TorchSight
 from apex_ompl.errors import ParameterError
@@ -225,10 +227,7 @@ class TrainingData:
         self.spline = {k: paths.about[k] for k in SPLINE}
         train, _ = split(paths, config.held_out)
         if self.sight is None and config.condition.scene == "clearances":
-            rng = np.random.default_rng(config.seed)
-            control = train.control(np.sort(rng.integers(len(train), size=min(KEY_PATHS, len(train)))))
-            keys = key_states(robot, train.spline.path(control).reshape(-1, robot.dof), config.condition.keys, rng)
-            self.sight = Sight(keys, self.probes, config.condition.hands)
+            self.sight = Sight(self._key_states(train), self.probes, config.condition.hands)
             self._eyes = TorchSight(self.sight, self._kernel, self._device)
             self._looked_at = self._eyes.tensor(train.spline.basis(self.probes.shares))
         eyes = self._eyes or self.probes
@@ -237,6 +236,17 @@ class TrainingData:
             self.validation = Shard([few], eyes, self._kernel, {}) if len(few) else None
         sets = [train] if self._mirror is None else [train, self._mirror.paths(train, self._kernel)]
         return Shard(sets, eyes, self._kernel, config.weights, Augmentation(config.parts, config.mixed))
+
+    def _key_states(self, train: Paths) -> KeyStates:
+        """Return states of paths, spread out, or those of the checkpoint that the run begins with."""
+        config, robot = self._config, self._kernel.robot
+        if config.initial is not None:
+            network = load_torch_model(config.initial, robot=robot.name).network
+            if network.config.condition.scene == "clearances":  # others are refused with the rest of their architecture
+                return KeyStates.of(*(getattr(network, name).numpy() for name in key_shapes(network.config)))
+        rng = np.random.default_rng(config.seed)
+        control = train.control(np.sort(rng.integers(len(train), size=min(KEY_PATHS, len(train)))))
+        return key_states(robot, train.spline.path(control).reshape(-1, robot.dof), config.condition.keys, rng)
 
     def look(self, control: Tensor, conditions: Conditions) -> Tensor:
         """Return what a model of scene ``clearances`` sees along paths, control points (B, points, dof): (B, F)."""

@@ -5,20 +5,27 @@ from __future__ import annotations
 import torch
 
 from apex_ompl.diffusion.autoencoder import LinearLatent
+from apex_ompl.diffusion.checkpoint import load_torch_model
 from apex_ompl.diffusion.config import TrainingConfig
 from apex_ompl.diffusion.data import TrainingData
 from apex_ompl.diffusion.model import LatentDiffusion
 from apex_ompl.diffusion.model_config import ModelConfig, SplineConfig, key_shapes
+from apex_ompl.errors import ParameterError
 from apex_ompl.kernel import RobotTables
 
 
 def initial_network(config: TrainingConfig, data: TrainingData, robot: RobotTables) -> LatentDiffusion:
     """Return a model with random weights, with the robot's limits and probe points, and a fitted linear latent space.
 
+    Where the configuration names a checkpoint, all is that of the checkpoint.
+
     Args:
         config: Configuration of the run; the same seed gives the same weights.
         data: Training data.
         robot: Kernel tables of the robot.
+
+    Raises:
+        ApexError: The checkpoint that the run begins with cannot be read, or is of another architecture.
     """
     probes, sight = data.probes, data.sight
     arms = (0, 0) if sight is None else sight.keys.joint.shape
@@ -27,6 +34,8 @@ def initial_network(config: TrainingConfig, data: TrainingData, robot: RobotTabl
         spline=SplineConfig(**data.spline), latent=config.latent, condition=config.condition, denoiser=config.denoiser,
         noise=config.noise, sampling=config.sampling,
     )  # fmt: skip
+    if config.initial is not None:
+        return _of_checkpoint(config.initial, model)
     with torch.random.fork_rng(devices=[]):  # torch's layers initialize their weights from the global generator
         torch.manual_seed(config.seed)
         network = LatentDiffusion(model)
@@ -40,3 +49,21 @@ def initial_network(config: TrainingConfig, data: TrainingData, robot: RobotTabl
     if isinstance(network.autoencoder, LinearLatent):
         network.autoencoder.fit(data.statistics_sample())
     return network
+
+
+def _of_checkpoint(name: str, wanted: ModelConfig) -> LatentDiffusion:
+    """Return the model of a checkpoint, ready to be trained on.
+
+    Raises:
+        ApexError: It cannot be read.
+        ParameterError: It is of another architecture, the first difference of which is named.
+    """
+    network = load_torch_model(name, robot=wanted.robot).network
+    found = network.config
+    for field in ModelConfig.model_fields:
+        theirs, ours = getattr(found, field), getattr(wanted, field)
+        if field != "sampling" and theirs != ours:
+            expected = f"a checkpoint with the {field} of this run, {ours!r}, not {theirs!r}"
+            raise ParameterError("initial", name, expected)
+    network.config = wanted
+    return network.train().requires_grad_(True)
