@@ -1,7 +1,8 @@
 """Apex and its controls on the frozen problems of ``unseen``: scenes of kinds that no training data are of.
 
 Rows: apex; the same planner with random bumps, a network of random weights, another problem's conditions, or the
-nearest training paths in the place of proposals; rrtconnect+polish; rrtconnect as OMPL has it and tuned; the straight
+nearest training paths in the place of proposals; apex, random bumps and random weights without trees, to see what
+proposals are worth where nothing else searches; rrtconnect+polish; rrtconnect as OMPL has it and tuned; the straight
 line and its repair, which ends by itself. With --model, apex with another checkpoint stands beside the one that ships,
 under the checkpoint's digest; controls of a network are those of the one that ships.
 Planners are tuned on the first 16 problems of a level, which are left out by default.
@@ -20,7 +21,7 @@ from pathlib import Path
 
 import record
 from controls import checkpoint_digest
-from head_to_head import ROWS, together
+from head_to_head import ROWS, TREELESS, together
 
 from apex_ompl.benchmark import Results, Row, Workers, bench
 from apex_ompl.benchmark.summary import statistics, warnings
@@ -40,8 +41,10 @@ FROZEN = 50  # problems of a level
 TUNED_ON = 16  # the first of these
 SUITE = "unseen"
 CONTROLS = ("bumps", "random weights", "shuffled conditions", "nearest paths")
+WITHOUT = " without trees"
+ALONE = tuple(name + WITHOUT for name in ("apex", "bumps", "random weights"))
 TREES = ("rrtconnect+polish", "rrtconnect", Row.of("rrtconnect", TUNED["rrtconnect"]).label, "straight line + repair")
-NAMES = ("apex", *CONTROLS, *TREES)
+NAMES = ("apex", *CONTROLS, *ALONE, *TREES)
 
 
 def rows(names: Sequence[str], model: Path | None) -> list[Row]:
@@ -52,7 +55,11 @@ def rows(names: Sequence[str], model: Path | None) -> list[Row]:
     """
     known = {row.label: row for row in ROWS if row.label in TREES}
     known |= {name: Row(name, name) for name in CONTROLS} | {"bumps": Row("bumps", "apex", {"model": "none"})}
-    found = [known.get(name, Row("apex", "apex")) for name in names]
+    known["apex"] = Row("apex", "apex")
+    for name in ALONE:
+        whole = known[name.removesuffix(WITHOUT)]
+        known[name] = Row(name, whole.planner, {**whole.params, **TREELESS})
+    found = [known[name] for name in names]
     if model is not None:
         read_config(model)
         found.append(Row(f"apex, {checkpoint_digest(model)}", "apex", {"model": str(model.resolve())}))
