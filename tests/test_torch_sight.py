@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from models import DOF, HANDS, POST, REFINED, WALL, kernel, keys, network, query, some_paths
 
+from apex_ompl.diffusion.compiled_sight import CompiledSight
 from apex_ompl.diffusion.obstacles import Obstacles
 from apex_ompl.diffusion.query import ObstacleSet, Probes
 from apex_ompl.diffusion.sight import REACH, Sight
@@ -76,6 +77,32 @@ def test_features_along_paths_are_those_of_numpy() -> None:
         np.testing.assert_allclose(row.numpy(), SIGHT.along(kernel(), path[None], scene.tables(), None)[0], atol=2e-4)
     pushed = found[:, -3 * DOF :].abs().amax(dim=1)
     assert pushed[2] > 0.1 and pushed[0] == 0.0
+
+
+def test_what_the_kernel_sees_is_what_torch_sees() -> None:
+    """Frames, distances with their gradients, and clearances at key states, of many scenes at once."""
+    rng = np.random.default_rng(5)
+    scenes = [drawn(rng, n) for n in (3, 0, 17, 8)]
+    among, limits = as_tensors(scenes), kernel().robot.arrays
+    states = rng.uniform(limits.lower, limits.upper, (4, 6, DOF))
+    paths = torch.tensor(states, dtype=torch.float32)
+    eyes, wanted = CompiledSight(SIGHT, kernel(), CPU), TorchSight(SIGHT, kernel(), CPU)
+    balls = [one.arm_balls(paths) for one in (eyes, wanted)]
+    for mine, theirs in zip(*balls, strict=True):
+        torch.testing.assert_close(mine, theirs, atol=1e-5, rtol=0.0)
+    torch.testing.assert_close(eyes.least(among, *balls[0]), wanted.least(among, *balls[1]), atol=1e-5, rtol=0.0)
+    torch.testing.assert_close(eyes.at_keys(among).float(), wanted.at_keys(among).float(), atol=1e-3, rtol=0.0)
+    points = torch.tensor(rng.uniform(-0.8, 0.8, (4, 40, 3)), dtype=torch.float32)
+    near, far = eyes.nearest(among, points), wanted.nearest(among, points)
+    torch.testing.assert_close(near[0], far[0], atol=1e-5, rtol=0.0)
+    assert ((near[1] - far[1]).abs().amax(dim=2) < 1e-3).float().mean() > 0.95, "but for points on edges"
+    lines = np.stack([np.linspace(query(k).start, query(k).goal, 3) for k in range(4)])
+    paths = torch.tensor(lines, dtype=torch.float32)
+    apart = (eyes.along(paths, among) - wanted.along(paths, among)).abs()
+    assert (apart < 1e-3).float().mean() > 0.97
+    nothing = as_tensors([drawn(rng, 0), drawn(rng, 0)])
+    assert len(eyes.at_keys(nothing)) == len(eyes.least(nothing, balls[0][0][:2], balls[0][1])) == 0
+    assert (eyes.nearest(nothing, points[:2])[0] == 0.4).all()
 
 
 def test_pushes_are_virtual_work() -> None:

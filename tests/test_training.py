@@ -228,7 +228,7 @@ def test_a_run_begins_with_the_weights_of_a_checkpoint(
     if second.data.sight is not None:
         assert np.array_equal(second.data.sight.keys.state, wanted["key_state"].numpy()), "it sees what it saw"
     second.advance()
-    moved = [float((p - wanted[name]).abs().max()) for name, p in second.network.named_parameters()]
+    moved = [float((p.detach() - wanted[name]).abs().max()) for name, p in second.network.named_parameters()]
     assert 0.0 < max(moved) < 1e-6, "it is trained"
 
 

@@ -15,6 +15,7 @@ from torch import Tensor
 from apex_ompl.datasets.records import SPLINE, Paths
 from apex_ompl.datasets.store import Store, load
 from apex_ompl.diffusion.checkpoint import load_torch_model
+from apex_ompl.diffusion.compiled_sight import CompiledSight
 from apex_ompl.diffusion.conditions import Conditions, ConditionTable
 from apex_ompl.diffusion.config import TrainingConfig
 from apex_ompl.diffusion.mirror import Mirror
@@ -228,7 +229,8 @@ class TrainingData:
         train, _ = split(paths, config.held_out)
         if self.sight is None and config.condition.scene == "clearances":
             self.sight = Sight(self._key_states(train), self.probes, config.condition.hands)
-            self._eyes = TorchSight(self.sight, self._kernel, self._device)
+            kind = CompiledSight if self._device.type == "cpu" else TorchSight
+            self._eyes = kind(self.sight, self._kernel, self._device)
             self._looked_at = self._eyes.tensor(train.spline.basis(self.probes.shares))
         eyes = self._eyes or self.probes
         if self.validation is None:

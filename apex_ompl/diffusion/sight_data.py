@@ -158,5 +158,5 @@ class SightTable:
         centres, radii = self._eyes.arm_balls(self._few @ control)
         some = obstacles.chosen(index[owner, place], owner)
         free = torch.zeros_like(chosen)
-        free[owner, place] = some.least(centres, radii) > 0.0
+        free[owner, place] = self._eyes.least(some, centres, radii) > 0.0
         return index, free

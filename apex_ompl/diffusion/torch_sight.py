@@ -1,6 +1,7 @@
 """What a model of scene ``clearances`` sees, computed by torch for many scenes at once, as training needs it.
 
-The features are those of :mod:`apex_ompl.diffusion.sight`, which computes them scene by scene.
+The features are those of :mod:`apex_ompl.diffusion.sight`, which computes them scene by scene. On the CPU the kernel
+computes them for all scenes, see :mod:`apex_ompl.diffusion.compiled_sight`.
 """
 
 from __future__ import annotations
@@ -33,7 +34,8 @@ class TorchSight:
         self._reach = self.tensor(sight.keys.ball)
         chains = Chains.of(robot, sight.probes.joint)
         self._chains = self.tensor(chains.below), self._index(chains.revolute), self.tensor(chains.to_state)
-        needed = self._with_parents(a.joint_parent, [*sight.probes.joint, *sight.keys.joint.ravel(), *chains.joint])
+        joints_of_all = [*sight.probes.joint, *sight.keys.joint.ravel(), *chains.joint]
+        self._needed = needed = self._with_parents(a.joint_parent, joints_of_all)
         place = {joint: k for k, joint in enumerate(needed)}
         depth = [0] * len(needed)
         for k, joint in enumerate(needed[1:], start=1):
@@ -98,13 +100,21 @@ class TorchSight:
         centres = torch.einsum("nacij,acpj->nacpi", rotation[:, joint], ball[..., :3]) + origin[:, joint][:, :, :, None]
         return centres.reshape(len(paths), -1, 3), ball[..., 3].flatten().repeat(paths.shape[1])
 
+    def nearest(self, obstacles: Obstacles, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Return distances, at most MAX_DISTANCE, and gradients of points of scenes, see :meth:`Obstacles.nearest`."""
+        return obstacles.nearest(points, MAX_DISTANCE)
+
+    def least(self, obstacles: Obstacles, centres: Tensor, radii: Tensor) -> Tensor:
+        """Return the least distance of each obstacle from balls of its scene, see :meth:`Obstacles.least`."""
+        return obstacles.least(centres, radii)
+
     def along(self, paths: Tensor, obstacles: Obstacles) -> Tensor:
         """Return the features along paths of L states each among obstacles, shape (B, L, dof): (B, features)."""
         count, states = paths.shape[:2]
         rotation, origin = self.frames(paths.flatten(0, 1))
         joint = self._probe_joint
         points = (rotation[:, joint] @ self._probe_offset[..., None])[..., 0] + origin[:, joint]
-        distances, gradients = obstacles.nearest(points.reshape(count, -1, 3), MAX_DISTANCE)
+        distances, gradients = self.nearest(obstacles, points.reshape(count, -1, 3))
         distances, gradients = distances.reshape(points.shape[:2]), gradients.reshape(points.shape)
         frames = rotation[:, self._chain_joint][..., 2], origin[:, self._chain_joint]
         pushed = pushes(self._chains, frames, points, distances, gradients)

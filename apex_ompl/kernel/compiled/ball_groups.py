@@ -33,7 +33,7 @@ def _lower_to(kind: int, balls: Floats, rotation: Floats, centre: Floats, size: 
 
 
 @inlined
-def _lower(s: SceneArrays, o: int, balls: Floats, least: Floats) -> None:
+def lower_to_distances(s: SceneArrays, o: int, balls: Floats, least: Floats) -> None:
     """Lower ``least``, shape (G,), to the signed distances of balls, shape (4, G), from an obstacle [m]."""
     kind, rotation, centre, size = s.kind[o], s.rotation[o], s.offset[o], s.size[o]
     if kind == BOX:
@@ -95,7 +95,7 @@ def group_clearances(
         least[c] = limit
         for o in range(len(s.kind)):
             if seen[o]:
-                _lower(s, o, outer[c], least[c])
+                lower_to_distances(s, o, outer[c], least[c])
     for g in range(len(balls)):
         best = limit
         while True:
