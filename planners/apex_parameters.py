@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 NAME = "apex"
 TURN_CALLS = 1_000  # of the termination condition of a bridge where rounds and trees take turns
 QUICK_CALLS = 1500  # iterations of a bridge between rounds of proposals
-AGAIN = 2  # factor on the iterations of the sprint behind the short repair of the first round
+AGAIN = 8  # factor on the iterations of the sprint behind the short repair of the first round
 SPRINT_FACTORS = (1, 8, 32)  # on those of the sprints before each round of proposals
 
 
@@ -34,7 +34,7 @@ class ApexParameters(Parameters):
         device: Where the network runs.
         line: Whether the straight line is a candidate.
         sprint: Iterations that RRT-Connect has before proposals, where it is the fallback and ``lambda_obs`` is 0;
-            behind a short repair it has twice as many, before the second and third round 8 and 32 times as many.
+            behind a short repair and before the second round it has 8 times as many, before the third 32 times.
             That is for trees in compiled code; OMPL's have an eighth.
         sampler: ``ddim``, ``dpm_solver`` or ``ddpm``; ``model`` takes that of the checkpoint.
         denoising_steps: Number of denoising steps; 0 takes that of the checkpoint: 2 for apex, all 256 for apex-paper.

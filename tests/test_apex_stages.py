@@ -135,7 +135,7 @@ def test_a_long_way_round_is_taken_where_other_trees_find_no_shorter_one(monkeyp
         found = []
         for seed in range(6):
             params = {"model": "none", "line": False, "seed": seed, "polish": True}
-            result = plan(cached_problem("cage/hard/800004"), timeout=20.0, params=params)
+            result = plan(cached_problem("cage/hard/800000"), timeout=20.0, params=params)
             assert result and result.solved_by == "sprint"
             found.append(result.length)
         return found

@@ -67,6 +67,35 @@ def test_trees_go_on_where_they_stopped() -> None:
     assert all(a < b for a, b in zip(sizes, sizes[1:], strict=False)) and len(sizes) > 3
 
 
+def test_guides_show_the_way(monkeypatch: pytest.MonkeyPatch) -> None:
+    """States of a path that other trees found; random states are the same however many are drawn at once."""
+    name = "posts/hard/800004"
+    checker, start, goals = of_problem(name)
+    _, _, path = grown(name, 1, 200_000)
+    assert path is not None
+
+    def pair(seed: int) -> TreePair:
+        return TreePair(checker.kernel, start, goals, LONGEST, RESOLUTION, np.random.default_rng(seed))
+
+    guides, most = sample_path(path, 0.2)[0], 12_000
+    for seed in range(3):
+        alone, guided, pieces = (pair(seed) for _ in range(3))
+        guided.guide(guides)
+        pieces.guide(guides)
+        assert alone.grow(most) is None
+        whole, part = guided.grow(most), None
+        while part is None:
+            part = pieces.grow(PIECE)
+        assert whole is not None and np.array_equal(whole, part)
+    monkeypatch.setattr(trees, "GUIDED", 1.0)
+    monkeypatch.setattr(trees, "GUIDE_SPREAD", 0.0)
+    only = pair(0)
+    only.guide(guides[5:7])
+    states = only._random_states(200)
+    assert all((states == guide).all(axis=1).sum() > 50 for guide in guides[5:7]), "and all are one of the two"
+    assert np.isin(states, guides[5:7]).all()
+
+
 def test_trees_that_are_full_get_more_room(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(trees, "ROOM", 4)
     checker, pair, path = grown("cage/hard/800001", 0)

@@ -16,13 +16,16 @@ LEAST_STEP = 0.01  # least longest step: one random state may cost as many as th
 ROOM = 1024  # nodes of a tree to begin with
 NEAR = 0.5  # share of random states that lie around a straight line between a start and a goal
 SPREAD = 2.0  # standard deviation of these from the line, at most [rad]
+GUIDED = 0.4  # share of all random states that lie around guides, where there are any
+GUIDE_SPREAD = 1.0  # standard deviation of these from the guides, at most [rad]
 
 
 class TreePair:
     """RRT-Connect on what a kernel proves, from some starts to some goals; it goes on where it stopped.
 
     A share NEAR of the random states is normally distributed around straight lines from starts to goals; the others are
-    uniform in the limits.
+    uniform in the limits. Where there are guides, states of paths that are nearly free, as of a model's proposals, a
+    share GUIDED of all is normally distributed around these instead (after Ichter, Harrison and Pavone 2018).
     States that the kernel cannot prove free count as blocked (:mod:`apex_ompl.kernel.compiled.tree_search`).
     """
 
@@ -45,7 +48,8 @@ class TreePair:
         self._at_once = max(int(AT_ONCE * min(longest, 1.0)), 1)  # short steps are many for each random state
         dof, most = kernel.robot.dof, max(len(starts), len(goals))
         self._starts, self._goals = starts, goals
-        self._rng, self._normal_rng = rng, rng.spawn(1)[0]
+        self._rng, (self._normal_rng, *self._guide_rngs) = rng, rng.spawn(3)
+        self._guides = np.empty((0, dof))
         self._sizes = np.array([len(starts), len(goals), 0], np.int64)
         room = max(ROOM, 2 * most)
         self._states, self._parents = np.zeros((2, dof, room)), np.full((2, room), -1, np.int64)
@@ -68,6 +72,10 @@ class TreePair:
     def take_counts(self) -> SearchCounts:
         """Return what was looked at since the last call."""
         return self._buffers.take_counts()
+
+    def guide(self, states: Array) -> None:
+        """Draw some of the random states around these from now on, shape (N, dof); around none where N is 0."""
+        self._guides = states
 
     def grow(self, iterations: int, stop: Callable[[], bool] = lambda: False) -> Array | None:
         """Return a path from a start to a goal, shape (N, dof), or None where the trees did not meet.
@@ -107,7 +115,18 @@ class TreePair:
         goals = self._goals[(which[:, 1] * len(self._goals)).astype(int)]
         around = starts + along * (goals - starts) + SPREAD * spread * normal[near]
         states[near] = np.clip(around, limits.lower, limits.upper)
+        if len(self._guides):
+            self._move_to_guides(states)
         return states
+
+    def _move_to_guides(self, states: Array) -> None:
+        """Put a share GUIDED of random states around guides."""
+        limits, (count, dof) = self._kernel.robot.arrays, states.shape
+        draws, normal = self._guide_rngs[0].random((count, 3)), self._guide_rngs[1].standard_normal((count, dof))
+        some = np.flatnonzero(draws[:, 0] < GUIDED)
+        chosen = self._guides[(draws[some, 1] * len(self._guides)).astype(int)]
+        apart = GUIDE_SPREAD * draws[some, 2, None] * normal[some]
+        states[some] = np.clip(chosen + apart, limits.lower, limits.upper)
 
     def _make_room(self) -> None:
         self._states = np.ascontiguousarray(np.concatenate([self._states, np.zeros_like(self._states)], axis=2))

@@ -6,8 +6,10 @@ Trees in compiled code grow first where this project's checker decides; OMPL's h
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 from ompl import base as ob
 
 from apex_ompl.apex.bridge import bridge_blocked
@@ -19,6 +21,7 @@ from apex_ompl.trajopt.path import Path
 from apex_ompl.types import Array
 
 SPACING = 0.1  # of states on a tree's path whose blocked stretches are bridged [rad, max-norm]
+GUIDING, EVERY = 8, 8  # candidates around whose states trees grow, the nearest to being free, and every so many states
 OMPL_SHARE = 0.125  # of the iterations of compiled trees that OMPL's have, which take several times as long for one
 EXACT, APPROXIMATE = ob.PlannerStatus.EXACT_SOLUTION, ob.PlannerStatus.APPROXIMATE_SOLUTION
 
@@ -48,6 +51,7 @@ class Sprint:
     def _compiled(self, context: SolveContext) -> Array | None:
         trees, (start, goal) = context.sprint_trees, context.pairs[0]
         trees = context.sprint_trees = trees or compiled_trees(context, [start], [goal], self.tree_range)
+        trees.guide(_guides(context, context.pairs[:1]))
         states = grow(context, trees, self.iterations)
         if states is not None:
             context.sprint_trees = None
@@ -89,6 +93,7 @@ class GrowTrees:
         trees = context.all_trees or (context.sprint_trees if len(context.pairs) == 1 else None)
         trees = trees or compiled_trees(context, context.starts, context.goals, self.tree_range)
         context.sprint_trees, context.all_trees = None, trees
+        trees.guide(_guides(context, context.pairs))
         with context.report.timed("rrtconnect"):
             states = grow(context, trees, iterations)
         if states is None:
@@ -116,6 +121,17 @@ class GrowTrees:
             if context.nearest is None or distance < context.nearest[1]:
                 context.nearest = Path(states), distance
         return None
+
+
+def _guides(context: SolveContext, pairs: Sequence[tuple[Array, Array]]) -> Array:
+    """Return states of the candidates between some pairs of start and goal that are nearest to being free."""
+    mine = [
+        one for one in context.pool.candidates
+        if any(np.array_equal(one.control[0], start) and np.array_equal(one.control[-1], goal) for start, goal in pairs)
+    ]  # fmt: skip
+    best = sorted(mine, key=lambda one: one.clearance_cost)[:GUIDING]
+    paths = [context.spline_path(one.control).states[EVERY // 2 :: EVERY] for one in best]
+    return np.concatenate(paths) if paths else np.empty((0, context.kernel.robot.dof))
 
 
 def verified(context: SolveContext, states: Array, stage: str, trees: Sprint | GrowTrees) -> Solution | None:
