@@ -224,6 +224,7 @@ def test_a_run_begins_with_the_weights_of_a_checkpoint(
     wanted = load_torch_model(first / "checkpoint").network.state_dict()
     again = {"condition": condition, "initial": str(first / "checkpoint"), "rate": 1e-9}
     second = Trainer(config(others, **again), tmp_path, HERE)
+    assert second.about()["config"]["initial"] == "checkpoint", "without its folder"
     assert_same(second.network.state_dict(), wanted)
     if second.data.sight is not None:
         assert np.array_equal(second.data.sight.keys.state, wanted["key_state"].numpy()), "it sees what it saw"

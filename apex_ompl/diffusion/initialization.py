@@ -13,6 +13,8 @@ from apex_ompl.diffusion.model_config import ModelConfig, SplineConfig, key_shap
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel import RobotTables
 
+NETWORKS = ("latent", "condition", "denoiser", "noise")  # parts of a model that a configuration sets
+
 
 def initial_network(config: TrainingConfig, data: TrainingData, robot: RobotTables) -> LatentDiffusion:
     """Return a model with random weights, with the robot's limits and probe points, and a fitted linear latent space.
@@ -60,9 +62,9 @@ def _of_checkpoint(name: str, wanted: ModelConfig) -> LatentDiffusion:
     """
     network = load_torch_model(name, robot=wanted.robot).network
     found = network.config
-    for field in ModelConfig.model_fields:
+    for field in (*NETWORKS, *(name for name in ModelConfig.model_fields if name not in (*NETWORKS, "sampling"))):
         theirs, ours = getattr(found, field), getattr(wanted, field)
-        if field != "sampling" and theirs != ours:
+        if theirs != ours:
             expected = f"a checkpoint with the {field} of this run, {ours!r}, not {theirs!r}"
             raise ParameterError("initial", name, expected)
     network.config = wanted

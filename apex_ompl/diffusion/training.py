@@ -183,7 +183,8 @@ class Trainer:
         config = self.config.model_dump(mode="json", by_alias=True)
         config["data"] = [Path(source).name for source in self.config.sources]  # names only: folders are private
         config["robot"] = Path(self.config.robot).name
-        config["cases"] = None if self.config.cases is None else Path(self.config.cases).name
+        for name in ("cases", "initial"):
+            config[name] = None if config[name] is None else Path(config[name]).name
         return {
             "phase": self.phase, "step": self.step, "seconds": round(self.seconds), "torch": torch.__version__,
             "paths": len(self.data.shard), "config": config,
