@@ -96,6 +96,13 @@ def test_what_the_kernel_sees_is_what_torch_sees() -> None:
     near, far = eyes.nearest(among, points), wanted.nearest(among, points)
     torch.testing.assert_close(near[0], far[0], atol=1e-5, rtol=0.0)
     assert ((near[1] - far[1]).abs().amax(dim=2) < 1e-3).float().mean() > 0.95, "but for points on edges"
+    many, torch_threads = scenes * 200, torch.get_num_threads()
+    torch.set_num_threads(3)
+    try:
+        again = eyes.nearest(as_tensors(many), points.repeat(200, 1, 1))
+    finally:
+        torch.set_num_threads(torch_threads)
+    assert torch.equal(again[0], near[0].repeat(200, 1)) and torch.equal(again[1], near[1].repeat(200, 1, 1))
     lines = np.stack([np.linspace(query(k).start, query(k).goal, 3) for k in range(4)])
     paths = torch.tensor(lines, dtype=torch.float32)
     apart = (eyes.along(paths, among) - wanted.along(paths, among)).abs()

@@ -27,13 +27,13 @@ class CompiledSight(TorchSight):
 
     def frames(self, states: Tensor) -> tuple[Tensor, Tensor]:
         """Return rotations (N, J, 3, 3) and origins (N, J, 3) [m] of the joints in use, at states (N, dof)."""
-        rotation, origin = self._kernel.joint_frames(states.numpy())
+        rotation, origin = self._kernel.joint_frames(states.numpy(), torch.get_num_threads())
         return _single(rotation[:, self._needed]), _single(origin[:, self._needed])
 
     def nearest(self, obstacles: Obstacles, points: Tensor) -> tuple[Tensor, Tensor]:
         """Return distances, at most MAX_DISTANCE, and gradients of points of scenes, see :meth:`Obstacles.nearest`."""
         first = np.searchsorted(obstacles.owner.numpy(), np.arange(len(points) + 1))
-        found = _lone(obstacles).nearest(first, points.numpy(), MAX_DISTANCE)
+        found = _lone(obstacles).nearest(first, points.numpy(), MAX_DISTANCE, torch.get_num_threads())
         return _single(found[0]), _single(found[1])
 
     def least(self, obstacles: Obstacles, centres: Tensor, radii: Tensor) -> Tensor:

@@ -111,8 +111,10 @@ class SightTable:
             control = self._varied(control, generator)
             strangers, free = self._strangers(control, held, generator)
             if self._augmentation.mixed > 0.0:
-                others = torch.where(free[..., None], self._keys[strangers].float(), 1.0)
-                at_keys = torch.minimum(at_keys, others.amin(dim=1))
+                for one in range(STRANGERS):  # few of them leave a path free
+                    rows = free[:, one].nonzero()[:, 0]
+                    others = self._keys[strangers[rows, one]].float()
+                    at_keys[rows] = torch.minimum(at_keys[rows], others)
             mask, index = torch.cat([mask, free], dim=1), torch.cat([index, strangers], dim=1)
         start, goal = control[:, 0], control[:, -1]
         line = start[:, None] + self._along[:, None] * (goal - start)[:, None]

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -14,28 +11,13 @@ from numpy.typing import ArrayLike, NDArray
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel.compiled import joint_push, motion_proof, queries
 from apex_ompl.kernel.compiled.workspace import workspace_sizes
+from apex_ompl.kernel.parts import in_parts
 from apex_ompl.kernel.tables import RobotTables, SceneTables
 from apex_ompl.types import Array
 from apex_ompl.util.arrays import compact
-from apex_ompl.util.validation import check_integer, shape_error
+from apex_ompl.util.validation import shape_error
 
 MOST_PAIRS = 16  # pairs that are listed for one state
-PART = 256  # states, fewer than which are not worth a thread of their own
-
-
-def _in_parts(count: int, threads: int, call: Callable[[slice], None]) -> None:
-    """Call with slices that together are all of some rows, several at once in threads.
-
-    Raises:
-        ParameterError: The number of threads is no positive whole number.
-    """
-    parts = min(check_integer(threads, "threads", 1), max(count // PART, 1))
-    if parts == 1:
-        call(slice(count))
-        return
-    edges = np.linspace(0, count, parts + 1).astype(int).tolist()
-    with ThreadPoolExecutor(parts) as pool:
-        list(pool.map(call, (slice(first, end) for first, end in pairwise(edges))))
 
 
 class Kernel:
@@ -90,7 +72,7 @@ class Kernel:
         def check(rows: slice) -> None:
             queries.check_states(*self.packed, *self.workspace(), states[rows], found[rows], counts[rows])
 
-        _in_parts(len(states), threads, check)
+        in_parts(len(states), threads, check)
         return found, counts
 
     def clearance(self, q: ArrayLike, limit: float = np.inf, threads: int = 1) -> Array:
@@ -111,7 +93,7 @@ class Kernel:
         def measure(rows: slice) -> None:
             queries.clearances(*self.packed, *self.workspace(), states[rows], float(limit), values[rows], none)
 
-        _in_parts(len(states), threads, measure)
+        in_parts(len(states), threads, measure)
         return values
 
     def clearance_gradient(self, q: ArrayLike, limit: float = np.inf, threads: int = 1) -> tuple[Array, Array]:
@@ -130,15 +112,24 @@ class Kernel:
                 *self.packed, *self.workspace(), states[rows], float(limit), values[rows], gradients[rows]
             )
 
-        _in_parts(len(states), threads, measure)
+        in_parts(len(states), threads, measure)
         return values, gradients
 
-    def joint_frames(self, q: ArrayLike) -> tuple[Array, Array]:
-        """Return rotations, shape (N, J, 3, 3), and origins, shape (N, J, 3) [m], of all joints, their axes along z."""
+    def joint_frames(self, q: ArrayLike, threads: int = 1) -> tuple[Array, Array]:
+        """Return rotations, shape (N, J, 3, 3), and origins, shape (N, J, 3) [m], of all joints, their axes along z.
+
+        Args:
+            q: States, shape (N, dof).
+            threads: Number of threads.
+        """
         states = self.states(q)
         joints = len(self.robot.arrays.joint_parent)
         rotation, origin = np.empty((len(states), joints, 3, 3)), np.empty((len(states), joints, 3))
-        queries.joint_frames(*self.robot.packed, *self.workspace(), states, rotation, origin)
+
+        def place(rows: slice) -> None:
+            queries.joint_frames(*self.robot.packed, *self.workspace(), states[rows], rotation[rows], origin[rows])
+
+        in_parts(len(states), threads, place)
         return rotation, origin
 
     def joint_pushes(

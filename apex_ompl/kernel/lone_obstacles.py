@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from apex_ompl.kernel.compiled import lone_obstacles
 from apex_ompl.kernel.compiled.arrays import GRID_ROW, SceneArrays
+from apex_ompl.kernel.parts import in_parts
 from apex_ompl.types import Array
 from apex_ompl.util.arrays import compact
 
@@ -31,20 +32,29 @@ class LoneObstacles:
             tree_high=nowhere, grid=np.empty((0, GRID_ROW), np.int64), values=np.empty(0, np.float32),
         )  # fmt: skip
 
-    def nearest(self, first: NDArray[np.int64], points: Array, limit: float) -> tuple[Array, Array]:
+    def nearest(
+        self, first: NDArray[np.int64], points: Array, limit: float, threads: int = 1
+    ) -> tuple[Array, Array]:  # fmt: skip
         """Return the signed distances of points from the nearest obstacles of their scenes, and their gradients.
 
         Args:
             first: First obstacle of each scene, and T, shape (B + 1,).
             points: Points of each scene, shape (B, N, 3) [m].
             limit: Larger distances are given as this, with gradients of 0 [m].
+            threads: Number of threads.
 
         Returns:
             Shapes (B, N) [m] and (B, N, 3).
         """
         distances, gradients = np.empty(points.shape[:2]), np.empty(points.shape)
-        starts = np.ascontiguousarray(first, np.int64)
-        lone_obstacles.nearest_of_scenes(self._arrays, starts, compact(points), float(limit), distances, gradients)
+        starts, rows = np.ascontiguousarray(first, np.int64), compact(points)
+
+        def measure(some: slice) -> None:
+            lone_obstacles.nearest_of_scenes(
+                self._arrays, starts[some.start or 0 :], rows[some], float(limit), distances[some], gradients[some]
+            )
+
+        in_parts(len(rows), threads, measure)
         return distances, gradients
 
     def least(self, owner: NDArray[np.int64], centres: Array, radii: Array) -> Array:
