@@ -16,21 +16,20 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from support import DATA, ROOT
-from trainings import HERE, SCRIPT, SMALL, VARIATIONAL, assert_same, config, query_from_path, weights
+from support import DATA
+from trainings import CLEARANCES, HERE, SCRIPT, SMALL, VARIATIONAL, assert_same, config, query_from_path, weights
 
 from apex_ompl.datasets.kernel_problems import load_kernel_problems, save_kernel_problems
 from apex_ompl.datasets.records import Paths
 from apex_ompl.datasets.store import Store, load, save
 from apex_ompl.diffusion.checkpoint import load_torch_model
-from apex_ompl.diffusion.config import TrainingConfig
 from apex_ompl.diffusion.distributed import DistributedProcess
 from apex_ompl.diffusion.proposals import Sampling
 from apex_ompl.diffusion.runlog import read_log
 from apex_ompl.diffusion.torch_model import TorchModel
 from apex_ompl.diffusion.training import Trainer, TrainingError
 from apex_ompl.diffusion.validation import query_from_problem, success_rates
-from apex_ompl.errors import ApexError, FileFormatError, MissingFileError, ParameterError
+from apex_ompl.errors import FileFormatError, MissingFileError
 from apex_ompl.kernel import Kernel, RobotTables
 from apex_ompl.kernel.scene_builder import scene_tables
 from apex_ompl.trajopt.candidates import first_valid
@@ -210,9 +209,6 @@ def test_success_rates_are_those_of_repair_and_proof(few: Path, tmp_path: Path) 
     assert {f"{problem.suite}/{problem.level}" for problem in problems} <= rates.keys()
 
 
-CLEARANCES = {"scene": "clearances", "width": 32, "out": 64, "along": 3, "keys": 16, "refined": True}
-
-
 @pytest.mark.parametrize("condition", [SMALL["condition"], CLEARANCES])
 def test_a_run_begins_with_the_weights_of_a_checkpoint(
     condition: dict[str, Any], few: Path, paths: Paths, tmp_path: Path
@@ -231,59 +227,6 @@ def test_a_run_begins_with_the_weights_of_a_checkpoint(
     second.advance()
     moved = [float((p.detach() - wanted[name]).abs().max()) for name, p in second.network.named_parameters()]
     assert 0.0 < max(moved) < 1e-6, "it is trained"
-
-
-# Configurations
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"schema": "apex-ompl/training/2"}, "schema: expected 'apex-ompl/training/1', got 'apex-ompl/training/2'"),
-        ({"stepz": 3}, "stepz: unknown key, did you mean 'steps'?"),
-        ({"steps": 0}, "steps: input should be greater than or equal to 1, got 0"),
-        ({"latent": {"kind": "quadratic"}}, "latent.kind: input should be 'linear' or 'variational'"),
-        ({"rate": float("nan")}, "rate: input should be a finite number"),
-        ({"initial": "apex", "latent": {"kind": "variational"}}, "expected a linear latent space with initial"),
-        ({"mirror": {"order": [0, 0], "sign": [1, 1], "shift": [0, 0]}}, "mirror: expected every joint's number once"),
-    ],
-)
-def test_faulty_configurations_are_named(change: dict[str, Any], message: str, few: Path, tmp_path: Path) -> None:
-    file = tmp_path / "faulty.yaml"
-    file.write_text(yaml.safe_dump({**SMALL, "data": str(few), **change}))
-    with pytest.raises(FileFormatError, match="faulty.yaml") as caught:
-        TrainingConfig.read(file)
-    assert message in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"data": "/no/such"}, "manifest of a data set '/no/such/manifest.json': no such file"),
-        ({"robot": "/no/such.npz"}, "file of kernel tables '/no/such.npz': no such file"),
-        ({"latent": {"dim": 500}}, "dimension of the latent space: expected a whole number from 1 to 192, got 500"),
-        ({"mirror": {"order": [0], "sign": [1], "shift": [0]}}, "mirror: expected 16 joints, got 1"),
-        ({"initial": "apix"}, "unknown checkpoint 'apix', did you mean 'apex'? known: apex, apex-paper"),
-    ],
-)
-def test_what_does_not_fit_is_named(change: dict[str, Any], message: str, few: Path, tmp_path: Path) -> None:
-    with pytest.raises(ApexError) as caught:
-        Trainer(config(**{"data": few, **change}), tmp_path, HERE)
-    assert str(caught.value) == message
-
-
-def test_a_checkpoint_of_another_architecture_is_named(few: Path, tmp_path: Path) -> None:
-    with pytest.raises(ParameterError, match=r"initial: expected a checkpoint with the latent of this run, .*dim=32"):
-        Trainer(config(few, initial="apex", condition={**CLEARANCES, "along": 12, "keys": 512}), tmp_path, HERE)
-
-
-def test_dotted_keys_change_a_configuration() -> None:
-    read = TrainingConfig.read(ROOT / "scripts" / "configs" / "apex.yaml", {"latent.dim": 7, "steps": 3})
-    assert read.latent.dim == 7 and read.steps == 3
-    for name in ("apex", "apex-paper"):
-        TrainingConfig.read(ROOT / "scripts" / "configs" / f"{name}.yaml")
-    with pytest.raises(FileFormatError, match="expected 'steps' to hold keys"):
-        TrainingConfig.read(ROOT / "scripts" / "configs" / "apex.yaml", {"steps.more": 3})
 
 
 def test_a_damaged_state_is_named(few: Path, tmp_path: Path) -> None:

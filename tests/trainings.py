@@ -21,6 +21,7 @@ SMALL = {
     "condition": {"width": 32, "out": 64, "along": 3}, "denoiser": {"width": 64, "blocks": 2}, "steps": 12, "batch": 32,
     "warmup": 2, "held_out": 0.0, "log_every": 5,
 }  # fmt: skip
+CLEARANCES = {"scene": "clearances", "width": 32, "out": 64, "along": 3, "keys": 16, "refined": True}
 VARIATIONAL = {
     "latent": {"kind": "variational", "width": 16, "channels": 4}, "autoencoder": {"steps": 5},
     "denoiser": {"kind": "unet", "width": 8, "multipliers": [1, 2]}, "condition": {"scene": "none", "point": True},

@@ -173,6 +173,6 @@ class SolveContext:
         return ob.PlannerTerminationCondition(lambda: self.stop() or next(left, None) is None)
 
 
-def joins(control: Array, query: Query) -> bool:
-    """Whether control points, shape (points, dof), begin and end at a query's start and goal."""
-    return np.array_equal(control[0], query.start) and np.array_equal(control[-1], query.goal)
+def joins(control: Array, start: Array, goal: Array) -> bool:
+    """Whether control points, shape (points, dof), begin and end at a start and a goal, shape (dof,)."""
+    return np.array_equal(control[0], start) and np.array_equal(control[-1], goal)

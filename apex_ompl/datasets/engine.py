@@ -1,6 +1,6 @@
 """Data engine: solves each problem by several methods and keeps the valid paths. It needs the kernel alone.
 
-Problems are drawn, and solved with OMPL and meshes, by :mod:`apex_ompl.generation.solving`.
+Problems are drawn, and solved with meshes, by :mod:`apex_ompl.generation.solving`.
 """
 
 from __future__ import annotations

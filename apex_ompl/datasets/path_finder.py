@@ -8,7 +8,7 @@ import numpy as np
 
 from apex_ompl.datasets.records import to_half
 from apex_ompl.kernel import Kernel
-from apex_ompl.kernel.shortcuts import shortcut
+from apex_ompl.kernel.shortcuts import ENOUGH, RESOLUTION, shortcut
 from apex_ompl.kernel.trees import TreePair
 from apex_ompl.trajopt.candidates import first_valid
 from apex_ompl.trajopt.optimizer import Optimizer
@@ -22,7 +22,6 @@ COMPARED_STATES = 12  # number of states at which two paths are compared
 CLEARANCE_RANGE = 0.2  # clearances are measured up to here [m]
 TREE_RANGE = 1.0  # longest step of trees [rad]
 TREE_ITERATIONS = 30_000  # of trees, at most
-CUTS, CUT_RESOLUTION = 100, 0.01  # shortcuts that are tried along a tree's path, and the states along them [rad]
 
 
 class PathFinder:
@@ -51,7 +50,11 @@ class PathFinder:
     def is_valid(self, states: Array) -> bool:
         """Whether a path, shape (N, dof), passes the full check."""
         inside = bool((states >= self.lower).all() and (states <= self.upper).all())
-        return inside and self.kernel.proves(states, FINE_RESOLUTION)
+        return inside and self.proves(states)
+
+    def proves(self, states: Array) -> bool:
+        """Whether a path, shape (N, dof), inside of the limits is proved free."""
+        return self.kernel.proves(states, FINE_RESOLUTION)
 
     def is_free(self, line: Array) -> bool:
         """Whether a straight motion, shape (2, dof), is free at the resolution that planners search with."""
@@ -64,7 +67,7 @@ class PathFinder:
         states = TreePair(self.kernel, *ends, TREE_RANGE, SEARCH_RESOLUTION, rng).grow(self.iterations)
         if states is None:
             return None
-        path, _ = shortcut(self.kernel, states, CUTS, CUT_RESOLUTION, rng)
+        path, _ = shortcut(self.kernel, states, ENOUGH, RESOLUTION, rng)
         return self.optimizer.spline.fit(path, self.lower, self.upper).control
 
     def optimize_proposals(self, seed: int) -> Array | None:

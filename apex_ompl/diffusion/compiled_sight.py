@@ -14,7 +14,8 @@ from apex_ompl.diffusion.query import MAX_DISTANCE
 from apex_ompl.diffusion.sight import KEY_RANGE, Sight
 from apex_ompl.diffusion.torch_sight import TorchSight
 from apex_ompl.kernel import Kernel
-from apex_ompl.kernel.lone_obstacles import LoneObstacles
+from apex_ompl.kernel.obstacle_batch import ObstacleBatch
+from apex_ompl.types import Array
 
 
 class CompiledSight(TorchSight):
@@ -33,23 +34,23 @@ class CompiledSight(TorchSight):
     def nearest(self, obstacles: Obstacles, points: Tensor) -> tuple[Tensor, Tensor]:
         """Return distances, at most MAX_DISTANCE, and gradients of points of scenes, see :meth:`Obstacles.nearest`."""
         first = np.searchsorted(obstacles.owner.numpy(), np.arange(len(points) + 1))
-        found = _lone(obstacles).nearest(first, points.numpy(), MAX_DISTANCE, torch.get_num_threads())
+        found = _batch(obstacles).nearest(first, points.numpy(), MAX_DISTANCE, torch.get_num_threads())
         return _single(found[0]), _single(found[1])
 
     def least(self, obstacles: Obstacles, centres: Tensor, radii: Tensor) -> Tensor:
         """Return the least distance of each obstacle from balls of its scene, see :meth:`Obstacles.least`."""
-        return _single(_lone(obstacles).least(obstacles.owner.numpy(), centres.numpy(), radii.numpy()))
+        return _single(_batch(obstacles).least(obstacles.owner.numpy(), centres.numpy(), radii.numpy()))
 
     def at_keys(self, obstacles: Obstacles) -> Tensor:
         """Return the features of key states by each obstacle alone, shape (T, K * A); a scene has the least of them."""
-        found = _lone(obstacles).clearances(self._groups, KEY_RANGE)
+        found = _batch(obstacles).clearances(self._groups, KEY_RANGE)
         return torch.from_numpy(np.maximum(found, -KEY_RANGE) / KEY_RANGE).half()
 
 
-def _lone(obstacles: Obstacles) -> LoneObstacles:
+def _batch(obstacles: Obstacles) -> ObstacleBatch:
     columns = (obstacles.shape, obstacles.position, obstacles.rotation, obstacles.size)
-    return LoneObstacles(*(column.numpy() for column in columns))
+    return ObstacleBatch(*(column.numpy() for column in columns))
 
 
-def _single(values: np.ndarray) -> Tensor:
+def _single(values: Array) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray(values, np.float32))

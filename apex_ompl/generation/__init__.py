@@ -1,1 +1,1 @@
-"""Generation of training data: units of work, their problems, and the solving of those with OMPL and meshes."""
+"""Generation of training data: units of work, their problems, and the solving of those with meshes."""

@@ -94,10 +94,9 @@ class MeshPathFinder(PathFinder):
         super().__init__(setup.checker.kernel, setup.start, setup.goals[0], optimizer)
         self.setup = setup
 
-    def is_valid(self, states: Array) -> bool:
-        """Whether a path, shape (N, dof), passes the full check."""
-        inside = bool((states >= self.lower).all() and (states <= self.upper).all())
-        return inside and bool(self.setup.checker.prove(states))
+    def proves(self, states: Array) -> bool:
+        """Whether a path, shape (N, dof), inside of the limits is proved free, by the meshes where it takes them."""
+        return bool(self.setup.checker.prove(states))
 
     def is_free(self, line: Array) -> bool:
         """Whether a straight motion, shape (2, dof), is free at the resolution that planners search with."""

@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel.compiled import joint_push, motion_proof, queries
 from apex_ompl.kernel.compiled.workspace import workspace_sizes
-from apex_ompl.kernel.parts import in_parts
 from apex_ompl.kernel.tables import RobotTables, SceneTables
+from apex_ompl.kernel.threads import in_threads
 from apex_ompl.types import Array
 from apex_ompl.util.arrays import compact
 from apex_ompl.util.validation import shape_error
@@ -72,7 +72,7 @@ class Kernel:
         def check(rows: slice) -> None:
             queries.check_states(*self.packed, *self.workspace(), states[rows], found[rows], counts[rows])
 
-        in_parts(len(states), threads, check)
+        in_threads(len(states), threads, check)
         return found, counts
 
     def clearance(self, q: ArrayLike, limit: float = np.inf, threads: int = 1) -> Array:
@@ -93,7 +93,7 @@ class Kernel:
         def measure(rows: slice) -> None:
             queries.clearances(*self.packed, *self.workspace(), states[rows], float(limit), values[rows], none)
 
-        in_parts(len(states), threads, measure)
+        in_threads(len(states), threads, measure)
         return values
 
     def clearance_gradient(self, q: ArrayLike, limit: float = np.inf, threads: int = 1) -> tuple[Array, Array]:
@@ -112,7 +112,7 @@ class Kernel:
                 *self.packed, *self.workspace(), states[rows], float(limit), values[rows], gradients[rows]
             )
 
-        in_parts(len(states), threads, measure)
+        in_threads(len(states), threads, measure)
         return values, gradients
 
     def joint_frames(self, q: ArrayLike, threads: int = 1) -> tuple[Array, Array]:
@@ -129,7 +129,7 @@ class Kernel:
         def place(rows: slice) -> None:
             queries.joint_frames(*self.robot.packed, *self.workspace(), states[rows], rotation[rows], origin[rows])
 
-        in_parts(len(states), threads, place)
+        in_threads(len(states), threads, place)
         return rotation, origin
 
     def joint_pushes(

@@ -12,6 +12,8 @@ from apex_ompl.kernel.search_buffers import SearchBuffers, SearchCounts
 from apex_ompl.types import Array
 
 TRIES, DRAWS = 64, 16  # motions between corners, and draws, between two looks at the clock
+ENOUGH = 100  # draws for a path of trees
+RESOLUTION = 0.01  # of the states along shortcuts of such a path [rad, max-norm]
 
 
 def shortcut(

@@ -115,7 +115,7 @@ class Resample:
         with context.report.timed("resample"):
             best = sorted(context.pool.candidates, key=lambda one: one.clearance_cost)[:MAX_RESAMPLED]
             for query in context.queries:
-                mine = [one.control for one in best if joins(one.control, query)]
+                mine = [one.control for one in best if joins(one.control, query.start, query.goal)]
                 control = context.sampler.renoise(np.stack(mine), query, self.noise) if mine else None
                 found = None if control is None else check(context, control, RESAMPLED)
                 if found is not None or context.stop():

@@ -8,15 +8,13 @@ from ompl import geometric as og
 
 from apex_ompl.apex.context import SolveContext
 from apex_ompl.apex.trees import compiled_trees, grow
-from apex_ompl.kernel.shortcuts import shortcut
+from apex_ompl.kernel.shortcuts import ENOUGH, RESOLUTION, shortcut
 from apex_ompl.ompl_adapter.simplify import simplify
 from apex_ompl.trajopt.path import Path, path_length
 from apex_ompl.types import Array
 
 DETOUR, OTHERS = 1.7, 2  # times the straight line's length, beyond which so many other trees are tried
 ITERATIONS = 6_000  # of each of these
-DRAWS = 100  # shortcuts that are tried
-RESOLUTION = 0.01  # of the states along them [rad, max-norm]
 
 
 @dataclass(frozen=True)
@@ -76,6 +74,6 @@ class Shorten:
 
 def _shortcut(context: SolveContext, states: Array) -> Array:
     """Return a polyline cut short."""
-    short, looked = shortcut(context.kernel, states, DRAWS, RESOLUTION, context.rng.spawn(1)[0], context.stop)
+    short, looked = shortcut(context.kernel, states, ENOUGH, RESOLUTION, context.rng.spawn(1)[0], context.stop)
     context.note_search(looked)
     return short

@@ -13,7 +13,7 @@ import numpy as np
 from ompl import base as ob
 
 from apex_ompl.apex.bridge import bridge_blocked
-from apex_ompl.apex.context import SolveContext
+from apex_ompl.apex.context import SolveContext, joins
 from apex_ompl.apex.stages.stage import Solution
 from apex_ompl.apex.trees import compiled_trees, grow, ompl_trees
 from apex_ompl.ompl_adapter.space import path_to_array
@@ -125,10 +125,7 @@ class GrowTrees:
 
 def _guides(context: SolveContext, pairs: Sequence[tuple[Array, Array]]) -> Array:
     """Return states of the candidates between some pairs of start and goal that are nearest to being free."""
-    mine = [
-        one for one in context.pool.candidates
-        if any(np.array_equal(one.control[0], start) and np.array_equal(one.control[-1], goal) for start, goal in pairs)
-    ]  # fmt: skip
+    mine = [one for one in context.pool.candidates if any(joins(one.control, *pair) for pair in pairs)]
     best = sorted(mine, key=lambda one: one.clearance_cost)[:GUIDING]
     paths = [context.spline_path(one.control).states[EVERY // 2 :: EVERY] for one in best]
     return np.concatenate(paths) if paths else np.empty((0, context.kernel.robot.dof))

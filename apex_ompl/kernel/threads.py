@@ -13,7 +13,7 @@ from apex_ompl.util.validation import check_integer
 PART = 256  # rows, fewer than which are not worth a thread of their own
 
 
-def in_parts(count: int, threads: int, call: Callable[[slice], None]) -> None:
+def in_threads(count: int, threads: int, call: Callable[[slice], None]) -> None:
     """Call with slices that together are all of some rows, several at once in threads.
 
     Raises:

@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from apex_ompl.kernel.compiled import lone_obstacles
+from apex_ompl.kernel.compiled import obstacle_batches
 from apex_ompl.kernel.compiled.arrays import GRID_ROW, SceneArrays
-from apex_ompl.kernel.parts import in_parts
+from apex_ompl.kernel.threads import in_threads
 from apex_ompl.types import Array
 from apex_ompl.util.arrays import compact
 
 
-class LoneObstacles:
-    """Boxes, balls, cylinders and capsules, each alone or together with others of its scene."""
+class ObstacleBatch:
+    """Boxes, balls, cylinders and capsules of many scenes, each alone or together with the others of its scene."""
 
     def __init__(self, kind: NDArray[np.int64], position: Array, rotation: Array, size: Array) -> None:
         """Take T primitives.
@@ -50,11 +50,11 @@ class LoneObstacles:
         starts, rows = np.ascontiguousarray(first, np.int64), compact(points)
 
         def measure(some: slice) -> None:
-            lone_obstacles.nearest_of_scenes(
+            obstacle_batches.nearest_of_scenes(
                 self._arrays, starts[some.start or 0 :], rows[some], float(limit), distances[some], gradients[some]
             )
 
-        in_parts(len(rows), threads, measure)
+        in_threads(len(rows), threads, measure)
         return distances, gradients
 
     def least(self, owner: NDArray[np.int64], centres: Array, radii: Array) -> Array:
@@ -68,7 +68,7 @@ class LoneObstacles:
         balls = np.empty((len(centres), 4, len(radii)))
         balls[:, :3], balls[:, 3] = np.asarray(centres).transpose(0, 2, 1), radii
         found, room = np.empty(len(owner)), np.empty(len(radii))
-        lone_obstacles.least_distances(self._arrays, np.ascontiguousarray(owner, np.int64), balls, room, found)
+        obstacle_batches.least_distances(self._arrays, np.ascontiguousarray(owner, np.int64), balls, room, found)
         return found
 
     def clearances(self, balls: Array, limit: float) -> Array:
@@ -81,5 +81,5 @@ class LoneObstacles:
         groups = compact(balls)
         outer, found = compact(groups[:, :, 0].transpose(1, 2, 0)), np.empty((len(self._arrays.kind), len(groups)))
         room = np.empty(groups.shape[1::-1])
-        lone_obstacles.clearances_alone(self._arrays, outer, groups, float(limit), room, found)
+        obstacle_batches.clearances_alone(self._arrays, outer, groups, float(limit), room, found)
         return found
