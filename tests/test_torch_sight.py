@@ -131,6 +131,35 @@ def test_pushes_are_virtual_work() -> None:
     assert (np.abs(found[:14]) > 1e-3).sum() >= 12 and not found[14:].any()
 
 
+def test_what_collisions_cost_rises_as_its_gradient_says() -> None:
+    """Against finite differences and the definition; nothing far away, and depth where arms are in obstacles."""
+    rng, margin = np.random.default_rng(3), 0.05
+    scenes, limits = [drawn(rng, n) for n in (6, 0, 3)], kernel().robot.arrays
+    among, paths = as_tensors(scenes), rng.uniform(limits.lower, limits.upper, (3, 4, DOF))
+    for kind in (CompiledSight, TorchSight):
+        eyes = kind(SIGHT, kernel(), CPU)
+
+        def cost(states: Array, eyes: TorchSight = eyes) -> tuple[Array, Array]:
+            found = eyes.collision_cost(torch.tensor(states, dtype=torch.float32), among, margin)
+            return found[0].double().numpy(), found[1].double().numpy()
+
+        found, slope = cost(paths)
+        assert found[0] > 0.1 and found[1] == 0.0 and not slope[1].any() and not slope[..., 14:].any()
+        centres, radii = eyes.arm_balls(torch.tensor(paths, dtype=torch.float32))
+        for k, scene in enumerate(scenes):
+            d = nearest_points(scene.tables(), centres[k].double().numpy(), 1.0)[0] - radii.double().numpy()
+            near = np.where(d < 0.0, margin / 2 - d, np.maximum(0.0, margin - d) ** 2 / (2 * margin))
+            np.testing.assert_allclose(found[k], near.sum() / 4, rtol=1e-3, atol=1e-4)
+        step, wanted = 2e-3, np.zeros_like(paths)
+        for where in np.ndindex(*paths.shape):
+            d = np.zeros_like(paths)
+            d[where] = step
+            wanted[where] = (cost(paths + d)[0] - cost(paths - d)[0])[where[0]] / (2 * step)
+        apart = np.abs(slope - wanted)
+        assert np.mean(apart < 0.03) > 0.95, "but for balls that are as near to two obstacles, or in their middle"
+        assert np.abs(wanted).max() > 0.3
+
+
 @pytest.fixture(scope="module")
 def varied() -> SightTable:
     return SightTable(some_paths(), TorchSight(SIGHT, kernel(), CPU), Augmentation(0.6, 1.0))

@@ -91,6 +91,22 @@ def test_an_interrupted_run_ends_with_the_same_weights(kind: str, few: Path, pat
     assert_same(weights(part), weights(whole))
 
 
+def test_estimates_of_a_model_that_pays_for_collisions_have_fewer(few: Path, tmp_path: Path) -> None:
+    """The same steps with and without; what is measured is what the collisions of its estimates cost."""
+    costs = []
+    for weight in (0.0, 3.0):
+        folder = tmp_path / f"{weight:g}"
+        folder.mkdir()
+        trainer = Trainer(config(few, condition=CLEARANCES, steps=150, rate=3e-3, collision=weight), folder, HERE)
+        trainer.run()
+        data, generator, network = trainer.data, torch.Generator().manual_seed(0), trainer.averaged_network()
+        control, conditions = data.shard.batch(np.arange(len(data.shard)), generator)
+        batch = network.autoencoder.encode(control), trainer._draws(len(control), generator), conditions, data.look
+        with torch.no_grad():
+            costs.append(float(network.loss(*batch, data.collide) - network.loss(*batch)))
+    assert costs[1] < 0.8 * costs[0]
+
+
 def test_rows_logged_after_the_last_save_are_removed(paths: Paths, tmp_path: Path) -> None:
     def trainer() -> Trainer:
         return Trainer(config(data, log_every=1, held_out=0.2), tmp_path, HERE)

@@ -24,6 +24,8 @@ from apex_ompl.errors import ApexError, FileFormatError, ParameterError
         ({"latent": {"kind": "quadratic"}}, "latent.kind: input should be 'linear' or 'variational'"),
         ({"rate": float("nan")}, "rate: input should be a finite number"),
         ({"initial": "apex", "latent": {"kind": "variational"}}, "expected a linear latent space with initial"),
+        ({"collision": -1.0}, "collision: input should be greater than or equal to 0"),
+        ({"collision": 1.0}, "expected parts, mixed and collision for the scene 'clearances'"),
         ({"mirror": {"order": [0, 0], "sign": [1, 1], "shift": [0, 0]}}, "mirror: expected every joint's number once"),
     ],
 )

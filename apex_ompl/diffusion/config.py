@@ -84,6 +84,8 @@ class TrainingConfig(StrictModel):
         parts: Share of the paths of which a part is taken, for a scene ``clearances``, as ``mixed`` is, see
             :class:`apex_ompl.diffusion.sight_data.Augmentation`.
         mixed: Share of the paths among whose obstacles are put some of another scene that leave it free.
+        collision: What collisions of the denoiser's estimates weigh in the loss, for a scene ``clearances``, see
+            :meth:`apex_ompl.diffusion.torch_sight.TorchSight.collision_cost`; the validation loss is without it.
         held_out: Share of the problems kept for the validation loss.
         units: Number of units of a data set in memory at the same time; all by default.
         log_every: Steps between two lines of the log.
@@ -117,6 +119,7 @@ class TrainingConfig(StrictModel):
     mirror: MirrorConfig | None = None
     parts: Share = 0.0
     mixed: Share = 0.0
+    collision: Annotated[float, Field(ge=0.0)] = 0.0
     held_out: Share = 0.02
     units: Count = 1_000_000
     log_every: Count = 100
@@ -128,8 +131,11 @@ class TrainingConfig(StrictModel):
 
     @model_validator(mode="after")
     def _varies_what_can_be_varied(self) -> Self:
-        if (self.parts or self.mixed) and (self.condition.scene != "clearances" or self.condition.point):
-            raise ValueError("expected parts and mixed for the scene 'clearances' without an obstacle point alone")
+        varied = self.parts or self.mixed or self.collision
+        if varied and (self.condition.scene != "clearances" or self.condition.point):
+            raise ValueError(
+                "expected parts, mixed and collision for the scene 'clearances' without an obstacle point alone"
+            )
         return self
 
     @model_validator(mode="after")

@@ -6,6 +6,7 @@ import fnmatch
 import hashlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -34,6 +35,8 @@ KEY_PATHS = 5_000  # paths of whose states key states are chosen
 STATISTICS_PATHS = 100_000  # most paths from which the statistics of the latent space are computed
 VALIDATION_SHARE = 0.02  # most of all problems on which the validation loss is taken
 CPU = torch.device("cpu")
+MARGIN = 0.02  # distance at which collisions begin to cost [m]
+COSTLY = 2  # of so many paths in a batch, the collisions of one are looked for
 PASSES, UNLIMITED = 4, 2**40  # passes over a shard before the next; steps where there is only one shard
 
 
@@ -231,7 +234,8 @@ class TrainingData:
             self.sight = Sight(self._key_states(train), self.probes, config.condition.hands)
             kind = CompiledSight if self._device.type == "cpu" else TorchSight
             self._eyes = kind(self.sight, self._kernel, self._device)
-            self._looked_at = self._eyes.tensor(train.spline.basis(self.probes.shares))
+            self._spline = train.spline
+            self._looked_at = self._eyes.tensor(self._spline.basis(self.probes.shares))
         eyes = self._eyes or self.probes
         if self.validation is None:
             few = split(paths, min(config.held_out, VALIDATION_SHARE))[1]  # the same problems for every larger share
@@ -255,3 +259,37 @@ class TrainingData:
         assert self._eyes is not None
         assert conditions.among is not None
         return self._eyes.along(self._looked_at @ control, conditions.among)
+
+    def collide(self, control: Tensor, conditions: Conditions, places: Tensor) -> Tensor:
+        """Return the mean of what the collisions of some of the paths cost, see :meth:`TorchSight.collision_cost` [m].
+
+        Args:
+            control: Control points, shape (B, points, dof) [rad].
+            conditions: Conditions of the paths.
+            places: Where in each of L equal pieces of a path its state is looked at, shape (L,) in 0..1.
+        """
+        assert self._eyes is not None
+        assert conditions.among is not None
+        mine = (conditions.among.owner % COSTLY == 0).nonzero()[:, 0]
+        among = conditions.among.chosen(mine, conditions.among.owner[mine] // COSTLY)
+        shares = (np.arange(len(places)) + places.cpu().numpy()) / len(places)
+        paths = self._eyes.tensor(self._spline.basis(shares)) @ control[::COSTLY]
+        with torch.no_grad():
+            cost, slope = self._eyes.collision_cost(paths, among, MARGIN)
+        costs: Tensor = _WithSlope.apply(paths, cost, slope)  # type: ignore[no-untyped-call]
+        return costs.mean()
+
+
+class _WithSlope(torch.autograd.Function):
+    """Numbers that depend on tensors, with gradients that are known."""
+
+    @staticmethod
+    def forward(ctx: Any, given: Tensor, found: Tensor, slope: Tensor) -> Tensor:
+        del given
+        ctx.save_for_backward(slope)
+        return found
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
+        (slope,) = ctx.saved_tensors
+        return gradient[:, None, None] * slope, None, None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -18,6 +19,23 @@ from apex_ompl.trajopt.spline import Spline
 
 Look = Callable[[Tensor, Conditions], Tensor]
 """Returns what a model sees along paths, control points of shape (B, points, dof) [rad], features of shape (B, F)."""
+
+Collide = Callable[[Tensor, Conditions, Tensor], Tensor]
+"""Returns what collisions of paths cost, control points of shape (B, points, dof) [rad], at some places along them."""
+
+
+class Draws(NamedTuple):
+    """Random numbers of a batch's loss.
+
+    Attributes:
+        noise: Standard normal epsilon, shape (B, *latent).
+        t: Diffusion steps, shape (B,).
+        places: Where in each of L equal pieces of a path collisions are looked for, shape (L,) in 0..1.
+    """
+
+    noise: Tensor
+    t: Tensor
+    places: Tensor
 
 
 class LatentDiffusion(nn.Module):
@@ -97,31 +115,46 @@ class LatentDiffusion(nn.Module):
         out = self.denoiser(latent, t, encoded)
         return out
 
-    def loss(self, clean: Tensor, noise: Tensor, t: Tensor, conditions: Conditions, look: Look | None = None) -> Tensor:
+    def loss(
+        self, clean: Tensor, draws: Draws, conditions: Conditions, look: Look | None = None,
+        collide: Collide | None = None,
+    ) -> Tensor:  # fmt: skip
         """Return the mean square error of the denoiser (equation 5 of the paper).
 
         loss = mean((f(sqrt(abar_t) z_0 + sqrt(1 - abar_t) epsilon, t, g) - target)^2), where the target is epsilon,
         the velocity or z_0, see :meth:`NoiseSchedule.target`. A denoiser that sees its own last estimate is evaluated
-        at a noisier step first, without one; the loss is the mean of both.
+        at a noisier step first, without one; the loss is the mean of both. What the collisions of the denoiser's last
+        estimate of z_0 cost may be added, after PRESTO (arXiv 2409.16012).
 
         Args:
             clean: Latent vectors z_0 of data, shape (B, *latent).
-            noise: Standard normal epsilon, of the same shape.
-            t: Steps, shape (B,).
+            draws: Noise epsilon and steps t.
             conditions: Conditions g.
             look: Where the denoiser sees its own estimate, returns the features along paths.
+            collide: Returns what the collisions of paths cost.
         """
+        noise, t, places = draws
         encoded = self.encoder(conditions)
         if self.is_regression:
             return nn.functional.mse_loss(self.denoise(torch.zeros_like(clean), torch.zeros_like(t), encoded), clean)
-        if not self.config.condition.refined:
-            return self._error(clean, noise, t, encoded)[0]
-        assert look is not None
-        first, estimate = self._error(clean, noise, torch.maximum(t, t.roll(1)), encoded)
-        with torch.no_grad(), torch.autocast(clean.device.type, enabled=False):  # half precision is coarse
-            control = self.autoencoder.control(estimate, conditions.start, conditions.goal)
-            along = look(torch.maximum(torch.minimum(control, self.encoder.upper), self.encoder.lower), conditions)
-        return 0.5 * (first + self._error(clean, noise, t, self.encoder.refine(encoded, along))[0])
+        first, single = None, torch.autocast(clean.device.type, enabled=False)  # for paths, half precision is coarse
+        if self.config.condition.refined:
+            assert look is not None
+            first, estimate = self._error(clean, noise, torch.maximum(t, t.roll(1)), encoded)
+            with torch.no_grad(), single:
+                along = look(self._decoded(estimate, conditions), conditions)
+            encoded = self.encoder.refine(encoded, along)
+        error, estimate = self._error(clean, noise, t, encoded)
+        error = error if first is None else 0.5 * (first + error)
+        if collide is None:
+            return error
+        with single:
+            return error + collide(self._decoded(estimate, conditions), conditions, places)
+
+    def _decoded(self, latent: Tensor, conditions: Conditions) -> Tensor:
+        """Return the control points of latent vectors, inside the limits."""
+        control = self.autoencoder.control(latent, conditions.start, conditions.goal)
+        return torch.maximum(torch.minimum(control, self.encoder.upper), self.encoder.lower)
 
     def _error(self, clean: Tensor, noise: Tensor, t: Tensor, encoded: Tensor) -> tuple[Tensor, Tensor]:
         """Return the mean square error of the denoiser at steps t, and its estimate of the latent vectors."""
@@ -131,6 +164,6 @@ class LatentDiffusion(nn.Module):
         error = nn.functional.mse_loss(output, self.schedule.target(prediction, clean, noise, t))
         signal, sigma = self.schedule.scales(t, clean)
         if prediction == "clean":
-            return error, output.detach()
+            return error, output
         found = (sample - sigma * output) / signal if prediction == "noise" else signal * sample - sigma * output
-        return error, found.detach()
+        return error, found

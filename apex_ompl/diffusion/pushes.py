@@ -62,9 +62,23 @@ def pushes(
         distances: Their signed distances from the nearest obstacles, shape (N, P) [m].
         gradients: The gradients of these, shape (N, P, 3).
     """
+    force = (1.0 - distances / REACH).clip(min=0.0)[..., None] * gradients
+    return generalized_forces(chains, frames, points, force)
+
+
+def generalized_forces(
+    chains: tuple[Tensor, Tensor, Tensor], frames: tuple[Tensor, Tensor], points: Tensor, force: Tensor
+) -> Tensor:
+    """Return generalized forces of forces on points at N states, their transposed Jacobians times these: (N, dof).
+
+    Args:
+        chains: ``below``, ``revolute`` and ``to_state`` of :class:`Chains`.
+        frames: Axes, shape (N, J, 3), and origins, shape (N, J, 3) [m], of its joints.
+        points: Shape (N, P, 3) [m].
+        force: Shape (N, P, 3).
+    """
     below, revolute, to_state = chains
     axes, origins = frames
-    force = (1.0 - distances / REACH).clip(min=0.0)[..., None] * gradients
     total, moment = (torch.einsum("jp,npi->nji", below, v) for v in (force, torch.linalg.cross(points, force)))
     torque = moment - torch.linalg.cross(origins, total)
     along = (axes * torch.where(revolute[:, None], torque, total)).sum(-1)

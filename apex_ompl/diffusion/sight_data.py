@@ -82,15 +82,18 @@ class SightTable:
 
     def _clearances(self, problems: int, *, keep: bool) -> tuple[Tensor, Tensor]:
         """Return the features of key states of each scene, and of each obstacle where they are kept."""
-        obstacles, rows = self._obstacles, []
-        found = torch.ones(problems, len(self._eyes.balls), device=self.control.device)
+        obstacles, features = self._obstacles, len(self._eyes.balls)
+        count = len(obstacles.owner)
+        found = torch.ones(problems, features, device=self.control.device)
+        kept = torch.empty(count if keep else 0, features, dtype=torch.half, device=self.control.device)
         step = 4096
-        for k in range(0, len(obstacles.owner), step):
+        for k in range(0, count, step):
             some = obstacles.part(slice(k, k + step))
             seen = self._eyes.at_keys(some)
             found.scatter_reduce_(0, some.owner[:, None].expand_as(seen), seen.float(), "amin")
-            rows += [seen] if keep else []
-        return found.half(), torch.cat(rows) if rows else found.new_zeros(0, found.shape[1]).half()
+            if keep:
+                kept[k : k + step] = seen
+        return found.half(), kept
 
     def batch(self, which: Tensor, generator: torch.Generator) -> tuple[Tensor, Conditions]:
         """Return control points (B, points, dof) and conditions of paths by their indices, augmented.

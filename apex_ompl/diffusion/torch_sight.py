@@ -10,8 +10,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from apex_ompl.diffusion.model_config import PIECES
 from apex_ompl.diffusion.obstacles import Obstacles, pairs_at_a_time
-from apex_ompl.diffusion.pushes import Chains, pushes
+from apex_ompl.diffusion.pushes import Chains, generalized_forces, pushes
 from apex_ompl.diffusion.query import MAX_DISTANCE, WORKSPACE_CENTRE
 from apex_ompl.diffusion.sight import KEY_RANGE, Sight
 from apex_ompl.kernel import Kernel
@@ -33,7 +34,9 @@ class TorchSight:
         self.balls = self.tensor(sight.balls(kernel))
         self._reach = self.tensor(sight.keys.ball)
         chains = Chains.of(robot, sight.probes.joint)
-        self._chains = self.tensor(chains.below), self._index(chains.revolute), self.tensor(chains.to_state)
+        self._chains = self._matrices(chains)
+        ball_chains = Chains.of(robot, np.repeat(sight.keys.joint.ravel(), PIECES))
+        self._ball_chains = self._matrices(ball_chains)
         joints_of_all = [*sight.probes.joint, *sight.keys.joint.ravel(), *chains.joint]
         self._needed = needed = self._with_parents(a.joint_parent, joints_of_all)
         place = {joint: k for k, joint in enumerate(needed)}
@@ -56,6 +59,7 @@ class TorchSight:
         self._probe_joint = self._index([place[j] for j in sight.probes.joint.tolist()])
         self._probe_offset = self.tensor(sight.probes.offset)
         self._chain_joint = self._index([place[j] for j in chains.joint.tolist()])
+        self._ball_chain_joint = self._index([place[j] for j in ball_chains.joint.tolist()])
         self._ball_joint = self._index([[place[j] for j in row] for row in sight.keys.joint.tolist()])
         self._centre = self.tensor(WORKSPACE_CENTRE)
 
@@ -69,6 +73,9 @@ class TorchSight:
                 found.add(joint)
                 joint = int(parents[joint])
         return sorted(found)
+
+    def _matrices(self, chains: Chains) -> tuple[Tensor, Tensor, Tensor]:
+        return self.tensor(chains.below), self._index(chains.revolute), self.tensor(chains.to_state)
 
     def tensor(self, values: object) -> Tensor:
         """Return numbers as a tensor where this computes."""
@@ -95,10 +102,40 @@ class TorchSight:
 
     def arm_balls(self, paths: Tensor) -> tuple[Tensor, Tensor]:
         """Return centres (B, N, 3) and radii (N,) [m] of balls that contain the arms at states, (B, S, dof)."""
-        rotation, origin = self.frames(paths.flatten(0, 1))
+        centres = self._placed_balls(*self.frames(paths.flatten(0, 1)))
+        return centres.reshape(len(paths), -1, 3), self._reach[:, :, 1:, 3].flatten().repeat(paths.shape[1])
+
+    def _placed_balls(self, rotation: Tensor, origin: Tensor) -> Tensor:
+        """Return centres of balls that contain the arms, shape (N, A, C, PIECES, 3) [m], by frames of joints."""
         joint, ball = self._ball_joint, self._reach[:, :, 1:]
-        centres = torch.einsum("nacij,acpj->nacpi", rotation[:, joint], ball[..., :3]) + origin[:, joint][:, :, :, None]
-        return centres.reshape(len(paths), -1, 3), ball[..., 3].flatten().repeat(paths.shape[1])
+        return torch.einsum("nacij,acpj->nacpi", rotation[:, joint], ball[..., :3]) + origin[:, joint][:, :, :, None]
+
+    def collision_cost(self, paths: Tensor, obstacles: Obstacles, margin: float) -> tuple[Tensor, Tensor]:
+        """Return how deep the arms are in obstacles along paths of L states, and the gradient of that.
+
+        It is the mean over states, and the sum over balls that contain the arms, of CHOMP's cost of the distance d
+        between ball and obstacle (Ratliff et al. 2009): margin / 2 - d inside, (d - margin)^2 / (2 margin) within the
+        margin, 0 outside. Held objects, and arms against one another, do not count.
+
+        Args:
+            paths: States, shape (B, L, dof) [rad].
+            obstacles: Obstacles of the B scenes.
+            margin: Distance at which the cost begins [m].
+
+        Returns:
+            Shapes (B,) [m] and (B, L, dof) [m / rad].
+        """
+        count, states = paths.shape[:2]
+        rotation, origin = self.frames(paths.flatten(0, 1))
+        centres = self._placed_balls(rotation, origin).flatten(1, 3)
+        distances, gradients = self.nearest(obstacles, centres.reshape(count, -1, 3))
+        depth = margin + self._reach[:, :, 1:, 3].flatten() - distances.reshape(centres.shape[:2])
+        slope = (depth / margin).clamp(0.0, 1.0)
+        cost = slope * (depth - 0.5 * margin * slope)
+        force = slope[..., None] * gradients.reshape(centres.shape)
+        frames = rotation[:, self._ball_chain_joint][..., 2], origin[:, self._ball_chain_joint]
+        away = generalized_forces(self._ball_chains, frames, centres, force)
+        return cost.reshape(count, -1).sum(dim=1) / states, -away.reshape(paths.shape) / states
 
     def nearest(self, obstacles: Obstacles, points: Tensor) -> tuple[Tensor, Tensor]:
         """Return distances, at most MAX_DISTANCE, and gradients of points of scenes, see :meth:`Obstacles.nearest`."""

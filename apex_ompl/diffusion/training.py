@@ -23,7 +23,7 @@ from apex_ompl.diffusion.config import TrainingConfig
 from apex_ompl.diffusion.data import TrainingData
 from apex_ompl.diffusion.distributed import DistributedProcess
 from apex_ompl.diffusion.initialization import initial_network
-from apex_ompl.diffusion.model import LatentDiffusion
+from apex_ompl.diffusion.model import Draws, LatentDiffusion
 from apex_ompl.diffusion.objective import Objective
 from apex_ompl.diffusion.proposals import Sampling
 from apex_ompl.diffusion.runlog import RunLog
@@ -36,6 +36,7 @@ from apex_ompl.util.files import check_writable, is_file
 
 VALIDATION_PATHS = 2048  # most held-out paths on which the validation loss is taken
 PHASES = ("autoencoder", "denoiser")
+COST_STATES = 8  # states of a path at which collisions are looked for
 MAX_SKIPPED = 20  # steps in a row whose gradient is not finite
 
 
@@ -90,7 +91,8 @@ class Trainer:
         if is_file(folder / STATE):
             self._load_state()
         self._runlog = RunLog(folder, self.progress) if process.rank == 0 else None
-        objective = Objective(self.network, config.autoencoder.divergence, self.data.look)
+        collide = self._collide if config.collision else None
+        objective = Objective(self.network, config.autoencoder.divergence, self.data.look, collide)
         self._objective: nn.Module = objective
         if process.world_size > 1:
             self._objective = nn.parallel.DistributedDataParallel(objective, find_unused_parameters=True)
@@ -230,23 +232,26 @@ class Trainer:
         shard = self.data.shard
         which = shard.sample(max(1, config.batch // process.world_size), generator)
         control, conditions = shard.batch(which, generator)
-        noise = self._noise(len(control), generator)
-        return self._evaluate(self._objective, control, conditions, noise)
+        draws = self._draws(len(control), generator)
+        return self._evaluate(self._objective, control, conditions, draws)
 
-    def _noise(self, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """Return standard normal noise, shape (count, *latent), and diffusion steps, shape (count,)."""
+    def _collide(self, control: Tensor, conditions: Conditions, places: Tensor) -> Tensor:
+        """Return what collisions of paths add to the loss."""
+        return self.config.collision * self.data.collide(control, conditions, places)
+
+    def _draws(self, count: int, generator: torch.Generator) -> Draws:
+        """Return the random numbers of the loss of ``count`` paths."""
         noise = torch.randn(count, *self.network.latent, generator=generator)
-        return noise, torch.randint(self.config.noise.steps, (count,), generator=generator)
+        t = torch.randint(self.config.noise.steps, (count,), generator=generator)
+        return Draws(noise, t, torch.rand(COST_STATES, generator=generator))
 
-    def _evaluate(
-        self, objective: nn.Module, control: Tensor, conditions: Conditions, noise: tuple[Tensor, Tensor]
-    ) -> Tensor:
+    def _evaluate(self, objective: nn.Module, control: Tensor, conditions: Conditions, draws: Draws) -> Tensor:
         """Return an objective, evaluated on the device in the configured precision."""
         device = self.process.device
         mixed = torch.autocast(device.type, torch.bfloat16) if self.config.precision == "bfloat16" else nullcontext()
         with mixed:
-            moved = (tensor.to(device) for tensor in noise)
-            loss: Tensor = objective(self.phase, control.to(device), conditions.to(device), *moved)
+            moved = Draws(*(tensor.to(device) for tensor in draws))
+            loss: Tensor = objective(self.phase, control.to(device), conditions.to(device), moved)
         return loss
 
     def _log(self, loss: float, last: bool) -> None:
@@ -263,7 +268,7 @@ class Trainer:
             control, conditions = validation.batch(which.numpy(), generator)
             objective = Objective(network, self.config.autoencoder.divergence, self.data.look)
             with torch.no_grad():
-                held_out = self._evaluate(objective, control, conditions, self._noise(len(control), generator))
+                held_out = self._evaluate(objective, control, conditions, self._draws(len(control), generator))
             row["held_out"] = f"{float(held_out):.6f}"
         if self.phase == "denoiser" and self.problems and (self.step % self.config.validate_every == 0 or last):
             sampling = Sampling(**self.config.validation_sampling.model_dump())
