@@ -1,9 +1,9 @@
 """How much repair proposals need on scenes of kinds that no training data are of: steps of the optimiser, no times.
 
 Four proposals of each model are checked as they are, and then repaired, the most promising one first, as the planner
-does, for at most 192 steps in all. Beside the checkpoint that ships stand random bumps, the same network with random
-weights, and checkpoints by their folders, each under its digest. Problems that the straight line's repair solves are
-told apart. Planners and trainings are tuned on the first 16 problems of a level; --first 0 -n 16 takes these.
+does, for at most 192 steps in all. Beside the checkpoint that ships stand the planner's random bumps, the same network
+with random weights, and checkpoints by their folders, each under its digest. Problems that the straight line's repair
+solves are told apart. Planners and trainings are tuned on the first 16 problems of a level; --first 0 -n 16 takes these.
 Each run is stored in benchmarks/runs/repair_steps when it ends; the command resumes where it was stopped.
 
 Usage: python benchmarks/repair_steps.py [FOLDER ...] [-n 34] [--first 16] [--jobs 2] [--report]
@@ -22,13 +22,13 @@ import record
 from controls import checkpoint_digest, drawn
 from unseen import FROZEN, SUITE, TUNED_ON
 
-from apex_ompl import load_model, problems
+from apex_ompl import problems
+from apex_ompl.apex.models import NONE, Model, trajectory_model
 from apex_ompl.apex.query import make_query
 from apex_ompl.benchmark import Results, Row, Workers, bench
 from apex_ompl.benchmark.rows import Job
 from apex_ompl.benchmark.runs import Run
 from apex_ompl.diffusion.checkpoint import SHIPPED, load_torch_model, read_config
-from apex_ompl.diffusion.proposals import TrajectoryModel
 from apex_ompl.ompl_adapter.setup import assemble
 from apex_ompl.problems.catalogue import VALIDATION
 from apex_ompl.problems.suite_robot import robot
@@ -49,9 +49,9 @@ LINE, BUMPS, RANDOM = "straight line", "bumps", "random weights"
 
 
 @cache
-def model(name: str) -> TrajectoryModel:
+def model(name: str) -> Model:
     """Return a model by its name, folder or kind."""
-    return drawn(load_torch_model("apex").network) if name == RANDOM else load_model(name)
+    return drawn(load_torch_model("apex").network) if name == RANDOM else trajectory_model(name, robot().name)
 
 
 def row(label: str, name: str, digest: str = "") -> Row:
@@ -66,7 +66,7 @@ def rows(folders: Sequence[Path]) -> list[Row]:
         ApexError: A checkpoint cannot be read.
     """
     apex = checkpoint_digest(SHIPPED / "apex")
-    found = [row(LINE, LINE), row("apex", "apex", apex), row(RANDOM, RANDOM, apex), row(BUMPS, BUMPS)]
+    found = [row(LINE, LINE), row("apex", "apex", apex), row(RANDOM, RANDOM, apex), row(BUMPS, NONE)]
     for folder in folders:
         read_config(folder)
         digest = checkpoint_digest(folder)
@@ -79,9 +79,8 @@ def repaired(job: Job) -> Run:
     optimizer, ready = Optimizer(), assemble(problems.load(job.problem), robot())
     kernel, start, goal = ready.checker.kernel, ready.start, ready.goals[0]
     name, generator = job.params["model"], np.random.default_rng(job.seed)
-    if name in (LINE, BUMPS):  # the first of these is the straight line
-        starts = optimizer.starts(start, goal, 1 + COUNT, generator)
-        control = starts[:1] if name == LINE else starts[1:]
+    if name == LINE:
+        control = optimizer.starts(start, goal, 1, generator)
     else:
         query = make_query(ready.checker, start, goal, point=False)
         control = model(name).propose(query, kernel, COUNT, generator=generator).control

@@ -10,9 +10,9 @@ import pytest
 import torch
 from models import POST, VARIATIONAL, WALL, kernel, network, query, some_paths
 
+from apex_ompl.diffusion.cost_gradient import gradient, log_likelihood
 from apex_ompl.diffusion.denoisers import UNetDenoiser
 from apex_ompl.diffusion.guidance import Guidance, collision_cost
-from apex_ompl.diffusion.guidance_gradient import gradient, log_likelihood
 from apex_ompl.diffusion.model import LatentDiffusion
 from apex_ompl.diffusion.model_config import NoiseConfig
 from apex_ompl.diffusion.proposals import Sampling

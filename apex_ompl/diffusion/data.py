@@ -6,7 +6,6 @@ import fnmatch
 import hashlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -19,6 +18,7 @@ from apex_ompl.diffusion.checkpoint import load_torch_model
 from apex_ompl.diffusion.compiled_sight import CompiledSight
 from apex_ompl.diffusion.conditions import Conditions, ConditionTable
 from apex_ompl.diffusion.config import TrainingConfig
+from apex_ompl.diffusion.cost_gradient import with_slopes
 from apex_ompl.diffusion.mirror import Mirror
 from apex_ompl.diffusion.model_config import key_shapes
 from apex_ompl.diffusion.query import Probes
@@ -275,21 +275,5 @@ class TrainingData:
         shares = (np.arange(len(places)) + places.cpu().numpy()) / len(places)
         paths = self._eyes.tensor(self._spline.basis(shares)) @ control[::COSTLY]
         with torch.no_grad():
-            cost, slope = self._eyes.collision_cost(paths, among, MARGIN)
-        costs: Tensor = _WithSlope.apply(paths, cost, slope)  # type: ignore[no-untyped-call]
-        return costs.mean()
-
-
-class _WithSlope(torch.autograd.Function):
-    """Numbers that depend on tensors, with gradients that are known."""
-
-    @staticmethod
-    def forward(ctx: Any, given: Tensor, found: Tensor, slope: Tensor) -> Tensor:
-        del given
-        ctx.save_for_backward(slope)
-        return found
-
-    @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
-        (slope,) = ctx.saved_tensors
-        return gradient[:, None, None] * slope, None, None
+            cost, slopes = self._eyes.collision_cost(paths, among, MARGIN)
+        return with_slopes(paths, cost, slopes).mean()

@@ -17,6 +17,7 @@ from apex_ompl.diffusion.model_config import ModelConfig, key_shapes
 from apex_ompl.diffusion.schedule import NoiseSchedule
 from apex_ompl.trajopt.spline import Spline
 
+COST_STATES = 8  # states of a path at which collisions are looked for
 Look = Callable[[Tensor, Conditions], Tensor]
 """Returns what a model sees along paths, control points of shape (B, points, dof) [rad], features of shape (B, F)."""
 
@@ -114,6 +115,12 @@ class LatentDiffusion(nn.Module):
             return out
         out = self.denoiser(latent, t, encoded)
         return out
+
+    def draws(self, count: int, generator: torch.Generator) -> Draws:
+        """Return the random numbers of the loss of ``count`` paths, on the CPU."""
+        noise = torch.randn(count, *self.latent, generator=generator)
+        t = torch.randint(self.config.noise.steps, (count,), generator=generator)
+        return Draws(noise, t, torch.rand(COST_STATES, generator=generator))
 
     def loss(
         self, clean: Tensor, draws: Draws, conditions: Conditions, look: Look | None = None,

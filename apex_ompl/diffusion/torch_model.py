@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from apex_ompl.diffusion.conditions import batch_queries
+from apex_ompl.diffusion.cost_gradient import gradient, log_likelihood
 from apex_ompl.diffusion.guidance import Guidance
-from apex_ompl.diffusion.guidance_gradient import gradient, log_likelihood
 from apex_ompl.diffusion.model import LatentDiffusion
 from apex_ompl.diffusion.model_config import key_shapes
 from apex_ompl.diffusion.proposals import TrajectoryModel

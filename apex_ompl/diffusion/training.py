@@ -36,7 +36,6 @@ from apex_ompl.util.files import check_writable, is_file
 
 VALIDATION_PATHS = 2048  # most held-out paths on which the validation loss is taken
 PHASES = ("autoencoder", "denoiser")
-COST_STATES = 8  # states of a path at which collisions are looked for
 MAX_SKIPPED = 20  # steps in a row whose gradient is not finite
 
 
@@ -232,26 +231,21 @@ class Trainer:
         shard = self.data.shard
         which = shard.sample(max(1, config.batch // process.world_size), generator)
         control, conditions = shard.batch(which, generator)
-        draws = self._draws(len(control), generator)
-        return self._evaluate(self._objective, control, conditions, draws)
+        return self._evaluate(self._objective, control, conditions, generator)
 
     def _collide(self, control: Tensor, conditions: Conditions, places: Tensor) -> Tensor:
         """Return what collisions of paths add to the loss."""
         return self.config.collision * self.data.collide(control, conditions, places)
 
-    def _draws(self, count: int, generator: torch.Generator) -> Draws:
-        """Return the random numbers of the loss of ``count`` paths."""
-        noise = torch.randn(count, *self.network.latent, generator=generator)
-        t = torch.randint(self.config.noise.steps, (count,), generator=generator)
-        return Draws(noise, t, torch.rand(COST_STATES, generator=generator))
-
-    def _evaluate(self, objective: nn.Module, control: Tensor, conditions: Conditions, draws: Draws) -> Tensor:
+    def _evaluate(
+        self, objective: nn.Module, control: Tensor, conditions: Conditions, generator: torch.Generator
+    ) -> Tensor:
         """Return an objective, evaluated on the device in the configured precision."""
         device = self.process.device
+        draws = Draws(*(tensor.to(device) for tensor in self.network.draws(len(control), generator)))
         mixed = torch.autocast(device.type, torch.bfloat16) if self.config.precision == "bfloat16" else nullcontext()
         with mixed:
-            moved = Draws(*(tensor.to(device) for tensor in draws))
-            loss: Tensor = objective(self.phase, control.to(device), conditions.to(device), moved)
+            loss: Tensor = objective(self.phase, control.to(device), conditions.to(device), draws)
         return loss
 
     def _log(self, loss: float, last: bool) -> None:
@@ -268,7 +262,7 @@ class Trainer:
             control, conditions = validation.batch(which.numpy(), generator)
             objective = Objective(network, self.config.autoencoder.divergence, self.data.look)
             with torch.no_grad():
-                held_out = self._evaluate(objective, control, conditions, self._draws(len(control), generator))
+                held_out = self._evaluate(objective, control, conditions, generator)
             row["held_out"] = f"{float(held_out):.6f}"
         if self.phase == "denoiser" and self.problems and (self.step % self.config.validate_every == 0 or last):
             sampling = Sampling(**self.config.validation_sampling.model_dump())

@@ -1,9 +1,8 @@
-"""Gradient of the obstacle guidance through a decoder of torch."""
+"""Costs of paths that the kernel computes, in the graphs of torch: obstacle guidance through a decoder, and losses."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -13,19 +12,15 @@ from apex_ompl.diffusion.guidance import Guidance, collision_cost
 from apex_ompl.kernel import Kernel
 
 
-class _CollisionCost(torch.autograd.Function):
-    """:func:`collision_cost` as a differentiable function of torch."""
+def with_slopes(paths: Tensor, cost: Tensor, slopes: Tensor) -> Tensor:
+    """Return costs of paths that were computed outside of torch as functions of the paths, with known gradients.
 
-    @staticmethod
-    def forward(context: Any, paths: Tensor, kernel: Kernel, margin: float) -> Tensor:
-        cost, slopes = collision_cost(kernel, paths.detach().cpu().double().numpy(), margin)
-        context.save_for_backward(torch.from_numpy(slopes).to(paths))
-        return torch.from_numpy(cost).to(paths)
-
-    @staticmethod
-    def backward(context: Any, *grads: Tensor) -> tuple[Tensor, None, None]:
-        (slopes,) = context.saved_tensors
-        return grads[0][:, None, None] * slopes, None, None
+    Args:
+        paths: Shape (B, N, dof) [rad].
+        cost: Shape (B,).
+        slopes: Gradients of the costs, shape (B, N, dof).
+    """
+    return cost + (slopes * (paths - paths.detach())).sum(dim=(1, 2))
 
 
 def log_likelihood(
@@ -41,8 +36,8 @@ def log_likelihood(
         guidance: Margin of the cost, and number of states.
     """
     paths = autoencoder.decode(latent, *ends)[:, guidance.states(autoencoder.spline.states)]
-    cost: Tensor = _CollisionCost.apply(paths, kernel, guidance.margin)  # type: ignore[no-untyped-call]
-    return -cost
+    found = collision_cost(kernel, paths.detach().cpu().double().numpy(), guidance.margin)
+    return -with_slopes(paths, *(torch.from_numpy(values).to(paths) for values in found))
 
 
 def gradient(function: Callable[[Tensor], Tensor], at: Tensor) -> Tensor:
