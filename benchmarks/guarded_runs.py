@@ -15,15 +15,14 @@ from __future__ import annotations
 import argparse
 import json
 import math
-from dataclasses import replace
 from typing import Any
 
 import record
 from closed_loop import FOLDER, SCRIPTED, Job, kept, made_by, stored
 
 from apex_ompl.loop.referee import LIMIT_TOLERANCE
-from apex_ompl.loop.run import default_settings, run
-from apex_ompl.loop.sensor import Sensor
+from apex_ompl.loop.run import run
+from apex_ompl.loop.settings import LoopSettings
 from apex_ompl.problems import worlds
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.statistics import share_interval
@@ -42,7 +41,7 @@ HEAD = (
 def made(job: Job) -> dict[str, Any]:
     """Run once, and return what is kept."""
     hastens = int(job.world.rpartition("/")[2]) % HASTENING == 0
-    settings = replace(default_settings(worlds.load(job.world), Sensor(seed=0)), timeout=SHORT, hastens=hastens)
+    settings = LoopSettings(timeout=SHORT, hastens=hastens)
     return kept(job, run(job.world, job.method, speed=job.speed, seed=0, settings=settings))
 
 

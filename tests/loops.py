@@ -76,7 +76,8 @@ def ready_of(name: str, *, speed: float = 1.0, **parameters: Any) -> Ready:
     limits = Timing(velocity_scale=speed).limits(setup.robot.limits, setup.robot.joint_names)
     kinds = ("velocity", "acceleration", "jerk")
     limits = replace(limits, **{kind: share * getattr(limits, kind) for kind in kinds})
-    return Ready(setup, limits, limits, LoopSettings(**{"timeout": 3.0, "hastens": False, **parameters}))
+    settings = LoopSettings(**{"timeout": 3.0, "hastens": False, **parameters}).completed(0.024, 0.4)
+    return Ready(setup, limits, limits, settings)
 
 
 def world_of(name: str, *obstacles: Obstacle) -> World:

@@ -13,7 +13,7 @@ from apex_ompl.errors import ParameterError
 from apex_ompl.loop.cycle import Loop, RunRecord
 from apex_ompl.loop.late_steps import Decided, undo
 from apex_ompl.loop.replanning import AtOnce
-from apex_ompl.loop.run import default_settings, run
+from apex_ompl.loop.run import run
 from apex_ompl.loop.sensor import Sensor, SensorStream
 from apex_ompl.loop.settings import LoopSettings
 from apex_ompl.scene.scripts import place_at
@@ -103,8 +103,7 @@ def test_obstacles_that_count_as_standing_are_told_without_a_velocity() -> None:
 def test_the_filter_knows_how_much_a_sensor_errs() -> None:
     """With the noise of the default sensor it would take most of the errors of this one for turns, and begin anew."""
     sensor = Sensor(noise=0.03)
-    error = default_settings(world_of(PROBLEM), sensor).error
-    loop = loop_of(ByHand(lambda ready, request: None), sensor, error=error, timeout=1.0)
+    loop = loop_of(ByHand(lambda ready, request: None), sensor, error=sensor.largest_error, timeout=1.0)
     for _ in steps(loop):
         pass
     assert loop.executor.tracker.settings.noise == pytest.approx(0.03)

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.loop.methods import METHODS
 from apex_ompl.loop.result import Outcome, RunResult
-from apex_ompl.loop.run import default_settings, run
-from apex_ompl.loop.sensor import Sensor
+from apex_ompl.loop.run import run
 from apex_ompl.loop.settings import LoopSettings
 from apex_ompl.problems import worlds
 from apex_ompl.problems.suite_robot import robot
@@ -45,8 +42,7 @@ def test_plans_begin_at_rest(name: str, waited: RunResult) -> None:
 def test_what_steps_find_free_and_no_proof_does_is_no_reason_to_wait_for_ever() -> None:
     """Two held objects meet at the goal; a search that looks in steps finds the same straight way to it each time."""
     world = worlds.load(GRAZING)
-    settings = replace(default_settings(world, Sensor()), timeout=12.0)
-    assert run(world, "rrtconnect", speed=0.25, settings=settings).outcome is Outcome.REACHED
+    assert run(world, "rrtconnect", speed=0.25, settings=LoopSettings(timeout=12.0)).outcome is Outcome.REACHED
 
 
 def test_who_waits_stays_on_the_first_plan(waited: RunResult) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +16,7 @@ from apex_ompl.loop.cycle import RunRecord
 from apex_ompl.loop.following import Following
 from apex_ompl.loop.referee import LIMIT_TOLERANCE
 from apex_ompl.loop.result import Outcome, RunResult
-from apex_ompl.loop.run import _Made, default_settings, load_world, run
-from apex_ompl.loop.sensor import Sensor
+from apex_ompl.loop.run import _Made, run
 from apex_ompl.loop.settings import LoopSettings
 from apex_ompl.problems import worlds
 from apex_ompl.problems.suite_robot import robot
@@ -83,9 +81,9 @@ def test_a_robot_that_stands_at_the_goal_is_there() -> None:
 
 def test_whoever_is_late_and_comes_to_rest_at_the_goal_has_reached_it() -> None:
     whole = run(MOVING, "no-network")
-    arrival, usual = whole.metrics["time_to_goal"], default_settings(load_world(MOVING), Sensor())
+    arrival = whole.metrics["time_to_goal"]
     for early in (0.01, 0.02, 0.03):
-        found = run(MOVING, "no-network", settings=replace(usual, timeout=arrival - early))
+        found = run(MOVING, "no-network", settings=LoopSettings(timeout=arrival - early))
         assert ("time_to_goal" in found.metrics) == (found.outcome is Outcome.REACHED)
         if found:
             assert found.metrics["time_to_goal"] <= arrival + 0.1

@@ -141,6 +141,10 @@ def _add_run(commands: Commands[argparse.ArgumentParser]) -> None:
     )
     parser.add_argument("--speed", type=float, default=1.0, metavar="SHARE", help="of the velocity limits")
     parser.add_argument("--budget", type=float, default=0.05, metavar="SECONDS", help="of a replan")
+    parser.add_argument(
+        "--evade", default="proved", help="how a robot at rest that is about to be touched steps aside: proved (clear "
+        "of all that obstacles can reach), risk (as predicted) or never (default: %(default)s)",
+    )  # fmt: skip
     parser.add_argument("--latency", type=float, metavar="SECONDS", help="of a replan (default: what its work costs)")
     parser.add_argument("--timeout", type=float, default=30.0, metavar="SECONDS", help="default: %(default)s")
     parser.add_argument("--seed", type=int, default=0, help="default: %(default)s")

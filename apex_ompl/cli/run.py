@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import argparse
 import json
-from dataclasses import replace
 
-from apex_ompl.loop.result import SUFFIXES, Outcome, RunResult
-from apex_ompl.loop.run import default_settings, load_world
+from apex_ompl.loop.result import INTERRUPTED, SUFFIXES, Outcome, RunResult
+from apex_ompl.loop.run import load_world
 from apex_ompl.loop.run import run as run_loop
 from apex_ompl.loop.sensor import Sensor
+from apex_ompl.loop.settings import LoopSettings
 from apex_ompl.util.files import check_writable, suffix_of
 
 SHOWN = {
@@ -25,9 +25,7 @@ def run(parsed: argparse.Namespace) -> int:
         check_writable(parsed.out)
     world, sensor = load_world(parsed.world), Sensor(seed=parsed.seed)
     latency = -1.0 if parsed.latency is None else parsed.latency
-    settings = replace(
-        default_settings(world, sensor), budget=parsed.budget, latency=latency, timeout=parsed.timeout
-    )  # fmt: skip
+    settings = LoopSettings(budget=parsed.budget, latency=latency, timeout=parsed.timeout, evade=parsed.evade)
     result = run_loop(
         world, parsed.planner, clock=parsed.clock, prediction=parsed.prediction, seed=parsed.seed, speed=parsed.speed,
         settings=settings, sensor=sensor,
@@ -38,6 +36,8 @@ def run(parsed: argparse.Namespace) -> int:
     print(json.dumps(told) if parsed.json else _summary(result))
     if result.outcome is Outcome.START_INVALID:
         return 3
+    if result.outcome is Outcome.ABORTED and result.reason.endswith(INTERRUPTED):
+        return 130
     return 0 if result else 1
 
 

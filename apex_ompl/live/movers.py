@@ -159,6 +159,18 @@ class Movers:
         other.arrays.growth[:, 0] += by
         return other
 
+    def with_margin(self, margin: float, growth: float = 0.0) -> Movers:
+        """Return a copy with a margin at the time stamps [m], which grows after them [m/s], in place of theirs."""
+        other = self.larger(0.0)
+        other.arrays.growth[:] = margin, growth
+        return other
+
+    def nominal(self, margin: float) -> Movers:
+        """Return a copy whose margins are at most so large [m], and do not grow."""
+        other = self.with_margin(margin)
+        other.arrays.growth[:, 0] = np.minimum(self.arrays.growth[:, 0], margin)
+        return other
+
     def at(self, time: float) -> dict[str, Array]:
         """Return where the obstacles are at a time [s]: positions, shape (3,) [m], by name."""
         a, found = self.arrays, {}

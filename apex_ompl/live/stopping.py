@@ -109,8 +109,7 @@ def stops_proved(
         growth: Margin of what was seen [m], and its growth since [m/s].
         period: Time from a moment to the stop [s].
     """
-    dof, curve, a, seen = motion.dof, curve_of(motion), expected.arrays, expected.larger(0.0)
-    seen.arrays.growth[:] = growth
+    dof, curve, a, seen = motion.dof, curve_of(motion), expected.arrays, expected.with_margin(*growth)
     states = np.stack([motion.positions, motion.velocities, motion.accelerations])
     room, movers = max(len(motion.times) + MOST_STEPS + 4, dof * PHASES + 2), len(a.kind)
     by_joints = np.zeros(len(moments), np.int64)

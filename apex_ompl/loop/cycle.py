@@ -12,10 +12,11 @@ import numpy as np
 from apex_ompl.live.movers import Movers
 from apex_ompl.loop.executor import Executor
 from apex_ompl.loop.following import SAME_TIME, Following, executed
+from apex_ompl.loop.late_steps import Decided, undo
 from apex_ompl.loop.observation import Observation
 from apex_ompl.loop.ready import Ready
 from apex_ompl.loop.replanning import Replanning
-from apex_ompl.loop.result import Event
+from apex_ompl.loop.result import INTERRUPTED, Event
 from apex_ompl.loop.sensor import CUT
 from apex_ompl.loop.tracking import Tracker, TrackSettings, as_they_are
 from apex_ompl.problems.worlds import World
@@ -41,9 +42,13 @@ class RunRecord:
         trajectory: What the robot did.
         events: What happened.
         reached: Whether the robot came to rest at a goal.
-        ended: Why the run ended else: ``timeout`` or ``stuck``.
+        ended: Why the run ended else: ``timeout``, ``stuck`` or ``aborted``.
         broken: Number of steps at which an obstacle was where the assumptions of the guarantee exclude it.
         measured: What was measured on a real clock, by name.
+        reason: What there is to say of the end, or nothing.
+        unguarded: Number of steps at which the robot moved without a fail-safe stop.
+        refused: Number of observations that were refused.
+        doubted: Number of observed places that contradicted what was known.
     """
 
     trajectory: Trajectory
@@ -52,6 +57,17 @@ class RunRecord:
     ended: str
     broken: int
     measured: Mapping[str, float] = field(default_factory=dict)
+    reason: str = ""
+    unguarded: int = 0
+    refused: int = 0
+    doubted: int = 0
+
+    @property
+    def counts(self) -> dict[str, float]:
+        """What was counted, as metrics have it."""
+        counts = {"broken_steps": self.broken, "unguarded_steps": self.unguarded}
+        counts |= {"refused_looks": self.refused, "doubted_places": self.doubted}
+        return {name: float(count) for name, count in counts.items()}
 
 
 class Loop:
@@ -76,31 +92,67 @@ class Loop:
         """
         self._world, self._ready, self._eyes = world, ready, eyes
         self._allowed = tuple(ready.setup.problem.allowed)
-        tracking = TrackSettings(noise=ready.settings.error / CUT)
-        self._tracker = Tracker(ready.kernel, tracking, self._allowed)
+        error, fastest = ready.settings.assumed
+        self._present: tuple[Obstacle, ...] = tuple(world.present(0.0))
+        self._tracker = Tracker(
+            ready.kernel, TrackSettings(noise=error / CUT), self._allowed, error, fastest, ready.settings.memory,
+            {o.name for o in self._present},
+        )  # fmt: skip
         start = ready.setup.start
         standing = Following.standing(start, 0.0, ready.names, to_goal=ready.is_goal(start))
         self.executor = Executor(
             ready, replanning, self._tracker, seed, standing, followed=[(0.0, standing)], lead=lead
         )  # fmt: skip
         self._waiting: list[Observation] = []
-        self._begun, self._rest, self._broken = False, 0.0, 0
-        self._present: tuple[Obstacle, ...] = ()
-        self._looked = 0.0
+        self._begun, self._rest, self._broken, self._refused, self._doubted = False, 0.0, 0, 0, 0
+        self._looked, self._closed, self._aborted, self._refusal = 0.0, 0.0, "", ""
 
     def advance(self, now: float) -> None:
         """Let the world move on to a time [s], and be looked at."""
         self._world.advance(now, self.executor.state(now))
-        self._waiting += self._eyes.observations(now)
+        if not self._aborted:
+            try:
+                self._waiting += self._eyes.observations(now)
+            except Exception as error:  # whatever a sensor does, the robot stops and the run is returned
+                self.abort(f"the sensor failed, {type(error).__name__}: {error}")
         self._present, self._looked = tuple(self._world.present(now)), now
+
+    def abort(self, why: str) -> None:
+        """Let the robot stop, and the run end for a reason."""
+        self._aborted = self._aborted or why
+
+    def interrupt(self, now: float, before: Decided) -> None:
+        """Undo a step that was interrupted, and abort the run.
+
+        Args:
+            now: Time of the step [s].
+            before: What had been decided before it.
+
+        Raises:
+            KeyboardInterrupt: The run was aborted before.
+        """
+        if self._aborted:
+            raise KeyboardInterrupt
+        undo(self.executor, now, before)
+        self.abort(INTERRUPTED)
 
     def observe(self, now: float) -> None:
         """Take the observations that have arrived by a time [s], to which the world has moved on."""
-        settings = self._ready.settings
-        for observation in [one for one in self._waiting if one.received <= now + 1e-9]:
-            self._tracker.take(observation)
-        self._waiting = [one for one in self._waiting if one.received > now + 1e-9]
-        self._broken += unexpected(self._tracker, self._present, now, settings.error, settings.fastest)
+        later = []
+        for observation in self._waiting:
+            if observation.received > now + 1e-9:
+                later.append(observation)
+                continue
+            taken = self._tracker.take(observation, now)
+            self._refused += bool(taken.refused)
+            self._doubted += len(taken.doubted)
+            if taken.refused and taken.refused != self._refusal:
+                self.executor.log(now, "observation refused", why=taken.refused)
+            for why in taken.doubted:
+                self.executor.log(now, "place doubted", why=why)
+            self._refusal = taken.refused or self._refusal
+        self._waiting = later
+        self._broken += unexpected(self._tracker, self._present, now)
 
     def step(self, now: float) -> RunRecord | None:
         """Decide what the robot does from a time on [s], and return what came of the run where it is over."""
@@ -111,7 +163,7 @@ class Loop:
             predicted = tracker.predicted(settings.margin, settings.prediction)
             soon = now + np.array([0.0, 1.0, 2.0]) * settings.budget
             tracker.eased(predicted, executor.state(now), soon)
-        if now >= settings.timeout - SAME_TIME and not executor.done(now):
+        if (self._aborted or now >= settings.timeout - SAME_TIME) and not executor.done(now):
             executor.close(now)
         executor.step(now, predicted, partial(self._records, predicted, now))
         if executor.done(now):
@@ -120,8 +172,9 @@ class Loop:
         self._rest = self._rest + settings.period if executor.following.at_rest(now) else 0.0
         if self._rest > settings.stuck:
             return self._ended(now, False, "stuck")
-        over = executor.closed and (executor.following.at_rest(now) or now >= settings.timeout + LONGEST_STOP)
-        return self._ended(now, False, "timeout") if over else None
+        self._closed = self._closed if executor.closed else now
+        over = executor.closed and (executor.following.at_rest(now) or now >= self._closed + LONGEST_STOP)
+        return self._ended(now, False, "aborted" if self._aborted else "timeout") if over else None
 
     def set_out(self, now: float) -> None:
         """Tell the world of the first motion, where there is one by a time [s], that of the last step."""
@@ -143,17 +196,22 @@ class Loop:
         )
 
     def _ended(self, now: float, reached: bool, why: str) -> RunRecord:
-        trajectory = executed(self.executor.followed, now)
-        return RunRecord(trajectory, tuple(self.executor.events), reached, why, self._broken)
+        trajectory, reason = executed(self.executor.followed, now), self._aborted
+        if not reached and not reason:
+            awaited = f"never seen: {', '.join(sorted(self._tracker.awaited))}" if self._tracker.awaited else ""
+            blind = "no look was of use in the end" if self.executor.blind(now) else ""
+            last = f"{self._refused} looks were refused, the last one since {self._refusal}" if self._refused else ""
+            reason = "; ".join(filter(None, (awaited, blind, last)))
+        return RunRecord(
+            trajectory, tuple(self.executor.events), reached, why, self._broken, reason=reason,
+            unguarded=self.executor.unguarded, refused=self._refused, doubted=self._doubted,
+        )  # fmt: skip
 
 
-def unexpected(tracker: Tracker, present: Iterable[Obstacle], now: float, error: float, fastest: float) -> bool:
+def unexpected(tracker: Tracker, present: Iterable[Obstacle], now: float) -> bool:
     """Whether an obstacle is where the assumptions of the guarantee exclude it: unseen, or farther than it can be."""
     for o in present:
-        track = tracker.tracks.get(o.name)
-        if track is None:
-            return True
-        way = float(np.linalg.norm(np.subtract(o.position, track.shape.position)))
-        if way > error + fastest * (now - track.stamp) + 1e-9:
+        known = [track for track in (*tracker.tracks.values(), *tracker.doubted) if track.shape.name == o.name]
+        if not any(tracker.may_be(track, o, now, errors=1) for track in known):
             return True
     return False

@@ -27,7 +27,7 @@ def endangered(following: Following, at: float, conflict: float, within: float =
     Args:
         following: What the robot follows.
         at: Time of the clock [s].
-        conflict: That of the first conflict of what it follows [s], infinite without one.
+        conflict: That of the first contact that is predicted of what it follows [s], infinite without one.
         within: The time from ``at`` on [s].
     """
     return following.at_rest(at) and conflict < at + within
@@ -36,7 +36,9 @@ def endangered(following: Following, at: float, conflict: float, within: float =
 def step_aside(search: Search) -> Trajectory | None:
     """Return the straight motion to a state nearby that stays clear, or else clear for longest, or None.
 
-    Besides states around, the robot may go back: to states of its last motion to a goal, and to where it began.
+    Besides states around, the robot may go back: to states of its last motion to a goal, and to where it began. Where
+    motions aside are to be proved clear of all that obstacles can reach, those that are come first; another one may
+    still have a fail-safe stop at each of its steps.
     """
     request, ready = search.request, search.ready
     q, limits, hold = search.start.position, ready.setup.robot.limits, ready.settings.rest_hold
@@ -56,7 +58,7 @@ def step_aside(search: Search) -> Trajectory | None:
     near = np.minimum(clear.min(axis=1), ready.kernel.clearance(states, SEEN).min(axis=1))
     search.charges.charge("clearance in time", len(states))
     size = np.abs(states - q).max(axis=1)
-    best, latest = None, request.conflict + GAIN
+    best, unproved, latest = None, None, request.conflict + GAIN
     for k in np.argsort(-(near - NEARNESS * size), kind="stable"):
         if search.charges.over():
             break
@@ -64,11 +66,15 @@ def step_aside(search: Search) -> Trajectory | None:
         search.charges.charge("straight motion")
         one = search.following(motion)
         conflict = ready.first_conflict(request.predicted, one, one.begin, one.end + hold, search.charges)
-        if conflict > latest and ready.clear_of_still(motion, search.charges):
-            best, latest = motion, conflict
-            if np.isinf(conflict):
-                break
-    return best
+        if conflict <= latest or not ready.clear_of_still(motion, search.charges):
+            continue
+        if request.reachable is not None and not ready.proved_to_rest(request.reachable, one):
+            unproved = motion if unproved is None else unproved
+            continue
+        best, latest = motion, conflict
+        if np.isinf(conflict):
+            break
+    return unproved if best is None else best
 
 
 def _looked(search: Search, states: Array, looks: Array) -> tuple[Array, Array]:

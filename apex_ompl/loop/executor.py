@@ -3,9 +3,10 @@
 At every step the robot goes on only where the next step and a stop behind it are proved clear of all that obstacles of
 bounded speed can reach; else it follows the stop that was proved a step before. By induction it is at rest whenever it
 is touched, as long as no obstacle is faster than was assumed, and each was seen, within the error assumed, not longer
-ago than what was known when the stop was proved. The one exception is a robot that leaves a place that an obstacle
-comes to: it goes on without a proved stop until there is one again behind which it is not touched soon. (A fail-safe
-manoeuvre that is verified online, Althoff and Dolan 2014; Pereira and Althoff 2015.)
+ago than what was known when the stop was proved. A robot at rest that is about to be touched may step aside along a
+motion that is proved like that until it is at rest again, which then is the fail-safe stop itself. Only where the user
+chooses so (``evade="risk"``) it leaves without; the steps at which it moves without a fail-safe stop are counted. (A
+fail-safe maneuver that is verified online, Althoff and Dolan 2014; Pereira and Althoff 2015.)
 """
 
 from __future__ import annotations
@@ -46,13 +47,16 @@ class Executor:
         tracker: What is known of the obstacles.
         seed: Of random choices.
         following: What the robot follows.
-        stop: The stop that was proved last, which begins at the next step; None behind a motion that leaves.
+        stop: The fail-safe stop: what is proved from the next step on until the robot is at rest, or from now on where
+            it is what the robot follows; None where it is at rest, or leaves without.
         followed: What was followed from which times on.
         events: What happened.
         route: The last motion to a goal, or None.
         pending: What was asked for and is not answered yet, or None.
         asked: Number of replans so far.
         conflict: Time of the first conflict of what is followed [s], or infinity.
+        contact: The same without margins for what is uncertain, where the robot will be at rest soon; else infinity.
+        unguarded: Number of steps at which the robot moved without a fail-safe stop.
         endangered: Since when a conflict is known that the command does not answer yet [s], or None.
         nearest: Distance of an obstacle below which the motion counts as blocked, where that goes by distance [m].
         closed: Whether the time is up: no motion is asked for or taken any more.
@@ -80,6 +84,8 @@ class Executor:
     pending: Request | None = None
     asked: int = 0
     conflict: float = math.inf
+    contact: float = math.inf
+    unguarded: int = 0
     endangered: float | None = None
     nearest: float = 0.0
     leaving: bool = False
@@ -108,18 +114,25 @@ class Executor:
             obstacles: Returns their records where they are now, with velocities; called where a replan is asked for.
         """
         settings = self.ready.settings
-        reachable = self.tracker.reachable(settings.error, settings.fastest) if settings.guarded else None
+        reachable = self.tracker.reachable(*settings.assumed) if settings.guarded else None
         if not self.closed:
             self._answer(now, predicted, reachable)
         if settings.monitored:
             self._look(now, predicted)
             if settings.from_rest:
                 self._halt(now)
+            if self.blind(now):
+                self._stop_blind(now)
         if reachable is not None:
             self._brake(now, predicted)
             self._guard(now, reachable, predicted)
+        self.unguarded += self.stop is None and self._moves(now)
         if not self.closed:
-            self._ask(now, predicted, obstacles)
+            self._ask(now, predicted, reachable, obstacles)
+
+    def _moves(self, now: float) -> bool:
+        """Whether the robot moves in the step from now on."""
+        return self.following.start(now).moves or self.following.start(now + self.ready.settings.period).moves
 
     def close(self, now: float) -> None:
         """Come to rest, since the time is up: follow the stop in hand. To be called before each step from then on.
@@ -146,7 +159,9 @@ class Executor:
             self.endangered, self.ahead, self.doing = now, found - now, self._doing(now)
         if not math.isfinite(found):
             self.endangered = None
-        self.conflict = found
+        self.conflict, self.contact = found, math.inf
+        if math.isfinite(found) and self.following.at_rest(now + self.ready.settings.budget):
+            self.contact = self._first_conflict(self.following, now, predicted.nominal(self.ready.settings.margin))
 
     def _doing(self, now: float) -> str:
         """Return whether the robot is going, braking, or standing."""
@@ -163,18 +178,36 @@ class Executor:
         return float(clear.min())
 
     def _brake(self, now: float, predicted: Movers) -> None:
-        """Stop where a conflict is near and no answer came within a step, if it is not touched as soon there."""
-        waited, stop = self.endangered is not None and now > self.endangered + SAME_TIME, self.stop
-        if not waited or self.conflict >= now + NEAR or stop is None or self.following.at_rest(now):
+        """Stop where a conflict is near and no answer came within a step, if it is not touched as soon there.
+
+        A robot that leaves without a fail-safe stop does not wait for an answer.
+        """
+        waited = self.endangered is not None and now > self.endangered + SAME_TIME
+        if not (waited or self.leaving) or self.conflict >= now + NEAR or self.following.at_rest(now):
             return
-        if self.following.start(now).moves and stop is not self.following:
-            if self._first_conflict(stop, now, predicted) > self.conflict + GAIN:
-                self._follow_stop(now, stop)
+        if not self.following.start(now).moves or self.following in (self.stop, self.braking):
+            return
+        stop = self.ready.unproved_stop(self.following, now) if self.stop is None else self.stop
+        if self._first_conflict(stop, now, predicted) > self.conflict + GAIN:
+            self._follow_stop(now, stop)
 
     def _first_conflict(self, one: Following, now: float, predicted: Movers) -> float:
         """Return the time of the first conflict of a motion, or of standing where it ends [s], or infinity."""
         hold = self.ready.settings.hold if one.to_goal else self.ready.settings.rest_hold
         return self.ready.first_conflict(predicted, one, now, max(one.end, now) + hold)
+
+    def blind(self, now: float) -> bool:
+        """Whether there was no look of use for too long."""
+        return now - self.tracker.last > self.ready.settings.silence
+
+    def _stop_blind(self, now: float) -> None:
+        """Stop, since there was no look of use for too long."""
+        if self.following.at_rest(now):
+            return
+        stop = self._stop_at(now)
+        if stop is not None and self.following not in (stop, self.braking):
+            self.log(now, "blind", last=self.tracker.last)
+            self._follow_stop(now, stop)
 
     def _halt(self, now: float) -> None:
         """Stop where the way to a goal is blocked."""
@@ -202,6 +235,10 @@ class Executor:
 
     def _guard(self, now: float, reachable: Movers, predicted: Movers) -> None:
         """Go on with a proved stop behind the next step, or stop."""
+        if self.following.at_rest(now):
+            self.leaving = False
+        elif self.stop is self.following:
+            return  # all of it is proved
         then = now + self.ready.settings.period
         found = self.ready.proved_stop(reachable, self.following, now, then)
         if found is not None:
@@ -251,12 +288,14 @@ class Executor:
             self.log(now, request.refused, why=reply.failed, **took)
             return
         request, found = self._at_once(now, request, found, predicted)
-        why, leaving = self._fault(now, request, found, predicted), False
+        why, proved, leaving = self._fault(now, request, found, predicted), False, False
         if not why and reachable is not None:
-            then = found.begin + self.ready.settings.period
-            may, stops = self._may_leave(now, found), self.ready.proved_stop(reachable, found, found.begin, then)
-            leaving = stops is None or (may and not found.to_goal)  # a stop at once is no way to leave
-            if leaving and not may:
+            aside, then = self._may_leave(now, found), found.begin + self.ready.settings.period
+            proved = aside and self.ready.proved_to_rest(reachable, found)
+            leaving = aside and not proved and self.ready.settings.evade == "risk"  # a stop at once is no way to leave
+            if self.leaving and found.to_goal:
+                why = "the robot leaves without a fail-safe stop"
+            elif not (proved or leaving) and self.ready.proved_stop(reachable, found, found.begin, then) is None:
                 why = "no stop behind its first step is proved"
         if why:
             self.log(now, request.refused, why=why, **took)
@@ -266,8 +305,9 @@ class Executor:
         if found.to_goal:
             self.route = found
         head = self.following.piece(now, request.join) if request.join > now + 1e-9 else None
+        self.leaving = leaving or (self.leaving and not self.following.at_rest(now))
         self.follow(found if head is None else found.behind(head, now), now)
-        self.leaving, self.sets_out, self.stop = leaving, found.begin, None if leaving else self.stop
+        self.sets_out, self.stop = found.begin, self.following if proved else None if self.leaving else self.stop
         if self.ready.settings.by_distance:
             self.nearest = min(self.ready.settings.trigger, self._distance(now, predicted) - NEARER)
 
@@ -303,10 +343,13 @@ class Executor:
         return ""
 
     def _may_leave(self, now: float, found: Following) -> bool:
-        """Whether a standing robot may set out without a proved stop, since what comes would touch it where it is."""
-        return self.following.at_rest(found.begin) and self.conflict < now + SOON
+        """Whether a robot at rest may step aside along a motion, since what comes would touch it where it is."""
+        at_rest = self.following.at_rest(found.begin) and not found.to_goal
+        return at_rest and self.ready.settings.evade != "never" and self.contact < now + SOON
 
-    def _ask(self, now: float, predicted: Movers, obstacles: Callable[[], tuple[Obstacle, ...]]) -> None:
+    def _ask(
+        self, now: float, predicted: Movers, reachable: Movers | None, obstacles: Callable[[], tuple[Obstacle, ...]]
+    ) -> None:
         """Ask for a replan where one is of use."""
         settings = self.ready.settings
         self._give_up(now)
@@ -314,9 +357,11 @@ class Executor:
             return
         join = now + settings.budget
         self.asked += 1
-        berth = max(settings.berth, settings.error + BLIND_TIME * settings.fastest)
+        error, fastest = settings.assumed
+        berth = max(settings.berth, error + BLIND_TIME * fastest)
         request = Request(
             self.asked, now, join, self.following, self.route, predicted, berth, obstacles(), self.conflict, self.seed,
+            contact=self.contact, reachable=reachable if settings.evade == "proved" else None,
             leaving=self.leaving and not self.following.at_rest(join),
         )  # fmt: skip
         if self.replanning.submit(request):
@@ -334,17 +379,19 @@ class Executor:
             return
         if not (settings.guarded or settings.hastens):  # a reflex, or one plan that is followed blindly
             return
+        if settings.evade == "never" and not request.hastens:
+            return
         if request.hastens and math.isfinite(self.conflict):
             self.log(now, request.refused, why="something is in the way", number=request.number, part="")
             self.pending = None
-        elif endangered(self.following, now + settings.budget, self.conflict, URGENT):
+        elif endangered(self.following, now + settings.budget, self.contact, URGENT):
             self.log(now, request.refused, why="an obstacle comes", number=request.number, part="")
             self.pending = None
 
     def _wants(self, now: float) -> bool:
         """Whether the robot needs another motion."""
         settings = self.ready.settings
-        if not math.isfinite(self.tracker.last):  # nothing was seen yet
+        if self.tracker.awaited or self.blind(now):
             return False
         if not settings.monitored:
             return self.route is None

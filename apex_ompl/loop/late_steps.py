@@ -9,7 +9,10 @@ from typing import Any
 from apex_ompl.loop.executor import Executor
 from apex_ompl.loop.following import Following
 
-DECISIONS = ("route", "leaving", "sets_out", "nearest", "ending", "conflict", "endangered", "ahead", "doing", "braking")
+DECISIONS = (
+    "route", "leaving", "sets_out", "nearest", "ending", "conflict", "contact", "endangered", "ahead", "doing",
+    "braking",
+)  # fmt: skip
 """Attributes of an executor that go with what it follows."""
 TAKEN = {"accepted": "rejected", "improved": "kept"}
 """Kinds of events of answers that were taken, and of those that came to nothing."""

@@ -55,8 +55,8 @@ class Portfolio:
     def replan(self, ready: Ready, request: Request, charges: Charges) -> Answer:
         """Return a motion from the time of joining on that is proved among what is expected, or none."""
         search = Search(ready, request, charges)
-        danger = request.following, request.join, request.conflict
-        aside, urgent = self.evades and endangered(*danger), endangered(*danger, URGENT)
+        danger, evades = (request.following, request.join, request.contact), ready.settings.evade != "never"
+        aside, urgent = self.evades and evades and endangered(*danger), endangered(*danger, URGENT)
         if aside and urgent and self._step_aside(search):
             return Answer(search.best, search.part, charges)
         waits = self.waits and not aside and not request.hastens and request.following.at_rest(request.join)

@@ -122,6 +122,15 @@ class Ready:
             charges.charge("interval among movers", found.intervals)
         return found.time + zero
 
+    def proved_to_rest(self, reachable: Movers, following: Following) -> bool:
+        """Whether nothing that obstacles can reach comes in the way of a motion until the robot is at rest again.
+
+        Args:
+            reachable: The obstacles, as large as all that they can reach.
+            following: The motion.
+        """
+        return bool(np.isinf(self.first_conflict(reachable, following, following.begin, following.end)))
+
     def proved_stop(self, reachable: Movers, following: Following, now: float, then: float) -> Following | None:
         """Return a stop from a motion at a later time that nothing can come in the way of, or None.
 
@@ -164,9 +173,10 @@ class Ready:
             Their number; and of how many of those looked at the stop is one of each joint by itself.
         """
         settings = self.settings
+        error, fastest = settings.assumed
         count, by_joints = stops_proved(
             self.kernel, predicted, following.motion, self.stopping, moments - following.begin, clock=following.begin,
-            age=age, growth=(settings.error + spread, settings.fastest), period=settings.period,
+            age=age, growth=(error + spread, fastest), period=settings.period,
         )  # fmt: skip
         left = np.flatnonzero(by_joints[:count])
         for done, k in enumerate(left):

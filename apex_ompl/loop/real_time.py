@@ -97,27 +97,31 @@ def run_in_real_time(world: World, ready: Ready, planner: PlannerProcess, eyes: 
     with undisturbed(cores()[0]):
         began = time.perf_counter()
         while ended is None:
-            wait = began + k * period - time.perf_counter()
-            if wait > 0.0:
-                time.sleep(wait)
-            seen = time.perf_counter() - began
-            if math.floor(seen / period) > k:  # periods went by without a step
-                undo(executor, (k + 1) * period, Decided.of(executor))
-                missed += math.floor(seen / period) - k
-                k = math.floor(seen / period)
             before = Decided.of(executor)
-            loop.advance(k * period)
-            looked = time.perf_counter()
-            loop.observe(k * period)
-            ended = loop.step((k + 1) * period)
-            ticks.append(time.perf_counter() - looked)
-            k += 1
-            if ended is None and time.perf_counter() - began > k * period:
-                undo(executor, k * period, before)
-                missed += 1
-            paused = time.perf_counter()
-            loop.set_out(k * period)
-            began += time.perf_counter() - paused
+            try:
+                wait = began + k * period - time.perf_counter()
+                if wait > 0.0:
+                    time.sleep(wait)
+                seen = time.perf_counter() - began
+                if math.floor(seen / period) > k:  # periods went by without a step
+                    undo(executor, (k + 1) * period, before)
+                    missed += math.floor(seen / period) - k
+                    k, before = math.floor(seen / period), Decided.of(executor)
+                loop.advance(k * period)
+                looked = time.perf_counter()
+                loop.observe(k * period)
+                ended = loop.step((k + 1) * period)
+                ticks.append(time.perf_counter() - looked)
+                k += 1
+                if ended is None and time.perf_counter() - began > k * period:
+                    undo(executor, k * period, before)
+                    missed += 1
+                paused = time.perf_counter()
+                loop.set_out(k * period)
+                began += time.perf_counter() - paused
+            except KeyboardInterrupt:
+                ended = None
+                loop.interrupt(max(k * period, executor.followed[-1][0]), before)
     world.advance(k * period, executor.state(k * period))  # what the motion is judged by
     middle, high, worst = np.percentile(ticks, [50.0, 99.0, 100.0]).tolist()
     measured = {"tick_p50": middle, "tick_p99": high, "tick_worst": worst, "deadline_misses": float(missed)}

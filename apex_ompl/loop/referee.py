@@ -7,7 +7,7 @@ robot itself, is proved apart along the motion's own cubic pieces.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -69,6 +69,7 @@ class RefereeReport:
 
     Attributes:
         contact: First contact with an obstacle that moves, or None.
+        moving_contact: First contact with one while the robot moved, which may be the same, or None.
         still_contact: First contact with what stands still or of the robot with itself, or None.
         limit_use: Largest share of each limit that the motion uses, by ``position``, ``velocity``, ``acceleration`` and
             ``jerk``.
@@ -80,6 +81,7 @@ class RefereeReport:
     """
 
     contact: RunContact | None
+    moving_contact: RunContact | None
     still_contact: RunContact | None
     limit_use: Mapping[str, float]
     clearance: float
@@ -94,13 +96,16 @@ class RefereeReport:
 
     @property
     def outcome(self) -> Outcome | None:
-        """The outcome: that of the first contact, else LIMITS or REACHED; None where only the goal was not reached."""
+        """The outcome: that of the contacts, else LIMITS or REACHED; None where only the goal was not reached.
+
+        It is HIT_MOVING where the robot moved in any contact with an obstacle, be it later than the first one.
+        """
         hits = [hit for hit in (self.contact, self.still_contact) if hit is not None]
         first = min(hits, key=lambda hit: hit.time, default=None)
         if first is not None:
             if first is self.still_contact:
                 return Outcome.HIT_STILL
-            return Outcome.HIT_MOVING if first.moved else Outcome.HIT_AT_REST
+            return Outcome.HIT_AT_REST if self.moving_contact is None else Outcome.HIT_MOVING
         if self.exceeded:
             return Outcome.LIMITS
         return Outcome.REACHED if self.at_rest and self.at_goal else None
@@ -108,7 +113,7 @@ class RefereeReport:
     @property
     def faults(self) -> tuple[str, ...]:
         """All that speaks against the run, a sentence each, contacts by time."""
-        hits = [hit for hit in (self.contact, self.still_contact) if hit is not None]
+        hits = {hit for hit in (self.contact, self.moving_contact, self.still_contact) if hit is not None}
         over = ", ".join(f"{name} {share:.4g}" for name, share in self.exceeded.items())
         return (
             *(str(hit) for hit in sorted(hits, key=lambda hit: hit.time)),
@@ -152,8 +157,10 @@ def judge(
     clearances = scripted.clearances(trajectory, times)
     least = int(np.nanargmin(clearances)) if not np.isnan(clearances).all() else 0
     speeds, rates = np.abs(trajectory.velocities[-1]), np.abs(trajectory.accelerations[-1])
+    contact, moving_contact = ExactMovers(robot, problem, scripted).first_contacts(trajectory, times)
     return RefereeReport(
-        contact=ExactMovers(robot, problem, scripted).first_contact(trajectory, times),
+        contact=contact,
+        moving_contact=moving_contact,
         still_contact=still_contact(checker, trajectory, times),
         limit_use=trajectory.use(limits or robot.limits),
         clearance=float(clearances[least]),
@@ -180,25 +187,41 @@ class ExactMovers:
         numbers = self._meshes.scene
         self._pairs = {name: [p for p in self._meshes.pairs if p[1] == n] for name, n in numbers.items()}
 
-    def first_contact(self, motion: Trajectory, times: Array) -> RunContact | None:
-        """Return the first contact at some times, shape (N,), increasing from 0 [s]; or None."""
+    def first_contacts(self, motion: Trajectory, times: Array) -> tuple[RunContact | None, RunContact | None]:
+        """Return the first contact, and the first while the robot moves, or None.
+
+        Args:
+            motion: The motion.
+            times: Times that are looked at, shape (N,), increasing from 0 [s].
+        """
+        first = None
+        for time, there in self._near(motion, times):
+            if first is not None and is_at_rest(motion, time):
+                continue
+            found = self.contact_at(motion, time, there)
+            first = found if first is None else first
+            if found is not None and found.moved:
+                return first, found
+        return first, None
+
+    def _near(self, motion: Trajectory, times: Array) -> Iterator[tuple[float, tuple[str, ...]]]:
+        """Yield the times at which the sphere covers do not prove the robot apart, with names of what is there."""
         kernel = self._scripted.kernel
         for piece in self._scripted.pieces(float(times[-1])):
             if piece.begin == piece.end:  # a moment, of which there is nothing to prove
-                return self._among(motion, times, piece)
-            time = piece.begin
+                yield from self._among(motion, times, piece)
+                return
+            time, last = piece.begin, -np.inf
             while len(piece.movers):
                 conflict = prove_motion(kernel, piece.movers, motion, time, piece.end)
                 if not conflict:
                     break
                 time = min(conflict.time + STRETCH, piece.end)
-                looked = times[(times >= conflict.time - SPACING) & (times >= piece.begin) & (times <= time)]
-                found = self._among(motion, looked, piece)
-                if found is not None:
-                    return found
+                begin = max(conflict.time - SPACING, piece.begin)
+                yield from self._among(motion, times[(times >= begin) & (times > last) & (times <= time)], piece)
+                last = time
                 if time >= piece.end:
                     break
-        return None
 
     def contact_at(self, motion: Trajectory, time: float, there: tuple[str, ...]) -> RunContact | None:
         """Return the deepest contact with one of the obstacles that are there at a time [s], or None."""
@@ -215,16 +238,12 @@ class ExactMovers:
             return None
         return RunContact(time, deepest.first, deepest.second, deepest.depth, not is_at_rest(motion, time))
 
-    def _among(self, motion: Trajectory, times: Array, piece: Piece) -> RunContact | None:
-        """Return the first contact at times inside of a piece, or None."""
-        if not len(piece.movers):
-            return None
-        spheres = clearance_in_time(self._scripted.kernel, piece.movers, motion(times), times, NEAR)[0]
-        for time in times[~(spheres > 0.0)].tolist():
-            found = self.contact_at(motion, time, piece.movers.names)
-            if found is not None:
-                return found
-        return None
+    def _among(self, motion: Trajectory, times: Array, piece: Piece) -> Iterator[tuple[float, tuple[str, ...]]]:
+        """Yield the times inside of a piece at which the sphere covers do not prove the robot apart."""
+        if len(piece.movers) and len(times):
+            spheres = clearance_in_time(self._scripted.kernel, piece.movers, motion(times), times, NEAR)[0]
+            there = piece.movers.names
+            yield from ((time, there) for time in times[~(spheres > 0.0)].tolist())
 
 
 def still_contact(checker: CollisionChecker, motion: Trajectory, times: Array) -> RunContact | None:

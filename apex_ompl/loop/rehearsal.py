@@ -34,7 +34,7 @@ def requests(ready: Ready) -> tuple[Request, ...]:
     soon = join + settings.period
     cases = ((standing, math.inf), (standing, soon), (line, soon), (line, math.inf))
     return tuple(
-        Request(k, 0.0, join, following, None, movers, settings.berth, (ball,), conflict, 0)
+        Request(k, 0.0, join, following, None, movers, settings.berth, (ball,), conflict, 0, conflict, movers)
         for k, (following, conflict) in enumerate(cases, 1)
     )
 

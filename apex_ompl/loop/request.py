@@ -29,9 +29,12 @@ class Request:
         berth: By how much they are larger where motions are optimised [m].
         obstacles: Their records, where they are expected to be when it is asked, with velocities.
         conflict: Time of the clock of the first conflict of what the robot follows [s], infinite without one.
+        contact: The same by the predictions as they are, without margins for what is uncertain, where the robot will be
+            at rest soon; else infinite.
         seed: The run's.
-        leaving: Whether the robot will be leaving a place that an obstacle comes to: another motion is of use only
-            where the guard will hardly stop it, since that would be there.
+        reachable: The obstacles as large as all that they can reach, where steps aside are to be proved clear of that.
+        leaving: Whether the robot will be leaving a place that an obstacle comes to without a fail-safe stop: another
+            motion is of use only where the guard will hardly stop it, since that would be there.
     """
 
     number: int
@@ -44,6 +47,8 @@ class Request:
     obstacles: tuple[Obstacle, ...]
     conflict: float
     seed: int
+    contact: float = math.inf
+    reachable: Movers | None = None
     leaving: bool = False
 
     @property

@@ -28,6 +28,7 @@ SUFFIXES = (".npz", ".json")
 ARCHIVE, ROLE = "run", "run file"  # name of the text in a NumPy archive, and what errors call the file
 TEXTS = ("reason", "robot", "method", "prediction", "clock")
 GOING, BRAKING, STANDING = "going", "braking", "standing"  # what a robot does when a conflict is predicted
+INTERRUPTED = "interrupted"  # reason of a run that the user ended
 JSON_NAMES = {"str": "text", "list": "list", "dict": "mapping"}
 
 
@@ -43,6 +44,7 @@ class Outcome(StrEnum):
     HIT_STILL = "hit-still"  # a contact with what stands still, or with itself
     STUCK = "stuck"  # no motion for longer than is allowed
     TIMEOUT = "timeout"
+    ABORTED = "aborted"  # the sensor failed, or the user interrupted it
     LIMITS = "limits"  # of position, velocity, acceleration or jerk
     MISALIGNED = "misaligned"  # rest outside the tolerances of the goal
     START_INVALID = "start-invalid"
@@ -54,8 +56,8 @@ class Event:
 
     Attributes:
         time: When [s].
-        kind: ``observation``, ``conflict``, ``stop``, ``request``, ``accepted``, ``rejected``, ``reaction``,
-            ``goal``, ``broken assumption`` or ``contact``.
+        kind: ``observation refused``, ``place doubted``, ``blind``, ``conflict``, ``stop``, ``request``, ``accepted``,
+            ``rejected``, ``reaction``, ``goal``, ``broken assumption`` or ``contact``.
         data: What there is to say of it: texts and numbers, JSON's.
     """
 
@@ -80,7 +82,7 @@ class RunResult:
         trajectory: What the robot did, from time 0 on.
         events: What happened, by time.
         metrics: Numbers by name: ``time_to_goal`` [s], ``rest_time`` [s], ``stops``, ``replans_asked``,
-            ``replans_accepted``, ``clearance`` [m], ``reaction_p95`` [s], ``broken_assumptions``, ...
+            ``replans_accepted``, ``clearance`` [m], ``reaction_p95`` [s], ``broken_steps``, ``unguarded_steps``, ...
         settings: Those of the loop and of the sensor, and the version of the table of costs; JSON's.
         robot_digest: Digest of the robot, see :func:`apex_ompl.robot.identity.digest`; empty where it is not known.
     """

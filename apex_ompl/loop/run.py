@@ -58,7 +58,8 @@ def run(
         prediction: ``still``, ``cv`` or ``truth``, see :class:`apex_ompl.loop.settings.LoopSettings`.
         seed: Of random choices, and of the sensor where none is given.
         speed: Share of the velocity limits that motions use, 0.001 to 1.
-        settings: Parameters of the loop; ``prediction`` counts instead of theirs.
+        settings: Parameters of the loop; ``prediction`` counts instead of theirs. Their largest error and speed are by
+            default those of the sensor and the world.
         sensor: How obstacles are seen.
 
     Raises:
@@ -70,7 +71,8 @@ def run(
     one = method(planner)
     sensor = sensor or Sensor(seed=seed)
     world = load_world(problem)
-    used = adapted(replace(settings or default_settings(world, sensor), prediction=prediction), one)
+    settings = (settings or LoopSettings()).completed(sensor.largest_error, world.fastest)
+    used = adapted(replace(settings, prediction=prediction), one)
     world.ran = True
     with quiet_ompl():
         seed_ompl(seed)
@@ -120,11 +122,6 @@ def load_world(problem: Problem | World | str | os.PathLike[str]) -> World:
     return moving_world(problem) if isinstance(problem, Problem) else worlds.load(os.fspath(problem))
 
 
-def default_settings(world: World, sensor: Sensor) -> LoopSettings:
-    """Return the parameters of the loop for a world and a sensor: obstacles are as fast, and seen as well, as there."""
-    return LoopSettings(fastest=world.fastest, error=sensor.largest_error)
-
-
 @dataclass(frozen=True, eq=False)
 class _Made:
     """What a result says besides what happened."""
@@ -140,7 +137,7 @@ class _Made:
         """Return the result."""
         robot = self.ready.setup.robot
         metrics = run_metrics(done.trajectory, done.events, robot.limits, clearance=clearance)
-        metrics |= {**done.measured, "broken_steps": float(done.broken)}
+        metrics |= {**done.measured, **done.counts}
         return RunResult(
             outcome=outcome, reason=reason, problem=self.problem(), robot=robot.name, method=self.planner,
             prediction=self.ready.settings.prediction, clock=self.clock, seed=self.seed, trajectory=done.trajectory,
@@ -156,15 +153,18 @@ class _Made:
         )  # fmt: skip
         outcome, reason = report.outcome, "; ".join(report.faults)
         if outcome is None:
-            ended = {"stuck": Outcome.STUCK, "timeout": Outcome.TIMEOUT}
+            ended = {"stuck": Outcome.STUCK, "timeout": Outcome.TIMEOUT, "aborted": Outcome.ABORTED}
             outcome = Outcome.MISALIGNED if done.reached else ended[done.ended]
             if not done.reached:
                 time = done.trajectory.duration
-                reason = f"no goal was reached in {time:.3g} s{self.blocked(time)}"
-        if report.contact is not None:
-            one = report.contact
-            told = Event(one.time, "contact", {"first": one.first, "second": one.second, "moved": one.moved})
-            done = replace(done, events=tuple(sorted((*done.events, told), key=lambda event: event.time)))
+                said = [done.reason] if done.reason else []
+                reason = "; ".join([f"no goal was reached in {time:.3g} s{self.blocked(time)}", *said])
+        told = [
+            Event(one.time, "contact", {"first": one.first, "second": one.second, "moved": one.moved})
+            for one in {report.contact, report.moving_contact}
+            if one is not None
+        ]
+        done = replace(done, events=tuple(sorted((*done.events, *told), key=lambda event: event.time)))
         return self.result(done, outcome, reason, report.clearance)
 
     def blocked(self, time: float) -> str:

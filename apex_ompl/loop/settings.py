@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from apex_ompl.errors import ParameterError, UnknownNameError
 from apex_ompl.util.validation import check_number
@@ -10,10 +10,14 @@ from apex_ompl.util.validation import check_number
 PREDICTIONS = ("still", "cv", "truth")
 """How obstacles are predicted: where they were seen (the paper), at constant velocity, or as they truly move."""
 
+EVADE = ("never", "proved", "risk")
+"""What a robot at rest does that an obstacle is about to touch, see :class:`LoopSettings`."""
+
 RANGES = {
     "watched": (0.0, 60.0), "period": (1e-3, 0.1), "budget": (1e-3, 10.0), "hold": (0.0, 10.0),
     "rest_hold": (0.0, 10.0), "margin": (0.0, 0.1), "berth": (0.0, 0.5), "error": (0.0, 0.5), "fastest": (0.0, 5.0),
     "trigger": (0.0, 1.0), "timeout": (0.1, 600.0), "stuck": (0.1, 600.0), "latency": (-1.0, 10.0),
+    "memory": (0.1, 600.0), "silence": (0.01, 60.0),
 }  # fmt: skip
 
 
@@ -29,6 +33,10 @@ class LoopSettings:
             costs.
         prediction: One of ``PREDICTIONS``: what plans are proved against.
         guarded: Whether the robot only goes on while a stop behind the next step is proved.
+        evade: What a robot at rest does that an obstacle is about to touch. ``proved``: it steps aside only along a
+            motion that is proved clear of all that obstacles can reach until it is at rest again, so that it is at rest
+            whenever it is touched. ``risk``: also along one that is only predicted to be clear; the steps without a
+            fail-safe stop are counted (``unguarded_steps``). ``never``: it stays.
         monitored: Whether the motion is looked at again while it is followed; without, it is followed blindly.
         verified: Whether motions are taken only where they are proved.
         from_rest: Whether the robot stops where its motion is blocked, and plans anew only where it stands.
@@ -40,8 +48,11 @@ class LoopSettings:
         rest_hold: Time for which a robot that stands elsewhere looks ahead [s].
         margin: Distance that is kept from obstacles that move [m].
         berth: Distance beyond it at which motions are optimised to pass by, where there is room [m].
-        error: Largest error of an observed place, for the guarantee [m].
-        fastest: Largest speed of any obstacle, for the guarantee [m/s].
+        error: Largest error of an observed place, for the guarantee [m]; None is that of the sensor.
+        fastest: Largest speed of any obstacle, for the guarantee [m/s]; None is that of the world.
+        memory: Every obstacle is seen at least this often, for the guarantee [s]: one that was not, while the sensor
+            looked, is forgotten.
+        silence: Time without a look of use after which the robot stops, and does not start [s].
         timeout: Time after which a run ends [s]; a robot that moves then stops first.
         stuck: Time of rest after which a run ends [s].
     """
@@ -52,6 +63,7 @@ class LoopSettings:
     latency: float = -1.0
     prediction: str = "cv"
     guarded: bool = True
+    evade: str = "proved"
     monitored: bool = True
     verified: bool = True
     from_rest: bool = False
@@ -62,8 +74,10 @@ class LoopSettings:
     rest_hold: float = 1.5
     margin: float = 0.005
     berth: float = 0.05
-    error: float = 0.024
-    fastest: float = 0.4
+    error: float | None = None
+    fastest: float | None = None
+    memory: float = 3.0
+    silence: float = 0.5
     timeout: float = 30.0
     stuck: float = 30.0
 
@@ -72,12 +86,33 @@ class LoopSettings:
 
         Raises:
             ParameterError: A number is out of its range, or the budget is no multiple of the period.
-            UnknownNameError: No such prediction.
+            UnknownNameError: No such prediction, or way to evade.
         """
         if self.prediction not in PREDICTIONS:
             raise UnknownNameError("prediction", str(self.prediction), PREDICTIONS)
+        if self.evade not in EVADE:
+            raise UnknownNameError("way to evade", str(self.evade), EVADE)
         for name, (low, high) in RANGES.items():
-            check_number(getattr(self, name), name, low, high)
+            if getattr(self, name) is not None or name not in ("error", "fastest"):
+                check_number(getattr(self, name), name, low, high)
         steps = self.budget / self.period
         if abs(steps - round(steps)) > 1e-6:
             raise ParameterError("budget", self.budget, f"a multiple of the period, {self.period:g} s")
+
+    def completed(self, error: float, fastest: float) -> LoopSettings:
+        """Return them with a largest error [m] and a largest speed [m/s] where these are None."""
+        return replace(
+            self, error=error if self.error is None else self.error,
+            fastest=fastest if self.fastest is None else self.fastest,
+        )  # fmt: skip
+
+    @property
+    def assumed(self) -> tuple[float, float]:
+        """Largest error of an observed place [m], and largest speed of any obstacle [m/s].
+
+        Raises:
+            ParameterError: They were not completed.
+        """
+        if self.error is None or self.fastest is None:
+            raise ParameterError("settings", "no error or no fastest", "both, as LoopSettings.completed fills in")
+        return self.error, self.fastest

@@ -5,6 +5,7 @@ from __future__ import annotations
 from itertools import count
 
 from apex_ompl.loop.cycle import Eyes, Loop, RunRecord
+from apex_ompl.loop.late_steps import Decided
 from apex_ompl.loop.ready import Ready
 from apex_ompl.loop.replanning import AtOnce
 from apex_ompl.loop.request import Replanner
@@ -23,11 +24,14 @@ def simulate(world: World, ready: Ready, replanner: Replanner, eyes: Eyes, seed:
     """
     loop = Loop(world, ready, AtOnce(ready, replanner), eyes, seed)
     for k in count():
-        now = k * ready.settings.period
-        loop.advance(now)
-        loop.observe(now)
-        ended = loop.step(now)
-        if ended is not None:
-            return ended
-        loop.set_out(now)
+        now, before = k * ready.settings.period, Decided.of(loop.executor)
+        try:
+            loop.advance(now)
+            loop.observe(now)
+            ended = loop.step(now)
+            if ended is not None:
+                return ended
+            loop.set_out(now)
+        except KeyboardInterrupt:
+            loop.interrupt(now, before)
     raise AssertionError("unreachable")

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,6 +20,9 @@ from apex_ompl.loop.observation import Observation
 from apex_ompl.scene.bodies import Obstacle, same_solid
 from apex_ompl.types import Array
 
+MOST_TRACKS = 64  # obstacles that are tracked at a time
+MOST_DOUBTED = 8  # places of one obstacle that contradict each other and are all kept
+GAP = 0.1  # longest time between two looks that counts as watched all through [s]
 GATE = 16.0  # squared Mahalanobis distance, of three axes, behind which an obstacle has turned
 AXES = 3
 LEAST = 0.002  # clearance to margins that a robot has where it stands [m]
@@ -56,6 +60,7 @@ class Track:
         velocity: Shape (3,) [m/s].
         covariance: Of place and velocity on each axis, shape (2, 2).
         seen: Number of observations since it was new or turned.
+        unseen: Time for which it was looked for and not seen since it was seen last [s].
     """
 
     shape: Obstacle
@@ -64,6 +69,7 @@ class Track:
     velocity: Array
     covariance: Array
     seen: int = 1
+    unseen: float = 0.0
 
     @classmethod
     def new(cls, seen: Obstacle, stamp: float, settings: TrackSettings) -> Track:
@@ -79,7 +85,7 @@ class Track:
         expected = forward @ self.covariance @ forward.T + drift
         miss = np.array(seen.position, float) - (self.place + dt * self.velocity)
         spread = expected[0, 0] + noise
-        self.shape, self.stamp = seen, stamp
+        self.shape, self.stamp, self.unseen = seen, stamp, 0.0
         if miss @ miss > GATE * spread:
             fresh = Track.new(seen, stamp, settings)
             self.place, self.velocity, self.covariance, self.seen = fresh.place, fresh.velocity, fresh.covariance, 1
@@ -97,42 +103,134 @@ class Track:
         return settings.widths * place, min(settings.speed_widths * speed, settings.most)
 
 
+class Taken(NamedTuple):
+    """What came of an observation.
+
+    Attributes:
+        refused: Why it was refused as a whole, or nothing.
+        doubted: Places in it that contradict what was known, a sentence each.
+    """
+
+    refused: str = ""
+    doubted: tuple[str, ...] = ()
+
+
 @dataclass(eq=False)
 class Tracker:
     """What the loop knows of obstacles that move.
+
+    A place that an obstacle cannot have come to since it was seen last contradicts an assumption: the obstacle may be
+    where it is seen now, or the look was wrong. Both count as where it can be, until a later look tells.
 
     Attributes:
         kernel: The robot's kernel, for pairs of bodies that may touch.
         settings: Parameters of the filters.
         allowed: Pairs of names of bodies that may touch.
+        error: Largest error of an observed place [m].
+        fastest: Largest speed of any obstacle [m/s].
+        memory: Time after which an obstacle is forgotten that was looked for and not seen [s].
+        awaited: Names of the obstacles that are known to be there and were not seen yet.
         tracks: Estimates by name.
-        last: The newest stamp [s].
+        doubted: Other estimates of obstacles, which contradict those of ``tracks``.
+        last: The newest stamp of a look of use [s].
     """
 
     kernel: Kernel
     settings: TrackSettings = field(default_factory=TrackSettings)
     allowed: tuple[tuple[str, str], ...] = ()
+    error: float = math.inf
+    fastest: float = math.inf
+    memory: float = math.inf
+    awaited: set[str] = field(default_factory=set)
     tracks: dict[str, Track] = field(default_factory=dict)
+    doubted: list[Track] = field(default_factory=list)
     last: float = -math.inf
     _made: Movers | None = field(default=None, init=False)
     _shapes: list[Obstacle] = field(default_factory=list, init=False)
 
-    def take(self, observation: Observation) -> None:
+    def take(self, observation: Observation, now: float = math.inf) -> Taken:
         """Take an observation, by its stamp and not by its arrival; what is older than what is known says nothing.
 
-        Stamps and places that are not finite are left out.
+        An observation that cannot be true is refused as a whole, so that what is known ages. One with places that
+        contradict what is known is taken.
+
+        Args:
+            observation: The observation.
+            now: Time of the clock [s].
         """
-        if not math.isfinite(observation.stamp):
-            return
-        self.last = max(self.last, observation.stamp)
+        fault = self._fault(observation, now)
+        if fault:
+            return Taken(refused=fault)
+        stamp, found = observation.stamp, []
+        watched = min(max(stamp - self.last, 0.0), GAP)
+        self.last = max(self.last, stamp)
         for seen in observation.seen:
-            if not np.isfinite(seen.position).all():
-                continue
+            self.awaited.discard(seen.name)
             track = self.tracks.get(seen.name)
             if track is None:
-                self.tracks[seen.name] = Track.new(seen, observation.stamp, self.settings)
-            elif observation.stamp > track.stamp:
-                track.update(seen, observation.stamp, self.settings)
+                self.tracks[seen.name] = Track.new(seen, stamp, self.settings)
+            elif stamp > track.stamp and not self._take_place(track, seen, stamp):
+                way = float(np.linalg.norm(np.subtract(seen.position, track.shape.position)))
+                found.append(f"{seen.name} was {way:.3g} m away {stamp - track.stamp:.3g} s before")
+        self._forget({seen.name for seen in observation.seen}, watched)
+        return Taken(doubted=tuple(found))
+
+    def _fault(self, observation: Observation, now: float) -> str:
+        """Return why an observation cannot be true, or nothing."""
+        stamp, names = observation.stamp, [seen.name for seen in observation.seen]
+        if not math.isfinite(stamp):
+            return f"its stamp is {stamp}"
+        if stamp > now + 1e-9:
+            return f"its stamp is {stamp - now:.3g} s in the future"
+        for seen in observation.seen:
+            if not np.isfinite(seen.position).all():
+                return f"the place of {seen.name} is not finite"
+            if seen.half_space is not None:
+                return f"{seen.name} has no bounds"
+        if len({*names}) < len(names):
+            return "it has a name twice"
+        if len({*names, *self.tracks}) > MOST_TRACKS:
+            return f"there are more than {MOST_TRACKS} obstacles"
+        return ""
+
+    def _take_place(self, track: Track, seen: Obstacle, stamp: float) -> bool:
+        """Take a later place of an obstacle; return whether it agrees with what was known."""
+        others = [one for one in self.doubted if one.shape.name == seen.name]
+        known = next((one for one in (track, *others) if self.may_be(one, seen, stamp)), None)
+        if known is not None:
+            known.update(seen, stamp, self.settings)
+            self.tracks[seen.name] = known
+            self.doubted = [one for one in self.doubted if one.shape.name != seen.name]
+            return True
+        kept = [*others, track]
+        del kept[1 : 1 + max(len(kept) - MOST_DOUBTED, 0)]  # the oldest and the newest ones stay
+        self.doubted = [one for one in self.doubted if one.shape.name != seen.name] + kept
+        self.tracks[seen.name] = Track.new(seen, stamp, self.settings)
+        return False
+
+    def may_be(self, track: Track, seen: Obstacle, stamp: float, errors: int = 2) -> bool:
+        """Whether an obstacle that was where a track says can be where it is seen at a later time [s].
+
+        Args:
+            track: The track.
+            seen: The obstacle.
+            stamp: The time [s].
+            errors: How many of both places are observed.
+        """
+        way = float(np.linalg.norm(np.subtract(seen.position, track.shape.position)))
+        return way <= errors * self.error + self.fastest * (stamp - track.stamp) + 1e-9
+
+    def _forget(self, seen: set[str], watched: float) -> None:
+        """Forget obstacles that were not seen for as long as one is not unseen.
+
+        Args:
+            seen: Names of those that were seen now.
+            watched: Time since the last look [s].
+        """
+        for track in (*self.tracks.values(), *self.doubted):
+            track.unseen += watched if track.shape.name not in seen else 0.0
+        self.tracks = {name: track for name, track in self.tracks.items() if track.unseen <= self.memory}
+        self.doubted = [track for track in self.doubted if track.unseen <= self.memory]
 
     def predicted(self, margin: float, prediction: str = "cv") -> Movers:
         """Return the obstacles as they are expected to move, larger by a margin [m] and by what is uncertain."""
@@ -158,8 +256,23 @@ class Tracker:
         return movers
 
     def reachable(self, error: float, fastest: float, margin: float = 0.0) -> Movers:
-        """Return the obstacles as large as all that they can reach: seen within an error [m], no faster than [m/s]."""
-        return self._as_seen(error + margin, fastest)
+        """Return the obstacles as large as all that they can reach: seen within an error [m], no faster than [m/s].
+
+        Where looks contradict each other, they can be at each of the places, which are obstacles of their own here.
+        """
+        if not self.doubted:
+            return self._as_seen(error + margin, fastest)
+        tracks = (*self.tracks.values(), *self.doubted)
+        names = [f"{k}: {track.shape.name}" for k, track in enumerate(tracks)]
+        pairs = [(row, names[k]) for k, track in enumerate(tracks) for row, _ in self._allowed_rows(track.shape.name)]
+        shapes = [t.shape.model_copy(update={"name": name}) for t, name in zip(tracks, names, strict=True)]
+        places = np.array([track.shape.position for track in tracks], float)
+        growth = np.tile((error + margin, fastest), (len(tracks), 1))
+        stamps = np.array([track.stamp for track in tracks])
+        return Movers(shapes, pairs).placed(places, np.zeros_like(places), growth, stamps)
+
+    def _allowed_rows(self, name: str) -> list[tuple[int, str]]:
+        return allowed_rows(self.kernel, self.allowed, [name])
 
     def _as_seen(self, margin: float, growth: float) -> Movers:
         """Return the obstacles where they were seen last, with a margin [m] that grows [m/s]."""

@@ -9,7 +9,6 @@ from __future__ import annotations
 from argparse import Namespace
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -24,8 +23,9 @@ from apex_ompl.benchmark.summary import Table
 from apex_ompl.loop import methods
 from apex_ompl.loop.charges import cost_table
 from apex_ompl.loop.result import RunResult
-from apex_ompl.loop.run import default_settings, load_world, run
+from apex_ompl.loop.run import load_world, run
 from apex_ompl.loop.sensor import Sensor
+from apex_ompl.loop.settings import LoopSettings
 from apex_ompl.problems.alignment import SIZES
 from apex_ompl.trajopt.path import path_length
 
@@ -43,7 +43,7 @@ def loop_result(problem: str, method: str, seed: int, limit: float, params: dict
     """
     world, sensor = load_world(problem), Sensor(seed=seed)
     changed = {name: value for name, value in params.items() if name not in ("speed", "prediction")}
-    settings = replace(default_settings(world, sensor), timeout=limit, **changed)
+    settings = LoopSettings(**{"timeout": limit, **changed})
     prediction = params.get("prediction", settings.prediction)
     return run(world, method, prediction=prediction, seed=seed, speed=params["speed"], settings=settings, sensor=sensor)
 
