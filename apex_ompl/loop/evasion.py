@@ -59,6 +59,7 @@ def step_aside(search: Search) -> Trajectory | None:
     search.charges.charge("clearance in time", len(states))
     size = np.abs(states - q).max(axis=1)
     best, unproved, latest = None, None, request.conflict + GAIN
+    proves = request.reachable if ready.settings.evade == "proved" else None
     for k in np.argsort(-(near - NEARNESS * size), kind="stable"):
         if search.charges.over():
             break
@@ -68,7 +69,7 @@ def step_aside(search: Search) -> Trajectory | None:
         conflict = ready.first_conflict(request.predicted, one, one.begin, one.end + hold, search.charges)
         if conflict <= latest or not ready.clear_of_still(motion, search.charges):
             continue
-        if request.reachable is not None and not ready.proved_to_rest(request.reachable, one):
+        if proves is not None and not ready.proved_to_rest(proves, one):
             unproved = motion if unproved is None else unproved
             continue
         best, latest = motion, conflict

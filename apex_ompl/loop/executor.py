@@ -62,6 +62,7 @@ class Executor:
         closed: Whether the time is up: no motion is asked for or taken any more.
         ending: Whether the robot follows the stop that ends the run.
         leaving: Whether the robot leaves a place that an obstacle comes to, and goes on without a proved stop.
+        aside: The last step aside that was followed, or None.
         sets_out: When it does [s].
         lead: How long before a step it is decided, by what was seen until then [s].
         ahead: How long before the conflict that was [s].
@@ -89,6 +90,7 @@ class Executor:
     endangered: float | None = None
     nearest: float = 0.0
     leaving: bool = False
+    aside: Following | None = None
     sets_out: float = -math.inf
     lead: float = 0.0
     ahead: float = math.inf
@@ -114,7 +116,7 @@ class Executor:
             obstacles: Returns their records where they are now, with velocities; called where a replan is asked for.
         """
         settings = self.ready.settings
-        reachable = self.tracker.reachable(*settings.assumed) if settings.guarded else None
+        reachable = self.tracker.reachable(*settings.assumed, q=self.state(now)) if settings.guarded else None
         if not self.closed:
             self._answer(now, predicted, reachable)
         if settings.monitored:
@@ -288,7 +290,7 @@ class Executor:
             self.log(now, request.refused, why=reply.failed, **took)
             return
         request, found = self._at_once(now, request, found, predicted)
-        why, proved, leaving = self._fault(now, request, found, predicted), False, False
+        why, aside, proved, leaving = self._fault(now, request, found, predicted), False, False, False
         if not why and reachable is not None:
             aside, then = self._may_leave(now, found), found.begin + self.ready.settings.period
             proved = aside and self.ready.proved_to_rest(reachable, found)
@@ -308,6 +310,7 @@ class Executor:
         self.leaving = leaving or (self.leaving and not self.following.at_rest(now))
         self.follow(found if head is None else found.behind(head, now), now)
         self.sets_out, self.stop = found.begin, self.following if proved else None if self.leaving else self.stop
+        self.aside = self.following if aside else None
         if self.ready.settings.by_distance:
             self.nearest = min(self.ready.settings.trigger, self._distance(now, predicted) - NEARER)
 
@@ -361,8 +364,8 @@ class Executor:
         berth = max(settings.berth, error + BLIND_TIME * fastest)
         request = Request(
             self.asked, now, join, self.following, self.route, predicted, berth, obstacles(), self.conflict, self.seed,
-            contact=self.contact, reachable=reachable if settings.evade == "proved" else None,
-            leaving=self.leaving and not self.following.at_rest(join),
+            contact=self.contact, reachable=reachable,
+            leaving=(self.leaving or self.following is self.aside) and not self.following.at_rest(join),
         )  # fmt: skip
         if self.replanning.submit(request):
             self.log(now, "improve" if request.hastens else "request", number=self.asked, join=join)

@@ -10,7 +10,7 @@ from apex_ompl.loop.executor import Executor
 from apex_ompl.loop.following import Following
 
 DECISIONS = (
-    "route", "leaving", "sets_out", "nearest", "ending", "conflict", "contact", "endangered", "ahead", "doing",
+    "route", "leaving", "aside", "sets_out", "nearest", "ending", "conflict", "contact", "endangered", "ahead", "doing",
     "braking",
 )  # fmt: skip
 """Attributes of an executor that go with what it follows."""

@@ -32,9 +32,9 @@ class Request:
         contact: The same by the predictions as they are, without margins for what is uncertain, where the robot will be
             at rest soon; else infinite.
         seed: The run's.
-        reachable: The obstacles as large as all that they can reach, where steps aside are to be proved clear of that.
-        leaving: Whether the robot will be leaving a place that an obstacle comes to without a fail-safe stop: another
-            motion is of use only where the guard will hardly stop it, since that would be there.
+        reachable: The obstacles as large as all that they can reach, where a fail-safe stop is asked for, else None.
+        leaving: Whether the robot will be leaving a place that an obstacle comes to: another motion is of use only
+            where the guard will hardly stop it, since that would be there.
     """
 
     number: int

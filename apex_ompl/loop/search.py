@@ -151,9 +151,20 @@ class Search:
                 return False
         return True
 
+    def may_begin(self, motion: Trajectory) -> bool:
+        """Whether there is a fail-safe stop after the first step of a motion, by what is known now."""
+        if self.request.reachable is None:
+            return True
+        one = self.following(motion)
+        self.charges.charge("foreseen stop")
+        return (
+            self.ready.proved_stop(self.request.reachable, one, one.begin, one.begin + self.ready.settings.period)
+            is not None
+        )
+
     def take(self, motion: Trajectory, part: str) -> bool:
         """Keep a proved motion where it is shorter than the best, or about so with more room; return whether it is."""
-        if motion.duration >= min(self.most, self.cost):
+        if motion.duration >= min(self.most, self.cost) or not self.may_begin(motion):
             return False
         guardable = self.guardable(motion)
         cost = motion.duration + (0.0 if guardable else NARROW)

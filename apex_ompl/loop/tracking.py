@@ -20,6 +20,7 @@ from apex_ompl.loop.observation import Observation
 from apex_ompl.scene.bodies import Obstacle, same_solid
 from apex_ompl.types import Array
 
+LOOKS = 16  # at an obstacle that are kept
 MOST_TRACKS = 64  # obstacles that are tracked at a time
 MOST_DOUBTED = 8  # places of one obstacle that contradict each other and are all kept
 GAP = 0.1  # longest time between two looks that counts as watched all through [s]
@@ -61,6 +62,7 @@ class Track:
         covariance: Of place and velocity on each axis, shape (2, 2).
         seen: Number of observations since it was new or turned.
         unseen: Time for which it was looked for and not seen since it was seen last [s].
+        looks: Places where it was seen, the oldest first, rows of a stamp [s] and a place [m].
     """
 
     shape: Obstacle
@@ -70,12 +72,14 @@ class Track:
     covariance: Array
     seen: int = 1
     unseen: float = 0.0
+    looks: list[tuple[float, float, float, float]] = field(default_factory=list)
 
     @classmethod
     def new(cls, seen: Obstacle, stamp: float, settings: TrackSettings) -> Track:
         """Begin with an observation."""
         spread = np.diag([settings.noise**2, settings.speed**2])
-        return cls(seen, stamp, np.array(seen.position, float), np.zeros(AXES), spread)
+        looks = [(stamp, *seen.position)]
+        return cls(seen, stamp, np.array(seen.position, float), np.zeros(AXES), spread, looks=looks)
 
     def update(self, seen: Obstacle, stamp: float, settings: TrackSettings) -> bool:
         """Take a later observation; return False where the obstacle has turned, and the velocity begins anew."""
@@ -86,6 +90,7 @@ class Track:
         miss = np.array(seen.position, float) - (self.place + dt * self.velocity)
         spread = expected[0, 0] + noise
         self.shape, self.stamp, self.unseen = seen, stamp, 0.0
+        self.looks = [*self.looks[1 - LOOKS :], (stamp, *seen.position)]
         if miss @ miss > GATE * spread:
             fresh = Track.new(seen, stamp, settings)
             self.place, self.velocity, self.covariance, self.seen = fresh.place, fresh.velocity, fresh.covariance, 1
@@ -255,21 +260,42 @@ class Tracker:
             movers.arrays.growth[:, 0] = np.maximum(movers.arrays.growth[:, 0] - missing, 0.0)
         return movers
 
-    def reachable(self, error: float, fastest: float, margin: float = 0.0) -> Movers:
+    def reachable(self, error: float, fastest: float, margin: float = 0.0, q: Array | None = None) -> Movers:
         """Return the obstacles as large as all that they can reach: seen within an error [m], no faster than [m/s].
 
-        Where looks contradict each other, they can be at each of the places, which are obstacles of their own here.
+        Every look bounds where an obstacle is by a ball that grows; what counts is the one that leaves a robot at a
+        state, shape (dof,), most room. Where looks contradict each other, an obstacle can be at each of the places,
+        which are obstacles of their own here.
         """
-        if not self.doubted:
-            return self._as_seen(error + margin, fastest)
         tracks = (*self.tracks.values(), *self.doubted)
+        if not tracks:
+            return self._as_seen(error + margin, fastest)
+        looks = np.array([track.looks[-1] if q is None else self._best_look(track, fastest, q) for track in tracks])
+        still, growth = np.zeros((len(tracks), AXES)), np.tile((error + margin, fastest), (len(tracks), 1))
+        if not self.doubted:
+            return self._movers().placed(looks[:, 1:], still, growth, looks[:, 0])
         names = [f"{k}: {track.shape.name}" for k, track in enumerate(tracks)]
         pairs = [(row, names[k]) for k, track in enumerate(tracks) for row, _ in self._allowed_rows(track.shape.name)]
         shapes = [t.shape.model_copy(update={"name": name}) for t, name in zip(tracks, names, strict=True)]
-        places = np.array([track.shape.position for track in tracks], float)
-        growth = np.tile((error + margin, fastest), (len(tracks), 1))
-        stamps = np.array([track.stamp for track in tracks])
-        return Movers(shapes, pairs).placed(places, np.zeros_like(places), growth, stamps)
+        return Movers(shapes, pairs).placed(looks[:, 1:], still, growth, looks[:, 0])
+
+    def _best_look(self, track: Track, fastest: float, q: Array) -> Array:
+        """Return the look whose ball leaves a robot at a state most room, by the nearest ball of its cover."""
+        looks = np.array(track.looks)
+        centres, radii = self._balls(q)
+        nearest = centres[np.argmin(np.linalg.norm(centres - looks[-1, 1:], axis=1) - radii)]
+        room = np.linalg.norm(looks[:, 1:] - nearest, axis=1) + fastest * looks[:, 0]
+        found: Array = looks[np.argmax(room)]
+        return found
+
+    def _balls(self, q: Array) -> tuple[Array, Array]:
+        """Return centres, shape (N, 3), and radii, shape (N,), of balls that contain the robot's bodies [m]."""
+        a = self.kernel.robot.arrays
+        rotation, origin = (value[0] for value in self.kernel.joint_frames(q[None]))
+        joint = a.body_joint
+        root = a.body_root
+        centres = np.einsum("nij,nj->ni", rotation[joint], a.node_centre[root]) + origin[joint]
+        return centres, a.node_radius[root]
 
     def _allowed_rows(self, name: str) -> list[tuple[int, str]]:
         return allowed_rows(self.kernel, self.allowed, [name])
@@ -282,15 +308,19 @@ class Tracker:
     def _placed(
         self, places: Sequence[ArrayLike], velocities: Sequence[ArrayLike], growth: Sequence[ArrayLike]
     ) -> Movers:
-        """Return the obstacles at places and velocities at their stamps; solids are made anew where a shape changed."""
-        shapes = [track.shape for track in self.tracks.values()]
-        made = self._made
-        if made is None or len(shapes) != len(self._shapes) or not all(map(same_solid, shapes, self._shapes)):
-            made = self._made = Movers(shapes, allowed_rows(self.kernel, self.allowed, [o.name for o in shapes]))
-        self._shapes = shapes
+        """Return the obstacles at places and velocities at their stamps."""
+        made = self._movers()
         at, along = (np.array(some, float).reshape(-1, AXES) for some in (places, velocities))
         stamps = np.array([track.stamp for track in self.tracks.values()])
         return made.placed(at, along, np.array(growth, float).reshape(-1, 2), stamps)
+
+    def _movers(self) -> Movers:
+        """Return the obstacles, made anew where a shape changed."""
+        shapes, made = [track.shape for track in self.tracks.values()], self._made
+        if made is None or len(shapes) != len(self._shapes) or not all(map(same_solid, shapes, self._shapes)):
+            made = self._made = Movers(shapes, allowed_rows(self.kernel, self.allowed, [o.name for o in shapes]))
+        self._shapes = shapes
+        return made
 
 
 def as_they_are(kernel: Kernel, present: Iterable[Obstacle], time: float, allowed: Iterable[tuple[str, str]]) -> Movers:
