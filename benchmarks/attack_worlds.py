@@ -1,13 +1,14 @@
 """Worlds that attack the closed loop within the assumptions of its guarantee, unlike the suites' worlds.
 
-One or two bodies of other shapes than cubes (rods, plates, balls, cylinders, capsules, a mesh), as fast as is allowed at
-any time, that stop, turn at once, and react to what the robot does; seen by one of six sensors. Everything is drawn from
-a number, and nothing is tuned on them.
+One or two bodies of other shapes than cubes (rods, plates, balls, cylinders, capsules, a mesh), as fast as is allowed
+at any time, that stop, turn at once, and react to what the robot does; seen by one of six sensors. Everything is drawn
+from a number, and nothing is tuned on them.
 """
 
 from __future__ import annotations
 
 import math
+import zlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -138,7 +139,7 @@ class AttackWorld(ScriptedWorld):
             number: Its number.
             folder: Where the mesh is kept.
         """
-        self.rng = np.random.default_rng([zlib_of(KIND), number])
+        self.rng = np.random.default_rng([zlib.crc32(KIND.encode()), number])
         suite = ("vertical", "horizontal")[number % 2]
         problem = problems.load(f"{suite}/free/{FIRST + number // 2}")
         self.places = RobotPlaces(problem)
@@ -224,10 +225,3 @@ def radius_of(fields: dict[str, Any]) -> float:
         if name in fields:
             return float(fields[name]["radius"]) + 0.5 * float(fields[name]["length"])
     return float(np.linalg.norm(trimesh.load(fields["mesh"]["file"]).vertices, axis=1).max())
-
-
-def zlib_of(text: str) -> int:
-    """Return a number of a text, the same everywhere."""
-    import zlib
-
-    return zlib.crc32(text.encode())
