@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.live.movers import Movers, allowed_rows, clearance_in_time
 from apex_ompl.loop.observation import Observation
-from apex_ompl.loop.tracking import LEAST, Track, Tracker, TrackSettings
+from apex_ompl.loop.tracking import LEAST, MOST_DOUBTED, MOST_TRACKS, Track, Tracker, TrackSettings
 from apex_ompl.problems.suite_robot import robot as suite_robot
 from apex_ompl.scene.bodies import Obstacle
 
@@ -128,14 +128,88 @@ def test_how_late_an_observation_is_received_does_not_matter() -> None:
 
 
 @pytest.mark.parametrize("bad", [(NAN, 0.0, 0.0), (0.0, INF, 0.0), (0.0, 0.0, -INF)])
-def test_places_that_are_not_finite_are_left_out(bad: tuple[float, ...]) -> None:
+def test_looks_with_places_that_are_not_finite_are_refused_whole(bad: tuple[float, ...]) -> None:
     stamps, places = drawn(1)
     good = list(map(look, stamps, places))
     one = tracked(*good[:5], look(stamps[4] + 0.01, bad), *good[5:])
     assert same(one.tracks["box"], tracked(*good).tracks["box"])
-    assert not tracked(look(0.0, bad)).tracks
-    both = tracked(Observation(0.0, 0.0, (at(bad), at((1.0, 0.0, 0.0), "other"))))
-    assert set(both.tracks) == {"other"}
+    tracker = Tracker(KERNEL, awaited={"box", "other"})
+    taken = tracker.take(Observation(0.0, 0.0, (at(bad), at((1.0, 0.0, 0.0), "other"))))
+    assert taken.refused == "the place of box is not finite"
+    assert not tracker.tracks and tracker.last == -INF and tracker.awaited == {"box", "other"}
+
+
+@pytest.mark.parametrize(
+    ("seen", "stamp", "words"),
+    [((BOX, BOX), 1.0, "a name twice"), ((BOX,), 1.2, "0.2 s in the future"),
+     (tuple(at((0, 0, 0), f"box_{k}") for k in range(MOST_TRACKS + 1)), 1.0, f"more than {MOST_TRACKS} obstacles"),
+     ((Obstacle(name="floor", half_space={"normal": (0, 0, 1)}),), 1.0, "no bounds")],
+)  # fmt: skip
+def test_looks_that_cannot_be_true_are_refused(seen: tuple[Obstacle, ...], stamp: float, words: str) -> None:
+    tracker = tracked(look(0.9, (1.0, 0.0, 0.0)))
+    before = (dict(tracker.tracks), tracker.last)
+    assert words in tracker.take(Observation(stamp, stamp, seen), now=1.0).refused
+    assert (dict(tracker.tracks), tracker.last) == before
+    assert not tracker.take(look(0.95, (1.0, 0.0, 0.0)), now=1.0).refused, "later looks are taken"
+
+
+def bounded(fastest: float = 0.4, error: float = 0.024, memory: float = 3.0) -> Tracker:
+    return Tracker(KERNEL, error=error, fastest=fastest, memory=memory)
+
+
+def test_a_place_that_cannot_be_does_not_replace_the_last_one() -> None:
+    """Both count until a later look tells, whichever of them it confirms."""
+    for true in ((0.0, 0.0, 0.0), (1e9, 0.0, 0.0)):
+        tracker = bounded()
+        for k in range(5):
+            assert not tracker.take(look(k / RATE, (0.0, 0.0, 0.0))).doubted
+        assert "box was 1e+09 m away" in tracker.take(look(5 / RATE, (1e9, 0.0, 0.0))).doubted[0]
+        places = [place[0] for place in tracker.reachable(0.024, 0.4).at(5 / RATE).values()]
+        assert sorted(places) == [0.0, 1e9]
+        assert not tracker.take(look(6 / RATE, true)).doubted
+        assert not tracker.doubted and tracker.tracks["box"].shape.position == true
+        assert tracker.reachable(0.024, 0.4).names == ("box",)
+
+
+def test_places_that_jump_for_ever_are_few() -> None:
+    tracker = bounded()
+    for k in range(100):
+        assert len(tracker.take(look(k / RATE, (10.0 * k, 0.0, 0.0))).doubted) == (k > 0)
+    kept = [track.shape.position[0] for track in tracker.doubted]
+    assert len(kept) == MOST_DOUBTED and kept[0] == 0.0 and kept[-1] == 980.0
+
+
+def test_obstacles_are_forgotten_that_were_looked_for_and_not_seen() -> None:
+    """And no others: a sensor that is silent forgets nothing."""
+    tracker = bounded(memory=0.5)
+    tracker.take(look(0.0, (0.0, 0.0, 0.0)))
+    tracker.take(Observation(9.0, 9.0, ()))
+    assert set(tracker.tracks) == {"box"}, "silence for 9 s"
+    stamps = 9.0 + np.arange(1, 31) / RATE
+    known = []
+    for stamp in stamps:
+        tracker.take(Observation(stamp, stamp, ()))
+        known.append("box" in tracker.tracks)
+    gone = stamps[known.index(False)] - 9.0
+    assert gone == pytest.approx(0.5 - 0.1, abs=1.5 / RATE)
+
+
+def test_a_new_name_at_each_look_does_not_fill_the_memory() -> None:
+    tracker, most = bounded(memory=1.0), 0
+    for k in range(200):
+        tracker.take(Observation(k / RATE, k / RATE, (at((1.0, 0.0, 0.0), f"box_{k}"),)))
+        most = max(most, len(tracker.tracks))
+    assert most <= 1.0 * RATE + 2
+
+
+def test_a_ball_around_an_earlier_look_counts_only_for_the_same_shape() -> None:
+    q, palm = suite_robot().home, suite_robot().link_pose(suite_robot().home, "left_hand_palm")[:3, 3]
+    away = palm + (0.0, 0.0, 0.3)
+    turned = at(away - (0.0, 0.0, 0.05)).model_copy(update={"orientation": (0.0, 0.0, 0.5**0.5, 0.5**0.5)})
+    for second, room in ((at(away - (0.0, 0.0, 0.05)), 0.3), (turned, 0.25)):
+        tracker = tracked(look(0.0, away))
+        tracker.take(Observation(0.1, 0.1, (second,)))
+        assert tracker.reachable(0.024, 0.1, q=q).at(0.1)["box"][2] - palm[2] == pytest.approx(room)
 
 
 @pytest.mark.parametrize("stamp", [NAN, INF, -INF])
@@ -162,7 +236,7 @@ def test_obstacles_are_within_what_they_can_reach(seed: int, error: float, faste
             continue
         off = rng.normal(size=3)
         tracker.take(look(times[k], truth[k] + error * rng.random() * off / np.linalg.norm(off)))
-        movers = tracker.reachable(error, fastest, margin)
+        movers = tracker.reachable(error, fastest, margin, suite_robot().home if rng.random() < 0.7 else None)
         a = movers.arrays
         for j in range(k, min(k + 40, 201)):
             allowed = a.growth[0, 0] + a.growth[0, 1] * (times[j] - a.stamp[0])

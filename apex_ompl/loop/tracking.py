@@ -62,7 +62,7 @@ class Track:
         covariance: Of place and velocity on each axis, shape (2, 2).
         seen: Number of observations since it was new or turned.
         unseen: Time for which it was looked for and not seen since it was seen last [s].
-        looks: Places where it was seen, the oldest first, rows of a stamp [s] and a place [m].
+        looks: Places where it was seen as it is now, the oldest first, rows of a stamp [s] and a place [m].
     """
 
     shape: Obstacle
@@ -89,8 +89,10 @@ class Track:
         expected = forward @ self.covariance @ forward.T + drift
         miss = np.array(seen.position, float) - (self.place + dt * self.velocity)
         spread = expected[0, 0] + noise
-        self.shape, self.stamp, self.unseen = seen, stamp, 0.0
-        self.looks = [*self.looks[1 - LOOKS :], (stamp, *seen.position)]
+        before = (
+            self.looks[1 - LOOKS :] if same_solid(seen, self.shape) else []
+        )  # a ball around another shape says nothing
+        self.shape, self.stamp, self.unseen, self.looks = seen, stamp, 0.0, [*before, (stamp, *seen.position)]
         if miss @ miss > GATE * spread:
             fresh = Track.new(seen, stamp, settings)
             self.place, self.velocity, self.covariance, self.seen = fresh.place, fresh.velocity, fresh.covariance, 1
