@@ -16,18 +16,23 @@ from loops import BLOCKED, PROBLEM, ByHand, Find, boxes, crossing, go, line, lin
 
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ApexError
+from apex_ompl.live.movers import Movers, clearance_in_time
 from apex_ompl.live.timed_spline import Start
 from apex_ompl.loop.charges import Charges
 from apex_ompl.loop.cycle import RunRecord
+from apex_ompl.loop.evasion import endangered, step_aside
 from apex_ompl.loop.following import Following
+from apex_ompl.loop.methods import METHODS
 from apex_ompl.loop.ready import Ready
 from apex_ompl.loop.referee import RefereeReport
 from apex_ompl.loop.replanning import NOTICED
 from apex_ompl.loop.request import Answer, Request
+from apex_ompl.loop.result import Event
 from apex_ompl.loop.run import run
-from apex_ompl.loop.search import EARLIER
+from apex_ompl.loop.search import EARLIER, Search
 from apex_ompl.loop.sensor import Sensor
-from apex_ompl.loop.settings import LoopSettings
+from apex_ompl.loop.settings import EVADE, LoopSettings
+from apex_ompl.ompl_adapter.setup import PlanningSetup
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.scripts import place_at
 from apex_ompl.trajectory import Trajectory
@@ -74,21 +79,100 @@ def touched(obstacles: list[Obstacle], motion: Trajectory) -> list[float]:
 def test_the_robot_touches_nothing_while_it_moves(
     seed: int, fastest: float, prediction: str, monitored: bool, hastens: bool
 ) -> None:
-    """But where it leaves a place that a box comes to, which is said in the event."""
-    some = boxes(seed, fastest)
-    parameters = {"fastest": fastest, "prediction": prediction, "monitored": monitored, "hastens": hastens}
-    done, report = go(ByHand(line), *some, sensor=Sensor(seed=seed), **parameters)
-    assert done.broken == 0 and report.still_contact is None
+    some, evade = boxes(seed, fastest), ("proved", "never")[seed // 2 % 2]
+    parameters = {"prediction": prediction, "monitored": monitored, "hastens": hastens, "evade": evade}
+    replanner: Any = METHODS["no-network"].make() if seed % 2 else ByHand(line)
+    done, report = go(replanner, *some, sensor=Sensor(seed=seed), fastest=fastest, **parameters)
+    assert done.broken == 0 and report.still_contact is None and done.unguarded == 0
     check_limits(report)
-    assert not any(event.kind == "broken assumption" for event in done.events)
-    accepted = [event for event in done.events if event.kind in ("accepted", "improved")]
-    assert monitored or not any(event.data["leaving"] for event in accepted)
-    hits = touched(some, done.trajectory)
-    if report.contact is not None and report.contact.moved:
-        hits.append(report.contact.time)
-    for time in hits:
-        assert [event for event in accepted if event.time <= time][-1].data["leaving"], time
+    assert "broken assumption" not in kinds(done)
+    assert not touched(some, done.trajectory) and report.moving_contact is None
     check_reactions(done)
+
+
+def coming(setup: PlanningSetup, gap: float = 0.2, speed: float = 0.4) -> Obstacle:
+    """A box that comes from the front to the robot at the start."""
+    palm = setup.robot.link_pose(setup.start, "left_hand_palm")[:3, 3]
+    box = Obstacle(name="box", box=(0.1, 0.1, 0.1), velocity=(-speed, 0.0, 0.0))
+    for x in np.arange(0.0, 1.0, 0.002).tolist():
+        place = tuple((palm + (x, 0.0, 0.0)).tolist())
+        there = box.model_copy(update={"position": place})
+        clear, _ = clearance_in_time(setup.checker.kernel, Movers([there]), setup.start[None], np.zeros(1))
+        if clear[0] >= gap:
+            return there
+    raise AssertionError("no place")
+
+
+def asides(done: RunRecord) -> list[Event]:
+    return [event for event in done.events if event.kind == "accepted" and event.data["part"] == "evade"]
+
+
+class Aside:
+    """Steps aside, and nothing else."""
+
+    def prepare(self, ready: Ready) -> None:
+        """Nothing is needed."""
+
+    def replan(self, ready: Ready, request: Request, charges: Charges) -> Answer:
+        search, soon = Search(ready, request, charges), endangered(request.following, request.join, request.contact)
+        found = step_aside(search) if soon else None
+        return Answer(None if found is None else search.following(found), "evade", charges)
+
+
+def test_a_robot_steps_aside_where_that_is_proved_or_at_its_risk_or_never() -> None:
+    """Where the box comes from near by, what it can reach includes every way out."""
+    setup, found = setup_of(PROBLEM), {}
+    for gap in (0.01, 0.2):
+        for evade in EVADE:
+            done, report = go(Aside(), coming(setup, gap), evade=evade, fastest=0.4, timeout=0.9)
+            found[gap, evade] = len(asides(done)) > 0, done.unguarded > 0
+            assert report.moving_contact is None or evade == "risk"
+            assert report.contact is not None or evade != "never"
+    assert found[0.2, "proved"] == (True, False) and found[0.01, "proved"] == (False, False)
+    assert found[0.01, "risk"] == (True, True)
+    assert found[0.2, "never"] == found[0.01, "never"] == (False, False)
+
+
+def test_a_robot_that_leaves_at_its_risk_does_not_go_to_a_goal() -> None:
+    """It is offered the way to the goal as soon as it leaves."""
+    refused = 0
+    for gap in (0.005, 0.01, 0.02):
+
+        def find(ready: Ready, request: Request) -> Following | None:
+            if request.following.at_rest(request.join):
+                return Aside().replan(ready, request, Charges(0.05)).found
+            search = Search(ready, request, Charges(0.05))
+            direct = search.direct(ready.goals[0])
+            return None if direct is None else search.following(direct)
+
+        box = coming(setup_of(PROBLEM), gap)
+        done, _ = go(ByHand(find, seconds=0.0), box, evade="risk", fastest=0.4, timeout=1.0)
+        leaves = [event for event in done.events if event.kind == "accepted" and event.data["leaving"]]
+        assert leaves and not any(event.data["to_goal"] for event in leaves) and done.unguarded
+        refused += "the robot leaves without a fail-safe stop" in reasons(done)
+    assert refused
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_robot_stays_where_what_is_near_stands_still(seed: int) -> None:
+    """Predictions have margins that grow; what comes nearer by them alone is no reason to leave."""
+    setup = setup_of(PROBLEM)
+    near = coming(setup, 0.03, speed=0.0)
+    done, report = go(Aside(), near, fastest=0.4, timeout=1.5, sensor=Sensor(seed=seed))
+    assert stood(done) and report.contact is None
+
+
+def test_steps_without_a_stop_are_counted_where_none_is_asked_for() -> None:
+    done, _ = go(ByHand(line), guarded=False)
+    moving = [t for t in np.arange(0.0, done.trajectory.duration, LoopSettings.period) if moves(done.trajectory, t)]
+    assert done.reached and done.unguarded == len(moving)
+    guarded, _ = go(ByHand(line))
+    assert guarded.reached and guarded.unguarded == 0
+
+
+def moves(motion: Trajectory, time: float) -> bool:
+    """Whether the robot moves within the step that begins at a time."""
+    return not (is_at_rest(motion, time) and is_at_rest(motion, time + LoopSettings.period))
 
 
 def check_reactions(done: RunRecord) -> set[str]:

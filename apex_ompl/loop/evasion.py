@@ -33,18 +33,23 @@ def endangered(following: Following, at: float, conflict: float, within: float =
     return following.at_rest(at) and conflict < at + within
 
 
-def step_aside(search: Search) -> Trajectory | None:
+def step_aside(search: Search, *, proved: bool = False) -> Trajectory | None:
     """Return the straight motion to a state nearby that stays clear, or else clear for longest, or None.
 
     Besides states around, the robot may go back: to states of its last motion to a goal, and to where it began. Where
-    motions aside are to be proved clear of all that obstacles can reach, those that are come first; another one may
-    still have a fail-safe stop at each of its steps.
+    motions aside are to be proved clear of all that obstacles can reach, the states are clear of that at the arrival
+    where possible, and motions that are proved come first; another one may still have a fail-safe stop at each of its
+    steps.
+
+    Args:
+        search: The replan.
+        proved: Whether only a motion that is proved is of use.
     """
     request, ready = search.request, search.ready
     q, limits, hold = search.start.position, ready.setup.robot.limits, ready.settings.rest_hold
     size = np.repeat(STRAYS, AROUND // len(STRAYS))[:, None]
     states = q + size * search.rng.normal(size=(len(size), len(q)))
-    looks = request.join + DURATION + np.linspace(0.0, hold, LOOKS)
+    looks = search.soonest + DURATION + np.linspace(0.0, hold, LOOKS)
     rows = np.arange(len(states))
     for turn in range(ASCENTS + 1):
         states = np.clip(states, limits.lower, limits.upper)
@@ -69,23 +74,40 @@ def step_aside(search: Search) -> Trajectory | None:
         conflict = ready.first_conflict(request.predicted, one, one.begin, one.end + hold, search.charges)
         if conflict <= latest or not ready.clear_of_still(motion, search.charges):
             continue
-        if proves is not None and not ready.proved_to_rest(proves, one):
+        if proves is not None and not ready.proved_to_rest(proves, Following(motion, search.soonest), search.charges):
             unproved = motion if unproved is None else unproved
             continue
         best, latest = motion, conflict
         if np.isinf(conflict):
             break
-    return unproved if best is None else best
+    return unproved if best is None and not proved else best
 
 
 def _looked(search: Search, states: Array, looks: Array) -> tuple[Array, Array]:
-    """Return clearances of states at some times, shape (N, times) [m], and their gradients, shape (N, times, dof)."""
-    clear, slopes = clearance_in_time(
-        search.ready.kernel, search.request.predicted, np.repeat(states, len(looks), axis=0),
-        np.tile(looks, len(states)), SEEN,
-    )  # fmt: skip
-    search.charges.charge("clearance in time", len(clear))
-    return clear.reshape(len(states), -1), slopes.reshape(len(states), len(looks), -1)[:, :, :-1]
+    """Return clearances of states at some times [m], and their gradients.
+
+    Where motions aside are to be proved, the last column is that to all that obstacles can reach at the first time.
+
+    Args:
+        search: The replan.
+        states: Shape (N, dof).
+        looks: Times of the clock, shape (T,) [s].
+
+    Returns:
+        Clearances, shape (N, T) or (N, T + 1), and gradients, shape (N, T or T + 1, dof).
+    """
+    ready, request, count = search.ready, search.request, len(states)
+    asked = [(request.predicted, looks)]
+    if request.reachable is not None and ready.settings.evade == "proved":
+        asked.append((request.reachable, looks[:1]))
+    clear, slopes = list[Array](), list[Array]()
+    for movers, times in asked:
+        many = np.repeat(states, len(times), axis=0)
+        values, gradients = clearance_in_time(ready.kernel, movers, many, np.tile(times, count), SEEN)
+        search.charges.charge("clearance in time", len(values))
+        clear.append(values.reshape(count, -1))
+        slopes.append(gradients.reshape(count, len(times), -1)[:, :, :-1])
+    return np.concatenate(clear, axis=1), np.concatenate(slopes, axis=1)
 
 
 def _back(search: Search) -> Array:

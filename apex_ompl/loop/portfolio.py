@@ -55,12 +55,15 @@ class Portfolio:
     def replan(self, ready: Ready, request: Request, charges: Charges) -> Answer:
         """Return a motion from the time of joining on that is proved among what is expected, or none."""
         search = Search(ready, request, charges)
-        danger, evades = (request.following, request.join, request.contact), ready.settings.evade != "never"
-        aside, urgent = self.evades and evades and endangered(*danger), endangered(*danger, URGENT)
-        if aside and urgent and self._step_aside(search):
+        evade, danger = ready.settings.evade, (request.following, request.join, request.contact)
+        comes = self.evades and evade != "never" and endangered(*danger)
+        urgent = comes and endangered(*danger, URGENT)
+        if urgent and self._step_aside(search):
             return Answer(search.best, search.part, charges)
-        waits = self.waits and not aside and not request.hastens and request.following.at_rest(request.join)
-        if (aside and not urgent) or waits:
+        aside, waits = comes and not urgent, not comes and self.waits and not request.hastens
+        waits = waits and request.following.at_rest(request.join)
+        fallback = step_aside(search, proved=True) if aside and evade == "proved" else None
+        if (aside and fallback is None) or waits:
             search.until = (WAITING if waits else ASIDE) * charges.limit  # some time is left for that
         if self.retimes:
             motion = retimed(search)
@@ -74,12 +77,12 @@ class Portfolio:
             quicken(search, request.following.piece(request.join, request.following.end))
         if self.sources and not search.over():
             self._optimise(search)
-        if aside and not urgent and search.best is None:
+        if search.best is None and fallback is not None:
+            search.best, search.part = search.following(fallback), "evade"
+        if search.best is None and aside:
             self._step_aside(search)
-        if waits and search.best is None:
-            nearer = wait_nearer(search)
-            if nearer is not None:
-                search.best, search.part = search.following(nearer), "wait"
+        if search.best is None and waits:
+            self._wait_nearer(search)
         return Answer(search.best, search.part, charges)
 
     @staticmethod
@@ -89,6 +92,13 @@ class Portfolio:
         if aside is not None:
             search.best, search.part = search.following(aside), "evade"
         return aside is not None
+
+    @staticmethod
+    def _wait_nearer(search: Search) -> None:
+        """Take a motion to where the robot may wait, where there is one."""
+        nearer = wait_nearer(search)
+        if nearer is not None:
+            search.best, search.part = search.following(nearer), "wait"
 
     def _optimise(self, search: Search) -> None:
         """Improve motions in space and time while there is time."""

@@ -122,14 +122,15 @@ class Ready:
             charges.charge("interval among movers", found.intervals)
         return found.time + zero
 
-    def proved_to_rest(self, reachable: Movers, following: Following) -> bool:
+    def proved_to_rest(self, reachable: Movers, following: Following, charges: Charges | None = None) -> bool:
         """Whether nothing that obstacles can reach comes in the way of a motion until the robot is at rest again.
 
         Args:
             reachable: The obstacles, as large as all that they can reach.
             following: The motion.
+            charges: Gets the number of intervals.
         """
-        return bool(np.isinf(self.first_conflict(reachable, following, following.begin, following.end)))
+        return bool(np.isinf(self.first_conflict(reachable, following, following.begin, following.end, charges)))
 
     def proved_stop(self, reachable: Movers, following: Following, now: float, then: float) -> Following | None:
         """Return a stop from a motion at a later time that nothing can come in the way of, or None.

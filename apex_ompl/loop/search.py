@@ -151,16 +151,21 @@ class Search:
                 return False
         return True
 
+    @property
+    def soonest(self) -> float:
+        """Time of the clock at which a motion begins at the earliest: a robot at rest does not wait [s]."""
+        request = self.request
+        soon = request.asked + self.charges.spent + self.ready.settings.period
+        return min(soon, request.join) if request.following.at_rest(request.asked) else request.join
+
     def may_begin(self, motion: Trajectory) -> bool:
         """Whether there is a fail-safe stop after the first step of a motion, by what is known now."""
-        if self.request.reachable is None:
+        reachable, one = self.request.reachable, Following(motion, self.soonest)
+        if reachable is None:
             return True
-        one = self.following(motion)
         self.charges.charge("foreseen stop")
-        return (
-            self.ready.proved_stop(self.request.reachable, one, one.begin, one.begin + self.ready.settings.period)
-            is not None
-        )
+        then = one.begin + self.ready.settings.period
+        return self.ready.proved_stop(reachable, one, one.begin, then) is not None
 
     def take(self, motion: Trajectory, part: str) -> bool:
         """Keep a proved motion where it is shorter than the best, or about so with more room; return whether it is."""
