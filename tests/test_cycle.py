@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,14 +13,18 @@ from loops import FAR, PROBLEM, ByHand, line, ready_of, world_of
 from apex_ompl.errors import ParameterError
 from apex_ompl.loop.cycle import Loop, RunRecord
 from apex_ompl.loop.late_steps import Decided, undo
+from apex_ompl.loop.observation import Observation
 from apex_ompl.loop.replanning import AtOnce
+from apex_ompl.loop.result import INTERRUPTED
 from apex_ompl.loop.run import run
 from apex_ompl.loop.sensor import Sensor, SensorStream
 from apex_ompl.loop.settings import LoopSettings
+from apex_ompl.loop.simulation import simulate
+from apex_ompl.problems import worlds
 from apex_ompl.scene.scripts import place_at
 from apex_ompl.trajectory.rests import is_at_rest
 
-PERIOD = LoopSettings.period
+PERIOD, NAN = LoopSettings.period, float("nan")
 
 
 def loop_of(replanner: Any, sensor: Sensor | None = None, **parameters: Any) -> Loop:
@@ -120,3 +125,122 @@ def test_a_world_is_for_one_run() -> None:
 def test_a_sensor_that_would_have_looked_too_often_is_a_sentence() -> None:
     with pytest.raises(ParameterError, match="watched"):
         SensorStream(Sensor(rate=20_000.0), world_of(PROBLEM), 60.0)
+
+
+class Changed:
+    """A sensor whose looks are changed by a function of their number, from the first on."""
+
+    def __init__(self, change: Callable[[int, Observation], Observation]) -> None:
+        self._eyes, self._change, self._count = SensorStream(Sensor(), world_of(PROBLEM, NEAR), 0.3), change, 0
+
+    def observations(self, until: float) -> list[Observation]:
+        found = [self._change(self._count + k, one) for k, one in enumerate(self._eyes.observations(until))]
+        self._count += len(found)
+        return found
+
+
+NEAR = FAR.model_copy(update={"name": "near", "position": (1.2, 0.0, 1.2)})
+WATCHED = 10  # looks before the run
+
+
+def seen_by(eyes: Any, **parameters: Any) -> RunRecord:
+    """A run with a sensor made by hand."""
+    ready, world = ready_of(PROBLEM, **{"timeout": 1.0, **parameters}), world_of(PROBLEM, NEAR)
+    return simulate(world, ready, ByHand(line), eyes, seed=0)
+
+
+def nowhere(k: int, one: Observation) -> Observation:
+    return replace(one, seen=tuple(o.model_copy(update={"position": (NAN,) * 3}) for o in one.seen))
+
+
+def test_a_robot_does_not_start_before_it_has_seen_what_is_there() -> None:
+    assert seen_by(Changed(lambda k, one: one)).reached
+    for change, words in (
+        (nowhere, "looks were refused, the last one since the place of near is not finite"),
+        (lambda k, one: replace(one, seen=()), "never seen: near"),
+    ):
+        done = seen_by(Changed(change))
+        assert not done.reached and (done.trajectory.positions == done.trajectory.positions[0]).all()
+        assert words in done.reason and done.ended == "timeout"
+    assert seen_by(Changed(nowhere)).refused > 30
+
+
+def test_a_look_of_the_future_does_not_block_the_later_ones() -> None:
+    ahead = Changed(lambda k, one: replace(one, stamp=one.stamp + 5.0) if k < WATCHED else one)
+    done = seen_by(ahead, timeout=3.0)
+    assert done.reached and done.refused == WATCHED
+    assert "in the future" in next(e for e in done.events if e.kind == "observation refused").data["why"]
+
+
+def test_a_robot_stops_where_there_is_no_look_of_use_for_too_long() -> None:
+    """As when a camera is unplugged under way."""
+    silent = Changed(lambda k, one: nowhere(k, one) if k > WATCHED + 3 else one)
+    done = seen_by(silent, silence=0.2, timeout=2.0)
+    assert not done.reached and "no look was of use in the end" in done.reason
+    blind = next(event for event in done.events if event.kind == "blind")
+    assert blind.time - blind.data["last"] == pytest.approx(0.2, abs=0.02)
+    assert is_at_rest(done.trajectory, blind.time + 0.5) and not is_at_rest(done.trajectory, blind.time)
+
+
+def test_one_place_far_away_is_doubted_and_does_not_count() -> None:
+    far = {"position": (1e9, 0.0, 0.0)}
+    jumps = Changed(
+        lambda k, one: replace(one, seen=tuple(o.model_copy(update=far) for o in one.seen)) if k == WATCHED + 4 else one
+    )
+    done = seen_by(jumps, timeout=3.0)
+    assert done.reached and done.doubted == 1 and done.broken == 0
+    assert "near was 1e+09 m away" in next(e for e in done.events if e.kind == "place doubted").data["why"]
+
+
+@pytest.mark.parametrize("step", [0, 30, 60])
+def test_a_sensor_that_fails_ends_the_run_at_rest_with_what_was_done_so_far(step: int) -> None:
+    class Failing(Changed):
+        def observations(self, until: float) -> list[Observation]:
+            if until >= step * PERIOD - 1e-9:
+                raise OSError("no camera")
+            return super().observations(until)
+
+    done = seen_by(Failing(lambda k, one: one), timeout=3.0)
+    assert done.ended == "aborted" and done.reason == "the sensor failed, OSError: no camera"
+    motion = done.trajectory
+    assert is_at_rest(motion, motion.duration) and step * PERIOD - 1e-9 <= motion.duration < step * PERIOD + 0.6
+
+
+@pytest.mark.parametrize("where", ["advance", "observe", "step", "set_out"])
+def test_an_interrupt_stops_the_robot_and_returns_what_was_done_so_far(
+    where: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever of a step was done, it is undone; the next interrupt is raised."""
+    original = getattr(Loop, where)
+    for count in (1, 2):
+        left = [count]
+
+        def interrupted(loop: Loop, now: float, left: list[int] = left) -> Any:
+            found = original(loop, now)
+            if now >= 0.4 and left[0]:
+                left[0] -= 1
+                raise KeyboardInterrupt
+            return found
+
+        monkeypatch.setattr(Loop, where, interrupted)
+        eyes = Changed(lambda k, one: one)
+        if count == 2:
+            with pytest.raises(KeyboardInterrupt):
+                seen_by(eyes, timeout=3.0)
+            continue
+        done = seen_by(eyes, timeout=3.0)
+        motion = done.trajectory
+        assert done.ended == "aborted" and done.reason == INTERRUPTED and done.unguarded == 0
+        assert is_at_rest(motion, motion.duration) and 0.4 < motion.duration < 1.0 and not is_at_rest(motion, 0.39)
+
+
+def test_assumptions_are_those_of_the_world_and_the_sensor_unless_they_are_given() -> None:
+    world = worlds.load("vertical/moving-large-0.2/800001")
+    for settings, assumed in (
+        (None, (0.03, 0.2)), (LoopSettings(timeout=0.5), (0.03, 0.2)), (LoopSettings(fastest=0.7), (0.03, 0.7)),
+        (LoopSettings(error=0.1, timeout=0.5), (0.1, 0.2)),
+    ):  # fmt: skip
+        found = run(world.name, "blind", settings=settings, sensor=Sensor(noise=0.01)).settings["loop"]
+        assert (found["error"], found["fastest"]) == pytest.approx(assumed, rel=1e-4)
+    with pytest.raises(ParameterError, match="completed"):
+        _ = LoopSettings().assumed

@@ -107,7 +107,8 @@ def test_what_is_asked_for_wrongly_is_named(given: dict[str, Any], words: str) -
 @pytest.mark.parametrize(
     "given",
     [{"period": 0.0}, {"period": NAN}, {"budget": 0.055}, {"timeout": 0.0}, {"timeout": float("inf")},
-     {"fastest": -0.1}, {"error": NAN}, {"latency": -2.0}, {"prediction": "best"}],
+     {"fastest": -0.1}, {"error": NAN}, {"latency": -2.0}, {"prediction": "best"}, {"evade": "maybe"},
+     {"memory": 0.0}, {"silence": NAN}],
     ids=str,
 )  # fmt: skip
 def test_parameters_outside_their_ranges_are_named(given: dict[str, Any]) -> None:
@@ -117,11 +118,13 @@ def test_parameters_outside_their_ranges_are_named(given: dict[str, Any]) -> Non
 
 @pytest.mark.parametrize("name", ["vertical/moving-medium-0.4/800005", "vertical/moving-huge-0.4/800007"])
 def test_a_robot_that_leaves_is_not_held_by_a_stop_before_it_has_set_out(name: str) -> None:
-    """A cube comes to where the robot stands within 0.2 s."""
-    found = run(name, "no-network", seed=0)
+    """A cube comes to where the robot stands within 0.2 s: too soon for a motion that is proved."""
+    found = run(name, "no-network", seed=0, settings=LoopSettings(evade="risk"))
     first = next(event for event in found.events if event.kind == "accepted")
-    assert first.data["part"] == "evade" and first.data["leaving"]
+    assert first.data["part"] == "evade" and first.data["leaving"] and found.metrics["unguarded_steps"] > 0.0
     assert found.outcome is Outcome.REACHED and found.metrics["clearance"] > 0.0
+    proved = run(name, "no-network", seed=0)
+    assert proved.outcome is Outcome.HIT_AT_REST and proved.metrics["unguarded_steps"] == 0.0
 
 
 def test_a_stop_that_ends_at_a_goal_is_one_to_the_goal() -> None:

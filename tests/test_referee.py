@@ -270,3 +270,24 @@ def test_pieces_are_the_legs_of_all_scripts(robot: Robot) -> None:
                 np.testing.assert_allclose(place, wanted, atol=1e-12)
     wanted_pieces = [(0.0, 1.0, ("a",)), (1.0, 2.0, ("a",)), (2.0, 3.0, ("a", "b")), (3.0, 5.0, ("a", "b"))]
     assert seen == wanted_pieces
+
+
+def test_a_contact_while_the_robot_moves_counts_behind_one_at_rest(robot: Robot) -> None:
+    """A ball comes to the hand at rest, stays there, and the robot moves off with it."""
+    goal = moved(robot, left_joint1=-0.6)
+    motion = concatenate([standing(robot, robot.home, 0.5), motion_between(robot, robot.home, goal)])
+    meet = hand_at(robot, motion, 0.0)
+    for leaves, outcome in ((0.45, Outcome.HIT_AT_REST), (motion.duration, Outcome.HIT_MOVING)):
+        rows = ((0.0, 2.0), (0.2, 0.0), (leaves - 0.1, 0.0), (leaves, 2.0))
+        script = tuple((t, *(meet + (x, 0.0, 0.0))) for t, x in rows)
+        report = judge(robot, problem_of(robot, motion, ball_of(script)), motion)
+        assert report.outcome is outcome and report.contact is not None and not report.contact.moved
+        later = report.moving_contact
+        assert (later is None) == (outcome is Outcome.HIT_AT_REST)
+        if later is not None:
+            assert 0.5 <= later.time <= 0.51 and later.moved
+            assert len(report.faults) == 2 and str(later) == report.faults[1]
+
+
+def ball_of(script: tuple[tuple[float, ...], ...]) -> Obstacle:
+    return Obstacle(name="ball", sphere={"radius": 0.03}, trajectory=script)

@@ -17,8 +17,6 @@ from apex_ompl.loop.following import Following
 from apex_ompl.loop.portfolio import Portfolio
 from apex_ompl.loop.ready import Ready
 from apex_ompl.loop.request import Request
-from apex_ompl.loop.result import Outcome
-from apex_ompl.loop.run import run
 from apex_ompl.loop.search import Search
 from apex_ompl.loop.sprint import CHARGE, Sprint
 from apex_ompl.loop.waiting import wait_nearer
@@ -171,10 +169,3 @@ def test_a_robot_that_leaves_takes_only_what_the_guard_will_hardly_stop(
         monkeypatch.setattr(search, "guardable", lambda motion, answer=guardable: answer)
         motion = search.direct(ready.goals[0])
         assert motion is not None and search.take(motion, "direct") == (guardable or not leaving)
-
-
-def test_a_robot_that_leaves_does_not_stop_where_it_is_touched_soon() -> None:
-    """It began to leave, then stopped as soon as a stop was proved, and stood where the cube came."""
-    result = run("vertical/moving-xlarge-0.2/800001", seed=0)
-    assert any(event.kind == "accepted" and event.data["leaving"] for event in result.events)
-    assert result.outcome is Outcome.REACHED, result.reason

@@ -295,9 +295,7 @@ class Executor:
             aside, then = self._may_leave(now, found), found.begin + self.ready.settings.period
             proved = aside and self.ready.proved_to_rest(reachable, found)
             leaving = aside and not proved and self.ready.settings.evade == "risk"  # a stop at once is no way to leave
-            if self.leaving and found.to_goal:
-                why = "the robot leaves without a fail-safe stop"
-            elif not (proved or leaving) and self.ready.proved_stop(reachable, found, found.begin, then) is None:
+            if not (proved or leaving) and self.ready.proved_stop(reachable, found, found.begin, then) is None:
                 why = "no stop behind its first step is proved"
         if why:
             self.log(now, request.refused, why=why, **took)
@@ -331,6 +329,8 @@ class Executor:
         settings = self.ready.settings
         if request.following is not self.following:
             return "the robot follows another motion by now"
+        if self.leaving and found.to_goal and not self.following.at_rest(now):
+            return "the robot leaves without a fail-safe stop"
         if now > request.join + 1e-9:
             return "it came too late"
         unfit = misfit(self.ready, found, request)
