@@ -24,7 +24,7 @@ from apex_ompl.scene.bodies import Obstacle, PlaceInTime
 from apex_ompl.scene.scripts import row_of
 from apex_ompl.types import Array
 
-KIND = "attack"
+KIND, SUITES = "attack", ("vertical", "horizontal")
 SENSORS = (
     {},  # the default one
     {"rate": 100.0, "age": 0.0, "noise": 0.0, "dropout": 0.0},
@@ -140,7 +140,7 @@ class AttackWorld(ScriptedWorld):
             folder: Where the mesh is kept.
         """
         self.rng = np.random.default_rng([zlib.crc32(KIND.encode()), number])
-        suite = ("vertical", "horizontal")[number % 2]
+        suite = SUITES[number % 2]
         problem = problems.load(f"{suite}/free/{FIRST + number // 2}")
         self.places = RobotPlaces(problem)
         speed = float(self.rng.choice(SPEEDS))

@@ -22,7 +22,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import os
 import time
 from collections.abc import Callable, Sequence
@@ -54,8 +53,8 @@ DEPENDS = (
 FOLDER = record.RESULTS.parent / "runs" / "closed_loop"
 SPEEDS = (1.0, 0.25)
 KEPT = (
-    "time_to_goal", "rest_time", "stops", "clearance", "limit_use", "broken_steps", "improvements", "tick_p50",
-    "tick_p99", "tick_worst", "deadline_misses",
+    "time_to_goal", "rest_time", "stops", "clearance", "limit_use", "broken_steps", "unguarded_steps", "improvements",
+    "tick_p50", "tick_p99", "tick_worst", "deadline_misses",
 )  # fmt: skip
 
 CLAIRVOYANT = "clairvoyant"
@@ -101,14 +100,11 @@ def made(job: Job) -> dict[str, Any]:
 
 def kept(job: Job, result: RunResult) -> dict[str, Any]:
     """Return what is kept of a run."""
-    taken = [event for event in result.events if event.kind in ("accepted", "improved")]
     timed = {
         name: [event.data["took"] for event in result.events if event.kind in some and "took" in event.data]
         for name, some in (("replans", ("accepted", "rejected")), ("plans", ("accepted",)))
     }
     expected = result.outcome is Outcome.HIT_MOVING and not result.metrics["broken_steps"]
-    contact = next((event.time for event in result.events if event.kind == "contact"), math.inf)
-    leaving = [event.data["leaving"] for event in taken if event.time <= contact][-1:]
     reactions = [
         [event.data[name] for name in ("seconds", "ahead", "doing")]
         for event in result.events
@@ -116,8 +112,7 @@ def kept(job: Job, result: RunResult) -> dict[str, Any]:
     ]
     return {
         **job._asdict(), **made_with(), "outcome": str(result.outcome), "reason": result.reason,
-        "hit_while_expected": expected, "hit_while_leaving": expected and leaving == [True], **timed,
-        "reactions": reactions,
+        "hit_while_expected": expected, **timed, "reactions": reactions,
         **{name: result.metrics[name] for name in KEPT if name in result.metrics},
     }  # fmt: skip
 
@@ -135,8 +130,7 @@ def offline(job: Job) -> dict[str, Any]:
     )
     return {
         **job._asdict(), **made_with(), "outcome": str(Outcome.REACHED if found else Outcome.TIMEOUT),
-        "hit_while_expected": False,
-        "hit_while_leaving": False, "seeds": seed, "reactions": [], "replans": [], "plans": [], **reached,
+        "hit_while_expected": False, "seeds": seed, "reactions": [], "replans": [], "plans": [], **reached,
     }  # fmt: skip
 
 

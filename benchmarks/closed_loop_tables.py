@@ -45,12 +45,12 @@ def summary(some: Sequence[Stored], best: Sequence[Stored] = ()) -> dict[str, An
     levels: dict[str, list[bool]] = {}
     for one in some:
         levels.setdefault(one["world"].rpartition("/")[0], []).append(one["outcome"] != "reached")
-    leaving = sum(one["hit_while_leaving"] for one in some)
+    unguarded = column(some, "unguarded_steps")
     ticks = {name: column(some, name) for name in ("tick_p50", "tick_p99", "tick_worst", "deadline_misses")}
     return {
         "n": len(some), "failed": failed / len(some), "interval": list(share_interval(failed, len(some))),
-        "causes": causes, "hits_while_expected": sum(one["hit_while_expected"] for one in some) - leaving,
-        "hits_while_leaving": leaving,
+        "causes": causes, "hits_while_expected": sum(one["hit_while_expected"] for one in some),
+        "unguarded_steps": sum(unguarded) if len(unguarded) == len(some) else None,  # runs of before did not count them
         "time_to_goal_s": of_all(times), "by_clairvoyant": of_all(compared), "compared": len(compared),
         "replan_s": of_all(replans), "replans": len(replans), "plan_s": of_all(plans),
         "levels": {level: [sum(row), len(row)] for level, row in levels.items()},
@@ -160,7 +160,7 @@ def causes_of(s: dict[str, Any]) -> str:
 
 def table(rows: dict[str, dict[str, Any]]) -> str:
     """Return the Markdown table of rows."""
-    head = ["", "N", "failed", "95 % interval", "causes", "hit while moving, as assumed", "leaving",
+    head = ["", "N", "failed", "95 % interval", "causes", "hit while moving, as assumed", "unguarded steps",
             "time to goal s p50", "p95", "by clairvoyant's p50", "p95", "stops", "worst level %",
             "plan ms p50", "p95", "reaction ms p95", "near ms p95", "over limits"]  # fmt: skip
     lines = [head, ["---", *["---:"] * (len(head) - 1)]]
@@ -170,7 +170,7 @@ def table(rows: dict[str, dict[str, Any]]) -> str:
         replans = [shown(v, 1e3) for v in (*s["plan_s"], s["reaction_s"][1], s["near_reaction_s"][1])]
         lines.append([
             name, s["n"], f"{100 * s['failed']:.1f} %", f"{100 * low:.1f} to {100 * high:.1f}", causes_of(s),
-            s["hits_while_expected"], s["hits_while_leaving"], *times, f"{s['stops']:.2g}",
+            s["hits_while_expected"], shown(s["unguarded_steps"]), *times, f"{s['stops']:.2g}",
             f"{100 * s['worst_level']:.3g}", *replans, s["over_limits"],
         ])  # fmt: skip
     return "\n".join(record.row(line) for line in lines)
