@@ -77,7 +77,7 @@ class LoopSettings:
     error: float | None = None
     fastest: float | None = None
     memory: float = 3.0
-    silence: float = 0.5
+    silence: float = 1.0
     timeout: float = 30.0
     stuck: float = 30.0
 
