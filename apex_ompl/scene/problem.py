@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import BeforeValidator, Field, PositiveFloat, PrivateAttr, Strict, field_validator, model_validator
+from pydantic import BeforeValidator, Field, PositiveFloat, PrivateAttr, field_validator, model_validator
 
 from apex_ompl.errors import FileFormatError, nearest_name
 from apex_ompl.scene.bodies import AttachedObject, Name, Obstacle, Quaternion, Vector, located
@@ -26,7 +26,7 @@ SCHEMA = "apex-ompl/problem/1"
 GOALS = ("joints", "alignment", "poses")
 """Kinds of goals."""
 
-JointValues = dict[str, Annotated[float, Strict()]]
+JointValues = dict[str, float]
 
 
 def _one_or_many(value: Any) -> Any:
