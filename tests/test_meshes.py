@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from support import CUBE_OBJ
 
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.collision.hulls import _farthest, convex_hull, hull_planes
+from apex_ompl.collision.hulls import convex_hull, farthest, hull_planes
 from apex_ompl.collision.shapes import coal_geometry, mesh_note
 from apex_ompl.errors import FileFormatError
 from apex_ompl.robot import Robot
@@ -113,7 +113,7 @@ def test_farthest_points_are_those_of_brute_force(seed: int, count: int, flat: b
     rng = np.random.default_rng(seed)
     points = rng.normal(size=(count, 3)) * ([1.0, 1.0, 0.0] if flat else [1.0, 0.3, 0.1])
     directions = np.concatenate([rng.normal(size=(20, 3)), np.eye(3), -np.eye(3)])
-    found, reach = _farthest(directions, points)
+    found, reach = farthest(directions, points)
     assert reach == pytest.approx((points @ directions.T).max(axis=0), abs=1e-12)
     assert np.einsum("ij,ij->i", points[found], directions) == pytest.approx(reach, abs=1e-12)
 

@@ -163,7 +163,9 @@ def test_operations_are_carried_out_one_after_the_other(robot: Robot, tmp_path: 
     assert set(bodies) == {"pillar", "rock"}
     assert bodies["pillar"].box == (0.1, 0.1, 0.1), "what is added again takes the place of the one before"
     assert "collision_objects.3: removes 'base'" in done.notes
-    done = converted(tmp_path, robot, SCENE + "    - {id: pebble, operation: 1}\n    - {id: '', operation: 1}\n" + again)
+    done = converted(
+        tmp_path, robot, SCENE + "    - {id: pebble, operation: 1}\n    - {id: '', operation: 1}\n" + again
+    )
     assert [b.name for b in done.problem.scene] == ["pillar"], "REMOVE without a name removes all"
 
 

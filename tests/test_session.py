@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 import pytest
+import torch
 from planning import EXACT, within
 
 from apex_ompl import Alignment, MotionPlanner, PlanStatus, PoseTarget, load_problem, plan, points_from_depth
@@ -20,6 +21,7 @@ from apex_ompl.result import PlanResult
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Goal, Problem
+from apex_ompl.trajectory import Trajectory
 
 POST = {"name": "post", "box": (0.1, 0.1, 0.6), "position": (0.45, 0.0, 0.3)}
 
@@ -247,6 +249,31 @@ def test_a_start_a_little_outside_of_its_limits_stays_where_it_is_moved_to(
         lambda planner, home: planner.world.add(None),
         lambda planner, home: planner.world.attach("post", "left_hand_palm", at={"left_joint1": 0.0}),
         lambda planner, home: points_from_depth(np.ones((2, 2)), (1.0, 1.0, 0.5, 0.5), np.eye(4), range=5),
+        lambda planner, home: points_from_depth([[1, 2], [1]], (1.0, 1.0, 0.5, 0.5), np.eye(4)),
+        lambda planner, home: points_from_depth(np.ones((2, 2)), (1.0, 1.0, 0.5, 0.5), 2.0 * np.eye(4)),
+        lambda planner, home: points_from_depth(np.ma.masked_all((2, 2)), (1.0, 1.0, 0.5, 0.5), np.eye(4)),
+        lambda planner, home: planner.check(np.ma.masked_array(home, mask=home == home[0])),
+        lambda planner, home: planner.check(home.astype(complex)),
+        lambda planner, home: planner.check([str(x) for x in home]),
+        lambda planner, home: planner.is_free(torch.tensor(home, requires_grad=True)),
+        lambda planner, home: planner.plan(np.ma.masked_array(home, mask=True), home),
+        lambda planner, home: planner.robot.link_pose(home, 5),
+        lambda planner, home: planner.robot.link_pose(home.astype(complex), "left_hand_palm"),
+        lambda planner, home: planner.world.allow(None, "left_link1"),
+        lambda planner, home: planner.world.allow("post", ["left_link1"]),
+        lambda planner, home: planner.world.add(name=5, box=(0.1, 0.1, 0.1)),
+        lambda planner, home: planner.world.add(name="cup", box=("0.1", 0.1, 0.1)),
+        lambda planner, home: planner.world.remove(["post"]),
+        lambda planner, home: planner.world.move(5, (0.0, 0.0, 0.0)),
+        lambda planner, home: planner.world.detach(["post"]),
+        lambda planner, home: planner.world.attach("post", 5, at=home),
+        lambda planner, home: planner.world.attach("post", "left_hand_palm", touch_links="left_hand_palm", at=home),
+        lambda planner, home: planner.world.set_points(["cloud"], [[2.0, 0.0, 0.0]], 0.01),
+        lambda planner, home: planner.world.set_points("cloud", [[2.0, 0.0, 0.0]], 0.01, file=5),
+        lambda planner, home: load_problem(None),
+        lambda planner, home: load_problem(b"shelf.yaml"),
+        lambda planner, home: Trajectory.load(5),
+        lambda planner, home: PlanResult.load(None),
     ],
 )
 def test_what_is_no_such_thing_is_an_error_of_this_package(planner: MotionPlanner, robot: Robot, asked: Any) -> None:

@@ -80,13 +80,13 @@ def _larger_hull(vertices: Array) -> coal.Convex:
         turn = np.pi * (1.0 + 5.0**0.5) * np.arange(count)
         flat = np.sqrt(1.0 - rise**2)
         directions = np.stack([flat * np.cos(turn), flat * np.sin(turn), rise], axis=1)
-        chosen = vertices[np.unique(_farthest(directions, vertices)[0])]
+        chosen = vertices[np.unique(farthest(directions, vertices)[0])]
         try:
             normals, offsets = hull_planes(_hull_of(chosen))
             centre = chosen.mean(axis=0)
             room = offsets - normals @ centre
             wide = room > 1e-6 * room.max()  # planes of slivers may be turned by rounding
-            reach = _farthest(normals[wide], vertices - centre)[1]
+            reach = farthest(normals[wide], vertices - centre)[1]
             return _hull_of(centre + (1.0 + 1e-6) * max(1.0, float((reach / room[wide]).max())) * (chosen - centre))
         except RuntimeError:
             continue
@@ -99,7 +99,21 @@ def _hull_of(points: Array) -> coal.Convex:
     return coal.Convex.convexHull(found, True, "Qt")
 
 
-def _farthest(directions: Array, points: Array) -> tuple[NDArray[np.intp], Array]:
+def below_support(normals: Array, corners: Array, points: Array) -> Array:
+    """Return how deep points are below the supporting planes of a convex body with these normals, shape (N,) [m].
+
+    Of a point inside it is at least the distance to the body's surface, and equal where the normal is that of the
+    nearest face. It takes a search over the corners for each point, not one over all faces.
+
+    Args:
+        normals: A unit normal for each point, shape (N, 3).
+        corners: Corners of the body, shape (P, 3) [m].
+        points: Shape (N, 3) [m].
+    """
+    return farthest(normals, corners)[1] - np.asarray(np.einsum("ij,ij->i", normals, points))
+
+
+def farthest(directions: Array, points: Array) -> tuple[NDArray[np.intp], Array]:
     """Return the point that is farthest in each direction, shape (D,), and how far it is, shape (D,) [m].
 
     Of the points of a grid's cells only those are looked at whose cell may reach farther than any first point of one.

@@ -70,7 +70,7 @@ class SceneBodies:
 
     def is_obstacle(self, name: str) -> bool:
         """Whether there is an obstacle of that name, which is not a fixture of the robot's."""
-        return name in self._obstacles and name not in self._fixtures
+        return isinstance(name, str) and name in self._obstacles and name not in self._fixtures
 
     @property
     def held(self) -> dict[str, AttachedObject]:
@@ -188,7 +188,7 @@ class SceneBodies:
         links = sorted({self.meshes.solids[k].name for k in range(self.meshes.links)})
         known = (*self._obstacles, *self._attached, *links)
         for name in (first, second):
-            if name not in known:
+            if not isinstance(name, str) or name not in known:
                 raise UnknownNameError("body", name, known)
         if first == second:
             raise SceneError(f"the body {first!r} is not checked against itself, expected two bodies")
@@ -218,7 +218,7 @@ class SceneBodies:
 
     @staticmethod
     def _find(bodies: dict[str, Any], name: str, kind: str) -> Any:
-        if name not in bodies:
+        if not isinstance(name, str) or name not in bodies:
             raise SceneError(f"no {kind} {name!r}; there are: {', '.join(bodies) or 'none'}")
         return bodies[name]
 

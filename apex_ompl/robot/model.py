@@ -18,7 +18,7 @@ from apex_ompl.robot.config import Hand, RobotConfig, read_config, read_disabled
 from apex_ompl.robot.geometry import check_geometry, pair_up
 from apex_ompl.scene.bodies import Body
 from apex_ompl.types import Array
-from apex_ompl.util.validation import shape_error
+from apex_ompl.util.validation import number_array, shape_error
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ class Robot:
         Raises:
             ParameterError: The number of joint values differs from ``dof``.
         """
-        q = np.asarray(q, dtype=float)
+        q = number_array(q, "state")
         if q.ndim == 0 or q.shape[-1] != len(self._order):
             raise shape_error(q, ("...", len(self._order)), "state")
         return q[..., self._order]
@@ -102,12 +102,17 @@ class Robot:
         Raises:
             UnknownNameError: No such link.
         """
-        if not self.model.existBodyName(link):
+        if not isinstance(link, str) or not self.model.existBodyName(link):
             raise UnknownNameError("link", link, self.link_names)
         return int(self.model.getFrameId(link, pin.FrameType.BODY))
 
     def link_pose(self, q: Array, link: str) -> Array:
-        """Return the pose of a link in the world at state ``q``, shape (4, 4) [m]."""
+        """Return the pose of a link in the world at state ``q``, shape (4, 4) [m].
+
+        Raises:
+            UnknownNameError: No such link.
+            ParameterError: The state has another shape.
+        """
         frame = self.link_frame(link)
         data = self.model.createData()
         pin.framesForwardKinematics(self.model, data, self.to_pinocchio(q))
@@ -148,7 +153,7 @@ class Robot:
 
     def limit_fault(self, q: Array) -> str | None:
         """Return a sentence on the first joint of ``q`` outside its limits, or None when all are inside."""
-        q = np.asarray(q, dtype=float)
+        q = number_array(q, "state")
         if q.shape != (self.dof,):
             return f"the state has shape {q.shape}, expected ({self.dof},)"
         low, high = self.limits.lower, self.limits.upper

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from apex_ompl.errors import FileFormatError, ParameterError
 from apex_ompl.types import Array
 from apex_ompl.util.files import BROKEN
-from apex_ompl.util.validation import check_array, finite_array
+from apex_ompl.util.validation import check_array, check_integer, finite_array, number_array, rigid_pose
 
 LARGEST = 1e4  # larger coordinates are errors [m]
 PCD_TYPES = {"F": "f", "I": "i", "U": "u"}
@@ -127,24 +127,23 @@ def points_from_depth(
     Args:
         depth: Depths, shape (rows, columns) [m].
         intrinsics: Focal lengths fx, fy and principal point cx, cy [pixels].
-        pose: Pose of the optical frame in the world, shape (4, 4) [m].
+        pose: Pose of the optical frame in the world, shape (4, 4) [m]: a rotation and a translation.
         stride: Every how many rows and columns are taken.
         range: Least and largest depth that is taken [m].
 
     Raises:
-        ParameterError: An argument has another shape, or is out of its range.
+        ParameterError: An argument has another shape, is out of its range, or has masked numbers, which a NaN can stand
+            for; the pose is not rigid.
     """
-    image = np.asarray(depth, float)
+    image = number_array(depth, "depth")
     if image.ndim != 2:
         raise ParameterError("depth", image.shape, "an image of shape (rows, columns)")
-    camera, placement = finite_array(intrinsics, "intrinsics"), finite_array(pose, "pose")
+    camera, placement = finite_array(intrinsics, "intrinsics"), rigid_pose(pose, "pose")
     check_array(camera, (4,), "intrinsics")
-    check_array(placement, (4, 4), "pose")
     focal_x, focal_y, centre_x, centre_y = camera.tolist()
     if not (focal_x > 0.0 and focal_y > 0.0):
         raise ParameterError("intrinsics", (focal_x, focal_y), "positive focal lengths")
-    if isinstance(stride, bool) or not isinstance(stride, (int, np.integer)) or stride < 1:
-        raise ParameterError("stride", stride, "a whole number from 1")
+    check_integer(stride, "stride", 1)
     ends = finite_array(range, "range")
     check_array(ends, (2,), "range")
     near, far = ends.tolist()

@@ -17,7 +17,7 @@ from pydantic import BeforeValidator, Field, PositiveFloat, PrivateAttr, field_v
 from apex_ompl.errors import FileFormatError, nearest_name
 from apex_ompl.scene.bodies import AttachedObject, Name, Obstacle, Quaternion, Vector, located
 from apex_ompl.types import Array
-from apex_ompl.util.files import write_atomically
+from apex_ompl.util.files import path_text, write_atomically
 from apex_ompl.util.schema import StrictModel, dump_yaml, read_yaml, validate
 
 SCHEMA = "apex-ompl/problem/1"
@@ -238,7 +238,7 @@ class Problem(StrictModel):
             MissingFileError: The file, or a mesh that it names, cannot be read.
             FileFormatError: The file does not follow the schema; the message names the field.
         """
-        path = Path(path)
+        path = Path(path_text(path))
         data = read_yaml(path, "problem file")
         if data.get("schema") != SCHEMA:
             raise FileFormatError(str(path), "schema", data.get("schema"), f"expected {SCHEMA!r}")
@@ -261,7 +261,7 @@ class Problem(StrictModel):
         Raises:
             MissingFileError: The folder is missing or cannot be written.
         """
-        write_atomically(Path(path), self.to_yaml().encode())
+        write_atomically(Path(path_text(path)), self.to_yaml().encode())
 
     def to_yaml(self) -> str:
         """Return the YAML text of the problem."""

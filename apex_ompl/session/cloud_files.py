@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from apex_ompl.errors import ParameterError
 from apex_ompl.types import Array
-from apex_ompl.util.files import write_atomically
+from apex_ompl.util.files import path_text, write_atomically
 from apex_ompl.util.validation import finite_array
 
 KEPT = 8  # temporary files that no obstacle has any more
@@ -35,9 +35,10 @@ class CloudFiles:
             ParameterError: The file is no ``.npy``.
         """
         if file is not None:
-            if Path(file).suffix != ".npy":
+            given = Path(path_text(file, "file"))
+            if given.suffix != ".npy":
                 raise ParameterError("file", str(file), "a file name ending in .npy")
-            return Path(file)
+            return given
         if self._folder is None:
             self._folder = tempfile.TemporaryDirectory(prefix="apex_ompl-")
         self._count += 1

@@ -171,8 +171,9 @@ class World:
                 taken = self._obstacle(held)
                 held = self._as_held(taken, link, finite_array(at, "at"))
             wanted = self._read(AttachedObject, held, "held object")
-            changes = {"link": link, "touch_links": None if touch_links is None else tuple(touch_links)}
-            wanted = wanted.model_copy(update={key: value for key, value in changes.items() if value is not None})
+            changes = {"link": link, "touch_links": touch_links}
+            if given := {key: value for key, value in changes.items() if value is not None}:
+                wanted = validate(AttachedObject, wanted.model_dump(exclude_none=True) | given, "held object")
             pairs = [] if taken is None else [pair for pair in self.allowed if taken.name in pair]
             if taken is not None:
                 self._checker.remove(taken.name)
@@ -196,7 +197,7 @@ class World:
             SceneError: There is no such held object.
         """
         with self._lock:
-            held, left = self.held.get(name), []
+            held, left = self.held.get(name) if isinstance(name, str) else None, []
             if at is not None and held is not None:
                 pose = self._checker.robot.link_pose(finite_array(at, "at"), held.link) @ held.pose
                 shape = held.model_dump(exclude_none=True, exclude={"link", "touch_links", "contact"})

@@ -47,7 +47,10 @@ def allowed_pairs(
         expected = f"expected {len(entries)} rows of {len(entries)} values, one for each of entry_names"
         raise reader.fail(f"{MATRIX}.entry_values", len(rows), expected)
     flags = [
-        [reader.flag(value, f"{MATRIX}.entry_values.{k}.{j} ({entries[k]}, {entries[j]})") for j, value in enumerate(row)]
+        [
+            reader.flag(value, f"{MATRIX}.entry_values.{k}.{j} ({entries[k]}, {entries[j]})")
+            for j, value in enumerate(row)
+        ]
         for k, row in enumerate(rows)
     ]
     defaults = [str(name) for name in reader.entries(matrix, "default_entry_names", MATRIX)]
