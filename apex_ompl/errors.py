@@ -25,7 +25,7 @@ def _rebuilt(kind: type[ApexError], args: tuple[Any, ...], attributes: dict[str,
     return error
 
 
-def nearest_name(name: str, known: Iterable[str]) -> str | None:
+def nearest_name(name: object, known: Iterable[str]) -> str | None:
     """Return the known name most like ``name``, or None when none is close or it is no text."""
     if not isinstance(name, str):
         return None

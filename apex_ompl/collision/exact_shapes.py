@@ -158,8 +158,8 @@ def _edges(hull: coal.ConvexBase) -> tuple[NDArray[np.int64], NDArray[np.int64]]
 def _depth(hull: coal.CollisionGeometry, corners: Array) -> float:
     """Return the largest depth of a triangle's centre below the faces of a hull [m], of many triangles that of some.
 
-    Those that lie on the hull, seen by their own planes, are left out: compared with all faces, each of the triangles of
-    a convex mesh would take as long as there are triangles.
+    Those that lie on the hull, seen by their own planes, are left out: comparing all triangles of a convex mesh with
+    all faces takes the square of their number.
     """
     corners = corners[~_on_hull(hull, corners)]
     normals, offsets = hull_planes(hull)

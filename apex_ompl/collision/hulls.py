@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 
 from apex_ompl.collision.shapes import is_shell, is_surface
 from apex_ompl.kernel.compiled.farthest_points import farthest_points
+from apex_ompl.scene.meshes import FLAT
 from apex_ompl.types import Array
 from apex_ompl.util.boxes import bounding_box
 from apex_ompl.util.weak_cache import weakly_cached
 
-THICKNESS = 1e-6  # by which hulls of surfaces are larger [m]
+THICKNESS = 1e-6  # by which hulls of surfaces are larger; of those longer than 1 m as much by their length [m]
 DIRECTIONS = (400, 60)  # in which hulls of too many vertices are sampled; fewer where Coal takes no more
 CELLS = 24  # along the longest side of a grid over vertices
 MOST_VERTICES = 50_000  # of a mesh whose hull is not sampled
@@ -39,7 +40,9 @@ def convex_hull(geometry: coal.CollisionGeometry) -> coal.CollisionGeometry:
 def _hull_of_mesh(mesh: coal.BVHModelBase) -> coal.Convex:
     vertices = np.array(mesh.vertices())
     if is_surface(mesh):
-        low, high = vertices.min(axis=0) - THICKNESS, vertices.max(axis=0) + THICKNESS
+        low, high = bounding_box(vertices)
+        room = max(THICKNESS, FLAT * float((high - low).max()))
+        low, high = low - room, high + room
         return _hull_of(np.array(list(product(*np.stack([low, high], axis=1)))))
     if len(vertices) > MOST_VERTICES:
         return _larger_hull(vertices)
@@ -110,7 +113,8 @@ def below_support(normals: Array, corners: Array, points: Array) -> Array:
         corners: Corners of the body, shape (P, 3) [m].
         points: Shape (N, 3) [m].
     """
-    return farthest(normals, corners)[1] - np.asarray(np.einsum("ij,ij->i", normals, points))
+    depths: Array = farthest(normals, corners)[1] - np.einsum("ij,ij->i", normals, points)
+    return depths
 
 
 def farthest(directions: Array, points: Array) -> tuple[NDArray[np.intp], Array]:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from apex_ompl.errors import FileFormatError, RobotError, UnknownNameError
 from apex_ompl.robot.assets import DATA, resolve
 from apex_ompl.robot.compose import compose
-from apex_ompl.robot.config import Hand, RobotConfig, read_config, read_disabled_pairs
+from apex_ompl.robot.config import WIDEST, Hand, RobotConfig, read_config, read_disabled_pairs
 from apex_ompl.robot.geometry import check_geometry, pair_up
 from apex_ompl.scene.bodies import Body
 from apex_ompl.types import Array
@@ -274,5 +274,8 @@ def _limits(config: RobotConfig, model: pin.Model, path: Path) -> Limits:
         if not (np.isfinite([low, high, speed]).all() and low < high and speed > 0):
             expected = "expected finite limits with lower < upper and velocity > 0"
             raise FileFormatError(str(path), f"joints.{name}", [low, high, speed], expected)
+        low, high = max(low, -WIDEST), min(high, WIDEST)
+        if not low < high:
+            raise FileFormatError(str(path), f"joints.{name}", [low, high], f"expected limits within {WIDEST:g}")
         rows.append((low, high, speed, joint.acceleration, joint.jerk))
     return Limits(*(np.array(column, float) for column in zip(*rows, strict=True)))

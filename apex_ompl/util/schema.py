@@ -38,7 +38,7 @@ def _strict(schema: Any) -> Any:
     if kind == "bool":
         return schema | {"strict": True}
     if kind in ("float", "int"):
-        return core_schema.no_info_before_validator_function(_number, schema)  # type: ignore[arg-type]
+        return core_schema.no_info_before_validator_function(_number, schema)
     return {key: inner if key in ("metadata", "config") else _strict(inner) for key, inner in schema.items()}
 
 

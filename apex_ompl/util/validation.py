@@ -87,7 +87,7 @@ def _shown(bound: float) -> str:
     return str(bound) if isinstance(bound, int) else f"{bound:g}"
 
 
-def number_array(given: ArrayLike, name: str, expected: str = "numbers") -> Array:
+def number_array(given: Any, name: str, expected: str = "numbers") -> Array:
     """Return real numbers as an array of floats, the same array where it is one; NaN and infinity are numbers.
 
     NumPy alone takes the numbers below a mask, which are not known, the real part of complex numbers, texts, and True.
@@ -190,7 +190,7 @@ def check_array(array: Array, shape: Sequence[int | str], name: str, *, finite: 
 
 
 RIGID = 1e-3
-"""How far the entries of R^T R may be from those of the identity for a rotation matrix R; single precision gives 1e-6."""
+"""How far the entries of R^T R may be from those of the identity for a rotation matrix R."""
 
 
 def rigid_pose(given: ArrayLike, name: str) -> Array:
