@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from apex_ompl.collision.clouds import PointCloud, cloud_geometry
 from apex_ompl.errors import FileFormatError
 from apex_ompl.kernel.distance_grid import grid_of_triangles_beside
-from apex_ompl.scene.bodies import Body, GridFile, MeshFile, PointFile
+from apex_ompl.scene.bodies import Body, BodyT, GridFile, MeshFile, PointFile, file_shape, located
 from apex_ompl.scene.grids import parse_surface
 from apex_ompl.scene.mesh_files import read_mesh
 from apex_ompl.scene.meshes import (
@@ -64,9 +64,39 @@ def coal_geometry(body: Body) -> coal.CollisionGeometry:
         return coal.Capsule(body.capsule.radius, body.capsule.length)
     if body.half_space is not None:
         return _half_space(np.asarray(body.half_space.normal, float), body.half_space.offset)
-    shape = body.mesh or body.points or body.voxels or body.distance_grid
+    shape = file_shape(body)
     assert shape is not None
-    return _load(body.name, shape)
+    return _as_read(shape) or _load(body.name, shape)
+
+
+@weakly_cached
+def _as_read(_: MeshFile | PointFile | GridFile) -> coal.CollisionGeometry | None:
+    """Return what was read of the file of a body by :func:`with_file_read`, None for others."""
+    return None
+
+
+def with_file_read(body: BodyT) -> BodyT:
+    """Return a body whose record keeps what its file holds now, and names it by an absolute path.
+
+    The file is not read again for this record, nor for others that are made from it: it may change or be gone.
+
+    Raises:
+        MissingFileError: The file cannot be read.
+        FileFormatError: The file holds no solid.
+    """
+    shape = file_shape(body)
+    if shape is None or _as_read(shape) is not None:
+        return body
+    body = located(body, Path())
+    shape = file_shape(body)
+    _as_read.keep(shape, _load(body.name, shape)) if shape is not None else None
+    return body
+
+
+def with_file_unread(body: BodyT) -> BodyT:
+    """Return a body whose file is read anew when it is needed."""
+    shape = file_shape(body)
+    return body if shape is None else body.model_copy(update={body.shape: shape.model_copy()})
 
 
 def world_geometry(body: Body) -> tuple[coal.CollisionGeometry, Array]:

@@ -7,6 +7,7 @@ closed]; lengths are in metres, the world has z up, quaternions are ordered xyzw
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -179,10 +180,10 @@ class Problem(StrictModel):
 
     @model_validator(mode="after")
     def _unique_names(self) -> Self:
-        names = [body.name for body in (*self.scene, *self.attached)]
-        twice = sorted({n for n in names if names.count(n) > 1})
-        if twice:
-            raise ValueError(f"the name {twice[0]!r} is given to more than one object")
+        counts = Counter(body.name for body in (*self.scene, *self.attached))
+        twice = min((name for name, count in counts.items() if count > 1), default=None)
+        if twice is not None:
+            raise ValueError(f"the name {twice!r} is given to more than one object")
         return self
 
     _file: str = PrivateAttr("")
