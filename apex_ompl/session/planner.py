@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import threading
 import time
 from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass
@@ -81,9 +83,10 @@ class MotionPlanner:
             ApexError: The robot is unknown, or one of its files is faulty.
         """
         self.robot = robot if isinstance(robot, Robot) else load_robot(robot)
-        self.robot_file = self.robot.name if isinstance(robot, Robot) else str(robot)
+        file = self.robot.name if isinstance(robot, Robot) else str(robot)
+        self.robot_file = os.path.abspath(file) if file.endswith((".yaml", ".yml")) else file
         self.model = model
-        self.world = World(CollisionChecker(self.robot), self.robot_file)
+        self.world = World(CollisionChecker(self.robot), threading.RLock(), self.robot_file)
         self._set_up()
 
     def _set_up(self) -> None:

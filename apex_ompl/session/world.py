@@ -38,30 +38,34 @@ class World:
         robot_file: Name or file of the robot.
     """
 
-    def __init__(self, checker: CollisionChecker, robot_file: str) -> None:
-        """Edit the scene of ``checker``, whose robot is found by its name or file in other processes."""
-        self._set_up(checker, robot_file)
+    def __init__(self, checker: CollisionChecker, lock: threading.RLock, robot_file: str = "") -> None:
+        """Edit the scene of ``checker`` while ``lock`` is held.
 
-    def _set_up(self, checker: CollisionChecker, robot_file: str) -> None:
-        self.checker, self.robot_file = checker, robot_file
-        self.lock = threading.RLock()
+        Args:
+            checker: The checker.
+            lock: The lock.
+            robot_file: What other processes find the robot by; its name by default.
+        """
+        self.checker, self.lock = checker, lock
+        self.robot_file = robot_file or checker.robot.name
         self._clouds = CloudFiles()
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what another process needs to make the same world; it reads the files of meshes and points anew."""
-        with self.lock:
-            bodies = tuple(self.obstacles.values()), tuple(self.held.values()), self.allowed
-        return {"robot": self.robot_file, "bodies": bodies}
+        return {"robot": self.robot_file, "bodies": self._bodies()}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Make the world anew."""
-        self._set_up(CollisionChecker(load_robot(state["robot"]), *state["bodies"]), state["robot"])
+        checker = CollisionChecker(load_robot(state["robot"]), *state["bodies"])
+        self.__init__(checker, threading.RLock(), state["robot"])  # type: ignore[misc]
 
     def __deepcopy__(self, memo: dict[int, Any]) -> World:
         """Return a world of its own with the same bodies, whose records do not change; no file is read."""
+        return World(CollisionChecker(self.checker.robot, *self._bodies()), threading.RLock(), self.robot_file)
+
+    def _bodies(self) -> tuple[tuple[Obstacle, ...], tuple[AttachedObject, ...], tuple[tuple[str, str], ...]]:
         with self.lock:
-            bodies = tuple(self.obstacles.values()), tuple(self.held.values()), self.allowed
-            return World(CollisionChecker(self.checker.robot, *bodies), self.robot_file)
+            return tuple(self.obstacles.values()), tuple(self.held.values()), self.allowed
 
     @property
     def obstacles(self) -> Mapping[str, Obstacle]:
