@@ -197,6 +197,20 @@ def load_robot(name_or_path: str | Path, relative_to: Path | None = None) -> Rob
     return build_robot(read_config(path), path)
 
 
+def bare_robot(name_or_path: str) -> tuple[Robot, RobotConfig, Path]:
+    """Return a robot without its files of disabled pairs and covers, which may still be to be made, and its own file.
+
+    Args:
+        name_or_path: A name out of :func:`robot_names`, or the path of a robot file.
+
+    Raises:
+        ApexError: As :func:`load_robot`.
+    """
+    path = DATA / f"{name_or_path}.robot.yaml" if name_or_path in robot_names() else Path(name_or_path).resolve()
+    config = read_config(path)
+    return build_robot(config.model_copy(update={"disabled_pairs": None, "covers": None}), path), config, path
+
+
 @cache
 def _shipped_robot(name: str) -> Robot:
     path = DATA / f"{name}.robot.yaml"
