@@ -14,7 +14,7 @@ import pinocchio as pin
 from apex_ompl.errors import MissingFileError, RobotError
 from apex_ompl.robot.assets import resolve
 from apex_ompl.robot.config import Part, RobotConfig
-from apex_ompl.robot.urdf_checks import check_urdf, numbers
+from apex_ompl.robot.urdf_checks import LIMITED, check_urdf, numbers
 from apex_ompl.scene.bodies import pose_matrix
 from apex_ompl.scene.mesh_files import UPRIGHT, collada_asset
 from apex_ompl.types import Array
@@ -68,7 +68,8 @@ def compose(config: RobotConfig, folder: Path) -> Composition:
             _locate_meshes(element, (urdf.parent, folder), part)
             if element.tag == "link":
                 names.append(element.get("name", ""))
-            for limit in element.findall("limit"):  # 0 by the specification; the parser asks for both
+            for limit in element.findall("limit") if element.get("type") in LIMITED else ():
+                # 0 by the specification; the parser asks for both.
                 limit.attrib.setdefault("lower", "0")
                 limit.attrib.setdefault("upper", "0")
             root.append(element)

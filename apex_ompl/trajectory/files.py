@@ -82,12 +82,8 @@ def decode(path: Path) -> tuple[Array, list[Array], tuple[str, ...]]:
     try:
         if suffix == ".npz":
             with np.load(io.BytesIO(read_file(path, ROLE)), allow_pickle=False) as archive:
-                states = [number_array(archive[name], name) for name in STATES]
-                return (
-                    number_array(archive["times"], "times"),
-                    states,
-                    tuple(str(name) for name in archive["joint_names"]),
-                )
+                times, *states = (number_array(archive[name], name) for name in ("times", *STATES))
+                return times, states, tuple(str(name) for name in archive["joint_names"])
         if suffix == ".csv":
             return _from_table(read_text(path, ROLE))
         return _from_messages((read_json if suffix == ".traj.json" else read_yaml)(path, ROLE))
