@@ -80,7 +80,7 @@ def _stl_text(content: bytes) -> Array:
     if closed != facets or len(corners) != 3 * facets:
         raise ValueError(f"{facets} facets with {closed} ends and {len(corners)} corners: it is cut off or damaged")
     if ended != solids:
-        raise ValueError(f"{facets} facets, but no 'endsolid' behind the last: it is cut off")
+        raise ValueError(f"{facets} facets, but no 'endsolid' after the last: it is cut off")
     return np.array(corners, float).reshape(-1, 3, 3)
 
 

@@ -67,7 +67,7 @@ def fans(faces: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def _head(content: bytes) -> tuple[str, list[Element], int]:
-    """Return the byte order, empty for text, the elements, and the place behind the head of a file."""
+    """Return the byte order, empty for text, the elements, and the place after the head of a file."""
     order, elements, at = None, list[Element](), 0
     if not content.startswith(b"ply"):
         raise ValueError("no line 'ply' at the beginning")
@@ -98,7 +98,7 @@ def _cut_off(element: Element, found: int) -> ValueError:
 
 
 def _ascii(element: Element, words: list[bytes]) -> tuple[dict[str, Any], list[bytes]]:
-    """Return the columns of an element of a text, and the words behind it."""
+    """Return the columns of an element of a text, and the words after it."""
     if not any(one.length for one in element.properties):
         width = len(element.properties)
         if len(words) < element.count * width:
@@ -121,7 +121,7 @@ def _ascii(element: Element, words: list[bytes]) -> tuple[dict[str, Any], list[b
 
 
 def _binary(element: Element, body: bytes, order: str) -> tuple[dict[str, Any], bytes]:
-    """Return the columns of an element of binary data, and what is behind it; lists by their lengths.
+    """Return the columns of an element of binary data, and what comes after it; lists by their lengths.
 
     Rows whose lists are as long as those of the row before are read at once, twice as many each time.
     """
