@@ -323,7 +323,7 @@ def test_what_mimics_a_locked_joint_stays_where_that_puts_it(tmp_path: Path) -> 
     path = write_arm(
         tmp_path, mimic='<mimic joint="shoulder" multiplier="-2" offset="0.5"/>', locked="locked: {shoulder: 0.1}\n"
     )
-    with pytest.raises(FileFormatError, match="'shoulder' is planned .* and held"):
+    with pytest.raises(FileFormatError, match="locked: expected joints that are not planned .*, got 'shoulder'"):
         load_robot(path)
     text = (tmp_path / "small.urdf").read_text()
     extra = '<link name="hand"/><joint name="wrist" type="revolute"><parent link="end"/><child link="hand"/>'

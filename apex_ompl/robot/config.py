@@ -107,9 +107,6 @@ class RobotConfig(StrictModel):
 
     @model_validator(mode="after")
     def _known_joints(self) -> Self:
-        for name in self.locked:
-            if name in self.joints:
-                raise ValueError(f"the joint {name!r} is planned (joints) and held (locked), expected one of the two")
         for group, names in self.groups.items():
             for name in names:
                 if name not in self.joints:

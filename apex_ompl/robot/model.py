@@ -224,6 +224,9 @@ def build_robot(config: RobotConfig, path: Path) -> Robot:
         MissingFileError: A URDF, an SRDF or a collision mesh is missing.
         RobotError: The description cannot be made into a robot.
     """
+    both = next((name for name in config.locked if name in config.joints), None)
+    if both is not None:
+        raise FileFormatError(str(path), "locked", both, "expected joints that are not planned (joints)")
     composition = compose(config, path.parent)
     try:
         model = pin.buildModelFromXML(composition.urdf, mimic=True)
