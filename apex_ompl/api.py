@@ -17,7 +17,7 @@ from apex_ompl.result import PlanResult
 from apex_ompl.scene.problem import Problem
 from apex_ompl.session import check_arguments, kept_planner
 from apex_ompl.trajectory import Timing
-from apex_ompl.util.files import is_file
+from apex_ompl.util.files import is_file, path_text
 
 
 def load_problem(name_or_path: str | os.PathLike[str]) -> Problem:
@@ -25,11 +25,11 @@ def load_problem(name_or_path: str | os.PathLike[str]) -> Problem:
 
     Raises:
         UnknownNameError: No problem of that name, or no such suite or level; the message lists the known ones.
-        ParameterError: No such seed, or the rest of an id is no level and seed.
+        ParameterError: No such seed, the rest of an id is no level and seed, or neither a name nor a path is given.
         MissingFileError: The file, or one that it names, cannot be read.
         FileFormatError: The file does not follow the schema.
     """
-    text = os.fspath(name_or_path)
+    text = path_text(name_or_path, "problem")
     if problems.is_id(text):
         return problems.load(text)
     if is_file(Path(text)) or text.endswith((".yaml", ".yml")):

@@ -22,7 +22,7 @@ from apex_ompl.trajopt.path import Path
 from apex_ompl.trajopt.spline import Spline
 from apex_ompl.types import Array
 from apex_ompl.util.archives import pack_archive, read_archive
-from apex_ompl.util.files import BROKEN, suffix_of, write_atomically
+from apex_ompl.util.files import BROKEN, path_text, suffix_of, write_atomically
 from apex_ompl.util.schema import dump_yaml, read_json, read_yaml
 from apex_ompl.util.validation import finite_array, finite_numbers
 
@@ -175,7 +175,7 @@ class PlanResult:
             ParameterError: Another suffix, or nothing of the kind in the result.
             MissingFileError: The folder is missing or cannot be written.
         """
-        path = pathlib.Path(path)
+        path = pathlib.Path(path_text(path))
         suffix = suffix_of(path, SUFFIXES)
         if self.trajectory is not None and suffix in (*MESSAGES, ".csv"):
             self.trajectory.save(path)
@@ -191,7 +191,7 @@ class PlanResult:
             FileFormatError: It is not a saved result.
             ParameterError: It has another suffix; a .csv holds no problem.
         """
-        path = pathlib.Path(path)
+        path = pathlib.Path(path_text(path))
         suffixes = tuple(s for s in SUFFIXES if s not in (*MESSAGES, ".csv"))
         if path.suffix not in suffixes or path.name.endswith(MESSAGES):
             raise ParameterError("result file", str(path), f"a file name ending in {', '.join(suffixes)}")

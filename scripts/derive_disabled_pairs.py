@@ -16,19 +16,21 @@ Usage: python scripts/derive_disabled_pairs.py dual_panda_softhand --soft left_h
 from __future__ import annotations
 
 import argparse
+import json
 from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
 
 from apex_ompl.collision.hulls import convex_hull
+from apex_ompl.errors import UnknownNameError
 from apex_ompl.robot import Robot
-from apex_ompl.robot.assets import DATA
-from apex_ompl.robot.config import PAIRS_SCHEMA, RobotConfig, read_config
+from apex_ompl.robot.config import PAIRS_SCHEMA, RobotConfig
 from apex_ompl.robot.geometry import link_of
-from apex_ompl.robot.model import build_robot
+from apex_ompl.robot.model import bare_robot
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.files import write_atomically
+from apex_ompl.util.schema import yaml_value
 from apex_ompl.util.validation import one_or_more, whole_number
 
 
@@ -70,13 +72,13 @@ class PairModel:
         """Return which pairs collide by the meshes, shape (pairs,)."""
         q = self.robot.to_pinocchio(q)
         pin.computeCollisions(self.robot.model, self.data, self.meshes, self.mesh_data, q, False)
-        return np.array([r.isCollision() for r in self.mesh_data.collisionResults])
+        return np.array([r.isCollision() for r in self.mesh_data.collisionResults], bool)
 
     def distances(self, q: np.ndarray) -> np.ndarray:
         """Return the signed distances of all pairs between convex hulls, shape (pairs,) [m]."""
         q = self.robot.to_pinocchio(q)
         pin.computeDistances(self.robot.model, self.data, self.hulls, self.hull_data, q)
-        return np.array([r.min_distance for r in self.hull_data.distanceResults])
+        return np.array([r.min_distance for r in self.hull_data.distanceResults], float)
 
 
 def sweep_soft(robot: Robot, pairs: list[tuple[int, int]]) -> list[str]:
@@ -132,6 +134,11 @@ def derive(
     return reasons
 
 
+def as_yaml(name: str) -> str:
+    """Return a name as YAML reads it, in quotes where it would be a number or a truth value without them."""
+    return name if yaml_value(name) == name else json.dumps(name)
+
+
 def main() -> None:
     """Derive and write the pairs of one robot."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -141,10 +148,10 @@ def main() -> None:
     parser.add_argument("--margin", type=float, default=0.02, help="metres")
     parser.add_argument("--seed", type=whole_number, default=0)
     args = parser.parse_args()
-    ships = DATA / f"{args.robot}.robot.yaml"
-    path = ships if ships.is_file() else Path(args.robot).resolve()
-    config = read_config(path)
-    robot = build_robot(config.model_copy(update={"disabled_pairs": None}), path)
+    robot, config, path = bare_robot(args.robot)
+    unknown = sorted({*args.soft} - {*robot.part_links})
+    if unknown:
+        raise UnknownNameError("part", unknown[0], robot.part_links)
     items = robot.geometry.geometryObjects
     pairs = candidates(robot, config)
     parts = {p: tuple(robot.part_of(link_of(robot.model, items[i])) for i in p) for p in pairs}
@@ -159,7 +166,7 @@ def main() -> None:
             rows.append({"links": links, "reason": reasons[pair]})
     rows.sort(key=lambda row: row["links"])
     lines = [f"schema: {PAIRS_SCHEMA}", f"# made by scripts/derive_disabled_pairs.py, seed {args.seed}", "pairs:"]
-    lines += [f'  - {{links: [{", ".join(r["links"])}], reason: "{r["reason"]}"}}' for r in rows]
+    lines += [f'  - {{links: [{", ".join(map(as_yaml, r["links"]))}], reason: "{r["reason"]}"}}' for r in rows]
     target = path.parent / (config.disabled_pairs or f"{path.name.split('.')[0]}.pairs.yaml")
     write_atomically(Path(target), ("\n".join(lines) + "\n").encode())
     print(f"{len(rows)} of {len(pairs)} pairs disabled -> {target}")

@@ -4,7 +4,10 @@ Prints per shape the balls of each level (the root first, leaves last), the volu
 solid, and how far the surface of the leaves is from the solid. With ``--tolerances`` it writes nothing, and prints
 how many leaves each gap takes instead.
 
+The file is the one that the robot's file names as ``covers``; without one, NAME.spheres.json beside it.
+
 Usage: python scripts/make_covers.py dual_panda_softhand [--gaps 0.02 0.007 0.0025] [-o FILE]
+       python scripts/make_covers.py my.robot.yaml    (name the file as ``covers`` in it then)
 """
 
 from __future__ import annotations
@@ -17,16 +20,16 @@ import coal
 import numpy as np
 
 from apex_ompl.collision.cover.spheres import GAPS, Cover, make_cover, quality, shape_key, unproved, write_covers
-from apex_ompl.robot import load_robot
-from apex_ompl.robot.assets import DATA
+from apex_ompl.robot import Robot
+from apex_ompl.robot.model import bare_robot
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.files import check_writable
 
 
-def shapes_of(robot: str) -> dict[str, tuple[list[str], coal.CollisionGeometry]]:
+def shapes_of(robot: Robot) -> dict[str, tuple[list[str], coal.CollisionGeometry]]:
     """Return shape key -> names of the links' geometry objects with that shape, and the shape."""
     shapes: dict[str, tuple[list[str], coal.CollisionGeometry]] = {}
-    for item in load_robot(robot).geometry.geometryObjects:
+    for item in robot.geometry.geometryObjects:
         shapes.setdefault(shape_key(item.geometry), ([], item.geometry))[0].append(item.name)
     return shapes
 
@@ -44,21 +47,22 @@ def row(name: str, geometry: coal.CollisionGeometry, cover: Cover, seconds: floa
 def main() -> None:
     """Make and write the covers of one robot."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("robot")
+    parser.add_argument("robot", help="one that ships, by name, or a robot file")
     parser.add_argument("--gaps", type=float, nargs="+", default=list(GAPS), help="metres, descending")
     parser.add_argument("--tolerances", type=float, nargs="+", help="metres: only compare these gaps")
     parser.add_argument("--only", default="", help="only shapes of links whose names contain this, with --tolerances")
     parser.add_argument("--effort", type=int, default=3, choices=(1, 2, 3), help="how thorough the search is")
     parser.add_argument("-o", "--output", type=Path)
     args = parser.parse_args()
-    output = args.output or DATA / f"{args.robot}.spheres.json"
+    robot, config, path = bare_robot(args.robot)
+    output = args.output or path.parent / (config.covers or f"{path.name.split('.')[0]}.spheres.json")
     if not args.tolerances:
         check_writable(output)
     covers = {}
     print(
         f"{'shape':44s} {'levels':12s} {'leaves':>6s}  {'volume':>6s}  {'mean mm':>7s}  {'max mm':>7s}  {'seconds':>7s}"
     )
-    for key, (names, geometry) in shapes_of(args.robot).items():
+    for key, (names, geometry) in shapes_of(robot).items():
         label = names[0] + (f" and {len(names) - 1} more" if len(names) > 1 else "")
         if args.tolerances:
             for gap in args.tolerances if any(args.only in name for name in names) else ():

@@ -171,3 +171,16 @@ def test_moveits_matrix_is_read(robot: Robot) -> None:
         read(broken, [])
     with pytest.raises(FileFormatError, match="default_entry_values"):
         read({"default_entry_names": ["a"]}, [])
+
+
+@pytest.mark.parametrize("value", ["false", "true", 0, 1, None])
+@pytest.mark.parametrize("key", ["entry_values", "default_entry_values"])
+def test_what_is_neither_true_nor_false_allows_nothing(robot: Robot, key: str, value: object) -> None:
+    data = matrix(["box", "left_hand_palm"], [], box=False)
+    if key == "entry_values":
+        data[key][0]["enabled"][1] = value
+    else:
+        data[key][0] = value
+    entry = r"0\.1 \(box, left_hand_palm\)" if key == "entry_values" else r"0 \(box\)"
+    with pytest.raises(FileFormatError, match=rf"{key}\.{entry}: expected true or false, got {value!r}"):
+        allowed_pairs(MessageReader(Path("scene.yaml")), data, robot, ["box"], {})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import os
 from pathlib import Path
 
 import coal
@@ -26,6 +27,7 @@ from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import AttachedObject, Obstacle
 from apex_ompl.scene.meshes import triangles, winding_number
 from apex_ompl.scene.points import parse_points
+from apex_ompl.session.cloud_files import CloudFiles
 
 
 def cloud_file(folder: Path, points: np.ndarray) -> str:
@@ -248,6 +250,30 @@ def test_clouds_of_a_world_are_replaced(robot: Robot, tmp_path: Path) -> None:
     del planner, world
     gc.collect()
     assert not folder.exists()
+
+
+def test_a_forked_process_leaves_the_clouds_of_its_parent() -> None:
+    files, point = CloudFiles(), np.zeros((1, 3))
+    first = files.path(None)
+    files.write(point, first, ())
+    read, write = os.pipe()
+    if (child := os.fork()) == 0:
+        try:
+            own = files.path(None)
+            files.write(point, own, ())
+            os.write(write, f"{own} {own.exists()}".encode())
+            del files  # as at the end of the process
+            gc.collect()
+        finally:
+            os._exit(0)
+    os.waitpid(child, 0)
+    own, written = os.read(read, 1000).decode().split()
+    assert written == "True" and Path(own).parent != first.parent and not Path(own).parent.exists()
+    assert first.exists()
+    files.write(point, files.path(None), ())
+    del files
+    gc.collect()
+    assert not first.parent.exists()
 
 
 def test_depth_images_become_points() -> None:

@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
+from itertools import product
 from pathlib import Path
 
-import coal
 import numpy as np
 import pytest
 import trimesh
+from geometry_files import bumpy_sphere
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support import CUBE_OBJ
 
-from apex_ompl.collision import CollisionChecker
-from apex_ompl.collision.hulls import _farthest, convex_hull, hull_planes
-from apex_ompl.collision.shapes import coal_geometry, mesh_note
+from apex_ompl.collision import CollisionChecker, exact_shapes
+from apex_ompl.collision.hulls import convex_hull, farthest, hull_planes
+from apex_ompl.collision.shapes import coal_geometry, mesh_geometry, mesh_note
 from apex_ompl.errors import FileFormatError
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import Obstacle
-from apex_ompl.scene.meshes import binary_stl
 
 FLAT = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\nf 1 2 3\nf 2 4 3\n"
 
@@ -34,7 +34,7 @@ FLIPPED = CUBE_OBJ.replace("f 1 3 2", "f 1 2 3")
         (CUBE_OBJ.replace("v 1 1 1", "v nan 1 1"), "not finite"),
         (CUBE_OBJ.replace("v 1 1 1", "v 1e300 1 1"), "too far"),
         (FLIPPED, "oriented against each other"),
-        ("", "expected a mesh of triangles .*, got ''"),
+        ("", "expected a mesh of triangles .*, got 'an empty file'"),
         ("hello\n", "expected a mesh of triangles .*, got 'hello"),
     ],
 )
@@ -75,6 +75,44 @@ def test_meshes_that_are_no_proper_solids_are_noted(robot: Robot, tmp_path) -> N
     assert mesh_note(Obstacle(name="b", box=(1.0, 1.0, 1.0))) == ""
 
 
+CUBE_FACES = [(0, 1, 3), (0, 3, 2), (4, 6, 7), (4, 7, 5), (0, 4, 5), (0, 5, 1), (2, 3, 7), (2, 7, 6), (0, 2, 6)]
+CUBE_FACES += [(0, 6, 4), (1, 5, 7), (1, 7, 3)]
+
+
+@pytest.mark.parametrize(
+    ("size", "solid", "words"),
+    [
+        ((1e-9, 1e-9, 1e-9), None, "vertices no more than 1e-09 m apart, less than 1e-06 m"),
+        ((5e-7, 5e-7, 5e-7), False, "vertices no more than 5e-07 m apart, less than 1e-06 m"),
+        ((0.0, 0.0, 0.0), False, "vertices no more than 0 m apart"),
+        ((1.0, 1.0, 1e-7), None, "vertices that all lie in one plane"),  # Coal crashes at hulls that are thinner
+        ((1.0, 1e-7, 1e-7), None, "vertices that all lie in one plane"),
+        ((2e-6, 2e-6, 2e-6), None, ""),
+        ((2e-6, 2e-6, 2e-6), False, ""),
+        ((1.0, 1.0, 2e-6), None, ""),
+        ((5000.0, 0.0, 100.0), False, ""),
+    ],
+)
+def test_meshes_as_small_or_as_thin_as_may_be(
+    robot: Robot, tmp_path: Path, size: tuple[float, float, float], solid: bool | None, words: str
+) -> None:
+    vertices = np.array(list(product((0.0, 1.0), repeat=3))) * size
+    trimesh.Trimesh(vertices, CUBE_FACES, process=False).export(tmp_path / "t.ply", vertex_normal=False)
+    obstacle = Obstacle(name="m", mesh={"file": str(tmp_path / "t.ply"), "solid": solid}, position=(3.0, 0.0, 1.0))
+    if words:
+        with pytest.raises(FileFormatError, match=words):
+            CollisionChecker(robot, [obstacle])
+        return
+    checker = CollisionChecker(robot, [obstacle])
+    assert checker.is_free(robot.home) and checker.clearance(robot.home) > 0.0
+
+
+def test_cells_that_are_too_small_are_refused(tmp_path: Path) -> None:
+    np.savez(tmp_path / "v.npz", occupied=np.ones((2, 2, 2)), resolution=1e-8, origin=[0.0, 0.0, 0.0])
+    with pytest.raises(FileFormatError, match=r"v\.npz: expected cells .*, got 'vertices no more than 2e-08 m apart"):
+        coal_geometry(Obstacle(name="v", voxels={"file": str(tmp_path / "v.npz")}))
+
+
 def test_a_mesh_with_a_hole_is_checked_by_the_winding_number(robot: Robot, tmp_path) -> None:
     file = tmp_path / "open.obj"
     file.write_text(CUBE_OBJ.replace("f 5 6 7\n", ""))
@@ -113,23 +151,38 @@ def test_farthest_points_are_those_of_brute_force(seed: int, count: int, flat: b
     rng = np.random.default_rng(seed)
     points = rng.normal(size=(count, 3)) * ([1.0, 1.0, 0.0] if flat else [1.0, 0.3, 0.1])
     directions = np.concatenate([rng.normal(size=(20, 3)), np.eye(3), -np.eye(3)])
-    found, reach = _farthest(directions, points)
+    found, reach = farthest(directions, points)
     assert reach == pytest.approx((points @ directions.T).max(axis=0), abs=1e-12)
     assert np.einsum("ij,ij->i", points[found], directions) == pytest.approx(reach, abs=1e-12)
 
 
-def test_binary_stl_is_read_as_by_coal_and_trimesh(tmp_path: Path) -> None:
-    mesh = trimesh.creation.annulus(0.1, 0.2, 0.3, sections=16)
-    mesh.export(tmp_path / "ring.stl")
-    content = (tmp_path / "ring.stl").read_bytes()
-    found = binary_stl(content)
-    assert found is not None
-    vertices, faces = found
-    loaded = coal.MeshLoader(coal.BV_AABB).load(str(tmp_path / "ring.stl"), np.ones(3))
-    assert (
-        (len(vertices), len(faces)) == (loaded.num_vertices, loaded.num_tris) == (len(mesh.vertices), len(mesh.faces))
-    )
-    assert vertices[faces] == pytest.approx(mesh.triangles, abs=1e-7)
-    assert trimesh.Trimesh(vertices, faces, process=False).is_watertight
-    assert binary_stl(content[:-1]) is None and binary_stl(mesh.export(file_type="stl_ascii").encode()) is None
-    assert binary_stl(b"") is None
+@pytest.mark.parametrize("shape", ["ball", "box", "capsule", "bumpy", "dented", "inside out"])
+def test_convex_meshes_are_known_without_comparing_all_triangles_with_all_faces(
+    monkeypatch: pytest.MonkeyPatch, shape: str
+) -> None:
+    made = {
+        "box": lambda: trimesh.creation.box((0.1, 0.2, 0.3)).subdivide().subdivide().subdivide().subdivide(),
+        "capsule": lambda: trimesh.creation.capsule(0.3, 0.1, count=[40, 40]),
+    }
+    mesh = made.get(shape, lambda: trimesh.creation.icosphere(4, 0.1))()
+    vertices, faces = np.array(mesh.vertices), np.array(mesh.faces)
+    if shape == "bumpy":
+        vertices, faces = bumpy_sphere(35, 0.1, 0.3)
+    elif shape == "dented":
+        vertices[7] *= 0.98
+    elif shape == "inside out":
+        faces = faces[:, ::-1]
+    geometry = mesh_geometry(vertices, faces)
+    hull, corners = convex_hull(geometry), vertices[faces]
+    normals, offsets = hull_planes(hull)
+    depths = (offsets - corners.mean(axis=1) @ normals.T).min(axis=1)
+    left = np.flatnonzero(~exact_shapes._on_hull(hull, corners))
+    convex = shape not in ("bumpy", "dented")
+    assert set(np.flatnonzero(depths > exact_shapes.CONVEX_TOLERANCE)) <= set(left)
+    assert (len(left) == 0) == convex
+    compared = list[int]()
+    monkeypatch.setattr(exact_shapes, "hull_planes", lambda h: (compared.append(1), (normals, offsets))[1])
+    found = exact_shapes._analysed(geometry)
+    assert (len(found.leaf) == 0) == convex and len(compared) <= 2
+    if shape == "dented":
+        assert found.depth == pytest.approx(depths.max(), abs=1e-15)

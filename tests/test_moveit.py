@@ -152,3 +152,37 @@ def test_the_command_converts_and_what_it_writes_plans(apex_cli, robot: Robot, t
     assert load_robot(load_problem(tmp_path / "p.yaml").robot).joint_names == robot.joint_names
     wrong = apex_cli(*arguments[:3], "-o", tmp_path / "q.txt")
     assert wrong.returncode == 2 and "ending in .yaml" in wrong.stderr
+
+
+def test_operations_are_carried_out_one_after_the_other(robot: Robot, tmp_path: Path) -> None:
+    again = """    - {id: pillar, primitives: [{type: 1, dimensions: [0.1, 0.1, 0.1]}]}
+"""
+    removed = SCENE + "    - {id: base, operation: 1}\n" + again
+    done = converted(tmp_path, robot, removed)
+    bodies = {b.name: b for b in done.problem.scene}
+    assert set(bodies) == {"pillar", "rock"}
+    assert bodies["pillar"].box == (0.1, 0.1, 0.1), "what is added again takes the place of the one before"
+    assert "collision_objects.3: removes 'base'" in done.notes
+    done = converted(
+        tmp_path, robot, SCENE + "    - {id: pebble, operation: 1}\n    - {id: '', operation: 1}\n" + again
+    )
+    assert [b.name for b in done.problem.scene] == ["pillar"], "REMOVE without a name removes all"
+
+
+@pytest.mark.parametrize("value", ["'1'", "true", "2"])
+def test_operations_are_whole_numbers(robot: Robot, tmp_path: Path, value: str) -> None:
+    with pytest.raises(FileFormatError, match=r"collision_objects\.3\.operation: expected 0 to add .* or 1 to remove"):
+        converted(tmp_path, robot, SCENE + f"    - {{id: base, operation: {value}}}\n")
+
+
+def test_what_ros_prints_may_end_in_an_empty_document(robot: Robot, tmp_path: Path) -> None:
+    done = converted(tmp_path, robot, SCENE + "---\n", "---\n" + REQUEST + "---\n---\n")
+    assert len(done.problem.scene) == 4
+    with pytest.raises(FileFormatError, match="expected one document of YAML, got '2 of them'"):
+        converted(tmp_path, robot, SCENE + "---\n" + SCENE)
+
+
+@pytest.mark.parametrize("value", ["['0', 0, 0]", "[true, 0, 0]", "{x: '1'}"])
+def test_texts_are_no_numbers(robot: Robot, tmp_path: Path, value: str) -> None:
+    with pytest.raises(FileFormatError, match=r"pose\.position: expected 3 finite numbers"):
+        converted(tmp_path, robot, SCENE.replace("position: [0.5, 0.0, 0.1]", f"position: {value}"))

@@ -18,7 +18,8 @@ from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import AttachedObject, MeshFile, Obstacle, pose_matrix
 from apex_ompl.scene.problem import Goal, Problem
 from apex_ompl.util import schema
-from apex_ompl.util.schema import dump_yaml, parse_yaml
+from apex_ompl.util.schema import dump_yaml, parse_yaml, validate
+from apex_ompl.util.validation import key_value
 
 FILE = """schema: apex-ompl/problem/1
 name: small
@@ -262,3 +263,36 @@ def test_faults_in_joint_names_name_the_file(problem: Problem, tmp_path: Path) -
         loaded.model_copy(update={"scene": ()}).goal_states([*problem.start, "elbow"])
     with pytest.raises(FileFormatError, match=f"^{problem.name}: start: "):
         problem.start_state(["elbow"])
+
+
+@pytest.mark.parametrize(
+    ("fields", "words"),
+    [
+        ({"box": ["0.1", 0.1, 0.1]}, r"box\.0: expected a number, got '0\.1'"),
+        ({"box": [True, 0.1, 0.1]}, r"box\.0: expected a number, got True"),
+        ({"sphere": {"radius": np.ma.masked}}, r"sphere\.radius: expected a number, got masked"),
+        ({"sphere": {"radius": 1j}}, r"sphere\.radius: .*number, got 1j"),
+        ({"mesh": {"file": "a.stl", "solid": "false"}}, r"mesh\.solid: expected true or false, got 'false'"),
+        ({"mesh": {"file": "a.stl", "solid": 0}}, r"mesh\.solid: expected true or false, got 0"),
+        ({"sphere": {"radius": 0.1}, "velocity": [0, "1", 0]}, r"velocity\.1: expected a number, got '1'"),
+    ],
+)
+def test_texts_and_truth_values_are_no_numbers(fields: dict, words: str) -> None:
+    with pytest.raises(FileFormatError, match=words):
+        validate(Obstacle, {"name": "o", **fields}, "obstacle")
+    given = (np.float32(0.5), np.int64(1), 2)
+    assert validate(Obstacle, {"name": "o", "box": given}, "obstacle").box == (0.5, 1.0, 2.0)
+
+
+def test_documents_without_content_do_not_count() -> None:
+    for text in ("a: 1\n---\n", "---\na: 1\n---\n---\n", "---\n---\na: 1\n...\n", "# nothing\n---\na: 1"):
+        assert parse_yaml(text, "f.yaml") == {"a": 1}
+    with pytest.raises(FileFormatError, match="f.yaml: expected one document of YAML, got '2 of them'"):
+        parse_yaml("a: 1\n---\nb: 2\n", "f.yaml")
+    with pytest.raises(FileFormatError, match="f.yaml: expected a mapping of keys to values, got None"):
+        parse_yaml("---\n---\n", "f.yaml")
+
+
+def test_values_on_a_command_line_are_read_as_in_files() -> None:
+    assert key_value("rate=1e-3") == ("rate", 1e-3)
+    assert key_value("name=on") == ("name", True) and key_value("name='1'") == ("name", "1")

@@ -7,8 +7,10 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import pinocchio as pin
 import pytest
+import trimesh
 
 from apex_ompl import PlanStatus, plan
+from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ApexError, FileFormatError, MissingFileError, RobotError, UnknownNameError
 from apex_ompl.robot import Robot, load_robot, robot_names
 from apex_ompl.robot.assets import DATA, resolve
@@ -240,3 +242,127 @@ def test_the_hand_of_a_link_is_what_hangs_together_with_it(robot: Robot, baxter:
     assert not any("right" in link for link in hand) and "left_link6" not in hand
     assert "left_wrist" in baxter.hand_of("left_gripper") and "left_lower_forearm" not in baxter.hand_of("left_gripper")
     assert not any("elbow" in link for link in baxter.hand_of("torso"))
+
+
+ARM_URDF = """<robot name="small"><link name="base"/>
+<link name="tip">{inertial}<collision>{origin}<geometry>{geometry}</geometry>
+</collision></link><link name="end"/><joint name="shoulder" type="{kind}"><parent link="base"/><child link="tip"/>
+<origin xyz="0 0 0.3"/><axis xyz="{axis}"/>{limit}</joint>
+<joint name="elbow" type="prismatic"><parent link="tip"/><child link="end"/><axis xyz="1 0 0"/>
+<limit lower="-9" upper="9" velocity="1" effort="1"/>{mimic}</joint></robot>"""
+LIMIT = '<limit lower="-1" upper="1" velocity="1" effort="1"/>'
+
+
+def write_arm(folder: Path, *, locked: str = "", joints: tuple[str, ...] = ("shoulder", "elbow"), **given: str) -> Path:
+    usual = {
+        "inertial": "",
+        "origin": "",
+        "geometry": '<box size="1 1 1"/>',
+        "kind": "revolute",
+        "axis": "0 1 0",
+        "limit": LIMIT,
+    }
+    (folder / "small.urdf").write_text(ARM_URDF.format(**usual | {"mimic": ""} | given))
+    path = folder / "small.robot.yaml"
+    planned = "".join(f"  {joint}: {{acceleration: 1, jerk: 10}}\n" for joint in joints)
+    path.write_text(
+        f"schema: apex-ompl/robot/1\nname: small\nparts: [{{name: arm, urdf: small.urdf}}]\n{locked}joints:\n{planned}"
+    )
+    return path
+
+
+@pytest.mark.parametrize(
+    ("limit", "lower", "upper"),
+    [
+        ('<limit upper="1" velocity="1" effort="1"/>', 0.0, 1.0),
+        ('<limit lower="-1" velocity="1" effort="1"/>', -1.0, 0.0),
+        ('<limit lower="-1e8" upper="1e8" velocity="1" effort="1"/>', -1e4, 1e4),
+        ('<limit lower="-1e16" upper="2" velocity="1" effort="1e30"/>', -1e4, 2.0),
+    ],
+)
+def test_limits_that_are_omitted_or_stand_for_none(tmp_path: Path, limit: str, lower: float, upper: float) -> None:
+    arm = load_robot(write_arm(tmp_path, limit=limit))
+    assert (arm.limits.lower[0], arm.limits.upper[0]) == (lower, upper)
+    checker = CollisionChecker(arm)
+    assert checker.is_free(arm.home) and checker.prove(
+        np.stack([arm.home, 0.5 * (arm.limits.lower + arm.limits.upper)])
+    )
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"axis": "0 0 0"}, "joint 'shoulder': axis xyz: expected a direction, got '0 0 0'"),
+        ({"axis": "0 1"}, "joint 'shoulder': axis xyz: expected 3 numbers, got '0 1'"),
+        ({"kind": "hinge"}, "joint 'shoulder': type: expected one of revolute, .*, got 'hinge'"),
+        ({"limit": LIMIT.replace('"1"', '"1o"', 1)}, "joint 'shoulder': limit upper: expected a number, got '1o'"),
+        ({"limit": LIMIT.replace('"-1"', '"nan"')}, "joint 'shoulder': limit lower: expected a number, got 'nan'"),
+        ({"limit": LIMIT.replace('"-1"', '"2"')}, "joint 'shoulder': limit: expected lower <= upper.* got 2 and 1"),
+        ({"limit": '<limit lower="-1" upper="1" effort="1"/>'}, "joint 'shoulder': .*velocity is missing"),
+        ({"limit": ""}, "joint 'shoulder': expected <limit> with velocity and effort"),
+        ({"inertial": "<inertial/>"}, "link 'tip': inertial: expected <mass> with value, value is missing"),
+        ({"inertial": '<inertial><mass value="1"/></inertial>'}, "link 'tip': inertial: expected <inertia> with ixx"),
+        (
+            {"inertial": '<inertial><mass value="1 kg"/></inertial>'},
+            "link 'tip': inertial: mass value: expected a number",
+        ),
+        ({"geometry": '<sphere radius="5cm"/>'}, "link 'tip': collision: sphere radius: expected a number, got '5cm'"),
+        ({"geometry": '<box size="1 1"/>'}, "link 'tip': collision: box size: expected 3 numbers, got '1 1'"),
+        ({"mimic": '<mimic joint="shoulder" offset="x"/>'}, "joint 'elbow': mimic offset: expected a number, got 'x'"),
+        ({"mimic": '<mimic joint="wrist"/>'}, "joint 'elbow' mimics 'wrist', which is no joint of the robot"),
+    ],
+)
+def test_faults_of_a_urdf_name_the_element(tmp_path: Path, capfd, given: dict[str, str], words: str) -> None:
+    with pytest.raises(RobotError, match=words) as error:
+        load_robot(write_arm(tmp_path, **given))
+    assert "small.urdf" in str(error.value) or "mimics" in words
+    assert capfd.readouterr() == ("", "")  # the parser prints what it finds
+
+
+def test_what_mimics_a_locked_joint_stays_where_that_puts_it(tmp_path: Path) -> None:
+    path = write_arm(
+        tmp_path, mimic='<mimic joint="shoulder" multiplier="-2" offset="0.5"/>', locked="locked: {shoulder: 0.1}\n"
+    )
+    with pytest.raises(FileFormatError, match="locked: expected joints that are not planned .*, got 'shoulder'"):
+        load_robot(path)
+    text = (tmp_path / "small.urdf").read_text()
+    extra = '<link name="hand"/><joint name="wrist" type="revolute"><parent link="end"/><child link="hand"/>'
+    (tmp_path / "small.urdf").write_text(text.replace("</robot>", f"{extra}{LIMIT}</joint></robot>"))
+    path.write_text(
+        path.read_text().replace("  shoulder:", "  wrist:").replace("  elbow: {acceleration: 1, jerk: 10}", "")
+    )
+    arm = load_robot(path)
+    assert arm.joint_names == ("wrist",)
+    tip = pin.SE3(pin.exp3(np.array([0.0, 0.1, 0.0])), np.array([0.0, 0.0, 0.3]))
+    end = tip * pin.SE3(np.eye(3), np.array([-2 * 0.1 + 0.5, 0.0, 0.0]))
+    np.testing.assert_allclose(arm.link_pose(arm.home, "end"), end.homogeneous, atol=1e-12)
+
+
+def test_links_are_in_metres_and_their_axes_are_those_of_the_link(tmp_path: Path) -> None:
+    """COLLADA's unit counts and its up axis does not, as in RViz; glTF, whose up is y, is turned."""
+    size = np.array([100.0, 200.0, 300.0])
+    block = trimesh.creation.box(size)
+    block.apply_translation(size / 2.0)
+    text = block.export(file_type="dae").decode()
+    unit = '<asset><unit name="mm" meter="0.001"/>'
+    (tmp_path / "m.dae").write_text(text.replace("<asset>", unit))
+    block.apply_scale(0.001)
+    block.export(tmp_path / "m.glb")
+    assert "<up_axis>Y_UP" in text
+    origin = '<origin xyz="1 2 3" rpy="0 0 1.5707963267948966"/>'
+    place = pin.SE3(pin.rpy.rpyToMatrix(0.0, 0.0, np.pi / 2), np.array([1.0, 2.0, 3.0]))
+    for file, scale, corner in (
+        ("m.dae", "1 1 1", (0.1, 0.2, 0.3)), ("m.dae", "1 2 3", (0.1, 0.4, 0.9)), ("m.glb", "1 2 3", (0.1, -0.6, 0.6)),
+    ):  # fmt: skip
+        geometry = f'<mesh filename="{file}" scale="{scale}"/>'
+        (item,) = load_robot(write_arm(tmp_path, geometry=geometry, origin=origin)).geometry.geometryObjects
+        within = place.inverse() * item.placement
+        vertices = np.array(item.geometry.vertices()) @ within.rotation.T + within.translation
+        found = np.stack([vertices.min(axis=0), vertices.max(axis=0)])
+        np.testing.assert_allclose(found, [np.minimum(corner, 0.0), np.maximum(corner, 0.0)], atol=1e-6)
+
+
+def test_links_that_are_too_small_are_refused(tmp_path: Path) -> None:
+    trimesh.creation.box((1e-9, 1e-9, 1e-9)).export(tmp_path / "m.stl")
+    with pytest.raises(RobotError, match="mesh of link 'tip' has vertices no more than 1e-09 m apart"):
+        load_robot(write_arm(tmp_path, geometry='<mesh filename="m.stl"/>'))

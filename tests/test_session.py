@@ -2,24 +2,31 @@
 
 from __future__ import annotations
 
+import copy
 import pickle
 import threading
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pinocchio as pin
 import pytest
+import torch
+import trimesh
 from planning import EXACT, within
 
 from apex_ompl import Alignment, MotionPlanner, PlanStatus, PoseTarget, load_problem, plan, points_from_depth
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.errors import ApexError, ParameterError, UnknownNameError
+from apex_ompl.collision.conservative import ConservativeChecker
+from apex_ompl.collision.scene_bodies import SceneBodies
+from apex_ompl.errors import ApexError, MissingFileError, ParameterError, UnknownNameError
 from apex_ompl.ompl_adapter.validity import full_check
 from apex_ompl.result import PlanResult
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Goal, Problem
+from apex_ompl.trajectory import Trajectory
 
 POST = {"name": "post", "box": (0.1, 0.1, 0.6), "position": (0.45, 0.0, 0.3)}
 
@@ -185,6 +192,121 @@ def name_of_bar() -> dict[str, object]:
     return {"name": "bar", "link": "left_hand_palm", "cylinder": {"radius": 0.02, "length": 0.12}}
 
 
+def test_what_a_world_read_stays_though_its_files_move(
+    robot: Robot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    goal = robot.home + np.where(np.arange(robot.dof) == 0, -0.3, 0.0)
+    palm = robot.link_pose(robot.home, "left_hand_palm")[:3, 3]
+    monkeypatch.chdir(tmp_path)
+    trimesh.creation.box((0.1, 0.1, 0.1)).export("m.stl")
+    open_box = trimesh.creation.box((0.1, 0.1, 0.1))
+    open_box.update_faces(np.arange(12) > 1)
+    open_box.export("open.stl")
+    np.save("c.npy", np.array([[0.0, 0.0, 0.0]]))
+    planner = MotionPlanner(robot)
+    planner.world.add(name="m", mesh={"file": "m.stl"}, position=(0.6, 0.0, 0.4))
+    planner.world.add(name="open", mesh={"file": "open.stl"}, position=tuple(palm + [0.0, 0.0, 0.6]))
+    planner.world.add(name="c", points={"file": "c.npy", "radius": 0.02}, position=(0.6, 0.0, 0.9))
+    assert planner.world.obstacles["m"].mesh.file == str(tmp_path / "m.stl")
+    before, copied = planner.plan(robot.home, goal), copy.deepcopy(planner)
+    assert before and any("open.stl" in note for note in before.notes)
+    (tmp_path / "sub").mkdir()
+    monkeypatch.chdir(tmp_path / "sub")
+    assert pickle.loads(pickle.dumps(planner)).plan(robot.home, goal), "another process finds the files"
+    for name in ("m.stl", "open.stl", "c.npy"):
+        (tmp_path / name).unlink()
+    for one in (planner, copied, copy.deepcopy(planner)):
+        again = one.plan(robot.home, goal)
+        assert again.notes == before.notes and again.clearance == before.clearance
+        assert np.array_equal(again.path.states, before.path.states)
+    planner.world.set_velocity("c", (0.0, 0.0, 0.1))
+    planner.world.move("m", (0.6, 0.0, 0.5), (0.0, 0.0, 0.6, 0.8))
+    assert planner.plan(robot.home, goal).movers == ("c",), "among obstacles that move"
+    planner.world.attach("m", "right_hand_palm", at=robot.home)
+    planner.world.detach("m", at=goal)
+    assert planner.plan(robot.home, goal, timeout=10.0)
+    taken = planner.world.obstacles["m"]
+    planner.world.remove("m")
+    for given in (taken, {"name": "m", "mesh": {"file": str(tmp_path / "m.stl")}}):
+        with pytest.raises(MissingFileError, match=r"m\.stl"):
+            planner.world.add(given)
+    with pytest.raises(MissingFileError, match=r"open\.stl"):
+        pickle.loads(pickle.dumps(planner))
+
+
+def test_a_body_that_is_added_again_is_read_again(planner: MotionPlanner, robot: Robot, tmp_path: Path) -> None:
+    file = tmp_path / "m.stl"
+    body = Obstacle(name="m", mesh={"file": str(file)}, position=(0.6, 0.0, 0.4))
+    start = dict(zip(robot.joint_names, robot.home.tolist(), strict=True))
+    problem = Problem(name="p", robot=robot.name, scene=(body,), start=start, goal={"joints": [start]})
+    sizes = []
+    for size in (0.1, 1.0):
+        trimesh.creation.box((size, size, size)).export(file)
+        planner.world.clear()
+        planner.world.add(body)
+        sizes.append(planner.check(robot.home).clearance)
+        planner.plan_problem(problem)
+        assert planner.check(robot.home).clearance == sizes[-1]
+        body = planner.world.obstacles["m"]
+    assert sizes[1] < sizes[0] - 0.05
+
+
+def test_copies_of_a_world_are_worlds_of_their_own(planner: MotionPlanner, robot: Robot) -> None:
+    goal = robot.home + np.where(np.arange(robot.dof) == 0, -0.3, 0.0)
+    planner.world.add(POST, {"name": "wall", "half_space": {"normal": (1.0, 0.0, 0.0), "offset": -0.5}})
+    planner.world.add(name="ball", sphere={"radius": 0.05}, position=(2.0, 0.0, 1.0), velocity=(0.0, 0.1, 0.0))
+    planner.world.attach({"name": "pen", "link": "right_hand_palm", "capsule": {"radius": 0.01, "length": 0.1}})
+    planner.world.allow("pen", "post")
+    planner.world.set_points("seen", [[2.0, 0.0, 0.0]], 0.01)
+    planner.world.move("wall", (0.0, 0.0, 0.1))
+    before = planner.plan(robot.home, goal)
+    for both in (copy.deepcopy((planner, planner.world)), pickle.loads(pickle.dumps((planner, planner.world)))):
+        other, world = both
+        assert other.world is world and world is not planner.world and other.robot is robot
+        assert dict(world.obstacles) == dict(planner.world.obstacles) and dict(world.held) == dict(planner.world.held)
+        assert world.allowed == planner.world.allowed
+        after = other.plan(robot.home, goal)
+        assert np.array_equal(after.path.states, before.path.states) and after.clearance == before.clearance
+        assert np.array_equal(after.trajectory.times, before.trajectory.times)
+        world.clear()
+        assert len(planner.world.obstacles) == 4 and not other.world.obstacles
+    for alone in (copy.deepcopy(planner.world), pickle.loads(pickle.dumps(planner.world)), copy.copy(planner.world)):
+        assert dict(alone.obstacles) == dict(planner.world.obstacles)
+        alone.remove("post")
+        assert "post" in planner.world.obstacles and "post" not in alone.obstacles
+
+
+def test_set_up_of_a_plan_costs_what_changed(
+    planner: MotionPlanner, robot: Robot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Records of obstacles are validated, and their solids are made, when they are added or changed and at no plan."""
+    goal = robot.home + np.where(np.arange(robot.dof) == 0, -0.3, 0.0)
+    counts = Counter[str]()
+
+    def counted(owner: Any, name: str) -> None:
+        original = getattr(owner, name)
+        monkeypatch.setattr(owner, name, lambda *given, **named: (counts.update([name]), original(*given, **named))[1])
+
+    boxes = [{"name": f"b{k}", "box": (0.05, 0.05, 0.05), "position": (2.0, 0.0, 0.1 * k)} for k in range(60)]
+    planner.world.add(*boxes)
+    counted(ConservativeChecker, "_solids_of")
+    counted(SceneBodies, "add")
+    late = {"name": "late", "sphere": {"radius": 0.05}, "position": (3.0, 0.0, 1.0), "appears": 1.0}
+    for more in ({}, late):  # the world's own checker, and that of what is there at time 0
+        planner.world.add(*([more] if more else []))
+        assert planner.plan(robot.home, goal, snapshot=True) and planner.check(robot.home)
+        counts.clear()
+        for _ in range(2):
+            assert planner.plan(robot.home, goal, snapshot=True) and planner.check(robot.home)
+        assert not counts
+        planner.world.move("b7", (2.0, 0.5, 0.0))
+        assert planner.plan(robot.home, goal, snapshot=True) and counts == {"_solids_of": 1}
+        planner.world.remove("b8")
+        planner.world.add(boxes[8])
+        assert planner.plan(robot.home, goal, snapshot=True)
+        assert counts == {"_solids_of": 2, "add": 1}
+
+
 def test_two_planners_plan_in_two_threads(robot: Robot) -> None:
     names = ["shelf/hard/800000", "shelf/hard/800001"]
     found: dict[str, PlanStatus] = {}
@@ -247,6 +369,31 @@ def test_a_start_a_little_outside_of_its_limits_stays_where_it_is_moved_to(
         lambda planner, home: planner.world.add(None),
         lambda planner, home: planner.world.attach("post", "left_hand_palm", at={"left_joint1": 0.0}),
         lambda planner, home: points_from_depth(np.ones((2, 2)), (1.0, 1.0, 0.5, 0.5), np.eye(4), range=5),
+        lambda planner, home: points_from_depth([[1, 2], [1]], (1.0, 1.0, 0.5, 0.5), np.eye(4)),
+        lambda planner, home: points_from_depth(np.ones((2, 2)), (1.0, 1.0, 0.5, 0.5), 2.0 * np.eye(4)),
+        lambda planner, home: points_from_depth(np.ma.masked_all((2, 2)), (1.0, 1.0, 0.5, 0.5), np.eye(4)),
+        lambda planner, home: planner.check(np.ma.masked_array(home, mask=home == home[0])),
+        lambda planner, home: planner.check(home.astype(complex)),
+        lambda planner, home: planner.check([str(x) for x in home]),
+        lambda planner, home: planner.is_free(torch.tensor(home, requires_grad=True)),
+        lambda planner, home: planner.plan(np.ma.masked_array(home, mask=True), home),
+        lambda planner, home: planner.robot.link_pose(home, 5),
+        lambda planner, home: planner.robot.link_pose(home.astype(complex), "left_hand_palm"),
+        lambda planner, home: planner.world.allow(None, "left_link1"),
+        lambda planner, home: planner.world.allow("post", ["left_link1"]),
+        lambda planner, home: planner.world.add(name=5, box=(0.1, 0.1, 0.1)),
+        lambda planner, home: planner.world.add(name="cup", box=("0.1", 0.1, 0.1)),
+        lambda planner, home: planner.world.remove(["post"]),
+        lambda planner, home: planner.world.move(5, (0.0, 0.0, 0.0)),
+        lambda planner, home: planner.world.detach(["post"]),
+        lambda planner, home: planner.world.attach("post", 5, at=home),
+        lambda planner, home: planner.world.attach("post", "left_hand_palm", touch_links="left_hand_palm", at=home),
+        lambda planner, home: planner.world.set_points(["cloud"], [[2.0, 0.0, 0.0]], 0.01),
+        lambda planner, home: planner.world.set_points("cloud", [[2.0, 0.0, 0.0]], 0.01, file=5),
+        lambda planner, home: load_problem(None),
+        lambda planner, home: load_problem(b"shelf.yaml"),
+        lambda planner, home: Trajectory.load(5),
+        lambda planner, home: PlanResult.load(None),
     ],
 )
 def test_what_is_no_such_thing_is_an_error_of_this_package(planner: MotionPlanner, robot: Robot, asked: Any) -> None:

@@ -172,6 +172,10 @@ def test_faulty_files_are_named(motion: Trajectory, tmp_path: Path) -> None:
         Trajectory.load(tmp_path / "m.csv")
     motion.save(tmp_path / "good.csv")
     table = (tmp_path / "good.csv").read_text()
+    point = "positions: [0.5], velocities: [0], accelerations: [0], time_from_start: {nanosec: 0, sec: "
+    message = f"joint_names: [a]\npoints: [{{{point}0}}}}, {{{point}1}}}}]\n"
+    (tmp_path / "good.traj.yaml").write_text(message)
+    assert Trajectory.load(tmp_path / "good.traj.yaml").duration == 1.0
     contents = {
         "a.csv": b"time,one\n0,1\n", "b.npz": b"PK", "c.traj.json": b"{}",
         "d.traj.yaml": b"points: [1]\njoint_names: []\n",
@@ -181,6 +185,8 @@ def test_faulty_files_are_named(motion: Trajectory, tmp_path: Path) -> None:
         "k.csv": b"time,a,a_velocity,a_acceleration\n0,0,0,0\n1,9,0,0\n",
         "l.csv": b"time,a,a_velocity,a_acceleration\n0,0,0,inf",
         "m.csv": ("time," + 200_000 * "x").encode(),
+        "n.traj.yaml": message.replace("0.5", "'0.5'").encode(),
+        "o.traj.yaml": message.replace("sec: 1", "sec: '1'").encode(),
     }  # fmt: skip
     for name, content in contents.items():
         (tmp_path / name).write_bytes(content)

@@ -2,13 +2,17 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
+from fractions import Fraction
 
 import numpy as np
 import pytest
+import torch
 
 from apex_ompl.errors import ParameterError
 from apex_ompl.util import validation as v
 from apex_ompl.util.bounded_cache import kept
+
+MASKED = np.ma.masked_array([1.0, 2.0], mask=[True, False])
 
 
 @pytest.mark.parametrize(
@@ -28,6 +32,28 @@ from apex_ompl.util.bounded_cache import kept
         (lambda: v.check_seed(2**31), "seed: expected a whole number from 0 to 2147483647, got 2147483648"),
         (lambda: v.finite_array([1.0, np.nan], "q"), "q: expected finite numbers, got nan"),
         (lambda: v.finite_array("abc", "q"), "q: expected finite numbers, got 'abc'"),
+        (lambda: v.finite_array("1.5", "q"), "q: expected finite numbers, got '1.5'"),
+        (lambda: v.finite_array(["1", 2.0], "q"), "q: expected finite numbers, got ['1', 2.0]"),
+        (lambda: v.finite_array([1.0, 1j], "q"), "q: expected finite numbers, got [1.0, 1j]"),
+        (lambda: v.finite_array([True, False], "q"), "q: expected finite numbers, got [True, False]"),
+        (lambda: v.finite_array([[1.0, 2.0], [1.0]], "q"), "q: expected finite numbers, got [[1.0, 2.0], [1.0]]"),
+        (lambda: v.finite_array(np.array([object()]), "q"), "q: expected finite numbers, got array"),
+        (lambda: v.number_array(np.array(["1"], object), "q"), "q: expected numbers, got array"),
+        (lambda: v.number_array([10**400], "q"), "q: expected numbers, got [1000"),
+        (lambda: v.number_array(MASKED, "q"), "q: expected numbers, none of them masked, got masked_array"),
+        (lambda: v.number_array([MASKED, MASKED], "q"), "q: expected numbers, none of them masked, got [masked"),
+        (
+            lambda: v.number_array([0.0, np.ma.masked], "q"),
+            "q: expected numbers, none of them masked, got [0.0, masked]",
+        ),
+        (lambda: v.number_array(torch.ones(2, requires_grad=True), "q"), "q: expected numbers without a gradient, got"),
+        (lambda: v.rigid_pose(np.eye(3), "pose"), "pose: expected an array of shape (4, 4), got (3, 3)"),
+        (lambda: v.rigid_pose(np.diag([1, 1, 2, 1]), "pose"), "pose: expected a rigid pose, whose 3 x 3 part is a rot"),
+        (
+            lambda: v.rigid_pose(np.diag([1, 1, -1, 1]), "pose"),
+            "pose: expected a rigid pose, whose 3 x 3 part is a rot",
+        ),
+        (lambda: v.rigid_pose(np.ones((4, 4)), "pose"), "pose: expected a rigid pose, whose last row is 0 0 0 1, got"),
         (lambda: v.check_nonnegative([0.0, -1.0], "d"), "d: expected a number, 0 or more, got"),
         (lambda: v.check_indices([0, 3], 3, "fixed", "joints"), "fixed: expected numbers of joints, 0 to 2, got"),
         (lambda: v.check_array(np.zeros(2), (3,), "q"), "q: expected an array of shape (3,), got (2,)"),
@@ -54,6 +80,14 @@ def test_good_values_pass() -> None:
     v.check_array(np.zeros((5, 14, 16)), ("B", 14, 16), "control points", finite=True)
     v.check_times(np.array([0.0, 0.1]), 2)
     assert v.check_path([[0, 1], [2, 3]]).dtype == float
+    given = np.array([1.0, np.nan])
+    assert v.number_array(given, "q") is given and v.finite_array(given[:1], "q") is not given
+    for numbers in ((1, 2.0), [np.float32(1), Fraction(2)], np.arange(1, 3), torch.tensor([1, 2])):
+        assert v.number_array(numbers, "q").tolist() == [1.0, 2.0]
+    assert v.number_array(np.ma.masked_array([1.0, 2.0]), "q").tolist() == [1.0, 2.0], "nothing is masked"
+    turn = np.eye(4, dtype=np.float32)
+    turn[:2, :2] = [[np.cos(1), -np.sin(1)], [np.sin(1), np.cos(1)]]
+    assert v.rigid_pose(turn, "pose").dtype == float
 
 
 @pytest.mark.parametrize("text", ["-1", "1.5", "2147483648", "x", ""])

@@ -211,7 +211,7 @@ def in_time(job: Job, stages: Sequence[str] = STAGES) -> tuple[PlanRun, Experime
         stages: See :func:`apex_ompl.planning.plan_among_movers`.
     """
     started, problem = time.perf_counter(), load_problem(job.problem)
-    movers = movers_of(problem)
+    movers = movers_of(problem.scene)
     with quiet_ompl():
         planning = _ready(job, problem.still, started)
         planning.setup = replace(planning.setup, problem=problem)

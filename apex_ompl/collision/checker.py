@@ -20,7 +20,7 @@ from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import AttachedObject, Obstacle
 from apex_ompl.types import Array, Flags
 from apex_ompl.util.arrays import compact
-from apex_ompl.util.validation import check_states, shape_error
+from apex_ompl.util.validation import check_states, number_array, shape_error
 
 LOOKED_AT = np.array([8, 4, 12, 2, 6, 10, 14, 1, 3, 5, 7, 9, 11, 13, 15, 0, 16]) / 16.0  # in a quick test, by share
 AT_ONCE, DOUBTFUL = 4, 3  # states of it at a time, and those that the meshes look at
@@ -94,7 +94,7 @@ class CollisionChecker(SceneBodies):
 
     def is_free(self, q: Array) -> bool:
         """Whether the state ``q``, shape (dof,), collides with nothing."""
-        q = np.asarray(q, float)
+        q = number_array(q, "state")
         if q.shape != (self.robot.dof,):
             raise shape_error(q, (self.robot.dof,), "state")
         if not self._two_stages:
@@ -112,7 +112,7 @@ class CollisionChecker(SceneBodies):
         Raises:
             ParameterError: Another shape, or the number of threads is no positive whole number.
         """
-        states = np.asarray(states, float)
+        states = number_array(states, "states")
         check_states(states, self.robot.dof)
         if not self._two_stages:
             return np.array([self._is_free_given(q) for q in states], bool)
@@ -130,7 +130,7 @@ class CollisionChecker(SceneBodies):
         Raises:
             ParameterError: Another shape.
         """
-        path = np.asarray(path, float)
+        path = number_array(path, "path")
         check_states(path, self.robot.dof, "path", least=1)
         place, share = np.divmod(LOOKED_AT * (len(path) - 1), 1.0)
         before = place.astype(int)
@@ -163,7 +163,7 @@ class CollisionChecker(SceneBodies):
         Raises:
             ParameterError: ``path`` has not the shape (N, dof), or too many steps; ``resolution`` is not positive.
         """
-        path = compact(path)
+        path = compact(number_array(path, "path"))
         if not (math.isfinite(resolution) and resolution > 0.0):
             raise ParameterError("resolution", resolution, "a positive number of radians")
         if path.ndim != 2 or path.shape[1] != self.robot.dof or len(path) == 0:
@@ -195,7 +195,7 @@ class CollisionChecker(SceneBodies):
             ParameterError: ``path`` has not the shape (N, dof).
         """
         if not isinstance(path, Curve):
-            path = np.asarray(path, float)
+            path = number_array(path, "path")
             check_states(path, self.robot.dof, "path", least=1)
             path = Curve.polyline(path)
         start = path.states[0]
@@ -247,7 +247,7 @@ class CollisionChecker(SceneBodies):
         It is that of the exact shapes at a free state, minus the largest depth of :meth:`contacts` at a colliding one,
         and NaN where a hand is outside its limits.
         """
-        proof = self.prove(np.asarray(q, float)[None])
+        proof = self.prove(number_array(q, "state")[None])
         if not proof.clearance <= 0.0:
             return proof.clearance
         return -max((contact.depth for contact in self.contacts(q)), default=0.0)

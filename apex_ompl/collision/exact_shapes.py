@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 
 from apex_ompl.collision.clouds import cloud_of
 from apex_ompl.collision.cover.spheres import shape_key
-from apex_ompl.collision.hulls import convex_hull, hull_planes
+from apex_ompl.collision.hulls import below_support, convex_hull, hull_planes
 from apex_ompl.collision.shapes import is_shell
 from apex_ompl.kernel.compiled.arrays import BOX, CAPSULE, CYLINDER, HALF_SPACE, SPHERE
 from apex_ompl.kernel.compiled.ball_tree import median_order, node_balls
 from apex_ompl.kernel.compiled.layout import Integers
 from apex_ompl.kernel.compiled.shapes import HULL, POINT, TRIANGLE, ShapeArrays
 from apex_ompl.scene.meshes import triangles
-from apex_ompl.types import Array
+from apex_ompl.types import Array, Flags
 from apex_ompl.util.bounded_cache import kept
 from apex_ompl.util.weak_cache import weakly_cached
 
@@ -156,7 +156,12 @@ def _edges(hull: coal.ConvexBase) -> tuple[NDArray[np.int64], NDArray[np.int64]]
 
 
 def _depth(hull: coal.CollisionGeometry, corners: Array) -> float:
-    """Return the largest depth of a triangle's centre below the faces of a hull [m], of many triangles that of some."""
+    """Return the largest depth of a triangle's centre below the faces of a hull [m], of many triangles that of some.
+
+    Those that lie on the hull, seen by their own planes, are left out: comparing all triangles of a convex mesh with
+    all faces takes the square of their number.
+    """
+    corners = corners[~_on_hull(hull, corners)]
     normals, offsets = hull_planes(hull)
     depth = 0.0
     if len(corners) > MANY:
@@ -167,6 +172,17 @@ def _depth(hull: coal.CollisionGeometry, corners: Array) -> float:
         centres = corners[first : first + 1000].mean(axis=1)
         depth = max(depth, float((offsets - centres @ normals.T).min(axis=1).max()))
     return depth
+
+
+def _on_hull(hull: coal.CollisionGeometry, corners: Array) -> Flags:
+    """Whether triangles, shape (T, 3, 3) [m], are proved to be no deeper below a hull than ``CONVEX_TOLERANCE``."""
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    long = np.linalg.norm(normals, axis=1)
+    normals = np.divide(normals, long[:, None], out=np.zeros_like(normals), where=long[:, None] > 0.0)
+    points, centres = np.array(hull.points()), corners.mean(axis=1)
+    outward = np.where(np.einsum("ij,ij->i", normals, centres - points.mean(axis=0)) < 0.0, -1.0, 1.0)
+    depths = below_support(normals * outward[:, None], points, centres)
+    return np.asarray((long > 0.0) & (depths <= CONVEX_TOLERANCE))
 
 
 def tree_order(centres: Array) -> NDArray[np.int64]:

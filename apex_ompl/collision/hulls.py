@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 
 from apex_ompl.collision.shapes import is_shell, is_surface
 from apex_ompl.kernel.compiled.farthest_points import farthest_points
+from apex_ompl.scene.meshes import FLAT
 from apex_ompl.types import Array
 from apex_ompl.util.boxes import bounding_box
 from apex_ompl.util.weak_cache import weakly_cached
 
-THICKNESS = 1e-6  # by which hulls of surfaces are larger [m]
+THICKNESS = 1e-6  # by which hulls of surfaces are larger; of those longer than 1 m as much by their length [m]
 DIRECTIONS = (400, 60)  # in which hulls of too many vertices are sampled; fewer where Coal takes no more
 CELLS = 24  # along the longest side of a grid over vertices
 MOST_VERTICES = 50_000  # of a mesh whose hull is not sampled
@@ -39,7 +40,9 @@ def convex_hull(geometry: coal.CollisionGeometry) -> coal.CollisionGeometry:
 def _hull_of_mesh(mesh: coal.BVHModelBase) -> coal.Convex:
     vertices = np.array(mesh.vertices())
     if is_surface(mesh):
-        low, high = vertices.min(axis=0) - THICKNESS, vertices.max(axis=0) + THICKNESS
+        low, high = bounding_box(vertices)
+        room = max(THICKNESS, FLAT * float((high - low).max()))
+        low, high = low - room, high + room
         return _hull_of(np.array(list(product(*np.stack([low, high], axis=1)))))
     if len(vertices) > MOST_VERTICES:
         return _larger_hull(vertices)
@@ -80,13 +83,13 @@ def _larger_hull(vertices: Array) -> coal.Convex:
         turn = np.pi * (1.0 + 5.0**0.5) * np.arange(count)
         flat = np.sqrt(1.0 - rise**2)
         directions = np.stack([flat * np.cos(turn), flat * np.sin(turn), rise], axis=1)
-        chosen = vertices[np.unique(_farthest(directions, vertices)[0])]
+        chosen = vertices[np.unique(farthest(directions, vertices)[0])]
         try:
             normals, offsets = hull_planes(_hull_of(chosen))
             centre = chosen.mean(axis=0)
             room = offsets - normals @ centre
             wide = room > 1e-6 * room.max()  # planes of slivers may be turned by rounding
-            reach = _farthest(normals[wide], vertices - centre)[1]
+            reach = farthest(normals[wide], vertices - centre)[1]
             return _hull_of(centre + (1.0 + 1e-6) * max(1.0, float((reach / room[wide]).max())) * (chosen - centre))
         except RuntimeError:
             continue
@@ -99,7 +102,22 @@ def _hull_of(points: Array) -> coal.Convex:
     return coal.Convex.convexHull(found, True, "Qt")
 
 
-def _farthest(directions: Array, points: Array) -> tuple[NDArray[np.intp], Array]:
+def below_support(normals: Array, corners: Array, points: Array) -> Array:
+    """Return how deep points are below the supporting planes of a convex body with these normals, shape (N,) [m].
+
+    Of a point inside it is at least the distance to the body's surface, and equal where the normal is that of the
+    nearest face. It takes a search over the corners for each point, not one over all faces.
+
+    Args:
+        normals: A unit normal for each point, shape (N, 3).
+        corners: Corners of the body, shape (P, 3) [m].
+        points: Shape (N, 3) [m].
+    """
+    depths: Array = farthest(normals, corners)[1] - np.einsum("ij,ij->i", normals, points)
+    return depths
+
+
+def farthest(directions: Array, points: Array) -> tuple[NDArray[np.intp], Array]:
     """Return the point that is farthest in each direction, shape (D,), and how far it is, shape (D,) [m].
 
     Of the points of a grid's cells only those are looked at whose cell may reach farther than any first point of one.

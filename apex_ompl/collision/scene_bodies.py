@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any
 
 from tqdm import tqdm
 
 from apex_ompl.collision.held_extent import extent_in_link
 from apex_ompl.collision.mesh_stage import MeshStage
-from apex_ompl.collision.shapes import coal_geometry, world_geometry
+from apex_ompl.collision.shapes import coal_geometry, mesh_note, with_file_read, world_geometry
 from apex_ompl.errors import SceneError, UnknownNameError
 from apex_ompl.robot import Robot
-from apex_ompl.scene.bodies import AttachedObject, Body, Obstacle
+from apex_ompl.scene.bodies import AttachedObject, Body, Obstacle, file_shape, given_fields, same_solid
 from apex_ompl.scene.scripts import moved_to, standing
 from apex_ompl.types import Array
 from apex_ompl.util.schema import validate
@@ -28,6 +29,9 @@ class SceneBodies:
         self.robot = robot
         self.meshes = MeshStage(robot)
         self._obstacles: dict[str, Body] = {}
+        self._changing: set[str] = set()  # obstacles that move or appear later
+        self._notes: dict[str, str] = {}
+        self._listed: dict[str, Obstacle] | None = None  # the obstacles without fixtures, made when they are asked for
         self._attached: dict[str, AttachedObject] = {}
         self._extents: dict[str, tuple[str, Array]] = {}
         self._fixtures = frozenset(body.name for body in robot.fixtures)
@@ -49,6 +53,28 @@ class SceneBodies:
         for pair in allowed:
             self.allow(*pair)
 
+    def become(
+        self, scene: Mapping[str, Obstacle], held: Mapping[str, AttachedObject], allowed: Iterable[tuple[str, str]]
+    ) -> None:
+        """Change what differs from obstacles and held objects, by name, and from pairs that may touch.
+
+        What stands where it did moves in place; other obstacles that are new become the last ones.
+
+        Raises:
+            SceneError, UnknownNameError, MissingFileError, FileFormatError: As :meth:`fill`.
+        """
+        for name in [name for name, body in self._attached.items() if held.get(name) is not body]:
+            self.detach(name)
+        for name, body in self.obstacles.items():
+            other = scene.get(name)
+            if other is None or not (same_solid(body, other) and file_shape(body) is file_shape(other)):
+                self.remove(name)
+            elif other is not body:
+                self._move_to(other)
+        new = [body for name, body in held.items() if name not in self._attached]
+        self.fill([body for name, body in scene.items() if name not in self._obstacles], new, fixtures=False)
+        self._set_allowed(frozenset(frozenset(pair) for pair in allowed))
+
     def _obstacle_moved(self, number: int) -> None:
         """Take note that an obstacle was moved, by its number in ``meshes``; overridden."""
 
@@ -64,18 +90,42 @@ class SceneBodies:
         return tuple(name for name in self._obstacles if name not in self._fixtures)
 
     @property
-    def obstacles(self) -> dict[str, Obstacle]:
-        """The obstacles by name, without the robot's fixtures."""
-        return {name: body for name, body in self._obstacles.items() if isinstance(body, Obstacle)}
+    def obstacles(self) -> Mapping[str, Obstacle]:
+        """The obstacles by name, without the robot's fixtures; later edits do not change the mapping."""
+        if self._listed is None:
+            self._listed = {name: body for name, body in self._obstacles.items() if isinstance(body, Obstacle)}
+        return MappingProxyType(self._listed)
+
+    @property
+    def changing_obstacles(self) -> tuple[Obstacle, ...]:
+        """Obstacles that move, or appear later than at time 0, in the order in which they were added."""
+        found = (self._obstacles[name] for name in sorted(self._changing, key=self.meshes.scene.__getitem__))
+        return tuple(one for one in found if isinstance(one, Obstacle))
+
+    @property
+    def mesh_notes(self) -> tuple[str, ...]:
+        """Sentences on meshes that are no proper solids as they are, and how they are taken."""
+        return tuple(self._notes.values())
+
+    def obstacle(self, name: str) -> Obstacle:
+        """Return an obstacle, which is not a fixture of the robot's.
+
+        Raises:
+            SceneError: There is no such obstacle.
+        """
+        found = self._obstacles.get(name) if isinstance(name, str) else None
+        if not isinstance(found, Obstacle):
+            raise SceneError(f"no obstacle {name!r}; there are: {', '.join(self.obstacles) or 'none'}")
+        return found
 
     def is_obstacle(self, name: str) -> bool:
         """Whether there is an obstacle of that name, which is not a fixture of the robot's."""
-        return name in self._obstacles and name not in self._fixtures
+        return isinstance(name, str) and name in self._obstacles and name not in self._fixtures
 
     @property
-    def held(self) -> dict[str, AttachedObject]:
-        """The held objects by name."""
-        return dict(self._attached)
+    def held(self) -> Mapping[str, AttachedObject]:
+        """The held objects by name; later edits do not change the mapping."""
+        return MappingProxyType(dict(self._attached))
 
     @property
     def held_extents(self) -> tuple[tuple[str, Array], ...]:
@@ -90,9 +140,19 @@ class SceneBodies:
             MissingFileError, FileFormatError: Its mesh file is missing, or holds no triangles.
         """
         self.check_name(obstacle.name)
+        obstacle = with_file_read(obstacle)
         self.meshes.add(obstacle.name, *world_geometry(obstacle))
-        self._obstacles[obstacle.name] = obstacle
+        self._put(obstacle)
+        if note := mesh_note(obstacle):
+            self._notes[obstacle.name] = note
         self._obstacles_changed()
+
+    def _put(self, body: Body) -> None:
+        """Keep the record of an obstacle that is new, or in place of the one before."""
+        self._obstacles[body.name] = body
+        self._listed = None
+        changes = isinstance(body, Obstacle) and (body.moving or body.appears > 0.0)
+        (self._changing.add if changes else self._changing.discard)(body.name)
 
     def move(self, name: str, position: Sequence[float], orientation: Sequence[float] | None = None) -> None:
         """Move an obstacle to a pose in the world [m, quaternion xyzw]; the orientation is kept by default.
@@ -105,20 +165,24 @@ class SceneBodies:
         """
         old = self._find(self._obstacles, name, "obstacle")
         turn = old.orientation if orientation is None else orientation
-        kept = {key: value for key, value in old.model_dump().items() if key != "trajectory"}
+        kept = given_fields(old, ("trajectory",))
         new = validate(
             type(old), {**kept, "position": _sequence(position), "orientation": _sequence(turn)}, f"obstacle {name!r}"
         )
         if isinstance(old, Obstacle) and old.trajectory is not None:
             new = moved_to(old, new.position).model_copy(update={"orientation": new.orientation})
-        self._obstacles[name] = new
-        if new.half_space is not None:  # its pose is part of its geometry
-            self.meshes.remove(name)
-            self.meshes.add(name, *world_geometry(new))
+        self._move_to(new)
+
+    def _move_to(self, body: Body) -> None:
+        """Put the record of an obstacle in place of the one before, from which it differs in pose and motion alone."""
+        self._put(body)
+        if body.half_space is not None:  # its pose is part of its geometry
+            self.meshes.remove(body.name)
+            self.meshes.add(body.name, *world_geometry(body))
             self._obstacles_changed()
             return
-        self.meshes.move(name, new.pose)
-        self._obstacle_moved(self.meshes.scene[name])
+        self.meshes.move(body.name, body.pose)
+        self._obstacle_moved(self.meshes.scene[body.name])
 
     def set_velocity(self, name: str, velocity: Sequence[float] | None) -> None:
         """Give an obstacle a constant velocity [m/s], or none, in place of a script; it is checked where it stands.
@@ -127,9 +191,10 @@ class SceneBodies:
             SceneError: There is no such obstacle.
             FileFormatError: The velocity is not valid.
         """
-        old = self._find(self.obstacles, name, "obstacle")
-        fields = {**standing(old).model_dump(), "velocity": None if velocity is None else _sequence(velocity)}
-        self._obstacles[name] = validate(Obstacle, fields, f"obstacle {name!r}")
+        fields = given_fields(standing(self.obstacle(name)))
+        if velocity is not None:
+            fields["velocity"] = _sequence(velocity)
+        self._put(validate(Obstacle, fields, f"obstacle {name!r}"))
 
     def remove(self, name: str) -> None:
         """Remove an obstacle.
@@ -140,6 +205,9 @@ class SceneBodies:
         self._find(self._obstacles, name, "obstacle")
         self._forget_allowed(name)
         del self._obstacles[name]
+        self._listed = None
+        self._changing.discard(name)
+        self._notes.pop(name, None)
         self.meshes.remove(name)
         self._obstacles_changed()
 
@@ -155,10 +223,13 @@ class SceneBodies:
         self.check_name(held.name)
         for link in (held.link, *(held.touch_links or ())):
             self.robot.link_frame(link)
+        held = with_file_read(held)
         geometry = coal_geometry(held)
         self.meshes.attach(held, geometry, held.pose)
         self._attached[held.name] = held
         self._extents[held.name] = held.link, extent_in_link(geometry, held.pose)
+        if note := mesh_note(held):
+            self._notes[held.name] = note
         self._held_changed()
 
     def detach(self, name: str) -> None:
@@ -169,6 +240,7 @@ class SceneBodies:
         """
         self._find(self._attached, name, "held object")
         del self._attached[name], self._extents[name]
+        self._notes.pop(name, None)
         self._forget_allowed(name)
         self.meshes.detach(name)
         self._held_changed()
@@ -185,11 +257,12 @@ class SceneBodies:
             UnknownNameError: There is no such body.
             SceneError: Both names are of the same body.
         """
-        links = sorted({self.meshes.solids[k].name for k in range(self.meshes.links)})
-        known = (*self._obstacles, *self._attached, *links)
+        links = {self.meshes.solids[k].name for k in range(self.meshes.links)}
         for name in (first, second):
-            if name not in known:
-                raise UnknownNameError("body", name, known)
+            if not isinstance(name, str) or not any(
+                name in known for known in (self._obstacles, self._attached, links)
+            ):
+                raise UnknownNameError("body", name, (*self._obstacles, *self._attached, *sorted(links)))
         if first == second:
             raise SceneError(f"the body {first!r} is not checked against itself, expected two bodies")
         pair = {frozenset((first, second))}
@@ -218,7 +291,7 @@ class SceneBodies:
 
     @staticmethod
     def _find(bodies: dict[str, Any], name: str, kind: str) -> Any:
-        if name not in bodies:
+        if not isinstance(name, str) or name not in bodies:
             raise SceneError(f"no {kind} {name!r}; there are: {', '.join(bodies) or 'none'}")
         return bodies[name]
 

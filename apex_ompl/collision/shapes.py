@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import io
 import logging
 import threading
 from contextlib import AbstractContextManager, nullcontext
@@ -17,10 +16,10 @@ from numpy.typing import NDArray
 from apex_ompl.collision.clouds import PointCloud, cloud_geometry
 from apex_ompl.errors import FileFormatError
 from apex_ompl.kernel.distance_grid import grid_of_triangles_beside
-from apex_ompl.scene.bodies import Body, GridFile, MeshFile, PointFile
+from apex_ompl.scene.bodies import Body, BodyT, GridFile, MeshFile, PointFile, file_shape, located
 from apex_ompl.scene.grids import parse_surface
+from apex_ompl.scene.mesh_files import read_mesh
 from apex_ompl.scene.meshes import (
-    binary_stl,
     capped,
     edges_of,
     extent_fault,
@@ -34,7 +33,6 @@ from apex_ompl.types import Array
 from apex_ompl.util.files import read_file
 from apex_ompl.util.weak_cache import weakly_cached
 
-LOADED_BY_COAL = (".stl", ".obj")  # which takes half a second less than the other library's import
 KEPT_MESHES = 32  # meshes that were loaded last and are kept for the next problem
 LARGE = 50_000  # triangles of a mesh from which on its grid of distances is made while its tree is
 MANY_TRIANGLES = 200_000  # which take seconds
@@ -66,9 +64,39 @@ def coal_geometry(body: Body) -> coal.CollisionGeometry:
         return coal.Capsule(body.capsule.radius, body.capsule.length)
     if body.half_space is not None:
         return _half_space(np.asarray(body.half_space.normal, float), body.half_space.offset)
-    shape = body.mesh or body.points or body.voxels or body.distance_grid
+    shape = file_shape(body)
     assert shape is not None
-    return _load(body.name, shape)
+    return _as_read(shape) or _load(body.name, shape)
+
+
+@weakly_cached
+def _as_read(_: MeshFile | PointFile | GridFile) -> coal.CollisionGeometry | None:
+    """Return what was read of the file of a body by :func:`with_file_read`, None for others."""
+    return None
+
+
+def with_file_read(body: BodyT) -> BodyT:
+    """Return a body whose record keeps what its file holds now, and names it by an absolute path.
+
+    The file is not read again for this record, nor for others that are made from it: it may change or be gone.
+
+    Raises:
+        MissingFileError: The file cannot be read.
+        FileFormatError: The file holds no solid.
+    """
+    shape = file_shape(body)
+    if shape is None or _as_read(shape) is not None:
+        return body
+    body = located(body, Path())
+    shape = file_shape(body)
+    _as_read.keep(shape, _load(body.name, shape)) if shape is not None else None
+    return body
+
+
+def with_file_unread(body: BodyT) -> BodyT:
+    """Return a body whose file is read anew when it is needed."""
+    shape = file_shape(body)
+    return body if shape is None else body.model_copy(update={body.shape: shape.model_copy()})
 
 
 def world_geometry(body: Body) -> tuple[coal.CollisionGeometry, Array]:
@@ -130,18 +158,20 @@ def _parse(role: str, shape: MeshFile | PointFile | GridFile, content: bytes) ->
     if isinstance(shape, PointFile):
         return cloud_geometry(PointCloud(parse_points(shape.file, content), shape.radius))
     if isinstance(shape, GridFile):
-        return mesh_geometry(*parse_surface(shape.file, content))
+        vertices, faces = parse_surface(shape.file, content)
+        if fault := extent_fault(vertices):
+            raise FileFormatError(shape.file, "", fault, f"expected cells of a solid ({role})")
+        return mesh_geometry(vertices, faces)
     return _parse_mesh(role, shape, content)
 
 
 def _parse_mesh(role: str, shape: MeshFile, content: bytes) -> coal.CollisionGeometry:
     file, scale = shape.file, np.asarray(shape.scale, float)
     try:
-        vertices, faces = _read_triangles(file, content, scale)
+        vertices, faces = read_mesh(file, content)
     except Exception as error:
-        found = content[:60].decode(errors="replace")
-        raise FileFormatError(file, "", found, f"expected a mesh of triangles ({role})") from error
-    alone = shape.solid is False
+        raise FileFormatError(file, "", str(error), f"expected a mesh of triangles ({role})") from error
+    vertices, alone = vertices * scale, shape.solid is False
     fault = "no triangles" if not len(faces) else extent_fault(vertices, flat=alone)
     fault = fault or ("" if alone else orientation_fault(vertices, faces))
     fault = fault or (hole_fault(vertices, faces) if shape.solid else "")
@@ -170,25 +200,6 @@ def _grid_beside(vertices: Array, faces: NDArray[np.int64], alone: bool) -> Abst
 def is_surface(_: coal.CollisionGeometry) -> bool:
     """Whether a geometry is a mesh without an inside, as its file was read."""
     return False
-
-
-def _read_triangles(file: str, content: bytes, scale: Array) -> tuple[Array, NDArray[np.int64]]:
-    """Return the vertices, shape (V, 3) [m], and the triangles, shape (T, 3), of a mesh file; of all that it holds."""
-    if not content.strip():
-        raise ValueError("an empty file")
-    suffix = Path(file).suffix.lower()
-    if suffix == ".stl" and (binary := binary_stl(content)) is not None:
-        return binary[0] * scale, binary[1]
-    if suffix in LOADED_BY_COAL:
-        # Trees of oriented boxes, which collisions need, are made of sound vertices only: Coal prints many lines else.
-        return triangles(coal.MeshLoader(coal.BV_AABB).load(file, scale))
-    import trimesh
-
-    loaded = trimesh.load_mesh(io.BytesIO(content), file_type=Path(file).suffix[1:].lower(), process=False)
-    vertices, faces = np.array(loaded.vertices, float) * scale, np.array(loaded.faces, np.int64)
-    if len(faces) and not 0 <= faces.min() <= faces.max() < len(vertices):
-        raise ValueError("a face names a vertex that is not there")
-    return vertices, faces
 
 
 def mesh_geometry(vertices: Array, faces: NDArray[np.int64]) -> coal.BVHModelOBBRSS:

@@ -21,7 +21,7 @@ from apex_ompl.diffusion.eight_bits import check_scales, expanded, is_scale
 from apex_ompl.diffusion.model_config import ModelConfig
 from apex_ompl.diffusion.proposals import TrajectoryModel
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError, UnknownNameError
-from apex_ompl.util.files import BROKEN, is_file, read_file
+from apex_ompl.util.files import BROKEN, is_file, path_text, read_file
 from apex_ompl.util.schema import StrictModel, read_json, validate
 
 if TYPE_CHECKING:
@@ -211,7 +211,7 @@ def shipped() -> tuple[str, ...]:
 
 
 def _folder(name: str | os.PathLike[str]) -> Path:
-    text = os.fspath(name)
+    text = path_text(name, "model")
     if text in shipped():
         return SHIPPED / text
     folder = Path(text)

@@ -80,6 +80,7 @@ PLANS = Group(
             "queries.joint_frames": (ROBOT + WORKSPACE + "f8[:, ::1], f8[:, :, :, ::1], f8[:, :, ::1]", 2),
             "ball_tree.median_order": ("f8[:, ::1], i8[::1], i8[:, ::1]", 1),
             "ball_tree.node_balls": ("f8[:, :, ::1], i8[::1], i8[::1], f8[:, ::1], f8[:, ::1]", 1),
+            "farthest_points.farthest_points": ("f8[:, ::1], f8[:, ::1], i8[::1], f8[:, ::1], f8, i8[::1]", 1),
             "motion_proof.lay_grid": ("f8[:, ::1], f8, i8[::1]", 1),
             "jerk_profiles.join_profiles": (
                 "f8[:, :, ::1], f8[:, :, ::1], i8[::1], f8[:, :, ::1], i8[:, :, ::1], f8[:, :, :, ::1], i8[::1], "

@@ -15,7 +15,7 @@ from apex_ompl.kernel.tables import RobotTables, SceneTables
 from apex_ompl.kernel.threads import in_threads
 from apex_ompl.types import Array
 from apex_ompl.util.arrays import compact
-from apex_ompl.util.validation import shape_error
+from apex_ompl.util.validation import number_array, shape_error
 
 MOST_PAIRS = 16  # pairs that are listed for one state
 
@@ -48,7 +48,7 @@ class Kernel:
         Raises:
             ParameterError: Another shape.
         """
-        states = compact(np.atleast_2d(np.asarray(q, dtype=float)))
+        states = compact(np.atleast_2d(number_array(q, "states")))
         if states.ndim != 2 or states.shape[1] != self.robot.dof:
             raise shape_error(states, ("N", self.robot.dof), "states")
         return states

@@ -20,7 +20,7 @@ from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Problem
 from apex_ompl.scene.scripts import is_there, problem_at, script_times, velocity_at
 from apex_ompl.types import Array
-from apex_ompl.util.validation import check_states, check_times
+from apex_ompl.util.validation import check_states, check_times, number_array
 
 SHORTEST_STEP = 0.01  # time between two states of a path [s]
 MAX_INTERVALS = 1_000_000
@@ -88,7 +88,7 @@ def check_timed_path(
     Raises:
         ParameterError: Another shape, times that do not increase from 0, or a moving obstacle that cannot be inflated.
     """
-    path, times = np.asarray(path, dtype=np.float64), np.asarray(times, dtype=np.float64)
+    path, times = number_array(path, "path"), number_array(times, "times")
     check_states(path, robot.dof, "path", least=2)
     check_times(times, len(path))
     for k, q in enumerate(path):

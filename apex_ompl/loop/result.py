@@ -19,7 +19,7 @@ from apex_ompl.trajectory.checks import START_TOLERANCE
 from apex_ompl.trajectory.files import KNOTS
 from apex_ompl.types import Array
 from apex_ompl.util.archives import pack_archive, read_archive
-from apex_ompl.util.files import BROKEN, suffix_of, write_atomically
+from apex_ompl.util.files import BROKEN, path_text, suffix_of, write_atomically
 from apex_ompl.util.schema import read_json
 from apex_ompl.util.validation import check_number, check_seed, finite_array, finite_numbers
 
@@ -129,7 +129,7 @@ class RunResult:
             ParameterError: Another suffix; or events, metrics or settings that are not JSON's, or not finite.
             MissingFileError: The folder is missing or cannot be written.
         """
-        path = Path(path)
+        path = Path(path_text(path))
         suffix, data = suffix_of(path, SUFFIXES), self.as_dict()
         _check_plain(data)
         if suffix == ".json":
@@ -148,7 +148,7 @@ class RunResult:
             FileFormatError: It is not a saved run, or contradicts itself.
             ParameterError: It has another suffix.
         """
-        path = Path(path)
+        path = Path(path_text(path))
         if path.suffix not in SUFFIXES or path.name == path.suffix:
             raise ParameterError(ROLE, str(path), f"a file name ending in {', '.join(SUFFIXES)}")
         if path.suffix == ".json":

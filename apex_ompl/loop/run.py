@@ -33,6 +33,7 @@ from apex_ompl.robot.model import Limits
 from apex_ompl.scene.problem import Problem
 from apex_ompl.scene.scripts import obstacle_at
 from apex_ompl.trajectory import Timing, Trajectory
+from apex_ompl.util.files import path_text
 from apex_ompl.util.validation import check_seed
 
 CLOCKS = ("sim", "real")
@@ -119,7 +120,7 @@ def load_world(problem: Problem | World | str | os.PathLike[str]) -> World:
         if problem.ran:
             raise ParameterError("problem", problem.name, "a world in which nothing ran yet: load it anew")
         return problem
-    return moving_world(problem) if isinstance(problem, Problem) else worlds.load(os.fspath(problem))
+    return moving_world(problem) if isinstance(problem, Problem) else worlds.load(path_text(problem, "problem"))
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,6 @@ from ompl import base as ob
 from ompl import geometric as og
 
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.collision.shapes import mesh_note
 from apex_ompl.ompl_adapter.space import Bounds, state_space, to_state
 from apex_ompl.ompl_adapter.validity import MotionCheck, MotionValidator, StateValidityChecker
 from apex_ompl.robot import Robot, load_robot
@@ -111,8 +110,9 @@ def assemble(
     lower, upper = bounds = _bounds(robot, start, held)
     limits = replace(robot.limits, lower=lower, upper=upper)
     sampled = workspace_goal(replace(robot, limits=limits) if len(held) else robot, problem)
-    now = problem_at(problem, 0.0)
-    checker = checker or CollisionChecker(robot, now.scene, now.attached, now.allowed)
+    if checker is None:
+        now = problem_at(problem, 0.0)
+        checker = CollisionChecker(robot, now.scene, now.attached, now.allowed)
     checker.prepare()
     start_fault = state_fault(checker, start)
     goal_faults = tuple(_held_fault(robot, start, goal, held) or state_fault(checker, goal) for goal in goals)
@@ -146,7 +146,7 @@ def assemble(
         goal_faults,
         sampled if isinstance(sampled, AlignmentGoal) else None,
         held,
-        (*start_notes, *filter(None, map(mesh_note, (*problem.scene, *problem.attached)))),
+        (*start_notes, *checker.mesh_notes),
     )
 
 

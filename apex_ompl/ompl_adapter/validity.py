@@ -16,7 +16,7 @@ from apex_ompl.collision.path_proof import Curve, PathProof
 from apex_ompl.trajectory.trajectory import ROUNDING, Trajectory
 from apex_ompl.types import Array
 from apex_ompl.util.resolution import SEARCH_RESOLUTION
-from apex_ompl.util.validation import check_states
+from apex_ompl.util.validation import check_states, number_array
 
 
 class MotionCheck:
@@ -146,7 +146,7 @@ def full_check(
     """
     robot, goals = checker.robot, list(goals)
     motion = path if isinstance(path, Trajectory) else None
-    states = np.asarray(path, float) if motion is None else motion.positions
+    states = number_array(path, "path") if motion is None else motion.positions
     check_states(states, robot.dof, "path", least=1)
     last = max(len(states) - 2, 0)
     if motion is not None and motion.use(robot.limits)["position"] > 1.0 + ROUNDING:

@@ -1,19 +1,20 @@
-"""The obstacles of a problem that move, as plans take them."""
+"""Obstacles that move, as plans take them."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
+
 from apex_ompl.errors import ParameterError
 from apex_ompl.scene.bodies import Obstacle
-from apex_ompl.scene.problem import Problem
 
 
-def movers_of(problem: Problem) -> tuple[Obstacle, ...]:
-    """Return the obstacles of a problem that a plan is made among in time: those that move.
+def movers_of(obstacles: Iterable[Obstacle]) -> tuple[Obstacle, ...]:
+    """Return the obstacles that a plan is made among in time: those that move.
 
     Raises:
         ParameterError: One does not move at constant velocity from time 0 on.
     """
-    movers = tuple(o for o in problem.scene if o.moving)
+    movers = tuple(o for o in obstacles if o.moving)
     scripted = next((o.name for o in movers if o.scripted), None)
     if scripted is not None:
         raise ParameterError(
@@ -22,9 +23,9 @@ def movers_of(problem: Problem) -> tuple[Obstacle, ...]:
     return movers
 
 
-def snapshot_notes(problem: Problem) -> list[str]:
+def snapshot_notes(obstacles: Sequence[Obstacle]) -> list[str]:
     """Return sentences on the obstacles that move, in a plan that takes them as they are at time 0."""
-    later = [o.name for o in problem.scene if o.appears > 0.0]
-    still = [name for name in problem.moving if name not in later]
+    later = [o.name for o in obstacles if o.appears > 0.0]
+    still = [o.name for o in obstacles if o.moving and not o.appears > 0.0]
     notes = ((still, "taken to stand still"), (later, "left out, not there yet"))
     return [f"snapshot: {', '.join(names)} {what}" for names, what in notes if names]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,8 +14,11 @@ import pinocchio as pin
 from apex_ompl.errors import MissingFileError, RobotError
 from apex_ompl.robot.assets import resolve
 from apex_ompl.robot.config import Part, RobotConfig
+from apex_ompl.robot.urdf_checks import LIMITED, check_urdf, numbers
 from apex_ompl.scene.bodies import pose_matrix
+from apex_ompl.scene.mesh_files import UPRIGHT, collada_asset
 from apex_ompl.types import Array
+from apex_ompl.util.files import read_file
 
 
 @dataclass(frozen=True)
@@ -58,12 +61,17 @@ def compose(config: RobotConfig, folder: Path) -> Composition:
         files.append(urdf)
         tree = _parse(urdf)
         _prune(tree, part)
+        check_urdf(tree, urdf, [n for j in tree.findall("joint") if rename(n := j.get("name", "")) in config.locked])
         names = []
         for element in [*tree.findall("link"), *tree.findall("joint")]:
             _rename_element(element, rename)
             _locate_meshes(element, (urdf.parent, folder), part)
             if element.tag == "link":
                 names.append(element.get("name", ""))
+            for limit in element.findall("limit") if element.get("type") in LIMITED else ():
+                # 0 by the specification; the parser asks for both.
+                limit.attrib.setdefault("lower", "0")
+                limit.attrib.setdefault("upper", "0")
             root.append(element)
         clash = links.intersection(names)
         if clash:
@@ -82,8 +90,7 @@ def compose(config: RobotConfig, folder: Path) -> Composition:
             found = _parse(files[-1]).iter("disable_collisions")
             pairs = [(rename(e.get("link1", "")), rename(e.get("link2", ""))) for e in found]
             disabled += [(a, b) for a, b in pairs if a in names and b in names]
-    for name, value in config.locked.items():
-        _lock(root, name, value)
+    _lock_all(root, config.locked)
     files += [Path(mesh.get("filename", "").removeprefix("file://")) for mesh in root.iter("mesh")]
     return Composition(ET.tostring(root, encoding="unicode"), disabled, part_links, tuple(dict.fromkeys(files)))
 
@@ -143,12 +150,38 @@ def _locate_meshes(element: ET.Element, folders: tuple[Path, Path], part: Part) 
             for mesh in holder.iter("mesh"):
                 role = f"{kind} mesh of link {element.get('name')!r}"
                 try:
-                    mesh.set("filename", str(_resolved(mesh.get("filename", ""), folders, role)))
+                    path = _resolved(mesh.get("filename", ""), folders, role)
                 except MissingFileError:
                     if kind == "collision":
                         raise
                     element.remove(holder)
                     break
+                mesh.set("filename", str(path))
+                _scale_and_turn(holder, mesh, path, role)
+
+
+def _scale_and_turn(holder: ET.Element, mesh: ET.Element, path: Path, role: str) -> None:
+    """Scale a COLLADA mesh to metres, and turn a glTF mesh so that z is up, as RViz shows them; Pinocchio does neither.
+
+    The ``<up_axis>`` of COLLADA is ignored: links are modelled in their own frames, whatever their files say, and RViz,
+    MoveIt and Gazebo take them like that (rviz#1045, geometric_shapes#52). RViz 2 and Drake turn glTF (rviz#1482).
+    """
+    given = numbers(mesh.get("scale", "1 1 1"), 3, role)
+    scale = given.copy()
+    if path.suffix.lower() == ".dae":
+        try:
+            scale *= collada_asset(read_file(path, role))[0]
+        except ValueError as error:
+            raise RobotError(f"{role}: {path} has {error}, expected COLLADA") from error
+    elif path.suffix.lower() in (".glb", ".gltf"):
+        upright = np.eye(4)
+        upright[:3, :3] = UPRIGHT["Y_UP"]
+        pose, scale = _origin(holder, role) @ upright, scale[[0, 2, 1]]  # in the axes of the file
+        for origin in holder.findall("origin"):
+            holder.remove(origin)
+        _set_origin(holder, pose)
+    if not np.array_equal(scale, given):
+        mesh.set("scale", " ".join(f"{v:.17g}" for v in scale))
 
 
 def _resolved(name: str, folders: tuple[Path, Path], role: str) -> Path:
@@ -164,6 +197,23 @@ def _mount(root: ET.Element, part: Part, child: str) -> None:
     ET.SubElement(joint, "child", link=child)
 
 
+def _lock_all(root: ET.Element, locked: Mapping[str, float]) -> None:
+    """Turn joints into fixed ones at their values, and those that mimic one of them at the values that follow."""
+    joints = {str(joint.get("name")): joint for joint in root.findall("joint")}
+    mimics = {name: mimic for name, joint in joints.items() if (mimic := joint.find("mimic")) is not None}
+    for name, mimic in mimics.items():
+        if mimic.get("joint") not in joints:
+            raise RobotError(f"the joint {name!r} mimics {mimic.get('joint')!r}, which is no joint of the robot")
+    waiting = dict(locked)
+    while waiting:
+        name, value = next(iter(waiting.items()))
+        del waiting[name]
+        _lock(root, name, value)
+        for follower, mimic in mimics.items():
+            if mimic.get("joint") == name and follower not in locked:
+                waiting[follower] = float(mimic.get("multiplier", "1")) * value + float(mimic.get("offset", "0"))
+
+
 def _lock(root: ET.Element, name: str, value: float) -> None:
     """Turn a revolute or prismatic joint into a fixed one at ``value`` [rad or m]."""
     joint = next((j for j in root.findall("joint") if j.get("name") == name), None)
@@ -174,18 +224,14 @@ def _lock(root: ET.Element, name: str, value: float) -> None:
         raise RobotError(f"locked: the joint {name!r} is {kind}, expected revolute, continuous or prismatic")
     axis_element = joint.find("axis")
     text = "1 0 0" if axis_element is None else axis_element.get("xyz", "1 0 0")
-    axis = _floats(text, name)
+    axis = numbers(text, 3, f"axis of joint {name!r}")
     axis /= np.linalg.norm(axis)
     motion = np.eye(4)
     if kind == "prismatic":
         motion[:3, 3] = value * axis
     else:
         motion[:3, :3] = pin.exp3(value * axis)
-    origin = joint.find("origin")
-    placement = np.eye(4)
-    if origin is not None:
-        placement[:3, 3] = _floats(origin.get("xyz", "0 0 0"), name)
-        placement[:3, :3] = pin.rpy.rpyToMatrix(*_floats(origin.get("rpy", "0 0 0"), name))
+    placement = _origin(joint, f"joint {name!r}")
     for tag in ("origin", "axis", "limit", "mimic", "dynamics", "safety_controller"):
         for element in joint.findall(tag):
             joint.remove(element)
@@ -193,17 +239,16 @@ def _lock(root: ET.Element, name: str, value: float) -> None:
     _set_origin(joint, placement @ motion)
 
 
-def _floats(text: str, joint: str) -> Array:
-    try:
-        values = np.array([float(v) for v in text.split()])
-    except ValueError:
-        values = np.empty(0)
-    if values.shape != (3,) or not np.isfinite(values).all():
-        raise RobotError(f"joint {joint!r}: expected three numbers, got {text!r}")
-    return values
+def _origin(element: ET.Element, what: str) -> Array:
+    """Return the pose that the origin of an element says, shape (4, 4) [m]."""
+    origin, pose = element.find("origin"), np.eye(4)
+    if origin is not None:
+        pose[:3, 3] = numbers(origin.get("xyz", "0 0 0"), 3, f"origin of {what}")
+        pose[:3, :3] = pin.rpy.rpyToMatrix(*numbers(origin.get("rpy", "0 0 0"), 3, f"origin of {what}"))
+    return pose
 
 
-def _set_origin(joint: ET.Element, pose: Array) -> None:
+def _set_origin(element: ET.Element, pose: Array) -> None:
     xyz, rpy = pose[:3, 3], pin.rpy.matrixToRpy(pose[:3, :3])
     text = {"xyz": " ".join(f"{v:.17g}" for v in xyz), "rpy": " ".join(f"{v:.17g}" for v in rpy)}
-    joint.insert(0, ET.Element("origin", text))
+    element.insert(0, ET.Element("origin", text))

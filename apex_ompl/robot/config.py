@@ -15,6 +15,10 @@ SCHEMA = "apex-ompl/robot/1"
 PAIRS_SCHEMA = "apex-ompl/disabled-pairs/1"
 
 
+WIDEST = 1e4
+"""Largest position of a joint [rad or m]; sines of larger ones are not exact enough for proofs."""
+
+
 class Part(StrictModel):
     """A URDF that is mounted on the world or on a link of an earlier part.
 
@@ -42,7 +46,10 @@ class Part(StrictModel):
 
 
 class Joint(StrictModel):
-    """A planned joint and its limits [rad, rad/s, rad/s^2, rad/s^3]; by default those of the URDF."""
+    """A planned joint and its limits [rad, rad/s, rad/s^2, rad/s^3]; by default those of the URDF.
+
+    Limits wider than ``WIDEST``, by which URDFs say that a joint has none, are narrowed to it.
+    """
 
     home: float = 0.0
     lower: float | None = None

@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from apex_ompl.errors import FileFormatError, RobotError, UnknownNameError
 from apex_ompl.robot.assets import DATA, resolve
 from apex_ompl.robot.compose import compose
-from apex_ompl.robot.config import Hand, RobotConfig, read_config, read_disabled_pairs
+from apex_ompl.robot.config import WIDEST, Hand, RobotConfig, read_config, read_disabled_pairs
 from apex_ompl.robot.geometry import check_geometry, pair_up
 from apex_ompl.scene.bodies import Body
 from apex_ompl.types import Array
-from apex_ompl.util.validation import shape_error
+from apex_ompl.util.validation import number_array, shape_error
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ class Robot:
         Raises:
             ParameterError: The number of joint values differs from ``dof``.
         """
-        q = np.asarray(q, dtype=float)
+        q = number_array(q, "state")
         if q.ndim == 0 or q.shape[-1] != len(self._order):
             raise shape_error(q, ("...", len(self._order)), "state")
         return q[..., self._order]
@@ -102,12 +102,17 @@ class Robot:
         Raises:
             UnknownNameError: No such link.
         """
-        if not self.model.existBodyName(link):
+        if not isinstance(link, str) or not self.model.existBodyName(link):
             raise UnknownNameError("link", link, self.link_names)
         return int(self.model.getFrameId(link, pin.FrameType.BODY))
 
     def link_pose(self, q: Array, link: str) -> Array:
-        """Return the pose of a link in the world at state ``q``, shape (4, 4) [m]."""
+        """Return the pose of a link in the world at state ``q``, shape (4, 4) [m].
+
+        Raises:
+            UnknownNameError: No such link.
+            ParameterError: The state has another shape.
+        """
         frame = self.link_frame(link)
         data = self.model.createData()
         pin.framesForwardKinematics(self.model, data, self.to_pinocchio(q))
@@ -148,7 +153,7 @@ class Robot:
 
     def limit_fault(self, q: Array) -> str | None:
         """Return a sentence on the first joint of ``q`` outside its limits, or None when all are inside."""
-        q = np.asarray(q, dtype=float)
+        q = number_array(q, "state")
         if q.shape != (self.dof,):
             return f"the state has shape {q.shape}, expected ({self.dof},)"
         low, high = self.limits.lower, self.limits.upper
@@ -192,6 +197,20 @@ def load_robot(name_or_path: str | Path, relative_to: Path | None = None) -> Rob
     return build_robot(read_config(path), path)
 
 
+def bare_robot(name_or_path: str) -> tuple[Robot, RobotConfig, Path]:
+    """Return a robot without its files of disabled pairs and covers, which may still be to be made, and its own file.
+
+    Args:
+        name_or_path: A name out of :func:`robot_names`, or the path of a robot file.
+
+    Raises:
+        ApexError: As :func:`load_robot`.
+    """
+    path = DATA / f"{name_or_path}.robot.yaml" if name_or_path in robot_names() else Path(name_or_path).resolve()
+    config = read_config(path)
+    return build_robot(config.model_copy(update={"disabled_pairs": None, "covers": None}), path), config, path
+
+
 @cache
 def _shipped_robot(name: str) -> Robot:
     path = DATA / f"{name}.robot.yaml"
@@ -205,6 +224,9 @@ def build_robot(config: RobotConfig, path: Path) -> Robot:
         MissingFileError: A URDF, an SRDF or a collision mesh is missing.
         RobotError: The description cannot be made into a robot.
     """
+    both = next((name for name in config.locked if name in config.joints), None)
+    if both is not None:
+        raise FileFormatError(str(path), "locked", both, "expected joints that are not planned (joints)")
     composition = compose(config, path.parent)
     try:
         model = pin.buildModelFromXML(composition.urdf, mimic=True)
@@ -269,5 +291,8 @@ def _limits(config: RobotConfig, model: pin.Model, path: Path) -> Limits:
         if not (np.isfinite([low, high, speed]).all() and low < high and speed > 0):
             expected = "expected finite limits with lower < upper and velocity > 0"
             raise FileFormatError(str(path), f"joints.{name}", [low, high, speed], expected)
+        low, high = max(low, -WIDEST), min(high, WIDEST)
+        if not low < high:
+            raise FileFormatError(str(path), f"joints.{name}", [low, high], f"expected limits within {WIDEST:g}")
         rows.append((low, high, speed, joint.acceleration, joint.jerk))
     return Limits(*(np.array(column, float) for column in zip(*rows, strict=True)))

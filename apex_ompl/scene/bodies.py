@@ -6,8 +6,9 @@ Lengths are in metres, the world has z up, quaternions are ordered xyzw.
 from __future__ import annotations
 
 import os
+from collections.abc import Collection
 from pathlib import Path
-from typing import Annotated, Self, TypeVar
+from typing import Annotated, Any, Self, TypeVar
 
 import numpy as np
 import pinocchio as pin
@@ -223,6 +224,17 @@ class AttachedObject(Body):
         if self.half_space is not None or self.points is not None:
             raise ValueError(f"{self.name!r}: {'a half_space' if self.half_space else 'points'} cannot be held")
         return self
+
+
+def given_fields(body: Body, left_out: Collection[str] = ()) -> dict[str, Any]:
+    """Return the fields of a body that have a value, by name; what they hold is not copied."""
+    fields = ((name, getattr(body, name)) for name in type(body).model_fields if name not in left_out)
+    return {name: value for name, value in fields if value is not None}
+
+
+def file_shape(body: Body) -> MeshFile | PointFile | GridFile | None:
+    """Return the shape of a body that is in a file, or None for one of another shape."""
+    return body.mesh or body.points or body.voxels or body.distance_grid
 
 
 def located(body: BodyT, folder: Path) -> BodyT:

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from apex_ompl.types import Array
 from apex_ompl.util.weak_cache import weakly_cached
 
-STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 LARGEST = 1e4  # larger coordinates are errors [m]
+SMALLEST = 1e-6  # meshes that are smaller are errors, of units for one [m]
+FLAT = 1e-6  # least thickness of a solid by its length; hulls of a thirtieth of it crash Coal
 
 
 @weakly_cached
@@ -24,34 +25,21 @@ def triangles(mesh: coal.BVHModelBase) -> tuple[Array, NDArray[np.int64]]:
     return vertices, faces
 
 
-def binary_stl(content: bytes) -> tuple[Array, NDArray[np.int64]] | None:
-    """Return vertices, shape (V, 3), and triangles, shape (T, 3), of a binary STL file, or None of one of another kind.
-
-    Corners at the same position become one vertex. It takes a fifth of the time that Coal's importer does.
-    """
-    if len(content) != 84 + STL_TRIANGLE.itemsize * int.from_bytes(content[80:84], "little"):
-        return None
-    corners = np.frombuffer(content, STL_TRIANGLE, offset=84)["corners"].astype(float).reshape(-1, 3)
-    if not len(corners):
-        return corners, np.empty((0, 3), np.int64)
-    numbers = _numbered(corners)
-    vertices = np.empty((int(numbers.max()) + 1, 3))
-    vertices[numbers] = corners
-    return vertices, numbers.reshape(-1, 3)
-
-
 def extent_fault(vertices: Array, flat: bool = False) -> str:
     """Return the reason for which vertices, shape (V, 3) [m], are not those of a solid, or an empty string.
 
-    Vertices must be finite, at most ``LARGEST``, and not all in one plane; Coal aborts the process for others. Those of
-    a surface may be ``flat``.
+    Vertices must be finite, at most ``LARGEST``, farther apart than ``SMALLEST``, and not all in one plane; Coal aborts
+    the process for others. Those of a surface may be ``flat``.
     """
     if not (np.isfinite(vertices).all() and np.abs(vertices).max() < LARGEST):
         return "vertices that are not finite or too far away"
+    size = float(np.ptp(vertices, axis=0).max())
+    if size < SMALLEST:
+        return f"vertices no more than {size:.3g} m apart, less than {SMALLEST:g} m"
     if flat:
         return ""
     spread = np.linalg.svd(vertices - vertices.mean(axis=0), compute_uv=False)
-    if len(vertices) < 4 or spread[2] <= 1e-9 * max(spread[0], 1e-9):
+    if len(vertices) < 4 or spread[2] <= FLAT * spread[0]:
         return "vertices that all lie in one plane"
     return ""
 
@@ -156,10 +144,10 @@ def edges_of(vertices: Array, faces: NDArray[np.int64]) -> Edges:
 def weld(vertices: Array) -> NDArray[np.int64]:
     """Return the index of the position of every vertex, shape (V,); vertices at the same position share one."""
     scale = max(float(np.abs(vertices).max()), 1e-9)
-    return _numbered(np.round(vertices / scale, 9))
+    return numbered(np.round(vertices / scale, 9))
 
 
-def _numbered(rows: Array) -> NDArray[np.int64]:
+def numbered(rows: Array) -> NDArray[np.int64]:
     """Return a number for each row of an array, the same for equal rows, shape (N,)."""
     order = np.lexsort(rows.T)
     numbers = np.empty(len(rows), np.int64)
@@ -222,7 +210,7 @@ def is_watertight(corners: Array) -> bool:
     Args:
         corners: Corners of the triangles, shape (T, 3, 3) [m]; those at the same position are equal bit for bit.
     """
-    return not Edges.of(_numbered(corners.reshape(-1, 3)).reshape(-1, 3)).balance.any()
+    return not Edges.of(numbered(corners.reshape(-1, 3)).reshape(-1, 3)).balance.any()
 
 
 def winding_number(point: Array, corners: Array) -> float:

@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from apex_ompl.errors import FileFormatError, ParameterError
+from apex_ompl.scene.ply import parse_ply
 from apex_ompl.types import Array
 from apex_ompl.util.files import BROKEN
-from apex_ompl.util.validation import check_array, finite_array
+from apex_ompl.util.validation import check_array, check_integer, finite_array, number_array, rigid_pose
 
 LARGEST = 1e4  # larger coordinates are errors [m]
 PCD_TYPES = {"F": "f", "I": "i", "U": "u"}
@@ -27,8 +28,8 @@ def parse_points(file: str, content: bytes) -> Array:
     try:
         if not content:
             raise ValueError("an empty file")
-        points = np.asarray(READERS[Path(file).suffix.lower()](content), float)
-    except (*BROKEN, AttributeError, IndexError) as error:
+        points = number_array(READERS[Path(file).suffix.lower()](content), "the array")
+    except (*BROKEN, AttributeError, IndexError, ParameterError) as error:
         raise FileFormatError(file, "", str(error)[:80], "expected a cloud of points") from error
     if points.ndim != 2 or points.shape[1] < 3 or not len(points):
         raise FileFormatError(file, "", f"an array of shape {points.shape}", "expected one point or more, shape (N, 3)")
@@ -44,10 +45,7 @@ def _read_npy(content: bytes) -> Array:
 
 
 def _read_ply(content: bytes) -> Array:
-    import trimesh
-
-    loaded: Any = trimesh.load(io.BytesIO(content), file_type="ply", process=False)
-    return np.asarray(loaded.vertices)
+    return parse_ply(content)[0]
 
 
 def _read_pcd(content: bytes) -> Array:
@@ -61,15 +59,21 @@ def _read_pcd(content: bytes) -> Array:
         if words and not words[0].startswith("#"):
             head[words[0]] = words[1:]
     names, count = head["FIELDS"], int(head["POINTS"][0])
+    wide, high = (int(head.get(side, [size])[0]) for side, size in (("WIDTH", str(count)), ("HEIGHT", "1")))
+    if wide * high != count:
+        raise ValueError(f"POINTS {count} in a head of WIDTH {wide} and HEIGHT {high}")
     repeats = [int(n) for n in head.get("COUNT", ["1"] * len(names))]
     kind = head["DATA"][0]
     if kind == "ascii":
-        table = np.loadtxt(io.BytesIO(content[at:]), ndmin=2, max_rows=count)
-        columns = np.cumsum([0, *repeats])
+        rows = [words for words in (line.split() for line in content[at:].splitlines()) if words][:count]
+        _check_count(sum(len(words) == sum(repeats) for words in rows), count)
+        table, columns = np.array(rows, float), np.cumsum([0, *repeats])
         return np.stack([table[:, columns[names.index(axis)]] for axis in "xyz"], axis=1)
     formats = [np.dtype(f"<{PCD_TYPES[kind]}{size}") for kind, size in zip(head["TYPE"], head["SIZE"], strict=True)]
     if kind == "binary_compressed":  # field by field
         packed, size = np.frombuffer(content, "<u4", 2, at).tolist()
+        if len(content) < at + 8 + packed:
+            raise ValueError(f"{len(content) - at - 8} of {packed} compressed bytes: it is cut off")
         data, at = _decompressed(content[at + 8 : at + 8 + packed], size), 0
         fields: list[Array] = []
         for form, n in zip(formats, repeats, strict=True):
@@ -79,8 +83,14 @@ def _read_pcd(content: bytes) -> Array:
     if kind != "binary":
         raise ValueError(f"PCD data {kind!r}, expected ascii, binary or binary_compressed")
     row = np.dtype([(f"{k}", form, (n,)) for k, (form, n) in enumerate(zip(formats, repeats, strict=True))])
-    rows: Any = np.frombuffer(content, row, count, at)
-    return np.stack([rows[str(names.index(axis))][:, 0] for axis in "xyz"], axis=1)
+    _check_count((len(content) - at) // row.itemsize, count)
+    records: Any = np.frombuffer(content, row, count, at)
+    return np.stack([records[str(names.index(axis))][:, 0] for axis in "xyz"], axis=1)
+
+
+def _check_count(found: int, count: int) -> None:
+    if found < count:
+        raise ValueError(f"{found} of the {count} points of its head: it is cut off")
 
 
 def _decompressed(packed: bytes, size: int) -> bytes:
@@ -127,24 +137,23 @@ def points_from_depth(
     Args:
         depth: Depths, shape (rows, columns) [m].
         intrinsics: Focal lengths fx, fy and principal point cx, cy [pixels].
-        pose: Pose of the optical frame in the world, shape (4, 4) [m].
+        pose: Pose of the optical frame in the world, shape (4, 4) [m]: a rotation and a translation.
         stride: Every how many rows and columns are taken.
         range: Least and largest depth that is taken [m].
 
     Raises:
-        ParameterError: An argument has another shape, or is out of its range.
+        ParameterError: An argument has another shape, is out of its range, or has masked numbers, which a NaN can stand
+            for; the pose is not rigid.
     """
-    image = np.asarray(depth, float)
+    image = number_array(depth, "depth")
     if image.ndim != 2:
         raise ParameterError("depth", image.shape, "an image of shape (rows, columns)")
-    camera, placement = finite_array(intrinsics, "intrinsics"), finite_array(pose, "pose")
+    camera, placement = finite_array(intrinsics, "intrinsics"), rigid_pose(pose, "pose")
     check_array(camera, (4,), "intrinsics")
-    check_array(placement, (4, 4), "pose")
     focal_x, focal_y, centre_x, centre_y = camera.tolist()
     if not (focal_x > 0.0 and focal_y > 0.0):
         raise ParameterError("intrinsics", (focal_x, focal_y), "positive focal lengths")
-    if isinstance(stride, bool) or not isinstance(stride, (int, np.integer)) or stride < 1:
-        raise ParameterError("stride", stride, "a whole number from 1")
+    check_integer(stride, "stride", 1)
     ends = finite_array(range, "range")
     check_array(ends, (2,), "range")
     near, far = ends.tolist()

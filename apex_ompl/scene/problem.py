@@ -7,17 +7,18 @@ closed]; lengths are in metres, the world has z up, quaternions are ordered xyzw
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import BeforeValidator, Field, PositiveFloat, PrivateAttr, Strict, field_validator, model_validator
+from pydantic import BeforeValidator, Field, PositiveFloat, PrivateAttr, field_validator, model_validator
 
 from apex_ompl.errors import FileFormatError, nearest_name
 from apex_ompl.scene.bodies import AttachedObject, Name, Obstacle, Quaternion, Vector, located
 from apex_ompl.types import Array
-from apex_ompl.util.files import write_atomically
+from apex_ompl.util.files import path_text, write_atomically
 from apex_ompl.util.schema import StrictModel, dump_yaml, read_yaml, validate
 
 SCHEMA = "apex-ompl/problem/1"
@@ -26,7 +27,7 @@ SCHEMA = "apex-ompl/problem/1"
 GOALS = ("joints", "alignment", "poses")
 """Kinds of goals."""
 
-JointValues = dict[str, Annotated[float, Strict()]]
+JointValues = dict[str, float]
 
 
 def _one_or_many(value: Any) -> Any:
@@ -179,10 +180,10 @@ class Problem(StrictModel):
 
     @model_validator(mode="after")
     def _unique_names(self) -> Self:
-        names = [body.name for body in (*self.scene, *self.attached)]
-        twice = sorted({n for n in names if names.count(n) > 1})
-        if twice:
-            raise ValueError(f"the name {twice[0]!r} is given to more than one object")
+        counts = Counter(body.name for body in (*self.scene, *self.attached))
+        twice = min((name for name, count in counts.items() if count > 1), default=None)
+        if twice is not None:
+            raise ValueError(f"the name {twice!r} is given to more than one object")
         return self
 
     _file: str = PrivateAttr("")
@@ -238,7 +239,7 @@ class Problem(StrictModel):
             MissingFileError: The file, or a mesh that it names, cannot be read.
             FileFormatError: The file does not follow the schema; the message names the field.
         """
-        path = Path(path)
+        path = Path(path_text(path))
         data = read_yaml(path, "problem file")
         if data.get("schema") != SCHEMA:
             raise FileFormatError(str(path), "schema", data.get("schema"), f"expected {SCHEMA!r}")
@@ -261,7 +262,7 @@ class Problem(StrictModel):
         Raises:
             MissingFileError: The folder is missing or cannot be written.
         """
-        write_atomically(Path(path), self.to_yaml().encode())
+        write_atomically(Path(path_text(path)), self.to_yaml().encode())
 
     def to_yaml(self) -> str:
         """Return the YAML text of the problem."""

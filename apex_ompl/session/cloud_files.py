@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import io
 import os
+import shutil
 import tempfile
+import weakref
 from collections.abc import Container
 from pathlib import Path
 
@@ -13,18 +15,22 @@ from numpy.typing import ArrayLike
 
 from apex_ompl.errors import ParameterError
 from apex_ompl.types import Array
-from apex_ompl.util.files import write_atomically
+from apex_ompl.util.files import path_text, write_atomically
 from apex_ompl.util.validation import finite_array
 
 KEPT = 8  # temporary files that no obstacle has any more
 
 
 class CloudFiles:
-    """A folder for the last clouds of a world; it is made when it is needed, and removed with this object."""
+    """A folder for the last clouds of a world; it is made when it is needed, and removed with this object.
+
+    It belongs to the process that made it: one that was forked from there makes a folder of its own.
+    """
 
     def __init__(self) -> None:
         """Make no folder yet."""
-        self._folder: tempfile.TemporaryDirectory[str] | None = None
+        self._folder: Path | None = None
+        self._process = 0  # that made the folder
         self._files: list[Path] = []
         self._count = 0
 
@@ -35,13 +41,15 @@ class CloudFiles:
             ParameterError: The file is no ``.npy``.
         """
         if file is not None:
-            if Path(file).suffix != ".npy":
+            given = Path(path_text(file, "file"))
+            if given.suffix != ".npy":
                 raise ParameterError("file", str(file), "a file name ending in .npy")
-            return Path(file)
-        if self._folder is None:
-            self._folder = tempfile.TemporaryDirectory(prefix="apex_ompl-")
+            return given
+        if self._folder is None or self._process != os.getpid():
+            self._folder, self._process, self._files = Path(tempfile.mkdtemp(prefix="apex_ompl-")), os.getpid(), []
+            weakref.finalize(self, _remove, self._folder, self._process)
         self._count += 1
-        return Path(self._folder.name) / f"cloud-{self._count}.npy"
+        return self._folder / f"cloud-{self._count}.npy"
 
     def write(self, cloud: Array, path: Path, used: Container[str]) -> None:
         """Write points, shape (N, 3) [m], to one of the paths that :meth:`path` returns.
@@ -57,12 +65,18 @@ class CloudFiles:
         content = io.BytesIO()
         np.save(content, cloud.astype(np.float32))
         write_atomically(path, content.getvalue())
-        if self._folder is not None and path.parent == Path(self._folder.name):
+        if path.parent == self._folder and self._process == os.getpid():
             self._files.append(path)
         free = [one for one in self._files if str(one) not in used and one != path]
-        for one in free[:-KEPT]:
+        for one in free[:-KEPT] if self._process == os.getpid() else ():
             self._files.remove(one)
             one.unlink(missing_ok=True)
+
+
+def _remove(folder: Path, process: int) -> None:
+    """Remove a folder in the process that made it."""
+    if os.getpid() == process:
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def cloud_of(points: ArrayLike) -> Array:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import threading
 import time
-from collections.abc import Mapping, Set
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
@@ -82,11 +83,15 @@ class MotionPlanner:
             ApexError: The robot is unknown, or one of its files is faulty.
         """
         self.robot = robot if isinstance(robot, Robot) else load_robot(robot)
-        self.robot_file = self.robot.name if isinstance(robot, Robot) else str(robot)
+        file = self.robot.name if isinstance(robot, Robot) else str(robot)
+        self.robot_file = os.path.abspath(file) if file.endswith((".yaml", ".yml")) else file
         self.model = model
-        self._lock = threading.RLock()
-        self._checker = CollisionChecker(self.robot)
-        self.world = World(self._checker, self._lock)
+        self.world = World(CollisionChecker(self.robot), threading.RLock(), self.robot_file)
+        self._set_up()
+
+    def _set_up(self) -> None:
+        self._checker, self._lock = self.world.checker, self.world.lock
+        self._left: CollisionChecker | None = None  # of the world without some obstacles, as it was needed last
 
     def __enter__(self) -> Self:
         """Return the planner."""
@@ -98,21 +103,13 @@ class MotionPlanner:
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what another process needs to make the same planner."""
-        with self._lock:
-            obstacles, held = tuple(self.world.obstacles.values()), tuple(self.world.held.values())
-            return {
-                "robot": self.robot_file, "model": self.model, "obstacles": obstacles, "held": held,
-                "allowed": self.world.allowed,
-            }  # fmt: skip
+        return {"robot_file": self.robot_file, "model": self.model, "world": self.world}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Make the planner anew."""
-        self.__init__(state["robot"], state["model"])  # type: ignore[misc]
-        self.world.add(*state["obstacles"])
-        for held in state["held"]:
-            self.world.attach(held)
-        for pair in state["allowed"]:
-            self.world.allow(*pair)
+        self.__dict__.update(state)
+        self.robot = self.world.checker.robot
+        self._set_up()
 
     def plan(
         self, start: State, goal: Target, planner: str | None = None, *,
@@ -170,13 +167,13 @@ class MotionPlanner:
         begin = joint_values(self.robot, start, "start")
         moving = self.robot.joint_names if group is None else planned_joints(self.robot, group)
         wanted = goal_record(self.robot, goal, {joint: v for joint, v in begin.items() if joint not in moving})
-        with self._lock:
-            fields = {
-                "name": name, "robot": self.robot_file, "scene": tuple(self.world.obstacles.values()),
-                "attached": tuple(self.world.held.values()), "allowed": self.world.allowed, "start": begin,
-                "goal": wanted,
+        query = validate(Problem, {"name": name, "robot": self.robot_file, "start": begin, "goal": wanted}, "problem")
+        with self._lock:  # what is in the world is valid already
+            bodies = {
+                "scene": tuple(self.world.obstacles.values()), "attached": tuple(self.world.held.values()),
+                "allowed": self.world.allowed,
             }  # fmt: skip
-        return validate(Problem, fields, "problem")
+        return query.model_copy(update={key: value for key, value in bodies.items() if value})
 
     def is_free(self, state: State) -> bool:
         """Whether a state is inside the limits and free in the world as it is now; :meth:`check` says why it is not.
@@ -210,7 +207,8 @@ class MotionPlanner:
             ApexError: The start or the goal is faulty.
         """
         with self._lock:
-            ready = assemble(self.problem(start, goal), self.robot, checker=self._checker_now())
+            checker = self._checker_without(self._absent(), kept=False)
+            ready = assemble(self.problem(start, goal), self.robot, checker=checker)
         ready.simple_setup.setPlannerAllocator(planners.allocator(NAME))
         return ready.simple_setup
 
@@ -224,10 +222,11 @@ class MotionPlanner:
         if not isinstance(timing, (bool, Timing)):
             raise ParameterError("timing", timing, "True, False or a Timing")
         how = (Timing() if timing else None) if isinstance(timing, bool) else timing
-        movers = _movers(problem, snapshot, how, leave_contact)
+        changing = self._checker.changing_obstacles
+        movers = _movers(changing, snapshot, how, leave_contact)
         with quiet_ompl():
             seed_ompl(seed)
-            notes = snapshot_notes(problem) if snapshot else []
+            notes = snapshot_notes(changing) if snapshot else []
             if planner is None:
                 planner = NAME
                 if not has_model(self.robot.name):
@@ -247,6 +246,7 @@ class MotionPlanner:
                 departed = problem.model_copy(update={"start": begin})
                 ready = assemble(departed, self.robot, seed=seed, checker=checker, moving=moving)
             notes += given.notes
+            notes += [note for note in self._checker.mesh_notes if note not in given.notes]
             if how is not None:
                 warm_up()
             if movers:
@@ -266,15 +266,30 @@ class MotionPlanner:
 
     def _checker_now(self) -> CollisionChecker:
         """Return a checker of what is there at time 0."""
-        return self._checker_without({o.name for o in self.world.obstacles.values() if not is_there(o, 0.0)})
+        return self._checker_without(self._absent())
 
-    def _checker_without(self, names: Set[str]) -> CollisionChecker:
-        """Return a checker of the world without some obstacles, which is the world's own where there are none."""
+    def _absent(self) -> set[str]:
+        """Return the names of the obstacles that are not there at time 0."""
+        return {o.name for o in self._checker.changing_obstacles if not is_there(o, 0.0)}
+
+    def _checker_without(self, names: Set[str], *, kept: bool = True) -> CollisionChecker:
+        """Return a checker of the world without some obstacles, which is the world's own where there are none.
+
+        Args:
+            names: Names of these obstacles.
+            kept: Whether it may be the one of the last time, in which only what was changed since is changed.
+        """
         if not names:
             return self._checker
-        left = [one for one in self.world.obstacles.values() if one.name not in names]
-        pairs = [pair for pair in self.world.allowed if names.isdisjoint(pair)]
-        return CollisionChecker(self.robot, left, tuple(self.world.held.values()), pairs)
+        scene = {name: body for name, body in self.world.obstacles.items() if name not in names}
+        held, pairs = self.world.held, [pair for pair in self.world.allowed if names.isdisjoint(pair)]
+        if kept and self._left is not None:
+            self._left.become(scene, held, pairs)
+            if [*self._left.obstacles] == [*scene] and [*self._left.held] == [*held]:  # as in one that is made anew
+                return self._left
+        made = CollisionChecker(self.robot, scene.values(), held.values(), pairs)
+        self._left = made if kept else self._left
+        return made
 
     def _parameters(self, planner: str, params: Mapping[str, Any] | None) -> dict[str, Any]:
         given = dict(params or {})
@@ -293,13 +308,15 @@ def check_arguments(timeout: float, seed: int) -> None:
     check_seed(seed)
 
 
-def _movers(problem: Problem, snapshot: bool, timing: Timing | None, leave_contact: float) -> tuple[Obstacle, ...]:
+def _movers(
+    changing: Sequence[Obstacle], snapshot: bool, timing: Timing | None, leave_contact: float
+) -> tuple[Obstacle, ...]:
     """Return the obstacles that a plan is made among in time: those that move, unless they are to stand still.
 
     Raises:
         ParameterError: There are such, and an option that does not go with them; or one follows a script.
     """
-    movers = () if snapshot else movers_of(problem)
+    movers = () if snapshot else movers_of(changing)
     if movers and timing is None:
         raise ParameterError("timing", False, f"True or a Timing, since the obstacle {movers[0].name!r} moves")
     if movers and leave_contact:

@@ -6,16 +6,16 @@ import os
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.collision.shapes import coal_geometry
+from apex_ompl.collision.shapes import coal_geometry, with_file_read, with_file_unread
 from apex_ompl.errors import FileFormatError, SceneError
-from apex_ompl.scene.bodies import MOTION, AttachedObject, Obstacle, pose_fields
+from apex_ompl.robot import load_robot
+from apex_ompl.scene.bodies import MOTION, AttachedObject, Obstacle, given_fields, pose_fields
 from apex_ompl.scene.problem import Problem
 from apex_ompl.session.cloud_files import CloudFiles, cloud_of
 from apex_ompl.types import Array
@@ -27,29 +27,60 @@ class World:
     """Obstacles around a robot and objects that it holds.
 
     Edits change the collision checker in place. They are safe from any thread: an edit waits until a plan of the same
-    planner has ended. An edit that fails changes nothing.
+    planner has ended. An edit that fails changes nothing. Files of meshes, points and grids are read once, when their
+    body is added: later they may change or be gone.
+
+    A copy has a checker of its own, and so has a world that was sent to another process, which reads the files anew.
+
+    Attributes:
+        checker: The collision checker; it is changed by edits alone.
+        lock: Held during an edit.
+        robot_file: Name or file of the robot.
     """
 
-    def __init__(self, checker: CollisionChecker, lock: threading.RLock) -> None:
-        """Edit the scene of ``checker`` while ``lock`` is held."""
-        self._checker = checker
-        self._lock = lock
+    def __init__(self, checker: CollisionChecker, lock: threading.RLock, robot_file: str = "") -> None:
+        """Edit the scene of ``checker`` while ``lock`` is held.
+
+        Args:
+            checker: The checker.
+            lock: The lock.
+            robot_file: What other processes find the robot by; its name by default.
+        """
+        self.checker, self.lock = checker, lock
+        self.robot_file = robot_file or checker.robot.name
         self._clouds = CloudFiles()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what another process needs to make the same world; it reads the files of meshes and points anew."""
+        return {"robot": self.robot_file, "bodies": self._bodies()}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Make the world anew."""
+        checker = CollisionChecker(load_robot(state["robot"]), *state["bodies"])
+        self.__init__(checker, threading.RLock(), state["robot"])  # type: ignore[misc]
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> World:
+        """Return a world of its own with the same bodies, whose records do not change; no file is read."""
+        return World(CollisionChecker(self.checker.robot, *self._bodies()), threading.RLock(), self.robot_file)
+
+    def _bodies(self) -> tuple[tuple[Obstacle, ...], tuple[AttachedObject, ...], tuple[tuple[str, str], ...]]:
+        with self.lock:
+            return tuple(self.obstacles.values()), tuple(self.held.values()), self.allowed
 
     @property
     def obstacles(self) -> Mapping[str, Obstacle]:
         """Obstacles by name, without the robot's own fixtures."""
-        return MappingProxyType(self._checker.obstacles)
+        return self.checker.obstacles
 
     @property
     def held(self) -> Mapping[str, AttachedObject]:
         """Held objects by name."""
-        return MappingProxyType(self._checker.held)
+        return self.checker.held
 
     @contextmanager
     def locked(self) -> Iterator[None]:
         """Keep other threads from planning and from editing, so that several edits are one."""
-        with self._lock:
+        with self.lock:
             yield
 
     def add(self, *obstacles: Obstacle | Mapping[str, Any], **fields: Any) -> None:
@@ -63,8 +94,8 @@ class World:
             SceneError: A name is taken already.
         """
         wanted = [self._read(Obstacle, one, "obstacle") for one in (*obstacles, *([fields] if fields else []))]
-        with self._lock:
-            self._add(wanted)
+        with self.lock:
+            self._add([with_file_unread(one) for one in wanted])
 
     def set_points(
         self, name: str, points: ArrayLike, radius: float, file: str | os.PathLike[str] | None = None
@@ -87,12 +118,12 @@ class World:
             MissingFileError: The file cannot be written.
         """
         cloud = cloud_of(points)
-        with self._lock:
+        with self.lock:
             path = self._clouds.path(file)
             wanted = self._read(Obstacle, {"name": name, "points": {"file": str(path), "radius": radius}}, "obstacle")
             old = self.obstacles.get(name)
             if old is None:
-                self._checker.check_name(name)
+                self.checker.check_name(name)
             elif old.points is None:
                 raise SceneError(f"the name {name!r} is taken by an obstacle that is no cloud of points")
             if not len(cloud):
@@ -103,10 +134,10 @@ class World:
                 return
             coal_geometry(wanted)  # what is wrong with it shows before anything is changed
             allowed = [pair for pair in self.allowed if name in pair]
-            self._checker.remove(name)
-            self._checker.add(wanted)
+            self.checker.remove(name)
+            self.checker.add(wanted)
             for pair in allowed:
-                self._checker.allow(*pair)
+                self.checker.allow(*pair)
 
     def move(self, name: str, position: Sequence[float], orientation: Sequence[float] | None = None) -> None:
         """Move an obstacle to a pose in the world [m, quaternion xyzw]; the orientation is kept by default.
@@ -117,9 +148,9 @@ class World:
             SceneError: There is no such obstacle.
             FileFormatError: The position or the orientation is not valid.
         """
-        with self._lock:
-            self._obstacle(name)
-            self._checker.move(name, position, orientation)
+        with self.lock:
+            self.checker.obstacle(name)
+            self.checker.move(name, position, orientation)
 
     def set_velocity(self, name: str, velocity: Sequence[float] | None) -> None:
         """Give an obstacle a constant velocity [m/s], or none, in place of a script that it may have.
@@ -128,9 +159,9 @@ class World:
             SceneError: There is no such obstacle.
             FileFormatError: The velocity is not valid.
         """
-        with self._lock:
-            self._obstacle(name)
-            self._checker.set_velocity(name, velocity)
+        with self.lock:
+            self.checker.obstacle(name)
+            self.checker.set_velocity(name, velocity)
 
     def remove(self, name: str) -> None:
         """Remove an obstacle.
@@ -138,9 +169,9 @@ class World:
         Raises:
             SceneError: There is no such obstacle, or it is a fixture of the robot.
         """
-        with self._lock:
-            self._obstacle(name)
-            self._checker.remove(name)
+        with self.lock:
+            self.checker.obstacle(name)
+            self.checker.remove(name)
 
     def attach(
         self, held: AttachedObject | Mapping[str, Any] | str, link: str | None = None,
@@ -161,32 +192,35 @@ class World:
             UnknownNameError: An unknown link.
             FileFormatError: A field is unknown or faulty.
         """
-        with self._lock:
+        with self.lock:
             taken = None
             if isinstance(held, str):
                 if link is None or at is None:
                     raise SceneError(
                         f"to attach the obstacle {held!r}, give the link and the state at which it is taken"
                     )
-                taken = self._obstacle(held)
+                taken = self.checker.obstacle(held)
                 held = self._as_held(taken, link, finite_array(at, "at"))
             wanted = self._read(AttachedObject, held, "held object")
-            changes = {"link": link, "touch_links": None if touch_links is None else tuple(touch_links)}
-            wanted = wanted.model_copy(update={key: value for key, value in changes.items() if value is not None})
+            wanted = with_file_unread(wanted) if taken is None else wanted
+            changes = {"link": link, "touch_links": touch_links}
+            if given := {key: value for key, value in changes.items() if value is not None}:
+                wanted = validate(AttachedObject, given_fields(wanted) | given, "held object")
+            wanted = with_file_read(wanted)
             pairs = [] if taken is None else [pair for pair in self.allowed if taken.name in pair]
             if taken is not None:
-                self._checker.remove(taken.name)
+                self.checker.remove(taken.name)
             try:
-                self._checker.attach(wanted)
+                self.checker.attach(wanted)
                 if at is not None:
                     self._check_grasp(wanted.name, finite_array(at, "at"))
             except Exception:
                 if wanted.name in self.held and (taken is not None or self.held[wanted.name] is wanted):
-                    self._checker.detach(wanted.name)
+                    self.checker.detach(wanted.name)
                 if taken is not None:
-                    self._checker.add(taken)
+                    self.checker.add(taken)
                 for pair in pairs:
-                    self._checker.allow(*pair)
+                    self.checker.allow(*pair)
                 raise
 
     def detach(self, name: str, *, at: ArrayLike | None = None) -> None:
@@ -195,19 +229,19 @@ class World:
         Raises:
             SceneError: There is no such held object.
         """
-        with self._lock:
-            held, left = self.held.get(name), []
+        with self.lock:
+            held, left = self.held.get(name) if isinstance(name, str) else None, list[Obstacle]()
             if at is not None and held is not None:
-                pose = self._checker.robot.link_pose(finite_array(at, "at"), held.link) @ held.pose
-                shape = held.model_dump(exclude_none=True, exclude={"link", "touch_links", "contact"})
+                pose = self.checker.robot.link_pose(finite_array(at, "at"), held.link) @ held.pose
+                shape = given_fields(held, ("link", "touch_links", "contact"))
                 left = [self._read(Obstacle, {**shape, **pose_fields(pose)}, "obstacle")]
-            self._checker.detach(name)
+            self.checker.detach(name)
             self._add(left)
 
     @property
     def allowed(self) -> tuple[tuple[str, str], ...]:
         """Pairs of bodies that may touch, as :meth:`allow` was told."""
-        return self._checker.allowed
+        return self.checker.allowed
 
     def allow(self, first: str, second: str, allowed: bool = True) -> None:
         """Let two bodies touch and overlap, as an entry of MoveIt's allowed collision matrix does; or no longer.
@@ -223,18 +257,18 @@ class World:
             UnknownNameError: There is no such body.
             SceneError: Both names are of the same body.
         """
-        with self._lock:
-            self._checker.allow(first, second, allowed)
+        with self.lock:
+            self.checker.allow(first, second, allowed)
 
     def clear(self) -> None:
         """Remove all obstacles, held objects and allowed pairs; the robot's fixtures stay."""
-        with self._lock:
+        with self.lock:
             for pair in self.allowed:
-                self._checker.allow(*pair, allowed=False)
+                self.checker.allow(*pair, allowed=False)
             for name in tuple(self.held):
-                self._checker.detach(name)
+                self.checker.detach(name)
             for name in tuple(self.obstacles):
-                self._checker.remove(name)
+                self.checker.remove(name)
 
     def load(self, problem: Problem) -> None:
         """Replace all obstacles, held objects and allowed pairs by those of a problem.
@@ -242,10 +276,11 @@ class World:
         Raises:
             ApexError: A body of the problem is faulty; the world is then empty.
         """
-        with self._lock:
+        with self.lock:
             self.clear()
             try:
-                self._checker.fill(problem.scene, problem.attached, problem.allowed, fixtures=False)
+                scene, held = map(with_file_unread, problem.scene), map(with_file_unread, problem.attached)
+                self.checker.fill(scene, held, problem.allowed, fixtures=False)
             except Exception:
                 self.clear()
                 raise
@@ -254,26 +289,21 @@ class World:
         added: list[str] = []
         try:
             for obstacle in obstacles:
-                self._checker.add(obstacle)
+                self.checker.add(obstacle)
                 added.append(obstacle.name)
         except Exception:
             for name in added:
-                self._checker.remove(name)
+                self.checker.remove(name)
             raise
 
-    def _obstacle(self, name: str) -> Obstacle:
-        if not self._checker.is_obstacle(name):
-            raise SceneError(f"no obstacle {name!r}; there are: {', '.join(self.obstacles) or 'none'}")
-        return self.obstacles[name]
-
     def _check_grasp(self, name: str, q: Array) -> None:
-        contacts = [contact for contact in self._checker.contacts(q) if name in (contact.first, contact.second)]
+        contacts = [contact for contact in self.checker.contacts(q) if name in (contact.first, contact.second)]
         if contacts:
             raise SceneError(f"the object {name!r} would overlap where it is taken: {contacts[0]}")
 
     def _as_held(self, obstacle: Obstacle, link: str, q: Array) -> dict[str, Any]:
-        pose = np.linalg.inv(self._checker.robot.link_pose(q, link)) @ obstacle.pose
-        shape = obstacle.model_dump(exclude_none=True, exclude={*MOTION})
+        pose = np.linalg.inv(self.checker.robot.link_pose(q, link)) @ obstacle.pose
+        shape = given_fields(obstacle, MOTION)
         return {**shape, "link": link, **pose_fields(pose)}
 
     @staticmethod

@@ -52,6 +52,12 @@ class MessageReader:
             raise self.fail(where, value, "expected a finite number")
         return float(value)
 
+    def flag(self, value: Any, where: str) -> bool:
+        """Return a truth value, which a text such as ``"false"`` is not."""
+        if not isinstance(value, bool):
+            raise self.fail(where, value, "expected true or false")
+        return value
+
     def numbers(self, data: Any, keys: str, default: Sequence[float], where: str) -> Array:
         """Return an array of finite numbers, given as a list or by their keys.
 
@@ -67,13 +73,10 @@ class MessageReader:
         if data is None:
             return np.array(default)
         values = [data.get(k, d) for k, d in zip(keys, default, strict=True)] if isinstance(data, Mapping) else data
-        try:
-            array = np.array(values, dtype=float)
-        except (TypeError, ValueError) as error:
-            raise self.fail(where, data, f"expected {len(keys)} numbers") from error
-        if array.shape != (len(keys),) or not np.isfinite(array).all():
+        numbers = isinstance(values, list) and len(values) == len(keys) and all(map(is_number, values))
+        if not numbers or not np.isfinite(values).all():
             raise self.fail(where, data, f"expected {len(keys)} finite numbers")
-        return array
+        return np.array(values, float)
 
 
 def inside(where: str, key: str) -> str:

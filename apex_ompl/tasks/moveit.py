@@ -26,6 +26,7 @@ from apex_ompl.tasks.messages import MessageReader, inside
 from apex_ompl.tasks.moveit_allowed import MATRIX, allowed_pairs
 from apex_ompl.types import Array
 from apex_ompl.util.schema import read_yaml, validate
+from apex_ompl.util.validation import is_integer
 
 PRIMITIVES = {1: "box", 2: "sphere", 3: "cylinder", 4: "cone"}
 ADD, REMOVE = 0, 1  # operations of moveit_msgs/CollisionObject
@@ -138,6 +139,14 @@ class _Reader(MessageReader):
         except FileFormatError as error:
             raise self.fail(inside(where, error.field), error.value, error.expected) from error
 
+    def operation(self, item: Mapping[str, Any], known: tuple[int, ...], where: str) -> int:
+        """Return what is done with an object, out of the known operations."""
+        found = item.get("operation", ADD)
+        if not is_integer(found) or found not in known:
+            also = f", or {REMOVE} to remove it" if REMOVE in known else ""
+            raise self.fail(f"{where}.operation", found, f"expected {ADD} to add an object{also}")
+        return int(found)
+
     def mesh(self, data: Mapping[str, Any], where: str) -> dict[str, Any]:
         resource = data.get("resource")
         if not resource:
@@ -212,20 +221,21 @@ def _obstacles(reader: _Reader, data: Mapping[str, Any], start: Array) -> list[O
     octomap = reader.section(reader.section(world, "octomap", "world"), "octomap", "world.octomap")
     if octomap.get("data"):
         raise reader.fail("world.octomap", "an octomap", "cannot be read, expected primitives and meshes")
-    found: list[Obstacle] = []
+    found: dict[str, list[Obstacle]] = {}  # by the object's name; operations are carried out one after the other
     for k, item in enumerate(reader.messages(world, "collision_objects")):
         where = f"collision_objects.{k}"
-        operation = item.get("operation", ADD)
-        if operation == REMOVE:
-            reader.notes.append(f"{where}: removed, so left out")
+        label = str(item.get("id", "")).strip()
+        if reader.operation(item, (ADD, REMOVE), where) == REMOVE:
+            gone = list(found) if not label else [label] if label in found else []  # without a name: all
+            reader.notes.append(f"{where}: removes {', '.join(map(repr, gone)) or repr(label)}")
+            found = {name: bodies for name, bodies in found.items() if name not in gone}
             continue
-        if operation != ADD:
-            raise reader.fail(f"{where}.operation", operation, f"expected {ADD} to add an object, or {REMOVE}")
         base = reader.frame(str(reader.section(item, "header", where).get("frame_id", "")), start, where)
-        for label, shape, pose in _bodies(reader, item, where):
-            placed = base @ pose
-            found.append(reader.body(Obstacle, {"name": label, **shape, **pose_fields(placed)}, where))
-    return found
+        found[label or where] = [  # in place of what was added by that name before
+            reader.body(Obstacle, {"name": name, **shape, **pose_fields(base @ pose)}, where)
+            for name, shape, pose in _bodies(reader, item, where)
+        ]
+    return [body for bodies in found.values() for body in bodies]
 
 
 def _attached(reader: _Reader, state: Mapping[str, Any], where: str, start: Array) -> Iterator[AttachedObject]:
@@ -233,6 +243,7 @@ def _attached(reader: _Reader, state: Mapping[str, Any], where: str, start: Arra
         here = f"{where}.attached_collision_objects.{k}"
         link = reader.frame_map.get(str(entry.get("link_name")), str(entry.get("link_name")))
         item = reader.section(entry, "object", here)
+        reader.operation(item, (ADD,), f"{here}.object")
         frame = str(reader.section(item, "header", f"{here}.object").get("frame_id", ""))
         inside = np.linalg.inv(reader.robot.link_pose(start, link))
         # MoveIt gives an attached object in the frame of its link unless the header says otherwise.

@@ -31,7 +31,8 @@ def allowed_pairs(
         names: Link in the file -> link of ``robot``.
 
     Raises:
-        FileFormatError: The matrix is not square, or has other faults.
+        FileFormatError: The matrix is not square, or has other faults; a value that is neither true nor false is named
+            with its two entries.
     """
     entries = [str(name) for name in reader.entries(matrix, "entry_names", MATRIX)]
     given = reader.entries(matrix, "entry_values", MATRIX)
@@ -45,10 +46,21 @@ def allowed_pairs(
     if [len(row) for row in rows] != [len(entries)] * len(entries):
         expected = f"expected {len(entries)} rows of {len(entries)} values, one for each of entry_names"
         raise reader.fail(f"{MATRIX}.entry_values", len(rows), expected)
+    flags = [
+        [
+            reader.flag(value, f"{MATRIX}.entry_values.{k}.{j} ({entries[k]}, {entries[j]})")
+            for j, value in enumerate(row)
+        ]
+        for k, row in enumerate(rows)
+    ]
     defaults = [str(name) for name in reader.entries(matrix, "default_entry_names", MATRIX)]
     values = reader.entries(matrix, "default_entry_values", MATRIX)
     if len(values) != len(defaults):
         raise reader.fail(f"{MATRIX}.default_entry_values", len(values), f"expected {len(defaults)} values")
+    usual = [
+        reader.flag(value, f"{MATRIX}.default_entry_values.{k} ({name})")
+        for k, (name, value) in enumerate(zip(defaults, values, strict=True))
+    ]
     known = (*dict.fromkeys((*robot.link_names, *bodies)),)
     ours = {name: _bodies_of(names.get(name, name), known) for name in (*entries, *defaults)}
     unknown = sorted(name for name, found in ours.items() if not found)
@@ -56,8 +68,8 @@ def allowed_pairs(
     for i, j in product(range(len(entries)), repeat=2):
         if i != j:
             pairs = set(map(_sorted, product(ours[entries[i]], ours[entries[j]])))
-            allowed, kept_apart = (allowed | pairs, kept_apart) if rows[i][j] else (allowed, kept_apart | pairs)
-    for name, value in zip(defaults, values, strict=True):
+            allowed, kept_apart = (allowed | pairs, kept_apart) if flags[i][j] else (allowed, kept_apart | pairs)
+    for name, value in zip(defaults, usual, strict=True):
         if value:
             allowed |= set(map(_sorted, product(ours[name], known))) - kept_apart
     links = set(robot.link_names)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from apex_ompl.types import Array
+from apex_ompl.util.validation import number_array
 
 SAME_STATE = 1e-9  # distance below which states count as one [rad]
 SAME_DIRECTION = 1e-7  # norm of the difference of unit directions below which they count as one
@@ -32,7 +33,7 @@ class Polyline:
 
         Where all states count as one, it has the first and the last of them, or one if these are equal.
         """
-        states = np.array(path, dtype=float)
+        states = np.array(number_array(path, "path"))
         kept, rows = [0], states.tolist()
         for k, row in enumerate(rows):
             if math.dist(row, rows[kept[-1]]) > SAME_STATE:

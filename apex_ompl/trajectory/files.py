@@ -16,6 +16,7 @@ from apex_ompl.errors import FileFormatError, ParameterError
 from apex_ompl.types import Array
 from apex_ompl.util.files import BROKEN, read_file, read_text, suffix_of
 from apex_ompl.util.schema import read_json, read_yaml
+from apex_ompl.util.validation import check_integer, number_array
 
 MESSAGES = (".traj.yaml", ".traj.json")
 SUFFIXES = (".npz", ".csv", *MESSAGES)
@@ -81,12 +82,12 @@ def decode(path: Path) -> tuple[Array, list[Array], tuple[str, ...]]:
     try:
         if suffix == ".npz":
             with np.load(io.BytesIO(read_file(path, ROLE)), allow_pickle=False) as archive:
-                states = [archive[name].astype(float) for name in STATES]
-                return archive["times"].astype(float), states, tuple(str(name) for name in archive["joint_names"])
+                times, *states = (number_array(archive[name], name) for name in ("times", *STATES))
+                return times, states, tuple(str(name) for name in archive["joint_names"])
         if suffix == ".csv":
             return _from_table(read_text(path, ROLE))
         return _from_messages((read_json if suffix == ".traj.json" else read_yaml)(path, ROLE))
-    except (OSError, *BROKEN, AttributeError, IndexError, csv.Error) as error:
+    except (OSError, *BROKEN, AttributeError, IndexError, csv.Error, ParameterError) as error:
         raise FileFormatError(str(path), "", str(error), "expected a saved trajectory") from error
 
 
@@ -112,8 +113,11 @@ def _from_messages(data: Mapping[str, Any]) -> tuple[Array, list[Array], tuple[s
     parsed = []
     for message in messages:
         points = message["points"]
-        stamps = [int(at["sec"]) * NANOSECONDS + int(at["nanosec"]) for at in (p["time_from_start"] for p in points)]
-        states = [np.array([point[name] for point in points], dtype=float) for name in STATES]
+        ends = [point["time_from_start"] for point in points]
+        stamps = [
+            check_integer(at["sec"], "sec") * NANOSECONDS + check_integer(at["nanosec"], "nanosec") for at in ends
+        ]
+        states = [number_array([point[name] for point in points], name) for name in STATES]
         parsed.append((np.array(stamps) / NANOSECONDS, states, [str(name) for name in message["joint_names"]]))
     if not parsed or any(not np.array_equal(times, parsed[0][0]) for times, _, _ in parsed):
         raise ValueError("messages of different times")

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from apex_ompl.errors import ParameterError
 from apex_ompl.trajopt.path import resample
-from apex_ompl.util.validation import check_array, check_path, check_positive
+from apex_ompl.util.validation import check_array, check_path, check_positive, number_array
 
 STEPS = 128  # of even length that a path is resampled to for its jerk
 
@@ -52,7 +52,7 @@ def spectral_arc_length(
     Raises:
         ParameterError: There is no movement, or ``spacing`` is not positive.
     """
-    speeds = np.asarray(speed, dtype=float)
+    speeds = number_array(speed, "speed")
     check_array(speeds, ("N",), "speed", finite=True, least=2)
     if not speeds.any():
         raise ParameterError("speed", 0.0, "speeds that are not all 0")

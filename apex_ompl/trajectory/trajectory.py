@@ -19,7 +19,7 @@ from apex_ompl.trajectory.extremes import Extremes
 from apex_ompl.trajectory.files import STATES, SUFFIXES, decode, encode
 from apex_ompl.trajectory.smoothness import spectral_arc_length
 from apex_ompl.types import Array
-from apex_ompl.util.files import suffix_of, write_atomically
+from apex_ompl.util.files import path_text, suffix_of, write_atomically
 from apex_ompl.util.validation import check_array, check_integer, check_positive, check_times, finite_array
 
 ROUNDING = 1e-9  # of shares of limits
@@ -267,7 +267,7 @@ class Trajectory:
             ParameterError: Another suffix, or ``controllers`` that do not name each joint once.
             MissingFileError: The file cannot be written.
         """
-        path = Path(path)
+        path = Path(path_text(path))
         states, suffix = {name: getattr(self, name) for name in STATES}, suffix_of(path, SUFFIXES)
         write_atomically(path, encode(suffix, self.times, states, self.joint_names, controllers))
 
@@ -280,7 +280,7 @@ class Trajectory:
             FileFormatError: It holds no trajectory.
             ParameterError: It has another suffix.
         """
-        path = Path(path)
+        path = Path(path_text(path))
         times, states, names = decode(path)
         try:
             return cls(times, states[0], states[1], states[2], names)

@@ -24,6 +24,18 @@ BROKEN = (
 """Exceptions raised on reading a NumPy archive that is damaged or holds other content."""
 
 
+def path_text(given: str | os.PathLike[str], name: str = "path") -> str:
+    """Return the text of a path, or of a name, that a caller gives.
+
+    Raises:
+        ParameterError: It is neither a text nor a path.
+    """
+    text = os.fspath(given) if isinstance(given, (str, os.PathLike)) else None
+    if not isinstance(text, str):
+        raise ParameterError(name, given, "a path or a name")
+    return text
+
+
 def is_file(path: Path) -> bool:
     """Whether a path is an existing file; False also for names that no file can have, pipes and devices."""
     try:

@@ -8,8 +8,10 @@ from collections.abc import Hashable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar, get_args, get_origin
 
+import numpy as np
 import yaml
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler, ValidationError
+from pydantic_core import CoreSchema, core_schema
 
 from apex_ompl.errors import FileFormatError, nearest_name
 from apex_ompl.util.files import read_text
@@ -17,12 +19,44 @@ from apex_ompl.util.files import read_text
 ModelT = TypeVar("ModelT", bound="StrictModel")
 
 
+def _number(value: Any) -> Any:
+    """Return what may become a number; pydantic alone takes texts and True for numbers, too."""
+    if isinstance(value, (str, bytes, bool, np.bool_, np.ma.MaskedArray)):
+        raise ValueError("expected a number")
+    return value
+
+
+def _strict(schema: Any) -> Any:
+    """Return a core schema of pydantic with strict numbers and truth values."""
+    if isinstance(schema, list):
+        return [_strict(inner) for inner in schema]
+    if not isinstance(schema, dict):
+        return tuple(map(_strict, schema)) if isinstance(schema, tuple) else schema
+    kind = schema.get("type")
+    if kind == "function-before" and schema["function"]["function"] is _number:  # of another record
+        return schema
+    if kind == "bool":
+        return schema | {"strict": True}
+    if kind in ("float", "int"):
+        return core_schema.no_info_before_validator_function(_number, schema)
+    return {key: inner if key in ("metadata", "config") else _strict(inner) for key, inner in schema.items()}
+
+
 class StrictModel(BaseModel):
-    """A frozen record without unknown keys and with finite numbers only."""
+    """A frozen record without unknown keys and with finite numbers only.
+
+    Numbers must be numbers, neither texts nor True or False, and what is true or false must be given as such.
+    """
 
     model_config = ConfigDict(
         extra="forbid", frozen=True, allow_inf_nan=False, populate_by_name=True, validate_default=True
     )
+
+    @classmethod
+    def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        """Return the schema of the record with strict numbers and truth values, wherever they stand in its fields."""
+        found: CoreSchema = _strict(handler(source))
+        return found
 
 
 NUMBERS = re.compile(r"\[[-+.\deE,\s]*\]")  # vectors in flow style: a level each, and most of the brackets
@@ -96,14 +130,29 @@ def read_json(path: Path, role: str) -> dict[str, Any]:
     return data
 
 
+def yaml_value(text: str) -> Any:
+    """Return the value that YAML text stands for, as files of this package are read.
+
+    Raises:
+        YAMLError: It does not parse.
+    """
+    return yaml.load(text, Loader=_loader_of(text))
+
+
+def _loader_of(text: str) -> type[_Loader | _FastLoader]:
+    return _FastLoader if _shallow(text) else _Loader
+
+
 def parse_yaml(text: str, source: str) -> dict[str, Any]:
     """Parse YAML text that holds one mapping; ``source`` names it in errors.
+
+    Documents without content do not count, such as that after the ``---`` at the end of what ROS's tools print.
 
     Raises:
         FileFormatError: It does not parse, or is not a mapping.
     """
     try:
-        data = yaml.load(text, Loader=_FastLoader if _shallow(text) else _Loader)
+        documents = list(yaml.load_all(text, Loader=_loader_of(text)))
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark
         place = f"line {mark.line + 1}, column {mark.column + 1}" if mark else ""
@@ -112,6 +161,10 @@ def parse_yaml(text: str, source: str) -> dict[str, Any]:
     except Exception as error:  # PyYAML raises many kinds, deep nesting a RecursionError
         what = str(error) or type(error).__name__
         raise FileFormatError(source, "", what, "expected valid YAML") from error
+    given = [one for one in documents if one is not None] or [None]
+    if len(given) > 1:
+        raise FileFormatError(source, "", f"{len(given)} of them", "expected one document of YAML")
+    data = given[0]
     if not isinstance(data, dict):
         raise FileFormatError(source, "", data, "expected a mapping of keys to values")
     return data
@@ -141,6 +194,8 @@ def validate(model: type[ModelT], data: dict[str, Any], source: str) -> ModelT:
             expected, value = "required key is missing", sorted(map(str, value)) if value else value
         elif first["type"] == "value_error":
             expected = str(first["ctx"]["error"])
+        elif first["type"] == "bool_type":
+            expected = "expected true or false"
         field = ".".join(location) if location else ""
         raise FileFormatError(source, field, value, expected) from error
 

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from apex_ompl.errors import ParameterError
 from apex_ompl.types import Array
+from apex_ompl.util.schema import yaml_value
 
 LARGEST_INT = 2**31 - 1
 """Largest seed or count, the largest signed integer of 32 bits."""
@@ -86,16 +87,51 @@ def _shown(bound: float) -> str:
     return str(bound) if isinstance(bound, int) else f"{bound:g}"
 
 
+def number_array(given: Any, name: str, expected: str = "numbers") -> Array:
+    """Return real numbers as an array of floats, the same array where it is one; NaN and infinity are numbers.
+
+    NumPy alone takes the numbers below a mask, which are not known, the real part of complex numbers, texts, and True.
+
+    Args:
+        given: Numbers, in an array or in nested sequences of one shape.
+        name: Their name in the error.
+        expected: What the error asks for.
+
+    Raises:
+        ParameterError: One is no number, is masked, or the sequences are ragged.
+    """
+    if type(given) is np.ndarray and given.dtype == float:
+        return given
+    if _is_masked(given):
+        raise ParameterError(name, given, f"{expected}, none of them masked")
+    try:
+        found = np.asarray(given)
+        if found.dtype.kind not in "iufO" or (found.dtype.kind == "O" and not all(map(_is_real, found.flat))):
+            raise ParameterError(name, given, expected)
+        return np.asarray(found, float)
+    except (TypeError, ValueError, OverflowError, RuntimeError) as error:  # the last from tensors that have a gradient
+        why = " without a gradient" if getattr(given, "requires_grad", False) else ""
+        raise ParameterError(name, given, f"{expected}{why}") from error
+
+
+def _is_masked(given: object) -> bool:
+    """Whether a number of an array, or of a sequence of some, is masked."""
+    if isinstance(given, (list, tuple)):
+        return any(map(_is_masked, given)) if any(not isinstance(one, (int, float)) for one in given) else False
+    return isinstance(given, np.ma.MaskedArray) and bool(np.ma.getmaskarray(given).any())
+
+
+def _is_real(value: object) -> bool:
+    return not isinstance(value, (str, bytes, bool, np.bool_, complex, np.complexfloating))
+
+
 def finite_array(given: ArrayLike, name: str) -> Array:
     """Return a copy of finite numbers as an array, in C's order.
 
     Raises:
         ParameterError: One is no finite number.
     """
-    try:
-        found = np.array(given, dtype=float, order="C")
-    except (TypeError, ValueError, OverflowError) as error:
-        raise ParameterError(name, given, "finite numbers") from error
+    found = np.array(number_array(given, name, "finite numbers"), order="C")
     if not np.isfinite(found).all():
         raise ParameterError(name, float(found[~np.isfinite(found)].flat[0]), "finite numbers")
     return found
@@ -153,6 +189,26 @@ def check_array(array: Array, shape: Sequence[int | str], name: str, *, finite: 
         raise ParameterError(name, float(array[~np.isfinite(array)].flat[0]), error.expected)
 
 
+RIGID = 1e-3
+"""How far the entries of R^T R may be from those of the identity for a rotation matrix R."""
+
+
+def rigid_pose(given: ArrayLike, name: str) -> Array:
+    """Return a pose as an array after checking that it is a rotation and a translation, shape (4, 4) [m].
+
+    Raises:
+        ParameterError: Another shape, a number that is not finite, a scale, a shear, or a reflection.
+    """
+    pose = finite_array(given, name)
+    check_array(pose, (4, 4), name)
+    turn = pose[:3, :3]
+    if not np.allclose(pose[3], (0.0, 0.0, 0.0, 1.0), rtol=0.0, atol=RIGID):
+        raise ParameterError(name, pose[3].tolist(), "a rigid pose, whose last row is 0 0 0 1")
+    if not np.allclose(turn.T @ turn, np.eye(3), rtol=0.0, atol=RIGID) or np.linalg.det(turn) < 0.0:
+        raise ParameterError(name, turn.tolist(), "a rigid pose, whose 3 x 3 part is a rotation matrix")
+    return pose
+
+
 def shape_error(
     array: Array, shape: Sequence[int | str], name: str, *, finite: bool = False, least: int = 0
 ) -> ParameterError:
@@ -178,7 +234,7 @@ def check_path(path: ArrayLike, name: str = "path") -> Array:
     Raises:
         ParameterError: Another shape, fewer states, or a number that is not finite.
     """
-    states = np.asarray(path, dtype=float)
+    states = number_array(path, name)
     check_array(states, ("N", "dof"), name, finite=True, least=2)
     return states
 
@@ -241,6 +297,6 @@ def key_value(text: str) -> tuple[str, Any]:
     if not key or not equals:
         raise argparse.ArgumentTypeError(f"{text!r}, expected KEY=VALUE")
     try:
-        return key, yaml.safe_load(value)
+        return key, yaml_value(value)
     except yaml.YAMLError as error:
         raise argparse.ArgumentTypeError(f"{text!r}, expected a value in YAML") from error
