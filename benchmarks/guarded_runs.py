@@ -3,8 +3,8 @@
 The loop plans anew without the network (every tenth attack with it), at full speed, for at most 3 s a run, in worlds of
 all suites' kinds whose obstacles do not come out of nowhere, and in worlds that attack it (``attack_worlds.py``). Of
 those with a moving cube the first 600 are frozen, with a witness; others may be such that no robot could evade. In
-every fifth run it looks for faster motions too, which takes most of the time. A run ends after 1 s of rest. The
-referee knows what truly happened, and every contact counts, not only the first one. The last rows are controls: the
+every fifth run it looks for faster motions too, which takes most of the time. A run ends after 0.5 s of rest, in
+every fifth after 1.5. The referee knows what truly happened, and every contact counts, not only the first one. The last rows are controls: the
 same attacks on a loop that steps aside at its risk, and on one that asks for no fail-safe stop.
 
 Runs are stored in benchmarks/runs/guarded_runs when they end; the command resumes where it was stopped, and those of
@@ -36,7 +36,7 @@ DEPENDS = (
     "benchmarks/closed_loop.py", "benchmarks/attack_worlds.py", "@planning", "apex_ompl/live", "apex_ompl/loop",
     "apex_ompl/trajectory",
 )  # fmt: skip
-SHORT, RESTS = 3.0, 1.0  # time of a run, and of rest after which it ends [s]
+SHORT, RESTS, LONGER = 3.0, 0.5, 1.5  # time of a run, and of rest after which it ends, in every fifth run longer [s]
 HASTENING, PROPOSING = 5, 10  # of so many runs one looks for faster motions, of so many attacks one uses the network
 KINDS = ("moving", "turning", "crowd", "pusher")
 CONTROLS: dict[str, dict[str, Any]] = {"no-network+risk": {"evade": "risk"}, "no-network+unguarded": {"guarded": False}}
@@ -49,8 +49,9 @@ HEAD = (
 def made(job: Job) -> dict[str, Any]:
     """Run once, and return what is kept."""
     number = int(job.world.rpartition("/")[2])
+    hastens = number % HASTENING == 0
     changed = CONTROLS.get(job.method, {})
-    settings = LoopSettings(timeout=SHORT, stuck=RESTS, hastens=number % HASTENING == 0, **changed)
+    settings = LoopSettings(timeout=SHORT, stuck=LONGER if hastens else RESTS, hastens=hastens, **changed)
     method = job.method.partition("+")[0]
     if kind_of(job.world) != KIND:
         return kept(job, run(job.world, method, speed=job.speed, seed=0, settings=settings))
