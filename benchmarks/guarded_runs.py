@@ -4,8 +4,8 @@ The loop plans anew without the network (every tenth attack with it), at full sp
 all suites' kinds whose obstacles do not come out of nowhere, and in worlds that attack it (``attack_worlds.py``). Of
 those with a moving cube the first 600 are frozen, with a witness; others may be such that no robot could evade. In
 every fifth run it looks for faster motions too, which takes most of the time. A run ends after 0.5 s of rest, in
-every fifth after 1.5. The referee knows what truly happened, and every contact counts, not only the first one. The last rows are controls: the
-same attacks on a loop that steps aside at its risk, and on one that asks for no fail-safe stop.
+every fifth after 1.5. The referee knows what truly happened, and every contact counts, not only the first one. The last
+rows are controls: the same attacks on a loop that steps aside at its risk, and on one that asks for no fail-safe stop.
 
 Runs are stored in benchmarks/runs/guarded_runs when they end; the command resumes where it was stopped, and those of
 the committed table are packed (``python benchmarks/pack.py unpack guarded_runs``).
