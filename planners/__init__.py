@@ -11,6 +11,10 @@ from apex_ompl.planners.tuned import TUNED
 __all__ = ["APEX", "TUNED", "Parameters", "allocator", "make", "names", "parameters"]
 
 
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
+
+
 def __getattr__(name: str) -> Any:
     if name == "APEX":  # torch comes with it
         from apex_ompl.planners.apex import APEX

@@ -17,7 +17,7 @@ from apex_ompl.api import load_problem, plan
 from apex_ompl.benchmark import runs
 from apex_ompl.benchmark.rows import Job
 from apex_ompl.errors import TimingStoppedError
-from apex_ompl.ompl_adapter.interrupt import ends_after, motions_until
+from apex_ompl.ompl_adapter.interrupt import ends_after
 from apex_ompl.ompl_adapter.repair import repair
 from apex_ompl.ompl_adapter.setup import PlanningSetup, assemble
 from apex_ompl.ompl_adapter.simplify import simplify

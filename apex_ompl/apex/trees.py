@@ -56,6 +56,24 @@ def compiled_trees(
     return TreePair(context.kernel, np.array(starts), np.array(goals), longest, SEARCH_RESOLUTION, rng)
 
 
+def rooted_trees(
+    context: SolveContext, starts: Sequence[Array], goals: Sequence[Array], tree_range: float
+) -> TreePair:  # fmt: skip
+    """Return compiled trees whose roots are starts and goals of the problem; OMPL's planner data are theirs."""
+    trees = compiled_trees(context, starts, goals, tree_range)
+    context.grown.append(trees)
+    return trees
+
+
+def rooted_ompl_trees(
+    context: SolveContext, starts: Sequence[Array], goal: Array | ob.Goal, tree_range: float
+) -> OmplTrees:  # fmt: skip
+    """Return OMPL's trees whose roots are starts and goals of the problem; OMPL's planner data are theirs."""
+    trees = ompl_trees(context.si, starts, goal, tree_range)
+    context.grown.append(trees[0])
+    return trees
+
+
 def grow(context: SolveContext, trees: TreePair, iterations: int) -> Array | None:
     """Return the path of compiled trees after some more iterations, or None; count what they looked at."""
     found = trees.grow(iterations, context.stop)

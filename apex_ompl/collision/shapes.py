@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import io
 import logging
-import threading
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from weakref import WeakValueDictionary
@@ -32,6 +31,7 @@ from apex_ompl.scene.meshes import (
 from apex_ompl.scene.points import parse_points
 from apex_ompl.types import Array
 from apex_ompl.util.files import read_file
+from apex_ompl.util.forking import ProcessLock
 from apex_ompl.util.weak_cache import weakly_cached
 
 LOADED_BY_COAL = (".stl", ".obj")  # which takes half a second less than the other library's import
@@ -41,7 +41,7 @@ MANY_TRIANGLES = 200_000  # which take seconds
 
 LOG = logging.getLogger("apex_ompl")
 
-_loading = threading.RLock()
+_loading = ProcessLock()
 _meshes: WeakValueDictionary[str, coal.BVHModelBase] = WeakValueDictionary()  # by content and scale
 _recent: list[coal.BVHModelBase] = []
 

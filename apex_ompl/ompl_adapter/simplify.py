@@ -9,9 +9,8 @@ import numpy as np
 from ompl import base as ob
 from ompl import geometric as og
 
-from apex_ompl.ompl_adapter.interrupt import motions_until
 from apex_ompl.ompl_adapter.space import array_to_path, path_to_array
-from apex_ompl.ompl_adapter.validity import MotionValidator
+from apex_ompl.ompl_adapter.validity import MotionValidator, motions_until
 from apex_ompl.trajopt.path import path_length
 from apex_ompl.types import Array
 

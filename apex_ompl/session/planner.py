@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Mapping, Set
 from dataclasses import dataclass
@@ -34,6 +33,7 @@ from apex_ompl.scene.scripts import is_there
 from apex_ompl.session.world import World
 from apex_ompl.trajectory import Timing, warm_up
 from apex_ompl.util.deadline import Deadline
+from apex_ompl.util.forking import ProcessLock
 from apex_ompl.util.schema import validate
 from apex_ompl.util.validation import check_number, check_positive, check_seed
 
@@ -84,7 +84,7 @@ class MotionPlanner:
         self.robot = robot if isinstance(robot, Robot) else load_robot(robot)
         self.robot_file = self.robot.name if isinstance(robot, Robot) else str(robot)
         self.model = model
-        self._lock = threading.RLock()
+        self._lock = ProcessLock()
         self._checker = CollisionChecker(self.robot)
         self.world = World(self._checker, self._lock)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from types import MappingProxyType
@@ -19,6 +18,7 @@ from apex_ompl.scene.bodies import MOTION, AttachedObject, Obstacle, pose_fields
 from apex_ompl.scene.problem import Problem
 from apex_ompl.session.cloud_files import CloudFiles, cloud_of
 from apex_ompl.types import Array
+from apex_ompl.util.forking import ProcessLock
 from apex_ompl.util.schema import validate
 from apex_ompl.util.validation import finite_array
 
@@ -30,7 +30,7 @@ class World:
     planner has ended. An edit that fails changes nothing.
     """
 
-    def __init__(self, checker: CollisionChecker, lock: threading.RLock) -> None:
+    def __init__(self, checker: CollisionChecker, lock: ProcessLock) -> None:
         """Edit the scene of ``checker`` while ``lock`` is held."""
         self._checker = checker
         self._lock = lock
