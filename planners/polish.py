@@ -81,7 +81,7 @@ class PolishedRRTConnect(OwnPlanner):
         dof = self.validator.checker.robot.dof
         self.report.first_path = path = Path(path_to_array(pdef.getSolutionPath(), dof))
         with self.report.timed("simplify"):
-            path = Path(simplify(og.PathSimplifier(si), si, path.states, lambda: bool(ptc())))
+            path = Path(simplify(si, path.states, lambda: bool(ptc())))
         self._add(path)
         if not ptc():
             with self.report.timed("polish"):

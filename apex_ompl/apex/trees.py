@@ -20,6 +20,7 @@ from apex_ompl.types import Array
 from apex_ompl.util.resolution import SEARCH_RESOLUTION
 
 OMPL_RANGE = 0.2  # OMPL's choice of the longest step, as a share of the extent of the space
+OMPL_SHARE = 0.125  # of the iterations of compiled trees that OMPL's have, which take several times as long for one
 OmplTrees = tuple[og.RRTConnect, ob.ProblemDefinition]
 
 

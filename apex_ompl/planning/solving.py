@@ -213,9 +213,7 @@ def _found_path(run: PlanRun) -> Path:
 
 
 def _simplified(run: PlanRun, path: Path) -> Path:
-    simple_setup = run.setup.simple_setup
-    si = simple_setup.getSpaceInformation()
-    return Path(shorten(simple_setup.getPathSimplifier(), si, path.states, run.ends_search))
+    return Path(shorten(run.setup.simple_setup.getSpaceInformation(), path.states, run.ends_search))
 
 
 def _out_of_time(run: PlanRun) -> PlanResult:

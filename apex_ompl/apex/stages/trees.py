@@ -15,14 +15,13 @@ from ompl import base as ob
 from apex_ompl.apex.bridge import bridge_blocked
 from apex_ompl.apex.context import SolveContext, joins
 from apex_ompl.apex.stages.stage import Solution
-from apex_ompl.apex.trees import grow, rooted_ompl_trees, rooted_trees
+from apex_ompl.apex.trees import OMPL_SHARE, grow, rooted_ompl_trees, rooted_trees
 from apex_ompl.ompl_adapter.space import path_to_array
 from apex_ompl.trajopt.path import Path
 from apex_ompl.types import Array
 
 SPACING = 0.1  # of states on a tree's path whose blocked stretches are bridged [rad, max-norm]
 GUIDING, EVERY = 8, 8  # candidates around whose states trees grow, the nearest to being free, and every so many states
-OMPL_SHARE = 0.125  # of the iterations of compiled trees that OMPL's have, which take several times as long for one
 EXACT, APPROXIMATE = ob.PlannerStatus.EXACT_SOLUTION, ob.PlannerStatus.APPROXIMATE_SOLUTION
 
 
