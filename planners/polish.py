@@ -81,7 +81,10 @@ class PolishedRRTConnect(OwnPlanner):
         dof = self.validator.checker.robot.dof
         self.report.first_path = path = Path(path_to_array(pdef.getSolutionPath(), dof))
         with self.report.timed("simplify"):
-            path = Path(simplify(si, path.states, lambda: bool(ptc())))
+            short = Path(simplify(si, path.states, lambda: bool(ptc())))
+            # parts of motions that were checked are looked at in other places than before
+            if self.validator.exclusive or self.validator.accepts(short.states, lambda: bool(ptc())):
+                path = short
         self._add(path)
         if not ptc():
             with self.report.timed("polish"):

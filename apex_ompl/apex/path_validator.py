@@ -12,6 +12,7 @@ from ompl import base as ob
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel import Kernel
+from apex_ompl.ompl_adapter.forwarding import forwarding
 from apex_ompl.ompl_adapter.simple_setup import SpaceInformation
 from apex_ompl.ompl_adapter.space import bounds_of, require_real_vectors, to_state
 from apex_ompl.ompl_adapter.validity import MotionValidator, StateValidityChecker
@@ -23,6 +24,7 @@ NOT_ACCEPTED = "the state validity checker that is set does not accept the path"
 
 LOG = logging.getLogger("apex_ompl")
 PLAIN = (ob.MotionValidator, MotionValidator)  # OMPL's own, and this project's
+LOOKS = 8  # every so many states of a path are looked at before its motions, which have the others
 DEFAULT_ROBOT = "dual_panda_softhand"
 
 
@@ -35,6 +37,7 @@ class PathValidator:
     space; the robot is then that of the setup, or known by name, and its obstacles are not known.
 
     Attributes:
+        si: By whose checkers motions are valid; where the motion validator is the user's, states between are, too.
         checker: Collision checker of the robot, among its obstacles where they are known.
         knows_obstacles: Whether the obstacles are known.
         exclusive: Whether this project's checker alone decides.
@@ -57,11 +60,12 @@ class PathValidator:
         self._checkers = _checkers(si)
         self._bounded: tuple[tuple[Any, ...], Kernel] | None = None  # what it was made of, and the kernel
         validity_checker, motions = self._checkers
-        self._walks = type(motions) not in PLAIN
+        plain = type(motions) in PLAIN
+        self.si = si if plain else forwarding(si, walks=True)
         self.knows_obstacles = isinstance(validity_checker, StateValidityChecker)
         if isinstance(validity_checker, StateValidityChecker):
             self.checker = validity_checker.checker
-            self.exclusive = type(validity_checker).isValid is StateValidityChecker.isValid and not self._walks
+            self.exclusive = type(validity_checker).isValid is StateValidityChecker.isValid and plain
         else:
             self.checker, self.exclusive = CollisionChecker(_robot_of(si, robot)), False
         dof, dimension = self.checker.robot.dof, int(si.getStateSpace().getDimension())
@@ -136,24 +140,11 @@ class PathValidator:
         if self.exclusive:
             return True
         states = [to_state(self._si, q) for q in path]
-        order = sorted(range(len(states)), key=lambda k: (-(k & -k), k))  # coarse before fine
-        for k in order:
+        first = sorted(range(0, len(states), LOOKS), key=lambda k: (-(k & -k), k))  # coarse before fine
+        for k in first:
             if stop() or not self._si.isValid(states[k]):
                 return False
-        for a, b in zip(states, states[1:], strict=False):
-            if stop() or not self._si.checkMotion(a, b) or (self._walks and not self._valid_between(a, b)):
-                return False
-        return True
-
-    def _valid_between(self, a: Any, b: Any) -> bool:
-        """Whether the states between two, at the resolution of the space, are valid."""
-        space, between = self._si.getStateSpace(), to_state(self._si, np.zeros(0))
-        count = int(space.validSegmentCount(a, b))
-        for k in range(1, count):
-            space.interpolate(a, b, k / count, between)
-            if not self._si.isValid(between):
-                return False
-        return True
+        return all(not stop() and self.si.checkMotion(a, b) for a, b in zip(states, states[1:], strict=False))
 
     def obstacle_distance(self, path: Array) -> float:
         """Return the least distance between robot and obstacles along a path, shape (N, dof) [m].

@@ -70,7 +70,7 @@ def rooted_ompl_trees(
     context: SolveContext, starts: Sequence[Array], goal: Array | ob.Goal, tree_range: float
 ) -> OmplTrees:  # fmt: skip
     """Return OMPL's trees whose roots are starts and goals of the problem; OMPL's planner data are theirs."""
-    trees = ompl_trees(context.si, starts, goal, tree_range)
+    trees = ompl_trees(context.validator.si, starts, goal, tree_range)
     context.grown.append(trees[0])
     return trees
 

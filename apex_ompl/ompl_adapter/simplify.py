@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import nullcontext
-from typing import Any
 
 import numpy as np
 from ompl import base as ob
 from ompl import geometric as og
 
+from apex_ompl.ompl_adapter.forwarding import forwarding
 from apex_ompl.ompl_adapter.space import array_to_path, path_to_array
 from apex_ompl.ompl_adapter.validity import MotionValidator, motions_until
 from apex_ompl.trajopt.path import path_length
@@ -32,7 +32,7 @@ def simplify(si: ob.SpaceInformation, path: Array, stop: Callable[[], bool] = la
     if len(path) < 3:
         return path
     validator = si.getMotionValidator()
-    watched = si if isinstance(validator, MotionValidator) else _watched(si, stop)
+    watched = si if isinstance(validator, MotionValidator) else forwarding(si, stop=stop)
     simplifier, work, best = og.PathSimplifier(watched), array_to_path(watched, path), path
     with motions_until(validator, stop) if isinstance(validator, MotionValidator) else nullcontext():
         for _ in range(ROUNDS):
@@ -47,23 +47,3 @@ def simplify(si: ob.SpaceInformation, path: Array, stop: Callable[[], bool] = la
             if gain < MIN_GAIN:
                 break
     return np.concatenate([path[:1], best[1:-1], path[-1:]])
-
-
-class _Forward(ob.MotionValidator):
-    """Motion validator that asks another space information, until it is told to stop."""
-
-    def __init__(self, watched: ob.SpaceInformation, si: ob.SpaceInformation, stop: Callable[[], bool]) -> None:
-        super().__init__(watched)
-        self._si, self._stop = si, stop
-
-    def checkMotion(self, first: Any, second: Any) -> bool:  # noqa: N802 - OMPL's name
-        return not self._stop() and bool(self._si.checkMotion(first, second))
-
-
-def _watched(si: ob.SpaceInformation, stop: Callable[[], bool]) -> ob.SpaceInformation:
-    """Return a space information that forwards to another, without valid motions once it is told to stop."""
-    watched = ob.SpaceInformation(si.getStateSpace())
-    watched.setStateValidityChecker(lambda state: bool(si.isValid(state)))
-    watched.setMotionValidator(_Forward(watched, si, stop))
-    watched.setup()
-    return watched

@@ -20,6 +20,7 @@ from apex_ompl.planning.departure import remedy
 from apex_ompl.planning.run import PlanRun
 from apex_ompl.result import FIRST, INSIDE, PlanResult, PlanStatus
 from apex_ompl.trajopt.path import Path
+from apex_ompl.util.forking import unforked
 from apex_ompl.util.stopwatch import timed
 
 STRAIGHT_LINE = "straight line"
@@ -103,7 +104,7 @@ def solve(run: PlanRun, simplify: bool, execute: Execute = execute) -> PlanResul
     try:
         if run.deadline.expired:
             return _out_of_time(run)
-        with timed(run.times, "setup"), run.deadline.paused():
+        with timed(run.times, "setup"), run.deadline.paused(), unforked():
             planner = _set_up(run)
         with motions_until(run.setup.motion_validator, run.ends_search):
             status = execute(run, planner, min(run.deadline.for_search, MAX_TIME))

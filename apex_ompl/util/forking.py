@@ -1,11 +1,13 @@
 """``os.fork`` while other threads are at work: a child has only the thread that forked, and all locks as they were.
 
-What another thread held then would never be opened. So a fork waits until no thread is preparing its first plan, which
-imports modules (whose locks are Python's own), and the locks of this package are open in the child.
+What another thread held then would never be opened. So a fork waits until no thread prepares a plan, which imports
+modules (whose locks are Python's own), or compiles code; and the locks of this package are open in the child.
 """
 
 from __future__ import annotations
 
+import concurrent.futures.thread  # noqa: F401 - see below
+import logging  # noqa: F401
 import os
 import threading
 from collections.abc import Iterator
@@ -13,16 +15,18 @@ from contextlib import contextmanager
 from types import TracebackType
 from weakref import WeakSet
 
-_locks: WeakSet[ProcessLock] = WeakSet()
+PATIENCE = 300.0  # how long a fork waits for what others do, before it goes on all the same [s]
 
 
 class ProcessLock:
     """Reentrant lock that is open in a forked child, whichever thread of the parent held it."""
 
+    _all: WeakSet[ProcessLock] = WeakSet()
+
     def __init__(self) -> None:
         """Make an open lock."""
         self._lock = threading.RLock()
-        _locks.add(self)
+        self._all.add(self)
 
     def __enter__(self) -> None:
         """Wait for the lock and close it."""
@@ -34,55 +38,60 @@ class ProcessLock:
         """Open the lock."""
         self._lock.release()
 
-    def renew(self) -> None:
-        """Open the lock in a child."""
-        self._lock = threading.RLock()
+    @classmethod
+    def open_all(cls) -> None:
+        """Open all locks, in a child."""
+        for lock in list(cls._all):
+            lock._lock = threading.RLock()
 
 
-class _Preparations:
-    """Threads that must not be forked away from what they do."""
+class _Gate:
+    """What a fork waits for."""
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
-        self._threads: list[int] = []
+        self._preparing: list[int] = []  # threads
+        self._compiling: list[threading.RLock] = []  # locks of others
+        self._held: list[threading.RLock] = []
 
-    def begin(self) -> None:
+    @contextmanager
+    def unforked(self) -> Iterator[None]:
         with self._changed:
-            self._threads.append(threading.get_ident())
+            self._preparing.append(threading.get_ident())
+        try:
+            yield
+        finally:
+            with self._changed:
+                self._preparing.remove(threading.get_ident())
+                self._changed.notify_all()
 
-    def end(self) -> None:
-        with self._changed:
-            self._threads.remove(threading.get_ident())
-            self._changed.notify_all()
+    def hold(self, lock: threading.RLock) -> None:
+        self._compiling.append(lock)
 
-    def before_fork(self) -> None:
+    def before(self) -> None:
         self._changed.acquire()
         mine = threading.get_ident()
-        self._changed.wait_for(lambda: all(thread == mine for thread in self._threads))
+        self._changed.wait_for(lambda: all(thread == mine for thread in self._preparing), PATIENCE)
+        self._held = [lock for lock in self._compiling if lock.acquire(timeout=PATIENCE)]
 
-    def after_fork(self) -> None:
+    def after_in_parent(self) -> None:
+        while self._held:
+            self._held.pop().release()
         self._changed.release()
 
-
-_preparations = _Preparations()
-
-
-@contextmanager
-def unforked() -> Iterator[None]:
-    """While the block runs, let other threads wait with ``os.fork``; for what imports modules or compiles code."""
-    _preparations.begin()
-    try:
-        yield
-    finally:
-        _preparations.end()
+    def after_in_child(self) -> None:
+        mine = threading.get_ident()
+        self._preparing = [thread for thread in self._preparing if thread == mine]
+        self.after_in_parent()
+        ProcessLock.open_all()
 
 
-def _in_child() -> None:
-    _preparations.after_fork()
-    for lock in list(_locks):
-        lock.renew()
+_gate = _Gate()
+unforked = _gate.unforked
+"""Context: let other threads wait with ``os.fork`` meanwhile; for what imports modules, a plan's set-up above all."""
+hold_at_fork = _gate.hold
+"""Let every fork wait for a lock, and hold it meanwhile, so that it is open in the child, too."""
 
-
-os.register_at_fork(
-    before=_preparations.before_fork, after_in_parent=_preparations.after_fork, after_in_child=_in_child
-)
+# What is registered last is called first before a fork. The two modules above hold locks of theirs, which what a fork
+# waits for may need, so that they must have registered already.
+os.register_at_fork(before=_gate.before, after_in_parent=_gate.after_in_parent, after_in_child=_gate.after_in_child)

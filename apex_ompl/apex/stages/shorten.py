@@ -88,7 +88,7 @@ def _another(context: SolveContext, states: Array, tree_range: float) -> Array |
     if context.validator.exclusive:
         trees = compiled_trees(context, [states[0]], [states[-1]], tree_range)
         return grow(context, trees, ITERATIONS)
-    tree, pdef = ompl_trees(context.si, [states[0]], states[-1], tree_range)
+    tree, pdef = ompl_trees(context.validator.si, [states[0]], states[-1], tree_range)
     status = tree.solve(context.counted(math.ceil(OMPL_SHARE * ITERATIONS))).getStatus()
     exact = status == ob.PlannerStatus.EXACT_SOLUTION
     return path_to_array(pdef.getSolutionPath(), states.shape[1]) if exact else None
@@ -98,7 +98,7 @@ def _shortcut(context: SolveContext, states: Array) -> Array:
     """Return a polyline cut short."""
     if not context.validator.exclusive:
         left = iter(range(MOTIONS))
-        return simplify(context.si, states, lambda: context.stop() or next(left, None) is None)
+        return simplify(context.validator.si, states, lambda: context.stop() or next(left, None) is None)
     short, looked = shortcut(context.kernel, states, ENOUGH, RESOLUTION, context.rng.spawn(1)[0], context.stop)
     context.note_search(looked)
     return short
