@@ -17,8 +17,8 @@ from apex_ompl.types import Array
 
 DETOUR, OTHERS = 1.7, 2  # times the straight line's length, beyond which so many other trees are tried
 ITERATIONS = 6_000  # of each of these
-MOTIONS = 1_000  # that are checked to cut a polyline short where another checker decides
-PASSES, IDLE, MIN_GAIN = 6, 2, 0.02  # over such a path; so many that shorten by less than this share are the last
+MOTIONS = 500  # that are checked to cut a polyline short where another checker decides
+PASSES, IDLE, MIN_GAIN = 4, 2, 0.02  # over such a path; so many that shorten by less than this share are the last
 
 
 @dataclass(frozen=True)
