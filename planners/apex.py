@@ -77,7 +77,7 @@ class APEX(OwnPlanner):
         self._grown: list[TreePair | og.RRTConnect] = []  # by the last call of ``solve``
 
     def setup(self) -> None:
-        """Make all ready that the first call of ``solve`` would have to: kernel, network, optimiser."""
+        """Make all ready that the first call of ``solve`` would have to: kernel, network, optimizer."""
         super().setup()
         self._prepare()
 

@@ -1,4 +1,4 @@
-"""GPMP and GPMP2: trajectory optimisation on a Gaussian-process prior, the baselines of the paper's comparison."""
+"""GPMP and GPMP2: trajectory optimization on a Gaussian-process prior, the baselines of the paper's comparison."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ class GaussianProcessParameters(Parameters):
     def problem(
         self, process: GaussianProcess, checker: CollisionChecker, lower: Array, upper: Array
     ) -> FactorGraph | CostFunctional:
-        """Return what is optimised."""
+        """Return what is optimized."""
 
     def factors(
         self, process: GaussianProcess, checker: CollisionChecker, lower: Array, upper: Array
@@ -181,7 +181,7 @@ class GPMP2(GaussianProcessParameters):
 
 
 class GaussianProcessPlanner(OwnPlanner):
-    """OMPL planner GPMP or GPMP2: one initial motion after the other is optimised, until one is proved free.
+    """OMPL planner GPMP or GPMP2: one initial motion after the other is optimized, until one is proved free.
 
     A local method: it ends without a solution when it has nothing left to begin from, and says what is in the way.
 
@@ -195,7 +195,7 @@ class GaussianProcessPlanner(OwnPlanner):
     def __init__(
         self, si: ob.SpaceInformation, validator: PathValidator, parameters: GaussianProcessParameters
     ) -> None:
-        """Optimise by the clearances of the validator's checker."""
+        """Optimize by the clearances of the validator's checker."""
         super().__init__(si, parameters.name)
         self.validator = validator
         self.parameters = parameters
@@ -238,7 +238,7 @@ class GaussianProcessPlanner(OwnPlanner):
             report.reason = report.reason or (
                 NOT_ACCEPTED if proof is None or proved else self._fault(path, proof, optimum)
             )
-        report.reason = report.reason or "time was up before the first motion was optimised"
+        report.reason = report.reason or "time was up before the first motion was optimized"
         return Status.TIMEOUT
 
     def _initial(self, process: GaussianProcess, pairs: list[tuple[Array, Array]]) -> Iterator[Array]:
@@ -265,7 +265,7 @@ class GaussianProcessPlanner(OwnPlanner):
         self.getProblemDefinition().addSolutionPath(solution, False, 0.0, name)
 
     def _fault(self, path: Path, proof: PathProof, optimum: Optimum) -> str:
-        """Return which constraint the path violates, where and how deep, and how the optimisation ended."""
+        """Return which constraint the path violates, where and how deep, and how the optimization ended."""
         where = int(np.argmin(np.abs(path.states - proof.state).max(axis=1))) / (len(path.states) - 1)
         depth = -self.validator.checker.clearance(proof.state)
         deep = f", {1e3 * depth:.0f} mm deep there" if depth >= 5e-4 else ""

@@ -52,7 +52,7 @@ class ImitationPlanner(OwnPlanner):
         self._optimizer = Optimizer()
 
     def setup(self) -> None:
-        """Make all ready that the first call of ``solve`` would have to: kernel, network, optimiser."""
+        """Make all ready that the first call of ``solve`` would have to: kernel, network, optimizer."""
         super().setup()
         checker = self.validator.checker
         home = checker.robot.home
@@ -159,7 +159,7 @@ class Imitation(Parameters):
     """A transformer policy that imitates the stored paths and sees the obstacles, rolled out once for each goal.
 
     The policy is that of Kim, Ohmura and Kuniyoshi (IROS 2021) without gaze and images: tokens of both arms' states,
-    of goals and of obstacles in a transformer encoder, behaviour cloning by the mean square error; with chunks of
+    of goals and of obstacles in a transformer encoder, behavior cloning by the mean square error; with chunks of
     states (Zhao et al. 2023). What the paper leaves open is chosen here: size and tokens of the network, a chunk of 16
     states of 256 of which 8 are followed, noise on the states of the training, and the straight line to the goal as
     what the network's output is added to. A path that ends within ``reach`` of the goal gets the goal as its last

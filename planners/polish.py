@@ -1,4 +1,4 @@
-"""RRTConnect whose path is shortened, put on a spline and optimised."""
+"""RRTConnect whose path is shortened, put on a spline and optimized."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def polished(
 ) -> Path | None:
     """Return a short valid path near a given one, shape (N, dof), or None.
 
-    The given path is fitted by ``optimizer.spline``, whose control points are optimised inside of the space's bounds.
+    The given path is fitted by ``optimizer.spline``, whose control points are optimized inside of the space's bounds.
     """
     kernel = validator.kernel
     limits = kernel.robot.arrays
@@ -40,10 +40,10 @@ def polished(
 
 
 class PolishedRRTConnect(OwnPlanner):
-    """OMPL planner: RRTConnect, OMPL's simplification by counts, and trajectory optimisation, until ``ptc`` ends it.
+    """OMPL planner: RRTConnect, OMPL's simplification by counts, and trajectory optimization, until ``ptc`` ends it.
 
-    What RRTConnect found is a solution as soon as it is found; the simplified and the optimised path are added to it,
-    and OMPL gives the shortest. Where optimisation finds nothing valid, the simplified path stands.
+    What RRTConnect found is a solution as soon as it is found; the simplified and the optimized path are added to it,
+    and OMPL gives the shortest. Where optimization finds nothing valid, the simplified path stands.
 
     Attributes:
         validator: Decides what is valid.
@@ -53,7 +53,7 @@ class PolishedRRTConnect(OwnPlanner):
     def __init__(
         self, si: ob.SpaceInformation, validator: PathValidator, optimizer: Optimizer, inner: og.RRTConnect
     ) -> None:
-        """Optimise what ``inner`` finds."""
+        """Optimize what ``inner`` finds."""
         super().__init__(si, NAME)
         inner.setup()
         self.validator = validator
@@ -107,13 +107,13 @@ class PolishedRRTConnect(OwnPlanner):
 @register(NAME)
 @dataclass(frozen=True)
 class RRTConnectPolish(Parameters):
-    """RRTConnect, simplified, fitted by a B-spline and optimised on its control points.
+    """RRTConnect, simplified, fitted by a B-spline and optimized on its control points.
 
     Attributes:
         range: Longest step of RRTConnect's trees, by default the tuned one; 0 lets OMPL choose.
         control_points: Number of control points of the spline.
         pinned: How many of them coincide with each end.
-        scene_margin: Clearance to obstacles that the optimiser asks for.
+        scene_margin: Clearance to obstacles that the optimizer asks for.
         own_margin: Clearance between the robot's links that it asks for.
         stiffness: Weight of the path's speed squared at first; it grows as long as paths stay valid.
     """

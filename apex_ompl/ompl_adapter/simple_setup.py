@@ -53,18 +53,19 @@ class SimpleSetup(og.SimpleSetup):
         """Set the checker that decides from now on; a function may return anything that is true or false."""
         super().setStateValidityChecker(_of_truth(svc))
 
-    def solve(self, time: float | ob.PlannerTerminationCondition = 1.0) -> ob.PlannerStatus:
+    def solve(self, time: float | ob.PlannerTerminationCondition = 1.0, *, ptc: Any = None) -> ob.PlannerStatus:
         """Solve within a time [s], or until a condition holds."""
-        ptc = time if isinstance(time, ob.PlannerTerminationCondition) else ends_after(time)
+        given = time if ptc is None else ptc
+        ptc = given if isinstance(given, ob.PlannerTerminationCondition) else ends_after(given)
         with running(ptc.terminate):
             self.setup()  # sampling begins after it
             await_goal(self.getGoal(), ptc)
             return super().solve(ptc)
 
-    def simplifySolution(self, duration: float | ob.PlannerTerminationCondition = 0.0) -> None:  # noqa: N802
+    def simplifySolution(self, duration: float | ob.PlannerTerminationCondition = 0.0, *, ptc: Any = None) -> None:  # noqa: N802
         """Shorten the solution, within a time [s] where one is given, or until a condition holds."""
         with running():
-            super().simplifySolution(duration)
+            super().simplifySolution(duration if ptc is None else ptc)
 
     def getPlannerData(self, data: ob.PlannerData) -> None:  # noqa: N802 - OMPL's name
         """Fill in the states and motions that the planner knows."""

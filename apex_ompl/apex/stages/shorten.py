@@ -1,4 +1,4 @@
-"""Shortening of the best path: shortcuts on a polyline, then the optimiser on a spline."""
+"""Shortening of the best path: shortcuts on a polyline, then the optimizer on a spline."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ PASSES, IDLE, MIN_GAIN = 4, 2, 0.02  # over such a path; so many that shorten by
 
 @dataclass(frozen=True)
 class Shorten:
-    """Shorten the best path; a polyline is cut short, and fitted by a spline, before it is optimised.
+    """Shorten the best path; a polyline is cut short, and fitted by a spline, before it is optimized.
 
     A polyline that stays far longer than the straight line goes a long way round: others are looked for by trees.
-    Where another checker decides, whose obstacles the optimiser does not know, cutting and optimising take turns.
+    Where another checker decides, whose obstacles the optimizer does not know, cutting and optimizing take turns.
 
     Attributes:
         tree_range: Longest step of these trees; 0 lets OMPL choose, None is for no trees [rad].
