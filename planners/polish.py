@@ -23,6 +23,7 @@ from apex_ompl.trajopt.spline import Spline
 from apex_ompl.types import Array
 
 NAME = "rrtconnect+polish"
+TRIES = 3  # of cutting a path short that another checker accepts
 
 
 def polished(
@@ -81,10 +82,12 @@ class PolishedRRTConnect(OwnPlanner):
         dof = self.validator.checker.robot.dof
         self.report.first_path = path = Path(path_to_array(pdef.getSolutionPath(), dof))
         with self.report.timed("simplify"):
-            short = Path(simplify(si, path.states, lambda: bool(ptc())))
-            # parts of motions that were checked are looked at in other places than before
-            if self.validator.exclusive or self.validator.accepts(short.states, lambda: bool(ptc())):
-                path = short
+            for _ in range(TRIES):
+                short = Path(simplify(si, path.states, lambda: bool(ptc())))
+                # parts of motions that were checked are looked at in other places than before
+                if self.validator.accepts(short.states, lambda: bool(ptc())):
+                    path = short
+                    break
         self._add(path)
         if not ptc():
             with self.report.timed("polish"):
