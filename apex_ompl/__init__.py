@@ -10,6 +10,8 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from apex_ompl.util.forking import unforked
+
 if TYPE_CHECKING:
     from apex_ompl.api import load_problem, plan, setup
     from apex_ompl.collision.cloud_contact import filter_points
@@ -76,7 +78,8 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     """Import public names when they are first used, so that importing the package costs nothing."""
     if name in _HOMES:
-        return getattr(import_module(f"apex_ompl.{_HOMES[name]}"), name)
+        with unforked():
+            return getattr(import_module(f"apex_ompl.{_HOMES[name]}"), name)
     raise AttributeError(f"module 'apex_ompl' has no attribute {name!r}")
 
 

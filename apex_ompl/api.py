@@ -18,8 +18,10 @@ from apex_ompl.scene.problem import Problem
 from apex_ompl.session import check_arguments, kept_planner
 from apex_ompl.trajectory import Timing
 from apex_ompl.util.files import is_file, path_text
+from apex_ompl.util.forking import unforked
 
 
+@unforked()
 def load_problem(name_or_path: str | os.PathLike[str]) -> Problem:
     """Return a problem by its name, one of a suite by its id (``shelf/hard/900012``), or one from a YAML file.
 
@@ -40,6 +42,7 @@ def load_problem(name_or_path: str | os.PathLike[str]) -> Problem:
     return Problem.load(text) if os.sep in text else problems.load(text)
 
 
+@unforked()
 def setup(problem: Problem | str | os.PathLike[str]) -> og.SimpleSetup:
     """Return OMPL's SimpleSetup of a problem, for planners and tools of OMPL's own.
 

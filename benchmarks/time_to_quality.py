@@ -24,7 +24,6 @@ from typing import Any
 import numpy as np
 import record
 from ompl import base as ob
-from ompl import geometric as og
 
 from apex_ompl import planners
 from apex_ompl.benchmark import Row, Workers, bench
@@ -139,7 +138,7 @@ def attempts(ready: PlanningSetup, job: Job) -> Lengths:
         if status != ob.PlannerStatus.EXACT_SOLUTION:
             return None
         path = path_to_array(setup.getSolutionPath(), ready.robot.dof)
-        return path if parameters.smooth else simplify(og.PathSimplifier(si), si, path)
+        return path if parameters.smooth else simplify(si, path)
 
     return repeated(attempt, ready, job.timeout)
 

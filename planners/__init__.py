@@ -7,13 +7,19 @@ from typing import Any
 
 from apex_ompl.planners.registry import Parameters, allocator, make, names, parameters
 from apex_ompl.planners.tuned import TUNED
+from apex_ompl.util.forking import unforked
 
 __all__ = ["APEX", "TUNED", "Parameters", "allocator", "make", "names", "parameters"]
 
 
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
+
+
 def __getattr__(name: str) -> Any:
     if name == "APEX":  # torch comes with it
-        from apex_ompl.planners.apex import APEX
+        with unforked():
+            from apex_ompl.planners.apex import APEX
 
         return APEX
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 from weakref import WeakSet
 
 import numpy as np
 from ompl import base as ob
+from ompl import geometric as og
 from ompl import util as ou
 
 from apex_ompl.apex.context import SolveContext
@@ -14,28 +16,27 @@ from apex_ompl.apex.models import Model, trajectory_model
 from apex_ompl.apex.path_validator import PathValidator
 from apex_ompl.apex.query import make_query
 from apex_ompl.apex.sampler import ProposalSampler
-from apex_ompl.apex.solver import LOG, solve
+from apex_ompl.apex.solver import solve
 from apex_ompl.apex.stages import Anytime, Shorten
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel.shortcuts import shortcut
 from apex_ompl.kernel.trees import TreePair
+from apex_ompl.ompl_adapter.own_planner import OwnPlanner, Tree
 from apex_ompl.ompl_adapter.report import SolveReport
-from apex_ompl.ompl_adapter.space import forget_states
-from apex_ompl.planners.apex_parameters import NAME, ApexParameters
+from apex_ompl.planners.apex_parameters import AUTO, NAME, ApexParameters
 from apex_ompl.trajopt.optimizer import Optimizer
 from apex_ompl.types import Array
 from apex_ompl.util.resolution import SEARCH_RESOLUTION
 
-Status = ob.PlannerStatus
 _warm_models: WeakSet[Model] = WeakSet()  # that have proposed something in this process
 
 
-class APEX(ob.Planner):
+class APEX(OwnPlanner):
     """OMPL planner APEX: section III of the paper inside ``solve``, probabilistically complete by RRTConnect.
 
     It works with any validity checker, and takes the one that is set when ``solve`` begins. With this project's,
     proposals are repaired, and guided if asked, among the obstacles; with another one they are checked by it. The first
-    valid path is shortened; with a path length objective it is improved until the termination condition holds.
+    valid path is shortened; with the parameter ``anytime`` it is improved until the termination condition holds.
 
     Attributes:
         parameters: Its parameters.
@@ -47,15 +48,22 @@ class APEX(ob.Planner):
         report: Report on the last call of ``solve``.
     """
 
-    def __init__(self, si: ob.SpaceInformation, parameters: ApexParameters | None = None) -> None:
-        """Plan in the space of ``si``, whose validity checker is set.
+    def __init__(self, si: ob.SpaceInformation, parameters: ApexParameters | None = None, **values: Any) -> None:
+        """Plan in the space of ``si``.
+
+        Args:
+            si: OMPL's space information.
+            parameters: Parameters of the planner.
+            **values: Parameters by name, such as ``robot`` and ``seed``, in place of these.
 
         Raises:
-            ApexError: The model or the robot cannot be loaded, or do not fit the space.
+            ApexError: The model or the robot cannot be loaded, or do not fit the space; there is no such parameter.
         """
         super().__init__(si, NAME)
-        self.parameters = parameters or ApexParameters()
-        self.validator = PathValidator(si, self.parameters.robot)
+        given = (parameters or ApexParameters()).changed(**values)
+        assert isinstance(given, ApexParameters)
+        self.parameters = given
+        self.validator = PathValidator(si, "" if given.robot == AUTO else given.robot)
         robot = self.validator.checker.robot.name
         self.model = trajectory_model(self.parameters.model, robot, self.parameters.device)
         steps, most = self.parameters.denoising_steps, self.model.schedule.steps
@@ -66,16 +74,16 @@ class APEX(ob.Planner):
         self.rejected_lines: list[Array] = []
         self._solves = 0
         self._warm = False
-        self.report = SolveReport()
+        self._grown: list[TreePair | og.RRTConnect] = []  # by the last call of ``solve``
 
     def setup(self) -> None:
-        """Make all ready that the first call of ``solve`` would have to: kernel, network, optimiser."""
+        """Make all ready that the first call of ``solve`` would have to: kernel, network, optimizer."""
         super().setup()
         self._prepare()
 
     def _prepare(self) -> None:
-        if self.validator.outdated:
-            self.validator, self._warm = PathValidator(self.getSpaceInformation(), self.parameters.robot), False
+        before, self.validator = self.validator, self.validator.current()
+        self._warm &= self.validator is before
         if self._warm:
             return
         checker = self.validator.checker
@@ -104,7 +112,7 @@ class APEX(ob.Planner):
 
     def clearQuery(self) -> None:  # noqa: N802 - OMPL's name
         """Forget the query; earlier paths stay candidates for the next one."""
-        self._solves, self.report, self.rejected_lines = 0, SolveReport(), []
+        self._solves, self.report, self.rejected_lines, self._grown = 0, SolveReport(), [], []
 
     def next_seed(self) -> int:
         """Return the seed of the next call of ``solve``: one that follows from the given one, or from OMPL's."""
@@ -112,24 +120,12 @@ class APEX(ob.Planner):
         self._solves += 1
         return first + self._solves - 1
 
-    def solve(self, ptc: ob.PlannerTerminationCondition) -> ob.PlannerStatus:
-        """Solve the problem; no exception leaves it, since one would end the process inside OMPL.
+    def _solve(self, ptc: ob.PlannerTerminationCondition) -> Any:
+        self._prepare()
+        with self.model.one_thread():
+            return self._plan(ptc)
 
-        Starts and goals are read anew by every call. ``report`` says what was done, and why where nothing was found.
-        """
-        self.report = SolveReport()
-        try:
-            self._prepare()
-            with self.model.one_thread():
-                status = self._solve(ptc)
-        except Exception as error:
-            LOG.exception("%s failed", NAME)
-            forget_states(error)
-            self.report.reason = f"{NAME} failed, {error!r}"
-            status = Status.CRASH
-        return Status(status)
-
-    def _solve(self, ptc: ob.PlannerTerminationCondition) -> ob.PlannerStatus:
+    def _plan(self, ptc: ob.PlannerTerminationCondition) -> Any:
         parameters = self.parameters
         generator = np.random.default_rng(self.next_seed())
         sampler = ProposalSampler(
@@ -141,6 +137,14 @@ class APEX(ob.Planner):
             optimizer=self.optimizer, report=self.report, experience=self.experience,
             rejected_lines=self.rejected_lines, lambda_obs=parameters.lambda_obs, rng=generator.spawn(1)[0],
         )  # fmt: skip
+        self._grown = context.grown
         shorten = Shorten(parameters.range if parameters.fallback else None) if parameters.polish else None
         inputs = self.getPlannerInputStates()
         return solve(context, inputs, parameters.stages(), shorten, Anytime(parameters.anytime))
+
+    def _trees(self) -> list[Tree]:
+        pairs = [trees for trees in self._grown if isinstance(trees, TreePair)]
+        return [Tree(*pair.nodes(number), bool(number)) for pair in pairs for number in range(2)]
+
+    def _inner_planners(self) -> list[ob.Planner]:
+        return [trees for trees in self._grown if isinstance(trees, ob.Planner)]

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from apex_ompl.diffusion.proposals import Sampling
 
 NAME = "apex"
+AUTO = "auto"  # what fits the setup
 TURN_CALLS = 1_000  # of the termination condition of a bridge where rounds and trees take turns
 QUICK_CALLS = 1500  # iterations of a bridge between rounds of proposals
 AGAIN = 8  # factor on the iterations of the sprint behind the short repair of the first round
@@ -30,7 +31,8 @@ class ApexParameters(Parameters):
     Attributes:
         model: Name or folder of a checkpoint; ``auto`` takes the one that ships for the robot, or ``none`` where there
             is none: random bumps of straight lines.
-        robot: The robot, where the validity checker is not this project's.
+        robot: The robot, by name or file, where the validity checker is not this project's; ``auto`` takes that of the
+            setup of ``apex_ompl.setup``, or else ``dual_panda_softhand``.
         device: Where the network runs.
         line: Whether the straight line is a candidate.
         sprint: Iterations that RRT-Connect has before proposals, where it is the fallback and ``lambda_obs`` is 0;
@@ -56,15 +58,16 @@ class ApexParameters(Parameters):
             before; otherwise there are more rounds of proposals alone.
         polish: Whether valid paths are shortened.
         approximate: Whether, without an exact solution, a path that ends near a goal is given as an approximate one.
-        anytime: Whether paths are improved until the time is up, as they are with a path length objective.
+        anytime: Whether paths are improved until the time is up, or until they satisfy the path length objective, where
+            there is one. An objective alone does not ask for it: OMPL's optimizing planners leave one in the problem.
         range: Longest step of RRTConnect's trees in sprints, in bridges and as fallback, by default the tuned one; 0
             lets OMPL choose.
         seed: Of the proposals' noise; -1 takes one that follows from OMPL's.
     """
 
     smooth: ClassVar[bool] = True
-    model: str = "auto"
-    robot: str = "dual_panda_softhand"
+    model: str = AUTO
+    robot: str = AUTO
     device: str = "cpu"
     line: bool = True
     sprint: int = bounded(TUNED[NAME]["sprint"], 0)

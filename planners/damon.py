@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import logging
 import time
 from dataclasses import dataclass
 from functools import partial
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from ompl import base as ob
 
+from apex_ompl.apex.path_validator import PathValidator
 from apex_ompl.apex.start_goal import read_goals, read_starts
-from apex_ompl.errors import ParameterError
 from apex_ompl.kernel import Kernel
-from apex_ompl.ompl_adapter.report import SolveReport
-from apex_ompl.ompl_adapter.space import array_to_path, forget_states, motions_free
-from apex_ompl.ompl_adapter.validity import StateValidityChecker
+from apex_ompl.ompl_adapter.own_planner import OwnPlanner
+from apex_ompl.ompl_adapter.space import array_to_path, motions_free
 from apex_ompl.planners.registry import Parameters, bounded, one_of, register
 from apex_ompl.planners.tuned import TUNED
 from apex_ompl.roadmaps.damon import Damon
@@ -25,13 +23,12 @@ from apex_ompl.trajopt.path import Path
 from apex_ompl.types import Array, Flags
 
 NAME = "damon"
-LOG = logging.getLogger("apex_ompl")
 Status = ob.PlannerStatus
 DEEP = 0.03  # overlap of spheres beyond which a node counts as in contact without a look at exact shapes [m]
 SEEN = 0.001  # clearances beyond this are not told apart [m]
 
 
-class DAMON(ob.Planner):
+class DAMON(OwnPlanner):
     """OMPL planner: :class:`apex_ompl.roadmaps.damon.Damon` by the validators of the space information.
 
     Every motion of a path is checked by the motion validator; nothing is random. The graph is finite, so that ``solve``
@@ -39,34 +36,26 @@ class DAMON(ob.Planner):
 
     Attributes:
         damon: The graph, and queries of it.
+        validator: Decides what is valid.
         report: What the last call of ``solve`` did.
     """
 
-    def __init__(self, si: ob.SpaceInformation, checker: StateValidityChecker, damon: Damon) -> None:
-        """Plan in the space of ``si``, whose validity checker is ``checker``."""
+    def __init__(self, si: ob.SpaceInformation, validator: PathValidator, damon: Damon) -> None:
+        """Plan in the space of ``si``, where ``validator`` decides what is valid."""
         super().__init__(si, NAME)
-        self.damon, self.report = damon, SolveReport()
-        self._checker, self._hit = checker, dict[bytes, tuple[Kernel, tuple[Flags, Flags]]]()
+        self.damon, self.validator = damon, validator
+        self._hit = dict[bytes, tuple[Kernel, tuple[Flags, Flags]]]()
 
     def clear(self) -> None:
         """Forget which nodes obstacles hit."""
         super().clear()
         self._hit.clear()
 
-    def solve(self, ptc: ob.PlannerTerminationCondition) -> ob.PlannerStatus:
-        """Solve the problem; no exception leaves it, since one would end the process inside OMPL."""
-        self.report = SolveReport()
-        try:
-            status = self._solve(ptc)
-        except Exception as error:
-            LOG.exception("%s failed", NAME)
-            forget_states(error)
-            self.report.reason = f"{NAME} failed, {error!r}"
-            status = Status.CRASH
-        return Status(status)
-
-    def _solve(self, ptc: ob.PlannerTerminationCondition) -> ob.PlannerStatus:
-        begin, inputs, dof = time.perf_counter(), self.getPlannerInputStates(), self._checker.dof
+    def _solve(self, ptc: ob.PlannerTerminationCondition) -> Any:
+        before, self.validator = self.validator, self.validator.current()
+        if self.validator is not before:
+            self._hit.clear()
+        begin, inputs, dof = time.perf_counter(), self.getPlannerInputStates(), self.validator.checker.robot.dof
         starts = read_starts(inputs, dof)
         goals = read_goals(inputs, dof, ptc, self.getProblemDefinition().getGoal())
         if not starts:
@@ -82,7 +71,7 @@ class DAMON(ob.Planner):
         search = self.damon.search(states, usable, *ends, free_nodes=free_nodes)
         with self.report.timed("search"):
             free = partial(motions_free, self.getSpaceInformation())
-            path = search.run(free, lambda: bool(ptc()), nodes_free=self._checker.checker.are_free)
+            path = search.run(free, lambda: bool(ptc()), nodes_free=self.validator.are_free)
         self.report.candidates = search.searches
         if path is None:
             used = f"{int(usable.sum())} of {len(usable)} nodes"
@@ -99,10 +88,11 @@ class DAMON(ob.Planner):
     def _nodes(self, states: Array) -> tuple[Flags, Flags]:
         """Return which nodes may be used, and which of them are free for sure, each of shape (N,).
 
-        By the sphere cover, which proves the second. Of nodes that it does not prove free, those deep in contact are
-        not used; the others are checked when a path uses them. The same until the scene changes.
+        By the sphere cover, which proves the second where no other checker has a say. Of nodes that it does not prove
+        free, those deep in contact are not used; the others are checked when a path uses them. The same until the scene
+        changes.
         """
-        checker = self._checker.checker
+        checker = self.validator.checker
         box, key = self.getSpaceInformation().getStateSpace().getBounds(), states[0].tobytes()
         kernel, known = self._hit.get(key, (None, None))
         if known is None or kernel is not checker.kernel:
@@ -112,7 +102,7 @@ class DAMON(ob.Planner):
             left = np.flatnonzero(inside & ~free)
             usable = free.copy()
             usable[left] = kernel.clearance(states[left], SEEN).min(axis=1) > -DEEP
-            known = usable, free
+            known = usable, free if self.validator.exclusive else np.zeros_like(free)
             self._hit[key] = kernel, known
         return known
 
@@ -141,14 +131,11 @@ class DAMONParameters(Parameters):
         """Return the planner.
 
         Raises:
-            ParameterError: ``si`` has no validity checker of this project.
+            ParameterError: ``si`` has neither a validity checker of this project nor is it of ``apex_ompl.setup``.
             MissingFileError: The model is missing.
             FileFormatError: The model is damaged, or for another robot.
         """
-        validity_checker = si.getStateValidityChecker()
-        if not isinstance(validity_checker, StateValidityChecker):
-            expected = "apex_ompl's StateValidityChecker, as apex_ompl.setup sets it"
-            raise ParameterError(f"state validity checker for {NAME}", type(validity_checker).__name__, expected)
-        robot = validity_checker.checker.robot
+        validator = PathValidator.of_setup(si, NAME)
+        robot = validator.checker.robot
         manifold = shared_manifold(self.model, robot.name)
-        return DAMON(si, validity_checker, Damon.of(manifold, robot.joint_names, self.nodes, self.connections))
+        return DAMON(si, validator, Damon.of(manifold, robot.joint_names, self.nodes, self.connections))

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import logging
 import time
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
 from ompl import base as ob
@@ -14,8 +14,8 @@ from ompl import util as ou
 from apex_ompl.apex.start_goal import read_goals, read_starts
 from apex_ompl.collision.changes import may_have_become_blocked
 from apex_ompl.kernel import Kernel
-from apex_ompl.ompl_adapter.report import SolveReport
-from apex_ompl.ompl_adapter.space import array_to_path, forget_states, motions_free
+from apex_ompl.ompl_adapter.own_planner import OwnPlanner, Tree
+from apex_ompl.ompl_adapter.space import array_to_path, motions_free, require_real_vectors
 from apex_ompl.ompl_adapter.validity import MotionValidator, StateValidityChecker
 from apex_ompl.planners.registry import Parameters, bounded, register
 from apex_ompl.planners.tuned import TUNED
@@ -25,11 +25,10 @@ from apex_ompl.trajopt.path import Path
 from apex_ompl.types import Array, Flags
 
 NAME = "drrt"
-LOG = logging.getLogger("apex_ompl")
 Status = ob.PlannerStatus
 
 
-class DRRT(ob.Planner):
+class DRRT(OwnPlanner):
     """OMPL planner: :class:`apex_ompl.roadmaps.dynamic_rrt.DynamicRRT` by the validators of the space information.
 
     ``solve`` keeps its tree: a later call, after obstacles or the start changed, trims it and grows it on. Edges that
@@ -44,11 +43,16 @@ class DRRT(ob.Planner):
     """
 
     def __init__(self, si: ob.SpaceInformation, parameters: DRRTParameters) -> None:
-        """Plan in the space of ``si``, a real vector space."""
+        """Plan in the space of ``si``.
+
+        Raises:
+            ParameterError: It is not a space of real vectors.
+        """
+        require_real_vectors(si.getStateSpace())
         super().__init__(si, NAME)
         self._seed, self._solves = parameters.seed, 0
         self.search = DynamicRRT(parameters.range, parameters.goal_bias, parameters.waypoint_bias)
-        self.report, self.removed = SolveReport(), 0
+        self.removed = 0
         self._trimmed: Kernel | None = None  # the kernel with which the edges were free
 
     def clear(self) -> None:
@@ -60,19 +64,8 @@ class DRRT(ob.Planner):
     def clearQuery(self) -> None:  # noqa: N802 - OMPL's name
         """Keep the tree, which is of use as long as the goals are the same."""
 
-    def solve(self, ptc: ob.PlannerTerminationCondition) -> ob.PlannerStatus:
-        """Solve the problem; no exception leaves it, since one would end the process inside OMPL."""
-        self.report, self.removed = SolveReport(), 0
-        try:
-            status = self._solve(ptc)
-        except Exception as error:
-            LOG.exception("%s failed", NAME)
-            forget_states(error)
-            self.report.reason = f"{NAME} failed, {error!r}"
-            status = Status.CRASH
-        return Status(status)
-
-    def _solve(self, ptc: ob.PlannerTerminationCondition) -> ob.PlannerStatus:
+    def _solve(self, ptc: ob.PlannerTerminationCondition) -> Any:
+        self.removed = 0
         si, begin = self.getSpaceInformation(), time.perf_counter()
         dof, inputs = int(si.getStateDimension()), self.getPlannerInputStates()
         starts = read_starts(inputs, dof)
@@ -125,6 +118,10 @@ class DRRT(ob.Planner):
 
         self.removed = tree.trim(free)
 
+    def _trees(self) -> list[Tree]:
+        tree = self.search.tree
+        return [] if tree is None else [Tree(tree.states.copy(), tree.parents.copy(), True)]
+
 
 @register(NAME)
 @dataclass(frozen=True)
@@ -147,5 +144,9 @@ class DRRTParameters(Parameters):
     seed: int = bounded(-1, -1)
 
     def build(self, si: ob.SpaceInformation) -> ob.Planner:
-        """Return the planner."""
+        """Return the planner.
+
+        Raises:
+            ParameterError: The space of ``si`` is not one of real vectors.
+        """
         return DRRT(si, self)

@@ -1,8 +1,7 @@
-"""GPMP and GPMP2: trajectory optimisation on a Gaussian-process prior, the baselines of the paper's comparison."""
+"""GPMP and GPMP2: trajectory optimization on a Gaussian-process prior, the baselines of the paper's comparison."""
 
 from __future__ import annotations
 
-import logging
 import time
 from abc import abstractmethod
 from collections.abc import Callable, Iterator
@@ -13,14 +12,13 @@ import numpy as np
 from ompl import base as ob
 from ompl import util as ou
 
+from apex_ompl.apex.path_validator import NOT_ACCEPTED, PathValidator
 from apex_ompl.apex.start_goal import nearest_pairs, read_goals, read_starts
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.path_proof import PathProof
-from apex_ompl.errors import ParameterError
 from apex_ompl.kernel.clearance_costs import ClearanceCosts, clearance_costs
-from apex_ompl.ompl_adapter.report import SolveReport
-from apex_ompl.ompl_adapter.space import array_to_path, bounds_of, forget_states
-from apex_ompl.ompl_adapter.validity import StateValidityChecker
+from apex_ompl.ompl_adapter.own_planner import OwnPlanner
+from apex_ompl.ompl_adapter.space import array_to_path, bounds_of
 from apex_ompl.planners.registry import Parameters, bounded, register
 from apex_ompl.planners.tuned import TUNED
 from apex_ompl.trajopt.gaussian_process import GaussianProcess
@@ -28,7 +26,6 @@ from apex_ompl.trajopt.gpmp import CostFunctional, Evaluation, FactorGraph, Opti
 from apex_ompl.trajopt.path import Path
 from apex_ompl.types import Array
 
-LOG = logging.getLogger("apex_ompl")
 Status = ob.PlannerStatus
 STATES = 256  # of a path, at least
 
@@ -77,7 +74,7 @@ class GaussianProcessParameters(Parameters):
     def problem(
         self, process: GaussianProcess, checker: CollisionChecker, lower: Array, upper: Array
     ) -> FactorGraph | CostFunctional:
-        """Return what is optimised."""
+        """Return what is optimized."""
 
     def factors(
         self, process: GaussianProcess, checker: CollisionChecker, lower: Array, upper: Array
@@ -94,13 +91,9 @@ class GaussianProcessParameters(Parameters):
         """Return the planner.
 
         Raises:
-            ParameterError: ``si`` has no validity checker of this project.
+            ParameterError: ``si`` has neither a validity checker of this project nor is it of ``apex_ompl.setup``.
         """
-        validity_checker = si.getStateValidityChecker()
-        if not isinstance(validity_checker, StateValidityChecker):
-            expected = "apex_ompl's StateValidityChecker, as apex_ompl.setup sets it"
-            raise ParameterError(f"state validity checker for {self.name}", type(validity_checker).__name__, expected)
-        return GaussianProcessPlanner(si, validity_checker.checker, self)
+        return GaussianProcessPlanner(si, PathValidator.of_setup(si, self.name), self)
 
 
 @register("gpmp")
@@ -187,44 +180,37 @@ class GPMP2(GaussianProcessParameters):
         return problem.maximum(supports, self.iterations, self.tolerance, stop=stop)
 
 
-class GaussianProcessPlanner(ob.Planner):
-    """OMPL planner GPMP or GPMP2: one initial motion after the other is optimised, until one is proved free.
+class GaussianProcessPlanner(OwnPlanner):
+    """OMPL planner GPMP or GPMP2: one initial motion after the other is optimized, until one is proved free.
 
     A local method: it ends without a solution when it has nothing left to begin from, and says what is in the way.
 
     Attributes:
         parameters: Its parameters.
+        validator: Decides what is valid.
         report: What the last call of ``solve`` did; ``steps`` counts motions that were tried.
         optima: What the initial motions came to in it.
     """
 
     def __init__(
-        self, si: ob.SpaceInformation, checker: CollisionChecker, parameters: GaussianProcessParameters
+        self, si: ob.SpaceInformation, validator: PathValidator, parameters: GaussianProcessParameters
     ) -> None:
-        """Optimise by the clearances of ``checker``, and prove by it."""
+        """Optimize by the clearances of the validator's checker."""
         super().__init__(si, parameters.name)
-        self._checker = checker
+        self.validator = validator
         self.parameters = parameters
-        self.report, self.optima = SolveReport(), list[Optimum]()
+        self.optima = list[Optimum]()
 
     def setup(self) -> None:
         """Load or compile what the first call of ``solve`` needs."""
         super().setup()
-        clearance_costs(self._checker.kernel, self._checker.robot.home, 0.01, 0.01)
-
-    def solve(self, ptc: ob.PlannerTerminationCondition) -> ob.PlannerStatus:
-        """Solve the problem; no exception leaves it, since one would end the process inside OMPL."""
-        self.report, self.optima = SolveReport(), []
-        try:
-            return Status(self._solve(ptc))
-        except Exception as error:
-            LOG.exception("%s failed", self.parameters.name)
-            forget_states(error)
-            self.report.reason = f"{self.parameters.name} failed, {error!r}"
-            return Status(Status.CRASH)
+        checker = self.validator.checker
+        clearance_costs(checker.kernel, checker.robot.home, 0.01, 0.01)
 
     def _solve(self, ptc: ob.PlannerTerminationCondition) -> Any:
-        begin, report, checker, inputs = time.perf_counter(), self.report, self._checker, self.getPlannerInputStates()
+        self.validator, self.optima = self.validator.current(), []
+        validator, checker = self.validator, self.validator.checker
+        begin, report, inputs = time.perf_counter(), self.report, self.getPlannerInputStates()
         lower, upper = bounds_of(self.getSpaceInformation(), checker.robot)
         starts = read_starts(inputs, len(lower))
         goals = read_goals(inputs, len(lower), ptc, self.getProblemDefinition().getGoal())
@@ -238,19 +224,21 @@ class GaussianProcessPlanner(ob.Planner):
                 break
             report.candidates += 1
             with report.timed("optimize"):
-                optimum = self.parameters.optimum(
-                    problem, supports, lambda states: bool(checker.prove(states, tolerance=0.0)), lambda: bool(ptc())
-                )
+                optimum = self.parameters.optimum(problem, supports, validator.is_valid, lambda: bool(ptc()))
             self.optima.append(optimum)
             report.steps += optimum.evaluations
             path = Path(problem.path(optimum.supports, STATES))
             with report.timed("prove"):
-                proof = checker.prove(path.states, tolerance=0.0)
-            if proof:
+                proof = checker.prove(path.states, tolerance=0.0) if validator.knows_obstacles else None
+                proved = proof is None or bool(proof)
+                valid = proved and validator.accepts(path.states, lambda: bool(ptc()))
+            if valid:
                 self._add(path, time.perf_counter() - begin)
                 return Status.EXACT_SOLUTION
-            report.reason = report.reason or self._fault(path, proof, optimum)
-        report.reason = report.reason or "time was up before the first motion was optimised"
+            report.reason = report.reason or (
+                NOT_ACCEPTED if proof is None or proved else self._fault(path, proof, optimum)
+            )
+        report.reason = report.reason or "time was up before the first motion was optimized"
         return Status.TIMEOUT
 
     def _initial(self, process: GaussianProcess, pairs: list[tuple[Array, Array]]) -> Iterator[Array]:
@@ -277,9 +265,9 @@ class GaussianProcessPlanner(ob.Planner):
         self.getProblemDefinition().addSolutionPath(solution, False, 0.0, name)
 
     def _fault(self, path: Path, proof: PathProof, optimum: Optimum) -> str:
-        """Return which constraint the path violates, where and how deep, and how the optimisation ended."""
+        """Return which constraint the path violates, where and how deep, and how the optimization ended."""
         where = int(np.argmin(np.abs(path.states - proof.state).max(axis=1))) / (len(path.states) - 1)
-        depth = -self._checker.clearance(proof.state)
+        depth = -self.validator.checker.clearance(proof.state)
         deep = f", {1e3 * depth:.0f} mm deep there" if depth >= 5e-4 else ""
         ended = "converged" if optimum.converged else "had not converged"
         return (

@@ -1,22 +1,19 @@
-"""RRTConnect whose path is shortened, put on a spline and optimised."""
+"""RRTConnect whose path is shortened, put on a spline and optimized."""
 
 from __future__ import annotations
 
-import logging
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from ompl import base as ob
 from ompl import geometric as og
 
-from apex_ompl.collision import CollisionChecker
-from apex_ompl.errors import ParameterError
-from apex_ompl.ompl_adapter.report import SolveReport
+from apex_ompl.apex.path_validator import PathValidator
+from apex_ompl.ompl_adapter.own_planner import OwnPlanner
 from apex_ompl.ompl_adapter.simplify import simplify
-from apex_ompl.ompl_adapter.space import Bounds, array_to_path, bounds_of, forget_states, path_to_array
-from apex_ompl.ompl_adapter.validity import StateValidityChecker
+from apex_ompl.ompl_adapter.space import array_to_path, await_goal, path_to_array
 from apex_ompl.planners.registry import Parameters, bounded, register
 from apex_ompl.planners.tuned import TUNED
 from apex_ompl.trajopt.optimizer import Optimizer
@@ -26,86 +23,81 @@ from apex_ompl.trajopt.spline import Spline
 from apex_ompl.types import Array
 
 NAME = "rrtconnect+polish"
-LOG = logging.getLogger("apex_ompl")
+TRIES = 3  # of cutting a path short that another checker accepts
 
 
 def polished(
-    optimizer: Optimizer, checker: CollisionChecker, states: Array, stop: Callable[[], bool] = lambda: False,
-    bounds: Bounds | None = None,
-) -> Path | None:  # fmt: skip
-    """Return a short path near a given one, shape (N, dof), that passes the full check, or None.
+    optimizer: Optimizer, validator: PathValidator, states: Array, stop: Callable[[], bool] = lambda: False
+) -> Path | None:
+    """Return a short valid path near a given one, shape (N, dof), or None.
 
-    The given path is fitted by ``optimizer.spline``, whose control points are optimised inside of ``bounds``, by
-    default the robot's limits.
+    The given path is fitted by ``optimizer.spline``, whose control points are optimized inside of the space's bounds.
     """
-    lower, upper = bounds or (checker.robot.limits.lower, checker.robot.limits.upper)
-    control = optimizer.spline.fit(states, lower, upper).control
-
-    def is_valid(found: Array) -> bool:
-        return bool(checker.prove(found, tolerance=0.0))
-
-    best = optimizer.shorten(checker.kernel.within(lower, upper), control, is_valid, stop)
+    kernel = validator.kernel
+    limits = kernel.robot.arrays
+    control = optimizer.spline.fit(states, limits.lower, limits.upper).control
+    best = optimizer.shorten(kernel, control, lambda path: validator.is_valid(path, stop), stop)
     return None if best is None else Path.on(optimizer.spline, best)
 
 
-class PolishedRRTConnect(ob.Planner):
-    """OMPL planner: RRTConnect, OMPL's simplification by counts, and trajectory optimisation, until ``ptc`` ends it.
+class PolishedRRTConnect(OwnPlanner):
+    """OMPL planner: RRTConnect, OMPL's simplification by counts, and trajectory optimization, until ``ptc`` ends it.
 
-    What RRTConnect found is a solution as soon as it is found; the simplified and the optimised path are added to it,
-    and OMPL gives the shortest. Where optimisation finds nothing valid, the simplified path stands.
+    What RRTConnect found is a solution as soon as it is found; the simplified and the optimized path are added to it,
+    and OMPL gives the shortest. Where optimization finds nothing valid, the simplified path stands.
 
     Attributes:
+        validator: Decides what is valid.
         report: What the last call of ``solve`` did.
     """
 
     def __init__(
-        self, si: ob.SpaceInformation, checker: CollisionChecker, optimizer: Optimizer, inner: og.RRTConnect
+        self, si: ob.SpaceInformation, validator: PathValidator, optimizer: Optimizer, inner: og.RRTConnect
     ) -> None:
-        """Optimise by ``checker`` what ``inner`` finds."""
+        """Optimize what ``inner`` finds."""
         super().__init__(si, NAME)
         inner.setup()
-        self._checker = checker
+        self.validator = validator
         self._optimizer = optimizer
         self._inner = inner
-        self.report, self._begin = SolveReport(), 0.0
+        self._begin = 0.0
 
     def clear(self) -> None:
         """Forget what was found."""
         super().clear()
         self._inner.clear()
 
-    def solve(self, ptc: ob.PlannerTerminationCondition) -> ob.PlannerStatus:
-        """Solve the problem; no exception leaves it, since one would end the process inside OMPL."""
-        self.report = SolveReport()
-        try:
-            return self._solve(ptc)
-        except Exception as error:
-            LOG.exception("%s failed", NAME)
-            forget_states(error)
-            self.report.reason = f"{NAME} failed, {error!r}"
-            return ob.PlannerStatus(ob.PlannerStatus.CRASH)
-
-    def _solve(self, ptc: ob.PlannerTerminationCondition) -> ob.PlannerStatus:
-        si, pdef, dof = self.getSpaceInformation(), self.getProblemDefinition(), self._checker.robot.dof
+    def _solve(self, ptc: ob.PlannerTerminationCondition) -> Any:
+        self.validator = self.validator.current()
+        si, pdef = self.getSpaceInformation(), self.getProblemDefinition()
         self._inner.setProblemDefinition(pdef)
         begin = self._begin = time.perf_counter()
+        await_goal(pdef.getGoal(), ptc)
         with self.report.timed("rrtconnect"):
             status = self._inner.solve(ptc)
         if status.getStatus() == ob.PlannerStatus.EXACT_SOLUTION:
             self.report.solved_by, self.report.first = NAME, time.perf_counter() - begin
         if status.getStatus() != ob.PlannerStatus.EXACT_SOLUTION or ptc():
-            return status
+            return status.getStatus()
+        dof = self.validator.checker.robot.dof
         self.report.first_path = path = Path(path_to_array(pdef.getSolutionPath(), dof))
         with self.report.timed("simplify"):
-            path = Path(simplify(og.PathSimplifier(si), si, path.states, lambda: bool(ptc())))
+            for _ in range(TRIES):
+                short = Path(simplify(si, path.states, lambda: bool(ptc())))
+                # parts of motions that were checked are looked at in other places than before
+                if self.validator.accepts(short.states, lambda: bool(ptc())):
+                    path = short
+                    break
         self._add(path)
         if not ptc():
             with self.report.timed("polish"):
-                bounds = bounds_of(si, self._checker.robot)
-                better = polished(self._optimizer, self._checker, path.states, lambda: bool(ptc()), bounds)
+                better = polished(self._optimizer, self.validator, path.states, lambda: bool(ptc()))
             if better is not None:
                 self._add(better)
-        return status
+        return status.getStatus()
+
+    def _inner_planners(self) -> list[ob.Planner]:
+        return [self._inner]
 
     def _add(self, path: Path) -> None:
         self.report.lengths.append((time.perf_counter() - self._begin, path.length))
@@ -118,13 +110,13 @@ class PolishedRRTConnect(ob.Planner):
 @register(NAME)
 @dataclass(frozen=True)
 class RRTConnectPolish(Parameters):
-    """RRTConnect, simplified, fitted by a B-spline and optimised on its control points.
+    """RRTConnect, simplified, fitted by a B-spline and optimized on its control points.
 
     Attributes:
         range: Longest step of RRTConnect's trees, by default the tuned one; 0 lets OMPL choose.
         control_points: Number of control points of the spline.
         pinned: How many of them coincide with each end.
-        scene_margin: Clearance to obstacles that the optimiser asks for.
+        scene_margin: Clearance to obstacles that the optimizer asks for.
         own_margin: Clearance between the robot's links that it asks for.
         stiffness: Weight of the path's speed squared at first; it grows as long as paths stay valid.
     """
@@ -150,17 +142,14 @@ class RRTConnectPolish(Parameters):
         """Return the planner.
 
         Raises:
-            ParameterError: ``si`` has no validity checker of this project.
+            ParameterError: ``si`` has neither a validity checker of this project nor is it of ``apex_ompl.setup``.
         """
-        validity_checker = si.getStateValidityChecker()
-        if not isinstance(validity_checker, StateValidityChecker):
-            expected = "apex_ompl's StateValidityChecker, as apex_ompl.setup sets it"
-            raise ParameterError(f"state validity checker for {NAME}", type(validity_checker).__name__, expected)
+        validator = PathValidator.of_setup(si, NAME)
         settings = OptimizerSettings(
             scene_margin=self.scene_margin, own_margin=self.own_margin, stiffness=self.stiffness
         )
         optimizer = Optimizer(Spline(self.control_points, self.pinned), settings)
-        optimizer.prepare(validity_checker.checker.kernel)
+        optimizer.prepare(validator.kernel)
         inner = og.RRTConnect(si)
         inner.setRange(self.range)
-        return PolishedRRTConnect(si, validity_checker.checker, optimizer, inner)
+        return PolishedRRTConnect(si, validator, optimizer, inner)

@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 from ompl import base as ob
 
 from apex_ompl.errors import ParameterError, UnknownNameError
+from apex_ompl.util.forking import unforked
 from apex_ompl.util.validation import LARGEST_INT
 
 
@@ -122,7 +123,8 @@ def allocator(name: str, /, **values: Any) -> Callable[[ob.SpaceInformation], ob
 
 def _load() -> None:
     """Import the modules that register planners."""
-    from apex_ompl.planners import apex_parameters, damon, drrt, gpmp, il, polish, sampling  # noqa: F401
+    with unforked():
+        from apex_ompl.planners import apex_parameters, damon, drrt, gpmp, il, polish, sampling  # noqa: F401
 
 
 def _read(name: str, value: Any, default: Any, field: dataclasses.Field[Any]) -> Any:

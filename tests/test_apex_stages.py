@@ -150,7 +150,7 @@ def test_with_time_left_paths_only_get_shorter(ready: PlanningSetup) -> None:
     setup = ready.simple_setup
     si = setup.getSpaceInformation()
     setup.setOptimizationObjective(ob.PathLengthOptimizationObjective(si))
-    planner = APEX(si, ApexParameters(seed=0, sprint=0))
+    planner = APEX(si, seed=0, sprint=0, anytime=True)
     setup.setPlanner(planner)
     setup.setup()
     assert setup.solve(within(3.0)).getStatus() == EXACT

@@ -10,18 +10,18 @@ import bad_planners
 import numpy as np
 import pytest
 from ompl import base as ob
-from ompl import geometric as og
 
 from apex_ompl import planners, planning
 from apex_ompl.api import load_problem, plan
 from apex_ompl.benchmark import runs
 from apex_ompl.benchmark.rows import Job
 from apex_ompl.errors import TimingStoppedError
-from apex_ompl.ompl_adapter.interrupt import ends_after, motions_until
+from apex_ompl.ompl_adapter.interrupt import ends_after
 from apex_ompl.ompl_adapter.repair import repair
 from apex_ompl.ompl_adapter.setup import PlanningSetup, assemble
 from apex_ompl.ompl_adapter.simplify import simplify
-from apex_ompl.ompl_adapter.validity import FullCheck, full_check
+from apex_ompl.ompl_adapter.space import to_state
+from apex_ompl.ompl_adapter.validity import FullCheck, full_check, motions_until
 from apex_ompl.planning import NOT_PROVED, PlanRun, find_path, parameterize, solve, straight_line, verify
 from apex_ompl.planning.timing import NOT_TIMED
 from apex_ompl.result import PlanResult, PlanStatus
@@ -223,12 +223,14 @@ def counting(limit: int) -> Callable[[], bool]:
 
 
 def test_motions_end_with_the_time_and_begin_again(ready: PlanningSetup) -> None:
-    validator = ready.motion_validator
-    check = validator.check
-    with pytest.raises(ValueError, match="ends"), motions_until(validator, counting(2)):
-        assert [validator.check(ready.start, ready.start) for _ in range(4)] == [True, True, False, False]
-        raise ValueError("ends")
-    assert validator.check is check
+    validator, state = ready.motion_validator, to_state(ready.simple_setup.getSpaceInformation(), ready.start)
+    with motions_until(validator, lambda: False):
+        with pytest.raises(ValueError, match="ends"), motions_until(validator, counting(2)):
+            assert [validator.checkMotion(state, state) for _ in range(4)] == [True, True, False, False]
+            raise ValueError("ends")
+        assert validator.checkMotion(state, state)
+    with motions_until(validator, lambda: True), motions_until(validator, lambda: False):
+        assert not validator.checkMotion(state, state), "the outer end counts, too"
 
 
 def test_shortening_ends_in_time(ready: PlanningSetup, found: PlanResult) -> None:
@@ -240,11 +242,10 @@ def test_shortening_ends_in_time(ready: PlanningSetup, found: PlanResult) -> Non
         return check(a, b)
 
     validator.check = counted
-    simplifier = og.PathSimplifier(si)
-    whole = simplify(simplifier, si, states_of(found))
+    whole = simplify(si, states_of(found))
     all_motions = len(asked)
     asked.clear()
-    short = simplify(simplifier, si, states_of(found), counting(4))
+    short = simplify(si, states_of(found), counting(4))
     assert len(asked) <= 3 < all_motions and Path(whole).length < found.length
     assert ready.checker.first_collision(short, SEARCH_RESOLUTION) is None
     assert np.array_equal(short[[0, -1]], states_of(found)[[0, -1]])

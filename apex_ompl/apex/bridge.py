@@ -74,7 +74,7 @@ def _bridge(context: SolveContext, a: Array, b: Array, tree_range: float, calls:
         if found is not None:
             return found
         calls = round(OMPL_SHARE * calls)
-    tree, pdef = ompl_trees(context.si, [a], b, tree_range)
+    tree, pdef = ompl_trees(context.validator.si, [a], b, tree_range)
     if tree.solve(context.counted(calls)).getStatus() != ob.PlannerStatus.EXACT_SOLUTION:
         return None
     inner = path_to_array(pdef.getSolutionPath(), len(a))

@@ -19,6 +19,8 @@ from apex_ompl.trajopt.path import Path
 from apex_ompl.types import Array
 
 if TYPE_CHECKING:
+    from ompl import geometric as og
+
     from apex_ompl.apex.sampler import ProposalSampler
     from apex_ompl.apex.trees import OmplTrees
     from apex_ompl.diffusion.query import Query
@@ -56,6 +58,7 @@ class SolveContext:
         sprint_ompl_trees: OMPL's, where another checker decides, or None.
         all_trees: Compiled trees for all starts and goals, or None.
         all_ompl_trees: OMPL's for all starts and goals, or None.
+        grown: Trees between starts and goals so far, for OMPL's planner data.
     """
 
     def __init__(
@@ -82,6 +85,7 @@ class SolveContext:
         self.sprint_ompl_trees: OmplTrees | None = None
         self.all_trees: TreePair | None = None
         self.all_ompl_trees: OmplTrees | None = None
+        self.grown: list[TreePair | og.RRTConnect] = []
         self._queries: list[Query] = []
 
     @property

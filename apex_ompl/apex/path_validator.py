@@ -12,61 +12,92 @@ from ompl import base as ob
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel import Kernel
-from apex_ompl.ompl_adapter.space import bounds_of, to_state
+from apex_ompl.ompl_adapter.forwarding import forwarding
+from apex_ompl.ompl_adapter.simple_setup import SpaceInformation
+from apex_ompl.ompl_adapter.space import bounds_of, require_real_vectors, to_state
 from apex_ompl.ompl_adapter.validity import MotionValidator, StateValidityChecker
-from apex_ompl.robot import load_robot
-from apex_ompl.types import Array
+from apex_ompl.robot import Robot, load_robot
+from apex_ompl.types import Array, Flags
 
 Stop = Callable[[], bool]
+NOT_ACCEPTED = "the state validity checker that is set does not accept the path"
 
 LOG = logging.getLogger("apex_ompl")
 PLAIN = (ob.MotionValidator, MotionValidator)  # OMPL's own, and this project's
+LOOKS = 8  # every so many states of a path are looked at before its motions, which have the others
+DEFAULT_ROBOT = "dual_panda_softhand"
 
 
 class PathValidator:
-    """Validity of states and paths of a space information.
+    """Validity of states and paths of a space information, by the checkers that it has.
 
-    With a ``StateValidityChecker`` of this project a path is valid by the full check. With another checker, or a
-    subclass that refines it, a path is valid when all of its states are and all motions between them, by
-    ``isValid`` and ``checkMotion``. Another checker knows the robot by name, and its obstacles are not known.
+    With a ``StateValidityChecker`` of this project a path is valid by the full check. With a subclass that refines it,
+    or with a motion validator of the user's, a path is valid when the full check says so and they do. Another checker
+    decides alone: a path is valid when all of its states are and all motions between them, at the resolution of the
+    space; the robot is then that of the setup, or known by name, and its obstacles are not known.
 
     Attributes:
+        si: By whose checkers motions are valid; where the motion validator is the user's, states between are, too.
         checker: Collision checker of the robot, among its obstacles where they are known.
         knows_obstacles: Whether the obstacles are known.
         exclusive: Whether this project's checker alone decides.
     """
 
-    def __init__(self, si: ob.SpaceInformation, robot: str) -> None:
-        """Take the checkers of ``si``.
+    def __init__(self, si: ob.SpaceInformation, robot: str = "") -> None:
+        """Take the checkers of ``si``; one that has none yet is asked again (see ``outdated``).
 
         Args:
-            si: OMPL's space information, its checkers set.
-            robot: Name of the robot, where the checker is not this project's.
+            si: OMPL's space information.
+            robot: Name of the robot where the checker is not this project's; by default that of the setup, or
+                DEFAULT_ROBOT.
 
         Raises:
             ApexError: There is no such robot.
-            ParameterError: The space has another dimension than the robot.
+            ParameterError: The space is not one of real vectors, or has another dimension than the robot.
         """
-        self._si = si
+        require_real_vectors(si.getStateSpace())
+        self._si, self._robot = si, robot
         self._checkers = _checkers(si)
         self._bounded: tuple[tuple[Any, ...], Kernel] | None = None  # what it was made of, and the kernel
         validity_checker, motions = self._checkers
+        plain = type(motions) in PLAIN
+        self.si = si if plain else forwarding(si, walks=True)
         self.knows_obstacles = isinstance(validity_checker, StateValidityChecker)
-        plain = type(validity_checker).isValid is StateValidityChecker.isValid and type(motions) in PLAIN
-        self.exclusive = self.knows_obstacles and plain
-        self.checker = (
-            validity_checker.checker
-            if isinstance(validity_checker, StateValidityChecker)
-            else CollisionChecker(load_robot(robot))
-        )
+        if isinstance(validity_checker, StateValidityChecker):
+            self.checker = validity_checker.checker
+            self.exclusive = type(validity_checker).isValid is StateValidityChecker.isValid and plain
+        else:
+            self.checker, self.exclusive = CollisionChecker(_robot_of(si, robot)), False
         dof, dimension = self.checker.robot.dof, int(si.getStateSpace().getDimension())
         if dof != dimension:
-            raise ParameterError("state space", dimension, f"{dof} dimensions, those of {self.checker.robot.name}")
-        if not self.knows_obstacles:
+            expected = f"{dof} dimensions, those of {self.checker.robot.name}, or another robot by robot=..."
+            raise ParameterError("state space", dimension, expected)
+        if validity_checker is not None and not self.knows_obstacles:
             LOG.warning(
                 "the validity checker is not apex_ompl's: it decides, and proposals are kept clear of %s itself only",
                 self.checker.robot.name,
             )
+
+    @classmethod
+    def of_setup(cls, si: ob.SpaceInformation, planner: str) -> PathValidator:
+        """Return a validator for a planner that is given no robot.
+
+        Raises:
+            ParameterError: ``si`` has neither a checker of this project nor is it of ``apex_ompl.setup``.
+        """
+        checker = si.getStateValidityChecker()
+        if not isinstance(checker, StateValidityChecker) and not isinstance(si, SpaceInformation):
+            expected = "apex_ompl's StateValidityChecker, or any other in a setup of apex_ompl.setup"
+            raise ParameterError(f"state validity checker for {planner}", type(checker).__name__, expected)
+        return cls(si)
+
+    def current(self) -> PathValidator:
+        """Return this validator, or one of the checkers that the space information has by now.
+
+        Raises:
+            ParameterError: A checker is of another robot.
+        """
+        return PathValidator(self._si, self._robot) if self.outdated else self
 
     @property
     def kernel(self) -> Kernel:
@@ -88,6 +119,12 @@ class PathValidator:
             return self.checker.is_free(q)
         return bool(self._si.isValid(to_state(self._si, q)))
 
+    def are_free(self, states: Array) -> Flags:
+        """Return whether states, shape (N, dof), are valid, shape (N,)."""
+        if self.exclusive:
+            return self.checker.are_free(states)
+        return np.array([self.is_free(q) for q in states], bool)
+
     def collides(self, path: Array) -> bool:
         """Whether a quick test finds that a path, shape (N, dof), is not valid; with another checker none does."""
         return self.knows_obstacles and self.checker.collides_along(path)
@@ -96,15 +133,18 @@ class PathValidator:
         """Whether a path, shape (N, dof), is valid; with another checker, not when it is told to stop meanwhile."""
         if self.knows_obstacles and not self.checker.prove(path, tolerance=0.0):
             return False
-        return self.exclusive or self._valid_by_ompl(path, stop)
+        return self.accepts(path, stop)
 
-    def _valid_by_ompl(self, path: Array, stop: Stop) -> bool:
+    def accepts(self, path: Array, stop: Stop = lambda: False) -> bool:
+        """Whether a path, shape (N, dof), is valid by other checkers than this project's, where there are any."""
+        if self.exclusive:
+            return True
         states = [to_state(self._si, q) for q in path]
-        order = sorted(range(len(states)), key=lambda k: (-(k & -k), k))  # coarse before fine
-        for k in order:
+        first = sorted(range(0, len(states), LOOKS), key=lambda k: (-(k & -k), k))  # coarse before fine
+        for k in first:
             if stop() or not self._si.isValid(states[k]):
                 return False
-        return all(not stop() and self._si.checkMotion(a, b) for a, b in zip(states, states[1:], strict=False))
+        return all(not stop() and self.si.checkMotion(a, b) for a, b in zip(states, states[1:], strict=False))
 
     def obstacle_distance(self, path: Array) -> float:
         """Return the least distance between robot and obstacles along a path, shape (N, dof) [m].
@@ -114,5 +154,12 @@ class PathValidator:
         return self.checker.obstacle_distance(path) if self.knows_obstacles else np.inf
 
 
-def _checkers(si: ob.SpaceInformation) -> tuple[ob.StateValidityChecker, ob.MotionValidator]:
+def _robot_of(si: ob.SpaceInformation, robot: str) -> Robot:
+    """Return the robot of a space information by name, or that of its setup, or the default one."""
+    if not robot and isinstance(si, SpaceInformation):
+        return si.robot
+    return load_robot(robot or DEFAULT_ROBOT)
+
+
+def _checkers(si: ob.SpaceInformation) -> tuple[ob.StateValidityChecker | None, ob.MotionValidator]:
     return si.getStateValidityChecker(), si.getMotionValidator()

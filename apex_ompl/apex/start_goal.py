@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from ompl import base as ob
 
-from apex_ompl.ompl_adapter.space import to_array
+from apex_ompl.ompl_adapter.space import await_goal, to_array
 from apex_ompl.types import Array
 
 MAX_GOALS, GOAL_ATTEMPTS = 8, 32  # goals that are read of a region, and samples that are drawn for them
@@ -46,7 +46,8 @@ def read_goals(inputs: Any, dof: int, ptc: ob.PlannerTerminationCondition, goal:
     sampled = goal is not None and goal.hasType(ob.GOAL_SAMPLEABLE_REGION)
     count = goal.maxSampleCount() if sampled else 0
     most, attempts = (count, count) if MAX_GOALS < count <= MAX_STATES else (MAX_GOALS, GOAL_ATTEMPTS)
-    state = inputs.nextGoal(ptc)  # waits for one
+    await_goal(goal, ptc)
+    state = inputs.nextGoal(ptc)
     for _ in range(attempts):
         if state is not None:
             found.append(to_array(state, dof))

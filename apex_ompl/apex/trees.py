@@ -20,6 +20,7 @@ from apex_ompl.types import Array
 from apex_ompl.util.resolution import SEARCH_RESOLUTION
 
 OMPL_RANGE = 0.2  # OMPL's choice of the longest step, as a share of the extent of the space
+OMPL_SHARE = 0.125  # of the iterations of compiled trees that OMPL's have, which take several times as long for one
 OmplTrees = tuple[og.RRTConnect, ob.ProblemDefinition]
 
 
@@ -54,6 +55,24 @@ def compiled_trees(
     longest = tree_range if tree_range > 0.0 else OMPL_RANGE * context.si.getStateSpace().getMaximumExtent()
     rng = context.rng.spawn(1)[0]
     return TreePair(context.kernel, np.array(starts), np.array(goals), longest, SEARCH_RESOLUTION, rng)
+
+
+def rooted_trees(
+    context: SolveContext, starts: Sequence[Array], goals: Sequence[Array], tree_range: float
+) -> TreePair:  # fmt: skip
+    """Return compiled trees whose roots are starts and goals of the problem; OMPL's planner data are theirs."""
+    trees = compiled_trees(context, starts, goals, tree_range)
+    context.grown.append(trees)
+    return trees
+
+
+def rooted_ompl_trees(
+    context: SolveContext, starts: Sequence[Array], goal: Array | ob.Goal, tree_range: float
+) -> OmplTrees:  # fmt: skip
+    """Return OMPL's trees whose roots are starts and goals of the problem; OMPL's planner data are theirs."""
+    trees = ompl_trees(context.validator.si, starts, goal, tree_range)
+    context.grown.append(trees[0])
+    return trees
 
 
 def grow(context: SolveContext, trees: TreePair, iterations: int) -> Array | None:

@@ -24,6 +24,7 @@ from apex_ompl.kernel.scene_builder import Solids, moved, tables_of
 from apex_ompl.kernel.tables import RobotTables, SceneTables
 from apex_ompl.robot import Robot
 from apex_ompl.types import Array
+from apex_ompl.util.forking import ProcessLock
 
 
 class UnprovedPairs(NamedTuple):
@@ -92,7 +93,7 @@ class ConservativeChecker:
         self.scene = scene
         self._robot = robot
         self._local = threading.local()
-        self._lock = threading.RLock()
+        self._lock = ProcessLock()
         self._solids: dict[int, Solids] = {}  # of obstacles, by number; those that are missing are new
         self._moved: set[int] = set()
         self._listed = False  # whether the obstacles of the tables are those of the scene, moved or not

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from itertools import product
 
 import coal
@@ -14,6 +13,7 @@ from apex_ompl.kernel.compiled.farthest_points import farthest_points
 from apex_ompl.scene.meshes import FLAT
 from apex_ompl.types import Array
 from apex_ompl.util.boxes import bounding_box
+from apex_ompl.util.forking import ProcessLock
 from apex_ompl.util.weak_cache import weakly_cached
 
 THICKNESS = 1e-6  # by which hulls of surfaces are larger; of those longer than 1 m as much by their length [m]
@@ -21,7 +21,7 @@ DIRECTIONS = (400, 60)  # in which hulls of too many vertices are sampled; fewer
 CELLS = 24  # along the longest side of a grid over vertices
 MOST_VERTICES = 50_000  # of a mesh whose hull is not sampled
 
-_building = threading.Lock()
+_building = ProcessLock()
 
 
 def convex_hull(geometry: coal.CollisionGeometry) -> coal.CollisionGeometry:

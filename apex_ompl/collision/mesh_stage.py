@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 import warnings
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -22,6 +21,7 @@ from apex_ompl.robot import Robot
 from apex_ompl.robot.geometry import link_of
 from apex_ompl.scene.bodies import AttachedObject
 from apex_ompl.types import Array
+from apex_ompl.util.forking import ProcessLock
 
 Manager = pin.BroadPhaseManager_DynamicAABBTreeCollisionManager
 Pair = tuple[int, int]
@@ -99,7 +99,7 @@ class MeshStage:
         self._request = _make_exact(coal.CollisionRequest())
         self._next = self.links
         self._containment: dict[Pair, list[ContainmentTest]] = {}
-        self.lock = threading.Lock()
+        self.lock = ProcessLock()
 
     def allow(self, allowed: Iterable[frozenset[str]]) -> None:
         """Let pairs of bodies touch, by their names, and no others but those of the robot's own."""

@@ -25,6 +25,7 @@ from apex_ompl.kernel.tables import with_pairs
 from apex_ompl.robot import Robot
 from apex_ompl.types import Array, Flags
 from apex_ompl.util.arrays import compact
+from apex_ompl.util.forking import ProcessLock
 
 MOST_PACKED = 64  # sets of held objects that are kept for each robot
 TOUCH = 1e-5  # distance that counts as contact [m]
@@ -163,7 +164,7 @@ class PathProver:
         self._robot = robot
         self._scene = scene
         self._local = threading.local()
-        self._lock = threading.Lock()
+        self._lock = ProcessLock()
         self._placed: dict[int, tuple[Solid, PlacedShape]] = {}
         self._current: tuple[Kernel, tuple[Integers, Floats, Integers]] | None = None
 

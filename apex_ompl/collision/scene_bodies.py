@@ -16,6 +16,7 @@ from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import AttachedObject, Body, Obstacle, file_shape, given_fields, same_solid
 from apex_ompl.scene.scripts import moved_to, standing
 from apex_ompl.types import Array
+from apex_ompl.util.forking import unforked
 from apex_ompl.util.schema import validate
 
 SHOWN_AFTER = 1.0  # of a progress bar [s]
@@ -36,6 +37,7 @@ class SceneBodies:
         self._extents: dict[str, tuple[str, Array]] = {}
         self._fixtures = frozenset(body.name for body in robot.fixtures)
 
+    @unforked()  # tqdm has a lock of its own
     def fill(
         self, scene: Iterable[Obstacle], attached: Iterable[AttachedObject],
         allowed: Iterable[tuple[str, str]] = (), *, fixtures: bool = True,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import logging
-import threading
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from weakref import WeakValueDictionary
@@ -31,6 +30,7 @@ from apex_ompl.scene.meshes import (
 from apex_ompl.scene.points import parse_points
 from apex_ompl.types import Array
 from apex_ompl.util.files import read_file
+from apex_ompl.util.forking import ProcessLock
 from apex_ompl.util.weak_cache import weakly_cached
 
 KEPT_MESHES = 32  # meshes that were loaded last and are kept for the next problem
@@ -39,7 +39,7 @@ MANY_TRIANGLES = 200_000  # which take seconds
 
 LOG = logging.getLogger("apex_ompl")
 
-_loading = threading.RLock()
+_loading = ProcessLock()
 _meshes: WeakValueDictionary[str, coal.BVHModelBase] = WeakValueDictionary()  # by content and scale
 _recent: list[coal.BVHModelBase] = []
 

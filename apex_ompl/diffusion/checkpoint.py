@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-import threading
 from collections.abc import Callable, Mapping
 from functools import lru_cache
 from pathlib import Path
@@ -22,6 +21,7 @@ from apex_ompl.diffusion.model_config import ModelConfig
 from apex_ompl.diffusion.proposals import TrajectoryModel
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError, UnknownNameError
 from apex_ompl.util.files import BROKEN, is_file, path_text, read_file
+from apex_ompl.util.forking import ProcessLock
 from apex_ompl.util.schema import StrictModel, read_json, validate
 
 if TYPE_CHECKING:
@@ -183,7 +183,7 @@ def shared_model(name: str | os.PathLike[str], *, device: str = "cpu", robot: st
         return _shared(str(folder.absolute()), stamp, device, robot)
 
 
-_loading = threading.Lock()
+_loading = ProcessLock()
 
 
 @lru_cache(maxsize=4)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import threading
 from collections.abc import Callable, Sequence
 from functools import lru_cache
 from pathlib import Path
@@ -22,6 +21,7 @@ from apex_ompl.imitation.network import PolicyNetwork
 from apex_ompl.kernel import Kernel
 from apex_ompl.types import Array
 from apex_ompl.util.files import is_file
+from apex_ompl.util.forking import ProcessLock
 from apex_ompl.util.threads import one_torch_thread
 
 EXECUTED = 8  # states of a chunk that are followed before the policy is asked again
@@ -143,7 +143,7 @@ def shared_policy(name: str | os.PathLike[str], *, robot: str | None = None) -> 
         return _shared(str(folder.absolute()), stamp, robot)
 
 
-_loading = threading.Lock()
+_loading = ProcessLock()
 
 
 @lru_cache(maxsize=4)

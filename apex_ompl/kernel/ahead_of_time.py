@@ -16,14 +16,17 @@ from typing import Any
 from tqdm import tqdm
 
 from apex_ompl.kernel.compiled.compilation import CompiledFunction, cache_folder, names_in_cache
+from apex_ompl.kernel.compiled.compilation import _lock as compiling
 from apex_ompl.kernel.entry_points import PLANS, RUNS, Group
 from apex_ompl.util.cores import usable_cores
 from apex_ompl.util.files import locked
+from apex_ompl.util.forking import hold_at_fork
 
 LOG = logging.getLogger("apex_ompl")
 
 CHILD = "import sys; from apex_ompl.kernel.ahead_of_time import compile_named; compile_named(sys.argv[1:])"
 
+hold_at_fork(compiling)
 _lock = threading.Lock()
 _ready: set[str] = set()  # groups
 

@@ -26,6 +26,7 @@ from apex_ompl.kernel.compiled.layout import Integers, Singles
 from apex_ompl.types import Array
 from apex_ompl.util.arrays import compact
 from apex_ompl.util.boxes import bounding_box
+from apex_ompl.util.forking import ProcessLock
 
 MOST_NODES = 6_000_000
 MOST_NODES_OF_POINTS = 1_000_000  # which are made anew with every image
@@ -103,7 +104,7 @@ class DistanceGrid:
 
 
 _kept: OrderedDict[bytes, DistanceGrid] = OrderedDict()
-_lock = threading.Lock()  # of these
+_lock = ProcessLock()  # of these
 
 
 def grid_of_triangles(corners: Array, solid: bool, at_work: Callable[[], None] = lambda: None) -> DistanceGrid:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+from numpy.typing import NDArray
 
 from apex_ompl.kernel.compiled import tree_search
 from apex_ompl.kernel.kernel import Kernel
@@ -63,6 +64,11 @@ class TreePair:
     def size(self) -> int:
         """Number of nodes."""
         return int(self._sizes[:2].sum())
+
+    def nodes(self, tree: int) -> tuple[Array, NDArray[np.int64]]:
+        """Return the states of tree 0, from the starts, or 1, from the goals, and the parent of each, -1 for roots."""
+        count = int(self._sizes[tree])
+        return np.ascontiguousarray(self._states[tree, :, :count].T), self._parents[tree, :count].copy()
 
     @property
     def steps(self) -> int:

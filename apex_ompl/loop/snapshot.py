@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from ompl import base as ob
-from ompl import geometric as og
 
 from apex_ompl.loop.charges import Charges
 from apex_ompl.loop.placing import fresh_checker, place
@@ -98,7 +97,7 @@ class Snapshot:
             status = simple_setup.solve(ob.PlannerTerminationCondition(search.charges.over))
             if status.getStatus() == ob.PlannerStatus.EXACT_SOLUTION:
                 found = path_to_array(simple_setup.getSolutionPath(), setup.robot.dof)
-                path = simplify(og.PathSimplifier(si), si, found, search.charges.over)
+                path = simplify(si, found, search.charges.over)
         setup.raise_faults()
         if path is None:
             return None

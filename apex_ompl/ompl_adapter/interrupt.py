@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
+import ctypes
 import signal
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from types import TracebackType
+from types import FrameType, TracebackType
 from typing import Any, Self
 
 from ompl import base as ob
 
-from apex_ompl.ompl_adapter.validity import MotionValidator
-
 MAX_TIME = 1e8  # OMPL counts nanoseconds in 64 bits [s]
+ROOM = 512  # for a C struct sigaction, which has 152 bytes on x86-64 [bytes]
 
 
 def ends_after(seconds: float) -> ob.PlannerTerminationCondition:
@@ -25,38 +25,46 @@ def ends_after(seconds: float) -> ob.PlannerTerminationCondition:
 
 
 class Interrupt:
-    """Holds SIGINT back while planning: it ends the planner at work, and is raised when planning has ended.
+    """Calls Python's handler of SIGINT while planning; what it raises ends the planner, and is raised afterwards.
 
-    Outside the main thread, where Python allows no signal handlers, it does nothing.
+    Outside the main thread, where Python allows no signal handlers, it does nothing, nor where SIGINT is ignored, or
+    handled by C code (as of ROS 2): that stays as it is.
 
     Attributes:
-        pressed: Whether SIGINT came.
+        pressed: Whether planning is to end.
     """
 
     def __init__(self) -> None:
         """Start without a handler; the ``with`` statement sets it."""
         self.pressed = False
         self._conditions: list[ob.PlannerTerminationCondition] = []
-        self._before: Any = None
+        self._before: Callable[[int, FrameType | None], Any] | None = None
+        self._mine = _Disposition()
+        self._raised: BaseException | None = None
 
     def __enter__(self) -> Self:
         """Take SIGINT over."""
         if threading.current_thread() is threading.main_thread():
-            self._before = signal.signal(signal.SIGINT, self._handle)
+            before, found = signal.getsignal(signal.SIGINT), _Disposition()
+            if callable(before):
+                signal.signal(signal.SIGINT, self._handle)
+                self._before, self._mine = before, _Disposition()
+                if self._mine != found:  # C code has taken it after Python
+                    self._give_back()
+                    found.restore()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Give SIGINT back, and raise KeyboardInterrupt when it came.
-
-        Raises:
-            KeyboardInterrupt: SIGINT came in the meantime.
-        """
-        if self._before is not None:
-            signal.signal(signal.SIGINT, self._before)
-        if self.pressed:
-            raise KeyboardInterrupt
+        """Give SIGINT back, and raise what its handler raised."""
+        if self._before is not None and signal.getsignal(signal.SIGINT) == self._handle:
+            found = _Disposition()
+            self._give_back()
+            if found != self._mine:  # C code has taken it in the meantime
+                found.restore()
+        if self._raised is not None:
+            raise self._raised
 
     @contextmanager
     def ends(self, condition: ob.PlannerTerminationCondition) -> Iterator[ob.PlannerTerminationCondition]:
@@ -69,22 +77,41 @@ class Interrupt:
         finally:
             self._conditions.remove(condition)
 
-    def _handle(self, *_: object) -> None:
+    def end(self) -> None:
+        """End the planner at work, and those to come."""
         self.pressed = True
-        for condition in self._conditions:
+        for condition in list(self._conditions):
             condition.terminate()
 
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        assert self._before is not None
+        try:
+            self._before(number, frame)
+        except BaseException as error:
+            self._raised = error
+            self.end()
 
-@contextmanager
-def motions_until(validator: MotionValidator, stop: Callable[[], bool]) -> Iterator[None]:
-    """While the block runs, let all motions be invalid once ``stop`` holds.
+    def _give_back(self) -> None:
+        signal.signal(signal.SIGINT, self._before)
+        self._before = None
 
-    OMPL looks at a termination condition between iterations and not inside of them, and simplifies paths by counts:
-    without motions to check, both soon come to their end.
-    """
-    check = validator.check
-    validator.check = lambda first, second: not stop() and check(first, second)
-    try:
-        yield
-    finally:
-        validator.check = check
+
+class _Disposition:
+    """What the process does at SIGINT, as the operating system has it: Python does not know what C code sets."""
+
+    def __init__(self) -> None:
+        self._action = ctypes.create_string_buffer(ROOM)
+        ctypes.CDLL(None).sigaction(int(signal.SIGINT), None, self._action)
+
+    def __eq__(self, other: object) -> bool:
+        """Whether the handler is the same."""
+        return isinstance(other, _Disposition) and self._handler == other._handler
+
+    __hash__ = None  # type: ignore[assignment]
+
+    @property
+    def _handler(self) -> bytes:
+        return self._action.raw[: ctypes.sizeof(ctypes.c_void_p)]  # first member of the struct
+
+    def restore(self) -> None:
+        ctypes.CDLL(None).sigaction(int(signal.SIGINT), self._action, None)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 from ompl import util as ou
 
-_lock = threading.Lock()
+from apex_ompl.util.forking import ProcessLock
+
+_lock = ProcessLock()
 _levels: list[ou.LogLevel] = []
 
 

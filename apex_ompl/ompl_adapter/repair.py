@@ -9,10 +9,18 @@ from ompl import base as ob
 from ompl import geometric as og
 
 from apex_ompl.collision.path_proof import PathProof
-from apex_ompl.ompl_adapter.interrupt import Interrupt, ends_after, motions_until
+from apex_ompl.ompl_adapter.interrupt import Interrupt, ends_after
 from apex_ompl.ompl_adapter.setup import PlanningSetup
-from apex_ompl.ompl_adapter.space import path_to_array, state_space, to_state
-from apex_ompl.ompl_adapter.validity import FullCheck, MotionProof, MotionValidator, StateValidityChecker, full_check
+from apex_ompl.ompl_adapter.simple_setup import SimpleSetup
+from apex_ompl.ompl_adapter.space import path_to_array, to_state
+from apex_ompl.ompl_adapter.validity import (
+    FullCheck,
+    MotionProof,
+    MotionValidator,
+    StateValidityChecker,
+    full_check,
+    motions_until,
+)
 from apex_ompl.trajopt.path import Path
 from apex_ompl.types import Array
 
@@ -65,11 +73,10 @@ def _free_ends(problem: PlanningSetup, path: Array, segment: int) -> tuple[int, 
 
 def _bridge(problem: PlanningSetup, a: Array, b: Array, deadline: float, interrupt: Interrupt) -> Array | None:
     """Return a path between two free states whose motions are proved, or None."""
-    space = state_space(problem.robot, bounds=problem.bounds)
-    setup = og.SimpleSetup(space)
+    setup = SimpleSetup(problem.robot, problem.bounds)
     si = setup.getSpaceInformation()
     validity_checker = StateValidityChecker(si, problem.checker)
-    motions = MotionValidator(si, MotionProof(problem.checker))
+    motions = MotionValidator(si, MotionProof(problem.checker), validity_checker)
     setup.setStateValidityChecker(validity_checker)
     si.setMotionValidator(motions)
     setup.setStartAndGoalStates(to_state(si, a), to_state(si, b))

@@ -16,7 +16,7 @@ class SolveReport:
 
     Attributes:
         solved_by: Stage that found the first valid path: ``line``, ``experience``, ``apex`` or ``apex+resample``,
-            with ``+repair`` where the optimiser had to help; ``sprint``, ``apex+bridge`` or ``rrtconnect``; empty
+            with ``+repair`` where the optimizer had to help; ``sprint``, ``apex+bridge`` or ``rrtconnect``; empty
             without one.
         reason: One sentence where there is no exact solution.
         times: Seconds by stage; those of ``guidance`` and ``distance`` are part of other stages.
@@ -28,7 +28,7 @@ class SolveReport:
         candidates: Number of candidates before trees: straight lines, earlier paths, proposals.
         proposed: Number of candidates that the model proposed.
         resampled: Number of candidates from collision-triggered resampling.
-        steps: Number of optimiser steps in repair.
+        steps: Number of optimizer steps in repair.
         improved: Number of shorter paths that were found after the first one.
     """
 

@@ -11,7 +11,8 @@ from ompl import base as ob
 from ompl import geometric as og
 
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.ompl_adapter.space import Bounds, state_space, to_state
+from apex_ompl.ompl_adapter.simple_setup import SimpleSetup
+from apex_ompl.ompl_adapter.space import Bounds, to_state
 from apex_ompl.ompl_adapter.validity import MotionCheck, MotionValidator, StateValidityChecker
 from apex_ompl.robot import Robot, load_robot
 from apex_ompl.scene.problem import Problem
@@ -55,7 +56,7 @@ class PlanningSetup:
     robot: Robot
     checker: CollisionChecker
     check: MotionCheck
-    simple_setup: og.SimpleSetup
+    simple_setup: SimpleSetup
     validity_checker: StateValidityChecker
     motion_validator: MotionValidator
     start: Array
@@ -121,14 +122,13 @@ def assemble(
         goals = sampling.states
         goals[:, held] = start[held]
         goal_faults = ("",) * len(goals) or (sampling.fault,)
-    space = state_space(robot, bounds=bounds)
-    simple_setup = og.SimpleSetup(space)
+    simple_setup = SimpleSetup(robot, bounds)
     si = simple_setup.getSpaceInformation()
     check = MotionCheck(checker, SEARCH_RESOLUTION)
-    validity_checker, motion_validator = StateValidityChecker(si, checker), MotionValidator(si, check)
+    validity_checker = StateValidityChecker(si, checker)
+    motion_validator = MotionValidator(si, check, validity_checker)
     simple_setup.setStateValidityChecker(validity_checker)
     si.setMotionValidator(motion_validator)
-    si.setStateValidityCheckingResolution(SEARCH_RESOLUTION / space.getMaximumExtent())
     simple_setup.setStartState(to_state(si, start))
     given = [goal for goal, fault in zip(goals, goal_faults, strict=False) if not fault]
     set_goals(simple_setup, given or list(goals))

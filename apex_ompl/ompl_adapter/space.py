@@ -6,6 +6,8 @@ radian, so that OMPL's Euclidean distance is the joint-space distance with hands
 
 from __future__ import annotations
 
+import sys
+import time
 import traceback
 from typing import Any
 
@@ -13,12 +15,15 @@ import numpy as np
 from ompl import base as ob
 from ompl import geometric as og
 
+from apex_ompl.errors import ParameterError
 from apex_ompl.robot import Robot
 from apex_ompl.types import Array, Flags
 from apex_ompl.util.resolution import SEARCH_RESOLUTION
 
 Bounds = tuple[Array, Array]
 """Lowest and highest positions of the joints, each of shape (dof,) [rad; synergies 0..1]."""
+
+GOAL_LOOK = 0.002  # between two looks for a goal that another thread samples [s]
 
 
 def state_space(
@@ -44,14 +49,21 @@ def state_space(
     return space
 
 
+def require_real_vectors(space: ob.StateSpace) -> None:
+    """Refuse spaces whose states are no vectors, or lie on a manifold that straight lines leave.
+
+    Raises:
+        ParameterError: The space is not OMPL's space of real vectors.
+    """
+    if not isinstance(space, ob.RealVectorStateSpace):
+        expected = "an ob.RealVectorStateSpace, as apex_ompl.ompl_adapter.space.state_space makes it"
+        raise ParameterError("state space", type(space).__name__, expected)
+
+
 def bounds_of(si: ob.SpaceInformation, robot: Robot) -> Bounds:
-    """Return the bounds of a state space inside of the robot's limits; these where the space has none of its own."""
-    lower, upper = robot.limits.lower, robot.limits.upper
-    space = si.getStateSpace()
-    if not hasattr(space, "getBounds"):
-        return lower, upper
-    box = space.getBounds()
-    return np.maximum(lower, box.low), np.minimum(upper, box.high)
+    """Return the bounds of a state space inside of the robot's limits."""
+    box = si.getStateSpace().getBounds()
+    return np.maximum(robot.limits.lower, box.low), np.minimum(robot.limits.upper, box.high)
 
 
 def to_array(state: Any, dof: int) -> Array:
@@ -59,12 +71,29 @@ def to_array(state: Any, dof: int) -> Array:
     return np.array(state[0:dof])
 
 
-def to_state(si: ob.SpaceInformation, q: Array) -> Any:
-    """Return a new OMPL state with the values of ``q``, shape (dof,), which is freed when Python drops it.
+def new_state(si: ob.SpaceInformation) -> Any:
+    """Return a new OMPL state, which is freed when Python drops it.
 
-    In OMPL's bindings states that a space allocates, and not a space information, are never freed.
+    In OMPL's bindings states that a space allocates, and not a space information, are never freed. And where Python
+    still holds the object of a state that OMPL has freed, as a checker does that keeps what it was given, a new state
+    at the same address gets that object, and its memory is freed at once. Such an address is given away for good here.
     """
-    state = si.allocState()
+    while True:
+        state = si.allocState()
+        if sys.getrefcount(state) <= _users_of_new():
+            return state
+        del state
+        si.getStateSpace().allocState()  # at the same address, and never freed
+
+
+def _users_of_new() -> int:
+    state = object()
+    return sys.getrefcount(state)
+
+
+def to_state(si: ob.SpaceInformation, q: Array) -> Any:
+    """Return a new OMPL state with the values of ``q``, shape (dof,), which is freed when Python drops it."""
+    state = new_state(si)
     state[0 : len(q)] = [float(v) for v in q]
     return state
 
@@ -77,7 +106,7 @@ def path_to_array(path: og.PathGeometric, dof: int) -> Array:
 def array_to_path(si: ob.SpaceInformation, states: Array) -> og.PathGeometric:
     """Return an OMPL path through ``states``, shape (N, dof)."""
     path = og.PathGeometric(si)
-    state = si.allocState()
+    state = new_state(si)
     for q in states:
         state[0 : len(q)] = [float(v) for v in q]
         path.append(state)  # a copy
@@ -92,11 +121,21 @@ def motions_free(si: ob.SpaceInformation, first: Array, last: Array) -> Flags:
         first: States that they begin at, taken to be free, shape (N, dof).
         last: States that they end at, shape (N, dof).
     """
-    a, b, found = si.allocState(), si.allocState(), []
+    a, b, found = new_state(si), new_state(si), []
     for p, q in zip(first.tolist(), last.tolist(), strict=True):
         a[0 : len(p)], b[0 : len(q)] = p, q
         found.append(bool(si.checkMotion(a, b)))
     return np.array(found, bool)
+
+
+def await_goal(goal: ob.Goal | None, ptc: ob.PlannerTerminationCondition) -> None:
+    """Wait for the first state of a goal that is sampled by another thread, until a condition holds.
+
+    ``nextGoal`` of OMPL's bindings waits for it, too, but holds the interpreter's lock, which Python's sampler needs.
+    """
+    if isinstance(goal, ob.GoalLazySamples):
+        while not goal.maxSampleCount() and goal.couldSample() and not ptc():
+            time.sleep(GOAL_LOOK)
 
 
 def forget_states(error: BaseException) -> None:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
+from weakref import ref
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,6 +15,7 @@ from ompl import base as ob
 
 from apex_ompl.collision.checker import CollisionChecker
 from apex_ompl.collision.path_proof import Curve, PathProof
+from apex_ompl.ompl_adapter.simple_setup import SpaceInformation
 from apex_ompl.trajectory.trajectory import ROUNDING, Trajectory
 from apex_ompl.types import Array
 from apex_ompl.util.resolution import SEARCH_RESOLUTION
@@ -78,23 +81,67 @@ class StateValidityChecker(ob.StateValidityChecker):
 
 
 class MotionValidator(ob.MotionValidator):
-    """OMPL motion validator over a collision checker, in bit-reversed order; no exception leaves it."""
+    """OMPL motion validator: by a check of its own as long as its validity checker is set, and else by the one that is.
 
-    def __init__(self, si: ob.SpaceInformation, check: MotionCheck | MotionProof) -> None:
-        """Check motions of ``si`` by ``check``."""
+    ``setStateValidityChecker`` of OMPL leaves the motion validator as it is. So this one asks at each motion which
+    checker the space information has; another one than its own is asked for states between both ends by OMPL's own
+    motion validator, at the resolution of the space.
+
+    No exception of its own check leaves it: it makes motions invalid and is kept in ``fault``.
+
+    Attributes:
+        check: Its own check of a straight motion between two free states.
+        validity_checker: The checker that it stands for.
+        stop: All motions are invalid once this holds.
+        fault: First exception of its own check, or None.
+    """
+
+    def __init__(
+        self, si: SpaceInformation, check: MotionCheck | MotionProof, validity_checker: StateValidityChecker
+    ) -> None:
+        """Check motions of ``si``, in place of the motion validator that it has."""
         super().__init__(si)
         self.check: Callable[[Array, Array], bool] = check
+        self.validity_checker = validity_checker
+        self.stop: Callable[[], bool] = lambda: False
         self.dof = check.checker.robot.dof
         self.fault: BaseException | None = None
+        self._si = ref(si)  # which owns this one
+        self._discrete = si.getMotionValidator()
+
+    @property
+    def decides(self) -> bool:
+        """Whether its own checker is the one that is set."""
+        si = self._si()
+        return si is not None and si.getStateValidityChecker() is self.validity_checker
 
     def checkMotion(self, first: Any, second: Any) -> bool:  # noqa: N802 - OMPL's name
         """Whether the straight motion between two states is free."""
         try:
-            return self.check(first[0 : self.dof], second[0 : self.dof])
+            if self.stop():
+                return False
+            if self.decides:
+                return self.check(first[0 : self.dof], second[0 : self.dof])
         except BaseException as error:
             first = second = None
             self.fault = self.fault or error
             return False
+        return bool(self._discrete.checkMotion(first, second))
+
+
+@contextmanager
+def motions_until(validator: MotionValidator, stop: Callable[[], bool]) -> Iterator[None]:
+    """While the block runs, let all motions be invalid once ``stop`` holds.
+
+    OMPL looks at a termination condition between iterations and not inside of them, and simplifies paths by counts:
+    without motions to check, both soon come to their end.
+    """
+    before = validator.stop
+    validator.stop = lambda: stop() or before()
+    try:
+        yield
+    finally:
+        validator.stop = before
 
 
 @dataclass(frozen=True)

@@ -9,17 +9,18 @@ import numpy as np
 from ompl import base as ob
 
 from apex_ompl.errors import ApexError
-from apex_ompl.ompl_adapter.interrupt import MAX_TIME, ends_after, motions_until
+from apex_ompl.ompl_adapter.interrupt import MAX_TIME, ends_after
 from apex_ompl.ompl_adapter.repair import repair
 from apex_ompl.ompl_adapter.report import LineAwarePlanner, report_of
 from apex_ompl.ompl_adapter.setup import PlanningSetup, set_goals
 from apex_ompl.ompl_adapter.simplify import simplify as shorten
 from apex_ompl.ompl_adapter.space import path_to_array
-from apex_ompl.ompl_adapter.validity import full_check
+from apex_ompl.ompl_adapter.validity import full_check, motions_until
 from apex_ompl.planning.departure import remedy
 from apex_ompl.planning.run import PlanRun
 from apex_ompl.result import FIRST, INSIDE, PlanResult, PlanStatus
 from apex_ompl.trajopt.path import Path
+from apex_ompl.util.forking import unforked
 from apex_ompl.util.stopwatch import timed
 
 STRAIGHT_LINE = "straight line"
@@ -103,7 +104,7 @@ def solve(run: PlanRun, simplify: bool, execute: Execute = execute) -> PlanResul
     try:
         if run.deadline.expired:
             return _out_of_time(run)
-        with timed(run.times, "setup"), run.deadline.paused():
+        with timed(run.times, "setup"), run.deadline.paused(), unforked():
             planner = _set_up(run)
         with motions_until(run.setup.motion_validator, run.ends_search):
             status = execute(run, planner, min(run.deadline.for_search, MAX_TIME))
@@ -213,9 +214,7 @@ def _found_path(run: PlanRun) -> Path:
 
 
 def _simplified(run: PlanRun, path: Path) -> Path:
-    simple_setup = run.setup.simple_setup
-    si = simple_setup.getSpaceInformation()
-    return Path(shorten(simple_setup.getPathSimplifier(), si, path.states, run.ends_search))
+    return Path(shorten(run.setup.simple_setup.getSpaceInformation(), path.states, run.ends_search))
 
 
 def _out_of_time(run: PlanRun) -> PlanResult:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import os
-import threading
 import time
 from collections.abc import Mapping, Sequence, Set
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
@@ -35,6 +35,8 @@ from apex_ompl.scene.scripts import is_there
 from apex_ompl.session.world import World
 from apex_ompl.trajectory import Timing, warm_up
 from apex_ompl.util.deadline import Deadline
+from apex_ompl.util.exiting import running
+from apex_ompl.util.forking import ProcessLock, unforked
 from apex_ompl.util.schema import validate
 from apex_ompl.util.validation import check_number, check_positive, check_seed
 
@@ -71,6 +73,7 @@ class MotionPlanner:
             result = planner.plan(planner.robot.home, goal)
     """
 
+    @unforked()
     def __init__(self, robot: str | Path | Robot = "dual_panda_softhand", model: str | None = None) -> None:
         """Make a planner in an empty world.
 
@@ -86,7 +89,7 @@ class MotionPlanner:
         file = self.robot.name if isinstance(robot, Robot) else str(robot)
         self.robot_file = os.path.abspath(file) if file.endswith((".yaml", ".yml")) else file
         self.model = model
-        self.world = World(CollisionChecker(self.robot), threading.RLock(), self.robot_file)
+        self.world = World(CollisionChecker(self.robot), ProcessLock(), self.robot_file)
         self._set_up()
 
     def _set_up(self) -> None:
@@ -132,7 +135,7 @@ class MotionPlanner:
             KeyboardInterrupt: Ctrl-C was pressed; planning ended in good order first.
         """
         started = time.perf_counter()
-        with self._lock:
+        with running(), self._lock:
             return self._plan(self.problem(start, goal, name, group), planner, started, group=group, **options)
 
     def plan_problem(self, problem: Problem, planner: str | None = None, **options: Any) -> PlanResult:
@@ -147,8 +150,9 @@ class MotionPlanner:
             ApexError: The problem, the planner or a parameter is faulty.
         """
         started = time.perf_counter()
-        with self._lock:
-            self.world.load(problem)
+        with running(), self._lock:
+            with unforked():
+                self.world.load(problem)
             return self._plan(problem, planner, started, **options)
 
     def problem(self, start: State, goal: Target, name: str = "world", group: Group | None = None) -> Problem:
@@ -224,14 +228,15 @@ class MotionPlanner:
         how = (Timing() if timing else None) if isinstance(timing, bool) else timing
         changing = self._checker.changing_obstacles
         movers = _movers(changing, snapshot, how, leave_contact)
-        with quiet_ompl():
+        with quiet_ompl(), ExitStack() as preparing:
+            preparing.enter_context(unforked())
             seed_ompl(seed)
             notes = snapshot_notes(changing) if snapshot else []
             if planner is None:
                 planner = NAME
                 if not has_model(self.robot.name):
                     notes.append(f"no model of {self.robot.name} ships, so random bumps take the place of proposals")
-            parameters = planners.parameters(planner, **self._parameters(planner, params))
+            parameters = planners.parameters(planner, **self._parameters(planner, params, seed))
             if how is not None:
                 start = how.start(how.limits(self.robot.limits, self.robot.joint_names))  # whether it fits the robot
                 if start is not None and leave_contact:
@@ -253,7 +258,8 @@ class MotionPlanner:
                 warm_up_among_movers(checker)
             times = {"setup": time.perf_counter() - started}
             run = PlanRun(ready, planner, parameters, seed, Deadline(timeout), times, notes)
-            with Interrupt() as run.interrupt:
+            preparing.close()
+            with Interrupt() as run.interrupt, running(run.interrupt.end):
                 if movers and how is not None:
                     result = plan_among_movers(run, movers, simplify, how)
                 else:
@@ -291,10 +297,12 @@ class MotionPlanner:
         self._left = made if kept else self._left
         return made
 
-    def _parameters(self, planner: str, params: Mapping[str, Any] | None) -> dict[str, Any]:
-        given = dict(params or {})
-        if self.model is not None and hasattr(planners.parameters(planner), "model"):
+    def _parameters(self, planner: str, params: Mapping[str, Any] | None, seed: int) -> dict[str, Any]:
+        given, known = dict(params or {}), planners.parameters(planner)
+        if self.model is not None and hasattr(known, "model"):
             given.setdefault("model", self.model)
+        if hasattr(known, "seed"):  # OMPL's is that of the whole process, where other threads plan as well
+            given.setdefault("seed", seed)
         return given
 
 

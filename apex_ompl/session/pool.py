@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import os
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 from apex_ompl.session.planner import MotionPlanner
+from apex_ompl.util.forking import ProcessLock
 
 MOST_IDLE = 4  # planners of a robot that are kept
 _Stamps = tuple[int, ...]
 _idle: dict[str, list[tuple[MotionPlanner, _Stamps]]] = {}
-_idle_lock = threading.Lock()
+_idle_lock = ProcessLock()
 
 
 @contextmanager

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -19,6 +18,7 @@ from apex_ompl.scene.bodies import MOTION, AttachedObject, Obstacle, given_field
 from apex_ompl.scene.problem import Problem
 from apex_ompl.session.cloud_files import CloudFiles, cloud_of
 from apex_ompl.types import Array
+from apex_ompl.util.forking import ProcessLock
 from apex_ompl.util.schema import validate
 from apex_ompl.util.validation import finite_array
 
@@ -38,7 +38,7 @@ class World:
         robot_file: Name or file of the robot.
     """
 
-    def __init__(self, checker: CollisionChecker, lock: threading.RLock, robot_file: str = "") -> None:
+    def __init__(self, checker: CollisionChecker, lock: ProcessLock, robot_file: str = "") -> None:
         """Edit the scene of ``checker`` while ``lock`` is held.
 
         Args:
@@ -57,11 +57,11 @@ class World:
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Make the world anew."""
         checker = CollisionChecker(load_robot(state["robot"]), *state["bodies"])
-        self.__init__(checker, threading.RLock(), state["robot"])  # type: ignore[misc]
+        self.__init__(checker, ProcessLock(), state["robot"])  # type: ignore[misc]
 
     def __deepcopy__(self, memo: dict[int, Any]) -> World:
         """Return a world of its own with the same bodies, whose records do not change; no file is read."""
-        return World(CollisionChecker(self.checker.robot, *self._bodies()), threading.RLock(), self.robot_file)
+        return World(CollisionChecker(self.checker.robot, *self._bodies()), ProcessLock(), self.robot_file)
 
     def _bodies(self) -> tuple[tuple[Obstacle, ...], tuple[AttachedObject, ...], tuple[tuple[str, str], ...]]:
         with self.lock:

@@ -22,7 +22,6 @@ Angles are in radians, lengths in metres.
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -38,6 +37,7 @@ from apex_ompl.tasks.alignment_errors import UP, angle, lowest_direction, within
 from apex_ompl.tasks.inverse_kinematics import Links, in_world
 from apex_ompl.tasks.link_faces import LinkFace, lip_direction
 from apex_ompl.types import Array
+from apex_ompl.util.forking import ProcessLock
 
 DEFAULT_TILT = (1.75, 2.36)  # 100 to 135 degrees from upright
 RESTART_SPREAD = 0.6  # standard deviation of initial states around home [rad]
@@ -79,7 +79,7 @@ class AlignmentGoal:
         pours = alignment.kind == "pour" and not isinstance(alignment.first, WorldVector)
         self._radial = lip_direction(held[str(alignment.first)]) if pours else None
         self._data = robot.model.createData()
-        self._lock = threading.Lock()  # of the data
+        self._lock = ProcessLock()  # of the data
         self._inverse = Links.of(robot).inverse(self.targets(), self._hand_joints())
 
     def _face(self, field: str, named: str | WorldVector, held: Mapping[str, AttachedObject]) -> LinkFace:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Sequence
 from weakref import WeakKeyDictionary
 
@@ -15,6 +14,7 @@ from apex_ompl.errors import UnknownNameError
 from apex_ompl.kernel import FixedVector, IKSolver, RobotTables, Target
 from apex_ompl.kernel.robot_builder import robot_tables
 from apex_ompl.robot import Robot
+from apex_ompl.util.forking import ProcessLock
 
 
 def in_world(vector: ArrayLike) -> FixedVector:
@@ -78,4 +78,4 @@ class Links:
 
 
 _known: WeakKeyDictionary[Robot, Links] = WeakKeyDictionary()
-_lock = threading.Lock()
+_lock = ProcessLock()

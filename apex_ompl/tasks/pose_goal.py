@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -18,6 +17,7 @@ from apex_ompl.tasks.alignment_errors import angle
 from apex_ompl.tasks.inverse_kinematics import Links, in_world
 from apex_ompl.tasks.link_faces import LinkFace
 from apex_ompl.types import Array
+from apex_ompl.util.forking import ProcessLock
 
 SPREAD = 0.6  # largest standard deviation of initial states around the start [rad]
 POSITION_WEIGHT = 4.0  # weight of a position error against an angle in inverse kinematics [rad/m]
@@ -62,7 +62,7 @@ class PoseGoal:
         self.frames = tuple(frame_of(robot, pose.frame, held) for pose in self.poses)
         self._numbers = [robot.link_frame(frame.link) for frame in self.frames]
         self._data = robot.model.createData()
-        self._lock = threading.Lock()  # of the data
+        self._lock = ProcessLock()  # of the data
         names = [h.synergy for h in robot.hands.values() if h.synergy is not None]
         hands = np.array([robot.joint_names.index(name) for name in names], dtype=np.intp)
         self._inverse = Links.of(robot).inverse(self.targets(), hands)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 import torch
 
-_lock = threading.Lock()
+from apex_ompl.util.forking import ProcessLock
+
+_lock = ProcessLock()
 _before: list[int] = []  # thread count to restore, one entry for each active block
 
 

@@ -1,27 +1,32 @@
-"""Shortening of the best path: shortcuts on a polyline, then the optimiser on a spline."""
+"""Shortening of the best path: shortcuts on a polyline, then the optimizer on a spline."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
-from ompl import geometric as og
+from ompl import base as ob
 
 from apex_ompl.apex.context import SolveContext
-from apex_ompl.apex.trees import compiled_trees, grow
+from apex_ompl.apex.trees import OMPL_SHARE, compiled_trees, grow, ompl_trees
 from apex_ompl.kernel.shortcuts import ENOUGH, RESOLUTION, shortcut
 from apex_ompl.ompl_adapter.simplify import simplify
+from apex_ompl.ompl_adapter.space import path_to_array
 from apex_ompl.trajopt.path import Path, path_length
 from apex_ompl.types import Array
 
 DETOUR, OTHERS = 1.7, 2  # times the straight line's length, beyond which so many other trees are tried
 ITERATIONS = 6_000  # of each of these
+MOTIONS = 500  # that are checked to cut a polyline short where another checker decides
+PASSES, IDLE, MIN_GAIN = 4, 2, 0.02  # over such a path; so many that shorten by less than this share are the last
 
 
 @dataclass(frozen=True)
 class Shorten:
-    """Shorten the best path; a polyline is cut short, and fitted by a spline, before it is optimised.
+    """Shorten the best path; a polyline is cut short, and fitted by a spline, before it is optimized.
 
     A polyline that stays far longer than the straight line goes a long way round: others are looked for by trees.
+    Where another checker decides, whose obstacles the optimizer does not know, cutting and optimizing take turns.
 
     Attributes:
         tree_range: Longest step of these trees; 0 lets OMPL choose, None is for no trees [rad].
@@ -33,16 +38,22 @@ class Shorten:
         """Accept what is shorter."""
         if context.best is None or context.stop():
             return
-        control = context.best.control
-        self._optimize(context, self._simplified(context, context.best) if control is None else control)
+        if context.validator.exclusive:
+            control = context.best.control
+            self._optimize(context, self._simplified(context, context.best) if control is None else control)
+            return
+        idle = 0
+        for _ in range(PASSES):
+            before = context.best.length
+            self._optimize(context, self._simplified(context, context.best))
+            idle += context.best.length > (1.0 - MIN_GAIN) * before
+            if context.stop() or idle == IDLE:
+                break
 
     def _simplified(self, context: SolveContext, path: Path) -> Array:
         """Return control points of the simplified path, which is accepted where it is valid and shorter."""
         with context.report.timed("simplify"):
-            if context.validator.exclusive:
-                found = self._cut_short(context, path.states)
-            else:  # one attempt at a time: foreign checkers may be slow
-                found = [simplify(og.PathSimplifier(context.si), context.si, path.states, context.stop, 1)]
+            found = self._cut_short(context, path.states)
             for states in found:
                 short = Path(states)
                 if short.length < path.length and context.is_valid(states) and context.accept_if_shorter(short):
@@ -57,7 +68,7 @@ class Shorten:
         for _ in range(OTHERS):
             if context.stop() or path_length(found[0]) <= DETOUR * path_length(states[[0, -1]]):
                 break
-            other = grow(context, compiled_trees(context, [states[0]], [states[-1]], self.tree_range), ITERATIONS)
+            other = _another(context, states, self.tree_range)
             found += [] if other is None else [_shortcut(context, other)]
             found.sort(key=path_length)
         return found
@@ -72,8 +83,22 @@ class Shorten:
             context.accept_if_shorter(context.spline_path(better))
 
 
+def _another(context: SolveContext, states: Array, tree_range: float) -> Array | None:
+    """Return another path between the ends of one, shape (N, dof), by new trees, or None."""
+    if context.validator.exclusive:
+        trees = compiled_trees(context, [states[0]], [states[-1]], tree_range)
+        return grow(context, trees, ITERATIONS)
+    tree, pdef = ompl_trees(context.validator.si, [states[0]], states[-1], tree_range)
+    status = tree.solve(context.counted(math.ceil(OMPL_SHARE * ITERATIONS))).getStatus()
+    exact = status == ob.PlannerStatus.EXACT_SOLUTION
+    return path_to_array(pdef.getSolutionPath(), states.shape[1]) if exact else None
+
+
 def _shortcut(context: SolveContext, states: Array) -> Array:
     """Return a polyline cut short."""
+    if not context.validator.exclusive:
+        left = iter(range(MOTIONS))
+        return simplify(context.validator.si, states, lambda: context.stop() or next(left, None) is None)
     short, looked = shortcut(context.kernel, states, ENOUGH, RESOLUTION, context.rng.spawn(1)[0], context.stop)
     context.note_search(looked)
     return short

@@ -15,14 +15,13 @@ from ompl import base as ob
 from apex_ompl.apex.bridge import bridge_blocked
 from apex_ompl.apex.context import SolveContext, joins
 from apex_ompl.apex.stages.stage import Solution
-from apex_ompl.apex.trees import compiled_trees, grow, ompl_trees
+from apex_ompl.apex.trees import OMPL_SHARE, grow, rooted_ompl_trees, rooted_trees
 from apex_ompl.ompl_adapter.space import path_to_array
 from apex_ompl.trajopt.path import Path
 from apex_ompl.types import Array
 
 SPACING = 0.1  # of states on a tree's path whose blocked stretches are bridged [rad, max-norm]
 GUIDING, EVERY = 8, 8  # candidates around whose states trees grow, the nearest to being free, and every so many states
-OMPL_SHARE = 0.125  # of the iterations of compiled trees that OMPL's have, which take several times as long for one
 EXACT, APPROXIMATE = ob.PlannerStatus.EXACT_SOLUTION, ob.PlannerStatus.APPROXIMATE_SOLUTION
 
 
@@ -50,7 +49,7 @@ class Sprint:
 
     def _compiled(self, context: SolveContext) -> Array | None:
         trees, (start, goal) = context.sprint_trees, context.pairs[0]
-        trees = context.sprint_trees = trees or compiled_trees(context, [start], [goal], self.tree_range)
+        trees = context.sprint_trees = trees or rooted_trees(context, [start], [goal], self.tree_range)
         trees.guide(_guides(context, context.pairs[:1]))
         states = grow(context, trees, self.iterations)
         if states is not None:
@@ -59,7 +58,8 @@ class Sprint:
 
     def _of_ompl(self, context: SolveContext) -> Array | None:
         trees, (start, goal) = context.sprint_ompl_trees, context.pairs[0]
-        tree, pdef = context.sprint_ompl_trees = trees or ompl_trees(context.si, [start], goal, self.tree_range)
+        trees = trees or rooted_ompl_trees(context, [start], goal, self.tree_range)
+        tree, pdef = context.sprint_ompl_trees = trees
         if tree.solve(context.counted(math.ceil(OMPL_SHARE * self.iterations))).getStatus() != EXACT:
             return None
         context.sprint_ompl_trees = None
@@ -91,7 +91,7 @@ class GrowTrees:
 
     def _compiled(self, context: SolveContext, iterations: int) -> Solution | None:
         trees = context.all_trees or (context.sprint_trees if len(context.pairs) == 1 else None)
-        trees = trees or compiled_trees(context, context.starts, context.goals, self.tree_range)
+        trees = trees or rooted_trees(context, context.starts, context.goals, self.tree_range)
         context.sprint_trees, context.all_trees = None, trees
         trees.guide(_guides(context, context.pairs))
         with context.report.timed("rrtconnect"):
@@ -105,7 +105,7 @@ class GrowTrees:
         goal = context.pdef.getGoal()
         whole = len(context.pairs) == 1 and goal.hasType(ob.GOAL_STATE)  # a region may have others
         trees = context.all_ompl_trees or (context.sprint_ompl_trees if whole else None)
-        trees = trees or ompl_trees(context.si, context.starts, goal, self.tree_range)
+        trees = trees or rooted_ompl_trees(context, context.starts, goal, self.tree_range)
         context.sprint_ompl_trees, context.all_ompl_trees = None, trees
         tree, pdef = trees
         with context.report.timed("rrtconnect"):
