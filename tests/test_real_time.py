@@ -21,7 +21,7 @@ from apex_ompl.errors import PlannerProcessError
 from apex_ompl.live.movers import Movers, clearance_in_time
 from apex_ompl.loop import planner_process
 from apex_ompl.loop.charges import Charges
-from apex_ompl.loop.cycle import RunRecord
+from apex_ompl.loop.cycle import Loop, RunRecord
 from apex_ompl.loop.following import Following
 from apex_ompl.loop.methods import replanner_of
 from apex_ompl.loop.observation import Observation
@@ -32,7 +32,7 @@ from apex_ompl.loop.referee import RefereeReport, judge
 from apex_ompl.loop.rehearsal import rehearse
 from apex_ompl.loop.replanning import answered
 from apex_ompl.loop.request import Answer, Request
-from apex_ompl.loop.result import Outcome, RunResult
+from apex_ompl.loop.result import INTERRUPTED, Outcome, RunResult
 from apex_ompl.loop.run import run
 from apex_ompl.loop.sensor import Sensor, SensorStream
 from apex_ompl.problems.worlds import World
@@ -93,6 +93,24 @@ def test_a_planner_that_never_answers_ends_defined() -> None:
 
 def test_observations_may_be_late_doubled_out_of_order_or_no_numbers() -> None:
     check_defined(*go(eyes=BadEyes))
+
+
+@pytest.mark.parametrize("where", ["advance", "step", "set_out"])
+def test_an_interrupt_stops_the_robot(where: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    original, left = getattr(Loop, where), [1]
+
+    def interrupted(loop: Loop, now: float) -> Any:
+        found = original(loop, now)
+        if now >= 0.5 and left:
+            left.pop()
+            raise KeyboardInterrupt
+        return found
+
+    monkeypatch.setattr(Loop, where, interrupted)
+    done, report, process = go()
+    assert done.ended == "aborted" and done.reason == INTERRUPTED and process.process.poll() is not None
+    assert is_at_rest(done.trajectory, done.trajectory.duration) and done.trajectory.duration < 1.5
+    assert report.moving_contact is None and done.unguarded == 0
 
 
 def test_a_run_by_name_is_a_result(tmp_path: Path) -> None:

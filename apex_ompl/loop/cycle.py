@@ -117,8 +117,8 @@ class Loop:
                 self.abort(f"the sensor failed, {type(error).__name__}: {error}")
         self._present, self._looked = tuple(self._world.present(now)), now
 
-    def abort(self, why: str) -> None:
-        """Let the robot stop, and the run end for a reason."""
+    def abort(self, why: str = "the interpreter ended") -> None:
+        """Let the robot stop, and the run end for a reason; may be called from any thread."""
         self._aborted = self._aborted or why
 
     def interrupt(self, now: float, before: Decided) -> None:

@@ -26,6 +26,7 @@ from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.scripts import standing
 from apex_ompl.trajectory import time_path
 from apex_ompl.util.cores import usable_cores
+from apex_ompl.util.exiting import running
 
 
 def cores() -> tuple[int | None, int | None]:
@@ -94,34 +95,35 @@ def run_in_real_time(world: World, ready: Ready, planner: PlannerProcess, eyes: 
     k, missed = 0, 0
     ended: RunRecord | None = None
     warm_up(ready, world, seed)
-    with undisturbed(cores()[0]):
+    with undisturbed(cores()[0]), running(loop.abort):
         began = time.perf_counter()
         while ended is None:
-            before = Decided.of(executor)
+            before, then = Decided.of(executor), (k + 1) * period
             try:
                 wait = began + k * period - time.perf_counter()
                 if wait > 0.0:
                     time.sleep(wait)
                 seen = time.perf_counter() - began
                 if math.floor(seen / period) > k:  # periods went by without a step
-                    undo(executor, (k + 1) * period, before)
+                    undo(executor, then, before)
                     missed += math.floor(seen / period) - k
-                    k, before = math.floor(seen / period), Decided.of(executor)
+                    k = math.floor(seen / period)
+                    before, then = Decided.of(executor), (k + 1) * period
                 loop.advance(k * period)
                 looked = time.perf_counter()
                 loop.observe(k * period)
-                ended = loop.step((k + 1) * period)
+                ended = loop.step(then)
                 ticks.append(time.perf_counter() - looked)
                 k += 1
-                if ended is None and time.perf_counter() - began > k * period:
-                    undo(executor, k * period, before)
+                if ended is None and time.perf_counter() - began > then:
+                    undo(executor, then, before)
                     missed += 1
                 paused = time.perf_counter()
-                loop.set_out(k * period)
+                loop.set_out(then)
                 began += time.perf_counter() - paused
             except KeyboardInterrupt:
-                ended = None
-                loop.interrupt(max(k * period, executor.followed[-1][0]), before)
+                ended, k = None, round(then / period)
+                loop.interrupt(then, before)
     world.advance(k * period, executor.state(k * period))  # what the motion is judged by
     middle, high, worst = np.percentile(ticks, [50.0, 99.0, 100.0]).tolist()
     measured = {"tick_p50": middle, "tick_p99": high, "tick_worst": worst, "deadline_misses": float(missed)}

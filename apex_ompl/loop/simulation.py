@@ -10,6 +10,7 @@ from apex_ompl.loop.ready import Ready
 from apex_ompl.loop.replanning import AtOnce
 from apex_ompl.loop.request import Replanner
 from apex_ompl.problems.worlds import World
+from apex_ompl.util.exiting import running
 
 
 def simulate(world: World, ready: Ready, replanner: Replanner, eyes: Eyes, seed: int) -> RunRecord:
@@ -23,15 +24,16 @@ def simulate(world: World, ready: Ready, replanner: Replanner, eyes: Eyes, seed:
         seed: Of random choices.
     """
     loop = Loop(world, ready, AtOnce(ready, replanner), eyes, seed)
-    for k in count():
-        now, before = k * ready.settings.period, Decided.of(loop.executor)
-        try:
-            loop.advance(now)
-            loop.observe(now)
-            ended = loop.step(now)
-            if ended is not None:
-                return ended
-            loop.set_out(now)
-        except KeyboardInterrupt:
-            loop.interrupt(now, before)
+    with running(loop.abort):
+        for k in count():
+            now, before = k * ready.settings.period, Decided.of(loop.executor)
+            try:
+                loop.advance(now)
+                loop.observe(now)
+                ended = loop.step(now)
+                if ended is not None:
+                    return ended
+                loop.set_out(now)
+            except KeyboardInterrupt:
+                loop.interrupt(now, before)
     raise AssertionError("unreachable")
