@@ -139,5 +139,9 @@ class SceneError(ApexError):
 
 def _short(value: object, limit: int = 80) -> str:
     """Return ``repr(value)`` cut to ``limit`` characters, on one line."""
-    text = " ".join(repr(value).split())
+    try:
+        text = repr(value)
+    except Exception:  # of an integer of more than 4300 digits, or of a class whose text fails
+        text = object.__repr__(value)
+    text = " ".join(text.split())
     return text if len(text) <= limit else text[: limit - 3] + "..."
