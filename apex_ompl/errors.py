@@ -25,8 +25,10 @@ def _rebuilt(kind: type[ApexError], args: tuple[Any, ...], attributes: dict[str,
     return error
 
 
-def nearest_name(name: str, known: Iterable[str]) -> str | None:
-    """Return the known name most like ``name``, or None when none is close."""
+def nearest_name(name: object, known: Iterable[str]) -> str | None:
+    """Return the known name most like ``name``, or None when none is close or it is no text."""
+    if not isinstance(name, str):
+        return None
     matches = difflib.get_close_matches(name, list(known), n=1, cutoff=0.6)
     return matches[0] if matches else None
 
@@ -40,7 +42,7 @@ class UnknownNameError(ApexError):
         known: The known names.
     """
 
-    def __init__(self, kind: str, name: str, known: Iterable[str]) -> None:
+    def __init__(self, kind: str, name: object, known: Iterable[str]) -> None:
         """Compose the message ``unknown KIND NAME; known: ...``."""
         self.kind = kind
         self.name = name

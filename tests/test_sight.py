@@ -30,6 +30,7 @@ from apex_ompl.diffusion.sight import KEY_RANGE, Sight, arms
 from apex_ompl.diffusion.sight_data import SightTable
 from apex_ompl.diffusion.torch_sight import TorchSight
 from apex_ompl.diffusion.training import Trainer
+from apex_ompl.errors import FileFormatError
 from apex_ompl.kernel import Kernel
 from apex_ompl.kernel.point_distances import nearest_points
 from apex_ompl.problems.objects import bar, two_cups

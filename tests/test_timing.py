@@ -209,6 +209,8 @@ def test_faulty_paths_are_named(path: object) -> None:
 def test_faulty_arguments_are_named() -> None:
     with pytest.raises(ParameterError, match="timing"):
         time_path(np.zeros((2, 3)), LIMITS, NAMES, 0.5)  # type: ignore[arg-type]
+    with pytest.raises(ParameterError, match="limits: expected a Limits"):
+        time_path(np.zeros((2, 3)), 5.0, NAMES)  # type: ignore[arg-type]
     with pytest.raises(ParameterError, match="joint_names"):
         time_path(np.zeros((2, 3)), LIMITS, ("one", "two"))
     assert Timing(start_velocity=[1.0, 0.0]) == Timing(start_velocity=np.array([1.0, 0.0]))
@@ -252,6 +254,10 @@ def test_limits_of_single_joints_are_lowered_for_a_plan() -> None:
         ({"max_velocity": {"two": 99.0}}, ParameterError, "max_velocity.two.*the robot's limit"),
         ({"max_jerk": {"two": -1.0}}, ParameterError, "max_jerk.two.*a positive number"),
         ({"max_acceleration": 1.0}, ParameterError, "max_acceleration.*by joint name"),
+        ({"max_velocity": {"two": 10**400}}, ParameterError, "max_velocity.two: expected a positive number, got 1000"),
+        ({"max_velocity": {5: 1.0}}, UnknownNameError, "unknown joint 5; known: one, three, two"),
+        ({"method": []}, UnknownNameError, r"unknown timing method \[\]; known: ruckig, spline"),
+        ({"method": 3}, UnknownNameError, "unknown timing method 3"),
     ):
         with pytest.raises(error, match=said):
             timed(path, Timing(**options))  # type: ignore[arg-type]

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from apex_ompl.errors import ParameterError, UnknownNameError
-from apex_ompl.util.validation import check_number
+from apex_ompl.errors import ParameterError
+from apex_ompl.util.validation import check_name, check_number
 
 PREDICTIONS = ("still", "cv", "truth")
 """How obstacles are predicted: where they were seen (the paper), at constant velocity, or as they truly move."""
@@ -74,8 +74,7 @@ class LoopSettings:
             ParameterError: A number is out of its range, or the budget is no multiple of the period.
             UnknownNameError: No such prediction.
         """
-        if self.prediction not in PREDICTIONS:
-            raise UnknownNameError("prediction", str(self.prediction), PREDICTIONS)
+        check_name(self.prediction, "prediction", PREDICTIONS)
         for name, (low, high) in RANGES.items():
             check_number(getattr(self, name), name, low, high)
         steps = self.budget / self.period
