@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -117,6 +118,28 @@ def test_a_straight_line_takes_the_least_time_there_is(length: float) -> None:
     assert made.form == "line" and made.deviation == 0.0
     assert made.trajectory.duration == pytest.approx(least, rel=1e-5)
     assert keeps_limits(made.trajectory)
+
+
+@pytest.mark.parametrize("jerk", [1e8, 1e11, 1e12, 1e300, np.inf])
+def test_without_a_limit_of_jerk_motions_are_the_fastest_within_the_others(jerk: float) -> None:
+    """A large number counts as none. Along a line they speed up and slow down at the limits."""
+    free = replace(LIMITS, jerk=np.full(3, jerk))
+    path = np.array([[0.0, 0.0, 0.0], [0.3, 0.0, 0.0], [0.3, 0.0, 0.4], [0.0, 0.2, 0.0]])
+    made = timed(path[:2], limits=free).trajectory
+    assert made.duration == pytest.approx(2.0 * np.sqrt(0.3 / LIMITS.acceleration[0]), rel=1e-5)
+    for method in METHODS:
+        limited, motion = (timed(path, Timing(method), limits=one).trajectory for one in (LIMITS, free))
+        assert motion.duration <= limited.duration * (1.0 + 1e-3)
+        assert keeps_limits(motion, free) and np.isfinite(motion.jerks).all()
+
+
+@pytest.mark.parametrize("limit", ["velocity", "acceleration", "jerk"])
+@pytest.mark.parametrize("value", [0.0, -1.0, np.nan])
+def test_a_limit_that_is_not_positive_is_named(limit: str, value: float) -> None:
+    faulty = replace(LIMITS, **{limit: np.array([1.0, value, 1.0])})
+    for count in (2, 3):
+        with pytest.raises(ParameterError, match=rf"^{limit} limit of two: expected a positive number, got {value}$"):
+            timed(np.eye(3)[:count], limits=faulty)
 
 
 def test_a_gentle_curve_takes_little_more_than_the_least_time() -> None:

@@ -42,14 +42,17 @@ class Part(StrictModel):
 
 
 class Joint(StrictModel):
-    """A planned joint and its limits [rad, rad/s, rad/s^2, rad/s^3]; by default those of the URDF."""
+    """A planned joint and its limits [rad, rad/s, rad/s^2, rad/s^3; no limit of jerk is ``.inf``].
+
+    Positions and velocity are by default those of the URDF.
+    """
 
     home: float = 0.0
     lower: float | None = None
     upper: float | None = None
     velocity: PositiveFloat | None = None
     acceleration: PositiveFloat
-    jerk: PositiveFloat
+    jerk: Annotated[float, Field(gt=0.0, allow_inf_nan=True)]
 
 
 class Hand(StrictModel):

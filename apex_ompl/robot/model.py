@@ -20,6 +20,7 @@ from apex_ompl.scene.bodies import Body
 from apex_ompl.types import Array
 from apex_ompl.util.validation import shape_error
 
+SHORTEST_RAMP = 1e-6  # from no acceleration to the largest, for motions whose knots have distinct times [s]
 LIMIT_SLACK = 1e-3  # by which a joint of a start or a goal may be outside its limits [rad; synergies 0..1]
 
 
@@ -32,7 +33,8 @@ class Limits:
         upper: Highest position.
         velocity: Largest speed [rad/s].
         acceleration: Largest acceleration [rad/s^2].
-        jerk: Largest jerk [rad/s^3].
+        jerk: Largest jerk [rad/s^3]; infinity for no limit. One that reaches the largest acceleration in less than
+            ``SHORTEST_RAMP`` is lowered to that.
     """
 
     lower: Array
@@ -40,6 +42,10 @@ class Limits:
     velocity: Array
     acceleration: Array
     jerk: Array
+
+    def __post_init__(self) -> None:
+        """Lower jerks that are too large to tell from none."""
+        object.__setattr__(self, "jerk", np.minimum(self.jerk, np.asarray(self.acceleration) / SHORTEST_RAMP))
 
 
 @dataclass(frozen=True, eq=False)

@@ -96,8 +96,13 @@ class Timing:
 
         Raises:
             UnknownNameError: A joint has a limit and is none of these.
-            ParameterError: A limit is higher than the robot's.
+            ParameterError: A limit is higher than the robot's, or one of the robot's is not positive.
         """
+        if len(joint_names) != len(limits.velocity):
+            raise ParameterError("joint_names", len(joint_names), f"{len(limits.velocity)}, as there are joints")
+        for limit in LIMITS:
+            for joint, value in zip(joint_names, getattr(limits, limit).tolist(), strict=True):
+                check_positive(value, f"{limit} limit of {joint}")
         scaled = {}
         for limit in LIMITS:
             values = np.array(getattr(limits, limit))
@@ -184,8 +189,8 @@ def time_path(
     if not isinstance(limits, Limits):
         raise ParameterError("limits", limits, "a Limits, such as load_robot(...).limits")
     states = finite_array(path.states if isinstance(path, Path) else path, "path")
-    _check(states, limits, joint_names)
     scaled = timing.limits(limits, joint_names)
+    _check(states, limits, joint_names)
     start = timing.start(scaled)
     reason, line = "", Polyline.through(states)
     for timed in _from_rest(line, scaled, tuple(joint_names), timing, stop):
@@ -211,8 +216,6 @@ def _by_joint(timing: Timing, limit: str) -> Mapping[str, float]:
 def _check(states: Array, limits: Limits, joint_names: Sequence[str]) -> None:
     dof = len(limits.velocity)
     check_states(states, dof, "path", least=1)
-    if len(joint_names) != dof:
-        raise ParameterError("joint_names", len(joint_names), f"{dof}, as there are joints")
     over = (states < limits.lower - LIMIT_TOLERANCE) | (states > limits.upper + LIMIT_TOLERANCE)
     if over.any():
         k, joint = np.argwhere(over)[0]
