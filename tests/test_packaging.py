@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import tarfile
@@ -91,3 +92,12 @@ def test_this_tree_works_from_a_foreign_folder(tmp_path: Path) -> None:
         [sys.executable, "-c", "import planners"], check=False, capture_output=True, text=True, cwd=ROOT, timeout=60
     )
     assert "import apex_ompl.planners, not planners" in done.stderr
+
+
+def test_the_calls_of_an_installed_package_are_not_made_of_a_clone(tmp_path: Path) -> None:
+    """Where nothing would be missing; .ci/run makes them of the wheel."""
+    done = subprocess.run(
+        [sys.executable, ROOT / "tests" / "installed"], check=False, capture_output=True, text=True, cwd=tmp_path,
+        timeout=60, env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )  # fmt: skip
+    assert done.returncode == 1 and "is the clone, expected an installed package" in done.stderr
