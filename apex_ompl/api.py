@@ -103,7 +103,7 @@ def plan(
     """
     check_arguments(timeout, seed)
     if planner is not None:
-        planners.parameters(planner, **dict(params or {}))  # before the problem is read
+        planners.parameters(planner, **planners.named(params))  # before the problem is read
     loaded = problem if isinstance(problem, Problem) else load_problem(problem)
     with kept_planner(loaded.robot) as kept:
         return kept.plan_problem(

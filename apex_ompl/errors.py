@@ -42,7 +42,7 @@ class UnknownNameError(ApexError):
         known: The known names.
     """
 
-    def __init__(self, kind: str, name: str, known: Iterable[str]) -> None:
+    def __init__(self, kind: str, name: object, known: Iterable[str]) -> None:
         """Compose the message ``unknown KIND NAME; known: ...``."""
         self.kind = kind
         self.name = name
@@ -141,5 +141,9 @@ class SceneError(ApexError):
 
 def _short(value: object, limit: int = 80) -> str:
     """Return ``repr(value)`` cut to ``limit`` characters, on one line."""
-    text = " ".join(repr(value).split())
+    try:
+        text = repr(value)
+    except Exception:  # of an integer of more than 4300 digits, or of a class whose text fails
+        text = object.__repr__(value)
+    text = " ".join(text.split())
     return text if len(text) <= limit else text[: limit - 3] + "..."

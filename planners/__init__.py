@@ -5,11 +5,11 @@ if not __name__.startswith("apex_ompl."):  # the folder also lies at the top of 
 
 from typing import Any
 
-from apex_ompl.planners.registry import Parameters, allocator, make, names, parameters
+from apex_ompl.planners.registry import Parameters, allocator, make, named, names, parameters
 from apex_ompl.planners.tuned import TUNED
 from apex_ompl.util.forking import unforked
 
-__all__ = ["APEX", "TUNED", "Parameters", "allocator", "make", "names", "parameters"]
+__all__ = ["APEX", "TUNED", "Parameters", "allocator", "make", "named", "names", "parameters"]
 
 
 def __dir__() -> list[str]:

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from typing import Any, ClassVar
 
 from ompl import base as ob
 
-from apex_ompl.errors import ParameterError, UnknownNameError
+from apex_ompl.errors import ParameterError
 from apex_ompl.util.forking import unforked
-from apex_ompl.util.validation import LARGEST_INT
+from apex_ompl.util.validation import LARGEST_INT, check_name
 
 
 @dataclass(frozen=True)
@@ -53,8 +54,7 @@ class Parameters:
         """
         known = {f.name: f for f in fields(self)}
         for name in values:
-            if name not in known:
-                raise UnknownNameError("parameter", name, known)
+            check_name(name, "parameter", known)
         read = {name: _read(name, value, getattr(self, name), known[name]) for name, value in values.items()}
         return dataclasses.replace(self, **read)
 
@@ -96,9 +96,20 @@ def parameters(name: str, /, **values: Any) -> Parameters:
         ParameterError: A value of the wrong type or out of range.
     """
     _load()
-    if name not in _REGISTRY:
-        raise UnknownNameError("planner", name, _REGISTRY)
-    return _REGISTRY[name]().changed(**values)
+    return _REGISTRY[check_name(name, "planner", _REGISTRY)]().changed(**values)
+
+
+def named(params: Mapping[str, Any] | None) -> dict[str, Any]:
+    """Return parameters that a caller gives by name, or none.
+
+    Raises:
+        ParameterError: They are not values by name.
+    """
+    if params is None:
+        return {}
+    if not isinstance(params, Mapping) or not all(isinstance(name, str) for name in params):
+        raise ParameterError("params", params, "values by name of parameter")
+    return dict(params)
 
 
 def make(name: str, si: ob.SpaceInformation, /, **values: Any) -> ob.Planner:
@@ -148,7 +159,7 @@ def _read(name: str, value: Any, default: Any, field: dataclasses.Field[Any]) ->
             read = words.get(word) if kind is bool else kind(word)
         except ValueError:
             read = None
-    elif kind is float and type(value) is int:
+    elif kind is float and type(value) is int and abs(value) < sys.float_info.max:
         read = float(value)
     if type(read) is not kind or not low <= read <= high:
         raise ParameterError(f"parameter {name!r}", value, expected)

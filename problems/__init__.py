@@ -21,6 +21,7 @@ if not __name__.startswith("apex_ompl."):  # the folder also lies at the top of 
 from apex_ompl.errors import ParameterError, UnknownNameError
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Problem
+from apex_ompl.util.validation import check_name
 
 if TYPE_CHECKING:
     from apex_ompl.problems.frozen import Witness
@@ -138,8 +139,7 @@ def frozen_names(suite: str, level: str, split: str = "test") -> tuple[str, ...]
     from apex_ompl.problems.catalogue import SPLITS, ProblemId
 
     ProblemId(suite, level, SPLITS["validation"].start)
-    if split not in frozen.COUNTS:
-        raise UnknownNameError("split with frozen problems", split, frozen.COUNTS)
+    check_name(split, "split with frozen problems", frozen.COUNTS)
     return tuple(f"{suite}/{level}/{seed}" for seed in frozen.frozen_seeds(suite, level, split))
 
 

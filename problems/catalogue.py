@@ -7,9 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from apex_ompl.errors import ParameterError, UnknownNameError
+from apex_ompl.errors import ParameterError
 from apex_ompl.problems import alignment, scenes
 from apex_ompl.problems.broad import levels as broad
+from apex_ompl.util.validation import check_name
 
 SPLITS = {"train": range(800_000), "validation": range(800_000, 900_000), "test": range(900_000, 1_000_000)}
 
@@ -54,10 +55,8 @@ class ProblemId:
             ParameterError: The seed is not a whole number from 0 to 999 999, or not one of validation where the suite
                 is for that alone.
         """
-        if not isinstance(self.suite, str) or self.suite not in KNOWN:
-            raise UnknownNameError("suite", str(self.suite), KNOWN)
-        if not isinstance(self.level, str) or self.level not in KNOWN[self.suite]:
-            raise UnknownNameError(f"level of {self.suite}", str(self.level), KNOWN[self.suite])
+        check_name(self.suite, "suite", KNOWN)
+        check_name(self.level, f"level of {self.suite}", KNOWN[self.suite])
         is_integer = isinstance(self.seed, (int, np.integer)) and not isinstance(self.seed, bool)
         if not is_integer or not 0 <= self.seed < SPLITS["test"].stop:
             raise ParameterError("seed", self.seed, f"a whole number from 0 to {SPLITS['test'].stop - 1}")

@@ -33,7 +33,7 @@ from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Problem
 from apex_ompl.trajectory import Trajectory
 from apex_ompl.types import Array
-from apex_ompl.util.validation import check_integer
+from apex_ompl.util.validation import check_integer, check_name
 
 MOVING_KIND = "moving"
 GENERATED = ("popup", "interceptor", "turning", "crowd", "pusher")
@@ -98,8 +98,7 @@ class WorldId:
         """
         known = (("kind of worlds", self.kind, GENERATED), ("suite of worlds", self.suite, SAMPLERS))
         for what, name, names in (*known, ("size of cubes", self.size, SIZES)):
-            if name not in names:
-                raise UnknownNameError(what, str(name), names)
+            check_name(name, what, names)
         _ = self.problem
 
     def __str__(self) -> str:
@@ -120,8 +119,7 @@ class WorldId:
             ParameterError: The text has another form, or the seed is not from 0 to 999 999.
         """
         kind, *rest = name.split("/")
-        if kind not in GENERATED:
-            raise UnknownNameError("kind of worlds", kind, GENERATED)
+        check_name(kind, "kind of worlds", GENERATED)
         if len(rest) != 3 or not SEED.fullmatch(rest[2]):
             raise ParameterError("world", name, f"a name such as {kind}/vertical/large/12")
         return cls(kind, rest[0], rest[1], int(rest[2]))
@@ -144,10 +142,8 @@ def ids(kind: str, split: str, count: int) -> tuple[str, ...]:
         UnknownNameError: No such kind or split.
         ParameterError: The count is not a whole number, or larger than there are worlds.
     """
-    if kind not in kinds():
-        raise UnknownNameError("kind of worlds", kind, kinds())
-    if split not in SPLITS:
-        raise UnknownNameError("split", split, SPLITS)
+    check_name(kind, "kind of worlds", kinds())
+    check_name(split, "split", SPLITS)
     levels = MOVING if kind == MOVING_KIND else SIZES
     check_integer(count, "count", 0, len(SPLITS[split]) * len(SAMPLERS) * len(levels))
     every = (f"{suite}/{level}/{seed}" for seed, suite, level in product(SPLITS[split], SAMPLERS, levels))

@@ -217,6 +217,17 @@ def test_a_broken_checker_is_a_crash_status(problem: Problem, monkeypatch: pytes
         ({"seed": 1.5}, ParameterError, "seed"),
         ({"planner": "rrtconect"}, UnknownNameError, "did you mean 'rrtconnect'"),
         ({"params": {"rnge": 1}}, UnknownNameError, "did you mean 'range'"),
+        ({"timeout": 10**400}, ParameterError, "timeout: expected a positive number of seconds, got 1000"),
+        ({"leave_contact": -(10**400)}, ParameterError, "leave_contact: expected a number from 0 to 0.001, got -1000"),
+        ({"seed": 10**400}, ParameterError, "seed: expected a whole number from 0 to 2147483647, got 1000"),
+        ({"planner": 5}, UnknownNameError, "unknown planner 5; known: .*rrtconnect"),
+        ({"planner": ["apex"]}, UnknownNameError, r"unknown planner \['apex'\]; known: .*rrtconnect"),
+        ({"params": {5: 1}}, ParameterError, "params: expected values by name of parameter, got {5: 1}"),
+        ({"params": "range=1"}, ParameterError, "params: expected values by name of parameter, got 'range=1'"),
+        ({"params": [1]}, ParameterError, r"params: expected values by name of parameter, got \[1\]"),
+        ({"params": {"range": 10**400}}, ParameterError, r"parameter 'range': expected a number in \[0, inf\]"),
+        ({"simplify": "false"}, ParameterError, "simplify: expected True or False, got 'false'"),
+        ({"snapshot": None}, ParameterError, "snapshot: expected True or False, got None"),
     ],
 )
 def test_faulty_arguments_are_named(problem: Problem, options: dict, error: type[Exception], match: str) -> None:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import errno
 import json
 import os
 import resource
@@ -237,11 +238,51 @@ def test_without_a_path_no_csv_is_written_and_the_status_is_printed(apex_cli, tm
     assert not (tmp_path / "r.csv").exists()
 
 
-def test_a_full_or_closed_output_is_no_traceback() -> None:
-    for shell in ("{} schema > /dev/full", "{} problems | true"):
-        command = shell.format(f"{sys.executable} -m apex_ompl.cli")
-        done = subprocess.run(command, check=False, shell=True, capture_output=True, text=True, timeout=60)
-        assert "Traceback" not in done.stderr and "Exception ignored" not in done.stderr
+@pytest.mark.parametrize(
+    ("shell", "code", "said"),
+    [
+        ("{} schema > /dev/full", 2, "apex-ompl: error: output: No space left on device\n"),
+        ("set -o pipefail; {} problems | true", 141, ""),
+        ("{} schema >&-", 0, ""),
+        ("{} schema <&- >&-", 0, ""),
+        ("{} check nothing >&-", 2, "apex-ompl: error: unknown problem 'nothing'; known: "),
+        ("{} check nothing 2>&-", 2, ""),
+    ],
+)
+def test_an_output_that_is_full_or_closed_is_no_traceback(shell: str, code: int, said: str) -> None:
+    command = ["bash", "-c", shell.format(f"{sys.executable} -m apex_ompl.cli")]
+    done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=60)
+    assert done.returncode == code and done.stdout == "", (done.returncode, done.stdout, done.stderr)
+    assert done.stderr.startswith(said) and done.stderr.count("\n") == bool(said), done.stderr
+
+
+def test_a_file_written_while_the_output_is_closed_holds_nothing_else(easy: Path, tmp_path: Path) -> None:
+    """What is opened first gets the number of the output, and what libraries print would go there."""
+    command = f"{sys.executable} -m apex_ompl.cli plan {easy} --timeout 30 --json --out {tmp_path}/r.json >&-"
+    assert subprocess.run(["bash", "-c", command], check=False, timeout=120).returncode == 0
+    assert json.loads((tmp_path / "r.json").read_text())["status"] == "EXACT_SOLUTION"
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (FileNotFoundError(errno.ENOENT, "No such file or directory", "table.json"), "table.json: No such file"),
+        (PermissionError(errno.EACCES, "Permission denied", b"folder"), "folder: Permission denied"),
+        (OSError(errno.ENOSPC, "No space left on device"), "error: No space left on device"),
+    ],
+)
+def test_an_error_of_the_system_names_its_file(
+    apex_cli, monkeypatch: pytest.MonkeyPatch, error: OSError, said: str
+) -> None:
+    """Not the output, unless it is the output."""
+
+    def fails(_: object) -> int:
+        raise error
+
+    monkeypatch.setattr("apex_ompl.cli.listings.schema", fails)
+    done = apex_cli("schema")
+    assert done.returncode == 2 and one_sentence(done.stderr) and said in done.stderr, done.stderr
+    assert "output" not in done.stderr
 
 
 def test_a_saved_npz_holds_the_checked_path(apex_cli, easy: Path, tmp_path: Path) -> None:

@@ -210,9 +210,9 @@ def test_faulty_points(robot: Robot, tmp_path: Path, points: np.ndarray, words: 
 
 
 def test_clouds_are_files_with_a_radius_and_are_not_held(robot: Robot, tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="file of points ending in"):
+    with pytest.raises(FileFormatError, match="file of points ending in"):
         Obstacle(name="c", points={"file": "a.xyz", "radius": 0.01})
-    with pytest.raises(ValueError, match="points cannot be held"):
+    with pytest.raises(FileFormatError, match="points cannot be held"):
         AttachedObject(name="c", points={"file": "a.npy", "radius": 0.01}, link="left_hand_palm")
     with pytest.raises(MissingFileError, match="nowhere"):
         CollisionChecker(robot, [Obstacle(name="c", points={"file": str(tmp_path / "nowhere.npy"), "radius": 0.01})])

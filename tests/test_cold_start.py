@@ -54,8 +54,9 @@ def test_no_code_is_loaded_or_compiled_while_the_time_limit_runs(planner: str) -
 
 
 TYPES = """
+import numpy as np
 from numba.core.sigutils import normalize_signature
-from apex_ompl import plan, run
+from apex_ompl import filter_points, load_robot, plan, run
 from apex_ompl.loop.settings import LoopSettings
 from apex_ompl.kernel.ahead_of_time import _function
 from apex_ompl.kernel.entry_points import PLANS, RUNS
@@ -64,6 +65,8 @@ assert plan("shelf/hard/800000", timeout=30.0)
 assert plan("vertical/large/800000", timeout=30.0, params={"line": False}).solved_by == "sprint"
 for world in ("vertical/moving-huge-0.4/800007", "turning/vertical/large/800000"):
     run(world, settings=LoopSettings(timeout=1.5))
+robot = load_robot("dual_panda_softhand")
+assert len(filter_points(np.random.default_rng(0).uniform(-1.0, 1.0, (1000, 3)), robot, robot.home)) < 1000
 for name, (types, _) in {**PLANS.functions, **RUNS.functions}.items():
     found = _function(name).dispatcher.signatures
     assert found == [normalize_signature(f"({types},)")[0]], (name, found)

@@ -22,24 +22,32 @@ def plus(a):
     return a[0] + 1.0
 
 f = compilation.entry_point(plus)
-assert f(np.ones(1)) == f(np.ones(1)) == 2.0
+found = f(np.ones(1)), f(np.ones(1))
+if found != (2.0, 2.0):
+    raise SystemExit(found)
 print(compilation.cache_folder())
 """
 
 
-def called(script: Path, cache: Path) -> subprocess.CompletedProcess[str]:
+def called(script: Path, cache: Path, *options: str, **environment: str) -> subprocess.CompletedProcess[str]:
     env = {"PATH": "", "NUMBA_CACHE_DIR": str(cache), "XDG_CACHE_HOME": str(cache), "PYTHONPATH": str(ROOT)}
-    done = subprocess.run([sys.executable, script], check=False, env=env, capture_output=True, text=True, timeout=120)
+    command = [sys.executable, *options, str(script)]
+    env |= environment
+    done = subprocess.run(command, check=False, env=env, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
     return done
 
 
+@pytest.fixture
+def script(tmp_path: Path) -> Path:
+    (tmp_path / "call.py").write_text(CALL)
+    return tmp_path / "call.py"
+
+
 @pytest.mark.parametrize("writable", [True, False])
-def test_code_is_kept_where_it_can_be(tmp_path: Path, writable: bool) -> None:
+def test_code_is_kept_where_it_can_be(tmp_path: Path, script: Path, writable: bool) -> None:
     (tmp_path / "file").write_text("not a folder")
     home = tmp_path / "cache" if writable else tmp_path / "file"
-    script = tmp_path / "call.py"
-    script.write_text(CALL)
     first, second = called(script, home), called(script, home)
     assert "compiles" in first.stderr
     if writable:
@@ -53,10 +61,77 @@ def test_the_same_code_at_another_place_is_not_compiled_again(tmp_path: Path) ->
     scripts = [tmp_path / place / "call.py" for place in ("here", "there", "edited")]
     for script in scripts:
         script.parent.mkdir()
-        script.write_text(CALL if script.parent.name != "edited" else CALL.replace("2.0", "3.0").replace("1.0", "2.0"))
+        script.write_text(
+            CALL if script.parent.name != "edited" else CALL.replace("(2.0, 2.0)", "(3.0, 3.0)").replace("1.0", "2.0")
+        )
     here, there, edited = (called(script, tmp_path / "cache") for script in scripts)
     assert here.stdout == there.stdout == edited.stdout
     assert "compiles" in here.stderr and "compiles" not in there.stderr
+
+
+@pytest.mark.parametrize("ending", [".nbi", ".nbc"])
+@pytest.mark.parametrize("size", [0, 50])
+def test_what_is_damaged_in_the_cache_is_compiled_anew(tmp_path: Path, script: Path, ending: str, size: int) -> None:
+    called(script, tmp_path)
+    (file,) = tmp_path.rglob(f"*plus*{ending}")
+    whole = file.read_bytes()
+    file.write_bytes(whole[:size])
+    damaged, mended = called(script, tmp_path), called(script, tmp_path)
+    assert (
+        damaged.stderr.startswith("apex_ompl compiles plus: the file of its code in ")
+        and str(tmp_path) in damaged.stderr
+    )
+    assert damaged.stderr.count("\n") == 1 and mended.stderr == "" and len(file.read_bytes()) == len(whole)
+
+
+READ_ONLY = """
+import builtins, errno, tempfile
+
+def refuse(*_, **__):  # as a read-only file system does, for root as well
+    raise OSError(errno.EROFS, "Read-only file system")
+
+before = builtins.open
+builtins.open = lambda file, mode="r", *more, **named: refuse() if "w" in mode else before(file, mode, *more, **named)
+tempfile.TemporaryFile = refuse
+"""
+FULL = "import resource\nresource.setrlimit(resource.RLIMIT_FSIZE, (2048, 2048))\n"  # largest size of a file [bytes]
+
+
+def under(prelude: str, script: Path) -> Path:
+    """A script that does something before it runs another."""
+    made = script.with_name(f"under_{script.name}")
+    made.write_text(f"{prelude}\nimport runpy\nrunpy.run_path({str(script)!r})\n")
+    return made
+
+
+def test_a_complete_cache_that_cannot_be_written_is_read(tmp_path: Path, script: Path) -> None:
+    first = called(script, tmp_path / "cache")
+    second = called(under(READ_ONLY, script), tmp_path / "cache")
+    assert second.stdout == first.stdout and second.stderr == ""
+    script.write_text(CALL.replace("plus", "other"))
+    missing = called(under(READ_ONLY, script), tmp_path / "cache")
+    assert "in every process anew, since " in missing.stderr and "cannot be written, or is full" in missing.stderr
+
+
+def test_where_there_is_no_room_code_is_compiled_and_not_kept(tmp_path: Path, script: Path) -> None:
+    for _ in range(2):
+        done = called(under(FULL, script), tmp_path / "cache")
+        assert "in every process anew, since " in done.stderr and "cannot be written, or is full" in done.stderr
+        assert "compiled plus in" in done.stderr
+    assert not list((tmp_path / "cache").rglob("*.tmp*"))
+
+
+def test_levels_of_optimization_have_caches_of_their_own(tmp_path: Path, script: Path) -> None:
+    """Without docstrings the code is another one, which would be compiled without a word."""
+    plain, optimized = called(script, tmp_path), called(script, tmp_path, "-OO")
+    assert plain.stdout != optimized.stdout and "compiles" in optimized.stderr
+    assert called(script, tmp_path, PYTHONOPTIMIZE="2").stderr == ""
+
+
+def test_numba_can_be_disabled_for_other_code(tmp_path: Path, script: Path) -> None:
+    script.write_text(CALL + "import numba\nassert not hasattr(numba.njit(plus), 'py_func')\n")
+    assert "apex_ompl compiled plus" in called(script, tmp_path, NUMBA_DISABLE_JIT="1").stderr
+    assert called(script, tmp_path, NUMBA_DISABLE_JIT="1").stderr == ""
 
 
 def test_compiled_functions_take_nothing_from_outside_their_folder() -> None:

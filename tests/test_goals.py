@@ -165,7 +165,7 @@ def test_vectors_in_the_world_state_the_same_task(robot: Robot) -> None:
     for q in robot.random_state(np.random.default_rng(0), 5):
         for mine, theirs in zip(seen.faces(q), named.faces(q), strict=True):
             np.testing.assert_allclose(mine, theirs, atol=1e-9)
-    with pytest.raises(ValueError, match="tail and a tip that differ"):
+    with pytest.raises(FileFormatError, match="tail and a tip that differ"):
         WorldVector(link="left_hand_palm", tail=(0, 0, 1), tip=(0, 0, 1))
 
 
@@ -182,7 +182,7 @@ def test_faulty_alignments_are_named(robot: Robot) -> None:
         alignment = Alignment(**{"kind": "vertical", "first": "a", "second": "b", **changes})
         with pytest.raises(error, match=match):
             AlignmentGoal(robot, alignment, [*objects, held("d", "left")], robot.home)
-    with pytest.raises(ValueError, match="tilt is for pour only"):
+    with pytest.raises(FileFormatError, match="tilt is for pour only"):
         Alignment(kind="vertical", first="a", second="b", tilt=(1.0, 2.0))
 
 

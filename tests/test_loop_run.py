@@ -96,7 +96,9 @@ def test_whoever_is_late_and_comes_to_rest_at_the_goal_has_reached_it() -> None:
      ({"problem": "nothing"}, "world 'nothing'"), ({"problem": "no/such/file.yaml"}, "no/such/file.yaml"),
      ({"speed": 0.0}, "velocity_scale|speed"), ({"speed": NAN}, "velocity_scale|speed"),
      ({"speed": -1.0}, "velocity_scale|speed"), ({"speed": 1.5}, "velocity_scale|speed"), ({"seed": -1}, "seed"),
-     ({"seed": 0.5}, "seed")],
+     ({"seed": 0.5}, "seed"), ({"planner": 5}, "unknown way of replanning 5"), ({"clock": None}, "unknown clock None"),
+     ({"prediction": []}, "unknown prediction"), ({"settings": 5}, "settings: expected a LoopSettings, got 5"),
+     ({"speed": 10**400}, "velocity_scale")],
 )  # fmt: skip
 def test_what_is_asked_for_wrongly_is_named(given: dict[str, Any], words: str) -> None:
     arguments = {"problem": MOVING, "planner": "no-network", **given}

@@ -217,7 +217,7 @@ def test_paths_of_meshes_and_robots_start_at_the_file(tmp_path: Path) -> None:
 
 
 def test_a_held_half_space_is_refused_from_python_too() -> None:
-    with pytest.raises(ValueError, match="cannot be held"):
+    with pytest.raises(FileFormatError, match="cannot be held"):
         AttachedObject(name="floor", link="palm", half_space={"normal": (0.0, 0.0, 1.0)})
 
 

@@ -9,7 +9,7 @@ import pinocchio as pin
 import pytest
 import trimesh
 
-from apex_ompl import PlanStatus, plan
+from apex_ompl import MotionPlanner, PlanStatus, plan
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ApexError, FileFormatError, MissingFileError, RobotError, UnknownNameError
 from apex_ompl.robot import Robot, load_robot, robot_names
@@ -148,6 +148,8 @@ def test_limit_fault_names_joint_value_and_limit(robot: Robot) -> None:
     assert robot.limit_fault(q) is None
     q[3] = 0.5
     assert robot.limit_fault(q) == "left_joint4 = 0.5 is outside its limits [-3.0718, -0.0698]"
+    q[3] = robot.limits.upper[3] + 1e-9
+    assert robot.limit_fault(q) == "left_joint4 = -0.0698 is 1e-09 outside its limits [-3.0718, -0.0698]"
     q[3] = np.nan
     assert "left_joint4" in (robot.limit_fault(q) or "")
     assert "(16,)" in (robot.limit_fault(q[:5]) or "")
@@ -177,6 +179,16 @@ def test_any_urdf_loads_from_a_short_file(tmp_path: Path) -> None:
     small = load_robot(write_small(tmp_path))
     assert small.joint_names == ("shoulder",)
     assert small.home.tolist() == [0.1]
+
+
+@pytest.mark.parametrize("jerk", [".inf", "1e12"])
+def test_a_robot_may_have_no_limit_of_jerk(jerk: str, tmp_path: Path) -> None:
+    path = write_small(tmp_path, '<sphere radius="0.05"/>')
+    path.write_text(path.read_text().replace("jerk: 10", f"jerk: {jerk}"))
+    assert load_robot(path).limits.jerk.tolist() == [1e6], "the acceleration, 1, is reached in a microsecond"
+    with MotionPlanner(path) as planner:
+        result = planner.plan([0.1], [0.5])
+    assert result and result.trajectory.duration == pytest.approx(2.0 * np.sqrt(0.4), rel=1e-5)
 
 
 def test_a_robot_names_the_files_that_it_was_read_from(robot: Robot, tmp_path: Path) -> None:

@@ -448,6 +448,13 @@ def test_faulty_arguments_are_named(planner: MotionPlanner, robot: Robot) -> Non
         (UnknownNameError, "unknown robot 'panda'", lambda: MotionPlanner("panda")),
         (UnknownNameError, "unknown checkpoint 'nope'", lambda: MotionPlanner(robot, "nope").plan_problem(hard)),
         (ApexError, "more than one pose is given for 'left_hand'", lambda: planner.plan(home, [hand, hand])),
+        (
+            UnknownNameError,
+            "unknown option 'timout', did you mean 'timeout'. known: group, leave_contact, params, ",
+            lambda: planner.plan(home, home, timout=3.0),
+        ),
+        (UnknownNameError, "unknown option 'started'; known", lambda: planner.plan_problem(hard, started=3.0)),
+        (UnknownNameError, "unknown group or joint 5", lambda: planner.plan(home, home, group=[5])),
     )
     for error, said, call in faulty:
         with pytest.raises(error, match=said):

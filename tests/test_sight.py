@@ -30,6 +30,7 @@ from apex_ompl.diffusion.sight import KEY_RANGE, Sight, arms
 from apex_ompl.diffusion.sight_data import SightTable
 from apex_ompl.diffusion.torch_sight import TorchSight
 from apex_ompl.diffusion.training import Trainer
+from apex_ompl.errors import FileFormatError
 from apex_ompl.kernel import Kernel
 from apex_ompl.kernel.point_distances import nearest_points
 from apex_ompl.problems.objects import bar, two_cups
@@ -214,14 +215,14 @@ def test_a_trained_model_is_read_by_both_and_plans(tmp_path: Path, refined: bool
 
 
 def test_condition_configs_that_do_not_fit_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="expected refined for the scene 'clearances' alone"):
+    with pytest.raises(FileFormatError, match="expected refined for the scene 'clearances' alone"):
         config(tmp_path, condition={"refined": True})
     for wrong in (
         {"parts": 0.5}, {"mixed": 0.5}, {"collision": 1.0},
         {"parts": 0.5, "condition": {"scene": "clearances", "point": True}},
     ):  # fmt: skip
-        with pytest.raises(ValueError, match="expected parts, mixed and collision for the scene 'clearances'"):
+        with pytest.raises(FileFormatError, match="expected parts, mixed and collision for the scene 'clearances'"):
             config(tmp_path, **wrong)
     made = model_config(**CLEARANCES)
-    with pytest.raises(ValueError, match="expected arms"):
+    with pytest.raises(FileFormatError, match="expected arms"):
         type(made).model_validate({**made.model_dump(), "arms": (0, 0)})

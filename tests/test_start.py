@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,6 +11,8 @@ import pytest
 import apex_ompl
 from apex_ompl import MotionPlanner, PlanStatus, Timing
 from apex_ompl.errors import ParameterError
+from apex_ompl.loop.referee import is_at_goal
+from apex_ompl.result import PlanResult
 
 DEPTH = 4e-4  # of the contact at the start [m]
 
@@ -51,8 +54,32 @@ def test_a_start_a_little_outside_a_limit_is_moved_to_it(over: float) -> None:
     result = kept.plan(start, goal_of(kept))
     assert result and result.path is not None, result.reason
     np.testing.assert_array_equal(result.path.states[0], np.clip(start, limits.lower, limits.upper))
-    names = [note.split()[0] for note in result.notes if "outside its limits" in note]
+    names = [note.split()[0] for note in result.notes if "of the start is" in note]
     assert names == [kept.robot.joint_names[4], kept.robot.joint_names[14]]
+
+
+@pytest.mark.parametrize("over", [1e-9, 4e-4, 1e-3])
+def test_a_goal_a_little_outside_a_limit_is_moved_to_it(over: float, tmp_path: Path) -> None:
+    kept = planner()
+    kept.world.clear()
+    home, limits = kept.robot.home, kept.robot.limits
+    goal = home.copy()
+    goal[0], goal[14] = limits.upper[0] + 0.99 * over, limits.lower[14] - 0.5 * over
+    inside = np.clip(goal, limits.lower, limits.upper)
+    far = np.r_[limits.upper[0] + 2e-3, home[1:]]
+    for goals, labels in ((goal, ["goal", "goal"]), ([far, goal], ["goal 1", "goal 1"])):
+        result = kept.plan(home, goals)
+        assert result and result.path is not None and result.trajectory is not None, result.reason
+        np.testing.assert_array_equal(result.path.states[-1], inside)
+        np.testing.assert_allclose(result.trajectory.positions[-1], inside, atol=1e-9)
+        notes = [note for note in result.notes if "outside its limits and is moved to" in note]
+        names = [f"{kept.robot.joint_names[k]} of the {label} is" for k, label in zip((0, 14), labels, strict=True)]
+        assert [" ".join(note.split()[: len(name.split())]) for note, name in zip(notes, names, strict=True)] == names
+        result.save(tmp_path / "r.npz")
+        assert PlanResult.load(tmp_path / "r.npz")
+    assert is_at_goal(kept.robot, result.problem, inside)
+    refused = kept.plan(home, far)
+    assert refused.status is PlanStatus.INVALID_GOAL and "outside its limits" in refused.reason
 
 
 def test_a_start_further_out_is_refused() -> None:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -119,6 +120,28 @@ def test_a_straight_line_takes_the_least_time_there_is(length: float) -> None:
     assert keeps_limits(made.trajectory)
 
 
+@pytest.mark.parametrize("jerk", [1e8, 1e11, 1e12, 1e300, np.inf])
+def test_without_a_limit_of_jerk_motions_are_the_fastest_within_the_others(jerk: float) -> None:
+    """A large number counts as none. Along a line they speed up and slow down at the limits."""
+    free = replace(LIMITS, jerk=np.full(3, jerk))
+    path = np.array([[0.0, 0.0, 0.0], [0.3, 0.0, 0.0], [0.3, 0.0, 0.4], [0.0, 0.2, 0.0]])
+    made = timed(path[:2], limits=free).trajectory
+    assert made.duration == pytest.approx(2.0 * np.sqrt(0.3 / LIMITS.acceleration[0]), rel=1e-5)
+    for method in METHODS:
+        limited, motion = (timed(path, Timing(method), limits=one).trajectory for one in (LIMITS, free))
+        assert motion.duration <= limited.duration * (1.0 + 1e-3)
+        assert keeps_limits(motion, free) and np.isfinite(motion.jerks).all()
+
+
+@pytest.mark.parametrize("limit", ["velocity", "acceleration", "jerk"])
+@pytest.mark.parametrize("value", [0.0, -1.0, np.nan])
+def test_a_limit_that_is_not_positive_is_named(limit: str, value: float) -> None:
+    faulty = replace(LIMITS, **{limit: np.array([1.0, value, 1.0])})
+    for count in (2, 3):
+        with pytest.raises(ParameterError, match=rf"^{limit} limit of two: expected a positive number, got {value}$"):
+            timed(np.eye(3)[:count], limits=faulty)
+
+
 def test_a_gentle_curve_takes_little_more_than_the_least_time() -> None:
     angle = np.linspace(0.0, np.pi, 256)
     path = np.stack([1.5 * np.cos(angle), 1.5 * np.sin(angle), np.zeros(256)], 1)
@@ -209,6 +232,8 @@ def test_faulty_paths_are_named(path: object) -> None:
 def test_faulty_arguments_are_named() -> None:
     with pytest.raises(ParameterError, match="timing"):
         time_path(np.zeros((2, 3)), LIMITS, NAMES, 0.5)  # type: ignore[arg-type]
+    with pytest.raises(ParameterError, match="limits: expected a Limits"):
+        time_path(np.zeros((2, 3)), 5.0, NAMES)  # type: ignore[arg-type]
     with pytest.raises(ParameterError, match="joint_names"):
         time_path(np.zeros((2, 3)), LIMITS, ("one", "two"))
     assert Timing(start_velocity=[1.0, 0.0]) == Timing(start_velocity=np.array([1.0, 0.0]))
@@ -252,6 +277,10 @@ def test_limits_of_single_joints_are_lowered_for_a_plan() -> None:
         ({"max_velocity": {"two": 99.0}}, ParameterError, "max_velocity.two.*the robot's limit"),
         ({"max_jerk": {"two": -1.0}}, ParameterError, "max_jerk.two.*a positive number"),
         ({"max_acceleration": 1.0}, ParameterError, "max_acceleration.*by joint name"),
+        ({"max_velocity": {"two": 10**400}}, ParameterError, "max_velocity.two: expected a positive number, got 1000"),
+        ({"max_velocity": {5: 1.0}}, UnknownNameError, "unknown joint 5; known: one, three, two"),
+        ({"method": []}, UnknownNameError, r"unknown timing method \[\]; known: ruckig, spline"),
+        ({"method": 3}, UnknownNameError, "unknown timing method 3"),
     ):
         with pytest.raises(error, match=said):
             timed(path, Timing(**options))  # type: ignore[arg-type]

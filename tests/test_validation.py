@@ -3,12 +3,13 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable
 from fractions import Fraction
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
-from apex_ompl.errors import ParameterError
+from apex_ompl.errors import ParameterError, UnknownNameError
 from apex_ompl.util import validation as v
 from apex_ompl.util.bounded_cache import kept
 
@@ -22,6 +23,9 @@ MASKED = np.ma.masked_array([1.0, 2.0], mask=[True, False])
         (lambda: v.check_number(2, "x", 0.0, 1.0), "x: expected a number from 0 to 1, got 2"),
         (lambda: v.check_number(float("inf"), "x"), "x: expected a number, got inf"),
         (lambda: v.check_number(10**400, "x", 0.0, 1.0), "x: expected a number from 0 to 1, got 1000"),
+        (lambda: v.check_number(10**400, "x"), "x: expected a number, got 1000"),
+        (lambda: v.check_positive(10**5000, "x"), "x: expected a positive number, got <int object"),
+        (lambda: v.check_flag("yes", "f"), "f: expected True or False, got 'yes'"),
         (lambda: v.check_positive(0.0, "x"), "x: expected a positive number, got 0.0"),
         (
             lambda: v.check_positive("1", "x", "a positive number of seconds"),
@@ -71,7 +75,16 @@ def test_the_error_names_the_value_and_what_was_expected(check: Callable[[], obj
     assert message in str(error.value)
 
 
+@pytest.mark.parametrize("name", ["mouse", 5, None, ["cat"], {}, np.array(["cat", "dog"])])
+def test_names_are_texts_and_known(name: Any) -> None:
+    assert v.check_name("cat", "animal", {"cat": 1, "dog": 2}) == "cat"
+    with pytest.raises(UnknownNameError, match="unknown animal .*; known: cat, dog"):
+        v.check_name(name, "animal", ("cat", "dog"))
+
+
 def test_good_values_pass() -> None:
+    assert v.check_flag(np.True_, "f") is True
+    v.check_options({"a": 1}, ("a", "b"))
     v.check_number(np.float32(0.5), "x", 0.0, 1.0)
     v.check_positive(np.int64(3), "x")
     assert type(v.check_integer(np.int64(3), "n", 3, 3)) is int

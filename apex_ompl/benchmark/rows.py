@@ -14,9 +14,9 @@ from typing import Any
 
 from apex_ompl import planners, problems
 from apex_ompl.api import load_problem
-from apex_ompl.errors import ParameterError, UnknownNameError
+from apex_ompl.errors import ParameterError
 from apex_ompl.problems.catalogue import SPLITS, VALIDATION
-from apex_ompl.util.validation import check_integer, check_positive
+from apex_ompl.util.validation import check_integer, check_name, check_positive
 
 RUNNER = re.compile(r"[\w.]+:\w+")
 ROW = re.compile(r"(?P<planner>[^\[\]]+?)(\[(?P<params>[^\[\]]*)\])?")
@@ -211,8 +211,7 @@ def jobs(
         ApexError: A suite, planner, parameter or split is unknown, a suite has no such split, or two rows have the same
             label.
     """
-    if split not in SPLITS:
-        raise UnknownNameError("split", split, SPLITS)
+    check_name(split, "split", SPLITS)
     check_integer(first, "first", 0)
     most = min(len(SPLITS[split]), 2**31 - seed) - first
     if runs > most:

@@ -1,7 +1,7 @@
 """The command line ``apex-ompl``: its options, and the exit codes of errors.
 
 Results go to standard output, logs and errors to standard error. Exit codes: 0 exact, 1 no plan or no timed motion, 2
-wrong usage or an invalid file, 3 invalid start or goal, 4 approximate, 130 interrupted.
+wrong usage or an invalid file, 3 invalid start or goal, 4 approximate, 130 interrupted, 141 nobody reads the output.
 
 Commands are named as MODULE:FUNCTION and imported when they run, so that ``--help`` needs none of what they need.
 """
@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import gc
 import os
+import signal
 import sys
 from collections.abc import Sequence
 from importlib import import_module
@@ -19,6 +20,7 @@ from typing import NoReturn
 
 from apex_ompl import __version__
 from apex_ompl.cli.options import LIMITS
+from apex_ompl.cli.streams import open_streams
 from apex_ompl.errors import ApexError
 
 PROBLEM_HELP = "name of a problem, an id as shelf/hard/900012, or a YAML file"
@@ -38,6 +40,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code; ``arguments`` default to ``sys.argv[1:]``."""
     if arguments is None:
         gc.set_threshold(GARBAGE, 50, 50)  # imports make many objects that stay: a tenth of the time of a short plan
+        open_streams()
     parsed = _parser().parse_args(arguments)
     module, _, function = parsed.run.partition(":")
     try:
@@ -52,11 +55,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 130
     except BrokenPipeError:
         sys.stdout = open(os.devnull, "w")  # the reader has closed the pipe; nothing may be flushed at exit
-        return 1
+        return 128 + signal.SIGPIPE
     except OSError as error:
         sys.stdout = open(os.devnull, "w")
-        print(f"apex-ompl: error: output: {error.strerror or error}", file=sys.stderr)
+        print(f"apex-ompl: error: {_place(error)}{error.strerror or error}", file=sys.stderr)
         return 2
+
+
+def _place(error: OSError) -> str:
+    """Return the file that an error names, if any, and a colon."""
+    return "" if error.filename is None else f"{os.fsdecode(error.filename)}: "
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -15,10 +15,9 @@ from numpy.typing import NDArray
 from apex_ompl.diffusion.geometry import Numbers, array_module
 from apex_ompl.diffusion.sampler import Predict
 from apex_ompl.diffusion.schedule import Estimate, NoiseSchedule
-from apex_ompl.errors import UnknownNameError
 from apex_ompl.kernel import Kernel
 from apex_ompl.types import Array
-from apex_ompl.util.validation import check_integer, check_number, check_positive
+from apex_ompl.util.validation import check_integer, check_name, check_number, check_positive
 
 SCALINGS = ("noise", "clean")
 
@@ -52,8 +51,7 @@ class Guidance:
             ParameterError: A number is out of range.
             UnknownNameError: There is no such scaling.
         """
-        if self.scaling not in SCALINGS:
-            raise UnknownNameError("scaling of guidance", self.scaling, SCALINGS)
+        check_name(self.scaling, "scaling of guidance", SCALINGS)
         for name, value in (("gamma", self.gamma), ("clip", self.clip), ("active_below", self.active_below)):
             check_number(value, name, 0.0)
         check_positive(self.margin, "margin")

@@ -18,12 +18,12 @@ from apex_ompl.diffusion.query import Probes, Query
 from apex_ompl.diffusion.sampler import SAMPLERS, Callback, Predict, ddpm, noise_like
 from apex_ompl.diffusion.schedule import Estimate, NoiseSchedule
 from apex_ompl.diffusion.sight import KeyStates, Sight
-from apex_ompl.errors import ParameterError, UnknownNameError
+from apex_ompl.errors import ParameterError
 from apex_ompl.kernel import Kernel
 from apex_ompl.trajopt.spline import Spline
 from apex_ompl.types import Array
 from apex_ompl.util.stopwatch import StageClock
-from apex_ompl.util.validation import check_array, check_integer, check_number
+from apex_ompl.util.validation import check_array, check_integer, check_name, check_number
 
 UNGUIDED = Guidance(gamma=0.0)
 
@@ -51,8 +51,7 @@ class Sampling:
             UnknownNameError: There is no such sampler.
             ParameterError: A number is out of range.
         """
-        if self.sampler not in SAMPLERS:
-            raise UnknownNameError("sampler", self.sampler, SAMPLERS)
+        check_name(self.sampler, "sampler", SAMPLERS)
         check_integer(self.steps, "number of denoising steps", 1)
         check_number(self.temperature, "temperature", 0.0)
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from apex_ompl.errors import FileFormatError, MissingFileError
-from apex_ompl.util.files import is_file, write_atomically
+from apex_ompl.util.files import is_file, read_text, write_atomically
 
 FIELDS = ("phase", "step", "loss", "held_out", "rate", "seconds", "sampled", "repaired", "levels")
 PLOTTED = ("loss", "held_out", "rate", "sampled", "repaired")
@@ -20,13 +20,13 @@ def read_log(folder: Path) -> list[dict[str, str]]:
     """Return the rows of a run's log.
 
     Raises:
-        FileFormatError: The file is not a log.
+        MissingFileError: The file cannot be read.
+        FileFormatError: It is not a log.
     """
     path = folder / FILE
     if not is_file(path):
         return []
-    with path.open(newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = list(csv.DictReader(io.StringIO(read_text(path, "log of a training run"), newline="")))
     if any(not (row.get("step") or "").isdecimal() or not row.get("phase") for row in rows):
         raise FileFormatError(str(path), "step", "no number", "expected the log of a training run")
     return rows

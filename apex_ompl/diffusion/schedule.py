@@ -13,9 +13,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from apex_ompl.diffusion.geometry import Numbers, array_module
-from apex_ompl.errors import UnknownNameError
 from apex_ompl.types import Array
-from apex_ompl.util.validation import check_integer
+from apex_ompl.util.validation import check_integer, check_name
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -62,8 +61,7 @@ class NoiseSchedule:
             UnknownNameError: No such schedule.
         """
         check_integer(self.steps, "steps", 1)
-        if self.kind not in SCHEDULES:
-            raise UnknownNameError("noise schedule", self.kind, SCHEDULES)
+        check_name(self.kind, "noise schedule", SCHEDULES)
 
     @cached_property
     def betas(self) -> Array:

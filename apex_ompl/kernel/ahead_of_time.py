@@ -9,18 +9,25 @@ import sys
 import threading
 import time
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, nullcontext
 from importlib import import_module
 from typing import Any
 
 from tqdm import tqdm
 
-from apex_ompl.kernel.compiled.compilation import CompiledFunction, cache_folder, names_in_cache
+from apex_ompl.kernel.compiled.compilation import (
+    CompiledFunction,
+    cache_folder,
+    can_keep_code,
+    names_in_cache,
+    whereabouts,
+)
 from apex_ompl.kernel.compiled.compilation import _lock as compiling
 from apex_ompl.kernel.entry_points import PLANS, RUNS, Group
 from apex_ompl.util.cores import usable_cores
 from apex_ompl.util.files import locked
 from apex_ompl.util.forking import hold_at_fork
+from apex_ompl.util.interpreter import this_python
 
 LOG = logging.getLogger("apex_ompl")
 
@@ -34,7 +41,7 @@ _ready: set[str] = set()  # groups
 def compile_ahead(group: Group) -> None:
     """Compile what is not in the cache yet, once in a process; other processes and threads wait meanwhile.
 
-    Where no cache can be written, each function is compiled when it is first called.
+    Where nothing can be kept in a cache, all of them are compiled in this process.
     """
     if group.what not in _ready:
         _compile_missing(group)
@@ -43,13 +50,16 @@ def compile_ahead(group: Group) -> None:
 
 def _compile_missing(group: Group) -> None:
     with _lock:
-        folder = cache_folder()
-        if folder is None or not _missing(group.functions):
+        folder, count = cache_folder(), max(2, len(usable_cores()))
+        if not _missing(group.functions):
             return
-        with locked(folder, wait=True):
-            shares = [left for share in group.shares(max(2, len(usable_cores()))) if (left := _missing(share))]
+        if folder is None or not can_keep_code():
+            folder, count = None, 1
+        with locked(folder, wait=True) if folder else nullcontext():
+            shares = [left for share in group.shares(count) if (left := _missing(share))]
             if shares:
-                LOG.warning("apex_ompl compiles %s (about %d s, kept in %s)", group.what, group.seconds, folder)
+                seconds = group.seconds * (1 if folder else 2)
+                LOG.warning("apex_ompl compiles %s (about %d s, %s)", group.what, seconds, whereabouts())
                 started = time.perf_counter()
                 _compile(group, shares)
                 LOG.warning("apex_ompl compiled %s in %.1f s", group.what, time.perf_counter() - started)
@@ -84,7 +94,7 @@ def _compile(group: Group, shares: list[list[str]]) -> None:
 @contextmanager
 def _beside(names: list[str], bar: Any, seconds: Mapping[str, int]) -> Iterator[None]:
     """Let a process compile functions during a block, and wait for it behind; it ends with the block's exception."""
-    command = [sys.executable, "-c", CHILD, *names]
+    command = [*this_python(), "-c", CHILD, *names]
     environment = {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     with subprocess.Popen(
         command, env=os.environ | environment, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True

@@ -104,6 +104,12 @@ PLANS = Group(
                 + "f8[:, :, :, ::1], f8[:, :, ::1], i8[::1], f8[:, :, ::1], f8[:, ::1], f8[:, :, ::1], f8, f8[:, ::1]",
                 1,
             ),
+            "triangle_distance.surface_distances": (
+                "f8[:, ::1], f8[:, :, ::1], f8[:, ::1], i8[::1], i8[::1], i8[::1], f8, f8[::1]",
+                1,
+            ),
+            "cloud_distance.primitive_distances": ("f8[:, ::1], i8, f8[::1], f8[::1]", 1),
+            "triangle_mesh.encloses": ("f8[:, :, ::1], f8[:, ::1], b1, f8, f8, f8", 1),
             "dense_layer.dense_layer": ("i1[:, ::1], f4[::1], f4[::1], f4[:, ::1], f4[:, ::1]", 1),
         },
     ),

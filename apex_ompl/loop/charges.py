@@ -5,7 +5,6 @@ So the same seed gives the same run bit for bit, on a loaded machine too, and al
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -14,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from apex_ompl.errors import FileFormatError
+from apex_ompl.util.schema import read_json
 
 TABLE = Path(__file__).with_name("costs.json")
 
@@ -23,10 +23,11 @@ def cost_table(path: Path = TABLE) -> Mapping[str, Any]:
     """Return the table of costs: ``version``, and ``seconds`` by kind of work.
 
     Raises:
-        FileFormatError: The file is not such a table.
+        MissingFileError: The file cannot be read.
+        FileFormatError: It is not such a table.
     """
+    table = read_json(path, "table of costs")
     try:
-        table: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
         seconds = {str(kind): float(value) for kind, value in table["seconds"].items()}
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise FileFormatError(str(path), "seconds", "not a table of costs", "expected seconds by kind") from error

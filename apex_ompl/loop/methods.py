@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
-from apex_ompl.errors import UnknownNameError
 from apex_ompl.loop.damon import ManifoldGraph
 from apex_ompl.loop.drrt import KeptTree
 from apex_ompl.loop.gpmp import IncrementalGPMP, IncrementalGPMP2
@@ -22,6 +21,7 @@ from apex_ompl.loop.settings import LoopSettings
 from apex_ompl.loop.snapshot import Snapshot
 from apex_ompl.loop.sources import Faster, Lines, Route
 from apex_ompl.loop.sprint import Sprint
+from apex_ompl.util.validation import check_name
 
 
 @dataclass(frozen=True)
@@ -122,9 +122,7 @@ def method(name: str) -> Method:
     Raises:
         UnknownNameError: There is none of that name.
     """
-    if name not in METHODS:
-        raise UnknownNameError("way of replanning", str(name), METHODS)
-    return METHODS[name]
+    return METHODS[check_name(name, "way of replanning", METHODS)]
 
 
 def adapted(settings: LoopSettings, one: Method) -> LoopSettings:

@@ -22,6 +22,7 @@ from apex_ompl.loop.request import Replanner, Request
 from apex_ompl.loop.settings import LoopSettings
 from apex_ompl.robot.model import Limits
 from apex_ompl.scene.problem import Problem
+from apex_ompl.util.interpreter import this_python
 
 STARTED = 120.0  # time that the process has to make itself ready [s]
 SENT = 2  # requests at most that are not answered yet
@@ -117,7 +118,7 @@ class PlannerProcess:
     def _start(self) -> None:
         mine, other = multiprocessing.Pipe()
         environment = {**os.environ, "OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "passive"}
-        command = [sys.executable, "-m", "apex_ompl.loop.planner_worker", str(other.fileno())]
+        command = [*this_python(), "-m", "apex_ompl.loop.planner_worker", str(other.fileno())]
         self.process = subprocess.Popen(
             command, pass_fds=[other.fileno()], env=environment, stdin=subprocess.DEVNULL, start_new_session=True
         )

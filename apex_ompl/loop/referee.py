@@ -285,6 +285,8 @@ def is_at_goal(robot: Robot, problem: Problem, q: Array, goals: ArrayLike | None
     region = workspace_goal(robot, problem) if goals is None else None
     if region is not None:
         return within(region.errors(q), region.bounds)
-    states = problem.goal_states(robot.joint_names) if goals is None else np.atleast_2d(np.asarray(goals, float))
+    if goals is None:
+        goals = robot.within_limits(problem.goal_states(robot.joint_names))
+    states = np.atleast_2d(np.asarray(goals, float))
     check_states(states, robot.dof, "goals")
     return bool((np.abs(states - q).max(axis=1, initial=0.0) <= SAME_STATE).any())

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.errors import ParameterError, UnknownNameError
+from apex_ompl.errors import ParameterError
 from apex_ompl.loop.charges import cost_table
 from apex_ompl.loop.cycle import RunRecord
 from apex_ompl.loop.methods import adapted, method, replanner_of
@@ -34,7 +34,7 @@ from apex_ompl.scene.problem import Problem
 from apex_ompl.scene.scripts import obstacle_at
 from apex_ompl.trajectory import Timing, Trajectory
 from apex_ompl.util.files import path_text
-from apex_ompl.util.validation import check_seed
+from apex_ompl.util.validation import check_name, check_seed
 
 CLOCKS = ("sim", "real")
 SHARE = 1.0 - 1e-6  # of the limits that is used: pieces of motions are rounded where they are joined
@@ -66,9 +66,10 @@ def run(
     Raises:
         ApexError: The world, the problem, a name or a number is unknown or faulty.
     """
-    if clock not in CLOCKS:
-        raise UnknownNameError("clock", str(clock), CLOCKS)
+    check_name(clock, "clock", CLOCKS)
     check_seed(seed)
+    if settings is not None and not isinstance(settings, LoopSettings):
+        raise ParameterError("settings", settings, "a LoopSettings")
     one = method(planner)
     sensor = sensor or Sensor(seed=seed)
     world = load_world(problem)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from apex_ompl.errors import ParameterError, UnknownNameError
-from apex_ompl.util.validation import check_number
+from apex_ompl.errors import ParameterError
+from apex_ompl.util.validation import check_name, check_number
 
 PREDICTIONS = ("still", "cv", "truth")
 """How obstacles are predicted: where they were seen (the paper), at constant velocity, or as they truly move."""
@@ -88,10 +88,8 @@ class LoopSettings:
             ParameterError: A number is out of its range, or the budget is no multiple of the period.
             UnknownNameError: No such prediction, or way to evade.
         """
-        if self.prediction not in PREDICTIONS:
-            raise UnknownNameError("prediction", str(self.prediction), PREDICTIONS)
-        if self.evade not in EVADE:
-            raise UnknownNameError("way to evade", str(self.evade), EVADE)
+        check_name(self.prediction, "prediction", PREDICTIONS)
+        check_name(self.evade, "way to evade", EVADE)
         for name, (low, high) in RANGES.items():
             if getattr(self, name) is not None or name not in ("error", "fastest"):
                 check_number(getattr(self, name), name, low, high)

@@ -25,7 +25,6 @@ from apex_ompl.util.resolution import SEARCH_RESOLUTION
 
 GOAL_STATES = 8  # how many states an alignment goal is sampled into
 GOAL_ATTEMPTS = 200
-START_SLACK = 1e-3  # by which a joint may be outside its limits at the start [rad; synergies 0..1]
 HELD_WIDTH = 1e-9  # half width of the bounds of joints that stay, for splines that are evaluated with rounding [rad]
 
 
@@ -48,8 +47,8 @@ class PlanningSetup:
             in the workspace that was not reached, why.
         alignment: The alignment goal, or None.
         held: Numbers of the joints that stay as at the start.
-        notes: Sentences on joints of the start that were moved to their limits, and on meshes that are no proper solids
-            as they are, and how they are taken.
+        notes: Sentences on joints of the start and the goals that were moved to their limits, and on meshes that are no
+            proper solids as they are, and how they are taken.
     """
 
     problem: Problem
@@ -103,10 +102,14 @@ def assemble(
     robot = robot or load_robot(problem.robot)
     names = robot.joint_names
     asked = problem.start_state(names)
-    start, start_notes = within_limits(robot, asked)
-    goals = problem.goal_states(names)
+    start = robot.within_limits(asked)
+    given_goals = problem.goal_states(names)
+    goals = robot.within_limits(given_goals)
+    notes = _moved_notes(robot, asked, start, "start")
+    for k, (given_goal, goal) in enumerate(zip(given_goals, goals, strict=True)):
+        notes += _moved_notes(robot, given_goal, goal, "goal" if len(goals) == 1 else f"goal {k}")
     held = np.array([k for k, name in enumerate(names) if moving is not None and name not in moving], np.intp)
-    stays = goals[:, held] == asked[held]
+    stays = given_goals[:, held] == asked[held]
     goals[:, held] = np.where(stays, start[held], goals[:, held])  # where it is moved to
     lower, upper = bounds = _bounds(robot, start, held)
     limits = replace(robot.limits, lower=lower, upper=upper)
@@ -146,25 +149,17 @@ def assemble(
         goal_faults,
         sampled if isinstance(sampled, AlignmentGoal) else None,
         held,
-        (*start_notes, *checker.mesh_notes),
+        (*notes, *checker.mesh_notes),
     )
 
 
-def within_limits(robot: Robot, start: Array) -> tuple[Array, list[str]]:
-    """Return a start, shape (dof,), with joints that are a little outside their limits moved to them, and notes on it.
-
-    Encoders and controllers are off by some tenths of a milliradian; joints that are further out are left as they are.
-    """
-    inside = np.clip(start, robot.limits.lower, robot.limits.upper)
-    moved = np.flatnonzero((inside != start) & (np.abs(inside - start) <= START_SLACK))
-    notes = [
-        f"{robot.joint_names[k]} starts {abs(inside[k] - start[k]):.2g} outside its limits and is moved to "
-        f"{inside[k]:.6g}"
-        for k in moved
+def _moved_notes(robot: Robot, asked: Array, moved: Array, what: str) -> list[str]:
+    """Return a note on each joint of a start or a goal that was moved to its limit."""
+    return [
+        f"{robot.joint_names[k]} of the {what} is {abs(moved[k] - asked[k]):.2g} outside its limits and is moved to "
+        f"{moved[k]:.6g}"
+        for k in np.flatnonzero(moved != asked)
     ]
-    start = start.copy()
-    start[moved] = inside[moved]
-    return start, notes
 
 
 def _bounds(robot: Robot, start: Array, held: NDArray[np.intp]) -> Bounds:

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from apex_ompl.errors import ParameterError, UnknownNameError
+from apex_ompl.errors import ParameterError
 from apex_ompl.robot import Robot
 from apex_ompl.scene.problem import Alignment, Goal, PoseTarget
 from apex_ompl.types import Array
 from apex_ompl.util.schema import validate
-from apex_ompl.util.validation import finite_array
+from apex_ompl.util.validation import check_name, finite_array
 
 State = Mapping[str, float] | ArrayLike
 """A state: values by joint name, or all of them in the robot's order, shape (dof,) [rad; synergies 0..1]."""
@@ -58,8 +58,7 @@ def state_array(robot: Robot, state: State, name: str) -> Array:
     """
     values = joint_values(robot, state, name)
     for joint in values:
-        if joint not in robot.joint_names:
-            raise UnknownNameError("joint", joint, robot.joint_names)
+        check_name(joint, "joint", robot.joint_names)
     for joint in robot.joint_names:
         if joint not in values:
             raise ParameterError(name, f"{len(values)} of {robot.dof} joints", f"all; {joint!r} is missing")
@@ -112,12 +111,8 @@ def planned_joints(robot: Robot, group: Group) -> tuple[str, ...]:
     if not isinstance(group, Iterable):
         raise ParameterError("group", group, "the name of a group or joint, or several of them")
     for name in [group] if isinstance(group, str) else group:
-        if name in robot.groups:
-            wanted |= {robot.joint_names[k] for k in robot.groups[name]}
-        elif name in robot.joint_names:
-            wanted.add(name)
-        else:
-            raise UnknownNameError("group or joint", str(name), (*robot.groups, *robot.joint_names))
+        check_name(name, "group or joint", (*robot.groups, *robot.joint_names))
+        wanted |= {robot.joint_names[k] for k in robot.groups[name]} if name in robot.groups else {name}
     if not wanted:
         raise ParameterError("group", group, "at least one group or joint")
     return tuple(name for name in robot.joint_names if name in wanted)

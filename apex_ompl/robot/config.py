@@ -46,9 +46,10 @@ class Part(StrictModel):
 
 
 class Joint(StrictModel):
-    """A planned joint and its limits [rad, rad/s, rad/s^2, rad/s^3]; by default those of the URDF.
+    """A planned joint and its limits [rad, rad/s, rad/s^2, rad/s^3; no limit of jerk is ``.inf``].
 
-    Limits wider than ``WIDEST``, by which URDFs say that a joint has none, are narrowed to it.
+    Positions and velocity are by default those of the URDF. Limits wider than ``WIDEST``, by which URDFs say that a
+    joint has none, are narrowed to it.
     """
 
     home: float = 0.0
@@ -56,7 +57,7 @@ class Joint(StrictModel):
     upper: float | None = None
     velocity: PositiveFloat | None = None
     acceleration: PositiveFloat
-    jerk: PositiveFloat
+    jerk: Annotated[float, Field(gt=0.0, allow_inf_nan=True)]
 
 
 class Hand(StrictModel):

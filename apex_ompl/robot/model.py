@@ -20,6 +20,9 @@ from apex_ompl.scene.bodies import Body
 from apex_ompl.types import Array
 from apex_ompl.util.validation import number_array, shape_error
 
+SHORTEST_RAMP = 1e-6  # from no acceleration to the largest, for motions whose knots have distinct times [s]
+LIMIT_SLACK = 1e-3  # by which a joint of a start or a goal may be outside its limits [rad; synergies 0..1]
+
 
 @dataclass(frozen=True)
 class Limits:
@@ -30,7 +33,8 @@ class Limits:
         upper: Highest position.
         velocity: Largest speed [rad/s].
         acceleration: Largest acceleration [rad/s^2].
-        jerk: Largest jerk [rad/s^3].
+        jerk: Largest jerk [rad/s^3]; infinity for no limit. One that reaches the largest acceleration in less than
+            ``SHORTEST_RAMP`` is lowered to that.
     """
 
     lower: Array
@@ -38,6 +42,10 @@ class Limits:
     velocity: Array
     acceleration: Array
     jerk: Array
+
+    def __post_init__(self) -> None:
+        """Lower jerks that are too large to tell from none."""
+        object.__setattr__(self, "jerk", np.minimum(self.jerk, np.asarray(self.acceleration) / SHORTEST_RAMP))
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,7 +169,18 @@ class Robot:
         if not bad.any():
             return None
         k = int(np.argmax(bad))
-        return f"{self.joint_names[k]} = {q[k]:.6g} is outside its limits [{low[k]:.6g}, {high[k]:.6g}]"
+        by = max(low[k] - q[k], q[k] - high[k])
+        amount = f"{by:.2g} " if by < LIMIT_SLACK else ""  # which may not show in the rounded value
+        return f"{self.joint_names[k]} = {q[k]:.6g} is {amount}outside its limits [{low[k]:.6g}, {high[k]:.6g}]"
+
+    def within_limits(self, states: Array) -> Array:
+        """Return states, shape (..., dof), with joints that are a little outside their limits moved to them.
+
+        Encoders and controllers are off by some tenths of a milliradian, and limits that were written with fewer digits
+        by less; joints that are further out are left as they are.
+        """
+        inside = np.clip(states, self.limits.lower, self.limits.upper)
+        return np.where(np.abs(inside - states) <= LIMIT_SLACK, inside, states)
 
     def random_state(self, rng: np.random.Generator, size: int | None = None) -> Array:
         """Return states drawn uniformly inside the limits, shape (dof,) or (size, dof)."""

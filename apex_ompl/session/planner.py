@@ -7,6 +7,7 @@ import time
 from collections.abc import Mapping, Sequence, Set
 from contextlib import ExitStack
 from dataclasses import dataclass
+from inspect import signature
 from pathlib import Path
 from typing import Any, Self
 
@@ -38,7 +39,7 @@ from apex_ompl.util.deadline import Deadline
 from apex_ompl.util.exiting import running
 from apex_ompl.util.forking import ProcessLock, unforked
 from apex_ompl.util.schema import validate
-from apex_ompl.util.validation import check_number, check_positive, check_seed
+from apex_ompl.util.validation import check_flag, check_number, check_options, check_positive, check_seed
 
 
 @dataclass(frozen=True)
@@ -131,10 +132,11 @@ class MotionPlanner:
                 ``timing``, ``leave_contact``.
 
         Raises:
-            ApexError: The start, the goal, the planner or a parameter is faulty.
+            ApexError: The start, the goal, the planner, a parameter or the name of an option is faulty.
             KeyboardInterrupt: Ctrl-C was pressed; planning ended in good order first.
         """
         started = time.perf_counter()
+        check_options(options, OPTIONS)
         with running(), self._lock:
             return self._plan(self.problem(start, goal, name, group), planner, started, group=group, **options)
 
@@ -147,9 +149,10 @@ class MotionPlanner:
             **options: As of :meth:`plan`, ``group`` among them.
 
         Raises:
-            ApexError: The problem, the planner or a parameter is faulty.
+            ApexError: The problem, the planner, a parameter or the name of an option is faulty.
         """
         started = time.perf_counter()
+        check_options(options, OPTIONS)
         with running(), self._lock:
             with unforked():
                 self.world.load(problem)
@@ -223,6 +226,8 @@ class MotionPlanner:
     ) -> PlanResult:  # fmt: skip
         check_arguments(timeout, seed)
         check_number(leave_contact, "leave_contact", 0.0, LARGEST_DEPTH)
+        check_flag(simplify, "simplify")
+        check_flag(snapshot, "snapshot")
         if not isinstance(timing, (bool, Timing)):
             raise ParameterError("timing", timing, "True, False or a Timing")
         how = (Timing() if timing else None) if isinstance(timing, bool) else timing
@@ -298,12 +303,16 @@ class MotionPlanner:
         return made
 
     def _parameters(self, planner: str, params: Mapping[str, Any] | None, seed: int) -> dict[str, Any]:
-        given, known = dict(params or {}), planners.parameters(planner)
+        given, known = planners.named(params), planners.parameters(planner)
         if self.model is not None and hasattr(known, "model"):
             given.setdefault("model", self.model)
         if hasattr(known, "seed"):  # OMPL's is that of the whole process, where other threads plan as well
             given.setdefault("seed", seed)
         return given
+
+
+OPTIONS = tuple(name for name, one in signature(MotionPlanner._plan).parameters.items() if one.kind is one.KEYWORD_ONLY)
+"""Options of a plan."""
 
 
 def check_arguments(timeout: float, seed: int) -> None:

@@ -16,7 +16,7 @@ from apex_ompl.util.validation import check_array
 EXACT, APPROXIMATE = "EXACT_SOLUTION", "APPROXIMATE_SOLUTION"
 WITH_PATH = (EXACT, APPROXIMATE, "TIMING_FAILED")
 SAME_STATE = 1e-6  # files of motions and of goals may be rounded [rad]
-START_TOLERANCE = 2e-3  # from the problem's start, whose joints may be moved to their limits [rad]
+START_TOLERANCE = 2e-3  # from the start and, of unknown robots, the goal, whose joints may be moved to limits [rad]
 LIMIT_TOLERANCE = 1e-6  # share by which a motion in a file may exceed a limit, as times are rounded
 
 
@@ -54,13 +54,14 @@ def check_plan(
     check_array(path, ("N", len(joint_names)), "path", finite=True, least=1)
     if motion is not None and status != EXACT:
         raise ParameterError("trajectory", f"{len(motion.times)} knots", f"none, as the status is {status}")
+    known = _load(problem.robot, robot)
     starts, goals = problem.start_state(joint_names)[None], problem.goal_states(joint_names)
     for name, states in (("path", path), *((("trajectory", motion.positions),) if motion is not None else ())):
         _check_end(name, states[0], starts, "start", START_TOLERANCE)
         if status != APPROXIMATE and len(goals):
-            wanted = np.where(goals == starts, states[0], goals)  # joints that stay do so where they were moved to
-            _check_end(name, states[-1], wanted, "goal", SAME_STATE)
-    known = _load(problem.robot, robot)
+            within = goals if known is None else known.within_limits(goals)
+            wanted = np.where(goals == starts, states[0], within)  # joints that stay do so where they were moved to
+            _check_end(name, states[-1], wanted, "goal", START_TOLERANCE if known is None else SAME_STATE)
     if known is not None:
         _check_limits(known, joint_names, path, motion)
 

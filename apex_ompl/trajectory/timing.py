@@ -9,7 +9,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import ArrayLike
 
-from apex_ompl.errors import ParameterError, TimingError, TimingStoppedError, UnknownNameError
+from apex_ompl.errors import ParameterError, TimingError, TimingStoppedError
 from apex_ompl.kernel.compiled.cubic_pieces import cubic_rates
 from apex_ompl.kernel.compiled.polyline_distance import max_distance
 from apex_ompl.kernel.compiled.time_parameterization import max_path_speeds, sample_times
@@ -24,7 +24,7 @@ from apex_ompl.trajectory.methods.ruckig_profiles import Profiles, joined
 from apex_ompl.trajectory.trajectory import Trajectory
 from apex_ompl.trajopt.path import Path
 from apex_ompl.types import Array
-from apex_ompl.util.validation import check_array, check_number, check_states, finite_array, is_number
+from apex_ompl.util.validation import check_array, check_name, check_number, check_positive, check_states, finite_array
 
 SHORTEST_DURATION = 1e-3  # of a motion between states that count as one [s]
 FALLBACK = "spline"  # where the method asked for has no blended motion
@@ -76,14 +76,12 @@ class Timing:
             UnknownNameError: No such method.
             ParameterError: A number is out of its range.
         """
-        if self.method not in METHODS:
-            raise UnknownNameError("timing method", str(self.method), METHODS)
+        check_name(self.method, "timing method", METHODS)
         for name, (low, high) in RANGES.items():
             check_number(getattr(self, name), name, low, high)
         for limit in LIMITS:
             for joint, value in _by_joint(self, limit).items():
-                if not (is_number(value) and 0.0 < value < np.inf):
-                    raise ParameterError(f"max_{limit}.{joint}", value, "a positive number")
+                check_positive(value, f"max_{limit}.{joint}")
         for name in ("start_velocity", "start_acceleration"):
             object.__setattr__(
                 self, name, tuple(np.atleast_1d(finite_array(getattr(self, name), name)).ravel().tolist())
@@ -98,14 +96,18 @@ class Timing:
 
         Raises:
             UnknownNameError: A joint has a limit and is none of these.
-            ParameterError: A limit is higher than the robot's.
+            ParameterError: A limit is higher than the robot's, or one of the robot's is not positive.
         """
+        if len(joint_names) != len(limits.velocity):
+            raise ParameterError("joint_names", len(joint_names), f"{len(limits.velocity)}, as there are joints")
+        for limit in LIMITS:
+            for joint, value in zip(joint_names, getattr(limits, limit).tolist(), strict=True):
+                check_positive(value, f"{limit} limit of {joint}")
         scaled = {}
         for limit in LIMITS:
             values = np.array(getattr(limits, limit))
             for joint, value in _by_joint(self, limit).items():
-                if joint not in joint_names:
-                    raise UnknownNameError("joint", joint, joint_names)
+                check_name(joint, "joint", joint_names)
                 k = list(joint_names).index(joint)
                 if value > values[k]:
                     raise ParameterError(f"max_{limit}.{joint}", value, f"at most {values[k]:g}, the robot's limit")
@@ -184,9 +186,11 @@ def time_path(
     timing = timing or Timing()
     if not isinstance(timing, Timing):
         raise ParameterError("timing", timing, "a Timing")
+    if not isinstance(limits, Limits):
+        raise ParameterError("limits", limits, "a Limits, such as load_robot(...).limits")
     states = finite_array(path.states if isinstance(path, Path) else path, "path")
-    _check(states, limits, joint_names)
     scaled = timing.limits(limits, joint_names)
+    _check(states, limits, joint_names)
     start = timing.start(scaled)
     reason, line = "", Polyline.through(states)
     for timed in _from_rest(line, scaled, tuple(joint_names), timing, stop):
@@ -212,8 +216,6 @@ def _by_joint(timing: Timing, limit: str) -> Mapping[str, float]:
 def _check(states: Array, limits: Limits, joint_names: Sequence[str]) -> None:
     dof = len(limits.velocity)
     check_states(states, dof, "path", least=1)
-    if len(joint_names) != dof:
-        raise ParameterError("joint_names", len(joint_names), f"{dof}, as there are joints")
     over = (states < limits.lower - LIMIT_TOLERANCE) | (states > limits.upper + LIMIT_TOLERANCE)
     if over.any():
         k, joint = np.argwhere(over)[0]

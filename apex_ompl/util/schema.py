@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Hashable, Mapping
+from collections.abc import Hashable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TypeVar, get_args, get_origin
+from typing import TYPE_CHECKING, Any, Self, TypeVar, get_args, get_origin
 
 import numpy as np
 import yaml
@@ -45,7 +46,9 @@ def _strict(schema: Any) -> Any:
 class StrictModel(BaseModel):
     """A frozen record without unknown keys and with finite numbers only.
 
-    Numbers must be numbers, neither texts nor True or False, and what is true or false must be given as such.
+    Numbers must be numbers, neither texts nor True or False, and what is true or false must be given as such. Made from
+    faulty values it raises a FileFormatError with the first fault, which names the class, the field, the value and what
+    was expected; pydantic's ValidationError is its cause.
     """
 
     model_config = ConfigDict(
@@ -57,6 +60,49 @@ class StrictModel(BaseModel):
         """Return the schema of the record with strict numbers and truth values, wherever they stand in its fields."""
         found: CoreSchema = _strict(handler(source))
         return found
+
+    def __init__(self, /, **data: Any) -> None:
+        """Make a record from its fields.
+
+        Raises:
+            FileFormatError: A field is unknown, missing or faulty.
+        """
+        with _first_fault(type(self), type(self).__name__):
+            super().__init__(**data)
+
+    # pydantic makes records inside of others without __init__, unless it takes it for one that does more than its own
+    __init__.__pydantic_base_init__ = True  # type: ignore[attr-defined]
+
+    @classmethod
+    def model_validate(cls, obj: Any, **options: Any) -> Self:
+        """Make a record from plain data.
+
+        Raises:
+            FileFormatError: A field is unknown, missing or faulty.
+        """
+        with _first_fault(cls, cls.__name__):
+            return super().model_validate(obj, **options)
+
+    @classmethod
+    def model_validate_json(cls, json_data: str | bytes | bytearray, **options: Any) -> Self:
+        """Make a record from JSON.
+
+        Raises:
+            FileFormatError: It is not JSON, or a field is unknown, missing or faulty.
+        """
+        with _first_fault(cls, cls.__name__):
+            return super().model_validate_json(json_data, **options)
+
+    if not TYPE_CHECKING:  # which knows that records are frozen
+
+        def __setattr__(self, name: str, value: Any) -> None:
+            """Set a private attribute.
+
+            Raises:
+                FileFormatError: The attribute is a field.
+            """
+            with _first_fault(type(self), type(self).__name__):
+                super().__setattr__(name, value)
 
 
 NUMBERS = re.compile(r"\[[-+.\deE,\s]*\]")  # vectors in flow style: a level each, and most of the brackets
@@ -176,8 +222,19 @@ def validate(model: type[ModelT], data: dict[str, Any], source: str) -> ModelT:
     Raises:
         FileFormatError: ``data`` does not fit ``model``.
     """
+    with _first_fault(model, source):
+        return super(StrictModel, model).model_validate(data)
+
+
+@contextmanager
+def _first_fault(model: type[BaseModel], source: str) -> Iterator[None]:
+    """Say what is wrong first with the values of a record that is made in a block, in one sentence.
+
+    Raises:
+        FileFormatError: pydantic found a fault.
+    """
     try:
-        return model.model_validate(data)
+        yield
     except ValidationError as error:
         faults = error.errors()
         # A misspelt key is reported as a missing key too; the misspelling is more informative.
@@ -196,6 +253,8 @@ def validate(model: type[ModelT], data: dict[str, Any], source: str) -> ModelT:
             expected = str(first["ctx"]["error"])
         elif first["type"] == "bool_type":
             expected = "expected true or false"
+        elif first["type"] == "frozen_instance":
+            expected = "records do not change, expected a new one as by model_copy(update={...})"
         field = ".".join(location) if location else ""
         raise FileFormatError(source, field, value, expected) from error
 

@@ -6,14 +6,14 @@ All number and shape checks of the package are made here, so that their messages
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import yaml
 from numpy.typing import ArrayLike, NDArray
 
-from apex_ompl.errors import ParameterError
+from apex_ompl.errors import ParameterError, UnknownNameError
 from apex_ompl.types import Array
 from apex_ompl.util.schema import yaml_value
 
@@ -31,13 +31,50 @@ def is_integer(value: object) -> bool:
     return isinstance(value, (int, np.integer)) and not isinstance(value, bool)
 
 
+def check_name(name: str, kind: str, known: Collection[str]) -> str:
+    """Return a name after checking that it is one of those that are known.
+
+    Args:
+        name: The name.
+        kind: What it is the name of, such as ``planner``.
+        known: The names that there are.
+
+    Raises:
+        UnknownNameError: There is no such name, or it is no text.
+    """
+    if not isinstance(name, str) or name not in known:
+        raise UnknownNameError(kind, name, known)
+    return name
+
+
+def check_options(given: Mapping[str, Any], known: Collection[str]) -> None:
+    """Check the names of options that a call takes as keywords and hands on.
+
+    Raises:
+        UnknownNameError: There is no option of a name.
+    """
+    for name in given:
+        check_name(name, "option", known)
+
+
+def check_flag(value: bool, name: str) -> bool:
+    """Return a truth value as a ``bool`` after checking that it is one.
+
+    Raises:
+        ParameterError: It is none, such as a text.
+    """
+    if not isinstance(value, (bool, np.bool_)):
+        raise ParameterError(name, value, "True or False")
+    return bool(value)
+
+
 def check_number(value: float, name: str, low: float = -np.inf, high: float = np.inf) -> None:
     """Check that a finite number lies in the closed interval [low, high].
 
     Raises:
         ParameterError: It does not, or the value is no finite number.
     """
-    if not is_number(value) or not -np.inf < value < np.inf or not low <= value <= high:
+    if not _is_finite(value) or not low <= value <= high:
         raise ParameterError(name, value, _in_range("a number", low, high))
 
 
@@ -52,7 +89,7 @@ def check_positive(value: float, name: str, expected: str = "a positive number")
     Raises:
         ParameterError: The value is no number, not positive, or not finite.
     """
-    if not is_number(value) or not 0.0 < value < np.inf:
+    if not _is_finite(value) or not value > 0.0:
         raise ParameterError(name, value, expected)
 
 
@@ -74,6 +111,14 @@ def check_seed(seed: int) -> int:
         ParameterError: It does not, or the value is no integer.
     """
     return check_integer(seed, "seed", 0, LARGEST_INT)
+
+
+def _is_finite(value: object) -> bool:
+    """Whether a value is a finite number, and no integer too large for a float."""
+    try:
+        return is_number(value) and bool(np.isfinite(float(value)))  # type: ignore[arg-type]
+    except OverflowError:
+        return False
 
 
 def _in_range(what: str, low: float, high: float | None) -> str:

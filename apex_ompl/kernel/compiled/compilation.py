@@ -2,9 +2,11 @@
 
 numba renews cached code when the one file that it was written in changes. The functions of this folder are compiled
 into each other and import nothing else, so their cache is a folder named after a digest of all its files, of the
-versions of Python and numba, and of the processor: installations of the same files share it, wherever they lie. It is
-in ``$NUMBA_CACHE_DIR`` when that is set, or in the user's cache folder; where neither can be written, the code is
-compiled anew in every process, and a warning says so.
+versions of Python and numba, of Python's level of optimization, which changes what is compiled, and of the processor:
+installations of the same files share it, wherever they lie. It is in ``$NUMBA_CACHE_DIR`` when that is set, or in the
+user's cache folder. One that cannot be written is read all the same, and files in it that are damaged are made anew.
+What cannot be kept is compiled in every process; a warning says so. ``$NUMBA_DISABLE_JIT`` is for other code: this one,
+as Python, would take minutes for a path.
 """
 
 from __future__ import annotations
@@ -18,7 +20,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
@@ -29,7 +31,7 @@ from numba.core.caching import CompileResultCacheImpl, FunctionCache, InTreeCach
 from numba.core.sigutils import normalize_signature
 
 from apex_ompl.kernel.compiled.linking import InnerCompiler
-from apex_ompl.util.cache import user_cache
+from apex_ompl.util.cache import has_room, user_cache
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -44,6 +46,8 @@ OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "_nrt": False,
 INNER: dict[str, Any] = {**OPTIONS, "no_cpython_wrapper": True, "pipeline_class": InnerCompiler, "fastmath": False}
 REASSOCIATING = {"reassoc", "contract"}
 
+ROOM = 8 * 2**20  # in the cache, which the code of some functions fills [bytes]
+
 _lock = threading.RLock()
 
 
@@ -53,40 +57,63 @@ def _digest() -> str:
     for path in sorted(Path(__file__).parent.glob("*.py")):
         digest.update(path.read_bytes())
     processor = f"{platform.machine()} {llvm.get_host_cpu_name()}"
-    digest.update(f"{sys.version_info[:3]} {numba.__version__} {processor}".encode())
+    digest.update(f"{sys.version_info[:3]} {sys.flags.optimize} {numba.__version__} {processor}".encode())
     return digest.hexdigest()[:16]
 
 
 @cache
 def cache_folder() -> Path | None:
-    """Return the folder that compiled code is kept in, or None when no place for it can be written."""
+    """Return the folder that compiled code is read from and kept in, or None when no place for it can be written."""
     given = os.environ.get("NUMBA_CACHE_DIR")
-    return user_cache(f"kernel-{_digest()}", (given,) if given else ())
+    return user_cache(f"kernel-{_digest()}", (given,) if given else (), or_filled=True)
+
+
+@cache
+def can_keep_code() -> bool:
+    """Whether compiled code can be kept: the cache can be written, and there is room."""
+    folder = cache_folder()
+    return folder is not None and has_room(folder, ROOM)
+
+
+def whereabouts() -> str:
+    """Return where compiled code is kept, in words for the log."""
+    folder = cache_folder()
+    if folder is not None and can_keep_code():
+        return f"kept in {folder}"
+    why = "no cache folder can be written" if folder is None else f"{folder} cannot be written, or is full"
+    return f"in every process anew, since {why}"
 
 
 def names_in_cache() -> set[str]:
     """Return the names of the functions of which there is code in the cache."""
     folder = cache_folder()
-    indices = folder.rglob("*.nbi") if folder else ()
-    return {path.name.split(".")[1].rsplit("-", 1)[0] for path in indices}
+    code = folder.rglob("*.nbc") if folder else ()
+    return {path.name.split(".")[1].rsplit("-", 1)[0] for path in code}
+
+
+def _jit(function: F, **options: Any) -> F:
+    """Let numba compile a function when it is called, whether or not the user has disabled it for other code."""
+    disabled, numba.config.DISABLE_JIT = numba.config.DISABLE_JIT, 0
+    try:
+        compiled: F = numba.njit(**options)(function)
+    finally:
+        numba.config.DISABLE_JIT = disabled
+    return compiled
 
 
 def inlined(function: F) -> F:
     """Compile a function that only other compiled ones call; LLVM inlines it."""
-    compiled: F = numba.njit(**INNER, forceinline=True)(function)
-    return compiled
+    return _jit(function, **INNER, forceinline=True)
 
 
 def reassociating_inlined(function: F) -> F:
     """Compile a function as :func:`inlined` does, in which sums may be taken in any order, several at a time."""
-    compiled: F = numba.njit(**INNER | {"fastmath": REASSOCIATING}, forceinline=True)(function)
-    return compiled
+    return _jit(function, **INNER | {"fastmath": REASSOCIATING}, forceinline=True)
 
 
 def outlined(function: F) -> F:
     """Compile a function that only other compiled ones call, once for all; LLVM inlines it where it is short."""
-    compiled: F = numba.njit(**INNER, forceinline=False)(function)
-    return compiled
+    return _jit(function, **INNER, forceinline=False)
 
 
 def ir_inlined(function: F) -> F:
@@ -94,8 +121,7 @@ def ir_inlined(function: F) -> F:
 
     Without numba's runtime no array can be returned from a function that is left standing.
     """
-    compiled: F = numba.njit(**INNER, inline="always")(function)
-    return compiled
+    return _jit(function, **INNER, inline="always")
 
 
 def entry_point(function: Callable[..., Any]) -> CompiledFunction:
@@ -114,6 +140,9 @@ def reassociating_entry_point(function: Callable[..., Any]) -> CompiledFunction:
 class _Locator(InTreeCacheLocator):  # type: ignore[misc]
     """Where numba keeps code: in one folder, whatever the place and the date of the file that a function stands in."""
 
+    def ensure_cache_path(self) -> None:
+        """It is there, and may be read-only."""
+
     def get_cache_path(self) -> str:
         return str(cache_folder())
 
@@ -126,11 +155,29 @@ class _CacheFiles(CompileResultCacheImpl):  # type: ignore[misc]
 
 
 class _Cache(FunctionCache):  # type: ignore[misc]
+    """The cache of a function, whose faults are no errors: the function is compiled."""
+
     _impl_class = _CacheFiles
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        try:
+            return super().load_overload(sig, target_context)
+        except Exception as error:  # pickle raises many kinds on a file that is empty or cut off
+            where = f"the file of its code in {cache_folder()} is damaged"
+            LOG.warning("apex_ompl compiles %s: %s (%s)", self._py_func.__name__, where, error)
+            with suppress(OSError):
+                self.flush()
+            return None
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        try:
+            super().save_overload(sig, data)
+        except Exception as error:  # the disk is full, or what is there is damaged
+            LOG.info("apex_ompl cannot keep the code of %s: %s", self._py_func.__name__, error)
 
 
 def _entry_point(function: Callable[..., Any], **options: Any) -> CompiledFunction:
-    dispatcher = numba.njit(**OPTIONS, **options)(function)
+    dispatcher: Any = _jit(function, **OPTIONS, **options)
     if cache_folder() is not None:
         dispatcher._cache = _Cache(function)
     return CompiledFunction(dispatcher, function.__name__)
@@ -198,6 +245,4 @@ class CompiledFunction:
         if CompiledFunction._announced:
             return
         CompiledFunction._announced = True
-        folder = cache_folder()
-        where = f"kept in {folder}" if folder else "in every process anew, since no cache folder can be written"
-        LOG.warning("apex_ompl compiles functions of its collision kernel (%s)", where)
+        LOG.warning("apex_ompl compiles functions of its collision kernel (%s)", whereabouts())

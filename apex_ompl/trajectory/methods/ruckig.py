@@ -148,7 +148,8 @@ def stops(
         try:
             calculate(solver, query, solution)
         except ruckig.RuckigError as error:
-            raise TimingError(f"Ruckig finds no motion along a line of {length:.3g} rad, {error}") from error
+            limit = ", ".join(f"{name} {getattr(query, f'max_{name}')[0]:.3g}" for name in DERIVATIVES)
+            raise TimingError(f"Ruckig finds no motion along a line of {length:.3g} rad within {limit}") from error
         times, arc, speed, acceleration = knots(solution)
         positions = start + arc * direction
         positions[0], positions[-1] = start, end

@@ -1,0 +1,136 @@
+"""Calls of every command of the command line, with every option."""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import subprocess
+import sys
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import apex_ompl
+from apex_ompl.cli.parser import _parser
+
+ELSEWHERE = {"--address"}  # needs a Ray cluster
+BLOCK = "v 0 0 0\nv 0.1 0 0\nv 0 0.1 0\nv 0 0 0.1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n"
+SCENE = """
+robot_state: {joint_state: {name: [panda_joint1], position: [0.0]}}
+world:
+  collision_objects:
+    - id: pillar
+      header: {frame_id: base_link}
+      primitives: [{type: 1, dimensions: [0.1, 0.1, 0.1]}]
+      primitive_poses: [{position: {x: 0.6, y: 0.0, z: 0.3}, orientation: {w: 1.0}}]
+"""
+REQUEST = "goal_constraints: [{joint_constraints: [{joint_name: panda_joint1, position: -0.5}]}]\n"
+
+CALLS: tuple[tuple[tuple[int, ...], str], ...] = (  # exit codes that may be, and arguments
+    ((0,), "--version"),
+    ((0,), "problems"),
+    ((0,), "planners"),
+    ((0,), "info"),
+    ((0,), "schema"),
+    ((0,), "check own.yaml"),
+    ((0,), "plan own.yaml --timeout 20 --out plan.npz --snapshot --leave-contact 0.001"),
+    (
+        (0,),
+        "plan own.yaml --planner rrtconnect --params params.yaml --set range=0.7 --seed 1 --timeout 20 --no-simplify "
+        "--timing-method spline --velocity-scale 0.9 --acceleration-scale 0.9 --jerk-scale 0.9 "
+        "--max-velocity left_joint1=1.5 --max-acceleration left_joint1=10 --max-jerk left_joint1=1000 "
+        "--minimum-duration 2.5 --out motion.traj.yaml --controllers --json",
+    ),
+    ((0,), "plan ball_in_cup --timeout 20 --no-timing --out path.json"),
+    (
+        (0, 1),
+        "run popup/vertical/large/12 --planner no-network --clock sim --prediction cv --speed 0.9 --budget 0.05 "
+        "--latency 0.05 --timeout 4 --seed 1 --out run.npz --json",
+    ),
+    ((0, 1), "run own.yaml --clock real --timeout 3 --out real.json"),
+    ((0,), "render plan.npz --out plan.png --azimuth 10"),
+    ((0,), "plot plan.npz --out plan.svg"),
+    ((0,), "plot run.npz --out run.png"),
+    ((0,), "view own.yaml plan.npz run.npz --out page.html --cover"),
+    (
+        (0,),
+        "convert scene.yaml request.yaml --out converted.yaml --robot dual_panda_softhand "
+        "--joint panda_joint1=left_joint1 --frame base_link=world",
+    ),
+    ((0,), "check converted.yaml"),
+    (
+        (0,),
+        "bench posts/easy --planners apex,rrtconnect --runs 1 --timeout 5 --seed 1 --split validation --no-simplify "
+        "--jobs 1 --keep --quiet --out results",
+    ),
+    ((0,), "report results --out report"),
+)
+WRITTEN = (
+    "plan.npz", "motion.traj.yaml", "path.json", "run.npz", "real.json", "plan.png", "plan.svg", "run.png", "page.html",
+    "converted.yaml", "report/report.html", "report/report.md",
+)  # fmt: skip
+
+
+def run(_: Path) -> list[str]:
+    """Run all calls in this folder, which holds nothing, and return the commands and options that none has."""
+    _write_inputs()
+    for codes, arguments in CALLS:
+        done = subprocess.run(
+            [_command(), *arguments.split()], check=False, capture_output=True, text=True, timeout=300
+        )
+        if done.returncode not in codes or "Traceback" in done.stderr:
+            sys.exit(f"apex-ompl {arguments}: exit code {done.returncode}\n{done.stdout}{done.stderr}")
+    for name in WRITTEN:
+        if not Path(name).stat().st_size:
+            sys.exit(f"{name} is empty")
+    said = {word for _, arguments in CALLS for word in arguments.split()} | set(_serve())
+    return [name for name in _known() if name not in said]
+
+
+def _command() -> str:
+    return str(Path(sys.executable).with_name("apex-ompl"))
+
+
+def _write_inputs() -> None:
+    """Write the files that commands read: a problem with a mesh, parameters, and a scene and request of MoveIt's."""
+    robot = apex_ompl.load_robot("dual_panda_softhand")
+    Path("block.obj").write_text(BLOCK)
+    with apex_ompl.MotionPlanner() as planner:
+        planner.world.add(name="post", box=(0.1, 0.1, 0.6), position=(0.5, 0.0, 0.3))
+        planner.world.add(name="block", mesh={"file": "block.obj"}, position=(0.6, 0.4, 0.0))
+        start, goal = robot.home.copy(), robot.home.copy()
+        start[[0, 1, 3]], goal[[0, 1, 3]] = (0.1, 0.4, -1.6), (-0.6, 0.4, -1.6)
+        planner.problem(start, goal, "own").save("own.yaml")
+        home = dict(zip(robot.joint_names, robot.home.tolist(), strict=True))
+    Path("params.yaml").write_text("range: 0.5\n")
+    names, values = ", ".join(["panda_joint1", *robot.joint_names[1:]]), ", ".join(map(str, home.values()))
+    Path("scene.yaml").write_text(SCENE.replace("[panda_joint1]", f"[{names}]").replace("[0.0]", f"[{values}]"))
+    Path("request.yaml").write_text(REQUEST)
+
+
+def _serve() -> Iterator[str]:
+    """Show a problem in a page that is served, load it, and stop; yield the words of the call."""
+    words = ["view", "own.yaml", "--no-browser", "--port", "18231"]
+    with subprocess.Popen([_command(), *words], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as server:
+        assert server.stdout is not None
+        address = next(word for word in server.stdout.readline().split() if word.startswith("http"))
+        with urllib.request.urlopen(address, timeout=60) as answer:
+            page = answer.read()
+        server.send_signal(signal.SIGINT)
+        server.communicate(timeout=60)
+    if b"<html" not in page or server.returncode not in (0, 130):
+        sys.exit(f"apex-ompl {' '.join(words)}: exit code {server.returncode}, {len(page)} bytes")
+    yield from words
+
+
+def _known() -> Iterator[str]:
+    """Yield the names of all commands, and the longest name of each of their options."""
+    actions: list[Any] = _parser()._actions
+    (commands,) = (one for one in actions if isinstance(one, argparse._SubParsersAction))
+    yield from commands.choices
+    for parser in commands.choices.values():
+        for action in parser._actions:
+            option = max(action.option_strings, key=len, default="")
+            if option and option != "--help" and option not in ELSEWHERE:
+                yield option

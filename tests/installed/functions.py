@@ -1,0 +1,232 @@
+"""Uses of every public function and class, and of the code on the pages of the documentation.
+
+What was called is seen by Python's own trace of calls, so that a public function without a use cannot be forgotten.
+"""
+
+from __future__ import annotations
+
+import inspect
+import io
+import re
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, redirect_stdout
+from importlib import import_module
+from pathlib import Path
+from types import CodeType, FrameType
+from typing import Any
+
+import numpy as np
+
+MODULES = (
+    "apex_ompl", "apex_ompl.ompl_adapter.space", "apex_ompl.planners", "apex_ompl.problems", "apex_ompl.robot",
+    "apex_ompl.session", "apex_ompl.trajectory",
+)  # fmt: skip
+
+
+def run(root: Path) -> list[str]:
+    """Run all uses in this folder, which holds nothing, and return the names of public functions that none calls."""
+    called: set[CodeType] = set()
+    made: set[type] = set()
+    with _traced(called, made):
+        _use_planner()
+        _use_records()
+        _use_trajectories()
+        _use_problems()
+        _use_ompl()
+        _use_run()
+    (Path("tests")).symlink_to(root / "tests")  # data that a page reads
+    for page in (root / "README.md", *sorted((root / "docs").glob("*.md"))):
+        code = "\n".join(re.findall(r"```python\n(.*?)```", page.read_text(), re.S))
+        with _traced(called, made), redirect_stdout(io.StringIO()):
+            exec(compile(code, page.name, "exec"), {"__name__": "__page__"})
+    return [name for name, code, kind in _public() if code not in called and not any(issubclass(m, kind) for m in made)]
+
+
+@contextmanager
+def _traced(called: set[CodeType], made: set[type]) -> Iterator[None]:
+    """Note the code of all functions that are called in a block, and the types of what they make or return."""
+
+    def note(frame: FrameType, event: str, value: Any) -> None:
+        if event == "call":
+            called.add(frame.f_code)
+            if frame.f_code.co_name == "__init__":
+                made.add(type(next(iter(frame.f_locals.values()), None)))
+        elif event == "return":
+            made.add(type(value))
+
+    sys.setprofile(note)
+    try:
+        yield
+    finally:
+        sys.setprofile(None)
+
+
+def _public() -> Iterator[tuple[str, CodeType | None, type | tuple[()]]]:
+    """Yield name and code of public functions and methods, and name and class of public classes."""
+    for module_name in MODULES:
+        module = import_module(module_name)
+        own = [name for name, value in vars(module).items() if getattr(value, "__module__", "") == module_name]
+        for name in getattr(module, "__all__", [name for name in own if not name.startswith("_")]):
+            value, label = getattr(module, name), f"{module_name}.{name}"
+            if inspect.isclass(value):
+                yield label, None, value
+                members = {method: one for method, one in vars(value).items() if not method.startswith("_")}
+                yield from ((f"{label}.{method}", code, ()) for method, one in members.items() if (code := _code(one)))
+            elif code := _code(value):
+                yield label, code, ()
+
+
+def _code(member: Any) -> CodeType | None:
+    """Return the code of a function, a method or a property of this package."""
+    if isinstance(member, property):
+        member = member.fget
+    function = inspect.unwrap(getattr(member, "__func__", getattr(member, "func", member)))
+    found = getattr(function, "__code__", None)
+    return found if getattr(function, "__module__", "").startswith("apex_ompl") else None
+
+
+def _use_planner() -> None:
+    """A kept planner, its world, and plans."""
+    import apex_ompl
+    from apex_ompl.session import check_arguments, kept_planner
+
+    robot = apex_ompl.load_robot("dual_panda_softhand")
+    home = robot.home
+    with apex_ompl.MotionPlanner(robot) as planner:
+        world = planner.world
+        seen = apex_ompl.points_from_depth(np.full((8, 8), 2.0), (50.0, 50.0, 4.0, 4.0), np.eye(4))
+        world.set_points("seen", apex_ompl.filter_points(seen + (0.0, 0.0, 1.0), robot, home), radius=0.01)
+        world.add(name="ball", sphere={"radius": 0.03}, position=(0.5, 0.0, 1.0))
+        world.move("ball", (0.6, 0.0, 1.0))
+        world.set_velocity("ball", (0.0, 0.1, 0.0))
+        world.set_velocity("ball", None)
+        world.allow("ball", "left_link0")
+        assert world.allowed and set(world.obstacles) == {"seen", "ball"} and not world.held
+        with world.locked():
+            world.attach("ball", "left_hand_palm", at=home)
+            world.detach("ball", at=home)
+        world.remove("ball")
+        assert planner.is_free(home) and bool(planner.check(home))
+        palm = robot.link_pose(home, "left_hand_palm")[:3, 3]
+        pose = apex_ompl.PoseTarget(frame="left_hand_palm", position=tuple(palm + (0.0, 0.0, 0.02)))
+        result = planner.plan(home, pose, timeout=20.0, timing=apex_ompl.Timing(velocity_scale=0.9))
+        assert result and result.status is apex_ompl.PlanStatus.EXACT_SOLUTION
+        assert planner.simple_setup(home, home + 0.01) and planner.problem(home, home).name == "world"
+        world.load(planner.problem(home, home))
+        world.clear()
+        assert planner.plan_problem(apex_ompl.load_problem("ball_in_cup"), "rrtconnect", timeout=20.0)
+    for name in ("result.npz", "result.json", "result.yaml"):
+        result.save(name)
+        assert apex_ompl.PlanResult.load(name).as_dict() == result.as_dict()
+    assert apex_ompl.plan("reach_past_post", timeout=20.0, params={"model": "apex"})
+    assert apex_ompl.load_model("apex-paper") is not None
+    with kept_planner("dual_panda_softhand") as kept:
+        assert kept.robot.name == robot.name
+    check_arguments(1.0, 0)
+    try:
+        planner.plan(home, home, timeout=-1.0)
+    except apex_ompl.ApexError as error:
+        assert "timeout" in str(error)
+
+
+def _use_records() -> None:
+    """Robots and problems."""
+    import apex_ompl
+    from apex_ompl.robot import Limits, robot_names
+
+    for name in robot_names():
+        robot = apex_ompl.load_robot(name)
+        q = robot.random_state(np.random.default_rng(0))
+        link = robot.link_names[-1]
+        assert len(q) == robot.dof and robot.limit_fault(robot.within_limits(q)) is None
+        assert robot.link_pose(q, link).shape == (4, 4) and robot.link_frame(link) >= 0
+        assert robot.hand_of(link) and robot.part_of(link) and len(robot.to_pinocchio(q)) >= robot.dof
+        assert isinstance(robot.limits, Limits)
+    problem = apex_ompl.load_problem("ball_in_cup")
+    alignment = apex_ompl.Alignment(kind="vertical", first="a", second="b")
+    assert alignment.distance is None and not problem.moving and problem.still == problem and problem.source
+    assert problem.start_state(apex_ompl.load_robot(problem.robot).joint_names).shape == (16,)
+    assert problem.goal_states(apex_ompl.load_robot(problem.robot).joint_names).shape[1] == 16
+    problem.save("problem.yaml")
+    again = apex_ompl.Problem.load("problem.yaml")
+    assert again.to_yaml() == problem.to_yaml() and apex_ompl.Problem.parse(again.as_dict(), "mine") == again
+
+
+def _use_trajectories() -> None:
+    """Time parameterization, and motions."""
+    import apex_ompl
+    from apex_ompl.trajectory import Sample, TimedPath, warm_up
+
+    warm_up()
+    robot = apex_ompl.load_robot("baxter")
+    path = np.stack([robot.home, robot.home + 0.1, robot.home + np.eye(robot.dof)[0] * 0.2])
+    timing = apex_ompl.Timing(method="spline", minimum_duration=1.0)
+    timed = apex_ompl.time_path(path, robot.limits, robot.joint_names, timing)
+    assert isinstance(timed, TimedPath) and timing.start(timing.limits(robot.limits, robot.joint_names)) is None
+    motion = timed.trajectory
+    assert motion.duration > 0.999 and motion.dof == robot.dof and max(motion.use(robot.limits).values()) <= 1.0 + 1e-9
+    assert motion.jerk > 0.0 and motion.jerks.size and motion.spectral_arc_length < 0.0
+    assert motion.states(motion.times).shape == (3, len(motion.times), robot.dof) and len(motion.knots) == 4
+    assert isinstance(motion.sample(0.1), Sample) and len(list(motion.stream(100.0))) > 100
+    assert motion.slower(2.0).duration > motion.after(0.5).duration
+    assert apex_ompl.Trajectory.unchecked(motion.times, motion.states(motion.times), motion.joint_names).duration
+    for name in ("motion.npz", "motion.csv", "motion.traj.yaml", "motion.traj.json"):
+        motion.save(name)
+        assert abs(apex_ompl.Trajectory.load(name).duration - motion.duration) < 1e-8
+
+
+def _use_problems() -> None:
+    """Ready-made problems, suites and frozen problems, and planners by name."""
+    from ompl import base as ob
+
+    from apex_ompl import load_problem, planners, problems
+
+    for name in problems.names():
+        assert load_problem(name).name
+    for suite, levels in problems.suites().items():
+        assert problems.sample(suite, level=levels[0], seed=800_000).name
+    (first, *_) = problems.frozen_names("shelf", "hard")
+    assert problems.is_id(first) and problems.witness(first).path.shape[1] == 16
+    assert problems.primitives(problems.load("unseen/wheels/800001"))
+    for name in planners.names():
+        assert name in planners.TUNED or planners.parameters(name) is not None
+    assert planners.parameters("rrtconnect").changed(**planners.named({"range": 0.7})).range == 0.7
+    space = ob.SpaceInformation(ob.RealVectorStateSpace(2))
+    assert planners.make("rrt", space, range=0.1).getName() and planners.allocator("rrt")(space).getName()
+    try:
+        planners.Parameters().build(space)
+    except TypeError as error:
+        assert "does not say" in str(error)
+
+
+def _use_ompl() -> None:
+    """APEX in a SimpleSetup, and states of OMPL's."""
+    import apex_ompl
+    from apex_ompl.ompl_adapter import space
+    from apex_ompl.planners import APEX
+
+    setup = apex_ompl.setup("shelf_swap")
+    si, robot = setup.getSpaceInformation(), apex_ompl.load_robot("dual_panda_softhand")
+    low, high = space.bounds_of(si, robot)
+    assert space.state_space(robot).getDimension() == robot.dof and (low <= high).all()
+    assert np.array_equal(space.to_array(space.to_state(si, robot.home), robot.dof), robot.home)
+    path = space.array_to_path(si, np.stack([robot.home, robot.home + 1e-3]))
+    ends = space.path_to_array(path, robot.dof)
+    assert space.motions_free(si, ends[:1], ends[1:]).shape == (1,)
+    space.forget_states(ValueError("nothing"))
+    planner = APEX(si)
+    setup.setPlanner(planner)
+    setup.setup()
+    assert setup.solve(20.0).getStatus() and planner.report is not None
+    setup.clear()
+
+
+def _use_run() -> None:
+    """The closed loop."""
+    import apex_ompl
+
+    result = apex_ompl.run("popup/vertical/large/12", planner="no-network")
+    for name in ("run.npz", "run.json"):
+        result.save(name)
+        assert apex_ompl.RunResult.load(name).as_dict() == result.as_dict()
