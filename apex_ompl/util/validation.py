@@ -15,7 +15,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from apex_ompl.errors import ParameterError, UnknownNameError
 from apex_ompl.types import Array
-from apex_ompl.util.schema import yaml_value
 
 LARGEST_INT = 2**31 - 1
 """Largest seed or count, the largest signed integer of 32 bits."""
@@ -342,6 +341,8 @@ def key_value(text: str) -> tuple[str, Any]:
     if not key or not equals:
         raise argparse.ArgumentTypeError(f"{text!r}, expected KEY=VALUE")
     try:
+        from apex_ompl.util.schema import yaml_value  # data are made on machines without pydantic
+
         return key, yaml_value(value)
     except yaml.YAMLError as error:
         raise argparse.ArgumentTypeError(f"{text!r}, expected a value in YAML") from error
