@@ -55,7 +55,7 @@ class SolveContext:
         nearest: Path that ends near a goal and its distance from it [rad], or None.
         rng: Source of the generators of compiled trees.
         sprint_trees: Compiled trees that a sprint began, or None.
-        sprint_ompl_trees: OMPL's, where another checker decides, or None.
+        sprint_ompl_trees: OMPL's, where another checker decides, by their longest step [rad].
         all_trees: Compiled trees for all starts and goals, or None.
         all_ompl_trees: OMPL's for all starts and goals, or None.
         grown: Trees between starts and goals so far, for OMPL's planner data.
@@ -82,7 +82,7 @@ class SolveContext:
         self.nearest: tuple[Path, float] | None = None
         self.rng = rng
         self.sprint_trees: TreePair | None = None
-        self.sprint_ompl_trees: OmplTrees | None = None
+        self.sprint_ompl_trees: dict[float, OmplTrees] = {}
         self.all_trees: TreePair | None = None
         self.all_ompl_trees: OmplTrees | None = None
         self.grown: list[TreePair | og.RRTConnect] = []

@@ -54,7 +54,7 @@ def _summary(result: RunResult) -> str:
         if name in metrics
     ]
     lines.append(f"  measured   {', '.join(some)}")
-    counts = ("replans_asked", "replans_accepted", "conflicts", "stops")
+    counts = ("replans_asked", "replans_accepted", "conflicts", "stops", "unguarded_steps", "broken_steps")
     lines.append("  events     " + ", ".join(f"{metrics[name]:.0f} {name.replace('_', ' ')}" for name in counts))
     lines.append(
         f"  method     {result.method}, prediction {result.prediction}, clock {result.clock}, seed {result.seed}"

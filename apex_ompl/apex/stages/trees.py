@@ -57,13 +57,16 @@ class Sprint:
         return states
 
     def _of_ompl(self, context: SolveContext) -> Array | None:
-        trees, (start, goal) = context.sprint_ompl_trees, context.pairs[0]
-        trees = trees or rooted_ompl_trees(context, [start], goal, self.tree_range)
-        tree, pdef = context.sprint_ompl_trees = trees
-        if tree.solve(context.counted(math.ceil(OMPL_SHARE * self.iterations))).getStatus() != EXACT:
-            return None
-        context.sprint_ompl_trees = None
-        return path_to_array(pdef.getSolutionPath(), context.kernel.robot.dof)
+        """Return the path of OMPL's trees, with OMPL's longest step first: other checkers' scenes may be wide open."""
+        start, goal = context.pairs[0]
+        for tree_range in dict.fromkeys((0.0, self.tree_range)):
+            trees = context.sprint_ompl_trees.get(tree_range)
+            trees = trees or rooted_ompl_trees(context, [start], goal, tree_range)
+            tree, pdef = context.sprint_ompl_trees[tree_range] = trees
+            if tree.solve(context.counted(math.ceil(OMPL_SHARE * self.iterations))).getStatus() == EXACT:
+                context.sprint_ompl_trees.clear()
+                return path_to_array(pdef.getSolutionPath(), context.kernel.robot.dof)
+        return None
 
 
 @dataclass(frozen=True)
@@ -104,9 +107,9 @@ class GrowTrees:
     def _of_ompl(self, context: SolveContext, iterations: int) -> Solution | None:
         goal = context.pdef.getGoal()
         whole = len(context.pairs) == 1 and goal.hasType(ob.GOAL_STATE)  # a region may have others
-        trees = context.all_ompl_trees or (context.sprint_ompl_trees if whole else None)
+        trees = context.all_ompl_trees or (context.sprint_ompl_trees.get(self.tree_range) if whole else None)
         trees = trees or rooted_ompl_trees(context, context.starts, goal, self.tree_range)
-        context.sprint_ompl_trees, context.all_ompl_trees = None, trees
+        context.sprint_ompl_trees, context.all_ompl_trees = {}, trees
         tree, pdef = trees
         with context.report.timed("rrtconnect"):
             status = tree.solve(context.counted(iterations)).getStatus()
