@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from loops import BLOCKED, PROBLEM, ByHand, Find, boxes, crossing, go, line, line_from, setup_of
+from loops import BLOCKED, PROBLEM, ByHand, Find, boxes, crossing, go, line, line_from, ready_of, setup_of
 
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ApexError
@@ -21,17 +21,19 @@ from apex_ompl.live.timed_spline import Start
 from apex_ompl.loop.charges import Charges
 from apex_ompl.loop.cycle import RunRecord
 from apex_ompl.loop.evasion import endangered, step_aside
+from apex_ompl.loop.executor import Executor
 from apex_ompl.loop.following import Following
 from apex_ompl.loop.methods import METHODS
 from apex_ompl.loop.ready import Ready
 from apex_ompl.loop.referee import RefereeReport
-from apex_ompl.loop.replanning import NOTICED
+from apex_ompl.loop.replanning import NOTICED, Reply
 from apex_ompl.loop.request import Answer, Request
 from apex_ompl.loop.result import Event
 from apex_ompl.loop.run import run
 from apex_ompl.loop.search import EARLIER, Search
 from apex_ompl.loop.sensor import Sensor
 from apex_ompl.loop.settings import EVADE, LoopSettings
+from apex_ompl.loop.tracking import Tracker
 from apex_ompl.ompl_adapter.setup import PlanningSetup
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.scripts import place_at
@@ -138,6 +140,32 @@ def test_a_proved_step_aside_is_not_stopped_on_its_way() -> None:
     first = asides(done)[0]
     assert not any(event.kind == "stop" and first.time < event.time < first.data["arrival"] for event in done.events)
     assert is_at_rest(done.trajectory, first.data["arrival"]) and report.moving_contact is None
+
+
+@pytest.mark.parametrize("proved_before", [True, False])
+def test_a_step_aside_is_no_proof_of_what_the_robot_does_until_then(proved_before: bool) -> None:
+    """The robot still moves when the answer comes, and will be at rest when it joins it."""
+    ready = ready_of(PROBLEM)
+    start, goal = ready.setup.start, ready.goals[0]
+    first = Following(line_from(ready, Start.at_rest(start), 0.95 * start + 0.05 * goal), 0.0)
+    now, join = 0.5 * first.end, first.end + 0.01
+    aside = Following(line_from(ready, Start.at_rest(first.motion.positions[-1]), start), join)
+    empty = Movers(())
+    request = Request(1, 0.0, join, first, None, empty, 0.05, (), now, 0, contact=now)
+
+    class Answered:
+        def reply(self, now: float) -> Reply:
+            return Reply(1, Answer(aside, "evade", Charges(0.05)))
+
+        def faults(self) -> tuple[str, ...]:
+            return ()
+
+    executor = Executor(ready, Answered(), Tracker(ready.kernel), 0, first, pending=request, conflict=now, contact=now)
+    executor.stop = first if proved_before else Following(first.motion.after(now), now)
+    before = executor.stop
+    executor._answer(now, empty, empty)
+    assert executor.following is not first and executor.aside is executor.following
+    assert executor.stop is (executor.following if proved_before else before)
 
 
 def test_a_robot_that_leaves_at_its_risk_does_not_go_to_a_goal() -> None:

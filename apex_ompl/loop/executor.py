@@ -293,7 +293,8 @@ class Executor:
         why, aside, proved, leaving = self._fault(now, request, found, predicted), False, False, False
         if not why and reachable is not None:
             aside, then = self._may_leave(now, found), found.begin + self.ready.settings.period
-            proved = aside and self.ready.proved_to_rest(reachable, found)
+            stands = self.following.at_rest(now) or self.stop is self.following  # what it does until then is proved
+            proved = aside and stands and self.ready.proved_to_rest(reachable, found)
             leaving = aside and not proved and self.ready.settings.evade == "risk"  # a stop at once is no way to leave
             if not (proved or leaving) and self.ready.proved_stop(reachable, found, found.begin, then) is None:
                 why = "no stop behind its first step is proved"
