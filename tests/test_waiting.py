@@ -166,6 +166,6 @@ def test_a_robot_that_leaves_takes_only_what_the_guard_will_hardly_stop(
     for leaving, guardable in product((False, True), repeat=2):
         search = search_of(ready, FAR)
         search = Search(ready, replace(search.request, leaving=leaving), Charges(0.05))
-        monkeypatch.setattr(search, "guardable", lambda motion, answer=guardable: answer)
+        monkeypatch.setattr(search, "delay", lambda motion, answer=guardable: 0.0 if answer else 1.0)
         motion = search.direct(ready.goals[0])
         assert motion is not None and search.take(motion, "direct") == (guardable or not leaving)

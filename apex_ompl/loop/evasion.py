@@ -1,4 +1,4 @@
-"""Steps aside: for a robot that stands where an obstacle comes."""
+"""Steps aside: for a robot that is at rest where an obstacle comes, or moves to where one will be."""
 
 from __future__ import annotations
 
@@ -33,10 +33,16 @@ def endangered(following: Following, at: float, conflict: float, within: float =
     return following.at_rest(at) and conflict < at + within
 
 
+def threatened(following: Following, at: float, conflict: float) -> bool:
+    """Whether a robot that moves at a time, as :func:`endangered` has it, comes into conflict soon."""
+    return not following.at_rest(at) and conflict < at + SOON
+
+
 def step_aside(search: Search, *, proved: bool = False) -> Trajectory | None:
     """Return the straight motion to a state nearby that stays clear, or else clear for longest, or None.
 
-    Besides states around, the robot may go back: to states of its last motion to a goal, and to where it began. Where
+    One that begins while the robot moves is the fastest to that state. Besides states around, the robot may go back: to
+    states of its last motion to a goal, and to where it began. Where
     motions aside are to be proved clear of all that obstacles can reach, the states are clear of that at the arrival
     where possible, and motions that are proved come first; another one may still have a fail-safe stop at each of its
     steps.
@@ -68,8 +74,9 @@ def step_aside(search: Search, *, proved: bool = False) -> Trajectory | None:
     for k in np.argsort(-(near - NEARNESS * size), kind="stable"):
         if search.charges.over():
             break
-        motion = time_path(np.stack([q, states[k]]), ready.limits, ready.names).trajectory
-        search.charges.charge("straight motion")
+        motion = _to(search, states[k])
+        if motion is None:
+            continue
         one = search.following(motion)
         conflict = ready.first_conflict(request.predicted, one, one.begin, one.end + hold, search.charges)
         if conflict <= latest or not ready.clear_of_still(motion, search.charges):
@@ -81,6 +88,15 @@ def step_aside(search: Search, *, proved: bool = False) -> Trajectory | None:
         if np.isinf(conflict):
             break
     return unproved if best is None and not proved else best
+
+
+def _to(search: Search, state: Array) -> Trajectory | None:
+    """Return the motion to a state, shape (dof,), or None where there is none within the limits."""
+    if search.start.moves:
+        return search.direct(state)
+    search.charges.charge("straight motion")
+    states = np.stack([search.start.position, state])
+    return time_path(states, search.ready.limits, search.ready.names).trajectory
 
 
 def _looked(search: Search, states: Array, looks: Array) -> tuple[Array, Array]:

@@ -241,6 +241,9 @@ class Executor:
             self.leaving = False
         elif self.stop is self.following:
             return  # all of it is proved
+        elif self.following is self.aside and self._proved_to_rest(now, reachable):
+            self.stop = self.following
+            return
         then = now + self.ready.settings.period
         found = self.ready.proved_stop(reachable, self.following, now, then)
         if found is not None:
@@ -259,6 +262,11 @@ class Executor:
             self.log(now, "broken assumption", what="no stop is in hand")
         elif self.stop is not self.following:
             self._follow_stop(now, self.stop)
+
+    def _proved_to_rest(self, now: float, reachable: Movers) -> bool:
+        """Whether all that the robot follows is proved until it is at rest, from when it moves on."""
+        begin = now if self.following.start(now).moves else max(now, self.sets_out)
+        return math.isinf(self.ready.first_conflict(reachable, self.following, begin, self.following.end))
 
     def _answered(self, now: float, how: str) -> None:
         """Note how long after a conflict was known the command changed."""
@@ -290,12 +298,12 @@ class Executor:
             self.log(now, request.refused, why=reply.failed, **took)
             return
         request, found = self._at_once(now, request, found, predicted)
-        why, aside, proved, leaving = self._fault(now, request, found, predicted), False, False, False
+        why, aside, leaving = self._fault(now, request, found, predicted), False, False
         if not why and reachable is not None:
             aside, then = self._may_leave(now, found), found.begin + self.ready.settings.period
-            stands = self.following.at_rest(now) or self.stop is self.following  # what it does until then is proved
-            proved = aside and stands and self.ready.proved_to_rest(reachable, found)
-            leaving = aside and not proved and self.ready.settings.evade == "risk"  # a stop at once is no way to leave
+            proved = aside and self.ready.proved_to_rest(reachable, found)
+            risk = self.ready.settings.evade == "risk" and self.following.at_rest(found.begin)
+            leaving = risk and aside and not proved  # a stop at once is no way to leave
             if not (proved or leaving) and self.ready.proved_stop(reachable, found, found.begin, then) is None:
                 why = "no stop behind its first step is proved"
         if why:
@@ -308,7 +316,7 @@ class Executor:
         head = self.following.piece(now, request.join) if request.join > now + 1e-9 else None
         self.leaving = leaving or (self.leaving and not self.following.at_rest(now))
         self.follow(found if head is None else found.behind(head, now), now)
-        self.sets_out, self.stop = found.begin, self.following if proved else None if self.leaving else self.stop
+        self.sets_out, self.stop = found.begin, None if self.leaving else self.stop
         self.aside = self.following if aside else None
         if self.ready.settings.by_distance:
             self.nearest = min(self.ready.settings.trigger, self._distance(now, predicted) - NEARER)
@@ -347,9 +355,10 @@ class Executor:
         return ""
 
     def _may_leave(self, now: float, found: Following) -> bool:
-        """Whether a robot at rest may step aside along a motion, since what comes would touch it where it is."""
-        at_rest = self.following.at_rest(found.begin) and not found.to_goal
-        return at_rest and self.ready.settings.evade != "never" and self.contact < now + SOON
+        """Whether the robot may step aside along a motion, since what comes would touch it where it is, or goes."""
+        if found.to_goal or self.ready.settings.evade == "never":
+            return False
+        return (self.contact if self.following.at_rest(found.begin) else self.conflict) < now + SOON
 
     def _ask(
         self, now: float, predicted: Movers, reachable: Movers | None, obstacles: Callable[[], tuple[Obstacle, ...]]

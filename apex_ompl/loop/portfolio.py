@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 from apex_ompl.live.retime import retime
 from apex_ompl.loop.charges import Charges
-from apex_ompl.loop.evasion import URGENT, endangered, step_aside
+from apex_ompl.loop.evasion import URGENT, endangered, step_aside, threatened
 from apex_ompl.loop.motion_pool import ROUNDS, MotionCandidate, MotionPool
 from apex_ompl.loop.quickening import quickened
 from apex_ompl.loop.ready import Ready
@@ -63,6 +63,8 @@ class Portfolio:
         aside, waits = comes and not urgent, not comes and self.waits and not request.hastens
         waits = waits and request.following.at_rest(request.join)
         fallback = step_aside(search, proved=True) if aside and evade == "proved" else None
+        flees = self.evades and evade != "never" and threatened(request.following, request.join, request.conflict)
+        aside = aside or (flees and request.reachable is not None)
         if (aside and fallback is None) or waits:
             search.until = (WAITING if waits else ASIDE) * charges.limit  # some time is left for that
         if self.retimes:

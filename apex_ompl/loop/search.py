@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol
@@ -23,6 +24,7 @@ MOTIONS = MotionSettings(samples=2)
 STATES = 64  # of a motion that splines begin from
 EARLIER = 0.02  # by which a motion must arrive before one without a conflict to replace it [s]
 GUARDED, AGE = 0.04, 0.08  # times between stops of a motion that are looked at, and how old what is known will be [s]
+SOON = 0.8  # time before a conflict from which on a motion is taken that the guard may stop in the way [s]
 TOGETHER = 16  # such times that are looked at in one call
 SPREAD = 0.01  # by which places that are seen differ from those that are expected [m]
 NARROW = 1.0  # time that a motion that the guard may stop must gain over one that it will hardly stop [s]
@@ -134,22 +136,36 @@ class Search:
             return False
         return self.cost <= GOOD * self.least or self.charges.spent > ENOUGH_TIME * self.charges.limit
 
-    def guardable(self, motion: Trajectory) -> bool:
-        """Whether the guard will hardly stop a motion: stops from it are proved in time, as they will be known then."""
+    def delay(self, motion: Trajectory) -> float:
+        """Return the time that a motion counts as longer since the guard may stop it [s].
+
+        It is 0 where the guard will hardly do so: stops from it are proved in time, as they will be known then. It is
+        infinite where the robot would stop in the way of an obstacle, unless it is about to be touched anyway.
+        """
+        at = self.unguarded_from(motion)
+        if math.isinf(at):
+            return 0.0
+        stop = self.ready.unproved_stop(self.following(motion), max(at - GUARDED, self.request.join))
+        until = stop.end + self.ready.settings.rest_hold
+        conflict = self.ready.first_conflict(self.request.predicted, stop, stop.begin, until, self.charges)
+        return NARROW if math.isinf(conflict) or self.request.conflict < self.request.join + SOON else math.inf
+
+    def unguarded_from(self, motion: Trajectory) -> float:
+        """Return the time of the clock from which on stops from a motion will hardly be proved, or infinity [s]."""
         settings, one, predicted = self.ready.settings, self.following(motion), self.request.predicted
         if not settings.guarded:
-            return True
+            return math.inf
         moments = np.arange(one.begin, one.end, GUARDED)
         for begin in range(0, len(moments), TOGETHER):
             if self.charges.over():
-                return False
+                return float(moments[begin])
             some = moments[begin : begin + TOGETHER]
             proved, by_joints = self.ready.foreseen_stops(predicted, one, some, AGE, SPREAD)
             self.charges.charge("foreseen stop", min(proved + 1, len(some)))
             self.charges.charge("stop joint by joint", by_joints)
             if proved < len(some):
-                return False
-        return True
+                return float(some[proved])
+        return math.inf
 
     @property
     def soonest(self) -> float:
@@ -171,9 +187,9 @@ class Search:
         """Keep a proved motion where it is shorter than the best, or about so with more room; return whether it is."""
         if motion.duration >= min(self.most, self.cost) or not self.may_begin(motion):
             return False
-        guardable = self.guardable(motion)
-        cost = motion.duration + (0.0 if guardable else NARROW)
-        if cost >= self.cost or ((self.request.hastens or self.request.leaving) and not guardable):
+        delay = self.delay(motion)
+        cost = motion.duration + delay
+        if cost >= self.cost or ((self.request.hastens or self.request.leaving) and delay > 0.0):
             return False
         self.best, self.part, self.cost = self.following(motion), part, cost
         return True
