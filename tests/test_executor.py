@@ -146,7 +146,7 @@ def test_a_proved_step_aside_is_not_stopped_on_its_way() -> None:
 def test_a_step_aside_is_no_proof_of_what_the_robot_does_until_then(
     moves: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The robot still moves when the answer comes, or stands until it joins it: where it moves, all has to be proved."""
+    """The robot still moves when the answer comes, or is at rest until it joins it: then the rest is proved alone."""
     ready = ready_of(PROBLEM)
     start, goal = ready.setup.start, ready.goals[0]
     first = Following(line_from(ready, Start.at_rest(start), 0.95 * start + 0.05 * goal), 0.0)
