@@ -10,7 +10,7 @@ from apex_ompl.loop.search import Search
 from apex_ompl.trajectory import Trajectory, time_path
 from apex_ompl.types import Array
 
-SOON = 0.8  # time before a contact from which on a step aside is looked for [s]
+SOON = 1.2  # time before a contact from which on a step aside is looked for [s]
 URGENT = 0.5  # time before one from which on that comes before anything else [s]
 AROUND, STRAYS = 24, (0.05, 0.2, 0.4)  # states that a robot may step aside to, and how far they are at first [rad]
 ASCENTS, STRIDE = 3, 0.25  # steps of these away from obstacles, and their length [rad]
