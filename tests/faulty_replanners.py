@@ -27,7 +27,10 @@ class Faulty:
     def replan(self, ready: Ready, request: Request, charges: Charges) -> Any:
         fault = ("", *self.faults)[min(self.calls, len(self.faults))]
         self.calls += 1
-        if fault == "killed":
+        if fault == "orphaned" and os.fork() == 0:  # a child that holds the connection open
+            time.sleep(15.0)
+            os._exit(0)
+        if fault in ("killed", "orphaned"):
             os.kill(os.getpid(), signal.SIGKILL)
         if fault == "never":
             time.sleep(3600.0)

@@ -191,6 +191,8 @@ class PlannerProcess:
                 else:
                     newest = said
                     del self._asked[:1]
+            if self.process.poll() is not None:  # a child of its own may still hold the connection open
+                self._replace("died")
         except (EOFError, OSError):
             self._replace("died")
         except PlannerProcessError as error:
