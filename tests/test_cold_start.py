@@ -1,4 +1,4 @@
-"""The first plan of a process: what is loaded or compiled, and when."""
+"""The first plan of a process: what is loaded or compiled, and when, with the library of the kernel and without."""
 
 from __future__ import annotations
 
@@ -9,17 +9,18 @@ from pathlib import Path
 
 import pytest
 
-from apex_ompl.kernel.entry_points import PLANS, RUNS, Group
+from apex_ompl.kernel.compiled.entry_points import PLANS, RUNS, Group
+from apex_ompl.kernel.library import CHOICE
 
 SCRIPT = """
 import sys
 from contextlib import contextmanager
 from apex_ompl import plan
-from apex_ompl.kernel.compiled import compilation
+from apex_ompl.kernel.compiled import jit
 from apex_ompl.util.deadline import Deadline
 
 late, running = [], False
-begin, paused, original = Deadline.__init__, Deadline.paused, compilation.CompiledFunction.__call__
+begin, paused, original = Deadline.__init__, Deadline.paused, jit.CompiledFunction.__call__
 
 def started(self, timeout):
     global running
@@ -39,7 +40,7 @@ def called(self, *arguments):
         late.append(self.name)
     return original(self, *arguments)
 
-Deadline.__init__, Deadline.paused, compilation.CompiledFunction.__call__ = started, stopped, called
+Deadline.__init__, Deadline.paused, jit.CompiledFunction.__call__ = started, stopped, called
 result = plan("shelf/hard/800000", sys.argv[1], timeout=30.0)
 print(result.status, late)
 """
@@ -58,8 +59,9 @@ import numpy as np
 from numba.core.sigutils import normalize_signature
 from apex_ompl import filter_points, load_robot, plan, run
 from apex_ompl.loop.settings import LoopSettings
-from apex_ompl.kernel.ahead_of_time import _function
-from apex_ompl.kernel.entry_points import PLANS, RUNS
+from apex_ompl.kernel.compiled.entry_points import PLANS, RUNS
+from apex_ompl.kernel.group_compilation import _function
+from apex_ompl.kernel.library import is_used
 
 assert plan("shelf/hard/800000", timeout=30.0)
 assert plan("vertical/large/800000", timeout=30.0, params={"line": False}).solved_by == "sprint"
@@ -67,7 +69,7 @@ for world in ("vertical/moving-huge-0.4/800007", "turning/vertical/large/800000"
     run(world, settings=LoopSettings(timeout=1.5))
 robot = load_robot("dual_panda_softhand")
 assert len(filter_points(np.random.default_rng(0).uniform(-1.0, 1.0, (1000, 3)), robot, robot.home)) < 1000
-for name, (types, _) in {**PLANS.functions, **RUNS.functions}.items():
+for name, (types, _) in () if is_used() else {**PLANS.functions, **RUNS.functions}.items():
     found = _function(name).dispatcher.signatures
     assert found == [normalize_signature(f"({types},)")[0]], (name, found)
 print("as declared")
@@ -75,24 +77,24 @@ print("as declared")
 
 
 def test_functions_are_called_with_the_types_that_they_were_compiled_for() -> None:
-    """Others would be compiled again."""
+    """Others would be compiled again, or refused by the library."""
     done = subprocess.run([sys.executable, "-c", TYPES], check=False, capture_output=True, text=True, timeout=300)
     assert done.stdout == "as declared\n", done.stderr
 
 
 FEW = """
 import sys
-from apex_ompl.kernel import ahead_of_time as ahead
-from apex_ompl.kernel.compiled.compilation import names_in_cache
-from apex_ompl.kernel.entry_points import PLANS, Group
+from apex_ompl.kernel import group_compilation
+from apex_ompl.kernel.compiled.entry_points import PLANS, Group
+from apex_ompl.kernel.compiled.jit import names_in_cache
 
 some = ("time_parameterization.sample_times", "motion_proof.lay_grid")
 parts = tuple({name: PLANS.functions[name]} for name in some)
 group = Group("two functions", 1, parts)
-ahead.CHILD = sys.argv[1] or ahead.CHILD
-ahead.compile_ahead(group)
+group_compilation.CHILD = sys.argv[1] or group_compilation.CHILD
+group_compilation.compile_group(group)
 assert names_in_cache() == {"sample_times", "lay_grid"}, names_in_cache()
-ahead.compile_ahead(group)
+group_compilation.compile_group(group)
 """
 
 
@@ -108,7 +110,7 @@ def test_all_functions_are_compiled_by_as_many_processes_as_there_are_cores(grou
 
 @pytest.mark.parametrize("child", ["", "raise SystemExit(1)"], ids=["beside", "alone"])
 def test_the_kernel_is_compiled_in_several_processes_or_in_one(tmp_path: Path, child: str) -> None:
-    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path), CHOICE: "numba"}
     command = [sys.executable, "-c", FEW, child]
     first, second = (
         subprocess.run(command, env=environment, check=False, capture_output=True, text=True, timeout=120)

@@ -21,6 +21,7 @@ from apex_ompl.kernel import Kernel, robot_builder, robot_specs
 from apex_ompl.kernel.compiled import motion_proof, queries
 from apex_ompl.kernel.compiled.arrays import PRISMATIC
 from apex_ompl.kernel.joint_tree import JointTree
+from apex_ompl.kernel.library import is_used
 from apex_ompl.kernel.scene_builder import scene_tables
 from apex_ompl.kernel.tables import RobotTables
 from apex_ompl.robot import Robot
@@ -205,20 +206,16 @@ def test_frames_and_gradients_of_real_robots(which: str, request: pytest.Fixture
     check_gradients(kernel, states)
 
 
-def test_read_only_arrays_are_not_compiled_for_anew(robot: Robot) -> None:
+def test_read_only_arrays_are_taken_and_not_compiled_for_anew(robot: Robot) -> None:
     checker = CollisionChecker(robot)
     checker.prepare()
-    before = [
-        len(f.dispatcher.signatures) for f in (queries.check_states, motion_proof.prove_path, motion_proof.lay_grid)
-    ]
+    functions = queries.check_states, motion_proof.prove_path, motion_proof.lay_grid
     path = np.tile(robot.home, (3, 1))
     path.flags.writeable = False
     assert checker.first_collision(path, 0.031) is None and checker.is_free(robot.home)
     checker.kernel.unproved(robot.home)
-    after = [
-        len(f.dispatcher.signatures) for f in (queries.check_states, motion_proof.prove_path, motion_proof.lay_grid)
-    ]
-    assert before == after == [1, 1, 1]
+    if not is_used():
+        assert [len(f.dispatcher.signatures) for f in functions] == [1, 1, 1]
 
 
 @pytest.mark.parametrize("step", [0.0, 1e-320, 1e18, 1e300])

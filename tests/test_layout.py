@@ -11,7 +11,7 @@ import pytest
 
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.kernel.compiled.arrays import robot_view, scene_view
-from apex_ompl.kernel.compiled.compilation import OPTIONS
+from apex_ompl.kernel.compiled.jit import uncached
 from apex_ompl.kernel.compiled.layout import new_buffers, unpack
 from apex_ompl.kernel.compiled.path_cost import Buffers, buffers_view
 from apex_ompl.robot import Robot
@@ -31,7 +31,7 @@ def copying(view: Any, names: Iterable[str], arguments: str) -> Any:
     )
     made: dict[str, Any] = {"view": view, "np": np}
     exec(f"def copy(out, seen, buffers, sizes):\n    found = view({arguments})\n{body}", made)
-    return numba.njit(**OPTIONS)(made["copy"])
+    return uncached(made["copy"])
 
 
 def laid_out(seen: Any, array: Any) -> bool:

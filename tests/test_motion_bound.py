@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -12,7 +11,8 @@ from support import states_around_home
 
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.kernel.compiled.arrays import robot_view
-from apex_ompl.kernel.compiled.compilation import OPTIONS, outlined
+from apex_ompl.kernel.compiled.compilation import outlined
+from apex_ompl.kernel.compiled.jit import uncached
 from apex_ompl.kernel.compiled.kinematics import place_joints, place_robot
 from apex_ompl.kernel.compiled.layout import new_buffers
 from apex_ompl.kernel.compiled.motion_bound import bound_displacements, cluster_displacement, relative_displacement
@@ -21,7 +21,7 @@ from apex_ompl.kernel.tables import RobotTables
 from apex_ompl.robot import Robot
 
 
-@numba.njit(**OPTIONS)
+@uncached
 def place(ri, rf, wi, wf, q):  # type: ignore[no-untyped-def]
     """Place all joints at a state."""
     t = robot_view(ri, rf)
@@ -30,7 +30,7 @@ def place(ri, rf, wi, wf, q):  # type: ignore[no-untyped-def]
     place_joints(t, w, q, t.lazy, 0, len(t.lazy))
 
 
-@numba.njit(**OPTIONS)
+@uncached
 def bound(ri, rf, wi, wf, q, step, deviation, clusters, pairs):  # type: ignore[no-untyped-def] # noqa: PLR0917
     """Put the bounds of all clusters and pairs for a motion around a state into place."""
     t = robot_view(ri, rf)
@@ -123,7 +123,7 @@ def test_spheres_of_real_robots_stay_within_their_bounds(
 def test_functions_that_only_compiled_ones_call_say_so() -> None:
     inner = outlined(lambda x: x + 1.0)
 
-    @numba.njit(**OPTIONS)
+    @uncached
     def outer(x):  # type: ignore[no-untyped-def]
         return inner(x)
 

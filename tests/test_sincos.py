@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from apex_ompl.kernel.compiled.compilation import OPTIONS
+from apex_ompl.kernel.compiled.jit import uncached
 from apex_ompl.kernel.compiled.sincos import MOST, TOGETHER, set_sines
 
 
-@numba.njit(**OPTIONS)
+@uncached
 def call(angles, count, cosines, sines):  # type: ignore[no-untyped-def]
     """Call it."""
     set_sines(angles, count, cosines, sines)

@@ -17,8 +17,8 @@ from apex_ompl.collision.robot_covers import covers_of
 from apex_ompl.collision.tabulate import primitives, tabulate
 from apex_ompl.kernel.ahead_of_time import compile_ahead
 from apex_ompl.kernel.compiled import motion_proof, queries
+from apex_ompl.kernel.compiled.entry_points import PLANS
 from apex_ompl.kernel.compiled.separation import COLLIDES
-from apex_ompl.kernel.entry_points import PLANS
 from apex_ompl.kernel.kernel import MOST_PAIRS, Kernel
 from apex_ompl.kernel.scene_builder import Solids, moved, tables_of
 from apex_ompl.kernel.tables import RobotTables, SceneTables

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from apex_ompl.kernel.compiled import obstacle_batches
 from apex_ompl.kernel.compiled.arrays import GRID_ROW, SceneArrays
+from apex_ompl.kernel.compiled.layout import pack
 from apex_ompl.kernel.threads import in_threads
 from apex_ompl.types import Array
 from apex_ompl.util.arrays import compact
@@ -25,12 +26,14 @@ class ObstacleBatch:
             size: Half edges, or radius and half length along z, shape (T, 3) [m].
         """
         none, nowhere = np.empty(0, np.int64), np.empty((0, 3))
-        self._arrays = SceneArrays(
+        self._count = len(kind)
+        arrays = SceneArrays(
             kind=np.ascontiguousarray(kind, np.int64), owner=none, exact=none, tree_skip=none,
             tree_range=np.empty((0, 2), np.int64), open=none, allowed=np.empty((0, 2), np.int64),
             rotation=compact(rotation), offset=compact(position), size=compact(size), tree_low=nowhere,
             tree_high=nowhere, grid=np.empty((0, GRID_ROW), np.int64), values=np.empty(0, np.float32),
         )  # fmt: skip
+        self._packed = pack(arrays)
 
     def nearest(
         self, first: NDArray[np.int64], points: Array, limit: float, threads: int = 1
@@ -51,7 +54,7 @@ class ObstacleBatch:
 
         def measure(some: slice) -> None:
             obstacle_batches.nearest_of_scenes(
-                self._arrays, starts[some.start or 0 :], rows[some], float(limit), distances[some], gradients[some]
+                *self._packed, starts[some.start or 0 :], rows[some], float(limit), distances[some], gradients[some]
             )
 
         in_threads(len(rows), threads, measure)
@@ -68,7 +71,7 @@ class ObstacleBatch:
         balls = np.empty((len(centres), 4, len(radii)))
         balls[:, :3], balls[:, 3] = np.asarray(centres).transpose(0, 2, 1), radii
         found, room = np.empty(len(owner)), np.empty(len(radii))
-        obstacle_batches.least_distances(self._arrays, np.ascontiguousarray(owner, np.int64), balls, room, found)
+        obstacle_batches.least_distances(*self._packed, np.ascontiguousarray(owner, np.int64), balls, room, found)
         return found
 
     def clearances(self, balls: Array, limit: float) -> Array:
@@ -79,7 +82,7 @@ class ObstacleBatch:
             limit: Larger clearances are given as this [m].
         """
         groups = compact(balls)
-        outer, found = compact(groups[:, :, 0].transpose(1, 2, 0)), np.empty((len(self._arrays.kind), len(groups)))
+        outer, found = compact(groups[:, :, 0].transpose(1, 2, 0)), np.empty((self._count, len(groups)))
         room = np.empty(groups.shape[1::-1])
-        obstacle_batches.clearances_alone(self._arrays, outer, groups, float(limit), room, found)
+        obstacle_batches.clearances_alone(*self._packed, outer, groups, float(limit), room, found)
         return found

@@ -10,7 +10,7 @@ from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.path_proof import Curve
 from apex_ompl.kernel import Kernel
 from apex_ompl.kernel.ahead_of_time import compile_ahead
-from apex_ompl.kernel.entry_points import RUNS
+from apex_ompl.kernel.compiled.entry_points import RUNS
 from apex_ompl.live.movers import Movers, curve_of, prove_motion
 from apex_ompl.live.stopping import stop, stop_along, stops_proved
 from apex_ompl.loop.charges import Charges

@@ -1,248 +1,96 @@
-"""Compilation of the kernel by numba, cached on disk where there is a writable place.
+"""Decorators of the kernel's functions: they come from the library that is built ahead of time, or numba compiles them.
 
-numba renews cached code when the one file that it was written in changes. The functions of this folder are compiled
-into each other and import nothing else, so their cache is a folder named after a digest of all its files, of the
-versions of Python and numba, of Python's level of optimization, which changes what is compiled, and of the processor:
-installations of the same files share it, wherever they lie. It is in ``$NUMBA_CACHE_DIR`` when that is set, or in the
-user's cache folder. One that cannot be written is read all the same, and files in it that are damaged are made anew.
-What cannot be kept is compiled in every process; a warning says so. ``$NUMBA_DISABLE_JIT`` is for other code: this one,
-as Python, would take minutes for a path.
+numba is not imported before it is to compile: a function that only other compiled ones call is handed to it when one
+of these is compiled. See :mod:`apex_ompl.kernel.library` and :mod:`apex_ompl.kernel.compiled.jit`.
 """
 
 from __future__ import annotations
 
-import gc
-import hashlib
-import logging
-import os
-import platform
-import sys
-import threading
-import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
-from functools import cache
-from pathlib import Path
-from typing import Any, TypeVar
+from collections.abc import Callable
+from functools import cached_property, update_wrapper
+from typing import Any, TypeVar, cast
 
-import numba
-from llvmlite import binding as llvm
-from numba.core.caching import CompileResultCacheImpl, FunctionCache, InTreeCacheLocator
-from numba.core.sigutils import normalize_signature
-
-from apex_ompl.kernel.compiled.linking import InnerCompiler
-from apex_ompl.util.cache import has_room, user_cache
+from apex_ompl.kernel.library import built_function
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-LOG = logging.getLogger("apex_ompl")
 
-# Without numba's runtime (_nrt) references to arrays are not counted, which would take most of the time; in return
-# compiled code may allocate nothing.
-OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "_nrt": False, "no_cfunc_wrapper": True}
+class Deferred:
+    """What numba knows as a function, made when numba asks for it."""
 
-# Functions that only compiled ones call need no code that unpacks Python's arguments, which takes long to compile. What
-# is not said here numba takes from the function that is being compiled when it comes to this one.
-INNER: dict[str, Any] = {**OPTIONS, "no_cpython_wrapper": True, "pipeline_class": InnerCompiler, "fastmath": False}
-REASSOCIATING = {"reassoc", "contract"}
+    def __init__(self, make: Callable[[], Any]) -> None:
+        """Take what makes it."""
+        self._make = make
 
-ROOM = 8 * 2**20  # in the cache, which the code of some functions fills [bytes]
+    @cached_property
+    def made(self) -> Any:
+        """The function as numba knows it."""
+        return self._make()
 
-_lock = threading.RLock()
+    @property
+    def _numba_type_(self) -> Any:
+        """Its type, which numba asks for wherever a compiled function names it."""
+        from apex_ompl.kernel.compiled import jit
 
+        return jit.type_of(self.made)
 
-@cache
-def _digest() -> str:
-    digest = hashlib.sha256()
-    for path in sorted(Path(__file__).parent.glob("*.py")):
-        digest.update(path.read_bytes())
-    processor = f"{platform.machine()} {llvm.get_host_cpu_name()}"
-    digest.update(f"{sys.version_info[:3]} {sys.flags.optimize} {numba.__version__} {processor}".encode())
-    return digest.hexdigest()[:16]
+    def __getattr__(self, name: str) -> Any:
+        """Return an attribute of numba's function."""
+        if name.startswith("__"):
+            raise AttributeError(name)
+        return getattr(self.made, name)
 
-
-@cache
-def cache_folder() -> Path | None:
-    """Return the folder that compiled code is read from and kept in, or None when no place for it can be written."""
-    given = os.environ.get("NUMBA_CACHE_DIR")
-    return user_cache(f"kernel-{_digest()}", (given,) if given else (), or_filled=True)
-
-
-@cache
-def can_keep_code() -> bool:
-    """Whether compiled code can be kept: the cache can be written, and there is room."""
-    folder = cache_folder()
-    return folder is not None and has_room(folder, ROOM)
-
-
-def whereabouts() -> str:
-    """Return where compiled code is kept, in words for the log."""
-    folder = cache_folder()
-    if folder is not None and can_keep_code():
-        return f"kept in {folder}"
-    why = "no cache folder can be written" if folder is None else f"{folder} cannot be written, or is full"
-    return f"in every process anew, since {why}"
-
-
-def names_in_cache() -> set[str]:
-    """Return the names of the functions of which there is code in the cache."""
-    folder = cache_folder()
-    code = folder.rglob("*.nbc") if folder else ()
-    return {path.name.split(".")[1].rsplit("-", 1)[0] for path in code}
-
-
-def _jit(function: F, **options: Any) -> F:
-    """Let numba compile a function when it is called, whether or not the user has disabled it for other code."""
-    disabled, numba.config.DISABLE_JIT = numba.config.DISABLE_JIT, 0
-    try:
-        compiled: F = numba.njit(**options)(function)
-    finally:
-        numba.config.DISABLE_JIT = disabled
-    return compiled
+    def __call__(self, *_: Any) -> Any:
+        """Refuse a call from Python, where views of arrays would not be counted."""
+        raise TypeError(f"{getattr(self, '__name__', 'this function')} is called by compiled functions only")
 
 
 def inlined(function: F) -> F:
-    """Compile a function that only other compiled ones call; LLVM inlines it."""
-    return _jit(function, **INNER, forceinline=True)
+    """Mark a function that only other compiled ones call; LLVM inlines it."""
+    return _inner(function, forceinline=True)
 
 
 def reassociating_inlined(function: F) -> F:
-    """Compile a function as :func:`inlined` does, in which sums may be taken in any order, several at a time."""
-    return _jit(function, **INNER | {"fastmath": REASSOCIATING}, forceinline=True)
+    """Mark a function as :func:`inlined` does, in which sums may be taken in any order, several at a time."""
+    return _inner(function, forceinline=True, reassociating=True)
 
 
 def outlined(function: F) -> F:
-    """Compile a function that only other compiled ones call, once for all; LLVM inlines it where it is short."""
-    return _jit(function, **INNER, forceinline=False)
+    """Mark a function that only other compiled ones call, compiled once for all; LLVM inlines it where it is short."""
+    return _inner(function, forceinline=False)
 
 
 def ir_inlined(function: F) -> F:
-    """Compile a function that only other compiled ones call; numba inlines it, which functions that return arrays need.
+    """Mark a function that only other compiled ones call; numba inlines it, which functions that return arrays need.
 
     Without numba's runtime no array can be returned from a function that is left standing.
     """
-    return _jit(function, **INNER, inline="always")
+    return _inner(function, inline="always")
 
 
-def entry_point(function: Callable[..., Any]) -> CompiledFunction:
-    """Compile a function that Python calls; its code is cached on disk, and its first compilation is announced.
+def entry_point(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a function that Python calls, as compiled code.
 
     Calls release the global interpreter lock, and run on the calling thread alone.
     """
-    return _entry_point(function)
+    return built_function(function) or _jit_entry_point(function)
 
 
-def reassociating_entry_point(function: Callable[..., Any]) -> CompiledFunction:
-    """Compile a function as :func:`entry_point` does, in which sums may be taken in any order, several at a time."""
-    return _entry_point(function, fastmath=REASSOCIATING)
+def reassociating_entry_point(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a function as :func:`entry_point` does, in which sums may be taken in any order, several at a time."""
+    return built_function(function) or _jit_entry_point(function, reassociating=True)
 
 
-class _Locator(InTreeCacheLocator):  # type: ignore[misc]
-    """Where numba keeps code: in one folder, whatever the place and the date of the file that a function stands in."""
+def _inner(function: F, **options: Any) -> F:
+    def make() -> Any:
+        from apex_ompl.kernel.compiled import jit
 
-    def ensure_cache_path(self) -> None:
-        """It is there, and may be read-only."""
+        return jit.inner(function, **options)
 
-    def get_cache_path(self) -> str:
-        return str(cache_folder())
-
-    def get_source_stamp(self) -> str:
-        return hashlib.sha256(Path(self._py_file).read_bytes()).hexdigest()
+    return cast(F, update_wrapper(Deferred(make), function))
 
 
-class _CacheFiles(CompileResultCacheImpl):  # type: ignore[misc]
-    _locator_classes = (_Locator,)
+def _jit_entry_point(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
+    from apex_ompl.kernel.compiled import jit
 
-
-class _Cache(FunctionCache):  # type: ignore[misc]
-    """The cache of a function, whose faults are no errors: the function is compiled."""
-
-    _impl_class = _CacheFiles
-
-    def load_overload(self, sig: Any, target_context: Any) -> Any:
-        try:
-            return super().load_overload(sig, target_context)
-        except Exception as error:  # pickle raises many kinds on a file that is empty or cut off
-            where = f"the file of its code in {cache_folder()} is damaged"
-            LOG.warning("apex_ompl compiles %s: %s (%s)", self._py_func.__name__, where, error)
-            with suppress(OSError):
-                self.flush()
-            return None
-
-    def save_overload(self, sig: Any, data: Any) -> None:
-        try:
-            super().save_overload(sig, data)
-        except Exception as error:  # the disk is full, or what is there is damaged
-            LOG.info("apex_ompl cannot keep the code of %s: %s", self._py_func.__name__, error)
-
-
-def _entry_point(function: Callable[..., Any], **options: Any) -> CompiledFunction:
-    dispatcher: Any = _jit(function, **OPTIONS, **options)
-    if cache_folder() is not None:
-        dispatcher._cache = _Cache(function)
-    return CompiledFunction(dispatcher, function.__name__)
-
-
-@contextmanager
-def _rare_collections() -> Iterator[None]:
-    """Look for garbage less often during a block: a tenth of numba's time goes there, and it keeps what it makes."""
-    before = gc.get_threshold()
-    if before[0]:  # else there are none
-        gc.set_threshold(max(before[0], 100_000), *before[1:])
-    try:
-        yield
-    finally:
-        gc.set_threshold(*before)
-
-
-class CompiledFunction:
-    """A compiled function whose first call warns that it compiles, unless an earlier process left its code.
-
-    Attributes:
-        name: Its name.
-        dispatcher: numba's dispatcher.
-    """
-
-    _announced = False
-
-    def __init__(self, dispatcher: Any, name: str) -> None:
-        """Wrap a dispatcher."""
-        self.dispatcher = dispatcher
-        self.name = name
-        self.__wrapped__ = dispatcher.py_func
-        self.__doc__ = dispatcher.py_func.__doc__
-        self._ready = False
-
-    @property
-    def is_cached(self) -> bool:
-        """Whether there is code of it in the cache."""
-        return self.name in names_in_cache()
-
-    def compile(self, types: str) -> None:
-        """Compile the function into the cache for arguments of the given types, without a warning."""
-        with _lock, _rare_collections():
-            self.dispatcher.compile(normalize_signature(f"({types},)")[0])  # the cache takes a text for another key
-            self._ready = True
-
-    def __call__(self, *arguments: Any) -> Any:
-        """Call the function, compiled for the types of the arguments."""
-        if self._ready:
-            return self.dispatcher(*arguments)
-        with _lock:
-            if self.is_cached:
-                result = self.dispatcher(*arguments)
-            else:
-                self._announce()
-                start = time.perf_counter()
-                with _rare_collections():
-                    result = self.dispatcher(*arguments)
-                LOG.warning("apex_ompl compiled %s in %.1f s", self.name, time.perf_counter() - start)
-            self._ready = True
-        return result
-
-    @staticmethod
-    def _announce() -> None:
-        if CompiledFunction._announced:
-            return
-        CompiledFunction._announced = True
-        LOG.warning("apex_ompl compiles functions of its collision kernel (%s)", whereabouts())
+    return jit.CompiledFunction(function, **options)

@@ -6,15 +6,28 @@ precision they would be four times as many bytes.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
-from apex_ompl.kernel.compiled.compilation import entry_point, inlined
+from apex_ompl.kernel.compiled.compilation import Deferred, entry_point, inlined
 from apex_ompl.kernel.compiled.layout import Bytes, Singles
-from apex_ompl.kernel.compiled.vector_products import LANES, row_products
 
-TILE = 4 if LANES == 16 else 2  # rows of weights by four others, whose sums stay in registers
+LANES = 8  # numbers that are added side by side; the same for all processors, so that results are
+TILE = 2  # rows of weights by four others, whose sums stay in registers
 ALONE = 8  # rows of weights by one other
-_by_four, _by_one = row_products(TILE, 4), row_products(ALONE, 1)
+
+
+def _products(weights: int, rows: int) -> Any:
+    def make() -> Any:
+        from apex_ompl.kernel.compiled.vector_products import row_products
+
+        return row_products(weights, rows, LANES)
+
+    return Deferred(make)
+
+
+_by_four, _by_one = _products(TILE, 4), _products(ALONE, 1)
 
 
 @inlined

@@ -16,7 +16,7 @@ from typing import Annotated, Any, NamedTuple, get_args, get_origin, get_type_hi
 import numpy as np
 from numpy.typing import NDArray
 
-from apex_ompl.kernel.compiled.views import buffer_code, table_code
+from apex_ompl.kernel.compiled.compilation import Deferred
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
@@ -92,7 +92,13 @@ def unpack(cls: Any, integers: Any, floats: Any, *singles: Any) -> Any:
 
 def table_view(cls: Any) -> Callable[..., Any]:
     """Return :func:`unpack` for compiled code: ``view(integers, floats[, singles])`` gives a ``cls`` of slices."""
-    return table_code(cls, layout(cls))
+
+    def make() -> Any:
+        from apex_ompl.kernel.compiled.views import table_code
+
+        return table_code(cls, layout(cls))
+
+    return Deferred(make)
 
 
 def buffer_view(cls: Any, dimensions: Sequence[str]) -> Callable[..., Any]:
@@ -100,7 +106,13 @@ def buffer_view(cls: Any, dimensions: Sequence[str]) -> Callable[..., Any]:
 
     ``sizes`` is a tuple of the numbers that the names in ``dimensions`` stand for.
     """
-    return buffer_code(cls, layout(cls), dimensions)
+
+    def make() -> Any:
+        from apex_ompl.kernel.compiled.views import buffer_code
+
+        return buffer_code(cls, layout(cls), dimensions)
+
+    return Deferred(make)
 
 
 @cache

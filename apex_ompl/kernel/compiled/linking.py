@@ -1,17 +1,18 @@
 """How numba compiles functions that only other compiled ones call: their code is linked into that of their callers.
 
-By itself numba optimises every function together with all that it calls, and makes machine code of it; a function that
-is called through five others is optimised six times. Here functions that Python never calls are left as they are
-lowered, and each function that Python calls is optimised once, with all that was linked into it.
+By itself numba optimizes every function together with all that it calls, and makes machine code of it; a function that
+is called through five others is optimized six times. Here functions that Python never calls are left as they are
+lowered, and each function that Python calls is optimized once, with all that was linked into it.
 """
 
 from __future__ import annotations
 
 import ctypes
+from types import SimpleNamespace
 from typing import Any
 
 from llvmlite import binding as llvm
-from numba.core.codegen import JITCodeLibrary
+from numba.core.codegen import CPUCodeLibrary, JITCodeLibrary, JITCPUCodegen
 from numba.core.compiler import CompilerBase, DefaultPassBuilder
 from numba.core.compiler_machinery import FunctionPass, register_pass
 from numba.core.typed_passes import NopythonTypeInference
@@ -41,11 +42,29 @@ class InnerLibrary(JITCodeLibrary):  # type: ignore[misc]
         return int(ctypes.cast(ctypes.pythonapi.PyErr_BadArgument, ctypes.c_void_p).value or 0)
 
 
-@register_pass(mutates_CFG=False, analysis_only=True)
-class ChooseInnerLibrary(FunctionPass):  # type: ignore[misc]
-    """Lets the code of a function be made in an :class:`InnerLibrary`."""
+class ForeignLibrary(InnerLibrary):
+    """Code of a function that Python calls, for other processors: it can be optimized for them, and not called."""
 
-    _name = "apex_ompl_choose_inner_library"
+    def optimized_for(self, target: Any, triple: str) -> Any:
+        """Return the module of the code with all that it calls, optimized as numba does for a target machine."""
+        self._ensure_finalized()
+        module = self._final_module.clone()
+        module.triple, module.data_layout = triple, str(target.target_data)
+        codegen = JITCPUCodegen.__new__(JITCPUCodegen)
+        codegen.__dict__ |= {
+            "_tm": target,
+            "_loopvect": self._codegen._loopvect,
+            "_opt_level": self._codegen._opt_level,
+        }
+        found = SimpleNamespace(_final_module=module, _codegen=codegen, _recorded_timings=self._recorded_timings)
+        CPUCodeLibrary._optimize_final_module(found)
+        return found._final_module
+
+
+class _ChooseLibrary(FunctionPass):  # type: ignore[misc]
+    """Lets the code of a function be made in a library of another kind than numba's."""
+
+    _kind: type[JITCodeLibrary]
 
     def __init__(self) -> None:
         """Make the pass."""
@@ -53,16 +72,38 @@ class ChooseInnerLibrary(FunctionPass):  # type: ignore[misc]
 
     def run_pass(self, state: Any) -> bool:
         """Set the library; the function is not changed."""
-        state.library = InnerLibrary(state.targetctx.codegen(), state.func_id.func_qualname)
+        state.library = self._kind(state.targetctx.codegen(), state.func_id.func_qualname)
         return False
+
+
+@register_pass(mutates_CFG=False, analysis_only=True)
+class ChooseInnerLibrary(_ChooseLibrary):
+    """Lets the code of a function be made in an :class:`InnerLibrary`."""
+
+    _name, _kind = "apex_ompl_choose_inner_library", InnerLibrary
+
+
+@register_pass(mutates_CFG=False, analysis_only=True)
+class ChooseForeignLibrary(_ChooseLibrary):
+    """Lets the code of a function be made in a :class:`ForeignLibrary`."""
+
+    _name, _kind = "apex_ompl_choose_foreign_library", ForeignLibrary
 
 
 class InnerCompiler(CompilerBase):  # type: ignore[misc]
     """Compiler of functions that only compiled ones call."""
 
+    _choice: type[_ChooseLibrary] = ChooseInnerLibrary
+
     def define_pipelines(self) -> list[Any]:
         """Return numba's passes, and the choice of the library among them."""
         passes = DefaultPassBuilder.define_nopython_pipeline(self.state)
-        passes.add_pass_after(ChooseInnerLibrary, NopythonTypeInference)
+        passes.add_pass_after(self._choice, NopythonTypeInference)
         passes.finalize()
         return [passes]
+
+
+class ForeignCompiler(InnerCompiler):
+    """Compiler of functions that Python calls, whose code is wanted for other processors than this one."""
+
+    _choice = ChooseForeignLibrary

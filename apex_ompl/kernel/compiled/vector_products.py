@@ -1,8 +1,6 @@
-"""Products of few rows by few rows, with the full width of the processor's vector registers.
+"""Products of few rows by few rows, several numbers at a time, as code of LLVM that numba puts where it is called.
 
-LLVM vectorises loops by half of the registers of processors with AVX-512, since wider ones may slow their clock; layers
-of networks, which are nothing but products, take a third less time by whole ones. So the vectors are written down here,
-as code of LLVM that numba puts where the function is called. (The same for factors of matrices gained nothing.)
+(The same for factors of matrices gained nothing.)
 """
 
 from __future__ import annotations
@@ -10,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from llvmlite import binding as llvm
 from llvmlite import ir
 from numba import float32
 from numba.core import cgutils
@@ -20,23 +17,11 @@ from numba.extending import intrinsic
 BYTE, WORD, SINGLE = ir.IntType(8), ir.IntType(32), ir.FloatType()
 
 
-def _lanes() -> int:
-    """Return how many numbers of single precision are in a vector register."""
-    try:
-        features = llvm.get_host_cpu_features()
-    except RuntimeError:  # unknown to LLVM
-        return 4
-    return 16 if features.get("avx512f") else 8 if features.get("avx2") else 4
-
-
-LANES = _lanes()
-
-
-def row_products(weights: int, rows: int) -> Callable[..., Any]:
+def row_products(weights: int, rows: int, lanes: int) -> Callable[..., Any]:
     """Return a compiled function of some rows of weights, in eight bits, by some rows of numbers.
 
     ``products(weight, i, x, b)``, with matrices of shapes (N, K) and (B, K), gives the sums of
-    ``weight[i + m, k] * x[b + n, k]`` over k, the last K % LANES left out, at ``rows * m + n``. For rows behind the
+    ``weight[i + m, k] * x[b + n, k]`` over k, the last K % lanes left out, at ``rows * m + n``. For rows behind the
     last one of a matrix that one is taken.
     """
 
@@ -50,7 +35,8 @@ def row_products(weights: int, rows: int) -> Callable[..., Any]:
             width = cgutils.unpack_tuple(builder, first.shape, 2)[1]
             some = _addresses(builder, first, arguments[1], weights)
             others = _addresses(builder, second, arguments[3], rows)
-            sums = _sums(builder, some, others, builder.sub(width, builder.srem(width, width.type(LANES))))
+            whole = builder.sub(width, builder.srem(width, width.type(lanes)))
+            sums = _sums(builder, some, others, whole, lanes)
             return context.make_tuple(builder, signature.return_type, sums)
 
         return signature, code
@@ -69,12 +55,12 @@ def _addresses(builder: Any, matrix: Any, first: Any, count: int) -> list[Any]:
     return found
 
 
-def _sums(builder: Any, weights: list[Any], rows: list[Any], count: Any) -> list[Any]:
-    """Return the sums of products of bytes and numbers at some addresses, the number of which LANES divides."""
-    vector, bytes_, words = _kind(SINGLE, LANES), _kind(BYTE, LANES), _kind(WORD, LANES)
-    zero = ir.Constant(vector, [0.0] * LANES)
+def _sums(builder: Any, weights: list[Any], rows: list[Any], count: Any, lanes: int) -> list[Any]:
+    """Return the sums of products of bytes and numbers at some addresses, the number of which ``lanes`` divides."""
+    vector, bytes_, words = _kind(SINGLE, lanes), _kind(BYTE, lanes), _kind(WORD, lanes)
+    zero = ir.Constant(vector, [0.0] * lanes)
     sums = [cgutils.alloca_once_value(builder, zero) for _ in range(len(weights) * len(rows))]
-    with cgutils.for_range_slice(builder, count.type(0), count, count.type(LANES)) as (k, _):
+    with cgutils.for_range_slice(builder, count.type(0), count, count.type(lanes)) as (k, _):
         numbers = [_load(builder, _place(builder, row, k, vector)) for row in rows]
         for m, weight in enumerate(weights):
             whole = builder.sext(_load(builder, _place(builder, weight, k, bytes_)), words)
@@ -86,7 +72,7 @@ def _sums(builder: Any, weights: list[Any], rows: list[Any], count: Any) -> list
 
 
 def _added_up(builder: Any, vectors: list[Any]) -> list[Any]:
-    """Return the sums of the numbers of vectors, the number of which is a power of 2 and at most LANES."""
+    """Return the sums of the numbers of vectors, the number of which is a power of 2 and at most their lanes."""
     count = len(vectors)
     while len(vectors) > 1:
         vectors = [_pairs_added(builder, a, b) for a, b in zip(vectors[::2], vectors[1::2], strict=True)]

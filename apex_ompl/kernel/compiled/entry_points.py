@@ -1,4 +1,4 @@
-"""Compiled functions that plans and runs need, and the types of their arguments.
+"""Compiled functions that Python calls, and the types of their arguments.
 
 Types are written as numba writes them: ``f8[:, ::1]`` is an array of shape (N, M).
 """
@@ -200,3 +200,76 @@ RUNS = Group(
     ),
 )
 """What a run of the closed loop needs besides."""
+
+OTHERS: Functions = {
+    "cloud_distance.near_mesh": (
+        "f8[:, :, ::1], f8[:, ::1], f8[:, ::1], i8[::1], i8[::1], f8[:, :, ::1], f8[:, ::1], f8[:, ::1], i8[::1], "
+        "i8[::1], f8[:, ::1], f8, i8[:, ::1]",
+        3,
+    ),
+    "cloud_distance.any_inside": (
+        "f8[:, :, ::1], f8[:, ::1], i8[::1], i8[::1], f8[:, :, ::1], f8[:, ::1], b1, f8[:, ::1], f8[::1], "
+        "f8[:, ::1], i8[:, ::1]",
+        2,
+    ),
+    "cloud_distance.near_primitive": (
+        "f8[:, :, ::1], f8[:, ::1], i8[::1], i8[::1], i8, f8[::1], f8[:, ::1], f8, i8[:, ::1]",
+        2,
+    ),
+    "graph_search.shortest_path": (
+        "i8[::1], i8[::1], f8[::1], i8[::1], f8[::1], f8[::1], f8[::1], f8[::1], i8[::1], f8[::1], i8[::1]",
+        1,
+    ),
+    "grid_regions.label_regions": ("i8[:, :, ::1], i8[::1]", 1),
+    "grid_regions.add_up": ("i8[:, :, ::1], i8[:, :, ::1]", 1),
+    "grid_regions.best_box": ("i8[:, :, ::1], i8[:, :, ::1], i8[:, ::1], f8, i8[:, ::1], i8[:, ::1]", 2),
+    "grid_tabulation.tabulate_points": (
+        "f8[:, ::1], f8, f8, f8, f8, f4[:, :, ::1], f4[:, :, ::1], f8[::1], i8[::1], f8[::1]",
+        2,
+    ),
+    "grid_tabulation.tabulate_triangles": (
+        "f8[:, :, ::1], b1, f8, f8, f8, f8, f8, f4[:, :, ::1], f4[:, :, ::1], f8[::1], i8[::1], f8[::1]",
+        3,
+    ),
+    "ik_solver.descend": (
+        ROBOT
+        + WORKSPACE
+        + "i8[::1], i8[::1], i8[::1], f8[::1], f8[:, ::1], f8[::1], i8[::1], f8, i8, f8, i8[::1], f8[::1]",
+        4,
+    ),
+    "ik_solver.residual_and_jacobian": (
+        ROBOT + WORKSPACE + "i8[::1], i8[::1], f8[::1], f8[::1], f8[::1], f8[:, ::1], i8[::1], f8[::1]",
+        2,
+    ),
+    "item_tree.order_items": ("f8[:, :, ::1], f8[::1], f8, i8[:, ::1], i8[::1], f4[:, ::1]", 1),
+    "item_tree.fill_boxes": ("f4[:, ::1], i8, f4[:, ::1]", 1),
+    "obstacle_batches.nearest_of_scenes": (
+        SCENE + "i8[::1], f8[:, :, ::1], f8, f8[:, ::1], f8[:, :, ::1]",
+        1,
+    ),
+    "obstacle_batches.least_distances": (SCENE + "i8[::1], f8[:, :, ::1], f8[::1], f8[::1]", 1),
+    "obstacle_batches.clearances_alone": (
+        SCENE + "f8[:, :, ::1], f8[:, :, :, ::1], f8, f8[:, ::1], f8[:, ::1]",
+        1,
+    ),
+    "path_cost.path_cost": (
+        ROBOT
+        + SCENE
+        + WORKSPACE
+        + f"f8[:, ::1], i8[::1], f8[:, ::1], i8, f8[:, ::1], {SETTINGS}, i8[::1], f8[::1], f8[::1]",
+        5,
+    ),
+    "state_costs.state_costs": (
+        ROBOT
+        + SCENE
+        + MOVERS
+        + WORKSPACE
+        + "f8[:, ::1], f8[:, ::1], f8[::1], f8, f8, f8[::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1]",
+        6,
+    ),
+    "triangle_mesh.column_boxes": ("f8[:, :, ::1], f8[::1], f8[::1], f8, f8[:, :, ::1], f8[:, :, :, :, ::1]", 1),
+}
+"""What point clouds, grids, inverse kinematics, roadmaps and trainings call; without the library, compiled at need."""
+
+ALL: Functions = {**PLANS.functions, **RUNS.functions, **OTHERS}
+"""All functions that Python calls."""
