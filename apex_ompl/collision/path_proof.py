@@ -20,6 +20,7 @@ from apex_ompl.kernel.compiled.cubic_pieces import cubic_rates
 from apex_ompl.kernel.compiled.layout import Floats, Integers, new_buffers, pack
 from apex_ompl.kernel.compiled.shapes import PairBuffers, ShapeArrays
 from apex_ompl.kernel.kernel import Kernel
+from apex_ompl.kernel.products import product
 from apex_ompl.kernel.scene_builder import primitive, scene_tables
 from apex_ompl.kernel.tables import with_pairs
 from apex_ompl.robot import Robot
@@ -139,7 +140,7 @@ def _shapes_of_bodies(robot: Robot, scene: MeshStage, kernel: Kernel) -> ShapeAr
     if key not in known:
         turns = [turn.T for turn in joint_tree(robot).turns]
         solids = [scene.solids[number] for number in kernel.robot.numbers]
-        bodies = [PlacedShape(s.shape, s.joint, turns[s.joint] @ s.placement.homogeneous) for s in solids]
+        bodies = [PlacedShape(s.shape, s.joint, product(turns[s.joint], s.placement.homogeneous)) for s in solids]
         while len(known) >= MOST_PACKED:
             known.popitem(last=False)
         known[key] = kernel.robot.arrays.node_centre, shape_arrays(bodies)

@@ -24,6 +24,7 @@ from apex_ompl.diffusion.proposals import TrajectoryModel
 from apex_ompl.diffusion.query import MAX_DISTANCE, WORKSPACE_CENTRE, ObstacleSet, Probes, Query
 from apex_ompl.kernel import Kernel
 from apex_ompl.kernel.compiled.dense_layer import dense_layer
+from apex_ompl.kernel.products import product
 from apex_ompl.trajopt.spline import Spline
 from apex_ompl.types import Array
 from apex_ompl.util.validation import check_integer
@@ -76,8 +77,8 @@ class ArrayModel(TrajectoryModel):
         """Return the latent vectors of control points, shape (B, points, dof) [rad]."""
         line = self._lines(control[:, 0], control[:, -1])
         residual = (control - line)[:, self.spline.inner].reshape(len(control), -1).astype(np.float32)
-        found = (residual - self._mean) @ self.weights["autoencoder.components"]
-        return np.asarray(found / self.weights["autoencoder.deviations"])
+        found = product(residual - self._mean, self.weights["autoencoder.components"])
+        return np.asarray(found / self.weights["autoencoder.deviations"], np.float32)
 
     def condition(self, queries: Sequence[Query], kernel: Kernel) -> Single:
         """Return the encoded conditions of Q queries, shape (Q, out)."""
@@ -117,15 +118,14 @@ class ArrayModel(TrajectoryModel):
     def score(self, latent: Single, kernel: Kernel, ends: tuple[Array, Array], guidance: Guidance) -> Single:
         """Return the gradient of log p(g | z) at latent vectors z, see :meth:`TrajectoryModel.score`."""
         basis = self._basis[guidance.states(self.spline.states)]
-        _, slopes = collision_cost(kernel, basis @ self.control(latent, ends), guidance.margin)
-        inner = (basis[:, self.spline.inner].T @ slopes).reshape(len(latent), -1)
-        found: Single = -inner.astype(np.float32) @ self._decoder.T
-        return found
+        _, slopes = collision_cost(kernel, product(basis, self.control(latent, ends)), guidance.margin)
+        inner = product(basis[:, self.spline.inner].T, slopes).reshape(len(latent), -1)
+        return -product(inner, self._decoder.T).astype(np.float32)
 
     def control(self, latent: Single, ends: tuple[Array, Array]) -> Array:
         """Return control points, shape (B, points, dof) [rad], of latent vectors between starts and goals."""
         control = self._lines(*ends)
-        free = (self._mean + latent @ self._decoder).reshape(len(latent), self.spline.free, -1)
+        free = (self._mean + product(latent, self._decoder)).reshape(len(latent), self.spline.free, -1)
         control[:, self.spline.inner] += free
         return control
 
@@ -163,7 +163,7 @@ class ArrayModel(TrajectoryModel):
     def _linear(self, name: str, values: Single) -> Single:
         weight, bias = self.weights[f"{name}.weight"], self.weights[f"{name}.bias"]
         if weight.dtype != np.int8:
-            return np.asarray(values @ weight.T + bias)
+            return np.asarray(product(values, weight.T) + bias, np.float32)
         found = np.empty((len(values), len(weight)), np.float32)
         scale = self.weights[f"{name}.weight{SUFFIX}"]
         dense_layer(weight, scale, bias, np.ascontiguousarray(values, np.float32), found)

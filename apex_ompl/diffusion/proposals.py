@@ -20,6 +20,7 @@ from apex_ompl.diffusion.schedule import Estimate, NoiseSchedule
 from apex_ompl.diffusion.sight import KeyStates, Sight
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel import Kernel
+from apex_ompl.kernel.products import product
 from apex_ompl.trajopt.spline import Spline
 from apex_ompl.types import Array
 from apex_ompl.util.stopwatch import StageClock
@@ -256,7 +257,7 @@ class TrajectoryModel(ABC):
         """Return what the model sees along paths of queries, as many of each: shape (B, features)."""
         assert self.sight is not None
         limits, each = kernel.robot.arrays, len(control) // len(queries)
-        paths = self._looked_at @ np.clip(control, limits.lower, limits.upper)
+        paths = product(self._looked_at, np.clip(control, limits.lower, limits.upper))
         rows = [
             self.sight.along(kernel, paths[k * each : (k + 1) * each], *query.seen()) for k, query in enumerate(queries)
         ]

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from apex_ompl.kernel.compiled.arrays import BINS, LIMIT_SLACK, PRISMATIC, REVOLUTE
+from apex_ompl.kernel.products import product
 from apex_ompl.kernel.robot_specs import BodySpec, JointSpec
 from apex_ompl.types import Array
 
@@ -123,7 +124,7 @@ def _points(
     """Return the centres of all spheres at values of the inner joints, in the frame of the cluster's, (N, n, 3)."""
     poses = {top: np.tile(np.eye(4), (len(values), 1, 1))}
     for k in inner:
-        poses[k] = poses[joints[k].parent] @ placements[k] @ _motions(joints[k], values)
+        poses[k] = product(product(poses[joints[k].parent], placements[k]), _motions(joints[k], values))
     return np.concatenate([transformed(poses[m.joint], m.centres) for m in members], axis=1)
 
 
@@ -193,4 +194,4 @@ def _middle(points: Array, radii: Array) -> Array:
 
 def transformed(pose: Array, points: Array) -> Array:
     """Return points, shape (n, 3), after poses, shape (..., 4, 4): shape (..., n, 3)."""
-    return points @ np.swapaxes(pose[..., :3, :3], -1, -2) + pose[..., None, :3, 3]
+    return product(points, np.swapaxes(pose[..., :3, :3], -1, -2)) + pose[..., None, :3, 3]

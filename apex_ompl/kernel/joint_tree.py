@@ -9,6 +9,7 @@ import numpy as np
 
 from apex_ompl.kernel.cluster_balls import ClusterBall, Member, cluster_ball, leaf_radii, part_balls
 from apex_ompl.kernel.compiled.arrays import FIXED
+from apex_ompl.kernel.products import product
 from apex_ompl.kernel.robot_specs import BodySpec, JointSpec
 from apex_ompl.types import Array
 
@@ -49,7 +50,7 @@ class JointTree:
         self.chains = [[0]]
         for k, joint in enumerate(joints[1:], start=1):
             placement = np.eye(4) if joint.placement is None else joint.placement
-            self.placements.append(self.turns[joint.parent].T @ placement @ self.turns[k])
+            self.placements.append(product(product(self.turns[joint.parent].T, placement), self.turns[k]))
             self.chains.append([k, *self.chains[joint.parent]])
         drivers = [joint.source for joint in joints if joint.kind != FIXED]
         self._shared = {source for source in drivers if drivers.count(source) > 1}

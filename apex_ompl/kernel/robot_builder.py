@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from apex_ompl.kernel.cluster_balls import ClusterBall, Member, transformed
 from apex_ompl.kernel.compiled.arrays import BINS, FIXED, LIMIT_SLACK, RobotArrays
 from apex_ompl.kernel.joint_tree import JointTree
+from apex_ompl.kernel.products import product
 from apex_ompl.kernel.robot_specs import BodySpec
 from apex_ompl.kernel.tables import RobotTables, pair_runs
 from apex_ompl.types import Array
@@ -57,7 +58,7 @@ class _Builder:
         self.number = {b: k for k, b in enumerate(order)}  # body as given -> row
         self.bodies = [bodies[b] for b in order]
         self.cluster_of = [self.clusters.index(keys[b]) for b in order]
-        frames = [tree.turns[b.joint].T @ np.asarray(b.placement, float) for b in self.bodies]
+        frames = [product(tree.turns[b.joint].T, b.placement) for b in self.bodies]
         self.centres = [
             transformed(frame, np.asarray(b.centres, float)) for frame, b in zip(frames, self.bodies, strict=True)
         ]

@@ -14,6 +14,7 @@ from apex_ompl.kernel.compiled.arrays import BOX, CAPSULE, GRID_ROW, HALF_SPACE,
 from apex_ompl.kernel.compiled.grid_distance import SLACK
 from apex_ompl.kernel.compiled.layout import Floats, Integers, Singles
 from apex_ompl.kernel.distance_grid import DistanceGrid
+from apex_ompl.kernel.products import product
 from apex_ompl.kernel.tables import SceneTables
 
 LEAF = 1  # obstacles in a leaf of the tree
@@ -94,7 +95,7 @@ def boxes_around(kind: Integers, rotation: Floats, offset: Floats, size: Floats)
     radius, half = size[:, :1], size[:, 1:2]
     extents = along * half + radius * np.sqrt(np.maximum(0.0, 1.0 - along**2))  # of cylinders
     kinds = kind[:, None]
-    extents = np.where(kinds == BOX, (np.abs(rotation) @ size[:, :, None])[:, :, 0], extents)
+    extents = np.where(kinds == BOX, product(np.abs(rotation), size[:, :, None])[:, :, 0], extents)
     extents = np.where(kinds == SPHERE, radius, extents)
     extents = np.where(kinds == CAPSULE, along * half + radius, extents) + ROUNDING
     return np.stack([offset - extents, offset + extents], axis=1)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from apex_ompl.kernel.products import product
 from apex_ompl.types import Array
 from apex_ompl.util.validation import number_array
 
@@ -102,8 +103,8 @@ class Curve:
         windows = np.lib.stride_tricks.sliding_window_view(self.control, 4, axis=0)[: self.spans]  # (spans, dof, 4)
         derivatives = []
         for weights, order in ((slopes, 1), (curvatures, 2)):
-            inner = (windows @ weights.T).transpose(0, 2, 1).reshape(-1, self.control.shape[1])
-            last = self.control[-3:].T @ ((-0.5, 0.0, 0.5) if order == 1 else (1.0, -2.0, 1.0))
+            inner = product(windows, weights.T).transpose(0, 2, 1).reshape(-1, self.control.shape[1])
+            last = product(((-0.5, 0.0, 0.5) if order == 1 else (1.0, -2.0, 1.0),), self.control[-3:])
             derivatives.append(np.ascontiguousarray(np.vstack([inner, last]) / self.spacing**order))
         return derivatives[0], derivatives[1]
 

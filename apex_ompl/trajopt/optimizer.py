@@ -23,6 +23,7 @@ from apex_ompl.kernel.compiled.path_cost import (
     path_cost,
 )
 from apex_ompl.kernel.compiled.path_optimization import optimize_path
+from apex_ompl.kernel.products import cholesky, product, solve
 from apex_ompl.trajopt.settings import OptimizerSettings
 from apex_ompl.trajopt.spline import Spline
 from apex_ompl.types import Array
@@ -102,7 +103,7 @@ class Optimizer:
         """
         check_integer(count, "count", 1)
         line = self.spline.line(start, goal)
-        bumps = _bumps(self.spline) @ rng.normal(size=(count, self.spline.free, line.shape[1]))
+        bumps = product(_bumps(self.spline), rng.normal(size=(count, self.spline.free, line.shape[1])))
         bumps[0] = 0.0
         paths = np.repeat(line[None], count, axis=0)
         paths[:, self.spline.inner] += size * bumps
@@ -269,7 +270,8 @@ def _grid(spline: Spline, samples: int) -> tuple[Array, NDArray[np.int64], Array
 def _bumps(spline: Spline) -> Array:
     """Return what turns normal numbers for the free control points into smooth bumps, shape (free, free)."""
     order = min(2, spline.degree)
-    root = np.linalg.inv(np.linalg.cholesky(spline.gram(order)[spline.inner, spline.inner])).T
+    factor = cholesky(spline.gram(order)[spline.inner, spline.inner])
+    root = product(factor.T, solve(factor, np.eye(len(factor)))).T  # the transpose of the factor's inverse
     weights = spline.basis(np.linspace(0.0, 1.0, 65))[:, spline.inner]
-    spread = np.sqrt(((weights @ root) ** 2).sum(axis=1)).max()
+    spread = np.sqrt((product(weights, root) ** 2).sum(axis=1)).max()
     return np.asarray(root / spread)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from apex_ompl.errors import ParameterError
+from apex_ompl.kernel.products import cholesky, product, solve
 from apex_ompl.types import Array
 from apex_ompl.util.validation import check_integer, check_path
 
@@ -116,7 +117,7 @@ class Spline:
         points = self._checked(control)
         # Each value is a mean of control points; rounding must not lead out of limits that all of them keep.
         states = np.clip(
-            _grid(self, 0) @ points, points.min(axis=-2, keepdims=True), points.max(axis=-2, keepdims=True)
+            product(_grid(self, 0), points), points.min(axis=-2, keepdims=True), points.max(axis=-2, keepdims=True)
         )
         states[..., 0, :], states[..., -1, :] = points[..., 0, :], points[..., -1, :]
         return np.asarray(states)
@@ -127,7 +128,7 @@ class Spline:
         Raises:
             ParameterError: Another number of control points.
         """
-        return np.asarray(_grid(self, order) @ self._checked(control))
+        return product(_grid(self, order), self._checked(control))
 
     def gram(self, order: int) -> Array:
         """Return the integrals over [0, 1] of products of derivatives of the weights, shape (points, points).
@@ -140,7 +141,7 @@ class Spline:
         total = np.zeros((self.points, self.points))
         for a, b in zip(breaks[:-1], breaks[1:], strict=True):
             values = self.basis((a + b) / 2 + (b - a) / 2 * at, order)
-            total += (b - a) / 2 * (values.T * weight) @ values
+            total += product((b - a) / 2 * (values.T * weight), values)
         return total
 
     def fit(self, polyline: ArrayLike, lower: ArrayLike = -np.inf, upper: ArrayLike = np.inf) -> Fit:
@@ -159,17 +160,16 @@ class Spline:
             return Fit(even, 0.0)
         u = np.linspace(0.0, 1.0, FIT_SAMPLES)
         wanted = np.stack([np.interp(u, along / along[-1], column) for column in line.T], axis=1)
-        weights, rough = _fit_grid(self)
-        rest = wanted - weights @ even
-        inner = weights[:, self.inner]
-        found = np.linalg.solve(inner.T @ inner / len(u) + ROUGHNESS * rough, inner.T @ rest / len(u))
+        weights, factor = _fit_grid(self)
+        rest = wanted - product(weights, even)
+        found = solve(factor, product(weights[:, self.inner].T, rest) / len(u))
         control = even.copy()
         control[self.inner] += found
         control = self.with_ends(np.clip(control, lower, upper), line[0], line[-1])
         # Between two samples the difference changes by at most half a spacing times the speeds.
         slope = self.degree * np.abs(np.diff(control, axis=0) / _spans(self)[:, None]).max(axis=0)
         speed = np.abs(np.diff(line, axis=0) / np.maximum(steps, 1e-300)[:, None]).max(axis=0) * along[-1]
-        apart = np.abs(weights @ control - wanted).max(axis=0) + (slope + speed) / (2 * (len(u) - 1))
+        apart = np.abs(product(weights, control) - wanted).max(axis=0) + (slope + speed) / (2 * (len(u) - 1))
         return Fit(control, float(apart.max()))
 
     def _checked(self, control: ArrayLike) -> Array:
@@ -231,5 +231,5 @@ def _grid(spline: Spline, order: int) -> Array:
 @lru_cache(maxsize=8)
 def _fit_grid(spline: Spline) -> tuple[Array, Array]:
     weights = spline.basis(np.linspace(0.0, 1.0, FIT_SAMPLES))
-    rough = spline.gram(min(3, spline.degree))[spline.inner, spline.inner]
-    return weights, rough
+    rough, inner = spline.gram(min(3, spline.degree))[spline.inner, spline.inner], weights[:, spline.inner]
+    return weights, cholesky(product(inner.T, inner) / len(weights) + ROUGHNESS * rough)

@@ -267,6 +267,9 @@ OTHERS: Functions = {
         + "f8[:, ::1], f8[:, ::1], f8[::1], f8, f8, f8[::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1]",
         6,
     ),
+    "matrix_products.matrix_products": ("f8[:, :, ::1], f8[:, :, ::1], f8[:, :, ::1]", 1),
+    "matrix_products.factorize": ("f8[:, ::1], f8[:, ::1]", 1),
+    "matrix_products.solve_factored": ("f8[:, ::1], f8[:, ::1]", 1),
     "triangle_mesh.column_boxes": ("f8[:, :, ::1], f8[::1], f8[::1], f8, f8[:, :, ::1], f8[:, :, :, :, ::1]", 1),
 }
 """What point clouds, grids, inverse kinematics, roadmaps and trainings call; without the library, compiled at need."""
