@@ -52,8 +52,9 @@ class StrictModel(BaseModel):
     """
 
     model_config = ConfigDict(
-        extra="forbid", frozen=True, allow_inf_nan=False, populate_by_name=True, validate_default=True
-    )
+        extra="forbid", frozen=True, allow_inf_nan=False, populate_by_name=True, validate_default=True,
+        defer_build=True,
+    )  # fmt: skip
 
     @classmethod
     def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
