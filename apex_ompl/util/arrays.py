@@ -1,11 +1,20 @@
-"""Arrays as compiled code takes them."""
+"""Kinds of arrays: as compiled code takes them, and masked ones."""
 
 from __future__ import annotations
+
+import sys
+from typing import Any, TypeGuard
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from apex_ompl.types import Array
+
+
+def is_masked_array(value: object) -> TypeGuard[np.ma.MaskedArray[Any, Any]]:
+    """Whether a value is a masked array; ``numpy.ma``, which takes long to import, is not imported for the answer."""
+    masked = sys.modules.get("numpy.ma")  # there are none before something imports it
+    return masked is not None and isinstance(value, masked.MaskedArray)
 
 
 def compact(values: ArrayLike) -> Array:

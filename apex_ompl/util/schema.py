@@ -15,6 +15,7 @@ from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler, ValidationErro
 from pydantic_core import CoreSchema, core_schema
 
 from apex_ompl.errors import FileFormatError, nearest_name
+from apex_ompl.util.arrays import is_masked_array
 from apex_ompl.util.files import read_text
 
 ModelT = TypeVar("ModelT", bound="StrictModel")
@@ -22,7 +23,7 @@ ModelT = TypeVar("ModelT", bound="StrictModel")
 
 def _number(value: Any) -> Any:
     """Return what may become a number; pydantic alone takes texts and True for numbers, too."""
-    if isinstance(value, (str, bytes, bool, np.bool_, np.ma.MaskedArray)):
+    if isinstance(value, (str, bytes, bool, np.bool_)) or is_masked_array(value):
         raise ValueError("expected a number")
     return value
 
