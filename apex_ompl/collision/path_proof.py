@@ -14,6 +14,7 @@ import numpy as np
 from apex_ompl.collision.exact_shapes import PlacedShape, joined, shape_arrays
 from apex_ompl.collision.mesh_stage import MeshStage
 from apex_ompl.collision.solids import Solid
+from apex_ompl.collision.stored_tables import stored_shapes
 from apex_ompl.collision.tabulate import joint_tree
 from apex_ompl.kernel.compiled import curve_proof
 from apex_ompl.kernel.compiled.cubic_pieces import cubic_rates
@@ -142,7 +143,8 @@ def _shapes_of_bodies(robot: Robot, scene: MeshStage, kernel: Kernel) -> ShapeAr
         bodies = [PlacedShape(s.shape, s.joint, turns[s.joint] @ s.placement.homogeneous) for s in solids]
         while len(known) >= MOST_PACKED:
             known.popitem(last=False)
-        known[key] = kernel.robot.arrays.node_centre, shape_arrays(bodies)
+        arrays = (shape_arrays if known else stored_shapes)(bodies)
+        known[key] = kernel.robot.arrays.node_centre, arrays
     return known[key][1]
 
 
