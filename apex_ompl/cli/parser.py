@@ -26,7 +26,7 @@ from apex_ompl.util.exiting import end_quickly
 
 PROBLEM_HELP = "name of a problem, an id as shelf/hard/900012, or a YAML file"
 RESULT_HELP = "a saved plan or run (.npz, .json, .yaml)"
-GARBAGE = 50_000  # objects between collections of the youngest
+GARBAGE = 200_000  # objects between collections of the youngest
 Commands = argparse._SubParsersAction  # of argparse, which has no public name for it
 
 
