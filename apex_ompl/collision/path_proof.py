@@ -25,7 +25,7 @@ from apex_ompl.kernel.scene_builder import primitive, scene_tables
 from apex_ompl.kernel.tables import with_pairs
 from apex_ompl.robot import Robot
 from apex_ompl.types import Array, Flags
-from apex_ompl.util.arrays import compact
+from apex_ompl.util.arrays import compact, distinct
 from apex_ompl.util.forking import ProcessLock
 
 MOST_PACKED = 64  # sets of held objects that are kept for each robot
@@ -179,7 +179,7 @@ class PathProver:
         if current is not None and current[0] is kernel:
             return current[1]
         with self._lock:
-            owners = np.unique(kernel.scene.arrays.owner).tolist()
+            owners = distinct(kernel.scene.arrays.owner).tolist()
             placed = {}
             for number in owners:
                 solid = self._scene.solids[number]
@@ -244,7 +244,7 @@ class PathProver:
     @staticmethod
     def _limits(kernel: Kernel, curve: Curve) -> Iterator[float]:
         """Yield limits of the clearance that is looked for [m], from that of the spheres at some states."""
-        places = np.unique(np.linspace(0, len(curve.states) - 1, SEEDS).round().astype(int))
+        places = distinct(np.linspace(0, len(curve.states) - 1, SEEDS).round().astype(int))
         near = float(np.nanmin(kernel.clearance(curve.states[places], MOST_LIMIT), initial=MOST_LIMIT))
         limit = max(near + SLACK, SLACK)
         while limit < MOST_LIMIT:
