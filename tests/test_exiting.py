@@ -109,6 +109,6 @@ def test_a_quick_end_waits_for_threads_and_exit_functions(code: int, last: str, 
 
 def test_a_quick_end_whose_output_nobody_reads_says_so() -> None:
     script = "import sys; from apex_ompl.util import exiting; print('x' * 9); sys.exit(exiting.end_quickly(0))"
-    command = ["bash", "-c", f'{sys.executable} -c "{script}" > /dev/full']
+    command = ["bash", "-c", f'unset PYTHONUNBUFFERED; {sys.executable} -c "{script}" > /dev/full']
     ended = subprocess.run(command, check=False, capture_output=True, text=True, timeout=60)
     assert ended.returncode == 120 and "No space left" in ended.stderr
