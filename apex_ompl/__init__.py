@@ -7,10 +7,9 @@ are in ``apex_ompl.planners``, ready-made problems in ``apex_ompl.problems``.
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from apex_ompl.util.forking import unforked
+from apex_ompl.util.lazy import lazy_names
 
 if TYPE_CHECKING:
     from apex_ompl.api import load_problem, plan, setup
@@ -28,10 +27,10 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 
-_HOMES = {
+_HOMES = {  # modules that public names are imported from when they are first used
     "Alignment": "scene.problem",
     "ApexError": "errors",
-    "MotionPlanner": "session",
+    "MotionPlanner": "session.planner",
     "PlanResult": "result",
     "PlanStatus": "result",
     "PoseTarget": "scene.problem",
@@ -75,14 +74,4 @@ __all__ = [
 ]
 
 
-def __getattr__(name: str) -> Any:
-    """Import public names when they are first used, so that importing the package costs nothing."""
-    if name in _HOMES:
-        with unforked():
-            return getattr(import_module(f"apex_ompl.{_HOMES[name]}"), name)
-    raise AttributeError(f"module 'apex_ompl' has no attribute {name!r}")
-
-
-def __dir__() -> list[str]:
-    """Return the public names."""
-    return sorted([*__all__, "__version__"])
+__getattr__, __dir__ = lazy_names(__name__, _HOMES, ("__version__",))

@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar
 
-from ompl import base as ob
-
 from apex_ompl.planners.registry import Parameters, bounded, one_of, register
 from apex_ompl.planners.tuned import TUNED
 
 if TYPE_CHECKING:
+    from ompl import base as ob
+
     from apex_ompl.apex.stages import Stage
     from apex_ompl.diffusion.proposals import Sampling
 

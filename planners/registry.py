@@ -6,13 +6,14 @@ import dataclasses
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
-from typing import Any, ClassVar
-
-from ompl import base as ob
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from apex_ompl.errors import ParameterError
 from apex_ompl.util.forking import unforked
 from apex_ompl.util.validation import LARGEST_INT, check_name
+
+if TYPE_CHECKING:
+    from ompl import base as ob
 
 
 @dataclass(frozen=True)
@@ -95,7 +96,10 @@ def parameters(name: str, /, **values: Any) -> Parameters:
         UnknownNameError: No such planner or parameter; the message lists the known ones.
         ParameterError: A value of the wrong type or out of range.
     """
-    _load()
+    with unforked():
+        from apex_ompl.planners import apex_parameters
+    if name != apex_parameters.NAME:  # it is the default; the modules of the others take longer to import
+        _load()
     return _REGISTRY[check_name(name, "planner", _REGISTRY)]().changed(**values)
 
 

@@ -11,6 +11,7 @@ training, 800 000 to 899 999 for validation, 900 000 to 999 999 for tests.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     from apex_ompl.problems.frozen import Witness
 
 DATA = Path(__file__).parent / "data"
+ID = re.compile(r"([A-Za-z_]+)/([A-Za-z0-9_.-]+)/(0|[1-9][0-9]{0,19})")  # suite, level and seed
 
 
 def names() -> tuple[str, ...]:
@@ -51,11 +53,9 @@ def load(name: str) -> Problem:
         MissingFileError: The file of a frozen problem cannot be read.
         FileFormatError: The hash or the content of the file of a frozen problem is wrong.
     """
-    from apex_ompl.problems.catalogue import ProblemId
-
-    problem_id = ProblemId.parse(name)
-    if problem_id is not None:
-        return sample(problem_id.suite, level=problem_id.level, seed=problem_id.seed)
+    if is_id(name):
+        suite, level, seed = name.split("/")
+        return sample(suite, level=level, seed=int(seed))
     if name not in names():
         raise UnknownNameError("problem", name, names())
     return Problem.load(DATA / f"{name}.yaml")
@@ -63,8 +63,6 @@ def load(name: str) -> Problem:
 
 def is_id(text: str) -> bool:
     """Whether a text has the form of an id of a problem of a suite."""
-    from apex_ompl.problems.catalogue import ID
-
     return ID.fullmatch(text) is not None
 
 

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
 
 import numpy as np
 
 from apex_ompl.errors import ParameterError
-from apex_ompl.problems import alignment, scenes
+from apex_ompl.problems import ID, alignment, scenes
 from apex_ompl.problems.broad import levels as broad
 from apex_ompl.util.validation import check_name
 
@@ -29,8 +28,6 @@ VALIDATION = {broad.UNSEEN: broad.LEVELS[broad.UNSEEN]}
 
 KNOWN = {**LEVELS, **TRAINING, **VALIDATION}
 """Every suite -> its levels."""
-
-ID = re.compile(r"([A-Za-z_]+)/([A-Za-z0-9_.-]+)/(0|[1-9][0-9]{0,19})")
 
 
 @dataclass(frozen=True)

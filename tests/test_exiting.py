@@ -72,3 +72,43 @@ def test_a_daemon_thread_begins_nothing_any_more() -> None:
     thread = threading.Thread(target=runs, daemon=True)
     thread.start()
     assert not begun.wait(0.1) and thread.is_alive()
+
+
+COMMAND = """
+import atexit, sys, threading, time
+from apex_ompl.util import exiting
+
+def slow():
+    time.sleep(0.3)
+    print("the thread")
+
+atexit.register(print, "the exit function")
+threading.Thread(target=slow).start()
+class Freed:
+    def __del__(self):
+        print("freed")
+kept = Freed()
+kept.self = kept  # freed by the interpreter's end alone
+code = exiting.end_quickly(int(sys.argv[1]))
+print("the command")
+{last}
+"""
+
+
+@pytest.mark.parametrize(("last", "freed"), [("sys.exit(code)", False), ("exiting._stay(); sys.exit(code)", True)])
+@pytest.mark.parametrize("code", [0, 3])
+def test_a_quick_end_waits_for_threads_and_exit_functions(code: int, last: str, freed: bool) -> None:
+    script = COMMAND.replace("{last}", last)
+    command = [sys.executable, "-c", script, str(code)]
+    ended = subprocess.run(command, check=False, capture_output=True, text=True, timeout=60)
+    assert ended.returncode == code and not ended.stderr
+    lines = ended.stdout.splitlines()
+    assert lines[:3] == ["the command", "the thread", "the exit function"]
+    assert ("freed" in lines) is freed
+
+
+def test_a_quick_end_whose_output_nobody_reads_says_so() -> None:
+    script = "import sys; from apex_ompl.util import exiting; print('x' * 9); sys.exit(exiting.end_quickly(0))"
+    command = ["bash", "-c", f'unset PYTHONUNBUFFERED; {sys.executable} -c "{script}" > /dev/full']
+    ended = subprocess.run(command, check=False, capture_output=True, text=True, timeout=60)
+    assert ended.returncode == 120 and "No space left" in ended.stderr

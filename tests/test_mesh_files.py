@@ -222,7 +222,7 @@ def test_collada_is_scaled_to_metres_and_stands_upright(tmp_path: Path, up: str,
     scaled = {"file": str(tmp_path / "a.dae"), "scale": (1.0 / metres, 2.0 / metres, 3.0 / metres)}
     vertices, faces = triangles(coal_geometry(Obstacle(name="m", mesh=scaled)))
     assert is_the_block(vertices, faces, np.array(corner) * (1.0, 2.0, 3.0)), "the scale is along the body's axes"
-    assert collada_asset((tmp_path / "a.dae").read_bytes()) == (metres, up or "Y_UP")
+    assert collada_asset((tmp_path / "a.dae").open("rb")) == (metres, up or "Y_UP")
 
 
 def test_gltf_stands_upright(robot: Robot, tmp_path: Path) -> None:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import copy
 import pickle
 import pkgutil
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from importlib import import_module
 from typing import Any
@@ -91,3 +93,37 @@ def test_records_are_copied_and_pickled() -> None:
     goal = Goal(poses=(PoseTarget(**POSE, tolerance={"angle": 0.1}),))
     for same in (pickle.loads(pickle.dumps(goal)), copy.deepcopy(goal), copy.copy(goal), goal.model_copy()):
         assert same == goal and type(same.poses[0]) is PoseTarget
+
+
+FIRST_USES = """
+import os, sys, threading
+sys.setswitchinterval(1e-6)
+from apex_ompl.scene.bodies import Obstacle
+from apex_ompl.scene.problem import Problem
+faults, begin = [], threading.Barrier(9)
+
+def use():
+    begin.wait()
+    try:
+        Obstacle(name="a", box=(1.0, 1.0, 1.0)).model_dump_json()
+        Obstacle.model_validate({"name": "b", "sphere": {"radius": 1.0}}).sphere.model_dump()
+        Problem.model_json_schema(by_alias=True)
+    except BaseException as error:
+        faults.append(error)
+
+threads = [threading.Thread(target=use) for _ in range(8)]
+for thread in threads: thread.start()
+begin.wait()
+child = os.fork()
+if not child:
+    Problem.model_json_schema(by_alias=True)
+    os._exit(0)
+for thread in threads: thread.join()
+print(os.waitpid(child, 0)[1], faults)
+"""
+
+
+def test_records_are_built_at_their_first_use_by_many_threads_and_in_a_child() -> None:
+    command = [sys.executable, "-W", "ignore", "-c", FIRST_USES]
+    done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=60)
+    assert done.stdout == "0 []\n", done.stdout + done.stderr

@@ -11,6 +11,7 @@ import torch
 
 from apex_ompl.errors import ParameterError, UnknownNameError
 from apex_ompl.util import validation as v
+from apex_ompl.util.arrays import distinct, is_masked_array
 from apex_ompl.util.bounded_cache import kept
 
 MASKED = np.ma.masked_array([1.0, 2.0], mask=[True, False])
@@ -118,3 +119,13 @@ def test_results_are_kept_up_to_a_number_and_the_oldest_are_dropped() -> None:
         assert kept(results, key, lambda key=key: made.append(key) or key.upper(), 3) == key.upper()
         assert len(results) <= 3
     assert "".join(made) == "abcdaeb" and list(results) == ["a", "e", "b"]
+
+
+@pytest.mark.parametrize("values", [[], [3], [2, 1, 2, 2, -1], [0.5, 0.25, 0.5], np.arange(6).reshape(2, 3) % 3])
+def test_distinct_numbers_are_those_of_numpy(values: Any) -> None:
+    found, wanted = distinct(values), np.unique(values)
+    assert found.dtype == wanted.dtype and found.tolist() == wanted.tolist()
+
+
+def test_masked_arrays_are_told_from_others() -> None:
+    assert is_masked_array(MASKED) and not is_masked_array(MASKED.data) and not is_masked_array([1.0])

@@ -2,7 +2,7 @@
 
 import sys
 
-from apex_ompl.cli.parser import main
+from apex_ompl.cli.parser import command
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(command())

@@ -22,10 +22,11 @@ from apex_ompl import __version__
 from apex_ompl.cli.options import LIMITS
 from apex_ompl.cli.streams import open_streams
 from apex_ompl.errors import ApexError
+from apex_ompl.util.exiting import end_quickly
 
 PROBLEM_HELP = "name of a problem, an id as shelf/hard/900012, or a YAML file"
 RESULT_HELP = "a saved plan or run (.npz, .json, .yaml)"
-GARBAGE = 50_000  # objects between collections of the youngest
+GARBAGE = 200_000  # objects between collections of the youngest
 Commands = argparse._SubParsersAction  # of argparse, which has no public name for it
 
 
@@ -34,6 +35,11 @@ class _Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         self.exit(2, f"{self.prog}: error: {message}\n")
+
+
+def command() -> int:
+    """Run the command line as a process of its own, and return its exit code, with which it must be ended."""
+    return end_quickly(main())
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

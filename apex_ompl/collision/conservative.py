@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from apex_ompl.collision.cover.spheres import shape_key
 from apex_ompl.collision.mesh_stage import MeshStage
-from apex_ompl.collision.robot_covers import covers_of
-from apex_ompl.collision.tabulate import primitives, tabulate
+from apex_ompl.collision.stored_tables import make_tables, stored_tables
+from apex_ompl.collision.tabulate import primitives
 from apex_ompl.kernel.ahead_of_time import compile_ahead
 from apex_ompl.kernel.compiled import motion_proof, queries
 from apex_ompl.kernel.compiled.entry_points import PLANS
@@ -155,10 +155,10 @@ class ConservativeChecker:
         if key in known:
             return _numbered(*known[key], numbers)
         rows = {number: row for row, number in enumerate(numbers)}
-        covers = covers_of(robot, [solid.shape for solid in solids])
         meets = [solid.joint > 0 or number >= scene.links for solid, number in zip(solids, numbers, strict=True)]
         pairs = [(rows[a], rows[b]) for a, b in scene.body_pairs]
-        tables = tabulate(robot, solids=solids, numbers=numbers, covers=covers, meets_scene=meets, pairs=pairs)
+        tables = (make_tables if known else stored_tables)(robot, solids, meets, pairs)
+        tables = replace(tables, numbers=tuple(numbers[k] for k in tables.numbers))
         while len(known) >= MOST_TABLES:
             known.pop(next(iter(known)), None)
         known[key] = tables, numbers

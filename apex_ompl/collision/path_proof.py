@@ -14,6 +14,7 @@ import numpy as np
 from apex_ompl.collision.exact_shapes import PlacedShape, joined, shape_arrays
 from apex_ompl.collision.mesh_stage import MeshStage
 from apex_ompl.collision.solids import Solid
+from apex_ompl.collision.stored_tables import stored_shapes
 from apex_ompl.collision.tabulate import joint_tree
 from apex_ompl.kernel.compiled import curve_proof
 from apex_ompl.kernel.compiled.cubic_pieces import cubic_rates
@@ -25,7 +26,7 @@ from apex_ompl.kernel.scene_builder import primitive, scene_tables
 from apex_ompl.kernel.tables import with_pairs
 from apex_ompl.robot import Robot
 from apex_ompl.types import Array, Flags
-from apex_ompl.util.arrays import compact
+from apex_ompl.util.arrays import compact, distinct
 from apex_ompl.util.forking import ProcessLock
 
 MOST_PACKED = 64  # sets of held objects that are kept for each robot
@@ -143,7 +144,8 @@ def _shapes_of_bodies(robot: Robot, scene: MeshStage, kernel: Kernel) -> ShapeAr
         bodies = [PlacedShape(s.shape, s.joint, product(turns[s.joint], s.placement.homogeneous)) for s in solids]
         while len(known) >= MOST_PACKED:
             known.popitem(last=False)
-        known[key] = kernel.robot.arrays.node_centre, shape_arrays(bodies)
+        arrays = (shape_arrays if known else stored_shapes)(bodies)
+        known[key] = kernel.robot.arrays.node_centre, arrays
     return known[key][1]
 
 
@@ -178,7 +180,7 @@ class PathProver:
         if current is not None and current[0] is kernel:
             return current[1]
         with self._lock:
-            owners = np.unique(kernel.scene.arrays.owner).tolist()
+            owners = distinct(kernel.scene.arrays.owner).tolist()
             placed = {}
             for number in owners:
                 solid = self._scene.solids[number]
@@ -243,7 +245,7 @@ class PathProver:
     @staticmethod
     def _limits(kernel: Kernel, curve: Curve) -> Iterator[float]:
         """Yield limits of the clearance that is looked for [m], from that of the spheres at some states."""
-        places = np.unique(np.linspace(0, len(curve.states) - 1, SEEDS).round().astype(int))
+        places = distinct(np.linspace(0, len(curve.states) - 1, SEEDS).round().astype(int))
         near = float(np.nanmin(kernel.clearance(curve.states[places], MOST_LIMIT), initial=MOST_LIMIT))
         limit = max(near + SLACK, SLACK)
         while limit < MOST_LIMIT:

@@ -6,8 +6,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any
 
-from tqdm import tqdm
-
 from apex_ompl.collision.held_extent import extent_in_link
 from apex_ompl.collision.mesh_stage import MeshStage
 from apex_ompl.collision.shapes import coal_geometry, mesh_note, with_file_read, world_geometry
@@ -17,6 +15,7 @@ from apex_ompl.scene.bodies import AttachedObject, Body, Obstacle, file_shape, g
 from apex_ompl.scene.scripts import moved_to, standing
 from apex_ompl.types import Array
 from apex_ompl.util.forking import unforked
+from apex_ompl.util.progress import progress
 from apex_ompl.util.schema import validate
 
 SHOWN_AFTER = 1.0  # of a progress bar [s]
@@ -48,7 +47,7 @@ class SceneBodies:
             SceneError, UnknownNameError, MissingFileError, FileFormatError: As :meth:`add` and :meth:`attach`.
         """
         bodies = (*(self.robot.fixtures if fixtures else ()), *scene)
-        for body in tqdm(bodies, desc="obstacles", delay=SHOWN_AFTER, leave=False, disable=None):
+        for body in progress(bodies, "obstacles", SHOWN_AFTER):
             self.add(body)
         for held in attached:
             self.attach(held)

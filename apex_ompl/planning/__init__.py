@@ -1,6 +1,9 @@
 """Steps of ``plan``: query, straight line, solve, verify, repair, time; the benchmark composes the same steps."""
 
-from apex_ompl.planning.among_movers import plan_among_movers
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 from apex_ompl.planning.run import PlanRun
 from apex_ompl.planning.solving import (
     NOT_PROVED,
@@ -13,6 +16,10 @@ from apex_ompl.planning.solving import (
     with_exact_ends,
 )
 from apex_ompl.planning.timing import finish, parameterize
+from apex_ompl.util.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from apex_ompl.planning.among_movers import plan_among_movers
 
 __all__ = [
     "NOT_PROVED",
@@ -28,3 +35,5 @@ __all__ = [
     "verify",
     "with_exact_ends",
 ]
+
+__getattr__, __dir__ = lazy_names(__name__, {"plan_among_movers": "among_movers"})

@@ -18,7 +18,7 @@ from apex_ompl.robot.urdf_checks import LIMITED, check_urdf, numbers
 from apex_ompl.scene.bodies import pose_matrix
 from apex_ompl.scene.mesh_files import UPRIGHT, collada_asset
 from apex_ompl.types import Array
-from apex_ompl.util.files import read_file
+from apex_ompl.util.files import opened
 
 
 @dataclass(frozen=True)
@@ -170,7 +170,8 @@ def _scale_and_turn(holder: ET.Element, mesh: ET.Element, path: Path, role: str)
     scale = given.copy()
     if path.suffix.lower() == ".dae":
         try:
-            scale *= collada_asset(read_file(path, role))[0]
+            with opened(path, role) as file:  # a visual mesh may be long, and its unit is at the beginning
+                scale *= collada_asset(file)[0]
         except ValueError as error:
             raise RobotError(f"{role}: {path} has {error}, expected COLLADA") from error
     elif path.suffix.lower() in (".glb", ".gltf"):

@@ -12,6 +12,8 @@ from apex_ompl.robot.model import Robot, load_robot
 
 FILE_NAME = re.compile(r'filename="([^"]*)"')
 
+PIECE = 2**17  # of a file that is read at once [bytes]
+
 _digests: WeakKeyDictionary[Robot, str] = WeakKeyDictionary()
 
 
@@ -21,13 +23,24 @@ def digest(robot: Robot) -> str:
         found = hashlib.sha256(FILE_NAME.sub(lambda match: Path(match[1]).name, robot.urdf).encode())
         for file in sorted(set(FILE_NAME.findall(robot.urdf)), key=lambda file: Path(file).name):
             path = Path(file.removeprefix("file://"))
-            found.update(path.read_bytes() if path.is_file() else file.encode())
+            if path.is_file():
+                _update(found, path)
+            else:
+                found.update(file.encode())
         pairs = [(pair.first, pair.second) for pair in robot.geometry.collisionPairs]
         found.update(repr((robot.name, robot.joint_names, pairs, robot.fixtures)).encode())
         for array in vars(robot.limits).values():
             found.update(array.tobytes())
         _digests[robot] = found.hexdigest()[:16]
     return _digests[robot]
+
+
+def _update(digest: hashlib._Hash, path: Path) -> None:
+    """Add the content of a file, piece by piece: the memory for a whole one takes longer than the digest."""
+    buffer = memoryview(bytearray(PIECE))
+    with path.open("rb", buffering=0) as file:
+        while count := file.readinto(buffer):
+            digest.update(buffer[:count])
 
 
 def load_same_robot(name_or_path: str, wanted: str) -> Robot:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection
 from pathlib import Path
 from xml.etree import ElementTree as ET
@@ -105,10 +106,10 @@ def numbers(text: str, count: int, what: str) -> Array:
         RobotError: The text holds something else.
     """
     try:
-        values = np.array([float(word) for word in text.split()])
+        values = [float(word) for word in text.split()]
     except ValueError:
-        values = np.empty(0)
-    if values.shape != (count,) or np.isnan(values).any():
+        values = []
+    if len(values) != count or any(map(math.isnan, values)):
         expected = "a number" if count == 1 else f"{count} numbers"
         raise RobotError(f"{what}: expected {expected}, got {text!r}")
-    return values
+    return np.array(values)

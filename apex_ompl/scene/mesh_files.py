@@ -13,6 +13,7 @@ import io
 import re
 from collections.abc import Callable
 from pathlib import Path
+from typing import IO
 from xml.etree import ElementTree
 
 import coal
@@ -134,7 +135,7 @@ def read_obj(file: str, content: bytes) -> Triangles:
 def read_dae(_: str, content: bytes) -> Triangles:
     """Return the triangles of a COLLADA file in metres, with z up."""
     vertices, faces = _by_trimesh(content, "dae")
-    metres, up = collada_asset(content)
+    metres, up = collada_asset(io.BytesIO(content))
     return metres * vertices @ UPRIGHT[up].T, faces
 
 
@@ -151,7 +152,7 @@ def _by_trimesh(content: bytes, kind: str) -> Triangles:
     return np.array(loaded.vertices, float), np.array(loaded.faces, np.int64)
 
 
-def collada_asset(content: bytes) -> tuple[float, str]:
+def collada_asset(file: IO[bytes]) -> tuple[float, str]:
     """Return the length of the unit of a COLLADA file [m], and the axis that is up, ``X_UP``, ``Y_UP`` or ``Z_UP``.
 
     It reads no further than to the first ``<asset>``, which is at the beginning.
@@ -161,7 +162,7 @@ def collada_asset(content: bytes) -> tuple[float, str]:
     """
     asset: ElementTree.Element | None = None
     try:
-        for _, element in ElementTree.iterparse(io.BytesIO(content)):
+        for _, element in ElementTree.iterparse(file):
             if element.tag.endswith("}asset") or element.tag == "asset":
                 asset = element
                 break

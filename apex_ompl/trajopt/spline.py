@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel.products import cholesky, product, solve
 from apex_ompl.types import Array
+from apex_ompl.util.arrays import distinct
 from apex_ompl.util.validation import check_integer, check_path
 
 FIT_SAMPLES = 1025
@@ -136,7 +137,7 @@ class Spline:
         For control points c of one joint, c . gram(k) . c is the integral of the k-th derivative squared. Exact, by
         Gauss's quadrature on each span.
         """
-        breaks = np.unique(self.knots)
+        breaks = distinct(self.knots)
         at, weight = np.polynomial.legendre.leggauss(self.degree + 1)
         total = np.zeros((self.points, self.points))
         for a, b in zip(breaks[:-1], breaks[1:], strict=True):

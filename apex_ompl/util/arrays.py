@@ -1,11 +1,20 @@
-"""Arrays as compiled code takes them."""
+"""Arrays as compiled code takes them, and what NumPy offers with ``numpy.ma``, whose import takes long."""
 
 from __future__ import annotations
 
+import sys
+from typing import Any, TypeGuard
+
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from apex_ompl.types import Array
+
+
+def is_masked_array(value: object) -> TypeGuard[np.ma.MaskedArray[Any, Any]]:
+    """Whether a value is a masked array; ``numpy.ma`` is not imported for the answer."""
+    masked = sys.modules.get("numpy.ma")  # there are none before something imports it
+    return masked is not None and isinstance(value, masked.MaskedArray)
 
 
 def compact(values: ArrayLike) -> Array:
@@ -17,3 +26,9 @@ def compact(values: ArrayLike) -> Array:
         return values
     found: Array = np.require(values, float, ["C", "W"])
     return found
+
+
+def distinct(values: ArrayLike) -> NDArray[Any]:
+    """Return distinct numbers in ascending order, as ``np.unique`` does, which imports ``numpy.ma``."""
+    found = np.sort(values, axis=None)
+    return np.concatenate([found[:1], found[1:][found[1:] != found[:-1]]])

@@ -2,10 +2,27 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
+from typing import Any, TypeVar
+
+from numpy.typing import NDArray
+
+from apex_ompl.errors import ApexError
+from apex_ompl.util.archives import pack_archive, read_archive
+from apex_ompl.util.files import is_file, write_atomically
+
+ABOUT = "about"  # the record in a file
+MOST_FILES = 64  # of arrays in a folder; those that were used least lately are removed
+
+LOG = logging.getLogger("apex_ompl")
+
+R = TypeVar("R")
+Arrays = Mapping[str, NDArray[Any]]
 
 
 def user_cache(name: str, homes: Sequence[str] = (), *, or_filled: bool = False) -> Path | None:
@@ -39,6 +56,55 @@ def has_room(folder: Path, size: int) -> bool:
     except OSError:
         return False
     return True
+
+
+def stored(
+    folder: str,
+    name: str,
+    make: Callable[[], tuple[dict[str, Any], Arrays]],
+    read: Callable[[dict[str, Any], dict[str, NDArray[Any]]], R],
+) -> R:
+    """Return arrays, and a record that goes with them, from the user's cache; they are made where it has none.
+
+    A file that is damaged or cut off is made anew, and a cache that cannot be written, or is full, is done without.
+    Processes may use a file at the same time.
+
+    Args:
+        folder: Name of the folder in the cache.
+        name: Name of the file, which must be a digest of all that its content depends on.
+        make: Makes the record, as of JSON, and the arrays.
+        read: Returns what they stand for.
+    """
+    home = user_cache(folder, or_filled=True)
+    path = None if home is None else home / f"{name}.npz"
+    if path is not None and is_file(path):
+        try:
+            found = read(*read_archive(path, ABOUT, "file of the cache"))
+        except Exception as error:  # NumPy, zipfile and what reads the content let many kinds through
+            LOG.warning("apex_ompl makes a file of its cache anew, which is damaged: %s", error)
+        else:
+            with suppress(OSError):  # it belongs to another user, or was removed meanwhile
+                os.utime(path)
+            return found
+    about, arrays = make()
+    if path is not None:
+        try:
+            write_atomically(path, pack_archive(ABOUT, about, arrays))
+            _remove_oldest(path.parent)
+        except (ApexError, OSError) as error:
+            LOG.info("apex_ompl cannot keep a file of its cache: %s", error)
+    return read(about, dict(arrays))
+
+
+def _remove_oldest(folder: Path) -> None:
+    """Remove the files of arrays that were used least lately, beyond ``MOST_FILES``."""
+    times = []
+    for file in folder.glob("*.npz"):
+        with suppress(OSError):  # another process has removed it
+            times.append((file.stat().st_mtime_ns, file))
+    for _, file in sorted(times)[:-MOST_FILES]:
+        with suppress(OSError):
+            file.unlink()
 
 
 def _holds_files(folder: Path) -> bool:

@@ -13,6 +13,7 @@ import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import IO
 
 from apex_ompl.errors import FileFormatError, FolderInUseError, MissingFileError, ParameterError
 
@@ -81,6 +82,25 @@ def read_file(path: Path, role: str) -> bytes:
     check_readable(path, role)
     try:
         return path.read_bytes()
+    except OSError as error:
+        raise MissingFileError(str(path), role, (error.strerror or "cannot be read").lower()) from error
+
+
+@contextmanager
+def opened(path: Path, role: str) -> Iterator[IO[bytes]]:
+    """Open a regular file to read some of it.
+
+    Args:
+        path: The file.
+        role: Description of the file for the error.
+
+    Raises:
+        MissingFileError: It cannot be read.
+    """
+    check_readable(path, role)
+    try:
+        with path.open("rb") as file:
+            yield file
     except OSError as error:
         raise MissingFileError(str(path), role, (error.strerror or "cannot be read").lower()) from error
 

@@ -15,14 +15,18 @@ from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler, ValidationErro
 from pydantic_core import CoreSchema, core_schema
 
 from apex_ompl.errors import FileFormatError, nearest_name
+from apex_ompl.util.arrays import is_masked_array
 from apex_ompl.util.files import read_text
+from apex_ompl.util.forking import ProcessLock, unforked
 
 ModelT = TypeVar("ModelT", bound="StrictModel")
+
+_building = ProcessLock()
 
 
 def _number(value: Any) -> Any:
     """Return what may become a number; pydantic alone takes texts and True for numbers, too."""
-    if isinstance(value, (str, bytes, bool, np.bool_, np.ma.MaskedArray)):
+    if isinstance(value, (str, bytes, bool, np.bool_)) or is_masked_array(value):
         raise ValueError("expected a number")
     return value
 
@@ -52,14 +56,21 @@ class StrictModel(BaseModel):
     """
 
     model_config = ConfigDict(
-        extra="forbid", frozen=True, allow_inf_nan=False, populate_by_name=True, validate_default=True
-    )
+        extra="forbid", frozen=True, allow_inf_nan=False, populate_by_name=True, validate_default=True,
+        defer_build=True,
+    )  # fmt: skip
 
     @classmethod
     def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
         """Return the schema of the record with strict numbers and truth values, wherever they stand in its fields."""
         found: CoreSchema = _strict(handler(source))
         return found
+
+    @classmethod
+    def model_rebuild(cls, *, _parent_namespace_depth: int = 2, **options: Any) -> bool | None:
+        """Build what validates the record, which waits for its first use: one thread at a time, while none forks."""
+        with unforked(), _building:
+            return super().model_rebuild(_parent_namespace_depth=_parent_namespace_depth + 1, **options)
 
     def __init__(self, /, **data: Any) -> None:
         """Make a record from its fields.

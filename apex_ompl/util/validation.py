@@ -10,11 +10,11 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import ArrayLike, NDArray
 
 from apex_ompl.errors import ParameterError, UnknownNameError
 from apex_ompl.types import Array
+from apex_ompl.util.arrays import is_masked_array
 
 LARGEST_INT = 2**31 - 1
 """Largest seed or count, the largest signed integer of 32 bits."""
@@ -162,7 +162,7 @@ def _is_masked(given: object) -> bool:
     """Whether a number of an array, or of a sequence of some, is masked."""
     if isinstance(given, (list, tuple)):
         return any(map(_is_masked, given)) if any(not isinstance(one, (int, float)) for one in given) else False
-    return isinstance(given, np.ma.MaskedArray) and bool(np.ma.getmaskarray(given).any())
+    return is_masked_array(given) and bool(np.ma.getmaskarray(given).any())
 
 
 def _is_real(value: object) -> bool:
@@ -340,6 +340,8 @@ def key_value(text: str) -> tuple[str, Any]:
     key, equals, value = text.partition("=")
     if not key or not equals:
         raise argparse.ArgumentTypeError(f"{text!r}, expected KEY=VALUE")
+    import yaml
+
     try:
         from apex_ompl.util.schema import yaml_value  # data are made on machines without pydantic
 

@@ -15,6 +15,7 @@ from apex_ompl.trajectory.deviation import deviation_bound
 from apex_ompl.trajectory.methods.ruckig_profiles import Profiles, calculate, joined, knots
 from apex_ompl.trajectory.methods.spline import blend
 from apex_ompl.trajectory.trajectory import ROUNDING, Trajectory, concatenate
+from apex_ompl.util.arrays import distinct
 
 LIMITS_SHARE = 1.0 - 1e-6  # of the limits that Ruckig is given, for its rounding
 JERK_SHARE = 1.0 - 1e-5  # of the limit which leaves room for rounding
@@ -80,7 +81,7 @@ def through_knots(
     Returns:
         The motion, or None where Ruckig finds none or is told to stop.
     """
-    chosen = np.unique([*range(0, len(guide.times), stride), len(guide.times) - 1])
+    chosen = distinct([*range(0, len(guide.times), stride), len(guide.times) - 1])
     solver, query = ruckig.Ruckig(guide.dof), ruckig.InputParameter(guide.dof)
     for name, share in zip(DERIVATIVES, (LIMITS_MARGIN, LIMITS_MARGIN, JERK_SHARE), strict=True):
         setattr(query, f"max_{name}", (share * getattr(limits, name)).tolist())
