@@ -21,6 +21,7 @@ from apex_ompl.kernel.compiled.layout import Integers
 from apex_ompl.kernel.compiled.shapes import HULL, POINT, TRIANGLE, ShapeArrays
 from apex_ompl.scene.meshes import triangles
 from apex_ompl.types import Array, Flags
+from apex_ompl.util.arrays import length
 from apex_ompl.util.bounded_cache import kept
 from apex_ompl.util.weak_cache import weakly_cached
 
@@ -102,7 +103,7 @@ class PlacedShape:
     def ball(self) -> Array:
         """Centre and radius of a ball around the solid in the joint's frame, shape (4,) [m]; 0 for half-spaces."""
         (a, b, c), centre = _size(self.geometry), np.zeros(3)
-        radius = {BOX: float(np.linalg.norm((a, b, c))), SPHERE: a, CYLINDER: float(np.hypot(a, b)), CAPSULE: a + b}
+        radius = {BOX: length((a, b, c)), SPHERE: a, CYLINDER: length((a, b)), CAPSULE: a + b}
         if self.mesh is not None:
             points = self.mesh.points
             centre = (points.min(axis=0) + points.max(axis=0)) / 2.0

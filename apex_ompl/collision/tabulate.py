@@ -26,6 +26,7 @@ from apex_ompl.kernel.tables import RobotTables
 from apex_ompl.robot import Robot
 from apex_ompl.scene.meshes import triangles
 from apex_ompl.types import Array
+from apex_ompl.util.arrays import length
 from apex_ompl.util.weak_cache import weakly_cached
 
 PROBE = 1e-3  # value of a planned joint at which axes and ratios are measured: no joint turns by half a turn or more
@@ -68,14 +69,14 @@ def joint_specs(robot: Robot) -> list[JointSpec]:
         checks = [(value, placements(p, value)) for value in (*CHECKS, *limits)]
         for k in (k for k in range(1, model.njoints) if model.joints[k].idx_q == p):
             motion = pin.log6(rest[k].actInv(probe[k])).vector / PROBE
-            speed, turn = np.linalg.norm(motion[:3]), np.linalg.norm(motion[3:])
+            speed, turn = length(motion[:3]), length(motion[3:])
             same = (
                 rest[k].actInv(there[k]).isApprox(pin.exp6(pin.Motion(value * motion)), 1e-6) for value, there in checks
             )
             if min(speed, turn) > 1e-9 or not all(same):
                 raise RobotError(f"joint {model.names[k]!r} is neither revolute nor prismatic, which the kernel needs")
             kind, along = (REVOLUTE, motion[3:]) if turn > speed else (PRISMATIC, motion[:3])
-            ratio = float(np.linalg.norm(along))
+            ratio = length(along)
             axis = along / ratio if ratio > 1e-9 else np.array([0.0, 0.0, 1.0])
             place = rest[k].homogeneous
             specs[k] = JointSpec(int(model.parents[k]), kind, place, axis, source[p], ratio)

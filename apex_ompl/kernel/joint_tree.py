@@ -12,6 +12,7 @@ from apex_ompl.kernel.compiled.arrays import FIXED
 from apex_ompl.kernel.products import product
 from apex_ompl.kernel.robot_specs import BodySpec, JointSpec
 from apex_ompl.types import Array
+from apex_ompl.util.arrays import length
 
 MOST_KEPT = 2000  # balls and radii
 MOST_PARTS = 62  # of a cluster: bits of a number
@@ -23,10 +24,10 @@ def turn_to(axis: Array | None) -> Array:
     """Return the rotation by which the kernel turns a joint's frame, so that ``axis`` is its z; shape (4, 4)."""
     turn = np.eye(4)
     if axis is not None:
-        z = np.asarray(axis, float) / np.linalg.norm(axis)
+        z = np.asarray(axis, float) / length(axis)
         x = np.eye(3)[int(np.argmin(np.abs(z)))]
-        x = x - z * (x @ z)
-        x /= np.linalg.norm(x)
+        x = x - z * float((x * z).sum())
+        x /= length(x)
         turn[:3, :3] = np.stack([x, np.cross(z, x), z], axis=1)
     return turn
 

@@ -11,6 +11,7 @@ from apex_ompl.kernel.compiled import tree_search
 from apex_ompl.kernel.kernel import Kernel
 from apex_ompl.kernel.search_buffers import SearchBuffers, SearchCounts
 from apex_ompl.types import Array
+from apex_ompl.util.arrays import length
 
 AT_ONCE = 256  # random states between two looks at the clock, where steps are 1 rad and longer
 LEAST_STEP = 0.01  # least longest step: one random state may cost as many as there are across the limits [rad]
@@ -44,7 +45,7 @@ class TreePair:
             rng: Source of the random states.
         """
         limits = kernel.robot.arrays
-        longest = min(max(longest, LEAST_STEP), float(np.linalg.norm(limits.upper - limits.lower)))  # no step is longer
+        longest = min(max(longest, LEAST_STEP), length(limits.upper - limits.lower))  # no step is longer
         self._kernel, self._longest, self._resolution = kernel, longest, resolution
         self._at_once = max(int(AT_ONCE * min(longest, 1.0)), 1)  # short steps are many for each random state
         dof, most = kernel.robot.dof, max(len(starts), len(goals))

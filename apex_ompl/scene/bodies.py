@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from apex_ompl.types import Array
+from apex_ompl.util.arrays import length
 from apex_ompl.util.schema import StrictModel
 
 MESH_SUFFIXES = (".stl", ".obj", ".ply", ".dae", ".glb", ".off")
@@ -249,7 +250,7 @@ def located(body: BodyT, folder: Path) -> BodyT:
 
 def pose_matrix(position: ArrayLike, orientation: ArrayLike) -> Array:
     """Return the homogeneous transform of a position [m] and a quaternion xyzw, shape (4, 4)."""
-    x, y, z, w = np.asarray(orientation, float) / np.linalg.norm(orientation)
+    x, y, z, w = np.asarray(orientation, float) / length(orientation)
     pose = np.eye(4)
     pose[:3, :3] = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],

@@ -11,6 +11,7 @@ from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import AttachedObject
 from apex_ompl.scene.problem import WorldVector
 from apex_ompl.types import Array
+from apex_ompl.util.arrays import length
 
 
 @dataclass(frozen=True)
@@ -34,7 +35,7 @@ class LinkFace:
         pose = held.pose
         axis = pose[:3, :3] @ np.asarray(held.contact.axis, float)
         point = pose[:3, :3] @ np.asarray(held.contact.point, float) + pose[:3, 3]
-        return cls(held.link, point, axis / np.linalg.norm(axis))
+        return cls(held.link, point, axis / length(axis))
 
     @classmethod
     def of_vector(cls, robot: Robot, vector: WorldVector, start: Array) -> LinkFace:
@@ -46,7 +47,7 @@ class LinkFace:
         pose = robot.link_pose(start, vector.link)
         tail, tip = np.asarray(vector.tail, float), np.asarray(vector.tip, float)
         axis = pose[:3, :3].T @ (tip - tail)
-        return cls(vector.link, pose[:3, :3].T @ (tip - pose[:3, 3]), axis / np.linalg.norm(axis))
+        return cls(vector.link, pose[:3, :3].T @ (tip - pose[:3, 3]), axis / length(axis))
 
     @classmethod
     def of_hand(cls, robot: Robot, name: str) -> LinkFace:
@@ -68,8 +69,8 @@ def lip_direction(vessel: AttachedObject) -> Array | None:
     """
     assert vessel.contact is not None
     axis = np.asarray(vessel.contact.axis, float)
-    axis = axis / np.linalg.norm(axis)
+    axis = axis / length(axis)
     point = np.asarray(vessel.contact.point, float)
-    across = vessel.pose[:3, :3] @ (point - (axis @ point) * axis)
-    length = float(np.linalg.norm(across))
-    return across / length if length > 1e-6 else None
+    across = vessel.pose[:3, :3] @ (point - float((axis * point).sum()) * axis)
+    size = length(across)
+    return across / size if size > 1e-6 else None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from typing import Any, TypeGuard
 
@@ -32,3 +33,8 @@ def distinct(values: ArrayLike) -> NDArray[Any]:
     """Return distinct numbers in ascending order, as ``np.unique`` does, which imports ``numpy.ma``."""
     found = np.sort(values, axis=None)
     return np.concatenate([found[:1], found[1:][found[1:] != found[:-1]]])
+
+
+def length(vector: ArrayLike) -> float:
+    """Return the Euclidean length of a vector, with the same bits on all processors, which NumPy's has not."""
+    return math.hypot(*np.asarray(vector, float).tolist())
