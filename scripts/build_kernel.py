@@ -1,7 +1,7 @@
 """Build the library of the kernel's compiled functions from the code that numba makes of them.
 
 Each function is compiled as numba does when Python calls it, for a processor of a level instead of this one, emitted as
-an object file, and linked with ``apex_ompl/kernel/library/kernel.c`` into ``apex_ompl/kernel/library/kernel-*.so``;
+an object file, and linked with ``apex_ompl/kernel/library/kernel.c`` into ``apex_ompl/kernel/library/kernel-*.elf``;
 a description beside it says from which sources and by which versions. Needs gcc, for another architecture its cross
 compiler (Debian: gcc-aarch64-linux-gnu).
 
@@ -15,6 +15,7 @@ import hashlib
 import json
 import os
 import re
+import struct
 import subprocess
 import sys
 import sysconfig
@@ -34,8 +35,10 @@ from apex_ompl.errors import ApexError
 from apex_ompl.kernel import library
 from apex_ompl.util.cores import usable_cores
 from apex_ompl.util.entry_point import run_script
+from apex_ompl.util.files import write_atomically
 
 VERSIONS = "numba", "llvmlite"
+PROGRAM, LOADED = 1, 2  # type and flag of a section of an ELF file
 
 
 class BuildError(ApexError):
@@ -91,13 +94,20 @@ class Built:
     @property
     def digest(self) -> str:
         """Digest of instructions and constants."""
-        from llvmlite import binding as llvm
-
         digest = hashlib.sha256()
-        for section in llvm.ObjectFileRef.from_data(self.code).sections():
-            if (section.name() or b"").startswith((b".text", b".rodata")):
-                digest.update(section.data())
+        for part in loaded_sections(self.code):
+            digest.update(part)
         return digest.hexdigest()
+
+
+def loaded_sections(code: bytes) -> Iterator[bytes]:
+    """Yield the sections of a 64-bit ELF file that a program loads, see the System V ABI, chapter 4."""
+    (first,) = struct.unpack_from("<Q", code, 40)
+    size, count = struct.unpack_from("<HH", code, 58)
+    for k in range(count):
+        kind, flags, _, begin, length = struct.unpack_from("<IQQQQ", code, first + k * size + 4)
+        if kind == PROGRAM and flags & LOADED:
+            yield code[begin : begin + length]
 
 
 def main() -> None:
@@ -126,7 +136,7 @@ def main() -> None:
             "code": code,
         }
         args.out.mkdir(parents=True, exist_ok=True)
-        file.write_bytes(temporary.read_bytes())
+        write_atomically(file, temporary.read_bytes())  # this process, and others, may have loaded the one before
         file.with_suffix(".json").write_text(json.dumps(description, indent=1) + "\n")
         print(f"{file}: {len(built)} functions, {file.stat().st_size / 2**20:.2f} MiB")
 

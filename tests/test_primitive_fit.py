@@ -162,7 +162,8 @@ def test_boxes_grow_inside_of_what_is_marked(seed: int) -> None:
     assert np.array_equal(sums[1:, 1:, 1:], marked.cumsum(0).cumsum(1).cumsum(2))
     left = marked * (rng.random(marked.shape) < 0.7)
     best = np.zeros((2, 3), np.int64)
-    count = best_box(sums, left, np.argwhere(marked), 1.0, np.empty((2, 3), np.int64), best)
+    seeds = np.ascontiguousarray(np.argwhere(marked))
+    count = best_box(sums, left, seeds, 1.0, np.empty((2, 3), np.int64), best)
     inside = tuple(slice(a, b) for a, b in best.T.tolist())
     assert marked[inside].all() and count == np.count_nonzero(left[inside])
     for axis in range(3):  # it cannot grow by another layer

@@ -42,8 +42,11 @@ def sources_digest() -> str:
 
 
 def library_file(machine: str) -> Path:
-    """Return the library of an architecture, as :func:`platform.machine` calls it; its description ends in .json."""
-    return FOLDER / f"kernel-{machine}.so"
+    """Return the library of an architecture, as :func:`platform.machine` calls it; its description ends in .json.
+
+    Tools that import all modules of a package would take it for one if its name ended in .so.
+    """
+    return FOLDER / f"kernel-{machine}.elf"
 
 
 def built_function(function: Callable[..., Any]) -> Callable[..., Any] | None:
