@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 from apex_ompl import planners
+from apex_ompl.util.display import one_line
 from apex_ompl.util.exiting import running
 from apex_ompl.util.forking import ProcessLock, unforked
 from apex_ompl.util.validation import check_options
@@ -44,6 +45,11 @@ class StateCheck:
     def __bool__(self) -> bool:
         """Whether the state is valid."""
         return not self.reason
+
+    def __repr__(self) -> str:
+        """Return whether the state is valid, why it is not, and the clearance."""
+        found = "valid" if self else f"invalid: {self.reason}"
+        return one_line("StateCheck", found, f"clearance {1e3 * self.clearance:.2f} mm")
 
 
 class MotionPlanner:
@@ -87,6 +93,13 @@ class MotionPlanner:
             import apex_ompl.session.one_plan  # noqa: F401 - with all that plans need
         self._checker, self._lock = self.world.checker, self.world.lock
         self._left: CollisionChecker | None = None  # of the world without some obstacles, as it was needed last
+
+    def __repr__(self) -> str:
+        """Return the robot, the model where one is given, and what is in the world."""
+        from apex_ompl.planners.apex_parameters import NAME
+
+        model = "" if self.model is None else f"model {self.model!r}"
+        return one_line("MotionPlanner", repr(self.robot.name), f"planner {NAME}", model, self.world.holds)
 
     def __enter__(self) -> Self:
         """Return the planner."""
