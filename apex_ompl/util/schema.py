@@ -19,6 +19,7 @@ from apex_ompl.util.arrays import is_masked_array
 from apex_ompl.util.display import values_line
 from apex_ompl.util.files import read_text
 from apex_ompl.util.forking import ProcessLock, unforked
+from apex_ompl.util.record_type import RecordType
 
 ModelT = TypeVar("ModelT", bound="StrictModel")
 
@@ -48,7 +49,7 @@ def _strict(schema: Any) -> Any:
     return {key: inner if key in ("metadata", "config") else _strict(inner) for key, inner in schema.items()}
 
 
-class StrictModel(BaseModel):
+class StrictModel(BaseModel, metaclass=RecordType):
     """A frozen record without unknown keys and with finite numbers only.
 
     Numbers must be numbers, neither texts nor True or False, and what is true or false must be given as such. Made from
