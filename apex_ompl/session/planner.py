@@ -10,7 +10,7 @@ import time
 from collections.abc import Set
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Self, Unpack
 
 from apex_ompl import planners
 from apex_ompl.util.display import one_line
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from apex_ompl.result import PlanResult
     from apex_ompl.robot import Robot
     from apex_ompl.scene.problem import Problem
+    from apex_ompl.session.keywords import PlanKeywords, ProblemKeywords
 
 
 @dataclass(frozen=True)
@@ -121,7 +122,7 @@ class MotionPlanner:
 
     def plan(
         self, start: State, goal: Target, planner: str | None = None, *,
-        group: Group | None = None, name: str = "world", **options: Any,
+        group: Group | None = None, name: str = "world", **options: Unpack[PlanKeywords],
     ) -> PlanResult:  # fmt: skip
         """Plan in the world as it is now.
 
@@ -147,7 +148,9 @@ class MotionPlanner:
             query = self.problem(start, goal, name, group)
             return plan_once(self, query, planner, started, PlanOptions(group=group, **options))
 
-    def plan_problem(self, problem: Problem, planner: str | None = None, **options: Any) -> PlanResult:
+    def plan_problem(
+        self, problem: Problem, planner: str | None = None, **options: Unpack[ProblemKeywords]
+    ) -> PlanResult:
         """Put the bodies of a problem into the world in place of those that are there, and plan.
 
         Args:
