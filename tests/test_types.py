@@ -13,21 +13,24 @@ from support import ROOT
 from apex_ompl.session.keywords import PlanKeywords, ProblemKeywords
 from apex_ompl.session.one_plan import PlanOptions
 
-SOURCES = ("api.py", "loop/run.py", "session/keywords.py", "session/planner.py", "util/record_type.py")
+SOURCES = ("api.py", "loop/run.py", "session/keywords.py", "session/planner.py")
+RECORDS = ("scene/bodies.py", "scene/problem.py", "util/record_type.py", "util/schema.py")
 USE = """
 from apex_ompl.api import plan
 from apex_ompl.loop.run import run
+from apex_ompl.scene.problem import PoseTarget, Problem
 from apex_ompl.session.planner import MotionPlanner
 
-def use(planner: MotionPlanner) -> None:
+def use(planner: MotionPlanner, problem: Problem) -> None:
     planner.plan([0.0], [1.0], timeout=3.0, timing=False, group="left_arm", leave_contact=0.001)
     planner.plan([0.0], [1.0], timeot=3)
     planner.plan([0.0], [1.0], seed="one")
-    planner.plan_problem(0, sed=3)
+    planner.plan_problem(problem, sed=3)
     plan("shelf_swap", timeot=3)
     run("popup", planer="apex")
+    PoseTarget(frame="left_hand_palm", positon=(0.5, 0.2, 0.4))
 """
-REFUSED = {8: '"timeot"', 9: '"seed"', 10: '"sed"', 11: '"timeot"', 12: '"planer"'}  # by line
+REFUSED = {9: '"timeot"', 10: '"seed"', 11: '"sed"', 12: '"timeot"', 13: '"planer"', 14: '"position"'}  # by line
 
 
 def test_keywords_are_those_that_plans_take() -> None:
@@ -35,11 +38,11 @@ def test_keywords_are_those_that_plans_take() -> None:
     assert set(ProblemKeywords.__annotations__) == names and set(PlanKeywords.__annotations__) == names - {"group"}
 
 
-def test_a_type_checker_refuses_options_that_do_not_exist(tmp_path: Path) -> None:
+def test_a_type_checker_refuses_options_and_fields_that_do_not_exist(tmp_path: Path) -> None:
     """It reads the modules of these functions alone, since the whole package takes it half a minute."""
     pytest.importorskip("mypy")
     (tmp_path / "use.py").write_text(USE)
-    sources = [ROOT / "apex_ompl" / source for source in SOURCES]
+    sources = [ROOT / "apex_ompl" / source for source in (*SOURCES, *RECORDS)]
     command = [
         sys.executable, "-m", "mypy", "--config-file=", "--follow-imports=skip", "--ignore-missing-imports",
         f"--cache-dir={tmp_path}", tmp_path / "use.py", *sources,
