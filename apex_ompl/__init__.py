@@ -1,8 +1,9 @@
 """APEX for OMPL: dual-arm planning with latent diffusion, real meshes and proven paths.
 
 ``plan`` solves a problem, ``run`` goes to a goal in closed loop while obstacles move, ``load_problem`` reads a problem,
-``setup`` gives OMPL's SimpleSetup of one, ``load_model`` reads a trained model, ``time_path`` times any path. Planners
-are in ``apex_ompl.planners``, ready-made problems in ``apex_ompl.problems``.
+``setup`` gives OMPL's SimpleSetup of one, ``load_model`` reads a trained model, ``time_path`` times any path, ``view``
+shows results in the browser. Planners are in ``apex_ompl.planners``, ready-made problems in ``apex_ompl.problems``;
+docs/README.md lists the other packages with public names.
 """
 
 from __future__ import annotations
@@ -16,61 +17,86 @@ if TYPE_CHECKING:
     from apex_ompl.collision.cloud_contact import filter_points
     from apex_ompl.diffusion.checkpoint import load_model
     from apex_ompl.errors import ApexError
+    from apex_ompl.live.retime import retime
     from apex_ompl.loop.result import RunResult
     from apex_ompl.loop.run import run
+    from apex_ompl.loop.sensor import Sensor
+    from apex_ompl.loop.settings import LoopSettings
     from apex_ompl.result import PlanResult, PlanStatus
-    from apex_ompl.robot import Robot, load_robot
+    from apex_ompl.robot import Limits, Robot, load_robot
+    from apex_ompl.scene.bodies import AttachedObject, Obstacle
     from apex_ompl.scene.points import points_from_depth
     from apex_ompl.scene.problem import Alignment, PoseTarget, Problem
-    from apex_ompl.session import MotionPlanner
+    from apex_ompl.session.planner import MotionPlanner
+    from apex_ompl.session.world import World
     from apex_ompl.trajectory import Timing, Trajectory, time_path
+    from apex_ompl.trajopt.path import Path
+    from apex_ompl.viz.view import view
 
 __version__ = "0.1.0"
 
 _HOMES = {  # modules that public names are imported from when they are first used
     "Alignment": "scene.problem",
     "ApexError": "errors",
+    "AttachedObject": "scene.bodies",
+    "Limits": "robot",
+    "LoopSettings": "loop.settings",
     "MotionPlanner": "session.planner",
+    "Obstacle": "scene.bodies",
+    "Path": "trajopt.path",
     "PlanResult": "result",
     "PlanStatus": "result",
     "PoseTarget": "scene.problem",
     "Problem": "scene.problem",
     "Robot": "robot",
     "RunResult": "loop.result",
+    "Sensor": "loop.sensor",
     "Timing": "trajectory",
     "Trajectory": "trajectory",
+    "World": "session.world",
+    "filter_points": "collision.cloud_contact",
     "load_model": "diffusion.checkpoint",
     "load_problem": "api",
-    "filter_points": "collision.cloud_contact",
     "load_robot": "robot",
     "plan": "api",
     "points_from_depth": "scene.points",
+    "retime": "live.retime",
     "run": "loop.run",
     "setup": "api",
     "time_path": "trajectory",
+    "view": "viz.view",
 }
 
 __all__ = [
     "Alignment",
     "ApexError",
+    "AttachedObject",
+    "Limits",
+    "LoopSettings",
     "MotionPlanner",
+    "Obstacle",
+    "Path",
     "PlanResult",
     "PlanStatus",
     "PoseTarget",
     "Problem",
     "Robot",
     "RunResult",
+    "Sensor",
     "Timing",
     "Trajectory",
+    "World",
     "filter_points",
     "load_model",
     "load_problem",
     "load_robot",
     "plan",
     "points_from_depth",
+    "retime",
     "run",
     "setup",
     "time_path",
+    "view",
 ]
 
 

@@ -22,6 +22,7 @@ from apex_ompl.trajopt.path import Path
 from apex_ompl.trajopt.spline import Spline
 from apex_ompl.types import Array
 from apex_ompl.util.archives import pack_archive, read_archive
+from apex_ompl.util.display import Summary, one_line
 from apex_ompl.util.files import BROKEN, path_text, suffix_of, write_atomically
 from apex_ompl.util.schema import dump_yaml, read_json, read_yaml
 from apex_ompl.util.validation import finite_array, finite_numbers
@@ -129,6 +130,21 @@ class PlanResult:
     def __bool__(self) -> bool:
         """Whether there is an exact path that passed the full check and, unless timing is off, is timed."""
         return self.status is PlanStatus.EXACT_SOLUTION
+
+    def __repr__(self) -> str:
+        """Return the status, the problem and what was found, in one line."""
+        by = f" by {self.solved_by}" if self.solved_by else ""
+        path = "" if self.path is None else f"{self.length:.3f} rad over {len(self.path)} states"
+        motion = "" if self.trajectory is None else f"motion {self.trajectory.duration:.3f} s"
+        return one_line("PlanResult", f"{self.status}{by}", repr(self.problem.name), path, motion, self.reason)
+
+    def __str__(self) -> str:
+        """Return the lines that ``apex-ompl plan`` prints."""
+        return str(_summary(self))
+
+    def _repr_html_(self) -> str:
+        """Return these lines as a table for notebooks."""
+        return _summary(self).html
 
     def as_dict(self) -> dict[str, Any]:
         """Return the fields as plain data, ready for JSON; numbers that do not exist are None."""
@@ -248,6 +264,43 @@ class PlanResult:
         del data["path"], data["trajectory"]
         knots = {} if self.trajectory is None else {key: getattr(self.trajectory, key) for key in KNOTS}
         return pack_archive("result", data, {"path": states, "joint_names": np.array(self.joint_names), **knots})
+
+
+def _summary(result: PlanResult) -> Summary:
+    """Return the lines about a result."""
+    times = [(name, f"{seconds:.3f}") for name, seconds in result.times.items() if name != "total"]
+    stages = ", ".join(f"{name} {text}" for name, text in times if not name.startswith(INSIDE))
+    inside = ", ".join(f"{name.removeprefix(INSIDE)} {text}" for name, text in times if name.startswith(INSIDE))
+    rows = [("reason", result.reason)] if result.reason else []
+    if "total" in result.times:
+        rows.append(("time", f"{result.times['total']:.3f} s ({stages})"))
+    if inside:
+        rows.append(("solve", inside))
+    if result.path is not None:
+        rows.append(("length", f"{result.length:.3f} rad over {len(result.path)} states"))
+        rows.append(("clearance", _clearance(result)))
+    if result.trajectory is not None:
+        motion = (
+            f"{result.trajectory.duration:.3f} s by {result.timing_method}, at most {result.deviation:.4f} rad off the "
+            f"path, {result.motion_clearance * 1e3:.2f} mm clear"
+        )
+        uses = ", ".join(f"{name} {share:.3f}" for name, share in result.limit_use.items() if name != "position")
+        rows += [("motion", motion), ("limits", f"{uses} used")]
+    if result.movers:
+        rows.append(("movers", f"proved apart from {', '.join(result.movers)} in time"))
+    rows.append(("checks", f"{result.checks} states checked, planner {result.planner}, seed {result.seed}"))
+    rows += [("note", note) for note in result.notes]
+    by = f" by {result.solved_by}" if result.solved_by else ""
+    return Summary(f"{result.problem.name}: {result.status}{by}", rows)
+
+
+def _clearance(result: PlanResult) -> str:
+    """Return the words for the clearance of a path."""
+    if np.isnan(result.clearance):
+        return "not proved"
+    pair = " <-> ".join(name for name in result.clearance_pair if name)
+    spheres = f"{100.0 * result.proved_by_spheres:.0f} % of the path proved by spheres, the rest by exact shapes"
+    return f"{result.clearance * 1e3:.2f} mm" + (f" ({pair})" if pair else "") + f"; {spheres}"
 
 
 def _finite(value: float) -> float | None:

@@ -10,13 +10,9 @@ import sys
 import time
 
 import apex_ompl
-from apex_ompl.apex.query import make_query
-from apex_ompl.errors import ApexError
-from apex_ompl.ompl_adapter.setup import assemble
-from apex_ompl.ompl_adapter.validity import full_check
-from apex_ompl.trajopt.candidates import first_valid
-from apex_ompl.trajopt.optimizer import Optimizer
-from apex_ompl.trajopt.path import path_length
+from apex_ompl.apex import make_query
+from apex_ompl.ompl_adapter import assemble, full_check
+from apex_ompl.trajopt import Optimizer, first_valid, path_length
 
 
 def main() -> None:
@@ -32,7 +28,7 @@ def main() -> None:
         query = make_query(ready.checker, start, goal)
         begin = time.perf_counter()
         proposed = model.propose(query, kernel, args.count).control
-    except ApexError as error:
+    except apex_ompl.ApexError as error:
         print(f"propose: error: {error}", file=sys.stderr)
         sys.exit(2)
     took = time.perf_counter() - begin

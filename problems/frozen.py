@@ -29,6 +29,7 @@ from apex_ompl.problems.suite_robot import ROBOT, robot
 from apex_ompl.scene.bodies import Obstacle, located
 from apex_ompl.scene.problem import Problem
 from apex_ompl.types import Array
+from apex_ompl.util.display import fields_line
 from apex_ompl.util.files import write_atomically
 from apex_ompl.util.schema import validate
 
@@ -55,6 +56,8 @@ class Witness:
     path: Array
     times: Array | None = None
 
+    __repr__ = fields_line
+
     def rounded(self) -> Witness:
         """Return the witness quantized as in its file."""
         path = self.path.copy()
@@ -80,6 +83,8 @@ class FrozenProblem:
     draw_number: int
     primitives: tuple[Obstacle, ...] | None = None
     groups: tuple[Group, ...] = ()
+
+    __repr__ = fields_line
 
     @property
     def digest(self) -> str:

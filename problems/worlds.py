@@ -33,6 +33,7 @@ from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Problem
 from apex_ompl.trajectory import Trajectory
 from apex_ompl.types import Array
+from apex_ompl.util.display import one_line
 from apex_ompl.util.validation import check_integer, check_name
 
 MOVING_KIND = "moving"
@@ -57,6 +58,10 @@ class World(ABC):
     problem: Problem
     fastest: float
     ran: bool = False
+
+    def __repr__(self) -> str:
+        """Return the name of the world, and whether a run was made in it."""
+        return one_line(type(self).__name__, repr(self.name), "ran" if self.ran else "")
 
     def begin(self, motion: Trajectory, time: float) -> None:  # noqa: B027 - most worlds do not care
         """Take the first motion that the robot is to follow, and when it begins [s]."""

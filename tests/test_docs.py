@@ -90,6 +90,21 @@ def test_names_of_the_package_exist(page: Path) -> None:
         assert is_there(name), name
 
 
+@pytest.mark.parametrize("page", [*PAGES, *sorted((ROOT / "examples").glob("*.py"))], ids=name_of)
+def test_code_imports_public_names_only(page: Path) -> None:
+    """They are those of ``apex_ompl`` and of the packages that docs/README.md lists."""
+    listed = set(re.findall(r"`(apex_ompl\.\w+)`", (ROOT / "docs" / "README.md").read_text()))
+    for code in CODE.get(page) or [page.read_text()] * (page.suffix == ".py"):
+        for node in ast.walk(ast.parse(code)):
+            if isinstance(node, ast.Import):
+                assert not [one.name for one in node.names if one.name.startswith("apex_ompl.")]
+            elif isinstance(node, ast.ImportFrom) and str(node.module).split(".")[0] == "apex_ompl":
+                assert node.module in {"apex_ompl", *listed}, node.module
+                module = importlib.import_module(node.module)
+                for name in (one.name for one in node.names if one.name not in module.__all__):
+                    importlib.import_module(f"{node.module}.{name}")  # a package or a module of functions
+
+
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
 def test_commands_are_understood(page: Path) -> None:
     for line in commands(page):

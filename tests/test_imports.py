@@ -56,7 +56,17 @@ def test_a_plan_imports_neither_torch_nor_other_planners() -> None:
     assert loaded(code, ("matplotlib", "torch", "trimesh", *others)) == []
 
 
-@pytest.mark.parametrize("package", ["apex_ompl", "apex_ompl.session", "apex_ompl.planning"])
+@pytest.mark.parametrize(
+    "package",
+    [
+        "apex_ompl",
+        *(
+            f"apex_ompl.{name}"
+            for name in ("apex", "datasets", "diffusion", "live", "loop", "ompl_adapter", "planning")
+        ),
+        *(f"apex_ompl.{name}" for name in ("scene", "session", "trajopt", "viz")),
+    ],
+)
 def test_public_names_are_those_of_their_modules(package: str) -> None:
     module = importlib.import_module(package)
     assert set(module.__all__) <= set(dir(module))
@@ -66,6 +76,13 @@ def test_public_names_are_those_of_their_modules(package: str) -> None:
         assert given[name] is getattr(module, name)
     with pytest.raises(AttributeError, match=f"module '{package}' has no attribute 'plans'"):
         module.plans  # noqa: B018
+
+
+@pytest.mark.parametrize(
+    "package", ["apex", "datasets", "diffusion", "live", "loop", "ompl_adapter", "scene", "session", "trajopt", "viz"]
+)
+def test_packages_cost_nothing_before_a_name_of_theirs_is_used(package: str) -> None:
+    assert loaded(f"import apex_ompl.{package}; dir(apex_ompl.{package})", (*LARGE, "numpy")) == []
 
 
 def test_the_planner_says_what_its_types_are() -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import sys
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,7 @@ from typing import Any
 from apex_ompl.api import plan
 from apex_ompl.cli.options import LIMITS, name_value_pairs, numbers_by_name
 from apex_ompl.errors import ParameterError
-from apex_ompl.result import INSIDE, SUFFIXES, PlanResult, PlanStatus
+from apex_ompl.result import SUFFIXES, PlanResult, PlanStatus
 from apex_ompl.robot import load_robot
 from apex_ompl.trajectory import Timing
 from apex_ompl.trajectory.files import MESSAGES
@@ -59,7 +58,7 @@ def run(parsed: argparse.Namespace) -> int:
     )
     if parsed.out is not None:
         _save(result, parsed.out, timed=not parsed.no_timing, controllers=parsed.controllers)
-    print(json.dumps(result.as_dict()) if parsed.json else _summary(result))
+    print(json.dumps(result.as_dict()) if parsed.json else result)
     return EXIT_CODES.get(result.status, 1)
 
 
@@ -77,40 +76,3 @@ def _save(result: PlanResult, out: Path, *, timed: bool, controllers: bool) -> N
         result.trajectory.save(out, groups)
     else:
         result.save(out)
-
-
-def _clearance(result: PlanResult) -> str:
-    """Return the words for the clearance of a path."""
-    if math.isnan(result.clearance):
-        return "not proved"
-    pair = " <-> ".join(name for name in result.clearance_pair if name)
-    spheres = f"{100.0 * result.proved_by_spheres:.0f} % of the path proved by spheres, the rest by exact shapes"
-    return f"{result.clearance * 1e3:.2f} mm" + (f" ({pair})" if pair else "") + f"; {spheres}"
-
-
-def _summary(result: PlanResult) -> str:
-    """Return the lines printed about a result."""
-    times = [(name, f"{seconds:.3f}") for name, seconds in result.times.items() if name != "total"]
-    stages = ", ".join(f"{name} {text}" for name, text in times if not name.startswith(INSIDE))
-    inside = ", ".join(f"{name.removeprefix(INSIDE)} {text}" for name, text in times if name.startswith(INSIDE))
-    lines = [f"{result.problem.name}: {result.status}" + (f" by {result.solved_by}" if result.solved_by else "")]
-    if result.reason:
-        lines.append(f"  reason     {result.reason}")
-    lines.append(f"  time       {result.times['total']:.3f} s ({stages})")
-    if inside:
-        lines.append(f"  solve      {inside}")
-    if result.path is not None:
-        lines.append(f"  length     {result.length:.3f} rad over {len(result.path)} states")
-        lines.append(f"  clearance  {_clearance(result)}")
-    if result.trajectory is not None:
-        uses = ", ".join(f"{name} {share:.3f}" for name, share in result.limit_use.items() if name != "position")
-        lines.append(
-            f"  motion     {result.trajectory.duration:.3f} s by {result.timing_method}, "
-            f"at most {result.deviation:.4f} rad off the path, {result.motion_clearance * 1e3:.2f} mm clear"
-        )
-        lines.append(f"  limits     {uses} used")
-    if result.movers:
-        lines.append(f"  movers     proved apart from {', '.join(result.movers)} in time")
-    lines.append(f"  checks     {result.checks} states checked, planner {result.planner}, seed {result.seed}")
-    lines += [f"  note       {note}" for note in result.notes]
-    return "\n".join(lines)

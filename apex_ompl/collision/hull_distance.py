@@ -11,6 +11,7 @@ import pinocchio as pin
 
 from apex_ompl.collision.solids import Solid, box_distances, transform, world_boxes
 from apex_ompl.types import Array
+from apex_ompl.util.display import fields_line
 
 
 @dataclass(frozen=True)
@@ -28,6 +29,8 @@ class Distance:
     first: str
     second: str
     points: Array
+
+    __repr__ = fields_line
 
 
 NO_PAIR = Distance(float("inf"), "", "", np.full((2, 3), np.nan))

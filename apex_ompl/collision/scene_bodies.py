@@ -14,6 +14,7 @@ from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import AttachedObject, Body, Obstacle, file_shape, given_fields, same_solid
 from apex_ompl.scene.scripts import moved_to, standing
 from apex_ompl.types import Array
+from apex_ompl.util.display import counted, one_line
 from apex_ompl.util.forking import unforked
 from apex_ompl.util.progress import progress
 from apex_ompl.util.schema import validate
@@ -35,6 +36,12 @@ class SceneBodies:
         self._attached: dict[str, AttachedObject] = {}
         self._extents: dict[str, tuple[str, Array]] = {}
         self._fixtures = frozenset(body.name for body in robot.fixtures)
+
+    def __repr__(self) -> str:
+        """Return the robot, and how many obstacles and held objects there are."""
+        held = f"{len(self._attached)} attached" if self._attached else ""
+        obstacles = counted(len(self.obstacles), "obstacle")
+        return one_line(type(self).__name__, repr(self.robot.name), obstacles, held)
 
     @unforked()  # tqdm has a lock of its own
     def fill(

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from apex_ompl.errors import ApexError
 from apex_ompl.trajopt.spline import Spline
 from apex_ompl.types import Array
+from apex_ompl.util.display import counted, one_line
 
 MICRO = 1e-6  # states are stored in whole microradians; the suites draw states of six decimals
 SOURCES = ("line", "bumps", "rrtconnect", "reversed", "part", "model")
@@ -70,6 +71,10 @@ class Paths:
     names: Mapping[str, tuple[str, ...]]
     about: Mapping[str, Any]
     counts: Mapping[str, Any] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        """Return the numbers of paths and problems."""
+        return one_line("Paths", f"{counted(len(self), 'path')} of {counted(self.problems, 'problem')}")
 
     def __post_init__(self) -> None:
         """Check that the arrays fit each other.

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from apex_ompl.datasets.records import FIELDS, DatasetError, Paths, about_fault, arrays_fault, names_fault
 from apex_ompl.errors import FileFormatError, MissingFileError
+from apex_ompl.util.display import one_line
 from apex_ompl.util.files import is_file, locked, make_folder, write_atomically
 
 SCHEMA = "apex-ompl/dataset/1"
@@ -48,6 +49,10 @@ class Store:
             raise FileFormatError(str(path), "", type(error).__name__, "expected the manifest of a data set") from error
         if found != SCHEMA:
             raise FileFormatError(str(path), "schema", found, f"expected {SCHEMA!r}")
+
+    def __repr__(self) -> str:
+        """Return the folder."""
+        return one_line("Store", repr(str(self.folder)))
 
     @classmethod
     def create(cls, folder: str | os.PathLike[str], manifest: Mapping[str, Any], same: Iterable[str]) -> Store:

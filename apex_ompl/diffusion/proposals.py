@@ -23,6 +23,7 @@ from apex_ompl.kernel import Kernel
 from apex_ompl.kernel.products import product
 from apex_ompl.trajopt.spline import Spline
 from apex_ompl.types import Array
+from apex_ompl.util.display import counted, fields_line, one_line
 from apex_ompl.util.stopwatch import StageClock
 from apex_ompl.util.validation import check_array, check_integer, check_name, check_number
 
@@ -44,6 +45,8 @@ class Sampling:
     steps: int = 2
     temperature: float = 1.0
     guidance: Guidance = UNGUIDED
+
+    __repr__ = fields_line
 
     def __post_init__(self) -> None:
         """Check the numbers.
@@ -71,6 +74,8 @@ class Proposals:
     latent: Numbers
     seconds: Mapping[str, float]
 
+    __repr__ = fields_line
+
 
 class TrajectoryModel(ABC):
     """Trained model that proposes paths; safe to use from several threads.
@@ -95,6 +100,12 @@ class TrajectoryModel(ABC):
         self.sight = Sight(KeyStates.of(**keys), probes, config.condition.hands) if keys else None
         self.sampling = Sampling(**config.sampling.model_dump())
         self._looked_at = self.spline.basis(probes.shares)
+
+    def __repr__(self) -> str:
+        """Return the robot, the size of the paths, and what the model sees of a scene."""
+        size = f"{self.spline.points} control points of {counted(len(self.config.joints), 'joint')}"
+        scene = f"scene {self.config.condition.scene!r}"
+        return one_line(type(self).__name__, f"robot {self.config.robot!r}", size, scene)
 
     @property
     def sees_point(self) -> bool:

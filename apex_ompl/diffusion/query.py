@@ -17,6 +17,7 @@ from apex_ompl.kernel.compiled.arrays import BOX, GRID, HALF_SPACE
 from apex_ompl.kernel.scene_builder import Solids, boxes_around, primitive, tables_of
 from apex_ompl.kernel.tables import SceneTables
 from apex_ompl.types import Array, Flags
+from apex_ompl.util.display import fields_line
 
 HALVES = np.array([[0.5, 0.5, 0.5], [1.0, 0.5, 0.5], [1.0, 0.5, 0.5], [1.0, 0.5, 0.5]], np.float32)
 """Factors from the sizes in data sets (edges, lengths) to those of the networks (half edges, half lengths), by shape;
@@ -50,6 +51,8 @@ class ObstacleSet:
     position: Array
     rotation: Array
     size: Array
+
+    __repr__ = fields_line
 
     @classmethod
     def from_rows(cls, rows: Sequence[ObstacleRecord]) -> ObstacleSet:
@@ -126,6 +129,8 @@ class Query:
     known: ObstacleSet | None
     scene: tuple[SceneTables, Flags] | None = None
     held: Sequence[HeldExtent] = ()
+
+    __repr__ = fields_line
 
     @cached_property
     def obstacles(self) -> ObstacleSet:

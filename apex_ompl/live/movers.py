@@ -23,6 +23,7 @@ from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.trajectory import Trajectory
 from apex_ompl.types import Array
 from apex_ompl.util.arrays import compact
+from apex_ompl.util.display import one_line
 from apex_ompl.util.validation import check_array, check_number, finite_array
 
 SHORTEST = 1e-3  # length of an interval of time that is given up [s]
@@ -98,6 +99,10 @@ class Movers:
         """Take a state, and make the views anew."""
         self.__dict__.update(state)
         self._pack(self.packed)
+
+    def __repr__(self) -> str:
+        """Return the names of the obstacles."""
+        return one_line("Movers", *self.names)
 
     def __len__(self) -> int:
         """Return the number of obstacles."""

@@ -23,6 +23,7 @@ from apex_ompl.robot.model import Limits
 from apex_ompl.trajectory.trajectory import Trajectory
 from apex_ompl.types import Array
 from apex_ompl.util.arrays import compact
+from apex_ompl.util.display import fields_line
 from apex_ompl.util.validation import check_number
 
 STAGE = 0.04  # least length of a stage, in the motion's own time [s]
@@ -101,6 +102,10 @@ class Retimed(NamedTuple):
     trajectory: Trajectory | None
     reason: str
     deviation: float
+
+    def __repr__(self) -> str:
+        """Return the fields, arrays by their shapes."""
+        return fields_line(self)
 
 
 def retime(

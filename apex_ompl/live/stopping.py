@@ -15,6 +15,7 @@ from apex_ompl.robot.model import Limits
 from apex_ompl.trajectory.trajectory import Trajectory
 from apex_ompl.types import Array, Flags
 from apex_ompl.util.arrays import compact
+from apex_ompl.util.display import fields_line
 
 DEVIATION = 1e-3  # of a stop from the path [rad]
 
@@ -33,6 +34,10 @@ class Stop(NamedTuple):
     trajectory: Trajectory
     beyond: Array
     deviation: float
+
+    def __repr__(self) -> str:
+        """Return the fields, arrays by their shapes."""
+        return fields_line(self)
 
     @property
     def within_limits(self) -> bool:

@@ -1,1 +1,28 @@
 """The closed loop: a robot that moves among obstacles that it observes, and plans anew while it moves."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from apex_ompl.util.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from apex_ompl.loop.observation import Observation
+    from apex_ompl.loop.result import Event, Outcome, RunResult
+    from apex_ompl.loop.sensor import Sensor, SensorStream
+    from apex_ompl.loop.settings import LoopSettings
+
+__all__ = ["Event", "LoopSettings", "Observation", "Outcome", "RunResult", "Sensor", "SensorStream"]
+
+__getattr__, __dir__ = lazy_names(
+    __name__,
+    {
+        "Event": "result",
+        "LoopSettings": "settings",
+        "Observation": "observation",
+        "Outcome": "result",
+        "RunResult": "result",
+        "Sensor": "sensor",
+        "SensorStream": "sensor",
+    },
+)

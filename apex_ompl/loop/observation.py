@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from apex_ompl.scene.bodies import Obstacle
+from apex_ompl.util.display import fields_line
 
 
 @dataclass(frozen=True)
@@ -21,3 +22,5 @@ class Observation:
     stamp: float
     received: float
     seen: tuple[Obstacle, ...]
+
+    __repr__ = fields_line

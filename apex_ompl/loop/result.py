@@ -19,6 +19,7 @@ from apex_ompl.trajectory.checks import START_TOLERANCE
 from apex_ompl.trajectory.files import KNOTS
 from apex_ompl.types import Array
 from apex_ompl.util.archives import pack_archive, read_archive
+from apex_ompl.util.display import Summary, fields_line, one_line
 from apex_ompl.util.files import BROKEN, path_text, suffix_of, write_atomically
 from apex_ompl.util.schema import read_json
 from apex_ompl.util.validation import check_number, check_seed, finite_array, finite_numbers
@@ -30,6 +31,11 @@ TEXTS = ("reason", "robot", "method", "prediction", "clock")
 GOING, BRAKING, STANDING = "going", "braking", "standing"  # what a robot does when a conflict is predicted
 INTERRUPTED = "interrupted"  # reason of a run that the user ended
 JSON_NAMES = {"str": "text", "list": "list", "dict": "mapping"}
+SHOWN = {
+    "time_to_goal": ("s", 1.0), "rest_time": ("s", 1.0), "clearance": ("mm", 1e3), "reaction_p95": ("ms", 1e3),
+    "tick_p99": ("ms", 1e3), "deadline_misses": ("", 1.0),
+}  # fmt: skip
+COUNTS = ("replans_asked", "replans_accepted", "conflicts", "stops", "unguarded_steps", "broken_steps")
 
 
 class Outcome(StrEnum):
@@ -64,6 +70,8 @@ class Event:
     time: float
     kind: str
     data: Mapping[str, Any] = field(default_factory=dict)
+
+    __repr__ = fields_line
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,6 +112,20 @@ class RunResult:
     def __bool__(self) -> bool:
         """Whether the goal was reached."""
         return self.outcome is Outcome.REACHED
+
+    def __repr__(self) -> str:
+        """Return the outcome, the method and the world, in one line."""
+        motion, clock = f"motion {self.trajectory.duration:.2f} s", f"{self.clock} clock"
+        head = f"{self.outcome} by {self.method}"
+        return one_line("RunResult", head, repr(self.problem.name), motion, clock, self.reason)
+
+    def __str__(self) -> str:
+        """Return the lines that ``apex-ompl run`` prints."""
+        return str(_summary(self))
+
+    def _repr_html_(self) -> str:
+        """Return these lines as a table for notebooks."""
+        return _summary(self).html
 
     def as_dict(self) -> dict[str, Any]:
         """Return the fields as plain data, ready for JSON."""
@@ -166,6 +188,23 @@ class RunResult:
             raise FileFormatError(str(path), str(error.args[0]), None, "required field is missing") from error
         except (*BROKEN, AttributeError) as error:
             raise FileFormatError(str(path), "", str(error), "expected a complete saved run") from error
+
+
+def _summary(result: RunResult) -> Summary:
+    """Return the lines about a run."""
+    metrics = result.metrics
+    measured = [
+        f"{name.replace('_', ' ')} {factor * metrics[name]:.3g} {unit}".rstrip()
+        for name, (unit, factor) in SHOWN.items()
+        if name in metrics
+    ]
+    counts = [f"{metrics[name]:.0f} {name.replace('_', ' ')}" for name in COUNTS if name in metrics]
+    made = f"{result.method}, prediction {result.prediction}, clock {result.clock}, seed {result.seed}"
+    rows = [
+        ("reason", result.reason), ("motion", f"{result.trajectory.duration:.2f} s"),
+        ("measured", ", ".join(measured)), ("events", ", ".join(counts)), ("method", made),
+    ]  # fmt: skip
+    return Summary(f"{result.problem.name}: {result.outcome}", [row for row in rows if row[1]])
 
 
 def _check_plain(data: Mapping[str, Any]) -> None:

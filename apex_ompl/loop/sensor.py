@@ -15,6 +15,7 @@ from apex_ompl.loop.observation import Observation
 from apex_ompl.problems.worlds import World
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.scripts import standing, vector
+from apex_ompl.util.display import fields_line, one_line
 from apex_ompl.util.validation import check_number, check_positive, check_seed
 
 EARLIEST = 2**20  # looks before time 0 at most
@@ -41,6 +42,8 @@ class Sensor:
     noise: float = 0.008
     dropout: float = 0.02
     seed: int = 0
+
+    __repr__ = fields_line
 
     def __post_init__(self) -> None:
         """Check all numbers.
@@ -91,6 +94,10 @@ class SensorStream:
         check_number(watched, "watched", 0.0, min(LONGEST, EARLIEST / sensor.rate))
         self.sensor, self._world = sensor, world
         self._number, self._until = -int(watched * sensor.rate + 1e-9), -watched
+
+    def __repr__(self) -> str:
+        """Return the sensor and the world."""
+        return one_line("SensorStream", repr(self.sensor), repr(self._world))
 
     def observations(self, until: float) -> tuple[Observation, ...]:
         """Return the observations with a stamp up to a time [s] that were not given yet, in order of stamp.

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from apex_ompl.errors import ParameterError
+from apex_ompl.util.display import fields_line
 from apex_ompl.util.validation import check_name, check_number
 
 PREDICTIONS = ("still", "cv", "truth")
@@ -80,6 +81,8 @@ class LoopSettings:
     silence: float = 1.0
     timeout: float = 30.0
     stuck: float = 30.0
+
+    __repr__ = fields_line
 
     def __post_init__(self) -> None:
         """Check the numbers.

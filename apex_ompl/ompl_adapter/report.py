@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any, Protocol, runtime_checkable
 
 from apex_ompl.trajopt.path import Path
+from apex_ompl.util.display import fields_line
 from apex_ompl.util.stopwatch import timed
 
 
@@ -45,6 +46,8 @@ class SolveReport:
     resampled: int = 0
     steps: int = 0
     improved: int = 0
+
+    __repr__ = fields_line
 
     def timed(self, stage: str) -> AbstractContextManager[None]:
         """Count the time of a block to a stage."""

@@ -21,6 +21,7 @@ from apex_ompl.tasks.alignment import AlignmentGoal, alignment_goal
 from apex_ompl.tasks.goal_sampling import sample
 from apex_ompl.tasks.pose_goal import PoseGoal
 from apex_ompl.types import Array
+from apex_ompl.util.display import counted, one_line
 from apex_ompl.util.resolution import SEARCH_RESOLUTION
 
 GOAL_STATES = 8  # how many states an alignment goal is sampled into
@@ -65,6 +66,11 @@ class PlanningSetup:
     alignment: AlignmentGoal | None
     held: NDArray[np.intp]
     notes: tuple[str, ...]
+
+    def __repr__(self) -> str:
+        """Return the problem, the robot and the number of goals."""
+        goals = counted(len(self.goals), "goal state")
+        return one_line("PlanningSetup", repr(self.problem.name), f"robot {self.robot.name!r}", goals, self.start_fault)
 
     def raise_faults(self) -> None:
         """Raise what the checkers kept inside of OMPL's callbacks, Ctrl-C among it."""

@@ -18,6 +18,7 @@ from apex_ompl.collision.path_proof import Curve, PathProof
 from apex_ompl.ompl_adapter.simple_setup import SpaceInformation
 from apex_ompl.trajectory.trajectory import ROUNDING, Trajectory
 from apex_ompl.types import Array
+from apex_ompl.util.display import fields_line
 from apex_ompl.util.resolution import SEARCH_RESOLUTION
 from apex_ompl.util.validation import check_states, number_array
 
@@ -161,6 +162,8 @@ class FullCheck:
     segment: int | None
     proof: PathProof | None = None
     timed_out: bool = False
+
+    __repr__ = fields_line
 
     def __bool__(self) -> bool:
         """Whether the path is a solution."""

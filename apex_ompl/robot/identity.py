@@ -9,6 +9,7 @@ from weakref import WeakKeyDictionary
 
 from apex_ompl.errors import RobotError
 from apex_ompl.robot.model import Robot, load_robot
+from apex_ompl.util.schema import StrictModel
 
 FILE_NAME = re.compile(r'filename="([^"]*)"')
 
@@ -28,11 +29,20 @@ def digest(robot: Robot) -> str:
             else:
                 found.update(file.encode())
         pairs = [(pair.first, pair.second) for pair in robot.geometry.collisionPairs]
-        found.update(repr((robot.name, robot.joint_names, pairs, robot.fixtures)).encode())
+        found.update(_spelled((robot.name, robot.joint_names, pairs, robot.fixtures)).encode())
         for array in vars(robot.limits).values():
             found.update(array.tobytes())
         _digests[robot] = found.hexdigest()[:16]
     return _digests[robot]
+
+
+def _spelled(value: object) -> str:
+    """Return ``repr`` of plain data with records in full, all of their fields: digests are stored in results."""
+    if isinstance(value, StrictModel):
+        return f"{type(value).__name__}({', '.join(f'{name}={_spelled(inner)}' for name, inner in value)})"
+    if type(value) is tuple:
+        return f"({', '.join(map(_spelled, value))}{',' * (len(value) == 1)})"
+    return repr(value)
 
 
 def _update(digest: hashlib._Hash, path: Path) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
@@ -18,6 +18,7 @@ from apex_ompl.robot.config import WIDEST, Hand, RobotConfig, read_config, read_
 from apex_ompl.robot.geometry import check_geometry, pair_up
 from apex_ompl.scene.bodies import Body
 from apex_ompl.types import Array
+from apex_ompl.util.display import counted, html_table, one_line
 from apex_ompl.util.validation import number_array, shape_error
 
 SHORTEST_RAMP = 1e-6  # from no acceleration to the largest, for motions whose knots have distinct times [s]
@@ -46,6 +47,13 @@ class Limits:
     def __post_init__(self) -> None:
         """Lower jerks that are too large to tell from none."""
         object.__setattr__(self, "jerk", np.minimum(self.jerk, np.asarray(self.acceleration) / SHORTEST_RAMP))
+
+    def __repr__(self) -> str:
+        """Return the number of joints and the range of their largest speeds."""
+        slowest, fastest = np.min(self.velocity), np.max(self.velocity)
+        return one_line(
+            "Limits", counted(len(self.velocity), "joint"), f"velocity {slowest:.3g} to {fastest:.3g} rad/s"
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,10 +86,25 @@ class Robot:
     geometry: pin.GeometryModel
     fixtures: tuple[Body, ...]
     part_links: Mapping[str, tuple[str, ...]]
-    urdf: str = field(repr=False)
-    covers: Path | None = field(repr=False)
-    files: tuple[Path, ...] = field(repr=False)
-    _order: NDArray[np.intp] = field(repr=False)
+    urdf: str
+    covers: Path | None
+    files: tuple[Path, ...]
+    _order: NDArray[np.intp]
+
+    def __repr__(self) -> str:
+        """Return the name and the number of planned joints."""
+        return one_line("Robot", repr(self.name), f"{self.dof} dof")
+
+    def _repr_html_(self) -> str:
+        """Return the joints with their limits as a table for notebooks."""
+        limits = self.limits
+        columns = limits.lower, limits.upper, limits.velocity, limits.acceleration, limits.jerk
+        rows = [
+            (name, *(f"{value:.4g}" for value in values))
+            for name, *values in zip(self.joint_names, *columns, strict=True)
+        ]
+        head = ("joint", "lower [rad]", "upper", "velocity [rad/s]", "acceleration [rad/s^2]", "jerk [rad/s^3]")
+        return html_table(f"{self.name}, {counted(self.dof, 'joint')}", rows, head)
 
     @property
     def dof(self) -> int:

@@ -18,6 +18,7 @@ from pydantic import BeforeValidator, Field, PositiveFloat, PrivateAttr, field_v
 from apex_ompl.errors import FileFormatError, nearest_name
 from apex_ompl.scene.bodies import AttachedObject, Name, Obstacle, Quaternion, Vector, located
 from apex_ompl.types import Array
+from apex_ompl.util.display import counted, one_line
 from apex_ompl.util.files import path_text, write_atomically
 from apex_ompl.util.schema import StrictModel, dump_yaml, read_yaml, validate
 
@@ -187,6 +188,15 @@ class Problem(StrictModel):
         return self
 
     _file: str = PrivateAttr("")
+
+    def __repr__(self) -> str:
+        """Return the name, the robot, the numbers of bodies, and the kind of goal."""
+        obstacles, goal = (
+            counted(len(self.scene), "obstacle"),
+            next(kind for kind in GOALS if getattr(self.goal, kind) is not None),
+        )
+        held = f"{len(self.attached)} attached" if self.attached else ""
+        return one_line("Problem", repr(self.name), f"robot {self.robot!r}", obstacles, held, f"goal {goal}")
 
     def __eq__(self, other: object) -> bool:
         """Whether another problem is the same, wherever it was read."""

@@ -10,9 +10,10 @@ import time
 from collections.abc import Set
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Self, Unpack
 
 from apex_ompl import planners
+from apex_ompl.util.display import one_line
 from apex_ompl.util.exiting import running
 from apex_ompl.util.forking import ProcessLock, unforked
 from apex_ompl.util.validation import check_options
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from apex_ompl.result import PlanResult
     from apex_ompl.robot import Robot
     from apex_ompl.scene.problem import Problem
+    from apex_ompl.session.keywords import PlanKeywords, ProblemKeywords
 
 
 @dataclass(frozen=True)
@@ -44,6 +46,11 @@ class StateCheck:
     def __bool__(self) -> bool:
         """Whether the state is valid."""
         return not self.reason
+
+    def __repr__(self) -> str:
+        """Return whether the state is valid, why it is not, and the clearance."""
+        found = "valid" if self else f"invalid: {self.reason}"
+        return one_line("StateCheck", found, f"clearance {1e3 * self.clearance:.2f} mm")
 
 
 class MotionPlanner:
@@ -88,6 +95,13 @@ class MotionPlanner:
         self._checker, self._lock = self.world.checker, self.world.lock
         self._left: CollisionChecker | None = None  # of the world without some obstacles, as it was needed last
 
+    def __repr__(self) -> str:
+        """Return the robot, the model where one is given, and what is in the world."""
+        from apex_ompl.planners.apex_parameters import NAME
+
+        model = "" if self.model is None else f"model {self.model!r}"
+        return one_line("MotionPlanner", repr(self.robot.name), f"planner {NAME}", model, self.world.holds)
+
     def __enter__(self) -> Self:
         """Return the planner."""
         return self
@@ -108,7 +122,7 @@ class MotionPlanner:
 
     def plan(
         self, start: State, goal: Target, planner: str | None = None, *,
-        group: Group | None = None, name: str = "world", **options: Any,
+        group: Group | None = None, name: str = "world", **options: Unpack[PlanKeywords],
     ) -> PlanResult:  # fmt: skip
         """Plan in the world as it is now.
 
@@ -134,7 +148,9 @@ class MotionPlanner:
             query = self.problem(start, goal, name, group)
             return plan_once(self, query, planner, started, PlanOptions(group=group, **options))
 
-    def plan_problem(self, problem: Problem, planner: str | None = None, **options: Any) -> PlanResult:
+    def plan_problem(
+        self, problem: Problem, planner: str | None = None, **options: Unpack[ProblemKeywords]
+    ) -> PlanResult:
         """Put the bodies of a problem into the world in place of those that are there, and plan.
 
         Args:

@@ -18,6 +18,7 @@ from apex_ompl.scene.bodies import MOTION, AttachedObject, Obstacle, given_field
 from apex_ompl.scene.problem import Problem
 from apex_ompl.session.cloud_files import CloudFiles, cloud_of
 from apex_ompl.types import Array
+from apex_ompl.util.display import counted, one_line
 from apex_ompl.util.forking import ProcessLock
 from apex_ompl.util.schema import validate
 from apex_ompl.util.validation import finite_array
@@ -66,6 +67,18 @@ class World:
     def _bodies(self) -> tuple[tuple[Obstacle, ...], tuple[AttachedObject, ...], tuple[tuple[str, str], ...]]:
         with self.lock:
             return tuple(self.obstacles.values()), tuple(self.held.values()), self.allowed
+
+    def __repr__(self) -> str:
+        """Return how many obstacles, held objects and allowed pairs there are."""
+        return one_line("World", self.holds)
+
+    @property
+    def holds(self) -> str:
+        """How many obstacles, held objects and allowed pairs there are, in words."""
+        counts = [counted(len(self.obstacles), "obstacle")]
+        counts += [f"{len(self.held)} attached"] if self.held else []
+        counts += [counted(len(self.allowed), "allowed pair")] if self.allowed else []
+        return ", ".join(counts)
 
     @property
     def obstacles(self) -> Mapping[str, Obstacle]:

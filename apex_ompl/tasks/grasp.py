@@ -16,6 +16,7 @@ from apex_ompl.robot import Robot
 from apex_ompl.robot.geometry import link_of
 from apex_ompl.scene.bodies import AttachedObject
 from apex_ompl.types import Array
+from apex_ompl.util.display import fields_line
 
 HandObjects = Sequence[tuple[str, AttachedObject]]
 """Objects by the name of the hand that is to hold each."""
@@ -41,6 +42,8 @@ class Grasp:
     synergy_joint: str | None
     synergy: float
     touched: str
+
+    __repr__ = fields_line
 
 
 def grasp(robot: Robot, hand: str, held: AttachedObject) -> Grasp:

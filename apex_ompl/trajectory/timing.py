@@ -24,6 +24,7 @@ from apex_ompl.trajectory.methods.ruckig_profiles import Profiles, joined
 from apex_ompl.trajectory.trajectory import Trajectory
 from apex_ompl.trajopt.path import Path
 from apex_ompl.types import Array
+from apex_ompl.util.display import fields_line
 from apex_ompl.util.validation import check_array, check_name, check_number, check_positive, check_states, finite_array
 
 SHORTEST_DURATION = 1e-3  # of a motion between states that count as one [s]
@@ -68,6 +69,8 @@ class Timing:
     max_jerk: Mapping[str, float] = field(default_factory=dict)
     start_velocity: Sequence[float] = ()
     start_acceleration: Sequence[float] = ()
+
+    __repr__ = fields_line
 
     def __post_init__(self) -> None:
         """Check the name and the numbers.
@@ -154,6 +157,8 @@ class TimedPath:
     deviation: float
     method: str
     form: str
+
+    __repr__ = fields_line
 
 
 def time_path(

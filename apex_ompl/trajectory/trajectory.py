@@ -19,6 +19,7 @@ from apex_ompl.trajectory.extremes import Extremes
 from apex_ompl.trajectory.files import STATES, SUFFIXES, decode, encode
 from apex_ompl.trajectory.smoothness import spectral_arc_length
 from apex_ompl.types import Array
+from apex_ompl.util.display import counted, fields_line, html_table, one_line
 from apex_ompl.util.files import path_text, suffix_of, write_atomically
 from apex_ompl.util.validation import check_array, check_integer, check_positive, check_times, finite_array
 
@@ -46,6 +47,10 @@ class Sample(NamedTuple):
     position: Array
     velocity: Array
     acceleration: Array
+
+    def __repr__(self) -> str:
+        """Return the time and the shapes of the rest."""
+        return fields_line(self)
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,6 +129,25 @@ class Trajectory:
     def jerks(self) -> Array:
         """Jerk between each two knots, shape (K - 1, dof) [rad/s^3]."""
         return np.diff(self.accelerations, axis=0) / np.diff(self.times)[:, None]
+
+    def __repr__(self) -> str:
+        """Return the numbers of joints and knots, and the duration."""
+        return one_line(
+            "Trajectory", counted(self.dof, "joint"), f"{self.duration:.3f} s", counted(len(self.times), "knot")
+        )
+
+    def _repr_html_(self) -> str:
+        """Return what each joint does as a table for notebooks."""
+        most = self._extremes
+        columns = self.positions[0], self.positions[-1], most.velocity, most.acceleration, most.jerk
+        rows = [
+            (name, *(f"{value:.4g}" for value in values))
+            for name, *values in zip(self.joint_names, *columns, strict=True)
+        ]
+        head = (
+            "joint", "start [rad]", "end", "largest velocity [rad/s]", "acceleration [rad/s^2]", "jerk [rad/s^3]"
+        )  # fmt: skip
+        return html_table(f"Motion of {self.duration:.3f} s, {counted(self.dof, 'joint')}", rows, head)
 
     def __call__(self, time: ArrayLike, order: int = 0) -> Array:
         """Return positions or their derivatives; before 0 and after the end the robot stands still.

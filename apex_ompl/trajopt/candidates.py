@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from apex_ompl.kernel import Kernel
 from apex_ompl.trajopt.optimizer import LAST_RESORT, Check, Optimizer
 from apex_ompl.types import Array
+from apex_ompl.util.display import fields_line
 
 ROUND, ROUNDS = 4, 12  # optimiser steps in a round of repair, and rounds a candidate has at most
 SOFT_ROUNDS = 2  # the last rounds, with still less weight on the speed term
@@ -47,6 +48,8 @@ class Candidate:
     exact: bool = False
     fine: bool = False
     given_up: bool = False
+
+    __repr__ = fields_line
 
     @property
     def priority(self) -> float:

@@ -28,6 +28,7 @@ from apex_ompl.trajopt.settings import OptimizerSettings
 from apex_ompl.trajopt.spline import Spline
 from apex_ompl.types import Array
 from apex_ompl.util.arrays import compact
+from apex_ompl.util.display import fields_line, values_line
 from apex_ompl.util.validation import check_array, check_integer, check_nonnegative
 
 Check = Callable[[Array], bool]
@@ -62,6 +63,8 @@ class OptimizationResult:
     steps: NDArray[np.int64]
     damping: Array
 
+    __repr__ = fields_line
+
 
 _prepared: set[Spline] = set()  # for which code is loaded
 
@@ -77,6 +80,10 @@ class Optimizer:
         """Work on control points of ``spline``."""
         self.spline = spline or Spline()
         self.settings = settings or OptimizerSettings()
+
+    def __repr__(self) -> str:
+        """Return the spline and the settings."""
+        return values_line("Optimizer", vars(self), {"spline": Spline(), "settings": OptimizerSettings()})
 
     def prepare(self, kernel: Kernel) -> None:
         """Load or compile now what the first steps in a process need."""

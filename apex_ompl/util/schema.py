@@ -16,8 +16,10 @@ from pydantic_core import CoreSchema, core_schema
 
 from apex_ompl.errors import FileFormatError, nearest_name
 from apex_ompl.util.arrays import is_masked_array
+from apex_ompl.util.display import values_line
 from apex_ompl.util.files import read_text
 from apex_ompl.util.forking import ProcessLock, unforked
+from apex_ompl.util.record_type import RecordType
 
 ModelT = TypeVar("ModelT", bound="StrictModel")
 
@@ -47,7 +49,7 @@ def _strict(schema: Any) -> Any:
     return {key: inner if key in ("metadata", "config") else _strict(inner) for key, inner in schema.items()}
 
 
-class StrictModel(BaseModel):
+class StrictModel(BaseModel, metaclass=RecordType):
     """A frozen record without unknown keys and with finite numbers only.
 
     Numbers must be numbers, neither texts nor True or False, and what is true or false must be given as such. Made from
@@ -103,6 +105,18 @@ class StrictModel(BaseModel):
         """
         with _first_fault(cls, cls.__name__):
             return super().model_validate_json(json_data, **options)
+
+    def __repr__(self) -> str:
+        """Return one line with the fields that are not their defaults."""
+        kinds = type(self).model_fields
+        defaults = {
+            name: one.get_default(call_default_factory=True) for name, one in kinds.items() if not one.is_required()
+        }
+        return values_line(type(self).__name__, dict(self), defaults)
+
+    def __str__(self) -> str:
+        """Return the same line."""
+        return repr(self)
 
     if not TYPE_CHECKING:  # which knows that records are frozen
 

@@ -1,1 +1,14 @@
 """Rendered scenes, films and plots."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from apex_ompl.util.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from apex_ompl.viz.browser.run import ShownRun
+
+__all__ = ["ShownRun"]
+
+__getattr__, __dir__ = lazy_names(__name__, {"ShownRun": "browser.run"})
