@@ -100,7 +100,7 @@ class MotionPlanner:
         from apex_ompl.planners.apex_parameters import NAME
 
         model = "" if self.model is None else f"model {self.model!r}"
-        return one_line("MotionPlanner", repr(self.robot.name), f"planner {NAME}", model, self.world.holds)
+        return one_line("MotionPlanner", repr(self.robot.name), f"planner {NAME}", model, self.world.contents)
 
     def __enter__(self) -> Self:
         """Return the planner."""

@@ -70,10 +70,10 @@ class World:
 
     def __repr__(self) -> str:
         """Return how many obstacles, held objects and allowed pairs there are."""
-        return one_line("World", self.holds)
+        return one_line("World", self.contents)
 
     @property
-    def holds(self) -> str:
+    def contents(self) -> str:
         """How many obstacles, held objects and allowed pairs there are, in words."""
         counts = [counted(len(self.obstacles), "obstacle")]
         counts += [f"{len(self.held)} attached"] if self.held else []

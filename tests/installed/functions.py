@@ -107,11 +107,12 @@ def _use_planner() -> None:
             world.attach("ball", "left_hand_palm", at=home)
             world.detach("ball", at=home)
         world.remove("ball")
-        assert planner.is_free(home) and bool(planner.check(home))
+        assert planner.is_free(home) and bool(planner.check(home)) and "1 obstacle" in repr(world)
         palm = robot.link_pose(home, "left_hand_palm")[:3, 3]
         pose = apex_ompl.PoseTarget(frame="left_hand_palm", position=tuple(palm + (0.0, 0.0, 0.02)))
         result = planner.plan(home, pose, timeout=20.0, timing=apex_ompl.Timing(velocity_scale=0.9))
         assert result and result.status is apex_ompl.PlanStatus.EXACT_SOLUTION
+        assert len(result.path.sample(0.1)) > 1
         assert planner.simple_setup(home, home + 0.01) and planner.problem(home, home).name == "world"
         world.load(planner.problem(home, home))
         world.clear()
