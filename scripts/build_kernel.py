@@ -38,7 +38,6 @@ from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.files import write_atomically
 
 VERSIONS = "numba", "llvmlite"
-PROGRAM, LOADED = 1, 2  # type and flag of a section of an ELF file
 
 
 class BuildError(ApexError):
@@ -95,18 +94,22 @@ class Built:
     def digest(self) -> str:
         """Digest of instructions and constants."""
         digest = hashlib.sha256()
-        for part in loaded_sections(self.code):
+        for part in code_sections(self.code):
             digest.update(part)
         return digest.hexdigest()
 
 
-def loaded_sections(code: bytes) -> Iterator[bytes]:
-    """Yield the sections of a 64-bit ELF file that a program loads, see the System V ABI, chapter 4."""
-    (first,) = struct.unpack_from("<Q", code, 40)
-    size, count = struct.unpack_from("<HH", code, 58)
-    for k in range(count):
-        kind, flags, _, begin, length = struct.unpack_from("<IQQQQ", code, first + k * size + 4)
-        if kind == PROGRAM and flags & LOADED:
+def code_sections(code: bytes) -> Iterator[bytes]:
+    """Yield instructions and constants of a 64-bit ELF file, see the System V ABI, chapter 4.
+
+    Other data are left out: messages of errors name the files of the numba that compiled them.
+    """
+    (table,) = struct.unpack_from("<Q", code, 40)
+    size, count, names = struct.unpack_from("<HHH", code, 58)
+    sections = [struct.unpack_from("<IIQQQQ", code, table + k * size) for k in range(count)]
+    for name, _, _, _, begin, length in sections:
+        label = code[sections[names][4] + name :].partition(b"\0")[0]
+        if label.startswith((b".text", b".rodata.cst")):
             yield code[begin : begin + length]
 
 
