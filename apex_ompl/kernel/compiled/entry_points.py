@@ -110,6 +110,9 @@ PLANS = Group(
             ),
             "cloud_distance.primitive_distances": ("f8[:, ::1], i8, f8[::1], f8[::1]", 1),
             "triangle_mesh.encloses": ("f8[:, :, ::1], f8[:, ::1], b1, f8, f8, f8", 1),
+            "matrix_products.matrix_products": ("f8[:, :, ::1], f8[:, :, ::1], f8[:, :, ::1]", 1),
+            "matrix_products.factorize": ("f8[:, ::1], f8[:, ::1]", 1),
+            "matrix_products.solve_factored": ("f8[:, ::1], f8[:, ::1]", 1),
             "dense_layer.dense_layer": ("i1[:, ::1], f4[::1], f4[::1], f4[:, ::1], f4[:, ::1]", 1),
         },
     ),
@@ -267,9 +270,6 @@ OTHERS: Functions = {
         + "f8[:, ::1], f8[:, ::1], f8[::1], f8, f8, f8[::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1]",
         6,
     ),
-    "matrix_products.matrix_products": ("f8[:, :, ::1], f8[:, :, ::1], f8[:, :, ::1]", 1),
-    "matrix_products.factorize": ("f8[:, ::1], f8[:, ::1]", 1),
-    "matrix_products.solve_factored": ("f8[:, ::1], f8[:, ::1]", 1),
     "triangle_mesh.column_boxes": ("f8[:, :, ::1], f8[::1], f8[::1], f8, f8[:, :, ::1], f8[:, :, :, :, ::1]", 1),
 }
 """What point clouds, grids, inverse kinematics, roadmaps and trainings call; without the library, compiled at need."""
