@@ -13,6 +13,7 @@ from apex_ompl.errors import ParameterError, TimingError, TimingStoppedError
 from apex_ompl.kernel.compiled.cubic_pieces import cubic_rates
 from apex_ompl.kernel.compiled.polyline_distance import max_distance
 from apex_ompl.kernel.compiled.time_parameterization import max_path_speeds, sample_times
+from apex_ompl.kernel.products import cholesky, solve
 from apex_ompl.robot.model import Limits
 from apex_ompl.trajectory.curve import SAME_STATE, Polyline
 from apex_ompl.trajectory.deviation import deviation_bound
@@ -305,3 +306,4 @@ def warm_up() -> None:
     Trajectory(*motion.knots, ("joint",)).states(motion.times)
     Extremes.of(*motion.knots)
     cubic_rates(*motion.knots, np.empty((len(motion.times), 2)))
+    solve(cholesky(np.eye(1)), np.ones((1, 1)))  # which curves through paths need
