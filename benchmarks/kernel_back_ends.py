@@ -19,14 +19,13 @@ from pathlib import Path
 
 import numpy as np
 import record
+from verdicts import NAMES, STATES
 
 from apex_ompl.kernel.library import CHOICE
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import one_or_more
 
-DEPENDS = ("@planning",)
-SUITES, LEVELS, SEEDS = ("shelf", "bins", "cage", "posts", "wall", "clutter", "swap"), ("medium", "hard"), (0, 1, 2)
-NAMES = [f"{suite}/{level}/80000{k}" for suite in SUITES for level in LEVELS for k in SEEDS]
+DEPENDS = ("@planning", "benchmarks/verdicts.py")
 NO_AVX512 = {
     "NPY_DISABLE_CPU_FEATURES": "X86_V4 AVX512_ICL",
     "OPENBLAS_CORETYPE": "Haswell",
@@ -34,22 +33,16 @@ NO_AVX512 = {
 }
 BACK_ENDS = {"library": {}, "numba": {CHOICE: "numba"}, "library, no AVX-512": NO_AVX512}
 ANSWERS = """
-import json, sys
-import numpy as np
-from apex_ompl import plan, problems
-from apex_ompl.collision import CollisionChecker
+from apex_ompl import plan
 from apex_ompl.kernel import library
-from apex_ompl.problems.suite_robot import robot
+
 out, each, plans, names = sys.argv[1], int(sys.argv[2]), int(sys.argv[3]), sys.argv[4:]
 assert library.is_used() == (library.os.environ.get(library.CHOICE) is None), library.why_not_used()
-limits, dof, found = robot().limits, robot().dof, {}
+found = {}
 for seed, name in enumerate(names if each else ()):
     problem, rng = problems.load(name), np.random.default_rng(seed)
     checker = CollisionChecker(robot(), problem.scene, problem.attached)
-    ends = problem.start_state(robot().joint_names), problem.goal_states(robot().joint_names)[0]
-    drawn = [rng.uniform(limits.lower, limits.upper, (each - 2 * (each // 4), dof))]
-    drawn += [end + 0.3 * rng.normal(size=(each // 4, dof)) for end in ends]
-    states = np.clip(np.concatenate(drawn), limits.lower, limits.upper)
+    states = drawn_states(problem, rng, each)
     found[f"free {name}"] = checker.are_free(states)
     found[f"unproved {name}"] = checker.kernel.unproved(states)[1]
     found[f"clearance {name}"], found[f"gradient {name}"] = checker.kernel.clearance_gradient(states[:500], 0.1)
@@ -147,9 +140,9 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         answers = {}
         for k, (name, environment) in enumerate(BACK_ENDS.items()):
-            out = Path(folder) / f"{k}.npz"
+            out, tables = Path(folder) / f"{k}.npz", {"XDG_CACHE_HOME": f"{folder}/{k}"}  # of the robot: made by each
             count = 0 if "AVX" in name else each
-            run(ANSWERS, environment, out, count, args.plans, *NAMES)
+            run(STATES + ANSWERS, environment | tables, out, count, args.plans, *NAMES)
             with np.load(out) as file:
                 answers[name] = dict(file)
     times = json.loads(run(TIMES, {CHOICE: "numba"}, args.rounds))
@@ -179,7 +172,8 @@ def same(a: np.ndarray, b: np.ndarray) -> bool:
 
 def run(code: str, environment: dict[str, str], *arguments: object) -> str:
     """Run a program, and return what it prints."""
-    env = {k: v for k, v in os.environ.items() if k != CHOICE} | {"OMP_NUM_THREADS": "1"} | environment
+    code_of_numba = {"NUMBA_CACHE_DIR": str(Path.home() / ".cache")}
+    env = {k: v for k, v in os.environ.items() if k != CHOICE} | {"OMP_NUM_THREADS": "1"} | code_of_numba | environment
     command = [sys.executable, "-c", code, *map(str, arguments)]
     done = subprocess.run(command, env=env, check=False, capture_output=True, text=True)
     if done.returncode:

@@ -100,10 +100,7 @@ class Built:
 
 
 def code_sections(code: bytes) -> Iterator[bytes]:
-    """Yield instructions and constants of a 64-bit ELF file, see the System V ABI, chapter 4.
-
-    Other data are left out: messages of errors name the files of the numba that compiled them.
-    """
+    """Yield instructions and constants of a 64-bit ELF file, see the System V ABI, chapter 4."""
     (table,) = struct.unpack_from("<Q", code, 40)
     size, count, names = struct.unpack_from("<HHH", code, 58)
     sections = [struct.unpack_from("<IIQQQQ", code, table + k * size) for k in range(count)]
@@ -154,12 +151,10 @@ def check(code: dict[str, str], file: Path) -> None:
         raise BuildError(f"{file.name} was built from other sources: run scripts/build_kernel.py")
     if hashlib.sha256(file.read_bytes()).hexdigest() != description["library"]:
         raise BuildError(f"{file.name} is not the file that {file.stem}.json describes: run scripts/build_kernel.py")
-    now = {name: version(name) for name in VERSIONS}
+    there, now = description["code"], {name: version(name) for name in VERSIONS}
     if now != description["versions"]:
-        print(f"not compared, since the library was built by {description['versions']} and here are {now}")
-    elif other := sorted(
-        name for name in code | description["code"] if code.get(name) != description["code"].get(name)
-    ):
+        raise BuildError(f"{file.name} was built by {description['versions']}, and {now} cannot be compared with these")
+    if other := sorted(name for name in code | there if code.get(name) != there.get(name)):
         raise BuildError(f"{file.name} has other code of {', '.join(other)}: run scripts/build_kernel.py")
 
 
@@ -266,6 +261,8 @@ def link(built: Sequence[Built], machine: Machine, folder: Path, out: Path) -> N
     run([machine.compiler, "-shared", *(f"-Wl,{one}" for one in options), front, *objects, "-lm", "-o", out])
     if unknown := sorted(unresolved(out)):
         raise BuildError(f"the code calls {', '.join(unknown)}, which neither kernel.c nor the C library has")
+    if sys.prefix.encode() in out.read_bytes():
+        raise BuildError(f"the code names files in {sys.prefix}: a function of numba's may raise an error there")
 
 
 def unresolved(file: Path) -> Iterator[str]:

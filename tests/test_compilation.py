@@ -137,6 +137,7 @@ def test_numba_can_be_disabled_for_other_code(tmp_path: Path, script: Path) -> N
 
 OUTSIDE = {
     ("jit", "apex_ompl.util.cache"),
+    ("jit", "apex_ompl.util.forking"),
     ("jit", "apex_ompl.kernel.library"),
     ("compilation", "apex_ompl.kernel.library"),
 }

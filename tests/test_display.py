@@ -128,7 +128,7 @@ def test_one_line_says_what_an_object_holds(result: PlanResult, run: RunResult, 
         assert repr(one) == text and len(text) <= WIDTH
     held = "2 obstacles, 2 attached, goal alignment"
     assert repr(result.problem) == f"Problem('ball_in_cup', robot 'dual_panda_softhand', {held})"
-    assert repr(robot.limits) == "Limits(16 joints, velocity 1.5 to 2.61 rad/s)"
+    assert repr(robot.limits) == "Limits(16 joints, velocity 1.5 to 2.61 rad/s or m/s)"
     assert repr(Timing(velocity_scale=0.3)) == "Timing(velocity_scale=0.3)" and repr(Sensor()) == "Sensor()"
     assert repr(planner.check(robot.home)).startswith("StateCheck(valid, clearance ")
     assert repr(planner.check(robot.limits.upper + 1.0)).startswith("StateCheck(invalid: left_joint1 = ")

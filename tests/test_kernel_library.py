@@ -216,6 +216,20 @@ def test_a_library_that_does_not_fit_is_replaced_by_numba(copy: Path, fault: str
     assert "apex_ompl compiles functions of its collision kernel" in done.stderr and reason in done.stderr
 
 
+@pytest.mark.skipif(platform.machine() not in MACHINES, reason="no library for this architecture")
+def test_a_broken_library_is_told_even_where_all_is_compiled_already(copy: Path) -> None:
+    flip(copy / library.library_file(platform.machine()).relative_to(ROOT))
+    run(SMALL, copy, NUMBA_CACHE_DIR=str(copy))
+    again = run(SMALL, copy, NUMBA_CACHE_DIR=str(copy))
+    assert again.stderr.count("\n") == 1 and "is damaged" in again.stderr
+
+
+@IS_BUILT_HERE
+def test_an_unknown_choice_is_named_and_ignored() -> None:
+    done = run(SMALL, **{library.CHOICE: "nubma"})
+    assert done.stdout == "1 \n" and "'nubma', expected library or numba" in done.stderr
+
+
 def test_other_architectures_and_choices_are_compiled_for(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(library.CHOICE, "numba")
     with pytest.raises(library.LibraryError, match=r"^\$APEX_OMPL_KERNEL is numba$"):

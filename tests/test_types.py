@@ -10,10 +10,9 @@ from pathlib import Path
 import pytest
 from support import ROOT
 
-from apex_ompl.session.keywords import PlanKeywords, ProblemKeywords
-from apex_ompl.session.one_plan import PlanOptions
+from apex_ompl.session.one_plan import PlanKeywords, PlanOptions, ProblemKeywords
 
-SOURCES = ("api.py", "loop/run.py", "session/keywords.py", "session/planner.py")
+SOURCES = ("api.py", "loop/run.py", "session/one_plan.py", "session/planner.py")
 RECORDS = ("scene/bodies.py", "scene/problem.py", "util/record_type.py", "util/schema.py")
 USE = """
 from apex_ompl.api import plan

@@ -25,9 +25,9 @@ from apex_ompl.util.arrays import length
 from apex_ompl.util.bounded_cache import kept
 from apex_ompl.util.weak_cache import weakly_cached
 
-CONVEX_TOLERANCE = 1e-7  # a mesh is its hull when its triangles' centres are no deeper than this below it [m]
+CONVEX_TOLERANCE = 1e-7  # a mesh is its hull when its triangles' centers are no deeper than this below it [m]
 MANY = 4000  # triangles
-LARGE_HULL = 24  # corners, from which a search by neighbours is faster than one of all
+LARGE_HULL = 24  # corners, from which a search by neighbors is faster than one of all
 
 
 MOST_MESHES = 256  # that are kept
@@ -41,11 +41,11 @@ class Mesh(NamedTuple):
     Attributes:
         points: Corners of its convex hull, or of the box around a cloud, shape (P, 3) [m].
         corners: Corners of its triangles in the tree's order, shape (T, 3, 3) [m]; none for a mesh that is its hull.
-        balls: Centre and radius around the triangles below each node of the tree, shape (2 T - 1, 4) [m].
-        halves: Half edges of their bounding box, which has the same centre, shape (2 T - 1, 3) [m].
+        balls: Center and radius around the triangles below each node of the tree, shape (2 T - 1, 4) [m].
+        halves: Half edges of their bounding box, which has the same center, shape (2 T - 1, 3) [m].
         child: First child of each node, -1 for leaves, shape (2 T - 1,).
         leaf: Triangle of each leaf, -1 for inner nodes, shape (2 T - 1,).
-        depth: Depth of triangles' centres below the hull, 0 for a mesh that is its hull [m].
+        depth: Depth of triangles' centers below the hull, 0 for a mesh that is its hull [m].
         edge_first: For each point of a large hull the first of its edges, and the end of the last; shape (P + 1,), else
             (0,).
         edge_end: The point at the other end of each edge, shape (edges,).
@@ -101,14 +101,14 @@ class PlacedShape:
 
     @cached_property
     def ball(self) -> Array:
-        """Centre and radius of a ball around the solid in the joint's frame, shape (4,) [m]; 0 for half-spaces."""
-        (a, b, c), centre = _size(self.geometry), np.zeros(3)
+        """Center and radius of a ball around the solid in the joint's frame, shape (4,) [m]; 0 for half-spaces."""
+        (a, b, c), center = _size(self.geometry), np.zeros(3)
         radius = {BOX: length((a, b, c)), SPHERE: a, CYLINDER: length((a, b)), CAPSULE: a + b}
         if self.mesh is not None:
             points = self.mesh.points
-            centre = (points.min(axis=0) + points.max(axis=0)) / 2.0
-            radius[HULL] = float(np.linalg.norm(points - centre, axis=1).max())
-        place = self.pose[:3, :3] @ centre + self.pose[:3, 3]
+            center = (points.min(axis=0) + points.max(axis=0)) / 2.0
+            radius[HULL] = float(np.linalg.norm(points - center, axis=1).max())
+        place = self.pose[:3, :3] @ center + self.pose[:3, 3]
         return np.append(place, radius.get(self.kind, 0.0) + 1e-12)
 
 
@@ -157,7 +157,7 @@ def _edges(hull: coal.ConvexBase) -> tuple[NDArray[np.int64], NDArray[np.int64]]
 
 
 def _depth(hull: coal.CollisionGeometry, corners: Array) -> float:
-    """Return the largest depth of a triangle's centre below the faces of a hull [m], of many triangles that of some.
+    """Return the largest depth of a triangle's center below the faces of a hull [m], of many triangles that of some.
 
     Those that lie on the hull, seen by their own planes, are left out: comparing all triangles of a convex mesh with
     all faces takes the square of their number.
@@ -170,8 +170,8 @@ def _depth(hull: coal.CollisionGeometry, corners: Array) -> float:
         if some > CONVEX_TOLERANCE:  # it is not convex, and the depth of the others matters little
             return some
     for first in range(0, len(corners), 1000):
-        centres = corners[first : first + 1000].mean(axis=1)
-        depth = max(depth, float((offsets - centres @ normals.T).min(axis=1).max()))
+        centers = corners[first : first + 1000].mean(axis=1)
+        depth = max(depth, float((offsets - centers @ normals.T).min(axis=1).max()))
     return depth
 
 
@@ -180,16 +180,16 @@ def _on_hull(hull: coal.CollisionGeometry, corners: Array) -> Flags:
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     long = np.linalg.norm(normals, axis=1)
     normals = np.divide(normals, long[:, None], out=np.zeros_like(normals), where=long[:, None] > 0.0)
-    points, centres = np.array(hull.points()), corners.mean(axis=1)
-    outward = np.where(np.einsum("ij,ij->i", normals, centres - points.mean(axis=0)) < 0.0, -1.0, 1.0)
-    depths = below_support(normals * outward[:, None], points, centres)
+    points, centers = np.array(hull.points()), corners.mean(axis=1)
+    outward = np.where(np.einsum("ij,ij->i", normals, centers - points.mean(axis=0)) < 0.0, -1.0, 1.0)
+    depths = below_support(normals * outward[:, None], points, centers)
     return np.asarray((long > 0.0) & (depths <= CONVEX_TOLERANCE))
 
 
-def tree_order(centres: Array) -> NDArray[np.int64]:
+def tree_order(centers: Array) -> NDArray[np.int64]:
     """Return points in the order of a tree whose nodes are halved across their longest sides."""
-    order = np.arange(len(centres))
-    median_order(np.ascontiguousarray(centres), order, np.empty((128, 2), np.int64))
+    order = np.arange(len(centers))
+    median_order(np.ascontiguousarray(centers), order, np.empty((128, 2), np.int64))
     return order
 
 

@@ -17,18 +17,15 @@ from tqdm import tqdm
 
 from apex_ompl.kernel.compiled.entry_points import ALL, Group
 from apex_ompl.kernel.compiled.jit import CompiledFunction, cache_folder, can_keep_code, names_in_cache, whereabouts
-from apex_ompl.kernel.compiled.jit import lock as compiling
 from apex_ompl.kernel.library import why_not_used
 from apex_ompl.util.cores import usable_cores
 from apex_ompl.util.files import locked
-from apex_ompl.util.forking import hold_at_fork
 from apex_ompl.util.interpreter import this_python
 
 LOG = logging.getLogger("apex_ompl")
 
 CHILD = "import sys; from apex_ompl.kernel.group_compilation import compile_named; compile_named(sys.argv[1:])"
 
-hold_at_fork(compiling)
 _lock = threading.Lock()
 
 

@@ -52,7 +52,7 @@ class Limits:
         """Return the number of joints and the range of their largest speeds."""
         slowest, fastest = np.min(self.velocity), np.max(self.velocity)
         return one_line(
-            "Limits", counted(len(self.velocity), "joint"), f"velocity {slowest:.3g} to {fastest:.3g} rad/s"
+            "Limits", counted(len(self.velocity), "joint"), f"velocity {slowest:.3g} to {fastest:.3g} rad/s or m/s"
         )
 
 
@@ -103,7 +103,7 @@ class Robot:
             (name, *(f"{value:.4g}" for value in values))
             for name, *values in zip(self.joint_names, *columns, strict=True)
         ]
-        head = ("joint", "lower [rad]", "upper", "velocity [rad/s]", "acceleration [rad/s^2]", "jerk [rad/s^3]")
+        head = ("joint", "lower [rad, m]", "upper", "velocity [1/s]", "acceleration [1/s^2]", "jerk [1/s^3]")
         return html_table(f"{self.name}, {counted(self.dof, 'joint')}", rows, head)
 
     @property

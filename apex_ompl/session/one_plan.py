@@ -6,7 +6,7 @@ import time
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypedDict
 
 from apex_ompl import planners
 from apex_ompl.apex.models import has_model
@@ -61,6 +61,24 @@ class PlanOptions:
 
 
 OPTIONS = tuple(field.name for field in fields(PlanOptions))
+
+
+class PlanKeywords(TypedDict, total=False):
+    """:class:`PlanOptions` as keywords of :meth:`apex_ompl.MotionPlanner.plan`, for editors and type checkers."""
+
+    timeout: float
+    seed: int
+    simplify: bool
+    params: Mapping[str, Any] | None
+    snapshot: bool
+    timing: bool | Timing
+    leave_contact: float
+
+
+class ProblemKeywords(PlanKeywords, total=False):
+    """:class:`PlanOptions` as keywords of :meth:`apex_ompl.MotionPlanner.plan_problem`."""
+
+    group: Group | None
 
 
 def check_arguments(timeout: float, seed: int) -> None:

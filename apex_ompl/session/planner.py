@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from apex_ompl.result import PlanResult
     from apex_ompl.robot import Robot
     from apex_ompl.scene.problem import Problem
-    from apex_ompl.session.keywords import PlanKeywords, ProblemKeywords
+    from apex_ompl.session.one_plan import PlanKeywords, ProblemKeywords
 
 
 @dataclass(frozen=True)

@@ -79,11 +79,8 @@ def read_file(path: Path, role: str) -> bytes:
     Raises:
         MissingFileError: It cannot be read.
     """
-    check_readable(path, role)
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise MissingFileError(str(path), role, (error.strerror or "cannot be read").lower()) from error
+    with opened(path, role) as file:
+        return file.read()
 
 
 @contextmanager

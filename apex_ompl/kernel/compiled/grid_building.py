@@ -154,23 +154,30 @@ def _envelope(line: Floats, n: int, at: Integers, ends: Floats) -> None:
 
 
 @outlined
-def transform_lines(squared: Singles, line: Floats, at: Integers, ends: Floats) -> None:
+def transform_lines(squared: Singles, axis: int, line: Floats, at: Integers, ends: Floats) -> None:
     """Replace squared distances f by min_m f(m) + |n - m|^2 over the nodes m of each line; FAR stands for infinity.
 
     Args:
-        squared: Shape (before, n, behind); lines are along the axis in the middle.
+        squared: Shape (nx, ny, nz).
+        axis: Axis that the lines are along, of n nodes.
         line: Room, shape (3 n,).
         at: Room, shape (n,).
-        ends: Room, likewise.
+        ends: Room, shape (n,).
     """
-    before, n, behind = squared.shape
-    for i in range(before):
-        for k in range(behind):
+    nx, ny, nz = squared.shape
+    n = nx if axis == 0 else ny if axis == 1 else nz
+    for i in range(ny if axis == 0 else nx):
+        for k in range(ny if axis == 2 else nz):
             for j in range(n):
-                line[j] = squared[i, j, k]
+                line[j] = squared[j, i, k] if axis == 0 else squared[i, j, k] if axis == 1 else squared[i, k, j]
             _envelope(line, n, at, ends)
             for j in range(n):
-                squared[i, j, k] = line[j]
+                if axis == 0:
+                    squared[j, i, k] = line[j]
+                elif axis == 1:
+                    squared[i, j, k] = line[j]
+                else:
+                    squared[i, k, j] = line[j]
 
 
 @outlined

@@ -32,10 +32,8 @@ def _bounds(
 ) -> None:  # fmt: skip
     """Put lower bounds into ``near`` from squared distances that are exact up to ``band``; see :func:`lower_bounds`."""
     split_near(squared, band, seed, near)
-    nx, ny, nz = squared.shape  # along one axis after the other (Felzenszwalb and Huttenlocher 2012)
-    transform_lines(squared.reshape((nx * ny, nz, 1)), line, at, ends)
-    transform_lines(squared.reshape((nx, ny, nz)), line, at, ends)
-    transform_lines(squared.reshape((1, nx, ny * nz)), line, at, ends)
+    for axis in (2, 1, 0):  # one axis after the other (Felzenszwalb and Huttenlocher 2012)
+        transform_lines(squared, axis, line, at, ends)
     lower_bounds(squared, near, band, slack, spacing, less)
 
 

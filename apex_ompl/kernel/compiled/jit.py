@@ -40,6 +40,7 @@ from numba.core.target_extension import CPU, dispatcher_registry, jit_registry, 
 from apex_ompl.kernel.compiled.linking import InnerCompiler
 from apex_ompl.kernel.library import why_not_used
 from apex_ompl.util.cache import has_room, user_cache
+from apex_ompl.util.forking import hold_at_fork
 
 LOG = logging.getLogger("apex_ompl")
 
@@ -59,6 +60,7 @@ FEATURES = "avx", "avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe", "xsave
 ROOM = 8 * 2**20  # in the cache, which the code of some functions fills [bytes]
 
 lock = threading.RLock()
+hold_at_fork(lock)
 
 
 @cache

@@ -30,7 +30,11 @@ CHOICE = "APEX_OMPL_KERNEL"
 
 
 class LibraryError(Exception):
-    """The library does not fit; the message says why, as the end of a sentence."""
+    """The library does not fit this machine; the message says why, as the end of a sentence."""
+
+
+class BrokenLibraryError(LibraryError):
+    """The library is for this machine, and cannot be used all the same."""
 
 
 def sources_digest() -> str:
@@ -72,14 +76,18 @@ def _found() -> tuple[Mapping[str, Callable[..., Any]], str]:
     try:
         return _load(), ""
     except LibraryError as error:
-        LOG.debug("apex_ompl's compiled kernel is not used, since %s", error)
+        level = logging.WARNING if isinstance(error, BrokenLibraryError) else logging.INFO
+        LOG.log(level, "apex_ompl compiles its kernel by numba where its cache has no code, since %s", error)
         return {}, str(error)
 
 
 def _load() -> Mapping[str, Callable[..., Any]]:
     """Return the library's functions, by module and name; raise LibraryError where it does not fit."""
-    if (choice := os.environ.get(CHOICE, "")) not in ("", "library"):
+    choice = os.environ.get(CHOICE, "library")
+    if choice == "numba":
         raise LibraryError(f"${CHOICE} is {choice}")
+    if choice != "library":
+        LOG.warning("$%s is %r, expected library or numba: it is ignored", CHOICE, choice)
     machine = platform.machine()
     file = library_file(machine)
     try:
@@ -93,15 +101,15 @@ def _load() -> Mapping[str, Callable[..., Any]]:
     try:
         is_whole = hashlib.sha256(file.read_bytes()).hexdigest() == description["library"]
     except OSError as error:
-        raise LibraryError(f"{file} cannot be read ({error.strerror})") from None
+        raise BrokenLibraryError(f"{file} cannot be read ({error.strerror})") from None
     if not is_whole:
-        raise LibraryError(f"{file} is damaged")
+        raise BrokenLibraryError(f"{file} is damaged")
     loader = ExtensionFileLoader("_kernel", str(file))
     try:
         module = loader.create_module(ModuleSpec("_kernel", loader, origin=str(file)))
         loader.exec_module(module)
     except ImportError as error:
-        raise LibraryError(f"{file} cannot be loaded ({error})") from None
+        raise BrokenLibraryError(f"{file} cannot be loaded ({error})") from None
     if not module.supported:
         raise LibraryError(f"this processor is not of level {description['processor']}")
     functions: Mapping[str, Callable[..., Any]] = module.functions

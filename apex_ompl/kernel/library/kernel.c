@@ -39,14 +39,6 @@ double numba_frexp(double x, int *exponent) {
 
 double numba_ldexp(double x, int exponent) { return isfinite(x) && x != 0.0 && exponent != 0 ? ldexp(x, exponent) : x; }
 
-/* Strides of a contiguous array in another shape; the kernel reshapes no others. */
-int numba_attempt_nocopy_reshape(intptr_t axes, const intptr_t *shape, const intptr_t *strides, intptr_t new_axes,
-                                 const intptr_t *new_shape, intptr_t *new_strides, intptr_t size, int fortran) {
-    (void)axes, (void)shape, (void)strides, (void)fortran;
-    for (intptr_t k = new_axes - 1; k >= 0; size *= new_shape[k--]) new_strides[k] = size;
-    return 1;
-}
-
 /* Puts a number into a slot; returns -1 with an exception set if it is none. */
 static int put_number(char kind, PyObject *value, int64_t *slot) {
     if (kind == 'D') {
