@@ -120,7 +120,7 @@ def plan_once(
         if planner is None:
             planner = NAME
             if not has_model(robot.name):
-                notes.append(f"no model of {robot.name} ships, so random bumps take the place of proposals")
+                notes.append(f"no model of {robot.name} ships, so random perturbations take the place of proposals")
         parameters = planners.parameters(planner, **_parameters(planner, kept.model, options))
         if how is not None:
             start = how.start(how.limits(robot.limits, robot.joint_names))  # whether it fits the robot
