@@ -74,6 +74,12 @@ class StrictModel(BaseModel, metaclass=RecordType):
         with unforked(), _building:
             return super().model_rebuild(_parent_namespace_depth=_parent_namespace_depth + 1, **options)
 
+    @classmethod
+    def model_json_schema(cls, *args: Any, **options: Any) -> dict[str, Any]:
+        """Return the JSON schema of the record, one thread at a time, while none forks: pydantic may still import."""
+        with unforked(), _building:
+            return super().model_json_schema(*args, **options)
+
     def __init__(self, /, **data: Any) -> None:
         """Make a record from its fields.
 
