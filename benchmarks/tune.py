@@ -34,17 +34,17 @@ import numpy as np
 import record
 
 from apex_ompl import planners
-from apex_ompl.benchmark import Results, Row, Workers, bench
-from apex_ompl.benchmark.runs import NO_PROBLEM, Run
-from apex_ompl.benchmark.summary import Statistics
+from apex_ompl.evaluation import Results, Row, Workers, bench
+from apex_ompl.evaluation.runs import NO_PROBLEM, Run
+from apex_ompl.evaluation.summary import Statistics
 from apex_ompl.problems.catalogue import VALIDATION
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import one_or_more
 
 DEPENDS = (
-    "@checking", "apex_ompl/apex", "apex_ompl/api.py", "apex_ompl/benchmark", "apex_ompl/diffusion",
-    "apex_ompl/ompl_adapter", "apex_ompl/planning", "apex_ompl/result.py", "apex_ompl/roadmaps", "apex_ompl/tasks",
-    "apex_ompl/trajopt", "benchmarks/baselines", "benchmarks/peers.py", "planners/apex.py",
+    "@checking", "apex_ompl/apex", "apex_ompl/api.py", "apex_ompl/evaluation", "apex_ompl/model",
+    "apex_ompl/ompl", "apex_ompl/planning", "apex_ompl/result.py", "apex_ompl/baselines", "apex_ompl/goals",
+    "apex_ompl/paths", "benchmarks/baselines", "benchmarks/peers.py", "planners/apex.py",
     "planners/apex_parameters.py", "planners/damon.py", "planners/drrt.py", "planners/gpmp.py", "planners/polish.py",
     "planners/registry.py", "planners/sampling.py", "problems",
 )  # fmt: skip

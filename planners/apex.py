@@ -21,10 +21,10 @@ from apex_ompl.apex.stages import Anytime, Shorten
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel.shortcuts import shortcut
 from apex_ompl.kernel.trees import TreePair
-from apex_ompl.ompl_adapter.own_planner import OwnPlanner, Tree
-from apex_ompl.ompl_adapter.report import SolveReport
+from apex_ompl.ompl.own_planner import OwnPlanner, Tree
+from apex_ompl.ompl.report import SolveReport
+from apex_ompl.paths.optimizer import Optimizer
 from apex_ompl.planners.apex_parameters import AUTO, NAME, ApexParameters
-from apex_ompl.trajopt.optimizer import Optimizer
 from apex_ompl.types import Array
 from apex_ompl.util.resolution import SEARCH_RESOLUTION
 

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from ompl import base as ob
 
     from apex_ompl.apex.stages import Stage
-    from apex_ompl.diffusion.proposals import Sampling
+    from apex_ompl.model.proposals import Sampling
 
 NAME = "apex"
 AUTO = "auto"  # what fits the setup
@@ -104,8 +104,8 @@ class ApexParameters(Parameters):
 
     def sampling(self, default: Sampling) -> Sampling:
         """Return how proposals are denoised; ``default`` is the checkpoint's own sampling."""
-        from apex_ompl.diffusion import proposals
-        from apex_ompl.diffusion.guidance import GUIDANCES
+        from apex_ompl.model import proposals
+        from apex_ompl.model.guidance import GUIDANCES
 
         chosen = GUIDANCES[self.scaling]
         guidance = replace(chosen, gamma=self.gamma * chosen.gamma if self.guidance else 0.0)

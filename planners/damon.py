@@ -12,14 +12,14 @@ from ompl import base as ob
 
 from apex_ompl.apex.path_validator import PathValidator
 from apex_ompl.apex.start_goal import read_goals, read_starts
+from apex_ompl.baselines.damon.manifold import shared_manifold
+from apex_ompl.baselines.damon.queries import Damon
 from apex_ompl.kernel import Kernel
-from apex_ompl.ompl_adapter.own_planner import OwnPlanner
-from apex_ompl.ompl_adapter.space import array_to_path, motions_free
+from apex_ompl.ompl.own_planner import OwnPlanner
+from apex_ompl.ompl.space import array_to_path, motions_free
+from apex_ompl.paths.path import Path
 from apex_ompl.planners.registry import Parameters, bounded, one_of, register
 from apex_ompl.planners.tuned import TUNED
-from apex_ompl.roadmaps.damon import Damon
-from apex_ompl.roadmaps.manifold import shared_manifold
-from apex_ompl.trajopt.path import Path
 from apex_ompl.types import Array, Flags
 
 NAME = "damon"
@@ -29,7 +29,7 @@ SEEN = 0.001  # clearances beyond this are not told apart [m]
 
 
 class DAMON(OwnPlanner):
-    """OMPL planner: :class:`apex_ompl.roadmaps.damon.Damon` by the validators of the space information.
+    """OMPL planner: :class:`apex_ompl.baselines.damon.queries.Damon` by the validators of the space information.
 
     Every motion of a path is checked by the motion validator; nothing is random. The graph is finite, so that ``solve``
     may end before its time without a path. In the closed loop it is the method ``damon``.

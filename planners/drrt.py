@@ -12,16 +12,16 @@ from ompl import base as ob
 from ompl import util as ou
 
 from apex_ompl.apex.start_goal import read_goals, read_starts
+from apex_ompl.baselines.drrt.dynamic_rrt import DynamicRRT
+from apex_ompl.baselines.drrt.goal_tree import GoalTree
 from apex_ompl.collision.changes import may_have_become_blocked
 from apex_ompl.kernel import Kernel
-from apex_ompl.ompl_adapter.own_planner import OwnPlanner, Tree
-from apex_ompl.ompl_adapter.space import array_to_path, motions_free, require_real_vectors
-from apex_ompl.ompl_adapter.validity import MotionValidator, StateValidityChecker
+from apex_ompl.ompl.own_planner import OwnPlanner, Tree
+from apex_ompl.ompl.space import array_to_path, motions_free, require_real_vectors
+from apex_ompl.ompl.validity import MotionValidator, StateValidityChecker
+from apex_ompl.paths.path import Path
 from apex_ompl.planners.registry import Parameters, bounded, register
 from apex_ompl.planners.tuned import TUNED
-from apex_ompl.roadmaps.dynamic_rrt import DynamicRRT
-from apex_ompl.roadmaps.goal_tree import GoalTree
-from apex_ompl.trajopt.path import Path
 from apex_ompl.types import Array, Flags
 
 NAME = "drrt"
@@ -29,7 +29,7 @@ Status = ob.PlannerStatus
 
 
 class DRRT(OwnPlanner):
-    """OMPL planner: :class:`apex_ompl.roadmaps.dynamic_rrt.DynamicRRT` by the validators of the space information.
+    """OMPL planner: :class:`~apex_ompl.baselines.drrt.dynamic_rrt.DynamicRRT` by the validators of the space information.
 
     ``solve`` keeps its tree: a later call, after obstacles or the start changed, trims it and grows it on. Edges that
     this project's sphere cover proves clear of every obstacle that is new or moved are not checked again; with another

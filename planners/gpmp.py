@@ -14,16 +14,16 @@ from ompl import util as ou
 
 from apex_ompl.apex.path_validator import NOT_ACCEPTED, PathValidator
 from apex_ompl.apex.start_goal import nearest_pairs, read_goals, read_starts
+from apex_ompl.baselines.gpmp.gaussian_process import GaussianProcess
+from apex_ompl.baselines.gpmp.optimizer import CostFunctional, Evaluation, FactorGraph, Optimum
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.path_proof import PathProof
 from apex_ompl.kernel.clearance_costs import ClearanceCosts, clearance_costs
-from apex_ompl.ompl_adapter.own_planner import OwnPlanner
-from apex_ompl.ompl_adapter.space import array_to_path, bounds_of
+from apex_ompl.ompl.own_planner import OwnPlanner
+from apex_ompl.ompl.space import array_to_path, bounds_of
+from apex_ompl.paths.path import Path
 from apex_ompl.planners.registry import Parameters, bounded, register
 from apex_ompl.planners.tuned import TUNED
-from apex_ompl.trajopt.gaussian_process import GaussianProcess
-from apex_ompl.trajopt.gpmp import CostFunctional, Evaluation, FactorGraph, Optimum
-from apex_ompl.trajopt.path import Path
 from apex_ompl.types import Array
 
 Status = ob.PlannerStatus
@@ -79,7 +79,7 @@ class GaussianProcessParameters(Parameters):
     def factors(
         self, process: GaussianProcess, checker: CollisionChecker, lower: Array, upper: Array
     ) -> tuple[Any, ...]:
-        """Return what :class:`apex_ompl.trajopt.gpmp.Factors` takes."""
+        """Return what :class:`apex_ompl.baselines.gpmp.optimizer.Factors` takes."""
         kernel, scene, own = checker.kernel, self.safety_distance, self.own_distance
 
         def clearances(states: Array, times: Array) -> ClearanceCosts:

@@ -13,17 +13,17 @@ from ompl import base as ob
 from apex_ompl.apex.path_validator import NOT_ACCEPTED, PathValidator
 from apex_ompl.apex.query import make_query
 from apex_ompl.apex.start_goal import nearest_pairs, read_goals, read_starts
-from apex_ompl.ompl_adapter.own_planner import OwnPlanner
-from apex_ompl.ompl_adapter.space import array_to_path, bounds_of, to_state
-from apex_ompl.ompl_adapter.validity import full_check
+from apex_ompl.ompl.own_planner import OwnPlanner
+from apex_ompl.ompl.space import array_to_path, bounds_of, to_state
+from apex_ompl.ompl.validity import full_check
+from apex_ompl.paths.candidates import first_valid
+from apex_ompl.paths.optimizer import Optimizer
+from apex_ompl.paths.path import Path
 from apex_ompl.planners.registry import Parameters, bounded, register
-from apex_ompl.trajopt.candidates import first_valid
-from apex_ompl.trajopt.optimizer import Optimizer
-from apex_ompl.trajopt.path import Path
 from apex_ompl.types import Array
 
 if TYPE_CHECKING:
-    from apex_ompl.imitation.policy import ImitationPolicy
+    from apex_ompl.baselines.imitation.policy import ImitationPolicy
 
 NAME, PAPER = "il", "il-paper"
 Status = ob.PlannerStatus
@@ -190,7 +190,7 @@ class Imitation(Parameters):
             ApexError: The policy is missing, damaged or of another robot, or ``si`` has neither a validity checker of
                 this project nor is it of ``apex_ompl.setup``.
         """
-        from apex_ompl.imitation.policy import shared_policy
+        from apex_ompl.baselines.imitation.policy import shared_policy
 
         validator = PathValidator.of_setup(si, self.name)
         policy = shared_policy(self.model, robot=validator.checker.robot.name)

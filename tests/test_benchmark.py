@@ -18,9 +18,9 @@ from ompl import base as ob
 from ompl import tools as ot
 
 from apex_ompl import benchmark, problems
-from apex_ompl.benchmark import Results, Row, Workers, bench, workers
-from apex_ompl.benchmark.summary import Statistics, statistics
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError
+from apex_ompl.evaluation import Results, Row, Workers, bench, workers
+from apex_ompl.evaluation.summary import Statistics, statistics
 
 LEVEL, RUNS = "swap/easy", 3
 ROWS = ("apex[seed=1]", "rrtconnect")

@@ -7,12 +7,12 @@ from pathlib import Path
 import pytest
 
 from apex_ompl import benchmark, planners
-from apex_ompl.benchmark import Row, bench
-from apex_ompl.benchmark.rows import PAPER, experiments, jobs
 from apex_ompl.cli.parser import main
-from apex_ompl.diffusion.guidance import EQUATION_7, Guidance
-from apex_ompl.diffusion.proposals import Sampling
 from apex_ompl.errors import ApexError, ParameterError, UnknownNameError
+from apex_ompl.evaluation import Row, bench
+from apex_ompl.evaluation.rows import PAPER, experiments, jobs
+from apex_ompl.model.guidance import EQUATION_7, Guidance
+from apex_ompl.model.proposals import Sampling
 
 LEVEL = "swap/easy"
 

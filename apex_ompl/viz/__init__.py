@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from apex_ompl.util.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from apex_ompl.viz.browser.run import ShownRun
+    from apex_ompl.viz.viewer.run import ShownRun
 
 __all__ = ["ShownRun"]
 
