@@ -10,9 +10,9 @@ from typing import Any
 from ompl import geometric as og
 
 from apex_ompl import planners, problems
+from apex_ompl.apex.parameters import NAME
 from apex_ompl.errors import ParameterError
 from apex_ompl.ompl.setup import assemble
-from apex_ompl.planners.apex_parameters import NAME
 from apex_ompl.planning import check_arguments, kept_planner
 from apex_ompl.result import PlanResult
 from apex_ompl.scene.problem import Problem

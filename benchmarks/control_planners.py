@@ -18,15 +18,15 @@ from neighbours import Neighbours
 from ompl import base as ob
 
 from apex_ompl.apex.models import AUTO, DEFAULT
+from apex_ompl.apex.parameters import ApexParameters
+from apex_ompl.apex.planner import APEX
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel import Kernel, RobotTables
 from apex_ompl.kernel.scene_builder import scene_tables
 from apex_ompl.model.array_model import ArrayModel
 from apex_ompl.model.proposals import Proposals, TrajectoryModel
 from apex_ompl.model.query import ObstacleSet, Query
-from apex_ompl.planners.apex import APEX
-from apex_ompl.planners.apex_parameters import ApexParameters
-from apex_ompl.planners.registry import register
+from apex_ompl.ompl.parameters import register
 from apex_ompl.training.data import shard_paths
 from apex_ompl.training.mirror import Mirror
 from apex_ompl.training.records import Paths, held_extents

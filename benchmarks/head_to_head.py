@@ -30,7 +30,7 @@ import record
 from apex_ompl.evaluation import Row, Workers, bench, report, write_database, write_logs
 from apex_ompl.evaluation.rows import PAPER
 from apex_ompl.evaluation.summary import SHARE_TIMES, Statistics, Table, statistics, tables, warnings
-from apex_ompl.planners.tuned import TUNED
+from apex_ompl.ompl.tuned import TUNED
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.statistics import share_interval
 from apex_ompl.util.validation import one_or_more

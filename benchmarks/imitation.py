@@ -21,13 +21,13 @@ from ompl import base as ob
 
 from apex_ompl import planners, problems
 from apex_ompl.apex.query import make_query
+from apex_ompl.baselines.imitation.planner import Imitation
 from apex_ompl.baselines.imitation.policy import shared_policy
 from apex_ompl.goals.alignment import AlignmentGoal
 from apex_ompl.ompl.process import quiet_ompl
 from apex_ompl.ompl.setup import PlanningSetup, assemble
 from apex_ompl.ompl.space import path_to_array
 from apex_ompl.paths.path import path_length
-from apex_ompl.planners.il import Imitation
 from apex_ompl.problems.catalogue import SPLITS
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.scene.problem import Alignment

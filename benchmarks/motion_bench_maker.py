@@ -34,8 +34,8 @@ from apex_ompl.evaluation.accounting import first_path_proof
 from apex_ompl.evaluation.rows import Job
 from apex_ompl.evaluation.runs import Run
 from apex_ompl.ompl.setup import PlanningSetup, assemble
+from apex_ompl.ompl.tuned import TUNED
 from apex_ompl.paths.path import path_length
-from apex_ompl.planners.tuned import TUNED
 from apex_ompl.robot import load_robot
 from apex_ompl.robot.moveit import convert
 from apex_ompl.scene.problem import Problem

@@ -33,9 +33,9 @@ from apex_ompl.evaluation.runs import NO_PROBLEM, Run
 from apex_ompl.evaluation.summary import Statistics
 from apex_ompl.ompl.repair import repair
 from apex_ompl.ompl.setup import PlanningSetup, assemble
+from apex_ompl.ompl.tuned import TUNED
 from apex_ompl.ompl.validity import full_check
 from apex_ompl.paths.path import path_length
-from apex_ompl.planners.tuned import TUNED
 from apex_ompl.planning import NOT_PROVED
 from apex_ompl.robot import Robot
 from apex_ompl.robot.geometry import link_of

@@ -25,7 +25,7 @@ import record
 from apex_ompl import MotionPlanner, PlanResult, load_problem, plan, problems
 from apex_ompl.ompl.process import quiet_ompl
 from apex_ompl.ompl.setup import assemble
-from apex_ompl.planners.tuned import TUNED
+from apex_ompl.ompl.tuned import TUNED
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.scene.problem import Problem
 from apex_ompl.util.entry_point import run_script

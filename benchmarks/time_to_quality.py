@@ -32,9 +32,9 @@ from apex_ompl.evaluation.runs import NO_PROBLEM, Run
 from apex_ompl.ompl.setup import PlanningSetup, assemble
 from apex_ompl.ompl.simplify import simplify
 from apex_ompl.ompl.space import path_to_array
+from apex_ompl.ompl.tuned import TUNED
 from apex_ompl.ompl.validity import full_check
 from apex_ompl.paths.path import path_length
-from apex_ompl.planners.tuned import TUNED
 from apex_ompl.problems import load
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.util.entry_point import run_script

@@ -27,7 +27,7 @@ from apex_ompl.kernel.trees import TreePair
 from apex_ompl.ompl.process import quiet_ompl, seed_ompl
 from apex_ompl.ompl.setup import PlanningSetup, assemble
 from apex_ompl.ompl.space import path_to_array
-from apex_ompl.planners.tuned import TUNED
+from apex_ompl.ompl.tuned import TUNED
 from apex_ompl.types import Array
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.resolution import SEARCH_RESOLUTION

@@ -98,9 +98,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     data = ROOT / "data" / "dual_panda_softhand"
     parser.add_argument("--data", type=Path, default=data, help="folder with paths.zip and robot.npz")
-    parser.add_argument(
-        "--out", type=Path, default=weights_folder(), help="where to put them (default: %(default)s)"
-    )
+    parser.add_argument("--out", type=Path, default=weights_folder(), help="where to put them (default: %(default)s)")
     parser.add_argument("--dims", type=one_or_more, nargs="+", default=[2, 4, 8], help="(default: %(default)s)")
     parser.add_argument("--states", type=one_or_more, default=200_000, help="states of paths (default: %(default)s)")
     parser.add_argument("--along", type=one_or_more, default=16, help="of them on a path (default: %(default)s)")

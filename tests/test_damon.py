@@ -20,22 +20,22 @@ from scipy.sparse.csgraph import dijkstra
 from support import DATA, ROOT
 
 from apex_ompl import plan, planners
+from apex_ompl.baselines import weights_folder
+from apex_ompl.baselines.damon.latent_graph import consecutive, farthest_points, free_of_self_collision, neighbours
+from apex_ompl.baselines.damon.lazy_search import Graph, LazySearch
+from apex_ompl.baselines.damon.manifold import load_manifold, shared_manifold
+from apex_ompl.baselines.damon.queries import Damon
+from apex_ompl.baselines.damon.sampling import sample_states, split_sample
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.discretization import sample_path
-from apex_ompl.training.store import load
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError
 from apex_ompl.kernel import Kernel, RobotTables
 from apex_ompl.kernel.scene_builder import scene_tables
 from apex_ompl.ompl.setup import PlanningSetup, assemble
 from apex_ompl.ompl.space import motions_free
 from apex_ompl.problems import load as load_problem
-from apex_ompl.baselines.damon.queries import Damon
-from apex_ompl.baselines.damon.latent_graph import consecutive, farthest_points, free_of_self_collision, neighbours
-from apex_ompl.baselines.damon.lazy_search import Graph, LazySearch
-from apex_ompl.baselines import weights_folder
-from apex_ompl.baselines.damon.manifold import load_manifold, shared_manifold
-from apex_ompl.baselines.damon.sampling import sample_states, split_sample
 from apex_ompl.robot import Robot
+from apex_ompl.training.store import load
 from apex_ompl.types import Array, Flags
 from apex_ompl.util.resolution import SEARCH_RESOLUTION
 
@@ -312,7 +312,7 @@ def test_shipped_models_are_small_and_sound() -> None:
     for name in SHIPPED:
         manifold = load_manifold(name, "dual_panda_softhand")
         assert manifold.config.dim == int(name.removeprefix("damon-")) and len(manifold.latent) == 20_000
-        assert not list(weights_folder(name).glob("*.p*t*")) and (BASELINES / name / "README.md").is_file()
+        assert not list(weights_folder(name).glob("*.p*t*")) and (weights_folder(name) / "README.md").is_file()
 
 
 def test_a_manifold_is_read_once_until_it_changes(models: Path, tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ from loops import PROBLEM, go, ready_of, setup_of
 from ompl import base as ob
 
 from apex_ompl import MotionPlanner, plan, planners, problems
+from apex_ompl.baselines.gpmp.planner import GaussianProcessPlanner
 from apex_ompl.baselines.gpmp.replanner import IncrementalGPMP, IncrementalGPMP2
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ParameterError, UnknownNameError
@@ -24,7 +25,6 @@ from apex_ompl.ompl.setup import PlanningSetup, assemble
 from apex_ompl.paths.optimizer import Optimizer
 from apex_ompl.paths.settings import OptimizerSettings
 from apex_ompl.paths.spline import Spline
-from apex_ompl.planners.gpmp import GaussianProcessPlanner
 from apex_ompl.result import PlanResult, PlanStatus
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import Obstacle

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from loops import BLOCKED, FAR, PROBLEM, line_from, ready_of
 
-from apex_ompl.loop import evasion
+from apex_ompl.loop.replan import evasion
 from apex_ompl.loop.replan.portfolio import Portfolio
 from apex_ompl.loop.replan.sprint import CHARGE, Sprint
 from apex_ompl.loop.replan.waiting import wait_nearer

@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Any, TypedDict
 
 from apex_ompl import planners
 from apex_ompl.apex.models import has_model
+from apex_ompl.apex.parameters import NAME
 from apex_ompl.collision.conservative import CheckCounts
 from apex_ompl.errors import ParameterError
 from apex_ompl.ompl.interrupt import Interrupt
 from apex_ompl.ompl.process import quiet_ompl, seed_ompl
 from apex_ompl.ompl.setup import assemble
-from apex_ompl.planners.apex_parameters import NAME
 from apex_ompl.planning.departure import LARGEST_DEPTH, find_departure, with_departure
 from apex_ompl.planning.movers import movers_of, snapshot_notes
 from apex_ompl.planning.query import Group, planned_joints

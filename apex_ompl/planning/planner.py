@@ -97,7 +97,7 @@ class MotionPlanner:
 
     def __repr__(self) -> str:
         """Return the robot, the model where one is given, and what is in the world."""
-        from apex_ompl.planners.apex_parameters import NAME
+        from apex_ompl.apex.parameters import NAME
 
         model = "" if self.model is None else f"model {self.model!r}"
         return one_line("MotionPlanner", repr(self.robot.name), f"planner {NAME}", model, self.world.contents)
@@ -234,8 +234,8 @@ class MotionPlanner:
         Raises:
             ApexError: The start or the goal is faulty.
         """
+        from apex_ompl.apex.parameters import NAME
         from apex_ompl.ompl.setup import assemble
-        from apex_ompl.planners.apex_parameters import NAME
 
         with self._lock:
             checker = self._checker_without(self._absent(), kept=False)

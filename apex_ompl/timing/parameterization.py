@@ -31,8 +31,8 @@ from apex_ompl.util.validation import check_array, check_name, check_number, che
 METHODS = MappingProxyType({"ruckig": ruckig_method.blended, "spline": spline_method.blended})
 """Methods by name.
 
-Each takes the polyline, the limits, the joint names, the allowed distance from the polyline [rad] and a function that is
-asked whether to give up; it returns the trajectory and a bound on its distance from the polyline [rad], or None.
+Each takes the polyline, the limits, the joint names, the allowed distance from the polyline [rad] and a function that
+is asked whether to give up; it returns the trajectory and a bound on its distance from the polyline [rad], or None.
 """
 DEFAULT_METHOD = "ruckig"
 

@@ -85,7 +85,7 @@ class TrainingConfig(StrictModel):
             :class:`apex_ompl.training.scene_data.Augmentation`.
         mixed: Share of the paths among whose obstacles are put some of another scene that leave it free.
         collision: What collisions of the denoiser's estimates weigh in the loss, for a scene ``clearances``, see
-            :meth:`~apex_ompl.training.torch_scene_encoding.TorchSight.collision_cost`; the validation loss is without it.
+            :meth:`~apex_ompl.training.torch_scene_encoding.TorchSight.collision_cost`; not in validation losses.
         held_out: Share of the problems kept for the validation loss.
         units: Number of units of a data set in memory at the same time; all by default.
         log_every: Steps between two lines of the log.

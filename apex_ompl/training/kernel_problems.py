@@ -1,8 +1,8 @@
 """Problems as tables of the kernel, to be solved on machines without Pinocchio, Coal and OMPL.
 
 They are written on a machine that has those (:mod:`apex_ompl.training.problem_records`), and solved from the straight
-line and from random bumps; paths that the sphere cover proves free are kept. Parts of paths are left out: the obstacle point
-at their start needs Coal.
+line and from random bumps; paths that the sphere cover proves free are kept. Parts of paths are left out: the
+obstacle point at their start needs Coal.
 """
 
 from __future__ import annotations

@@ -11,4 +11,4 @@ if TYPE_CHECKING:
 
 __all__ = ["ShownRun"]
 
-__getattr__, __dir__ = lazy_names(__name__, {"ShownRun": "browser.run"})
+__getattr__, __dir__ = lazy_names(__name__, {"ShownRun": "viewer.run"})

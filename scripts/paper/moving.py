@@ -20,7 +20,7 @@ from apex_ompl.evaluation import Results, Row
 from apex_ompl.evaluation.rows import Job
 from apex_ompl.evaluation.runs import Run
 from apex_ompl.evaluation.summary import Table
-from apex_ompl.loop import methods
+from apex_ompl.loop.replan import methods
 from apex_ompl.loop.result import RunResult
 from apex_ompl.loop.run import load_world, run
 from apex_ompl.loop.sensor import Sensor

@@ -8,13 +8,13 @@ import numpy as np
 
 from apex_ompl.baselines.damon.lazy_search import Motion
 from apex_ompl.baselines.damon.manifold import shared_manifold
+from apex_ompl.baselines.damon.planner import DAMONParameters
 from apex_ompl.baselines.damon.queries import Damon
 from apex_ompl.baselines.drrt.replanner import Clearances, timed
 from apex_ompl.moving.charges import Charges
 from apex_ompl.moving.ready import Ready
 from apex_ompl.moving.request import Answer, Request
 from apex_ompl.moving.search import Search
-from apex_ompl.planners.registry import parameters
 from apex_ompl.types import Array, Flags
 
 PLANNER = "damon"
@@ -22,7 +22,7 @@ PLANNER = "damon"
 
 @dataclass(eq=False)
 class ManifoldGraph:
-    """The planner ``damon`` in the loop: :class:`~apex_ompl.baselines.damon.queries.Damon` with that planner's defaults.
+    """The planner ``damon`` in the loop: :class:`~apex_ompl.baselines.damon.queries.Damon` with its defaults.
 
     Which nodes are free of what stands still is found before a run, and which edges when they are first used in it. At
     each replan, nodes that an obstacle hits where it stands when the new motion begins are left out, and A* finds a
@@ -48,7 +48,7 @@ class ManifoldGraph:
             MissingFileError: The model is missing.
             FileFormatError: The model is damaged, or for another robot.
         """
-        values = parameters(PLANNER)
+        values = DAMONParameters()
         robot = ready.setup.robot
         manifold = shared_manifold(str(getattr(values, "model")), robot.name)  # noqa: B009 - of a subclass
         kind, connections = getattr(values, "nodes"), getattr(values, "connections")  # noqa: B009

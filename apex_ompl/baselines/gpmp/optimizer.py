@@ -1,20 +1,16 @@
 """Motion planning on a Gaussian-process prior: GPMP2's factor graph, and GPMP's functional gradient.
 
 The unknowns are the inner supports theta = (q_i, v_i) of
-:class:`apex_ompl.baselines.gpmp.gaussian_process.GaussianProcess`; the first and the last support are fixed, which is the limit of priors without variance. Clearances count at the
-supports and at states interpolated between them. Nothing here knows OMPL; clearances are handed in.
-
-GPMP2 (Dong, Mukadam, Dellaert and Boots, RSS 2016; Mukadam et al., IJRR 2018) finds the maximum of the posterior,
-
-    J(theta) = 1/2 sum_i |Phi x_i - x_i+1|^2_Q + 1/2 (eps / sigma)^2 sum_k |r(q_k)|^2 + 1/2 sum_k |l(q_k) / sigma_l|^2,
-
-by Levenberg-Marquardt steps whose normal equations are block-tridiagonal; r are the violations of the safety distance
-eps as shares of it, l those of the joint limits. GPMP (Mukadam, Yan and Boots, ICRA 2016) minimises
-
-    U(theta) = 1/2 sum_i |Phi x_i - x_i+1|^2_Q + (eps / sigma)^2 int 1/2 |r(q(t))|^2 |q'(t)| dt
-
-by steps along its functional gradient theta - mu + K g: g is the gradient of the integral, over the length of the path,
-at interpolated states mapped back to the supports, K the covariance of the supports given the ends.
+:class:`apex_ompl.baselines.gpmp.gaussian_process.GaussianProcess`; the first and the last support are fixed, which is
+the limit of priors without variance. Clearances count at the supports and at states interpolated between them.
+Nothing here knows OMPL; clearances are handed in. GPMP2 (Dong, Mukadam, Dellaert and Boots, RSS 2016; Mukadam et al.,
+IJRR 2018) finds the maximum of the posterior, J(theta) = 1/2 sum_i |Phi x_i - x_i+1|^2_Q + 1/2 (eps / sigma)^2 sum_k
+|r(q_k)|^2 + 1/2 sum_k |l(q_k) / sigma_l|^2, by Levenberg-Marquardt steps whose normal equations are block-
+tridiagonal; r are the violations of the safety distance eps as shares of it, l those of the joint limits. GPMP
+(Mukadam, Yan and Boots, ICRA 2016) minimises U(theta) = 1/2 sum_i |Phi x_i - x_i+1|^2_Q + (eps / sigma)^2 int 1/2
+|r(q(t))|^2 |q'(t)| dt by steps along its functional gradient theta - mu + K g: g is the gradient of the integral,
+over the length of the path, at interpolated states mapped back to the supports, K the covariance of the supports
+given the ends.
 """
 
 from __future__ import annotations

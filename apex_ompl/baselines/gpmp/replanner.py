@@ -10,6 +10,7 @@ import numpy as np
 
 from apex_ompl.baselines.gpmp.gaussian_process import GaussianProcess
 from apex_ompl.baselines.gpmp.optimizer import CostFunctional, Evaluation, FactorGraph, Factors, Optimum
+from apex_ompl.baselines.gpmp.planner import GPMP, GPMP2, GaussianProcessParameters
 from apex_ompl.kernel.clearance_costs import ClearanceCosts, clearance_costs
 from apex_ompl.moving.charges import Charges
 from apex_ompl.moving.ready import Ready
@@ -17,7 +18,6 @@ from apex_ompl.moving.request import Answer, Request
 from apex_ompl.moving.search import STATES, Guess, Search, least_duration
 from apex_ompl.moving.sources import rest_of_route
 from apex_ompl.moving.timed_spline import PINNED, Start, TimedSpline
-from apex_ompl.planners.gpmp import GPMP, GPMP2, GaussianProcessParameters
 from apex_ompl.timing import Trajectory
 from apex_ompl.timing.spline_method import least_knot_spacing
 from apex_ompl.types import Array

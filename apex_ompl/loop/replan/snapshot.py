@@ -19,9 +19,9 @@ from apex_ompl.ompl.process import seed_ompl
 from apex_ompl.ompl.setup import PlanningSetup, assemble, set_goals
 from apex_ompl.ompl.simplify import simplify
 from apex_ompl.ompl.space import path_to_array, to_state
+from apex_ompl.ompl.tuned import TUNED
 from apex_ompl.ompl.validity import MotionValidator
 from apex_ompl.planners.registry import parameters
-from apex_ompl.planners.tuned import TUNED
 from apex_ompl.types import Array
 
 RRTCONNECT = "rrtconnect"

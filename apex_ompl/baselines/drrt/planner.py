@@ -17,11 +17,11 @@ from apex_ompl.baselines.drrt.goal_tree import GoalTree
 from apex_ompl.collision.changes import may_have_become_blocked
 from apex_ompl.kernel import Kernel
 from apex_ompl.ompl.own_planner import OwnPlanner, Tree
+from apex_ompl.ompl.parameters import Parameters, bounded, register
 from apex_ompl.ompl.space import array_to_path, motions_free, require_real_vectors
+from apex_ompl.ompl.tuned import TUNED
 from apex_ompl.ompl.validity import MotionValidator, StateValidityChecker
 from apex_ompl.paths.path import Path
-from apex_ompl.planners.registry import Parameters, bounded, register
-from apex_ompl.planners.tuned import TUNED
 from apex_ompl.types import Array, Flags
 
 NAME = "drrt"
@@ -29,7 +29,7 @@ Status = ob.PlannerStatus
 
 
 class DRRT(OwnPlanner):
-    """OMPL planner: :class:`~apex_ompl.baselines.drrt.dynamic_rrt.DynamicRRT` by the validators of the space information.
+    """OMPL planner: :class:`~apex_ompl.baselines.drrt.dynamic_rrt.DynamicRRT` by the space's validators.
 
     ``solve`` keeps its tree: a later call, after obstacles or the start changed, trims it and grows it on. Edges that
     this project's sphere cover proves clear of every obstacle that is new or moved are not checked again; with another

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar
 
-from apex_ompl.planners.registry import Parameters, bounded, one_of, register
-from apex_ompl.planners.tuned import TUNED
+from apex_ompl.ompl.parameters import Parameters, bounded, one_of, register
+from apex_ompl.ompl.tuned import TUNED
 
 if TYPE_CHECKING:
     from ompl import base as ob
@@ -153,6 +153,6 @@ class ApexParameters(Parameters):
         Raises:
             ApexError: The model or the robot cannot be loaded, or do not fit the space.
         """
-        from apex_ompl.planners.apex import APEX
+        from apex_ompl.apex.planner import APEX
 
         return APEX(si, self)

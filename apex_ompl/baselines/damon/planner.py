@@ -16,10 +16,10 @@ from apex_ompl.baselines.damon.manifold import shared_manifold
 from apex_ompl.baselines.damon.queries import Damon
 from apex_ompl.kernel import Kernel
 from apex_ompl.ompl.own_planner import OwnPlanner
+from apex_ompl.ompl.parameters import Parameters, bounded, one_of, register
 from apex_ompl.ompl.space import array_to_path, motions_free
+from apex_ompl.ompl.tuned import TUNED
 from apex_ompl.paths.path import Path
-from apex_ompl.planners.registry import Parameters, bounded, one_of, register
-from apex_ompl.planners.tuned import TUNED
 from apex_ompl.types import Array, Flags
 
 NAME = "damon"

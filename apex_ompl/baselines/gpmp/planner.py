@@ -20,10 +20,10 @@ from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.path_proof import PathProof
 from apex_ompl.kernel.clearance_costs import ClearanceCosts, clearance_costs
 from apex_ompl.ompl.own_planner import OwnPlanner
+from apex_ompl.ompl.parameters import Parameters, bounded, register
 from apex_ompl.ompl.space import array_to_path, bounds_of
+from apex_ompl.ompl.tuned import TUNED
 from apex_ompl.paths.path import Path
-from apex_ompl.planners.registry import Parameters, bounded, register
-from apex_ompl.planners.tuned import TUNED
 from apex_ompl.types import Array
 
 Status = ob.PlannerStatus

@@ -14,12 +14,12 @@ from apex_ompl.apex.path_validator import NOT_ACCEPTED, PathValidator
 from apex_ompl.apex.query import make_query
 from apex_ompl.apex.start_goal import nearest_pairs, read_goals, read_starts
 from apex_ompl.ompl.own_planner import OwnPlanner
+from apex_ompl.ompl.parameters import Parameters, bounded, register
 from apex_ompl.ompl.space import array_to_path, bounds_of, to_state
 from apex_ompl.ompl.validity import full_check
 from apex_ompl.paths.candidates import first_valid
 from apex_ompl.paths.optimizer import Optimizer
 from apex_ompl.paths.path import Path
-from apex_ompl.planners.registry import Parameters, bounded, register
 from apex_ompl.types import Array
 
 if TYPE_CHECKING:

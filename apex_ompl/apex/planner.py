@@ -13,6 +13,7 @@ from ompl import util as ou
 
 from apex_ompl.apex.context import SolveContext
 from apex_ompl.apex.models import Model, trajectory_model
+from apex_ompl.apex.parameters import AUTO, NAME, ApexParameters
 from apex_ompl.apex.path_validator import PathValidator
 from apex_ompl.apex.query import make_query
 from apex_ompl.apex.sampler import ProposalSampler
@@ -24,7 +25,6 @@ from apex_ompl.kernel.trees import TreePair
 from apex_ompl.ompl.own_planner import OwnPlanner, Tree
 from apex_ompl.ompl.report import SolveReport
 from apex_ompl.paths.optimizer import Optimizer
-from apex_ompl.planners.apex_parameters import AUTO, NAME, ApexParameters
 from apex_ompl.types import Array
 from apex_ompl.util.resolution import SEARCH_RESOLUTION
 
