@@ -15,22 +15,22 @@ from apex_ompl.util.lazy import lazy_names
 if TYPE_CHECKING:
     from apex_ompl.api import load_problem, plan, setup
     from apex_ompl.collision.cloud_contact import filter_points
-    from apex_ompl.diffusion.checkpoint import load_model
     from apex_ompl.errors import ApexError
-    from apex_ompl.live.retime import retime
     from apex_ompl.loop.result import RunResult
     from apex_ompl.loop.run import run
     from apex_ompl.loop.sensor import Sensor
-    from apex_ompl.loop.settings import LoopSettings
+    from apex_ompl.model.checkpoint import load_model
+    from apex_ompl.moving.retime import retime
+    from apex_ompl.moving.settings import LoopSettings
+    from apex_ompl.paths.path import Path
+    from apex_ompl.planning.planner import MotionPlanner
+    from apex_ompl.planning.world import World
     from apex_ompl.result import PlanResult, PlanStatus
     from apex_ompl.robot import Limits, Robot, load_robot
     from apex_ompl.scene.bodies import AttachedObject, Obstacle
     from apex_ompl.scene.points import points_from_depth
     from apex_ompl.scene.problem import Alignment, PoseTarget, Problem
-    from apex_ompl.session.planner import MotionPlanner
-    from apex_ompl.session.world import World
-    from apex_ompl.trajectory import Timing, Trajectory, time_path
-    from apex_ompl.trajopt.path import Path
+    from apex_ompl.timing import Timing, Trajectory, time_path
     from apex_ompl.viz.view import view
 
 __version__ = "0.1.0"
@@ -40,10 +40,10 @@ _HOMES = {  # modules that public names are imported from when they are first us
     "ApexError": "errors",
     "AttachedObject": "scene.bodies",
     "Limits": "robot",
-    "LoopSettings": "loop.settings",
-    "MotionPlanner": "session.planner",
+    "LoopSettings": "moving.settings",
+    "MotionPlanner": "planning.planner",
     "Obstacle": "scene.bodies",
-    "Path": "trajopt.path",
+    "Path": "paths.path",
     "PlanResult": "result",
     "PlanStatus": "result",
     "PoseTarget": "scene.problem",
@@ -51,19 +51,19 @@ _HOMES = {  # modules that public names are imported from when they are first us
     "Robot": "robot",
     "RunResult": "loop.result",
     "Sensor": "loop.sensor",
-    "Timing": "trajectory",
-    "Trajectory": "trajectory",
-    "World": "session.world",
+    "Timing": "timing",
+    "Trajectory": "timing",
+    "World": "planning.world",
     "filter_points": "collision.cloud_contact",
-    "load_model": "diffusion.checkpoint",
+    "load_model": "model.checkpoint",
     "load_problem": "api",
     "load_robot": "robot",
     "plan": "api",
     "points_from_depth": "scene.points",
-    "retime": "live.retime",
+    "retime": "moving.retime",
     "run": "loop.run",
     "setup": "api",
-    "time_path": "trajectory",
+    "time_path": "timing",
     "view": "viz.view",
 }
 

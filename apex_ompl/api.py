@@ -10,13 +10,13 @@ from typing import Any
 from ompl import geometric as og
 
 from apex_ompl import planners, problems
+from apex_ompl.apex.parameters import NAME
 from apex_ompl.errors import ParameterError
-from apex_ompl.ompl_adapter.setup import assemble
-from apex_ompl.planners.apex_parameters import NAME
+from apex_ompl.ompl.setup import assemble
+from apex_ompl.planning import check_arguments, kept_planner
 from apex_ompl.result import PlanResult
 from apex_ompl.scene.problem import Problem
-from apex_ompl.session import check_arguments, kept_planner
-from apex_ompl.trajectory import Timing
+from apex_ompl.timing import Timing
 from apex_ompl.util.files import is_file, path_text
 from apex_ompl.util.forking import unforked
 

@@ -14,12 +14,12 @@ import numpy as np
 from ompl import base as ob
 
 from apex_ompl.errors import FileFormatError, ParameterError
+from apex_ompl.paths.path import Path
+from apex_ompl.paths.spline import Spline
 from apex_ompl.scene.problem import Problem
-from apex_ompl.trajectory import Trajectory
-from apex_ompl.trajectory.checks import check_plan
-from apex_ompl.trajectory.files import KNOTS, MESSAGES
-from apex_ompl.trajopt.path import Path
-from apex_ompl.trajopt.spline import Spline
+from apex_ompl.timing import Trajectory
+from apex_ompl.timing.checks import check_plan
+from apex_ompl.timing.files import KNOTS, MESSAGES
 from apex_ompl.types import Array
 from apex_ompl.util.archives import pack_archive, read_archive
 from apex_ompl.util.display import Summary, one_line
@@ -79,7 +79,7 @@ class PlanResult:
         trajectory: The timed motion, which passed the full check along its own samples and keeps all limits, or None.
         limit_use: Largest share of each limit that ``trajectory`` uses, by ``position``, ``velocity``,
             ``acceleration`` and ``jerk``; empty without one.
-        timing_method: Method that made ``trajectory``, see ``apex_ompl.trajectory.Timing``; empty without one.
+        timing_method: Method that made ``trajectory``, see ``apex_ompl.timing.Timing``; empty without one.
         deviation: Largest distance of ``trajectory`` from ``path`` [rad], NaN without one.
         motion_clearance: Least distance of a checked pair along ``trajectory`` [m], NaN without one.
         times: Seconds per stage, and ``total``; those of a planner's own stages, as ``solve: repair``, are part of
@@ -93,7 +93,7 @@ class PlanResult:
         proved_by_spheres: Share of the path's length that sphere covers proved; exact shapes proved the rest.
         checks: Number of states checked one by one; those inside proved stretches of motions do not count.
         solved_by: What found the path: the planner's name, or the stage of apex that did (see
-            ``apex_ompl.ompl_adapter.report.SolveReport``), with ``+repair`` where a stretch of it failed the full check
+            ``apex_ompl.ompl.report.SolveReport``), with ``+repair`` where a stretch of it failed the full check
             and was planned anew; ``straight line`` where that is a solution, so that no planner ran; empty without a
             path.
         notes: What a user should know about this run, such as a snapshot of moving obstacles.
@@ -184,7 +184,7 @@ class PlanResult:
         """Write the result by the suffix of ``path``.
 
         ``.npz``, ``.json`` and ``.yaml`` hold all fields, for :meth:`load`. ``.traj.yaml``, ``.traj.json`` and ``.csv``
-        hold the timed motion, see :meth:`apex_ompl.trajectory.Trajectory.save`; a ``.csv`` of a result without one
+        hold the timed motion, see :meth:`apex_ompl.timing.Trajectory.save`; a ``.csv`` of a result without one
         holds the path.
 
         Raises:

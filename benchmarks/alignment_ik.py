@@ -15,16 +15,16 @@ import record
 
 from apex_ompl import load_problem
 from apex_ompl.collision import CollisionChecker
+from apex_ompl.goals.alignment import alignment_goal
 from apex_ompl.robot import Robot
 from apex_ompl.robot.assets import DATA
 from apex_ompl.robot.config import Part, read_config
 from apex_ompl.robot.model import build_robot
 from apex_ompl.scene.bodies import Body
-from apex_ompl.tasks.alignment import alignment_goal
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import one_or_more, whole_number
 
-DEPENDS = ("@checking", "apex_ompl/tasks", "problems")
+DEPENDS = ("@checking", "apex_ompl/goals", "problems")
 PROBLEMS = ("stack_boxes", "ball_in_cup", "peg_in_hole", "pour", "handover")
 
 

@@ -22,15 +22,15 @@ from unittest import mock
 import record
 from ompl import base as ob
 
-from apex_ompl.benchmark import Row, Workers, bench, runs
-from apex_ompl.benchmark.rows import Job
-from apex_ompl.benchmark.runs import NO_PROBLEM, Run
-from apex_ompl.benchmark.summary import Statistics
-from apex_ompl.planners import apex_parameters
-from apex_ompl.planners.apex_parameters import ApexParameters
+from apex_ompl.apex import parameters as apex_parameters
+from apex_ompl.apex.parameters import ApexParameters
+from apex_ompl.evaluation import Row, Workers, bench, runs
+from apex_ompl.evaluation.rows import Job
+from apex_ompl.evaluation.runs import NO_PROBLEM, Run
+from apex_ompl.evaluation.summary import Statistics
+from apex_ompl.paths.optimizer import Optimizer
+from apex_ompl.paths.settings import OptimizerSettings
 from apex_ompl.result import FIRST, INSIDE
-from apex_ompl.trajopt.optimizer import Optimizer
-from apex_ompl.trajopt.settings import OptimizerSettings
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import one_or_more
 

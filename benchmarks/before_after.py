@@ -30,14 +30,14 @@ from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import one_or_more
 
 DEPENDS = (
-    "@planning", "apex_ompl/trajectory", "apex_ompl/session", "benchmarks/apex_profile.py", "benchmarks/checkouts.py",
+    "@planning", "apex_ompl/timing", "apex_ompl/planning", "benchmarks/apex_profile.py", "benchmarks/checkouts.py",
 )  # fmt: skip
 TIMEOUT = 10.0  # [s]
 STAGES = ("call", "solve", "first path", "propose", "repair", "polish", "verify", "timing")
 WORKER = """
 import json, sys, time
 from apex_ompl import MotionPlanner, load_problem
-from apex_ompl.ompl_adapter.process import quiet_ompl
+from apex_ompl.ompl.process import quiet_ompl
 with quiet_ompl(), MotionPlanner() as planner:
     planner.plan_problem(load_problem("wall/easy/800000"))
     print("ready", flush=True)

@@ -35,20 +35,20 @@ from closed_loop_tables import Row, Stored, by_clock, by_size, by_waiting, named
 from tqdm import tqdm
 
 from apex_ompl import plan, problems
-from apex_ompl.loop.charges import cost_table
-from apex_ompl.loop.methods import METHODS
+from apex_ompl.loop.replan.methods import METHODS
 from apex_ompl.loop.result import Outcome, RunResult
 from apex_ompl.loop.run import CLOCKS, run
+from apex_ompl.moving.charges import cost_table
 from apex_ompl.problems import worlds
-from apex_ompl.trajectory.timing import Timing
+from apex_ompl.timing.parameterization import Timing
 from apex_ompl.util import provenance
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.files import write_atomically
 from apex_ompl.util.validation import one_or_more
 
 DEPENDS = (
-    "@planning", "apex_ompl/imitation", "apex_ompl/live", "apex_ompl/loop", "apex_ompl/roadmaps",
-    "apex_ompl/trajectory", "benchmarks/baselines", "benchmarks/closed_loop_tables.py",
+    "@planning", "apex_ompl/moving", "apex_ompl/loop", "apex_ompl/baselines",
+    "apex_ompl/timing", "benchmarks/baselines", "benchmarks/closed_loop_tables.py",
 )  # fmt: skip
 FOLDER = record.RESULTS.parent / "runs" / "closed_loop"
 SPEEDS = (1.0, 0.25)

@@ -21,15 +21,15 @@ import record
 from apex_ompl import plan, problems
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.mesh_stage import MeshStage, exact_requests
-from apex_ompl.ompl_adapter.validity import full_check
+from apex_ompl.ompl.validity import full_check
+from apex_ompl.paths.path import resample
 from apex_ompl.robot import Robot, load_robot
 from apex_ompl.scene.bodies import Obstacle
-from apex_ompl.trajopt.path import resample
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.resolution import FINE_RESOLUTION
 from apex_ompl.util.validation import one_or_more, whole_number
 
-DEPENDS = ("@checking", "apex_ompl/ompl_adapter", "problems")
+DEPENDS = ("@checking", "apex_ompl/ompl", "problems")
 SCENES = (3, 10, 30, 100, 300)
 CROWDED = 30  # obstacles; more are made smaller, so that some room is left
 LIMIT = 0.1  # clearances over this are not looked for, as by an optimiser [m]

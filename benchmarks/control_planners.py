@@ -18,19 +18,19 @@ from neighbours import Neighbours
 from ompl import base as ob
 
 from apex_ompl.apex.models import AUTO, DEFAULT
-from apex_ompl.datasets.records import Paths, held_extents
-from apex_ompl.diffusion.array_model import ArrayModel
-from apex_ompl.diffusion.checkpoint import load_torch_model
-from apex_ompl.diffusion.data import shard_paths
-from apex_ompl.diffusion.mirror import Mirror
-from apex_ompl.diffusion.proposals import Proposals, TrajectoryModel
-from apex_ompl.diffusion.query import ObstacleSet, Query
+from apex_ompl.apex.parameters import ApexParameters
+from apex_ompl.apex.planner import APEX
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel import Kernel, RobotTables
 from apex_ompl.kernel.scene_builder import scene_tables
-from apex_ompl.planners.apex import APEX
-from apex_ompl.planners.apex_parameters import ApexParameters
-from apex_ompl.planners.registry import register
+from apex_ompl.model.array_model import ArrayModel
+from apex_ompl.model.proposals import Proposals, TrajectoryModel
+from apex_ompl.model.query import ObstacleSet, Query
+from apex_ompl.ompl.parameters import register
+from apex_ompl.training.data import shard_paths
+from apex_ompl.training.mirror import Mirror
+from apex_ompl.training.records import Paths, held_extents
+from apex_ompl.training.torch_model import load_torch_model
 
 DATA = Path(__file__).resolve().parents[1] / "data" / "dual_panda_softhand"
 NEAR = 4  # times as many nearest paths as are wanted are there to draw from
@@ -135,7 +135,7 @@ def training_paths() -> tuple[Paths, RobotTables]:
 @cache
 def neighbours() -> Neighbours:
     """Return the paths that ship to look for neighbours in, with their mirror images."""
-    from apex_ompl.diffusion.checkpoint import SHIPPED, read_config
+    from apex_ompl.model.checkpoint import SHIPPED, read_config
 
     paths, tables = training_paths()
     mirror = Mirror(**read_config(SHIPPED / "apex").trained["config"]["mirror"])

@@ -14,12 +14,12 @@ import torch
 
 from apex_ompl import problems
 from apex_ompl.apex.query import make_query
-from apex_ompl.diffusion.array_model import ArrayModel
-from apex_ompl.diffusion.model import LatentDiffusion
-from apex_ompl.diffusion.proposals import Proposals
-from apex_ompl.diffusion.query import Query
-from apex_ompl.ompl_adapter.setup import assemble
+from apex_ompl.model.array_model import ArrayModel
+from apex_ompl.model.proposals import Proposals
+from apex_ompl.model.query import Query
+from apex_ompl.ompl.setup import assemble
 from apex_ompl.problems.suite_robot import robot
+from apex_ompl.training.latent_diffusion import LatentDiffusion
 
 
 class Shuffled(ArrayModel):

@@ -26,43 +26,43 @@ import numpy as np
 import record
 from replan_times import replan_times
 
+from apex_ompl.baselines.control.mppi import PathIntegral, softmax
+from apex_ompl.baselines.control.potential_field import PotentialField
+from apex_ompl.baselines.control.short_horizon import Horizon
+from apex_ompl.baselines.damon.lazy_search import LazySearch
+from apex_ompl.baselines.damon.replanner import ManifoldGraph
+from apex_ompl.baselines.drrt.goal_tree import GoalTree
+from apex_ompl.baselines.drrt.replanner import Clearances, KeptTree
+from apex_ompl.baselines.gpmp.replanner import CHARGE, IncrementalGPMP2
+from apex_ompl.baselines.imitation.replanner import Imitation
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ParameterError, UnknownNameError
-from apex_ompl.live.movers import Movers, clearance_in_time, curve_of, prove_motion
-from apex_ompl.live.retime import retime
-from apex_ompl.live.timed_spline import MotionOptimizer, Start, TimedSpline
-from apex_ompl.loop.charges import TABLE, Charges, cost_table
-from apex_ompl.loop.damon import ManifoldGraph
-from apex_ompl.loop.drrt import Clearances, KeptTree
-from apex_ompl.loop.following import Following
-from apex_ompl.loop.gpmp import CHARGE, IncrementalGPMP2
-from apex_ompl.loop.imitation import Imitation
-from apex_ompl.loop.mppi import PathIntegral, softmax
-from apex_ompl.loop.paper import OneProposal
-from apex_ompl.loop.potential_field import PotentialField
-from apex_ompl.loop.proposals import Proposals
-from apex_ompl.loop.ready import Ready
-from apex_ompl.loop.request import Request
-from apex_ompl.loop.search import AGE, GUARDED, MOTIONS, SPREAD, Search
-from apex_ompl.loop.settings import LoopSettings
-from apex_ompl.loop.short_horizon import Horizon
-from apex_ompl.loop.snapshot import Snapshot
-from apex_ompl.loop.sprint import CHARGE as SPRINT
-from apex_ompl.loop.sprint import Sprint
-from apex_ompl.ompl_adapter.process import quiet_ompl
-from apex_ompl.ompl_adapter.setup import assemble
+from apex_ompl.loop.replan.paper import OneProposal
+from apex_ompl.loop.replan.proposals import Proposals
+from apex_ompl.loop.replan.snapshot import Snapshot
+from apex_ompl.loop.replan.sprint import CHARGE as SPRINT
+from apex_ompl.loop.replan.sprint import Sprint
+from apex_ompl.moving.charges import TABLE, Charges, cost_table
+from apex_ompl.moving.following import Following
+from apex_ompl.moving.movers import Movers, clearance_in_time, curve_of, prove_motion
+from apex_ompl.moving.ready import Ready
+from apex_ompl.moving.request import Request
+from apex_ompl.moving.retime import retime
+from apex_ompl.moving.search import AGE, GUARDED, MOTIONS, SPREAD, Search
+from apex_ompl.moving.settings import LoopSettings
+from apex_ompl.moving.timed_spline import MotionOptimizer, Start, TimedSpline
+from apex_ompl.ompl.process import quiet_ompl
+from apex_ompl.ompl.setup import assemble
+from apex_ompl.paths.optimizer import Optimizer
 from apex_ompl.problems import worlds
-from apex_ompl.roadmaps.goal_tree import GoalTree
-from apex_ompl.roadmaps.lazy_search import LazySearch
-from apex_ompl.trajectory import time_path
-from apex_ompl.trajectory.methods.moving_start import between, through
-from apex_ompl.trajopt.optimizer import Optimizer
+from apex_ompl.timing import time_path
+from apex_ompl.timing.moving_start import between, through
 from apex_ompl.types import Array, Flags
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.files import write_atomically
 from apex_ompl.util.validation import one_or_more
 
-DEPENDS = ("@planning", "apex_ompl/live", "apex_ompl/loop", "apex_ompl/roadmaps", "apex_ompl/trajectory")
+DEPENDS = ("@planning", "apex_ompl/moving", "apex_ompl/loop", "apex_ompl/baselines", "apex_ompl/timing")
 REPEATS = 5
 PLANNERS = (
     "apex", "no-network", "retime", "apex-sprint", "rrtconnect", "potential-field", "mppi", "gpmp2", "drrt", "damon",

@@ -26,7 +26,7 @@ from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.resolution import FINE_RESOLUTION, SEARCH_RESOLUTION
 from apex_ompl.util.validation import one_or_more
 
-DEPENDS = ("@checking", "apex_ompl/ompl_adapter", "problems", "benchmarks/collision_checker.py")
+DEPENDS = ("@checking", "apex_ompl/ompl", "problems", "benchmarks/collision_checker.py")
 PROBLEMS = ("shelf_swap", "reach_past_post")
 
 

@@ -23,16 +23,16 @@ from typing import Any
 import numpy as np
 import record
 
-from apex_ompl.datasets.engine import EngineOptions
-from apex_ompl.datasets.records import SOURCES
-from apex_ompl.generation.solving import solve_unit
-from apex_ompl.generation.units import UNIT_SIZE, Unit, level_weight, static_levels
+from apex_ompl.paths.spline import Spline
 from apex_ompl.problems import scenes
-from apex_ompl.trajopt.spline import Spline
+from apex_ompl.training.engine import EngineOptions
+from apex_ompl.training.problem_solving import solve_unit
+from apex_ompl.training.records import SOURCES
+from apex_ompl.training.units import UNIT_SIZE, Unit, level_weight, static_levels
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import one_or_more, whole_number
 
-DEPENDS = ("@planning", "apex_ompl/datasets", "apex_ompl/generation")
+DEPENDS = ("@planning", "apex_ompl/training", "apex_ompl/training")
 SCRIPT = Path(__file__).resolve().parent.parent / "scripts" / "generate_data.py"
 WANTED, CORES = 500_000, (2, 16, 64)
 SCALED = ("vertical", "horizontal", "wall/easy", "swap/medium")  # levels solved with one and with several workers

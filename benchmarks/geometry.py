@@ -34,14 +34,14 @@ from tqdm import tqdm
 from apex_ompl import MotionPlanner, PlanResult, load_model, load_problem, problems
 from apex_ompl.apex.query import make_query
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.diffusion.proposals import TrajectoryModel
-from apex_ompl.ompl_adapter.process import quiet_ompl
+from apex_ompl.model.proposals import TrajectoryModel
+from apex_ompl.ompl.process import quiet_ompl
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import one_or_more
 
-DEPENDS = ("@planning", "apex_ompl/trajectory", "apex_ompl/session", "benchmarks/geometry_versions.py")
+DEPENDS = ("@planning", "apex_ompl/timing", "apex_ompl/planning", "benchmarks/geometry_versions.py")
 LEVELS = ("shelf/medium", "bins/medium", "cage/medium", "posts/medium", "wall/medium", "clutter/medium")
 CLOUD, CLOUDS, POINT_RADIUS = 100_000, 25, 0.005  # points of a new cloud, how many, and the radius of points [m]
 WARM = 200  # triangles and points of a first one, which compiles what is not compiled yet

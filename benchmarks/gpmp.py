@@ -18,8 +18,8 @@ import record
 from head_to_head import together
 from tune import TUNED_ON
 
-from apex_ompl.benchmark import Results, Row, Workers, bench
-from apex_ompl.benchmark.summary import statistics, warnings
+from apex_ompl.evaluation import Results, Row, Workers, bench
+from apex_ompl.evaluation.summary import statistics, warnings
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import one_or_more
 

@@ -26,15 +26,15 @@ from closed_loop import FOLDER, SCRIPTED, Job, kept, made_by, stored
 
 from apex_ompl.loop.referee import LIMIT_TOLERANCE
 from apex_ompl.loop.run import run
-from apex_ompl.loop.settings import LoopSettings
+from apex_ompl.moving.settings import LoopSettings
 from apex_ompl.problems import worlds
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.statistics import share_interval
 from apex_ompl.util.validation import one_or_more
 
 DEPENDS = (
-    "benchmarks/closed_loop.py", "benchmarks/attack_worlds.py", "@planning", "apex_ompl/live", "apex_ompl/loop",
-    "apex_ompl/trajectory",
+    "benchmarks/closed_loop.py", "benchmarks/attack_worlds.py", "@planning", "apex_ompl/moving", "apex_ompl/loop",
+    "apex_ompl/timing",
 )  # fmt: skip
 SHORT, RESTS, LONGER = 3.0, 0.5, 1.5  # time of a run, and of rest after which it ends, in every fifth run longer [s]
 HASTENING, PROPOSING = 5, 10  # of so many runs one looks for faster motions, of so many attacks one uses the network

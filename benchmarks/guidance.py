@@ -19,20 +19,20 @@ import torch
 
 from apex_ompl import problems
 from apex_ompl.apex.query import make_query
-from apex_ompl.benchmark import Row, Workers, bench
-from apex_ompl.benchmark.rows import Job
-from apex_ompl.benchmark.runs import Run
-from apex_ompl.diffusion.checkpoint import load_model
-from apex_ompl.diffusion.guidance import EQUATION_7, GUIDANCES, Guidance
-from apex_ompl.ompl_adapter.setup import assemble
-from apex_ompl.ompl_adapter.validity import full_check
+from apex_ompl.evaluation import Row, Workers, bench
+from apex_ompl.evaluation.rows import Job
+from apex_ompl.evaluation.runs import Run
+from apex_ompl.model.checkpoint import load_model
+from apex_ompl.model.guidance import EQUATION_7, GUIDANCES, Guidance
+from apex_ompl.ompl.setup import assemble
+from apex_ompl.ompl.validity import full_check
+from apex_ompl.paths.path import path_length
 from apex_ompl.problems.suite_robot import robot
-from apex_ompl.trajopt.path import path_length
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.statistics import share_interval
 from apex_ompl.util.validation import one_or_more
 
-DEPENDS = ("@planning", "apex_ompl/diffusion")
+DEPENDS = ("@planning", "apex_ompl/model")
 MODEL, COUNT = "apex-paper", 8
 LEVELS = ("vertical/large", "horizontal/large")
 FOLDER = record.ROOT / "benchmarks" / "runs" / "guidance"

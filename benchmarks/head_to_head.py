@@ -1,4 +1,4 @@
-"""Planners head to head on all static levels of the test split, through ``apex_ompl.benchmark``.
+"""Planners head to head on all static levels of the test split, through ``apex_ompl.evaluation``.
 
 Rows: apex; apex without trees after its proposals; the straight line and its repair, which ends by itself; rounds of
 eight random bumps instead of proposals, with the same repair, for 2 s; rrtconnect+polish; rrtconnect as OMPL has it and
@@ -27,16 +27,16 @@ from pathlib import Path
 import numpy as np
 import record
 
-from apex_ompl.benchmark import Row, Workers, bench, report, write_database, write_logs
-from apex_ompl.benchmark.rows import PAPER
-from apex_ompl.benchmark.summary import SHARE_TIMES, Statistics, Table, statistics, tables, warnings
-from apex_ompl.planners.tuned import TUNED
+from apex_ompl.evaluation import Row, Workers, bench, report, write_database, write_logs
+from apex_ompl.evaluation.rows import PAPER
+from apex_ompl.evaluation.summary import SHARE_TIMES, Statistics, Table, statistics, tables, warnings
+from apex_ompl.ompl.tuned import TUNED
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.statistics import share_interval
 from apex_ompl.util.validation import one_or_more
 
 DEPENDS = (
-    "@benchmark", "apex_ompl/imitation", "apex_ompl/roadmaps", "benchmarks/baselines", "benchmarks/controls.py",
+    "@benchmark", "apex_ompl/baselines", "benchmarks/baselines", "benchmarks/controls.py",
     "benchmarks/control_planners.py", "benchmarks/neighbours.py",
 )  # fmt: skip
 FOLDER = Path(__file__).parent / "runs" / "head_to_head"

@@ -21,23 +21,23 @@ from ompl import base as ob
 
 from apex_ompl import planners, problems
 from apex_ompl.apex.query import make_query
-from apex_ompl.imitation.policy import shared_policy
-from apex_ompl.ompl_adapter.process import quiet_ompl
-from apex_ompl.ompl_adapter.setup import PlanningSetup, assemble
-from apex_ompl.ompl_adapter.space import path_to_array
-from apex_ompl.planners.il import Imitation
+from apex_ompl.baselines.imitation.planner import Imitation
+from apex_ompl.baselines.imitation.policy import shared_policy
+from apex_ompl.goals.alignment import AlignmentGoal
+from apex_ompl.ompl.process import quiet_ompl
+from apex_ompl.ompl.setup import PlanningSetup, assemble
+from apex_ompl.ompl.space import path_to_array
+from apex_ompl.paths.path import path_length
 from apex_ompl.problems.catalogue import SPLITS
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.scene.problem import Alignment
-from apex_ompl.tasks.alignment import AlignmentGoal
-from apex_ompl.trajectory.smoothness import jerk
-from apex_ompl.trajopt.path import path_length
+from apex_ompl.timing.smoothness import jerk
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.files import make_folder
 from apex_ompl.util.statistics import share_interval
 from apex_ompl.util.validation import one_or_more
 
-DEPENDS = ("@benchmark", "apex_ompl/imitation", "benchmarks/baselines/il", "benchmarks/baselines/il-paper")
+DEPENDS = ("@benchmark", "apex_ompl/baselines/imitation", "benchmarks/baselines/il", "benchmarks/baselines/il-paper")
 LEVELS = (*(f"{task}/{size}" for task in ("vertical", "horizontal") for size in ("free", "small", "medium", "large")),
           "shelf/easy")  # fmt: skip
 KINDS: dict[tuple[str, ...], Literal["vertical", "horizontal"]] = {

@@ -59,9 +59,9 @@ import numpy as np
 from apex_ompl import load_model, plan, problems
 from apex_ompl.kernel import library
 from apex_ompl.kernel.compiled import jit
-from apex_ompl.ompl_adapter.setup import assemble
+from apex_ompl.ompl.setup import assemble
 from apex_ompl.problems.suite_robot import robot
-from apex_ompl.trajopt.optimizer import Optimizer
+from apex_ompl.paths.optimizer import Optimizer
 
 chosen = library.os.environ.pop(library.CHOICE)
 built = library._load()

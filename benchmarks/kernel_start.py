@@ -25,11 +25,11 @@ from apex_ompl.kernel.library import CHOICE
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import one_or_more
 
-DEPENDS = ("@planning", "apex_ompl/cli", "apex_ompl/session", "apex_ompl/loop", "pyproject.toml", "constraints.txt")
+DEPENDS = ("@planning", "apex_ompl/cli", "apex_ompl/planning", "apex_ompl/loop", "pyproject.toml", "constraints.txt")
 PLAN = ("apex-ompl", "plan", "ball_in_cup")
 RUN = """
 import apex_ompl
-from apex_ompl.loop.settings import LoopSettings
+from apex_ompl.moving.settings import LoopSettings
 apex_ompl.run("vertical/moving-huge-0.4/800007", settings=LoopSettings(timeout=1.0))
 """
 STARTS = {

@@ -30,13 +30,13 @@ from apex_ompl.kernel.compiled.layout import Floats, Integers
 from apex_ompl.kernel.compiled.path_cost import PANEL, add_sample
 from apex_ompl.kernel.compiled.path_optimization import _factorise
 from apex_ompl.kernel.compiled.workspace import workspace_view
-from apex_ompl.ompl_adapter.setup import assemble
+from apex_ompl.ompl.setup import assemble
+from apex_ompl.paths.optimizer import Optimizer, _grid
 from apex_ompl.problems.suite_robot import robot
-from apex_ompl.trajopt.optimizer import Optimizer, _grid
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import one_or_more
 
-DEPENDS = ("apex_ompl/diffusion", "apex_ompl/kernel", "apex_ompl/trajopt", "apex_ompl/collision")
+DEPENDS = ("apex_ompl/model", "apex_ompl/kernel", "apex_ompl/paths", "apex_ompl/collision")
 PROBLEM = "shelf/hard/800003"
 PROPOSALS, BUMPED, STEPS = 4, 8, 12
 JOINT = 108  # operations

@@ -18,15 +18,15 @@ import record
 
 from apex_ompl import load_model, problems
 from apex_ompl.apex.query import make_query
-from apex_ompl.diffusion.checkpoint import shipped
-from apex_ompl.diffusion.guidance import Guidance
-from apex_ompl.diffusion.proposals import Sampling
-from apex_ompl.ompl_adapter.setup import assemble
+from apex_ompl.model.checkpoint import shipped
+from apex_ompl.model.guidance import Guidance
+from apex_ompl.model.proposals import Sampling
+from apex_ompl.ompl.setup import assemble
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import one_or_more
 
-DEPENDS = ("apex_ompl/diffusion", "apex_ompl/apex/query.py", "apex_ompl/kernel", "apex_ompl/ompl_adapter", "problems")
+DEPENDS = ("apex_ompl/model", "apex_ompl/apex/query.py", "apex_ompl/kernel", "apex_ompl/ompl", "problems")
 PROBLEM = "shelf/hard/800003"
 COUNTS = (1, 4, 8, 32)
 STEPS = (1, 2, 8)

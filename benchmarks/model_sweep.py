@@ -20,14 +20,14 @@ from typing import Any
 import record
 import torch
 
-from apex_ompl.datasets.kernel_problems import load_kernel_problems
-from apex_ompl.diffusion.checkpoint import load_torch_model
-from apex_ompl.diffusion.runlog import read_log
-from apex_ompl.diffusion.validation import success_rates
+from apex_ompl.training.kernel_problems import load_kernel_problems
+from apex_ompl.training.runlog import read_log
+from apex_ompl.training.torch_model import load_torch_model
+from apex_ompl.training.validation import success_rates
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import one_or_more
 
-DEPENDS = ("apex_ompl/diffusion", "apex_ompl/datasets", "scripts/train.py", "scripts/configs")
+DEPENDS = ("apex_ompl/model", "apex_ompl/training", "scripts/train.py", "scripts/configs")
 LOSSES = ("loss", "held_out")
 ROOT = record.RESULTS.parent.parent
 VARIANTS: dict[str, dict[str, Any]] = {

@@ -28,17 +28,17 @@ import record
 from scipy.spatial.transform import Rotation
 
 from apex_ompl.api import load_problem
-from apex_ompl.benchmark import Row, Workers, bench
-from apex_ompl.benchmark.accounting import first_path_proof
-from apex_ompl.benchmark.rows import Job
-from apex_ompl.benchmark.runs import Run
 from apex_ompl.errors import MissingFileError
-from apex_ompl.ompl_adapter.setup import PlanningSetup, assemble
-from apex_ompl.planners.tuned import TUNED
+from apex_ompl.evaluation import Row, Workers, bench
+from apex_ompl.evaluation.accounting import first_path_proof
+from apex_ompl.evaluation.rows import Job
+from apex_ompl.evaluation.runs import Run
+from apex_ompl.ompl.setup import PlanningSetup, assemble
+from apex_ompl.ompl.tuned import TUNED
+from apex_ompl.paths.path import path_length
 from apex_ompl.robot import load_robot
+from apex_ompl.robot.moveit import convert
 from apex_ompl.scene.problem import Problem
-from apex_ompl.tasks.moveit import convert
-from apex_ompl.trajopt.path import path_length
 from apex_ompl.util.deadline import Deadline
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.files import write_atomically
@@ -51,7 +51,7 @@ try:
 except ImportError as error:
     sys.exit(f"motion_bench_maker.py: error: no VAMP ({error}), expected: pip install vamp-planner")
 
-DEPENDS = ("@benchmark", "benchmarks/peers.py", "apex_ompl/tasks", "apex_ompl/robot/data/baxter.robot.yaml")
+DEPENDS = ("@benchmark", "benchmarks/peers.py", "apex_ompl/goals", "apex_ompl/robot/data/baxter.robot.yaml")
 FOLDER = Path(__file__).parent / "runs" / "motion_bench_maker"
 DATA = record.ROOT / "apex_ompl" / "robot" / "data"
 SETS = ("easy", "medium", "hard")

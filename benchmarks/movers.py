@@ -19,18 +19,18 @@ import numpy as np
 import record
 
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.live.movers import Movers, clearance_in_time, curve_of, prove_motion
-from apex_ompl.live.retime import retime
-from apex_ompl.live.safe_intervals import blocked
-from apex_ompl.live.stopping import stop, stop_along
+from apex_ompl.moving.movers import Movers, clearance_in_time, curve_of, prove_motion
+from apex_ompl.moving.retime import retime
+from apex_ompl.moving.safe_intervals import blocked
+from apex_ompl.moving.stopping import stop, stop_along
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.scripts import obstacle_at
-from apex_ompl.trajectory import Timing, Trajectory, time_path
+from apex_ompl.timing import Timing, Trajectory, time_path
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import one_or_more
 
-DEPENDS = ("@checking", "apex_ompl/live", "apex_ompl/trajectory")
+DEPENDS = ("@checking", "apex_ompl/moving", "apex_ompl/timing")
 MOMENTS, PIECES, LONG = 100, 256, 3.0
 MOTIONS = 200  # different ones
 SHAPES = [

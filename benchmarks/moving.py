@@ -21,18 +21,18 @@ import numpy as np
 import record
 
 from apex_ompl import problems
-from apex_ompl.benchmark import Results, Row, Workers, bench, runs
-from apex_ompl.benchmark.rows import Job
-from apex_ompl.benchmark.runs import Run
-from apex_ompl.live.moving import check_timed_path
+from apex_ompl.evaluation import Results, Row, Workers, bench, runs
+from apex_ompl.evaluation.rows import Job
+from apex_ompl.evaluation.runs import Run
+from apex_ompl.moving.swept import check_timed_path
 from apex_ompl.planning.among_movers import RETIMED, SPACE_TIME, STAGES
 from apex_ompl.problems.alignment import SIZES, SPEEDS, VELOCITY_SCALE
 from apex_ompl.problems.suite_robot import robot
-from apex_ompl.trajectory import time_path
+from apex_ompl.timing import time_path
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import one_or_more
 
-DEPENDS = ("@benchmark", "apex_ompl/live", "apex_ompl/trajectory")
+DEPENDS = ("@benchmark", "apex_ompl/moving", "apex_ompl/timing")
 FOLDER = record.RESULTS.parent / "runs" / "moving"
 TIMEOUT, SPACING = 10.0, 0.004  # [s]
 LEVELS = [

@@ -8,12 +8,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from apex_ompl.datasets.records import Paths
-from apex_ompl.diffusion.conditions import Conditions, ConditionTable, batch_queries, pad_obstacles
-from apex_ompl.diffusion.query import Probes, Query
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel import Kernel, RobotTables
 from apex_ompl.kernel.scene_builder import scene_tables
+from apex_ompl.model.query import Probes, Query
+from apex_ompl.training.conditions import Conditions, ConditionTable, batch_queries, pad_obstacles
+from apex_ompl.training.records import Paths
 from apex_ompl.types import Array
 
 ALONG = 7  # states of the straight line at which clearances are compared

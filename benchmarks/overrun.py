@@ -25,14 +25,14 @@ import record
 from robustness import walled
 
 from apex_ompl import plan, problems
-from apex_ompl.benchmark.rows import Job
-from apex_ompl.benchmark.runs import run
+from apex_ompl.evaluation.rows import Job
+from apex_ompl.evaluation.runs import run
 from apex_ompl.scene.bodies import MeshFile, Obstacle
 from apex_ompl.scene.problem import Problem
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import check_positive
 
-DEPENDS = ("@benchmark", "apex_ompl/trajectory", "benchmarks/robustness.py")
+DEPENDS = ("@benchmark", "apex_ompl/timing", "benchmarks/robustness.py")
 PLANNERS = ("apex", "rrtconnect", "rrtconnect+polish", "rrt", "bitstar", "informedrrtstar", "aorrtc", "kpiece1")
 SUITES = ("shelf", "bins", "cage", "clutter", "swap", "posts", "wall")
 COUNTS = {0.05: 40, 0.5: 30, 5.0: 5}

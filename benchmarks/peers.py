@@ -5,7 +5,7 @@ the collision checker on random states is part of the results. It plans with the
 distance, which is finer than the greatest step of a joint that OMPL's planners use here. What differs: it proves no
 motions by clearance; its paths are shortened by its own shortcuts; of several goals it takes the first. Its paths then
 go through the stages of rrtconnect's: the shortened one has to pass the full check, or is repaired; where that fails,
-the path as it was found is tried. First-path times are accounted as in apex_ompl.benchmark. None tries the straight
+the path as it was found is tried. First-path times are accounted as in apex_ompl.evaluation. None tries the straight
 line before it plans, but apex, which does so itself. Problems with shapes that RoboPlan does not have are left out.
 Each run is stored in benchmarks/runs/peers when it ends; the command resumes where it was stopped.
 
@@ -26,21 +26,21 @@ import numpy as np
 import record
 
 from apex_ompl.api import load_problem
-from apex_ompl.benchmark import Results, Row, Workers, bench
-from apex_ompl.benchmark.accounting import first_path_proof
-from apex_ompl.benchmark.rows import Job
-from apex_ompl.benchmark.runs import NO_PROBLEM, Run
-from apex_ompl.benchmark.summary import Statistics
-from apex_ompl.ompl_adapter.repair import repair
-from apex_ompl.ompl_adapter.setup import PlanningSetup, assemble
-from apex_ompl.ompl_adapter.validity import full_check
-from apex_ompl.planners.tuned import TUNED
+from apex_ompl.evaluation import Results, Row, Workers, bench
+from apex_ompl.evaluation.accounting import first_path_proof
+from apex_ompl.evaluation.rows import Job
+from apex_ompl.evaluation.runs import NO_PROBLEM, Run
+from apex_ompl.evaluation.summary import Statistics
+from apex_ompl.ompl.repair import repair
+from apex_ompl.ompl.setup import PlanningSetup, assemble
+from apex_ompl.ompl.tuned import TUNED
+from apex_ompl.ompl.validity import full_check
+from apex_ompl.paths.path import path_length
 from apex_ompl.planning import NOT_PROVED
 from apex_ompl.robot import Robot
 from apex_ompl.robot.geometry import link_of
 from apex_ompl.scene.bodies import Body, pose_matrix
 from apex_ompl.scene.problem import Problem
-from apex_ompl.trajopt.path import path_length
 from apex_ompl.types import Array
 from apex_ompl.util.deadline import Deadline
 from apex_ompl.util.entry_point import run_script

@@ -31,23 +31,24 @@ from neighbours import Neighbours
 
 from apex_ompl import load_model
 from apex_ompl.apex.query import make_query
-from apex_ompl.benchmark import Results, Row, Workers, bench
-from apex_ompl.benchmark.rows import Job
-from apex_ompl.benchmark.runs import NO_PROBLEM, Run
-from apex_ompl.diffusion.checkpoint import SHIPPED, load_torch_model, read_config
-from apex_ompl.diffusion.data import shard_paths
-from apex_ompl.diffusion.guidance import EQUATION_7, Guidance
-from apex_ompl.diffusion.mirror import Mirror
-from apex_ompl.diffusion.proposals import Sampling, TrajectoryModel
+from apex_ompl.evaluation import Results, Row, Workers, bench
+from apex_ompl.evaluation.rows import Job
+from apex_ompl.evaluation.runs import NO_PROBLEM, Run
 from apex_ompl.kernel import Kernel, RobotTables
 from apex_ompl.kernel.scene_builder import scene_tables
-from apex_ompl.ompl_adapter.setup import PlanningSetup, assemble
-from apex_ompl.ompl_adapter.validity import full_check
+from apex_ompl.model.checkpoint import SHIPPED, read_config
+from apex_ompl.model.guidance import EQUATION_7, Guidance
+from apex_ompl.model.proposals import Sampling, TrajectoryModel
+from apex_ompl.ompl.setup import PlanningSetup, assemble
+from apex_ompl.ompl.validity import full_check
+from apex_ompl.paths.candidates import first_valid
+from apex_ompl.paths.optimizer import Optimizer
+from apex_ompl.paths.path import path_length
 from apex_ompl.problems import load
 from apex_ompl.problems.suite_robot import robot
-from apex_ompl.trajopt.candidates import first_valid
-from apex_ompl.trajopt.optimizer import Optimizer
-from apex_ompl.trajopt.path import path_length
+from apex_ompl.training.data import shard_paths
+from apex_ompl.training.mirror import Mirror
+from apex_ompl.training.torch_model import load_torch_model
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import one_or_more, whole_number
 

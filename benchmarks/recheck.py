@@ -26,19 +26,19 @@ import record
 from tqdm import tqdm
 
 from apex_ompl.api import load_problem
-from apex_ompl.benchmark import Results
 from apex_ompl.errors import TimingError
-from apex_ompl.ompl_adapter.setup import PlanningSetup, assemble
-from apex_ompl.ompl_adapter.validity import full_check
+from apex_ompl.evaluation import Results
+from apex_ompl.ompl.setup import PlanningSetup, assemble
+from apex_ompl.ompl.validity import full_check
 from apex_ompl.result import PlanResult
 from apex_ompl.robot import load_robot
-from apex_ompl.trajectory import Trajectory, time_path
+from apex_ompl.timing import Trajectory, time_path
 from apex_ompl.types import Array
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.files import make_folder
 from apex_ompl.util.validation import one_or_more, positive_number
 
-DEPENDS = ("@benchmark", "apex_ompl/trajectory", "benchmarks/head_to_head.py", "benchmarks/standing.py")
+DEPENDS = ("@benchmark", "apex_ompl/timing", "benchmarks/head_to_head.py", "benchmarks/standing.py")
 RUNS = Path(__file__).parent / "runs"
 SPACING = 0.0031 / 20  # a twentieth of the spacing at which paths were checked before they were proved [rad, max-norm]
 MOTION_SPACING = 0.00031 / 20  # and of motions

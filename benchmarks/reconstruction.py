@@ -17,18 +17,19 @@ import record
 import torch
 
 from apex_ompl import load_model, problems
-from apex_ompl.datasets.records import Paths
-from apex_ompl.datasets.store import load
-from apex_ompl.diffusion.autoencoder import LinearLatent
-from apex_ompl.diffusion.checkpoint import load_torch_model, shipped
-from apex_ompl.diffusion.data import split
-from apex_ompl.ompl_adapter.setup import assemble
-from apex_ompl.ompl_adapter.validity import full_check
+from apex_ompl.model.checkpoint import shipped
+from apex_ompl.ompl.setup import assemble
+from apex_ompl.ompl.validity import full_check
 from apex_ompl.problems.suite_robot import robot
+from apex_ompl.training.autoencoder import LinearLatent
+from apex_ompl.training.data import split
+from apex_ompl.training.records import Paths
+from apex_ompl.training.store import load
+from apex_ompl.training.torch_model import load_torch_model
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import one_or_more
 
-DEPENDS = ("apex_ompl/diffusion", "apex_ompl/trajopt", "apex_ompl/datasets", "data/dual_panda_softhand")
+DEPENDS = ("apex_ompl/model", "apex_ompl/paths", "apex_ompl/training", "data/dual_panda_softhand")
 DATA = record.RESULTS.parent.parent / "data" / "dual_panda_softhand" / "paths.zip"
 
 

@@ -19,8 +19,8 @@ from apex_ompl.util import provenance
 from apex_ompl.util.files import write_atomically
 
 try:
-    from apex_ompl.benchmark import Results
-    from apex_ompl.benchmark.metrics import next_percentile
+    from apex_ompl.evaluation import Results
+    from apex_ompl.evaluation.metrics import next_percentile
 except ImportError as missing:
     expected = "pip install -c constraints.txt -e '.[bench]'"
     sys.exit(f"{Path(sys.argv[0]).stem}: error: no {missing.name}, expected: {expected}")
@@ -29,16 +29,16 @@ ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
 CHECKING = (
     "apex_ompl/scene", "apex_ompl/robot", "apex_ompl/kernel", "apex_ompl/collision", "apex_ompl/util",
-    "apex_ompl/trajopt/path.py",
+    "apex_ompl/paths/path.py",
 )  # fmt: skip
 PLANNING = (
-    *CHECKING, "apex_ompl/apex", "apex_ompl/api.py", "apex_ompl/diffusion", "apex_ompl/ompl_adapter",
-    "apex_ompl/planning", "apex_ompl/result.py", "apex_ompl/tasks", "apex_ompl/trajopt", "planners", "problems",
+    *CHECKING, "apex_ompl/apex", "apex_ompl/api.py", "apex_ompl/model", "apex_ompl/ompl",
+    "apex_ompl/planning", "apex_ompl/result.py", "apex_ompl/goals", "apex_ompl/paths", "planners", "problems",
 )  # fmt: skip
 GROUPS = {
     "@checking": CHECKING,
     "@planning": PLANNING,
-    "@benchmark": (*PLANNING, "apex_ompl/benchmark", "apex_ompl/trajectory/smoothness.py"),
+    "@benchmark": (*PLANNING, "apex_ompl/evaluation", "apex_ompl/timing/smoothness.py"),
 }
 """Names of groups of paths in ``DEPENDS``."""
 

@@ -26,16 +26,17 @@ from unseen import FROZEN, SUITE, TUNED_ON
 from apex_ompl import problems
 from apex_ompl.apex.models import NONE, Model, trajectory_model
 from apex_ompl.apex.query import make_query
-from apex_ompl.benchmark import Results, Row, Workers, bench
-from apex_ompl.benchmark.rows import Job
-from apex_ompl.benchmark.runs import Run
-from apex_ompl.diffusion.checkpoint import SHIPPED, load_torch_model, read_config
-from apex_ompl.ompl_adapter.setup import assemble
+from apex_ompl.evaluation import Results, Row, Workers, bench
+from apex_ompl.evaluation.rows import Job
+from apex_ompl.evaluation.runs import Run
+from apex_ompl.model.checkpoint import SHIPPED, read_config
+from apex_ompl.ompl.setup import assemble
+from apex_ompl.paths.candidates import CandidatePool
+from apex_ompl.paths.optimizer import Optimizer
+from apex_ompl.paths.path import path_length
 from apex_ompl.problems.catalogue import VALIDATION
 from apex_ompl.problems.suite_robot import robot
-from apex_ompl.trajopt.candidates import CandidatePool
-from apex_ompl.trajopt.optimizer import Optimizer
-from apex_ompl.trajopt.path import path_length
+from apex_ompl.training.torch_model import load_torch_model
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.resolution import FINE_RESOLUTION
 from apex_ompl.util.statistics import share_interval

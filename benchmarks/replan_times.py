@@ -10,10 +10,10 @@ from dataclasses import dataclass, field
 
 from apex_ompl import run
 from apex_ompl.loop import replanning
-from apex_ompl.loop.charges import Charges
-from apex_ompl.loop.ready import Ready
 from apex_ompl.loop.replanning import Reply
-from apex_ompl.loop.request import Replanner, Request
+from apex_ompl.moving.charges import Charges
+from apex_ompl.moving.ready import Ready
+from apex_ompl.moving.request import Replanner, Request
 
 
 @dataclass

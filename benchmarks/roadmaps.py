@@ -16,14 +16,14 @@ from typing import Any
 import record
 from tune import TUNED_ON
 
-from apex_ompl.benchmark import Results, Row, Workers, bench
-from apex_ompl.benchmark.runs import NO_PROBLEM
+from apex_ompl.evaluation import Results, Row, Workers, bench
+from apex_ompl.evaluation.runs import NO_PROBLEM
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.statistics import share_interval
 from apex_ompl.util.validation import one_or_more
 
 DEPENDS = (
-    "@planning", "apex_ompl/benchmark", "apex_ompl/roadmaps", "benchmarks/baselines", "benchmarks/tune.py",
+    "@planning", "apex_ompl/evaluation", "apex_ompl/baselines", "benchmarks/baselines", "benchmarks/tune.py",
     "scripts/train_damon.py",
 )  # fmt: skip
 FOLDER = record.ROOT / "benchmarks" / "runs" / "roadmaps"

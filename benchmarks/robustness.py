@@ -22,12 +22,12 @@ import record
 from ompl import base as ob
 
 from apex_ompl import plan, problems
+from apex_ompl.apex.parameters import ApexParameters
+from apex_ompl.apex.planner import APEX
 from apex_ompl.errors import ApexError
-from apex_ompl.ompl_adapter.process import quiet_ompl
-from apex_ompl.ompl_adapter.setup import assemble
-from apex_ompl.ompl_adapter.space import to_state
-from apex_ompl.planners.apex import APEX
-from apex_ompl.planners.apex_parameters import ApexParameters
+from apex_ompl.ompl.process import quiet_ompl
+from apex_ompl.ompl.setup import assemble
+from apex_ompl.ompl.space import to_state
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Goal, Problem

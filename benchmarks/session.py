@@ -23,16 +23,16 @@ from importlib.util import find_spec
 import record
 
 from apex_ompl import MotionPlanner, PlanResult, load_problem, plan, problems
-from apex_ompl.ompl_adapter.process import quiet_ompl
-from apex_ompl.ompl_adapter.setup import assemble
-from apex_ompl.planners.tuned import TUNED
+from apex_ompl.ompl.process import quiet_ompl
+from apex_ompl.ompl.setup import assemble
+from apex_ompl.ompl.tuned import TUNED
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.scene.problem import Problem
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.resolution import SEARCH_RESOLUTION
 from apex_ompl.util.validation import one_or_more
 
-DEPENDS = ("@planning", "apex_ompl/trajectory", "apex_ompl/session", "apex_ompl/cli")
+DEPENDS = ("@planning", "apex_ompl/timing", "apex_ompl/planning", "apex_ompl/cli")
 LEVELS = ("shelf/hard", "vertical/medium", "clutter/medium")
 WARM_UP = "wall/easy/800000"
 STEP = 0.001  # by which an obstacle is moved [m]

@@ -22,12 +22,12 @@ import numpy as np
 import record
 
 from apex_ompl import problems
-from apex_ompl.benchmark import Row, Workers, bench, runs
-from apex_ompl.benchmark.log import short
-from apex_ompl.benchmark.rows import Job
-from apex_ompl.benchmark.runs import Run
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.ompl_adapter import setup
+from apex_ompl.evaluation import Row, Workers, bench, runs
+from apex_ompl.evaluation.log import short
+from apex_ompl.evaluation.rows import Job
+from apex_ompl.evaluation.runs import Run
+from apex_ompl.ompl import setup
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import one_or_more
 

@@ -15,9 +15,9 @@ from dataclasses import replace
 import head_to_head
 import record
 
-from apex_ompl.benchmark import Row, Workers, bench
-from apex_ompl.benchmark.summary import statistics, warnings
-from apex_ompl.planners.tuned import TUNED
+from apex_ompl.evaluation import Row, Workers, bench
+from apex_ompl.evaluation.summary import statistics, warnings
+from apex_ompl.ompl.tuned import TUNED
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import one_or_more
 

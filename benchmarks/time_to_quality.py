@@ -4,7 +4,7 @@ The reference lengths are made once (``--reference``), on the first 20 test prob
 benchmarks/reference_lengths.json. Then each planner has 10 s: apex, which improves its path all the time (``anytime``);
 rrtconnect with OMPL's simplification, and rrtconnect+polish, restarted with other random numbers as long as there is
 time; aorrtc; rrtconnect and aorrtc as OMPL has them, and with the parameters that benchmarks/tune.py chose, which their
-labels name. A path counts from when it has passed the full check, as first paths do in apex_ompl.benchmark.
+labels name. A path counts from when it has passed the full check, as first paths do in apex_ompl.evaluation.
 Each run is stored in benchmarks/runs/time_to_quality when it ends; the command resumes where it was stopped.
 
 Usage: python benchmarks/time_to_quality.py [--reference] [SUITE/hard ...] [-n 10] [--jobs 1]
@@ -26,17 +26,17 @@ import record
 from ompl import base as ob
 
 from apex_ompl import planners
-from apex_ompl.benchmark import Row, Workers, bench
-from apex_ompl.benchmark.rows import Job
-from apex_ompl.benchmark.runs import NO_PROBLEM, Run
-from apex_ompl.ompl_adapter.setup import PlanningSetup, assemble
-from apex_ompl.ompl_adapter.simplify import simplify
-from apex_ompl.ompl_adapter.space import path_to_array
-from apex_ompl.ompl_adapter.validity import full_check
-from apex_ompl.planners.tuned import TUNED
+from apex_ompl.evaluation import Row, Workers, bench
+from apex_ompl.evaluation.rows import Job
+from apex_ompl.evaluation.runs import NO_PROBLEM, Run
+from apex_ompl.ompl.setup import PlanningSetup, assemble
+from apex_ompl.ompl.simplify import simplify
+from apex_ompl.ompl.space import path_to_array
+from apex_ompl.ompl.tuned import TUNED
+from apex_ompl.ompl.validity import full_check
+from apex_ompl.paths.path import path_length
 from apex_ompl.problems import load
 from apex_ompl.problems.suite_robot import robot
-from apex_ompl.trajopt.path import path_length
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.files import write_atomically
 from apex_ompl.util.validation import one_or_more

@@ -48,19 +48,19 @@ from tqdm import tqdm
 from apex_ompl import plan, problems
 from apex_ompl.errors import TimingError
 from apex_ompl.kernel.compiled.polyline_distance import max_distance
-from apex_ompl.ompl_adapter.setup import assemble
-from apex_ompl.ompl_adapter.validity import full_check
+from apex_ompl.ompl.setup import assemble
+from apex_ompl.ompl.validity import full_check
+from apex_ompl.paths.path import Path
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.result import PlanResult
-from apex_ompl.trajectory import Timing, Trajectory, time_path
-from apex_ompl.trajectory.curve import Polyline
-from apex_ompl.trajectory.methods import METHODS
-from apex_ompl.trajopt.path import Path
+from apex_ompl.timing import Timing, Trajectory, time_path
+from apex_ompl.timing.curve import Polyline
+from apex_ompl.timing.parameterization import METHODS
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.files import write_atomically
 from apex_ompl.util.validation import one_or_more, whole_number
 
-DEPENDS = ("@planning", "apex_ompl/trajectory")
+DEPENDS = ("@planning", "apex_ompl/timing")
 Method = Callable[[np.ndarray], Trajectory | None]
 KEPT = FilePath(__file__).parent / "runs" / "timing"  # rrtconnect's paths
 DERIVATIVES = ("position", "velocity", "acceleration", "jerk")

@@ -12,17 +12,17 @@ from toppra import algorithm, constraint
 
 from apex_ompl.kernel.compiled.time_parameterization import max_path_speeds
 from apex_ompl.problems.suite_robot import robot
-from apex_ompl.trajectory import Timing, Trajectory
-from apex_ompl.trajectory.curve import Curve, Polyline
-from apex_ompl.trajectory.methods.ruckig import stops
-from apex_ompl.trajectory.methods.ruckig_profiles import calculate, knots
-from apex_ompl.trajectory.methods.spline import (
+from apex_ompl.timing import Timing, Trajectory
+from apex_ompl.timing.curve import Curve, Polyline
+from apex_ompl.timing.ruckig_method import stops
+from apex_ompl.timing.ruckig_profiles import calculate, knots
+from apex_ompl.timing.spline_method import (
     CONTROL_POINT_SPACING,
     GRID_POINTS_PER_SPAN,
     least_knot_spacing,
     spline_in_time,
 )
-from apex_ompl.trajectory.trajectory import concatenate
+from apex_ompl.timing.trajectory import concatenate
 
 LIMITS, NAMES = robot().limits, robot().joint_names
 APART_ON_PATH = CONTROL_POINT_SPACING * Timing().deviation  # of control points, as the first that time_path tries [rad]

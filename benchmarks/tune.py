@@ -6,7 +6,7 @@ default on the first four; 2 s a run. Problems and seeds are the same for all. T
 of the time to the first path that passed the full check, where an unsolved one counts as 4 s (PAR2); for planners that
 go on improving or shorten their path, times the mean of the length at the end over the shortest of the planner's
 candidates, where an unsolved one counts as 2. Paths are not simplified. The candidate of the lowest score on the last
-problems is chosen; planners/tuned.py keeps it.
+problems is chosen; apex_ompl/ompl/tuned.py keeps it.
 Each run is stored in benchmarks/runs/tune when it ends; the command resumes where it was stopped.
 
 Levels are the hard and large ones of the suites and every second validation kind of ``unseen``. Where planners are
@@ -34,21 +34,21 @@ import numpy as np
 import record
 
 from apex_ompl import planners
-from apex_ompl.benchmark import Results, Row, Workers, bench
-from apex_ompl.benchmark.runs import NO_PROBLEM, Run
-from apex_ompl.benchmark.summary import Statistics
+from apex_ompl.evaluation import Results, Row, Workers, bench
+from apex_ompl.evaluation.runs import NO_PROBLEM, Run
+from apex_ompl.evaluation.summary import Statistics
 from apex_ompl.problems.catalogue import VALIDATION
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import one_or_more
 
 DEPENDS = (
-    "@checking", "apex_ompl/apex", "apex_ompl/api.py", "apex_ompl/benchmark", "apex_ompl/diffusion",
-    "apex_ompl/ompl_adapter", "apex_ompl/planning", "apex_ompl/result.py", "apex_ompl/roadmaps", "apex_ompl/tasks",
-    "apex_ompl/trajopt", "benchmarks/baselines", "benchmarks/peers.py", "planners/apex.py",
-    "planners/apex_parameters.py", "planners/damon.py", "planners/drrt.py", "planners/gpmp.py", "planners/polish.py",
-    "planners/registry.py", "planners/sampling.py", "problems",
+    "@checking", "apex_ompl/apex", "apex_ompl/api.py", "apex_ompl/evaluation", "apex_ompl/model",
+    "apex_ompl/ompl/own_planner.py", "apex_ompl/ompl/parameters.py", "apex_ompl/ompl/repair.py",
+    "apex_ompl/ompl/setup.py", "apex_ompl/ompl/simplify.py", "apex_ompl/ompl/space.py", "apex_ompl/ompl/validity.py",
+    "apex_ompl/planning", "apex_ompl/result.py", "apex_ompl/baselines", "apex_ompl/goals", "apex_ompl/paths",
+    "benchmarks/baselines", "benchmarks/peers.py", "planners", "problems",
 )  # fmt: skip
-# All that plans but planners/tuned.py, which follows from the result: candidates name each parameter that is tuned.
+# All that plans but apex_ompl/ompl/tuned.py, which follows from the result: candidates name all tuned parameters.
 FOLDER = Path(__file__).parent / "runs" / "tune"
 BASELINES_FOLDER = FOLDER.with_name("tune_baselines")
 ROBOPLAN = "roboplan"

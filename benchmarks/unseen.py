@@ -23,10 +23,10 @@ import record
 from controls import checkpoint_digest
 from head_to_head import ROWS, TREELESS, together
 
-from apex_ompl.benchmark import Results, Row, Workers, bench
-from apex_ompl.benchmark.summary import statistics, warnings
-from apex_ompl.diffusion.checkpoint import read_config
-from apex_ompl.planners.tuned import TUNED
+from apex_ompl.evaluation import Results, Row, Workers, bench
+from apex_ompl.evaluation.summary import statistics, warnings
+from apex_ompl.model.checkpoint import read_config
+from apex_ompl.ompl.tuned import TUNED
 from apex_ompl.problems.catalogue import VALIDATION
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import one_or_more

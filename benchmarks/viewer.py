@@ -19,18 +19,18 @@ import numpy as np
 import record
 
 from apex_ompl import load_problem, plan, problems
-from apex_ompl.ompl_adapter.process import quiet_ompl
+from apex_ompl.ompl.process import quiet_ompl
 from apex_ompl.scene.problem import Problem
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import one_or_more
-from apex_ompl.viz.browser.editor import GOAL
-from apex_ompl.viz.browser.live_page import PERIOD, LivePage
-from apex_ompl.viz.browser.nodes import pose_of
-from apex_ompl.viz.browser.page import write_page
-from apex_ompl.viz.browser.server import serving
-from apex_ompl.viz.browser.shown import Shown
+from apex_ompl.viz.viewer.editor import GOAL
+from apex_ompl.viz.viewer.live_page import PERIOD, LivePage
+from apex_ompl.viz.viewer.nodes import pose_of
+from apex_ompl.viz.viewer.page import write_page
+from apex_ompl.viz.viewer.server import serving
+from apex_ompl.viz.viewer.shown import Shown
 
-DEPENDS = ("@planning", "apex_ompl/viz", "apex_ompl/session")
+DEPENDS = ("@planning", "apex_ompl/viz", "apex_ompl/planning")
 PAGES = ("ball_in_cup", "shelf/hard/900012", "cage/hard/900001", "clutter/hard/900002")
 LEVELS = ("shelf/hard", "clutter/hard", "cage/hard", "posts/medium")
 DRAGS = 100  # poses of a drag

@@ -24,12 +24,12 @@ import record
 from tqdm import tqdm
 
 from apex_ompl.collision import CollisionChecker
+from apex_ompl.planning.world import World
 from apex_ompl.robot import load_robot
-from apex_ompl.session.world import World
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import one_or_more
 
-DEPENDS = ("@checking", "apex_ompl/session/world.py")
+DEPENDS = ("@checking", "apex_ompl/planning/world.py")
 SHAPES = (
     {"box": (0.1, 0.15, 0.2)}, {"sphere": {"radius": 0.08}}, {"cylinder": {"radius": 0.05, "length": 0.3}},
     {"capsule": {"radius": 0.04, "length": 0.2}}, {"half_space": {"normal": (0.0, 0.0, 1.0), "offset": -0.05}},

@@ -4,7 +4,7 @@ from ompl import base as ob
 from ompl import geometric as og
 
 from apex_ompl import planners, robot
-from apex_ompl.ompl_adapter import space
+from apex_ompl.ompl import space
 
 panda = robot.load_robot("dual_panda_softhand")
 setup = og.SimpleSetup(space.state_space(panda))

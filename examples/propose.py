@@ -11,8 +11,8 @@ import time
 
 import apex_ompl
 from apex_ompl.apex import make_query
-from apex_ompl.ompl_adapter import assemble, full_check
-from apex_ompl.trajopt import Optimizer, first_valid, path_length
+from apex_ompl.ompl import assemble, full_check
+from apex_ompl.paths import Optimizer, first_valid, path_length
 
 
 def main() -> None:

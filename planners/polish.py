@@ -11,15 +11,15 @@ from ompl import base as ob
 from ompl import geometric as og
 
 from apex_ompl.apex.path_validator import PathValidator
-from apex_ompl.ompl_adapter.own_planner import OwnPlanner
-from apex_ompl.ompl_adapter.simplify import simplify
-from apex_ompl.ompl_adapter.space import array_to_path, await_goal, path_to_array
-from apex_ompl.planners.registry import Parameters, bounded, register
-from apex_ompl.planners.tuned import TUNED
-from apex_ompl.trajopt.optimizer import Optimizer
-from apex_ompl.trajopt.path import Path
-from apex_ompl.trajopt.settings import OptimizerSettings
-from apex_ompl.trajopt.spline import Spline
+from apex_ompl.ompl.own_planner import OwnPlanner
+from apex_ompl.ompl.parameters import Parameters, bounded, register
+from apex_ompl.ompl.simplify import simplify
+from apex_ompl.ompl.space import array_to_path, await_goal, path_to_array
+from apex_ompl.ompl.tuned import TUNED
+from apex_ompl.paths.optimizer import Optimizer
+from apex_ompl.paths.path import Path
+from apex_ompl.paths.settings import OptimizerSettings
+from apex_ompl.paths.spline import Spline
 from apex_ompl.types import Array
 
 NAME = "rrtconnect+polish"

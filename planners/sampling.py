@@ -12,7 +12,7 @@ from typing import ClassVar
 from ompl import base as ob
 from ompl import geometric as og
 
-from apex_ompl.planners.registry import Parameters, bounded, register
+from apex_ompl.ompl.parameters import Parameters, bounded, register
 
 UNIT = "rad"
 # OMPL spells these setters differently.

@@ -16,9 +16,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-if not __name__.startswith("apex_ompl."):  # the folder also lies at the top of the source tree
-    raise ImportError("import apex_ompl.problems, not problems")
-
 from apex_ompl.errors import ParameterError, UnknownNameError
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Problem

@@ -17,14 +17,14 @@ from functools import cache, partial
 
 import numpy as np
 
+from apex_ompl.goals.alignment_sampling import AlignmentSampler
+from apex_ompl.goals.cover_clearance import scene_kernel
+from apex_ompl.goals.grasp import HandObjects
 from apex_ompl.problems.drawn_problem import MARGIN, DrawnProblem
 from apex_ompl.problems.objects import block_and_peg, boxes, cup_and_ball
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Alignment
-from apex_ompl.tasks.alignment_sampling import AlignmentSampler
-from apex_ompl.tasks.cover_clearance import scene_kernel
-from apex_ompl.tasks.grasp import HandObjects
 from apex_ompl.types import Array
 
 SIZES = {"small": 0.06, "medium": 0.10, "large": 0.15, "xlarge": 0.20, "huge": 0.30}  # edges of the cubes [m]

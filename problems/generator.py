@@ -8,6 +8,7 @@ from functools import lru_cache
 import numpy as np
 
 from apex_ompl.errors import ApexError
+from apex_ompl.goals.hand_poses import HandPoseSampler
 from apex_ompl.problems import alignment, scenes
 from apex_ompl.problems.broad import drawing, simple
 from apex_ompl.problems.broad.levels import GRAMMARS, SUITE
@@ -15,7 +16,6 @@ from apex_ompl.problems.catalogue import ProblemId
 from apex_ompl.problems.drawn_problem import MARGIN, DrawnProblem
 from apex_ompl.problems.suite_robot import empty_hand_tables, robot
 from apex_ompl.scene.problem import Problem
-from apex_ompl.tasks.hand_poses import HandPoseSampler
 
 SYNERGIES = (0.0, 0.4)  # interval of the synergies of empty hands
 MAX_DRAWS = 300  # for one id, before it is given up

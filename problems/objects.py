@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from apex_ompl.goals.grasp import HandObjects
 from apex_ompl.scene.bodies import AttachedObject
-from apex_ompl.tasks.grasp import HandObjects
 
 DATA = Path(__file__).parent / "data"
 PALM = -0.009  # z of the surface of an object that lies on the palm, in the palm's frame [m]

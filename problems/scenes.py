@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from apex_ompl.goals.hand_poses import Direction, HandRegion
 from apex_ompl.problems.obstacles import bar, box, primitive
 from apex_ompl.scene.bodies import Obstacle
-from apex_ompl.tasks.hand_poses import Direction, HandRegion
 
 FORWARD: Direction = (1.0, 0.0, 0.0)
 DOWN: Direction = (0.0, 0.0, -1.0)

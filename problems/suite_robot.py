@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from functools import cache
 
+from apex_ompl.goals.hand_poses import DualArmTables
 from apex_ompl.robot import Robot, load_robot
-from apex_ompl.tasks.hand_poses import DualArmTables
 
 ROBOT = "dual_panda_softhand"
 

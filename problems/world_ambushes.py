@@ -14,7 +14,7 @@ import numpy as np
 from apex_ompl.problems.world_robot import RobotPlaces, base_entry, cube
 from apex_ompl.problems.world_scripts import ScriptedWorld
 from apex_ompl.scene.problem import Problem
-from apex_ompl.trajectory import Trajectory
+from apex_ompl.timing import Trajectory
 from apex_ompl.types import Array
 
 SPEEDS = (0.1, 0.4)  # [m/s]

@@ -15,7 +15,7 @@ from apex_ompl.problems.world_scripts import ScriptedWorld
 from apex_ompl.scene.bodies import PlaceInTime
 from apex_ompl.scene.problem import Problem
 from apex_ompl.scene.scripts import place_at, row_of
-from apex_ompl.trajectory import Trajectory
+from apex_ompl.timing import Trajectory
 from apex_ompl.types import Array
 
 SPEED = 0.15  # [m/s]

@@ -9,7 +9,7 @@ from apex_ompl.problems.worlds import World
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Problem
 from apex_ompl.scene.scripts import fastest, is_there, obstacle_at, recorded
-from apex_ompl.trajectory import Trajectory
+from apex_ompl.timing import Trajectory
 from apex_ompl.types import Array
 from apex_ompl.util.validation import check_number
 

@@ -31,7 +31,7 @@ from apex_ompl.problems.alignment import SAMPLERS, SIZES
 from apex_ompl.problems.catalogue import MOVING, SPLITS, ProblemId
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Problem
-from apex_ompl.trajectory import Trajectory
+from apex_ompl.timing import Trajectory
 from apex_ompl.types import Array
 from apex_ompl.util.display import one_line
 from apex_ompl.util.validation import check_integer, check_name

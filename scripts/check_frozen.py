@@ -11,9 +11,9 @@ import numpy as np
 
 from apex_ompl import problems
 from apex_ompl.errors import ApexError
-from apex_ompl.live.moving import check_timed_path
-from apex_ompl.ompl_adapter.setup import assemble
-from apex_ompl.ompl_adapter.validity import full_check
+from apex_ompl.moving.swept import check_timed_path
+from apex_ompl.ompl.setup import assemble
+from apex_ompl.ompl.validity import full_check
 from apex_ompl.problems import frozen
 from apex_ompl.problems.catalogue import ProblemId
 from apex_ompl.problems.generator import first_draw

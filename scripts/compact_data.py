@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from apex_ompl.datasets.records import PATH_FIELDS, SOURCES, DatasetError, Paths
-from apex_ompl.datasets.store import Store, save
+from apex_ompl.training.records import PATH_FIELDS, SOURCES, DatasetError, Paths
+from apex_ompl.training.store import Store, save
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.files import check_writable, write_atomically
 from apex_ompl.util.validation import whole_number

@@ -13,12 +13,12 @@ from pathlib import Path
 import numpy as np
 
 from apex_ompl import problems
-from apex_ompl.datasets import description
-from apex_ompl.datasets.records import SOURCES, DatasetError, Paths
-from apex_ompl.datasets.store import Store, load
-from apex_ompl.ompl_adapter.setup import assemble
-from apex_ompl.ompl_adapter.validity import full_check
+from apex_ompl.ompl.setup import assemble
+from apex_ompl.ompl.validity import full_check
 from apex_ompl.problems.suite_robot import robot
+from apex_ompl.training import description
+from apex_ompl.training.records import SOURCES, DatasetError, Paths
+from apex_ompl.training.store import Store, load
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.files import check_writable, is_file, write_atomically
 from apex_ompl.util.validation import one_or_more, whole_number

@@ -19,15 +19,15 @@ from ready_made.specifications import SPECIFICATIONS, AlignmentSpecification, Ha
 
 from apex_ompl.api import plan
 from apex_ompl.collision import CollisionChecker
+from apex_ompl.goals.grasp import HandObjects, close_hands
+from apex_ompl.goals.inverse_kinematics import Links, in_world
 from apex_ompl.kernel import offset_target, opposition_target
-from apex_ompl.ompl_adapter.setup import assemble
-from apex_ompl.ompl_adapter.validity import full_check
+from apex_ompl.ompl.setup import assemble
+from apex_ompl.ompl.validity import full_check
 from apex_ompl.problems.objects import DATA
 from apex_ompl.robot import Robot, load_robot
 from apex_ompl.scene.bodies import AttachedObject
 from apex_ompl.scene.problem import Goal, Problem
-from apex_ompl.tasks.grasp import HandObjects, close_hands
-from apex_ompl.tasks.inverse_kinematics import Links, in_world
 from apex_ompl.util.entry_point import run_script
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -28,10 +28,11 @@ import numpy as np
 
 from apex_ompl.api import plan
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.live.moving import check_timed_path, constant_velocity_times, inflated
-from apex_ompl.ompl_adapter.setup import assemble
-from apex_ompl.ompl_adapter.validity import full_check
-from apex_ompl.planners.tuned import TUNED
+from apex_ompl.moving.swept import check_timed_path, constant_velocity_times, inflated
+from apex_ompl.ompl.setup import assemble
+from apex_ompl.ompl.tuned import TUNED
+from apex_ompl.ompl.validity import full_check
+from apex_ompl.paths.path import states_between
 from apex_ompl.problems import frozen
 from apex_ompl.problems.alignment import VELOCITY_SCALE, straight_line_duration
 from apex_ompl.problems.catalogue import VALIDATION, ProblemId
@@ -40,7 +41,6 @@ from apex_ompl.problems.generator import first_drawn
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.scene.problem import Problem
 from apex_ompl.scene.scripts import obstacle_at
-from apex_ompl.trajopt.path import states_between
 from apex_ompl.types import Array
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.resolution import SEARCH_RESOLUTION

@@ -19,13 +19,13 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from apex_ompl.datasets.engine import EngineOptions
-from apex_ompl.datasets.kernel_problems import load_kernel_problems, save_kernel_problems, solve_kernel_problems
-from apex_ompl.datasets.records import Paths
-from apex_ompl.datasets.store import Store
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel import RobotTables
-from apex_ompl.trajopt.spline import Spline
+from apex_ompl.paths.spline import Spline
+from apex_ompl.training.engine import EngineOptions
+from apex_ompl.training.kernel_problems import load_kernel_problems, save_kernel_problems, solve_kernel_problems
+from apex_ompl.training.records import Paths
+from apex_ompl.training.store import Store
 from apex_ompl.util.cluster import spread
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.files import check_writable, make_folder
@@ -128,9 +128,9 @@ def _write_units(
 def _planned_units(args: argparse.Namespace) -> tuple[Solve, dict[str, Any], dict[str, Any], RobotTables]:
     """Return the solving function, units to draw, the robot for the manifest, and its tables with empty hands."""
     from apex_ompl.collision import CollisionChecker
-    from apex_ompl.generation.solving import solve_unit
-    from apex_ompl.generation.units import plan_units
     from apex_ompl.problems.suite_robot import robot
+    from apex_ompl.training.problem_solving import solve_unit
+    from apex_ompl.training.units import plan_units
 
     units = {unit.name: unit for unit in plan_units(args.problems, args.levels)}
     sizes = {unit.size for unit in units.values()}
@@ -165,8 +165,8 @@ def write_cases(args: argparse.Namespace) -> None:
     Raises:
         MissingFileError: The folder cannot be made.
     """
-    from apex_ompl.generation.records import kernel_problems
-    from apex_ompl.generation.units import plan_units
+    from apex_ompl.training.problem_records import kernel_problems
+    from apex_ompl.training.units import plan_units
 
     check_writable(make_folder(args.folder, "folder for problems") / "cases.npz")
     units = plan_units(args.problems, args.levels, args.split)

@@ -19,8 +19,8 @@ from apex_ompl.scene.problem import Problem
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.files import make_folder
 from apex_ompl.viz.appearance import mesh_of
-from apex_ompl.viz.browser.shown import Shown
 from apex_ompl.viz.view import view
+from apex_ompl.viz.viewer.shown import Shown
 
 OUT = Path(__file__).resolve().parent.parent / "docs" / "pages"
 SHELF, SCANNED = "shelf/hard/900012", "posts/medium/900003"

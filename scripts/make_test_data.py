@@ -12,8 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from apex_ompl.datasets.kernel_problems import load_kernel_problems, save_kernel_problems
-from apex_ompl.datasets.store import load, save
+from apex_ompl.training.kernel_problems import load_kernel_problems, save_kernel_problems
+from apex_ompl.training.store import load, save
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.files import make_folder, write_atomically
 

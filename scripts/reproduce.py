@@ -29,8 +29,8 @@ from apex_ompl.util.validation import one_or_more
 
 ROOT = Path(__file__).resolve().parents[1]
 DEPENDS = (
-    "@benchmark", "apex_ompl/datasets", "apex_ompl/generation", "apex_ompl/imitation", "apex_ompl/live",
-    "apex_ompl/loop", "apex_ompl/roadmaps", "benchmarks/baselines", "apex_ompl/trajectory", "apex_ompl/viz",
+    "@benchmark", "apex_ompl/training", "apex_ompl/training", "apex_ompl/baselines/imitation", "apex_ompl/moving",
+    "apex_ompl/loop", "apex_ompl/baselines", "benchmarks/baselines", "apex_ompl/timing", "apex_ompl/viz",
     "scripts/paper/examples.py", "scripts/paper/fid.py", "scripts/paper/figure.py",
     "scripts/paper/model_pictures.py", "scripts/paper/moving.py", "scripts/paper/realism.py",
     "scripts/paper/rows.py", "scripts/paper/static.py",

@@ -14,12 +14,9 @@ from pathlib import Path
 
 import numpy as np
 
-from apex_ompl.datasets.store import load
-from apex_ompl.kernel import Kernel, RobotTables
-from apex_ompl.kernel.scene_builder import scene_tables
-from apex_ompl.roadmaps.latent_graph import chosen_nodes, consecutive, edges
-from apex_ompl.roadmaps.manifold import (
-    BASELINES,
+from apex_ompl.baselines import weights_folder
+from apex_ompl.baselines.damon.latent_graph import chosen_nodes, consecutive, edges
+from apex_ompl.baselines.damon.manifold import (
     CONFIG,
     DECODED,
     MOST_NODES,
@@ -30,9 +27,12 @@ from apex_ompl.roadmaps.manifold import (
     halved,
     save_manifold,
 )  # fmt: skip
-from apex_ompl.roadmaps.sampling import sample_states, split_sample
-from apex_ompl.roadmaps.state_autoencoder import StateAutoencoder
+from apex_ompl.baselines.damon.sampling import sample_states, split_sample
+from apex_ompl.baselines.damon.state_autoencoder import StateAutoencoder
+from apex_ompl.kernel import Kernel, RobotTables
+from apex_ompl.kernel.scene_builder import scene_tables
 from apex_ompl.robot import load_robot
+from apex_ompl.training.store import load
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import one_or_more
 
@@ -44,7 +44,7 @@ def make(args: argparse.Namespace, dim: int) -> None:
     import torch
 
     torch.set_num_threads(1)
-    from apex_ompl.roadmaps.manifold_training import train
+    from apex_ompl.baselines.damon.manifold_training import train
 
     begin = time.perf_counter()
     tables = RobotTables.load(args.data / "robot.npz")
@@ -98,7 +98,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     data = ROOT / "data" / "dual_panda_softhand"
     parser.add_argument("--data", type=Path, default=data, help="folder with paths.zip and robot.npz")
-    parser.add_argument("--out", type=Path, default=BASELINES, help="folder of the folders (default: %(default)s)")
+    parser.add_argument("--out", type=Path, default=weights_folder(), help="where to put them (default: %(default)s)")
     parser.add_argument("--dims", type=one_or_more, nargs="+", default=[2, 4, 8], help="(default: %(default)s)")
     parser.add_argument("--states", type=one_or_more, default=200_000, help="states of paths (default: %(default)s)")
     parser.add_argument("--along", type=one_or_more, default=16, help="of them on a path (default: %(default)s)")

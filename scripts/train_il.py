@@ -25,9 +25,9 @@ def train(args: argparse.Namespace) -> None:
     import torch
     from tqdm import tqdm
 
-    from apex_ompl.imitation.checkpoint import save_policy
-    from apex_ompl.imitation.config import ImitationConfig
-    from apex_ompl.imitation.training import ImitationTrainer
+    from apex_ompl.baselines.imitation.checkpoint import save_policy
+    from apex_ompl.baselines.imitation.config import ImitationConfig
+    from apex_ompl.baselines.imitation.training import ImitationTrainer
     from apex_ompl.util.threads import one_torch_thread
 
     name = Path(args.config).stem

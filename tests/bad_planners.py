@@ -11,8 +11,8 @@ from typing import Any
 from ompl import base as ob
 from ompl import geometric as og
 
-from apex_ompl.benchmark.rows import Job
-from apex_ompl.planners.registry import Parameters, register
+from apex_ompl.evaluation.rows import Job
+from apex_ompl.ompl.parameters import Parameters, register
 
 
 class Cheat(ob.Planner):

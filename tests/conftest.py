@@ -15,16 +15,16 @@ from support import DATA
 from apex_ompl import plan
 from apex_ompl.cli import main
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.datasets.records import Paths
-from apex_ompl.datasets.store import load, save
-from apex_ompl.ompl_adapter.process import quiet_ompl
-from apex_ompl.ompl_adapter.setup import PlanningSetup, assemble
+from apex_ompl.ompl.process import quiet_ompl
+from apex_ompl.ompl.setup import PlanningSetup, assemble
 from apex_ompl.problems.suite_robot import robot as suite_robot
 from apex_ompl.result import PlanResult
 from apex_ompl.robot import Robot, load_robot
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Goal, Problem
-from apex_ompl.viz.browser.server import serving
+from apex_ompl.training.records import Paths
+from apex_ompl.training.store import load, save
+from apex_ompl.viz.viewer.server import serving
 
 hypothesis_settings.register_profile("here", derandomize=True, deadline=None)  # the same examples on every machine
 hypothesis_settings.load_profile("here")

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from apex_ompl.kernel import Kernel
-from apex_ompl.live.movers import Movers
+from apex_ompl.moving.movers import Movers
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import Obstacle
-from apex_ompl.trajectory import Timing, Trajectory, time_path
+from apex_ompl.timing import Timing, Trajectory, time_path
 
 SPEEDS = (0.1, 0.2, 0.4)  # of movers [m/s]
 

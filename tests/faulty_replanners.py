@@ -9,10 +9,10 @@ from typing import Any
 
 from loops import line
 
-from apex_ompl.loop.charges import Charges
-from apex_ompl.loop.following import Following
-from apex_ompl.loop.ready import Ready
-from apex_ompl.loop.request import Answer, Request
+from apex_ompl.moving.charges import Charges
+from apex_ompl.moving.following import Following
+from apex_ompl.moving.ready import Ready
+from apex_ompl.moving.request import Answer, Request
 
 
 class Faulty:

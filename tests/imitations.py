@@ -8,9 +8,9 @@ from typing import Any
 import torch
 from support import DATA
 
-from apex_ompl.imitation.config import ImitationConfig, NetworkConfig
-from apex_ompl.imitation.network import PolicyNetwork
-from apex_ompl.imitation.training import ImitationTrainer
+from apex_ompl.baselines.imitation.config import ImitationConfig, NetworkConfig
+from apex_ompl.baselines.imitation.network import PolicyNetwork
+from apex_ompl.baselines.imitation.training import ImitationTrainer
 
 GROUPS = [list(range(7)), list(range(7, 14)), [14, 15]]
 NETWORK = {"groups": GROUPS, "width": 32, "layers": 2, "heads": 4, "chunk": 8, "clock": 64}

@@ -10,22 +10,22 @@ from typing import Any
 import numpy as np
 
 from apex_ompl import problems
-from apex_ompl.live.timed_spline import Start, TimedSpline
-from apex_ompl.loop.charges import Charges
 from apex_ompl.loop.cycle import RunRecord
-from apex_ompl.loop.following import Following
-from apex_ompl.loop.ready import Ready
 from apex_ompl.loop.referee import RefereeReport, judge
-from apex_ompl.loop.request import Answer, Request
 from apex_ompl.loop.sensor import Sensor, SensorStream
-from apex_ompl.loop.settings import LoopSettings
 from apex_ompl.loop.simulation import simulate
-from apex_ompl.ompl_adapter.setup import PlanningSetup, assemble
+from apex_ompl.moving.charges import Charges
+from apex_ompl.moving.following import Following
+from apex_ompl.moving.ready import Ready
+from apex_ompl.moving.request import Answer, Request
+from apex_ompl.moving.settings import LoopSettings
+from apex_ompl.moving.timed_spline import Start, TimedSpline
+from apex_ompl.ompl.setup import PlanningSetup, assemble
 from apex_ompl.problems.world_scripts import moving_world
 from apex_ompl.problems.worlds import World
 from apex_ompl.scene.bodies import Obstacle
-from apex_ompl.trajectory import Timing, Trajectory, time_path
-from apex_ompl.trajectory.methods.spline import least_knot_spacing
+from apex_ompl.timing import Timing, Trajectory, time_path
+from apex_ompl.timing.spline_method import least_knot_spacing
 
 PROBLEM, BLOCKED = "vertical/free/1", "vertical/free/0"  # the straight line is free, and meets what stands still
 Find = Callable[[Ready, Request], Following | None]

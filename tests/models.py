@@ -8,11 +8,10 @@ import numpy as np
 import torch
 from support import DATA
 
-from apex_ompl.datasets.records import Paths
-from apex_ompl.datasets.store import load
-from apex_ompl.diffusion.autoencoder import LinearLatent
-from apex_ompl.diffusion.model import LatentDiffusion
-from apex_ompl.diffusion.model_config import (
+from apex_ompl.kernel import Kernel, RobotTables
+from apex_ompl.kernel.compiled.arrays import BOX, CAPSULE, CYLINDER, SPHERE
+from apex_ompl.kernel.scene_builder import Primitive, scene_tables
+from apex_ompl.model.config import (
     ConditionConfig,
     DenoiserConfig,
     LatentConfig,
@@ -20,11 +19,12 @@ from apex_ompl.diffusion.model_config import (
     NoiseConfig,
     key_shapes,
 )
-from apex_ompl.diffusion.query import ObstacleSet, Probes, Query
-from apex_ompl.diffusion.sight import KeyStates, key_states
-from apex_ompl.kernel import Kernel, RobotTables
-from apex_ompl.kernel.compiled.arrays import BOX, CAPSULE, CYLINDER, SPHERE
-from apex_ompl.kernel.scene_builder import Primitive, scene_tables
+from apex_ompl.model.query import ObstacleSet, Probes, Query
+from apex_ompl.model.scene_encoding import KeyStates, key_states
+from apex_ompl.training.autoencoder import LinearLatent
+from apex_ompl.training.latent_diffusion import LatentDiffusion
+from apex_ompl.training.records import Paths
+from apex_ompl.training.store import load
 
 DOF = 16
 KINDS = {"box": BOX, "sphere": SPHERE, "cylinder": CYLINDER, "capsule": CAPSULE}

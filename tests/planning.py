@@ -11,8 +11,8 @@ from ompl import base as ob
 from ompl import geometric as og
 
 from apex_ompl import problems
-from apex_ompl.ompl_adapter.setup import PlanningSetup
-from apex_ompl.ompl_adapter.space import path_to_array
+from apex_ompl.ompl.setup import PlanningSetup
+from apex_ompl.ompl.space import path_to_array
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.scene.problem import Problem
 

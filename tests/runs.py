@@ -10,8 +10,8 @@ from apex_ompl.robot import Robot
 from apex_ompl.robot.identity import digest
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Goal, Problem
-from apex_ompl.trajectory import Timing, Trajectory, time_path
-from apex_ompl.trajectory.trajectory import concatenate
+from apex_ompl.timing import Timing, Trajectory, time_path
+from apex_ompl.timing.trajectory import concatenate
 
 
 def moved(robot: Robot, **joints: float) -> np.ndarray:

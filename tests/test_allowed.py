@@ -14,9 +14,9 @@ from apex_ompl import MotionPlanner, Problem, load_problem, plan
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import FileFormatError, SceneError, UnknownNameError
 from apex_ompl.robot import Robot
+from apex_ompl.robot.moveit_allowed import allowed_pairs
+from apex_ompl.robot.moveit_messages import MessageReader
 from apex_ompl.scene.bodies import AttachedObject, Obstacle
-from apex_ompl.tasks.messages import MessageReader
-from apex_ompl.tasks.moveit_allowed import allowed_pairs
 from apex_ompl.util.resolution import SEARCH_RESOLUTION
 
 

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from apex_ompl import MotionPlanner, plan
-from apex_ompl.benchmark import Row, bench
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ParameterError
-from apex_ompl.live.moving import check_timed_path
-from apex_ompl.live.timed_proof import TimedProver
+from apex_ompl.evaluation import Row, bench
+from apex_ompl.moving.swept import check_timed_path
+from apex_ompl.moving.timed_proof import TimedProver
 from apex_ompl.planning import among_movers
 from apex_ompl.planning.among_movers import MARGIN
 from apex_ompl.problems import load
@@ -21,7 +21,7 @@ from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import AttachedObject, Obstacle
 from apex_ompl.scene.problem import Goal, Problem
 from apex_ompl.scene.scripts import obstacle_at
-from apex_ompl.trajectory import Timing
+from apex_ompl.timing import Timing
 
 
 def with_mover(problem: Problem, robot: Robot, *, shape: dict | None = None, after: float = 0.35) -> Problem:

@@ -15,16 +15,16 @@ from planning import EASY, EXACT, HARD, UserValidityChecker, cached_problem, sta
 from support import ROOT
 
 from apex_ompl import plan, planners
+from apex_ompl.apex.parameters import ApexParameters
 from apex_ompl.apex.start_goal import read_goals
-from apex_ompl.diffusion.proposals import TrajectoryModel
-from apex_ompl.ompl_adapter.setup import PlanningSetup, assemble
-from apex_ompl.ompl_adapter.space import path_to_array, state_space, to_state
-from apex_ompl.ompl_adapter.validity import StateValidityChecker, full_check
+from apex_ompl.model.proposals import TrajectoryModel
+from apex_ompl.ompl.setup import PlanningSetup, assemble
+from apex_ompl.ompl.space import path_to_array, state_space, to_state
+from apex_ompl.ompl.validity import StateValidityChecker, full_check
+from apex_ompl.paths.path import path_length
 from apex_ompl.planners import APEX
-from apex_ompl.planners.apex_parameters import ApexParameters
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.result import INSIDE
-from apex_ompl.trajopt.path import path_length
 
 pytestmark = pytest.mark.usefixtures("quiet")
 

@@ -17,12 +17,12 @@ from support import ROOT
 
 import apex_ompl
 from apex_ompl import plan, planners
+from apex_ompl.apex.parameters import ApexParameters
 from apex_ompl.errors import ApexError, MissingFileError, ParameterError, UnknownNameError
-from apex_ompl.ompl_adapter.setup import PlanningSetup, assemble
-from apex_ompl.ompl_adapter.space import state_space, to_state
-from apex_ompl.ompl_adapter.validity import StateValidityChecker, full_check
+from apex_ompl.ompl.setup import PlanningSetup, assemble
+from apex_ompl.ompl.space import state_space, to_state
+from apex_ompl.ompl.validity import StateValidityChecker, full_check
 from apex_ompl.planners import APEX
-from apex_ompl.planners.apex_parameters import ApexParameters
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.result import PlanStatus
 from apex_ompl.scene.bodies import Obstacle

@@ -12,15 +12,15 @@ from ompl import base as ob
 from planning import DIFFUSION_ONLY, EXACT, HARD, TIMEOUT, cached_problem, states, within
 
 from apex_ompl import plan, planners
+from apex_ompl.apex.parameters import ApexParameters
 from apex_ompl.apex.path_validator import PathValidator
 from apex_ompl.apex.stages import Propose, TakeTurns, shorten
 from apex_ompl.apex.stages.turns import ITERATIONS
-from apex_ompl.ompl_adapter.setup import PlanningSetup
-from apex_ompl.ompl_adapter.validity import full_check
+from apex_ompl.ompl.setup import PlanningSetup
+from apex_ompl.ompl.validity import full_check
+from apex_ompl.paths.path import path_length, resample
 from apex_ompl.planners import APEX
-from apex_ompl.planners.apex_parameters import ApexParameters
 from apex_ompl.result import INSIDE
-from apex_ompl.trajopt.path import path_length, resample
 
 pytestmark = pytest.mark.usefixtures("quiet")
 

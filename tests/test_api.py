@@ -16,15 +16,15 @@ import apex_ompl
 from apex_ompl import MotionPlanner, PlanStatus, load_problem, plan, planners, planning
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import FileFormatError, ParameterError, UnknownNameError
-from apex_ompl.ompl_adapter.process import seed_ompl
-from apex_ompl.ompl_adapter.repair import repair
-from apex_ompl.ompl_adapter.setup import assemble
-from apex_ompl.ompl_adapter.space import path_to_array
-from apex_ompl.ompl_adapter.validity import FullCheck, full_check
+from apex_ompl.ompl.process import seed_ompl
+from apex_ompl.ompl.repair import repair
+from apex_ompl.ompl.setup import assemble
+from apex_ompl.ompl.space import path_to_array
+from apex_ompl.ompl.validity import FullCheck, full_check
+from apex_ompl.paths.path import path_length, resample
 from apex_ompl.robot import Robot, load_robot
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Goal, Problem
-from apex_ompl.trajopt.path import path_length, resample
 
 BAXTER = ROOT / "examples" / "baxter_table.yaml"
 

@@ -17,10 +17,10 @@ import pytest
 from ompl import base as ob
 from ompl import tools as ot
 
-from apex_ompl import benchmark, problems
-from apex_ompl.benchmark import Results, Row, Workers, bench, workers
-from apex_ompl.benchmark.summary import Statistics, statistics
+from apex_ompl import evaluation, problems
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError
+from apex_ompl.evaluation import Results, Row, Workers, bench, workers
+from apex_ompl.evaluation.summary import Statistics, statistics
 
 LEVEL, RUNS = "swap/easy", 3
 ROWS = ("apex[seed=1]", "rrtconnect")
@@ -49,8 +49,8 @@ def test_runs_record_their_outcome(results: Results) -> None:
 
 
 def test_the_log_is_ompls_own(results: Results) -> None:
-    logs = benchmark.write_logs(results)
-    file = benchmark.write_database(results, logs)
+    logs = evaluation.write_logs(results)
+    file = evaluation.write_database(results, logs)
     assert [log.name for log in logs] == ["swap_easy.log"]
     database = sqlite3.connect(file)
     names = dict(database.execute("SELECT id, name FROM plannerConfigs").fetchall())
@@ -163,7 +163,7 @@ def test_figures_count_what_is_not_solved_as_endless() -> None:
 
 
 def test_the_report_opens_without_a_network(results: Results, tmp_path: Path) -> None:
-    page, text = benchmark.report(results.folder, tmp_path / "report")
+    page, text = evaluation.report(results.folder, tmp_path / "report")
     html, found = page.read_text(), text.read_text()
     assert not re.findall(r"""(?:src|href)=["'](?!data:)""", html) and html.count("data:image/png;base64") >= 3
     for f in statistics(results):
@@ -177,24 +177,24 @@ def test_load_beyond_the_runs_is_reported(results: Results) -> None:
     assert all(run["load"] >= 0.0 for run in results.runs)
     for load, said in ((1.4, False), (1.6, True)):
         loaded = Results(results.folder, results.about, [{**run, "load": load} for run in results.runs])
-        assert ("The load was over 1.5 in 6 of 6 runs" in benchmark.markdown(loaded)) is said
+        assert ("The load was over 1.5 in 6 of 6 runs" in evaluation.markdown(loaded)) is said
 
 
 def test_planners_that_end_early_are_reported(results: Results) -> None:
     refused = {"status ENUM": str(ob.PlannerStatus.PlannerStatusType.INVALID_GOAL.value)}
     made = [{**run, "solved": False, "properties": refused} for run in results.runs[:2]]
-    text = benchmark.markdown(Results(results.folder, results.about, made))
+    text = evaluation.markdown(Results(results.folder, results.about, made))
     assert "Ended early, unsolved: " in text
     for label in {run["label"] for run in made}:
         assert f"{sum(run['label'] == label for run in made)} x {label}, INVALID_GOAL" in text
-    assert "Ended early" not in benchmark.markdown(results)
+    assert "Ended early" not in evaluation.markdown(results)
 
 
 def test_runs_at_the_same_time_are_reported(results: Results, tmp_path: Path) -> None:
     options: dict = {"runs": 2, "timeout": 10.0, "split": "validation", "quiet": True}
     found = bench([LEVEL], ROWS[1:], tmp_path, workers=Workers(2), **options)
     assert outcome(found) == [one for one in outcome(results) if one[1] == ROWS[1]][:2]
-    assert "went at the same time" in benchmark.markdown(found)
+    assert "went at the same time" in evaluation.markdown(found)
 
 
 def test_a_cluster_of_ray_makes_the_same_runs(results: Results, tmp_path: Path) -> None:
@@ -210,7 +210,7 @@ def test_a_cluster_of_ray_makes_the_same_runs(results: Results, tmp_path: Path) 
         ray.shutdown()
     first = problems.frozen_names("swap", "easy", "validation")[0]
     assert outcome(found) == [one for one in outcome(results) if one[0] == first]
-    assert "made on a cluster" in benchmark.markdown(found)
+    assert "made on a cluster" in evaluation.markdown(found)
 
 
 def test_faulty_results_are_named(results: Results, tmp_path: Path) -> None:
@@ -228,7 +228,7 @@ def test_faulty_results_are_named(results: Results, tmp_path: Path) -> None:
     with pytest.raises(ParameterError, match="the parameters that it has in"):
         bench([LEVEL], [Row("rrtconnect", "rrtconnect", timeout=1.0)], tmp_path, **options)
     with pytest.raises(FileFormatError, match="one run or more"):
-        benchmark.report(tmp_path, tmp_path / "out")
+        evaluation.report(tmp_path, tmp_path / "out")
     (tmp_path / "runs.jsonl").write_text("nonsense\n{}\n")
     with pytest.raises(FileFormatError, match="line 1: expected a run"):
         Results.load(tmp_path)

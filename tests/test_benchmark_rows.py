@@ -6,13 +6,13 @@ from pathlib import Path
 
 import pytest
 
-from apex_ompl import benchmark, planners
-from apex_ompl.benchmark import Row, bench
-from apex_ompl.benchmark.rows import PAPER, experiments, jobs
+from apex_ompl import evaluation, planners
 from apex_ompl.cli.parser import main
-from apex_ompl.diffusion.guidance import EQUATION_7, Guidance
-from apex_ompl.diffusion.proposals import Sampling
 from apex_ompl.errors import ApexError, ParameterError, UnknownNameError
+from apex_ompl.evaluation import Row, bench
+from apex_ompl.evaluation.rows import PAPER, experiments, jobs
+from apex_ompl.model.guidance import EQUATION_7, Guidance
+from apex_ompl.model.proposals import Sampling
 
 LEVEL = "swap/easy"
 
@@ -79,7 +79,7 @@ def test_a_row_may_make_its_runs_itself(tmp_path: Path) -> None:
     assert [by_seed[k]["session"] for k in range(3)] == [0, 0, 1] and by_seed[0]["first"] == 0.25
     assert [session["commit"] for session in found.sessions()] == ["a", "b"]
     assert found.about["rows"]["own"]["all"] == {"luck": [0, 2]}
-    assert "guesser" not in benchmark.markdown(found) and "| own | 3 |" in benchmark.markdown(found)
+    assert "guesser" not in evaluation.markdown(found) and "| own | 3 |" in evaluation.markdown(found)
     with pytest.raises(ParameterError, match="the parameters that it has in"):
         bench([LEVEL], [Row("own", "guesser", {"luck": []}, runner=row.runner)], tmp_path, **options)
 

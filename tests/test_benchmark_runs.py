@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from support import ROOT
 
-from apex_ompl import benchmark, load_problem, problems
-from apex_ompl.benchmark import Row, Workers, bench, runs
-from apex_ompl.benchmark.accounting import first_path_proof
-from apex_ompl.benchmark.rows import Job
+from apex_ompl import evaluation, load_problem, problems
 from apex_ompl.errors import ParameterError
-from apex_ompl.ompl_adapter.setup import assemble
-from apex_ompl.ompl_adapter.validity import full_check
+from apex_ompl.evaluation import Row, Workers, bench, runs
+from apex_ompl.evaluation.accounting import first_path_proof
+from apex_ompl.evaluation.rows import Job
+from apex_ompl.ompl.setup import assemble
+from apex_ompl.ompl.validity import full_check
 from apex_ompl.result import PlanResult
 from apex_ompl.robot import Robot
 
@@ -62,10 +62,10 @@ def test_success_is_the_full_check_and_a_dead_process_is_a_crash(tmp_path: Path)
     assert [run["reason"] for run in by["dies"]] == ["the process died"] and len(by["rrtconnect"]) == 1
     assert [run["status"] for run in by["dies"]] == ["CRASH"]
     assert [run["status"] for run in by["shaky"]] == ["TIMEOUT"] * 2, "it is tried again in a process of its own"
-    database = sqlite3.connect(benchmark.write_database(found, benchmark.write_logs(found)))
+    database = sqlite3.connect(evaluation.write_database(found, evaluation.write_logs(found)))
     solved = "SELECT sum(solved) FROM runs JOIN plannerConfigs p ON p.id = plannerid WHERE p.name = 'cheat'"
     assert database.execute(solved).fetchone() == (0,)
-    assert "Crashed: 1 x dies: the process died." in benchmark.markdown(found)
+    assert "Crashed: 1 x dies: the process died." in evaluation.markdown(found)
     with pytest.raises(ParameterError, match="planners that do not end the process"):
         bench(["wall/hard"], [Row("dies", "dies", {"on": 0})], tmp_path / "x", workers=able, quiet=True)
 

@@ -15,8 +15,6 @@ from apex_ompl.api import load_problem
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.shapes import coal_geometry
 from apex_ompl.errors import ParameterError
-from apex_ompl.generation.records import problem_record
-from apex_ompl.generation.units import Unit, plan_units
 from apex_ompl.kernel import Kernel
 from apex_ompl.problems import generator
 from apex_ompl.problems.broad import compounds, shapes
@@ -40,6 +38,8 @@ from apex_ompl.problems.frozen import digest
 from apex_ompl.problems.generator import first_drawn
 from apex_ompl.problems.suite_robot import empty_hand_tables
 from apex_ompl.robot import Robot
+from apex_ompl.training.problem_records import problem_record
+from apex_ompl.training.units import Unit, plan_units
 
 LEVELS = [(suite, level) for suite, levels in GRAMMARS.items() for level in levels]
 FREE = 800_500  # seeds of validation from here on are not frozen

@@ -20,11 +20,11 @@ from apex_ompl import plan
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Problem
 from apex_ompl.viz.appearance import CONTACT
-from apex_ompl.viz.browser.nodes import paint
-from apex_ompl.viz.browser.page import FIELD_OF_VIEW, draw, write_page
-from apex_ompl.viz.browser.server import serving
-from apex_ompl.viz.browser.shown import Shown
 from apex_ompl.viz.view import view
+from apex_ompl.viz.viewer.nodes import paint
+from apex_ompl.viz.viewer.page import FIELD_OF_VIEW, draw, write_page
+from apex_ompl.viz.viewer.server import serving
+from apex_ompl.viz.viewer.shown import Shown
 
 pytestmark = needs_browser
 VIEW = (sys.executable, "-c", "import sys; from apex_ompl.cli import main; sys.exit(main())", "view")

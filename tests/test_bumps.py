@@ -15,8 +15,8 @@ from apex_ompl.apex.models import has_model, trajectory_model
 from apex_ompl.apex.query import make_query
 from apex_ompl.api import load_problem
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.diffusion.proposals import Sampling, TrajectoryModel
 from apex_ompl.errors import FileFormatError
+from apex_ompl.model.proposals import Sampling, TrajectoryModel
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import Obstacle
 

@@ -10,20 +10,20 @@ import pytest
 from support import ROOT
 
 from apex_ompl import problems
-from apex_ompl.datasets.kernel_problems import KernelProblem, load_kernel_problems, save_kernel_problems
-from apex_ompl.datasets.path_finder import PathFinder
-from apex_ompl.datasets.records import SOURCES
-from apex_ompl.datasets.store import Store
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError
-from apex_ompl.generation.records import kernel_problems
-from apex_ompl.generation.units import Unit
 from apex_ompl.kernel import Kernel, RobotTables
 from apex_ompl.kernel.table_checks import MADE
-from apex_ompl.ompl_adapter.setup import assemble
-from apex_ompl.ompl_adapter.validity import full_check
+from apex_ompl.ompl.setup import assemble
+from apex_ompl.ompl.validity import full_check
+from apex_ompl.paths.optimizer import Optimizer
+from apex_ompl.paths.spline import Spline
 from apex_ompl.problems.suite_robot import robot
-from apex_ompl.trajopt.optimizer import Optimizer
-from apex_ompl.trajopt.spline import Spline
+from apex_ompl.training.kernel_problems import KernelProblem, load_kernel_problems, save_kernel_problems
+from apex_ompl.training.path_finder import PathFinder
+from apex_ompl.training.problem_records import kernel_problems
+from apex_ompl.training.records import SOURCES
+from apex_ompl.training.store import Store
+from apex_ompl.training.units import Unit
 
 WITHOUT = """
 import runpy, sys

@@ -23,11 +23,11 @@ from apex_ompl.collision.clouds import PointCloud, cloud_geometry
 from apex_ompl.collision.cover.spheres import shape_key
 from apex_ompl.collision.shapes import is_shell, is_surface, mesh_geometry
 from apex_ompl.errors import ApexError, FileFormatError, MissingFileError, ParameterError, SceneError
+from apex_ompl.planning.cloud_files import CloudFiles
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import AttachedObject, Obstacle
 from apex_ompl.scene.meshes import triangles, winding_number
 from apex_ompl.scene.points import parse_points
-from apex_ompl.session.cloud_files import CloudFiles
 
 
 def cloud_file(folder: Path, points: np.ndarray) -> str:

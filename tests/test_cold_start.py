@@ -58,7 +58,7 @@ TYPES = """
 import numpy as np
 from numba.core.sigutils import normalize_signature
 from apex_ompl import filter_points, load_robot, plan, run
-from apex_ompl.loop.settings import LoopSettings
+from apex_ompl.moving.settings import LoopSettings
 from apex_ompl.kernel.compiled.entry_points import PLANS, RUNS
 from apex_ompl.kernel.group_compilation import _function
 from apex_ompl.kernel.library import is_used

@@ -14,7 +14,7 @@ from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.discretization import sample_path
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel.compiled.separation import COLLIDES
-from apex_ompl.ompl_adapter.validity import full_check
+from apex_ompl.ompl.validity import full_check
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import AttachedObject, MeshFile, Obstacle
 from apex_ompl.util.resolution import FINE_RESOLUTION

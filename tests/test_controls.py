@@ -12,8 +12,8 @@ from models import kernel, query
 from support import DATA, ROOT, benchmark_script
 
 from apex_ompl import load_model, plan, planners, problems
-from apex_ompl.benchmark.rows import Row, jobs
 from apex_ompl.errors import ParameterError
+from apex_ompl.evaluation.rows import Row, jobs
 
 NAMES = ("random weights", "shuffled conditions", "nearest paths")
 

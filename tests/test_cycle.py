@@ -18,11 +18,11 @@ from apex_ompl.loop.replanning import AtOnce
 from apex_ompl.loop.result import INTERRUPTED
 from apex_ompl.loop.run import run
 from apex_ompl.loop.sensor import Sensor, SensorStream
-from apex_ompl.loop.settings import LoopSettings
 from apex_ompl.loop.simulation import simulate
+from apex_ompl.moving.settings import LoopSettings
 from apex_ompl.problems import worlds
 from apex_ompl.scene.scripts import place_at
-from apex_ompl.trajectory.rests import is_at_rest
+from apex_ompl.timing.rests import is_at_rest
 
 PERIOD, NAN = LoopSettings.period, float("nan")
 

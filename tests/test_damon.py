@@ -20,21 +20,22 @@ from scipy.sparse.csgraph import dijkstra
 from support import DATA, ROOT
 
 from apex_ompl import plan, planners
+from apex_ompl.baselines import weights_folder
+from apex_ompl.baselines.damon.latent_graph import consecutive, farthest_points, free_of_self_collision, neighbours
+from apex_ompl.baselines.damon.lazy_search import Graph, LazySearch
+from apex_ompl.baselines.damon.manifold import load_manifold, shared_manifold
+from apex_ompl.baselines.damon.queries import Damon
+from apex_ompl.baselines.damon.sampling import sample_states, split_sample
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.discretization import sample_path
-from apex_ompl.datasets.store import load
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError
 from apex_ompl.kernel import Kernel, RobotTables
 from apex_ompl.kernel.scene_builder import scene_tables
-from apex_ompl.ompl_adapter.setup import PlanningSetup, assemble
-from apex_ompl.ompl_adapter.space import motions_free
+from apex_ompl.ompl.setup import PlanningSetup, assemble
+from apex_ompl.ompl.space import motions_free
 from apex_ompl.problems import load as load_problem
-from apex_ompl.roadmaps.damon import Damon
-from apex_ompl.roadmaps.latent_graph import consecutive, farthest_points, free_of_self_collision, neighbours
-from apex_ompl.roadmaps.lazy_search import Graph, LazySearch
-from apex_ompl.roadmaps.manifold import BASELINES, load_manifold, shared_manifold
-from apex_ompl.roadmaps.sampling import sample_states, split_sample
 from apex_ompl.robot import Robot
+from apex_ompl.training.store import load
 from apex_ompl.types import Array, Flags
 from apex_ompl.util.resolution import SEARCH_RESOLUTION
 
@@ -183,7 +184,7 @@ def test_reconstruction_is_better_in_more_dimensions(models: Path) -> None:
 
 def test_training_is_repeatable_and_its_pieces_are_numpys(models: Path) -> None:
     torch = pytest.importorskip("torch")
-    from apex_ompl.roadmaps.manifold_training import StateNetwork, train
+    from apex_ompl.baselines.damon.manifold_training import StateNetwork, train
 
     one = load_manifold(str(models / "damon-2")).autoencoder
     network = StateNetwork(14, 64, 2)
@@ -306,12 +307,12 @@ def test_faults_of_models_are_said_in_one_sentence(models: Path, tmp_path: Path)
 
 
 def test_shipped_models_are_small_and_sound() -> None:
-    size = sum(file.stat().st_size for name in SHIPPED for file in (BASELINES / name).iterdir())
+    size = sum(file.stat().st_size for name in SHIPPED for file in weights_folder(name).iterdir())
     assert size <= 6 * 2**20
     for name in SHIPPED:
         manifold = load_manifold(name, "dual_panda_softhand")
         assert manifold.config.dim == int(name.removeprefix("damon-")) and len(manifold.latent) == 20_000
-        assert not list((BASELINES / name).glob("*.p*t*")) and (BASELINES / name / "README.md").is_file()
+        assert not list(weights_folder(name).glob("*.p*t*")) and (weights_folder(name) / "README.md").is_file()
 
 
 def test_a_manifold_is_read_once_until_it_changes(models: Path, tmp_path: Path) -> None:

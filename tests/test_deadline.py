@@ -13,20 +13,20 @@ from ompl import base as ob
 
 from apex_ompl import planners, planning
 from apex_ompl.api import load_problem, plan
-from apex_ompl.benchmark import runs
-from apex_ompl.benchmark.rows import Job
 from apex_ompl.errors import TimingStoppedError
-from apex_ompl.ompl_adapter.interrupt import ends_after
-from apex_ompl.ompl_adapter.repair import repair
-from apex_ompl.ompl_adapter.setup import PlanningSetup, assemble
-from apex_ompl.ompl_adapter.simplify import simplify
-from apex_ompl.ompl_adapter.space import to_state
-from apex_ompl.ompl_adapter.validity import FullCheck, full_check, motions_until
+from apex_ompl.evaluation import runs
+from apex_ompl.evaluation.rows import Job
+from apex_ompl.ompl.interrupt import ends_after
+from apex_ompl.ompl.repair import repair
+from apex_ompl.ompl.setup import PlanningSetup, assemble
+from apex_ompl.ompl.simplify import simplify
+from apex_ompl.ompl.space import to_state
+from apex_ompl.ompl.validity import FullCheck, full_check, motions_until
+from apex_ompl.paths.path import Path
 from apex_ompl.planning import NOT_PROVED, PlanRun, find_path, parameterize, solve, straight_line, verify
 from apex_ompl.planning.timing import NOT_TIMED
 from apex_ompl.result import PlanResult, PlanStatus
-from apex_ompl.trajectory import Timing, time_path
-from apex_ompl.trajopt.path import Path
+from apex_ompl.timing import Timing, time_path
 from apex_ompl.util.deadline import Deadline
 from apex_ompl.util.resolution import SEARCH_RESOLUTION
 

@@ -11,19 +11,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from models import DOF, VARIATIONAL, WALL, kernel, network, query, some_paths
 
-from apex_ompl.datasets.records import SHAPES
-from apex_ompl.diffusion.autoencoder import LinearLatent, VariationalLatent
-from apex_ompl.diffusion.conditions import ConditionTable, batch_queries
-from apex_ompl.diffusion.denoisers import UNetDenoiser
-from apex_ompl.diffusion.encoders import ConditionEncoder
-from apex_ompl.diffusion.geometry import rotation_matrices, signed_distances
-from apex_ompl.diffusion.model_config import DenoiserConfig
-from apex_ompl.diffusion.proposals import Sampling
-from apex_ompl.diffusion.query import ObstacleSet, Probes, Query
-from apex_ompl.diffusion.torch_model import TorchModel
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel import Kernel
-from apex_ompl.trajopt.spline import Spline
+from apex_ompl.model.config import DenoiserConfig
+from apex_ompl.model.geometry import SHAPES, rotation_matrices, signed_distances
+from apex_ompl.model.proposals import Sampling
+from apex_ompl.model.query import ObstacleSet, Probes, Query
+from apex_ompl.paths.spline import Spline
+from apex_ompl.training.autoencoder import LinearLatent, VariationalLatent
+from apex_ompl.training.conditions import ConditionTable, batch_queries
+from apex_ompl.training.denoisers import UNetDenoiser
+from apex_ompl.training.encoders import ConditionEncoder
+from apex_ompl.training.torch_model import TorchModel
 
 # Latent spaces
 

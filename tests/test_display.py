@@ -20,17 +20,17 @@ import apex_ompl
 from apex_ompl import Alignment, MotionPlanner, Obstacle, PlanResult, PoseTarget, Problem, RunResult, Timing, Trajectory
 from apex_ompl.cli import run as run_command
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.datasets import Paths
-from apex_ompl.diffusion.checkpoint import CheckpointConfig
-from apex_ompl.live import Movers
 from apex_ompl.loop import Sensor, SensorStream
-from apex_ompl.ompl_adapter import assemble
+from apex_ompl.model.checkpoint import CheckpointConfig
+from apex_ompl.moving import Movers
+from apex_ompl.ompl import assemble
+from apex_ompl.paths import Optimizer, Spline
 from apex_ompl.problems import witness, worlds
 from apex_ompl.robot import Robot
 from apex_ompl.robot.config import RobotConfig
 from apex_ompl.robot.identity import _spelled
 from apex_ompl.scene import AttachedObject, Goal
-from apex_ompl.trajopt import Optimizer, Spline
+from apex_ompl.training import Paths
 from apex_ompl.util.display import WIDTH, Summary, fields_line, html_table, one_line
 from apex_ompl.util.schema import StrictModel
 

@@ -12,15 +12,15 @@ from ompl import base as ob
 from planning import solved
 
 from apex_ompl import plan, planners
+from apex_ompl.baselines.drrt.dynamic_rrt import DynamicRRT
+from apex_ompl.baselines.drrt.goal_tree import GoalTree
+from apex_ompl.baselines.drrt.planner import DRRT
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.changes import may_have_become_blocked
 from apex_ompl.collision.discretization import sample_path
-from apex_ompl.ompl_adapter.setup import PlanningSetup, assemble
-from apex_ompl.ompl_adapter.space import to_state
-from apex_ompl.planners.drrt import DRRT
+from apex_ompl.ompl.setup import PlanningSetup, assemble
+from apex_ompl.ompl.space import to_state
 from apex_ompl.problems import load as load_problem
-from apex_ompl.roadmaps.dynamic_rrt import DynamicRRT
-from apex_ompl.roadmaps.goal_tree import GoalTree
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Problem

@@ -16,29 +16,29 @@ from loops import BLOCKED, PROBLEM, ByHand, Find, boxes, crossing, go, line, lin
 
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ApexError
-from apex_ompl.live.movers import Movers, clearance_in_time
-from apex_ompl.live.timed_spline import Start
-from apex_ompl.loop.charges import Charges
 from apex_ompl.loop.cycle import RunRecord
-from apex_ompl.loop.evasion import endangered, step_aside
 from apex_ompl.loop.executor import Executor
-from apex_ompl.loop.following import Following
-from apex_ompl.loop.methods import METHODS
-from apex_ompl.loop.ready import Ready
 from apex_ompl.loop.referee import RefereeReport
+from apex_ompl.loop.replan.evasion import endangered, step_aside
+from apex_ompl.loop.replan.methods import METHODS
 from apex_ompl.loop.replanning import NOTICED, Reply
-from apex_ompl.loop.request import Answer, Request
 from apex_ompl.loop.result import Event
 from apex_ompl.loop.run import run
-from apex_ompl.loop.search import EARLIER, Search
 from apex_ompl.loop.sensor import Sensor
-from apex_ompl.loop.settings import EVADE, LoopSettings
 from apex_ompl.loop.tracking import Tracker
-from apex_ompl.ompl_adapter.setup import PlanningSetup
+from apex_ompl.moving.charges import Charges
+from apex_ompl.moving.following import Following
+from apex_ompl.moving.movers import Movers, clearance_in_time
+from apex_ompl.moving.ready import Ready
+from apex_ompl.moving.request import Answer, Request
+from apex_ompl.moving.search import EARLIER, Search
+from apex_ompl.moving.settings import EVADE, LoopSettings
+from apex_ompl.moving.timed_spline import Start
+from apex_ompl.ompl.setup import PlanningSetup
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.scripts import place_at
-from apex_ompl.trajectory import Trajectory
-from apex_ompl.trajectory.rests import is_at_rest
+from apex_ompl.timing import Trajectory
+from apex_ompl.timing.rests import is_at_rest
 
 
 def reasons(done: RunRecord) -> set[str]:

@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from runs import motion_between, moved
 
-from apex_ompl.live.stopping import stop
-from apex_ompl.loop.following import Following, executed
+from apex_ompl.moving.following import Following, executed
+from apex_ompl.moving.stopping import stop
 from apex_ompl.problems.suite_robot import robot
-from apex_ompl.trajectory import Trajectory
+from apex_ompl.timing import Trajectory
 
 BEGIN = 0.37
 shares = st.floats(0.0, 1.0)

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from loops import boxes, ready_of
 
-from apex_ompl.live.movers import Movers
-from apex_ompl.live.stopping import stops_proved
-from apex_ompl.loop.following import Following
-from apex_ompl.loop.ready import Ready
-from apex_ompl.loop.search import SPREAD
-from apex_ompl.trajectory import time_path
+from apex_ompl.moving.following import Following
+from apex_ompl.moving.movers import Movers
+from apex_ompl.moving.ready import Ready
+from apex_ompl.moving.search import SPREAD
+from apex_ompl.moving.stopping import stops_proved
+from apex_ompl.timing import time_path
 
 AGE, FASTEST = 0.08, 0.4
 PROBLEM = "vertical/free/800000"

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.loop.methods import METHODS
+from apex_ompl.loop.replan.methods import METHODS
 from apex_ompl.loop.result import Outcome, RunResult
 from apex_ompl.loop.run import run
-from apex_ompl.loop.settings import LoopSettings
+from apex_ompl.moving.settings import LoopSettings
 from apex_ompl.problems import worlds
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.scene.scripts import problem_at

@@ -15,15 +15,15 @@ from support import ROOT
 from apex_ompl import problems
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError, UnknownNameError
-from apex_ompl.live.moving import check_timed_path
-from apex_ompl.ompl_adapter.validity import full_check
+from apex_ompl.moving.swept import check_timed_path
+from apex_ompl.ompl.validity import full_check
+from apex_ompl.paths.path import resample
 from apex_ompl.problems import frozen
 from apex_ompl.problems.catalogue import ProblemId
 from apex_ompl.problems.generator import first_drawn
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import Obstacle
-from apex_ompl.trajopt.path import resample
 
 FOLDER = ROOT / "problems" / "frozen"
 SUITE_LEVELS = [(suite, level) for suite, levels in problems.suites().items() for level in levels]

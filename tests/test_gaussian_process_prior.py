@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from apex_ompl.baselines.gpmp.block_tridiagonal import BlockTridiagonal
+from apex_ompl.baselines.gpmp.gaussian_process import GaussianProcess
+from apex_ompl.baselines.gpmp.optimizer import CostFunctional, FactorGraph
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel.clearance_costs import ClearanceCosts
-from apex_ompl.trajopt.block_tridiagonal import BlockTridiagonal
-from apex_ompl.trajopt.gaussian_process import GaussianProcess
-from apex_ompl.trajopt.gpmp import CostFunctional, FactorGraph
 
 EPS, CENTRE, RADIUS = 0.3, np.array([0.5, 0.45]), 0.25
 

@@ -13,17 +13,18 @@ from support import ROOT
 
 from apex_ompl import problems
 from apex_ompl.collision.checker import NO_POINT
-from apex_ompl.datasets.engine import STRAIGHT_SHARE, EngineOptions
-from apex_ompl.datasets.records import FIELDS, SHAPES, SOURCES, Paths, to_half
-from apex_ompl.datasets.store import Store, load
 from apex_ompl.errors import ParameterError, UnknownNameError
-from apex_ompl.generation.solving import solve_unit
-from apex_ompl.generation.units import Unit, plan_units, static_levels
-from apex_ompl.ompl_adapter.setup import assemble
-from apex_ompl.ompl_adapter.validity import full_check
+from apex_ompl.model.geometry import SHAPES
+from apex_ompl.ompl.setup import assemble
+from apex_ompl.ompl.validity import full_check
+from apex_ompl.paths.path import path_length
+from apex_ompl.paths.spline import Spline
 from apex_ompl.problems.suite_robot import robot
-from apex_ompl.trajopt.path import path_length
-from apex_ompl.trajopt.spline import Spline
+from apex_ompl.training.engine import STRAIGHT_SHARE, EngineOptions
+from apex_ompl.training.problem_solving import solve_unit
+from apex_ompl.training.records import FIELDS, SOURCES, Paths, to_half
+from apex_ompl.training.store import Store, load
+from apex_ompl.training.units import Unit, plan_units, static_levels
 from apex_ompl.util.cluster import ClusterError, spread
 
 SCRIPT = ROOT / "scripts" / "generate_data.py"

@@ -10,25 +10,25 @@ from loops import PROBLEM, go, ready_of, setup_of
 from ompl import base as ob
 
 from apex_ompl import MotionPlanner, plan, planners, problems
+from apex_ompl.baselines.gpmp.planner import GaussianProcessPlanner
+from apex_ompl.baselines.gpmp.replanner import IncrementalGPMP, IncrementalGPMP2
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ParameterError, UnknownNameError
 from apex_ompl.kernel.clearance_costs import clearance_costs
-from apex_ompl.live.movers import Movers, clearance_in_time
-from apex_ompl.loop.charges import Charges
-from apex_ompl.loop.following import Following
-from apex_ompl.loop.gpmp import IncrementalGPMP, IncrementalGPMP2
-from apex_ompl.loop.methods import METHODS
-from apex_ompl.loop.request import Request
+from apex_ompl.loop.replan.methods import METHODS
 from apex_ompl.loop.run import run
-from apex_ompl.ompl_adapter.setup import PlanningSetup, assemble
-from apex_ompl.planners.gpmp import GaussianProcessPlanner
+from apex_ompl.moving.charges import Charges
+from apex_ompl.moving.following import Following
+from apex_ompl.moving.movers import Movers, clearance_in_time
+from apex_ompl.moving.request import Request
+from apex_ompl.ompl.setup import PlanningSetup, assemble
+from apex_ompl.paths.optimizer import Optimizer
+from apex_ompl.paths.settings import OptimizerSettings
+from apex_ompl.paths.spline import Spline
 from apex_ompl.result import PlanResult, PlanStatus
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Goal, Problem
-from apex_ompl.trajopt.optimizer import Optimizer
-from apex_ompl.trajopt.settings import OptimizerSettings
-from apex_ompl.trajopt.spline import Spline
 
 NAMES = ("gpmp", "gpmp2")
 OPEN = ("vertical/small/800001", "horizontal/small/800002")

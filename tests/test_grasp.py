@@ -5,9 +5,9 @@ import pytest
 
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import SceneError, UnknownNameError
+from apex_ompl.goals.grasp import grasp
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import AttachedObject
-from apex_ompl.tasks.grasp import grasp
 
 ALONG_X = (0.0, np.sqrt(0.5), 0.0, np.sqrt(0.5))
 

@@ -18,23 +18,23 @@ from support import ROOT, needs
 
 from apex_ompl import plan, planners
 from apex_ompl.apex.query import make_query
+from apex_ompl.baselines.imitation import policy as policies
+from apex_ompl.baselines.imitation.checkpoint import save_policy
+from apex_ompl.baselines.imitation.policy import shared_policy
+from apex_ompl.baselines.imitation.replanner import Imitation
+from apex_ompl.baselines.imitation.training import ImitationTrainer
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ApexError, FileFormatError, MissingFileError, ParameterError
-from apex_ompl.imitation import policy as policies
-from apex_ompl.imitation.checkpoint import save_policy
-from apex_ompl.imitation.policy import shared_policy
-from apex_ompl.imitation.training import ImitationTrainer
-from apex_ompl.live.movers import Movers
-from apex_ompl.loop.charges import Charges, cost_table
 from apex_ompl.loop.cycle import RunRecord
-from apex_ompl.loop.following import Following
-from apex_ompl.loop.imitation import Imitation
-from apex_ompl.loop.methods import METHODS
 from apex_ompl.loop.referee import RefereeReport
+from apex_ompl.loop.replan.methods import METHODS
 from apex_ompl.loop.replanning import SHARE
-from apex_ompl.loop.request import Request
-from apex_ompl.ompl_adapter.setup import assemble
-from apex_ompl.ompl_adapter.space import path_to_array
+from apex_ompl.moving.charges import Charges, cost_table
+from apex_ompl.moving.following import Following
+from apex_ompl.moving.movers import Movers
+from apex_ompl.moving.request import Request
+from apex_ompl.ompl.setup import assemble
+from apex_ompl.ompl.space import path_to_array
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Goal, Problem
@@ -202,7 +202,7 @@ def test_no_path_that_is_returned_collides(seed: int, few: Path, tmp_path: Path)
 
 def test_what_is_missing_or_wrong_is_named(straight: Path, problem: Problem, monkeypatch: pytest.MonkeyPatch) -> None:
     si = assemble(problem).simple_setup.getSpaceInformation()
-    monkeypatch.setattr(policies, "BASELINES", Path("/no/such/place"))
+    monkeypatch.setattr(policies, "weights_folder", Path("/no/such/place").joinpath)
     for name in ("il", "il-paper"):
         with pytest.raises(
             MissingFileError, match=f"imitation policy '/no/such/place/{name}'.*{name}.yaml --save makes"

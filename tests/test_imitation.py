@@ -14,18 +14,18 @@ from imitations import GROUPS, NETWORK, SMALL, config, lively, trained
 from support import DATA, ROOT
 from trainings import query_from_path
 
-from apex_ompl.datasets.records import Paths
-from apex_ompl.datasets.store import load
-from apex_ompl.diffusion.conditions import Conditions, batch_queries
-from apex_ompl.diffusion.mirror import Mirror
+from apex_ompl.baselines.imitation.config import ImitationConfig, NetworkConfig
+from apex_ompl.baselines.imitation.data import NO_PROBES, WindowData
+from apex_ompl.baselines.imitation.network import PolicyNetwork
+from apex_ompl.baselines.imitation.policy import shared_policy
+from apex_ompl.baselines.imitation.training import ImitationTrainer
 from apex_ompl.errors import ApexError, FileFormatError
-from apex_ompl.imitation.config import ImitationConfig, NetworkConfig
-from apex_ompl.imitation.data import NO_PROBES, WindowData
-from apex_ompl.imitation.network import PolicyNetwork
-from apex_ompl.imitation.policy import shared_policy
-from apex_ompl.imitation.training import ImitationTrainer
 from apex_ompl.kernel import Kernel, RobotTables
 from apex_ompl.kernel.scene_builder import scene_tables
+from apex_ompl.training.conditions import Conditions, batch_queries
+from apex_ompl.training.mirror import Mirror
+from apex_ompl.training.records import Paths
+from apex_ompl.training.store import load
 from apex_ompl.util.threads import one_torch_thread
 
 MIRROR = yaml.safe_load((ROOT / "scripts" / "configs" / "il.yaml").read_text())["mirror"]

@@ -19,14 +19,14 @@ from imitations import NETWORK, SMALL, config, lively, trained, weights
 from support import DATA, ROOT
 from trainings import assert_same, query_from_path
 
-from apex_ompl.datasets.store import load
+from apex_ompl.baselines.imitation.checkpoint import load_policy_network, save_policy
+from apex_ompl.baselines.imitation.config import NetworkConfig
+from apex_ompl.baselines.imitation.policy import ImitationPolicy, policy_folder, shared_policy
+from apex_ompl.baselines.imitation.training import ImitationTrainer
 from apex_ompl.errors import ApexError, FileFormatError, MissingFileError
-from apex_ompl.imitation.checkpoint import load_policy_network, save_policy
-from apex_ompl.imitation.config import NetworkConfig
-from apex_ompl.imitation.policy import ImitationPolicy, policy_folder, shared_policy
-from apex_ompl.imitation.training import ImitationTrainer
 from apex_ompl.kernel import Kernel, RobotTables
 from apex_ompl.kernel.scene_builder import scene_tables
+from apex_ompl.training.store import load
 from apex_ompl.util.threads import one_torch_thread
 
 CLOCK = NETWORK["clock"]

@@ -60,11 +60,8 @@ def test_a_plan_imports_neither_torch_nor_other_planners() -> None:
     "package",
     [
         "apex_ompl",
-        *(
-            f"apex_ompl.{name}"
-            for name in ("apex", "datasets", "diffusion", "live", "loop", "ompl_adapter", "planning")
-        ),
-        *(f"apex_ompl.{name}" for name in ("scene", "session", "trajopt", "viz")),
+        *(f"apex_ompl.{name}" for name in ("apex", "loop", "model", "moving", "ompl", "paths", "planning")),
+        *(f"apex_ompl.{name}" for name in ("scene", "training", "viz")),
     ],
 )
 def test_public_names_are_those_of_their_modules(package: str) -> None:
@@ -79,7 +76,7 @@ def test_public_names_are_those_of_their_modules(package: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "package", ["apex", "datasets", "diffusion", "live", "loop", "ompl_adapter", "scene", "session", "trajopt", "viz"]
+    "package", ["apex", "loop", "model", "moving", "ompl", "paths", "planning", "scene", "training", "viz"]
 )
 def test_packages_cost_nothing_before_a_name_of_theirs_is_used(package: str) -> None:
     assert loaded(f"import apex_ompl.{package}; dir(apex_ompl.{package})", (*LARGE, "numpy")) == []
@@ -87,8 +84,8 @@ def test_packages_cost_nothing_before_a_name_of_theirs_is_used(package: str) -> 
 
 def test_the_planner_says_what_its_types_are() -> None:
     """Its methods name types of modules that are imported later."""
-    from apex_ompl.session import kept_planner, planner
+    from apex_ompl.planning import kept_planner, planner
 
     assert apex_ompl.MotionPlanner is planner.MotionPlanner and callable(kept_planner)
-    get, _ = lazy_names("apex_ompl.session", {"World": "world"})
-    assert get("World").__module__ == "apex_ompl.session.world"
+    get, _ = lazy_names("apex_ompl.planning", {"World": "world"})
+    assert get("World").__module__ == "apex_ompl.planning.world"

@@ -79,7 +79,7 @@ import sys
 sys.modules |= {"numba": None, "llvmlite": None}
 import numpy as np
 import apex_ompl
-from apex_ompl.loop.settings import LoopSettings
+from apex_ompl.moving.settings import LoopSettings
 
 robot = apex_ompl.load_robot("dual_panda_softhand")
 assert apex_ompl.plan("shelf/hard/800000", timeout=30.0)

@@ -14,17 +14,17 @@ import pytest
 from planning import cached_problem
 
 from apex_ompl.errors import ParameterError
-from apex_ompl.ompl_adapter.setup import assemble
+from apex_ompl.ompl.setup import assemble
 from apex_ompl.result import PlanResult
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Problem
-from apex_ompl.viz.browser.live_page import LivePage
-from apex_ompl.viz.browser.nodes import pose_of
-from apex_ompl.viz.browser.run import ShownRun
-from apex_ompl.viz.browser.scene import BrowserScene
-from apex_ompl.viz.browser.shown import Shown
 from apex_ompl.viz.sources import saved_in
 from apex_ompl.viz.view import view
+from apex_ompl.viz.viewer.live_page import LivePage
+from apex_ompl.viz.viewer.nodes import pose_of
+from apex_ompl.viz.viewer.run import ShownRun
+from apex_ompl.viz.viewer.scene import BrowserScene
+from apex_ompl.viz.viewer.shown import Shown
 
 RED = (0xE0, 0x10, 0x1B)  # of contacts
 LARGEST = 6e6  # of a page [bytes]

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from loops import PROBLEM, crossing, go, setup_of
 
-from apex_ompl.live.movers import Movers
-from apex_ompl.live.timed_spline import Start
-from apex_ompl.loop.methods import METHODS
-from apex_ompl.loop.mppi import softmax
-from apex_ompl.loop.potential_field import Field, PotentialField, repulsive
+from apex_ompl.baselines.control.mppi import softmax
+from apex_ompl.baselines.control.potential_field import Field, PotentialField, repulsive
+from apex_ompl.baselines.control.short_horizon import Horizon
+from apex_ompl.loop.replan.methods import METHODS
 from apex_ompl.loop.result import Outcome
 from apex_ompl.loop.run import run
 from apex_ompl.loop.sensor import Sensor
-from apex_ompl.loop.short_horizon import Horizon
+from apex_ompl.moving.movers import Movers
+from apex_ompl.moving.timed_spline import Start
 from apex_ompl.scene.bodies import Obstacle
 
 CONTROLS = ("mppi", "potential-field", "drrt", "damon")

@@ -13,17 +13,17 @@ from runs import motion_between
 from apex_ompl import problems
 from apex_ompl.errors import ApexError
 from apex_ompl.loop.cycle import RunRecord
-from apex_ompl.loop.following import Following
 from apex_ompl.loop.referee import LIMIT_TOLERANCE
 from apex_ompl.loop.result import Outcome, RunResult
 from apex_ompl.loop.run import _Made, run
-from apex_ompl.loop.settings import LoopSettings
+from apex_ompl.moving.following import Following
+from apex_ompl.moving.settings import LoopSettings
 from apex_ompl.problems import worlds
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.scripts import place_at
-from apex_ompl.trajectory import time_path
-from apex_ompl.trajectory.rests import is_at_rest
+from apex_ompl.timing import time_path
+from apex_ompl.timing.rests import is_at_rest
 
 MOVING = "vertical/moving-large-0.2/800001"
 NAN = float("nan")

@@ -9,9 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import linalg
 
-from apex_ompl.benchmark import metrics
 from apex_ompl.errors import ParameterError
-from apex_ompl.trajectory import smoothness
+from apex_ompl.evaluation import metrics
+from apex_ompl.timing import smoothness
 from apex_ompl.util.statistics import share_interval
 
 

@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 from loops import FAR, PROBLEM, line_from, ready_of
 
-from apex_ompl.live.movers import Movers
-from apex_ompl.live.timed_spline import Start, TimedSpline
-from apex_ompl.loop.charges import Charges
-from apex_ompl.loop.following import Following
-from apex_ompl.loop.proposals import Renoised
-from apex_ompl.loop.quickening import quickened
-from apex_ompl.loop.ready import Ready
-from apex_ompl.loop.request import Request
-from apex_ompl.loop.search import EARLIER, Search
-from apex_ompl.trajectory.methods.spline import least_knot_spacing
+from apex_ompl.loop.replan.proposals import Renoised
+from apex_ompl.loop.replan.quickening import quickened
+from apex_ompl.moving.charges import Charges
+from apex_ompl.moving.following import Following
+from apex_ompl.moving.movers import Movers
+from apex_ompl.moving.ready import Ready
+from apex_ompl.moving.request import Request
+from apex_ompl.moving.search import EARLIER, Search
+from apex_ompl.moving.timed_spline import Start, TimedSpline
+from apex_ompl.timing.spline_method import least_knot_spacing
 
 
 @pytest.fixture(scope="module")

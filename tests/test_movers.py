@@ -12,12 +12,12 @@ from hypothesis import strategies as st
 
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ApexError
-from apex_ompl.live.movers import Movers, allowed_rows, clearance_in_time, prove_motion
+from apex_ompl.goals.cover_clearance import scene_kernel
+from apex_ompl.moving.movers import Movers, allowed_rows, clearance_in_time, prove_motion
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.scripts import obstacle_at
-from apex_ompl.tasks.cover_clearance import scene_kernel
-from apex_ompl.trajectory import Timing, Trajectory, time_path
+from apex_ompl.timing import Timing, Trajectory, time_path
 
 SHAPES = [
     {"box": (0.12, 0.1, 0.08)}, {"sphere": {"radius": 0.06}}, {"cylinder": {"radius": 0.05, "length": 0.15}},

@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 from timings import LIMITS, NAMES, RATE, paths, timed
 
 from apex_ompl.errors import TimingError
-from apex_ompl.trajectory import Timing, time_path
-from apex_ompl.trajectory.methods.moving_start import between, through
-from apex_ompl.trajectory.trajectory import concatenate
+from apex_ompl.timing import Timing, time_path
+from apex_ompl.timing.moving_start import between, through
+from apex_ompl.timing.trajectory import concatenate
 
 
 @settings(max_examples=30)

@@ -19,9 +19,9 @@ import apex_ompl
 from apex_ompl import planners
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ParameterError, UnknownNameError
-from apex_ompl.ompl_adapter.setup import PlanningSetup, assemble
-from apex_ompl.ompl_adapter.space import new_state, state_space, to_state
-from apex_ompl.ompl_adapter.validity import StateValidityChecker
+from apex_ompl.ompl.setup import PlanningSetup, assemble
+from apex_ompl.ompl.space import new_state, state_space, to_state
+from apex_ompl.ompl.validity import StateValidityChecker
 from apex_ompl.planners import APEX
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.robot import load_robot

@@ -12,15 +12,15 @@ from planning import HARD, cached_problem
 from scipy.interpolate import BSpline
 
 from apex_ompl import PlanResult, Timing, plan
+from apex_ompl.apex.parameters import ApexParameters
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.path_proof import Curve
 from apex_ompl.errors import ParameterError
-from apex_ompl.ompl_adapter.setup import assemble
+from apex_ompl.ompl.setup import assemble
+from apex_ompl.paths.path import Path
+from apex_ompl.paths.spline import Spline
 from apex_ompl.planners import APEX
-from apex_ompl.planners.apex_parameters import ApexParameters
 from apex_ompl.planning import PlanRun, solve, straight_line
-from apex_ompl.trajopt.path import Path
-from apex_ompl.trajopt.spline import Spline
 from apex_ompl.util.deadline import Deadline
 
 

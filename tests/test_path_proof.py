@@ -17,10 +17,10 @@ from support import benchmark_script, states_around_home
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.exact_shapes import ball_tree, mesh_of
 from apex_ompl.collision.path_proof import TOLERANCE, Curve
-from apex_ompl.ompl_adapter.validity import full_check
+from apex_ompl.ompl.validity import full_check
 from apex_ompl.robot import Robot, load_robot
 from apex_ompl.scene.bodies import Obstacle
-from apex_ompl.trajectory import time_path
+from apex_ompl.timing import time_path
 
 
 @pytest.fixture(scope="module")

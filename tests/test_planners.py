@@ -10,8 +10,8 @@ from support import needs
 
 from apex_ompl import plan, planners
 from apex_ompl.errors import ParameterError, UnknownNameError
-from apex_ompl.ompl_adapter.process import seed_ompl
-from apex_ompl.ompl_adapter.setup import assemble
+from apex_ompl.ompl.process import seed_ompl
+from apex_ompl.ompl.setup import assemble
 from apex_ompl.planners.sampling import OmplParameters, setter_stem
 from apex_ompl.scene.problem import Problem
 

@@ -9,12 +9,12 @@ import torch
 from apex_ompl import load_problem
 from apex_ompl.apex.query import make_query
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.diffusion.geometry import signed_distances
-from apex_ompl.diffusion.query import ObstacleSet
-from apex_ompl.generation.records import problem_record
-from apex_ompl.ompl_adapter.setup import assemble
+from apex_ompl.model.geometry import signed_distances
+from apex_ompl.model.query import ObstacleSet
+from apex_ompl.ompl.setup import assemble
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.scene.bodies import HalfSpace, Obstacle
+from apex_ompl.training.problem_records import problem_record
 
 
 def sorted_rows(obstacles: ObstacleSet) -> np.ndarray:

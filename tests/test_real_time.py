@@ -18,25 +18,25 @@ from faulty_replanners import Faulty
 from loops import BLOCKED, PROBLEM, crossing, ready_of, setup_of, world_of
 
 from apex_ompl.errors import PlannerProcessError
-from apex_ompl.live.movers import Movers, clearance_in_time
 from apex_ompl.loop import planner_process
-from apex_ompl.loop.charges import Charges
 from apex_ompl.loop.cycle import Loop, RunRecord
-from apex_ompl.loop.following import Following
-from apex_ompl.loop.methods import replanner_of
 from apex_ompl.loop.observation import Observation
 from apex_ompl.loop.planner_process import PlannerProcess, Work
-from apex_ompl.loop.ready import Ready
 from apex_ompl.loop.real_time import run_in_real_time
 from apex_ompl.loop.referee import RefereeReport, judge
 from apex_ompl.loop.rehearsal import rehearse
+from apex_ompl.loop.replan.methods import replanner_of
 from apex_ompl.loop.replanning import answered
-from apex_ompl.loop.request import Answer, Request
 from apex_ompl.loop.result import INTERRUPTED, Outcome, RunResult
 from apex_ompl.loop.run import run
 from apex_ompl.loop.sensor import Sensor, SensorStream
+from apex_ompl.moving.charges import Charges
+from apex_ompl.moving.following import Following
+from apex_ompl.moving.movers import Movers, clearance_in_time
+from apex_ompl.moving.ready import Ready
+from apex_ompl.moving.request import Answer, Request
 from apex_ompl.problems.worlds import World
-from apex_ompl.trajectory.rests import is_at_rest
+from apex_ompl.timing.rests import is_at_rest
 
 
 class BadEyes:

@@ -12,14 +12,14 @@ from runs import motion_between, moved, problem_of, standing
 
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ParameterError
-from apex_ompl.live.scripted import ScriptedMovers
 from apex_ompl.loop.referee import judge
 from apex_ompl.loop.result import Outcome
+from apex_ompl.moving.scripted import ScriptedMovers
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.scripts import is_there, place_at
-from apex_ompl.trajectory import Timing, Trajectory, time_path
-from apex_ompl.trajectory.trajectory import concatenate
+from apex_ompl.timing import Timing, Trajectory, time_path
+from apex_ompl.timing.trajectory import concatenate
 
 SHAPES = [
     {"box": (0.12, 0.1, 0.08)}, {"sphere": {"radius": 0.06}}, {"cylinder": {"radius": 0.05, "length": 0.15}},

@@ -11,7 +11,7 @@ from small_arm import arm_problem
 
 from apex_ompl import plan
 from apex_ompl.errors import MissingFileError, ParameterError
-from apex_ompl.ompl_adapter.setup import assemble
+from apex_ompl.ompl.setup import assemble
 from apex_ompl.scene.problem import Problem
 from apex_ompl.viz.render import render
 from apex_ompl.viz.scene_renderer import SceneRenderer

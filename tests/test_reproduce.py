@@ -22,9 +22,9 @@ import reproduce  # noqa: E402
 from paper import examples, figure, moving, page, published, realism, rows, static  # noqa: E402
 
 from apex_ompl import planners, problems  # noqa: E402
-from apex_ompl.benchmark import Row  # noqa: E402
-from apex_ompl.benchmark.rows import Job, load_runner  # noqa: E402
-from apex_ompl.loop import methods  # noqa: E402
+from apex_ompl.evaluation import Row  # noqa: E402
+from apex_ompl.evaluation.rows import Job, load_runner  # noqa: E402
+from apex_ompl.loop.replan import methods  # noqa: E402
 from apex_ompl.loop.result import Outcome  # noqa: E402
 from apex_ompl.problems.alignment import SIZES  # noqa: E402
 from apex_ompl.robot import Robot  # noqa: E402

@@ -12,13 +12,13 @@ from crossings import arm_motion, crossing
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel import Kernel
-from apex_ompl.live.movers import Movers, prove_motion
-from apex_ompl.live.retime import retime
-from apex_ompl.live.safe_intervals import Blocked, blocked
+from apex_ompl.moving.movers import Movers, prove_motion
+from apex_ompl.moving.retime import retime
+from apex_ompl.moving.safe_intervals import Blocked, blocked
 from apex_ompl.robot import Robot
 from apex_ompl.robot.model import Limits
 from apex_ompl.scene.bodies import Obstacle
-from apex_ompl.trajectory import Timing, Trajectory, time_path
+from apex_ompl.timing import Timing, Trajectory, time_path
 
 HOLD, HORIZON, TICK, PIECES = 1.0, 20.0, 0.01, 256
 

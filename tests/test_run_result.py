@@ -17,9 +17,9 @@ from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError
 from apex_ompl.loop.metrics import failure_ratio, run_metrics
 from apex_ompl.loop.result import Event, Outcome, RunResult
 from apex_ompl.robot import Robot
-from apex_ompl.trajectory.files import KNOTS
-from apex_ompl.trajectory.rests import is_at_rest, rests
-from apex_ompl.trajectory.trajectory import concatenate
+from apex_ompl.timing.files import KNOTS
+from apex_ompl.timing.rests import is_at_rest, rests
+from apex_ompl.timing.trajectory import concatenate
 
 
 @pytest.fixture(scope="module")

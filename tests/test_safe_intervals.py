@@ -9,12 +9,12 @@ from crossings import arm_motion, crossing, crossing_obstacle
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.kernel import Kernel
 from apex_ompl.kernel.compiled.blocked_intervals import MOST_SPANS
-from apex_ompl.live.movers import Movers, clearance_in_time
-from apex_ompl.live.safe_intervals import Blocked, blocked
+from apex_ompl.moving.movers import Movers, clearance_in_time
+from apex_ompl.moving.safe_intervals import Blocked, blocked
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.scripts import obstacle_at
-from apex_ompl.trajectory import Trajectory
+from apex_ompl.timing import Trajectory
 
 HORIZON = 6.0
 SAMPLING = 1e-3  # [s]

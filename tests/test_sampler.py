@@ -11,9 +11,9 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from apex_ompl.diffusion.sampler import SAMPLERS, ddim, ddpm, dpm_solver
-from apex_ompl.diffusion.schedule import PREDICTIONS, SCHEDULES, Estimate, NoiseSchedule
 from apex_ompl.errors import ParameterError, UnknownNameError
+from apex_ompl.model.sampler import SAMPLERS, ddim, ddpm, dpm_solver
+from apex_ompl.model.schedule import PREDICTIONS, SCHEDULES, Estimate, NoiseSchedule
 
 # Noise
 

@@ -72,7 +72,7 @@ def test_a_fault_is_one_sentence_with_class_field_and_value(case: str) -> None:
 
 def records() -> Iterator[type[StrictModel]]:
     for module in pkgutil.walk_packages(apex_ompl.__path__, "apex_ompl."):
-        if not module.name.startswith(("apex_ompl.cli.__main__", "apex_ompl.viz", "apex_ompl.benchmark")):
+        if not module.name.startswith(("apex_ompl.cli.__main__", "apex_ompl.viz", "apex_ompl.evaluation")):
             import_module(module.name)
     left = [StrictModel]
     while left:

@@ -16,13 +16,14 @@ from small_arm import arm_problem
 from test_moving import path_from_home, problem_with
 
 from apex_ompl import plan
-from apex_ompl.benchmark.rows import Job
-from apex_ompl.benchmark.runs import run as bench_run
 from apex_ompl.cli import main
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import FileFormatError, ParameterError
-from apex_ompl.live.moving import check_timed_path
-from apex_ompl.ompl_adapter.setup import assemble
+from apex_ompl.evaluation.rows import Job
+from apex_ompl.evaluation.runs import run as bench_run
+from apex_ompl.moving.swept import check_timed_path
+from apex_ompl.ompl.setup import assemble
+from apex_ompl.planning import MotionPlanner
 from apex_ompl.result import PlanResult
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import AttachedObject, Obstacle
@@ -37,11 +38,10 @@ from apex_ompl.scene.scripts import (
     recorded,
     velocity_at,
 )
-from apex_ompl.session import MotionPlanner
-from apex_ompl.viz.browser.page import write_page
-from apex_ompl.viz.browser.scene import BrowserScene
-from apex_ompl.viz.browser.shown import Shown
 from apex_ompl.viz.render import render
+from apex_ompl.viz.viewer.page import write_page
+from apex_ompl.viz.viewer.scene import BrowserScene
+from apex_ompl.viz.viewer.shown import Shown
 
 steps = st.lists(st.tuples(st.floats(1e-2, 3.0), *[st.floats(-2.0, 2.0)] * 3), max_size=6)
 BOX = {"name": "box", "box": (0.1, 0.1, 0.1)}

@@ -21,12 +21,12 @@ from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.conservative import ConservativeChecker
 from apex_ompl.collision.scene_bodies import SceneBodies
 from apex_ompl.errors import ApexError, MissingFileError, ParameterError, UnknownNameError
-from apex_ompl.ompl_adapter.validity import full_check
+from apex_ompl.ompl.validity import full_check
 from apex_ompl.result import PlanResult
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Goal, Problem
-from apex_ompl.trajectory import Trajectory
+from apex_ompl.timing import Trajectory
 
 POST = {"name": "post", "box": (0.1, 0.1, 0.6), "position": (0.45, 0.0, 0.3)}
 

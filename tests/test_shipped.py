@@ -10,18 +10,18 @@ from support import DATA, ROOT, needs
 
 from apex_ompl import load_model, load_problem
 from apex_ompl.apex.query import make_query
-from apex_ompl.datasets.kernel_problems import load_kernel_problems
-from apex_ompl.datasets.store import load
-from apex_ompl.diffusion.checkpoint import SHIPPED, shipped
-from apex_ompl.diffusion.guidance import EQUATION_7
-from apex_ompl.diffusion.proposals import Sampling
-from apex_ompl.diffusion.validation import query_from_problem
 from apex_ompl.kernel import Kernel
-from apex_ompl.ompl_adapter.setup import assemble
-from apex_ompl.ompl_adapter.validity import full_check
+from apex_ompl.model.checkpoint import SHIPPED, shipped
+from apex_ompl.model.guidance import EQUATION_7
+from apex_ompl.model.proposals import Sampling
+from apex_ompl.ompl.setup import assemble
+from apex_ompl.ompl.validity import full_check
+from apex_ompl.paths.candidates import first_valid
+from apex_ompl.paths.optimizer import Optimizer
 from apex_ompl.problems.suite_robot import robot
-from apex_ompl.trajopt.candidates import first_valid
-from apex_ompl.trajopt.optimizer import Optimizer
+from apex_ompl.training.kernel_problems import load_kernel_problems
+from apex_ompl.training.store import load
+from apex_ompl.training.validation import query_from_problem
 from apex_ompl.util.resolution import FINE_RESOLUTION
 
 FULL = ROOT / "data" / "dual_panda_softhand"

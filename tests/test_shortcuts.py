@@ -14,8 +14,8 @@ from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.discretization import sample_path
 from apex_ompl.kernel.shortcuts import shortcut
 from apex_ompl.kernel.trees import TreePair
+from apex_ompl.paths.path import path_length
 from apex_ompl.problems.suite_robot import robot
-from apex_ompl.trajopt.path import path_length
 from apex_ompl.types import Array
 
 RESOLUTION = 0.02

@@ -18,24 +18,24 @@ from trainings import HERE, config, query_from_path
 from apex_ompl import load_model, plan, problems
 from apex_ompl.apex.query import make_query
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.datasets.records import DatasetError, held_extents
-from apex_ompl.datasets.store import save
-from apex_ompl.diffusion.array_model import ArrayModel
-from apex_ompl.diffusion.checkpoint import load_torch_model
-from apex_ompl.diffusion.conditions import batch_queries
-from apex_ompl.diffusion.mirror import Mirror
-from apex_ompl.diffusion.model_config import PIECES
-from apex_ompl.diffusion.query import MAX_DISTANCE, ObstacleSet, Probes
-from apex_ompl.diffusion.sight import KEY_RANGE, Sight, arms
-from apex_ompl.diffusion.sight_data import SightTable
-from apex_ompl.diffusion.torch_sight import TorchSight
-from apex_ompl.diffusion.training import Trainer
 from apex_ompl.errors import FileFormatError
 from apex_ompl.kernel import Kernel
 from apex_ompl.kernel.point_distances import nearest_points
+from apex_ompl.model.array_model import ArrayModel
+from apex_ompl.model.config import PIECES
+from apex_ompl.model.query import MAX_DISTANCE, ObstacleSet, Probes
+from apex_ompl.model.scene_encoding import KEY_RANGE, Sight, arms
 from apex_ompl.problems.objects import bar, two_cups
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.scene.bodies import Obstacle
+from apex_ompl.training.conditions import batch_queries
+from apex_ompl.training.mirror import Mirror
+from apex_ompl.training.records import DatasetError, held_extents
+from apex_ompl.training.scene_data import SightTable
+from apex_ompl.training.store import save
+from apex_ompl.training.torch_model import load_torch_model
+from apex_ompl.training.torch_scene_encoding import TorchSight
+from apex_ompl.training.training import Trainer
 
 ALONG = 3
 MIRROR = Mirror(**yaml.safe_load((ROOT / "scripts" / "configs" / "apex.yaml").read_text())["mirror"])

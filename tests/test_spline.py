@@ -8,7 +8,7 @@ from scipy.integrate import quad
 from scipy.interpolate import BSpline
 
 from apex_ompl.errors import ParameterError
-from apex_ompl.trajopt.spline import Spline
+from apex_ompl.paths.spline import Spline
 
 SPLINES = [Spline(), Spline(14, 3), Spline(22, 3, 100), Spline(6, 1, 64), Spline(8, 2, 33, 3), Spline(3, 1, 5, 1)]
 

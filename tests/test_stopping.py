@@ -7,10 +7,10 @@ import pytest
 import ruckig
 from timings import LIMITS, NAMES
 
-from apex_ompl.live.stopping import DEVIATION, stop, stop_along
+from apex_ompl.moving.stopping import DEVIATION, stop, stop_along
 from apex_ompl.robot import Robot
 from apex_ompl.robot.model import Limits
-from apex_ompl.trajectory import Timing, Trajectory, time_path
+from apex_ompl.timing import Timing, Trajectory, time_path
 
 WIDE = 100.0  # rad, by which position limits are moved out of the way
 SAMPLES = 400

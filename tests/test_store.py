@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from apex_ompl.datasets.description import duplicates, level_statistics
-from apex_ompl.datasets.records import FIELDS, DatasetError, Paths, from_micro, to_micro
-from apex_ompl.datasets.store import Store, load, save
 from apex_ompl.errors import ApexError, FileFormatError, FolderInUseError, MissingFileError
-from apex_ompl.trajopt.spline import Spline
+from apex_ompl.paths.spline import Spline
+from apex_ompl.training.description import duplicates, level_statistics
+from apex_ompl.training.records import FIELDS, DatasetError, Paths, from_micro, to_micro
+from apex_ompl.training.store import Store, load, save
 
 DOF, FREE = 5, 12
 ABOUT = {"robot": "some", "joints": ["a", "b", "c", "d", "e"], **asdict(Spline())}
@@ -160,8 +160,8 @@ def test_a_disk_that_is_really_full_leaves_nothing_behind(tmp_path: Path) -> Non
     code = f"""
 import resource, signal
 from pathlib import Path
-from apex_ompl.datasets.store import Store, load
-from apex_ompl.datasets.records import DatasetError
+from apex_ompl.training.store import Store, load
+from apex_ompl.training.records import DatasetError
 paths = load(Path({str(tmp_path / "large.zip")!r}))
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))

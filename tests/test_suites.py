@@ -14,13 +14,13 @@ from apex_ompl import problems
 from apex_ompl.api import load_problem
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ApexError, ParameterError, UnknownNameError
+from apex_ompl.goals.alignment import AlignmentGoal
 from apex_ompl.problems import alignment, scenes
 from apex_ompl.problems.catalogue import SPLITS, ProblemId
 from apex_ompl.problems.frozen import digest
 from apex_ompl.robot import Robot
 from apex_ompl.scene.problem import Alignment, Problem
 from apex_ompl.scene.scripts import obstacle_at
-from apex_ompl.tasks.alignment import AlignmentGoal
 
 SUITE_LEVELS = [(suite, level) for suite, levels in problems.suites().items() for level in levels]
 EXTREME = ("shelf", "bins", "wall", "swap", "clutter")

@@ -11,11 +11,11 @@ import pytest
 
 from apex_ompl import api, cli, plan, planners, planning
 from apex_ompl.errors import ParameterError, TimingError
-from apex_ompl.ompl_adapter.setup import assemble
-from apex_ompl.ompl_adapter.validity import full_check
+from apex_ompl.ompl.setup import assemble
+from apex_ompl.ompl.validity import full_check
+from apex_ompl.paths.path import Path as JointPath
 from apex_ompl.result import PlanResult, PlanStatus
-from apex_ompl.trajectory import Timing, Trajectory, time_path
-from apex_ompl.trajopt.path import Path as JointPath
+from apex_ompl.timing import Timing, Trajectory, time_path
 from apex_ompl.util.deadline import Deadline
 
 

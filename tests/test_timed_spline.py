@@ -9,11 +9,11 @@ from hypothesis import strategies as st
 
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ParameterError
-from apex_ompl.live.movers import Movers, curve_of, prove_motion
-from apex_ompl.live.timed_spline import MotionOptimizer, MotionSettings, Start, TimedSpline, _grid
+from apex_ompl.moving.movers import Movers, curve_of, prove_motion
+from apex_ompl.moving.timed_spline import MotionOptimizer, MotionSettings, Start, TimedSpline, _grid
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import Obstacle
-from apex_ompl.trajectory import Trajectory
+from apex_ompl.timing import Trajectory
 
 
 @pytest.fixture(scope="module")

@@ -14,11 +14,11 @@ from timings import LIMITS, NAMES, RATE, keeps_limits, paths, timed
 from apex_ompl.errors import ParameterError, TimingError, UnknownNameError
 from apex_ompl.kernel.compiled.time_parameterization import max_path_speeds, sample_times
 from apex_ompl.robot import Limits
-from apex_ompl.trajectory import Timing, Trajectory, time_path
-from apex_ompl.trajectory.curve import Curve, Polyline
-from apex_ompl.trajectory.methods import DEFAULT_METHOD, METHODS
-from apex_ompl.trajectory.methods.ruckig import through_knots
-from apex_ompl.trajectory.methods.spline import blend
+from apex_ompl.timing import Timing, Trajectory, time_path
+from apex_ompl.timing.curve import Curve, Polyline
+from apex_ompl.timing.parameterization import DEFAULT_METHOD, METHODS
+from apex_ompl.timing.ruckig_method import through_knots
+from apex_ompl.timing.spline_method import blend
 
 
 @settings(max_examples=40)

@@ -9,15 +9,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from models import DOF, HANDS, POST, REFINED, WALL, kernel, keys, network, query, some_paths
 
-from apex_ompl.diffusion.compiled_sight import CompiledSight
-from apex_ompl.diffusion.obstacles import Obstacles
-from apex_ompl.diffusion.query import ObstacleSet, Probes
-from apex_ompl.diffusion.sight import REACH, Sight
-from apex_ompl.diffusion.sight_data import Augmentation, SightTable
-from apex_ompl.diffusion.torch_model import TorchModel
-from apex_ompl.diffusion.torch_sight import TorchSight
 from apex_ompl.kernel import Kernel
 from apex_ompl.kernel.point_distances import nearest_points
+from apex_ompl.model.query import ObstacleSet, Probes
+from apex_ompl.model.scene_encoding import REACH, Sight
+from apex_ompl.training.kernel_scene_encoding import CompiledSight
+from apex_ompl.training.obstacles import Obstacles
+from apex_ompl.training.scene_data import Augmentation, SightTable
+from apex_ompl.training.torch_model import TorchModel
+from apex_ompl.training.torch_scene_encoding import TorchSight
 from apex_ompl.types import Array
 
 CPU = torch.device("cpu")

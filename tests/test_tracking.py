@@ -12,9 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.live.movers import Movers, allowed_rows, clearance_in_time
 from apex_ompl.loop.observation import Observation
 from apex_ompl.loop.tracking import LEAST, MOST_DOUBTED, MOST_TRACKS, Track, Tracker, TrackSettings
+from apex_ompl.moving.movers import Movers, allowed_rows, clearance_in_time
 from apex_ompl.problems.suite_robot import robot as suite_robot
 from apex_ompl.scene.bodies import Obstacle
 

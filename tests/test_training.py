@@ -19,21 +19,20 @@ import yaml
 from support import DATA
 from trainings import CLEARANCES, HERE, SCRIPT, SMALL, VARIATIONAL, assert_same, config, query_from_path, weights
 
-from apex_ompl.datasets.kernel_problems import load_kernel_problems, save_kernel_problems
-from apex_ompl.datasets.records import Paths
-from apex_ompl.datasets.store import Store, load, save
-from apex_ompl.diffusion.checkpoint import load_torch_model
-from apex_ompl.diffusion.distributed import DistributedProcess
-from apex_ompl.diffusion.proposals import Sampling
-from apex_ompl.diffusion.runlog import read_log
-from apex_ompl.diffusion.torch_model import TorchModel
-from apex_ompl.diffusion.training import Trainer, TrainingError
-from apex_ompl.diffusion.validation import query_from_problem, success_rates
 from apex_ompl.errors import FileFormatError, MissingFileError
 from apex_ompl.kernel import Kernel, RobotTables
 from apex_ompl.kernel.scene_builder import scene_tables
-from apex_ompl.trajopt.candidates import first_valid
-from apex_ompl.trajopt.optimizer import Optimizer
+from apex_ompl.model.proposals import Sampling
+from apex_ompl.paths.candidates import first_valid
+from apex_ompl.paths.optimizer import Optimizer
+from apex_ompl.training.distributed import DistributedProcess
+from apex_ompl.training.kernel_problems import load_kernel_problems, save_kernel_problems
+from apex_ompl.training.records import Paths
+from apex_ompl.training.runlog import read_log
+from apex_ompl.training.store import Store, load, save
+from apex_ompl.training.torch_model import TorchModel, load_torch_model
+from apex_ompl.training.training import Trainer, TrainingError
+from apex_ompl.training.validation import query_from_problem, success_rates
 from apex_ompl.util.resolution import FINE_RESOLUTION
 from apex_ompl.util.threads import one_torch_thread
 

@@ -10,9 +10,9 @@ import yaml
 from support import ROOT
 from trainings import CLEARANCES, HERE, SMALL, config
 
-from apex_ompl.diffusion.config import TrainingConfig
-from apex_ompl.diffusion.training import Trainer
 from apex_ompl.errors import ApexError, FileFormatError, ParameterError
+from apex_ompl.training.config import TrainingConfig
+from apex_ompl.training.training import Trainer
 
 
 @pytest.mark.parametrize(

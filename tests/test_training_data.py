@@ -11,15 +11,15 @@ import yaml
 from support import DATA, ROOT
 from trainings import HERE, config, query_from_path
 
-from apex_ompl.datasets.records import Paths
-from apex_ompl.datasets.store import Store, save
-from apex_ompl.diffusion.data import is_held_out, shard_paths, split
-from apex_ompl.diffusion.mirror import Mirror
-from apex_ompl.diffusion.training import Trainer
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel import Kernel, RobotTables
 from apex_ompl.kernel.compiled.arrays import BOX
 from apex_ompl.kernel.scene_builder import Primitive, scene_tables
+from apex_ompl.training.data import is_held_out, shard_paths, split
+from apex_ompl.training.mirror import Mirror
+from apex_ompl.training.records import Paths
+from apex_ompl.training.store import Store, save
+from apex_ompl.training.training import Trainer
 
 
 def test_mirror_images_are_valid_where_paths_are(paths: Paths) -> None:

@@ -12,8 +12,8 @@ from scipy.interpolate import CubicSpline
 
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError
 from apex_ompl.robot import Limits
-from apex_ompl.trajectory import Trajectory
-from apex_ompl.trajectory.trajectory import concatenate
+from apex_ompl.timing import Trajectory
+from apex_ompl.timing.trajectory import concatenate
 
 NAMES = ("one", "two", "three")
 LIMITS = Limits(*(np.full(3, v) for v in (-2.0, 3.0, 1.5, 4.0, 30.0)))

@@ -14,8 +14,8 @@ import pytest
 from support import ROOT
 
 from apex_ompl import planners
-from apex_ompl.benchmark import Results, Row
-from apex_ompl.benchmark.rows import Job
+from apex_ompl.evaluation import Results, Row
+from apex_ompl.evaluation.rows import Job
 
 RESULTS = [
     json.loads((ROOT / "benchmarks" / "results" / f"{name}.json").read_text()) for name in ("tune", "tune_baselines")

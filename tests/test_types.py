@@ -10,15 +10,15 @@ from pathlib import Path
 import pytest
 from support import ROOT
 
-from apex_ompl.session.one_plan import PlanKeywords, PlanOptions, ProblemKeywords
+from apex_ompl.planning.one_plan import PlanKeywords, PlanOptions, ProblemKeywords
 
-SOURCES = ("api.py", "loop/run.py", "session/one_plan.py", "session/planner.py")
+SOURCES = ("api.py", "loop/run.py", "planning/one_plan.py", "planning/planner.py")
 RECORDS = ("scene/bodies.py", "scene/problem.py", "util/record_type.py", "util/schema.py")
 USE = """
 from apex_ompl.api import plan
 from apex_ompl.loop.run import run
 from apex_ompl.scene.problem import PoseTarget, Problem
-from apex_ompl.session.planner import MotionPlanner
+from apex_ompl.planning.planner import MotionPlanner
 
 def use(planner: MotionPlanner, problem: Problem) -> None:
     planner.plan([0.0], [1.0], timeout=3.0, timing=False, group="left_arm", leave_contact=0.001)

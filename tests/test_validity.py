@@ -14,12 +14,12 @@ from support import states_around_home
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.discretization import bit_reversed, sample_path, states_between
 from apex_ompl.errors import ParameterError
-from apex_ompl.ompl_adapter.setup import assemble
-from apex_ompl.ompl_adapter.space import array_to_path, path_to_array, state_space, to_array, to_state
-from apex_ompl.ompl_adapter.validity import MotionCheck, StateValidityChecker, full_check
+from apex_ompl.ompl.setup import assemble
+from apex_ompl.ompl.space import array_to_path, path_to_array, state_space, to_array, to_state
+from apex_ompl.ompl.validity import MotionCheck, StateValidityChecker, full_check
+from apex_ompl.paths.path import path_length
 from apex_ompl.robot import Robot
 from apex_ompl.scene.problem import Problem
-from apex_ompl.trajopt.path import path_length
 
 
 @pytest.mark.parametrize("n", [0, 1, 2, 3, 5, 8, 13, 100, 257])

@@ -16,20 +16,20 @@ from apex_ompl import load_problem, plan
 from apex_ompl.cli import main
 from apex_ompl.collision.tabulate import joint_tree
 from apex_ompl.errors import MissingFileError, ParameterError, RobotError
-from apex_ompl.ompl_adapter.setup import assemble
+from apex_ompl.ompl.setup import assemble
 from apex_ompl.result import PlanResult
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Problem
 from apex_ompl.viz.appearance import items_of
-from apex_ompl.viz.browser.live_page import LivePage
-from apex_ompl.viz.browser.nodes import RobotNodes, pose_of
-from apex_ompl.viz.browser.page import write_page
-from apex_ompl.viz.browser.scene import _cover_of
-from apex_ompl.viz.browser.server import HOST, free_port
-from apex_ompl.viz.browser.shown import Shown, markdown
 from apex_ompl.viz.sources import saved_in
 from apex_ompl.viz.view import view
+from apex_ompl.viz.viewer.live_page import LivePage
+from apex_ompl.viz.viewer.nodes import RobotNodes, pose_of
+from apex_ompl.viz.viewer.page import write_page
+from apex_ompl.viz.viewer.scene import _cover_of
+from apex_ompl.viz.viewer.server import HOST, free_port
+from apex_ompl.viz.viewer.shown import Shown, markdown
 
 RED = (0xE0, 0x10, 0x1B)  # of contacts
 LARGEST = 6e6  # of a page [bytes]

@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 from loops import BLOCKED, FAR, PROBLEM, line_from, ready_of
 
-from apex_ompl.live.movers import Movers
-from apex_ompl.live.timed_spline import Start
-from apex_ompl.loop import evasion
-from apex_ompl.loop.charges import Charges
-from apex_ompl.loop.following import Following
-from apex_ompl.loop.portfolio import Portfolio
-from apex_ompl.loop.ready import Ready
-from apex_ompl.loop.request import Request
-from apex_ompl.loop.search import Search
-from apex_ompl.loop.sprint import CHARGE, Sprint
-from apex_ompl.loop.waiting import wait_nearer
+from apex_ompl.loop.replan import evasion
+from apex_ompl.loop.replan.portfolio import Portfolio
+from apex_ompl.loop.replan.sprint import CHARGE, Sprint
+from apex_ompl.loop.replan.waiting import wait_nearer
+from apex_ompl.moving.charges import Charges
+from apex_ompl.moving.following import Following
+from apex_ompl.moving.movers import Movers
+from apex_ompl.moving.ready import Ready
+from apex_ompl.moving.request import Request
+from apex_ompl.moving.search import Search
+from apex_ompl.moving.timed_spline import Start
 from apex_ompl.scene.bodies import Obstacle
 
 

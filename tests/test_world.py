@@ -12,8 +12,8 @@ from support import CUBE_OBJ, states_around_home
 from apex_ompl import MotionPlanner
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ApexError, FileFormatError, MissingFileError, SceneError, UnknownNameError
+from apex_ompl.planning.world import World
 from apex_ompl.robot import Robot
-from apex_ompl.session.world import World
 
 SHAPES = (
     {"box": (0.1, 0.15, 0.2)}, {"sphere": {"radius": 0.08}}, {"cylinder": {"radius": 0.05, "length": 0.3}},

@@ -22,7 +22,7 @@ from apex_ompl.problems.worlds import World
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Problem
 from apex_ompl.scene.scripts import is_there, obstacle_at, place_at
-from apex_ompl.trajectory import Timing, Trajectory, time_path
+from apex_ompl.timing import Timing, Trajectory, time_path
 from apex_ompl.types import Array
 
 STEP, BEGIN = 0.01, 0.25  # of the clock, and when the first motion begins [s]

@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import strategies as st
 
 from apex_ompl.robot import Limits
-from apex_ompl.trajectory import TimedPath, Timing, Trajectory, time_path
+from apex_ompl.timing import TimedPath, Timing, Trajectory, time_path
 
 NAMES = ("one", "two", "three")
 LIMITS = Limits(

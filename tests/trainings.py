@@ -8,11 +8,11 @@ from typing import Any
 import torch
 from support import DATA, ROOT
 
-from apex_ompl.datasets.records import Paths
-from apex_ompl.diffusion.config import TrainingConfig
-from apex_ompl.diffusion.distributed import DistributedProcess
-from apex_ompl.diffusion.query import ObstacleSet, Query
-from apex_ompl.diffusion.training import Trainer
+from apex_ompl.model.query import ObstacleSet, Query
+from apex_ompl.training.config import TrainingConfig
+from apex_ompl.training.distributed import DistributedProcess
+from apex_ompl.training.records import Paths
+from apex_ompl.training.training import Trainer
 
 SCRIPT = ROOT / "scripts" / "train.py"
 HERE = DistributedProcess(0, 1, torch.device("cpu"))

@@ -10,7 +10,7 @@ from ompl import base as ob
 from apex_ompl.apex.context import SolveContext
 from apex_ompl.apex.path_validator import PathValidator
 from apex_ompl.apex.trees import compiled_trees, grow, ompl_trees
-from apex_ompl.ompl_adapter.space import path_to_array
+from apex_ompl.ompl.space import path_to_array
 from apex_ompl.types import Array
 
 Stop = Callable[[], bool]

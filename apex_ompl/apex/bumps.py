@@ -7,12 +7,12 @@ from contextlib import AbstractContextManager, nullcontext
 
 import numpy as np
 
-from apex_ompl.diffusion.proposals import Proposals, Sampling
-from apex_ompl.diffusion.query import Query
-from apex_ompl.diffusion.sampler import Callback
-from apex_ompl.diffusion.schedule import NoiseSchedule
 from apex_ompl.kernel import Kernel
-from apex_ompl.trajopt.optimizer import Optimizer
+from apex_ompl.model.proposals import Proposals, Sampling
+from apex_ompl.model.query import Query
+from apex_ompl.model.sampler import Callback
+from apex_ompl.model.schedule import NoiseSchedule
+from apex_ompl.paths.optimizer import Optimizer
 from apex_ompl.types import Array
 
 SIZE = 0.6  # how far bumps stray [rad]

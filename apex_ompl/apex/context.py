@@ -11,11 +11,11 @@ from ompl import base as ob
 
 from apex_ompl.apex.path_validator import PathValidator
 from apex_ompl.apex.query import make_query, rough_kernel
-from apex_ompl.ompl_adapter.report import SolveReport
-from apex_ompl.ompl_adapter.space import array_to_path
-from apex_ompl.trajopt.candidates import Candidate, CandidatePool
-from apex_ompl.trajopt.optimizer import Optimizer
-from apex_ompl.trajopt.path import Path
+from apex_ompl.ompl.report import SolveReport
+from apex_ompl.ompl.space import array_to_path
+from apex_ompl.paths.candidates import Candidate, CandidatePool
+from apex_ompl.paths.optimizer import Optimizer
+from apex_ompl.paths.path import Path
 from apex_ompl.types import Array
 
 if TYPE_CHECKING:
@@ -23,9 +23,9 @@ if TYPE_CHECKING:
 
     from apex_ompl.apex.sampler import ProposalSampler
     from apex_ompl.apex.trees import OmplTrees
-    from apex_ompl.diffusion.query import Query
     from apex_ompl.kernel.search_buffers import SearchCounts
     from apex_ompl.kernel.trees import TreePair
+    from apex_ompl.model.query import Query
 
 MIN_GAIN = 1e-3  # least decrease of length that counts as an improvement [rad]
 CLEARANCE_SPACING = 0.1  # of a path's states whose distance from obstacles is compared [rad, max-norm]

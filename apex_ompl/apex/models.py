@@ -5,9 +5,9 @@ from __future__ import annotations
 from functools import cache
 
 from apex_ompl.apex.bumps import BumpModel
-from apex_ompl.diffusion.checkpoint import SHIPPED, read_config, shared_model
-from apex_ompl.diffusion.proposals import TrajectoryModel
 from apex_ompl.errors import MissingFileError
+from apex_ompl.model.checkpoint import SHIPPED, read_config, shared_model
+from apex_ompl.model.proposals import TrajectoryModel
 
 DEFAULT = "apex"  # checkpoint that ships
 AUTO, NONE = "auto", "none"  # names in the place of a checkpoint's

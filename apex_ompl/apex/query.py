@@ -6,9 +6,9 @@ import numpy as np
 
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.checker import NO_POINT
-from apex_ompl.diffusion.primitive_fit import scene_of_primitives
-from apex_ompl.diffusion.query import Query
 from apex_ompl.kernel import Kernel
+from apex_ompl.model.primitive_fit import scene_of_primitives
+from apex_ompl.model.query import Query
 from apex_ompl.types import Array
 
 

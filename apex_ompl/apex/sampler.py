@@ -8,12 +8,12 @@ from dataclasses import replace
 import numpy as np
 
 from apex_ompl.apex.models import Model
-from apex_ompl.diffusion.geometry import Numbers
-from apex_ompl.diffusion.proposals import Proposals, Sampling
-from apex_ompl.diffusion.query import Query
-from apex_ompl.diffusion.schedule import Estimate
 from apex_ompl.kernel import Kernel
-from apex_ompl.ompl_adapter.report import SolveReport
+from apex_ompl.model.geometry import Numbers
+from apex_ompl.model.proposals import Proposals, Sampling
+from apex_ompl.model.query import Query
+from apex_ompl.model.schedule import Estimate
+from apex_ompl.ompl.report import SolveReport
 from apex_ompl.types import Array
 
 Stop = Callable[[], bool]

@@ -11,7 +11,7 @@ from ompl import base as ob
 from apex_ompl.apex.context import SolveContext
 from apex_ompl.apex.stages import Anytime, Shorten, Stage
 from apex_ompl.apex.start_goal import nearest_pairs, read_goals, read_starts
-from apex_ompl.ompl_adapter.space import array_to_path
+from apex_ompl.ompl.space import array_to_path
 from apex_ompl.types import Array
 
 LOG = logging.getLogger("apex_ompl")

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from ompl import base as ob
 
-from apex_ompl.ompl_adapter.space import await_goal, to_array
+from apex_ompl.ompl.space import await_goal, to_array
 from apex_ompl.types import Array
 
 MAX_GOALS, GOAL_ATTEMPTS = 8, 32  # goals that are read of a region, and samples that are drawn for them

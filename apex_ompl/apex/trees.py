@@ -15,7 +15,7 @@ from ompl import geometric as og
 
 from apex_ompl.apex.context import SolveContext
 from apex_ompl.kernel.trees import TreePair
-from apex_ompl.ompl_adapter.space import to_state
+from apex_ompl.ompl.space import to_state
 from apex_ompl.types import Array
 from apex_ompl.util.resolution import SEARCH_RESOLUTION
 

@@ -10,7 +10,7 @@ from apex_ompl.cli.options import import_extra
 
 def bench(parsed: argparse.Namespace) -> int:
     """Run a benchmark."""
-    benchmark = import_extra("apex_ompl.benchmark", "benchmarks", "bench")
+    benchmark = import_extra("apex_ompl.evaluation", "benchmarks", "bench")
     import_extra("scipy", "benchmarks", "bench")  # needed after the runs only; missing packages are reported before
     results = benchmark.bench(
         parsed.suites, _split_planners(parsed.planners), parsed.out, runs=parsed.runs, timeout=parsed.timeout,
@@ -26,7 +26,7 @@ def bench(parsed: argparse.Namespace) -> int:
 
 def report(parsed: argparse.Namespace) -> int:
     """Write the report of a benchmark."""
-    for file in import_extra("apex_ompl.benchmark", "benchmarks", "bench").report(parsed.results, parsed.out):
+    for file in import_extra("apex_ompl.evaluation", "benchmarks", "bench").report(parsed.results, parsed.out):
         print(file)
     return 0
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from apex_ompl.api import load_problem
-from apex_ompl.ompl_adapter.setup import assemble
+from apex_ompl.ompl.setup import assemble
 
 
 def run(parsed: argparse.Namespace) -> int:

@@ -9,7 +9,7 @@ from pathlib import Path
 from apex_ompl.cli.options import name_value_pairs
 from apex_ompl.errors import ParameterError
 from apex_ompl.robot import load_robot
-from apex_ompl.tasks.moveit import convert
+from apex_ompl.robot.moveit import convert
 
 
 def run(parsed: argparse.Namespace) -> int:

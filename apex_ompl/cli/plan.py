@@ -13,8 +13,8 @@ from apex_ompl.cli.options import LIMITS, name_value_pairs, numbers_by_name
 from apex_ompl.errors import ParameterError
 from apex_ompl.result import SUFFIXES, PlanResult, PlanStatus
 from apex_ompl.robot import load_robot
-from apex_ompl.trajectory import Timing
-from apex_ompl.trajectory.files import MESSAGES
+from apex_ompl.timing import Timing
+from apex_ompl.timing.files import MESSAGES
 from apex_ompl.util.files import check_writable, suffix_of
 from apex_ompl.util.schema import read_yaml
 

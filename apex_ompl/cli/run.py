@@ -9,7 +9,7 @@ from apex_ompl.loop.result import INTERRUPTED, SUFFIXES, Outcome
 from apex_ompl.loop.run import load_world
 from apex_ompl.loop.run import run as run_loop
 from apex_ompl.loop.sensor import Sensor
-from apex_ompl.loop.settings import LoopSettings
+from apex_ompl.moving.settings import LoopSettings
 from apex_ompl.util.files import check_writable, suffix_of
 
 

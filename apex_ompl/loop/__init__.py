@@ -10,15 +10,13 @@ if TYPE_CHECKING:
     from apex_ompl.loop.observation import Observation
     from apex_ompl.loop.result import Event, Outcome, RunResult
     from apex_ompl.loop.sensor import Sensor, SensorStream
-    from apex_ompl.loop.settings import LoopSettings
 
-__all__ = ["Event", "LoopSettings", "Observation", "Outcome", "RunResult", "Sensor", "SensorStream"]
+__all__ = ["Event", "Observation", "Outcome", "RunResult", "Sensor", "SensorStream"]
 
 __getattr__, __dir__ = lazy_names(
     __name__,
     {
         "Event": "result",
-        "LoopSettings": "settings",
         "Observation": "observation",
         "Outcome": "result",
         "RunResult": "result",

@@ -9,20 +9,20 @@ from typing import Protocol
 
 import numpy as np
 
-from apex_ompl.live.movers import Movers
 from apex_ompl.loop.executor import Executor
-from apex_ompl.loop.following import SAME_TIME, Following, executed
 from apex_ompl.loop.late_steps import Decided, undo
 from apex_ompl.loop.observation import Observation
-from apex_ompl.loop.ready import Ready
 from apex_ompl.loop.replanning import Replanning
 from apex_ompl.loop.result import INTERRUPTED, Event
 from apex_ompl.loop.sensor import CUT
 from apex_ompl.loop.tracking import Tracker, TrackSettings, as_they_are
+from apex_ompl.moving.following import SAME_TIME, Following, executed
+from apex_ompl.moving.movers import Movers
+from apex_ompl.moving.ready import Ready
 from apex_ompl.problems.worlds import World
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.scripts import obstacle_at, vector
-from apex_ompl.trajectory import Trajectory
+from apex_ompl.timing import Trajectory
 
 LONGEST_STOP = 5.0  # behind which a run ends that does not come to rest when the time is up [s]
 

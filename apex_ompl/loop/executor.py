@@ -18,16 +18,16 @@ from typing import Any
 
 import numpy as np
 
-from apex_ompl.live.movers import Movers, clearance_in_time
-from apex_ompl.loop.evasion import GAIN, SOON, URGENT, endangered
-from apex_ompl.loop.fitting import misfit
-from apex_ompl.loop.following import SAME_TIME, Following
-from apex_ompl.loop.ready import Ready
+from apex_ompl.loop.replan.evasion import GAIN, SOON, URGENT, endangered
 from apex_ompl.loop.replanning import Replanning
-from apex_ompl.loop.request import Request
 from apex_ompl.loop.result import BRAKING, GOING, STANDING, Event
-from apex_ompl.loop.search import EARLIER
 from apex_ompl.loop.tracking import Tracker
+from apex_ompl.moving.fitting import misfit
+from apex_ompl.moving.following import SAME_TIME, Following
+from apex_ompl.moving.movers import Movers, clearance_in_time
+from apex_ompl.moving.ready import Ready
+from apex_ompl.moving.request import Request
+from apex_ompl.moving.search import EARLIER
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.types import Array
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from apex_ompl.loop.executor import Executor
-from apex_ompl.loop.following import Following
+from apex_ompl.moving.following import Following
 
 DECISIONS = (
     "route", "leaving", "aside", "sets_out", "nearest", "ending", "conflict", "contact", "endangered", "ahead", "doing",

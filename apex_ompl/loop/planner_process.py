@@ -16,10 +16,10 @@ from multiprocessing.connection import Connection
 from typing import Any, Self
 
 from apex_ompl.errors import PlannerProcessError
-from apex_ompl.loop.charges import Charges
 from apex_ompl.loop.replanning import Reply
-from apex_ompl.loop.request import Replanner, Request
-from apex_ompl.loop.settings import LoopSettings
+from apex_ompl.moving.charges import Charges
+from apex_ompl.moving.request import Replanner, Request
+from apex_ompl.moving.settings import LoopSettings
 from apex_ompl.robot.model import Limits
 from apex_ompl.scene.problem import Problem
 from apex_ompl.util.interpreter import this_python

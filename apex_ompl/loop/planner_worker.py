@@ -10,11 +10,11 @@ from typing import Any
 
 from apex_ompl.errors import ApexError
 from apex_ompl.loop.planner_process import WallTime, Work
-from apex_ompl.loop.ready import Ready
 from apex_ompl.loop.rehearsal import rehearse
 from apex_ompl.loop.replanning import SHARE, answered
-from apex_ompl.ompl_adapter.process import quiet_ompl, seed_ompl
-from apex_ompl.ompl_adapter.setup import assemble
+from apex_ompl.moving.ready import Ready
+from apex_ompl.ompl.process import quiet_ompl, seed_ompl
+from apex_ompl.ompl.setup import assemble
 from apex_ompl.util.threads import one_torch_thread
 
 

@@ -14,17 +14,17 @@ from dataclasses import replace
 import numpy as np
 
 from apex_ompl.loop.cycle import Eyes, Loop, RunRecord
-from apex_ompl.loop.following import Following
 from apex_ompl.loop.late_steps import Decided, undo
 from apex_ompl.loop.observation import Observation
 from apex_ompl.loop.planner_process import PlannerProcess
-from apex_ompl.loop.ready import Ready
-from apex_ompl.loop.request import Request
 from apex_ompl.loop.tracking import Tracker
+from apex_ompl.moving.following import Following
+from apex_ompl.moving.ready import Ready
+from apex_ompl.moving.request import Request
 from apex_ompl.problems.worlds import World
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.scripts import standing
-from apex_ompl.trajectory import time_path
+from apex_ompl.timing import time_path
 from apex_ompl.util.cores import usable_cores
 from apex_ompl.util.exiting import running
 

@@ -17,19 +17,19 @@ from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.path_proof import Curve
 from apex_ompl.collision.scene_bodies import SceneBodies
 from apex_ompl.errors import ParameterError
-from apex_ompl.live.movers import clearance_in_time, prove_motion
-from apex_ompl.live.scripted import Piece, ScriptedMovers
+from apex_ompl.goals.alignment_errors import within
 from apex_ompl.loop.result import Outcome
-from apex_ompl.ompl_adapter.setup import workspace_goal
+from apex_ompl.moving.movers import clearance_in_time, prove_motion
+from apex_ompl.moving.scripted import Piece, ScriptedMovers
+from apex_ompl.ompl.setup import workspace_goal
 from apex_ompl.robot import Robot
 from apex_ompl.robot.model import Limits
 from apex_ompl.scene.bodies import Obstacle, pose_matrix
 from apex_ompl.scene.problem import Problem
 from apex_ompl.scene.scripts import place_at
-from apex_ompl.tasks.alignment_errors import within
-from apex_ompl.trajectory import Trajectory
-from apex_ompl.trajectory.checks import SAME_STATE
-from apex_ompl.trajectory.rests import AT_REST, is_at_rest
+from apex_ompl.timing import Trajectory
+from apex_ompl.timing.checks import SAME_STATE
+from apex_ompl.timing.rests import AT_REST, is_at_rest
 from apex_ompl.types import Array
 from apex_ompl.util.validation import check_number, check_states
 

@@ -6,14 +6,14 @@ import math
 
 import numpy as np
 
-from apex_ompl.live.movers import Movers
-from apex_ompl.loop.charges import Charges
-from apex_ompl.loop.following import Following
-from apex_ompl.loop.ready import Ready
 from apex_ompl.loop.replanning import answered
-from apex_ompl.loop.request import Replanner, Request
+from apex_ompl.moving.charges import Charges
+from apex_ompl.moving.following import Following
+from apex_ompl.moving.movers import Movers
+from apex_ompl.moving.ready import Ready
+from apex_ompl.moving.request import Replanner, Request
 from apex_ompl.scene.bodies import Obstacle, Sphere
-from apex_ompl.trajectory import time_path
+from apex_ompl.timing import time_path
 
 RADIUS, VELOCITY = 0.06, (0.02, 0.0, 0.0)  # of the obstacle in the way [m, m/s]
 LONG = 1.0  # that a rehearsed replan may take by the table of costs [s]

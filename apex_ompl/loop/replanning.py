@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from apex_ompl.loop.charges import Charges
-from apex_ompl.loop.following import Following
-from apex_ompl.loop.ready import Ready
-from apex_ompl.loop.request import Answer, Replanner, Request
+from apex_ompl.moving.charges import Charges
+from apex_ompl.moving.following import Following
+from apex_ompl.moving.ready import Ready
+from apex_ompl.moving.request import Answer, Replanner, Request
 
 SHARE = 0.85  # of the budget after which nothing new is begun
 NOTICED = 0.003  # time after which a replan that another one has overtaken ends [s]

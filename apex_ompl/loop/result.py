@@ -14,9 +14,9 @@ import numpy as np
 
 from apex_ompl.errors import FileFormatError, ParameterError
 from apex_ompl.scene.problem import Problem
-from apex_ompl.trajectory import Trajectory
-from apex_ompl.trajectory.checks import START_TOLERANCE
-from apex_ompl.trajectory.files import KNOTS
+from apex_ompl.timing import Trajectory
+from apex_ompl.timing.checks import START_TOLERANCE
+from apex_ompl.timing.files import KNOTS
 from apex_ompl.types import Array
 from apex_ompl.util.archives import pack_archive, read_archive
 from apex_ompl.util.display import Summary, fields_line, one_line

@@ -11,20 +11,20 @@ import numpy as np
 
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ParameterError
-from apex_ompl.loop.charges import cost_table
 from apex_ompl.loop.cycle import RunRecord
-from apex_ompl.loop.methods import adapted, method, replanner_of
 from apex_ompl.loop.metrics import run_metrics
 from apex_ompl.loop.planner_process import PlannerProcess, Work
-from apex_ompl.loop.ready import Ready
 from apex_ompl.loop.real_time import cores, run_in_real_time
 from apex_ompl.loop.referee import judge
+from apex_ompl.loop.replan.methods import adapted, method, replanner_of
 from apex_ompl.loop.result import Event, Outcome, RunResult
 from apex_ompl.loop.sensor import Sensor, SensorStream
-from apex_ompl.loop.settings import LoopSettings
 from apex_ompl.loop.simulation import simulate
-from apex_ompl.ompl_adapter.process import quiet_ompl, seed_ompl
-from apex_ompl.ompl_adapter.setup import assemble
+from apex_ompl.moving.charges import cost_table
+from apex_ompl.moving.ready import Ready
+from apex_ompl.moving.settings import LoopSettings
+from apex_ompl.ompl.process import quiet_ompl, seed_ompl
+from apex_ompl.ompl.setup import assemble
 from apex_ompl.problems import worlds
 from apex_ompl.problems.world_scripts import moving_world
 from apex_ompl.problems.worlds import World
@@ -32,7 +32,7 @@ from apex_ompl.robot.identity import digest
 from apex_ompl.robot.model import Limits
 from apex_ompl.scene.problem import Problem
 from apex_ompl.scene.scripts import obstacle_at
-from apex_ompl.trajectory import Timing, Trajectory
+from apex_ompl.timing import Timing, Trajectory
 from apex_ompl.util.files import path_text
 from apex_ompl.util.validation import check_name, check_seed
 
@@ -53,10 +53,10 @@ def run(
     Args:
         problem: A world, its name (:func:`apex_ompl.problems.worlds.load`), a problem among whose obstacles some move,
             its name, or its file.
-        planner: Name of a way of replanning, see :func:`apex_ompl.loop.methods.names`.
+        planner: Name of a way of replanning, see :func:`apex_ompl.loop.replan.methods.names`.
         clock: ``sim``, on which work is charged by counts, so that the same seed gives the same run; or ``real``, the
             clock on the wall, with the planner in a process of its own.
-        prediction: ``still``, ``cv`` or ``truth``, see :class:`apex_ompl.loop.settings.LoopSettings`.
+        prediction: ``still``, ``cv`` or ``truth``, see :class:`apex_ompl.moving.settings.LoopSettings`.
         seed: Of random choices, and of the sensor where none is given.
         speed: Share of the velocity limits that motions use, 0.001 to 1.
         settings: Parameters of the loop; ``prediction`` counts instead of theirs. Their largest error and speed are by

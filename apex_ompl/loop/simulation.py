@@ -6,9 +6,9 @@ from itertools import count
 
 from apex_ompl.loop.cycle import Eyes, Loop, RunRecord
 from apex_ompl.loop.late_steps import Decided
-from apex_ompl.loop.ready import Ready
 from apex_ompl.loop.replanning import AtOnce
-from apex_ompl.loop.request import Replanner
+from apex_ompl.moving.ready import Ready
+from apex_ompl.moving.request import Replanner
 from apex_ompl.problems.worlds import World
 from apex_ompl.util.exiting import running
 

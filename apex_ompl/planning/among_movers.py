@@ -1,8 +1,8 @@
 """Plans among obstacles that move at constant velocity: motions in time, proved in time.
 
 1. A path among what stands still is found and timed as ever; where its motion meets no mover, that is the plan.
-2. Else the motion along the path is retimed: it waits, slows down or hurries (:mod:`apex_ompl.live.retime`).
-3. Motions are optimised in space and time from several paths and durations (:mod:`apex_ompl.live.timed_spline`).
+2. Else the motion along the path is retimed: it waits, slows down or hurries (:mod:`apex_ompl.moving.retime`).
+3. Motions are optimised in space and time from several paths and durations (:mod:`apex_ompl.moving.timed_spline`).
 4. Where all that fails, paths are planned around what the movers sweep.
 
 The motion that arrives first is taken.
@@ -20,11 +20,12 @@ import numpy as np
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.path_proof import PathProof
 from apex_ompl.kernel import Kernel
-from apex_ompl.live.retime import retime
-from apex_ompl.live.timed_proof import TimedProver
-from apex_ompl.live.timed_spline import MotionOptimizer, Start, TimedSpline
-from apex_ompl.ompl_adapter.setup import assemble
-from apex_ompl.ompl_adapter.validity import full_check
+from apex_ompl.moving.retime import retime
+from apex_ompl.moving.timed_proof import TimedProver
+from apex_ompl.moving.timed_spline import MotionOptimizer, Start, TimedSpline
+from apex_ompl.ompl.setup import assemble
+from apex_ompl.ompl.validity import full_check
+from apex_ompl.paths.path import Path
 from apex_ompl.planning.motion_guesses import guesses
 from apex_ompl.planning.run import PlanRun
 from apex_ompl.planning.solving import find_path, query_fault
@@ -33,8 +34,7 @@ from apex_ompl.result import PlanResult, PlanStatus
 from apex_ompl.robot.model import Limits
 from apex_ompl.scene.bodies import Obstacle, Sphere
 from apex_ompl.scene.scripts import obstacle_at
-from apex_ompl.trajectory import Timing, Trajectory, time_path
-from apex_ompl.trajopt.path import Path
+from apex_ompl.timing import Timing, Trajectory, time_path
 from apex_ompl.util.deadline import Deadline
 from apex_ompl.util.stopwatch import timed
 

@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.ompl_adapter.setup import PlanningSetup, state_fault
+from apex_ompl.ompl.setup import PlanningSetup, state_fault
+from apex_ompl.paths.path import Path
 from apex_ompl.result import PlanResult
-from apex_ompl.trajectory import Timing, time_path
-from apex_ompl.trajectory.trajectory import concatenate
-from apex_ompl.trajopt.path import Path
+from apex_ompl.timing import Timing, time_path
+from apex_ompl.timing.trajectory import concatenate
 from apex_ompl.types import Array
 
 LARGEST_DEPTH = 1e-3  # of contacts that the refusal of a start names ``leave_contact`` for [m]

@@ -7,10 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from apex_ompl.paths.optimizer import Optimizer
 from apex_ompl.planning.run import PlanRun
 from apex_ompl.robot.model import Limits
-from apex_ompl.trajectory import Trajectory
-from apex_ompl.trajopt.optimizer import Optimizer
+from apex_ompl.timing import Trajectory
 from apex_ompl.types import Array
 
 GOALS = 2  # nearest goals of which there are several

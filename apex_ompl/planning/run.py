@@ -6,12 +6,12 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 from apex_ompl.collision.path_proof import PathProof
-from apex_ompl.ompl_adapter.interrupt import Interrupt
-from apex_ompl.ompl_adapter.report import SolveReport
-from apex_ompl.ompl_adapter.setup import PlanningSetup
+from apex_ompl.ompl.interrupt import Interrupt
+from apex_ompl.ompl.report import SolveReport
+from apex_ompl.ompl.setup import PlanningSetup
+from apex_ompl.paths.path import Path
 from apex_ompl.result import PlanResult, PlanStatus
 from apex_ompl.robot.identity import digest
-from apex_ompl.trajopt.path import Path
 from apex_ompl.types import Array
 from apex_ompl.util.deadline import Deadline
 

@@ -9,17 +9,17 @@ import numpy as np
 from ompl import base as ob
 
 from apex_ompl.errors import ApexError
-from apex_ompl.ompl_adapter.interrupt import MAX_TIME, ends_after
-from apex_ompl.ompl_adapter.repair import repair
-from apex_ompl.ompl_adapter.report import LineAwarePlanner, report_of
-from apex_ompl.ompl_adapter.setup import PlanningSetup, set_goals
-from apex_ompl.ompl_adapter.simplify import simplify as shorten
-from apex_ompl.ompl_adapter.space import path_to_array
-from apex_ompl.ompl_adapter.validity import full_check, motions_until
+from apex_ompl.ompl.interrupt import MAX_TIME, ends_after
+from apex_ompl.ompl.repair import repair
+from apex_ompl.ompl.report import LineAwarePlanner, report_of
+from apex_ompl.ompl.setup import PlanningSetup, set_goals
+from apex_ompl.ompl.simplify import simplify as shorten
+from apex_ompl.ompl.space import path_to_array
+from apex_ompl.ompl.validity import full_check, motions_until
+from apex_ompl.paths.path import Path
 from apex_ompl.planning.departure import remedy
 from apex_ompl.planning.run import PlanRun
 from apex_ompl.result import FIRST, INSIDE, PlanResult, PlanStatus
-from apex_ompl.trajopt.path import Path
 from apex_ompl.util.forking import unforked
 from apex_ompl.util.stopwatch import timed
 

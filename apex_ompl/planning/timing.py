@@ -7,11 +7,11 @@ from dataclasses import replace
 from math import nan
 
 from apex_ompl.errors import TimingError, TimingStoppedError
-from apex_ompl.ompl_adapter.validity import FullCheck, full_check
+from apex_ompl.ompl.validity import FullCheck, full_check
 from apex_ompl.planning.run import PlanRun
 from apex_ompl.result import PlanResult, PlanStatus
-from apex_ompl.trajectory import Timing, Trajectory, time_path
-from apex_ompl.trajectory.trajectory import ROUNDING
+from apex_ompl.timing import Timing, Trajectory, time_path
+from apex_ompl.timing.trajectory import ROUNDING
 from apex_ompl.util.stopwatch import timed
 
 NOT_TIMED = "a path was found but not timed in time"

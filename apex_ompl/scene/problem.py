@@ -70,7 +70,7 @@ ALIGNMENT_DEFAULTS: dict[str, tuple[float, Tolerance]] = {
 
 
 class Alignment(StrictModel):
-    """An alignment of two contact faces (section III-A of the paper), defined in ``apex_ompl.tasks.alignment``.
+    """An alignment of two contact faces (section III-A of the paper), defined in ``apex_ompl.goals.alignment``.
 
     Attributes:
         kind: ``vertical`` (stacking), ``horizontal`` (insertion), ``pour`` or ``handover``.

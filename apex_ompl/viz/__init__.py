@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 from apex_ompl.util.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from apex_ompl.viz.browser.run import ShownRun
+    from apex_ompl.viz.viewer.run import ShownRun
 
 __all__ = ["ShownRun"]
 
-__getattr__, __dir__ = lazy_names(__name__, {"ShownRun": "browser.run"})
+__getattr__, __dir__ = lazy_names(__name__, {"ShownRun": "viewer.run"})

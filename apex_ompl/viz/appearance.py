@@ -17,7 +17,7 @@ import trimesh
 from apex_ompl.collision.clouds import cloud_of
 from apex_ompl.collision.shapes import coal_geometry, is_shell
 from apex_ompl.collision.solids import Solid, world_boxes
-from apex_ompl.ompl_adapter.setup import PlanningSetup
+from apex_ompl.ompl.setup import PlanningSetup
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import Body
 from apex_ompl.scene.meshes import triangles

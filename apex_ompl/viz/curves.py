@@ -10,7 +10,7 @@ from apex_ompl.collision import CollisionChecker
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.scripts import is_there, obstacle_at
-from apex_ompl.trajectory import Trajectory
+from apex_ompl.timing import Trajectory
 from apex_ompl.types import Array
 
 ORDERS = ("position", "velocity", "acceleration", "jerk")

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from apex_ompl.errors import ParameterError
-from apex_ompl.ompl_adapter.setup import assemble
+from apex_ompl.ompl.setup import assemble
 from apex_ompl.result import PlanResult
 from apex_ompl.robot.identity import load_same_robot
 from apex_ompl.util.files import suffix_of, write_atomically

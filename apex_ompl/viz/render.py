@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 
 from apex_ompl.errors import ParameterError
 from apex_ompl.loop.result import RunResult
-from apex_ompl.ompl_adapter.setup import assemble
+from apex_ompl.ompl.setup import assemble
+from apex_ompl.paths.path import resample
 from apex_ompl.result import PlanResult
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Problem
 from apex_ompl.scene.scripts import is_there, obstacle_at
-from apex_ompl.trajectory import Trajectory
-from apex_ompl.trajopt.path import resample
+from apex_ompl.timing import Trajectory
 from apex_ompl.types import Array
 from apex_ompl.util.files import check_writable, write_atomically
 from apex_ompl.viz.appearance import SILENT_EVENTS

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apex_ompl.errors import MissingFileError
-from apex_ompl.ompl_adapter.setup import PlanningSetup
+from apex_ompl.ompl.setup import PlanningSetup
 from apex_ompl.scene.scripts import is_there
 from apex_ompl.types import Array
 from apex_ompl.viz.appearance import BACKGROUND, EDGE, OBSTACLES, Item, focus_of, ghosts_of, items_of, joint_poses

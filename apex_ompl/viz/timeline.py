@@ -11,10 +11,10 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.live.scripted import ScriptedMovers
 from apex_ompl.loop.result import RunResult
+from apex_ompl.moving.scripted import ScriptedMovers
 from apex_ompl.robot import Robot
-from apex_ompl.trajectory.rests import rests
+from apex_ompl.timing.rests import rests
 from apex_ompl.types import Array
 from apex_ompl.util.files import suffix_of, write_atomically
 from apex_ompl.viz.appearance import CLEARANCE_COLOURS, EVENT_COLOURS, SILENT_EVENTS, WAY_COLOURS

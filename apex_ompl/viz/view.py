@@ -13,10 +13,10 @@ from apex_ompl.loop.result import RunResult
 from apex_ompl.result import PlanResult
 from apex_ompl.scene.problem import Problem
 from apex_ompl.util.files import check_writable
-from apex_ompl.viz.browser.saved_run import shown_of
-from apex_ompl.viz.browser.server import HOST, import_viser, serving
-from apex_ompl.viz.browser.shown import Shown
 from apex_ompl.viz.sources import load_saved, saved_in
+from apex_ompl.viz.viewer.saved_run import shown_of
+from apex_ompl.viz.viewer.server import HOST, import_viser, serving
+from apex_ompl.viz.viewer.shown import Shown
 
 MOST = 6  # sources side by side
 KINDS = (Problem, PlanResult, RunResult, Shown)
@@ -70,11 +70,11 @@ def view(
         check_writable(Path(out))
     shown = [one if isinstance(one, Shown) else shown_of(one) for one in given]
     if out is not None:
-        from apex_ompl.viz.browser.page import write_page
+        from apex_ompl.viz.viewer.page import write_page
 
         write_page(shown, out, cover)
         return
-    from apex_ompl.viz.browser.live_page import LivePage
+    from apex_ompl.viz.viewer.live_page import LivePage
 
     with serving(port) as server:
         page = LivePage(server, shown, choices)

@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from apex_ompl.goals.hand_poses import Direction
 from apex_ompl.problems.broad.shapes import Parts, Point, mirror, place, turn
-from apex_ompl.tasks.hand_poses import Direction
 from apex_ompl.types import Array
 
 STANDING, FLOATING = "standing", "floating"

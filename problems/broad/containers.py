@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from apex_ompl.goals.hand_poses import Direction
 from apex_ompl.problems.broad.composition import FLOATING, Composition, Place, at
 from apex_ompl.problems.broad.compounds import SIDES, frame, grille, hollow_box, lattice, ring, tube
 from apex_ompl.problems.broad.shapes import (
@@ -22,7 +23,6 @@ from apex_ompl.problems.broad.shapes import (
     turn,
 )  # fmt: skip
 from apex_ompl.problems.scenes import DOWN, FORWARD
-from apex_ompl.tasks.hand_poses import Direction
 
 
 def crates(rng: np.random.Generator) -> Composition:

@@ -13,8 +13,8 @@ from functools import cache
 import numpy as np
 
 from apex_ompl.kernel import Kernel
-from apex_ompl.trajopt.candidates import first_valid
-from apex_ompl.trajopt.optimizer import Optimizer
+from apex_ompl.paths.candidates import first_valid
+from apex_ompl.paths.optimizer import Optimizer
 from apex_ompl.types import Array
 from apex_ompl.util.resolution import FINE_RESOLUTION, SEARCH_RESOLUTION
 

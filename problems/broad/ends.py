@@ -10,6 +10,9 @@ from numpy.typing import NDArray
 
 from apex_ompl.collision.shapes import world_geometry
 from apex_ompl.collision.tabulate import primitives
+from apex_ompl.goals.cover_clearance import has_clearance
+from apex_ompl.goals.hand_poses import HandPoseSampler, HandRegion
+from apex_ompl.goals.inverse_kinematics import Links
 from apex_ompl.kernel import Kernel, RobotTables, SceneTables
 from apex_ompl.kernel.scene_builder import Solids, boxes_around, tables_of
 from apex_ompl.problems.broad.composition import Place
@@ -17,9 +20,6 @@ from apex_ompl.problems.broad.held import Held
 from apex_ompl.problems.broad.shapes import Part, kernel_columns
 from apex_ompl.problems.scenes import DOWN, FORWARD
 from apex_ompl.problems.suite_robot import robot
-from apex_ompl.tasks.cover_clearance import has_clearance
-from apex_ompl.tasks.hand_poses import HandPoseSampler, HandRegion
-from apex_ompl.tasks.inverse_kinematics import Links
 from apex_ompl.types import Array
 
 FINGERS = (DOWN, FORWARD, (0.0, 0.0, 1.0), (0.0, -1.0, 0.0), (0.0, 1.0, 0.0))

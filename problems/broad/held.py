@@ -15,11 +15,11 @@ import numpy as np
 
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import SceneError
+from apex_ompl.goals.grasp import grasp
+from apex_ompl.goals.hand_poses import DualArmTables
 from apex_ompl.problems.objects import ALONG_X, PALM, cup
 from apex_ompl.problems.suite_robot import empty_hand_tables, robot
 from apex_ompl.scene.bodies import AttachedObject
-from apex_ompl.tasks.grasp import grasp
-from apex_ompl.tasks.hand_poses import DualArmTables
 from apex_ompl.types import Array
 
 NONE_HELD, ONE_HELD = 0.45, 0.3  # shares of problems with empty hands, and with an object in one

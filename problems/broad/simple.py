@@ -9,6 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from apex_ompl.goals.cover_clearance import scene_kernel
+from apex_ompl.goals.hand_poses import HandPoseSampler, HandRegion, Interval
+from apex_ompl.goals.inverse_kinematics import Links
 from apex_ompl.kernel import RobotTables
 from apex_ompl.problems import alignment
 from apex_ompl.problems.drawn_problem import MARGIN, DrawnProblem
@@ -16,9 +19,6 @@ from apex_ompl.problems.obstacles import primitive
 from apex_ompl.problems.scenes import DOWN, FORWARD
 from apex_ompl.problems.suite_robot import empty_hand_tables, robot
 from apex_ompl.scene.bodies import AttachedObject, Obstacle
-from apex_ompl.tasks.cover_clearance import scene_kernel
-from apex_ompl.tasks.hand_poses import HandPoseSampler, HandRegion, Interval
-from apex_ompl.tasks.inverse_kinematics import Links
 from apex_ompl.types import Array
 
 LEVELS = ("free", "alignment")

@@ -14,12 +14,12 @@ from paper.figure import Made, blank, of_runs
 from paper.moving import LIMIT, loop_result, loop_runs
 from paper.rows import FAITHFUL, MOVING, TASKS, UNGUIDED
 
-from apex_ompl.benchmark.runs import Run
-from apex_ompl.benchmark.summary import Table
+from apex_ompl.evaluation.runs import Run
+from apex_ompl.evaluation.summary import Table
 from apex_ompl.loop.referee import judge
 from apex_ompl.loop.result import Outcome, RunResult
 from apex_ompl.problems.suite_robot import robot
-from apex_ompl.trajectory import Trajectory
+from apex_ompl.timing import Trajectory
 
 STRIP_LEVELS = {"small": f"{TASKS[1]}/moving-small-0.1", "large": f"{TASKS[1]}/moving-huge-0.1"}
 HITS = (Outcome.HIT_MOVING, Outcome.HIT_STILL, Outcome.HIT_AT_REST)

@@ -13,8 +13,8 @@ from paper.rows import PLANNERS, STATIC, colour, installed
 from paper.static import runs_of
 
 from apex_ompl import planners
-from apex_ompl.benchmark import metrics
-from apex_ompl.benchmark.summary import Table
+from apex_ompl.evaluation import metrics
+from apex_ompl.evaluation.summary import Table
 from apex_ompl.problems.catalogue import SPLITS
 
 LEVELS = tuple(level for level in STATIC if level.endswith(("/small", "/medium", "/large")))

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 import record
 
-from apex_ompl.benchmark import Results
-from apex_ompl.benchmark.metrics import failure_ratio
-from apex_ompl.benchmark.summary import Table, about, warnings
+from apex_ompl.evaluation import Results
+from apex_ompl.evaluation.metrics import failure_ratio
+from apex_ompl.evaluation.summary import Table, about, warnings
 from apex_ompl.util.files import write_atomically
 from apex_ompl.util.statistics import share_interval
 

@@ -15,18 +15,18 @@ from paper.figure import Made, blank
 
 from apex_ompl import load_model, load_problem
 from apex_ompl.apex.query import make_query
-from apex_ompl.benchmark.metrics import diversity as mean_distance
-from apex_ompl.benchmark.summary import Table
-from apex_ompl.diffusion.guidance import EQUATION_7, Guidance
-from apex_ompl.diffusion.proposals import Sampling
+from apex_ompl.evaluation.metrics import diversity as mean_distance
+from apex_ompl.evaluation.summary import Table
 from apex_ompl.kernel import Kernel
 from apex_ompl.kernel.compiled.arrays import BOX, HALF_SPACE, SPHERE
-from apex_ompl.ompl_adapter.setup import PlanningSetup, assemble
-from apex_ompl.ompl_adapter.validity import full_check
+from apex_ompl.model.guidance import EQUATION_7, Guidance
+from apex_ompl.model.proposals import Sampling
+from apex_ompl.ompl.setup import PlanningSetup, assemble
+from apex_ompl.ompl.validity import full_check
+from apex_ompl.paths.candidates import first_valid
+from apex_ompl.paths.optimizer import Optimizer
+from apex_ompl.paths.path import path_length
 from apex_ompl.problems.suite_robot import robot
-from apex_ompl.trajopt.candidates import first_valid
-from apex_ompl.trajopt.optimizer import Optimizer
-from apex_ompl.trajopt.path import path_length
 
 DENOISED, DENOISER = "horizontal/large/900003", "apex-paper"
 MANY, PROPOSER = "posts/hard/900004", "apex"

@@ -1,6 +1,6 @@
 """Figures among cubes that move, in the closed loop on the simulated clock: failure ratio by task, over size, sweeps.
 
-Each run is a row's own function to the benchmark (:class:`apex_ompl.benchmark.Row`), so that the runs are stored, and
+Each run is a row's own function to the benchmark (:class:`apex_ompl.evaluation.Row`), so that the runs are stored, and
 resume, as all others do. The same seed gives the same run on a loaded machine, too.
 """
 
@@ -16,18 +16,18 @@ from paper.figure import Made, blank, number, of_runs, ratio, ratio_cells
 from paper.rows import BOTH, FAITHFUL, METHODS, MOVING, OURS, PACE, SWEEPS, SWEPT, TASKS, UNGUIDED, colour, installed
 from paper.static import median, of_task, runs_of
 
-from apex_ompl.benchmark import Results, Row
-from apex_ompl.benchmark.rows import Job
-from apex_ompl.benchmark.runs import Run
-from apex_ompl.benchmark.summary import Table
-from apex_ompl.loop import methods
-from apex_ompl.loop.charges import cost_table
+from apex_ompl.evaluation import Results, Row
+from apex_ompl.evaluation.rows import Job
+from apex_ompl.evaluation.runs import Run
+from apex_ompl.evaluation.summary import Table
+from apex_ompl.loop.replan import methods
 from apex_ompl.loop.result import RunResult
 from apex_ompl.loop.run import load_world, run
 from apex_ompl.loop.sensor import Sensor
-from apex_ompl.loop.settings import LoopSettings
+from apex_ompl.moving.charges import cost_table
+from apex_ompl.moving.settings import LoopSettings
+from apex_ompl.paths.path import path_length
 from apex_ompl.problems.alignment import SIZES
-from apex_ompl.trajopt.path import path_length
 
 LIMIT = 30.0  # of a run [s]
 SAMPLES = 0.01  # between samples of an executed motion for S_r [s]

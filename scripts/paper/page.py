@@ -15,9 +15,9 @@ from paper.published import ENTRIES, PICTURES, RIVALS, Entry, Rival, Where
 from paper.rows import PACE, PATIENCE
 from paper.static import TIMEOUT
 
-from apex_ompl.diffusion.guidance import EQUATION_7
-from apex_ompl.loop.charges import cost_table
-from apex_ompl.loop.settings import LoopSettings
+from apex_ompl.model.guidance import EQUATION_7
+from apex_ompl.moving.charges import cost_table
+from apex_ompl.moving.settings import LoopSettings
 from apex_ompl.util.files import write_atomically
 
 MISSING, NONE = "not measured yet", ""

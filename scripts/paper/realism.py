@@ -15,23 +15,24 @@ from tqdm import tqdm
 
 from apex_ompl import problems
 from apex_ompl.apex.query import make_query
-from apex_ompl.benchmark import Row
-from apex_ompl.benchmark.rows import Job
-from apex_ompl.benchmark.runs import Run
-from apex_ompl.benchmark.runs import planned as planned_run
-from apex_ompl.datasets.engine import EngineOptions
-from apex_ompl.datasets.records import SOURCES, Paths
-from apex_ompl.datasets.store import Store
-from apex_ompl.diffusion.autoencoder import Autoencoder
-from apex_ompl.diffusion.checkpoint import load_model, load_torch_model
-from apex_ompl.diffusion.guidance import GUIDANCES, Guidance
-from apex_ompl.generation.solving import solve_unit
-from apex_ompl.generation.units import plan_units
-from apex_ompl.ompl_adapter.setup import PlanningSetup, assemble
-from apex_ompl.ompl_adapter.validity import full_check
+from apex_ompl.evaluation import Row
+from apex_ompl.evaluation.rows import Job
+from apex_ompl.evaluation.runs import Run
+from apex_ompl.evaluation.runs import planned as planned_run
+from apex_ompl.model.checkpoint import load_model
+from apex_ompl.model.guidance import GUIDANCES, Guidance
+from apex_ompl.ompl.setup import PlanningSetup, assemble
+from apex_ompl.ompl.validity import full_check
+from apex_ompl.paths.path import path_length
+from apex_ompl.paths.spline import Spline
 from apex_ompl.problems.suite_robot import robot
-from apex_ompl.trajopt.path import path_length
-from apex_ompl.trajopt.spline import Spline
+from apex_ompl.training.autoencoder import Autoencoder
+from apex_ompl.training.engine import EngineOptions
+from apex_ompl.training.problem_solving import solve_unit
+from apex_ompl.training.records import SOURCES, Paths
+from apex_ompl.training.store import Store
+from apex_ompl.training.torch_model import load_torch_model
+from apex_ompl.training.units import plan_units
 from apex_ompl.types import Array
 from apex_ompl.util.cluster import spread
 

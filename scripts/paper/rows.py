@@ -7,10 +7,10 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 
-from apex_ompl.benchmark import Row
-from apex_ompl.benchmark.rows import PAPER
-from apex_ompl.diffusion.guidance import EQUATION_7
-from apex_ompl.planners.tuned import TUNED
+from apex_ompl.evaluation import Row
+from apex_ompl.evaluation.rows import PAPER
+from apex_ompl.model.guidance import EQUATION_7
+from apex_ompl.ompl.tuned import TUNED
 from apex_ompl.problems.alignment import SIZES, SPEEDS
 
 TASKS = ("vertical", "horizontal")

@@ -13,11 +13,11 @@ from paper.figure import Made, blank, number, of_runs, ratio, ratio_cells
 from paper.rows import BOTH, PLANNERS, STATIC, TASKS, colour, installed
 
 from apex_ompl import planners
-from apex_ompl.benchmark import Results, Row, Workers, bench
-from apex_ompl.benchmark.metrics import next_percentile
-from apex_ompl.benchmark.rows import jobs as jobs_of
-from apex_ompl.benchmark.runs import NO_PROBLEM, Run
-from apex_ompl.benchmark.summary import Table
+from apex_ompl.evaluation import Results, Row, Workers, bench
+from apex_ompl.evaluation.metrics import next_percentile
+from apex_ompl.evaluation.rows import jobs as jobs_of
+from apex_ompl.evaluation.runs import NO_PROBLEM, Run
+from apex_ompl.evaluation.summary import Table
 
 TIMEOUT = 10.0  # [s]
 OVER_SIZE = 7  # the first so many rows are those of the figure over size: apex, and each model guided and not

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+from apex_ompl.goals.grasp import HandObjects
 from apex_ompl.problems.objects import bar, block_and_peg, boxes, cup_and_ball, parcels, two_cups
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Alignment
-from apex_ompl.tasks.grasp import HandObjects
 
 FORWARD, DOWN = (1.0, 0.0, 0.0), (0.0, 0.0, -1.0)
 

@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 
 MODULES = (
-    "apex_ompl", "apex_ompl.ompl_adapter.space", "apex_ompl.planners", "apex_ompl.problems", "apex_ompl.robot",
-    "apex_ompl.session", "apex_ompl.trajectory",
+    "apex_ompl", "apex_ompl.ompl.space", "apex_ompl.planners", "apex_ompl.problems", "apex_ompl.robot",
+    "apex_ompl.planning", "apex_ompl.timing",
 )  # fmt: skip
 
 
@@ -89,7 +89,7 @@ def _code(member: Any) -> CodeType | None:
 def _use_planner() -> None:
     """A kept planner, its world, and plans."""
     import apex_ompl
-    from apex_ompl.session import check_arguments, kept_planner
+    from apex_ompl.planning import check_arguments, kept_planner
 
     robot = apex_ompl.load_robot("dual_panda_softhand")
     home = robot.home
@@ -157,7 +157,7 @@ def _use_records() -> None:
 def _use_trajectories() -> None:
     """Time parameterization, and motions."""
     import apex_ompl
-    from apex_ompl.trajectory import Sample, TimedPath, warm_up
+    from apex_ompl.timing import Sample, TimedPath, warm_up
 
     warm_up()
     robot = apex_ompl.load_robot("baxter")
@@ -204,7 +204,7 @@ def _use_problems() -> None:
 def _use_ompl() -> None:
     """APEX in a SimpleSetup, and states of OMPL's."""
     import apex_ompl
-    from apex_ompl.ompl_adapter import space
+    from apex_ompl.ompl import space
     from apex_ompl.planners import APEX
 
     setup = apex_ompl.setup("shelf_swap")

@@ -1,7 +1,7 @@
 """Stages of APEX inside ``solve``; each returns the first valid path that it finds, or None.
 
 A stage is a small record of its parameters with one method, ``run(context)``. Their order and their parameters are
-chosen by ``apex_ompl.planners.apex_parameters.ApexParameters.stages``.
+chosen by ``apex_ompl.apex.parameters.ApexParameters.stages``.
 """
 
 from apex_ompl.apex.stages.anytime import Anytime

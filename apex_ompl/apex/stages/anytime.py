@@ -11,8 +11,8 @@ from ompl import base as ob
 
 from apex_ompl.apex.context import SolveContext
 from apex_ompl.apex.stages.proposals import BATCH, PROPOSED, RESAMPLED
-from apex_ompl.diffusion.query import Query
-from apex_ompl.trajopt.candidates import STEPS_PER_PATH, Candidate
+from apex_ompl.model.query import Query
+from apex_ompl.paths.candidates import STEPS_PER_PATH, Candidate
 from apex_ompl.types import Array
 
 LOG = logging.getLogger("apex_ompl")

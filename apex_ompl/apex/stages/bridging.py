@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from apex_ompl.apex.bridge import MAX_CALLS, bridge_blocked, every_other
 from apex_ompl.apex.context import SolveContext
 from apex_ompl.apex.stages.stage import Solution
-from apex_ompl.trajopt.path import Path
+from apex_ompl.paths.path import Path
 
 MAX_BRIDGED = 2  # candidates
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from apex_ompl.apex.context import SolveContext
 from apex_ompl.apex.stages.stage import Solution, solution_of
-from apex_ompl.trajopt.candidates import Candidate
+from apex_ompl.paths.candidates import Candidate
 from apex_ompl.types import Array
 
 LINE, EXPERIENCE = "line", "experience"

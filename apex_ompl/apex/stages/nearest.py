@@ -10,7 +10,7 @@ from apex_ompl.apex.bridge import valid_prefix
 from apex_ompl.apex.context import SolveContext
 from apex_ompl.apex.stages.bridging import MAX_BRIDGED
 from apex_ompl.apex.stages.stage import Solution
-from apex_ompl.trajopt.path import Path
+from apex_ompl.paths.path import Path
 
 
 @dataclass(frozen=True)

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import NamedTuple, Protocol
 
 from apex_ompl.apex.context import SolveContext
-from apex_ompl.trajopt.candidates import Candidate
-from apex_ompl.trajopt.path import Path
+from apex_ompl.paths.candidates import Candidate
+from apex_ompl.paths.path import Path
 
 
 class Solution(NamedTuple):

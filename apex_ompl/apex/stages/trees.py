@@ -16,8 +16,8 @@ from apex_ompl.apex.bridge import bridge_blocked
 from apex_ompl.apex.context import SolveContext, joins
 from apex_ompl.apex.stages.stage import Solution
 from apex_ompl.apex.trees import OMPL_SHARE, grow, rooted_ompl_trees, rooted_trees
-from apex_ompl.ompl_adapter.space import path_to_array
-from apex_ompl.trajopt.path import Path
+from apex_ompl.ompl.space import path_to_array
+from apex_ompl.paths.path import Path
 from apex_ompl.types import Array
 
 SPACING = 0.1  # of states on a tree's path whose blocked stretches are bridged [rad, max-norm]

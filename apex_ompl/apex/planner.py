@@ -1,0 +1,150 @@
+"""APEX: paths proposed by latent diffusion, checked, repaired, resampled, and completed by RRTConnect."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+from weakref import WeakSet
+
+import numpy as np
+from ompl import base as ob
+from ompl import geometric as og
+from ompl import util as ou
+
+from apex_ompl.apex.context import SolveContext
+from apex_ompl.apex.models import Model, trajectory_model
+from apex_ompl.apex.parameters import AUTO, NAME, ApexParameters
+from apex_ompl.apex.path_validator import PathValidator
+from apex_ompl.apex.query import make_query
+from apex_ompl.apex.sampler import ProposalSampler
+from apex_ompl.apex.solver import solve
+from apex_ompl.apex.stages import Anytime, Shorten
+from apex_ompl.errors import ParameterError
+from apex_ompl.kernel.shortcuts import shortcut
+from apex_ompl.kernel.trees import TreePair
+from apex_ompl.ompl.own_planner import OwnPlanner, Tree
+from apex_ompl.ompl.report import SolveReport
+from apex_ompl.paths.optimizer import Optimizer
+from apex_ompl.types import Array
+from apex_ompl.util.resolution import SEARCH_RESOLUTION
+
+_warm_models: WeakSet[Model] = WeakSet()  # that have proposed something in this process
+
+
+class APEX(OwnPlanner):
+    """OMPL planner APEX: section III of the paper inside ``solve``, probabilistically complete by RRTConnect.
+
+    It works with any validity checker, and takes the one that is set when ``solve`` begins. With this project's,
+    proposals are repaired, and guided if asked, among the obstacles; with another one they are checked by it. The first
+    valid path is shortened; with the parameter ``anytime`` it is improved until the termination condition holds.
+
+    Attributes:
+        parameters: Its parameters.
+        validator: Decides what is valid.
+        model: Makes proposals.
+        optimizer: Repairs and shortens.
+        experience: Control points of earlier paths minus those of their straight lines, each of shape (points, dof).
+        rejected_lines: Straight lines that were found invalid before ``solve``, each of shape (2, dof).
+        report: Report on the last call of ``solve``.
+    """
+
+    def __init__(self, si: ob.SpaceInformation, parameters: ApexParameters | None = None, **values: Any) -> None:
+        """Plan in the space of ``si``.
+
+        Args:
+            si: OMPL's space information.
+            parameters: Parameters of the planner.
+            **values: Parameters by name, such as ``robot`` and ``seed``, in place of these.
+
+        Raises:
+            ApexError: The model or the robot cannot be loaded, or do not fit the space; there is no such parameter.
+        """
+        super().__init__(si, NAME)
+        given = (parameters or ApexParameters()).changed(**values)
+        assert isinstance(given, ApexParameters)
+        self.parameters = given
+        self.validator = PathValidator(si, "" if given.robot == AUTO else given.robot)
+        robot = self.validator.checker.robot.name
+        self.model = trajectory_model(self.parameters.model, robot, self.parameters.device)
+        steps, most = self.parameters.denoising_steps, self.model.schedule.steps
+        if steps > most:
+            raise ParameterError("parameter 'denoising_steps'", steps, f"at most {most}, those of the checkpoint")
+        self.optimizer = Optimizer(self.model.spline)
+        self.experience: list[Array] = []
+        self.rejected_lines: list[Array] = []
+        self._solves = 0
+        self._warm = False
+        self._grown: list[TreePair | og.RRTConnect] = []  # by the last call of ``solve``
+
+    def setup(self) -> None:
+        """Make all ready that the first call of ``solve`` would have to: kernel, network, optimizer."""
+        super().setup()
+        self._prepare()
+
+    def _prepare(self) -> None:
+        before, self.validator = self.validator, self.validator.current()
+        self._warm &= self.validator is before
+        if self._warm:
+            return
+        checker = self.validator.checker
+        self.optimizer.prepare(checker.kernel)
+        home = checker.robot.home
+        ends = home[None], home[None]
+        rng = np.random.default_rng(0)
+        TreePair(self.validator.kernel, *ends, 1.0, SEARCH_RESOLUTION, rng).grow(1)
+        shortcut(self.validator.kernel, np.stack([home] * 3), 1, SEARCH_RESOLUTION, rng)
+        if self.model not in _warm_models:
+            query = make_query(checker, home, home, point=self.model.sees_point)
+            sampling = self.parameters.sampling(self.model.sampling)
+            quick = replace(sampling, sampler="ddim", steps=min(2, sampling.steps))
+            with self.model.one_thread():
+                self.model.propose(query, self.validator.kernel, 1, sampling=quick)
+            _warm_models.add(self.model)
+        if self.parameters.lambda_obs > 0.0:
+            self.validator.obstacle_distance(np.stack([home, home]))
+        self._warm = True
+
+    def clear(self) -> None:
+        """Forget everything found so far."""
+        super().clear()
+        self.clearQuery()
+        self.experience = []
+
+    def clearQuery(self) -> None:  # noqa: N802 - OMPL's name
+        """Forget the query; earlier paths stay candidates for the next one."""
+        self._solves, self.report, self.rejected_lines, self._grown = 0, SolveReport(), [], []
+
+    def next_seed(self) -> int:
+        """Return the seed of the next call of ``solve``: one that follows from the given one, or from OMPL's."""
+        first = self.parameters.seed if self.parameters.seed >= 0 else int(ou.RNG().uniformInt(0, 2**31 - 2))
+        self._solves += 1
+        return first + self._solves - 1
+
+    def _solve(self, ptc: ob.PlannerTerminationCondition) -> Any:
+        self._prepare()
+        with self.model.one_thread():
+            return self._plan(ptc)
+
+    def _plan(self, ptc: ob.PlannerTerminationCondition) -> Any:
+        parameters = self.parameters
+        generator = np.random.default_rng(self.next_seed())
+        sampler = ProposalSampler(
+            self.model, self.validator.kernel, parameters.sampling(self.model.sampling),
+            generator=generator, stop=lambda: bool(ptc()), report=self.report,
+        )  # fmt: skip
+        context = SolveContext(
+            self.getSpaceInformation(), self.getProblemDefinition(), ptc, validator=self.validator, sampler=sampler,
+            optimizer=self.optimizer, report=self.report, experience=self.experience,
+            rejected_lines=self.rejected_lines, lambda_obs=parameters.lambda_obs, rng=generator.spawn(1)[0],
+        )  # fmt: skip
+        self._grown = context.grown
+        shorten = Shorten(parameters.range if parameters.fallback else None) if parameters.polish else None
+        inputs = self.getPlannerInputStates()
+        return solve(context, inputs, parameters.stages(), shorten, Anytime(parameters.anytime))
+
+    def _trees(self) -> list[Tree]:
+        pairs = [trees for trees in self._grown if isinstance(trees, TreePair)]
+        return [Tree(*pair.nodes(number), bool(number)) for pair in pairs for number in range(2)]
+
+    def _inner_planners(self) -> list[ob.Planner]:
+        return [trees for trees in self._grown if isinstance(trees, ob.Planner)]

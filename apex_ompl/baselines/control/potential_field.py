@@ -1,0 +1,149 @@
+"""An artificial potential field in joint space, followed over a short horizon."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from apex_ompl.baselines.control.short_horizon import Horizon, finish, first_proved
+from apex_ompl.kernel import Kernel
+from apex_ompl.moving.charges import Charges
+from apex_ompl.moving.movers import Movers, clearance_in_time
+from apex_ompl.moving.ready import Ready
+from apex_ompl.moving.request import Answer, Request
+from apex_ompl.moving.search import Search
+from apex_ompl.types import Array
+
+LEAST = 0.25  # clearance below which the potential goes on with the slope that it has there, as a share of the reach
+
+
+class Field(NamedTuple):
+    """A potential in joint space: towards a goal, and away from what is near (Khatib 1986).
+
+    The attractive part is ``attraction * |q - goal|^2 / 2``, which goes on as a cone beyond ``cone``. The repulsive
+    parts are ``repulsion * (reach / d - 1)^2 / 2`` for clearances d below the reach: of obstacles that move, of what
+    stands still, and of the robot to itself. The last two fade with the square of the distance to the goal inside the
+    cone, so that a goal close to contact is a minimum (Ge and Cui 2000).
+
+    Attributes:
+        goal: Shape (dof,).
+        attraction: Gain [1/s^2].
+        cone: Distance to the goal from which on its force is constant [rad].
+        repulsion: Gain for obstacles that move [rad^2/s^2].
+        own_repulsion: Gain for what stands still and the robot itself [rad^2/s^2].
+        reach: Clearance to obstacles that move below which they repel [m].
+        own_reach: The same of what stands still and of the robot itself [m].
+    """
+
+    goal: Array
+    attraction: float
+    cone: float
+    repulsion: float
+    own_repulsion: float
+    reach: float
+    own_reach: float
+
+    def potential_and_force(self, kernel: Kernel, movers: Movers, q: Array, time: float) -> tuple[float, Array]:
+        """Return the potential [rad^2/s^2] at a state, shape (dof,), and its force, shape (dof,) [rad/s^2].
+
+        Args:
+            kernel: The robot among what stands still.
+            movers: The obstacles that move.
+            q: The state.
+            time: Time of the movers' stamps [s].
+        """
+        way = q - self.goal
+        distance = float(np.linalg.norm(way))
+        inside = min(distance, self.cone)
+        potential = self.attraction * inside * (distance - 0.5 * inside)
+        force = -self.attraction * way * (inside / max(distance, 1e-12))
+        moving, slope = clearance_in_time(kernel, movers, q[None], np.array([time]), self.reach)
+        values, slopes = kernel.clearance_gradient(q, self.own_reach)
+        fade, fading = (inside / self.cone) ** 2, 2.0 * way / self.cone**2 * (distance < self.cone)
+        for clearance, gradient, reach, gain, share, sharing in (
+            (moving[0], slope[0, :-1], self.reach, self.repulsion, 1.0, 0.0),
+            (values[0, 0], slopes[0, 0], self.own_reach, self.own_repulsion, fade, fading),
+            (values[0, 1], slopes[0, 1], self.own_reach, self.own_repulsion, fade, fading),
+        ):
+            if clearance < reach:
+                height, steepness = repulsive(clearance / reach)
+                potential += gain * share * height
+                force = force + gain * (share * steepness / reach * gradient - sharing * height)
+        return potential, force
+
+
+def repulsive(share: float) -> tuple[float, float]:
+    """Return (1 / share - 1)^2 / 2, and by how much it falls with the share; below ``LEAST`` on the tangent there."""
+    at = max(share, LEAST)
+    steepness = (1.0 / at - 1.0) / at**2
+    return 0.5 * (1.0 / at - 1.0) ** 2 + steepness * (at - share), steepness
+
+
+@dataclass(eq=False)
+class PotentialField:
+    """A reflex: the way down an artificial potential (Khatib 1986) with damping, over a short horizon.
+
+    Obstacles repel from where they are expected when the robot is there. The horizon, or a part of it, is followed by a
+    stop and proved. There is no way out of local minima. Ten sets of parameters were tried in 4 to 8
+    worlds of each of the kinds ``moving`` and ``popup`` of the validation split.
+
+    Attributes:
+        steps: Number of steps of the horizon, the stop at its end among them.
+        step: Time of a step [s].
+        damping: Of the speed [1/s].
+        attraction: See :class:`Field`.
+        cone: Likewise.
+        repulsion: Likewise.
+        own_repulsion: Likewise.
+        reach: Likewise.
+        own_reach: Likewise.
+        counts: Numbers of steps of which a proof is tried.
+        near: Distance of any joint to a goal from which on the straight motion to it is tried first [rad].
+    """
+
+    steps: int = 14
+    step: float = 0.05
+    damping: float = 8.0
+    attraction: float = 30.0
+    cone: float = 0.8
+    repulsion: float = 1.5
+    own_repulsion: float = 1.0
+    reach: float = 0.15
+    own_reach: float = 0.03
+    counts: tuple[int, ...] = (14, 8)
+    near: float = 0.5
+
+    def prepare(self, ready: Ready) -> None:
+        """Nothing is needed."""
+
+    def replan(self, ready: Ready, request: Request, charges: Charges) -> Answer:
+        """Return the motion down the potential, or a straight one to a goal that is near."""
+        search = Search(ready, request, charges)
+        if not len(search.goals):
+            return Answer(None, "", charges)
+        motion, part = finish(search, self.near), "finish"
+        if motion is None:
+            horizon = Horizon(ready.limits, self.step)
+            motion, part = first_proved(search, horizon, self.controls(search, horizon), self.counts), "field"
+        return Answer(None if motion is None else search.following(motion), part, charges)
+
+    def field(self, goal: Array) -> Field:
+        """Return the potential with a goal, shape (dof,)."""
+        return Field(goal, self.attraction, self.cone, self.repulsion, self.own_repulsion, self.reach, self.own_reach)
+
+    def controls(self, search: Search, horizon: Horizon) -> Array:
+        """Return the accelerations down the potential, shape (K, dof) [rad/s^2]."""
+        ready, request = search.ready, search.request
+        field, fingers = self.field(search.goals[0]), ready.fingers
+
+        def control(k: int, speed: Array, at: Array) -> Array:
+            time = request.join + (k + 1) * self.step
+            _, force = field.potential_and_force(ready.kernel, request.predicted, at[0], time)
+            force[fingers] = 0.0
+            search.charges.charge("force")
+            return force - self.damping * speed
+
+        points = horizon.steer(search.start, (self.steps, 1), control)
+        return horizon.applied(points)[:, 0]

@@ -1,0 +1,1 @@
+"""DAMON: A* over a graph on a learned manifold of states."""

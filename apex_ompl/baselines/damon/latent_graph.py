@@ -1,0 +1,146 @@
+"""DAMON's graph: nodes spread over a latent space of states, joined to their neighbours where the robot allows it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from apex_ompl.baselines.damon.state_autoencoder import StateAutoencoder
+from apex_ompl.kernel import Kernel
+from apex_ompl.types import Array, Flags, Indices
+
+POOL = 5  # times as many nodes are nearest in the latent space as are joined: those of them nearest in joint space
+SPACING = 0.05  # of the states at which edges are checked for self-collision [rad, max-norm]
+BLOCK = 512  # nodes whose distances are computed at once
+
+
+@dataclass(frozen=True, eq=False)
+class StateSample:
+    """States of paths that are known to be valid.
+
+    Attributes:
+        states: Shape (N, J) [rad].
+        paths: Number of the path of each, shape (N,), in order; those of one path are in their order along it.
+    """
+
+    states: Array
+    paths: Indices
+
+
+def farthest_points(points: Array, count: int, first: int = 0) -> Indices:
+    """Return points each of which is the farthest from those before it (Gonzalez 1985), shape (count,).
+
+    No two of them are nearer to each other than any point is to the nearest of them.
+
+    Args:
+        points: Shape (N, d).
+        count: At most N.
+        first: Number of the first point.
+    """
+    found = np.empty(count, np.int64)
+    columns = np.ascontiguousarray(points.T, np.float32)
+    away = np.full(points.shape[0], np.inf, np.float32)
+    k = first
+    for n in range(count):
+        found[n] = k
+        squares = np.square(columns[0] - columns[0, k])
+        for column in columns[1:]:
+            squares += np.square(column - column[k])
+        np.minimum(away, squares, out=away)
+        k = int(np.argmax(away))
+    return found
+
+
+def nearest_nodes(latent: Array, states: Array, z: Array, q: Array, count: int) -> Indices:
+    """Return the nodes nearest to a state in joint space among those nearest in latent space, the nearest first.
+
+    Args:
+        latent: Latent vectors of the nodes, shape (N, d).
+        states: States of the nodes, shape (N, J).
+        z: Latent vector, shape (d,).
+        q: State, shape (J,).
+        count: Number of nodes that are wanted; :data:`POOL` times as many are nearest in latent space.
+    """
+    away = np.square(latent - z).sum(axis=1)
+    pool = min(POOL * count, len(latent))
+    near = np.argpartition(away, pool - 1)[:pool]
+    order = np.argsort(np.linalg.norm(states[near] - q, axis=1), kind="stable")
+    return near[order[:count]]
+
+
+def neighbours(latent: Array, states: Array, count: int) -> Indices:
+    """Return the nearest nodes of each node as :func:`nearest_nodes` does, itself left out, shape (N, count)."""
+    found = np.empty((len(latent), count), np.int64)
+    squares, pool = np.square(latent).sum(axis=1), min(POOL * count + 1, len(latent))
+    for k in range(0, len(latent), BLOCK):
+        rows = np.arange(k, min(k + BLOCK, len(latent)))
+        away = squares - 2.0 * (latent[rows] @ latent.T)
+        near = np.argpartition(away, pool - 1, axis=1)[:, :pool]
+        length = np.linalg.norm(states[near] - states[rows, None], axis=2)
+        length[near == rows[:, None]] = np.inf
+        order = np.argsort(length, axis=1, kind="stable")[:, :count]
+        found[rows] = np.take_along_axis(near, order, axis=1)
+    return found
+
+
+def free_of_self_collision(kernel: Kernel, first: Array, last: Array) -> Flags:
+    """Return whether the sphere cover proves straight motions free of self-collision, at states along them, shape (M,).
+
+    Args:
+        kernel: The robot.
+        first: States that they begin at, shape (M, dof).
+        last: States that they end at, shape (M, dof).
+    """
+    found = np.ones(len(first), bool)
+    counts = np.ceil(np.abs(last - first).max(axis=1) / SPACING).astype(int) + 1
+    for count in np.unique(counts):
+        which = np.flatnonzero(counts == count)
+        for some in np.array_split(which, max(1, len(which) * count // 100_000)):
+            shares = np.linspace(0.0, 1.0, count)[:, None]
+            states = first[some, None] + shares * (last - first)[some, None]
+            clear = kernel.clearance(states.reshape(-1, states.shape[2]), 0.01)[:, 1] > 0.0
+            found[some] = np.all(clear.reshape(len(some), count), axis=1)
+    return found
+
+
+def consecutive(paths: Indices) -> Indices:
+    """Return pairs of nodes that follow each other along a path, shape (M, 2).
+
+    Args:
+        paths: Number of the path of each node, shape (N,), the nodes in their order along paths.
+    """
+    k = np.flatnonzero(paths[1:] == paths[:-1])
+    return np.stack([k, k + 1], axis=1)
+
+
+def edges(
+    latent: Array, states: Array, count: int, *, kernel: Kernel, whole: Array, joints: Indices
+) -> Indices:  # fmt: skip
+    """Return the pairs of neighbours whose straight motion is free of self-collision, the smaller number first.
+
+    Args:
+        latent: Latent vectors of the nodes, shape (N, d).
+        states: Their states, shape (N, J).
+        count: Number of neighbours of a node.
+        kernel: The robot.
+        whole: A state of all joints, shape (dof,), for those that the graph has no values of.
+        joints: Which joints the graph has values of, shape (J,).
+
+    Returns:
+        Shape (M, 2).
+    """
+    near = neighbours(latent, states, count)
+    pairs = np.stack([np.repeat(np.arange(len(latent)), near.shape[1]), near.ravel()], axis=1)
+    pairs = np.unique(np.sort(pairs, axis=1), axis=0)
+    full = np.repeat(whole[None], len(states), axis=0)
+    full[:, joints] = states
+    free = free_of_self_collision(kernel, full[pairs[:, 0]], full[pairs[:, 1]])
+    found: Indices = pairs[free]
+    return found
+
+
+def chosen_nodes(sample: StateSample, autoencoder: StateAutoencoder, count: int) -> Indices:
+    """Return states of a sample that are spread evenly over the latent space, in the order of the sample, (count,)."""
+    latent = autoencoder.encode(sample.states)
+    return np.sort(farthest_points(latent, min(count, len(latent))))

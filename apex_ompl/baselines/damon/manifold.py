@@ -1,0 +1,213 @@
+"""A learned manifold of states with its graph, as a folder: ``config.json``, ``model.safetensors`` and a model card."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+from safetensors import SafetensorError
+from safetensors.numpy import load as load_arrays
+from safetensors.numpy import save as save_arrays
+
+from apex_ompl.baselines import weights_folder
+from apex_ompl.baselines.damon.lazy_search import Graph
+from apex_ompl.baselines.damon.state_autoencoder import StateAutoencoder, weight_shapes
+from apex_ompl.errors import FileFormatError, MissingFileError
+from apex_ompl.types import Array, Indices
+from apex_ompl.util.files import is_file, make_folder, read_file, write_atomically
+from apex_ompl.util.schema import StrictModel, read_json, validate
+
+SCHEMA = "apex-ompl/manifold/1"
+CONFIG, WEIGHTS, CARD = "config.json", "model.safetensors", "README.md"
+MADE_BY = "python scripts/train_damon.py"
+DECODED, STORED = "decoded", "stored"
+MOST_NODES = 65_535  # edges are stored in 16 bits
+
+
+class ManifoldConfig(StrictModel):
+    """Content of ``config.json``.
+
+    Attributes:
+        schema_: Version of the format.
+        robot: Name of the robot.
+        joints: Joints that the manifold has values of.
+        dim: Dimension of the latent space.
+        hidden: Width of the hidden layers.
+        digest: SHA-256 of the file of weights.
+        trained: Record of the training.
+    """
+
+    schema_: Literal["apex-ompl/manifold/1"] = Field(alias="schema")
+    robot: str
+    joints: tuple[str, ...]
+    dim: int = Field(ge=1, le=64)
+    hidden: int = Field(ge=1, le=4096)
+    digest: str
+    trained: dict[str, Any] = {}
+
+
+@dataclass(frozen=True, eq=False)
+class Manifold:
+    """An autoencoder of states, and a graph of nodes of its latent space.
+
+    Attributes:
+        config: What it is of.
+        autoencoder: The autoencoder.
+        latent: Latent vectors of the nodes, shape (N, d).
+        stored: The states that these were encoded from, shape (N, J) [rad].
+        pairs: Edges by kind of nodes, ``decoded`` and ``stored``, each of shape (M, 2).
+    """
+
+    config: ManifoldConfig
+    autoencoder: StateAutoencoder
+    latent: Array
+    stored: Array
+    pairs: Mapping[str, Indices]
+
+    def states(self, kind: str) -> Array:
+        """Return the states of the nodes, shape (N, J): decoded from their latent vectors, or those stored."""
+        return self.autoencoder.decode(self.latent) if kind == DECODED else self.stored
+
+    def graph(self, kind: str) -> Graph:
+        """Return the graph of the nodes of a kind, ``decoded`` or ``stored``."""
+        return _graph(self, kind)
+
+
+def halved(weights: Mapping[str, NDArray[np.float32]]) -> dict[str, NDArray[np.float32]]:
+    """Return weights as they are after they were stored in half precision."""
+    return {name: value.astype(np.float16).astype(np.float32) for name, value in weights.items()}
+
+
+def save_manifold(folder: str | os.PathLike[str], manifold: Manifold, trained: Mapping[str, Any]) -> None:
+    """Write a manifold; the configuration last, so that a folder is complete or damaged by its digest.
+
+    Raises:
+        MissingFileError: The folder cannot be written.
+    """
+    path = make_folder(folder, "folder of a manifold")
+    arrays: dict[str, NDArray[Any]] = {k: v.astype(np.float16) for k, v in manifold.autoencoder.weights.items()}
+    arrays |= {"lower": manifold.autoencoder.lower, "upper": manifold.autoencoder.upper}
+    arrays |= {"latent": manifold.latent.astype(np.float16), "stored": manifold.stored.astype(np.float16)}
+    arrays |= {f"edges.{kind}": pairs.astype(np.uint16) for kind, pairs in manifold.pairs.items()}
+    content = save_arrays(arrays)
+    config = manifold.config.model_copy(
+        update={"digest": hashlib.sha256(content).hexdigest(), "trained": dict(trained)}
+    )
+    write_atomically(path / WEIGHTS, content)
+    write_atomically(path / CARD, card(manifold, trained).encode())
+    text = json.dumps(config.model_dump(mode="json", by_alias=True), indent=1) + "\n"
+    write_atomically(path / CONFIG, text.encode())
+
+
+def card(manifold: Manifold, trained: Mapping[str, Any]) -> str:
+    """Return the model card, Markdown."""
+    config, counts = manifold.config, {kind: len(pairs) for kind, pairs in manifold.pairs.items()}
+    lines = [
+        f"# A manifold of states of {config.robot} in {config.dim} dimensions",
+        "",
+        f"A variational autoencoder of {len(config.joints)} joints, {config.hidden} units in two hidden layers, and "
+        f"{len(manifold.latent)} nodes of its latent space with {counts[DECODED]} edges between decoded states and "
+        f"{counts[STORED]} between stored ones. For the planner `damon`, a baseline; see `docs/baselines.md`.",
+        "",
+        f"Made by `{MADE_BY}`: " + ", ".join(f"{key} {value}" for key, value in trained.items()) + ".",
+        "",
+    ]
+    return "\n".join(lines)
+
+
+def folder_of(name: str) -> Path:
+    """Return the folder of a manifold: one of the source tree's ``benchmarks/baselines`` by name, or a path.
+
+    Raises:
+        MissingFileError: There is none.
+    """
+    for folder in (weights_folder(name), Path(name)):
+        if is_file(folder / CONFIG):
+            return folder
+    why = f"no folder of the tree's benchmarks/baselines, nor a path; `{MADE_BY}` makes damon-2, damon-4 and damon-8"
+    raise MissingFileError(name, "manifold of the planner damon", why)
+
+
+def load_manifold(name: str, robot: str | None = None) -> Manifold:
+    """Return a manifold by the name of its folder, or by a path.
+
+    Args:
+        name: For example ``damon-2``.
+        robot: Name of the robot that it must be for; by default any.
+
+    Raises:
+        MissingFileError: There is none.
+        FileFormatError: It is damaged, of another version, or for another robot.
+    """
+    folder = folder_of(name)
+    data = read_json(folder / CONFIG, "configuration of a manifold")
+    if data.get("schema") != SCHEMA:
+        raise FileFormatError(str(folder / CONFIG), "schema", data.get("schema"), f"expected {SCHEMA!r}")
+    config = validate(ManifoldConfig, data, str(folder / CONFIG))
+    if robot is not None and config.robot != robot:
+        raise FileFormatError(str(folder / CONFIG), "robot", config.robot, f"expected {robot!r}")
+    source = folder / WEIGHTS
+    content = read_file(source, "weights of a manifold")
+    found = hashlib.sha256(content).hexdigest()
+    if found != config.digest:
+        raise FileFormatError(str(source), "", f"SHA-256 {found[:12]}...", f"expected {config.digest[:12]}...: damaged")
+    try:
+        arrays = load_arrays(content)
+    except (SafetensorError, ValueError, KeyError) as error:
+        raise FileFormatError(str(source), "", str(error), "expected safetensors") from error
+    fault = _fault(arrays, config)
+    if fault:
+        raise FileFormatError(str(source), fault, "values that do not fit", f"expected arrays that fit {CONFIG}")
+    weights = {key: arrays[key].astype(np.float32) for key in weight_shapes(len(config.joints), config.hidden, 1)}
+    autoencoder = StateAutoencoder(weights, arrays["lower"].astype(float), arrays["upper"].astype(float))
+    pairs = {kind: arrays[f"edges.{kind}"].astype(np.int64) for kind in (DECODED, STORED)}
+    return Manifold(config, autoencoder, arrays["latent"].astype(float), arrays["stored"].astype(float), pairs)
+
+
+def shared_manifold(name: str, robot: str | None = None) -> Manifold:
+    """Return a manifold from a cache; it is read again when its files change.
+
+    Raises:
+        ApexError: As :func:`load_manifold` does.
+    """
+    files = [folder_of(name) / file for file in (CONFIG, WEIGHTS)]
+    stamp = tuple(file.stat().st_mtime_ns for file in files if is_file(file))
+    return _shared(str(files[0].parent.absolute()), robot, stamp)
+
+
+@lru_cache(maxsize=4)
+def _shared(folder: str, robot: str | None, stamp: tuple[int, ...]) -> Manifold:
+    del stamp
+    return load_manifold(folder, robot)
+
+
+@lru_cache(maxsize=4)
+def _graph(manifold: Manifold, kind: str) -> Graph:
+    return Graph.of(manifold.states(kind), manifold.pairs[kind])
+
+
+def _fault(arrays: Mapping[str, NDArray[Any]], config: ManifoldConfig) -> str:
+    """Return the name of the array that is missing or does not fit the others, or an empty text."""
+    joints, nodes = len(config.joints), len(arrays.get("latent", ()))
+    shapes: dict[str, tuple[int, ...]] = {
+        **weight_shapes(joints, config.hidden, config.dim), "lower": (joints,), "upper": (joints,),
+        "latent": (nodes, config.dim), "stored": (nodes, joints),
+    }  # fmt: skip
+    for name, shape in shapes.items():
+        if name not in arrays or arrays[name].shape != shape or not np.isfinite(arrays[name]).all():
+            return name
+    for kind in (DECODED, STORED):
+        name = f"edges.{kind}"
+        pairs = arrays.get(name)
+        if pairs is None or pairs.ndim != 2 or pairs.shape[1] != 2 or (len(pairs) and int(pairs.max()) >= nodes):
+            return name
+    return "" if 0 < nodes <= MOST_NODES else "latent"

@@ -1,0 +1,90 @@
+"""An imitation policy in the closed loop: its next chunks of states, followed unproved, again and again."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from apex_ompl.apex.query import make_query
+from apex_ompl.baselines.control.short_horizon import along
+from apex_ompl.collision import CollisionChecker
+from apex_ompl.moving.charges import Charges
+from apex_ompl.moving.placing import fresh_checker, place
+from apex_ompl.moving.ready import Ready
+from apex_ompl.moving.request import Answer, Request
+from apex_ompl.moving.search import Search
+from apex_ompl.types import Array
+
+if TYPE_CHECKING:
+    from apex_ompl.baselines.imitation.policy import ImitationPolicy
+
+NAME = "policy"
+STILL = 1e-6  # of a way below which the policy stands [rad]
+
+
+@dataclass(eq=False)
+class Imitation:
+    """The policy of the planner ``il`` as a reflex (Kim, Ohmura and Kuniyoshi, IROS 2021), to the nearest goal.
+
+    The policy is shown the state in which the robot will be, and obstacles where they are seen. Its share of time is
+    what share of the first distance to the goal has been covered. The next ``steps`` states of its clock are the
+    control points of a motion that ends at rest, and that is replaced by the next replan while it is followed. A motion
+    that ends within ``reach`` of the goal goes to the goal. Nothing is proved: what keeps the robot clear of obstacles
+    is what the policy has learned.
+
+    Attributes:
+        model: Name or folder of the policy.
+        steps: Number of states of its clock that a motion follows.
+        reach: Distance from the goal of any joint from which on the motion ends there [rad].
+    """
+
+    model: str = "il"
+    steps: int = 64
+    reach: float = 0.05
+    _policy: ImitationPolicy | None = field(default=None, repr=False)
+    _checker: CollisionChecker | None = field(default=None, repr=False)
+    _whole: float = 0.0
+
+    def prepare(self, ready: Ready) -> None:
+        """Load the policy.
+
+        Raises:
+            ApexError: It is missing, damaged, or of another robot.
+        """
+        from apex_ompl.baselines.imitation.policy import shared_policy
+
+        self._policy = shared_policy(self.model, robot=ready.setup.robot.name)
+        self._checker, self._whole = fresh_checker(ready), 0.0
+        self.states(ready.setup.start, ready.setup.start)
+
+    def replan(self, ready: Ready, request: Request, charges: Charges) -> Answer:
+        """Return the motion along the next states of the policy, which nothing has proved, or none."""
+        search = Search(ready, request, charges)
+        if not len(search.goals):
+            return Answer(None, NAME, charges)
+        assert self._checker is not None and self._policy is not None
+        for obstacle in request.obstacles:
+            place(self._checker, obstacle, obstacle.position)
+        goal = search.goals[0]
+        states = self.states(search.start.position, goal)
+        charges.charge("chunk of a policy", -(-(len(states) - 1) // self._policy.executed))
+        if np.abs(states[-1] - goal).max() <= self.reach:
+            states = np.concatenate([states, goal[None]])
+        if np.abs(states - search.start.position).max() <= STILL:
+            return Answer(None, NAME, charges)
+        motion = along(search, states, states[-1])
+        return Answer(None if motion is None else search.following(motion), NAME, charges)
+
+    def states(self, start: Array, goal: Array) -> Array:
+        """Return the next states of the policy among the obstacles that were placed last, shape (N, dof)."""
+        assert self._policy is not None and self._checker is not None
+        policy, distance = self._policy, float(np.linalg.norm(goal - start))
+        self._whole = max(self._whole, distance)
+        share = 1.0 - distance / self._whole if self._whole > 0.0 else 0.0
+        begin = min(round(share * (policy.clock - 1)), policy.clock - 2)
+        query = make_query(self._checker, start, goal, point=policy.sees_point)
+        found = policy.roll_out([query], self._checker.kernel, begin=begin, steps=self.steps)
+        assert found is not None  # nothing stops it
+        return np.asarray(found[0])

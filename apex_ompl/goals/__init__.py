@@ -1,0 +1,1 @@
+"""Goals: alignments, poses, grasps, and inverse kinematics."""

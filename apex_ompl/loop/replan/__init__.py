@@ -1,0 +1,1 @@
+"""Replanners: how the closed loop finds its next motion."""

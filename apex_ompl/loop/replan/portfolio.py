@@ -1,0 +1,197 @@
+"""Replanning while the robot moves: the speed along the path, and splines in space and time from several sources."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from apex_ompl.loop.replan.evasion import URGENT, endangered, step_aside, threatened
+from apex_ompl.loop.replan.quickening import quickened
+from apex_ompl.loop.replan.waiting import wait_nearer
+from apex_ompl.moving.charges import Charges
+from apex_ompl.moving.motion_pool import ROUNDS, MotionCandidate, MotionPool
+from apex_ompl.moving.ready import Ready
+from apex_ompl.moving.request import Answer, Request
+from apex_ompl.moving.retime import retime
+from apex_ompl.moving.search import Search, Source
+from apex_ompl.timing import Trajectory
+from apex_ompl.types import Array
+
+FACTORS = ((1.3, 2.5), (1.0, 1.8))  # durations that are tried in turn, as multiples of what a path takes at least
+GOALS = 2  # nearest goals that are tried directly
+ENOUGH = 10  # candidates at which no further source is asked
+ASIDE = 0.7  # share of the budget that other parts have where it may step aside behind them
+WAITING = 0.85  # and where a robot that stands may go nearer to a goal
+CARRIED = 6  # candidates that are carried over to the next replan
+SHARE = 0.5  # of the time that is left, for candidates before the next source is asked
+
+
+@dataclass(eq=False)
+class Portfolio:
+    """Retiming, and a pool of motions in space and time from several sources; what arrives first is taken.
+
+    Candidates of a replan that failed are carried over to the next one of the same run. Where only a faster motion is
+    of use, none are, and each replan begins with another source.
+
+    Attributes:
+        sources: Where motions to start from come from, those that gain most for their time first.
+        retimes: Whether the speed along the rest of the motion is chosen anew.
+        evades: Whether a robot that stands where an obstacle comes steps aside.
+        waits: Whether one that stands, while no way to a goal is found, goes nearer to it.
+    """
+
+    sources: Sequence[Source]
+    retimes: bool = True
+    evades: bool = True
+    waits: bool = True
+    carried: list[tuple[MotionCandidate, float]] = field(default_factory=list)
+
+    def prepare(self, ready: Ready) -> None:
+        """Load what the sources need, and forget earlier runs."""
+        self.carried = []
+        for source in self.sources:
+            source.prepare(ready)
+
+    def replan(self, ready: Ready, request: Request, charges: Charges) -> Answer:
+        """Return a motion from the time of joining on that is proved among what is expected, or none."""
+        search = Search(ready, request, charges)
+        evade, danger = ready.settings.evade, (request.following, request.join, request.contact)
+        comes = self.evades and evade != "never" and endangered(*danger)
+        urgent = comes and endangered(*danger, URGENT)
+        if urgent and self._step_aside(search):
+            return Answer(search.best, search.part, charges)
+        aside, waits = comes and not urgent, not comes and self.waits and not request.hastens
+        waits = waits and request.following.at_rest(request.join)
+        fallback = step_aside(search, proved=True) if aside and evade == "proved" else None
+        flees = self.evades and evade != "never" and threatened(request.following, request.join, request.conflict)
+        aside = aside or (flees and request.reachable is not None)
+        if (aside and fallback is None) or waits:
+            search.until = (WAITING if waits else ASIDE) * charges.limit  # some time is left for that
+        if self.retimes:
+            motion = retimed(search)
+            if motion is not None:
+                search.take(motion, "retime")
+        for goal in search.goals[:GOALS] if self.sources else ():
+            motion = straight(search, goal)
+            if motion is not None:
+                search.take(motion, "direct")
+        if self.sources and search.request.hastens:
+            quicken(search, request.following.piece(request.join, request.following.end))
+        if self.sources and not search.over():
+            self._optimise(search)
+        if search.best is None and fallback is not None:
+            search.best, search.part = search.following(fallback), "evade"
+        if search.best is None and aside:
+            self._step_aside(search)
+        if search.best is None and waits:
+            self._wait_nearer(search)
+        return Answer(search.best, search.part, charges)
+
+    @staticmethod
+    def _step_aside(search: Search) -> bool:
+        """Take a step aside; return whether there is one."""
+        aside = step_aside(search)
+        if aside is not None:
+            search.best, search.part = search.following(aside), "evade"
+        return aside is not None
+
+    @staticmethod
+    def _wait_nearer(search: Search) -> None:
+        """Take a motion to where the robot may wait, where there is one."""
+        nearer = wait_nearer(search)
+        if nearer is not None:
+            search.best, search.part = search.following(nearer), "wait"
+
+    def _optimise(self, search: Search) -> None:
+        """Improve motions in space and time while there is time."""
+        pool, goals = search.pool(), search.goals
+        if not len(goals):
+            return
+        hastens = search.request.hastens
+        if not hastens:
+            carried, self.carried = self.carried, []
+            for one, begun in carried:
+                pool.carry(one, search.request.join - begun)
+        turn = search.request.number % len(self.sources) if hastens else 0
+        sources = iter([*self.sources[turn:], *self.sources[:turn]])
+        while not search.over():
+            source = next(sources, None)
+            if source is None and not pool.candidates:
+                break
+            if source is not None and len(pool.candidates) < ENOUGH:
+                self._ask(source, search, pool)
+            left = search.charges.limit - search.charges.spent
+            until = search.charges.spent + (SHARE * left if source is not None else left)
+            if not self._improve(search, pool, min(until, search.until)) and source is None:
+                break
+        if hastens:
+            return
+        open_ones = [one for one in pool.candidates if not one.given_up and one.rounds < ROUNDS]
+        open_ones.sort(key=lambda one: one.priority)
+        self.carried = [(one, search.request.join) for one in open_ones[:CARRIED]]
+
+    @staticmethod
+    def _ask(source: Source, search: Search, pool: MotionPool) -> None:
+        """Take the motions of a source into the pool."""
+        for guess in source.guesses(search):
+            for factor in (1.0,) if guess.timed else FACTORS[search.request.number % len(FACTORS)]:
+                if search.charges.over():
+                    return
+                least = factor * guess.duration
+                if least >= search.wanted():
+                    continue
+                timed = guess.states, least
+                made = timed if guess.timed else search.shaped(guess.states, guess.goal, least)
+                if made is not None and made[1] < search.wanted():
+                    pool.add(*made, guess.goal, source.name)
+
+    @staticmethod
+    def _improve(search: Search, pool: MotionPool, until: float) -> bool:
+        """Improve motions until a time by the charges; return whether there is more to improve."""
+        while True:
+            found = pool.improve(search.wanted, until)
+            if found is None:
+                return search.charges.spent >= until
+            if search.take(found[1], found[0].origin):
+                quicken(search, found[1])
+            if search.over():
+                return False
+
+
+def quicken(search: Search, motion: Trajectory) -> None:
+    """Take a faster motion through states of one that is proved, where there is one that is proved, too."""
+    for faster in quickened(search, motion):
+        if search.accepts(faster) and search.take(faster, "quicken"):
+            return
+
+
+def straight(search: Search, goal: Array) -> Trajectory | None:
+    """Return the direct motion to a goal, or a slower or retimed one, that is proved, or None."""
+    ready, request = search.ready, search.request
+    fastest = search.direct(goal)
+    if fastest is None or fastest.duration <= 0.0 or fastest.duration >= search.wanted():
+        return None
+    if not ready.clear_of_still(fastest, search.charges):
+        return None
+    if search.accepts(fastest):
+        return fastest
+    made = retime(ready.kernel, request.predicted, fastest, ready.limits, clock=request.join, hold=ready.settings.hold)
+    search.charges.charge("retiming")
+    slow = made.trajectory
+    if slow is not None and slow.duration < search.wanted() and search.accepts(slow):
+        return slow
+    return None
+
+
+def retimed(search: Search) -> Trajectory | None:
+    """Return the rest of the motion at another speed, where it goes to a goal and that is proved, or None."""
+    ready, request = search.ready, search.request
+    following = request.following
+    if not following.to_goal or following.at_rest(request.join):
+        return None
+    made = retime(
+        ready.kernel, request.predicted, following.motion, ready.limits, time=request.join - following.begin,
+        clock=request.join, hold=ready.settings.hold,
+    )  # fmt: skip
+    search.charges.charge("retiming")
+    return made.trajectory if made.trajectory is not None and search.accepts(made.trajectory) else None

@@ -1,0 +1,228 @@
+"""A trained model evaluated by NumPy: ready without torch, which takes longer to import than most problems to solve.
+
+It computes what torch does for models of a linear latent space and an MLP denoiser, with large matrices of weights in
+eight bits; names of weights are those of the torch module
+:class:`apex_ompl.training.latent_diffusion.LatentDiffusion`, where the layers are explained.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apex_ompl.kernel import Kernel
+from apex_ompl.kernel.compiled.dense_layer import dense_layer
+from apex_ompl.kernel.products import product
+from apex_ompl.model.config import OBSTACLE_SCENES, ModelConfig, key_shapes
+from apex_ompl.model.geometry import SHAPES, signed_distances
+from apex_ompl.model.guidance import Guidance, collision_cost
+from apex_ompl.model.proposals import TrajectoryModel
+from apex_ompl.model.quantization import SUFFIX, quantized
+from apex_ompl.model.query import MAX_DISTANCE, WORKSPACE_CENTRE, ObstacleSet, Probes, Query
+from apex_ompl.paths.spline import Spline
+from apex_ompl.types import Array
+from apex_ompl.util.validation import check_integer
+
+Single = NDArray[np.float32]
+STEP_SIZE = 128  # of the embedding of a step
+EPSILON = 1e-5  # of the layer normalization, as in torch
+
+
+def is_supported(config: ModelConfig) -> bool:
+    """Whether NumPy can evaluate models of a configuration."""
+    return config.latent.kind == "linear" and config.denoiser.kind in ("mlp", "regression")
+
+
+class ArrayModel(TrajectoryModel):
+    """Trained model whose networks NumPy evaluates, in single precision as torch does.
+
+    Attributes:
+        weights: Weights by their names in the checkpoint: matrices in eight bits with ``NAME.scale``, others in single
+            precision.
+    """
+
+    def __init__(self, config: ModelConfig, weights: Mapping[str, NDArray[Any]], about: Mapping[str, Any]) -> None:
+        """Use weights that fit a configuration, see :func:`is_supported`, in any precision."""
+        joint, offset = weights["probe_joint"], np.asarray(weights["probe_offset"], float)
+        probes = Probes(np.asarray(joint, np.int64), offset, config.condition.along)
+        super().__init__(config, about, probes, {name: weights[name] for name in key_shapes(config)})
+        self.weights: dict[str, NDArray[Any]] = {
+            k: np.ascontiguousarray(v, np.int8 if v.dtype == np.int8 else np.float32)
+            for k, v in quantized(weights).items()
+        }
+        half = STEP_SIZE // 2
+        self._frequencies = np.exp(np.float32(-math.log(10_000.0)) * np.arange(half, dtype=np.float32) / half)
+        self._mean = self.weights["autoencoder.mean"]
+        self._decoder = np.ascontiguousarray(
+            (self.weights["autoencoder.components"] * self.weights["autoencoder.deviations"]).T
+        )
+        self._basis = self.spline.basis(self.spline.parameters)
+        self._shares = self.spline.line(np.zeros(1), np.ones(1))
+
+    def one_thread(self) -> AbstractContextManager[None]:
+        """Let its networks compute by one thread inside a block; they always do."""
+        return nullcontext()
+
+    def zeros(self, count: int) -> Single:
+        """Return ``count`` latent vectors of zeros."""
+        return np.zeros((count, self.config.latent.dim), np.float32)
+
+    def encode(self, control: Array) -> Single:
+        """Return the latent vectors of control points, shape (B, points, dof) [rad]."""
+        line = self._lines(control[:, 0], control[:, -1])
+        residual = (control - line)[:, self.spline.inner].reshape(len(control), -1).astype(np.float32)
+        found = product(residual - self._mean, self.weights["autoencoder.components"])
+        return np.asarray(found / self.weights["autoencoder.deviations"], np.float32)
+
+    def condition(self, queries: Sequence[Query], kernel: Kernel) -> Single:
+        """Return the encoded conditions of Q queries, shape (Q, out)."""
+        lower, upper = self.weights["encoder.lower"], self.weights["encoder.upper"]
+        ends = np.array([[q.start, q.goal] for q in queries], np.float32)
+        scaled = np.asarray(2.0 * (ends - lower) / (upper - lower) - 1.0, np.float32)
+        parts: list[Single] = [scaled.reshape(len(queries), -1)]
+        centre = np.array(WORKSPACE_CENTRE, np.float32)
+        if self.config.condition.point:
+            parts.append(np.array([q.point for q in queries], np.float32) - centre)
+        if self.sight is not None:
+            parts.append(self.sight.features(queries, kernel))
+        if self.config.condition.scene in OBSTACLE_SCENES:
+            start, goal = (np.array([getattr(q, name) for q in queries], float) for name in ("start", "goal"))
+            probes = self.probes.positions(kernel, start, goal)
+            features = [self._obstacle_features(q.obstacles, points) for q, points in zip(queries, probes, strict=True)]
+            parts.append(np.array(features, np.float32))
+        return self._layers("encoder.phi", 3 if self.sight is not None else 2, np.concatenate(parts, axis=1))
+
+    def refine(self, condition: Single, along: Single) -> Single:
+        """Return encoded conditions with what lies along estimates of paths, features of shape (B, F)."""
+        return condition + self._layers("encoder.psi", 3, along)
+
+    def denoise(self, latent: Single, t: int, condition: Single) -> Single:
+        """Return the denoiser's output for latent vectors at a step, each with its condition, or one for all."""
+        angles = np.float32(t) * self._frequencies
+        step = self._linear("denoiser.step.1", np.concatenate([np.sin(angles), np.cos(angles)])[None])
+        embedding = _silu(step + condition)
+        x = self._linear("denoiser.enter", latent)
+        for k in range(self.config.denoiser.blocks):
+            block = f"denoiser.blocks.{k}"
+            scale, shift = np.split(self._linear(f"{block}.modulation", embedding), 2, axis=-1)
+            y = _normalized(x) * (1.0 + scale) + shift
+            x = x + self._linear(f"{block}.second", _silu(self._linear(f"{block}.first", y)))
+        return self._linear("denoiser.leave", _normalized(x))
+
+    def score(self, latent: Single, kernel: Kernel, ends: tuple[Array, Array], guidance: Guidance) -> Single:
+        """Return the gradient of log p(g | z) at latent vectors z, see :meth:`TrajectoryModel.score`."""
+        basis = self._basis[guidance.states(self.spline.states)]
+        _, slopes = collision_cost(kernel, product(basis, self.control(latent, ends)), guidance.margin)
+        inner = product(basis[:, self.spline.inner].T, slopes).reshape(len(latent), -1)
+        return -product(inner, self._decoder.T).astype(np.float32)
+
+    def control(self, latent: Single, ends: tuple[Array, Array]) -> Array:
+        """Return control points, shape (B, points, dof) [rad], of latent vectors between starts and goals."""
+        control = self._lines(*ends)
+        free = (self._mean + product(latent, self._decoder)).reshape(len(latent), self.spline.free, -1)
+        control[:, self.spline.inner] += free
+        return control
+
+    def _lines(self, start: Array, goal: Array) -> Array:
+        """Return the control points of straight lines between ends of shape (B, dof)."""
+        return np.asarray(start)[:, None] + self._shares * (np.asarray(goal) - start)[:, None]
+
+    def _obstacle_features(self, obstacles: ObstacleSet, probes: Single) -> Single:
+        """Return what the encoder sees of the obstacles of a query, shape (features,); probes have (L, P, 3)."""
+        along, count = probes.shape[:2]
+        centre = np.array(WORKSPACE_CENTRE, np.float32)
+        position, size = (np.asarray(v, np.float32) for v in (obstacles.position, obstacles.size))
+        rotation = np.asarray(obstacles.rotation, np.float32)
+        kinds = np.eye(len(SHAPES), dtype=np.float32)[obstacles.shape]
+        inputs, parts = [kinds, position - centre, rotation.reshape(-1, 9), size], []
+        if self.config.condition.scene == "distances":
+            points = np.broadcast_to(probes.reshape(1, -1, 3), (len(obstacles), along * count, 3))
+            distances = signed_distances(obstacles.shape, position, rotation, size, points)
+            distances = np.clip(distances, -MAX_DISTANCE, MAX_DISTANCE) / np.float32(MAX_DISTANCE)
+            parts += [(probes - centre).ravel(), distances.min(axis=0, initial=1.0)]
+            looked_at = distances.reshape(-1, along, count)[:, [0, along // 2, -1]]
+            inputs.append(looked_at.reshape(-1, 3 * count))
+        tokens = np.concatenate(inputs, axis=1)
+        tokens = _silu(self._linear("encoder.thing.0", tokens))
+        tokens = self._linear("encoder.thing.4", _silu(self._linear("encoder.thing.2", tokens)))
+        parts += [tokens.sum(axis=0) / np.float32(max(1, len(obstacles))), tokens.max(axis=0, initial=0.0)]
+        return np.concatenate(parts)
+
+    def _layers(self, name: str, count: int, values: Single) -> Single:
+        """Return the output of an MLP of ``count`` layers."""
+        for k in range(count):
+            values = self._linear(f"{name}.{2 * k}", _silu(values) if k else values)
+        return values
+
+    def _linear(self, name: str, values: Single) -> Single:
+        weight, bias = self.weights[f"{name}.weight"], self.weights[f"{name}.bias"]
+        if weight.dtype != np.int8:
+            return np.asarray(product(values, weight.T) + bias, np.float32)
+        found = np.empty((len(values), len(weight)), np.float32)
+        scale = self.weights[f"{name}.weight{SUFFIX}"]
+        dense_layer(weight, scale, bias, np.ascontiguousarray(values, np.float32), found)
+        return found
+
+
+def weight_shapes(config: ModelConfig) -> dict[str, tuple[int, ...]]:
+    """Return the shapes of a model's weights by their names.
+
+    Raises:
+        ParameterError: There is no such model.
+    """
+    dof, condition, denoiser = len(config.joints), config.condition, config.denoiser
+    spline = Spline(**config.spline.model_dump())
+    dim, free = config.latent.dim, spline.free * dof
+    check_integer(dim, "dimension of the latent space", 1, free)
+    shapes: dict[str, tuple[int, ...]] = {
+        "probe_joint": (config.probes,), "probe_offset": (config.probes, 3), "autoencoder.mean": (free,),
+        "autoencoder.components": (free, dim), "autoencoder.deviations": (dim,),
+        "encoder.lower": (dof,), "encoder.upper": (dof,), **key_shapes(config),
+    }  # fmt: skip
+    layers: list[tuple[str, int, int]] = []
+    size = 2 * dof + 3 * condition.point
+    if condition.scene in OBSTACLE_SCENES:
+        features = len(SHAPES) + 15 + (3 * config.probes if condition.scene == "distances" else 0)
+        layers += [("encoder.thing.0", features, condition.width)]
+        layers += [(f"encoder.thing.{k}", condition.width, condition.width) for k in (2, 4)]
+        size += 2 * condition.width
+    if condition.scene == "distances":
+        size += 4 * condition.along * config.probes
+    hidden = 2 * condition.width
+    layers.append(("encoder.phi.0", size + config.seen, hidden))
+    if condition.scene == "clearances":
+        layers += [("encoder.phi.2", hidden, hidden), ("encoder.phi.4", hidden, condition.out)]
+    else:
+        layers.append(("encoder.phi.2", hidden, condition.out))
+    if condition.refined:
+        layers += [("encoder.psi.0", config.along_size, hidden), ("encoder.psi.2", hidden, hidden)]
+        layers.append(("encoder.psi.4", hidden, condition.out))
+    width = denoiser.width
+    layers += [("denoiser.step.1", STEP_SIZE, condition.out), ("denoiser.enter", dim, width)]
+    layers += [("denoiser.leave", width, dim)]
+    for k in range(denoiser.blocks):
+        block = f"denoiser.blocks.{k}"
+        layers += [(f"{block}.modulation", condition.out, 2 * width)]
+        layers += [(f"{block}.{name}", width, width) for name in ("first", "second")]
+    for name, before, after in layers:
+        shapes |= {f"{name}.weight": (after, before), f"{name}.bias": (after,)}
+    return shapes
+
+
+def _silu(values: Single) -> Single:
+    """Return x / (1 + exp(-x))."""
+    with np.errstate(over="ignore"):  # x / inf is the limit, 0
+        return np.asarray(values / (np.float32(1.0) + np.exp(-values)))
+
+
+def _normalized(values: Single) -> Single:
+    """Return rows shifted and scaled to mean 0 and variance 1."""
+    centred = values - values.mean(axis=-1, keepdims=True)
+    variance = np.square(centred).mean(axis=-1, keepdims=True)
+    found: Single = centred / np.sqrt(variance + np.float32(EPSILON))
+    return found

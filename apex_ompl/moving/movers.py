@@ -1,0 +1,294 @@
+"""Obstacles that move, beside the scene: proofs of timed motions among them, and clearances in time."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from copy import copy
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from apex_ompl.collision.path_proof import Curve
+from apex_ompl.collision.shapes import world_geometry
+from apex_ompl.collision.tabulate import primitives
+from apex_ompl.errors import ParameterError, SceneError, UnknownNameError
+from apex_ompl.kernel import Kernel
+from apex_ompl.kernel.compiled.layout import pack, unpack
+from apex_ompl.kernel.compiled.movers import MoverArrays, clearances_in_time, first_conflict
+from apex_ompl.kernel.scene_builder import Solids, grid_columns, joined
+from apex_ompl.scene.bodies import Obstacle
+from apex_ompl.timing import Trajectory
+from apex_ompl.types import Array
+from apex_ompl.util.arrays import compact
+from apex_ompl.util.display import one_line
+from apex_ompl.util.validation import check_array, check_number, finite_array
+
+SHORTEST = 1e-3  # length of an interval of time that is given up [s]
+PREPARED = 64  # motions whose curves are kept
+
+
+class Movers:
+    """Obstacles that move at constant velocity without turning, outside of the scene that a kernel has.
+
+    Each has a place and a velocity at a time stamp, and a margin by which it counts as larger, which may grow behind
+    the time stamp. An update is a write to an array.
+
+    Attributes:
+        names: Names of the obstacles.
+        arrays: The solids that they are made of, see :class:`apex_ompl.kernel.compiled.movers.MoverArrays`; views of
+            ``packed``.
+        packed: What compiled code takes.
+    """
+
+    def __init__(
+        self, obstacles: Iterable[Obstacle], allowed: Iterable[tuple[int, str]] = (), *, stamp: float = 0.0
+    ) -> None:
+        """Place obstacles where their records say at a time stamp, with their velocities and without margins.
+
+        Meshes, points, voxels and grids of distances move as grids of distances.
+
+        Args:
+            obstacles: The obstacles; those without a velocity stand still.
+            allowed: Bodies, as rows of the robot's tables, and names of movers that they may touch.
+            stamp: Time of the places [s].
+
+        Raises:
+            SceneError: A name is given twice.
+            ParameterError: An obstacle is a half-space.
+        """
+        given = tuple(obstacles)
+        self.names = tuple(o.name for o in given)
+        if len(set(self.names)) < len(given):
+            raise SceneError(f"names of movers must differ, found {', '.join(o.name for o in given)}")
+        for o in given:
+            if o.half_space is not None:
+                raise ParameterError(f"mover {o.name}", "a half_space", "a shape that is bounded")
+        rows = [Solids.of(primitives(*world_geometry(o))) for o in given]
+        owner = np.repeat(np.arange(len(rows)), np.array([len(some.kind) for some in rows], int))
+        solids = joined(rows)
+        places = np.array([o.position for o in given], float).reshape(-1, 3)
+        self._from_body = solids.offset - places[owner]
+        pairs = [(body, self._row(name)) for body, name in allowed]
+        velocity = np.array([o.velocity or (0.0, 0.0, 0.0) for o in given], float).reshape(-1, 3)
+        arrays = MoverArrays(
+            kind=solids.kind,
+            owner=owner.astype(np.int64),
+            allowed=np.array(pairs, np.int64).reshape(-1, 2),
+            rotation=solids.rotation,
+            place=solids.offset,
+            size=solids.size,
+            velocity=velocity[owner],
+            stamp=np.full(len(owner), float(stamp)),
+            growth=np.zeros((len(owner), 2)),
+            **grid_columns(solids.grids),
+        )
+        self._pack(pack(arrays))
+
+    def _pack(self, packed: tuple[Array, ...]) -> None:
+        self.packed = packed
+        self.arrays: MoverArrays = unpack(MoverArrays, *packed)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the state without views of its arrays."""
+        return {name: value for name, value in self.__dict__.items() if name != "arrays"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Take a state, and make the views anew."""
+        self.__dict__.update(state)
+        self._pack(self.packed)
+
+    def __repr__(self) -> str:
+        """Return the names of the obstacles."""
+        return one_line("Movers", *self.names)
+
+    def __len__(self) -> int:
+        """Return the number of obstacles."""
+        return len(self.names)
+
+    def update(
+        self, name: str, position: ArrayLike | None = None, velocity: ArrayLike | None = None,
+        *, stamp: float | None = None, growth: tuple[float, float] | None = None,
+    ) -> None:  # fmt: skip
+        """Write what is known of an obstacle now; what is not given stays.
+
+        Args:
+            name: Its name.
+            position: Where it was at the time stamp, shape (3,) [m].
+            velocity: Shape (3,) [m/s].
+            stamp: Time stamp [s].
+            growth: Margin at the time stamp [m], and its growth behind it [m/s]; neither is negative.
+
+        Raises:
+            UnknownNameError: There is no such obstacle.
+            ParameterError: A number that is not finite, or another shape; a margin that is negative.
+        """
+        mine = self.arrays.owner == self._row(name)
+        given = (("position", position, 3), ("velocity", velocity, 3), ("growth", growth, 2))
+        values = {key: finite_array(value, key) for key, value, _ in given if value is not None}
+        for key, _, count in given:
+            if key in values:
+                check_array(values[key], (count,), key)
+        if stamp is not None:
+            check_number(stamp, "stamp")
+        if "growth" in values and values["growth"].min() < 0.0:
+            raise ParameterError("growth", growth, "numbers that are not negative")
+        if "position" in values:
+            self.arrays.place[mine] = values.pop("position") + self._from_body[mine]
+        for key, value in values.items():
+            getattr(self.arrays, key)[mine] = value
+        if stamp is not None:
+            self.arrays.stamp[mine] = stamp
+
+    def placed(self, positions: Array, velocities: Array, growth: Array, stamps: Array) -> Movers:
+        """Return a copy in which all that is known of the obstacles is written, as by :meth:`update` but unchecked.
+
+        Args:
+            positions: Where they were at the time stamps, shape (N, 3) [m].
+            velocities: Shape (N, 3) [m/s].
+            growth: Margins at the time stamps [m], and their growth behind them [m/s], shape (N, 2).
+            stamps: Time stamps, shape (N,) [s].
+        """
+        other = self.larger(0.0)
+        a = other.arrays
+        a.place[:] = positions[a.owner] + self._from_body
+        a.velocity[:], a.stamp[:], a.growth[:] = velocities[a.owner], stamps[a.owner], growth[a.owner]
+        return other
+
+    def larger(self, by: float) -> Movers:
+        """Return a copy with margins that are larger by a distance [m]."""
+        other, (integers, floats, *singles) = copy(self), self.packed
+        other._pack((integers, floats.copy(), *singles))  # nothing else is written to
+        other.arrays.growth[:, 0] += by
+        return other
+
+    def with_margin(self, margin: float, growth: float = 0.0) -> Movers:
+        """Return a copy with a margin at the time stamps [m], which grows after them [m/s], in place of theirs."""
+        other = self.larger(0.0)
+        other.arrays.growth[:] = margin, growth
+        return other
+
+    def nominal(self, margin: float) -> Movers:
+        """Return a copy whose margins are at most so large [m], and do not grow."""
+        other = self.with_margin(margin)
+        other.arrays.growth[:, 0] = np.minimum(self.arrays.growth[:, 0], margin)
+        return other
+
+    def at(self, time: float) -> dict[str, Array]:
+        """Return where the obstacles are at a time [s]: positions, shape (3,) [m], by name."""
+        a, found = self.arrays, {}
+        for row, name in enumerate(self.names):
+            k = int(np.argmax(a.owner == row))
+            found[name] = a.place[k] - self._from_body[k] + (time - a.stamp[k]) * a.velocity[k]
+        return found
+
+    def _row(self, name: str) -> int:
+        if name not in self.names:
+            raise UnknownNameError("mover", name, self.names)
+        return self.names.index(name)
+
+
+class Conflict(NamedTuple):
+    """Where a motion can no longer be proved.
+
+    Attributes:
+        time: First moment that cannot be proved [s from the motion's begin]; infinite where all of it is proved.
+        body: Name of the body that is not proved apart there, empty where there is none.
+        mover: Name of the mover.
+        intervals: Number of intervals of time looked at.
+    """
+
+    time: float
+    body: str
+    mover: str
+    intervals: int
+
+    def __bool__(self) -> bool:
+        """Whether there is one."""
+        return math.isfinite(self.time)
+
+
+@lru_cache(maxsize=PREPARED)
+def curve_of(motion: Trajectory) -> Curve:
+    """Return the cubic pieces of a motion as proofs take them; those of the last motions are kept."""
+    return Curve.cubic(motion.times, motion.positions, motion.velocities, motion.accelerations)
+
+
+def prove_motion(
+    kernel: Kernel, movers: Movers, motion: Trajectory, begin: float = 0.0, end: float | None = None,
+    *, clock: float = 0.0, shortest: float = SHORTEST,
+) -> Conflict:  # fmt: skip
+    """Prove that a timed motion stays apart from obstacles that move, and find the first moment that is not proved.
+
+    The proof is that of the sphere covers along the motion's own cubic pieces
+    (:mod:`apex_ompl.kernel.compiled.movers`): it is sound, and may leave contacts of some millimetres open that there
+    are not. The scene of the kernel and the robot itself are not looked at.
+
+    Args:
+        kernel: The kernel of the robot with what it holds.
+        movers: The obstacles.
+        motion: The motion; behind its end the robot stands.
+        begin: Where on the motion to begin [s].
+        end: Where to end [s], by default at its end.
+        clock: Time of the movers' stamps when the motion is at 0 [s].
+        shortest: Length of an interval of time that is given up [s].
+
+    Raises:
+        ParameterError: The motion is one of other joints, or a number is not finite.
+    """
+    if motion.dof != kernel.robot.dof:
+        raise ParameterError("motion", motion.dof, f"one of {kernel.robot.dof} joints")
+    until = motion.duration if end is None else end
+    for name, value in (("begin", begin), ("end", until), ("clock", clock)):
+        check_number(value, name)
+    curve = curve_of(motion)
+    found = np.empty(3, np.int64)
+    time = first_conflict(
+        *kernel.robot.packed, *movers.packed, *kernel.workspace(), curve.knots, curve.states, curve.rates, curve.slack,
+        float(begin), float(until), float(clock), float(shortest),
+        np.empty((len(movers.arrays.kind), 3)), np.empty(kernel.robot.dof), found,
+    )  # fmt: skip
+    body, mover, intervals = found.tolist()
+    names = (kernel.robot.body_names[body], movers.names[mover]) if body >= 0 and math.isfinite(time) else ("", "")
+    return Conflict(float(time), *names, intervals)
+
+
+def clearance_in_time(
+    kernel: Kernel, movers: Movers, states: ArrayLike, times: ArrayLike, limit: float = np.inf
+) -> tuple[Array, Array]:
+    """Return the signed clearances of a robot's sphere cover to movers, and their gradients.
+
+    Args:
+        kernel: The kernel of the robot with what it holds.
+        movers: The obstacles.
+        states: States, shape (N, dof).
+        times: Times of the movers' stamps, shape (N,) [s].
+        limit: Larger clearances are given as this [m]; a small one is faster.
+
+    Returns:
+        Values, shape (N,) [m], NaN where a state is not finite or a hand is outside its limits, margins subtracted;
+        and gradients, shape (N, dof + 1): with respect to the state [m/rad], and to the time [m/s].
+
+    Raises:
+        ParameterError: Another shape, or a time that is not finite.
+    """
+    q, at = kernel.states(states), compact(finite_array(times, "times"))
+    check_array(at, (len(q),), "times")
+    values, gradients = np.empty(len(q)), np.empty((len(q), q.shape[1] + 1))
+    clearances_in_time(
+        *kernel.robot.packed, *movers.packed, *kernel.workspace(), q, at, float(limit),
+        np.empty((len(movers.arrays.kind), 3)), values, gradients,
+    )  # fmt: skip
+    return values, gradients
+
+
+def allowed_rows(kernel: Kernel, allowed: Iterable[tuple[str, str]], names: Sequence[str]) -> list[tuple[int, str]]:
+    """Return pairs of names of bodies that may touch as rows of a robot's tables and names of movers."""
+    rows: list[tuple[int, str]] = []
+    for pair in allowed:
+        for mover, body in (pair, pair[::-1]):
+            if mover in names:
+                rows += [(k, mover) for k, name in enumerate(kernel.robot.body_names) if name == body]
+    return rows

@@ -1,0 +1,211 @@
+"""All that a run of the closed loop keeps ready, so that a replan pays for nothing but the plan."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from apex_ompl.collision import CollisionChecker
+from apex_ompl.collision.path_proof import Curve
+from apex_ompl.kernel import Kernel
+from apex_ompl.kernel.ahead_of_time import compile_ahead
+from apex_ompl.kernel.compiled.entry_points import RUNS
+from apex_ompl.moving.charges import Charges
+from apex_ompl.moving.following import Following
+from apex_ompl.moving.movers import Movers, curve_of, prove_motion
+from apex_ompl.moving.settings import LoopSettings
+from apex_ompl.moving.stopping import stop, stop_along, stops_proved
+from apex_ompl.ompl.setup import PlanningSetup
+from apex_ompl.robot.model import Limits
+from apex_ompl.timing import Trajectory
+from apex_ompl.timing.checks import SAME_STATE
+from apex_ompl.types import Array
+
+GRAZING = 1e-4  # distance from still things and own parts, such as held objects, below which a motion is not taken [m]
+
+
+@dataclass(eq=False)
+class Ready:
+    """The robot among what stands still.
+
+    Attributes:
+        setup: The problem without the obstacles that move.
+        limits: Limits of motions; at most those of stops.
+        stopping: Limits of stops.
+        settings: Parameters of the loop.
+    """
+
+    setup: PlanningSetup
+    limits: Limits
+    stopping: Limits
+    settings: LoopSettings
+
+    def __post_init__(self) -> None:
+        """Compile what runs need, where that was not done yet."""
+        compile_ahead(RUNS)
+
+    @property
+    def checker(self) -> CollisionChecker:
+        """The collision checker."""
+        return self.setup.checker
+
+    @property
+    def kernel(self) -> Kernel:
+        """The kernel."""
+        return self.setup.checker.kernel
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the joints."""
+        return self.setup.robot.joint_names
+
+    @property
+    def goals(self) -> Array:
+        """Valid goal states, shape (goals, dof)."""
+        return self.setup.valid_goals
+
+    @property
+    def fingers(self) -> list[int]:
+        """Indices of the planned joints that close hands, which stay where there is nothing to be grasped."""
+        synergies = (hand.synergy for hand in self.setup.robot.hands.values())
+        return [self.names.index(name) for name in synergies if name in self.names]
+
+    def is_goal(self, q: Array) -> bool:
+        """Whether a state, shape (dof,), is a goal, as the referee sees it: stops may end that near to one."""
+        return bool(len(self.goals)) and bool((np.abs(self.goals - q).max(axis=1) <= SAME_STATE).any())
+
+    def clear_of_still(self, motion: Trajectory, charges: Charges | None = None) -> bool:
+        """Whether a motion keeps the limits, and is proved as by :meth:`is_clear`."""
+        return self.keeps_limits(motion) and self.is_clear(curve_of(motion), charges)
+
+    def is_clear(self, curve: Curve, charges: Charges | None = None) -> bool:
+        """Whether a curve is proved free of what stands still and of the robot itself.
+
+        It does not graze either, but where it begins like that: pieces of it are proved again where they are joined.
+        """
+        proof = self.checker.prove(curve, tolerance=0.0)
+        if charges is not None:
+            charges.charge("proof interval", proof.intervals)
+            charges.charge("exact proof", int(proof.by_spheres < 1.0))
+        return bool(proof) and (proof.clearance >= GRAZING or self._touches(curve.states[0]))
+
+    def line_is_clear(self, first: Array, last: Array, charges: Charges | None = None) -> bool:
+        """Whether the straight motion between two states, shape (dof,), is proved as by :meth:`is_clear`."""
+        return self.is_clear(Curve.polyline(np.stack([first, last])), charges)
+
+    def _touches(self, q: Array) -> bool:
+        """Whether what stands still or the robot's own parts are nearer than a graze at a state, shape (dof,)."""
+        states, still = np.stack([q, q]), np.zeros((2, len(q)))
+        proof = self.checker.prove(Curve.cubic(np.array([0.0, 1.0]), states, still, still), tolerance=0.0)
+        return not proof or proof.clearance < GRAZING
+
+    def keeps_limits(self, motion: Trajectory) -> bool:
+        """Whether a motion keeps the limits."""
+        return max(motion.use(self.limits).values()) <= 1.0 + 1e-9
+
+    def first_conflict(
+        self, movers: Movers, following: Following, begin: float, until: float, charges: Charges | None = None
+    ) -> float:
+        """Return the time of the clock at which a motion can no longer be proved clear of movers [s], or infinity.
+
+        Args:
+            movers: The obstacles.
+            following: The motion.
+            begin: Time of the clock from which on it is looked at [s].
+            until: Time until which it is looked at [s], behind its end, too.
+            charges: Gets the number of intervals.
+        """
+        zero = following.begin
+        found = prove_motion(self.kernel, movers, following.motion, begin - zero, until - zero, clock=zero)
+        if charges is not None:
+            charges.charge("interval among movers", found.intervals)
+        return found.time + zero
+
+    def proved_to_rest(self, reachable: Movers, following: Following, charges: Charges | None = None) -> bool:
+        """Whether nothing that obstacles can reach comes in the way of a motion until the robot is at rest again.
+
+        Args:
+            reachable: The obstacles, as large as all that they can reach.
+            following: The motion.
+            charges: Gets the number of intervals.
+        """
+        return bool(np.isinf(self.first_conflict(reachable, following, following.begin, following.end, charges)))
+
+    def proved_stop(self, reachable: Movers, following: Following, now: float, then: float) -> Following | None:
+        """Return a stop from a motion at a later time that nothing can come in the way of, or None.
+
+        Whatever obstacles do that were seen where ``reachable`` says, they touch the robot neither until that time nor
+        during the stop.
+
+        Args:
+            reachable: The obstacles, as large as all that they can reach.
+            following: The motion.
+            now: Time of the clock [s].
+            then: Time of the clock at which the stop begins [s].
+        """
+        if following.at_rest(then):
+            stopped = Following.standing(following.motion.positions[-1], then, self.names, to_goal=following.to_goal)
+            clear = following.at_rest(now) or np.isinf(self.first_conflict(reachable, following, now, following.end))
+            return stopped if clear else None
+        if np.isfinite(self.first_conflict(reachable, following, now, then)):
+            return None
+        for along in (True, False):
+            found = self.clear_stop(following, then, along)
+            if found is not None and np.isinf(self.first_conflict(reachable, found, then, found.end)):
+                return found
+        return None
+
+    def foreseen_stops(
+        self, predicted: Movers, following: Following, moments: Array, age: float, spread: float
+    ) -> tuple[int, int]:
+        """Return behind how many times of the clock, from the first on, stops from a motion will hardly be refused.
+
+        They are proved by what will be known then, as far as can be told now (:func:`stops_proved`).
+
+        Args:
+            predicted: The obstacles.
+            following: The motion.
+            moments: Times of the clock, shape (N,) [s].
+            age: How old what is known will be [s].
+            spread: By how much more than the error assumed places will differ from those expected [m].
+
+        Returns:
+            Their number; and of how many of those looked at the stop is one of each joint by itself.
+        """
+        settings = self.settings
+        error, fastest = settings.assumed
+        count, by_joints = stops_proved(
+            self.kernel, predicted, following.motion, self.stopping, moments - following.begin, clock=following.begin,
+            age=age, growth=(error + spread, fastest), period=settings.period,
+        )  # fmt: skip
+        left = np.flatnonzero(by_joints[:count])
+        for done, k in enumerate(left):
+            if self.clear_stop(following, float(moments[k]) + settings.period, along=False) is None:
+                return int(k), done + 1
+        return count, len(left)
+
+    def unproved_stop(self, following: Following, then: float) -> Following:
+        """Return a stop from a motion along its path from a time of the clock on [s]."""
+        made = stop_along(following.motion, then - following.begin, self.stopping)
+        return Following(made.trajectory, then, self.is_goal(made.trajectory.positions[-1]))
+
+    def clear_stop(self, following: Following, then: float, along: bool) -> Following | None:
+        """Return a stop from a motion along its path, or else joint by joint, that meets nothing that stands still."""
+        at = then - following.begin
+        if along:
+            made = stop_along(following.motion, at, self.stopping)
+            ends_there = abs(made.trajectory.duration - (following.motion.duration - at)) < 1e-9
+            if ends_there:  # the rest of the motion itself, which is proved
+                return Following(made.trajectory, then, following.to_goal)
+        else:
+            start = following.start(then)
+            made = stop(self.stopping, self.names, *start)
+            if not made.within_limits:
+                return None
+        curve = Curve.cubic(
+            made.trajectory.times, made.trajectory.positions, made.trajectory.velocities, made.trajectory.accelerations
+        )
+        if not self.is_clear(curve):
+            return None
+        return Following(made.trajectory, then, self.is_goal(made.trajectory.positions[-1]))

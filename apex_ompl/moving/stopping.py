@@ -1,0 +1,132 @@
+"""Stops from any state of motion: along the path of a motion, or joint by joint, and their proofs in advance."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from apex_ompl.kernel import Kernel
+from apex_ompl.kernel.compiled.path_stop import MOST_STEPS, stop_on_path
+from apex_ompl.kernel.compiled.stop_profiles import PHASES, stop_joints
+from apex_ompl.kernel.compiled.stops_among_movers import first_unproved_stop
+from apex_ompl.moving.movers import SHORTEST, Movers, curve_of
+from apex_ompl.robot.model import Limits
+from apex_ompl.timing.trajectory import Trajectory
+from apex_ompl.types import Array, Flags
+from apex_ompl.util.arrays import compact
+from apex_ompl.util.display import fields_line
+
+DEVIATION = 1e-3  # of a stop from the path [rad]
+
+
+class Stop(NamedTuple):
+    """A motion to rest.
+
+    Attributes:
+        trajectory: The motion, from the state that it was asked for.
+        beyond: How far it passes the position limits of each joint, shape (dof,) [rad; synergies 0..1]. A joint for
+            which this is not 0 has no stop within its limits: the state was not in its stoppable set.
+        deviation: Largest distance of any joint from the path along which it stops [rad]; infinity where it stops
+            joint by joint.
+    """
+
+    trajectory: Trajectory
+    beyond: Array
+    deviation: float
+
+    def __repr__(self) -> str:
+        """Return the fields, arrays by their shapes."""
+        return fields_line(self)
+
+    @property
+    def within_limits(self) -> bool:
+        """Whether it keeps the position limits."""
+        return not self.beyond.any()
+
+
+def stop(limits: Limits, joint_names: tuple[str, ...], position: Array, velocity: Array, acceleration: Array) -> Stop:
+    """Return the soonest stop from a state, of each joint by itself.
+
+    It is what Ruckig's velocity interface finds (Berscheid and Kroeger 2021), in closed form:
+    :mod:`apex_ompl.kernel.compiled.stop_profiles`. A joint whose soonest stop would pass a position limit brakes for
+    longer, as long as keeps the limit, and swings back. The limits of acceleration and jerk are kept; that of velocity
+    is where it can be, i.e. where |v + a |a| / (2 J)| is within it.
+
+    Args:
+        limits: Limits of the joints.
+        joint_names: Their names.
+        position: Shape (dof,) [rad; synergies 0..1].
+        velocity: Within the limits, likewise [rad/s].
+        acceleration: Within the limits, likewise [rad/s^2].
+    """
+    dof = len(position)
+    lengths, jerks, beyond = np.empty((dof, PHASES)), np.empty((dof, PHASES)), np.empty(dof)
+    times, knots = np.empty(dof * PHASES + 2), np.empty((3, dof * PHASES + 2, dof))
+    state, bounds = (position, velocity, acceleration), (limits.lower, limits.upper, limits.acceleration, limits.jerk)
+    count = stop_joints(*map(compact, (*state, *bounds)), lengths, jerks, times, knots, beyond)
+    return Stop(Trajectory.unchecked(times[:count], knots[:, :count], joint_names), beyond, np.inf)
+
+
+def stop_along(motion: Trajectory, time: float, limits: Limits, deviation: float = DEVIATION) -> Stop:
+    """Return the soonest stop along the path of a motion, among profiles of slowing down.
+
+    It begins with the state of the motion at ``time``, exactly, keeps the limits of velocity, acceleration and jerk,
+    and is the rest of the motion itself where no profile ends sooner (:mod:`apex_ompl.kernel.compiled.path_stop`).
+
+    Args:
+        motion: A motion within the limits that ends at rest.
+        time: Time of the motion, from 0 to its end [s].
+        limits: Limits of the joints.
+        deviation: Largest distance of any joint from the path [rad].
+    """
+    dof = motion.dof
+    states = np.stack([motion.positions, motion.velocities, motion.accelerations])
+    room = len(motion.times) + MOST_STEPS + 4
+    start, control, work, still = np.empty((3, dof)), np.empty((MOST_STEPS + 4, dof)), np.empty((2, dof)), np.zeros(dof)
+    times, knots = np.empty(room), np.empty((3, room, dof))
+    bounds = map(compact, (limits.lower, limits.upper, limits.velocity, limits.acceleration, limits.jerk))
+    count = stop_on_path(compact(motion.times), states, time, start, *bounds, deviation, control, *work, times, knots)
+    if not count:
+        return Stop(motion.after(time), still, 0.0)
+    return Stop(Trajectory.unchecked(times[:count], knots[:, :count], motion.joint_names), still, float(work[1].max()))
+
+
+def stops_proved(
+    kernel: Kernel, expected: Movers, motion: Trajectory, limits: Limits, moments: Array,
+    *, clock: float, age: float, growth: tuple[float, float], period: float,
+) -> tuple[int, Flags]:  # fmt: skip
+    """Return how many of some moments of a motion, from the first on, have a proved stop, and of which kind.
+
+    At each, obstacles were seen a while ago, where they are expected then, and may have gone anywhere since. The next
+    period of the motion is proved clear of that, and the soonest stop along it behind (:func:`stop_along`), or else
+    that of each joint by itself (:func:`stop`), which are flagged, shape (N,). What stands still is not looked at: a
+    stop along the motion stays within a millimetre of it.
+
+    Args:
+        kernel: The kernel of the robot with what it holds.
+        expected: The obstacles as they are expected to move; their margins do not count.
+        motion: A motion within the limits that ends at rest.
+        limits: Limits of stops.
+        moments: Times of the motion, shape (N,) [s].
+        clock: Time of the obstacles' stamps when the motion is at 0 [s].
+        age: How long before a moment they were seen [s].
+        growth: Margin of what was seen [m], and its growth since [m/s].
+        period: Time from a moment to the stop [s].
+    """
+    dof, curve, a, seen = motion.dof, curve_of(motion), expected.arrays, expected.with_margin(*growth)
+    states = np.stack([motion.positions, motion.velocities, motion.accelerations])
+    room, movers = max(len(motion.times) + MOST_STEPS + 4, dof * PHASES + 2), len(a.kind)
+    by_joints = np.zeros(len(moments), np.int64)
+    bounds = map(compact, (limits.lower, limits.upper, limits.velocity, limits.acceleration, limits.jerk))
+    count = int(
+        first_unproved_stop(
+            *kernel.robot.packed, *seen.packed, *kernel.workspace(), a.place, a.velocity, a.stamp, float(age),
+            curve.knots, curve.states, curve.rates, curve.slack, states, *bounds, DEVIATION, compact(moments),
+            by_joints, float(period), float(clock), SHORTEST, np.empty((movers, 3)), np.empty(dof),
+            np.empty(3, np.int64), np.empty((3, dof)), np.empty((MOST_STEPS + 4, dof)), np.empty(dof), np.empty(dof),
+            np.empty((2, dof, PHASES)), np.empty(room), np.empty((3, room, dof)), np.empty((room, dof)),
+            np.empty((room, 2 * dof)),
+        )
+    )  # fmt: skip
+    return count, by_joints.astype(bool)

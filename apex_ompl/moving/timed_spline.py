@@ -1,0 +1,273 @@
+"""Optimisation in space and time: splines in time among obstacles that move, from a moving start to rest at a goal."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apex_ompl.errors import ParameterError
+from apex_ompl.kernel import Kernel
+from apex_ompl.kernel.compiled.motion_optimization import WIDTH, optimize_motion
+from apex_ompl.kernel.compiled.path_cost import CostSettings, PathReport, optimization_buffer_sizes
+from apex_ompl.moving.movers import Movers
+from apex_ompl.robot.model import Limits
+from apex_ompl.timing import Trajectory
+from apex_ompl.timing.spline_method import least_knot_spacing, spline_in_time, start_points
+from apex_ompl.types import Array
+from apex_ompl.util.validation import check_array, check_positive
+
+PINNED = 3  # control points at each end that say where and how a motion begins and ends
+KNOT_SPACING = 0.1  # that is aimed at [s]
+LEAST_SPANS, MOST_SPANS = 8, 40
+ROUNDS = 4  # of steps, between which a motion over its limits gets more time
+SLOWER = 1.02  # least factor on its duration then
+
+
+@dataclass(frozen=True)
+class MotionSettings:
+    """Cost of a motion, and when its optimisation ends.
+
+    Attributes:
+        samples: Number of samples between two knots.
+        scene_margin: Clearance to obstacles and movers below which a sample costs [m].
+        own_margin: Clearance between the robot's own links below which a sample costs [m].
+        stiffness: Weight of half the integral of the speed squared over the share of the motion [1/rad^2].
+        limit_weight: Weight of half the square of what a limit is exceeded by, as a share of it.
+        limit_share: Share of the limits above which there is a cost.
+        damping: Weight of the speed of the change at the first step.
+        steps: Largest number of steps of a round.
+        tolerance: A step that lowers the cost by less than this share is the last.
+    """
+
+    samples: int = 4
+    scene_margin: float = 0.04
+    own_margin: float = 0.02
+    stiffness: float = 1e-3
+    limit_weight: float = 1.0
+    limit_share: float = 0.97
+    damping: float = 1e-2
+    steps: int = 16
+    tolerance: float = 1e-3
+
+
+class Start(NamedTuple):
+    """What a robot does when a motion begins: position, velocity and acceleration, each of shape (dof,)."""
+
+    position: Array
+    velocity: Array
+    acceleration: Array
+
+    @classmethod
+    def at_rest(cls, q: Array) -> Start:
+        """Return rest at a state, shape (dof,)."""
+        return cls(q, np.zeros_like(q), np.zeros_like(q))
+
+    @property
+    def moves(self) -> bool:
+        """Whether it has a velocity or an acceleration."""
+        return bool(self.velocity.any() or self.acceleration.any())
+
+
+class TimedSpline(NamedTuple):
+    """A uniform cubic B-spline in time, which begins in a given way and ends at rest.
+
+    Attributes:
+        control: Control points, shape (P, dof) [rad]; the first three say how it begins, the last three are the goal.
+        spacing: Knot spacing [s].
+        start: How it begins.
+    """
+
+    control: Array
+    spacing: float
+    start: Start
+
+    @property
+    def duration(self) -> float:
+        """Duration [s]."""
+        return (len(self.control) - PINNED) * self.spacing
+
+    @classmethod
+    def along(cls, states: Array, duration: float, start: Start, goal: Array) -> TimedSpline:
+        """Return the spline whose control points are states of a motion, evenly spaced in time.
+
+        Args:
+            states: States of the motion, evenly spaced in time, shape (N, dof); from a moving start they begin as that.
+            duration: Its duration [s]; the spline takes a knot spacing longer, since it rounds the end, and another one
+                from rest.
+            start: How the spline begins.
+            goal: Where it ends, shape (dof,).
+
+        Raises:
+            ParameterError: ``duration`` is not positive, or the states have another shape.
+        """
+        check_array(states, ("N", len(goal)), "states", finite=True, least=2)
+        check_positive(duration, "duration")
+        count = int(np.clip(round(duration / KNOT_SPACING), LEAST_SPANS, MOST_SPANS))
+        spacing = float(duration / count)
+        given, wanted = np.linspace(0.0, 1.0, len(states)), np.linspace(0.0, 1.0, count + 1)
+        states = np.stack([np.interp(wanted, given, column) for column in states.T], axis=1)
+        before = 1 if start.moves else 2  # at rest the first three control points are one
+        control = np.concatenate([np.repeat(states[:1], before, axis=0), states, states[-1:], states[-1:]])
+        control[-PINNED:] = goal
+        return cls(control, spacing, start).lasting(spacing)
+
+    def lasting(self, spacing: float) -> TimedSpline:
+        """Return the spline with another knot spacing [s] and the same begin."""
+        control = self.control.copy()
+        control[:PINNED] = start_points(self.start, spacing)
+        if not self.start.moves:
+            control[:PINNED] = self.start.position
+        return TimedSpline(control, spacing, self.start)
+
+    def trajectory(self, joint_names: Sequence[str]) -> Trajectory:
+        """Return the motion itself; begin and end are exact, and so are joints that stay."""
+        motion = spline_in_time(self.control, self.spacing, tuple(joint_names), self.start)
+        inner = motion.positions[1:-1]  # averages of control points
+        np.clip(inner, self.control.min(axis=0), self.control.max(axis=0), out=inner)
+        return motion
+
+
+class MotionOptimizer:
+    """Levenberg-Marquardt on splines in time, among still obstacles and movers; without random numbers of its own.
+
+    The cost is that of :mod:`apex_ompl.kernel.compiled.motion_optimization`.
+
+    Attributes:
+        samples: Number of samples that steps have looked at so far.
+    """
+
+    def __init__(self, kernel: Kernel, movers: Movers, limits: Limits, settings: MotionSettings | None = None) -> None:
+        """Optimise motions of the kernel's robot within limits of velocity, acceleration and jerk.
+
+        Raises:
+            ParameterError: The limits are those of other joints.
+        """
+        check_array(limits.velocity, (kernel.robot.dof,), "limits")
+        self.kernel, self.movers, self.limits = kernel, movers, limits
+        self.settings = settings or MotionSettings()
+        self.samples = 0
+
+    def improve(
+        self, spline: TimedSpline, *, clock: float = 0.0, steps: int | None = None, enough: float = np.inf,
+        damping: float | None = None,
+    ) -> tuple[TimedSpline, PathReport]:  # fmt: skip
+        """Return a spline of the same duration with a lower cost, and what came of the steps.
+
+        Args:
+            spline: The spline.
+            clock: Time of the movers' stamps when it begins [s].
+            steps: Most steps; by default the settings'.
+            enough: The steps end when the clearances at the samples reach this [m].
+            damping: Of the first step; by default the settings'. The report has that to go on with.
+
+        Raises:
+            ParameterError: Control points of another shape.
+        """
+        steps = self.settings.steps if steps is None else steps
+        better, report, _ = self._run(spline, clock, steps, enough, 0, damping=damping)
+        return better, report
+
+    def evaluate(self, spline: TimedSpline, *, clock: float = 0.0) -> tuple[PathReport, Array]:
+        """Return what a spline costs, and its gradient, shape (free control points, dof)."""
+        dof = self.kernel.robot.dof
+        _, report, slope = self._run(spline, clock, 0, np.inf, (len(spline.control) - 2 * PINNED) * dof)
+        return report, slope.reshape(-1, dof)
+
+    def repair(
+        self, spline: TimedSpline, accepts: Callable[[Trajectory], bool], *, clock: float = 0.0,
+        stop: Callable[[], bool] = lambda: False,
+    ) -> Trajectory | None:  # fmt: skip
+        """Return a motion that keeps the limits and is accepted, or None.
+
+        Between rounds of steps a motion that is over its limits gets as much more time as it needs.
+
+        Args:
+            spline: Where to start from.
+            accepts: The full check; asked about motions within the limits.
+            clock: Time of the movers' stamps when it begins [s].
+            stop: Asked between rounds whether to give up.
+        """
+        names = self.kernel.robot.joint_names
+        for _ in range(ROUNDS):
+            if stop():
+                return None
+            spline, _ = self.improve(spline, clock=clock)
+            least = least_knot_spacing(spline.control, self.limits)
+            if least > spline.spacing:
+                spline = spline.lasting(max(least, SLOWER * spline.spacing))
+                if least_knot_spacing(spline.control, self.limits) > spline.spacing:
+                    continue
+            motion = spline.trajectory(names)
+            if accepts(motion):
+                return motion
+        return None
+
+    def _run(
+        self,
+        spline: TimedSpline,
+        clock: float,
+        steps: int,
+        enough: float,
+        slopes: int,
+        *,
+        damping: float | None = None,
+    ) -> tuple[TimedSpline, PathReport, Array]:
+        control = np.array(spline.control, order="C")
+        points, dof = len(control), self.kernel.robot.dof
+        if points <= 2 * PINNED:
+            raise ParameterError("control points", points, f"more than {2 * PINNED}")
+        check_array(control, ("P", dof), "control points", finite=True)
+        s, limits = self.settings, self.limits
+        weights, first, gram = _grid(points, s.samples)
+        times = clock + (np.arange(len(weights)) + 0.5) / len(weights) * spline.duration
+        powers = np.power(spline.spacing, [[1.0], [2.0], [3.0]])
+        most = s.limit_share * powers * np.stack([limits.velocity, limits.acceleration, limits.jerk])
+        integers, floats = optimization_buffer_sizes((points - 2 * PINNED) * dof, points, dof)
+        slope = np.empty(slopes)
+        report = optimize_motion(
+            *self.kernel.packed, *self.movers.packed, *self.kernel.workspace(),
+            np.empty((len(self.movers.arrays.kind), 3)), weights, first, gram, times, most, float(s.limit_weight),
+            PINNED, control, tuple(self._numbers(steps, enough, damping)), np.empty(integers, np.int64),
+            np.empty(floats), slope,
+        )  # fmt: skip
+        made = PathReport(*report)
+        self.samples += (made.steps + 1) * len(times)
+        return spline._replace(control=control), made, slope
+
+    def _numbers(self, steps: int, enough: float, damping: float | None) -> CostSettings:
+        s = self.settings
+        return CostSettings(
+            float(s.scene_margin), float(s.own_margin), float(s.stiffness),
+            float(s.damping if damping is None else damping), float(enough), float(s.tolerance), int(steps),
+        )  # fmt: skip
+
+
+@lru_cache(maxsize=64)
+def _grid(points: int, samples: int) -> tuple[Array, NDArray[np.int64], Array]:
+    """Return weights at the samples, where they begin, and the matrix of the speed over the share of the motion."""
+    spans = points - PINNED
+    at = (np.arange(samples) + 0.5) / samples
+    weights = np.tile(_basis(at), (spans, 1))
+    first = np.repeat(np.arange(spans), samples)
+    nodes, shares = np.polynomial.legendre.leggauss(WIDTH)
+    slopes = _slopes((nodes + 1.0) / 2.0) * spans
+    block = (slopes.T * (shares / 2.0 / spans)) @ slopes
+    gram = np.zeros((points, points))
+    for k in range(spans):
+        gram[k : k + WIDTH, k : k + WIDTH] += block
+    return np.ascontiguousarray(weights), first.astype(np.int64), gram
+
+
+def _basis(x: Array) -> Array:
+    """Return the weights of the four control points of a span at shares of it, shape (N, 4)."""
+    return np.stack([(1 - x) ** 3, 3 * x**3 - 6 * x**2 + 4, -3 * x**3 + 3 * x**2 + 3 * x + 1, x**3], axis=1) / 6.0
+
+
+def _slopes(x: Array) -> Array:
+    """Return the derivatives of :func:`_basis` with respect to the share, shape (N, 4)."""
+    return np.stack([-((1 - x) ** 2), 3 * x**2 - 4 * x, -3 * x**2 + 2 * x + 1, x**2], axis=1) / 2.0

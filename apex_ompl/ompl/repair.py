@@ -1,0 +1,95 @@
+"""Repair of paths that pass the search resolution and fail the full check."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+from ompl import base as ob
+from ompl import geometric as og
+
+from apex_ompl.collision.path_proof import PathProof
+from apex_ompl.ompl.interrupt import Interrupt, ends_after
+from apex_ompl.ompl.setup import PlanningSetup
+from apex_ompl.ompl.simple_setup import SimpleSetup
+from apex_ompl.ompl.space import path_to_array, to_state
+from apex_ompl.ompl.validity import (
+    FullCheck,
+    MotionProof,
+    MotionValidator,
+    StateValidityChecker,
+    full_check,
+    motions_until,
+)
+from apex_ompl.paths.path import Path
+from apex_ompl.types import Array
+
+MAX_BRIDGES = 20
+RANGE = 1.0  # of the trees, as tuned for rrtconnect [rad]
+
+
+def repair(
+    problem: PlanningSetup, path: Array, fault: FullCheck, deadline: float, interrupt: Interrupt | None = None
+) -> tuple[Path, PathProof] | None:
+    """Plan stretches that fail the full check anew; the motions there are proved one by one.
+
+    Args:
+        problem: Planning setup of the problem.
+        path: States, shape (N, dof), the first and the last of them free.
+        fault: Outcome of the full check of ``path``.
+        deadline: Value of ``time.perf_counter`` at which to give up [s].
+        interrupt: Ends the work in good order when it was pressed.
+
+    Returns:
+        A path that passes the full check with its proof, or None.
+    """
+    interrupt = interrupt or Interrupt()
+    for _ in range(MAX_BRIDGES):
+        if time.perf_counter() >= deadline or fault.segment is None or interrupt.pressed:
+            return None
+        first, last = _free_ends(problem, path, fault.segment)
+        bridge = _bridge(problem, path[first], path[last], deadline, interrupt)
+        if bridge is None:
+            return None
+        path = np.concatenate([path[:first], bridge, path[last + 1 :]])
+        fault = full_check(problem.checker, path, problem.start, problem.goals, deadline=deadline)
+        if fault.proof is not None and fault:
+            return Path(path), fault.proof
+    return None
+
+
+def _free_ends(problem: PlanningSetup, path: Array, segment: int) -> tuple[int, int]:
+    """Return the states nearest to a segment, before and after it, that are proved free.
+
+    Shortcuts may put a state between those that were checked, so that a state of the path itself collides.
+    """
+    first, last = segment, segment + 1
+    while first > 0 and not problem.checker.prove(path[first, None], tolerance=0.0):
+        first -= 1
+    while last < len(path) - 1 and not problem.checker.prove(path[last, None], tolerance=0.0):
+        last += 1
+    return first, last
+
+
+def _bridge(problem: PlanningSetup, a: Array, b: Array, deadline: float, interrupt: Interrupt) -> Array | None:
+    """Return a path between two free states whose motions are proved, or None."""
+    setup = SimpleSetup(problem.robot, problem.bounds)
+    si = setup.getSpaceInformation()
+    validity_checker = StateValidityChecker(si, problem.checker)
+    motions = MotionValidator(si, MotionProof(problem.checker), validity_checker)
+    setup.setStateValidityChecker(validity_checker)
+    si.setMotionValidator(motions)
+    setup.setStartAndGoalStates(to_state(si, a), to_state(si, b))
+    planner = og.RRTConnect(si)
+    planner.setRange(RANGE)
+    setup.setPlanner(planner)
+    condition = ends_after(deadline - time.perf_counter())
+    with interrupt.ends(condition) as ptc, motions_until(motions, lambda: time.perf_counter() >= deadline):
+        status = setup.solve(ptc)
+    fault = validity_checker.fault or motions.fault
+    if fault is not None:
+        raise fault
+    if status.getStatus() != ob.PlannerStatus.EXACT_SOLUTION:
+        return None
+    bridge = path_to_array(setup.getSolutionPath(), problem.robot.dof)
+    return np.stack([a, b]) if len(bridge) < 2 else np.concatenate([a[None], bridge[1:-1], b[None]])

@@ -1,0 +1,220 @@
+"""Planning setup: robot, collision checker, state space, start and goals of a problem in one SimpleSetup."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from ompl import base as ob
+from ompl import geometric as og
+
+from apex_ompl.collision import CollisionChecker
+from apex_ompl.goals.alignment import AlignmentGoal, alignment_goal
+from apex_ompl.goals.goal_sampling import sample
+from apex_ompl.goals.pose_goal import PoseGoal
+from apex_ompl.ompl.simple_setup import SimpleSetup
+from apex_ompl.ompl.space import Bounds, to_state
+from apex_ompl.ompl.validity import MotionCheck, MotionValidator, StateValidityChecker
+from apex_ompl.robot import Robot, load_robot
+from apex_ompl.scene.problem import Problem
+from apex_ompl.scene.scripts import problem_at
+from apex_ompl.types import Array
+from apex_ompl.util.display import counted, one_line
+from apex_ompl.util.resolution import SEARCH_RESOLUTION
+
+GOAL_STATES = 8  # how many states an alignment goal is sampled into
+GOAL_ATTEMPTS = 200
+HELD_WIDTH = 1e-9  # half width of the bounds of joints that stay, for splines that are evaluated with rounding [rad]
+
+
+@dataclass(frozen=True, eq=False)
+class PlanningSetup:
+    """A problem made ready for OMPL.
+
+    Attributes:
+        problem: The problem.
+        robot: Its robot.
+        checker: Collision checker of the robot in the scene.
+        check: Check of straight motions at the search resolution.
+        simple_setup: OMPL's setup, with start and goals set and no planner chosen.
+        validity_checker: OMPL's state validity checker.
+        motion_validator: OMPL's motion validator.
+        start: Start state, shape (dof,).
+        goals: Goal states, shape (goals, dof); for one in the workspace those that were sampled.
+        start_fault: Why the start is invalid, or empty.
+        goal_faults: Why each goal is invalid, or empty; invalid ones are not given to OMPL unless all are. For a goal
+            in the workspace that was not reached, why.
+        alignment: The alignment goal, or None.
+        held: Numbers of the joints that stay as at the start.
+        notes: Sentences on joints of the start and the goals that were moved to their limits, and on meshes that are no
+            proper solids as they are, and how they are taken.
+    """
+
+    problem: Problem
+    robot: Robot
+    checker: CollisionChecker
+    check: MotionCheck
+    simple_setup: SimpleSetup
+    validity_checker: StateValidityChecker
+    motion_validator: MotionValidator
+    start: Array
+    goals: Array
+    start_fault: str
+    goal_faults: tuple[str, ...]
+    alignment: AlignmentGoal | None
+    held: NDArray[np.intp]
+    notes: tuple[str, ...]
+
+    def __repr__(self) -> str:
+        """Return the problem, the robot and the number of goals."""
+        goals = counted(len(self.goals), "goal state")
+        return one_line("PlanningSetup", repr(self.problem.name), f"robot {self.robot.name!r}", goals, self.start_fault)
+
+    def raise_faults(self) -> None:
+        """Raise what the checkers kept inside of OMPL's callbacks, Ctrl-C among it."""
+        fault = self.validity_checker.fault or self.motion_validator.fault
+        if fault is not None:
+            raise fault
+
+    @property
+    def bounds(self) -> Bounds:
+        """Bounds of the state space."""
+        return _bounds(self.robot, self.start, self.held)
+
+    @property
+    def valid_goals(self) -> Array:
+        """The goals that are inside the limits and free, shape (valid, dof)."""
+        return self.goals[[not fault for fault in self.goal_faults[: len(self.goals)]]]
+
+
+def assemble(
+    problem: Problem, robot: Robot | None = None, seed: int = 0, checker: CollisionChecker | None = None,
+    moving: Sequence[str] | None = None,
+) -> PlanningSetup:  # fmt: skip
+    """Make a problem ready for OMPL.
+
+    Args:
+        problem: The problem; moving obstacles stand where they are at time 0, if they are there then.
+        robot: Its robot, when it is loaded already.
+        seed: Seed of the sampling of an alignment goal.
+        checker: Collision checker that has the bodies of the problem already.
+        moving: Names of the joints that are planned; the others stay as at the start. All by default.
+
+    Raises:
+        ApexError: The robot, a mesh or a joint of the problem is unknown or faulty.
+    """
+    robot = robot or load_robot(problem.robot)
+    names = robot.joint_names
+    asked = problem.start_state(names)
+    start = robot.within_limits(asked)
+    given_goals = problem.goal_states(names)
+    goals = robot.within_limits(given_goals)
+    notes = _moved_notes(robot, asked, start, "start")
+    for k, (given_goal, goal) in enumerate(zip(given_goals, goals, strict=True)):
+        notes += _moved_notes(robot, given_goal, goal, "goal" if len(goals) == 1 else f"goal {k}")
+    held = np.array([k for k, name in enumerate(names) if moving is not None and name not in moving], np.intp)
+    stays = given_goals[:, held] == asked[held]
+    goals[:, held] = np.where(stays, start[held], goals[:, held])  # where it is moved to
+    lower, upper = bounds = _bounds(robot, start, held)
+    limits = replace(robot.limits, lower=lower, upper=upper)
+    sampled = workspace_goal(replace(robot, limits=limits) if len(held) else robot, problem)
+    if checker is None:
+        now = problem_at(problem, 0.0)
+        checker = CollisionChecker(robot, now.scene, now.attached, now.allowed)
+    checker.prepare()
+    start_fault = state_fault(checker, start)
+    goal_faults = tuple(_held_fault(robot, start, goal, held) or state_fault(checker, goal) for goal in goals)
+    if sampled is not None and not start_fault:
+        sampling = sample(sampled, checker, np.random.default_rng(seed), GOAL_STATES, GOAL_ATTEMPTS)
+        goals = sampling.states
+        goals[:, held] = start[held]
+        goal_faults = ("",) * len(goals) or (sampling.fault,)
+    simple_setup = SimpleSetup(robot, bounds)
+    si = simple_setup.getSpaceInformation()
+    check = MotionCheck(checker, SEARCH_RESOLUTION)
+    validity_checker = StateValidityChecker(si, checker)
+    motion_validator = MotionValidator(si, check, validity_checker)
+    simple_setup.setStateValidityChecker(validity_checker)
+    si.setMotionValidator(motion_validator)
+    simple_setup.setStartState(to_state(si, start))
+    given = [goal for goal, fault in zip(goals, goal_faults, strict=False) if not fault]
+    set_goals(simple_setup, given or list(goals))
+    return PlanningSetup(
+        problem,
+        robot,
+        checker,
+        check,
+        simple_setup,
+        validity_checker,
+        motion_validator,
+        start,
+        goals,
+        start_fault,
+        goal_faults,
+        sampled if isinstance(sampled, AlignmentGoal) else None,
+        held,
+        (*notes, *checker.mesh_notes),
+    )
+
+
+def _moved_notes(robot: Robot, asked: Array, moved: Array, what: str) -> list[str]:
+    """Return a note on each joint of a start or a goal that was moved to its limit."""
+    return [
+        f"{robot.joint_names[k]} of the {what} is {abs(moved[k] - asked[k]):.2g} outside its limits and is moved to "
+        f"{moved[k]:.6g}"
+        for k in np.flatnonzero(moved != asked)
+    ]
+
+
+def _bounds(robot: Robot, start: Array, held: NDArray[np.intp]) -> Bounds:
+    """Return the robot's limits, narrowed to the start for joints that stay."""
+    lower, upper = robot.limits.lower.copy(), robot.limits.upper.copy()
+    lower[held] = np.maximum(lower[held], start[held] - HELD_WIDTH)
+    upper[held] = np.minimum(upper[held], start[held] + HELD_WIDTH)
+    return lower, upper
+
+
+def _held_fault(robot: Robot, start: Array, goal: Array, held: NDArray[np.intp]) -> str:
+    """Return why a goal is out of reach of the joints that are planned, or nothing."""
+    for k in held:
+        if goal[k] != start[k]:
+            name = robot.joint_names[k]
+            return f"{name} = {goal[k]:.6g} at the goal, which is not in the group and stays at {start[k]:.6g}"
+    return ""
+
+
+def workspace_goal(robot: Robot, problem: Problem) -> AlignmentGoal | PoseGoal | None:
+    """Return the goal of a problem that is given in the workspace, or None where it is joint configurations.
+
+    Raises:
+        UnknownNameError: A held object, a link or a hand is unknown.
+        FileFormatError: An alignment does not fit the held objects.
+    """
+    if problem.goal.poses is not None:
+        return PoseGoal(robot, problem.goal.poses, problem.attached, problem.start_state(robot.joint_names))
+    return alignment_goal(robot, problem)
+
+
+def set_goals(simple_setup: og.SimpleSetup, goals: list[Array]) -> None:
+    """Give OMPL one goal state, or several of which any will do; each is a state of shape (dof,)."""
+    si = simple_setup.getSpaceInformation()
+    if len(goals) == 1:
+        simple_setup.setGoalState(to_state(si, goals[0]))
+        return
+    region = ob.GoalStates(si)
+    for goal in goals:
+        region.addState(to_state(si, goal))
+    simple_setup.setGoal(region)
+
+
+def state_fault(checker: CollisionChecker, q: Array) -> str:
+    """Return why a state is invalid: the first joint out of limits, or the deepest contact; else nothing.
+
+    A pair that is nearer than the proof of paths takes for contact is a fault too: no path could leave the state.
+    """
+    fault = checker.robot.limit_fault(q)
+    if fault:
+        return fault
+    return checker.prove(q[None], tolerance=0.0).reason

@@ -1,0 +1,83 @@
+"""OMPL's SimpleSetup for a robot: what its bindings leave out, for planners of OMPL's own as well."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from ompl import base as ob
+from ompl import geometric as og
+
+from apex_ompl.ompl.interrupt import ends_after
+from apex_ompl.ompl.own_planner import OwnPlanner
+from apex_ompl.ompl.space import Bounds, await_goal, state_space
+from apex_ompl.robot import Robot
+from apex_ompl.util.exiting import running
+
+
+class SpaceInformation(ob.SpaceInformation):
+    """OMPL's space information of a robot, whose Python object lives as long as OMPL's own.
+
+    Attributes:
+        robot: The robot, for planners that another checker does not tell.
+    """
+
+    def __init__(self, space: ob.StateSpace, robot: Robot) -> None:
+        """Describe a space of a robot."""
+        super().__init__(space)
+        self.robot = robot
+
+    def setStateValidityChecker(self, svc: ob.StateValidityChecker | Callable[[Any], Any]) -> None:  # noqa: N802 - OMPL's name
+        """Set the checker that decides from now on; a function may return anything that is true or false."""
+        super().setStateValidityChecker(_of_truth(svc))
+
+
+class SimpleSetup(og.SimpleSetup):
+    """OMPL's SimpleSetup in the state space of a robot.
+
+    Beyond OMPL's own, checkers may return ``numpy.bool_``; ``solve`` lets goals be sampled by Python in another thread;
+    ``getPlannerData`` knows this package's planners; and a daemon thread inside of ``solve`` when the interpreter ends
+    is ended in order.
+    """
+
+    def __init__(self, robot: Robot, bounds: Bounds | None = None) -> None:
+        """Make a setup without checker, start and goal.
+
+        Args:
+            robot: The robot.
+            bounds: Bounds of the state space, by default the robot's limits.
+        """
+        super().__init__(SpaceInformation(state_space(robot, bounds=bounds), robot))
+
+    def setStateValidityChecker(self, svc: ob.StateValidityChecker | Callable[[Any], Any]) -> None:  # noqa: N802 - OMPL's name
+        """Set the checker that decides from now on; a function may return anything that is true or false."""
+        super().setStateValidityChecker(_of_truth(svc))
+
+    def solve(self, time: float | ob.PlannerTerminationCondition = 1.0, *, ptc: Any = None) -> ob.PlannerStatus:
+        """Solve within a time [s], or until a condition holds."""
+        given = time if ptc is None else ptc
+        ptc = given if isinstance(given, ob.PlannerTerminationCondition) else ends_after(given)
+        with running(ptc.terminate):
+            self.setup()  # sampling begins after it
+            await_goal(self.getGoal(), ptc)
+            return super().solve(ptc)
+
+    def simplifySolution(self, duration: float | ob.PlannerTerminationCondition = 0.0, *, ptc: Any = None) -> None:  # noqa: N802
+        """Shorten the solution, within a time [s] where one is given, or until a condition holds."""
+        with running():
+            super().simplifySolution(duration if ptc is None else ptc)
+
+    def getPlannerData(self, data: ob.PlannerData) -> None:  # noqa: N802 - OMPL's name
+        """Fill in the states and motions that the planner knows."""
+        planner = self.getPlanner()
+        if isinstance(planner, OwnPlanner):
+            planner.fill_data(data)
+        else:
+            super().getPlannerData(data)
+
+
+def _of_truth(svc: Any) -> Any:
+    """Return a checker whose answers are ``bool``: OMPL's bindings take nothing else of a function."""
+    if isinstance(svc, ob.StateValidityChecker) or not callable(svc):
+        return svc
+    return lambda state: bool(svc(state))

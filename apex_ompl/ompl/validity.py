@@ -1,0 +1,228 @@
+"""OMPL validity checkers over the collision checker, and the full check that decides what counts as a solution."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+from weakref import ref
+
+import numpy as np
+from numpy.typing import ArrayLike
+from ompl import base as ob
+
+from apex_ompl.collision.checker import CollisionChecker
+from apex_ompl.collision.path_proof import Curve, PathProof
+from apex_ompl.ompl.simple_setup import SpaceInformation
+from apex_ompl.timing.trajectory import ROUNDING, Trajectory
+from apex_ompl.types import Array
+from apex_ompl.util.display import fields_line
+from apex_ompl.util.resolution import SEARCH_RESOLUTION
+from apex_ompl.util.validation import check_states, number_array
+
+
+class MotionCheck:
+    """Collision check of straight motions between states at a spacing; a plain callable, without OMPL."""
+
+    def __init__(self, checker: CollisionChecker, resolution: float = SEARCH_RESOLUTION) -> None:
+        """Check by ``checker`` at a spacing of ``resolution`` [rad, max-norm]."""
+        self.checker = checker
+        self.resolution = resolution
+
+    def __call__(self, a: ArrayLike, b: ArrayLike) -> bool:
+        """Whether the motion from ``a`` to ``b`` is free, its end first; ``a`` is taken to be free."""
+        return self.checker.first_collision(np.array([a, b]), self.resolution, start=False) is None
+
+
+class MotionProof:
+    """Proof of straight motions between states; a plain callable, without OMPL."""
+
+    def __init__(self, checker: CollisionChecker) -> None:
+        """Prove by ``checker``."""
+        self.checker = checker
+
+    def __call__(self, a: ArrayLike, b: ArrayLike) -> bool:
+        """Whether the motion from ``a`` to ``b`` is proved free."""
+        return bool(self.checker.prove(np.array([a, b]), tolerance=0.0))
+
+
+class StateValidityChecker(ob.StateValidityChecker):
+    """OMPL state validity checker over a collision checker.
+
+    No exception leaves it, since one would end the process inside OMPL: a fault makes states invalid and is
+    kept in ``fault``, without OMPL's states (see ``forget_states``).
+    """
+
+    def __init__(self, si: ob.SpaceInformation, checker: CollisionChecker) -> None:
+        """Check states of ``si`` by ``checker``."""
+        super().__init__(si)
+        self.checker = checker
+        self.dof = checker.robot.dof
+        self.fault: BaseException | None = None
+
+    def isValid(self, state: Any) -> bool:  # noqa: N802 - OMPL's name
+        """Whether the state is free."""
+        try:
+            return self.checker.is_free(np.array(state[0 : self.dof]))
+        except BaseException as error:
+            state = None
+            self.fault = self.fault or error
+            return False
+
+    def clearance(self, state: Any) -> float:
+        """Return the least distance of all checked pairs at the state [m], 0 after a fault."""
+        try:
+            return self.checker.clearance(np.array(state[0 : self.dof]))
+        except BaseException as error:
+            state = None
+            self.fault = self.fault or error
+            return 0.0
+
+
+class MotionValidator(ob.MotionValidator):
+    """OMPL motion validator: by a check of its own as long as its validity checker is set, and else by the one that is.
+
+    ``setStateValidityChecker`` of OMPL leaves the motion validator as it is. So this one asks at each motion which
+    checker the space information has; another one than its own is asked for states between both ends by OMPL's own
+    motion validator, at the resolution of the space.
+
+    No exception of its own check leaves it: it makes motions invalid and is kept in ``fault``.
+
+    Attributes:
+        check: Its own check of a straight motion between two free states.
+        validity_checker: The checker that it stands for.
+        stop: All motions are invalid once this holds.
+        fault: First exception of its own check, or None.
+    """
+
+    def __init__(
+        self, si: SpaceInformation, check: MotionCheck | MotionProof, validity_checker: StateValidityChecker
+    ) -> None:
+        """Check motions of ``si``, in place of the motion validator that it has."""
+        super().__init__(si)
+        self.check: Callable[[Array, Array], bool] = check
+        self.validity_checker = validity_checker
+        self.stop: Callable[[], bool] = lambda: False
+        self.dof = check.checker.robot.dof
+        self.fault: BaseException | None = None
+        self._si = ref(si)  # which owns this one
+        self._discrete = si.getMotionValidator()
+
+    @property
+    def decides(self) -> bool:
+        """Whether its own checker is the one that is set."""
+        si = self._si()
+        return si is not None and si.getStateValidityChecker() is self.validity_checker
+
+    def checkMotion(self, first: Any, second: Any) -> bool:  # noqa: N802 - OMPL's name
+        """Whether the straight motion between two states is free."""
+        try:
+            if self.stop():
+                return False
+            if self.decides:
+                return self.check(first[0 : self.dof], second[0 : self.dof])
+        except BaseException as error:
+            first = second = None
+            self.fault = self.fault or error
+            return False
+        return bool(self._discrete.checkMotion(first, second))
+
+
+@contextmanager
+def motions_until(validator: MotionValidator, stop: Callable[[], bool]) -> Iterator[None]:
+    """While the block runs, let all motions be invalid once ``stop`` holds.
+
+    OMPL looks at a termination condition between iterations and not inside of them, and simplifies paths by counts:
+    without motions to check, both soon come to their end.
+    """
+    before = validator.stop
+    validator.stop = lambda: stop() or before()
+    try:
+        yield
+    finally:
+        validator.stop = before
+
+
+@dataclass(frozen=True)
+class FullCheck:
+    """Outcome of the full check of a path.
+
+    Attributes:
+        ok: Whether the path is a solution.
+        reason: One sentence about the first fault found, empty when there is none.
+        segment: Index of the segment (states k and k + 1) with the fault, or None.
+        proof: The proof, or None where limits or ends are at fault.
+        timed_out: Whether the time was over before the path was proved.
+    """
+
+    ok: bool
+    reason: str
+    segment: int | None
+    proof: PathProof | None = None
+    timed_out: bool = False
+
+    __repr__ = fields_line
+
+    def __bool__(self) -> bool:
+        """Whether the path is a solution."""
+        return self.ok
+
+
+def full_check(
+    checker: CollisionChecker,
+    path: Array | Trajectory,
+    start: Array | None = None,
+    goals: Iterable[Array] = (),
+    *,
+    deadline: float | None = None,
+) -> FullCheck:
+    """Decide whether a path or a motion is a solution.
+
+    It is when it stays inside the limits, begins at ``start`` and ends at one of ``goals`` bit for bit, and is proved
+    free from end to end (:meth:`apex_ompl.collision.CollisionChecker.prove`).
+
+    Args:
+        checker: Collision checker.
+        path: States joined by straight lines, shape (N, dof), or a timed motion, which is proved along its own cubic
+            pieces.
+        start: The given start, shape (dof,), or None for any.
+        goals: Goal states; none means any end.
+        deadline: Value of ``time.perf_counter`` at which to give up [s].
+
+    Raises:
+        ParameterError: ``path`` has not the shape (N, dof).
+    """
+    robot, goals = checker.robot, list(goals)
+    motion = path if isinstance(path, Trajectory) else None
+    states = number_array(path, "path") if motion is None else motion.positions
+    check_states(states, robot.dof, "path", least=1)
+    last = max(len(states) - 2, 0)
+    if motion is not None and motion.use(robot.limits)["position"] > 1.0 + ROUNDING:
+        return FullCheck(False, "the motion leaves the position limits", None)
+    inside = ((states >= robot.limits.lower) & (states <= robot.limits.upper)).all(axis=1)
+    if motion is None and not inside.all():
+        k = int(np.argmin(inside))
+        return FullCheck(False, f"state {k}: {robot.limit_fault(states[k])}", min(k, last))
+    if start is not None and not np.array_equal(states[0], start):
+        return FullCheck(False, "the path does not begin at the start", 0)
+    if goals and not any(np.array_equal(states[-1], goal) for goal in goals):
+        return FullCheck(False, "the path does not end at a goal", last)
+    if deadline is not None and time.perf_counter() >= deadline:
+        return FullCheck(False, "not proved in time", None, timed_out=True)
+    curve = Curve.polyline(states)
+    if motion is not None:
+        curve = Curve.cubic(motion.times, states, motion.velocities, motion.accelerations)
+    proof = checker.prove(curve, deadline=deadline)
+    if proof:
+        return FullCheck(True, "", None, proof)
+    if proof.timed_out:
+        return FullCheck(False, proof.reason, None, proof, True)
+    contacts = checker.contacts(proof.state) if np.isfinite(proof.state).all() and proof.clearance <= 0.0 else []
+    reason = str(contacts[0]) if contacts else proof.reason
+    if motion is not None:
+        return FullCheck(False, f"at {proof.parameter:.3f} s: {reason}", None, proof)
+    lengths = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(states, axis=0)).max(axis=1))])
+    segment = min(int(np.searchsorted(lengths, proof.parameter, side="right")) - 1, last)
+    return FullCheck(False, f"between states {segment} and {segment + 1}: {reason}", segment, proof)

@@ -1,0 +1,297 @@
+"""Import of MoveIt and MotionBenchMaker files: a planning scene and a motion plan request, both as YAML.
+
+The messages are ``moveit_msgs/PlanningScene`` (or its ``world`` alone) and ``moveit_msgs/MotionPlanRequest``, in either
+of two spellings: poses as lists or as x/y/z(/w) mappings, primitive types by name or by number. The pose of a primitive
+is composed with that of its object and of the object's frame; every primitive of an object becomes an obstacle. Content
+that would change the problem and is not supported is an error that names it. Content that is left out without effect
+is listed in the notes.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from apex_ompl.errors import FileFormatError, UnknownNameError
+from apex_ompl.robot import Robot
+from apex_ompl.robot.assets import resolve
+from apex_ompl.robot.moveit_allowed import MATRIX, allowed_pairs
+from apex_ompl.robot.moveit_messages import MessageReader, inside
+from apex_ompl.scene.bodies import AttachedObject, BodyT, Obstacle, pose_fields, pose_matrix
+from apex_ompl.scene.problem import Goal, Problem
+from apex_ompl.types import Array
+from apex_ompl.util.schema import read_yaml, validate
+from apex_ompl.util.validation import is_integer
+
+PRIMITIVES = {1: "box", 2: "sphere", 3: "cylinder", 4: "cone"}
+ADD, REMOVE = 0, 1  # operations of moveit_msgs/CollisionObject
+WORLD_FRAMES = ("", "world", "map")
+HARMLESS = ("workspace_parameters", "planner_id", "num_planning_attempts", "allowed_planning_time", "pipeline_id")
+
+
+@dataclass
+class Conversion:
+    """A converted problem, with notes on the content of the files that was left out."""
+
+    problem: Problem
+    notes: list[str] = field(default_factory=list)
+
+
+@dataclass
+class _Reader(MessageReader):
+    robot: Robot
+    joint_map: Mapping[str, str]
+    frame_map: Mapping[str, str]
+    notes: list[str] = field(default_factory=list)
+
+    def joint(self, name: str, where: str) -> str | None:
+        """Return the name of a planned joint of this robot, or None if the robot does not plan the joint."""
+        mapped = self.joint_map.get(name, name)
+        if mapped in self.robot.joint_names:
+            return mapped
+        if name in self.joint_map:
+            raise UnknownNameError(f"joint in the map of {name!r}", mapped, self.robot.joint_names)
+        note = f"{where}: joint {name!r} is not planned by {self.robot.name}"
+        if note not in self.notes:
+            self.notes.append(note)
+        return None
+
+    def frame(self, name: str, start: Array, where: str) -> Array:
+        """Return the pose of a frame in the world at the start state, shape (4, 4)."""
+        name = self.frame_map.get(name, name).lstrip("/")
+        if name in WORLD_FRAMES:
+            return np.eye(4)
+        if name in self.robot.link_names:
+            return self.robot.link_pose(start, name)
+        expected = f"expected the frame world or a link of {self.robot.name}; map it with --frame {name}=LINK"
+        raise self.fail(f"{where}.header.frame_id", name, expected)
+
+    def pose(self, data: Any, where: str) -> Array:
+        """Return a pose message as a matrix, shape (4, 4) [m]; the identity when the message is empty."""
+        if not data:
+            return np.eye(4)
+        if not isinstance(data, Mapping):
+            raise self.fail(where, data, "expected a mapping of keys to values")
+        position = self.numbers(data.get("position"), "xyz", (0.0, 0.0, 0.0), f"{where}.position")
+        turn = self.numbers(data.get("orientation"), "xyzw", (0.0, 0.0, 0.0, 1.0), f"{where}.orientation")
+        if not float(np.linalg.norm(turn)) > 1e-6:
+            turn = np.array([0.0, 0.0, 0.0, 1.0])  # an empty message means no rotation
+        return pose_matrix(position, turn)
+
+    def state(self, data: Mapping[str, Any], where: str) -> dict[str, float]:
+        """Return the planned joints of a robot state message."""
+        joints, at = self.section(data, "joint_state", where), f"{where}.joint_state"
+        names, positions = self.entries(joints, "name", at), self.entries(joints, "position", at)
+        if len(names) != len(positions):
+            raise self.fail(at, len(positions), f"expected {len(names)} positions")
+        if self.section(data, "multi_dof_joint_state", where).get("joint_names"):
+            self.notes.append(f"{where}.multi_dof_joint_state: the robot's base does not move")
+        found = {}
+        for k, (name, position) in enumerate(zip(names, positions, strict=True)):
+            ours = self.joint(str(name), at)
+            if ours is not None:
+                found[ours] = self.number(position, f"{at}.position.{k}")
+        return found
+
+    def shapes(self, item: Mapping[str, Any], where: str) -> Iterator[tuple[dict[str, Any], Array]]:
+        """Yield (shape fields, pose in the object's frame) of an object message."""
+        for k, (primitive, pose) in enumerate(self.paired(item, "primitives", "primitive_poses", where)):
+            yield self.primitive(primitive, f"{where}.primitives.{k}"), pose
+        for k, (mesh, pose) in enumerate(self.paired(item, "meshes", "mesh_poses", where)):
+            yield self.mesh(mesh, f"{where}.meshes.{k}"), pose
+        for k, (plane, pose) in enumerate(self.paired(item, "planes", "plane_poses", where)):
+            a, b, c, d = self.numbers(plane.get("coef"), "abcd", (0, 0, 1, 0), f"{where}.planes.{k}.coef")
+            self.notes.append(f"{where}.planes.{k}: read as the half-space below the plane")
+            yield {"half_space": {"normal": (a, b, c), "offset": -d}}, pose
+
+    def paired(self, item: Mapping[str, Any], shapes: str, poses: str, where: str) -> list[tuple[Any, Array]]:
+        found, placed = self.messages(item, shapes, where), self.entries(item, poses, where)
+        if placed and len(placed) != len(found):
+            raise self.fail(f"{where}.{poses}", len(placed), f"expected {len(found)} poses, one per shape")
+        placed = placed or [None] * len(found)
+        return [(s, self.pose(p, f"{where}.{poses}.{k}")) for k, (s, p) in enumerate(zip(found, placed, strict=True))]
+
+    def primitive(self, data: Mapping[str, Any], where: str) -> dict[str, Any]:
+        kind = data.get("type")
+        kind = PRIMITIVES.get(kind, kind) if isinstance(kind, int) else str(kind).lower()
+        size = self.entries(data, "dimensions", where)
+        counts = {"box": 3, "sphere": 1, "cylinder": 2}
+        if kind not in counts:
+            raise self.fail(f"{where}.type", data.get("type"), "cannot be read, expected box, sphere or cylinder")
+        if len(size) != counts[kind]:
+            raise self.fail(f"{where}.dimensions", size, f"expected {counts[kind]} numbers for a {kind}")
+        values = [self.number(v, f"{where}.dimensions.{k}") for k, v in enumerate(size)]
+        if kind == "box":
+            return {"box": tuple(values)}
+        if kind == "sphere":
+            return {"sphere": {"radius": values[0]}}
+        return {"cylinder": {"radius": values[1], "length": values[0]}}
+
+    def body(self, kind: type[BodyT], fields: dict[str, Any], where: str) -> BodyT:
+        """Return an obstacle or a held object."""
+        try:
+            return validate(kind, fields, str(self.file))
+        except FileFormatError as error:
+            raise self.fail(inside(where, error.field), error.value, error.expected) from error
+
+    def operation(self, item: Mapping[str, Any], known: tuple[int, ...], where: str) -> int:
+        """Return what is done with an object, out of the known operations."""
+        found = item.get("operation", ADD)
+        if not is_integer(found) or found not in known:
+            also = f", or {REMOVE} to remove it" if REMOVE in known else ""
+            raise self.fail(f"{where}.operation", found, f"expected {ADD} to add an object{also}")
+        return int(found)
+
+    def mesh(self, data: Mapping[str, Any], where: str) -> dict[str, Any]:
+        resource = data.get("resource")
+        if not resource:
+            raise self.fail(where, sorted(data), "cannot be read, expected a mesh by path (resource)")
+        scale = self.numbers(data.get("dimensions") or data.get("scale"), "xyz", (1.0, 1.0, 1.0), f"{where}.scale")
+        file = resolve(str(resource), self.file.resolve().parent, f"mesh {where}")
+        return {"mesh": {"file": str(file), "scale": tuple(scale.tolist())}}
+
+
+def convert(
+    scene: Path,
+    request: Path,
+    robot: Robot,
+    joint_map: Mapping[str, str] | None = None,
+    frame_map: Mapping[str, str] | None = None,
+) -> Conversion:
+    """Return the problem of a planning scene and a motion plan request.
+
+    Args:
+        scene: YAML of a ``moveit_msgs/PlanningScene`` or its world.
+        request: YAML of a ``moveit_msgs/MotionPlanRequest``.
+        robot: The robot.
+        joint_map: Joint name in the files -> planned joint of ``robot``.
+        frame_map: Frame in the files -> ``world`` or a link of ``robot``.
+
+    Raises:
+        MissingFileError: A file or a mesh cannot be read.
+        FileFormatError: Content is faulty or not supported; the message names it.
+        UnknownNameError: The joint map names an unknown joint.
+    """
+    scene_data, request_data = read_yaml(scene, "scene file"), read_yaml(request, "request file")
+    notes: list[str] = []
+    at_scene = _Reader(scene, robot, joint_map or {}, frame_map or {}, notes)
+    at_request = _Reader(request, robot, joint_map or {}, frame_map or {}, notes)
+    scene_state = at_scene.section(scene_data, "robot_state")
+    start_state = at_request.section(request_data, "start_state")
+    start = dict(zip(robot.joint_names, robot.home.tolist(), strict=True))
+    given = at_scene.state(scene_state, "robot_state") | at_request.state(start_state, "start_state")
+    if not given:
+        raise at_request.fail("start_state.joint_state", None, "expected joints of the robot; is a joint map missing?")
+    missing = [name for name in robot.joint_names if name not in given]
+    if missing:
+        notes.append(f"start: {', '.join(missing)} not given, taken at home")
+    start |= given
+    q = np.array([start[name] for name in robot.joint_names])
+    obstacles = _obstacles(at_scene, scene_data, q)
+    attached = list(_attached(at_scene, scene_state, "robot_state", q))
+    attached += list(_attached(at_request, start_state, "start_state", q))
+    bodies = [body.name for body in (*obstacles, *attached)]
+    allowed, unknown = allowed_pairs(at_scene, at_scene.section(scene_data, MATRIX), robot, bodies, frame_map or {})
+    if unknown:
+        notes.append(f"{MATRIX}: neither links nor objects here, so left out: {', '.join(unknown)}")
+    for key, usual in (("link_padding", 0.0), ("link_scale", 1.0)):
+        if any(item.get(key.removeprefix("link_"), usual) != usual for item in at_scene.messages(scene_data, key)):
+            notes.append(f"{key}: not used, the robot has its own size")
+    goals = _goals(at_request, request_data, start)
+    for key in HARMLESS:
+        if request_data.get(key):
+            notes.append(f"{key}: not used")
+    name = re.sub(r"[^A-Za-z0-9_.-]+", "_", scene.stem).strip("_.-") or "converted"
+    fields = {
+        "name": name, "robot": robot.name, "scene": tuple(obstacles), "attached": tuple(attached),
+        "allowed": tuple(allowed), "start": start,
+        "goal": Goal(joints=tuple(goals)),
+    }  # fmt: skip
+    problem = validate(Problem, fields, str(scene))
+    return Conversion(problem, notes)
+
+
+def _obstacles(reader: _Reader, data: Mapping[str, Any], start: Array) -> list[Obstacle]:
+    world = reader.section(data, "world") if "world" in data else data
+    octomap = reader.section(reader.section(world, "octomap", "world"), "octomap", "world.octomap")
+    if octomap.get("data"):
+        raise reader.fail("world.octomap", "an octomap", "cannot be read, expected primitives and meshes")
+    found: dict[str, list[Obstacle]] = {}  # by the object's name; operations are carried out one after the other
+    for k, item in enumerate(reader.messages(world, "collision_objects")):
+        where = f"collision_objects.{k}"
+        label = str(item.get("id", "")).strip()
+        if reader.operation(item, (ADD, REMOVE), where) == REMOVE:
+            gone = list(found) if not label else [label] if label in found else []  # without a name: all
+            reader.notes.append(f"{where}: removes {', '.join(map(repr, gone)) or repr(label)}")
+            found = {name: bodies for name, bodies in found.items() if name not in gone}
+            continue
+        base = reader.frame(str(reader.section(item, "header", where).get("frame_id", "")), start, where)
+        found[label or where] = [  # in place of what was added by that name before
+            reader.body(Obstacle, {"name": name, **shape, **pose_fields(base @ pose)}, where)
+            for name, shape, pose in _bodies(reader, item, where)
+        ]
+    return [body for bodies in found.values() for body in bodies]
+
+
+def _attached(reader: _Reader, state: Mapping[str, Any], where: str, start: Array) -> Iterator[AttachedObject]:
+    for k, entry in enumerate(reader.messages(state, "attached_collision_objects", where)):
+        here = f"{where}.attached_collision_objects.{k}"
+        link = reader.frame_map.get(str(entry.get("link_name")), str(entry.get("link_name")))
+        item = reader.section(entry, "object", here)
+        reader.operation(item, (ADD,), f"{here}.object")
+        frame = str(reader.section(item, "header", f"{here}.object").get("frame_id", ""))
+        inside = np.linalg.inv(reader.robot.link_pose(start, link))
+        # MoveIt gives an attached object in the frame of its link unless the header says otherwise.
+        base = np.eye(4) if frame in ("", str(entry.get("link_name"))) else inside @ reader.frame(frame, start, here)
+        touch = [reader.frame_map.get(str(t), str(t)) for t in reader.entries(entry, "touch_links", here)]
+        unknown = [t for t in touch if t not in reader.robot.link_names]
+        if unknown:
+            reader.notes.append(f"{here}.touch_links: {', '.join(unknown)} are no links of {reader.robot.name}")
+        known = tuple(t for t in touch if t in reader.robot.link_names)
+        for label, shape, pose in _bodies(reader, item, here):
+            fields = {"name": label, "link": link, **shape, **pose_fields(base @ pose)}
+            if known:
+                fields["touch_links"] = tuple({*known, *reader.robot.hand_of(link)})
+            yield reader.body(AttachedObject, fields, here)
+
+
+def _bodies(reader: _Reader, item: Mapping[str, Any], where: str) -> list[tuple[str, dict[str, Any], Array]]:
+    """Return (name, shape fields, pose in the object's header frame) of every shape of an object."""
+    label = re.sub(r"[^A-Za-z0-9_.-]+", "_", str(item.get("id", "")).strip()).strip("_.-")
+    label = label or where.replace(".", "_")
+    own = reader.pose(item.get("pose"), f"{where}.pose")
+    shapes = list(reader.shapes(item, where))
+    if not shapes:
+        raise reader.fail(where, sorted(item), "expected primitives, meshes or planes")
+    names = [label] if len(shapes) == 1 else [f"{label}/{k}" for k in range(len(shapes))]
+    return [(name, shape, own @ pose) for name, (shape, pose) in zip(names, shapes, strict=True)]
+
+
+def _goals(reader: _Reader, data: Mapping[str, Any], start: Mapping[str, float]) -> list[dict[str, float]]:
+    for key in ("path_constraints", "trajectory_constraints"):
+        if any((data.get(key) or {}).values()) if isinstance(data.get(key), Mapping) else data.get(key):
+            raise reader.fail(key, "constraints along the path", "cannot be read, expected none")
+    goals = []
+    for k, goal in enumerate(reader.messages(data, "goal_constraints")):
+        where = f"goal_constraints.{k}"
+        for other in ("position_constraints", "orientation_constraints", "visibility_constraints"):
+            if goal.get(other):
+                raise reader.fail(f"{where}.{other}", "a list", "cannot be read, expected joint_constraints only")
+        values = dict(start)
+        reached = False
+        for j, constraint in enumerate(reader.messages(goal, "joint_constraints", where)):
+            at = f"{where}.joint_constraints.{j}"
+            ours = reader.joint(str(constraint.get("joint_name")), at)
+            if ours is not None:
+                values[ours], reached = reader.number(constraint.get("position"), f"{at}.position"), True
+        if not reached:
+            raise reader.fail(where, sorted(goal), "expected joint_constraints on joints of the robot")
+        goals.append(values)
+    if not goals:
+        raise reader.fail("goal_constraints", None, "expected at least one goal")
+    return goals

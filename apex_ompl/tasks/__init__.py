@@ -1,1 +1,0 @@
-"""Tasks: alignment goals, grasps, inverse kinematics, MoveIt files."""

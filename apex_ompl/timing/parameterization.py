@@ -1,0 +1,317 @@
+"""Time parameterization: from a path to a motion within limits of velocity, acceleration and jerk."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cache
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from apex_ompl.errors import ParameterError, TimingError, TimingStoppedError
+from apex_ompl.kernel.compiled.cubic_pieces import cubic_rates
+from apex_ompl.kernel.compiled.polyline_distance import max_distance
+from apex_ompl.kernel.compiled.time_parameterization import max_path_speeds, sample_times
+from apex_ompl.kernel.products import cholesky, solve
+from apex_ompl.paths.path import Path
+from apex_ompl.robot.model import Limits
+from apex_ompl.timing import ruckig_method, spline_method
+from apex_ompl.timing.curve import SAME_STATE, Polyline
+from apex_ompl.timing.deviation import deviation_bound
+from apex_ompl.timing.extremes import Extremes
+from apex_ompl.timing.moving_start import from_moving_start
+from apex_ompl.timing.ruckig_profiles import Profiles, joined
+from apex_ompl.timing.trajectory import Trajectory
+from apex_ompl.types import Array
+from apex_ompl.util.display import fields_line
+from apex_ompl.util.validation import check_array, check_name, check_number, check_positive, check_states, finite_array
+
+METHODS = MappingProxyType({"ruckig": ruckig_method.blended, "spline": spline_method.blended})
+"""Methods by name.
+
+Each takes the polyline, the limits, the joint names, the allowed distance from the polyline [rad] and a function that
+is asked whether to give up; it returns the trajectory and a bound on its distance from the polyline [rad], or None.
+"""
+DEFAULT_METHOD = "ruckig"
+
+SHORTEST_DURATION = 1e-3  # of a motion between states that count as one [s]
+FALLBACK = "spline"  # where the method asked for has no blended motion
+BLENDS = 8  # deviations that are tried, each half of the one before, until the motion stops at corners
+LIMIT_TOLERANCE = 1e-9  # that a path may be outside the position limits, by rounding [rad]
+LIMITS = ("velocity", "acceleration", "jerk")
+RANGES = {
+    **{f"{limit}_scale": (1e-3, 1.0) for limit in LIMITS},
+    "deviation": (1e-3, 10.0), "minimum_duration": (0.0, 3600.0),
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Timing:
+    """How a path is timed.
+
+    Attributes:
+        method: ``ruckig`` or ``spline``, the keys of :data:`METHODS`; straight lines, stops and moving starts
+            are by Ruckig with both.
+        velocity_scale: Share of the velocity limits that is used, 0.001 to 1.
+        acceleration_scale: Share of the acceleration limits.
+        jerk_scale: Share of the jerk limits.
+        deviation: Largest distance of the motion from the path, 0.001 to 10 [rad, Euclidean; synergies 0..1]; a motion
+            from a moving start may leave it by more, as little as can be.
+        minimum_duration: Least duration of the motion, up to 3600 [s].
+        max_velocity: Lower limits of velocity by joint name [rad/s]; the scale comes on top.
+        max_acceleration: Lower limits of acceleration, likewise [rad/s^2].
+        max_jerk: Lower limits of jerk, likewise [rad/s^3].
+        start_velocity: Velocity at the start, one number a joint, or none for rest [rad/s].
+        start_acceleration: Acceleration at the start, likewise [rad/s^2].
+    """
+
+    method: str = DEFAULT_METHOD
+    velocity_scale: float = 1.0
+    acceleration_scale: float = 1.0
+    jerk_scale: float = 1.0
+    deviation: float = 0.05
+    minimum_duration: float = 0.0
+    max_velocity: Mapping[str, float] = field(default_factory=dict)
+    max_acceleration: Mapping[str, float] = field(default_factory=dict)
+    max_jerk: Mapping[str, float] = field(default_factory=dict)
+    start_velocity: Sequence[float] = ()
+    start_acceleration: Sequence[float] = ()
+
+    __repr__ = fields_line
+
+    def __post_init__(self) -> None:
+        """Check the name and the numbers.
+
+        Raises:
+            UnknownNameError: No such method.
+            ParameterError: A number is out of its range.
+        """
+        check_name(self.method, "timing method", METHODS)
+        for name, (low, high) in RANGES.items():
+            check_number(getattr(self, name), name, low, high)
+        for limit in LIMITS:
+            for joint, value in _by_joint(self, limit).items():
+                check_positive(value, f"max_{limit}.{joint}")
+        for name in ("start_velocity", "start_acceleration"):
+            object.__setattr__(
+                self, name, tuple(np.atleast_1d(finite_array(getattr(self, name), name)).ravel().tolist())
+            )
+
+    def limits(self, limits: Limits, joint_names: Sequence[str]) -> Limits:
+        """Return the limits of a plan: the lower ones of single joints, scaled.
+
+        Args:
+            limits: The robot's limits, which are upper bounds.
+            joint_names: Names of the joints in their order.
+
+        Raises:
+            UnknownNameError: A joint has a limit and is none of these.
+            ParameterError: A limit is higher than the robot's, or one of the robot's is not positive.
+        """
+        if len(joint_names) != len(limits.velocity):
+            raise ParameterError("joint_names", len(joint_names), f"{len(limits.velocity)}, as there are joints")
+        for limit in LIMITS:
+            for joint, value in zip(joint_names, getattr(limits, limit).tolist(), strict=True):
+                check_positive(value, f"{limit} limit of {joint}")
+        scaled = {}
+        for limit in LIMITS:
+            values = np.array(getattr(limits, limit))
+            for joint, value in _by_joint(self, limit).items():
+                check_name(joint, "joint", joint_names)
+                k = list(joint_names).index(joint)
+                if value > values[k]:
+                    raise ParameterError(f"max_{limit}.{joint}", value, f"at most {values[k]:g}, the robot's limit")
+                values[k] = value
+            scaled[limit] = values * getattr(self, f"{limit}_scale")
+        return replace(limits, **scaled)
+
+    def start(self, limits: Limits) -> tuple[Array, Array] | None:
+        """Return velocity and acceleration at the start, each of shape (dof,), or None for rest.
+
+        Args:
+            limits: The scaled limits.
+
+        Raises:
+            ParameterError: Not one number a joint, or a number over its limit.
+        """
+        derivatives = []
+        for name, limit in (("velocity", limits.velocity), ("acceleration", limits.acceleration)):
+            given = np.array(getattr(self, f"start_{name}"), dtype=float)
+            if not given.size:
+                given = np.zeros(len(limit))
+            check_array(given, limit.shape, f"start_{name}")
+            if np.any(np.abs(given) > limit):
+                k = int(np.argmax(np.abs(given) / limit))
+                raise ParameterError(f"start_{name}", given[k], f"at most {limit[k]:g} for joint {k + 1}, as scaled")
+            derivatives.append(given)
+        return (derivatives[0], derivatives[1]) if any(v.any() for v in derivatives) else None
+
+
+@dataclass(frozen=True, eq=False)
+class TimedPath:
+    """A timed path.
+
+    Attributes:
+        trajectory: The motion.
+        deviation: Its largest distance from the path [rad].
+        method: Name of the method that made it.
+        form: ``blended``: along a curve that cuts corners, as fast as the limits allow; ``line``: along a straight
+            line; ``stops``: from corner to corner; with ``moving start`` before it where the motion does not start at
+            rest.
+    """
+
+    trajectory: Trajectory
+    deviation: float
+    method: str
+    form: str
+
+    __repr__ = fields_line
+
+
+def time_path(
+    path: Path | ArrayLike, limits: Limits, joint_names: Sequence[str], timing: Timing | None = None,
+    fault: Callable[[Trajectory], str] = lambda trajectory: "", *, stop: Callable[[], bool] = lambda: False,
+) -> TimedPath:  # fmt: skip
+    """Time a path.
+
+    A straight line is followed by a jerk-limited profile of Ruckig's (:mod:`apex_ompl.timing.ruckig_method`),
+    which is the fastest. Any other path is followed by a blended motion of the method in ``timing``. Where ``fault``
+    rejects a motion, half its deviation is tried, several times, and at last a motion that stops at every corner. Where
+    Ruckig has no motion within the deviation and the position limits, which it does not know, the spline takes its
+    place.
+
+    Args:
+        path: Path, or states of shape (N, dof). The motion follows the straight lines between its states, also where
+            it has a spline, because these are what passed the full check.
+        limits: Limits of the joints.
+        joint_names: Names of the joints, in the order of the columns.
+        timing: How the path is timed.
+        fault: Returns why a motion is invalid, empty for a valid one.
+        stop: Asked often whether to give up.
+
+    Raises:
+        TimingStoppedError: It was told to stop before it had a valid motion.
+        TimingError: No valid motion was found; the message is the fault of the last one that was tried.
+        ParameterError: The path has another shape, a number that is not finite, or a position outside the limits; the
+            names are not those of the joints; or an option is out of its range.
+    """
+    timing = timing or Timing()
+    if not isinstance(timing, Timing):
+        raise ParameterError("timing", timing, "a Timing")
+    if not isinstance(limits, Limits):
+        raise ParameterError("limits", limits, "a Limits, such as load_robot(...).limits")
+    states = finite_array(path.states if isinstance(path, Path) else path, "path")
+    scaled = timing.limits(limits, joint_names)
+    _check(states, limits, joint_names)
+    start = timing.start(scaled)
+    reason, line = "", Polyline.through(states)
+    for timed in _from_rest(line, scaled, tuple(joint_names), timing, stop):
+        rest = replace(timed, trajectory=_lasting(timed.trajectory, timing.minimum_duration))
+        for candidate in [rest] if start is None else _from_moving_start(start, rest, line, scaled, timing, stop=stop):
+            reason = fault(candidate.trajectory)
+            if not reason:
+                return candidate
+            if stop():
+                break
+    if stop():
+        raise TimingStoppedError(reason or "no motion was found in time")
+    raise TimingError(reason or "no motion from the velocity at the start stays within the limits")
+
+
+def _by_joint(timing: Timing, limit: str) -> Mapping[str, float]:
+    given = getattr(timing, f"max_{limit}")
+    if not isinstance(given, Mapping):
+        raise ParameterError(f"max_{limit}", given, "values by joint name")
+    return given
+
+
+def _check(states: Array, limits: Limits, joint_names: Sequence[str]) -> None:
+    dof = len(limits.velocity)
+    check_states(states, dof, "path", least=1)
+    over = (states < limits.lower - LIMIT_TOLERANCE) | (states > limits.upper + LIMIT_TOLERANCE)
+    if over.any():
+        k, joint = np.argwhere(over)[0]
+        allowed = f"{limits.lower[joint]:g} to {limits.upper[joint]:g} for {joint_names[joint]} in state {k}"
+        raise ParameterError("path", float(states[k, joint]), allowed)
+
+
+def _from_rest(
+    line: Polyline, limits: Limits, joint_names: tuple[str, ...], timing: Timing, stop: Callable[[], bool]
+) -> Iterator[TimedPath]:
+    """Yield motions from rest to rest, each closer to the path than the one before, until ``stop`` holds."""
+    if stop():
+        return
+    if line.length <= SAME_STATE:
+        yield TimedPath(_at_rest(line.states, joint_names), 0.0, "ruckig", "line")
+        return
+    straight = len(line.corners().states) == 2
+    if not straight:
+        for k in range(BLENDS):
+            for method in dict.fromkeys((timing.method, FALLBACK)):
+                motion = METHODS[method](line, limits, joint_names, timing.deviation / 2**k, stop)
+                if stop():
+                    return
+                if motion is not None:
+                    yield TimedPath(*motion, method, "blended")
+                    break
+    motion = ruckig_method.stops(line, limits, joint_names, stop)
+    if motion is not None:
+        yield TimedPath(*motion, "ruckig", "line" if straight else "stops")
+
+
+def _from_moving_start(
+    start: tuple[Array, Array], timed: TimedPath, line: Polyline, limits: Limits, timing: Timing,
+    *, stop: Callable[[], bool],
+) -> list[TimedPath]:  # fmt: skip
+    """Return motions from a moving start: those that keep the deviation, fastest first, then the others, nearest first.
+
+    Args:
+        start: Velocity and acceleration at the start, each of shape (dof,).
+        timed: The motion from rest, which they join.
+        line: The path.
+        limits: The scaled limits.
+        timing: How the path is timed.
+        stop: Asked often whether to look for no more.
+    """
+    candidates = []
+    for motion, join_time in from_moving_start(*start, timed.trajectory, limits, timing.minimum_duration):
+        if stop():
+            break
+        arc_at = np.array([0.0, join_time]), np.zeros(2)  # it may be near any point of the path
+        head_deviation = deviation_bound(motion, line, arc_at, line.length, timing.deviation, stop=stop)
+        deviation = max(head_deviation, timed.deviation)
+        candidates.append(replace(timed, trajectory=motion, deviation=deviation, form=f"moving start, {timed.form}"))
+    return sorted(candidates, key=lambda made: (max(made.deviation, timing.deviation), made.trajectory.duration))
+
+
+def _at_rest(states: Array, joint_names: tuple[str, ...]) -> Trajectory:
+    """Return a motion at rest at a state, shape (1, dof), or to another one that counts as the same, shape (2, dof)."""
+    still = np.zeros_like(states)
+    return Trajectory(np.linspace(0.0, SHORTEST_DURATION, len(states)), states.copy(), still, still.copy(), joint_names)
+
+
+def _lasting(motion: Trajectory, duration: float) -> Trajectory:
+    """Return a motion slowed down to a duration [s] if it is shorter; one at rest stays at rest so long."""
+    if motion.duration >= duration:
+        return motion
+    if motion.duration > SHORTEST_DURATION:
+        return motion.slower(duration / motion.duration)
+    still = np.zeros((2, motion.dof))
+    return Trajectory(np.array([0.0, duration]), motion.positions[[0, -1]], still, still, motion.joint_names)
+
+
+@cache
+def warm_up() -> None:
+    """Load the compiled code: about 10 ms in each process, or a few seconds when it must be compiled first."""
+    x = np.empty(3)
+    max_path_speeds(np.ones((3, 1)), np.zeros((3, 1)), np.ones(1), np.ones(1), 1.0, x)
+    sample_times(x, 1.0, 1.0, np.empty(1))
+    max_distance(np.zeros((1, 1)), np.zeros(1), np.array([[0.0], [1.0]]), np.array([0.0, 1.0]), 1.0)
+    still = Profiles(np.ones((1, 1, 1)), np.zeros((1, 1, 1)), np.ones(1), brakes=False)
+    motion = joined(still, np.zeros((3, 2, 1)), ("joint",))
+    Trajectory(*motion.knots, ("joint",)).states(motion.times)
+    Extremes.of(*motion.knots)
+    cubic_rates(*motion.knots, np.empty((len(motion.times), 2)))
+    solve(cholesky(np.eye(1)), np.ones((1, 1)))  # which curves through paths need

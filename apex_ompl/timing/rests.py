@@ -1,0 +1,46 @@
+"""Where a motion stands still."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from apex_ompl.timing.trajectory import Trajectory
+from apex_ompl.types import Array, Flags
+
+AT_REST = 1e-6
+"""Largest velocity of a joint that stands [rad/s]."""
+
+
+def is_at_rest(motion: Trajectory, time: float) -> bool:
+    """Whether no joint is faster than ``AT_REST`` at a time [s]; before 0 and after the end the robot stands."""
+    return bool((np.abs(motion(time, 1)) <= AT_REST).all())
+
+
+def rests(motion: Trajectory) -> Array:
+    """Return the intervals of time in which a motion stands, shape (N, 2) [s].
+
+    In each, no joint is ever faster than ``AT_REST``. A moment of rest between two pieces that move is an interval
+    without length; its begin and its end are knots.
+    """
+    slow = np.all(np.abs(motion.velocities) <= AT_REST, axis=1).tolist()
+    stands = _stands(motion)
+    found, k, last = list[tuple[int, int]](), 0, len(slow) - 1
+    while k <= last:
+        if slow[k]:
+            end = k
+            while end < last and stands[end]:
+                end += 1
+            found.append((k, end))
+            k = end
+        k += 1
+    return np.asarray(motion.times[np.array(found, int).reshape(-1, 2)])
+
+
+def _stands(motion: Trajectory) -> Flags:
+    """Return which pieces between knots are never fast, shape (K - 1,)."""
+    v, a, j, t = motion.velocities, motion.accelerations[:-1], motion.jerks, np.diff(motion.times)[:, None]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        turn = np.clip(np.nan_to_num(-a / j), 0.0, t)  # where the velocity is extreme
+    inner = np.abs(v[:-1] + turn * (a + turn * j / 2.0))
+    fastest = np.maximum(np.maximum(np.abs(v[:-1]), np.abs(v[1:])), inner)
+    return np.asarray((fastest <= AT_REST).all(axis=1))

@@ -1,0 +1,320 @@
+"""Trajectories: joint motions over time, of constant jerk between knots."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from apex_ompl.errors import FileFormatError, ParameterError
+from apex_ompl.kernel.compiled.cubic_pieces import relative_gap, sample_motion
+from apex_ompl.robot.model import Limits
+from apex_ompl.timing.extremes import Extremes
+from apex_ompl.timing.files import STATES, SUFFIXES, decode, encode
+from apex_ompl.timing.smoothness import spectral_arc_length
+from apex_ompl.types import Array
+from apex_ompl.util.display import counted, fields_line, html_table, one_line
+from apex_ompl.util.files import path_text, suffix_of, write_atomically
+from apex_ompl.util.validation import check_array, check_integer, check_positive, check_times, finite_array
+
+ROUNDING = 1e-9  # of shares of limits
+CONTINUITY_TOLERANCE = 1e-6  # relative error of a knot integrated from the one before; files of ROS round times
+MAX_SAMPLES = 10**7
+BLOCK = 1000  # samples of a stream that are computed at once
+SPEED_SPACING, MAX_SPEED_SAMPLES = (
+    0.001,
+    2**15,
+)  # of the speed profile for the spectral arc length [s], and their number
+
+
+class Sample(NamedTuple):
+    """State of a trajectory at one time, or at several.
+
+    Attributes:
+        time: Time since the start, a number or shape (N,) [s].
+        position: Shape (..., dof) [rad; synergies 0..1].
+        velocity: Shape (..., dof) [rad/s].
+        acceleration: Shape (..., dof) [rad/s^2].
+    """
+
+    time: float | Array
+    position: Array
+    velocity: Array
+    acceleration: Array
+
+    def __repr__(self) -> str:
+        """Return the time and the shapes of the rest."""
+        return fields_line(self)
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """Motion of all planned joints over time; the jerk is constant between knots.
+
+    Each joint's position is a piecewise cubic polynomial with continuous acceleration. So the largest velocity,
+    acceleration and jerk are known exactly, and a controller that interpolates positions, velocities and accelerations
+    at the knots by quintic polynomials, as ROS 2's joint_trajectory_controller does, makes the same motion.
+
+    Attributes:
+        times: Times of the knots, increasing from 0, shape (K,) [s].
+        positions: Positions at the knots, shape (K, dof) [rad; synergies 0..1].
+        velocities: Velocities at the knots, shape (K, dof) [rad/s].
+        accelerations: Accelerations at the knots, shape (K, dof) [rad/s^2].
+        joint_names: Names of the columns.
+    """
+
+    times: Array
+    positions: Array
+    velocities: Array
+    accelerations: Array
+    joint_names: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        """Check shapes and numbers.
+
+        Raises:
+            ParameterError: Times that do not increase from 0, another shape, a number that is not finite, a joint given
+                twice, or knots that no motion of constant jerk joins.
+        """
+        for name in ("times", *STATES):
+            object.__setattr__(self, name, finite_array(getattr(self, name), name))
+        names = tuple(self.joint_names)
+        object.__setattr__(self, "joint_names", names)
+        if not names or len(set(names)) < len(names):
+            raise ParameterError("joint_names", names, "one name or more, each once")
+        check_times(self.times)
+        for name in STATES:
+            check_array(getattr(self, name), (len(self.times), len(names)), name)
+        if relative_gap(*self.knots) <= CONTINUITY_TOLERANCE:
+            return
+        q, v, a, t = self.positions, self.velocities, self.accelerations, np.diff(self.times)[:, None]
+        reached = q[:-1] + t * (v[:-1] + t * (2.0 * a[:-1] + a[1:]) / 6.0), v[:-1] + t * (a[:-1] + a[1:]) / 2.0
+        for name, integrated, given in zip(STATES, reached, (q[1:], v[1:]), strict=False):
+            error = np.abs(integrated - given) / np.maximum(1.0, np.abs(given))
+            if error.size and error.max() > CONTINUITY_TOLERANCE:
+                k = int(error.max(axis=1).argmax())
+                raise ParameterError(name, float(given[k][error[k].argmax()]), f"constant jerk before knot {k + 1}")
+
+    @classmethod
+    def unchecked(cls, times: Array, states: Array, joint_names: tuple[str, ...]) -> Trajectory:
+        """Return the motion through knots that compiled code has made, states of shape (3, K, dof): 1 us, not 75."""
+        motion = object.__new__(cls)
+        values = times, *states, joint_names
+        for name, value in zip(("times", *STATES, "joint_names"), values, strict=True):
+            object.__setattr__(motion, name, value)
+        return motion
+
+    @property
+    def knots(self) -> tuple[Array, Array, Array, Array]:
+        """Times, positions, velocities and accelerations, as compiled code takes them."""
+        return self.times, self.positions, self.velocities, self.accelerations
+
+    @property
+    def duration(self) -> float:
+        """Duration [s]."""
+        return float(self.times[-1])
+
+    @property
+    def dof(self) -> int:
+        """Number of joints."""
+        return len(self.joint_names)
+
+    @cached_property
+    def jerks(self) -> Array:
+        """Jerk between each two knots, shape (K - 1, dof) [rad/s^3]."""
+        return np.diff(self.accelerations, axis=0) / np.diff(self.times)[:, None]
+
+    def __repr__(self) -> str:
+        """Return the numbers of joints and knots, and the duration."""
+        return one_line(
+            "Trajectory", counted(self.dof, "joint"), f"{self.duration:.3f} s", counted(len(self.times), "knot")
+        )
+
+    def _repr_html_(self) -> str:
+        """Return what each joint does as a table for notebooks."""
+        most = self._extremes
+        columns = self.positions[0], self.positions[-1], most.velocity, most.acceleration, most.jerk
+        rows = [
+            (name, *(f"{value:.4g}" for value in values))
+            for name, *values in zip(self.joint_names, *columns, strict=True)
+        ]
+        head = (
+            "joint", "start [rad]", "end", "largest velocity [rad/s]", "acceleration [rad/s^2]", "jerk [rad/s^3]"
+        )  # fmt: skip
+        return html_table(f"Motion of {self.duration:.3f} s, {counted(self.dof, 'joint')}", rows, head)
+
+    def __call__(self, time: ArrayLike, order: int = 0) -> Array:
+        """Return positions or their derivatives; before 0 and after the end the robot stands still.
+
+        Args:
+            time: One time, or several of shape (N,) [s].
+            order: 0 for positions, 1 for velocities, 2 for accelerations, 3 for jerks.
+
+        Returns:
+            Shape (dof,), or (N, dof).
+
+        Raises:
+            ParameterError: ``order`` is none of these, or a time is not a finite number.
+        """
+        check_integer(order, "order", 0, len(STATES))
+        given = finite_array(time, "time")
+        if given.ndim > 1:
+            raise ParameterError("time", given.shape, "one time, or several of shape (N,)")
+        out = np.empty((1, given.size, self.dof))
+        sample_motion(*self.knots, np.atleast_1d(given), order, out)
+        values: Array = out[0, 0] if given.ndim == 0 else out[0]
+        return values
+
+    def states(self, times: Array) -> Array:
+        """Return positions, velocities and accelerations at finite times, shape (N,) [s], in one, shape (3, N, dof)."""
+        out = np.empty((len(STATES), len(times), self.dof))
+        sample_motion(*self.knots, times, 0, out)
+        return out
+
+    def sample(self, spacing: float) -> Sample:
+        """Return states at a spacing in time, and at the end.
+
+        Raises:
+            ParameterError: ``spacing`` is not a positive number of seconds.
+        """
+        check_positive(spacing, "spacing", "a positive number of seconds")
+        if self.duration / spacing > MAX_SAMPLES:
+            raise ParameterError("spacing", spacing, f"at most {MAX_SAMPLES} samples")
+        times = np.append(spacing * np.arange(max(0, np.ceil(self.duration / spacing - 1e-9))), self.duration)
+        return Sample(times, *self.states(times))
+
+    def stream(self, rate: float = 1000.0) -> Iterator[Sample]:
+        """Return the states at the rate of a controller one by one, the end last.
+
+        Args:
+            rate: Samples a second [Hz].
+
+        Raises:
+            ParameterError: ``rate`` is not a positive number.
+        """
+        check_positive(rate, "rate", "a positive number of samples a second")
+        return self._stream(rate)
+
+    def _stream(self, rate: float) -> Iterator[Sample]:
+        count = int(np.ceil(self.duration * rate - 1e-9))
+        for begin in range(0, count + 1, BLOCK):
+            which = np.arange(begin, min(begin + BLOCK, count + 1))
+            times = np.where(which == count, self.duration, which / rate)
+            states = self.states(times)
+            for k, time in enumerate(times.tolist()):
+                yield Sample(time, states[0][k], states[1][k], states[2][k])
+
+    def use(self, limits: Limits) -> dict[str, float]:
+        """Return the largest share of each limit that any joint uses at any time, by name of the derivative.
+
+        That is max |x_j(t)| / limit_j; for ``position`` it is 1 at a limit and 0 in the middle between two.
+
+        Raises:
+            ParameterError: The limits are those of other joints.
+        """
+        if len(limits.velocity) != self.dof:
+            raise ParameterError("limits", len(limits.velocity), f"those of {self.dof} joints")
+        middle, half = (limits.upper + limits.lower) / 2.0, (limits.upper - limits.lower) / 2.0
+        low, high, velocity, acceleration, jerk = self._extremes
+        return {
+            "position": float((np.maximum(high - middle, middle - low) / half).max()),
+            "velocity": float((velocity / limits.velocity).max()),
+            "acceleration": float((acceleration / limits.acceleration).max()),
+            "jerk": float((jerk / limits.jerk).max()),
+        }
+
+    @cached_property
+    def _extremes(self) -> Extremes:
+        return Extremes.of(*self.knots)
+
+    @property
+    def jerk(self) -> float:
+        """Root mean square over time of the norm of the jerk [rad/s^3]; 0 for a motion without duration."""
+        if not self.duration:
+            return 0.0
+        squares = np.sum(self.jerks**2, axis=1)
+        return float(np.sqrt(squares @ np.diff(self.times) / self.duration))
+
+    @property
+    def spectral_arc_length(self) -> float:
+        """Spectral arc length of the speed |q'|, nearer to 0 for smoother motions; 0 for one without motion."""
+        spacing = max(SPEED_SPACING, self.duration / MAX_SPEED_SAMPLES)
+        speed = np.linalg.norm(self.sample(spacing).velocity, axis=1)
+        return spectral_arc_length(speed, spacing) if len(speed) > 1 and speed.any() else 0.0
+
+    def slower(self, factor: float) -> Trajectory:
+        """Return the same motion in a time that is ``factor`` times as long.
+
+        Raises:
+            ParameterError: ``factor`` is not a positive number.
+        """
+        check_positive(factor, "factor", "a positive number")
+        velocities, accelerations = self.velocities / factor, self.accelerations / factor**2
+        slow = Trajectory(self.times * factor, self.positions, velocities, accelerations, self.joint_names)
+        if "_extremes" in self.__dict__:
+            slow.__dict__["_extremes"] = self._extremes.slower(factor)
+        return slow
+
+    def after(self, time: float) -> Trajectory:
+        """Return the rest of the motion from a time on [s].
+
+        Raises:
+            ParameterError: ``time`` is not a finite number.
+        """
+        finite_array(time, "time")
+        knots = (self.positions, self.velocities, self.accelerations)
+        later = self.times > time + 1e-9
+        if not later.any():
+            q, v, a = (values[-1:] for values in knots)
+            return Trajectory(np.zeros(1), q, v, a, self.joint_names)
+        now = self.states(np.array([time], float))
+        q, v, a = (np.concatenate([here, values[later]]) for here, values in zip(now, knots, strict=True))
+        return Trajectory(np.append(0.0, self.times[later] - time), q, v, a, self.joint_names)
+
+    def save(self, path: str | os.PathLike[str], controllers: Mapping[str, Sequence[str]] | None = None) -> None:
+        """Write the motion by the suffix of ``path``; :meth:`load` reads it back.
+
+        ``.npz`` holds the knots; ``.csv`` a row for each, under a header of joint names; ``.traj.yaml`` and
+        ``.traj.json`` a ``trajectory_msgs/JointTrajectory`` of ROS 2, whose times are whole nanoseconds.
+
+        Args:
+            path: The file.
+            controllers: Joints by the name of their controller; the file then has one message for each, by name.
+
+        Raises:
+            ParameterError: Another suffix, or ``controllers`` that do not name each joint once.
+            MissingFileError: The file cannot be written.
+        """
+        path = Path(path_text(path))
+        states, suffix = {name: getattr(self, name) for name in STATES}, suffix_of(path, SUFFIXES)
+        write_atomically(path, encode(suffix, self.times, states, self.joint_names, controllers))
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Trajectory:
+        """Read what :meth:`save` wrote; messages of several controllers become one motion.
+
+        Raises:
+            MissingFileError: The file cannot be read.
+            FileFormatError: It holds no trajectory.
+            ParameterError: It has another suffix.
+        """
+        path = Path(path_text(path))
+        times, states, names = decode(path)
+        try:
+            return cls(times, states[0], states[1], states[2], names)
+        except ParameterError as error:
+            raise FileFormatError(str(path), error.name, error.value, f"expected {error.expected}") from error
+
+
+def concatenate(parts: Sequence[Trajectory]) -> Trajectory:
+    """Return motions one after the other; each starts in the last state of the one before it."""
+    ends = np.cumsum([0.0, *(part.duration for part in parts)])
+    times = [part.times[(k > 0) :] + end for k, (part, end) in enumerate(zip(parts, ends[:-1], strict=True))]
+    states = [np.concatenate([getattr(part, name)[(k > 0) :] for k, part in enumerate(parts)]) for name in STATES]
+    return Trajectory(np.concatenate(times), states[0], states[1], states[2], parts[0].joint_names)

@@ -1,0 +1,301 @@
+"""Training of the model (``train`` of the paper's Algorithm 1), which resumes after an interruption."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import time
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from apex_ompl.errors import ApexError, FileFormatError
+from apex_ompl.kernel import RobotTables
+from apex_ompl.model.proposals import Sampling
+from apex_ompl.training.autoencoder import VariationalLatent
+from apex_ompl.training.checkpoint_writer import save_model
+from apex_ompl.training.conditions import Conditions
+from apex_ompl.training.config import TrainingConfig
+from apex_ompl.training.data import TrainingData
+from apex_ompl.training.distributed import DistributedProcess
+from apex_ompl.training.initialization import initial_network
+from apex_ompl.training.kernel_problems import KernelProblem
+from apex_ompl.training.latent_diffusion import Draws, LatentDiffusion
+from apex_ompl.training.objective import Objective
+from apex_ompl.training.runlog import RunLog
+from apex_ompl.training.torch_model import TorchModel
+from apex_ompl.training.training_state import EXPECTED, STATE, read_state, write_state
+from apex_ompl.training.validation import success_rates
+from apex_ompl.util.files import check_writable, is_file
+
+VALIDATION_PATHS = 2048  # most held-out paths on which the validation loss is taken
+PHASES = ("autoencoder", "denoiser")
+MAX_SKIPPED = 20  # steps in a row whose gradient is not finite
+
+
+class TrainingError(ApexError):
+    """A training run cannot continue."""
+
+
+class Trainer:
+    """Training run of a model, resumed from the state in its folder where there is one.
+
+    Each step samples its paths, noise and diffusion steps with a seed of its own. A resumed run therefore ends with the
+    same weights as an uninterrupted one on the same machine.
+
+    Attributes:
+        config: Configuration of the run.
+        folder: Folder of the run.
+        process: This process among those that train together.
+        problems: Validation problems.
+        data: Training data.
+        network: Model in training.
+        averaged: Exponential moving average of its weights, by name.
+        phase: ``autoencoder`` or ``denoiser``.
+        step: Number of steps done in the phase.
+        seconds: Time of all steps [s].
+    """
+
+    def __init__(
+        self, config: TrainingConfig, folder: Path, process: DistributedProcess,
+        problems: Sequence[KernelProblem] = (), report: Callable[[str], None] = print,
+    ) -> None:  # fmt: skip
+        """Make a model, or load the state of the run in ``folder``.
+
+        Args:
+            config: Configuration of the run.
+            folder: Folder of the run, which must exist.
+            process: This process among those that train together.
+            problems: Validation problems; none for no validation by proposals.
+            report: Prints a line for each validation.
+
+        Raises:
+            ApexError: Data, tables or state cannot be read or do not fit.
+        """
+        self.config, self.folder, self.process, self.problems, self._report = config, folder, process, problems, report
+        check_writable(folder / STATE)
+        robot = RobotTables.load(config.robot)
+        self.data = TrainingData(config, robot, process.device)
+        self.network = initial_network(config, self.data, robot).to(process.device)
+        self.phase = self._first_phase
+        self.step, self.seconds, self._skipped = 0, 0.0, 0
+        self._digest = hashlib.sha256(f"{config.determining}{robot.name}{self.data.digest()}".encode()).hexdigest()
+        self._start_phase()
+        if is_file(folder / STATE):
+            self._load_state()
+        self._runlog = RunLog(folder, self.progress) if process.rank == 0 else None
+        collide = self._collide if config.collision else None
+        objective = Objective(self.network, config.autoencoder.divergence, self.data.look, collide)
+        self._objective: nn.Module = objective
+        if process.world_size > 1:
+            self._objective = nn.parallel.DistributedDataParallel(objective, find_unused_parameters=True)
+
+    @property
+    def steps(self) -> int:
+        """Number of steps of the phase."""
+        return self.config.autoencoder.steps if self.phase == "autoencoder" else self.config.steps
+
+    @property
+    def done(self) -> bool:
+        """Whether the training is complete."""
+        return self.phase == "denoiser" and self.step >= self.steps
+
+    def advance(self) -> float:
+        """Do one step of AdamW, and return its loss; a step whose gradient is not finite changes no weight.
+
+        The average w' of the weights w follows as w' <- d w' + (1 - d) w with d = min(ema, (1 + step) / (10 + step)).
+
+        Raises:
+            TrainingError: The gradients of many steps in a row were not finite.
+        """
+        started = time.perf_counter()
+        if self.step >= self.steps:
+            self._end_autoencoder()
+        self.data.count_step()
+        for group in self._optimizer.param_groups:
+            group["lr"] = self._rate()
+        loss = self._loss()
+        self._optimizer.zero_grad(set_to_none=True)
+        loss.backward()  # type: ignore[no-untyped-call]
+        norm = nn.utils.clip_grad_norm_(self._parameters, self.config.clip)
+        self.step += 1
+        if torch.isfinite(norm):  # the same in all processes, as gradients are shared
+            self._skipped = 0
+            self._optimizer.step()
+            with torch.no_grad():
+                share = 1.0 - min(self.config.ema, (1.0 + self.step) / (10.0 + self.step))
+                torch._foreach_lerp_([self.averaged[name] for name in self._names], list(self._parameters), share)
+        else:
+            self._skipped += 1
+            if self._skipped >= MAX_SKIPPED:
+                raise TrainingError(f"{self.phase}, step {self.step}: {MAX_SKIPPED} gradients in a row are not finite")
+        self.seconds += time.perf_counter() - started
+        return float(loss.detach())
+
+    def run(self, seconds: float = math.inf, watch: Callable[[Trainer, float], None] | None = None) -> None:
+        """Train to the end, or for some seconds; log, save and validate at the configured intervals.
+
+        Args:
+            seconds: Time limit [s].
+            watch: Called after each step with this trainer and the loss.
+        """
+        started = saved = time.perf_counter()
+        losses: list[float] = []
+        while not self.done and not self.process.any(time.perf_counter() - started >= seconds):
+            losses.append(self.advance())
+            if watch is not None:
+                watch(self, losses[-1])
+            last = self.step == self.steps
+            if self.step % self.config.log_every == 0 or last:
+                self._log(float(np.mean(losses)), last)
+                losses = []
+            if time.perf_counter() - saved > self.config.save_every:
+                self.save()
+                saved = time.perf_counter()
+        self.save()
+
+    def save(self) -> None:
+        """Write the state of the run, and the averaged model as a checkpoint."""
+        if self.process.rank != 0:
+            return
+        state = {
+            "phase": self.phase, "step": self.step, "number": self.data.number, "left": self.data.left,
+            "seconds": self.seconds, "network": self.network.state_dict(), "averaged": self.averaged,
+            "optimizer": self._optimizer.state_dict(),
+        }  # fmt: skip
+        write_state(self.folder, self._digest, state)
+        save_model(self.folder / "checkpoint", self.averaged_network(), self.about())
+
+    def averaged_network(self) -> LatentDiffusion:
+        """Return a model with the averaged weights."""
+        with torch.random.fork_rng(devices=[]):
+            network = LatentDiffusion(self.network.config)
+        network.load_state_dict({**self.network.state_dict(), **self.averaged})
+        return network.eval()
+
+    def about(self) -> dict[str, Any]:
+        """Return the record of the training for a checkpoint, ready for JSON."""
+        config = self.config.model_dump(mode="json", by_alias=True)
+        config["data"] = [Path(source).name for source in self.config.sources]  # names only: folders are private
+        config["robot"] = Path(self.config.robot).name
+        for name in ("cases", "initial"):
+            config[name] = None if config[name] is None else Path(config[name]).name
+        return {
+            "phase": self.phase, "step": self.step, "seconds": round(self.seconds), "torch": torch.__version__,
+            "paths": len(self.data.shard), "config": config,
+        }  # fmt: skip
+
+    def _start_phase(self) -> None:
+        """Make the optimizer and the averaged weights of the phase."""
+        network = self.network
+        modules = [network.autoencoder] if self.phase == "autoencoder" else [network.encoder, network.denoiser]
+        chosen = {id(p) for module in modules for p in module.parameters()}
+        named = [(name, p) for name, p in self.network.named_parameters() if id(p) in chosen]
+        self._names, self._parameters = [name for name, _ in named], [p for _, p in named]
+        self.averaged = {name: p.detach().clone() for name, p in self.network.named_parameters()}
+        self._optimizer = torch.optim.AdamW(
+            [
+                {"params": [p for p in self._parameters if p.ndim > 1], "weight_decay": self.config.decay},
+                {"params": [p for p in self._parameters if p.ndim <= 1], "weight_decay": 0.0},
+            ],
+            lr=self._rate(), betas=(0.9, 0.99), fused=self.process.device.type == "cuda",
+        )  # fmt: skip
+
+    def _end_autoencoder(self) -> None:
+        """Take over the averaged autoencoder, fit the scale of its latent space, and start with the denoiser."""
+        autoencoder = self.network.autoencoder
+        assert isinstance(autoencoder, VariationalLatent)
+        self.network.load_state_dict({**self.network.state_dict(), **self.averaged})
+        autoencoder.fit_scale(self.data.statistics_sample().to(self.process.device))
+        autoencoder.requires_grad_(False)
+        self.phase, self.step = "denoiser", 0
+        self._start_phase()
+
+    def _rate(self) -> float:
+        """Return the learning rate: rate min(1, (step + 1) / warmup) (1 + cos(pi step / steps)) / 2."""
+        largest = self.config.autoencoder.rate if self.phase == "autoencoder" else self.config.rate
+        rise = min(1.0, (self.step + 1) / self.config.warmup)
+        return float(largest * rise * 0.5 * (1.0 + math.cos(math.pi * min(1.0, self.step / self.steps))))
+
+    def _loss(self) -> Tensor:
+        """Return the loss of this step's batch."""
+        config, process = self.config, self.process
+        numbers = [config.seed, PHASES.index(self.phase), self.step, process.rank]
+        generator = torch.Generator().manual_seed(int(np.random.SeedSequence(numbers).generate_state(1)[0]))
+        shard = self.data.shard
+        which = shard.sample(max(1, config.batch // process.world_size), generator)
+        control, conditions = shard.batch(which, generator)
+        return self._evaluate(self._objective, control, conditions, generator)
+
+    def _collide(self, control: Tensor, conditions: Conditions, places: Tensor) -> Tensor:
+        """Return what collisions of paths add to the loss."""
+        return self.config.collision * self.data.collide(control, conditions, places)
+
+    def _evaluate(
+        self, objective: nn.Module, control: Tensor, conditions: Conditions, generator: torch.Generator
+    ) -> Tensor:
+        """Return an objective, evaluated on the device in the configured precision."""
+        device = self.process.device
+        draws = Draws(*(tensor.to(device) for tensor in self.network.draws(len(control), generator)))
+        mixed = torch.autocast(device.type, torch.bfloat16) if self.config.precision == "bfloat16" else nullcontext()
+        with mixed:
+            loss: Tensor = objective(self.phase, control.to(device), conditions.to(device), draws)
+        return loss
+
+    def _log(self, loss: float, last: bool) -> None:
+        """Append a row to the log, with the validation loss, and where it is time the success rates."""
+        if self._runlog is None:
+            return
+        row: dict[str, Any] = {"phase": self.phase, "step": self.step, "loss": f"{loss:.6f}"}
+        row |= {"rate": f"{self._rate():.3g}", "seconds": f"{self.seconds:.1f}"}
+        network = self.averaged_network().to(self.process.device)
+        validation = self.data.validation
+        if validation is not None:
+            generator = torch.Generator().manual_seed(self.config.seed)
+            which = torch.randperm(len(validation), generator=generator)[:VALIDATION_PATHS].sort().values
+            control, conditions = validation.batch(which.numpy(), generator)
+            objective = Objective(network, self.config.autoencoder.divergence, self.data.look)
+            with torch.no_grad():
+                held_out = self._evaluate(objective, control, conditions, generator)
+            row["held_out"] = f"{float(held_out):.6f}"
+        if self.phase == "denoiser" and self.problems and (self.step % self.config.validate_every == 0 or last):
+            sampling = Sampling(**self.config.validation_sampling.model_dump())
+            model, count = TorchModel(network, {}), self.config.proposals
+            rates = success_rates(model, self.problems, count, sampling=sampling)
+            row |= {name: f"{rates.pop(name):.4f}" for name in ("sampled", "repaired")}
+            row["levels"] = json.dumps({k: round(v, 3) for k, v in rates.items()})
+            self._report(f"step {self.step}: {row['sampled']} sampled, {row['repaired']} repaired")
+        self._runlog.add(row)
+
+    @property
+    def progress(self) -> dict[str, int]:
+        """Number of steps done, by phase."""
+        before = {"autoencoder": self.config.autoencoder.steps} if self.phase != self._first_phase else {}
+        return {**before, self.phase: self.step}
+
+    @property
+    def _first_phase(self) -> str:
+        return "autoencoder" if isinstance(self.network.autoencoder, VariationalLatent) else "denoiser"
+
+    def _load_state(self) -> None:
+        state = read_state(self.folder, self._digest, self.process.device)
+        try:
+            self.network.load_state_dict(state["network"])
+            if state["phase"] != self.phase:
+                self.network.autoencoder.requires_grad_(False)
+                self.phase = state["phase"]
+                self._start_phase()
+            self.step, self.seconds = state["step"], state["seconds"]
+            averaged = {name: state["averaged"][name].to(self.process.device) for name in self.averaged}
+            self._optimizer.load_state_dict(state["optimizer"])
+            number, left = state["number"], state["left"]
+        except (AttributeError, KeyError, RuntimeError, TypeError, ValueError) as error:
+            raise FileFormatError(str(self.folder / STATE), "", type(error).__name__, EXPECTED) from error
+        self.averaged = averaged
+        self.data.go_to(number, left)

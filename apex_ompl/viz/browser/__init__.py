@@ -1,1 +1,0 @@
-"""Scenes, motions and plans in a browser, live or as pages that play offline."""

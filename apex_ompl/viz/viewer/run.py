@@ -1,0 +1,193 @@
+"""A run among moving obstacles: layers that are fed by time stamps, shown live or played as a motion is."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from apex_ompl.errors import ParameterError
+from apex_ompl.scene.bodies import MOTION, Obstacle
+from apex_ompl.types import Array
+from apex_ompl.util.validation import check_array, check_nonnegative
+from apex_ompl.viz.appearance import RUN_COLOURS, RUN_OPACITIES, body_item
+from apex_ompl.viz.viewer.nodes import add_item, turn_of
+from apex_ompl.viz.viewer.scene import BrowserScene
+from apex_ompl.viz.viewer.shown import Shown
+
+BODIES, MOTIONS = ("true", "observed", "predicted"), ("committed", "stop")
+EVENTS = "events"
+EVENT_HEIGHT = 1.35  # of the label of the last event [m]
+EVENT_TIME = 1.0  # how long it is shown [s]
+
+
+@dataclass(eq=False)
+class ShownRun(Shown):
+    """A run: the robot's states, and layers of obstacles, motions and events, each with a time.
+
+    Layers of obstacles are ``true``, ``observed`` and ``predicted``; of motions ``committed``, what the robot will do,
+    and ``stop``, how it would come to rest; ``events`` are texts. What was fed to a layer last before a time is what is
+    shown then. It may be fed by one thread while another shows it.
+
+    Attributes:
+        has_ended: Whether nothing more is fed, so that it is played from its beginning.
+    """
+
+    has_ended: bool = False
+    _times: dict[str, list[float]] = field(default_factory=dict)
+    _values: dict[str, list[Any]] = field(default_factory=dict)
+    _nodes: LayerNodes | None = None
+
+    @property
+    def grows(self) -> bool:
+        """Whether it goes on; set ``has_ended`` when it does not."""
+        return not self.has_ended
+
+    @property
+    def is_editable(self) -> bool:
+        """Whether its problem can be edited: not that of a run."""
+        return False
+
+    def feed_state(self, time: float, q: Array) -> None:
+        """Say where the robot was at a time [s], shape (dof,).
+
+        Raises:
+            ParameterError: Another shape, or a time before the last one.
+        """
+        check_array(np.asarray(q, float), (self.setup.robot.dof,), "state", finite=True)
+        self._feed("robot", time, np.array(q, float))
+
+    def feed_bodies(self, layer: str, time: float, bodies: Sequence[Obstacle]) -> None:
+        """Say which obstacles a layer has from a time on [s].
+
+        Raises:
+            ParameterError: There is no such layer, or a time before the last one.
+        """
+        _check_layer(layer, BODIES)
+        self._feed(layer, time, {body.name: body for body in bodies})
+
+    def feed_motion(self, layer: str, time: float, states: Array) -> None:
+        """Say which motion a layer has from a time on [s]: states of shape (N, dof), none for no motion.
+
+        Raises:
+            ParameterError: There is no such layer, another shape, or a time before the last one.
+        """
+        _check_layer(layer, MOTIONS)
+        check_array(np.asarray(states, float), ("N", self.setup.robot.dof), "states", finite=True)
+        self._feed(layer, time, np.array(states, float))
+
+    def feed_event(self, time: float, text: str) -> None:
+        """Say what happened at a time [s].
+
+        Raises:
+            ParameterError: A time before the last one.
+        """
+        self._feed(EVENTS, time, (time, text))
+
+    def _feed(self, layer: str, time: float, value: Any) -> None:
+        check_nonnegative(time, "time")
+        times = self._times.setdefault(layer, [])
+        if times and time < times[-1]:
+            raise ParameterError("time", time, f"at least {times[-1]}, that of the last {layer}")
+        self._values.setdefault(layer, []).append(value)
+        times.append(float(time))  # last: a page may be reading in another thread, by the times
+
+    @property
+    def duration(self) -> float:
+        """Time of the last thing that was fed [s]."""
+        return max((times[-1] for times in self._times.values()), default=0.0)
+
+    def state(self, time: float) -> Array:
+        """Return the state at a time, between those that were fed; shape (dof,)."""
+        times, values = self._times.get("robot", []), self._values.get("robot", [])
+        k = bisect_right(times, time)
+        if k == 0 or k == len(times):
+            return np.asarray(values[min(k, len(values) - 1)] if values else self.setup.start)
+        share = (time - times[k - 1]) / (times[k] - times[k - 1])
+        return np.asarray(values[k - 1] + share * (values[k] - values[k - 1]))
+
+    def latest(self, layer: str, time: float) -> tuple[int, Any]:
+        """Return number and content of what a layer has at a time; -1 and None before the first."""
+        k = bisect_right(self._times.get(layer, []), time) - 1
+        return k, None if k < 0 else self._values[layer][k]
+
+    def draw(self, scene: BrowserScene, time: float) -> None:
+        """Show the run at a time in its scene."""
+        scene.show(self.state(time))
+        if self._nodes is None or self._nodes.scene is not scene:
+            self._nodes = LayerNodes(scene)
+        self._nodes.show(self, time)
+
+
+class LayerNodes:
+    """Nodes of the layers of a run; only what changes is sent.
+
+    Attributes:
+        scene: The scene that they are drawn in.
+    """
+
+    def __init__(self, scene: BrowserScene) -> None:
+        """Draw below the root of a scene."""
+        self.scene = scene
+        self._shown: dict[str, int] = {}
+        self._bodies: dict[str, dict[str, tuple[Obstacle, Any]]] = {layer: {} for layer in BODIES}
+        self._motions: dict[str, Any] = {}
+        self._event: tuple[int, Any] | None = None
+
+    def show(self, run: ShownRun, time: float) -> None:
+        """Show all layers as they are at a time."""
+        for layer in (*BODIES, *MOTIONS):
+            number, value = run.latest(layer, time)
+            if self._shown.get(layer, -1) == number:
+                continue
+            self._shown[layer] = number
+            if layer in BODIES:
+                self._show_bodies(layer, value or {})
+            else:
+                self._show_motion(layer, value)
+        self._show_event(*run.latest(EVENTS, time), time)
+
+    def _show_bodies(self, layer: str, bodies: Mapping[str, Obstacle]) -> None:
+        known = self._bodies[layer]
+        for name in [name for name in known if name not in bodies]:
+            known.pop(name)[1].remove()
+        for name, body in bodies.items():
+            before = known.get(name)
+            if before is not None and _same_shape(before[0], body):
+                before[1].wxyz, before[1].position = turn_of(body.pose), body.pose[:3, 3]
+                known[name] = body, before[1]
+                continue
+            if before is not None:
+                before[1].remove()
+            item = replace(body_item(body, layer), colour=RUN_COLOURS[layer], opacity=RUN_OPACITIES[layer])
+            handle = add_item(self.scene.api, self.scene.root, item)
+            known[name] = body, handle
+
+    def _show_motion(self, layer: str, states: Array | None) -> None:
+        old = self._motions.pop(layer, None)
+        if old is not None:
+            old.remove()
+        if states is not None and len(states) > 1:
+            self._motions[layer] = self.scene.show_lines(layer, [states], RUN_COLOURS[layer], 0.008)
+
+    def _show_event(self, number: int, event: tuple[float, str] | None, time: float) -> None:
+        late = event is None or time - event[0] > EVENT_TIME
+        if self._event is not None and (late or self._event[0] != number):
+            self._event[1].remove()
+            self._event = None
+        if event is not None and not late and self._event is None:
+            path, at = f"{self.scene.root}/event", (0.0, 0.0, EVENT_HEIGHT)
+            self._event = number, self.scene.api.add_label(path, event[1], position=at)
+
+
+def _same_shape(first: Obstacle, second: Obstacle) -> bool:
+    left = {"position", "orientation", *MOTION}
+    return first.model_dump(exclude=left) == second.model_dump(exclude=left)
+
+
+def _check_layer(layer: str, known: Sequence[str]) -> None:
+    if layer not in known:
+        raise ParameterError("layer", layer, f"one of {', '.join(known)}")
