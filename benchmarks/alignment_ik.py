@@ -29,7 +29,7 @@ PROBLEMS = ("stack_boxes", "ball_in_cup", "peg_in_hole", "pour", "handover")
 
 
 def robot_with_bases_apart(distance: float) -> Robot:
-    """Return the dual Panda with its bases and tables ``distance`` metres apart."""
+    """Return the dual Panda with its bases and tables ``distance`` meters apart."""
     path = DATA / "dual_panda_softhand.robot.yaml"
     config = read_config(path)
 

@@ -62,7 +62,7 @@ STAGES = Row("stages", "apex", {"seed": SEED, **TREELESS}, levels=HARD)
 
 
 def run_variant(job: Job) -> Run:
-    """Return the columns of a run with other samples of the optimiser in repair, or without later sprints."""
+    """Return the columns of a run with other samples of the optimizer in repair, or without later sprints."""
     params = dict(job.params)
     samples, later_sprints = params.pop("samples", None), params.pop("later_sprints", True)
     build = ApexParameters.build

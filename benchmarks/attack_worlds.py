@@ -200,7 +200,7 @@ class AttackWorld(ScriptedWorld):
     def nearest(self, here: Array, q: Array) -> Array:
         """Return the middle of the nearest ball of the robot at a state, of those that can evade, shape (3,) [m]."""
         balls = self.places.balls(q, evading=True)
-        return np.asarray(balls.centres[np.argmin(np.linalg.norm(balls.centres - here, axis=1) - balls.radii)])
+        return np.asarray(balls.centers[np.argmin(np.linalg.norm(balls.centers - here, axis=1) - balls.radii)])
 
     def _outside(self, radius: float) -> Array:
         """Return a place with a drawn gap to the robot at its start, shape (3,) [m]."""
@@ -210,7 +210,7 @@ class AttackWorld(ScriptedWorld):
             way = self.rng.normal(size=3)
             for distance in np.arange(gap, FARTHEST, STEP):
                 place = hand + distance * way / np.linalg.norm(way)
-                clear = (np.linalg.norm(balls.centres - place, axis=1) - balls.radii).min() - radius
+                clear = (np.linalg.norm(balls.centers - place, axis=1) - balls.radii).min() - radius
                 if clear >= gap and place[2] > 0.05:
                     return np.asarray(place)
 

@@ -32,7 +32,7 @@ from apex_ompl.util.validation import one_or_more, whole_number
 DEPENDS = ("@checking", "apex_ompl/ompl", "problems")
 SCENES = (3, 10, 30, 100, 300)
 CROWDED = 30  # obstacles; more are made smaller, so that some room is left
-LIMIT = 0.1  # clearances over this are not looked for, as by an optimiser [m]
+LIMIT = 0.1  # clearances over this are not looked for, as by an optimizer [m]
 
 
 def boxes(count: int, rng: np.random.Generator) -> list[Obstacle]:

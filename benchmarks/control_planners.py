@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 from controls import Shuffled, drawn
-from neighbours import Neighbours
+from neighbors import Neighbors
 from ompl import base as ob
 
 from apex_ompl.apex.models import AUTO, DEFAULT
@@ -105,7 +105,7 @@ class NearestPaths(ArrayModel):
     def propose(self, query: Any, kernel: Kernel, count: int, **options: Any) -> Proposals:
         """Return training paths, moved to the ends of queries."""
         queries = [query] if isinstance(query, Query) else list(query)
-        rng, near = options.get("generator") or np.random.default_rng(0), neighbours()
+        rng, near = options.get("generator") or np.random.default_rng(0), neighbors()
         found = [
             near.refitted(q, kernel, NEAR * count)[np.sort(rng.permutation(NEAR * count)[:count])] for q in queries
         ]
@@ -133,13 +133,13 @@ def training_paths() -> tuple[Paths, RobotTables]:
 
 
 @cache
-def neighbours() -> Neighbours:
-    """Return the paths that ship to look for neighbours in, with their mirror images."""
+def neighbors() -> Neighbors:
+    """Return the paths that ship to look for neighbors in, with their mirror images."""
     from apex_ompl.model.checkpoint import SHIPPED, read_config
 
     paths, tables = training_paths()
     mirror = Mirror(**read_config(SHIPPED / "apex").trained["config"]["mirror"])
-    return Neighbours([paths, mirror.paths(paths, Kernel(tables, scene_tables([])))], tables)
+    return Neighbors([paths, mirror.paths(paths, Kernel(tables, scene_tables([])))], tables)
 
 
 def training_query(paths: Paths, k: int) -> Query:

@@ -2,7 +2,7 @@
 
 1. Validation problems, each in four versions: as it is; with every box, ball, cylinder and capsule as a mesh; with
    points on them, 5 mm apart, with balls that reach to their surfaces from inside; and as one grid of the cells of 1 cm
-   whose centres are inside of them. Whole calls of a kept planner, the first path of apex, and the answers at states
+   whose centers are inside of them. Whole calls of a kept planner, the first path of apex, and the answers at states
    around the problem's start and goal: those of the mesh must be those of the shapes; points lie inside of these. How
    far proposals of the model are from those among the shapes, with the same noise, over the standard deviation of
    these: two that have nothing to do with each other are 1.4 apart.

@@ -62,7 +62,7 @@ def version(problem: Problem, kind: str, folder: Path) -> Problem:
 
 
 def voxels(bodies: Sequence[Obstacle]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the outer corner of the first cell, and which cells have their centres inside of obstacles."""
+    """Return the outer corner of the first cell, and which cells have their centers inside of obstacles."""
     boxes = []
     for body in bodies:
         low, high = solid_of(body).bounds

@@ -37,7 +37,7 @@ from apex_ompl.util.validation import one_or_more
 
 DEPENDS = (
     "@benchmark", "apex_ompl/baselines", "benchmarks/baselines", "benchmarks/controls.py",
-    "benchmarks/control_planners.py", "benchmarks/neighbours.py",
+    "benchmarks/control_planners.py", "benchmarks/neighbors.py",
 )  # fmt: skip
 FOLDER = Path(__file__).parent / "runs" / "head_to_head"
 TIMEOUT = 10.0  # [s]

@@ -28,7 +28,7 @@ from apex_ompl.kernel.compiled.compilation import entry_point, reassociating_ent
 from apex_ompl.kernel.compiled.kinematics import place_cluster, place_robot
 from apex_ompl.kernel.compiled.layout import Floats, Integers
 from apex_ompl.kernel.compiled.path_cost import PANEL, add_sample
-from apex_ompl.kernel.compiled.path_optimization import _factorise
+from apex_ompl.kernel.compiled.path_optimization import _factorize
 from apex_ompl.kernel.compiled.workspace import workspace_view
 from apex_ompl.ompl.setup import assemble
 from apex_ompl.paths.optimizer import Optimizer, _grid
@@ -61,12 +61,12 @@ def place(tables: tuple[Integers, Floats], work: tuple[Integers, Floats], states
 
 
 @reassociating_entry_point
-def factorise(matrix: Floats, factor: Floats, band: int, panel: Floats) -> bool:
-    """Copy a banded matrix and factorise it."""
+def factorize(matrix: Floats, factor: Floats, band: int, panel: Floats) -> bool:
+    """Copy a banded matrix and factorize it."""
     for i in range(len(matrix)):
         for j in range(i, min(len(matrix), i + band)):
             factor[i, j] = matrix[i, j]
-    return _factorise(factor, band, panel)
+    return _factorize(factor, band, panel)
 
 
 @reassociating_entry_point
@@ -147,7 +147,7 @@ def stages(repeat: int) -> list[tuple[str, float, float, str, float]]:
     banded = np.where(np.abs(np.subtract.outer(np.arange(n), np.arange(n))) < band, 0.01, 0.0) + 10.0 * np.eye(n)
     factor, panel = np.zeros((n, n)), np.zeros(PANEL)
     count = float(sum(min(band, n - k) ** 2 for k in range(n)))
-    took = least(lambda: factorise(banded, factor, band, panel), repeat)
+    took = least(lambda: factorize(banded, factor, band, panel), repeat)
     rows.append(("Cholesky factor of a step", count, 8.0 * n * band, "double", took))
     took = least(lambda: optimizer.improve(kernel, near, steps=0), repeat, len(near))
     rows.append(("cost of a path, with gradient and matrix", np.nan, 0.0, "double", took))

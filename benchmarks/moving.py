@@ -71,7 +71,7 @@ def retimed(job: Job) -> Run:
 
 
 def space_time(job: Job) -> Run:
-    """Return a run in which motions are optimised in space and time only."""
+    """Return a run in which motions are optimized in space and time only."""
     return _run(job, (SPACE_TIME,))
 
 

@@ -80,7 +80,7 @@ NODES = 1_000_000  # most of RoboPlan's trees
 GROUPS = ("all hard", "all")
 STATES = 200  # on which the checkers are compared, for each problem
 ORIGIN = np.eye(4)
-COLOUR = np.array([0.5, 0.5, 0.5, 1.0])
+COLOR = np.array([0.5, 0.5, 0.5, 1.0])
 
 
 def representable(problem: Problem) -> bool:
@@ -101,15 +101,15 @@ def add(scene: Scene, body: Body, frame: str, at: Array = ORIGIN) -> None:
     """Add a solid to a scene, posed at ``at`` in the frame of the joint that a link is fixed to."""
     pose = np.asfortranarray(at @ pose_matrix(body.position, body.orientation))
     if body.box is not None:
-        scene.addBoxGeometry(body.name, frame, Box(*body.box), pose, COLOUR)
+        scene.addBoxGeometry(body.name, frame, Box(*body.box), pose, COLOR)
     elif body.sphere is not None:
-        scene.addSphereGeometry(body.name, frame, Sphere(body.sphere.radius), pose, COLOUR)
+        scene.addSphereGeometry(body.name, frame, Sphere(body.sphere.radius), pose, COLOR)
     elif body.cylinder is not None:
         shape = Cylinder(body.cylinder.radius, body.cylinder.length)
-        scene.addCylinderGeometry(body.name, frame, shape, pose, COLOUR)
+        scene.addCylinderGeometry(body.name, frame, shape, pose, COLOR)
     elif body.mesh is not None:
         shape = Mesh(body.mesh.file, np.array(body.mesh.scale))
-        scene.addMeshGeometry(body.name, frame, shape, pose, COLOUR)
+        scene.addMeshGeometry(body.name, frame, shape, pose, COLOR)
 
 
 def roboplan_scene(ready: PlanningSetup) -> Scene:

@@ -2,7 +2,7 @@
 
 The models, unguided and guided, stand beside the straight line, random bumps, the nearest training paths, a regression
 network of the same size, conditions and training, the same network with random weights, and with the conditions of
-another problem of the level. All are repaired by the same steps of the same optimiser, shortened, and pass the same
+another problem of the level. All are repaired by the same steps of the same optimizer, shortened, and pass the same
 full check; beside them rrtconnect+polish, whose trees have the tuned range. Times leave out the setup of the problem.
 Each run is stored in benchmarks/runs/proposals when it ends; the command resumes where it was stopped. Runs with other
 models or data need another folder.
@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 import record
 from controls import Shuffled, checkpoint_digest, digest, drawn, next_query
-from neighbours import Neighbours
+from neighbors import Neighbors
 
 from apex_ompl import load_model
 from apex_ompl.apex.query import make_query
@@ -54,7 +54,7 @@ from apex_ompl.util.validation import one_or_more, whole_number
 
 ROOT = record.ROOT
 FOLDER = record.RESULTS.parent / "runs" / "proposals"
-DEPENDS = ("@benchmark", "benchmarks/controls.py", "benchmarks/neighbours.py")
+DEPENDS = ("@benchmark", "benchmarks/controls.py", "benchmarks/neighbors.py")
 COUNTS = (1, 8, 32)
 GUIDED = Guidance(gamma=1.0)
 PAPER = Sampling("ddpm", 256)
@@ -89,13 +89,13 @@ def model(name: str) -> TrajectoryModel:
 
 
 @cache
-def neighbours(data: str) -> Neighbours:
-    """Return the training paths to look for neighbours in, with the mirror images that the model saw."""
+def neighbors(data: str) -> Neighbors:
+    """Return the training paths to look for neighbors in, with the mirror images that the model saw."""
     tables = RobotTables.load(ROOT / "data" / "dual_panda_softhand" / "robot.npz")
     paths, _ = shard_paths(data.split(","), 0, 10**9, 0)
     mirror = load_model("apex").about["config"]["mirror"]
     images = [] if mirror is None else [Mirror(**mirror).paths(paths, Kernel(tables, scene_tables([])))]
-    return Neighbours([paths, *images], tables)
+    return Neighbors([paths, *images], tables)
 
 
 def made_of(method: str, args: argparse.Namespace) -> str:
@@ -177,7 +177,7 @@ def proposer(ready: PlanningSetup, optimizer: Optimizer, job: Job) -> Callable[[
     if method in ("line", "bumps"):
         return lambda count: optimizer.starts(start, goal, count, np.random.default_rng(seed))
     if method == "nearest paths":
-        near = neighbours(job.params["data"])
+        near = neighbors(job.params["data"])
         return lambda count: near.refitted(make_query(ready.checker, start, goal, point=False), kernel, count)
     kinds = {"regression": job.params["regression"], "random weights": method, "shuffled conditions": method}
     network = model(kinds.get(method, "apex-paper" if method.startswith("apex-paper") else "apex"))
@@ -256,7 +256,7 @@ def main() -> None:
         "--paper", type=whole_number, default=5, help="of a level for apex-paper (default: %(default)s)"
     )
     parser.add_argument(
-        "--data", default=str(ROOT / "data" / "dual_panda_softhand" / "paths.zip"), help="for neighbours"
+        "--data", default=str(ROOT / "data" / "dual_panda_softhand" / "paths.zip"), help="for neighbors"
     )
     parser.add_argument("--jobs", type=one_or_more, default=2, help="processes (default: %(default)s)")
     parser.add_argument("--split", choices=("validation", "test"), default="test")

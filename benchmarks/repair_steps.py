@@ -1,4 +1,4 @@
-"""How much repair proposals need on scenes of kinds that no training data are of: steps of the optimiser, no times.
+"""How much repair proposals need on scenes of kinds that no training data are of: steps of the optimizer, no times.
 
 Four proposals of each model are checked as they are, and then repaired, the most promising one first, as the planner
 does, for at most 192 steps in all. Beside the checkpoint that ships stand the planner's random bumps, the same network

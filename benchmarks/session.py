@@ -2,7 +2,7 @@
 
 Test problems are planned by the default planner, with timing, one at a time. ``plan`` and the kept planner are warm:
 one problem of another kind was planned before. The kept planner has the problem's world already; in the last row an
-obstacle is moved by a millimetre first, which counts. Times are those of the whole call, with set-up, proof and timing;
+obstacle is moved by a millimeter first, which counts. Times are those of the whole call, with set-up, proof and timing;
 ``beside solve`` is what is not spent in the planner's ``solve``. A fresh process runs
 ``apex-ompl plan NAME``, with the compiled code in its cache. RoboPlan's row, with its tuned range, where RoboPlan is
 there and has the shapes: its scene is built, it plans and shortens, and nothing is proved or timed.

@@ -22,7 +22,7 @@ from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import one_or_more
 
 DEPENDS = (
-    "@benchmark", "benchmarks/controls.py", "benchmarks/control_planners.py", "benchmarks/neighbours.py",
+    "@benchmark", "benchmarks/controls.py", "benchmarks/control_planners.py", "benchmarks/neighbors.py",
     "benchmarks/head_to_head.py",
 )  # fmt: skip
 KINDS = ("hard", "large", "extreme")

@@ -32,7 +32,7 @@ from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import one_or_more
 
 DEPENDS = (
-    "@benchmark", "benchmarks/controls.py", "benchmarks/control_planners.py", "benchmarks/neighbours.py",
+    "@benchmark", "benchmarks/controls.py", "benchmarks/control_planners.py", "benchmarks/neighbors.py",
     "benchmarks/head_to_head.py",
 )  # fmt: skip
 FOLDER = record.RESULTS.parent / "runs" / "unseen"
@@ -48,7 +48,7 @@ NAMES = ("apex", *CONTROLS, *ALONE, *TREES)
 
 
 def rows(names: Sequence[str], model: Path | None) -> list[Row]:
-    """Return the rows of some names, and of apex with a checkpoint, labelled with its digest.
+    """Return the rows of some names, and of apex with a checkpoint, labeled with its digest.
 
     Raises:
         ApexError: The checkpoint cannot be read.

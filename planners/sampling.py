@@ -174,7 +174,7 @@ class PRM(OmplParameters):
 @register("prmstar")
 @dataclass(frozen=True)
 class PRMstar(OmplParameters):
-    """PRM with the neighbourhood that makes it asymptotically optimal (Karaman and Frazzoli, 2011)."""
+    """PRM with the neighborhood that makes it asymptotically optimal (Karaman and Frazzoli, 2011)."""
 
     planner: ClassVar[str] = "PRMstar"
     threaded: ClassVar[bool] = True

@@ -3,7 +3,7 @@
 Starts are home + N(0, 0.35^2), the objects at least 8 cm above the tables and 0.4 m apart. Goals are found by inverse
 kinematics from home + N(0, 0.6^2). Both are free by 1 cm, except that the two objects are in contact at the goal.
 
-Obstacles are cubes. Their centres are those of a held object at a random state in the middle half of the straight line
+Obstacles are cubes. Their centers are those of a held object at a random state in the middle half of the straight line
 from start to goal, + N(0, 0.1^2) m; cubes drawn evenly over the workspace would rarely block a motion. A static cube
 keeps 3 cm to start and goal. On ``extreme`` 100 and 70 cubes, which may overlap, form a cave: they are spread by
 N(0, 0.2^2) m and keep 1.5 cm. A moving cube keeps 3 cm to the start at time 0, and to the goal at the time when the
@@ -33,9 +33,9 @@ SPEEDS = (0.1, 0.2, 0.4)  # [m/s]
 MAX_CUBES = 3
 EXTREME_CUBES = {"vertical": 100, "horizontal": 70}
 START_SPREAD = 0.35  # standard deviation of starts around home [rad]
-START_HEIGHT, START_SEPARATION = 0.08, 0.4  # of the objects above the tables, and of their centres [m]
+START_HEIGHT, START_SEPARATION = 0.08, 0.4  # of the objects above the tables, and of their centers [m]
 CUBE_MARGIN, EXTREME_MARGIN = 0.03, 0.015  # of cubes to start and goal [m]
-CUBE_SPREAD, EXTREME_SPREAD = 0.1, 0.2  # standard deviation of the centres of cubes around those of held objects [m]
+CUBE_SPREAD, EXTREME_SPREAD = 0.1, 0.2  # standard deviation of the centers of cubes around those of held objects [m]
 CUBE_ATTEMPTS = 20  # positions tried for a cube
 VELOCITY_SCALE = 0.25  # of the velocity limits, at which straight lines are followed
 
@@ -119,17 +119,17 @@ def _draw_cube(
         size: Edge of the cube [m].
         speed: Of the cube, in a random horizontal direction [m/s].
         margin: Distance that it keeps to start and goal [m].
-        spread: Standard deviation of its centre around that of the held object [m].
+        spread: Standard deviation of its center around that of the held object [m].
     """
     duration = straight_line_duration(ends[0], ends[1])
     for _ in range(CUBE_ATTEMPTS):
         fraction, held = rng.uniform(0.25, 0.75), int(rng.integers(len(sampler.attached)))
         state = ends[0] + fraction * (ends[1] - ends[0])
-        centre = sampler.box_corners(state[None])[0, held].mean(axis=0) + rng.normal(0.0, spread, 3)
+        center = sampler.box_corners(state[None])[0, held].mean(axis=0) + rng.normal(0.0, spread, 3)
         heading = rng.uniform(0.0, 2.0 * np.pi)
         velocity = np.round(speed * np.array([np.cos(heading), np.sin(heading), 0.0]), 4)
-        centre[2] = max(centre[2], size / 2)  # above the table
-        initial = np.round(centre - velocity * fraction * duration, 4)
+        center[2] = max(center[2], size / 2)  # above the table
+        initial = np.round(center - velocity * fraction * duration, 4)
         final = initial + velocity * duration
         if all(
             _cube_distance(sampler, q, _cube(size, position)) >= margin
@@ -140,8 +140,8 @@ def _draw_cube(
     return None
 
 
-def _cube(size: float, centre: Array) -> Obstacle:
-    x, y, z = (float(v) for v in centre)
+def _cube(size: float, center: Array) -> Obstacle:
+    x, y, z = (float(v) for v in center)
     return Obstacle(name="cube", box=(size, size, size), position=(x, y, z))
 
 

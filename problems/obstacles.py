@@ -1,4 +1,4 @@
-"""Obstacles of generated scenes, their numbers rounded to a tenth of a millimetre."""
+"""Obstacles of generated scenes, their numbers rounded to a tenth of a millimeter."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from apex_ompl.types import Array
 
 
 def box(name: str, size: Sequence[float], position: Sequence[float]) -> Obstacle:
-    """Return an upright box of edges ``size`` [m] centred at ``position`` [m]."""
+    """Return an upright box of edges ``size`` [m] centerd at ``position`` [m]."""
     return _obstacle(name=name, box=_rounded(size), position=_rounded(position))
 
 
 def bar(name: str, radius: float, length: float, position: Sequence[float]) -> Obstacle:
-    """Return an upright cylinder centred at ``position`` [m]; ``length`` is not rounded."""
+    """Return an upright cylinder centerd at ``position`` [m]; ``length`` is not rounded."""
     cylinder = {"radius": _rounded([radius])[0], "length": length}
     return _obstacle(name=name, cylinder=cylinder, position=_rounded(position))
 
@@ -37,7 +37,7 @@ def primitive(name: str, kind: int, size: Array, position: Array, quaternion: Ar
         name: Name of the obstacle.
         kind: 0 to 3, in the order above.
         size: Edges of a box; the first one is the diameter of the others, the third one their length, shape (3,) [m].
-        position: Centre, shape (3,) [m].
+        position: Center, shape (3,) [m].
         quaternion: Orientation as xyzw, of any norm but 0, shape (4,).
     """
     width, _, length = _rounded(size)

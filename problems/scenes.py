@@ -1,6 +1,6 @@
 """Scenes in which both arms are busy at once: shelf, bins, cage, posts, wall, swap and clutter.
 
-Each function draws obstacles and the regions of both hands at the start and at the goal. Lengths are in metres. The
+Each function draws obstacles and the regions of both hands at the start and at the goal. Lengths are in meters. The
 arms stand at y = 0.5 (left) and -0.5 (right) on tables whose surface is z = 0, and reach forward along x.
 """
 
@@ -199,7 +199,7 @@ def swap(rng: np.random.Generator, level: str) -> ReachingTask:
 
 
 def clutter(rng: np.random.Generator, level: str) -> ReachingTask:
-    """Draw ten to forty-five primitives, 4 cm to half a metre long; each hand moves sideways among them."""
+    """Draw ten to forty-five primitives, 4 cm to half a meter long; each hand moves sideways among them."""
     count, widest, longest = {
         "easy": (10, 0.14, 0.2),
         "medium": (20, 0.14, 0.3),

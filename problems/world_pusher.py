@@ -92,8 +92,8 @@ class PusherWorld(ScriptedWorld):
     def _towards(self, here: Array, q: Array) -> Array:
         """Return its velocity towards the nearest link at a state, shape (dof,), from a place; both shape (3,)."""
         balls = self._robot.balls(q, evading=True)
-        outside = np.maximum(np.abs(balls.centres - here) - self._edge / 2.0, 0.0)
-        nearest = balls.centres[np.argmin(np.linalg.norm(outside, axis=1) - balls.radii)]
+        outside = np.maximum(np.abs(balls.centers - here) - self._edge / 2.0, 0.0)
+        nearest = balls.centers[np.argmin(np.linalg.norm(outside, axis=1) - balls.radii)]
         way = np.append(nearest[:2], max(nearest[2], self._edge / 2.0)) - here
         distance = float(np.linalg.norm(way))
         if distance < SPEED * PERIOD:

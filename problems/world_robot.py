@@ -24,19 +24,19 @@ class Balls(NamedTuple):
     """Balls that contain the robot and what it holds.
 
     Attributes:
-        centres: Shape (N, 3) [m].
+        centers: Shape (N, 3) [m].
         radii: Shape (N,) [m].
     """
 
-    centres: Array
+    centers: Array
     radii: Array
 
     def clearance(self, place: Array, edge: float) -> float:
         """Return the distance to a cube at a place, shape (3,), with an edge [m]: at most the true one.
 
-        It is negative only where the centre of a ball is less than its radius from the cube.
+        It is negative only where the center of a ball is less than its radius from the cube.
         """
-        outside = np.maximum(np.abs(self.centres - place) - edge / 2.0, 0.0)
+        outside = np.maximum(np.abs(self.centers - place) - edge / 2.0, 0.0)
         return float((np.linalg.norm(outside, axis=1) - self.radii).min())
 
 
@@ -61,7 +61,7 @@ class RobotPlaces:
         ends = np.append(a.body_root[1:], len(a.node_count))
         body = np.repeat(np.arange(len(ends)), ends - a.body_root)
         leaf = a.node_count == 0
-        self._joint, self._centre = a.body_joint[body][leaf], a.node_centre[leaf]
+        self._joint, self._center = a.body_joint[body][leaf], a.node_center[leaf]
         self._radius: Array = a.node_radius[leaf]
         evading = [not name.rpartition("_")[0].endswith(NEVER_EVADING) for name in self._kernel.robot.body_names]
         self._evading: NDArray[np.bool_] = np.array(evading)[body][leaf]
@@ -69,9 +69,9 @@ class RobotPlaces:
     def balls(self, q: Array, evading: bool = False) -> Balls:
         """Return the balls at a state, shape (dof,); with ``evading`` without those of links that stay at the bases."""
         rotation, origin = (value[0] for value in self._kernel.joint_frames(q[None]))
-        centres = np.einsum("nij,nj->ni", rotation[self._joint], self._centre) + origin[self._joint]
+        centers = np.einsum("nij,nj->ni", rotation[self._joint], self._center) + origin[self._joint]
         chosen = self._evading if evading else slice(None)
-        return Balls(centres[chosen], self._radius[chosen])
+        return Balls(centers[chosen], self._radius[chosen])
 
     def hand(self, q: Array, link: str) -> Array:
         """Return where a hand is at a state, shape (3,) [m]."""

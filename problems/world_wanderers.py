@@ -19,7 +19,7 @@ from apex_ompl.scene.problem import Problem
 from apex_ompl.scene.scripts import row_of
 from apex_ompl.types import Array
 
-LOW, HIGH = np.array([-0.2, -0.6, 0.1]), np.array([0.6, 0.6, 0.9])  # of the centres of cubes [m]
+LOW, HIGH = np.array([-0.2, -0.6, 0.1]), np.array([0.6, 0.6, 0.9])  # of the centers of cubes [m]
 SPEEDS = (0.1, 0.4)  # of which each cube draws one [m/s]
 LEGS = (0.5, 2.0)  # between turns [s]
 START_CLEARANCE = 0.05  # of the robot to a cube at time 0 [m]
@@ -76,7 +76,7 @@ class Wanderer:
 
 
 def box_of(edge: float) -> tuple[Array, Array]:
-    """Return the corners of the box that the centre of a cube with an edge [m] stays in, each of shape (3,) [m]."""
+    """Return the corners of the box that the center of a cube with an edge [m] stays in, each of shape (3,) [m]."""
     return np.maximum(LOW, [-np.inf, -np.inf, edge / 2.0]), HIGH
 
 

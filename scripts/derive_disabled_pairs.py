@@ -145,7 +145,7 @@ def main() -> None:
     parser.add_argument("robot", help="one that ships, by name, or a robot file")
     parser.add_argument("--soft", action="append", default=[], metavar="PART")
     parser.add_argument("--samples", type=one_or_more, default=200_000)
-    parser.add_argument("--margin", type=float, default=0.02, help="metres")
+    parser.add_argument("--margin", type=float, default=0.02, help="meters")
     parser.add_argument("--seed", type=whole_number, default=0)
     args = parser.parse_args()
     robot, config, path = bare_robot(args.robot)

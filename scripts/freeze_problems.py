@@ -5,8 +5,8 @@ to them, and missing ones are added; --replace draws all again.
 --mend finds new witnesses for the problems named, which stay as they are.
 
 Witnesses among obstacles that stand still are found by rrtconnect, and on ``extreme`` by apex, or else by rrtconnect
-with a range of 0.7 rad, each in eight seconds. There they keep half a millimetre of clearance: obstacles are a
-millimetre larger on each side for the planner, and the robot's own distances are looked up along its path.
+with a range of 0.7 rad, each in eight seconds. There they keep half a millimeter of clearance: obstacles are a
+millimeter larger on each side for the planner, and the robot's own distances are looked up along its path.
 On ``unseen`` apex, and else rrtconnect with its tuned range, each have ten seconds.
 
 Usage: python scripts/freeze_problems.py [--replace] [--jobs 2] [SUITE/LEVEL ...]

@@ -2,7 +2,7 @@
 
 The hand has 19 joints (5 abductions, 14 flexions), all driven by one synergy (0 open, 1 closed) through
 mimic joints. Dimensions are those of the maker's open description of the hand; each pair of rolling
-half joints, 13 mm apart, is modelled by one hinge in the middle of the pair. Geometry is primitives: a palm
+half joints, 13 mm apart, is modeled by one hinge in the middle of the pair. Geometry is primitives: a palm
 box, a flange cylinder, and capsules whose ends lie on the joint axes, so that each hand is one connected
 solid at every synergy. The left hand is the mirror image (x -> -x) of the right one.
 

@@ -3,7 +3,7 @@
 Each dimension takes some minutes on one core; folders that are there already are left as they are, so that the command
 goes on where it was stopped.
 
-Usage: python scripts/train_damon.py [--dims 2 4 8] [--nodes 20000] [--neighbours 12] [--beta 1e-3] [--again]
+Usage: python scripts/train_damon.py [--dims 2 4 8] [--nodes 20000] [--neighbors 12] [--beta 1e-3] [--again]
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ def make(args: argparse.Namespace, dim: int) -> None:
     along = consecutive(sample.paths[nodes])
     pairs = {}
     for kind, states in ((DECODED, autoencoder.decode(latent)), (STORED, stored)):
-        near = edges(latent, states, args.neighbours, kernel=kernel, whole=robot.home, joints=joints)
+        near = edges(latent, states, args.neighbors, kernel=kernel, whole=robot.home, joints=joints)
         pairs[kind] = np.unique(np.concatenate([near, along]), axis=0)
     config = ManifoldConfig(
         schema_=SCHEMA, robot=tables.name, joints=tuple(tables.joint_names[k] for k in joints), dim=dim,
@@ -83,7 +83,7 @@ def make(args: argparse.Namespace, dim: int) -> None:
     )  # fmt: skip
     trained = {
         "seed": args.seed, "states": len(sample.states), "epochs": args.epochs, "beta": args.beta,
-        "neighbours": args.neighbours, "held_out_error_rad": round(error, 4),
+        "neighbors": args.neighbors, "held_out_error_rad": round(error, 4),
     }  # fmt: skip
     manifold = Manifold(config, autoencoder, latent, stored, pairs)
     save_manifold(args.out / f"damon-{dim}", manifold, trained)
@@ -103,7 +103,7 @@ def main() -> None:
     parser.add_argument("--states", type=one_or_more, default=200_000, help="states of paths (default: %(default)s)")
     parser.add_argument("--along", type=one_or_more, default=16, help="of them on a path (default: %(default)s)")
     parser.add_argument("--nodes", type=one_or_more, default=20_000, help="nodes (default: %(default)s)")
-    parser.add_argument("--neighbours", type=one_or_more, default=12, help="of a node (default: %(default)s)")
+    parser.add_argument("--neighbors", type=one_or_more, default=12, help="of a node (default: %(default)s)")
     parser.add_argument("--beta", type=float, default=1e-3, help="weight of the divergence (default: %(default)s)")
     parser.add_argument("--epochs", type=one_or_more, default=20, help="passes (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=0, help="of all random choices (default: %(default)s)")

@@ -26,10 +26,10 @@ def pose(rng: np.random.Generator, spread: float = 0.5) -> np.ndarray:
 
 def balls(rng: np.random.Generator, leaves: int) -> dict[str, np.ndarray]:
     """A tree of spheres as covers have them: leaves, and a root that contains them."""
-    centres, radii = rng.normal(0.0, 0.05, (leaves, 3)), rng.uniform(0.01, 0.06, leaves)
-    root = float((np.linalg.norm(centres, axis=1) + radii).max())
+    centers, radii = rng.normal(0.0, 0.05, (leaves, 3)), rng.uniform(0.01, 0.06, leaves)
+    root = float((np.linalg.norm(centers, axis=1) + radii).max())
     return {
-        "centres": np.concatenate([np.zeros((1, 3)), centres]), "radii": np.array([root, *radii]),
+        "centers": np.concatenate([np.zeros((1, 3)), centers]), "radii": np.array([root, *radii]),
         "first": np.array([1] + [0] * leaves), "count": np.array([leaves] + [0] * leaves),
     }  # fmt: skip
 

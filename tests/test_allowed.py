@@ -61,7 +61,7 @@ def test_an_allowed_pair_is_not_checked_by_either_stage(crowded: CollisionChecke
             assert bool(checker.prove(q[None], tolerance=0.0)) <= checker.is_free(q)
     assert checker.is_free(home) and checker.clearance(home) > 0.0 and checker.prove(home[None])
     near = checker.kernel.clearance(home[None], 1.0)[0, 0]
-    assert deep < -0.02 and near > -0.005, "the spheres' clearance, by which paths are optimised, leaves pairs out, too"
+    assert deep < -0.02 and near > -0.005, "the spheres' clearance, by which paths are optimized, leaves pairs out, too"
     motion = np.stack([home, home + 1e-4])
     assert checker.first_collision(motion, SEARCH_RESOLUTION) is None
     for pair in checker.allowed:

@@ -94,7 +94,7 @@ def test_valid_paths_that_pass_too_near_are_resampled(ready: PlanningSetup) -> N
     wary = plan(cached_problem(HARD), timeout=20.0, params={"polish": False, "lambda_obs": 0.5})
     assert plain and wary
     gaps = [validator.obstacle_distance(result.path.states) for result in (plain, wary)]
-    assert gaps[1] >= gaps[0] - 1e-9, "nothing is half a metre off, so the one that keeps most distance stands"
+    assert gaps[1] >= gaps[0] - 1e-9, "nothing is half a meter off, so the one that keeps most distance stands"
     assert wary.times[INSIDE + "resample"] > plain.times.get(INSIDE + "resample", 0.0)
     by_hand = min(ready.checker.distance(q).value for q in resample(wary.path.states, 1500))
     assert by_hand - 2e-3 < gaps[1] <= min(by_hand, ready.checker.distance(wary.path[-1]).value) + 1e-5

@@ -46,11 +46,11 @@ def opened(driver: Any, where: str) -> None:
 WRITTEN, LIVE = slice(310, 700), slice(20, 380)  # columns that no panel covers
 
 
-def is_drawn(driver: Any, columns: slice, reds: int = 100, colours: int = 200) -> bool:
-    """Whether the picture has many colours, and pixels of the hue of obstacles."""
+def is_drawn(driver: Any, columns: slice, reds: int = 100, colors: int = 200) -> bool:
+    """Whether the picture has many colors, and pixels of the hue of obstacles."""
     seen = picture(driver)[140:-60, columns].reshape(-1, 3)
     red = (seen[:, 0] > 1.4 * seen[:, 1]) & (seen[:, 0] > 1.4 * seen[:, 2])
-    return len(np.unique(seen, axis=0)) > colours and red.sum() >= reds
+    return len(np.unique(seen, axis=0)) > colors and red.sum() >= reds
 
 
 def with_a_cloud(problem: Problem, folder: Path) -> Problem:
@@ -66,7 +66,7 @@ def test_pages_show_and_play_to_the_end(driver: Any, name: str, tmp_path: Path) 
     assert result.trajectory is not None
     write_page([Shown.of(result)], tmp_path / "page.html")
     opened(driver, address(tmp_path / "page.html"))
-    few = {"reds": 300, "colours": 30} if name == "a cloud" else {}  # points have one colour, plain shapes few
+    few = {"reds": 300, "colors": 30} if name == "a cloud" else {}  # points have one color, plain shapes few
     until(lambda: is_drawn(driver, WRITTEN, **few), "a picture with obstacles")
     slider = until(lambda: driver.find_elements("css selector", "[role=slider]"), "a slider")[0]
     end = result.trajectory.duration

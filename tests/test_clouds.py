@@ -36,7 +36,7 @@ def cloud_file(folder: Path, points: np.ndarray) -> str:
 
 
 def touched(robot: Robot, q: np.ndarray, points: np.ndarray, radius: float) -> bool:
-    """By Coal, ball by ball, and by winding numbers of the balls' centres."""
+    """By Coal, ball by ball, and by winding numbers of the balls' centers."""
     data = robot.model.createData()
     pin.forwardKinematics(robot.model, data, robot.to_pinocchio(q))
     for item in robot.geometry.geometryObjects:

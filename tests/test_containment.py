@@ -29,8 +29,8 @@ def test_an_obstacle_wholly_inside_a_link_is_a_collision(robot: Robot, shape: di
     for link in (f"{side}_link{k}" for side in ("left", "right") for k in range(1, 6)):
         item = next(g for g in robot.geometry.geometryObjects if link_of(robot.model, g) == link)
         vertices, _ = triangles(item.geometry)
-        centre = robot.link_pose(robot.home, link) @ item.placement.homogeneous @ [*vertices.mean(axis=0), 1.0]
-        checker = CollisionChecker(robot, [Obstacle(name="seed", position=tuple(centre[:3]), **shape)])
+        center = robot.link_pose(robot.home, link) @ item.placement.homogeneous @ [*vertices.mean(axis=0), 1.0]
+        checker = CollisionChecker(robot, [Obstacle(name="seed", position=tuple(center[:3]), **shape)])
         # Nothing touches the surface ...
         assert surface_contacts(checker, robot.home) == []
         # ... and still the state is not free, also after the obstacle was moved away and back.
@@ -38,7 +38,7 @@ def test_an_obstacle_wholly_inside_a_link_is_a_collision(robot: Robot, shape: di
         assert "seed" in (c.second for c in checker.contacts(robot.home))
         checker.move("seed", (0.0, 0.0, 3.0))
         assert checker.is_free(robot.home)
-        checker.move("seed", tuple(centre[:3]))
+        checker.move("seed", tuple(center[:3]))
         assert not checker.is_free(robot.home)
 
 

@@ -21,7 +21,7 @@ from support import DATA, ROOT
 
 from apex_ompl import plan, planners
 from apex_ompl.baselines import weights_folder
-from apex_ompl.baselines.damon.latent_graph import consecutive, farthest_points, free_of_self_collision, neighbours
+from apex_ompl.baselines.damon.latent_graph import consecutive, farthest_points, free_of_self_collision, neighbors
 from apex_ompl.baselines.damon.lazy_search import Graph, LazySearch
 from apex_ompl.baselines.damon.manifold import load_manifold, shared_manifold
 from apex_ompl.baselines.damon.queries import Damon
@@ -66,11 +66,11 @@ def test_farthest_points_are_spread(seed: int, count: int, dim: int) -> None:
 
 
 @pytest.mark.parametrize("count", [3, 12])
-def test_neighbours_are_the_nearest(count: int) -> None:
+def test_neighbors_are_the_nearest(count: int) -> None:
     """As by brute force: of the nearest in latent space, the nearest in joint space; and nodes along paths follow."""
     rng = np.random.default_rng(count)
     latent, states = rng.normal(size=(700, 2)), rng.normal(size=(700, 5))
-    found = neighbours(latent, states, count)
+    found = neighbors(latent, states, count)
     for k in range(0, 700, 37):
         away = np.linalg.norm(latent - latent[k], axis=1)
         pool = [j for j in np.argsort(away)[: 5 * count + 1] if j != k]
@@ -203,7 +203,7 @@ def test_training_is_repeatable_and_its_pieces_are_numpys(models: Path) -> None:
 
 
 def test_edges_of_a_graph_are_free_of_self_collision(models: Path, robot: Robot) -> None:
-    """Neighbours' straight motions, by the sphere cover at states along them; the rest follow each other on paths."""
+    """Neighbors' straight motions, by the sphere cover at states along them; the rest follow each other on paths."""
     manifold = load_manifold(str(models / "damon-2"))
     tables = RobotTables.load(DATA / "robot.npz")
     kernel = Kernel(tables, scene_tables([]))

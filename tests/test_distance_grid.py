@@ -55,7 +55,7 @@ def _balls_apart(si: Integers, sf: Floats, sg: Singles, balls: Floats, found: Fl
 
 
 def apart(grid: DistanceGrid, pose: np.ndarray, points: np.ndarray, radii: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Whether balls are proved apart, and bounds of their centres' distances that suffice for their radii."""
+    """Whether balls are proved apart, and bounds of their centers' distances that suffice for their radii."""
     tables = scene_tables([(0, Primitive(GRID, pose, (), grid))])
     found = np.empty((len(points), 2))
     _balls_apart(*tables.packed, np.column_stack([points, radii]), found)

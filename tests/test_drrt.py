@@ -37,11 +37,11 @@ def along(first: Array, last: Array, count: int = 8) -> Array:
     return first[:, None] + shares * (last - first)[:, None]
 
 
-def outside(centre: Array, radius: float) -> Callable[[Array, Array], Flags]:
+def outside(center: Array, radius: float) -> Callable[[Array, Array], Flags]:
     """Whether motions keep out of a disc, by states along them."""
 
     def free(first: Array, last: Array) -> Flags:
-        return np.asarray((np.linalg.norm(along(first, last) - centre, axis=2) > radius).all(axis=1))
+        return np.asarray((np.linalg.norm(along(first, last) - center, axis=2) > radius).all(axis=1))
 
     return free
 

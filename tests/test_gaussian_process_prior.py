@@ -13,7 +13,7 @@ from apex_ompl.baselines.gpmp.optimizer import CostFunctional, FactorGraph
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel.clearance_costs import ClearanceCosts
 
-EPS, CENTRE, RADIUS = 0.3, np.array([0.5, 0.45]), 0.25
+EPS, CENTER, RADIUS = 0.3, np.array([0.5, 0.45]), 0.25
 
 
 def dense_covariance(process: GaussianProcess, times: np.ndarray, first: np.ndarray) -> np.ndarray:
@@ -33,7 +33,7 @@ def random_supports(process: GaussianProcess, dof: int, seed: int) -> np.ndarray
 
 def disc(q: np.ndarray, times: np.ndarray) -> ClearanceCosts:
     """Clearance costs of points of the plane that keep away from a disc."""
-    away = q - CENTRE
+    away = q - CENTER
     distance = np.linalg.norm(away, axis=1)
     normal = away / distance[:, None]
     violation = np.maximum((EPS - (distance - RADIUS)) / EPS, 0.0)
@@ -246,7 +246,7 @@ def test_gtsam_finds_the_same_optimum() -> None:
 
             def error(factor: object, now: object, jacobians: list | None, w: list = w) -> np.ndarray:
                 q = sum(c * now.atPoint2(key) for c, key in zip(w, factor.keys(), strict=True))
-                away = q - CENTRE
+                away = q - CENTER
                 distance = np.linalg.norm(away)
                 violation = max((EPS - (distance - RADIUS)) / EPS, 0.0)
                 if jacobians is not None:

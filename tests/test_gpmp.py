@@ -143,7 +143,7 @@ def test_a_failure_says_what_is_in_the_way_and_how_deep(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_the_termination_condition_is_honoured_inside_iterations(name: str, robot: Robot) -> None:
+def test_the_termination_condition_is_honored_inside_iterations(name: str, robot: Robot) -> None:
     setup = assemble(problems.load(HOPELESS), robot)
     planner = planner_of(setup, name)
     for most in (0, 1, 6):

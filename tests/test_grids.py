@@ -121,8 +121,8 @@ def test_height_fields_are_full_below(robot: Robot, tmp_path: Path) -> None:
 
 def test_distance_grids_are_full_where_the_surface_may_reach(robot: Robot, tmp_path: Path) -> None:
     side, low = 0.02, np.array([0.4, -0.1, 0.4])
-    centres = low + side * (np.stack(np.meshgrid(*[np.arange(12)] * 3, indexing="ij"), axis=-1) + 0.5)
-    distances = np.linalg.norm(centres - [0.52, 0.02, 0.52], axis=-1) - 0.05
+    centers = low + side * (np.stack(np.meshgrid(*[np.arange(12)] * 3, indexing="ij"), axis=-1) + 0.5)
+    distances = np.linalg.norm(centers - [0.52, 0.02, 0.52], axis=-1) - 0.05
     grid = grid_obstacle(tmp_path, "distance_grid", distances=distances, resolution=side, origin=low)
     ball = Obstacle(name="ball", sphere={"radius": 0.05}, position=(0.52, 0.02, 0.52))
     rng = np.random.default_rng(0)

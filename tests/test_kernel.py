@@ -37,12 +37,12 @@ SHAPES = {
 
 
 def leaves_at(specs: list, bodies: list, q: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-    """World centres and radii of the leaves of each body."""
+    """World centers and radii of the leaves of each body."""
     poses, found = frames(specs, q), []
     for body in bodies:
         at = poses[body.joint] @ body.placement
         leaf = body.count == 0
-        found.append((body.centres[leaf] @ at[:3, :3].T + at[:3, 3], body.radii[leaf]))
+        found.append((body.centers[leaf] @ at[:3, :3].T + at[:3, 3], body.radii[leaf]))
     return found
 
 
@@ -116,7 +116,7 @@ def single_ball() -> RobotTables:
     specs = [robot_specs.JointSpec(0)]
     specs += [robot_specs.JointSpec(k, PRISMATIC, np.eye(4), np.eye(3)[k], k) for k in range(3)]
     cover = {
-        "centres": np.zeros((1, 3)),
+        "centers": np.zeros((1, 3)),
         "radii": np.array([0.01]),
         "first": np.zeros(1, int),
         "count": np.zeros(1, int),

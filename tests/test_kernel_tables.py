@@ -183,12 +183,12 @@ def test_balls_of_pairs_hold_the_bodies_that_they_are_about(seed: int, name: str
         first, count = a.pair_bodies[p]
         for side, cluster in enumerate(clusters):
             joint = a.cluster_joint[cluster]
-            centre = rotation[joint] @ a.pair_ball[p, side, :3] + origin[joint]
+            center = rotation[joint] @ a.pair_ball[p, side, :3] + origin[joint]
             smaller += a.pair_ball[p, side, 3] < 0.9 * a.cluster_ball[cluster, 3]
             for body in np.unique(a.bodies[first : first + count, side]):
                 nodes = np.arange(ends[body], ends[body + 1])
-                where = a.node_centre[nodes] @ rotation[a.body_joint[body]].T + origin[a.body_joint[body]]
-                away = np.linalg.norm(where - centre, axis=1)
+                where = a.node_center[nodes] @ rotation[a.body_joint[body]].T + origin[a.body_joint[body]]
+                away = np.linalg.norm(where - center, axis=1)
                 assert away[0] + a.node_radius[nodes[0]] <= a.pair_ball[p, side, 3]
                 leaves = a.node_count[nodes] == 0
                 assert (away + a.node_radius[nodes])[leaves].max() <= a.pair_outer[p, side]
@@ -208,12 +208,12 @@ def check_parts(tables: RobotTables, states: np.ndarray) -> None:
         for p in range(first, first + count):
             joints = set(a.lazy[a.part_lazy[p, 0] : sum(a.part_lazy[p])].tolist())
             balls = a.part_ball[p, bins]
-            centres = np.einsum("nij,nj->ni", rotation[:, top], balls[:, :3]) + origin[:, top]
+            centers = np.einsum("nij,nj->ni", rotation[:, top], balls[:, :3]) + origin[:, top]
             for b in range(a.part_bodies[p, 0], sum(a.part_bodies[p])):
                 joint, root = a.body_joint[b], a.body_root[b]
                 assert joint == top or joint in joints
-                placed = rotation[:, joint] @ a.node_centre[root] + origin[:, joint]
-                away = np.linalg.norm(placed - centres, axis=1)
+                placed = rotation[:, joint] @ a.node_center[root] + origin[:, joint]
+                away = np.linalg.norm(placed - centers, axis=1)
                 assert (away + a.node_radius[root] <= balls[:, 3]).all()
                 assert (away + a.node_outer[root] <= a.part_outer[p, bins]).all()
 

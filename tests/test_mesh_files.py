@@ -215,14 +215,14 @@ def test_binary_stl_is_read_as_by_coal_and_trimesh(tmp_path: Path) -> None:
         ("", (SIZE[0], -SIZE[2], SIZE[1])),  # y by the specification
     ],
 )
-@pytest.mark.parametrize("metres", [1.0, 0.001, 0.0254])
-def test_collada_is_scaled_to_metres_and_stands_upright(tmp_path: Path, up: str, corner: tuple, metres: float) -> None:
-    unit = "" if metres == 1.0 else f'<unit name="u" meter="{metres}"/>'
+@pytest.mark.parametrize("meters", [1.0, 0.001, 0.0254])
+def test_collada_is_scaled_to_metres_and_stands_upright(tmp_path: Path, up: str, corner: tuple, meters: float) -> None:
+    unit = "" if meters == 1.0 else f'<unit name="u" meter="{meters}"/>'
     (tmp_path / "a.dae").write_text(dae(unit, f"<up_axis>{up}</up_axis>" if up else ""))
-    scaled = {"file": str(tmp_path / "a.dae"), "scale": (1.0 / metres, 2.0 / metres, 3.0 / metres)}
+    scaled = {"file": str(tmp_path / "a.dae"), "scale": (1.0 / meters, 2.0 / meters, 3.0 / meters)}
     vertices, faces = triangles(coal_geometry(Obstacle(name="m", mesh=scaled)))
     assert is_the_block(vertices, faces, np.array(corner) * (1.0, 2.0, 3.0)), "the scale is along the body's axes"
-    assert collada_asset((tmp_path / "a.dae").open("rb")) == (metres, up or "Y_UP")
+    assert collada_asset((tmp_path / "a.dae").open("rb")) == (meters, up or "Y_UP")
 
 
 def test_gltf_stands_upright(robot: Robot, tmp_path: Path) -> None:

@@ -121,8 +121,8 @@ def test_a_mesh_with_a_hole_is_checked_by_the_winding_number(robot: Robot, tmp_p
         assert CollisionChecker(robot, [room]).is_free(robot.home) == free
 
 
-def test_a_hull_of_too_many_neighbours_is_replaced_by_a_little_larger_one(robot: Robot, tmp_path) -> None:
-    """Two cones of 600 triangles at one base: Coal takes no vertex of a hull with more than 255 neighbours."""
+def test_a_hull_of_too_many_neighbors_is_replaced_by_a_little_larger_one(robot: Robot, tmp_path) -> None:
+    """Two cones of 600 triangles at one base: Coal takes no vertex of a hull with more than 255 neighbors."""
     count, file = 600, tmp_path / "cones.obj"
     turn = 2.0 * np.pi * np.arange(count) / count
     rim = np.stack([0.3 * np.cos(turn), 0.3 * np.sin(turn), 0.0 * turn], axis=1)
@@ -182,7 +182,7 @@ def test_convex_meshes_are_known_without_comparing_all_triangles_with_all_faces(
     assert (len(left) == 0) == convex
     compared = list[int]()
     monkeypatch.setattr(exact_shapes, "hull_planes", lambda h: (compared.append(1), (normals, offsets))[1])
-    found = exact_shapes._analysed(geometry)
+    found = exact_shapes._analyzed(geometry)
     assert (len(found.leaf) == 0) == convex and len(compared) <= 2
     if shape == "dented":
         assert found.depth == pytest.approx(depths.max(), abs=1e-15)

@@ -50,7 +50,7 @@ def buffers(tables: RobotTables) -> tuple[np.ndarray, np.ndarray, Workspace]:
 
 
 def placed(tables: RobotTables, q: np.ndarray) -> tuple[Workspace, list[np.ndarray]]:
-    """The joints at a state, and the world centres of all spheres, cluster by cluster."""
+    """The joints at a state, and the world centers of all spheres, cluster by cluster."""
     t, (wi, wf, w) = tables.arrays, buffers(tables)
     place(*tables.packed, wi, wf, q)
     ends = [*t.body_root[1:], len(t.node_first)]
@@ -59,7 +59,7 @@ def placed(tables: RobotTables, q: np.ndarray) -> tuple[Workspace, list[np.ndarr
         rows = []
         for b in range(first, first + count):
             j, nodes = t.body_joint[b], slice(int(t.body_root[b]), int(ends[b]))
-            rows.append(t.node_centre[nodes] @ w.rotation[j].T + w.origin[j])
+            rows.append(t.node_center[nodes] @ w.rotation[j].T + w.origin[j])
         found.append(np.concatenate(rows))
     return w, found
 

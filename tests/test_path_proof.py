@@ -98,9 +98,9 @@ def test_grazing_paths_are_proved_only_where_coal_finds_them_free(
 def test_clearance_along_a_path_has_a_closed_form() -> None:
     robot = load_robot("dual_panda_softhand")
     name, states = "left_link7", robot.home + np.linspace(-0.3, 0.3, 2)[:, None] * np.eye(robot.dof)[0]
-    centre = robot.link_pose(robot.home, name)[:3, 3] + [0.6, 0.0, 0.0]
-    ball = CollisionChecker(robot, [Obstacle(name="ball", sphere={"radius": 0.05}, position=tuple(centre))])
-    small = CollisionChecker(robot, [Obstacle(name="ball", sphere={"radius": 0.01}, position=tuple(centre))])
+    center = robot.link_pose(robot.home, name)[:3, 3] + [0.6, 0.0, 0.0]
+    ball = CollisionChecker(robot, [Obstacle(name="ball", sphere={"radius": 0.05}, position=tuple(center))])
+    small = CollisionChecker(robot, [Obstacle(name="ball", sphere={"radius": 0.01}, position=tuple(center))])
     # the distance to a ball grows by what its radius shrinks
     first, second = ball.obstacle_distance(states), small.obstacle_distance(states)
     assert second - first == pytest.approx(0.04, abs=2 * TOLERANCE)
@@ -223,7 +223,7 @@ def test_convex_meshes_are_their_hulls(tmp_path: Path, grazing: ModuleType) -> N
 
 @settings(max_examples=30, deadline=None)
 @given(st.integers(30, 400), st.integers(0, 2**32 - 1))
-def test_corners_of_a_hull_whose_neighbours_are_nearer_are_the_farthest(count: int, seed: int) -> None:
+def test_corners_of_a_hull_whose_neighbors_are_nearer_are_the_farthest(count: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
     found = coal.StdVec_Vec3s()
     found.extend(list(rng.normal(size=(count, 3)) ** 3))

@@ -86,12 +86,12 @@ def test_a_half_space_and_an_empty_scene() -> None:
 def test_groups_have_the_clearance_of_their_nearest_ball() -> None:
     tables, solids = scene(25)
     rng = np.random.default_rng(4)
-    centres = rng.uniform(-1, 1, (60, 5, 1, 3)) + rng.normal(0.0, 0.05, (60, 5, 3, 3))
+    centers = rng.uniform(-1, 1, (60, 5, 1, 3)) + rng.normal(0.0, 0.05, (60, 5, 3, 3))
     radii = rng.uniform(0.02, 0.06, (60, 5, 3, 1))
-    middle = centres.mean(axis=2, keepdims=True)
-    reach = (np.linalg.norm(centres - middle, axis=-1, keepdims=True) + radii).max(axis=2, keepdims=True)
-    balls = np.concatenate([np.concatenate([middle, reach], -1), np.concatenate([centres, radii], -1)], axis=2)
-    each = brute(solids, centres.reshape(-1, 3)).min(axis=0).reshape(60, 5, 3) - radii[..., 0]
+    middle = centers.mean(axis=2, keepdims=True)
+    reach = (np.linalg.norm(centers - middle, axis=-1, keepdims=True) + radii).max(axis=2, keepdims=True)
+    balls = np.concatenate([np.concatenate([middle, reach], -1), np.concatenate([centers, radii], -1)], axis=2)
+    each = brute(solids, centers.reshape(-1, 3)).min(axis=0).reshape(60, 5, 3) - radii[..., 0]
     wanted = each.min(axis=(1, 2))
     assert (wanted < 0).any() and (wanted > 0.1).any()
     np.testing.assert_allclose(group_clearances(tables, balls), wanted, atol=1e-6)

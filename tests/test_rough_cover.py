@@ -39,7 +39,7 @@ def in_boxes(boxes: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 def answered_for(cover: Cover, points: np.ndarray) -> np.ndarray:
     """Whether each point is in a leaf and in all balls above it: what a walk down the tree relies on."""
-    inside = np.linalg.norm(points[:, None] - cover.centres, axis=2) <= cover.radii
+    inside = np.linalg.norm(points[:, None] - cover.centers, axis=2) <= cover.radii
     for k, parent in enumerate(cover.parents):
         if parent >= 0:
             inside[:, k] &= inside[:, parent]
@@ -76,7 +76,7 @@ def test_covers_of_boxes_contain_them(sides: tuple[float, float, float], seed: i
     drawn = np.random.default_rng(seed).uniform(-half, half, (500, 3))
     assert answered_for(cover, np.concatenate([signs * half, drawn])).all()
     assert len(cover.leaves) <= 64
-    smaller = Cover(cover.centres, cover.radii - 1e-3, cover.first, cover.count)
+    smaller = Cover(cover.centers, cover.radii - 1e-3, cover.first, cover.count)
     assert not answered_for(smaller, signs * half).all()
 
 
@@ -91,7 +91,7 @@ def test_covers_of_cylinders_contain_them(radius: float, share: float, seed: int
     away[:1000], height[500:1500] = radius, half * rng.choice([-1.0, 1.0], 1000)  # on the surface, and on the edges
     points = np.stack([away * np.cos(angle), away * np.sin(angle), height], axis=1)
     assert answered_for(cover, points).all()
-    smaller = Cover(cover.centres, cover.radii - 0.2 * radius, cover.first, cover.count)
+    smaller = Cover(cover.centers, cover.radii - 0.2 * radius, cover.first, cover.count)
     assert not answered_for(smaller, points).all()
 
 
@@ -99,9 +99,9 @@ def test_covers_of_cylinders_contain_them(radius: float, share: float, seed: int
 def test_covers_of_cylinders_are_proved_and_near(radius: float, half: float) -> None:
     cover = cylinder_cover(radius, half)
     slack = 2.0 * max(FINEST, 2.0 * half * FINEST_SHARE)  # balls that meet in a point have none
-    wider = Cover(cover.centres, cover.radii + slack, cover.first, cover.count)
+    wider = Cover(cover.centers, cover.radii + slack, cover.first, cover.count)
     assert len(uncovered_boxes(solid_of(coal.Cylinder(radius, 2.0 * half)), wider)) == 0
     leaf = cover.leaves
-    across = np.linalg.norm(cover.centres[leaf, :2], axis=1) + cover.radii[leaf] - radius
-    along = np.abs(cover.centres[leaf, 2]) + cover.radii[leaf] - half
+    across = np.linalg.norm(cover.centers[leaf, :2], axis=1) + cover.radii[leaf] - radius
+    along = np.abs(cover.centers[leaf, 2]) + cover.radii[leaf] - half
     assert len(leaf) <= 48 and max(across.max(), along.max()) < 0.2 * radius + 1e-5

@@ -280,8 +280,8 @@ def test_films_show_scripts(tmp_path: Path) -> None:
     result = replace(plan(problem, timeout=20.0), problem=scripts, movers=("late",))
 
     def red(frame: np.ndarray) -> int:
-        colours = frame[..., :3].astype(int)
-        return int(((colours[..., 0] > colours[..., 1] + 40) & (colours[..., 0] > colours[..., 2] + 40)).sum())
+        colors = frame[..., :3].astype(int)
+        return int(((colors[..., 0] > colors[..., 1] + 40) & (colors[..., 0] > colors[..., 2] + 40)).sum())
 
     render(result, tmp_path / "r.gif", (320, 240))
     with Image.open(tmp_path / "r.gif") as film:

@@ -31,7 +31,7 @@ def shapes() -> dict[str, dict[str, coal.CollisionGeometry]]:
 
 def held(cover: Cover, points: np.ndarray) -> np.ndarray:
     """Which points lie in a leaf and in every ball above it."""
-    inside = np.linalg.norm(points[:, None] - cover.centres, axis=2) <= cover.radii
+    inside = np.linalg.norm(points[:, None] - cover.centers, axis=2) <= cover.radii
     for k in range(1, len(cover.radii)):
         inside[:, k] &= inside[:, cover.parents[k]]
     return inside[:, cover.count == 0].any(axis=1)
@@ -68,14 +68,14 @@ def inner_points(geometry: coal.CollisionGeometry, rng: np.random.Generator, cou
 
 
 def changed(cover: Cover, **columns: np.ndarray) -> Cover:
-    fields = {"centres": cover.centres, "radii": cover.radii, "first": cover.first, "count": cover.count}
+    fields = {"centers": cover.centers, "radii": cover.radii, "first": cover.first, "count": cover.count}
     return Cover(**fields | columns)
 
 
 def moved_away(cover: Cover, ball: int) -> Cover:
-    centres = cover.centres.copy()
-    centres[ball] += 100.0
-    return changed(cover, centres=centres)
+    centers = cover.centers.copy()
+    centers[ball] += 100.0
+    return changed(cover, centers=centers)
 
 
 def extruded(outline: list[tuple[float, float]], height: float) -> coal.BVHModelOBBRSS:
@@ -228,13 +228,13 @@ def test_key_tells_shapes_apart() -> None:
 def test_round_trip(tmp_path: Path) -> None:
     box = coal.Box(0.0537, 0.11, 0.2)
     cover = make_cover(box)
-    loose = changed(cover, centres=cover.centres + 3.3e-7, radii=cover.radii + 1e-6)
+    loose = changed(cover, centers=cover.centers + 3.3e-7, radii=cover.radii + 1e-6)
     write_covers(tmp_path / "a.json", {"made": cover, "loose": loose})
     back = read_covers(tmp_path / "a.json")
-    for name in ("centres", "radii", "first", "count"):
+    for name in ("centers", "radii", "first", "count"):
         assert np.array_equal(getattr(back["made"], name), getattr(cover, name))
     assert len(unproved(box, back["loose"])) == 0
-    shift = np.linalg.norm(back["loose"].centres - loose.centres, axis=1)
+    shift = np.linalg.norm(back["loose"].centers - loose.centers, axis=1)
     assert (back["loose"].radii >= loose.radii + shift - 1e-9).all()
     write_covers(tmp_path / "b.json", back)
     assert (tmp_path / "b.json").read_bytes() == (tmp_path / "a.json").read_bytes()

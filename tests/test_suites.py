@@ -86,7 +86,7 @@ def test_every_scene_can_be_built(suite: str, level: str) -> None:
 
 
 @pytest.mark.parametrize(("suite", "level"), HARD_LEVELS)
-def test_starts_and_goals_of_the_hard_suites_have_a_clearance_of_a_centimetre(
+def test_starts_and_goals_of_the_hard_suites_have_a_clearance_of_a_centimeter(
     robot: Robot, suite: str, level: str
 ) -> None:
     """By Coal's distances, the links against each other included; the hands hold nothing."""

@@ -60,11 +60,11 @@ def test_joints_are_where_the_kernel_has_them() -> None:
     states = np.random.default_rng(0).uniform(kernel().robot.arrays.lower, kernel().robot.arrays.upper, (9, DOF))
     eyes = TorchSight(SIGHT, kernel(), CPU)
     paths = torch.tensor(states, dtype=torch.float32)[None]
-    centres, radii = eyes.arm_balls(paths)
+    centers, radii = eyes.arm_balls(paths)
     rotation, origin = kernel().joint_frames(states)
     ball, joint = SIGHT.keys.ball[:, :, 1:], SIGHT.keys.joint
     wanted = np.einsum("nacij,acpj->nacpi", rotation[:, joint], ball[..., :3]) + origin[:, joint][:, :, :, None]
-    np.testing.assert_allclose(centres.numpy().reshape(wanted.shape), wanted, atol=1e-5)
+    np.testing.assert_allclose(centers.numpy().reshape(wanted.shape), wanted, atol=1e-5)
     np.testing.assert_allclose(radii.reshape(9, -1)[0], ball[..., 3].ravel(), atol=1e-6)
 
 
@@ -145,9 +145,9 @@ def test_what_collisions_cost_rises_as_its_gradient_says() -> None:
 
         found, slope = cost(paths)
         assert found[0] > 0.1 and found[1] == 0.0 and not slope[1].any() and not slope[..., 14:].any()
-        centres, radii = eyes.arm_balls(torch.tensor(paths, dtype=torch.float32))
+        centers, radii = eyes.arm_balls(torch.tensor(paths, dtype=torch.float32))
         for k, scene in enumerate(scenes):
-            d = nearest_points(scene.tables(), centres[k].double().numpy(), 1.0)[0] - radii.double().numpy()
+            d = nearest_points(scene.tables(), centers[k].double().numpy(), 1.0)[0] - radii.double().numpy()
             near = np.where(d < 0.0, margin / 2 - d, np.maximum(0.0, margin - d) ** 2 / (2 * margin))
             np.testing.assert_allclose(found[k], near.sum() / 4, rtol=1e-3, atol=1e-4)
         step, wanted = 2e-3, np.zeros_like(paths)
@@ -166,7 +166,7 @@ def varied() -> SightTable:
 
 
 def test_augmented_paths_are_free_among_their_obstacles(varied: SightTable) -> None:
-    """Among those of another scene, too; a part is another curve than its path by less than a centimetre."""
+    """Among those of another scene, too; a part is another curve than its path by less than a centimeter."""
     paths, robot = some_paths(), kernel().robot
     which = torch.arange(0, len(paths), len(paths) // 60)
     control, conditions = varied.batch(which, torch.Generator().manual_seed(0))

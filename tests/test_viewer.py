@@ -75,8 +75,8 @@ def test_the_drawn_cover_is_that_of_the_kernel(robot: Robot) -> None:
         pin_rotation = rotation[joint] @ np.asarray(turns[joint])[:3, :3].T
         there = rows[:, :3] @ pin_rotation.T + origin[joint]
         mine = np.flatnonzero(leaves & (joint_of == joint))
-        centres = tables.node_centre[mine] @ rotation[joint].T + origin[joint]
-        np.testing.assert_allclose(there, centres, atol=1e-9)
+        centers = tables.node_center[mine] @ rotation[joint].T + origin[joint]
+        np.testing.assert_allclose(there, centers, atol=1e-9)
         np.testing.assert_array_equal(rows[:, 3], tables.node_radius[mine])
 
 

@@ -415,8 +415,8 @@ def test_balls_contain_the_robot_and_columns_what_cannot_evade() -> None:
         bound, distance = places.balls(q).clearance(place, edge), checker.obstacle_distance(q[None])
         assert bound <= distance + 1e-6 and (distance < 0.02 or bound > distance - 0.02)
         every, evading = places.balls(q), places.balls(q, evading=True)
-        kept = {tuple(c) for c in evading.centres}
-        stays = np.array([tuple(c) not in kept for c in every.centres])
+        kept = {tuple(c) for c in evading.centers}
+        stays = np.array([tuple(c) not in kept for c in every.centers])
         assert 0 < stays.sum() < len(stays)
-        reach = np.abs(every.centres[stays, None, :2] - np.array(BASES)).max(axis=2).min(axis=1) + every.radii[stays]
+        reach = np.abs(every.centers[stays, None, :2] - np.array(BASES)).max(axis=2).min(axis=1) + every.radii[stays]
         assert reach.max() <= BASE_REACH

@@ -29,7 +29,7 @@ class BumpModel:
     """
 
     def __init__(self) -> None:
-        """Make bumps of the optimiser's default spline."""
+        """Make bumps of the optimizer's default spline."""
         self.spline, self.schedule = Optimizer().spline, NoiseSchedule(1)
         self.sampling, self.sees_point = Sampling(steps=1), False
 

@@ -52,7 +52,7 @@ class ApexParameters(Parameters):
         noise: How far they are noised for that, as a share of the schedule.
         lambda_obs: Valid paths that come nearer to an obstacle than this are resampled too; the one that keeps most
             distance stands when none comes out better.
-        repair: Whether candidates are improved by the optimiser.
+        repair: Whether candidates are improved by the optimizer.
         bridge: Whether blocked stretches of the best candidates are bridged by short trees.
         fallback: Whether RRTConnect takes turns with more rounds of proposals in the time that is left, and sprints
             before; otherwise there are more rounds of proposals alone.

@@ -22,7 +22,7 @@ from apex_ompl.util.boxes import bounding_box
 from apex_ompl.util.weak_cache import weakly_cached
 
 ANCHOR_RADIUS = 1e-6  # [m]
-CONVEX_TOLERANCE = 5e-4  # a mesh is convex when its triangles' centres are no deeper than this below its hull [m]
+CONVEX_TOLERANCE = 5e-4  # a mesh is convex when its triangles' centers are no deeper than this below its hull [m]
 MOST_DEPTHS = 2**22  # of triangles below faces of the hull; a mesh of more counts as not convex
 
 
@@ -31,8 +31,8 @@ class EnclosingMesh:
     """A mesh that may contain other solids.
 
     A mesh counts as convex when no point of a triangle is deeper below its hull than 3 ``CONVEX_TOLERANCE``. Only the
-    centres of the triangles are tested: the depth is a concave function that is not negative, so on a triangle it is
-    at most three times its value at the centre.
+    centers of the triangles are tested: the depth is a concave function that is not negative, so on a triangle it is
+    at most three times its value at the center.
 
     Attributes:
         hull: Convex hull.
@@ -54,7 +54,7 @@ class EnclosingMesh:
     @staticmethod
     @weakly_cached
     def of(mesh: coal.BVHModelBase) -> EnclosingMesh:
-        """Analyse a mesh; the analysis is kept as long as the mesh."""
+        """Analyze a mesh; the analysis is kept as long as the mesh."""
         hull = convex_hull(mesh)
         vertices, faces = triangles(mesh)
         corners, edges = np.ascontiguousarray(capped(vertices, faces)), edges_of(vertices, faces)
@@ -75,12 +75,12 @@ class EnclosingMesh:
         return bool(encloses(self.corners, self.box, self.watertight, x, y, z))
 
 
-def _is_convex(centres: Array, hull: coal.Convex) -> bool:
-    """Whether no centre of a triangle, shape (T, 3) [m], is deeper below a hull than ``CONVEX_TOLERANCE``."""
-    if len(centres) * hull.num_polygons > MOST_DEPTHS:
+def _is_convex(centers: Array, hull: coal.Convex) -> bool:
+    """Whether no center of a triangle, shape (T, 3) [m], is deeper below a hull than ``CONVEX_TOLERANCE``."""
+    if len(centers) * hull.num_polygons > MOST_DEPTHS:
         return False
     normals, offsets = hull_planes(hull)
-    depths = offsets[:, None] - normals @ centres.T
+    depths = offsets[:, None] - normals @ centers.T
     return float(depths.min(axis=0).max()) <= CONVEX_TOLERANCE
 
 

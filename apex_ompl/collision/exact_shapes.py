@@ -119,11 +119,11 @@ def mesh_of(geometry: coal.CollisionGeometry) -> Mesh:
     That of a cloud has a tree over its points.
     """
     if cloud_of(geometry) is not None:
-        return _analysed(geometry)
-    return kept(_meshes, shape_key(geometry), lambda: _analysed(geometry), MOST_MESHES)
+        return _analyzed(geometry)
+    return kept(_meshes, shape_key(geometry), lambda: _analyzed(geometry), MOST_MESHES)
 
 
-def _analysed(geometry: coal.CollisionGeometry) -> Mesh:
+def _analyzed(geometry: coal.CollisionGeometry) -> Mesh:
     cloud = cloud_of(geometry)
     if cloud is not None:
         points = np.ascontiguousarray(cloud.points[tree_order(cloud.points)])[:, None]

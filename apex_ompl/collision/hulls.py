@@ -27,7 +27,7 @@ _building = ProcessLock()
 def convex_hull(geometry: coal.CollisionGeometry) -> coal.CollisionGeometry:
     """Return the convex hull of a mesh, or the geometry itself when it is convex already.
 
-    That of a surface without an inside, which may be flat, is the box around it. Coal takes at most 255 neighbours of a
+    That of a surface without an inside, which may be flat, is the box around it. Coal takes at most 255 neighbors of a
     vertex. Where a hull has more, and of meshes of more than ``MOST_VERTICES``,
     which take seconds, a slightly larger body with fewer vertices is returned.
     """
@@ -76,7 +76,7 @@ def hull_planes(hull: coal.Convex) -> tuple[Array, Array]:
 def _larger_hull(vertices: Array) -> coal.Convex:
     """Return a convex body of few vertices that contains the given ones, shape (V, 3) [m].
 
-    It is the hull of those that are farthest in some direction, stretched about its centre until it contains all.
+    It is the hull of those that are farthest in some direction, stretched about its center until it contains all.
     """
     for count in DIRECTIONS:
         rise = 1.0 - (2.0 * np.arange(count) + 1.0) / count
@@ -86,14 +86,14 @@ def _larger_hull(vertices: Array) -> coal.Convex:
         chosen = vertices[np.unique(farthest(directions, vertices)[0])]
         try:
             normals, offsets = hull_planes(_hull_of(chosen))
-            centre = chosen.mean(axis=0)
-            room = offsets - normals @ centre
+            center = chosen.mean(axis=0)
+            room = offsets - normals @ center
             wide = room > 1e-6 * room.max()  # planes of slivers may be turned by rounding
-            reach = farthest(normals[wide], vertices - centre)[1]
-            return _hull_of(centre + (1.0 + 1e-6) * max(1.0, float((reach / room[wide]).max())) * (chosen - centre))
+            reach = farthest(normals[wide], vertices - center)[1]
+            return _hull_of(center + (1.0 + 1e-6) * max(1.0, float((reach / room[wide]).max())) * (chosen - center))
         except RuntimeError:
             continue
-    raise AssertionError("a hull of few vertices has few neighbours")
+    raise AssertionError("a hull of few vertices has few neighbors")
 
 
 def _hull_of(points: Array) -> coal.Convex:

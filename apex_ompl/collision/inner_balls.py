@@ -1,7 +1,7 @@
 """Balls inside of solids, by which the compiled kernel sees that states collide without asking the meshes.
 
 Where a ball that lies inside of a body meets an obstacle, the body does. A handful of balls finds most collisions of a
-search, which are centimetres deep; what they do not find is left to the meshes.
+search, which are centimeters deep; what they do not find is left to the meshes.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _known: dict[str, Array] = {}  # by shape key
 
 
 def inner_balls(geometry: coal.CollisionGeometry) -> Array:
-    """Return centres and radii of a few balls inside of a solid, shape (K, 4) [m]; none for a surface.
+    """Return centers and radii of a few balls inside of a solid, shape (K, 4) [m]; none for a surface.
 
     They are chosen greedily: each covers the most of the places, on a lattice, that none before covers.
 

@@ -137,7 +137,7 @@ def obstacles_alone(kernel: Kernel, chosen: Flags) -> Kernel:
 def _shapes_of_bodies(robot: Robot, scene: MeshStage, kernel: Kernel) -> ShapeArrays:
     """Return the shapes of a kernel's bodies; those of the last sets of held objects are kept."""
     known = _bodies.setdefault(robot, OrderedDict())
-    key = id(kernel.robot.arrays.node_centre)  # shared by all kernels of one set of bodies
+    key = id(kernel.robot.arrays.node_center)  # shared by all kernels of one set of bodies
     if key not in known:
         turns = [turn.T for turn in joint_tree(robot).turns]
         solids = [scene.solids[number] for number in kernel.robot.numbers]
@@ -145,7 +145,7 @@ def _shapes_of_bodies(robot: Robot, scene: MeshStage, kernel: Kernel) -> ShapeAr
         while len(known) >= MOST_PACKED:
             known.popitem(last=False)
         arrays = (shape_arrays if known else stored_shapes)(bodies)
-        known[key] = kernel.robot.arrays.node_centre, arrays
+        known[key] = kernel.robot.arrays.node_center, arrays
     return known[key][1]
 
 

@@ -36,7 +36,7 @@ class Solid:
 
     @cached_property
     def half_box(self) -> tuple[Array, Array]:
-        """Centre and half edges of the bounding box in the solid's frame, each of shape (3,) [m]."""
+        """Center and half edges of the bounding box in the solid's frame, each of shape (3,) [m]."""
         if self.shape.getNodeType() == coal.GEOM_HALFSPACE:
             return np.zeros(3), np.full(3, np.inf)
         self.shape.computeLocalAABB()
@@ -65,9 +65,9 @@ def world_boxes(solids: Sequence[Solid], poses: Sequence[pin.SE3]) -> Array:
     """Return axis-aligned boxes around solids at poses in the world, shape (n, 2, 3) [m]."""
     if not solids:
         return np.empty((0, 2, 3))
-    centre, half = np.array([solid.half_box for solid in solids]).transpose(1, 0, 2)
+    center, half = np.array([solid.half_box for solid in solids]).transpose(1, 0, 2)
     turn = np.array([pose.rotation for pose in poses])
-    middle = (turn @ centre[:, :, None])[:, :, 0] + np.array([pose.translation for pose in poses])
+    middle = (turn @ center[:, :, None])[:, :, 0] + np.array([pose.translation for pose in poses])
     with np.errstate(invalid="ignore"):  # half-spaces: 0 times infinity
         reach = (np.abs(turn) @ half[:, :, None])[:, :, 0]
     reach = np.where(np.isnan(reach), np.inf, reach)

@@ -104,7 +104,7 @@ def tabulate(
     """
     bodies = [
         BodySpec(
-            solid.part or solid.name, solid.joint, solid.placement.homogeneous, cover.centres, cover.radii,
+            solid.part or solid.name, solid.joint, solid.placement.homogeneous, cover.centers, cover.radii,
             cover.first, cover.count, inner_balls(solid.shape) if meets else no_balls(), meets,
         )
         for solid, cover, meets in zip(solids, covers, meets_scene, strict=True)
@@ -146,7 +146,7 @@ def primitives(shape: coal.CollisionGeometry, pose: Array) -> list[Primitive]:
         return [Primitive(GRID, pose, (), grid_of_triangles(mesh.corners, solid=True), exact=mesh.closed)]
     found = []
     for low, high in bounding_boxes(mesh.boundary):
-        centre = np.eye(4)
-        centre[:3, 3] = (low + high) / 2.0
-        found.append(Primitive(BOX, pose @ centre, tuple((high - low) / 2.0), exact=False))
+        center = np.eye(4)
+        center[:3, 3] = (low + high) / 2.0
+        found.append(Primitive(BOX, pose @ center, tuple((high - low) / 2.0), exact=False))
     return found

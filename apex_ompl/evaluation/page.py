@@ -22,7 +22,7 @@ from apex_ompl.evaluation.summary import Statistics, about, statistics, tables, 
 from apex_ompl.util.files import make_folder, write_atomically
 
 COLUMNS = 4  # of subplots
-COLOURS = (
+COLORS = (
     "#0b6e4f",
     "#c8553d",
     "#3d5a80",
@@ -120,11 +120,11 @@ def html(results: Results, found: Sequence[Statistics]) -> str:
 def pictures(found: Sequence[Statistics]) -> dict[str, str]:
     """Return PNG pictures in base 64, by the names of :data:`TITLES`."""
     labels = list(dict.fromkeys(f.label for f in found))
-    colours = {label: COLOURS[k % len(COLOURS)] for k, label in enumerate(labels)}
-    made = {"success": _grid(found, _curve, colours, "s", log=True)}
+    colors = {label: COLORS[k % len(COLORS)] for k, label in enumerate(labels)}
+    made = {"success": _grid(found, _curve, colors, "s", log=True)}
     if any(f.solved for f in found):
-        made["time"] = _grid(found, _box("first"), colours, "s", log=True, legend=False)
-        made["length"] = _grid(found, _box("length"), colours, "rad", legend=False)
+        made["time"] = _grid(found, _box("first"), colors, "s", log=True, legend=False)
+        made["length"] = _grid(found, _box("length"), colors, "rad", legend=False)
     staged = [f for f in found if len(f.by) > 1]
     if staged:
         made["stages"] = _bars(staged)
@@ -132,19 +132,19 @@ def pictures(found: Sequence[Statistics]) -> dict[str, str]:
 
 
 def _grid(
-    found: Sequence[Statistics], draw: Callable[..., None], colours: dict[str, str], unit: str, *, log: bool = False,
+    found: Sequence[Statistics], draw: Callable[..., None], colors: dict[str, str], unit: str, *, log: bool = False,
     legend: bool = True,
 ) -> str:  # fmt: skip
     """Return a picture with a subplot for each level."""
     levels = list(dict.fromkeys(f.experiment for f in found))
     columns = min(COLUMNS, len(levels))
     rows = math.ceil(len(levels) / columns)
-    height = 2.4 if legend else 0.6 + 0.28 * len(colours)
+    height = 2.4 if legend else 0.6 + 0.28 * len(colors)
     figure = Figure(figsize=(3.2 * columns, height * rows + 0.7), layout="constrained")
     axes = figure.subplots(rows, columns, squeeze=False).ravel()
     for axis, level in zip(axes, levels, strict=False):
         mine = [f for f in found if f.experiment == level]
-        draw(axis, mine, colours)
+        draw(axis, mine, colors)
         axis.set_title(short(level), fontsize=9)
         axis.tick_params(labelsize=7)
         axis.set_xlabel(unit, fontsize=7)
@@ -155,27 +155,27 @@ def _grid(
     for axis in axes[len(levels) :]:
         axis.set_visible(False)
     if legend:
-        handles = [Line2D([], [], color=colour, label=label) for label, colour in colours.items()]
+        handles = [Line2D([], [], color=color, label=label) for label, color in colors.items()]
         figure.legend(handles=handles, loc="outside upper center", ncols=min(4, len(handles)), fontsize=8)
     return _png(figure)
 
 
-def _curve(axis: Any, mine: Sequence[Statistics], colours: dict[str, str]) -> None:
+def _curve(axis: Any, mine: Sequence[Statistics], colors: dict[str, str]) -> None:
     for f in mine:
         times = f.times()
         there = times[np.isfinite(times)]
         at = np.concatenate([[1e-3], np.maximum(there, 1e-3), [max(f.limit, *there, 1e-3)]])
         share = np.concatenate([[0.0], np.arange(1, len(there) + 1), [len(there)]]) / len(times)
-        axis.step(at, share, where="post", color=colours[f.label], linewidth=1.4)
+        axis.step(at, share, where="post", color=colors[f.label], linewidth=1.4)
     axis.set_ylim(-0.02, 1.02)
 
 
 def _box(key: str) -> Callable[..., None]:
-    def draw(axis: Any, mine: Sequence[Statistics], colours: dict[str, str]) -> None:
+    def draw(axis: Any, mine: Sequence[Statistics], colors: dict[str, str]) -> None:
         values = [[max(run[key], 1e-4) for run in f.solved if run[key] is not None] for f in mine]
         shown = axis.boxplot(values, orientation="horizontal", patch_artist=True, showfliers=False, whis=(5, 95))
         for patch, f in zip(shown["boxes"], mine, strict=True):
-            patch.set_facecolor(colours[f.label])
+            patch.set_facecolor(colors[f.label])
             patch.set_alpha(0.6)
         for line in shown["medians"]:
             line.set_color("black")
@@ -191,7 +191,7 @@ def _bars(found: Sequence[Statistics]) -> str:
     axis, left = figure.subplots(), np.zeros(len(found))
     for k, name in enumerate(names):
         shares = np.array([f.by[name] / len(f.runs) for f in found])
-        axis.barh(range(len(found)), shares, left=left, label=name, color=COLOURS[k % len(COLOURS)])
+        axis.barh(range(len(found)), shares, left=left, label=name, color=COLORS[k % len(COLORS)])
         left += shares
     axis.set_yticks(range(len(found)), [f"{f.experiment}, {f.label}" for f in found], fontsize=7)
     axis.invert_yaxis()

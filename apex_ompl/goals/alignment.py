@@ -1,6 +1,6 @@
 """Alignment goals: the task as two vectors to be aligned (section III-A of the paper).
 
-Each object has a contact face with the centre p and the outward unit axis a, fixed to the link that holds it. With
+Each object has a contact face with the center p and the outward unit axis a, fixed to the link that holds it. With
 e = p2 - p1 and the wanted distance d, the error terms of an alignment are
 
 - ``angle``: the angle between a1 and -a2 (not for pouring),
@@ -17,7 +17,7 @@ and, depending on its kind,
   angle between the lip and the lowest point of the rim,
 - ``handover``: no further term. The second face is the grasp point of a hand with the outward normal of its palm.
 
-Angles are in radians, lengths in metres.
+Angles are in radians, lengths in meters.
 """
 
 from __future__ import annotations

@@ -76,15 +76,15 @@ class AlignmentSampler:
             rng: Source of the states home + N(0, spread^2).
             spread: Standard deviation of the joints of the arms [rad].
             min_height: Of the lowest corner of the objects' bounding boxes above z = 0 [m].
-            min_separation: Of the centres of the two boxes [m].
+            min_separation: Of the centers of the two boxes [m].
 
         Returns:
             Shape (dof,), rounded to a millionth of a radian.
         """
         states = np.round(self._around_home(rng, spread), 6)
         corners = self.box_corners(states)
-        centres = corners.mean(axis=2)
-        separation = np.linalg.norm(centres[:, 0] - centres[:, 1], axis=1)
+        centers = corners.mean(axis=2)
+        separation = np.linalg.norm(centers[:, 0] - centers[:, 1], axis=1)
         height = corners[..., 2].min(axis=(1, 2))
         candidates = states[self._within_limits(states) & (height >= min_height) & (separation >= min_separation)]
         clear = (q for q in candidates if has_clearance(self.kernel, q, self.margin)[0])

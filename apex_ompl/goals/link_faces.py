@@ -20,7 +20,7 @@ class LinkFace:
 
     Attributes:
         link: The link.
-        point: Centre of the face in the link's frame, shape (3,) [m].
+        point: Center of the face in the link's frame, shape (3,) [m].
         axis: Outward unit axis in the link's frame, shape (3,).
     """
 

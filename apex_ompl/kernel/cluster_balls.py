@@ -20,14 +20,14 @@ class ClusterBall(NamedTuple):
     """Ball around a cluster in the frame of its joint.
 
     Attributes:
-        centre: Shape (3,) [m].
+        center: Shape (3,) [m].
         radius: Radius around the solids [m].
         outer: Radius around the leaf spheres [m].
-        spread: Largest distance of a sphere's centre from that of the ball [m].
-        speed: Largest speed of such a centre, per unit of the inner planned joint.
+        spread: Largest distance of a sphere's center from that of the ball [m].
+        speed: Largest speed of such a center, per unit of the inner planned joint.
     """
 
-    centre: Array
+    center: Array
     radius: float
     outer: float
     spread: float
@@ -39,13 +39,13 @@ class Member(NamedTuple):
 
     Attributes:
         joint: Its joint.
-        centres: Centres of its spheres in the joint's frame, shape (n, 3) [m].
+        centers: Centers of its spheres in the joint's frame, shape (n, 3) [m].
         radii: Shape (n,) [m].
         outer: Radii around the leaves below each, shape (n,) [m].
     """
 
     joint: int
-    centres: Array
+    centers: Array
     radii: Array
     outer: Array
 
@@ -60,7 +60,7 @@ def cluster_ball(
 ) -> ClusterBall:
     """Return the ball around a cluster.
 
-    Inner joints are sampled over their range; between two samples a centre moves by at most its speed times half the
+    Inner joints are sampled over their range; between two samples a center moves by at most its speed times half the
     spacing.
 
     Args:
@@ -78,12 +78,12 @@ def cluster_ball(
     roots = np.concatenate([np.arange(len(m.radii)) == 0 for m in members])
     speeds = np.concatenate([_speed(m, top, joints, placements, (low, high)) for m in members])
     slack = 0.0 if limits is None else speeds * (high - low) / (SAMPLES - 1) / 2.0
-    centre = _middle(points[:, roots], (radii + slack)[roots])
-    away = np.linalg.norm(points - centre, axis=2).max(axis=0) + slack
+    center = _middle(points[:, roots], (radii + slack)[roots])
+    away = np.linalg.norm(points - center, axis=2).max(axis=0) + slack
     leaves = np.concatenate([m.outer for m in members])
     # The roots contain the solids; the leaves and inner nodes are what moves.
     return ClusterBall(
-        centre, float((away + radii)[roots].max()) + 1e-9, float((away + leaves)[roots].max()) + 1e-9,
+        center, float((away + radii)[roots].max()) + 1e-9, float((away + leaves)[roots].max()) + 1e-9,
         float(away.max()) + 1e-9, float(speeds.max()),
     )  # fmt: skip
 
@@ -101,10 +101,10 @@ def part_balls(
     Args are those of :func:`cluster_ball`, but for the limits, which are the robot's own and hold within LIMIT_SLACK.
 
     Returns:
-        Centres and radii around the solids, shape (BINS, 4), and radii around the leaf spheres, shape (BINS,) [m].
+        Centers and radii around the solids, shape (BINS, 4), and radii around the leaf spheres, shape (BINS,) [m].
     """
     low, high = limits or (0.0, 0.0)
-    roots = [Member(m.joint, m.centres[:1], m.radii[:1], m.outer[:1]) for m in members]
+    roots = [Member(m.joint, m.centers[:1], m.radii[:1], m.outer[:1]) for m in members]
     points = _points(roots, top, inner, joints, placements, np.linspace(low, high, SAMPLES))
     speeds = np.concatenate([_speed(m, top, joints, placements, (low, high)) for m in roots])
     slack = speeds * ((high - low) / (SAMPLES - 1) / 2.0 + LIMIT_SLACK)
@@ -112,27 +112,27 @@ def part_balls(
     within = points[rows]  # (BINS, OF_BIN + 1, bodies, 3)
     radii, leaves = np.concatenate([m.radii for m in roots]), np.concatenate([m.outer for m in roots])
     wide = (radii + slack)[:, None]
-    centre = 0.5 * ((within - wide).min(axis=(1, 2)) + (within + wide).max(axis=(1, 2)))
-    away = np.linalg.norm(within - centre[:, None, None], axis=3).max(axis=1) + slack
-    return np.column_stack([centre, (away + radii).max(axis=1) + 1e-9]), (away + leaves).max(axis=1) + 1e-9
+    center = 0.5 * ((within - wide).min(axis=(1, 2)) + (within + wide).max(axis=(1, 2)))
+    away = np.linalg.norm(within - center[:, None, None], axis=3).max(axis=1) + slack
+    return np.column_stack([center, (away + radii).max(axis=1) + 1e-9]), (away + leaves).max(axis=1) + 1e-9
 
 
 def _points(
     members: Sequence[Member], top: int, inner: Sequence[int], joints: Sequence[JointSpec],
     placements: Sequence[Array], values: Array,
 ) -> Array:  # fmt: skip
-    """Return the centres of all spheres at values of the inner joints, in the frame of the cluster's, (N, n, 3)."""
+    """Return the centers of all spheres at values of the inner joints, in the frame of the cluster's, (N, n, 3)."""
     poses = {top: np.tile(np.eye(4), (len(values), 1, 1))}
     for k in inner:
         poses[k] = product(product(poses[joints[k].parent], placements[k]), _motions(joints[k], values))
-    return np.concatenate([transformed(poses[m.joint], m.centres) for m in members], axis=1)
+    return np.concatenate([transformed(poses[m.joint], m.centers) for m in members], axis=1)
 
 
 def _speed(
     body: Member, top: int, joints: Sequence[JointSpec], placements: Sequence[Array], limits: tuple[float, float]
 ) -> Array:
     """Bound the speed of a body's spheres relative to the cluster's joint, per unit of the planned joint."""
-    reach = np.linalg.norm(body.centres, axis=1)
+    reach = np.linalg.norm(body.centers, axis=1)
     speed = np.zeros(len(reach))
     k = body.joint
     while k != top:
@@ -159,7 +159,7 @@ def _motions(joint: JointSpec, q: Array) -> Array:
     return poses
 
 
-def leaf_radii(centres: Array, radii: Array, body: BodySpec) -> Array:
+def leaf_radii(centers: Array, radii: Array, body: BodySpec) -> Array:
     """Return for each node a radius around all leaves below it."""
     above = np.full(len(radii), -1)
     for k in np.flatnonzero(body.count):
@@ -167,29 +167,29 @@ def leaf_radii(centres: Array, radii: Array, body: BodySpec) -> Array:
     leaves = np.flatnonzero(np.asarray(body.count) == 0)
     outer, at = np.zeros(len(radii)), leaves
     while len(leaves):
-        np.maximum.at(outer, at, np.linalg.norm(centres[leaves] - centres[at], axis=1) + radii[leaves])
+        np.maximum.at(outer, at, np.linalg.norm(centers[leaves] - centers[at], axis=1) + radii[leaves])
         at = above[at]
         leaves, at = leaves[at >= 0], at[at >= 0]
     return outer + 1e-12
 
 
 def _middle(points: Array, radii: Array) -> Array:
-    """Return the approximate centre of the smallest ball around balls at points (..., n, 3) with radii (n,).
+    """Return the approximate center of the smallest ball around balls at points (..., n, 3) with radii (n,).
 
     By steps towards the farthest ball (Badoiu and Clarkson 2003).
     """
     flat = points.reshape(-1, 3)
     wide = np.broadcast_to(radii, points.shape[:-1]).ravel()
-    centre: Array = flat.mean(axis=0)
+    center: Array = flat.mean(axis=0)
     for step in range(1, 100):
-        offsets = flat - centre
+        offsets = flat - center
         lengths = np.sqrt(np.einsum("ij,ij->i", offsets, offsets))
         k = int(np.argmax(lengths + wide))
         long = float(lengths[k])
         if long == 0.0:
             break
-        centre = centre + offsets[k] / long * (long + wide[k]) / (step + 1) * 0.5
-    return centre
+        center = center + offsets[k] / long * (long + wide[k]) / (step + 1) * 0.5
+    return center
 
 
 def transformed(pose: Array, points: Array) -> Array:

@@ -81,7 +81,7 @@ class DistanceGrid:
 
     Attributes:
         low: Place of the first node, shape (3,) [m].
-        spacing: Distance of neighbouring nodes [m].
+        spacing: Distance of neighboring nodes [m].
         shape: Number of nodes along the axes.
         tree: Sizes of the tree.
         block: The bounds at the nodes, that hold between them too [m], then boxes and items of the tree [m].

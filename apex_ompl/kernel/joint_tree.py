@@ -68,7 +68,7 @@ class JointTree:
         self, members: Sequence[Member], top: int, inner: Sequence[int], limits: tuple[float, float] | None
     ) -> ClusterBall:
         """Return the ball of :func:`apex_ompl.kernel.cluster_balls.cluster_ball`; it is kept."""
-        content = tuple((m.joint, m.centres.tobytes(), m.radii.tobytes(), m.outer.tobytes()) for m in members)
+        content = tuple((m.joint, m.centers.tobytes(), m.radii.tobytes(), m.outer.tobytes()) for m in members)
         key = top, tuple(inner), limits, content
         return self._kept(key, lambda: cluster_ball(members, top, inner, self.joints, self.placements, limits))
 
@@ -86,16 +86,16 @@ class JointTree:
         below = sum(one.parent == top for one in self.joints[1:])
         return top if below >= MOST_PARTS else chain[max(chain.index(top) - 1, 0)]
 
-    def outer_radii(self, centres: Array, body: BodySpec) -> Array:
+    def outer_radii(self, centers: Array, body: BodySpec) -> Array:
         """Return the radii of :func:`apex_ompl.kernel.cluster_balls.leaf_radii`, shape (n,); they are kept."""
         radii = np.asarray(body.radii, float)
         key = (
-            centres.tobytes(),
+            centers.tobytes(),
             radii.tobytes(),
             np.asarray(body.first, int).tobytes(),
             np.asarray(body.count, int).tobytes(),
         )
-        return self._kept(key, lambda: leaf_radii(centres, radii, body))
+        return self._kept(key, lambda: leaf_radii(centers, radii, body))
 
     def _kept(self, key: tuple[object, ...], make: Callable[[], T]) -> T:
         found = self._known.get(key)

@@ -60,16 +60,16 @@ class ObstacleBatch:
         in_threads(len(rows), threads, measure)
         return distances, gradients
 
-    def least(self, owner: NDArray[np.int64], centres: Array, radii: Array) -> Array:
+    def least(self, owner: NDArray[np.int64], centers: Array, radii: Array) -> Array:
         """Return the least distance of each obstacle from balls of its scene, shape (T,) [m].
 
         Args:
             owner: The scene of each, shape (T,).
-            centres: Centres of balls of each scene, shape (B, N, 3) [m].
+            centers: Centers of balls of each scene, shape (B, N, 3) [m].
             radii: Shape (N,) [m].
         """
-        balls = np.empty((len(centres), 4, len(radii)))
-        balls[:, :3], balls[:, 3] = np.asarray(centres).transpose(0, 2, 1), radii
+        balls = np.empty((len(centers), 4, len(radii)))
+        balls[:, :3], balls[:, 3] = np.asarray(centers).transpose(0, 2, 1), radii
         found, room = np.empty(len(owner)), np.empty(len(radii))
         obstacle_batches.least_distances(*self._packed, np.ascontiguousarray(owner, np.int64), balls, room, found)
         return found

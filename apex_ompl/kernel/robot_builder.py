@@ -59,8 +59,8 @@ class _Builder:
         self.bodies = [bodies[b] for b in order]
         self.cluster_of = [self.clusters.index(keys[b]) for b in order]
         frames = [product(tree.turns[b.joint].T, b.placement) for b in self.bodies]
-        self.centres = [
-            transformed(frame, np.asarray(b.centres, float)) for frame, b in zip(frames, self.bodies, strict=True)
+        self.centers = [
+            transformed(frame, np.asarray(b.centers, float)) for frame, b in zip(frames, self.bodies, strict=True)
         ]
         self.inner = [
             np.column_stack([transformed(frame, b.inner[:, :3]), b.inner[:, 3]])
@@ -85,7 +85,7 @@ class _Builder:
         inner = {k for ks in self.lazy for k in ks}
         trees = [np.asarray(b.radii, float) for b in bodies]
         starts = np.cumsum([0, *(len(t) for t in trees)])
-        outer = [self.tree.outer_radii(c, b) for c, b in zip(self.centres, bodies, strict=True)]
+        outer = [self.tree.outer_radii(c, b) for c, b in zip(self.centers, bodies, strict=True)]
         balls = [self._ball(c, outer) for c in range(len(self.clusters))]
         pair_rows = self._pairs(pairs)
         pair_balls = self._pair_balls(pair_rows, balls, outer)
@@ -118,19 +118,19 @@ class _Builder:
             joint_shift=np.array([j.shift for j in joints], float),
             lower=np.array(self.lower, float),
             upper=np.array(self.upper, float),
-            cluster_ball=np.array([[*ball.centre, ball.radius] for ball in balls]).reshape(-1, 4),
+            cluster_ball=np.array([[*ball.center, ball.radius] for ball in balls]).reshape(-1, 4),
             cluster_outer=np.array([ball.outer for ball in balls]),
             part_ball=np.array([ball for ball, _ in parts]).reshape(-1, BINS, 4),
             part_outer=np.array([leaves for _, leaves in parts]).reshape(-1, BINS),
             cluster_spread=np.array([ball.spread for ball in balls]),
             cluster_speed=np.array([ball.speed for ball in balls]),
             cluster_range=np.array([self._range(c) for c in range(len(balls))]).reshape(-1, 2),
-            node_centre=np.concatenate([np.empty((0, 3)), *self.centres]),
+            node_center=np.concatenate([np.empty((0, 3)), *self.centers]),
             node_radius=np.concatenate([np.empty(0), *trees]),
             node_outer=np.concatenate([np.empty(0), *outer]),
             body_inner=_spans([len(balls) for balls in self.inner]),
             inner_ball=np.concatenate([np.empty((0, 4)), *self.inner]),
-            pair_ball=np.array([[[*b.centre, b.radius] for b in two] for two in pair_balls]).reshape(-1, 2, 4),
+            pair_ball=np.array([[[*b.center, b.radius] for b in two] for two in pair_balls]).reshape(-1, 2, 4),
             pair_outer=np.array([[b.outer for b in two] for two in pair_balls]).reshape(-1, 2),
             pair_parts=_ints([self._pair_parts(clusters, rows) for clusters, _, rows in pair_rows]).reshape(-1, 2),
             run_pairs=pair_runs(_ints([key for key, _, _ in pair_rows]).reshape(-1, 2)),
@@ -205,7 +205,7 @@ class _Builder:
     def _members(self, cluster: int, outer: Sequence[Array], some: frozenset[int] | None) -> list[Member]:
         """Return the bodies of a cluster, or some of them."""
         return [
-            Member(b.joint, self.centres[k], np.asarray(b.radii, float), outer[k])
+            Member(b.joint, self.centers[k], np.asarray(b.radii, float), outer[k])
             for k, b in enumerate(self.bodies)
             if self.cluster_of[k] == cluster and (some is None or k in some)
         ]

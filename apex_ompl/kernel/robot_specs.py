@@ -47,18 +47,18 @@ class BodySpec:
         name: Name of the body.
         joint: Number of its joint.
         placement: Pose of the spheres' frame in the joint's, shape (4, 4) [m].
-        centres: Shape (n, 3) [m]; node 0 is the root.
+        centers: Shape (n, 3) [m]; node 0 is the root.
         radii: Shape (n,) [m].
         first: First child of each node, shape (n,).
         count: Number of children of each node, 0 for leaves, shape (n,).
-        inner: Centres and radii of balls inside of the solid, in the frame of the spheres, shape (k, 4) [m].
+        inner: Centers and radii of balls inside of the solid, in the frame of the spheres, shape (k, 4) [m].
         meets_scene: Whether it is checked against obstacles.
     """
 
     name: str
     joint: int
     placement: Array
-    centres: Array
+    centers: Array
     radii: Array
     first: NDArray[np.int64]
     count: NDArray[np.int64]

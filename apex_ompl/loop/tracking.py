@@ -284,20 +284,20 @@ class Tracker:
     def _best_look(self, track: Track, fastest: float, q: Array) -> Array:
         """Return the look whose ball leaves a robot at a state most room, by the nearest ball of its cover."""
         looks = np.array(track.looks)
-        centres, radii = self._balls(q)
-        nearest = centres[np.argmin(np.linalg.norm(centres - looks[-1, 1:], axis=1) - radii)]
+        centers, radii = self._balls(q)
+        nearest = centers[np.argmin(np.linalg.norm(centers - looks[-1, 1:], axis=1) - radii)]
         room = np.linalg.norm(looks[:, 1:] - nearest, axis=1) + fastest * looks[:, 0]
         found: Array = looks[np.argmax(room)]
         return found
 
     def _balls(self, q: Array) -> tuple[Array, Array]:
-        """Return centres, shape (N, 3), and radii, shape (N,), of balls that contain the robot's bodies [m]."""
+        """Return centers, shape (N, 3), and radii, shape (N,), of balls that contain the robot's bodies [m]."""
         a = self.kernel.robot.arrays
         rotation, origin = (value[0] for value in self.kernel.joint_frames(q[None]))
         joint = a.body_joint
         root = a.body_root
-        centres = np.einsum("nij,nj->ni", rotation[joint], a.node_centre[root]) + origin[joint]
-        return centres, a.node_radius[root]
+        centers = np.einsum("nij,nj->ni", rotation[joint], a.node_center[root]) + origin[joint]
+        return centers, a.node_radius[root]
 
     def _allowed_rows(self, name: str) -> list[tuple[int, str]]:
         return allowed_rows(self.kernel, self.allowed, [name])

@@ -23,7 +23,7 @@ from apex_ompl.model.geometry import SHAPES, signed_distances
 from apex_ompl.model.guidance import Guidance, collision_cost
 from apex_ompl.model.proposals import TrajectoryModel
 from apex_ompl.model.quantization import SUFFIX, quantized
-from apex_ompl.model.query import MAX_DISTANCE, WORKSPACE_CENTRE, ObstacleSet, Probes, Query
+from apex_ompl.model.query import MAX_DISTANCE, WORKSPACE_CENTER, ObstacleSet, Probes, Query
 from apex_ompl.paths.spline import Spline
 from apex_ompl.types import Array
 from apex_ompl.util.validation import check_integer
@@ -85,9 +85,9 @@ class ArrayModel(TrajectoryModel):
         ends = np.array([[q.start, q.goal] for q in queries], np.float32)
         scaled = np.asarray(2.0 * (ends - lower) / (upper - lower) - 1.0, np.float32)
         parts: list[Single] = [scaled.reshape(len(queries), -1)]
-        centre = np.array(WORKSPACE_CENTRE, np.float32)
+        center = np.array(WORKSPACE_CENTER, np.float32)
         if self.config.condition.point:
-            parts.append(np.array([q.point for q in queries], np.float32) - centre)
+            parts.append(np.array([q.point for q in queries], np.float32) - center)
         if self.sight is not None:
             parts.append(self.sight.features(queries, kernel))
         if self.config.condition.scene in OBSTACLE_SCENES:
@@ -135,16 +135,16 @@ class ArrayModel(TrajectoryModel):
     def _obstacle_features(self, obstacles: ObstacleSet, probes: Single) -> Single:
         """Return what the encoder sees of the obstacles of a query, shape (features,); probes have (L, P, 3)."""
         along, count = probes.shape[:2]
-        centre = np.array(WORKSPACE_CENTRE, np.float32)
+        center = np.array(WORKSPACE_CENTER, np.float32)
         position, size = (np.asarray(v, np.float32) for v in (obstacles.position, obstacles.size))
         rotation = np.asarray(obstacles.rotation, np.float32)
         kinds = np.eye(len(SHAPES), dtype=np.float32)[obstacles.shape]
-        inputs, parts = [kinds, position - centre, rotation.reshape(-1, 9), size], []
+        inputs, parts = [kinds, position - center, rotation.reshape(-1, 9), size], []
         if self.config.condition.scene == "distances":
             points = np.broadcast_to(probes.reshape(1, -1, 3), (len(obstacles), along * count, 3))
             distances = signed_distances(obstacles.shape, position, rotation, size, points)
             distances = np.clip(distances, -MAX_DISTANCE, MAX_DISTANCE) / np.float32(MAX_DISTANCE)
-            parts += [(probes - centre).ravel(), distances.min(axis=0, initial=1.0)]
+            parts += [(probes - center).ravel(), distances.min(axis=0, initial=1.0)]
             looked_at = distances.reshape(-1, along, count)[:, [0, along // 2, -1]]
             inputs.append(looked_at.reshape(-1, 3 * count))
         tokens = np.concatenate(inputs, axis=1)
@@ -222,7 +222,7 @@ def _silu(values: Single) -> Single:
 
 def _normalized(values: Single) -> Single:
     """Return rows shifted and scaled to mean 0 and variance 1."""
-    centred = values - values.mean(axis=-1, keepdims=True)
-    variance = np.square(centred).mean(axis=-1, keepdims=True)
-    found: Single = centred / np.sqrt(variance + np.float32(EPSILON))
+    centerd = values - values.mean(axis=-1, keepdims=True)
+    variance = np.square(centerd).mean(axis=-1, keepdims=True)
+    found: Single = centerd / np.sqrt(variance + np.float32(EPSILON))
     return found

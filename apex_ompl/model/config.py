@@ -163,7 +163,7 @@ class ModelConfig(StrictModel):
 
 
 PIECES = 4  # balls of a cluster of bodies that moves together, at key states
-HELD_FEATURES = 7  # of a hand: whether it holds something, the centre and the half edges of a box around it
+HELD_FEATURES = 7  # of a hand: whether it holds something, the center and the half edges of a box around it
 
 
 def key_shapes(config: ModelConfig) -> dict[str, tuple[int, ...]]:

@@ -52,7 +52,7 @@ class FittedShapes:
     Attributes:
         kind: BOX, SPHERE or CYLINDER, shape (n,).
         rotation: Primitive to grid, shape (n, 3, 3).
-        position: Centres, shape (n, 3) [m].
+        position: Centers, shape (n, 3) [m].
         size: Half edges; radius; or radius and half length along z, shape (n, 3) [m].
     """
 
@@ -101,7 +101,7 @@ class _Nodes:
         return cls(block * grid.spacing, gap, reach, label)
 
     def on_border(self) -> Flags:
-        """Return which nodes are occupied and have a neighbour that is not, shape (nx, ny, nz)."""
+        """Return which nodes are occupied and have a neighbor that is not, shape (nx, ny, nz)."""
         outside = self.label == OUTSIDE
         beside = np.zeros_like(outside)
         for axis in range(3):

@@ -25,7 +25,7 @@ radii are kept."""
 KINEMATICS_BATCH = 1024
 """Number of paths whose joint frames are in memory at the same time."""
 
-WORKSPACE_CENTRE = (0.4, 0.0, 0.6)
+WORKSPACE_CENTER = (0.4, 0.0, 0.6)
 """Origin of all points that a model sees [m]."""
 
 MAX_DISTANCE = 0.4
@@ -41,7 +41,7 @@ class ObstacleSet:
 
     Attributes:
         shape: Indices into ``apex_ompl.training.records.SHAPES``, shape (M,).
-        position: Positions of the centres in the world, shape (M, 3) [m].
+        position: Positions of the centers in the world, shape (M, 3) [m].
         rotation: Rotation matrices, obstacle to world, shape (M, 3, 3).
         size: Half edges; radius; or radius and half length along z, shape (M, 3) [m].
     """
@@ -147,7 +147,7 @@ class Query:
 class Probes:
     """Probe points: P points fixed to the robot's links, whose distances to the obstacles the encoder sees.
 
-    By default they are the centres of the bounding balls of the sphere cover's clusters.
+    By default they are the centers of the bounding balls of the sphere cover's clusters.
 
     Attributes:
         joint: Joint that carries each point, an index into the kernel's tables, shape (P,).

@@ -7,7 +7,7 @@ The vector of features of a query is, one behind the other:
   distances from the nearest obstacle, shape (L, P), the gradients of these, shape (L, P, 3), and how they push the
   joints, shape (L, dof), see :meth:`apex_ompl.kernel.Kernel.joint_pushes`;
 - a box around what each hand holds, in the frame of the link that holds it, shape (H, 7): whether there is one, its
-  centre and its half edges.
+  center and its half edges.
 
 All are scaled to about -1..1. An arm is what moves at one joint of the world; at key states it is seen as balls around
 pieces of its links, with the fingers half closed and without held objects.
@@ -28,7 +28,7 @@ from apex_ompl.kernel.scene_builder import scene_tables
 from apex_ompl.kernel.tables import SceneTables
 from apex_ompl.model.config import HELD_FEATURES, PIECES
 from apex_ompl.model.geometry import HeldExtent
-from apex_ompl.model.query import MAX_DISTANCE, WORKSPACE_CENTRE, Probes, Query
+from apex_ompl.model.query import MAX_DISTANCE, WORKSPACE_CENTER, Probes, Query
 from apex_ompl.types import Array, Flags
 
 ROUNDS = 10  # of Lloyd's algorithm, which divides a cluster's spheres among its pieces
@@ -47,7 +47,7 @@ class KeyStates:
     Attributes:
         state: Key states, shape (K, dof) [rad].
         joint: Joint that carries each cluster, shape (A, C).
-        ball: Centre in the joint's frame and radius of the ball around each cluster, and of those of its pieces,
+        ball: Center in the joint's frame and radius of the ball around each cluster, and of those of its pieces,
             shape (A, C, 1 + PIECES, 4) [m].
     """
 
@@ -114,15 +114,15 @@ def _pieces(robot: RobotTables, kernel: Kernel, cluster: int) -> Array:
     middle = (a.lower + a.upper)[None] / 2.0
     rotation, origin = (frames[0] for frames in kernel.joint_frames(middle))
     first, number = a.cluster_bodies[cluster]
-    centres, radii, home = [], [], a.cluster_joint[cluster]
+    centers, radii, home = [], [], a.cluster_joint[cluster]
     ends = np.append(a.body_root, len(a.node_first))
     for body in range(first, first + number):
         nodes = np.arange(ends[body], ends[body + 1])
         nodes, joint = nodes[a.node_count[nodes] == 0], a.body_joint[body]
-        world = a.node_centre[nodes] @ rotation[joint].T + origin[joint]
-        centres.append((world - origin[home]) @ rotation[home])
+        world = a.node_center[nodes] @ rotation[joint].T + origin[joint]
+        centers.append((world - origin[home]) @ rotation[home])
         radii.append(a.node_radius[nodes])
-    points, sizes = np.concatenate(centres), np.concatenate(radii)
+    points, sizes = np.concatenate(centers), np.concatenate(radii)
     seeds = points[[int(np.linalg.norm(points - points.mean(axis=0), axis=1).argmax())]]
     while len(seeds) < PIECES:
         apart = np.linalg.norm(points[:, None] - seeds, axis=2).min(axis=1)
@@ -195,7 +195,7 @@ class Sight:
         found = distances.reshape(points.shape[:2]), gradients.reshape(points.shape)
         pushed = kernel.joint_pushes(frames, probes.joint, points, found, REACH)
         near = np.maximum(distances, -MAX_DISTANCE) / MAX_DISTANCE
-        parts = (points - np.array(WORKSPACE_CENTRE), near, gradients, pushed)
+        parts = (points - np.array(WORKSPACE_CENTER), near, gradients, pushed)
         return np.concatenate([part.reshape(count, -1) for part in parts], axis=1, dtype=np.float32, casting="unsafe")
 
     def held(self, extents: Sequence[HeldExtent]) -> NDArray[np.float32]:

@@ -26,7 +26,7 @@ class Solid:
     Attributes:
         kind: BOX, SPHERE or CYLINDER.
         rotation: From its frame, shape (3, 3).
-        position: Of its centre, shape (3,) [m].
+        position: Of its center, shape (3,) [m].
         size: Half edges; radius; or radius and half length along z; shape (3,), 0 behind these [m].
     """
 

@@ -13,7 +13,7 @@ from apex_ompl.timing import Trajectory
 from apex_ompl.timing.spline_method import least_knot_spacing
 from apex_ompl.types import Array
 
-ROUND, ROUNDS = 4, 8  # optimiser steps in a round, and rounds that a candidate has at most
+ROUND, ROUNDS = 4, 8  # optimizer steps in a round, and rounds that a candidate has at most
 PENALTY = 2.0  # factor on the priority of a candidate for every round spent on it
 CLEAR = -0.003  # clearance at the samples from which on a proof is tried; spheres protrude [m]
 ENOUGH = 0.03  # at which a round ends early [m]
@@ -73,7 +73,7 @@ class MotionPool:
             clock: Time of the clock then [s].
             charges: Gets the samples that are looked at.
             accepts: The proof.
-            berth: How much nearer than the obstacles of the optimiser motions may come, of which a proof is tried [m].
+            berth: How much nearer than the obstacles of the optimizer motions may come, of which a proof is tried [m].
         """
         self._optimizer, self._start, self._clock, self._charges = optimizer, start, clock, charges
         self._accepts, self._least = accepts, CLEAR - berth

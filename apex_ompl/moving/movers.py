@@ -223,7 +223,7 @@ def prove_motion(
     """Prove that a timed motion stays apart from obstacles that move, and find the first moment that is not proved.
 
     The proof is that of the sphere covers along the motion's own cubic pieces
-    (:mod:`apex_ompl.kernel.compiled.movers`): it is sound, and may leave contacts of some millimetres open that there
+    (:mod:`apex_ompl.kernel.compiled.movers`): it is sound, and may leave contacts of some millimeters open that there
     are not. The scene of the kernel and the robot itself are not looked at.
 
     Args:

@@ -26,7 +26,7 @@ class Request:
         following: What the robot follows until then.
         route: The last motion to a goal, or None.
         predicted: The obstacles as they are expected to move; what motions are proved against.
-        berth: By how much they are larger where motions are optimised [m].
+        berth: By how much they are larger where motions are optimized [m].
         obstacles: Their records, where they are expected to be when it is asked, with velocities.
         conflict: Time of the clock of the first conflict of what the robot follows [s], infinite without one.
         contact: The same by the predictions as they are, without margins for what is uncertain, where the robot will be

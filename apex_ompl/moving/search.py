@@ -195,7 +195,7 @@ class Search:
         return True
 
     def pool(self, berth: bool = True) -> MotionPool:
-        """Return an empty pool of motions, which are optimised with a berth around obstacles or without.
+        """Return an empty pool of motions, which are optimized with a berth around obstacles or without.
 
         The berth of a request is larger among fast obstacles; a proof is tried of what keeps the rest of it, since the
         guard stops a robot that comes nearer. (Trying it of all that might be proved changes times by 0.0 % in 40

@@ -48,7 +48,7 @@ class LoopSettings:
         hold: Time for which the goal must stay clear from the arrival on [s].
         rest_hold: Time for which a robot that stands elsewhere looks ahead [s].
         margin: Distance that is kept from obstacles that move [m].
-        berth: Distance beyond it at which motions are optimised to pass by, where there is room [m].
+        berth: Distance beyond it at which motions are optimized to pass by, where there is room [m].
         error: Largest error of an observed place, for the guarantee [m]; None is that of the sensor.
         fastest: Largest speed of any obstacle, for the guarantee [m/s]; None is that of the world.
         memory: Every obstacle is seen at least this often, for the guarantee [s]: one that was not, while the sensor

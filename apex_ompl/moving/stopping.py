@@ -101,7 +101,7 @@ def stops_proved(
     At each, obstacles were seen a while ago, where they are expected then, and may have gone anywhere since. The next
     period of the motion is proved clear of that, and the soonest stop along it behind (:func:`stop_along`), or else
     that of each joint by itself (:func:`stop`), which are flagged, shape (N,). What stands still is not looked at: a
-    stop along the motion stays within a millimetre of it.
+    stop along the motion stays within a millimeter of it.
 
     Args:
         kernel: The kernel of the robot with what it holds.

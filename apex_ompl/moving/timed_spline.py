@@ -1,4 +1,4 @@
-"""Optimisation in space and time: splines in time among obstacles that move, from a moving start to rest at a goal."""
+"""Optimization in space and time: splines in time among obstacles that move, from a moving start to rest at a goal."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ SLOWER = 1.02  # least factor on its duration then
 
 @dataclass(frozen=True)
 class MotionSettings:
-    """Cost of a motion, and when its optimisation ends.
+    """Cost of a motion, and when its optimization ends.
 
     Attributes:
         samples: Number of samples between two knots.
@@ -142,7 +142,7 @@ class MotionOptimizer:
     """
 
     def __init__(self, kernel: Kernel, movers: Movers, limits: Limits, settings: MotionSettings | None = None) -> None:
-        """Optimise motions of the kernel's robot within limits of velocity, acceleration and jerk.
+        """Optimize motions of the kernel's robot within limits of velocity, acceleration and jerk.
 
         Raises:
             ParameterError: The limits are those of other joints.

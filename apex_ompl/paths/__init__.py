@@ -1,4 +1,4 @@
-"""Trajectory optimisation: B-spline paths, the optimiser, the candidate pool."""
+"""Trajectory optimization: B-spline paths, the optimizer, the candidate pool."""
 
 from __future__ import annotations
 

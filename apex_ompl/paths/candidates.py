@@ -1,4 +1,4 @@
-"""Candidate paths: repaired by the optimiser, the most promising one first."""
+"""Candidate paths: repaired by the optimizer, the most promising one first."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from apex_ompl.paths.optimizer import LAST_RESORT, Check, Optimizer
 from apex_ompl.types import Array
 from apex_ompl.util.display import fields_line
 
-ROUND, ROUNDS = 4, 12  # optimiser steps in a round of repair, and rounds a candidate has at most
+ROUND, ROUNDS = 4, 12  # optimizer steps in a round of repair, and rounds a candidate has at most
 SOFT_ROUNDS = 2  # the last rounds, with still less weight on the speed term
 ROUGH_ROUNDS = 2  # of these, the first, among primitives that look like the obstacles
 REPAIR_STIFFNESS = 0.3  # factor on the settings' stiffness: clear comes before short
@@ -61,14 +61,14 @@ class CandidatePool:
     """Candidates for a valid path among the obstacles of a kernel.
 
     Candidates are checked when they are added. Repair improves the one with the least priority value by a few
-    optimiser steps, and checks it again as soon as it is nearly clear at its samples. A candidate that is clear at the
+    optimizer steps, and checks it again as soon as it is nearly clear at its samples. A candidate that is clear at the
     samples and still invalid is sampled more densely. In the last rounds of a candidate the speed term counts less.
     Where there are primitives that look like the obstacles, first costs and rounds of repair are among these; what is
     clear there, or still is not after ``ROUGH_ROUNDS``, goes on among the obstacles.
 
     Attributes:
         candidates: All candidates.
-        steps: Number of optimiser steps taken.
+        steps: Number of optimizer steps taken.
     """
 
     def __init__(

@@ -1,6 +1,6 @@
-"""Trajectory optimisation on B-spline control points: paths made clear of obstacles, and then short.
+"""Trajectory optimization on B-spline control points: paths made clear of obstacles, and then short.
 
-One optimiser serves repair, shortening and data generation. It needs NumPy and the compiled kernel only; the full
+One optimizer serves repair, shortening and data generation. It needs NumPy and the compiled kernel only; the full
 check is handed in.
 """
 
@@ -44,7 +44,7 @@ LAST_RESORT = 0.1  # factor on the stiffness where nothing came out valid
 
 @dataclass(frozen=True, eq=False)
 class OptimizationResult:
-    """Paths after some optimiser steps.
+    """Paths after some optimizer steps.
 
     Attributes:
         control: Control points, shape (B, points, dof).
@@ -92,11 +92,11 @@ class Optimizer:
             _prepared.add(self.spline)
 
     def finer(self) -> Optimizer:
-        """Return an optimiser with more samples."""
+        """Return an optimizer with more samples."""
         return Optimizer(self.spline, replace(self.settings, samples=FINER * self.settings.samples))
 
     def coarser(self) -> Optimizer:
-        """Return an optimiser with fewer samples."""
+        """Return an optimizer with fewer samples."""
         return Optimizer(self.spline, replace(self.settings, samples=max(1, self.settings.samples // COARSER)))
 
     def starts(self, start: Array, goal: Array, count: int, rng: np.random.Generator, size: float = 1.0) -> Array:

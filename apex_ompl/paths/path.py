@@ -19,7 +19,7 @@ from apex_ompl.util.validation import check_integer, check_positive
 class Path:
     """Path in joint space, from planner to time parameterization.
 
-    Planners check and return ``states``, to be joined by straight lines. A path that was optimised keeps the B-spline
+    Planners check and return ``states``, to be joined by straight lines. A path that was optimized keeps the B-spline
     that its states were taken from.
 
     Attributes:
@@ -152,7 +152,7 @@ def states_between(a: Array, b: Array, spacing: float) -> Array:
     Args:
         a: First state, shape (dof,).
         b: Last state, shape (dof,).
-        spacing: Largest distance between neighbours, ``a`` and ``b`` among them.
+        spacing: Largest distance between neighbors, ``a`` and ``b`` among them.
 
     Returns:
         States, shape (M, dof); M is 0 where ``a`` and ``b`` are close enough.

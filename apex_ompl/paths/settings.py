@@ -1,4 +1,4 @@
-"""Settings of the trajectory optimiser."""
+"""Settings of the trajectory optimizer."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from apex_ompl.util.validation import check_integer, check_number, check_positiv
 
 @dataclass(frozen=True)
 class OptimizerSettings:
-    """Cost of a path, and when its optimisation ends.
+    """Cost of a path, and when its optimization ends.
 
     Attributes:
         samples: Number of states whose clearance counts: the middles of as many even intervals of the parameter, as

@@ -217,7 +217,7 @@ def _basis(knots: Array, degree: int, u: Array, order: int) -> Array:
 
 
 def _spans(spline: Spline) -> Array:
-    """Return the spans over which neighbouring control points differ, shape (points - 1,)."""
+    """Return the spans over which neighboring control points differ, shape (points - 1,)."""
     knots = spline.knots
     return np.asarray(knots[spline.degree + 1 : -1] - knots[1 : -spline.degree - 1])
 

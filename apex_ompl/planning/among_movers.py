@@ -2,7 +2,7 @@
 
 1. A path among what stands still is found and timed as ever; where its motion meets no mover, that is the plan.
 2. Else the motion along the path is retimed: it waits, slows down or hurries (:mod:`apex_ompl.moving.retime`).
-3. Motions are optimised in space and time from several paths and durations (:mod:`apex_ompl.moving.timed_spline`).
+3. Motions are optimized in space and time from several paths and durations (:mod:`apex_ompl.moving.timed_spline`).
 4. Where all that fails, paths are planned around what the movers sweep.
 
 The motion that arrives first is taken.
@@ -175,7 +175,7 @@ def _retimed(among: Among, still: PlanResult) -> PlanResult | None:
 
 
 def _by_space_time(among: Among, still: PlanResult, turn: int, best: PlanResult | None) -> PlanResult | None:
-    """Return the motion that is optimised in space and time and ends first, or None.
+    """Return the motion that is optimized in space and time and ends first, or None.
 
     Args:
         among: What it works on.

@@ -1,6 +1,6 @@
 """Starts that touch something: the way out of a contact along growing clearance, before the plan proper.
 
-Real robots report states in which a hand rests on a table or an object on a shelf, by fractions of a millimetre inside
+Real robots report states in which a hand rests on a table or an object on a shelf, by fractions of a millimeter inside
 of the model. A plan may begin there where the caller allows it (``leave_contact``): a short straight motion leads out
 of the contact, and what follows is planned and proved as ever.
 """

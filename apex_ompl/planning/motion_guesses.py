@@ -1,4 +1,4 @@
-"""Motions that plans among movers are optimised from."""
+"""Motions that plans among movers are optimized from."""
 
 from __future__ import annotations
 

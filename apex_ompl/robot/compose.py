@@ -161,9 +161,9 @@ def _locate_meshes(element: ET.Element, folders: tuple[Path, Path], part: Part) 
 
 
 def _scale_and_turn(holder: ET.Element, mesh: ET.Element, path: Path, role: str) -> None:
-    """Scale a COLLADA mesh to metres, and turn a glTF mesh so that z is up, as RViz shows them; Pinocchio does neither.
+    """Scale a COLLADA mesh to meters, and turn a glTF mesh so that z is up, as RViz shows them; Pinocchio does neither.
 
-    The ``<up_axis>`` of COLLADA is ignored: links are modelled in their own frames, whatever their files say, and RViz,
+    The ``<up_axis>`` of COLLADA is ignored: links are modeled in their own frames, whatever their files say, and RViz,
     MoveIt and Gazebo take them like that (rviz#1045, geometric_shapes#52). RViz 2 and Drake turn glTF (rviz#1482).
     """
     given = numbers(mesh.get("scale", "1 1 1"), 3, role)

@@ -1,6 +1,6 @@
 """Solids of problem and robot files: shapes, poses, obstacles and held objects.
 
-Lengths are in metres, the world has z up, quaternions are ordered xyzw.
+Lengths are in meters, the world has z up, quaternions are ordered xyzw.
 """
 
 from __future__ import annotations
@@ -60,13 +60,13 @@ def _ending_in(known: tuple[str, ...], role: str) -> AfterValidator:
 
 
 class Sphere(StrictModel):
-    """A ball centred on the object's origin; radius [m]."""
+    """A ball centerd on the object's origin; radius [m]."""
 
     radius: Size
 
 
 class RoundBar(StrictModel):
-    """A cylinder along z centred on the origin, or a capsule whose ``length`` excludes its end caps [m]."""
+    """A cylinder along z centerd on the origin, or a capsule whose ``length`` excludes its end caps [m]."""
 
     radius: Size
     length: Size
@@ -204,7 +204,7 @@ def same_solid(first: Body, second: Body) -> bool:
 
 
 class ContactFace(StrictModel):
-    """The face of a held object that is brought into contact: centre [m] and outward axis, in the object's frame."""
+    """The face of a held object that is brought into contact: center [m] and outward axis, in the object's frame."""
 
     point: Vector = (0.0, 0.0, 0.0)
     axis: Direction = (0.0, 0.0, 1.0)

@@ -1,7 +1,7 @@
 """Voxels, height fields and distance grids that users bring, as surfaces of triangles.
 
 A ``.npz`` file holds one of ``occupied`` (nx, ny, nz), the cells that are full; ``heights`` (nx, ny) [m], full from
-their least on up to each; or ``distances`` (nx, ny, nz), signed distances at the centres of cells [m]; with
+their least on up to each; or ``distances`` (nx, ny, nz), signed distances at the centers of cells [m]; with
 ``resolution``, the side of the cells [m], and ``origin`` (3,), the outer corner of the first one [m].
 A ``.bt`` file holds a map of OctoMap.
 """
@@ -59,9 +59,9 @@ def parse_surface(file: str, content: bytes) -> tuple[Array, NDArray[np.int64]]:
         raise FileFormatError(file, "", str(error)[:80], "expected an .npz file of NumPy") from error
     side = float(resolution) if resolution.ndim == 0 and is_number(resolution[()]) else np.nan
     if not 0.0 < side < LARGEST:
-        raise FileFormatError(file, "resolution", str(resolution)[:40], f"expected metres from 0 to {LARGEST:g}")
+        raise FileFormatError(file, "resolution", str(resolution)[:40], f"expected meters from 0 to {LARGEST:g}")
     if origin.shape != (3,) or not (np.abs(origin) < LARGEST).all():
-        raise FileFormatError(file, "origin", str(origin)[:40], f"expected three numbers of metres, below {LARGEST:g}")
+        raise FileFormatError(file, "origin", str(origin)[:40], f"expected three numbers of meters, below {LARGEST:g}")
     if not np.isfinite(values).all():
         raise FileFormatError(file, name, "numbers that are not finite", "expected finite ones")
     occupied = _occupied(file, name, values, side)

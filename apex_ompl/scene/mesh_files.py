@@ -1,8 +1,8 @@
-"""Files of triangle meshes: ``.stl``, ``.obj``, ``.ply``, ``.dae``, ``.glb`` and ``.off``, in metres and with z up.
+"""Files of triangle meshes: ``.stl``, ``.obj``, ``.ply``, ``.dae``, ``.glb`` and ``.off``, in meters and with z up.
 
-Most formats give neither unit nor direction: their numbers are metres in the frame of the body. COLLADA gives both,
-``<unit>`` and ``<up_axis>`` of its first ``<asset>``, one metre and y by default; glTF is in metres with y up. Meshes
-of both are scaled to metres, and turned so that z is up.
+Most formats give neither unit nor direction: their numbers are meters in the frame of the body. COLLADA gives both,
+``<unit>`` and ``<up_axis>`` of its first ``<asset>``, one meter and y by default; glTF is in meters with y up. Meshes
+of both are scaled to meters, and turned so that z is up.
 
 Files say how much they hold, all but ``.obj``; one that holds less is cut off, and an error.
 """
@@ -133,10 +133,10 @@ def read_obj(file: str, content: bytes) -> Triangles:
 
 
 def read_dae(_: str, content: bytes) -> Triangles:
-    """Return the triangles of a COLLADA file in metres, with z up."""
+    """Return the triangles of a COLLADA file in meters, with z up."""
     vertices, faces = _by_trimesh(content, "dae")
-    metres, up = collada_asset(io.BytesIO(content))
-    return metres * vertices @ UPRIGHT[up].T, faces
+    meters, up = collada_asset(io.BytesIO(content))
+    return meters * vertices @ UPRIGHT[up].T, faces
 
 
 def read_glb(_: str, content: bytes) -> Triangles:
@@ -169,11 +169,11 @@ def collada_asset(file: IO[bytes]) -> tuple[float, str]:
     except ElementTree.ParseError as error:
         raise ValueError(f"XML that is cut off or broken: {error}") from error
     unit, axis = (None, None) if asset is None else (asset.find("{*}unit"), asset.find("{*}up_axis"))
-    metres = float("1" if unit is None else unit.get("meter", "1"))
+    meters = float("1" if unit is None else unit.get("meter", "1"))
     up = "Y_UP" if axis is None or not axis.text else axis.text.strip()
-    if not 0.0 < metres < np.inf or up not in UPRIGHT:
-        raise ValueError(f"a unit of {metres:g} m with {up}")
-    return metres, up
+    if not 0.0 < meters < np.inf or up not in UPRIGHT:
+        raise ValueError(f"a unit of {meters:g} m with {up}")
+    return meters, up
 
 
 READERS: dict[str, Callable[[str, bytes], Triangles]] = {

@@ -45,16 +45,16 @@ def extent_fault(vertices: Array, flat: bool = False) -> str:
 
 
 def orientation_fault(vertices: Array, faces: NDArray[np.int64]) -> str:
-    """Return an error message if neighbouring triangles are oriented inconsistently, or an empty string.
+    """Return an error message if neighboring triangles are oriented inconsistently, or an empty string.
 
-    Holes are allowed: the inside is then defined by the generalised winding number.
+    Holes are allowed: the inside is then defined by the generalized winding number.
 
     Args:
         vertices: Shape (V, 3) [m].
         faces: Indices of the corners, shape (T, 3).
     """
     opposed = edges_of(vertices, faces).opposed
-    return "neighbouring triangles that are oriented against each other" if opposed else ""
+    return "neighboring triangles that are oriented against each other" if opposed else ""
 
 
 def hole_fault(vertices: Array, faces: NDArray[np.int64]) -> str:
@@ -116,7 +116,7 @@ class Edges:
 
     @property
     def opposed(self) -> bool:
-        """Whether neighbouring triangles are oriented against each other."""
+        """Whether neighboring triangles are oriented against each other."""
         return bool(((self.balance != 0) & (self.uses > 1)).any())
 
     @property
@@ -200,7 +200,7 @@ def capped(vertices: Array, faces: NDArray[np.int64]) -> Array:
     for loop in np.unique(label[rim[:, 0]]):
         own = where[rim[label[rim[:, 0]] == loop]]
         hub = np.broadcast_to(own.mean(axis=(0, 1)), (len(own), 3))
-        fans.append(np.stack([own[:, 1], own[:, 0], hub], axis=1))  # against the edge of the neighbour
+        fans.append(np.stack([own[:, 1], own[:, 0], hub], axis=1))  # against the edge of the neighbor
     return np.concatenate([corners, *fans])
 
 

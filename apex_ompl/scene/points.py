@@ -150,7 +150,7 @@ def points_from_depth(
         raise ParameterError("depth", image.shape, "an image of shape (rows, columns)")
     camera, placement = finite_array(intrinsics, "intrinsics"), rigid_pose(pose, "pose")
     check_array(camera, (4,), "intrinsics")
-    focal_x, focal_y, centre_x, centre_y = camera.tolist()
+    focal_x, focal_y, center_x, center_y = camera.tolist()
     if not (focal_x > 0.0 and focal_y > 0.0):
         raise ParameterError("intrinsics", (focal_x, focal_y), "positive focal lengths")
     check_integer(stride, "stride", 1)
@@ -164,5 +164,5 @@ def points_from_depth(
     with np.errstate(invalid="ignore"):
         kept = (seen >= near) & (seen <= far)
     d = seen[kept]
-    local = np.stack([(columns[kept] - centre_x) * d / focal_x, (rows[kept] - centre_y) * d / focal_y, d], axis=1)
+    local = np.stack([(columns[kept] - center_x) * d / focal_x, (rows[kept] - center_y) * d / focal_y, d], axis=1)
     return np.asarray(local @ placement[:3, :3].T + placement[:3, 3])

@@ -1,7 +1,7 @@
 """Planning problems: the robot, a scene, held objects, a start and a goal, as records and as YAML files.
 
 The file format is ``schema: apex-ompl/problem/1``. Joints go by name [rad; hand synergies 0 open to 1
-closed]; lengths are in metres, the world has z up, quaternions are ordered xyzw.
+closed]; lengths are in meters, the world has z up, quaternions are ordered xyzw.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ SAME_DIRECTION = 1e-7  # norm of the difference of unit directions below which t
 
 @dataclass(frozen=True, eq=False)
 class Polyline:
-    """States joined by straight lines, no two neighbours the same.
+    """States joined by straight lines, no two neighbors the same.
 
     Attributes:
         states: Shape (N, dof) [rad; synergies 0..1].

@@ -39,7 +39,7 @@ def spectral_arc_length(
 ) -> float:
     """Return the spectral arc length of a speed profile (SPARC), at most 0 and nearer to 0 for smoother motions.
 
-    It is -sum_k sqrt((df_k / f_c)^2 + (dV_k)^2) over the normalised amplitude spectrum V(f), up to f_c: ``cutoff``, or
+    It is -sum_k sqrt((df_k / f_c)^2 + (dV_k)^2) over the normalized amplitude spectrum V(f), up to f_c: ``cutoff``, or
     the last frequency below it at which V reaches ``threshold`` (Balasubramanian et al. 2015).
 
     Args:

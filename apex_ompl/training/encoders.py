@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from apex_ompl.model.config import OBSTACLE_SCENES
 from apex_ompl.model.geometry import SHAPES
-from apex_ompl.model.query import MAX_DISTANCE, WORKSPACE_CENTRE
+from apex_ompl.model.query import MAX_DISTANCE, WORKSPACE_CENTER
 from apex_ompl.training.conditions import Conditions, pad_obstacles
 
 PADDING = -1e4  # below every feature, for the maximum over obstacles
@@ -28,7 +28,7 @@ class ConditionEncoder(nn.Module):
 
     lower: Tensor
     upper: Tensor
-    centre: Tensor
+    center: Tensor
 
     def __init__(
         self, dof: int, *, out: int, width: int, scene: str, point: bool, probes: int, along: int, seen: int = 0,
@@ -51,7 +51,7 @@ class ConditionEncoder(nn.Module):
         self.scene, self.point, self.along = scene, point, along
         self.register_buffer("lower", torch.full((dof,), -1.0))
         self.register_buffer("upper", torch.full((dof,), 1.0))
-        self.register_buffer("centre", torch.tensor(WORKSPACE_CENTRE), persistent=False)
+        self.register_buffer("center", torch.tensor(WORKSPACE_CENTER), persistent=False)
         size = 2 * dof + 3 * point
         if scene in OBSTACLE_SCENES:
             features = len(SHAPES) + 15 + (3 * probes if scene == "distances" else 0)
@@ -85,7 +85,7 @@ class ConditionEncoder(nn.Module):
         span = self.upper - self.lower
         parts = [2.0 * (q - self.lower) / span - 1.0 for q in (conditions.start, conditions.goal)]
         if self.point:
-            parts.append(conditions.point - self.centre)
+            parts.append(conditions.point - self.center)
         if self.scene in OBSTACLE_SCENES:
             parts += self._obstacle_features(conditions)
         parts.append(conditions.seen)
@@ -97,13 +97,13 @@ class ConditionEncoder(nn.Module):
         mask = conditions.mask
         o = conditions.obstacles()
         kinds = nn.functional.one_hot(o.shape, len(SHAPES)).to(o.position)
-        inputs = [kinds, o.position - self.centre, o.rotation.flatten(1), o.size]
+        inputs = [kinds, o.position - self.center, o.rotation.flatten(1), o.size]
         parts: list[Tensor] = []
         if self.scene == "distances":
             along, probes = conditions.probes.shape[1:3]
-            with torch.autocast(mask.device.type, enabled=False):  # half precision is some millimetres off
+            with torch.autocast(mask.device.type, enabled=False):  # half precision is some millimeters off
                 distances = conditions.probe_distances().clamp(-MAX_DISTANCE, MAX_DISTANCE) / MAX_DISTANCE
-            parts += [(conditions.probes - self.centre).flatten(1), pad_obstacles(distances, mask, 1.0).amin(dim=1)]
+            parts += [(conditions.probes - self.center).flatten(1), pad_obstacles(distances, mask, 1.0).amin(dim=1)]
             inputs.append(distances.reshape(-1, along, probes)[:, [0, along // 2, -1]].flatten(1))
         tokens = self.thing(torch.cat(inputs, dim=1))
         mean = pad_obstacles(tokens, mask, 0.0).sum(dim=1) / mask.sum(dim=1, keepdim=True).clamp(min=1)

@@ -37,9 +37,9 @@ class CompiledSight(TorchSight):
         found = _batch(obstacles).nearest(first, points.numpy(), MAX_DISTANCE, torch.get_num_threads())
         return _single(found[0]), _single(found[1])
 
-    def least(self, obstacles: Obstacles, centres: Tensor, radii: Tensor) -> Tensor:
+    def least(self, obstacles: Obstacles, centers: Tensor, radii: Tensor) -> Tensor:
         """Return the least distance of each obstacle from balls of its scene, see :meth:`Obstacles.least`."""
-        return _single(_batch(obstacles).least(obstacles.owner.numpy(), centres.numpy(), radii.numpy()))
+        return _single(_batch(obstacles).least(obstacles.owner.numpy(), centers.numpy(), radii.numpy()))
 
     def at_keys(self, obstacles: Obstacles) -> Tensor:
         """Return the features of key states by each obstacle alone, shape (T, K * A); a scene has the least of them."""

@@ -45,14 +45,14 @@ class Obstacles:
         shape, position, rotation, size = (column[which] for column in columns)
         return Obstacles(shape, position, rotation, size, owner)
 
-    def least(self, centres: Tensor, radii: Tensor) -> Tensor:
+    def least(self, centers: Tensor, radii: Tensor) -> Tensor:
         """Return the least distance of each obstacle from balls of its scene, (B, N, 3) and (N,) [m]: shape (T,)."""
-        step = max(1, pairs_at_a_time(centres.device) // max(1, centres.shape[1]))
+        step = max(1, pairs_at_a_time(centers.device) // max(1, centers.shape[1]))
         rows = []
         for k in range(0, len(self.owner), step):
             some = self.part(slice(k, k + step))
-            rows.append((some.distances(centres[some.owner]) - radii).amin(dim=1))
-        return torch.cat(rows) if rows else centres.new_zeros(0)
+            rows.append((some.distances(centers[some.owner]) - radii).amin(dim=1))
+        return torch.cat(rows) if rows else centers.new_zeros(0)
 
     def nearest(self, points: Tensor, limit: float) -> tuple[Tensor, Tensor]:
         """Return the signed distances of points from the nearest obstacles of their scenes, and their gradients.

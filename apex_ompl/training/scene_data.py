@@ -160,8 +160,8 @@ class SightTable:
         chosen = self._uniform(generator, count, STRANGERS) < shares[:, 1:2]
         chosen &= (number > 0) & (shares[:, 2:3] < self._augmentation.mixed) & ~held.any(dim=1, keepdim=True)
         owner, place = chosen.nonzero(as_tuple=True)
-        centres, radii = self._eyes.arm_balls(self._few @ control)
+        centers, radii = self._eyes.arm_balls(self._few @ control)
         some = obstacles.chosen(index[owner, place], owner)
         free = torch.zeros_like(chosen)
-        free[owner, place] = self._eyes.least(some, centres, radii) > 0.0
+        free[owner, place] = self._eyes.least(some, centers, radii) > 0.0
         return index, free

@@ -13,7 +13,7 @@ from torch import Tensor
 from apex_ompl.kernel import Kernel
 from apex_ompl.kernel.compiled.arrays import FIXED, REVOLUTE
 from apex_ompl.model.config import PIECES
-from apex_ompl.model.query import MAX_DISTANCE, WORKSPACE_CENTRE
+from apex_ompl.model.query import MAX_DISTANCE, WORKSPACE_CENTER
 from apex_ompl.model.scene_encoding import KEY_RANGE, Sight
 from apex_ompl.training.obstacles import Obstacles, pairs_at_a_time
 from apex_ompl.training.pushes import Chains, generalized_forces, pushes
@@ -61,7 +61,7 @@ class TorchSight:
         self._chain_joint = self._index([place[j] for j in chains.joint.tolist()])
         self._ball_chain_joint = self._index([place[j] for j in ball_chains.joint.tolist()])
         self._ball_joint = self._index([[place[j] for j in row] for row in sight.keys.joint.tolist()])
-        self._centre = self.tensor(WORKSPACE_CENTRE)
+        self._center = self.tensor(WORKSPACE_CENTER)
 
     @staticmethod
     def _with_parents(parents: np.ndarray, joints: list[int]) -> list[int]:
@@ -101,12 +101,12 @@ class TorchSight:
         return rotation, origin
 
     def arm_balls(self, paths: Tensor) -> tuple[Tensor, Tensor]:
-        """Return centres (B, N, 3) and radii (N,) [m] of balls that contain the arms at states, (B, S, dof)."""
-        centres = self._placed_balls(*self.frames(paths.flatten(0, 1)))
-        return centres.reshape(len(paths), -1, 3), self._reach[:, :, 1:, 3].flatten().repeat(paths.shape[1])
+        """Return centers (B, N, 3) and radii (N,) [m] of balls that contain the arms at states, (B, S, dof)."""
+        centers = self._placed_balls(*self.frames(paths.flatten(0, 1)))
+        return centers.reshape(len(paths), -1, 3), self._reach[:, :, 1:, 3].flatten().repeat(paths.shape[1])
 
     def _placed_balls(self, rotation: Tensor, origin: Tensor) -> Tensor:
-        """Return centres of balls that contain the arms, shape (N, A, C, PIECES, 3) [m], by frames of joints."""
+        """Return centers of balls that contain the arms, shape (N, A, C, PIECES, 3) [m], by frames of joints."""
         joint, ball = self._ball_joint, self._reach[:, :, 1:]
         return torch.einsum("nacij,acpj->nacpi", rotation[:, joint], ball[..., :3]) + origin[:, joint][:, :, :, None]
 
@@ -127,23 +127,23 @@ class TorchSight:
         """
         count, states = paths.shape[:2]
         rotation, origin = self.frames(paths.flatten(0, 1))
-        centres = self._placed_balls(rotation, origin).flatten(1, 3)
-        distances, gradients = self.nearest(obstacles, centres.reshape(count, -1, 3))
-        depth = margin + self._reach[:, :, 1:, 3].flatten() - distances.reshape(centres.shape[:2])
+        centers = self._placed_balls(rotation, origin).flatten(1, 3)
+        distances, gradients = self.nearest(obstacles, centers.reshape(count, -1, 3))
+        depth = margin + self._reach[:, :, 1:, 3].flatten() - distances.reshape(centers.shape[:2])
         slope = (depth / margin).clamp(0.0, 1.0)
         cost = slope * (depth - 0.5 * margin * slope)
-        force = slope[..., None] * gradients.reshape(centres.shape)
+        force = slope[..., None] * gradients.reshape(centers.shape)
         frames = rotation[:, self._ball_chain_joint][..., 2], origin[:, self._ball_chain_joint]
-        away = generalized_forces(self._ball_chains, frames, centres, force)
+        away = generalized_forces(self._ball_chains, frames, centers, force)
         return cost.reshape(count, -1).sum(dim=1) / states, -away.reshape(paths.shape) / states
 
     def nearest(self, obstacles: Obstacles, points: Tensor) -> tuple[Tensor, Tensor]:
         """Return distances, at most MAX_DISTANCE, and gradients of points of scenes, see :meth:`Obstacles.nearest`."""
         return obstacles.nearest(points, MAX_DISTANCE)
 
-    def least(self, obstacles: Obstacles, centres: Tensor, radii: Tensor) -> Tensor:
+    def least(self, obstacles: Obstacles, centers: Tensor, radii: Tensor) -> Tensor:
         """Return the least distance of each obstacle from balls of its scene, see :meth:`Obstacles.least`."""
-        return obstacles.least(centres, radii)
+        return obstacles.least(centers, radii)
 
     def along(self, paths: Tensor, obstacles: Obstacles) -> Tensor:
         """Return the features along paths of L states each among obstacles, shape (B, L, dof): (B, features)."""
@@ -156,18 +156,18 @@ class TorchSight:
         frames = rotation[:, self._chain_joint][..., 2], origin[:, self._chain_joint]
         pushed = pushes(self._chains, frames, points, distances, gradients)
         near = distances.clamp(min=-MAX_DISTANCE) / MAX_DISTANCE
-        parts = (points - self._centre, near, gradients, pushed)
+        parts = (points - self._center, near, gradients, pushed)
         return torch.cat([part.reshape(count, -1) for part in parts], dim=1)
 
     def at_keys(self, obstacles: Obstacles) -> Tensor:
         """Return the features of key states by each obstacle alone, shape (T, K * A); a scene has the least of them."""
         pieces = self.balls[:, :, 1:]
-        centres, radii = pieces[..., :3].reshape(-1, 3), pieces[..., 3].flatten()
-        groups, step = len(pieces), max(1, pairs_at_a_time(centres.device) // len(centres))
+        centers, radii = pieces[..., :3].reshape(-1, 3), pieces[..., 3].flatten()
+        groups, step = len(pieces), max(1, pairs_at_a_time(centers.device) // len(centers))
         rows = []
         for k in range(0, len(obstacles.owner), step):
             some = obstacles.part(slice(k, k + step))
-            apart = some.distances(centres.expand(len(some.owner), -1, -1)) - radii
+            apart = some.distances(centers.expand(len(some.owner), -1, -1)) - radii
             least = apart.reshape(len(apart), groups, -1).amin(dim=2)
             rows.append((least.clamp(-KEY_RANGE, KEY_RANGE) / KEY_RANGE).half())
         return torch.cat(rows) if rows else torch.zeros(0, groups, dtype=torch.float16, device=self._device)

@@ -1,4 +1,4 @@
-"""YAML files validated by pydantic: reading, errors in one sentence, and serialisation."""
+"""YAML files validated by pydantic: reading, errors in one sentence, and serialization."""
 
 from __future__ import annotations
 

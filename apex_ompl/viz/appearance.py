@@ -1,6 +1,6 @@
 """How a scene looks: one list of items that pictures, films and pages are drawn from.
 
-Obstacles are red, fixtures have the colour of wood, held objects have colours of their own. The contact faces of an
+Obstacles are red, fixtures have the color of wood, held objects have colors of their own. The contact faces of an
 alignment are arrows along their outward axes.
 """
 
@@ -27,21 +27,21 @@ ROBOT, HELD, FACES, FIXTURES, OBSTACLES = LAYERS = ("robot", "held", "faces", "f
 """Layers of items: the first three move with the robot."""
 
 GHOST_OPACITY = 0.3
-HELD_COLOURS = ("#2a9d8f", "#e9a03b", "#8e6bbf", "#4c78a8")
+HELD_COLORS = ("#2a9d8f", "#e9a03b", "#8e6bbf", "#4c78a8")
 OBSTACLE, FIXTURE, BACKGROUND, EDGE, CONTACT = "#c8553d", "#c9a77c", "#f4f4f1", "#6b2d20", "#e0101b"
 HAND, LINK = "#4a4e57", "#d9dce1"
-SIDE_COLOURS = {"left": "#e8eef4", "right": "#f3ece2"}
-FACE_COLOURS = ("#d62728", "#1f4ed8")
-WAY_COLOURS = ("#1f6fb4", "#d97a1a", "#2b9348", "#8e44ad")  # of the ways of hands
-CLEARANCE_COLOURS = ("#0b6e4f", "#7a9e1f", "#16798c", "#555b66")  # of curves, by result
-LIMIT_COLOURS = {"velocity": "#1f6fb4", "acceleration": "#d97a1a", "jerk": "#8e44ad"}
+SIDE_COLORS = {"left": "#e8eef4", "right": "#f3ece2"}
+FACE_COLORS = ("#d62728", "#1f4ed8")
+WAY_COLORS = ("#1f6fb4", "#d97a1a", "#2b9348", "#8e44ad")  # of the ways of hands
+CLEARANCE_COLORS = ("#0b6e4f", "#7a9e1f", "#16798c", "#555b66")  # of curves, by result
+LIMIT_COLORS = {"velocity": "#1f6fb4", "acceleration": "#d97a1a", "jerk": "#8e44ad"}
 NOW, COVER = "#c8553d", "#3a86c8"  # of the cursor of curves, and of sphere covers
-PROPOSAL_COLOURS = {"sampled": "#8a8f98", "guided": "#1f6fb4", "repaired": "#2b9348", "not repaired": "#d97a1a"}
+PROPOSAL_COLORS = {"sampled": "#8a8f98", "guided": "#1f6fb4", "repaired": "#2b9348", "not repaired": "#d97a1a"}
 DENOISED = "#8e44ad"
-RUN_COLOURS = {
+RUN_COLORS = {
     "true": "#c8553d", "observed": "#e9a03b", "predicted": "#8e44ad", "committed": "#2b9348", "stop": "#e0101b",
 }  # fmt: skip
-EVENT_COLOURS = {
+EVENT_COLORS = {
     "conflict": "#e9a03b", "request": "#1f6fb4", "accepted": "#2b9348", "rejected": "#8a8f98",
     "improve": "#9db4c8", "improved": "#7fb069", "kept": "#c4c7cc", "stop": "#d97a1a",
     "broken assumption": "#6b2d20", "contact": "#e0101b", "goal": "#0b6e4f",
@@ -63,19 +63,19 @@ class Item:
         name: Name, unique among the items of a layer.
         layer: One of ``LAYERS``.
         body: Name of the link, the held object, the fixture or the obstacle that it is, or is part of.
-        colour: As ``#rrggbb``.
+        color: As ``#rrggbb``.
         opacity: 0 to 1.
         joint: Joint of the robot's model that carries it; 0 for the world.
         placement: Pose in the frame of that joint, shape (4, 4).
         mesh: The mesh, or None for balls.
-        points: Centres of the balls, shape (N, 3) [m]; none for a mesh.
+        points: Centers of the balls, shape (N, 3) [m]; none for a mesh.
         radius: Of the balls [m].
     """
 
     name: str
     layer: str
     body: str
-    colour: str
+    color: str
     opacity: float
     joint: int
     placement: Array
@@ -115,10 +115,10 @@ def robot_items(robot: Robot, coarse: bool = False) -> Iterator[Item]:
         shapes = pin.buildGeomFromUrdfString(robot.model, robot.urdf, pin.GeometryType.VISUAL)
     for k, item in enumerate(shapes.geometryObjects):
         is_hand = "hand" in item.name or "gripper" in item.name
-        colour = HAND if is_hand else SIDE_COLOURS.get(item.name.split("_", 1)[0], LINK)
+        color = HAND if is_hand else SIDE_COLORS.get(item.name.split("_", 1)[0], LINK)
         link = robot.model.frames[item.parentFrame].name
         place = np.array(item.placement.homogeneous)
-        yield Item(f"{k}_{item.name}", ROBOT, link, colour, 1.0, item.parentJoint, place, mesh_of(item.geometry))
+        yield Item(f"{k}_{item.name}", ROBOT, link, color, 1.0, item.parentJoint, place, mesh_of(item.geometry))
 
 
 def held_items(setup: PlanningSetup) -> Iterator[Item]:
@@ -127,8 +127,8 @@ def held_items(setup: PlanningSetup) -> Iterator[Item]:
     for k, held in enumerate(setup.problem.attached):
         frame = robot.model.frames[robot.link_frame(held.link)]
         place = np.array((frame.placement * pin.SE3(held.pose)).homogeneous)
-        colour = HELD_COLOURS[k % len(HELD_COLOURS)]
-        yield _item(held, HELD, colour, 1.0, (frame.parentJoint, place))
+        color = HELD_COLORS[k % len(HELD_COLORS)]
+        yield _item(held, HELD, color, 1.0, (frame.parentJoint, place))
 
 
 def face_items(setup: PlanningSetup) -> Iterator[Item]:
@@ -137,10 +137,10 @@ def face_items(setup: PlanningSetup) -> Iterator[Item]:
         return
     robot = setup.robot
     faces = (setup.alignment.first, setup.alignment.second)
-    for k, (face, colour) in enumerate(zip(faces, FACE_COLOURS, strict=True)):
+    for k, (face, color) in enumerate(zip(faces, FACE_COLORS, strict=True)):
         frame = robot.model.frames[robot.link_frame(face.link)]
         name, place = f"face_{k}_{face.link}", np.array(frame.placement.homogeneous)
-        yield Item(name, FACES, face.link, colour, 1.0, frame.parentJoint, place, arrow(face.point, face.axis))
+        yield Item(name, FACES, face.link, color, 1.0, frame.parentJoint, place, arrow(face.point, face.axis))
 
 
 def body_item(body: Body, layer: str) -> Item:
@@ -150,10 +150,10 @@ def body_item(body: Body, layer: str) -> Item:
     return _item(body, layer, OBSTACLE, PLATE if is_thin_plate(body) else SOLID, (0, body.pose))
 
 
-def _item(body: Body, layer: str, colour: str, opacity: float, at: tuple[int, Array]) -> Item:
+def _item(body: Body, layer: str, color: str, opacity: float, at: tuple[int, Array]) -> Item:
     geometry = coal_geometry(body)
     cloud = cloud_of(geometry)
-    plain = Item(body.name, layer, body.name, colour, opacity, *at)
+    plain = Item(body.name, layer, body.name, color, opacity, *at)
     if cloud is None:
         return replace(plain, mesh=mesh_of(geometry))
     points = np.asarray(cloud.points[:: len(cloud.points) // MOST_POINTS + 1], float)

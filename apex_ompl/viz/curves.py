@@ -27,9 +27,9 @@ def shares_of_limits(motion: Trajectory, robot: Robot, times: Array) -> Array:
         times: Shape (N,) [s].
     """
     limits = robot.limits
-    centre, half = (limits.upper + limits.lower) / 2.0, (limits.upper - limits.lower) / 2.0
+    center, half = (limits.upper + limits.lower) / 2.0, (limits.upper - limits.lower) / 2.0
     bounds = (limits.velocity, limits.acceleration, limits.jerk)
-    scaled = [(motion(times) - centre) / half]
+    scaled = [(motion(times) - center) / half]
     return np.stack([*scaled, *(motion(times, order) / bound for order, bound in enumerate(bounds, 1))])
 
 

@@ -14,7 +14,7 @@ from apex_ompl.ompl.setup import assemble
 from apex_ompl.result import PlanResult
 from apex_ompl.robot.identity import load_same_robot
 from apex_ompl.util.files import suffix_of, write_atomically
-from apex_ompl.viz.appearance import CLEARANCE_COLOURS
+from apex_ompl.viz.appearance import CLEARANCE_COLORS
 from apex_ompl.viz.curves import ORDERS, clearances, shares_of_limits
 
 FORMATS = (".png", ".pdf", ".svg")
@@ -71,7 +71,7 @@ def plot_motion(result: PlanResult, out: str | os.PathLike[str]) -> None:
     clearance_times = np.linspace(0.0, motion.duration, CLEARANCE_SAMPLES)
     axis = figure.add_subplot(grid[len(ORDERS), :])
     movers = [o for o in result.problem.scene if o.name in result.movers]
-    axis.plot(clearance_times, 1e3 * clearances(checker, motion, clearance_times, movers), color=CLEARANCE_COLOURS[0])
+    axis.plot(clearance_times, 1e3 * clearances(checker, motion, clearance_times, movers), color=CLEARANCE_COLORS[0])
     axis.set_ylim(bottom=0.0)
     axis.grid(alpha=0.25)
     axis.set_ylabel("clearance mm", fontsize=9)

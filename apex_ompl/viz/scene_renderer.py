@@ -17,7 +17,7 @@ from apex_ompl.viz.appearance import BACKGROUND, EDGE, OBSTACLES, Item, focus_of
 
 SIZE = (1280, 960)
 AZIMUTH = 26.0
-CAPTION = "#222222"  # colour of text
+CAPTION = "#222222"  # color of text
 
 
 class SceneRenderer:
@@ -62,7 +62,7 @@ class SceneRenderer:
         else:
             mesh = pv.wrap(item.mesh)
         mesh = mesh.transform(pose, inplace=False)
-        actors = [self._plotter.add_mesh(mesh, color=item.colour, opacity=item.opacity, specular=0.15)]
+        actors = [self._plotter.add_mesh(mesh, color=item.color, opacity=item.opacity, specular=0.15)]
         if item.layer == OBSTACLES:
             if item.opacity < 0.5:
                 actors.append(self._plotter.add_mesh(mesh.extract_feature_edges(30), color=EDGE, line_width=1.5))

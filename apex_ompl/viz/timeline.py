@@ -17,7 +17,7 @@ from apex_ompl.robot import Robot
 from apex_ompl.timing.rests import rests
 from apex_ompl.types import Array
 from apex_ompl.util.files import suffix_of, write_atomically
-from apex_ompl.viz.appearance import CLEARANCE_COLOURS, EVENT_COLOURS, SILENT_EVENTS, WAY_COLOURS
+from apex_ompl.viz.appearance import CLEARANCE_COLORS, EVENT_COLORS, SILENT_EVENTS, WAY_COLORS
 from apex_ompl.viz.plots import FORMATS
 from apex_ompl.viz.sources import robot_of
 
@@ -25,7 +25,7 @@ TIME_STEP, MAX_SAMPLES = 0.005, 4000  # of curves [s]
 MARGIN = 0.01  # beside the run, as a share of its duration
 JOINTS = 4  # that have curves of their own, those that come nearest to their limits
 FARTHEST = 0.5  # distance that is shown at most, where the least one is below it [m]
-REST, LARGEST, SEEN = "#dfe3e8", "#30343b", "#b9bec7"  # colours: bands of rest, the largest speed, observations
+REST, LARGEST, SEEN = "#dfe3e8", "#30343b", "#b9bec7"  # colors: bands of rest, the largest speed, observations
 MARKS = ("goal", "contact")  # events that are lines through all rows
 
 
@@ -62,7 +62,7 @@ def plot_run(result: RunResult, out: str | os.PathLike[str]) -> None:
     for axis in (events, speeds, distance):
         for event in result.events:
             if event.kind in MARKS:
-                axis.axvline(event.time, color=EVENT_COLOURS[event.kind], linewidth=1.2)
+                axis.axvline(event.time, color=EVENT_COLORS[event.kind], linewidth=1.2)
         axis.tick_params(labelsize=8)
     distance.set(xlabel="time s", xlim=(-MARGIN * end, (1.0 + MARGIN) * max(end, TIME_STEP)))
     figure.suptitle(_title(result), fontsize=10, wrap=True)
@@ -79,16 +79,16 @@ def _title(result: RunResult) -> str:
 def _kinds(result: RunResult) -> list[str]:
     """Return the kinds of events in the order of their rows, the last one at the top; reactions have none."""
     there = {event.kind for event in result.events} - {"reaction"}
-    known = ("observation", *EVENT_COLOURS)
+    known = ("observation", *EVENT_COLORS)
     return [*(kind for kind in known if kind in there), *sorted(there.difference(known))][::-1]
 
 
 def _draw_events(axis: Any, result: RunResult, kinds: list[str]) -> None:
     for row, kind in enumerate(kinds):
         times = [event.time for event in result.events if event.kind == kind]
-        colour = SEEN if kind in SILENT_EVENTS else EVENT_COLOURS.get(kind, LARGEST)
+        color = SEEN if kind in SILENT_EVENTS else EVENT_COLORS.get(kind, LARGEST)
         marker, size = ("|", 5.0) if kind in SILENT_EVENTS else ("o", 5.5)
-        axis.plot(times, np.full(len(times), row), marker, color=colour, markersize=size)
+        axis.plot(times, np.full(len(times), row), marker, color=color, markersize=size)
     axis.set(yticks=range(len(kinds)), yticklabels=kinds, ylim=(-0.6, max(len(kinds), 1) - 0.4))
     axis.grid(alpha=0.25)
 
@@ -100,8 +100,8 @@ def _draw_speeds(axis: Any, result: RunResult, robot: Robot, times: Array) -> No
     axis.fill_between(times, largest, color=LARGEST, alpha=0.10, linewidth=0.0)
     axis.plot(times, largest, color=LARGEST, linewidth=1.6, label="largest")
     order = np.argsort(-shares.max(axis=0), kind="stable")[:JOINTS].tolist()
-    for joint, colour in zip(order, WAY_COLOURS, strict=False):
-        axis.plot(times, shares[:, joint], color=colour, linewidth=0.8, label=robot.joint_names[joint])
+    for joint, color in zip(order, WAY_COLORS, strict=False):
+        axis.plot(times, shares[:, joint], color=color, linewidth=0.8, label=robot.joint_names[joint])
     axis.axhline(1.0, color="black", linewidth=0.8, linestyle="--")
     axis.set(ylim=(0.0, 1.3), ylabel="speed\nshare of limit", yticks=np.linspace(0.0, 1.0, 6))
     axis.legend(fontsize=7, ncols=JOINTS + 2, loc="upper center", frameon=False)
@@ -125,7 +125,7 @@ def _draw_distance(axis: Any, result: RunResult, robot: Robot, times: Array) -> 
     shown = np.where(np.isfinite(found), found, np.nan)
     axis.axhline(0.0, color="black", linewidth=0.8)
     if np.isfinite(shown).any():
-        axis.plot(times, 1e3 * shown, color=CLEARANCE_COLOURS[0], linewidth=1.3)
+        axis.plot(times, 1e3 * shown, color=CLEARANCE_COLORS[0], linewidth=1.3)
         low, high = float(np.nanmin(shown)), float(np.nanmax(shown))
         top = min(high, FARTHEST) if low < FARTHEST else high
         axis.set_ylim(1e3 * min(1.1 * low, -0.05 * top), 1e3 * 1.05 * top)

@@ -33,11 +33,11 @@ def hollow_box(x: float, y: float, z: float, thick: float, open_sides: Sequence[
         if side in open_sides:
             continue
         axis, sign = k // 2, 2 * (k % 2) - 1
-        edges, centre = inner + 2 * thick, np.zeros(3)
+        edges, center = inner + 2 * thick, np.zeros(3)
         edges[axis] = thick
-        centre[axis] = sign * (inner[axis] + thick) / 2.0
+        center[axis] = sign * (inner[axis] + thick) / 2.0
         x, y, z = edges
-        found += box(x, y, z, at=centre)
+        found += box(x, y, z, at=center)
     return found
 
 

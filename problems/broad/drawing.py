@@ -92,8 +92,8 @@ def _candidate(rng: np.random.Generator, suite: str, grammar: Grammar, held: Hel
     parts = scene.parts
     if rng.random() < SPRINKLED:
         for _ in range(int(rng.integers(1, MOST_LOOSE + 1))):
-            centre = palms[int(rng.integers(len(palms)))] + rng.normal(0.0, 0.18, 3)
-            parts = [*parts, *place(solid(rng, 0.015, 0.2), shift(*centre))]
+            center = palms[int(rng.integers(len(palms)))] + rng.normal(0.0, 0.18, 3)
+            parts = [*parts, *place(solid(rng, 0.015, 0.2), shift(*center))]
     parts = clear_parts(held.tables.both, _near(parts)[:MOST_OBSTACLES], ends, margin)
     return Candidate(parts, ends, held, representation)
 
@@ -132,9 +132,9 @@ def _aligned(rng: np.random.Generator) -> tuple[Held, Array | None]:
 def _in_the_way(rng: np.random.Generator, scene: Composition, palms: Array) -> Composition:
     """Return a composition moved so that one of its places, or of its parts, is where a palm passes."""
     one = scene.places[int(rng.integers(len(scene.places)))]
-    centre = one.point if rng.random() < 0.5 else scene.parts[int(rng.integers(len(scene.parts)))].pose[:3, 3]
+    center = one.point if rng.random() < 0.5 else scene.parts[int(rng.integers(len(scene.parts)))].pose[:3, 3]
     to = palms[int(rng.integers(len(palms)))] + rng.normal(0.0, 0.05, 3)
-    return scene.placed(shift(*to) @ turn("z", rng.normal(0.0, 0.3)) @ shift(*-centre))
+    return scene.placed(shift(*to) @ turn("z", rng.normal(0.0, 0.3)) @ shift(*-center))
 
 
 def _near(parts: Parts) -> Parts:

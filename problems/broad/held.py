@@ -90,7 +90,7 @@ def _grasped(kind: str, shares: tuple[float, ...], side: int) -> tuple[tuple[Att
 
 
 def _scaled(share: float, low: float, high: float) -> float:
-    """Return the length at a share of an interval [m], in tenths of millimetres."""
+    """Return the length at a share of an interval [m], in tenths of millimeters."""
     return round(low + share * (high - low), 4)
 
 

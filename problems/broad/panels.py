@@ -19,9 +19,9 @@ def windows(rng: np.random.Generator) -> Composition:
         size = rng.uniform(0.19, min(0.36, 0.9 * each), 2)
         y, z = rng.uniform(-1, 1, 2) * (each - size[0], 0.6 * height - size[1]) / 2
         low, high = (y - size[0] / 2, z - size[1] / 2), (y + size[0] / 2, z + size[1] / 2)
-        centre = (k - (count - 1) / 2) * each
-        parts += moved(window(each, height, thick, low, high), 0, centre, 0)
-        places += [at(x, centre + y, z, FORWARD) for x in (-0.12, 0.02, 0.1)]
+        center = (k - (count - 1) / 2) * each
+        parts += moved(window(each, height, thick, low, high), 0, center, 0)
+        places += [at(x, center + y, z, FORWARD) for x in (-0.12, 0.02, 0.1)]
     between = turn("z", float(rng.choice([0.0, 0.0, np.pi / 2, -np.pi / 2])))
     return Composition(parts, places).placed(shift(0, 0, height / 2) @ between)
 

@@ -104,7 +104,7 @@ def feasible(parts: Sequence[Part], groups: Sequence[Group]) -> bool:
 
 
 def obstacles(parts: Sequence[Part]) -> tuple[Obstacle, ...]:
-    """Return parts as obstacles ``part_0`` ..., their numbers rounded to a tenth of a millimetre."""
+    """Return parts as obstacles ``part_0`` ..., their numbers rounded to a tenth of a millimeter."""
     return tuple(_obstacle(f"part_{k}", part) for k, part in enumerate(parts))
 
 

@@ -75,15 +75,15 @@ def clutter(rng: np.random.Generator) -> Composition:
 def pebbles(rng: np.random.Generator) -> Composition:
     """Draw up to 280 tiny solids in clouds."""
     found = _scattered(rng, int(np.exp(rng.uniform(np.log(30), np.log(280)))), 0.008, 0.06)
-    centres = rng.uniform(LOW, HIGH, (int(rng.integers(2, 9)), 3))
+    centers = rng.uniform(LOW, HIGH, (int(rng.integers(2, 9)), 3))
     spread = rng.uniform(0.06, 0.25)
     if rng.random() < 0.7:
         parts = list[Part]()
         for kind, size, pose in found.parts:
             there = pose.copy()
-            there[:3, 3] = centres[int(rng.integers(len(centres)))] + rng.normal(0, spread, 3)
+            there[:3, 3] = centers[int(rng.integers(len(centers)))] + rng.normal(0, spread, 3)
             parts.append(Part(kind, size, there))
-        return Composition(parts, [*places_at(centres), *places_at(rng.uniform(LOW, HIGH, (3, 3)))])
+        return Composition(parts, [*places_at(centers), *places_at(rng.uniform(LOW, HIGH, (3, 3)))])
     return found
 
 

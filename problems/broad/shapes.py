@@ -1,6 +1,6 @@
 """Parts of scenes, and an algebra on lists of them: placed, repeated, mirrored, scaled, nested, cut and jittered.
 
-A part is a primitive with a pose. Lengths are in metres; poses are homogeneous transforms, shape (4, 4). Every function
+A part is a primitive with a pose. Lengths are in meters; poses are homogeneous transforms, shape (4, 4). Every function
 returns new parts and leaves its arguments as they are.
 """
 
@@ -82,12 +82,12 @@ def random_turn(rng: np.random.Generator) -> Array:
 
 
 def box(x: float, y: float, z: float, at: Point = (0.0, 0.0, 0.0)) -> Parts:
-    """Return an upright box by its edges and its centre [m]."""
+    """Return an upright box by its edges and its center [m]."""
     return [Part(BOX, (max(x, THINNEST), max(y, THINNEST), max(z, THINNEST)), shift(*at))]
 
 
 def ball(radius: float, at: Point = (0.0, 0.0, 0.0)) -> Parts:
-    """Return a ball by its radius and centre [m]."""
+    """Return a ball by its radius and center [m]."""
     return [Part(SPHERE, (max(radius, THINNEST), 0.0, 0.0), shift(*at))]
 
 

@@ -64,13 +64,13 @@ def _draw_obstacles(rng: np.random.Generator, tables: RobotTables, ends: Array) 
     scene: list[Obstacle] = []
     for k in range(int(rng.integers(MAX_OBSTACLES + 1))):
         for _ in range(ATTEMPTS):
-            centre = rng.uniform(LOW, HIGH)
+            center = rng.uniform(LOW, HIGH)
             if rng.integers(2):
-                centre = palms[int(rng.integers(len(palms)))] + rng.normal(0.0, PALM_SPREAD, 3)
+                center = palms[int(rng.integers(len(palms)))] + rng.normal(0.0, PALM_SPREAD, 3)
             size, quaternion = rng.uniform(*SIZE, 3), rng.normal(size=4)
             kind = int(rng.integers(4))
             # Data sets refer to problems by their content, these names included.
-            obstacle = primitive(f"thing_{k}", kind, size, np.maximum(centre, LOW), quaternion)
+            obstacle = primitive(f"thing_{k}", kind, size, np.maximum(center, LOW), quaternion)
             if (scene_kernel(robot(), tables, [obstacle]).clearance(ends, MARGIN)[:, 0] >= MARGIN).all():
                 scene.append(obstacle)
                 break

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from paper import realism
 from paper.figure import Made, blank, of_runs
-from paper.rows import PLANNERS, STATIC, colour, installed
+from paper.rows import PLANNERS, STATIC, color, installed
 from paper.static import runs_of
 
 from apex_ompl import planners
@@ -52,10 +52,10 @@ def fid(args: Any) -> Made:
             ends = f"{r.interval[0]:.2f} to {r.interval[1]:.2f}"
             measured = [str(r.dimension), f"{r.fid:.2f}", ends, f"{r.floor:.2f}", f"{r.kid:.4f}", f"{took:.1f}"]
             lines.append([name, row.label, f"{r.made} of {len(mine)}", *measured])
-            axis.bar(k, r.fid, color=colour(row.label))
+            axis.bar(k, r.fid, color=color(row.label))
             axis.plot([k, k], np.maximum(r.interval, 1e-2), color="black", linewidth=1)
             floor = max(floor, r.floor)
-        axis.axhline(floor, color="grey", linestyle=":")
+        axis.axhline(floor, color="gray", linestyle=":")
         axis.set_yscale("log")
         axis.set_title(f"FID, {name} features (dots: floor)")
         axis.set_xticks(range(len(rows)), [row.label for row in rows], rotation=40, fontsize=7, ha="right")

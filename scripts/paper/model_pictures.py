@@ -1,7 +1,7 @@
 """How a model denoises a trajectory, and how diverse its trajectories are, drawn as the paper's figures are.
 
 ``denoising`` shows the paths of both hands at t = 0, 64, 128 and 256 of the reverse process (section IV-A), from above
-and from the side, the obstacles as grey outlines. ``diversity`` shows valid trajectories of one problem: x and y of
+and from the side, the obstacles as gray outlines. ``diversity`` shows valid trajectories of one problem: x and y of
 both hands over the path, from start to goal (section IV-D).
 """
 

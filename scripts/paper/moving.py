@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 from paper.figure import Made, blank, number, of_runs, ratio, ratio_cells
-from paper.rows import BOTH, FAITHFUL, METHODS, MOVING, OURS, PACE, SWEEPS, SWEPT, TASKS, UNGUIDED, colour, installed
+from paper.rows import BOTH, FAITHFUL, METHODS, MOVING, OURS, PACE, SWEEPS, SWEPT, TASKS, UNGUIDED, color, installed
 from paper.static import median, of_task, runs_of
 
 from apex_ompl.evaluation import Results, Row
@@ -133,7 +133,7 @@ def drawn(sizes: dict[str, Any], rows: Sequence[Row]) -> Any:
             at = np.array(list(SIZES.values())) + 0.0012 * (k - len(shown) / 2)  # beside each other
             ours = row.label.startswith((FAITHFUL, OURS))
             axis.errorbar(at, line, ends if ours else None, fmt="--" if "unguided" in row.label else "-", marker="o",
-                          color=colour(row.label), linewidth=1.6 if ours else 0.9, elinewidth=0.8,
+                          color=color(row.label), linewidth=1.6 if ours else 0.9, elinewidth=0.8,
                           label=row.label.removesuffix(IDEAL))  # fmt: skip
         axis.set_title("replans take no time" if ideal else "replans are charged")
         axis.set_xlabel("edge of the moving cube m")

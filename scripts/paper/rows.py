@@ -88,7 +88,7 @@ SWEEPS = (
 )
 """One choice changed at a time, on the levels with a large cube."""
 
-COLOURS = {
+COLORS = {
     OURS: "#0b6e4f", "apex, unguided": "#9fc8b7", FAITHFUL: "#3d5a80", UNGUIDED: "#98b6d8",
     "apex's model alone": "#7a5195", "apex's model alone, unguided": "#c9a6d6", "rrt": "#c8553d",
     "rrtconnect": "#e0a458", "drrt": "#a3443b", "gpmp": "#6a994e", "gpmp2": "#386641", "il": "#bc6c25",
@@ -97,10 +97,10 @@ COLOURS = {
 }  # fmt: skip
 
 
-def colour(label: str) -> str:
-    """Return the colour of a row in pictures; variants have that of their row."""
-    known = [name for name in COLOURS if label == name or label.startswith(f"{name}, ")]
-    return COLOURS[max(known, key=len)] if known else "#999999"
+def color(label: str) -> str:
+    """Return the color of a row in pictures; variants have that of their row."""
+    known = [name for name in COLORS if label == name or label.startswith(f"{name}, ")]
+    return COLORS[max(known, key=len)] if known else "#999999"
 
 
 def installed(rows: Sequence[Row], known: Collection[str]) -> tuple[Row, ...]:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import record
 from paper.figure import Made, blank, number, of_runs, ratio, ratio_cells
-from paper.rows import BOTH, PLANNERS, STATIC, TASKS, colour, installed
+from paper.rows import BOTH, PLANNERS, STATIC, TASKS, color, installed
 
 from apex_ompl import planners
 from apex_ompl.evaluation import Results, Row, Workers, bench
@@ -69,7 +69,7 @@ def failure(args: Namespace) -> Made:
         for t, task in enumerate(TASKS):
             for k, row in enumerate(rows):
                 cell, at = data[f"{task}, {row.label}"], t * (len(rows) + 1) + k
-                axis.bar(at, cell[key] or 0.0, color=colour(row.label), label=None if t else row.label)
+                axis.bar(at, cell[key] or 0.0, color=color(row.label), label=None if t else row.label)
                 if key == "R_f":
                     axis.plot([at, at], cell["interval"], color="black", linewidth=1)
         axis.set_title({"R_f": "R_f %", "S_r": "S_r rad, median of the solved"}[key])
@@ -102,7 +102,7 @@ def size(args: Namespace) -> Made:
             ends = np.transpose([(c["R_f"] - c["interval"][0], c["interval"][1] - c["R_f"]) for c in cells])
             at = np.array([STATIC[level] for level in levels]) + 0.0015 * (k - len(rows) / 2)  # beside each other
             style = "--" if "unguided" in row.label else "-"
-            axis.errorbar(at, line, np.maximum(ends, 0.0), fmt=style, color=colour(row.label), marker="o",
+            axis.errorbar(at, line, np.maximum(ends, 0.0), fmt=style, color=color(row.label), marker="o",
                           linewidth=1.5, elinewidth=0.8, label=row.label)  # fmt: skip
         axis.set_title(task)
         axis.set_xlabel("edge of the cubes m")

@@ -50,16 +50,16 @@ def shelf() -> list[Obstacle]:
     board, depth, front = 0.02, 0.36, 0.56
     columns, levels = (-0.72, -0.24, 0.24, 0.72), (0.12, 0.42, 0.72, 1.02)
     middle = front + depth / 2
-    height, centre = levels[-1] - levels[0] + board, (levels[0] + levels[-1]) / 2
+    height, center = levels[-1] - levels[0] + board, (levels[0] + levels[-1]) / 2
     width = columns[-1] - columns[0] + board
     uprights = [
-        Obstacle(name=f"upright_{k}", box=(depth, board, height), position=(middle, y, centre))
+        Obstacle(name=f"upright_{k}", box=(depth, board, height), position=(middle, y, center))
         for k, y in enumerate(columns)
     ]
     shelves = [
         Obstacle(name=f"board_{k}", box=(depth, width, board), position=(middle, 0.0, z)) for k, z in enumerate(levels)
     ]
-    back = Obstacle(name="back", box=(board, width, height), position=(front + depth + board / 2, 0.0, centre))
+    back = Obstacle(name="back", box=(board, width, height), position=(front + depth + board / 2, 0.0, center))
     return [*uprights, *shelves, back]
 
 

@@ -26,7 +26,7 @@ def proposal_round(
 
     Args:
         count: Number of proposals for each pair of start and goal.
-        repair: Whether candidates are improved by the optimiser.
+        repair: Whether candidates are improved by the optimizer.
         resample: How often colliding candidates are resampled.
         noise: How far they are noised for that, as a share of the schedule.
         temperature: Factor on the standard deviation of the proposals' initial noise.
@@ -77,7 +77,7 @@ class Propose:
 
 @dataclass(frozen=True)
 class Repair:
-    """Optimiser steps on the candidates, the most promising one first.
+    """Optimizer steps on the candidates, the most promising one first.
 
     Attributes:
         min_steps: Budget of steps in all, at least.

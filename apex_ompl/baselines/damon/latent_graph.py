@@ -1,4 +1,4 @@
-"""DAMON's graph: nodes spread over a latent space of states, joined to their neighbours where the robot allows it."""
+"""DAMON's graph: nodes spread over a latent space of states, joined to their neighbors where the robot allows it."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def nearest_nodes(latent: Array, states: Array, z: Array, q: Array, count: int) 
     return near[order[:count]]
 
 
-def neighbours(latent: Array, states: Array, count: int) -> Indices:
+def neighbors(latent: Array, states: Array, count: int) -> Indices:
     """Return the nearest nodes of each node as :func:`nearest_nodes` does, itself left out, shape (N, count)."""
     found = np.empty((len(latent), count), np.int64)
     squares, pool = np.square(latent).sum(axis=1), min(POOL * count + 1, len(latent))
@@ -117,12 +117,12 @@ def consecutive(paths: Indices) -> Indices:
 def edges(
     latent: Array, states: Array, count: int, *, kernel: Kernel, whole: Array, joints: Indices
 ) -> Indices:  # fmt: skip
-    """Return the pairs of neighbours whose straight motion is free of self-collision, the smaller number first.
+    """Return the pairs of neighbors whose straight motion is free of self-collision, the smaller number first.
 
     Args:
         latent: Latent vectors of the nodes, shape (N, d).
         states: Their states, shape (N, J).
-        count: Number of neighbours of a node.
+        count: Number of neighbors of a node.
         kernel: The robot.
         whole: A state of all joints, shape (dof,), for those that the graph has no values of.
         joints: Which joints the graph has values of, shape (J,).
@@ -130,7 +130,7 @@ def edges(
     Returns:
         Shape (M, 2).
     """
-    near = neighbours(latent, states, count)
+    near = neighbors(latent, states, count)
     pairs = np.stack([np.repeat(np.arange(len(latent)), near.shape[1]), near.ravel()], axis=1)
     pairs = np.unique(np.sort(pairs, axis=1), axis=0)
     full = np.repeat(whole[None], len(states), axis=0)

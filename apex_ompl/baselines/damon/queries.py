@@ -20,16 +20,16 @@ class Damon:
     """DAMON (arXiv 2203.13282, IROS 2023): planning on a low-dimensional manifold of the states of safe motions.
 
     A variational autoencoder learns the manifold from the states of valid paths. Offline, nodes are spread over it and
-    joined to their neighbours; online, those that obstacles hit are left out, and A* finds a path over the rest.
+    joined to their neighbors; online, those that obstacles hit are left out, and A* finds a path over the rest.
 
     It is reimplemented from the abstract, and from abstracts of the authors' other papers: the method's section was not
     at hand. These leave open, and here it is: the network (J -> 64 -> 64 -> d with SiLU, trained on joint angles scaled
     by their limits); how nodes are spread (farthest-point sampling of the latent vectors of the training states);
-    neighbours (of the five times as many nodes that are nearest in the latent space the 12 nearest in joint space, as
+    neighbors (of the five times as many nodes that are nearest in the latent space the 12 nearest in joint space, as
     far as a sphere cover proves the straight motion between free of self-collision, and nodes that follow each other
     along a training path); lengths (Euclidean, in joint space); when edges are checked (where the shortest path uses
     one, as in lazy PRM; nodes, too, that spheres neither prove free nor see deep in contact); how a start and a goal
-    that are not on the manifold are reached (by straight motions from the nearest nodes, chosen as neighbours are);
+    that are not on the manifold are reached (by straight motions from the nearest nodes, chosen as neighbors are);
     hands (no part of the manifold; they stay as at the start until the last motion).
 
     Attributes:

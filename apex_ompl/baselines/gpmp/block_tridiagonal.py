@@ -10,7 +10,7 @@ from apex_ompl.types import Array
 
 
 class BlockTridiagonal(NamedTuple):
-    """A symmetric matrix A of n x n blocks of b x b, zero but for its diagonal blocks D_i and their neighbours.
+    """A symmetric matrix A of n x n blocks of b x b, zero but for its diagonal blocks D_i and their neighbors.
 
     Attributes:
         diagonal: Diagonal blocks D_i = A_i,i, symmetric, shape (n, b, b).

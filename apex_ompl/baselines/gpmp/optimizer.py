@@ -7,7 +7,7 @@ Nothing here knows OMPL; clearances are handed in. GPMP2 (Dong, Mukadam, Dellaer
 IJRR 2018) finds the maximum of the posterior, J(theta) = 1/2 sum_i |Phi x_i - x_i+1|^2_Q + 1/2 (eps / sigma)^2 sum_k
 |r(q_k)|^2 + 1/2 sum_k |l(q_k) / sigma_l|^2, by Levenberg-Marquardt steps whose normal equations are block-
 tridiagonal; r are the violations of the safety distance eps as shares of it, l those of the joint limits. GPMP
-(Mukadam, Yan and Boots, ICRA 2016) minimises U(theta) = 1/2 sum_i |Phi x_i - x_i+1|^2_Q + (eps / sigma)^2 int 1/2
+(Mukadam, Yan and Boots, ICRA 2016) minimizes U(theta) = 1/2 sum_i |Phi x_i - x_i+1|^2_Q + (eps / sigma)^2 int 1/2
 |r(q(t))|^2 |q'(t)| dt by steps along its functional gradient theta - mu + K g: g is the gradient of the integral,
 over the length of the path, at interpolated states mapped back to the supports, K the covariance of the supports
 given the ends.
@@ -60,7 +60,7 @@ class Evaluation(NamedTuple):
 
 
 class Optimum(NamedTuple):
-    """What an optimisation came to.
+    """What an optimization came to.
 
     Attributes:
         supports: Positions and velocities, shape (N + 1, 2, dof).
@@ -217,7 +217,7 @@ class FactorGraph(Factors):
 
 @dataclass(frozen=True)
 class CostFunctional(Factors):
-    """The cost functional of GPMP, and its minimisation along the functional gradient."""
+    """The cost functional of GPMP, and its minimization along the functional gradient."""
 
     def evaluate(self, supports: Array) -> Evaluation:
         """Return what supports cost, shape (N + 1, 2, dof)."""

@@ -115,7 +115,7 @@ class IncrementalGPMP2:
         return np.stack([positions, velocities], axis=1)
 
     def problem(self, search: Search, duration: float) -> Any:
-        """Return what is optimised, of motions that last so long [s]: the factor graph."""
+        """Return what is optimized, of motions that last so long [s]: the factor graph."""
         return FactorGraph(*self.terms(search, duration))
 
     def optimum(self, problem: Any, supports: Array, stop: Callable[[], bool]) -> Optimum:
@@ -149,7 +149,7 @@ class IncrementalGPMP(IncrementalGPMP2):
     iterations: int = 20
 
     def problem(self, search: Search, duration: float) -> Any:
-        """Return what is optimised, of motions that last so long [s]: the cost functional."""
+        """Return what is optimized, of motions that last so long [s]: the cost functional."""
         return CostFunctional(*self.terms(search, duration))
 
     def optimum(self, problem: Any, supports: Array, stop: Callable[[], bool]) -> Optimum:

@@ -10,7 +10,7 @@ from torch.nn import functional
 
 from apex_ompl.baselines.imitation.config import NetworkConfig
 from apex_ompl.model.geometry import SHAPES
-from apex_ompl.model.query import WORKSPACE_CENTRE
+from apex_ompl.model.query import WORKSPACE_CENTER
 from apex_ompl.training.conditions import Conditions
 
 OBSTACLE_FEATURES = len(SHAPES) + 3 + 9 + 3  # one-hot shape, position, rotation matrix, size
@@ -112,14 +112,14 @@ class PolicyNetwork(nn.Module):
         """Return tokens of goals and obstacles, (B, C, width), and which of them are there, (B, C)."""
         goal = (conditions.goal - self.mean) / self.deviation
         tokens = [embed(goal[:, list(g)]) for embed, g in zip(self.goals, self.config.groups, strict=True)]
-        centre = goal.new_tensor(WORKSPACE_CENTRE)
+        center = goal.new_tensor(WORKSPACE_CENTER)
         if self.config.obstacles == "point":
-            seen = self.obstacle(conditions.point - centre)[:, None]
+            seen = self.obstacle(conditions.point - center)[:, None]
             mask = torch.ones(len(goal), 1, dtype=torch.bool, device=goal.device)
         else:
             kind = functional.one_hot(conditions.shape, len(SHAPES)).to(goal.dtype)
             turned = conditions.rotation.flatten(2)
-            features = torch.cat([kind, conditions.position - centre, turned, conditions.size], dim=2)
+            features = torch.cat([kind, conditions.position - center, turned, conditions.size], dim=2)
             seen, mask = self.obstacle(features), conditions.mask
         there = torch.cat([mask.new_ones(len(goal), len(tokens)), mask], dim=1)
         return torch.cat([torch.stack(tokens, dim=1), seen], dim=1), there

@@ -66,7 +66,7 @@ class ImitationTrainer:
             torch.manual_seed(config.seed)
             self.network = PolicyNetwork(config.network)
         self.data.fit(self.network)
-        first = "" if config.init is None else self._initialise(config.init)
+        first = "" if config.init is None else self._initialize(config.init)
         self.network.to(device)
         self.step, self.seconds, self._skipped = 0, 0.0, 0
         determining = f"{config.determining}{robot.name}{self.data.digest()}{first}"
@@ -206,7 +206,7 @@ class ImitationTrainer:
         assert self._held_out is not None
         return float(self.loss(network, self._held_out))
 
-    def _initialise(self, folder: str) -> str:
+    def _initialize(self, folder: str) -> str:
         """Take the weights and statistics of a policy where shapes agree, and return the digest of its file."""
         other, about = load_policy_network(folder, robot=self.robot)
         mine = self.network.state_dict()

@@ -24,8 +24,8 @@ class Part(Protocol):
     def high(self) -> Array:
         """Upper corner of the bounding box, shape (3,) [m]."""
 
-    def outside(self, centres: Array, halves: Array) -> Flags:
-        """Which axis-parallel boxes, centres and half sides of shape (N, 3) [m], are proved disjoint from the part."""
+    def outside(self, centers: Array, halves: Array) -> Flags:
+        """Which axis-parallel boxes, centers and half sides of shape (N, 3) [m], are proved disjoint from the part."""
 
     def depth(self, points: Array) -> Array:
         """Return the depth of points, shape (N, 3), below the surface; negative outside, shape (N,) [m]."""
@@ -88,9 +88,9 @@ class Polytope:
         normals = np.concatenate([np.eye(3), -np.eye(3)])
         return cls(normals, np.tile(half, 2), (signs * half)[rows], -half, half)
 
-    def outside(self, centres: Array, halves: Array) -> Flags:
+    def outside(self, centers: Array, halves: Array) -> Flags:
         """See :class:`Part`."""
-        nearest = centres @ self.normals.T - halves @ np.abs(self.normals).T
+        nearest = centers @ self.normals.T - halves @ np.abs(self.normals).T
         return np.asarray((nearest > self.offsets).any(axis=1))
 
     def depth(self, points: Array) -> Array:
@@ -121,9 +121,9 @@ class RoundBody:
         """See :class:`Part`."""
         return np.array([self.radius, self.radius, self.half_length + self.capped * self.radius])
 
-    def outside(self, centres: Array, halves: Array) -> Flags:
+    def outside(self, centers: Array, halves: Array) -> Flags:
         """See :class:`Part`."""
-        near = np.maximum(np.abs(centres) - halves, 0.0)
+        near = np.maximum(np.abs(centers) - halves, 0.0)
         across = np.hypot(near[:, 0], near[:, 1])
         along = near[:, 2] - self.half_length
         if self.capped:

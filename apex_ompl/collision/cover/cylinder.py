@@ -13,8 +13,8 @@ from apex_ompl.types import Array
 LEAVES = 48  # most leaves
 GAPS = np.linspace(0.1, 0.8, 29)[:, None, None, None]  # of the ball behind an end, as shares of the radius
 IN_RING = np.arange(4, 15)[:, None, None]  # balls around an edge
-RING_RADII = np.linspace(0.55, 0.98, 16)[:, None]  # of their centres, as shares of the radius
-SUNK = np.linspace(0.5, 1.5, 6)  # of their centres below the end, as shares of the height of the ring
+RING_RADII = np.linspace(0.55, 0.98, 16)[:, None]  # of their centers, as shares of the radius
+SUNK = np.linspace(0.5, 1.5, 6)  # of their centers below the end, as shares of the height of the ring
 
 
 class _End(NamedTuple):
@@ -23,7 +23,7 @@ class _End(NamedTuple):
     Attributes:
         gap: Gap of the ball behind the end.
         in_ring: Number of balls around the edge.
-        ring: Radius of the ring of their centres.
+        ring: Radius of the ring of their centers.
         sunk: Distance of these from the end.
         ball: Their radius.
     """
@@ -60,14 +60,14 @@ def cylinder_cover(radius: float, half_length: float) -> Cover:
     parts = [(top, top_radii), (top * [1.0, 1.0, -1.0], top_radii), *([(between, between_radii)] if middle else [])]
     low = inner if middle else 0.0  # the parts of the cylinder that the groups answer for
     spans = [(low, half_length / radius), (-half_length / radius, -low), (-inner, inner)][: len(parts)]
-    centres, radii = [np.zeros(3)], [math.hypot(1.0, half_length / radius)]
+    centers, radii = [np.zeros(3)], [math.hypot(1.0, half_length / radius)]
     for lower, upper in spans:
-        centres.append(np.array([0.0, 0.0, (lower + upper) / 2.0]))
+        centers.append(np.array([0.0, 0.0, (lower + upper) / 2.0]))
         radii.append(math.hypot(1.0, (upper - lower) / 2.0))
     sizes = [len(part) for _, part in parts]
     firsts = 1 + len(parts) + np.cumsum([0, *sizes])[:-1]
     return Cover(
-        radius * np.concatenate([np.array(centres), *(part for part, _ in parts)]),
+        radius * np.concatenate([np.array(centers), *(part for part, _ in parts)]),
         radius * np.concatenate([radii, *(part for _, part in parts)]) + PAD,
         np.array([1, *firsts, *[0] * sum(sizes)], np.int64),
         np.array([len(parts), *sizes, *[0] * sum(sizes)], np.int64),

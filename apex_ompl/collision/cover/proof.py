@@ -25,13 +25,13 @@ class Cover:
     """A tree of balls in the frame of a geometry; the union of the leaves contains the solid.
 
     Attributes:
-        centres: Shape (n, 3) [m].
+        centers: Shape (n, 3) [m].
         radii: Shape (n,) [m].
         first: Index of the first child of each ball, shape (n,); the root is ball 0, children follow their parent.
         count: Number of children, shape (n,); 0 for a leaf.
     """
 
-    centres: Array
+    centers: Array
     radii: Array
     first: Indices
     count: Indices
@@ -59,7 +59,7 @@ class Cover:
 
 
 def uncovered_boxes(solid: Solid, cover: Cover) -> Array:
-    """Return the centres of boxes that are not proved to be covered, shape (N, 3) [m]; a proved cover has none."""
+    """Return the centers of boxes that are not proved to be covered, shape (N, 3) [m]; a proved cover has none."""
     part = solid.parts[0]
     if isinstance(part, RoundBody) and part.capped:
         return _uncovered_discs(part, cover)
@@ -71,28 +71,28 @@ def grow_to_cover(solid: Solid, cover: Cover, coarser: float) -> Cover:
     proof = _Proof(solid, cover)
     proof.finest *= coarser
     proof.run(grow=True)
-    return Cover(cover.centres, proof.radii + 2.5 * PAD, cover.first, cover.count)
+    return Cover(cover.centers, proof.radii + 2.5 * PAD, cover.first, cover.count)
 
 
-def distances(points: Array, centres: Array) -> Array:
-    """Return the distances of points, shape (N, 3), to centres, shape (M, 3): shape (N, M)."""
-    square = (points[:, None, 0] - centres[None, :, 0]) ** 2
+def distances(points: Array, centers: Array) -> Array:
+    """Return the distances of points, shape (N, 3), to centers, shape (M, 3): shape (N, M)."""
+    square = (points[:, None, 0] - centers[None, :, 0]) ** 2
     for axis in (1, 2):
-        square += (points[:, None, axis] - centres[None, :, axis]) ** 2
+        square += (points[:, None, axis] - centers[None, :, axis]) ** 2
     return np.asarray(np.sqrt(square))
 
 
-def _farthest_distances(centres: Array, halves: Array, balls: Array) -> Array:
-    """Return the distance of the farthest point of each box to each centre of a ball: shape (N, n) [m].
+def _farthest_distances(centers: Array, halves: Array, balls: Array) -> Array:
+    """Return the distance of the farthest point of each box to each center of a ball: shape (N, n) [m].
 
     Args:
-        centres: Centres of the boxes, shape (N, 3) [m].
+        centers: Centers of the boxes, shape (N, 3) [m].
         halves: Half sides of the boxes, shape (N, 3) [m].
-        balls: Centres of the balls, shape (n, 3) [m].
+        balls: Centers of the balls, shape (n, 3) [m].
     """
-    square = np.zeros((len(centres), len(balls)))
+    square = np.zeros((len(centers), len(balls)))
     for axis in range(3):
-        side = np.abs(centres[:, None, axis] - balls[None, :, axis])
+        side = np.abs(centers[:, None, axis] - balls[None, :, axis])
         side += halves[:, None, axis]
         square += side * side
     return np.asarray(np.sqrt(square, out=square))
@@ -101,7 +101,7 @@ def _farthest_distances(centres: Array, halves: Array, balls: Array) -> Array:
 def worst_excess(far: Array, radii: Array, parents: Indices) -> Array:
     """Return max(far - radius) over each ball and its ancestors: shape (N, n) [m].
 
-    A box whose farthest point is ``far`` from a centre, shape (N, n), lies in the ball and in all its ancestors where
+    A box whose farthest point is ``far`` from a center, shape (N, n), lies in the ball and in all its ancestors where
     the result is not positive.
     """
     excess = far - radii
@@ -115,42 +115,42 @@ class _Proof:
 
     def __init__(self, solid: Solid, cover: Cover) -> None:
         self.solid = solid
-        self.centres, self.radii = cover.centres, cover.radii - PAD
+        self.centers, self.radii = cover.centers, cover.radii - PAD
         self.parents, self.leaves = cover.parents, cover.leaves
         self.finest = max(FINEST, float((solid.high - solid.low).max()) * FINEST_SHARE)
 
     def run(self, grow: bool) -> Array:
-        """Return the centres of the boxes not covered, shape (N, 3); with ``grow`` none, as the radii are enlarged."""
-        which, centres, halves = self._start()
-        while len(centres):
-            keep = self._touching(which, centres, halves)
-            which, centres, halves = which[keep], centres[keep], halves[keep]
+        """Return the centers of the boxes not covered, shape (N, 3); with ``grow`` none, as the radii are enlarged."""
+        which, centers, halves = self._start()
+        while len(centers):
+            keep = self._touching(which, centers, halves)
+            which, centers, halves = which[keep], centers[keep], halves[keep]
             last = bool(len(halves)) and float(halves.max()) * 2.0 <= self.finest
-            uncovered = self._uncovered(centres, halves)
+            uncovered = self._uncovered(centers, halves)
             if grow and last:
-                self._grow(centres[uncovered], halves[uncovered])
+                self._grow(centers[uncovered], halves[uncovered])
                 return np.zeros((0, 3))
-            which, centres, halves = which[uncovered], centres[uncovered], halves[uncovered]
-            if last or len(centres) > TOO_MANY:
-                return centres
+            which, centers, halves = which[uncovered], centers[uncovered], halves[uncovered]
+            if last or len(centers) > TOO_MANY:
+                return centers
             if grow:
-                self._grow_over_points(which, centres)
-            elif len(found := self._counterexamples(which, centres)):
+                self._grow_over_points(which, centers)
+            elif len(found := self._counterexamples(which, centers)):
                 return found
-            which, centres, halves = _halved(which, centres, halves)
+            which, centers, halves = _halved(which, centers, halves)
         return np.zeros((0, 3))
 
     def _start(self) -> tuple[Indices, Array, Array]:
-        which, centres, halves = [], [], []
+        which, centers, halves = [], [], []
         for k, part in enumerate(self.solid.parts):
             size = np.maximum(part.high - part.low, 1e-9)
             counts = np.clip(np.round(size / size.min()), 1, 8).astype(int) if len(self.solid.parts) == 1 else [1] * 3
             axes = [lo + s * (np.arange(n) + 0.5) / n for lo, s, n in zip(part.low, size, counts, strict=True)]
             grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
             which.append(np.full(len(grid), k))
-            centres.append(grid)
+            centers.append(grid)
             halves.append(np.broadcast_to(0.5 * size / counts + 1e-9, grid.shape))
-        return np.concatenate(which), np.concatenate(centres), np.concatenate(halves)
+        return np.concatenate(which), np.concatenate(centers), np.concatenate(halves)
 
     def _by_part(self, which: Indices) -> list[tuple[int, slice]]:
         """Return each part with the slice of its boxes, which are sorted by part."""
@@ -160,18 +160,18 @@ class _Proof:
         starts, stops = [0, *edges.tolist()], [*edges.tolist(), len(which)]
         return [(int(which[a]), slice(a, b)) for a, b in zip(starts, stops, strict=True)]
 
-    def _touching(self, which: Indices, centres: Array, halves: Array) -> Flags:
-        keep = np.ones(len(centres), bool)
+    def _touching(self, which: Indices, centers: Array, halves: Array) -> Flags:
+        keep = np.ones(len(centers), bool)
         for k, rows in self._by_part(which):
-            keep[rows] = ~self.solid.parts[k].outside(centres[rows], halves[rows])
+            keep[rows] = ~self.solid.parts[k].outside(centers[rows], halves[rows])
         return keep
 
-    def _uncovered(self, centres: Array, halves: Array) -> Flags:
+    def _uncovered(self, centers: Array, halves: Array) -> Flags:
         """Which boxes lie in no leaf together with all its ancestors."""
-        result = np.ones(len(centres), bool)
-        for rows in self._chunks(len(centres)):
+        result = np.ones(len(centers), bool)
+        for rows in self._chunks(len(centers)):
             excess = worst_excess(
-                _farthest_distances(centres[rows], halves[rows], self.centres), self.radii, self.parents
+                _farthest_distances(centers[rows], halves[rows], self.centers), self.radii, self.parents
             )
             result[rows] = ~(excess[:, self.leaves] <= 0.0).any(axis=1)
         return result
@@ -180,21 +180,21 @@ class _Proof:
         step = max(1, 200_000 // len(self.radii))
         return [slice(a, a + step) for a in range(0, count, step)]
 
-    def _counterexamples(self, which: Indices, centres: Array) -> Array:
-        """Return the centres that lie in the solid and in no leaf: counterexamples to the cover."""
-        inside = self._touching(which, centres, np.zeros_like(centres))
-        points = centres[inside]
+    def _counterexamples(self, which: Indices, centers: Array) -> Array:
+        """Return the centers that lie in the solid and in no leaf: counterexamples to the cover."""
+        inside = self._touching(which, centers, np.zeros_like(centers))
+        points = centers[inside]
         return points[self._uncovered(points, np.zeros_like(points))]
 
-    def _grow_over_points(self, which: Indices, centres: Array) -> None:
-        points = self._counterexamples(which, centres)
+    def _grow_over_points(self, which: Indices, centers: Array) -> None:
+        points = self._counterexamples(which, centers)
         self._grow(points, np.zeros_like(points))
 
-    def _grow(self, centres: Array, halves: Array) -> None:
+    def _grow(self, centers: Array, halves: Array) -> None:
         """Enlarge, for each box, the leaf with the smallest excess, and its ancestors."""
-        while len(centres):
-            rows = self._chunks(len(centres))[0]
-            far = _farthest_distances(centres[rows], halves[rows], self.centres)
+        while len(centers):
+            rows = self._chunks(len(centers))[0]
+            far = _farthest_distances(centers[rows], halves[rows], self.centers)
             excess = worst_excess(far, self.radii, self.parents)[:, self.leaves]
             least = excess.min(axis=1)
             # The worst half first: the balls that they enlarge often contain the other boxes too.
@@ -204,15 +204,15 @@ class _Proof:
                 while ball >= 0:
                     self.radii[ball] = max(self.radii[ball], row[ball] + 1e-9)
                     ball = int(self.parents[ball])
-            done = np.zeros(len(centres), bool)
+            done = np.zeros(len(centers), bool)
             done[rows] = worst | (least <= 0.0)
-            centres, halves = centres[~done], halves[~done]
+            centers, halves = centers[~done], halves[~done]
 
 
-def _halved(which: Indices, centres: Array, halves: Array) -> tuple[Indices, Array, Array]:
+def _halved(which: Indices, centers: Array, halves: Array) -> tuple[Indices, Array, Array]:
     """Return the eight octants of each box; boxes of one part stay together."""
     signs = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
-    parts = (centres[:, None] + halves[:, None] * signs).reshape(-1, 3)
+    parts = (centers[:, None] + halves[:, None] * signs).reshape(-1, 3)
     return np.repeat(which, 8), parts, np.repeat(0.5 * halves, 8, axis=0)
 
 
@@ -223,15 +223,15 @@ def _uncovered_discs(part: RoundBody, cover: Cover) -> Array:
     have to be small everywhere, since a tight ball touches the capsule along a whole circle.
     """
     radii, parents, leaves = cover.radii - PAD, cover.parents, cover.leaves
-    across = np.hypot(cover.centres[:, 0], cover.centres[:, 1]) + part.radius
+    across = np.hypot(cover.centers[:, 0], cover.centers[:, 1]) + part.radius
     ends = np.array([[0.0, 0.0, sign * part.half_length] for sign in (-1.0, 1.0)])
-    caps = worst_excess(distances(ends, cover.centres) + part.radius, radii, parents)[:, leaves]
+    caps = worst_excess(distances(ends, cover.centers) + part.radius, radii, parents)[:, leaves]
     left = ends[(caps > 0.0).all(axis=1)]
     if part.half_length == 0.0:
         return left
     low, high = np.array([-part.half_length]), np.array([part.half_length])
     for _ in range(24):
-        far = [np.hypot(z[:, None] - cover.centres[:, 2], across) for z in (low, high)]
+        far = [np.hypot(z[:, None] - cover.centers[:, 2], across) for z in (low, high)]
         excess = worst_excess(np.maximum(*far), radii, parents)[:, leaves]
         uncovered = (excess > 0.0).all(axis=1)
         low, high = low[uncovered], high[uncovered]

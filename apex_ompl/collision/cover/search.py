@@ -28,7 +28,7 @@ FLAT_BELOW = 6  # up to so many leaves are children of the root
 class _Level:
     """A level of the tree: balls, and for each group of points the ball that contains it."""
 
-    centres: Array
+    centers: Array
     owner: Indices
     gap: float
     radii: Array = field(default_factory=lambda: np.zeros(0))
@@ -46,12 +46,12 @@ class _Search:
         self.candidates, self.effort = candidates, effort
         self.rng = np.random.default_rng(0)
 
-    def gaps(self, centres: Array, depth: Array | None = None) -> Array:
+    def gaps(self, centers: Array, depth: Array | None = None) -> Array:
         """Return the gap of each ball if it contained one group alone, shape (balls, groups) [m]."""
         if depth is None:
-            depth = self.solid.depth(centres)
-        square = np.einsum("ij,ij->i", self.points, self.points) - 2.0 * centres @ self.points.T
-        square += np.einsum("ij,ij->i", centres, centres)[:, None]
+            depth = self.solid.depth(centers)
+        square = np.einsum("ij,ij->i", self.points, self.points) - 2.0 * centers @ self.points.T
+        square += np.einsum("ij,ij->i", centers, centers)[:, None]
         far = np.sqrt(np.maximum(square, 0.0, out=square), out=square)
         if not self.single:
             far = np.maximum.reduceat(far, self.starts, axis=1)
@@ -94,27 +94,27 @@ class _Search:
 
     def refine(self, level: _Level, turns: int, steps: int) -> _Level:
         """Alternate between assigning points and moving balls, and return the best level found."""
-        centres = level.centres.copy()
+        centers = level.centers.copy()
         best = level
         best_gap = np.inf
-        reach = np.full(len(centres), 0.25 * float((self.solid.high - self.solid.low).max()))
+        reach = np.full(len(centers), 0.25 * float((self.solid.high - self.solid.low).max()))
         for _ in range(turns):
-            needs = self.gaps(centres)
+            needs = self.gaps(centers)
             owner = needs.argmin(axis=0)
             gap = float(needs.min(axis=0).max())
             if gap < best_gap - 1e-6:
-                best, best_gap = _Level(centres.copy(), owner, gap), gap
+                best, best_gap = _Level(centers.copy(), owner, gap), gap
             point_owner = owner[self.groups]
-            for k in range(len(centres)):
+            for k in range(len(centers)):
                 own = self.points[point_owner == k]
                 if len(own):
-                    centres[k], reach[k] = self._recentre(centres[k], own, reach[k], steps)
-        needs = self.gaps(centres)
+                    centers[k], reach[k] = self._recenter(centers[k], own, reach[k], steps)
+        needs = self.gaps(centers)
         gap = float(needs.min(axis=0).max())
-        return _Level(centres, needs.argmin(axis=0), gap) if gap < best_gap else best
+        return _Level(centers, needs.argmin(axis=0), gap) if gap < best_gap else best
 
-    def _recentre(self, centre: Array, own: Array, reach: float, steps: int) -> tuple[Array, float]:
-        """Return the centre with the smallest gap around the ball's points, by random search, and the next reach."""
+    def _recenter(self, center: Array, own: Array, reach: float, steps: int) -> tuple[Array, float]:
+        """Return the center with the smallest gap around the ball's points, by random search, and the next reach."""
         count = 12 if self.effort == 1 else 24
         if len(own) > 80:  # the extreme points alone determine the radius
             own = own[np.unique((own @ DIRECTIONS.T).argmax(axis=0))]
@@ -122,27 +122,27 @@ class _Search:
         step = min(reach, float(np.ptp(own, axis=0).max()) * 0.5 + 1e-4)
         for _ in range(steps):
             shift = self.rng.normal(size=(count, 3)) * (step * self.rng.random((count, 1)))
-            tries = np.concatenate([centre[None], centre + shift])
+            tries = np.concatenate([center[None], center + shift])
             square = np.einsum("ij,ij->i", own, own) - 2.0 * tries @ own.T
             far = np.sqrt(np.maximum(square.max(axis=1) + np.einsum("ij,ij->i", tries, tries), 0.0))
             k = int(np.argmin(far - self.solid.depth(tries)))
             if k:
                 moved = max(moved, float(np.linalg.norm(shift[k - 1])))
-                centre = tries[k]
+                center = tries[k]
             else:
                 step *= 0.5
-        return centre, max(2.0 * moved, 1e-3)
+        return center, max(2.0 * moved, 1e-3)
 
     def remove_balls(self, level: _Level, gap: float) -> _Level:
         """Remove balls as long as the others can cover the points within the gap."""
         tries = (0, 3, 8)[self.effort - 1]
-        while len(level.centres) > 1:
-            needs = self.gaps(level.centres)
+        while len(level.centers) > 1:
+            needs = self.gaps(level.centers)
             needs[level.owner, np.arange(self.number)] = np.inf
-            missed = np.zeros(len(level.centres))  # gap that results if other balls contain these points
+            missed = np.zeros(len(level.centers))  # gap that results if other balls contain these points
             np.maximum.at(missed, level.owner, needs.min(axis=0))
             for k in np.argsort(missed, kind="stable")[:tries]:
-                fewer = np.delete(level.centres, k, axis=0)
+                fewer = np.delete(level.centers, k, axis=0)
                 found = self.refine(_Level(fewer, level.owner, np.inf), 8, 4)
                 if found.gap <= gap:
                     level = found
@@ -157,7 +157,7 @@ class _Search:
         level = self.refine(self.greedy(gap, most * 3 // 2), turns, steps)
         if self.effort > 1 and level.gap <= 1.3 * gap:  # a sharp corner may keep the gap from being met
             level = self.remove_balls(level, max(level.gap, gap))
-        if len(level.centres) <= most:
+        if len(level.centers) <= most:
             return level
         level = self.greedy(gap, most)
         wanted = max(level.gap, gap)
@@ -183,12 +183,12 @@ def search(solid: Solid, gaps: Sequence[float], most: int, effort: int) -> Cover
     The arguments are those of :func:`apex_ompl.collision.cover.spheres.make_cover`.
     """
     rng = np.random.default_rng(0)
-    surface, inner, centres = ((350, 120, 350), (1200, 700, 1500), (3500, 1500, 4000))[effort - 1]
-    candidates = solid.inside(centres)
+    surface, inner, centers = ((350, 120, 350), (1200, 700, 1500), (3500, 1500, 4000))[effort - 1]
+    candidates = solid.inside(centers)
     points = _points(solid, surface, inner, rng)
     run = _Search(solid, points, np.arange(len(points)), candidates, effort)
     if effort > 1:
-        run.candidates = np.concatenate([candidates, _towards(run, candidates, rng.permutation(len(points))[:centres])])
+        run.candidates = np.concatenate([candidates, _towards(run, candidates, rng.permutation(len(points))[:centers])])
     leaves = run.cover(0.9 * gaps[-1], most)
     if effort > 1:  # cover also what lies between the coarse points
         points = _points(solid, 6 * surface, 2 * inner, rng)
@@ -197,12 +197,12 @@ def search(solid: Solid, gaps: Sequence[float], most: int, effort: int) -> Cover
     levels = [_tightened(run, leaves)]
     owner = levels[0].owner
     for wanted in reversed(gaps[:-1]):
-        if len(levels[-1].centres) <= FLAT_BELOW:
+        if len(levels[-1].centers) <= FLAT_BELOW:
             break
         points, owner = _extreme_points(points, owner)
         run = _Search(solid, points, owner, candidates[:: max(1, len(candidates) // 1500)], effort)
-        level = _tightened(run, run.cover(max(wanted, COARSER * levels[-1].gap), len(levels[-1].centres)))
-        if len(level.centres) < 0.6 * len(levels[-1].centres):
+        level = _tightened(run, run.cover(max(wanted, COARSER * levels[-1].gap), len(levels[-1].centers)))
+        if len(level.centers) < 0.6 * len(levels[-1].centers):
             levels.append(level)
             points, owner = run.points, level.owner[run.groups]
     return _tree(points, levels)
@@ -217,7 +217,7 @@ def _points(solid: Solid, surface: int, inner: int, rng: np.random.Generator) ->
 
 
 def _towards(run: _Search, candidates: Array, chosen: Indices) -> Array:
-    """Return centres between points and their best candidates, for corners finer than the grid of candidates."""
+    """Return centers between points and their best candidates, for corners finer than the grid of candidates."""
     best = candidates[run.gaps(candidates)[:, chosen].argmin(axis=0)]
     points = run.points[chosen]
     between = points + np.array([0.2, 0.4, 0.6, 0.8])[np.arange(len(points)) % 4, None] * (best - points)
@@ -244,9 +244,9 @@ def _tightened(run: _Search, level: _Level) -> _Level:
     """Return a level without empty balls, each radius as small as the ball's points allow."""
     used, owner = np.unique(level.owner, return_inverse=True)
     radii = np.zeros(len(used))
-    far = np.linalg.norm(run.points - level.centres[level.owner[run.groups]], axis=1)
+    far = np.linalg.norm(run.points - level.centers[level.owner[run.groups]], axis=1)
     np.maximum.at(radii, owner.ravel()[run.groups], far)
-    return _Level(level.centres[used], owner.ravel(), level.gap, radii)
+    return _Level(level.centers[used], owner.ravel(), level.gap, radii)
 
 
 def _tree(points: Array, levels: list[_Level]) -> Cover:
@@ -257,8 +257,8 @@ def _tree(points: Array, levels: list[_Level]) -> Cover:
     top = len(levels)
     children: dict[tuple[int, int], list[tuple[int, int]]] = {}
     for height in range(top - 1, -1, -1):
-        upper = levels[height + 1].owner if height + 1 < top else np.zeros(len(levels[height].centres), int)
-        for ball in range(len(levels[height].centres)):
+        upper = levels[height + 1].owner if height + 1 < top else np.zeros(len(levels[height].centers), int)
+        for ball in range(len(levels[height].centers)):
             children.setdefault((height + 1, int(upper[ball])), []).append((height, ball))
     root = (top, 0)
 
@@ -281,19 +281,19 @@ def _tree(points: Array, levels: list[_Level]) -> Cover:
         count.append(len(found))
         order += found
         k += 1
-    centres, radii = [], []
-    middle = _enclosing_centre(points)
+    centers, radii = [], []
+    middle = _enclosing_center(points)
     for height, ball in order:
-        centres.append(middle if height == top else levels[height].centres[ball])
+        centers.append(middle if height == top else levels[height].centers[ball])
         whole = height == top
         radii.append(np.linalg.norm(points - middle, axis=1).max() if whole else levels[height].radii[ball])
-    return Cover(np.array(centres), np.array(radii), np.array(first, np.int64), np.array(count, np.int64))
+    return Cover(np.array(centers), np.array(radii), np.array(first, np.int64), np.array(count, np.int64))
 
 
-def _enclosing_centre(points: Array) -> Array:
-    """Return the approximate centre of the smallest enclosing ball of points, shape (N, 3) (Badoiu, Clarkson 2003)."""
-    centre = 0.5 * (points.min(axis=0) + points.max(axis=0))
+def _enclosing_center(points: Array) -> Array:
+    """Return the approximate center of the smallest enclosing ball of points, shape (N, 3) (Badoiu, Clarkson 2003)."""
+    center = 0.5 * (points.min(axis=0) + points.max(axis=0))
     for k in range(1, 300):
-        far = points[np.argmax(((points - centre) ** 2).sum(axis=1))]
-        centre = centre + (far - centre) / (k + 1) ** 1.2
-    return np.asarray(centre)
+        far = points[np.argmax(((points - center) ** 2).sum(axis=1))]
+        center = center + (far - center) / (k + 1) ** 1.2
+    return np.asarray(center)

@@ -101,7 +101,7 @@ def make_cover(
 
 
 def unproved(geometry: coal.CollisionGeometry, cover: Cover) -> Array:
-    """Return the centres of boxes that are not proved to be covered, shape (N, 3) [m]; a proved cover has none."""
+    """Return the centers of boxes that are not proved to be covered, shape (N, 3) [m]; a proved cover has none."""
     return uncovered_boxes(solid_of(geometry), cover)
 
 
@@ -115,18 +115,18 @@ def quality(
     convex parts that represent it; its gaps are distances to its triangles.
     """
     solid = solid_of(geometry)
-    centres, radii = cover.centres[cover.leaves], cover.radii[cover.leaves]
-    low, high = (centres - radii[:, None]).min(axis=0), (centres + radii[:, None]).max(axis=0)
+    centers, radii = cover.centers[cover.leaves], cover.radii[cover.leaves]
+    low, high = (centers - radii[:, None]).min(axis=0), (centers + radii[:, None]).max(axis=0)
     points = rng.uniform(low, high, (samples, 3))
-    in_leaf = (distances(points, centres) <= radii).any(axis=1)
+    in_leaf = (distances(points, centers) <= radii).any(axis=1)
     inner = rng.uniform(solid.low, solid.high, (samples, 3))
     volume = float(solid.contains(inner).mean() * np.prod(solid.high - solid.low))
     ratio = float(in_leaf.mean() * np.prod(high - low)) / max(volume, 1e-12)
     chosen = rng.choice(len(radii), samples, p=radii**2 / (radii**2).sum())
     directions = rng.normal(size=(samples, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    points = centres[chosen] + radii[chosen, None] * directions
-    gaps_to = distances(points, centres) - radii
+    points = centers[chosen] + radii[chosen, None] * directions
+    gaps_to = distances(points, centers) - radii
     gaps_to[np.arange(samples), chosen] = np.inf
     points = points[(gaps_to > 0.0).all(axis=1)][: max(samples // 10, 1)]
     dot, request = coal.Sphere(1e-9), coal.DistanceRequest()
@@ -139,7 +139,7 @@ def quality(
 
 
 def write_covers(path: Path | str, covers: Mapping[str, Cover]) -> None:
-    """Write covers by the keys of their shapes, rounded outward to micrometres so that they stay proved.
+    """Write covers by the keys of their shapes, rounded outward to micrometers so that they stay proved.
 
     Raises:
         MissingFileError: The file cannot be written.
@@ -149,7 +149,7 @@ def write_covers(path: Path | str, covers: Mapping[str, Cover]) -> None:
         cover = _rounded(covers[key])
         balls = [
             [*(round(float(x), 6) + 0.0 for x in c), round(float(r), 6), int(f), int(n)]
-            for c, r, f, n in zip(cover.centres, cover.radii, cover.first, cover.count, strict=True)
+            for c, r, f, n in zip(cover.centers, cover.radii, cover.first, cover.count, strict=True)
         ]
         rows.append(f"  {json.dumps(key)}: [\n" + ",\n".join(f"   {json.dumps(ball)}" for ball in balls) + "\n  ]")
     text = f'{{\n "schema": {json.dumps(SCHEMA)},\n "columns": {json.dumps(COLUMNS)},\n "covers": {{\n'
@@ -214,8 +214,8 @@ def _cover_of(rows: Any, file: str, field: str) -> Cover:
 def _capsule(part: RoundBody, gap: float, most: int) -> Cover:
     """Return balls of equal size along the axis of a capsule of radius r and half length h.
 
-    A ball that protrudes by e has the radius r + e, and the centre of the last one is e before the end of the axis.
-    A ball contains the cylinder up to s = sqrt(2 r e + e^2) on either side of its centre, so n balls cover the
+    A ball that protrudes by e has the radius r + e, and the center of the last one is e before the end of the axis.
+    A ball contains the cylinder up to s = sqrt(2 r e + e^2) on either side of its center, so n balls cover the
     capsule when e + (n - 1) s = h, which is solved for e by bisection.
     """
     gap = min(gap, max(0.5 * part.radius, 1e-3))
@@ -231,20 +231,20 @@ def _capsule(part: RoundBody, gap: float, most: int) -> Cover:
         number += 1
     step = np.sqrt(2 * part.radius * high + high * high)
     z = (2.0 * np.arange(number) - (number - 1)) * step
-    centres = np.stack([0.0 * z, 0.0 * z, z], axis=1)
+    centers = np.stack([0.0 * z, 0.0 * z, z], axis=1)
     radii = np.full(number, part.radius + high)
     if number > 1:
-        centres = np.concatenate([np.zeros((1, 3)), centres])
+        centers = np.concatenate([np.zeros((1, 3)), centers])
         radii = np.concatenate([[part.half_length + part.radius], radii])
     first, count = np.zeros(len(radii), np.int64), np.zeros(len(radii), np.int64)
     if number > 1:
         first[0], count[0] = 1, number
-    return _rounded(Cover(centres, radii + 4 * PAD, first, count))
+    return _rounded(Cover(centers, radii + 4 * PAD, first, count))
 
 
 def _rounded(cover: Cover) -> Cover:
-    """Return a cover rounded to micrometres whose balls contain the given ones."""
-    centres = np.round(cover.centres, 6)
-    shift = np.linalg.norm(centres - cover.centres, axis=1)
+    """Return a cover rounded to micrometers whose balls contain the given ones."""
+    centers = np.round(cover.centers, 6)
+    shift = np.linalg.norm(centers - cover.centers, axis=1)
     radii = np.round(np.ceil((cover.radii + shift) * 1e6 - 1e-4) / 1e6, 6)
-    return Cover(centres, radii, cover.first, cover.count)
+    return Cover(centers, radii, cover.first, cover.count)

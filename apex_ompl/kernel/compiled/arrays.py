@@ -23,7 +23,7 @@ Pairs = Annotated[Integers, 2]
 Spans = Annotated[Integers, 2]  # first and number
 Vectors = Annotated[Floats, 3]
 Rotations = Annotated[Floats, 3, 3]
-Balls = Annotated[Floats, 4]  # centre and radius
+Balls = Annotated[Floats, 4]  # center and radius
 
 
 class RobotArrays(NamedTuple):
@@ -34,17 +34,17 @@ class RobotArrays(NamedTuple):
     are placed at every state, ``lazy`` ones, which are inner joints of clusters, only where balls around cluster and
     part are not enough.
 
-    ``cluster_ball`` holds centre and radius of a ball around all of a cluster's solids in the frame of
+    ``cluster_ball`` holds center and radius of a ball around all of a cluster's solids in the frame of
     ``cluster_joint``, for all values of its inner joints; ``cluster_outer`` is the radius around its leaf spheres,
-    ``cluster_spread`` the largest distance of a sphere's centre from the ball's, ``cluster_speed`` the largest speed
-    of such a centre in that frame, per unit of ``q[cluster_dof]``.
+    ``cluster_spread`` the largest distance of a sphere's center from the ball's, ``cluster_speed`` the largest speed
+    of such a center in that frame, per unit of ``q[cluster_dof]``.
 
     A cluster is made of parts, ``cluster_parts``: the bodies that are fixed to its joint, and each finger, or all as
     one. ``part_ball`` and ``part_outer`` are what ``cluster_ball`` and ``cluster_outer`` are, around a part alone, for
     each of BINS ranges of equal length of values of ``q[cluster_dof]``; ``cluster_range`` is the lowest value, and the
     number of ranges per unit, or 0. ``part_lazy`` are the inner joints of a part, ``part_bodies`` its bodies.
 
-    A node is a sphere (``node_centre`` in the frame of its body's joint, ``node_radius``) around the part of the solid
+    A node is a sphere (``node_center`` in the frame of its body's joint, ``node_radius``) around the part of the solid
     that the leaves below cover; ``node_outer`` is a radius around the leaves themselves. ``body_inner`` says which of
     ``inner_ball`` are inside of a body's solid, in the frame of its joint.
 
@@ -89,7 +89,7 @@ class RobotArrays(NamedTuple):
     cluster_spread: Floats
     cluster_speed: Floats
     cluster_range: Annotated[Floats, 2]
-    node_centre: Vectors
+    node_center: Vectors
     node_radius: Floats
     node_outer: Floats
     body_inner: Spans

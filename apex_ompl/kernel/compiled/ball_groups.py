@@ -13,7 +13,7 @@ from apex_ompl.kernel.compiled.signed_distance import distance, primitive_distan
 
 
 @inlined
-def _lower_to(kind: int, balls: Floats, rotation: Floats, centre: Floats, size: Floats, least: Floats) -> None:
+def _lower_to(kind: int, balls: Floats, rotation: Floats, center: Floats, size: Floats, least: Floats) -> None:
     """Lower ``least``, shape (G,), to the signed distances of balls, shape (4, G), from a primitive [m].
 
     Its numbers are read before the loop, and its kind is to be a constant, so that several balls are taken at a time.
@@ -22,7 +22,7 @@ def _lower_to(kind: int, balls: Floats, rotation: Floats, centre: Floats, size: 
     r00, r10, r20 = rotation[0, 0], rotation[1, 0], rotation[2, 0]
     r01, r11, r21 = rotation[0, 1], rotation[1, 1], rotation[2, 1]
     r02, r12, r22 = rotation[0, 2], rotation[1, 2], rotation[2, 2]
-    px, py, pz, sizes = centre[0], centre[1], centre[2], (size[0], size[1], size[2])
+    px, py, pz, sizes = center[0], center[1], center[2], (size[0], size[1], size[2])
     for n in range(len(least)):
         dx, dy, dz = x[n] - px, y[n] - py, z[n] - pz
         a = r00 * dx + r10 * dy + r20 * dz
@@ -35,15 +35,15 @@ def _lower_to(kind: int, balls: Floats, rotation: Floats, centre: Floats, size: 
 @inlined
 def lower_to_distances(s: SceneArrays, o: int, balls: Floats, least: Floats) -> None:
     """Lower ``least``, shape (G,), to the signed distances of balls, shape (4, G), from an obstacle [m]."""
-    kind, rotation, centre, size = s.kind[o], s.rotation[o], s.offset[o], s.size[o]
+    kind, rotation, center, size = s.kind[o], s.rotation[o], s.offset[o], s.size[o]
     if kind == BOX:
-        _lower_to(BOX, balls, rotation, centre, size, least)
+        _lower_to(BOX, balls, rotation, center, size, least)
     elif kind == CYLINDER:
-        _lower_to(CYLINDER, balls, rotation, centre, size, least)
+        _lower_to(CYLINDER, balls, rotation, center, size, least)
     elif kind == CAPSULE:
-        _lower_to(CAPSULE, balls, rotation, centre, size, least)
+        _lower_to(CAPSULE, balls, rotation, center, size, least)
     elif kind == SPHERE:
-        _lower_to(SPHERE, balls, rotation, centre, size, least)
+        _lower_to(SPHERE, balls, rotation, center, size, least)
     else:
         for n in range(len(least)):
             d = distance(s, o, balls[0, n], balls[1, n], balls[2, n]) - balls[3, n]
@@ -83,8 +83,8 @@ def group_clearances(
         sf: Floats of the scene.
         sg: Singles of the scene.
         seen: Which obstacles count, shape (obstacles,).
-        outer: Centres and radii of the balls around clusters, shape (C, 4, G) [m].
-        balls: Centres and radii, shape (G, C, 1 + M, 4) [m]: C clusters of a group with M balls each, behind a ball
+        outer: Centers and radii of the balls around clusters, shape (C, 4, G) [m].
+        balls: Centers and radii, shape (G, C, 1 + M, 4) [m]: C clusters of a group with M balls each, behind a ball
             that contains these.
         limit: Larger clearances are given as this [m].
         least: Room, shape (C, G).

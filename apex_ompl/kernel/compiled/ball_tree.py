@@ -9,16 +9,16 @@ from apex_ompl.kernel.compiled.layout import Floats, Integers
 
 
 @inlined
-def _select(centres: Floats, order: Integers, axis: int, first: int, last: int, middle: int) -> None:
+def _select(centers: Floats, order: Integers, axis: int, first: int, last: int, middle: int) -> None:
     """Order the items of a range so that those before ``middle`` are not behind it along an axis (quickselect)."""
     low, high = first, last - 1
     while low < high:
-        pivot = centres[order[(low + high) // 2], axis]
+        pivot = centers[order[(low + high) // 2], axis]
         i, j = low, high
         while i <= j:
-            while centres[order[i], axis] < pivot:
+            while centers[order[i], axis] < pivot:
                 i += 1
-            while centres[order[j], axis] > pivot:
+            while centers[order[j], axis] > pivot:
                 j -= 1
             if i <= j:
                 order[i], order[j] = order[j], order[i]
@@ -32,11 +32,11 @@ def _select(centres: Floats, order: Integers, axis: int, first: int, last: int, 
 
 
 @entry_point
-def median_order(centres: Floats, order: Integers, ranges: Integers) -> None:
+def median_order(centers: Floats, order: Integers, ranges: Integers) -> None:
     """Order items so that the halves of any range that halving leads to are apart along its longest side.
 
     Args:
-        centres: Places of the items, shape (N, 3).
+        centers: Places of the items, shape (N, 3).
         order: Numbers of the items, shape (N,).
         ranges: Room for ranges that wait, shape (n, 2), n longer than twice the depth of the tree.
     """
@@ -51,24 +51,24 @@ def median_order(centres: Floats, order: Integers, ranges: Integers) -> None:
         for i in range(3):
             low, high = math.inf, -math.inf
             for k in range(first, last):
-                low, high = min(low, centres[order[k], i]), max(high, centres[order[k], i])
+                low, high = min(low, centers[order[k], i]), max(high, centers[order[k], i])
             if high - low > longest:
                 axis, longest = i, high - low
         middle = (first + last) // 2
-        _select(centres, order, axis, first, last, middle)
+        _select(centers, order, axis, first, last, middle)
         ranges[top, 0], ranges[top, 1], ranges[top + 1, 0], ranges[top + 1, 1] = first, middle, middle, last
         top += 2
 
 
 @entry_point
 def node_balls(corners: Floats, first: Integers, last: Integers, balls: Floats, halves: Floats) -> None:
-    """Write for each node the bounding box of the corners of its triangles, and a ball around them with its centre.
+    """Write for each node the bounding box of the corners of its triangles, and a ball around them with its center.
 
     Args:
         corners: Corners of triangles, or points, shape (T, k, 3) [m].
         first: First triangle of each node, shape (n,).
         last: The one behind its last, shape (n,).
-        balls: Gets centre and radius, shape (n, 4) [m].
+        balls: Gets center and radius, shape (n, 4) [m].
         halves: Gets the half edges of the boxes, shape (n, 3) [m].
     """
     for n in range(len(first)):

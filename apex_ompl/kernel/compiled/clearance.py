@@ -1,6 +1,6 @@
 """Signed clearance of the sphere cover, and its gradient with respect to the state.
 
-The clearance to the scene is min (d_o(x_n) - r_n) over obstacles o and leaf spheres n with centre x_n and radius r_n,
+The clearance to the scene is min (d_o(x_n) - r_n) over obstacles o and leaf spheres n with center x_n and radius r_n,
 d_o being the signed distance to the obstacle; between links it is min (|x_m - x_n| - r_m - r_n). The gradient is that
 of the nearest pair, n . J with the unit vector n from one to the other and the point's Jacobian J.
 """
@@ -173,7 +173,7 @@ def gradient_to_obstacle(t: RobotArrays, s: SceneArrays, w: Workspace, found: Ne
 
 @inlined
 def gradient_between_bodies(t: RobotArrays, w: Workspace, found: Nearest, out: Floats) -> None:
-    """Add the gradient of the distance between two leaves to ``out`` (dof,); zero where their centres meet."""
+    """Add the gradient of the distance between two leaves to ``out`` (dof,); zero where their centers meet."""
     ja, jb = t.body_joint[found[1]], t.body_joint[found[3]]
     x, y, z = node_position(t, w, ja, found[2])
     u, v, r = node_position(t, w, jb, found[4])

@@ -26,14 +26,14 @@ def _local(pose: Floats, x: float, y: float, z: float) -> Point:
 
 @inlined
 def _from_box(ball: Floats, half: Floats, x: float, y: float, z: float) -> float:
-    """Return the distance of a point from a box around the centre of a node's ball [m]."""
+    """Return the distance of a point from a box around the center of a node's ball [m]."""
     x, y, z = abs(x - ball[0]) - half[0], abs(y - ball[1]) - half[1], abs(z - ball[2]) - half[2]
     return float(math.sqrt(max(x, 0.0) ** 2 + max(y, 0.0) ** 2 + max(z, 0.0) ** 2))
 
 
 @inlined
 def _world(pose: Floats, ball: Floats) -> Point:
-    """Return the centre of a ball that is given in the frame of a pose, shape (4, 4)."""
+    """Return the center of a ball that is given in the frame of a pose, shape (4, 4)."""
     return (
         pose[0, 0] * ball[0] + pose[0, 1] * ball[1] + pose[0, 2] * ball[2] + pose[0, 3],
         pose[1, 0] * ball[0] + pose[1, 1] * ball[1] + pose[1, 2] * ball[2] + pose[1, 3],

@@ -31,7 +31,7 @@ def radius(g: PairBuffers, s: int) -> float:
 def _climb(corners: Corners, g: PairBuffers, s: int, x: float, y: float, z: float) -> int:
     """Return the corner of the hull on side ``s`` that is farthest along a direction in its frame.
 
-    From the corner that was found last, by way of neighbours that are farther: where none is, no corner is.
+    From the corner that was found last, by way of neighbors that are farther: where none is, no corner is.
     """
     points, first, graph, at = corners.points, g.first[s], g.graph[s], g.at[s]
     best = points[first + at, 0] * x + points[first + at, 1] * y + points[first + at, 2] * z
@@ -51,7 +51,7 @@ def _climb(corners: Corners, g: PairBuffers, s: int, x: float, y: float, z: floa
 def support(corners: Corners, g: PairBuffers, s: int, x: float, y: float, z: float) -> Vector:
     """Return the point of the core of side ``s`` that is farthest along a direction, in the world [m]."""
     points = corners.points
-    kind, o = g.kind[s], g.centre[s]
+    kind, o = g.kind[s], g.center[s]
     if kind == SPHERE:
         return o[0], o[1], o[2]
     r, size = g.rotation[s], g.size[s]

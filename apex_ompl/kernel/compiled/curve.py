@@ -48,7 +48,7 @@ def set_state(knots: Floats, states: Floats, rates: Floats, u: float, out: Float
 def _set_polyline(knots: Floats, states: Floats, a: float, b: float, middle: Floats, w: Workspace) -> None:
     """Set step and deviation for a polyline: the chord, and the largest distance of a vertex from it."""
     empty, half = states[:0], 0.5 * (b - a)
-    dof, centre = len(middle), a + half
+    dof, center = len(middle), a + half
     set_state(knots, states, empty, b, w.end)
     for i in range(dof):
         w.step[i] = w.end[i]
@@ -61,7 +61,7 @@ def _set_polyline(knots: Floats, states: Floats, a: float, b: float, middle: Flo
         return
     k = piece_of(knots, a) + 1
     while k < len(knots) and knots[k] < b:
-        along = min(max((knots[k] - centre) / half, -1.0), 1.0)
+        along = min(max((knots[k] - center) / half, -1.0), 1.0)
         for i in range(dof):
             w.deviation[i] = max(w.deviation[i], abs(states[k, i] - middle[i] - along * w.step[i]))
         k += 1

@@ -79,7 +79,7 @@ def _crossing(corners: Floats, t: int, y: float, z: float) -> tuple[int, float]:
         f = e + 1 if e < 2 else 0
         y0, z0, y1, z1 = corners[t, e, 1], corners[t, e, 2], corners[t, f, 1], corners[t, f, 2]
         if y0 <= y < y1 or y1 <= y < y0:
-            # From the lower end, so that neighbours compute the same side bit for bit.
+            # From the lower end, so that neighbors compute the same side bit for bit.
             swap = y1 < y0
             if swap:
                 y0, z0, y1, z1 = y1, z1, y0, z0

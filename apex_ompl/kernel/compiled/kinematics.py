@@ -70,8 +70,8 @@ def point_position(w: Workspace, j: int, c: Floats) -> tuple[float, float, float
 
 @inlined
 def node_position(t: RobotArrays, w: Workspace, j: int, n: int) -> tuple[float, float, float]:
-    """Return the centre of node ``n``, fixed to joint ``j``, in the world [m]."""
-    return point_position(w, j, t.node_centre[n])
+    """Return the center of node ``n``, fixed to joint ``j``, in the world [m]."""
+    return point_position(w, j, t.node_center[n])
 
 
 @inlined
@@ -121,7 +121,7 @@ def is_near_ball(
     while top > 0:
         top -= 1
         n = w.stack[top]
-        c, apart = t.node_centre[n], radii[n] + reach
+        c, apart = t.node_center[n], radii[n] + reach
         if (x - c[0]) ** 2 + (y - c[1]) ** 2 + (z - c[2]) ** 2 > apart * apart:
             continue
         if t.node_count[n] == 0:

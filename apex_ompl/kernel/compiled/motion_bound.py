@@ -17,8 +17,8 @@ since a point that has moved by m stays within arm_i of the axis, and an arc is 
     |p''| <= sum_i arm_i |step_i| (|step_i| + 2 sum_k |step_k|),  k the revolute joints between the root and i,
 
 the latter by the Jacobi identity; prismatic joints have arm 1 and no square of their own. The code sums from the tip:
-``levers`` is the sum of |step_i| arm_i so far. ``linear`` is v of the centre of the cluster's ball; the remainder adds
-what differs for centres of spheres up to ``cluster_spread`` away, the deviation from the straight motion, which is
+``levers`` is the sum of |step_i| arm_i so far. ``linear`` is v of the center of the cluster's ball; the remainder adds
+what differs for centers of spheres up to ``cluster_spread`` away, the deviation from the straight motion, which is
 propagated as m is, and what moves inside the cluster.
 """
 

@@ -76,7 +76,7 @@ def _widen(w: Workspace, state: Floats, middle: Floats, along: float) -> None:
 @inlined
 def _set_motion(path: Floats, starts: Integers, a: int, b: int, middle: Floats, w: Workspace) -> None:
     """Set step, deviation and half width of ``w`` for the path from state ``a`` to ``b`` around ``middle``."""
-    centre, dof = (a + b) // 2, len(middle)
+    center, dof = (a + b) // 2, len(middle)
     _state(path, starts, b, w.end)
     for i in range(dof):
         w.step[i] = 0.5 * w.end[i]
@@ -84,11 +84,11 @@ def _set_motion(path: Floats, starts: Integers, a: int, b: int, middle: Floats, 
     _state(path, starts, a, w.end)
     for i in range(dof):
         w.step[i] -= 0.5 * w.end[i]
-    _widen(w, w.end, middle, 2.0 * (a - centre) / (b - a))
+    _widen(w, w.end, middle, 2.0 * (a - center) / (b - a))
     _state(path, starts, b, w.end)
-    _widen(w, w.end, middle, 2.0 * (b - centre) / (b - a))
+    _widen(w, w.end, middle, 2.0 * (b - center) / (b - a))
     for k in range(piece_of(starts, a) + 1, piece_of(starts, b) + 1):
-        _widen(w, path[k], middle, 2.0 * (starts[k] - centre) / (b - a))
+        _widen(w, path[k], middle, 2.0 * (starts[k] - center) / (b - a))
     for i in range(dof):
         w.half_width[i] = max(w.half_width[i], abs(w.step[i]) + w.deviation[i]) + 1e-12  # against rounding
         w.deviation[i] += 1e-12

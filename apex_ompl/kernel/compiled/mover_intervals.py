@@ -1,6 +1,6 @@
 """Times at which a ball that stands still may meet a mover, in closed form.
 
-In the frame of the mover, at a time T behind its stamp, a ball's centre is at p + u T, and the ball meets the mover
+In the frame of the mover, at a time T behind its stamp, a ball's center is at p + u T, and the ball meets the mover
 grown by the ball's radius and the margin, R(T) = R + g T with g the growth of the margin, 0 before the stamp. The set
 of such T is an interval: the distance is convex in T, and R linear. For
 
@@ -118,7 +118,7 @@ def meeting_times(m: MoverArrays, o: int, x: float, y: float, z: float, radius: 
     Args:
         m: The movers.
         o: Number of the mover.
-        x: Centre of the ball [m].
+        x: Center of the ball [m].
         y: The same.
         z: The same.
         radius: Of the ball [m].

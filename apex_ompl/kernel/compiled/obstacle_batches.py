@@ -57,7 +57,7 @@ def least_distances(
         sf: See ``si``.
         sg: See ``si``.
         owner: The scene of each, shape (T,).
-        balls: Centres and radii, shape (B, 4, N) [m].
+        balls: Centers and radii, shape (B, 4, N) [m].
         room: Shape (N,).
         least: Gets the distances.
     """
@@ -83,7 +83,7 @@ def clearances_alone(
         sf: See ``si``.
         sg: See ``si``.
         outer: Balls that contain those of a cluster, shape (C, 4, G) [m].
-        balls: Centres and radii, shape (G, C, 1 + M, 4): M balls of each of C clusters behind the outer one [m].
+        balls: Centers and radii, shape (G, C, 1 + M, 4): M balls of each of C clusters behind the outer one [m].
         limit: Larger clearances are given as this [m].
         room: Shape (C, G).
         clearances: Gets the clearances.

@@ -48,7 +48,7 @@ def _set_node(h: ShapeArrays, g: PairBuffers, s: int, node: int) -> None:
         if corner <= POINT:
             g.first[s], g.corners[s] = POINT - corner, 1
         for i in range(3):
-            g.centre[s, i] = o[i]
+            g.center[s, i] = o[i]
     else:
         g.kind[s], g.size[s, 0] = SPHERE, b[3]
         if s == 1:
@@ -56,7 +56,7 @@ def _set_node(h: ShapeArrays, g: PairBuffers, s: int, node: int) -> None:
             for i in range(3):
                 g.size[s, i] = h.node_half[node, i]
         for i in range(3):
-            g.centre[s, i] = o[i] + r[i, 0] * b[0] + r[i, 1] * b[1] + r[i, 2] * b[2]
+            g.center[s, i] = o[i] + r[i, 0] * b[0] + r[i, 1] * b[1] + r[i, 2] * b[2]
 
 
 @inlined
@@ -113,7 +113,7 @@ def _nodes_apart(h: ShapeArrays, g: PairBuffers, m: int, n: int) -> float:
 @outlined
 def _ball_and_box_bound(h: ShapeArrays, g: PairBuffers) -> float:
     """Return a lower bound of the distance of a ball on side 0 from a box on side 1 during the motion [m]."""
-    r, a, b, half = g.rotation[1], g.centre[0], g.centre[1], g.size[1]
+    r, a, b, half = g.rotation[1], g.center[0], g.center[1], g.size[1]
     x, y, z = _in_frame(r, b[0] - a[0], b[1] - a[1], b[2] - a[2])
     x = math.copysign(max(abs(x) - half[0], 0.0), x)
     y = math.copysign(max(abs(y) - half[1], 0.0), y)

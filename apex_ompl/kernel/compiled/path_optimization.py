@@ -80,7 +80,7 @@ def _take_away(factor: Floats, k: int, last: int, end: int, panel: Floats) -> No
 
 
 @reassociating_inlined
-def _factorise(factor: Floats, band: int, panel: Floats) -> bool:
+def _factorize(factor: Floats, band: int, panel: Floats) -> bool:
     """Replace a matrix by its upper Cholesky factor; both are zero beyond ``band`` from the diagonal.
 
     Rows are taken eight at a time, so that a row below is read and written once for all of them; ``panel`` (PANEL,) is
@@ -134,7 +134,7 @@ def _newton_step(
     for i in range(n):
         if held[i]:
             step[i] = 0.0
-    if not _factorise(factor, band, panel):
+    if not _factorize(factor, band, panel):
         return False
     for i in range(n):
         step[i] /= factor[i, i]
@@ -189,7 +189,7 @@ def descend(
         control: Control points.
         settings: Settings.
         b: Buffers.
-        width: Number of neighbouring control points that a sample depends on.
+        width: Number of neighboring control points that a sample depends on.
     """
     points, dof = control.shape
     n = (points - 2 * pinned) * dof

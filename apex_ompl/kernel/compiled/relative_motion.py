@@ -3,7 +3,7 @@
 From the tip to the root the joints between two shapes form one chain: those of the moving side up to the lowest common
 joint, then those of the other side down to its joint, whose motion counts with the opposite sign. Along this chain the
 bounds are those of :mod:`apex_ompl.kernel.compiled.motion_bound`, of adaptive collision checking (Schwarzer, Saha and
-Latombe 2005) and of Taylor's theorem, for all points of a ball with centre c and radius s around the moving shape:
+Latombe 2005) and of Taylor's theorem, for all points of a ball with center c and radius s around the moving shape:
 
     arm_i = |a_i x (c - o_i)| + s + m,
     velocity = sum_i step_i a_i x (c - o_i),    turn = sum_i step_i a_i.
@@ -49,7 +49,7 @@ def place_shape(f: Frames, h: ShapeArrays, row: int, g: PairBuffers, s: int) -> 
     for i in range(3):
         g.origin[s, i] = o[i] + r[i, 0] * p[0] + r[i, 1] * p[1] + r[i, 2] * p[2]
         g.ball[s, i] = o[i] + r[i, 0] * ball[0] + r[i, 1] * ball[1] + r[i, 2] * ball[2]
-        g.centre[s, i], g.size[s, i] = g.origin[s, i], h.size[row, i]
+        g.center[s, i], g.size[s, i] = g.origin[s, i], h.size[row, i]
         for k in range(3):
             g.rotation[s, i, k] = r[i, 0] * a[0, k] + r[i, 1] * a[1, k] + r[i, 2] * a[2, k]
     g.ball[s, 3] = ball[3]
@@ -118,7 +118,7 @@ def set_relative_motion(f: Frames, g: PairBuffers, s: int, joint: int, other: in
 
 @inlined
 def _least(corners: Corners, g: PairBuffers, s: int, x: float, y: float, z: float) -> float:
-    """Return the least value of direction . (p - c) over the piece of side ``s``, c the centre of the side's ball."""
+    """Return the least value of direction . (p - c) over the piece of side ``s``, c the center of the side's ball."""
     p = support(corners, g, s, -x, -y, -z)
     c = g.ball[s]
     along = x * (p[0] - c[0]) + y * (p[1] - c[1]) + z * (p[2] - c[2])

@@ -12,9 +12,9 @@ def next_obstacles(s: SceneArrays, x: float, y: float, z: float, radius: float, 
 
     Args:
         s: The scene.
-        x: Centre of the ball [m].
-        y: Centre of the ball [m].
-        z: Centre of the ball [m].
+        x: Center of the ball [m].
+        y: Center of the ball [m].
+        z: Center of the ball [m].
         radius: Radius of the ball [m], which may change from call to call; a ball that is not a number meets all.
         k: Node to begin with: 0, or the one that the call before returned.
 

@@ -25,11 +25,11 @@ class ShapeArrays(NamedTuple):
     triangles in ``root`` (else -1). An inner node has its first child in ``child``, the second stands behind it; a leaf
     has -1 there, and the first of its three corners in ``corner``, or POINT less the place of a single point. A hull
     may be that of balls around points, whose radius is its ``size``. Balls of nodes are in the shape's frame, with the
-    half edges of the nodes' bounding boxes around the same centres in ``node_half``. Triangles lie at most ``depth``
+    half edges of the nodes' bounding boxes around the same centers in ``node_half``. Triangles lie at most ``depth``
     below the hull [m].
 
     A hull of many corners has the place of its first corner in ``edge_first`` as its ``graph`` (else -1). The
-    neighbours of corner k, which count from 0 as the corners do, are those from ``edge_first[graph + k]`` to
+    neighbors of corner k, which count from 0 as the corners do, are those from ``edge_first[graph + k]`` to
     ``edge_first[graph + k + 1]`` in ``edge_end``.
 
     Bodies come first, in the order of the robot's tables.
@@ -55,7 +55,7 @@ class ShapeArrays(NamedTuple):
 
 
 class Corners(NamedTuple):
-    """Corners of hulls and triangles, and the neighbours of those of large hulls, see :class:`ShapeArrays`."""
+    """Corners of hulls and triangles, and the neighbors of those of large hulls, see :class:`ShapeArrays`."""
 
     points: Vectors
     edge_first: Integers
@@ -75,18 +75,18 @@ class PairBuffers(NamedTuple):
         kind: Kind of the convex piece that is looked at on a side.
         first: First of its points.
         corners: Number of its points.
-        graph: Place of the neighbours of its points, -1 where it has none.
+        graph: Place of the neighbors of its points, -1 where it has none.
         at: The point that was found last.
         nodes: Pairs of nodes that wait in a traversal.
         chain: Joints between the two sides.
         rotation: Rotations of the shapes in the world.
         origin: Origins of the shapes in the world [m].
-        centre: Centres of the pieces in the world, those of hulls are origins of their frames [m].
+        center: Centers of the pieces in the world, those of hulls are origins of their frames [m].
         size: Sizes of the pieces.
         normal: Unit vector from side 0 to side 1 that separates the pieces.
         simplex: Points of the difference of the pieces [m].
-        ball: Centres and radii of the balls around the shapes in the world [m].
-        velocity: Displacement of the centre of a side's ball as seen from the other side, to first order [m].
+        ball: Centers and radii of the balls around the shapes in the world [m].
+        velocity: Displacement of the center of a side's ball as seen from the other side, to first order [m].
         turn: Rotation of a side as seen from the other side, to first order.
         arc_bound: Bound on the displacement of a side's points as seen from the other side [m].
         remainder: Bound on what that displacement differs from the first order by [m].
@@ -101,7 +101,7 @@ class PairBuffers(NamedTuple):
     chain: Annotated[Integers, 256]
     rotation: Annotated[Floats, 2, 3, 3]
     origin: Annotated[Floats, 2, 3]
-    centre: Annotated[Floats, 2, 3]
+    center: Annotated[Floats, 2, 3]
     size: Annotated[Floats, 2, 3]
     normal: Annotated[Floats, 3]
     simplex: Annotated[Floats, 4, 3]

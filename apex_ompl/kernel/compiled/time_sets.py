@@ -38,7 +38,7 @@ def add_span(spans: Floats, count: int, first: float, last: float) -> int:
 
 @inlined
 def _merged(spans: Floats, count: int, k: int, first: float, last: float) -> int:
-    """Extend the nearer neighbour of place ``k`` by an interval; return the number of intervals."""
+    """Extend the nearer neighbor of place ``k`` by an interval; return the number of intervals."""
     if k == count or (k > 0 and first - spans[k - 1, 1] < spans[k, 0] - last):
         spans[k - 1, 1] = last
     else:

@@ -39,7 +39,7 @@ def _crossings(corners: Floats, x: float, y: float, z: float) -> int:
     """Return how often a ray along +x leaves a mesh, less how often it enters: the winding number of a closed mesh.
 
     A triangle meets the ray only if its projection onto the plane of y and z contains the point. The projections of
-    neighbours share an edge bit for bit, so a ray through an edge or a corner is counted once.
+    neighbors share an edge bit for bit, so a ray through an edge or a corner is counted once.
     """
     total = 0
     for t in range(corners.shape[0]):

@@ -83,7 +83,7 @@ def _added_up(builder: Any, vectors: list[Any]) -> list[Any]:
 
 
 def _pairs_added(builder: Any, first: Any, second: Any) -> Any:
-    """Return the sums of neighbours in a vector, and behind them those in another one, if there is one."""
+    """Return the sums of neighbors in a vector, and behind them those in another one, if there is one."""
     other = ir.Constant(first.type, ir.Undefined) if second is None else second
     width = first.type.count * (1 if second is None else 2)
     halves = []

@@ -16,10 +16,10 @@ class Workspace(NamedTuple):
     Attributes:
         rotation: Rotations of the joints in the world.
         origin: Origins of the joints in the world [m].
-        ball: Centres of the clusters' balls in the world [m].
+        ball: Centers of the clusters' balls in the world [m].
         ball_rows: The same and their radii, a row each of x, y, z and radius.
         opened: Whether inner joints of a part of a cluster and ``root`` of its bodies are those of this state.
-        root: Centres of the bodies' root spheres in the world [m].
+        root: Centers of the bodies' root spheres in the world [m].
         stack: Nodes that wait in a traversal of trees of spheres.
         angle: Values of joints that are to be placed [rad], [m].
         cosine: Their cosines.

@@ -78,7 +78,7 @@ class Portfolio:
         if self.sources and search.request.hastens:
             quicken(search, request.following.piece(request.join, request.following.end))
         if self.sources and not search.over():
-            self._optimise(search)
+            self._optimize(search)
         if search.best is None and fallback is not None:
             search.best, search.part = search.following(fallback), "evade"
         if search.best is None and aside:
@@ -102,7 +102,7 @@ class Portfolio:
         if nearer is not None:
             search.best, search.part = search.following(nearer), "wait"
 
-    def _optimise(self, search: Search) -> None:
+    def _optimize(self, search: Search) -> None:
         """Improve motions in space and time while there is time."""
         pool, goals = search.pool(), search.goals
         if not len(goals):

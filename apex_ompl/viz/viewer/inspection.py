@@ -18,7 +18,7 @@ from apex_ompl.paths.spline import Spline
 from apex_ompl.scene.scripts import problem_at
 from apex_ompl.types import Array
 from apex_ompl.util.resolution import FINE_RESOLUTION
-from apex_ompl.viz.appearance import DENOISED, PROPOSAL_COLOURS
+from apex_ompl.viz.appearance import DENOISED, PROPOSAL_COLORS
 from apex_ompl.viz.viewer.editor import Editor
 from apex_ompl.viz.viewer.player import Player
 from apex_ompl.viz.viewer.server import Do, asked
@@ -46,7 +46,7 @@ class Inspection:
             draw = server.gui.add_button("draw proposals")
             self._said = server.gui.add_markdown("")
             self._seen = {
-                kind: server.gui.add_checkbox(kind, initial_value=kind != "sampled") for kind in PROPOSAL_COLOURS
+                kind: server.gui.add_checkbox(kind, initial_value=kind != "sampled") for kind in PROPOSAL_COLORS
             }
             self._step = server.gui.add_slider("denoising", min=0, max=STEPS, step=1, initial_value=STEPS)
         player.replaced.append(self._forget)
@@ -101,7 +101,7 @@ class Inspection:
             "not repaired": improved[~np.array(proved)],
         }  # fmt: skip
         for kind, control in groups.items():
-            self._redraw(kind, control, model.spline, PROPOSAL_COLOURS[kind])
+            self._redraw(kind, control, model.spline, PROPOSAL_COLORS[kind])
         self._estimates = [*estimates, guided]
         self.denoise()
         self._layers()
@@ -114,13 +114,13 @@ class Inspection:
             k = min(int(self._step.value), len(self._estimates) - 1)
             self._redraw("denoising", self._estimates[k], self._model.spline, DENOISED)
 
-    def _redraw(self, name: str, control: Array, spline: Spline, colour: str) -> None:
+    def _redraw(self, name: str, control: Array, spline: Spline, color: str) -> None:
         old = self._nodes.pop(name, None)
         if old is not None:
             old.remove()
         if len(control):
             paths = spline.path(control)[:, :: max(1, spline.states // STATES)]
-            self._nodes[name] = self._player.scenes[0].show_lines(f"proposals/{name}", list(paths), colour)
+            self._nodes[name] = self._player.scenes[0].show_lines(f"proposals/{name}", list(paths), color)
 
     def _layers(self, _: Any = None) -> None:
         for kind, box in self._seen.items():

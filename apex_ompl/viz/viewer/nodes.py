@@ -23,9 +23,9 @@ STILL = 1e-7  # change of a pose's numbers below which it is not sent
 SIZE = 2.0  # of a drawn point, in radii of its ball
 
 
-def rgb(colour: str) -> tuple[int, int, int]:
-    """Return the numbers of a colour ``#rrggbb``."""
-    red, green, blue, *_ = ImageColor.getrgb(colour)
+def rgb(color: str) -> tuple[int, int, int]:
+    """Return the numbers of a color ``#rrggbb``."""
+    red, green, blue, *_ = ImageColor.getrgb(color)
     return red, green, blue
 
 
@@ -46,12 +46,12 @@ def add_item(api: Any, above: str, item: Item) -> Any:
     if item.mesh is None:
         points = np.asarray(item.points, np.float32)
         return api.add_point_cloud(
-            name, points, rgb(item.colour), point_size=SIZE * item.radius, point_shape="circle", precision="float32",
+            name, points, rgb(item.color), point_size=SIZE * item.radius, point_shape="circle", precision="float32",
             **at,
         )  # fmt: skip
     vertices, faces = lighter(item.mesh, LINK_TRIANGLES if item.layer == ROBOT else MOST_TRIANGLES)
     return api.add_mesh_simple(
-        name, vertices, faces, color=rgb(item.colour), opacity=None if item.opacity >= 1.0 else item.opacity,
+        name, vertices, faces, color=rgb(item.color), opacity=None if item.opacity >= 1.0 else item.opacity,
         flat_shading=len(faces) < FLAT, side="double", cast_shadow=False, receive_shadow=False, **at,
     )  # fmt: skip
 
@@ -66,13 +66,13 @@ def lighter(mesh: trimesh.Trimesh, most: int) -> tuple[NDArray[np.float32], NDAr
     return vertices, np.asarray(faces, np.uint32)
 
 
-def paint(item: Item, handle: Any, colour: str) -> None:
-    """Draw an item in a colour, if it is not drawn so."""
+def paint(item: Item, handle: Any, color: str) -> None:
+    """Draw an item in a color, if it is not drawn so."""
     if item.mesh is None:
-        if not np.array_equal(handle.colors, rgb(colour)):
-            handle.colors = np.array(rgb(colour), np.uint8)
-    elif tuple(handle.color) != rgb(colour):
-        handle.color = rgb(colour)
+        if not np.array_equal(handle.colors, rgb(color)):
+            handle.colors = np.array(rgb(color), np.uint8)
+    elif tuple(handle.color) != rgb(color):
+        handle.color = rgb(color)
 
 
 class RobotNodes:

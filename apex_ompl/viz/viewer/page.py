@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from apex_ompl.util.files import check_writable, write_atomically
-from apex_ompl.viz.appearance import BACKGROUND, CLEARANCE_COLOURS, LIMIT_COLOURS, NOW, focus_of
+from apex_ompl.viz.appearance import BACKGROUND, CLEARANCE_COLORS, LIMIT_COLORS, NOW, focus_of
 from apex_ompl.viz.viewer.nodes import rgb
 from apex_ompl.viz.viewer.scene import BrowserScene
 from apex_ompl.viz.viewer.server import serving
@@ -150,11 +150,11 @@ def _curves(sources: Sequence[Shown], duration: float) -> tuple[str, float, floa
         figure.subplots_adjust(left=0.13, right=0.97, top=0.98, bottom=0.13, hspace=0.12)
         for k, one in enumerate(timed):
             curves, style = one.curves, ("-", "--", ":", "-.")[k % 4]
-            shade = CLEARANCE_COLOURS[k % len(CLEARANCE_COLOURS)]
+            shade = CLEARANCE_COLORS[k % len(CLEARANCE_COLORS)]
             axes[0].plot(curves["time"], curves["clearance"], style, color=shade, linewidth=1.0, label=one.name)
-            for name, colour in LIMIT_COLOURS.items():
+            for name, color in LIMIT_COLORS.items():
                 label = name if k == 0 else None
-                axes[1].plot(curves["time"], curves[name], style, color=colour, linewidth=0.8, label=label)
+                axes[1].plot(curves["time"], curves[name], style, color=color, linewidth=0.8, label=label)
         axes[0].set(ylabel="clearance mm", ylim=(0.0, None), xlim=(0.0, duration))
         if len(timed) > 1:
             axes[0].legend(fontsize=5, loc="upper right", frameon=False)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from apex_ompl.types import Array
-from apex_ompl.viz.appearance import CLEARANCE_COLOURS, LIMIT_COLOURS, NOW
+from apex_ompl.viz.appearance import CLEARANCE_COLORS, LIMIT_COLORS, NOW
 from apex_ompl.viz.viewer.page import HOLD, draw
 from apex_ompl.viz.viewer.server import Do, asked
 from apex_ompl.viz.viewer.shown import Shown, markdown
@@ -138,18 +138,18 @@ class Player:
             return
         times = max(timed, key=lambda one: one.duration).curves["time"]
 
-        def line(one: Shown, name: str, colour: str) -> tuple[str, Array, str]:
+        def line(one: Shown, name: str, color: str) -> tuple[str, Array, str]:
             label = name if len(timed) == 1 else f"{name}, {one.name}"
-            return colour, np.interp(times, one.curves["time"], one.curves[name], right=np.nan), label
+            return color, np.interp(times, one.curves["time"], one.curves[name], right=np.nan), label
 
-        colours = [CLEARANCE_COLOURS[k % len(CLEARANCE_COLOURS)] for k in range(len(timed))]
-        gaps = [line(one, "clearance", colour) for one, colour in zip(timed, colours, strict=True)]
+        colors = [CLEARANCE_COLORS[k % len(CLEARANCE_COLORS)] for k in range(len(timed))]
+        gaps = [line(one, "clearance", color) for one, color in zip(timed, colors, strict=True)]
         self._add_plot("clearance mm", times, gaps, max(float(np.nanmax(values)) for _, values, _ in gaps))
-        shares = [line(one, name, colour) for one in timed for name, colour in LIMIT_COLOURS.items()]
+        shares = [line(one, name, color) for one in timed for name, color in LIMIT_COLORS.items()]
         self._add_plot("share of limits", times, shares, 1.0)
 
     def _add_plot(self, title: str, times: Array, lines: Sequence[tuple[str, Array, str]], top: float) -> None:
-        series = [{"label": "s"}, *({"label": label, "stroke": colour, "width": 1.5} for colour, _, label in lines)]
+        series = [{"label": "s"}, *({"label": label, "stroke": color, "width": 1.5} for color, _, label in lines)]
         data = (times, *(values for _, values, _ in lines), np.full(len(times), np.nan))
         series.append({"label": "now", "stroke": NOW, "width": 3, "points": {"show": True, "size": 8}})
         scales = {"x": {"time": False}, "y": {"range": (0.0, 1.05 * top + 1e-6)}}

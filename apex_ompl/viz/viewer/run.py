@@ -13,7 +13,7 @@ from apex_ompl.errors import ParameterError
 from apex_ompl.scene.bodies import MOTION, Obstacle
 from apex_ompl.types import Array
 from apex_ompl.util.validation import check_array, check_nonnegative
-from apex_ompl.viz.appearance import RUN_COLOURS, RUN_OPACITIES, body_item
+from apex_ompl.viz.appearance import RUN_COLORS, RUN_OPACITIES, body_item
 from apex_ompl.viz.viewer.nodes import add_item, turn_of
 from apex_ompl.viz.viewer.scene import BrowserScene
 from apex_ompl.viz.viewer.shown import Shown
@@ -162,7 +162,7 @@ class LayerNodes:
                 continue
             if before is not None:
                 before[1].remove()
-            item = replace(body_item(body, layer), colour=RUN_COLOURS[layer], opacity=RUN_OPACITIES[layer])
+            item = replace(body_item(body, layer), color=RUN_COLORS[layer], opacity=RUN_OPACITIES[layer])
             handle = add_item(self.scene.api, self.scene.root, item)
             known[name] = body, handle
 
@@ -171,7 +171,7 @@ class LayerNodes:
         if old is not None:
             old.remove()
         if states is not None and len(states) > 1:
-            self._motions[layer] = self.scene.show_lines(layer, [states], RUN_COLOURS[layer], 0.008)
+            self._motions[layer] = self.scene.show_lines(layer, [states], RUN_COLORS[layer], 0.008)
 
     def _show_event(self, number: int, event: tuple[float, str] | None, time: float) -> None:
         late = event is None or time - event[0] > EVENT_TIME

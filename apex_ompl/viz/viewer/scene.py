@@ -20,7 +20,7 @@ from apex_ompl.viz.appearance import (
     EDGE,
     OBSTACLES,
     SOLID,
-    WAY_COLOURS,
+    WAY_COLORS,
     Item,
     body_item,
     end_links,
@@ -108,11 +108,11 @@ class BrowserScene:
         """
         touching = {body for contact in contacts for body in (contact.first, contact.second)} if fault else set()
         for item, handle in nodes.handles:
-            paint(item, handle, CONTACT if item.body in touching else item.colour)
+            paint(item, handle, CONTACT if item.body in touching else item.color)
         self._touching[name] = touching
         known = set().union(*self._touching.values())
         for item, handle in self._static.values():
-            paint(item, handle, CONTACT if item.body in known else item.colour)
+            paint(item, handle, CONTACT if item.body in known else item.color)
         label = self._labels.pop(name, None)
         if label is not None:
             label.remove()
@@ -123,27 +123,25 @@ class BrowserScene:
             self._labels[name] = self.api.add_label(f"{self.root}/why {plain(name)}", f"{name}: {fault}", position=at)
 
     def show_ways(self, states: Sequence[Array]) -> None:
-        """Draw the ways of the hands through states, each in a colour of its own."""
+        """Draw the ways of the hands through states, each in a color of its own."""
         links, robot = end_links(self.setup.robot), self.setup.robot
         for k, (link, way) in enumerate(zip(links, link_ways(robot, links, states), strict=True)):
-            colour = WAY_COLOURS[k % len(WAY_COLOURS)]
-            self._ways.append(self._add_lines(f"ways/{plain(link)}", [way], colour, WAY))
+            color = WAY_COLORS[k % len(WAY_COLORS)]
+            self._ways.append(self._add_lines(f"ways/{plain(link)}", [way], color, WAY))
 
     def set_ways_visible(self, visible: bool) -> None:
         """Show or hide the ways of the hands."""
         for node in self._ways:
             node.visible = visible
 
-    def show_lines(self, name: str, paths: Sequence[Array], colour: str, thickness: float = LINE) -> Any:
+    def show_lines(self, name: str, paths: Sequence[Array], color: str, thickness: float = LINE) -> Any:
         """Draw the ways of the hands along several paths, each of shape (N, dof), as one node, and return it."""
         links, robot = end_links(self.setup.robot), self.setup.robot
-        return self._add_lines(
-            name, [way for path in paths for way in link_ways(robot, links, path)], colour, thickness
-        )
+        return self._add_lines(name, [way for path in paths for way in link_ways(robot, links, path)], color, thickness)
 
-    def _add_lines(self, name: str, ways: Sequence[Array], colour: str, thickness: float) -> Any:
+    def _add_lines(self, name: str, ways: Sequence[Array], color: str, thickness: float) -> Any:
         pieces = np.concatenate([np.stack([way[:-1], way[1:]], axis=1) for way in ways]).astype(np.float32)
-        return self.api.add_line_segments(f"{self.root}/{name}", pieces, rgb(colour), thickness=thickness)
+        return self.api.add_line_segments(f"{self.root}/{name}", pieces, rgb(color), thickness=thickness)
 
     @property
     def has_cover(self) -> bool:
@@ -192,7 +190,7 @@ class BrowserScene:
 
 
 def _cover_of(setup: PlanningSetup) -> Mapping[int, Array]:
-    """Return the leaf spheres of the kernel's cover by joint, rows of centre in the joint's frame and radius [m]."""
+    """Return the leaf spheres of the kernel's cover by joint, rows of center in the joint's frame and radius [m]."""
     tables, turns = setup.checker.kernel.robot.arrays, joint_tree(setup.robot).turns
     ends = np.append(tables.body_root[1:], len(tables.node_count))
     joint = np.repeat(tables.body_joint, ends - tables.body_root)
@@ -200,8 +198,8 @@ def _cover_of(setup: PlanningSetup) -> Mapping[int, Array]:
     found = {}
     for j in sorted(set(joint[leaf].tolist()) - {0}):
         which = np.flatnonzero(leaf & (joint == j))
-        centres = tables.node_centre[which] @ np.asarray(turns[j])[:3, :3].T
-        found[int(j)] = np.column_stack([centres, tables.node_radius[which]])
+        centers = tables.node_center[which] @ np.asarray(turns[j])[:3, :3].T
+        found[int(j)] = np.column_stack([centers, tables.node_radius[which]])
     return found
 
 

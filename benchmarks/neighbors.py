@@ -21,11 +21,11 @@ NEAR = 0.3  # clearances are clipped here [m]
 PER_METRE = 3.0  # weight of clearances beside joint angles [rad/m]
 
 
-class Neighbours:
+class Neighbors:
     """Training paths by start, goal, and the clearances of the robot's probes along the straight line between them."""
 
     def __init__(self, several: Sequence[Paths], robot: RobotTables) -> None:
-        """Look for neighbours among paths of ``robot``, all of the same spline."""
+        """Look for neighbors among paths of ``robot``, all of the same spline."""
         self._probes, self.spline = Probes.from_robot(robot, ALONG), several[0].spline
         kernel, rows, rests = Kernel(robot, scene_tables([])), [], []
         for paths in several:
@@ -62,7 +62,7 @@ class Neighbours:
 
 
 def features(conditions: Conditions) -> NDArray[np.float32]:
-    """Return the features by which neighbours are compared, shape (B, features) [rad]."""
+    """Return the features by which neighbors are compared, shape (B, features) [rad]."""
     least = pad_obstacles(conditions.probe_distances().clamp(-NEAR, NEAR), conditions.mask, NEAR).amin(dim=1)
     rows = torch.cat([conditions.start, conditions.goal, PER_METRE * least / least.shape[1] ** 0.5], dim=1)
     return np.asarray(rows.numpy(), np.float32)
