@@ -89,7 +89,7 @@ def plan(
         simplify: Whether to shorten the path that was found.
         params: Parameters of the planner by name.
         snapshot: Take moving obstacles to stand where they are at time 0. Otherwise the motion is planned in time, and
-            proved apart from where they are then (:mod:`apex_ompl.planning.among_movers`).
+            proved apart from where they are then (:mod:`apex_ompl.planning.among_dynamic_obstacles`).
         timing: How the path is timed, or whether; the timed motion is proved too.
         leave_contact: Depth of contacts at the start that the path may leave along growing clearance, up to 0.001 [m];
             a note says so, since that way out is not proved.

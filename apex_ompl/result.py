@@ -97,8 +97,8 @@ class PlanResult:
             and was planned anew; ``straight line`` where that is a solution, so that no planner ran; empty without a
             path.
         notes: What a user should know about this run, such as a snapshot of moving obstacles.
-        movers: Names of the moving obstacles that ``trajectory`` was proved apart from, where they are in time when it
-            begins at time 0; ``path`` and the clearances are those among what stands still.
+        dynamic_obstacles: Names of the moving obstacles that ``trajectory`` was proved apart from, where they are in
+            time when it begins at time 0; ``path`` and the clearances are those among what stands still.
     """
 
     status: PlanStatus
@@ -125,7 +125,7 @@ class PlanResult:
     notes: tuple[str, ...] = ()
     held_joints: tuple[str, ...] = ()
     robot_digest: str = ""
-    movers: tuple[str, ...] = ()
+    dynamic_obstacles: tuple[str, ...] = ()
 
     def __bool__(self) -> bool:
         """Whether there is an exact path that passed the full check and, unless timing is off, is timed."""
@@ -165,7 +165,7 @@ class PlanResult:
             "checks": self.checks,
             "times": dict(self.times),
             "notes": list(self.notes),
-            "movers": list(self.movers),
+            "dynamic_obstacles": list(self.dynamic_obstacles),
             "joint_names": list(self.joint_names),
             "held_joints": list(self.held_joints),
             "path": None if self.path is None else self.path.states.tolist(),
@@ -217,7 +217,13 @@ class PlanResult:
             data = (read_json if path.suffix == ".json" else read_yaml)(path, "result file")
         if data.get("schema") != SCHEMA:
             raise FileFormatError(str(path), "schema", data.get("schema"), f"expected {SCHEMA!r}")
-        older = {"clearance_pair": ["", ""], "timing_method": "", "held_joints": [], "robot_digest": "", "movers": []}
+        older = {
+            "clearance_pair": ["", ""],
+            "timing_method": "",
+            "held_joints": [],
+            "robot_digest": "",
+            "dynamic_obstacles": [],
+        }
         data = dict.fromkeys(PROOF) | older | data  # older files lack some
         try:
             states = None if data["path"] is None else finite_array(data["path"], "path")
@@ -233,7 +239,7 @@ class PlanResult:
                 times=finite_numbers(data["times"], "times"),
                 timing_method=str(data["timing_method"]), checks=int(data["checks"]), solved_by=data["solved_by"],
                 notes=tuple(data["notes"]), held_joints=tuple(data["held_joints"]),
-                robot_digest=str(data["robot_digest"]), movers=tuple(map(str, data["movers"])),
+                robot_digest=str(data["robot_digest"]), dynamic_obstacles=tuple(map(str, data["dynamic_obstacles"])),
                 clearance_pair=tuple(data["clearance_pair"]), **number,
             )  # fmt: skip
             check_plan(
@@ -286,8 +292,8 @@ def _summary(result: PlanResult) -> Summary:
         )
         uses = ", ".join(f"{name} {share:.3f}" for name, share in result.limit_use.items() if name != "position")
         rows += [("motion", motion), ("limits", f"{uses} used")]
-    if result.movers:
-        rows.append(("movers", f"proved apart from {', '.join(result.movers)} in time"))
+    if result.dynamic_obstacles:
+        rows.append(("dynamic obstacles", f"proved apart from {', '.join(result.dynamic_obstacles)} in time"))
     rows.append(("checks", f"{result.checks} states checked, planner {result.planner}, seed {result.seed}"))
     rows += [("note", note) for note in result.notes]
     by = f" by {result.solved_by}" if result.solved_by else ""

@@ -43,8 +43,8 @@ from apex_ompl.loop.replan.snapshot import Snapshot
 from apex_ompl.loop.replan.sprint import CHARGE as SPRINT
 from apex_ompl.loop.replan.sprint import Sprint
 from apex_ompl.moving.charges import TABLE, Charges, cost_table
+from apex_ompl.moving.dynamic_obstacles import DynamicObstacles, clearance_in_time, curve_of, prove_motion
 from apex_ompl.moving.following import Following
-from apex_ompl.moving.movers import Movers, clearance_in_time, curve_of, prove_motion
 from apex_ompl.moving.ready import Ready
 from apex_ompl.moving.request import Request
 from apex_ompl.moving.retime import retime
@@ -95,9 +95,9 @@ def interval_of_proof(ready: Ready) -> float:
     raise SystemExit("no motion is proved by spheres alone, expected one of 100")
 
 
-def reachable(movers: Movers, time: float) -> Movers:
+def reachable(dynamic: DynamicObstacles, time: float) -> DynamicObstacles:
     """Return all that obstacles can reach which were seen at a time, where they are expected then [s]."""
-    found = movers.larger(0.0)
+    found = dynamic.larger(0.0)
     arrays = found.arrays
     arrays.place[:] += arrays.velocity * (time - arrays.stamp)[:, None]
     arrays.velocity[:], arrays.stamp[:], arrays.growth[:] = 0.0, time, (LoopSettings().error + SPREAD, 0.2)
@@ -110,7 +110,7 @@ def measured(name: str, found: dict[str, list[float]]) -> None:
     setup = assemble(world.problem.still)
     ready = Ready(setup, setup.robot.limits, setup.robot.limits, LoopSettings())
     kernel, limits, goal = ready.kernel, ready.limits, ready.goals[0]
-    movers = Movers(world.present(0.0))
+    dynamic = DynamicObstacles(world.present(0.0))
     ends = np.stack([setup.start, goal])
     found["straight motion"].append(seconds(lambda: time_path(ends, limits, ready.names)))
     motion = time_path(ends, limits, ready.names).trajectory
@@ -122,11 +122,11 @@ def measured(name: str, found: dict[str, list[float]]) -> None:
     found["joined motion"].append(seconds(lambda: through(pieces, limits, ready.names)) - 2.0 * piece)
     one, half = Following(motion, 0.0), 0.5 * motion.duration
     then = half + ready.settings.period
-    found["proved stop"].append(seconds(lambda: ready.proved_stop(reachable(movers, half), one, half, then)))
+    found["proved stop"].append(seconds(lambda: ready.proved_stop(reachable(dynamic, half), one, half, then)))
     moments = np.arange(0.0, motion.duration, GUARDED)
-    looked, _ = ready.foreseen_stops(movers, one, moments, AGE, SPREAD)
+    looked, _ = ready.foreseen_stops(dynamic, one, moments, AGE, SPREAD)
     if looked > 0:
-        taken = seconds(lambda: ready.foreseen_stops(movers, one, moments, AGE, SPREAD))
+        taken = seconds(lambda: ready.foreseen_stops(dynamic, one, moments, AGE, SPREAD))
         found["foreseen stop"].append(taken / min(looked + 1, len(moments)))
     found["stop joint by joint"].append(seconds(lambda: ready.clear_stop(one, half, along=False)))
     curve = curve_of(motion)
@@ -136,17 +136,19 @@ def measured(name: str, found: dict[str, list[float]]) -> None:
     taken = seconds(lambda: ready.checker.prove(curve, tolerance=0.0))
     if proof.by_spheres < 1.0:
         found["exact proof"].append(max(taken - rate * proof.intervals, 0.0))
-    intervals = prove_motion(kernel, movers, motion).intervals
-    found["interval among movers"].append(seconds(lambda: prove_motion(kernel, movers, motion)) / max(intervals, 1))
+    intervals = prove_motion(kernel, dynamic, motion).intervals
+    found["interval among dynamic obstacles"].append(
+        seconds(lambda: prove_motion(kernel, dynamic, motion)) / max(intervals, 1)
+    )
     line = np.linspace(setup.start, goal, 64)
     spline = TimedSpline.along(line, motion.duration, Start.at_rest(setup.start), goal)
-    optimizer = MotionOptimizer(kernel, movers, limits, MOTIONS)
+    optimizer = MotionOptimizer(kernel, dynamic, limits, MOTIONS)
     optimizer.improve(spline, steps=4)
     count = optimizer.samples
     found["sample of a motion"].append(seconds(lambda: optimizer.improve(spline, steps=4)) / count)
-    found["retiming"].append(seconds(lambda: retime(kernel, movers, motion, limits)))
+    found["retiming"].append(seconds(lambda: retime(kernel, dynamic, motion, limits)))
     times = np.linspace(0.0, motion.duration, 64)
-    found["clearance in time"].append(seconds(lambda: clearance_in_time(kernel, movers, line, times, 0.3)) / 64)
+    found["clearance in time"].append(seconds(lambda: clearance_in_time(kernel, dynamic, line, times, 0.3)) / 64)
     bent = np.stack([setup.start, 0.5 * (setup.start + goal) + 0.05, goal])
     bent = np.clip(
         Optimizer().spline.path(Optimizer().spline.fit(bent, limits.lower, limits.upper).control),
@@ -161,14 +163,14 @@ def controls(name: str, found: dict[str, list[float]]) -> None:
     world = worlds.load(name)
     setup = assemble(world.problem.still)
     ready = Ready(setup, setup.robot.limits, setup.robot.limits, LoopSettings())
-    movers, standing = Movers(world.present(0.0)), Following.standing(setup.start, 0.0, ready.names)
-    search = Search(ready, Request(1, 0.0, 0.05, standing, None, movers, movers, (), np.inf, 0), Charges(0.1))
+    dynamic, standing = DynamicObstacles(world.present(0.0)), Following.standing(setup.start, 0.0, ready.names)
+    search = Search(ready, Request(1, 0.0, 0.05, standing, None, dynamic, dynamic, (), np.inf, 0), Charges(0.1))
     control, horizon = PathIntegral(), Horizon(ready.limits)
     points = horizon.roll(search.start, control.tried(search, horizon))
     states = np.ascontiguousarray(points[3:]).reshape(-1, points.shape[2])
     times = np.repeat(0.05 * np.arange(control.steps), control.rollouts)
     some = np.ascontiguousarray(states[:: control.sparse])
-    moving = seconds(lambda: clearance_in_time(ready.kernel, movers, states, times, control.berth))
+    moving = seconds(lambda: clearance_in_time(ready.kernel, dynamic, states, times, control.berth))
     own = seconds(lambda: ready.kernel.clearance(some, control.own_berth))
     found["near clearance in time"].append(moving / len(states))
     found["near clearance"].append(own / len(some))
@@ -233,8 +235,10 @@ def trees() -> dict[str, float]:
         setup, present = assemble(world.problem.still), tuple(world.present(0.0))
         ready, source = Ready(setup, setup.robot.limits, setup.robot.limits, LoopSettings()), Snapshot()
         source.prepare(ready)
-        movers, standing = Movers(present), Following.standing(setup.start, 0.0, ready.names)
-        search = Search(ready, Request(2, 0.0, 0.05, standing, None, movers, movers, present, np.inf, 0), Charges(0.1))
+        dynamic, standing = DynamicObstacles(present), Following.standing(setup.start, 0.0, ready.names)
+        search = Search(
+            ready, Request(2, 0.0, 0.05, standing, None, dynamic, dynamic, present, np.inf, 0), Charges(0.1)
+        )
         with quiet_ompl():
             begin = time.perf_counter()
             source.path(search, proved=False)

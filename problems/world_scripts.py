@@ -84,5 +84,5 @@ def moving_world(problem: Problem) -> ScriptedWorld:
     touching = next((pair for pair in problem.allowed if {*pair} & {*problem.moving}), None)
     if touching is not None:
         raise ParameterError("allowed", touching, "no obstacle that moves in a pair that may touch")
-    movers = tuple(o for o in problem.scene if o.moving)
-    return ScriptedWorld(problem.name, problem.still, movers, max(map(fastest, movers), default=0.0))
+    dynamic = tuple(o for o in problem.scene if o.moving)
+    return ScriptedWorld(problem.name, problem.still, dynamic, max(map(fastest, dynamic), default=0.0))

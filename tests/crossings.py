@@ -1,16 +1,16 @@
-"""Motions of a robot, and movers that cross them."""
+"""Motions of a robot, and dynamic obstacles that cross them."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from apex_ompl.kernel import Kernel
-from apex_ompl.moving.movers import Movers
+from apex_ompl.moving.dynamic_obstacles import DynamicObstacles
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.timing import Timing, Trajectory, time_path
 
-SPEEDS = (0.1, 0.2, 0.4)  # of movers [m/s]
+SPEEDS = (0.1, 0.2, 0.4)  # of dynamic obstacles [m/s]
 
 
 def arm_motion(robot: Robot, rng: np.random.Generator, speed: float) -> Trajectory:
@@ -51,7 +51,7 @@ def crossing_obstacle(
     turn = rng.normal(0.0, 1.0, 4)
     turn /= np.linalg.norm(turn)
     return Obstacle(
-        name="mover", position=tuple(place), velocity=tuple(velocity), orientation=tuple(turn),
+        name="dynamic_obstacle", position=tuple(place), velocity=tuple(velocity), orientation=tuple(turn),
         **shape(kind, float(rng.choice([0.04, 0.08, 0.15]))),
     )  # fmt: skip
 
@@ -59,11 +59,11 @@ def crossing_obstacle(
 def crossing(
     kernel: Kernel, motion: Trajectory, rng: np.random.Generator, kind: str = "box",
     growth: tuple[float, float] = (0.0, 0.0),
-) -> Movers | None:  # fmt: skip
-    """The mover of :func:`crossing_obstacle`, or None."""
+) -> DynamicObstacles | None:  # fmt: skip
+    """The dynamic obstacle of :func:`crossing_obstacle`, or None."""
     obstacle = crossing_obstacle(kernel, motion, rng, kind)
     if obstacle is None:
         return None
-    movers = Movers([obstacle])
-    movers.update("mover", growth=growth)
-    return movers
+    dynamic = DynamicObstacles([obstacle])
+    dynamic.update("dynamic_obstacle", growth=growth)
+    return dynamic

@@ -56,7 +56,7 @@ def run_by_hand(robot: Robot, joint: str = "left_joint1", link: str = "left_hand
     stop = first.duration
     events = (
         *(Event(t, "observation") for t in np.arange(0.0, stop, 0.05).tolist()),
-        Event(stop, "conflict", {"body": "left_link7", "mover": "ball", "at": 1.1}),
+        Event(stop, "conflict", {"body": "left_link7", "dynamic_obstacle": "ball", "at": 1.1}),
         Event(stop, "request"),
         Event(stop, "stop"),
         Event(stop, "reaction", {"seconds": 0.01, "ahead": 0.4, "doing": "going"}),

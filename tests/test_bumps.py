@@ -75,7 +75,7 @@ def test_apex_plans_without_a_model() -> None:
 
 def test_the_closed_loop_runs_with_a_robot_whose_hands_do_not_close() -> None:
     problem = load_problem(BAXTER)
-    box = Obstacle(name="mover", box=(0.1, 0.1, 0.1), position=(0.75, -1.4, 0.35), velocity=(0.0, 0.25, 0.0))
+    box = Obstacle(name="dynamic_obstacle", box=(0.1, 0.1, 0.1), position=(0.75, -1.4, 0.35), velocity=(0.0, 0.25, 0.0))
     result = run(problem.model_copy(update={"scene": (*problem.scene, box)}))
     assert result.outcome == "reached", result.reason
     assert not any("Error" in event.data.get("why", "") for event in result.events)

@@ -22,7 +22,7 @@ from apex_ompl.cli import run as run_command
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.loop import Sensor, SensorStream
 from apex_ompl.model.checkpoint import CheckpointConfig
-from apex_ompl.moving import Movers
+from apex_ompl.moving import DynamicObstacles
 from apex_ompl.ompl import assemble
 from apex_ompl.paths import Optimizer, Spline
 from apex_ompl.problems import witness, worlds
@@ -119,7 +119,7 @@ def test_one_line_says_what_an_object_holds(result: PlanResult, run: RunResult, 
         world: f"{type(world).__name__}('turning/vertical/large/12')",
         paths: f"Paths({len(paths)} paths of {paths.problems} problems)",
         witness("shelf/hard/900012"): f"Witness(path=array {witness('shelf/hard/900012').path.shape})",
-        Movers([Obstacle(name="ball", sphere={"radius": 0.1}, velocity=(0.1, 0.0, 0.0))]): "Movers(ball)",
+        DynamicObstacles([Obstacle(name="a", sphere={"radius": 0.1}, velocity=(1, 0, 0))]): "DynamicObstacles(a)",
         Optimizer(Spline(10)): "Optimizer(spline=Spline(points=10, pinned=1, states=256, degree=5))",
         apex_ompl.load_model("apex"): "ArrayModel(robot 'dual_panda_softhand', 14 control points of 16 joints, scene "
         "'clearances')",

@@ -27,8 +27,8 @@ from apex_ompl.loop.run import run
 from apex_ompl.loop.sensor import Sensor
 from apex_ompl.loop.tracking import Tracker
 from apex_ompl.moving.charges import Charges
+from apex_ompl.moving.dynamic_obstacles import DynamicObstacles, clearance_in_time
 from apex_ompl.moving.following import Following
-from apex_ompl.moving.movers import Movers, clearance_in_time
 from apex_ompl.moving.ready import Ready
 from apex_ompl.moving.request import Answer, Request
 from apex_ompl.moving.search import EARLIER, Search
@@ -99,7 +99,7 @@ def coming(setup: PlanningSetup, gap: float = 0.2, speed: float = 0.4) -> Obstac
     for x in np.arange(0.0, 1.0, 0.002).tolist():
         place = tuple((palm + (x, 0.0, 0.0)).tolist())
         there = box.model_copy(update={"position": place})
-        clear, _ = clearance_in_time(setup.checker.kernel, Movers([there]), setup.start[None], np.zeros(1))
+        clear, _ = clearance_in_time(setup.checker.kernel, DynamicObstacles([there]), setup.start[None], np.zeros(1))
         if clear[0] >= gap:
             return there
     raise AssertionError("no place")
@@ -152,10 +152,12 @@ def test_a_step_aside_is_no_proof_of_what_the_robot_does_until_then(
     first = Following(line_from(ready, Start.at_rest(start), 0.95 * start + 0.05 * goal), 0.0)
     now, join = (0.5 if moves else 1.0) * first.end, first.end + 0.01
     aside = Following(line_from(ready, Start.at_rest(first.motion.positions[-1]), start), join)
-    empty = Movers(())
+    empty = DynamicObstacles(())
     request = Request(1, 0.0, join, first, None, empty, 0.05, (), now, 0, contact=now)
 
-    def first_conflict(movers: Movers, one: Following, begin: float, until: float, charges: Any = None) -> float:
+    def first_conflict(
+        dynamic: DynamicObstacles, one: Following, begin: float, until: float, charges: Any = None
+    ) -> float:
         return begin if begin < join - 1e-9 else np.inf
 
     class Answered:

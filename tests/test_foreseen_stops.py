@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from loops import boxes, ready_of
 
+from apex_ompl.moving.dynamic_obstacles import DynamicObstacles
 from apex_ompl.moving.following import Following
-from apex_ompl.moving.movers import Movers
 from apex_ompl.moving.ready import Ready
 from apex_ompl.moving.search import SPREAD
 from apex_ompl.moving.stopping import stops_proved
@@ -21,7 +21,7 @@ PROBLEM = "vertical/free/800000"
 
 class Case(NamedTuple):
     ready: Ready
-    movers: Movers
+    dynamic: DynamicObstacles
     following: Following
     moments: np.ndarray
 
@@ -37,14 +37,16 @@ def case(seed: int) -> Case:
         if ready.clear_of_still(motion):
             break
     following = Following(motion, float(rng.uniform(0.0, 2.0)))
-    movers = Movers(boxes(seed, FASTEST)[: 1 + seed % 2], stamp=following.begin - float(rng.uniform(0.0, 0.1)))
-    return Case(ready, movers, following, np.arange(following.begin, following.end, 0.02))
+    dynamic = DynamicObstacles(
+        boxes(seed, FASTEST)[: 1 + seed % 2], stamp=following.begin - float(rng.uniform(0.0, 0.1))
+    )
+    return Case(ready, dynamic, following, np.arange(following.begin, following.end, 0.02))
 
 
 def proved(one: Case, time: float) -> Following | None:
     """The stop that the guard would prove at a time, by what is known then."""
-    settings, seen = one.ready.settings, one.movers.larger(0.0)
-    for name, place in one.movers.at(time - AGE).items():
+    settings, seen = one.ready.settings, one.dynamic.larger(0.0)
+    for name, place in one.dynamic.at(time - AGE).items():
         growth = settings.error + SPREAD, settings.fastest
         seen.update(name, place, (0.0, 0.0, 0.0), stamp=time - AGE, growth=growth)
     return one.ready.proved_stop(seen, one.following, time, time + settings.period)
@@ -53,7 +55,7 @@ def proved(one: Case, time: float) -> Following | None:
 @pytest.mark.parametrize("seed", range(12))
 def test_stops_are_foreseen_where_the_guard_proves_them(seed: int) -> None:
     one = case(seed)
-    count, by_joints = one.ready.foreseen_stops(one.movers, one.following, one.moments, AGE, SPREAD)
+    count, by_joints = one.ready.foreseen_stops(one.dynamic, one.following, one.moments, AGE, SPREAD)
     stops = [proved(one, float(time)) for time in one.moments[: count + 1]]
     assert all(stop is not None for stop in stops[:count])
     assert count == len(one.moments) or stops[count] is None
@@ -62,7 +64,7 @@ def test_stops_are_foreseen_where_the_guard_proves_them(seed: int) -> None:
 
 def test_of_both_kinds_there_are_some_and_some_are_not_proved() -> None:
     ends = [
-        one.ready.foreseen_stops(one.movers, one.following, one.moments, AGE, SPREAD) for one in map(case, range(12))
+        one.ready.foreseen_stops(one.dynamic, one.following, one.moments, AGE, SPREAD) for one in map(case, range(12))
     ]
     lengths = [len(case(seed).moments) for seed in range(12)]
     assert any(count == most for (count, _), most in zip(ends, lengths, strict=True))
@@ -72,11 +74,11 @@ def test_of_both_kinds_there_are_some_and_some_are_not_proved() -> None:
 
 def test_what_is_expected_is_left_as_it_was_and_without_obstacles_all_are_proved() -> None:
     one = case(1)
-    before = [array.copy() for array in one.movers.packed]
+    before = [array.copy() for array in one.dynamic.packed]
     zero = one.following.begin
     options: dict = {"clock": zero, "age": AGE, "growth": (0.03, FASTEST), "period": 0.01}
-    some = one.ready.kernel, one.movers, one.following.motion, one.ready.stopping, one.moments - zero
+    some = one.ready.kernel, one.dynamic, one.following.motion, one.ready.stopping, one.moments - zero
     stops_proved(*some, **options)
-    assert all(np.array_equal(a, b) for a, b in zip(before, one.movers.packed, strict=True))
-    count, by_joints = stops_proved(some[0], Movers([]), *some[2:], **options)
+    assert all(np.array_equal(a, b) for a, b in zip(before, one.dynamic.packed, strict=True))
+    count, by_joints = stops_proved(some[0], DynamicObstacles([]), *some[2:], **options)
     assert count == len(one.moments) and not by_joints.any()

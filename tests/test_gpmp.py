@@ -18,8 +18,8 @@ from apex_ompl.kernel.clearance_costs import clearance_costs
 from apex_ompl.loop.replan.methods import METHODS
 from apex_ompl.loop.run import run
 from apex_ompl.moving.charges import Charges
+from apex_ompl.moving.dynamic_obstacles import DynamicObstacles, clearance_in_time
 from apex_ompl.moving.following import Following
-from apex_ompl.moving.movers import Movers, clearance_in_time
 from apex_ompl.moving.request import Request
 from apex_ompl.ompl.setup import PlanningSetup, assemble
 from apex_ompl.paths.optimizer import Optimizer
@@ -67,15 +67,15 @@ def test_gradients_of_states_are_those_of_finite_differences(ready: PlanningSetu
     """Among obstacles that stand, and one that comes by."""
     palm = ready.robot.link_pose(ready.start, "left_hand_palm")[:3, 3]
     box = Obstacle(name="box", box=(0.1,) * 3, position=tuple((palm + (0, 0.4, 0.1)).tolist()), velocity=(0, -0.3, 0))
-    movers, kernel, rng = Movers([box]), ready.checker.kernel, np.random.default_rng(0)
+    dynamic, kernel, rng = DynamicObstacles([box]), ready.checker.kernel, np.random.default_rng(0)
     states = np.linspace(ready.start, ready.goals[0], 30) + 0.02 * rng.normal(size=(30, ready.robot.dof))
     states = np.clip(states, ready.robot.limits.lower + 1e-3, ready.robot.limits.upper - 1e-3)
     times = np.linspace(0.0, 1.5, 30)
 
     def cost(q: np.ndarray) -> np.ndarray:
-        return clearance_costs(kernel, q, 0.15, 0.05, times, movers.packed).cost
+        return clearance_costs(kernel, q, 0.15, 0.05, times, dynamic.packed).cost
 
-    found = clearance_costs(kernel, states, 0.15, 0.05, times, movers.packed)
+    found = clearance_costs(kernel, states, 0.15, 0.05, times, dynamic.packed)
     matching = 0
     for _ in range(5):
         way = rng.normal(size=states.shape)
@@ -84,7 +84,7 @@ def test_gradients_of_states_are_those_of_finite_differences(ready: PlanningSetu
     assert matching >= 145 and (found.cost > 0.0).sum() > 20  # where two spheres are as near there is a kink
     alone = clearance_costs(kernel, states, 0.15, 0.05)
     assert (found.cost >= alone.cost).all() and (found.cost > alone.cost + 0.1).any()
-    moving, _ = clearance_in_time(kernel, movers, states, times, 0.15)
+    moving, _ = clearance_in_time(kernel, dynamic, states, times, 0.15)
     np.testing.assert_allclose(found.clearance[:, 0], np.minimum(alone.clearance[:, 0], moving), atol=1e-12)
 
 
@@ -219,12 +219,12 @@ def test_the_replanner_begins_as_the_robot_moves(kind: type[IncrementalGPMP2]) -
     ready = ready_of(PROBLEM)
     replanner = kind()
     replanner.prepare(ready)
-    movers = Movers([Obstacle(name="far", box=(0.1,) * 3, position=(2.0, 2.0, 1.0))])
+    dynamic = DynamicObstacles([Obstacle(name="far", box=(0.1,) * 3, position=(2.0, 2.0, 1.0))])
     standing = Following.standing(ready.setup.start, 0.0, ready.names)
 
     def ask(following: Following, route: Following | None, join: float) -> tuple[Following, Charges]:
         charges = Charges(0.2)
-        request = Request(1, join - 0.05, join, following, route, movers, 0.0, (), np.inf, 0)
+        request = Request(1, join - 0.05, join, following, route, dynamic, 0.0, (), np.inf, 0)
         found = replanner.replan(ready, request, charges).found
         assert found is not None and found.to_goal and ready.clear_of_still(found.motion)
         return found, charges
@@ -238,7 +238,7 @@ def test_the_replanner_begins_as_the_robot_moves(kind: type[IncrementalGPMP2]) -
     for order in range(3):
         np.testing.assert_allclose(second.motion(0.0, order), behind[order], atol=1e-9)
     assert second.motion.duration < first.motion.duration
-    assert replanner.replan(ready, Request(1, 0.0, 0.05, standing, None, movers, 0.0, (), np.inf, 0), Charges(0.0))
+    assert replanner.replan(ready, Request(1, 0.0, 0.05, standing, None, dynamic, 0.0, (), np.inf, 0), Charges(0.0))
 
 
 @pytest.mark.parametrize("name", ["gpmp", "gpmp2"])

@@ -30,8 +30,8 @@ from apex_ompl.loop.referee import RefereeReport
 from apex_ompl.loop.replan.methods import METHODS
 from apex_ompl.loop.replanning import SHARE
 from apex_ompl.moving.charges import Charges, cost_table
+from apex_ompl.moving.dynamic_obstacles import DynamicObstacles
 from apex_ompl.moving.following import Following
-from apex_ompl.moving.movers import Movers
 from apex_ompl.moving.request import Request
 from apex_ompl.ompl.setup import assemble
 from apex_ompl.ompl.space import path_to_array
@@ -259,7 +259,7 @@ def test_a_replan_begins_as_the_robot_moves_and_is_charged_by_chunks(straight: P
     begin, moving = 0.0, Following.standing(ready.setup.start, 0.0, ready.names)
     for number in range(1, 5):
         join, charges = begin + 0.1, Charges(SHARE * ready.settings.budget)
-        nothing = Movers(())
+        nothing = DynamicObstacles(())
         request = Request(number, begin, join, moving, None, nothing, 0.0, (), np.inf, 0)
         answer = method.replan(ready, request, charges)
         assert answer.found is not None

@@ -52,7 +52,11 @@ def test_no_large_library_is_imported_before_it_is_needed(code: str, more: tuple
 
 def test_a_plan_imports_neither_torch_nor_other_planners() -> None:
     code = "import apex_ompl; assert apex_ompl.plan('ball_in_cup', timeout=30.0)"
-    others = ("apex_ompl.planners.sampling", "apex_ompl.problems.catalogue", "apex_ompl.planning.among_movers")
+    others = (
+        "apex_ompl.planners.sampling",
+        "apex_ompl.problems.catalogue",
+        "apex_ompl.planning.among_dynamic_obstacles",
+    )
     assert loaded(code, ("matplotlib", "torch", "trimesh", *others)) == []
 
 

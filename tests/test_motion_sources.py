@@ -11,8 +11,8 @@ from loops import FAR, PROBLEM, line_from, ready_of
 from apex_ompl.loop.replan.proposals import Renoised
 from apex_ompl.loop.replan.quickening import quickened
 from apex_ompl.moving.charges import Charges
+from apex_ompl.moving.dynamic_obstacles import DynamicObstacles
 from apex_ompl.moving.following import Following
-from apex_ompl.moving.movers import Movers
 from apex_ompl.moving.ready import Ready
 from apex_ompl.moving.request import Request
 from apex_ompl.moving.search import EARLIER, Search
@@ -28,8 +28,8 @@ def ready() -> Ready:
 def search_of(ready: Ready, *, slower: float = 1.5, conflict: float = np.inf) -> Search:
     """A replan 0.3 s behind the begin of the straight motion to the goal, made slower."""
     motion = line_from(ready, Start.at_rest(ready.setup.start), ready.goals[0]).slower(slower)
-    one, movers = Following(motion, 0.0, to_goal=True), Movers([FAR])
-    request = Request(1, 0.25, 0.3, one, one, movers, 0.0, (FAR,), conflict, 0)
+    one, dynamic = Following(motion, 0.0, to_goal=True), DynamicObstacles([FAR])
+    request = Request(1, 0.25, 0.3, one, one, dynamic, 0.0, (FAR,), conflict, 0)
     return Search(ready, request, Charges(0.05))
 
 

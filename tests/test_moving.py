@@ -40,15 +40,20 @@ def test_valid_paths_are_free_at_all_times_and_invalid_ones_nearly_touch(robot: 
     hand = robot.link_pose(path[2], "left_hand_palm")[:3, 3]
     velocity = rng.normal(0.0, 0.2, 3)
     at = hand + rng.normal(0.0, 0.12, 3) - velocity * times[2]
-    mover = Obstacle.model_validate(
-        {"name": "mover", "position": at.tolist(), "velocity": velocity.tolist(), **SHAPES[seed % len(SHAPES)]}
+    dynamic_obstacle = Obstacle.model_validate(
+        {
+            "name": "dynamic_obstacle",
+            "position": at.tolist(),
+            "velocity": velocity.tolist(),
+            **SHAPES[seed % len(SHAPES)],
+        }
     )
-    check = check_timed_path(robot, problem_with(robot, mover), path, times)
-    checker = CollisionChecker(robot, [mover], proofs=False)
+    check = check_timed_path(robot, problem_with(robot, dynamic_obstacle), path, times)
+    checker = CollisionChecker(robot, [dynamic_obstacle], proofs=False)
     nearest = np.inf
     for time in np.linspace(0.0, times[-1], 150):
         q = np.array([np.interp(time, times, column) for column in path.T])
-        checker.move("mover", obstacle_at(mover, time).position)
+        checker.move("dynamic_obstacle", obstacle_at(dynamic_obstacle, time).position)
         if check:
             assert checker.is_free(q), time
         elif checker.is_free(q):
@@ -58,7 +63,7 @@ def test_valid_paths_are_free_at_all_times_and_invalid_ones_nearly_touch(robot: 
     assert check or nearest < 0.02  # the inflated obstacle was 2.5 mm larger, samples are some 10 mm apart
 
 
-def test_without_movers_it_is_the_full_check(robot: Robot, post: Obstacle) -> None:
+def test_without_dynamic_obstacles_it_is_the_full_check(robot: Robot, post: Obstacle) -> None:
     start, goal = robot.home.copy(), robot.home.copy()
     start[[0, 1, 3]], goal[[0, 1, 3]] = (0.1, 0.4, -1.6), (-1.3, 0.4, -1.6)
     path = np.stack([start, goal])

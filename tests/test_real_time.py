@@ -31,8 +31,8 @@ from apex_ompl.loop.result import INTERRUPTED, Outcome, RunResult
 from apex_ompl.loop.run import run
 from apex_ompl.loop.sensor import Sensor, SensorStream
 from apex_ompl.moving.charges import Charges
+from apex_ompl.moving.dynamic_obstacles import DynamicObstacles, clearance_in_time
 from apex_ompl.moving.following import Following
-from apex_ompl.moving.movers import Movers, clearance_in_time
 from apex_ompl.moving.ready import Ready
 from apex_ompl.moving.request import Answer, Request
 from apex_ompl.problems.worlds import World
@@ -218,7 +218,7 @@ def test_a_request_ends_what_the_process_is_busy_with() -> None:
     begun, spent = time.monotonic(), []
     with PlannerProcess(work) as process:
         for number in (1, 2, 3):
-            none = Movers([])
+            none = DynamicObstacles([])
             process.submit(Request(number, 0.0, 1.0, standing, None, none, 0.0, (), math.inf, 0))
             while number != 2 and (not spent or spent[-1].number != number):
                 assert time.monotonic() < begun + 60.0
@@ -232,7 +232,7 @@ def test_a_process_that_reads_nothing_holds_nobody_up() -> None:
     ready, world = ready_of(PROBLEM), world_of(PROBLEM)
     work = Work(world.problem.still, ready.limits, ready.stopping, ready.settings, Faulty, ("never",), 0)
     standing = Following.standing(ready.setup.start, 0.0, ready.names)
-    large = Movers([]).larger(0.0)
+    large = DynamicObstacles([]).larger(0.0)
     first = Request(1, 0.0, 0.05, standing, None, large, large, (), np.inf, 0)
     with PlannerProcess(work) as process:
         assert process.submit(first)
@@ -246,16 +246,16 @@ def test_a_process_that_reads_nothing_holds_nobody_up() -> None:
     assert process.process.poll() is not None
 
 
-def test_movers_travel_between_processes() -> None:
+def test_dynamic_obstacles_travel_between_processes() -> None:
     setup, box = setup_of(PROBLEM), crossing(setup_of(PROBLEM))
-    movers = Movers([box])
-    movers.update(box.name, velocity=(0.1, 0.0, 0.0), growth=(0.01, 0.1))
-    other = pickle.loads(pickle.dumps(movers))
+    dynamic = DynamicObstacles([box])
+    dynamic.update(box.name, velocity=(0.1, 0.0, 0.0), growth=(0.01, 0.1))
+    other = pickle.loads(pickle.dumps(dynamic))
     arguments: tuple[Any, ...] = setup.start[None], np.array([0.5]), 1.0
-    assert np.array_equal(clearance_in_time(setup.checker.kernel, movers, *arguments)[0],
+    assert np.array_equal(clearance_in_time(setup.checker.kernel, dynamic, *arguments)[0],
                           clearance_in_time(setup.checker.kernel, other, *arguments)[0])  # fmt: skip
     other.update(box.name, position=(0.0, 0.0, 5.0))  # its arrays are views again
     assert (
         clearance_in_time(setup.checker.kernel, other, *arguments)[0]
-        > clearance_in_time(setup.checker.kernel, movers, *arguments)[0]
+        > clearance_in_time(setup.checker.kernel, dynamic, *arguments)[0]
     )

@@ -14,7 +14,7 @@ from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ParameterError
 from apex_ompl.loop.referee import judge
 from apex_ompl.loop.result import Outcome
-from apex_ompl.moving.scripted import ScriptedMovers
+from apex_ompl.moving.scripted import ScriptedDynamicObstacles
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.scripts import is_there, place_at
@@ -29,15 +29,15 @@ COARSE = 0.004  # of the samples of brute force, a multiple of the referee's [s]
 
 
 class Dense:
-    """Contacts with movers by all meshes at any time, without spheres."""
+    """Contacts with dynamic obstacles by all meshes at any time, without spheres."""
 
-    def __init__(self, robot: Robot, movers: list[Obstacle]) -> None:
-        self.movers = movers
-        shapes = [Obstacle.model_validate({**o.model_dump(include={"name", o.shape, "orientation"})}) for o in movers]
+    def __init__(self, robot: Robot, dynamic: list[Obstacle]) -> None:
+        self.dynamic = dynamic
+        shapes = [Obstacle.model_validate({**o.model_dump(include={"name", o.shape, "orientation"})}) for o in dynamic]
         self.checker = CollisionChecker(robot, shapes, proofs=False)
 
     def contacts(self, motion: Trajectory, time: float) -> list[tuple[str, str]]:
-        here = [o for o in self.movers if is_there(o, time)]
+        here = [o for o in self.dynamic if is_there(o, time)]
         for o in here:
             self.checker.move(o.name, place_at(o, time))
         names = {o.name for o in here}
@@ -50,8 +50,8 @@ def motion_of(robot: Robot, rng: np.random.Generator) -> Trajectory:
     return time_path(path, robot.limits, robot.joint_names, Timing(method="spline", velocity_scale=0.8)).trajectory
 
 
-def mover_of(robot: Robot, motion: Trajectory, rng: np.random.Generator, name: str) -> Obstacle:
-    """A mover that passes near a hand, by a velocity or by a script with corners, and may appear late."""
+def dynamic_obstacle_of(robot: Robot, motion: Trajectory, rng: np.random.Generator, name: str) -> Obstacle:
+    """A dynamic obstacle that passes near a hand, by a velocity or by a script with corners, and may appear late."""
     time = rng.uniform(0.0, motion.duration)
     near = robot.link_pose(motion(time), "left_hand_palm")[:3, 3] + rng.normal(0.0, 0.12, 3)
     fields: dict[str, object] = {"name": name, **SHAPES[rng.integers(len(SHAPES))]}
@@ -72,9 +72,9 @@ def mover_of(robot: Robot, motion: Trajectory, rng: np.random.Generator, name: s
 def test_the_first_contact_is_that_of_dense_samples(robot: Robot, seed: int) -> None:
     rng = np.random.default_rng(seed)
     motion = motion_of(robot, rng)
-    movers = [mover_of(robot, motion, rng, f"mover{k}") for k in range(rng.integers(1, 3))]
-    dense = Dense(robot, movers)
-    report = judge(robot, problem_of(robot, motion, *movers), motion)
+    dynamic = [dynamic_obstacle_of(robot, motion, rng, f"dynamic_obstacle{k}") for k in range(rng.integers(1, 3))]
+    dense = Dense(robot, dynamic)
+    report = judge(robot, problem_of(robot, motion, *dynamic), motion)
     hit = report.contact
     until = np.inf if hit is None else hit.time - 1e-9
     for time in np.arange(0.0, motion.duration, COARSE).tolist():
@@ -94,8 +94,8 @@ def test_the_samples_meet_and_miss(robot: Robot) -> None:
     for seed in range(12):
         rng = np.random.default_rng(seed)
         motion = motion_of(robot, rng)
-        mover = mover_of(robot, motion, rng, "mover")
-        found.append(judge(robot, problem_of(robot, motion, mover), motion).contact is not None)
+        dynamic_obstacle = dynamic_obstacle_of(robot, motion, rng, "dynamic_obstacle")
+        found.append(judge(robot, problem_of(robot, motion, dynamic_obstacle), motion).contact is not None)
     assert 3 <= sum(found) <= 11
 
 
@@ -104,14 +104,14 @@ def test_the_samples_meet_and_miss(robot: Robot) -> None:
 def test_the_clearance_is_a_lower_bound(robot: Robot, seed: int) -> None:
     rng = np.random.default_rng(seed)
     motion = motion_of(robot, rng)
-    mover = mover_of(robot, motion, rng, "mover")
-    report = judge(robot, problem_of(robot, motion, mover), motion)
-    shape = Obstacle.model_validate(mover.model_dump(include={"name", mover.shape}))
+    dynamic_obstacle = dynamic_obstacle_of(robot, motion, rng, "dynamic_obstacle")
+    report = judge(robot, problem_of(robot, motion, dynamic_obstacle), motion)
+    shape = Obstacle.model_validate(dynamic_obstacle.model_dump(include={"name", dynamic_obstacle.shape}))
     alone = CollisionChecker(robot, [shape])
     nearest = np.inf
     for time in np.arange(0.0, motion.duration, 0.05).tolist():
-        if is_there(mover, time):
-            alone.move("mover", place_at(mover, time))
+        if is_there(dynamic_obstacle, time):
+            alone.move("dynamic_obstacle", place_at(dynamic_obstacle, time))
             nearest = min(nearest, alone.obstacle_distance(motion(time)[None]))
     assert report.clearance <= nearest + 1e-9
     assert not np.isfinite(nearest) or report.clearance > nearest - 0.12, "and near to it"
@@ -153,7 +153,7 @@ def test_what_may_move_counts_as_moving_though_it_stood(robot: Robot, there_and_
     ball = Obstacle(name="ball", sphere={"radius": 0.03}, position=tuple(hand_at(robot, motion, motion.duration)))
     problem = problem_of(robot, motion, ball)
     assert judge(robot, problem, motion).outcome is Outcome.HIT_STILL
-    report = judge(robot, problem, motion, movers=["ball"])
+    report = judge(robot, problem, motion, dynamic=["ball"])
     assert report.outcome is Outcome.HIT_MOVING and report.contact is not None and report.still_contact is None
     assert report.contact.second == "ball" and np.isfinite(report.clearance)
 
@@ -260,12 +260,12 @@ def test_pieces_are_the_legs_of_all_scripts(robot: Robot) -> None:
         Obstacle(name="a", sphere={"radius": 0.1}, trajectory=rows),
         Obstacle(name="b", sphere={"radius": 0.1}, position=(0.0, 0.0, 2.0), velocity=(1.0, 0.0, 0.0), appears=2.0),
     ]
-    scripted = ScriptedMovers(CollisionChecker(robot).kernel, moving)
+    scripted = ScriptedDynamicObstacles(CollisionChecker(robot).kernel, moving)
     seen = []
-    for begin, end, movers in scripted.pieces(5.0):
-        seen.append((begin, end, movers.names))
+    for begin, end, dynamic in scripted.pieces(5.0):
+        seen.append((begin, end, dynamic.names))
         for time in np.linspace(begin, end, 4):
-            for name, place in movers.at(float(time)).items():
+            for name, place in dynamic.at(float(time)).items():
                 wanted = place_at(next(o for o in moving if o.name == name), float(time))
                 np.testing.assert_allclose(place, wanted, atol=1e-12)
     wanted_pieces = [(0.0, 1.0, ("a",)), (1.0, 2.0, ("a",)), (2.0, 3.0, ("a", "b")), (3.0, 5.0, ("a", "b"))]

@@ -12,7 +12,7 @@ from crossings import arm_motion, crossing
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel import Kernel
-from apex_ompl.moving.movers import Movers, prove_motion
+from apex_ompl.moving.dynamic_obstacles import DynamicObstacles, prove_motion
 from apex_ompl.moving.retime import retime
 from apex_ompl.moving.safe_intervals import Blocked, blocked
 from apex_ompl.robot import Robot
@@ -94,22 +94,22 @@ def test_random_crossings(kernel: Kernel, robot: Robot, speed: float, seed: int)
     ratios, found, possible, open_ones = [], 0, 0, 0
     while possible < 12:
         motion = arm_motion(robot, rng, speed)
-        movers = crossing(kernel, motion, rng)
+        dynamic = crossing(kernel, motion, rng)
         time = float(rng.choice([0.0, 0.1]) * motion.duration)
-        if movers is None or not prove_motion(kernel, movers, motion, time, motion.duration + HOLD):
+        if dynamic is None or not prove_motion(kernel, dynamic, motion, time, motion.duration + HOLD):
             continue
         edges = np.linspace(time, motion.duration, PIECES + 1)
         within = {"begin": time, "end": time + HORIZON + HOLD}
         ends = (np.full((1, 2), t) for t in (time, motion.duration))
-        start, end = (blocked(kernel, movers, motion, place, **within) for place in ends)
-        pieces = blocked(kernel, movers, motion, np.stack([edges[:-1], edges[1:]], axis=1), **within)
+        start, end = (blocked(kernel, dynamic, motion, place, **within) for place in ends)
+        pieces = blocked(kernel, dynamic, motion, np.stack([edges[:-1], edges[1:]], axis=1), **within)
         least = earliest(pieces, start, end, time, TICK * PIECES / (motion.duration - time))
-        made = retime(kernel, movers, motion, robot.limits, time=time, clock=time, hold=HOLD, horizon=HORIZON)
+        made = retime(kernel, dynamic, motion, robot.limits, time=time, clock=time, hold=HOLD, horizon=HORIZON)
         assert (made.trajectory is None) == bool(made.reason)
         if made.trajectory is not None:
             assert_kept(robot, motion, time, made.trajectory, made.deviation)
             until = made.trajectory.duration + HOLD
-            open_ones += bool(prove_motion(kernel, movers, made.trajectory, 0.0, until, clock=time))
+            open_ones += bool(prove_motion(kernel, dynamic, made.trajectory, 0.0, until, clock=time))
         if math.isinf(least):
             continue
         possible += 1
@@ -125,9 +125,11 @@ def test_random_crossings(kernel: Kernel, robot: Robot, speed: float, seed: int)
 def test_a_motion_that_meets_nothing_stays_as_it_is(
     kernel: Kernel, robot: Robot, swing: Trajectory, quarter: Limits
 ) -> None:
-    movers = Movers([Obstacle(name="mover", box=(0.1, 0.1, 0.1), position=(0.0, 0.0, 3.0), velocity=(0.1, 0.0, 0.0))])
+    dynamic = DynamicObstacles(
+        [Obstacle(name="dynamic_obstacle", box=(0.1, 0.1, 0.1), position=(0.0, 0.0, 3.0), velocity=(0.1, 0.0, 0.0))]
+    )
     for time in (0.0, 0.7):
-        made = retime(kernel, movers, swing, quarter, time=time)
+        made = retime(kernel, dynamic, swing, quarter, time=time)
         assert made.trajectory is not None and made.deviation == 0.0
         assert made.trajectory.duration == pytest.approx(swing.duration - time, abs=1e-9)
         assert_kept(robot, swing, time, made.trajectory, 0.0)
@@ -136,56 +138,71 @@ def test_a_motion_that_meets_nothing_stays_as_it_is(
 def test_a_place_next_to_a_knot_gives_one_knot(
     kernel: Kernel, robot: Robot, swing: Trajectory, quarter: Limits
 ) -> None:
-    movers = Movers([Obstacle(name="mover", box=(0.1, 0.1, 0.1), position=(0.0, 0.0, 3.0), velocity=(0.1, 0.0, 0.0))])
+    dynamic = DynamicObstacles(
+        [Obstacle(name="dynamic_obstacle", box=(0.1, 0.1, 0.1), position=(0.0, 0.0, 3.0), velocity=(0.1, 0.0, 0.0))]
+    )
     for knot in swing.times[1:-1]:
-        made = retime(kernel, movers, swing, quarter, time=float(np.nextafter(knot, 0.0)))
+        made = retime(kernel, dynamic, swing, quarter, time=float(np.nextafter(knot, 0.0)))
         assert made.trajectory is not None and np.diff(made.trajectory.times).min() > 1e-9
         assert_kept(robot, swing, float(knot), checked(made.trajectory), 1e-9)
 
 
 @pytest.mark.parametrize("time", [0.0, 0.3])
-def test_it_waits_for_a_mover_that_crosses(
+def test_it_waits_for_a_dynamic_obstacle_that_crosses(
     kernel: Kernel, robot: Robot, swing: Trajectory, quarter: Limits, time: float
 ) -> None:
     middle = hand(kernel, swing, swing.duration / 2.0)
     slow = np.array([0.0, 0.0, 0.15])
-    movers = Movers(
-        [Obstacle(name="mover", box=(0.1, 0.1, 0.1), position=tuple(middle - slow * 1.2), velocity=tuple(slow))]
+    dynamic = DynamicObstacles(
+        [
+            Obstacle(
+                name="dynamic_obstacle", box=(0.1, 0.1, 0.1), position=tuple(middle - slow * 1.2), velocity=tuple(slow)
+            )
+        ]
     )
-    assert prove_motion(kernel, movers, swing)
-    made = retime(kernel, movers, swing, quarter, time=time, clock=time)
+    assert prove_motion(kernel, dynamic, swing)
+    made = retime(kernel, dynamic, swing, quarter, time=time, clock=time)
     assert made.trajectory is not None and made.trajectory.duration > swing.duration - time + 0.2
     assert_kept(robot, swing, time, made.trajectory, made.deviation)
     assert checked(made.trajectory).use(quarter)["velocity"] <= 1.0 + 1e-9
-    assert not prove_motion(kernel, movers, made.trajectory, 0.0, made.trajectory.duration + 1.0, clock=time)
+    assert not prove_motion(kernel, dynamic, made.trajectory, 0.0, made.trajectory.duration + 1.0, clock=time)
 
 
 @pytest.mark.parametrize("time", [0.0, 0.5])
-def test_without_movers_a_slow_motion_hurries(kernel: Kernel, robot: Robot, swing: Trajectory, time: float) -> None:
-    made = retime(kernel, Movers([]), swing, robot.limits, time=time)
+def test_without_dynamic_obstacles_a_slow_motion_hurries(
+    kernel: Kernel, robot: Robot, swing: Trajectory, time: float
+) -> None:
+    made = retime(kernel, DynamicObstacles([]), swing, robot.limits, time=time)
     assert made.trajectory is not None and made.trajectory.duration < 0.6 * (swing.duration - time)
     assert_kept(robot, swing, time, made.trajectory, made.deviation)
 
 
-def test_it_hurries_before_a_mover(kernel: Kernel, robot: Robot, swing: Trajectory) -> None:
+def test_it_hurries_before_a_dynamic_obstacle(kernel: Kernel, robot: Robot, swing: Trajectory) -> None:
     late = 0.75 * swing.duration
     there = hand(kernel, swing, late)
     base = kernel.joint_frames(swing(late)[None])[1][0][1]
     inwards = -0.3 * (there - base) * np.array([1.0, 1.0, 0.0]) / np.linalg.norm((there - base)[:2])
-    movers = Movers(
-        [Obstacle(name="mover", box=(0.1, 0.1, 0.1), position=tuple(there - inwards * late), velocity=tuple(inwards))]
+    dynamic = DynamicObstacles(
+        [
+            Obstacle(
+                name="dynamic_obstacle",
+                box=(0.1, 0.1, 0.1),
+                position=tuple(there - inwards * late),
+                velocity=tuple(inwards),
+            )
+        ]
     )
-    assert prove_motion(kernel, movers, swing)
-    made = retime(kernel, movers, swing, robot.limits, time=0.2, clock=0.2, hold=0.1)
+    assert prove_motion(kernel, dynamic, swing)
+    made = retime(kernel, dynamic, swing, robot.limits, time=0.2, clock=0.2, hold=0.1)
     assert made.trajectory is not None and made.trajectory.duration < swing.duration - 0.2
     assert_kept(robot, swing, 0.2, made.trajectory, made.deviation)
-    assert not prove_motion(kernel, movers, made.trajectory, clock=0.2)
+    assert not prove_motion(kernel, dynamic, made.trajectory, clock=0.2)
 
 
 def test_reasons(kernel: Kernel, robot: Robot, swing: Trajectory) -> None:
     def among(place: np.ndarray, **more: float) -> str:
-        movers = Movers([Obstacle(name="mover", box=(0.1, 0.1, 0.1), position=tuple(place))])
-        made = retime(kernel, movers, swing, robot.limits, **more)
+        dynamic = DynamicObstacles([Obstacle(name="dynamic_obstacle", box=(0.1, 0.1, 0.1), position=tuple(place))])
+        made = retime(kernel, dynamic, swing, robot.limits, **more)
         assert made.trajectory is None
         return made.reason
 
@@ -198,13 +215,13 @@ def test_reasons(kernel: Kernel, robot: Robot, swing: Trajectory) -> None:
         among(np.zeros(3), time=math.nan)
     short = Trajectory(np.zeros(1), np.zeros((1, 2)), np.zeros((1, 2)), np.zeros((1, 2)), ("a", "b"))
     with pytest.raises(ParameterError, match="joints"):
-        retime(kernel, Movers([]), short, robot.limits)
+        retime(kernel, DynamicObstacles([]), short, robot.limits)
 
 
-def test_no_movers_and_a_motion_that_has_ended(
+def test_no_dynamic_obstacles_and_a_motion_that_has_ended(
     kernel: Kernel, robot: Robot, swing: Trajectory, quarter: Limits
 ) -> None:
-    made = retime(kernel, Movers([]), swing, quarter)
+    made = retime(kernel, DynamicObstacles([]), swing, quarter)
     assert made.trajectory is not None and made.trajectory.duration == pytest.approx(swing.duration)
-    ended = retime(kernel, Movers([]), swing, robot.limits, time=swing.duration)
+    ended = retime(kernel, DynamicObstacles([]), swing, robot.limits, time=swing.duration)
     assert ended.trajectory is not None and ended.trajectory.duration == 0.0

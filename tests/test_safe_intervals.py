@@ -1,4 +1,4 @@
-"""Blocked intervals of time against samples of the distances between spheres and movers."""
+"""Blocked intervals of time against samples of the distances between spheres and dynamic obstacles."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from crossings import arm_motion, crossing, crossing_obstacle
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.kernel import Kernel
 from apex_ompl.kernel.compiled.blocked_intervals import MOST_SPANS
-from apex_ompl.moving.movers import Movers, clearance_in_time
+from apex_ompl.moving.dynamic_obstacles import DynamicObstacles, clearance_in_time
 from apex_ompl.moving.safe_intervals import Blocked, blocked
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import Obstacle
@@ -40,21 +40,21 @@ def largest_leaf(kernel: Kernel) -> float:
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("growth", [(0.0, 0.0), (0.01, 0.0), (0.01, 0.03), (0.0, 0.6)])
-def test_states_are_blocked_when_spheres_meet_movers(
+def test_states_are_blocked_when_spheres_meet_dynamic_obstacles(
     kernel: Kernel, robot: Robot, kind: str, growth: tuple[float, float]
 ) -> None:
     rng, times = np.random.default_rng(0), np.arange(0.0, HORIZON, SAMPLING)
     blocked_ones = 0
     for _ in range(6):
         motion = arm_motion(robot, rng, 0.25)
-        movers = crossing(kernel, motion, rng, kind, growth)
-        if movers is None:
+        dynamic = crossing(kernel, motion, rng, kind, growth)
+        if dynamic is None:
             continue
-        movers.update("mover", stamp=float(rng.choice([-0.5, 0.0, 2.0])))
+        dynamic.update("dynamic_obstacle", stamp=float(rng.choice([-0.5, 0.0, 2.0])))
         where = np.sort(rng.uniform(0.0, motion.duration, 3))
-        found = blocked(kernel, movers, motion, np.stack([where, where], axis=1), begin=0.0, end=HORIZON)
+        found = blocked(kernel, dynamic, motion, np.stack([where, where], axis=1), begin=0.0, end=HORIZON)
         for place, state in enumerate(motion(where)):
-            clearance = clearance_in_time(kernel, movers, np.tile(state, (len(times), 1)), times)[0]
+            clearance = clearance_in_time(kernel, dynamic, np.tile(state, (len(times), 1)), times)[0]
             inside = is_blocked(found, place, times)
             assert inside[clearance <= -OVERHANG].all()
             blocked_ones += inside.any()
@@ -71,17 +71,17 @@ def test_pieces_are_blocked_when_any_of_their_states_is(kernel: Kernel, robot: R
     touched = 0
     for _ in range(10):
         motion = arm_motion(robot, rng, 0.25)
-        movers = crossing(kernel, motion, rng, kind, (0.005, 0.01))
-        if movers is None:
+        dynamic = crossing(kernel, motion, rng, kind, (0.005, 0.01))
+        if dynamic is None:
             continue
         edges = np.linspace(0.0, motion.duration, 65)
         places = np.stack([edges[:-1], edges[1:]], axis=1)
-        found = blocked(kernel, movers, motion, places, begin=0.0, end=HORIZON, slack=slack)
+        found = blocked(kernel, dynamic, motion, places, begin=0.0, end=HORIZON, slack=slack)
         count = 4000
         where, times = rng.uniform(0.0, motion.duration, count), rng.uniform(0.0, HORIZON, count)
         states = motion(where) + rng.uniform(-slack, slack, (count, robot.dof))
         states = np.clip(states, robot.limits.lower, robot.limits.upper)
-        meets = clearance_in_time(kernel, movers, states, times)[0] <= -OVERHANG
+        meets = clearance_in_time(kernel, dynamic, states, times)[0] <= -OVERHANG
         piece = np.clip(np.searchsorted(edges, where, side="right") - 1, 0, 63)
         for k in np.flatnonzero(meets):
             assert found.meets(int(piece[k]), times[k], times[k])
@@ -93,13 +93,13 @@ def test_a_piece_adds_little_to_the_intervals_of_its_states(kernel: Kernel, robo
     rng, excess = np.random.default_rng(2), []
     for _ in range(20):
         motion = arm_motion(robot, rng, 0.25)
-        movers = crossing(kernel, motion, rng)
-        if movers is None:
+        dynamic = crossing(kernel, motion, rng)
+        if dynamic is None:
             continue
         edges = np.linspace(0.0, motion.duration, 257)
-        found = blocked(kernel, movers, motion, np.stack([edges[:-1], edges[1:]], axis=1), begin=0.0, end=HORIZON)
+        found = blocked(kernel, dynamic, motion, np.stack([edges[:-1], edges[1:]], axis=1), begin=0.0, end=HORIZON)
         middles = (edges[:-1] + edges[1:]) / 2.0
-        states = blocked(kernel, movers, motion, np.stack([middles, middles], axis=1), begin=0.0, end=HORIZON)
+        states = blocked(kernel, dynamic, motion, np.stack([middles, middles], axis=1), begin=0.0, end=HORIZON)
         long, short = (
             np.array([np.diff(b.spans[p, : b.counts[p]], axis=1).sum() for p in range(256)]) for b in (found, states)
         )
@@ -108,28 +108,30 @@ def test_a_piece_adds_little_to_the_intervals_of_its_states(kernel: Kernel, robo
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_states_are_blocked_when_meshes_touch_movers(kernel: Kernel, robot: Robot, kind: str) -> None:
+def test_states_are_blocked_when_meshes_touch_dynamic_obstacles(kernel: Kernel, robot: Robot, kind: str) -> None:
     rng, times, contacts = np.random.default_rng(3), np.arange(0.0, HORIZON, SAMPLING), 0
     for _ in range(4):
         motion = arm_motion(robot, rng, 0.25)
-        mover = crossing_obstacle(kernel, motion, rng, kind)
-        if mover is None:
+        dynamic_obstacle = crossing_obstacle(kernel, motion, rng, kind)
+        if dynamic_obstacle is None:
             continue
-        movers, place = Movers([mover]), np.full((1, 2), rng.uniform(0.3, 0.8) * motion.duration)
-        found, state = blocked(kernel, movers, motion, place, begin=0.0, end=HORIZON), motion(place[0, 0])
-        checker = CollisionChecker(robot, [mover])
-        near = clearance_in_time(kernel, movers, np.tile(state, (len(times), 1)), times)[0] <= 0.0
+        dynamic, place = DynamicObstacles([dynamic_obstacle]), np.full((1, 2), rng.uniform(0.3, 0.8) * motion.duration)
+        found, state = blocked(kernel, dynamic, motion, place, begin=0.0, end=HORIZON), motion(place[0, 0])
+        checker = CollisionChecker(robot, [dynamic_obstacle])
+        near = clearance_in_time(kernel, dynamic, np.tile(state, (len(times), 1)), times)[0] <= 0.0
         for time in rng.permutation(times[near])[:100]:
-            checker.move("mover", obstacle_at(mover, time).position)
+            checker.move("dynamic_obstacle", obstacle_at(dynamic_obstacle, time).position)
             if not checker.is_free(state):
                 contacts += 1
                 assert found.meets(0, time, time)
     assert contacts > 20
 
 
-def test_far_movers_block_nothing(kernel: Kernel, robot: Robot) -> None:
+def test_far_dynamic_obstacles_block_nothing(kernel: Kernel, robot: Robot) -> None:
     motion: Trajectory = arm_motion(robot, np.random.default_rng(4), 0.25)
-    movers = Movers([Obstacle(name="mover", box=(0.1, 0.1, 0.1), position=(0.0, 0.0, 5.0), velocity=(0.0, 0.2, 0.0))])
+    dynamic = DynamicObstacles(
+        [Obstacle(name="dynamic_obstacle", box=(0.1, 0.1, 0.1), position=(0.0, 0.0, 5.0), velocity=(0.0, 0.2, 0.0))]
+    )
     edges = np.linspace(0.0, motion.duration, 33)
-    found = blocked(kernel, movers, motion, np.stack([edges[:-1], edges[1:]], axis=1), begin=0.0, end=HORIZON)
+    found = blocked(kernel, dynamic, motion, np.stack([edges[:-1], edges[1:]], axis=1), begin=0.0, end=HORIZON)
     assert not found.counts.any()

@@ -156,15 +156,15 @@ def test_timed_paths_among_scripts_are_free_at_all_times_or_nearly_touch(robot: 
     places = [hands[rng.integers(4)] + rng.normal(0.0, 0.15, 3) for _ in knots]
     rows = tuple((float(t), *map(float, p)) for t, p in zip(knots, places, strict=True))
     appears = float(rng.uniform(0.0, times[-1])) if seed % 2 else 0.0
-    mover = Obstacle(name="mover", box=(0.12, 0.1, 0.08), trajectory=rows, appears=appears)
-    check = check_timed_path(robot, problem_with(robot, mover), path, times)
-    checker = CollisionChecker(robot, [obstacle_at(mover, 0.0)], proofs=False)
+    dynamic_obstacle = Obstacle(name="dynamic_obstacle", box=(0.12, 0.1, 0.08), trajectory=rows, appears=appears)
+    check = check_timed_path(robot, problem_with(robot, dynamic_obstacle), path, times)
+    checker = CollisionChecker(robot, [obstacle_at(dynamic_obstacle, 0.0)], proofs=False)
     nearest = np.inf
     for time in np.linspace(0.0, times[-1], 150):
-        if not is_there(mover, time):
+        if not is_there(dynamic_obstacle, time):
             continue
         q = np.array([np.interp(time, times, column) for column in path.T])
-        checker.move("mover", obstacle_at(mover, time).position)
+        checker.move("dynamic_obstacle", obstacle_at(dynamic_obstacle, time).position)
         if check:
             assert checker.is_free(q), time
         else:
@@ -247,7 +247,7 @@ def result(scripts: Problem) -> PlanResult:
     """A motion that is shown among scripts."""
     found = plan(scripts.still, "rrtconnect", timeout=20.0)
     assert found and found.trajectory is not None and found.trajectory.duration > 0.6
-    return replace(found, problem=scripts, movers=("turns", "late"))
+    return replace(found, problem=scripts, dynamic_obstacles=("turns", "late"))
 
 
 def test_pages_show_scripts(result: PlanResult, server: Any, tmp_path: Path) -> None:
@@ -277,7 +277,7 @@ def test_films_show_scripts(tmp_path: Path) -> None:
     problem = arm_problem(tmp_path)
     late = Obstacle(name="late", box=(0.3, 0.3, 0.3), position=(-0.5, -0.4, 0.8), appears=0.4)
     scripts = problem.model_copy(update={"scene": (*problem.scene, late)})
-    result = replace(plan(problem, timeout=20.0), problem=scripts, movers=("late",))
+    result = replace(plan(problem, timeout=20.0), problem=scripts, dynamic_obstacles=("late",))
 
     def red(frame: np.ndarray) -> int:
         colors = frame[..., :3].astype(int)

@@ -1,4 +1,4 @@
-"""Splines in time among movers: costs, gradients, exact starts, limits, and motions that give way."""
+"""Splines in time among dynamic obstacles: costs, gradients, exact starts, limits, and motions that give way."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ParameterError
-from apex_ompl.moving.movers import Movers, curve_of, prove_motion
+from apex_ompl.moving.dynamic_obstacles import DynamicObstacles, curve_of, prove_motion
 from apex_ompl.moving.timed_spline import MotionOptimizer, MotionSettings, Start, TimedSpline, _grid
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import Obstacle
@@ -86,11 +86,11 @@ def test_gradients_by_finite_differences(robot: Robot, bare: CollisionChecker) -
     start, goal = ends(robot)
     spline = line(start, goal, 0.6)  # over its limits
     spline.control[3:-3] += rng.normal(0.0, 0.03, spline.control[3:-3].shape) * (np.arange(robot.dof) < 7)
-    movers = Movers([crossing(robot, 1.3)])
-    movers.update("box", growth=(0.005, 0.01))
-    optimizer = MotionOptimizer(bare.kernel, movers, robot.limits)
+    dynamic = DynamicObstacles([crossing(robot, 1.3)])
+    dynamic.update("box", growth=(0.005, 0.01))
+    optimizer = MotionOptimizer(bare.kernel, dynamic, robot.limits)
     report, gradient = optimizer.evaluate(spline, clock=1.0)
-    without, _ = MotionOptimizer(bare.kernel, Movers([]), robot.limits).evaluate(spline, clock=1.0)
+    without, _ = MotionOptimizer(bare.kernel, DynamicObstacles([]), robot.limits).evaluate(spline, clock=1.0)
     assert report.clearance_cost > without.clearance_cost and report.scene_clearance < without.scene_clearance
     step, relative = 1e-6, []
     for i, d in zip(rng.integers(0, len(gradient), 25), rng.integers(0, 7, 25), strict=True):
@@ -109,21 +109,21 @@ def test_a_motion_gives_way_within_its_limits(robot: Robot, bare: CollisionCheck
     q, goal = ends(robot)
     spline = line(q, goal, 1.2)
     box = crossing(robot, 0.5 * spline.duration)
-    movers = Movers([box])
-    assert prove_motion(bare.kernel, movers, spline.trajectory(robot.joint_names))
+    dynamic = DynamicObstacles([box])
+    assert prove_motion(bare.kernel, dynamic, spline.trajectory(robot.joint_names))
     start = Start(q, np.where(np.arange(robot.dof) == 1, 0.3, 0.0), np.zeros(robot.dof)) if moving else spline.start
 
     def accepts(motion: Trajectory) -> bool:
-        return not prove_motion(bare.kernel, movers, motion) and bool(bare.prove(curve_of(motion), tolerance=0.0))
+        return not prove_motion(bare.kernel, dynamic, motion) and bool(bare.prove(curve_of(motion), tolerance=0.0))
 
-    optimizer = MotionOptimizer(bare.kernel, movers, robot.limits)
+    optimizer = MotionOptimizer(bare.kernel, dynamic, robot.limits)
     motion = optimizer.repair(spline._replace(start=start).lasting(spline.spacing), accepts)
     assert motion is not None and accepts(motion)
     assert max(motion.use(robot.limits).values()) <= 1.0 + 1e-9
     assert np.array_equal(motion.velocities[0], start.velocity) and np.array_equal(motion(motion.duration), goal)
     exact = CollisionChecker(robot, [box], proofs=False)
     for time in np.linspace(0.0, motion.duration, 100):
-        exact.move("box", Movers([box]).at(time)["box"])
+        exact.move("box", DynamicObstacles([box]).at(time)["box"])
         assert exact.is_free(motion(time))
     assert optimizer.repair(spline, lambda motion: False) is None
     assert optimizer.repair(spline, accepts, stop=lambda: True) is None
@@ -135,7 +135,7 @@ def test_bad_input_is_named(robot: Robot, bare: CollisionChecker) -> None:
         line(start, goal, -1.0)
     with pytest.raises(ParameterError, match="states"):
         TimedSpline.along(start[None], 1.0, Start.at_rest(start), goal)
-    optimizer = MotionOptimizer(bare.kernel, Movers([]), robot.limits, MotionSettings(steps=2))
+    optimizer = MotionOptimizer(bare.kernel, DynamicObstacles([]), robot.limits, MotionSettings(steps=2))
     spline = line(start, goal, 1.0)
     with pytest.raises(ParameterError, match="control points"):
         optimizer.improve(spline._replace(control=spline.control[:6]))

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.loop.observation import Observation
 from apex_ompl.loop.tracking import LEAST, MOST_DOUBTED, MOST_TRACKS, Track, Tracker, TrackSettings
-from apex_ompl.moving.movers import Movers, allowed_rows, clearance_in_time
+from apex_ompl.moving.dynamic_obstacles import DynamicObstacles, allowed_rows, clearance_in_time
 from apex_ompl.problems.suite_robot import robot as suite_robot
 from apex_ompl.scene.bodies import Obstacle
 
@@ -236,11 +236,11 @@ def test_obstacles_are_within_what_they_can_reach(seed: int, error: float, faste
             continue
         off = rng.normal(size=3)
         tracker.take(look(times[k], truth[k] + error * rng.random() * off / np.linalg.norm(off)))
-        movers = tracker.reachable(error, fastest, margin, suite_robot().home if rng.random() < 0.7 else None)
-        a = movers.arrays
+        dynamic = tracker.reachable(error, fastest, margin, suite_robot().home if rng.random() < 0.7 else None)
+        a = dynamic.arrays
         for j in range(k, min(k + 40, 201)):
             allowed = a.growth[0, 0] + a.growth[0, 1] * (times[j] - a.stamp[0])
-            assert np.linalg.norm(truth[j] - movers.at(times[j])["box"]) <= allowed - margin + 1e-9
+            assert np.linalg.norm(truth[j] - dynamic.at(times[j])["box"]) <= allowed - margin + 1e-9
 
 
 @settings(max_examples=40)
@@ -250,7 +250,7 @@ def test_margins_are_eased_where_the_robot_stands(seed: int, margin: float, gap:
     direction = rng.normal(size=3)
     direction /= np.linalg.norm(direction)
     low, high = 0.0, 3.0
-    alone = Movers([at((0, 0, 0))])
+    alone = DynamicObstacles([at((0, 0, 0))])
     for _ in range(40):  # as near in that direction as leaves the gap
         middle = 0.5 * (low + high)
         alone.update("box", np.array((0.4, 0.0, 0.6)) + middle * direction)
@@ -277,7 +277,7 @@ def test_no_margin_is_left_where_an_obstacle_touches_the_robot() -> None:
 
 
 def test_obstacles_whose_shapes_change_or_appear_are_as_if_made_anew(tmp_path: Path) -> None:
-    """Solids are kept from call to call: after each look all is as in movers that were never there before."""
+    """Solids are kept from call to call: after each look all is as in obstacles that were never there before."""
     trimesh.creation.box((0.1, 0.2, 0.1)).export(tmp_path / "m.stl")
     block = Obstacle(name="block", mesh={"file": str(tmp_path / "m.stl")}, position=(0.5, 0.0, 0.5))
     turned = block.model_copy(update={"orientation": (0.0, 0.0, 0.5**0.5, 0.5**0.5)})
@@ -290,7 +290,7 @@ def test_obstacles_whose_shapes_change_or_appear_are_as_if_made_anew(tmp_path: P
         found = tracker.predicted(0.02), tracker.predicted(0.02, "still"), tracker.reachable(0.01, 0.4, 0.005)
         shapes = [track.shape for track in tracker.tracks.values()]
         for one, kind in zip(found, ("cv", "still", "reach"), strict=True):
-            made = Movers(shapes, allowed_rows(KERNEL, tracker.allowed, list(tracker.tracks)))
+            made = DynamicObstacles(shapes, allowed_rows(KERNEL, tracker.allowed, list(tracker.tracks)))
             for name, track in tracker.tracks.items():
                 first, later = track.growth(tracker.settings)
                 growth = {"cv": (0.02 + first, later), "still": (0.02, 0.0), "reach": (0.015, 0.4)}[kind]

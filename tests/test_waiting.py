@@ -14,8 +14,8 @@ from apex_ompl.loop.replan.portfolio import Portfolio
 from apex_ompl.loop.replan.sprint import CHARGE, Sprint
 from apex_ompl.loop.replan.waiting import wait_nearer
 from apex_ompl.moving.charges import Charges
+from apex_ompl.moving.dynamic_obstacles import DynamicObstacles
 from apex_ompl.moving.following import Following
-from apex_ompl.moving.movers import Movers
 from apex_ompl.moving.ready import Ready
 from apex_ompl.moving.request import Request
 from apex_ompl.moving.search import Search
@@ -41,8 +41,8 @@ def search_of(
 ) -> Search:
     """A replan of a robot that stands, at the start unless elsewhere, and for which none was found before."""
     standing = Following.standing(ready.setup.start if at is None else at, 0.0, ready.names)
-    movers = Movers(obstacles)
-    request = Request(2, 0.0, 0.05, standing, None, movers, 0.0, obstacles, conflict, 0)
+    dynamic = DynamicObstacles(obstacles)
+    request = Request(2, 0.0, 0.05, standing, None, dynamic, 0.0, obstacles, conflict, 0)
     return Search(ready, request, Charges(budget))
 
 

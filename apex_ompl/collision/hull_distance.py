@@ -49,25 +49,25 @@ def hull_distance(first: Solid, at: pin.SE3, second: Solid, there: pin.SE3) -> D
 
 
 def closest(
-    movers: Sequence[Solid], at: Sequence[pin.SE3], others: Sequence[Solid], there: Sequence[pin.SE3]
+    dynamic: Sequence[Solid], at: Sequence[pin.SE3], others: Sequence[Solid], there: Sequence[pin.SE3]
 ) -> Distance:
     """Return the least signed distance of the hulls of two sets of solids; pairs whose boxes are farther are left out.
 
     Args:
-        movers: Solids of the one set.
+        dynamic: Solids of the one set.
         at: Their poses in the world.
         others: Solids of the other set.
         there: Their poses in the world.
     """
     best = NO_PAIR
-    if not movers or not others:
+    if not dynamic or not others:
         return best
-    bounds = box_distances(world_boxes(movers, at), world_boxes(others, there))
+    bounds = box_distances(world_boxes(dynamic, at), world_boxes(others, there))
     for k in np.argsort(bounds, axis=None, kind="stable").tolist():
         i, j = divmod(k, len(others))
         if bounds[i, j] > max(best.value, 0.0):
             break
-        found = hull_distance(movers[i], at[i], others[j], there[j])
+        found = hull_distance(dynamic[i], at[i], others[j], there[j])
         if found.value < best.value:
             best = found
     return best

@@ -230,14 +230,14 @@ class MeshStage:
             fixtures: Whether the robot's fixtures are obstacles too.
         """
         left_out = () if fixtures else {body.name for body in self._robot.fixtures}
-        movers = [self.solids[k] for k in self.moving]
+        dynamic = [self.solids[k] for k in self.moving]
         others = [self.solids[k] for name, k in self.scene.items() if name not in left_out]
         with self.lock:
             pin.forwardKinematics(self.model, self.data, q)
-            poses = [self._pose(solid) for solid in movers]
-            boxes = world_boxes(movers, poses)
+            poses = [self._pose(solid) for solid in dynamic]
+            boxes = world_boxes(dynamic, poses)
             others = [part for solid in others for part in nearest_balls(solid, boxes)]
-            return closest(movers, poses, others, [solid.placement for solid in others])
+            return closest(dynamic, poses, others, [solid.placement for solid in others])
 
     def _pose(self, solid: Solid) -> pin.SE3:
         """Return the pose of a solid in the world at the state that the joints are placed for."""

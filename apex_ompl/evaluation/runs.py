@@ -23,10 +23,10 @@ from apex_ompl.ompl.process import quiet_ompl, seed_ompl
 from apex_ompl.ompl.report import SolveReport, report_of
 from apex_ompl.ompl.setup import assemble
 from apex_ompl.paths.path import path_length
-from apex_ompl.planning import PlanRun, finish, plan_among_movers, query_fault, solve, with_exact_ends
-from apex_ompl.planning.among_movers import STAGES
-from apex_ompl.planning.among_movers import warm_up as warm_up_among_movers
-from apex_ompl.planning.movers import movers_of
+from apex_ompl.planning import PlanRun, finish, plan_among_dynamic_obstacles, query_fault, solve, with_exact_ends
+from apex_ompl.planning.among_dynamic_obstacles import STAGES
+from apex_ompl.planning.among_dynamic_obstacles import warm_up as warm_up_among_dynamic_obstacles
+from apex_ompl.planning.dynamic_obstacles import dynamic_of
 from apex_ompl.problems.generator import SuiteError
 from apex_ompl.result import FIRST, PlanResult, PlanStatus
 from apex_ompl.robot import Robot, load_robot
@@ -208,15 +208,15 @@ def in_time(job: Job, stages: Sequence[str] = STAGES) -> tuple[PlanRun, Experime
 
     Args:
         job: The run.
-        stages: See :func:`apex_ompl.planning.plan_among_movers`.
+        stages: See :func:`apex_ompl.planning.plan_among_dynamic_obstacles`.
     """
     started, problem = time.perf_counter(), load_problem(job.problem)
-    movers = movers_of(problem.scene)
+    dynamic = dynamic_of(problem.scene)
     with quiet_ompl():
         planning = _ready(job, problem.still, started)
         planning.setup = replace(planning.setup, problem=problem)
-        warm_up_among_movers(planning.setup.checker)
-        result = plan_among_movers(planning, movers, job.simplify, Timing(), stages)
+        warm_up_among_dynamic_obstacles(planning.setup.checker)
+        result = plan_among_dynamic_obstacles(planning, dynamic, job.simplify, Timing(), stages)
         return planning, Experiment(), finish(planning, result, started)
 
 
@@ -241,7 +241,7 @@ def columns(planning: PlanRun, experiment: Experiment, result: PlanResult) -> Ru
     found = path is not None
     total = sum(times.get(stage, 0.0) for stage in ("solve", "simplify", *PROOF))
     first = times.get(FIRST, times.get("solve", 0.0))
-    if result.movers:  # the motion is what is asked for, and comes last
+    if result.dynamic_obstacles:  # the motion is what is asked for, and comes last
         first = total = times["total"] - times["setup"]
     elif report is None or not report.first_verified:  # the planner itself had not made the full check
         setup = planning.setup

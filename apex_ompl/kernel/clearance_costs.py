@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from apex_ompl.kernel.compiled.dynamic_obstacles import DynamicArrays
 from apex_ompl.kernel.compiled.layout import pack, unpack
-from apex_ompl.kernel.compiled.movers import MoverArrays
 from apex_ompl.kernel.compiled.state_costs import state_costs
 from apex_ompl.kernel.kernel import Kernel
 from apex_ompl.types import Array
@@ -16,8 +16,8 @@ from apex_ompl.util.arrays import compact
 from apex_ompl.util.validation import check_array, check_positive, finite_array
 
 _NOTHING = np.empty(0)
-NO_MOVERS: tuple[Any, ...] = pack(
-    MoverArrays(
+NO_DYNAMIC_OBSTACLES: tuple[Any, ...] = pack(
+    DynamicArrays(
         kind=np.empty(0, np.int64), owner=np.empty(0, np.int64), grid=np.empty((0, 4), np.int64),
         allowed=np.empty((0, 2), np.int64), rotation=_NOTHING, place=_NOTHING, size=_NOTHING, velocity=_NOTHING,
         stamp=_NOTHING, growth=_NOTHING, values=np.empty(0, np.float32),
@@ -46,7 +46,7 @@ class ClearanceCosts(NamedTuple):
 
 def clearance_costs(
     kernel: Kernel, states: ArrayLike, scene_margin: float, own_margin: float, times: ArrayLike | None = None,
-    movers: tuple[Any, ...] = NO_MOVERS,
+    dynamic: tuple[Any, ...] = NO_DYNAMIC_OBSTACLES,
 ) -> ClearanceCosts:  # fmt: skip
     """Return what states cost that are nearer than margins to obstacles, or of which links are to each other.
 
@@ -57,8 +57,8 @@ def clearance_costs(
         states: States, shape (N, dof).
         scene_margin: Clearance to obstacles below which a state costs [m].
         own_margin: Clearance between links below which it costs [m].
-        times: Times at which movers are looked at, shape (N,) [s]; by default 0.
-        movers: Obstacles that move, packed as :class:`apex_ompl.kernel.compiled.movers.MoverArrays`.
+        times: Times at which dynamic obstacles are looked at, shape (N,) [s]; by default 0.
+        dynamic: Obstacles that move, packed as :class:`apex_ompl.kernel.compiled.dynamic_obstacles.DynamicArrays`.
 
     Raises:
         ParameterError: Another shape, a margin that is not positive, or a time that is not finite.
@@ -69,10 +69,10 @@ def clearance_costs(
     count, dof = q.shape
     at = np.zeros(count) if times is None else compact(finite_array(times, "times"))
     check_array(at, (count,), "times")
-    offset = np.empty((len(unpack(MoverArrays, *movers).kind), 3))
+    offset = np.empty((len(unpack(DynamicArrays, *dynamic).kind), 3))
     values, gradient, gram = np.empty((count, 3)), np.empty((count, dof)), np.empty((count, dof, dof))
     state_costs(
-        *kernel.packed, *movers, *kernel.workspace(), offset, q, at, float(scene_margin), float(own_margin),
+        *kernel.packed, *dynamic, *kernel.workspace(), offset, q, at, float(scene_margin), float(own_margin),
         np.empty(dof), values, gradient, gram,
     )  # fmt: skip
     return ClearanceCosts(values[:, 0], gradient, gram, values[:, 1:])

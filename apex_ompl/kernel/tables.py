@@ -87,12 +87,12 @@ class RobotTables:
         """
         check_indices(joints, self.dof, "joints", "planned joints")
         a, mine = self.arrays, {int(k) for k in joints}
-        movers: list[set[int]] = []  # of each joint; parents come first
+        dynamic: list[set[int]] = []  # of each joint; parents come first
         for parent, source in zip(a.joint_parent, a.joint_source, strict=True):
-            above = movers[parent] if movers else set()
-            movers.append(above | ({int(source)} - {-1}))
+            above = dynamic[parent] if dynamic else set()
+            dynamic.append(above | ({int(source)} - {-1}))
         inner = (set() if dof < 0 else {int(dof)} for dof in a.cluster_dof)
-        clusters = [movers[j] | own for j, own in zip(a.cluster_joint, inner, strict=True)]
+        clusters = [dynamic[j] | own for j, own in zip(a.cluster_joint, inner, strict=True)]
         meets = [bool(m) and bool(c) and c <= mine for m, c in zip(a.cluster_meets_scene, clusters, strict=True)]
         pairs = [bool(both) and both <= mine for both in (clusters[c] | clusters[d] for c, d in a.pair_clusters)]
         arrays = with_pairs(a, np.array(pairs, bool))._replace(cluster_meets_scene=np.array(meets, np.int64))

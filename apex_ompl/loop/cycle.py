@@ -16,8 +16,8 @@ from apex_ompl.loop.replanning import Replanning
 from apex_ompl.loop.result import INTERRUPTED, Event
 from apex_ompl.loop.sensor import CUT
 from apex_ompl.loop.tracking import Tracker, TrackSettings, as_they_are
+from apex_ompl.moving.dynamic_obstacles import DynamicObstacles
 from apex_ompl.moving.following import SAME_TIME, Following, executed
-from apex_ompl.moving.movers import Movers
 from apex_ompl.moving.ready import Ready
 from apex_ompl.problems.worlds import World
 from apex_ompl.scene.bodies import Obstacle
@@ -183,7 +183,7 @@ class Loop:
             self._world.begin(route.motion, max(route.begin, now))
             self._begun = True
 
-    def _records(self, predicted: Movers, now: float) -> tuple[Obstacle, ...]:
+    def _records(self, predicted: DynamicObstacles, now: float) -> tuple[Obstacle, ...]:
         """Return the obstacles where they are expected to be now, with the velocities that are expected."""
         prediction, tracks = self._ready.settings.prediction, self._tracker.tracks
         if prediction == "truth":

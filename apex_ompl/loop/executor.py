@@ -22,9 +22,9 @@ from apex_ompl.loop.replan.evasion import GAIN, SOON, URGENT, endangered
 from apex_ompl.loop.replanning import Replanning
 from apex_ompl.loop.result import BRAKING, GOING, STANDING, Event
 from apex_ompl.loop.tracking import Tracker
+from apex_ompl.moving.dynamic_obstacles import DynamicObstacles, clearance_in_time
 from apex_ompl.moving.fitting import misfit
 from apex_ompl.moving.following import SAME_TIME, Following
-from apex_ompl.moving.movers import Movers, clearance_in_time
 from apex_ompl.moving.ready import Ready
 from apex_ompl.moving.request import Request
 from apex_ompl.moving.search import EARLIER
@@ -107,7 +107,7 @@ class Executor:
         self.following = one
         self.followed.append((time, one))
 
-    def step(self, now: float, predicted: Movers, obstacles: Callable[[], tuple[Obstacle, ...]]) -> None:
+    def step(self, now: float, predicted: DynamicObstacles, obstacles: Callable[[], tuple[Obstacle, ...]]) -> None:
         """Decide what the robot does until the next step.
 
         Args:
@@ -150,7 +150,7 @@ class Executor:
         if stop is not self.following:
             self._follow_stop(now, stop)
 
-    def _look(self, now: float, predicted: Movers) -> None:
+    def _look(self, now: float, predicted: DynamicObstacles) -> None:
         """Find the first conflict of what is followed."""
         if self.ready.settings.by_distance:
             found = now if self._distance(now, predicted) < self.nearest else math.inf
@@ -171,7 +171,7 @@ class Executor:
             return STANDING
         return BRAKING if self.following is self.braking else GOING
 
-    def _distance(self, now: float, predicted: Movers) -> float:
+    def _distance(self, now: float, predicted: DynamicObstacles) -> float:
         """Return how far obstacles are from the robot, at most twice the trigger [m]."""
         looked = np.array([now])
         clear, _ = clearance_in_time(
@@ -179,7 +179,7 @@ class Executor:
         )
         return float(clear.min())
 
-    def _brake(self, now: float, predicted: Movers) -> None:
+    def _brake(self, now: float, predicted: DynamicObstacles) -> None:
         """Stop where a conflict is near and no answer came within a step, if it is not touched as soon there.
 
         A robot that leaves without a fail-safe stop does not wait for an answer.
@@ -193,7 +193,7 @@ class Executor:
         if self._first_conflict(stop, now, predicted) > self.conflict + GAIN:
             self._follow_stop(now, stop)
 
-    def _first_conflict(self, one: Following, now: float, predicted: Movers) -> float:
+    def _first_conflict(self, one: Following, now: float, predicted: DynamicObstacles) -> float:
         """Return the time of the first conflict of a motion, or of standing where it ends [s], or infinity."""
         hold = self.ready.settings.hold if one.to_goal else self.ready.settings.rest_hold
         return self.ready.first_conflict(predicted, one, now, max(one.end, now) + hold)
@@ -235,7 +235,7 @@ class Executor:
         settings = self.ready.settings
         return settings.stuck if settings.from_rest else settings.period
 
-    def _guard(self, now: float, reachable: Movers, predicted: Movers) -> None:
+    def _guard(self, now: float, reachable: DynamicObstacles, predicted: DynamicObstacles) -> None:
         """Go on with a proved stop behind the next step, or stop."""
         if self.following.at_rest(now):
             self.leaving = False
@@ -263,7 +263,7 @@ class Executor:
         elif self.stop is not self.following:
             self._follow_stop(now, self.stop)
 
-    def _proved_to_rest(self, now: float, reachable: Movers) -> bool:
+    def _proved_to_rest(self, now: float, reachable: DynamicObstacles) -> bool:
         """Whether all that the robot follows is proved until it is at rest, from when it moves on."""
         begin = now if self.following.start(now).moves else max(now, self.sets_out)
         return math.isinf(self.ready.first_conflict(reachable, self.following, begin, self.following.end))
@@ -275,7 +275,7 @@ class Executor:
             self.log(now, "reaction", seconds=took, how=how, ahead=self.ahead, doing=self.doing)
             self.endangered = None
 
-    def _answer(self, now: float, predicted: Movers, reachable: Movers | None) -> None:
+    def _answer(self, now: float, predicted: DynamicObstacles, reachable: DynamicObstacles | None) -> None:
         """Take the answer of a replan that is known by now, where it is of use."""
         reply, request = self.replanning.reply(now), self.pending
         faults = self.replanning.faults()
@@ -321,7 +321,9 @@ class Executor:
         if self.ready.settings.by_distance:
             self.nearest = min(self.ready.settings.trigger, self._distance(now, predicted) - NEARER)
 
-    def _at_once(self, now: float, request: Request, found: Following, predicted: Movers) -> tuple[Request, Following]:
+    def _at_once(
+        self, now: float, request: Request, found: Following, predicted: DynamicObstacles
+    ) -> tuple[Request, Following]:
         """Return a request and its answer, which begins now where a robot that stands can set out at once."""
         if request.following is not self.following or abs(found.begin - request.join) > SAME_TIME:
             return request, found
@@ -333,7 +335,7 @@ class Executor:
             return replace(request, join=join), replace(found, begin=join)
         return request, found
 
-    def _fault(self, now: float, request: Request, found: Following, predicted: Movers) -> str:
+    def _fault(self, now: float, request: Request, found: Following, predicted: DynamicObstacles) -> str:
         """Return why an answer is of no use any more, or nothing."""
         settings = self.ready.settings
         if request.following is not self.following:
@@ -361,7 +363,11 @@ class Executor:
         return (self.contact if self.following.at_rest(found.begin) else self.conflict) < now + SOON
 
     def _ask(
-        self, now: float, predicted: Movers, reachable: Movers | None, obstacles: Callable[[], tuple[Obstacle, ...]]
+        self,
+        now: float,
+        predicted: DynamicObstacles,
+        reachable: DynamicObstacles | None,
+        obstacles: Callable[[], tuple[Obstacle, ...]],
     ) -> None:
         """Ask for a replan where one is of use."""
         settings = self.ready.settings

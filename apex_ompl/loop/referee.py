@@ -1,8 +1,8 @@
 """What truly happened in a run: contacts of the executed motion, limits, and where it ends.
 
 The motion is looked at by the exact shapes at samples ``SPACING`` apart, with each obstacle where its script has it
-then. Stretches of time that the sphere covers prove apart from all movers need no samples; what stands still, and the
-robot itself, is proved apart along the motion's own cubic pieces.
+then. Stretches of time that the sphere covers prove apart from all dynamic obstacles need no samples; what stands
+still, and the robot itself, is proved apart along the motion's own cubic pieces.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from apex_ompl.collision.scene_bodies import SceneBodies
 from apex_ompl.errors import ParameterError
 from apex_ompl.goals.alignment_errors import within
 from apex_ompl.loop.result import Outcome
-from apex_ompl.moving.movers import clearance_in_time, prove_motion
-from apex_ompl.moving.scripted import Piece, ScriptedMovers
+from apex_ompl.moving.dynamic_obstacles import clearance_in_time, prove_motion
+from apex_ompl.moving.scripted import Piece, ScriptedDynamicObstacles
 from apex_ompl.ompl.setup import workspace_goal
 from apex_ompl.robot import Robot
 from apex_ompl.robot.model import Limits
@@ -125,7 +125,7 @@ class RefereeReport:
 
 def judge(
     robot: Robot, problem: Problem, trajectory: Trajectory, *, end: float | None = None,
-    goals: ArrayLike | None = None, limits: Limits | None = None, movers: Iterable[str] = (),
+    goals: ArrayLike | None = None, limits: Limits | None = None, dynamic: Iterable[str] = (),
 ) -> RefereeReport:  # fmt: skip
     """Find out what truly happened in a run.
 
@@ -136,7 +136,7 @@ def judge(
         end: When the run ended [s], by default with the motion.
         goals: States of which the motion is to end in one, shape (N, dof); by default the goal of the problem.
         limits: Limits that are to be kept, by default the robot's.
-        movers: Names of obstacles that count as moving, though they stood all the time.
+        dynamic: Names of obstacles that count as moving, though they stood all the time.
 
     Raises:
         ParameterError: The motion is one of other joints, ``end`` is before its end, or the goals have another shape.
@@ -146,18 +146,18 @@ def judge(
         raise ParameterError("trajectory", ", ".join(trajectory.joint_names), f"the joints of {robot.name}")
     until = trajectory.duration if end is None else end
     check_number(until, "end", trajectory.duration)
-    names = {*problem.moving, *movers}
+    names = {*problem.moving, *dynamic}
     still = [o for o in problem.scene if o.name not in names]
     checker = CollisionChecker(
         robot, still, problem.attached, [pair for pair in problem.allowed if not {*pair} & names]
     )  # fmt: skip
     moving = [o for o in problem.scene if o.name in names]
-    scripted = ScriptedMovers(checker.kernel, moving, problem.allowed)
+    scripted = ScriptedDynamicObstacles(checker.kernel, moving, problem.allowed)
     times = np.append(SPACING * np.arange(np.ceil(until / SPACING - 1e-9)), until)
     clearances = scripted.clearances(trajectory, times)
     least = int(np.nanargmin(clearances)) if not np.isnan(clearances).all() else 0
     speeds, rates = np.abs(trajectory.velocities[-1]), np.abs(trajectory.accelerations[-1])
-    contact, moving_contact = ExactMovers(robot, problem, scripted).first_contacts(trajectory, times)
+    contact, moving_contact = ExactDynamicObstacles(robot, problem, scripted).first_contacts(trajectory, times)
     return RefereeReport(
         contact=contact,
         moving_contact=moving_contact,
@@ -170,10 +170,10 @@ def judge(
     )
 
 
-class ExactMovers:
+class ExactDynamicObstacles:
     """The exact shapes of a robot, of what it holds and of obstacles that move."""
 
-    def __init__(self, robot: Robot, problem: Problem, scripted: ScriptedMovers) -> None:
+    def __init__(self, robot: Robot, problem: Problem, scripted: ScriptedDynamicObstacles) -> None:
         """Take the robot, the problem for what is held and may touch, and the obstacles."""
         self._robot, self._scripted = robot, scripted
         self._obstacles: dict[str, Obstacle] = {o.name: o for o in scripted.obstacles}
@@ -212,8 +212,8 @@ class ExactMovers:
                 yield from self._among(motion, times, piece)
                 return
             time, last = piece.begin, -np.inf
-            while len(piece.movers):
-                conflict = prove_motion(kernel, piece.movers, motion, time, piece.end)
+            while len(piece.dynamic):
+                conflict = prove_motion(kernel, piece.dynamic, motion, time, piece.end)
                 if not conflict:
                     break
                 time = min(conflict.time + STRETCH, piece.end)
@@ -240,9 +240,9 @@ class ExactMovers:
 
     def _among(self, motion: Trajectory, times: Array, piece: Piece) -> Iterator[tuple[float, tuple[str, ...]]]:
         """Yield the times inside of a piece at which the sphere covers do not prove the robot apart."""
-        if len(piece.movers) and len(times):
-            spheres = clearance_in_time(self._scripted.kernel, piece.movers, motion(times), times, NEAR)[0]
-            there = piece.movers.names
+        if len(piece.dynamic) and len(times):
+            spheres = clearance_in_time(self._scripted.kernel, piece.dynamic, motion(times), times, NEAR)[0]
+            there = piece.dynamic.names
             yield from ((time, there) for time in times[~(spheres > 0.0)].tolist())
 
 

@@ -8,8 +8,8 @@ import numpy as np
 
 from apex_ompl.loop.replanning import answered
 from apex_ompl.moving.charges import Charges
+from apex_ompl.moving.dynamic_obstacles import DynamicObstacles
 from apex_ompl.moving.following import Following
-from apex_ompl.moving.movers import Movers
 from apex_ompl.moving.ready import Ready
 from apex_ompl.moving.request import Replanner, Request
 from apex_ompl.scene.bodies import Obstacle, Sphere
@@ -30,11 +30,11 @@ def requests(ready: Ready) -> tuple[Request, ...]:
     _, places = ready.kernel.joint_frames(0.5 * (start + goal)[None])
     position = tuple(places[0, -1].tolist())
     ball = Obstacle(name="rehearsal", sphere=Sphere(radius=RADIUS), position=position, velocity=VELOCITY)
-    movers, join = Movers([ball]), min(settings.budget, 0.5 * line.end)
+    dynamic, join = DynamicObstacles([ball]), min(settings.budget, 0.5 * line.end)
     soon = join + settings.period
     cases = ((standing, math.inf), (standing, soon), (line, soon), (line, math.inf))
     return tuple(
-        Request(k, 0.0, join, following, None, movers, settings.berth, (ball,), conflict, 0, conflict, movers)
+        Request(k, 0.0, join, following, None, dynamic, settings.berth, (ball,), conflict, 0, conflict, dynamic)
         for k, (following, conflict) in enumerate(cases, 1)
     )
 

@@ -149,9 +149,9 @@ class _Made:
 
     def judged(self, done: RunRecord) -> RunResult:
         """Return the result with what the referee says."""
-        movers = [o.name for o in self.world.script()]
+        dynamic = [o.name for o in self.world.script()]
         report = judge(
-            self.ready.setup.robot, self.problem(), done.trajectory, goals=self.ready.goals, movers=movers
+            self.ready.setup.robot, self.problem(), done.trajectory, goals=self.ready.goals, dynamic=dynamic
         )  # fmt: skip
         outcome, reason = report.outcome, "; ".join(report.faults)
         if outcome is None:

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from apex_ompl.kernel import Kernel
 from apex_ompl.loop.observation import Observation
-from apex_ompl.moving.movers import Movers, allowed_rows, clearance_in_time
+from apex_ompl.moving.dynamic_obstacles import DynamicObstacles, allowed_rows, clearance_in_time
 from apex_ompl.scene.bodies import Obstacle, same_solid
 from apex_ompl.types import Array
 
@@ -152,7 +152,7 @@ class Tracker:
     tracks: dict[str, Track] = field(default_factory=dict)
     doubted: list[Track] = field(default_factory=list)
     last: float = -math.inf
-    _made: Movers | None = field(default=None, init=False)
+    _made: DynamicObstacles | None = field(default=None, init=False)
     _shapes: list[Obstacle] = field(default_factory=list, init=False)
 
     def take(self, observation: Observation, now: float = math.inf) -> Taken:
@@ -239,7 +239,7 @@ class Tracker:
         self.tracks = {name: track for name, track in self.tracks.items() if track.unseen <= self.memory}
         self.doubted = [track for track in self.doubted if track.unseen <= self.memory]
 
-    def predicted(self, margin: float, prediction: str = "cv") -> Movers:
+    def predicted(self, margin: float, prediction: str = "cv") -> DynamicObstacles:
         """Return the obstacles as they are expected to move, larger by a margin [m] and by what is uncertain."""
         if prediction == "still":
             return self._as_seen(margin, 0.0)
@@ -247,22 +247,22 @@ class Tracker:
         growth = [(margin + first, later) for first, later in (track.growth(self.settings) for track in some)]
         return self._placed([track.place for track in some], [track.velocity for track in some], growth)
 
-    def eased(self, movers: Movers, q: Array, times: ArrayLike) -> Movers:
+    def eased(self, dynamic: DynamicObstacles, q: Array, times: ArrayLike) -> DynamicObstacles:
         """Take so much of the margins away that the robot may stand where it is, in place, and return the obstacles.
 
         Args:
-            movers: Obstacles with margins.
+            dynamic: Obstacles with margins.
             q: The robot's state, shape (dof,).
             times: Times of the clock at which it may stand there [s].
         """
         at = np.atleast_1d(np.asarray(times, float))
-        clear, _ = clearance_in_time(self.kernel, movers, np.repeat(q[None], len(at), axis=0), at, 2.0 * LEAST)
+        clear, _ = clearance_in_time(self.kernel, dynamic, np.repeat(q[None], len(at), axis=0), at, 2.0 * LEAST)
         missing = LEAST - float(np.min(clear, initial=LEAST))
         if missing > 0.0:
-            movers.arrays.growth[:, 0] = np.maximum(movers.arrays.growth[:, 0] - missing, 0.0)
-        return movers
+            dynamic.arrays.growth[:, 0] = np.maximum(dynamic.arrays.growth[:, 0] - missing, 0.0)
+        return dynamic
 
-    def reachable(self, error: float, fastest: float, margin: float = 0.0, q: Array | None = None) -> Movers:
+    def reachable(self, error: float, fastest: float, margin: float = 0.0, q: Array | None = None) -> DynamicObstacles:
         """Return the obstacles as large as all that they can reach: seen within an error [m], no faster than [m/s].
 
         Every look bounds where an obstacle is by a ball that grows; what counts is the one that leaves a robot at a
@@ -275,11 +275,11 @@ class Tracker:
         looks = np.array([track.looks[-1] if q is None else self._best_look(track, fastest, q) for track in tracks])
         still, growth = np.zeros((len(tracks), AXES)), np.tile((error + margin, fastest), (len(tracks), 1))
         if not self.doubted:
-            return self._movers().placed(looks[:, 1:], still, growth, looks[:, 0])
+            return self._dynamic().placed(looks[:, 1:], still, growth, looks[:, 0])
         names = [f"{k}: {track.shape.name}" for k, track in enumerate(tracks)]
         pairs = [(row, names[k]) for k, track in enumerate(tracks) for row, _ in self._allowed_rows(track.shape.name)]
         shapes = [t.shape.model_copy(update={"name": name}) for t, name in zip(tracks, names, strict=True)]
-        return Movers(shapes, pairs).placed(looks[:, 1:], still, growth, looks[:, 0])
+        return DynamicObstacles(shapes, pairs).placed(looks[:, 1:], still, growth, looks[:, 0])
 
     def _best_look(self, track: Track, fastest: float, q: Array) -> Array:
         """Return the look whose ball leaves a robot at a state most room, by the nearest ball of its cover."""
@@ -302,30 +302,34 @@ class Tracker:
     def _allowed_rows(self, name: str) -> list[tuple[int, str]]:
         return allowed_rows(self.kernel, self.allowed, [name])
 
-    def _as_seen(self, margin: float, growth: float) -> Movers:
+    def _as_seen(self, margin: float, growth: float) -> DynamicObstacles:
         """Return the obstacles where they were seen last, with a margin [m] that grows [m/s]."""
         places = [track.shape.position for track in self.tracks.values()]
         return self._placed(places, [(0.0, 0.0, 0.0)] * len(places), [(margin, growth)] * len(places))
 
     def _placed(
         self, places: Sequence[ArrayLike], velocities: Sequence[ArrayLike], growth: Sequence[ArrayLike]
-    ) -> Movers:
+    ) -> DynamicObstacles:
         """Return the obstacles at places and velocities at their stamps."""
-        made = self._movers()
+        made = self._dynamic()
         at, along = (np.array(some, float).reshape(-1, AXES) for some in (places, velocities))
         stamps = np.array([track.stamp for track in self.tracks.values()])
         return made.placed(at, along, np.array(growth, float).reshape(-1, 2), stamps)
 
-    def _movers(self) -> Movers:
+    def _dynamic(self) -> DynamicObstacles:
         """Return the obstacles, made anew where a shape changed."""
         shapes, made = [track.shape for track in self.tracks.values()], self._made
         if made is None or len(shapes) != len(self._shapes) or not all(map(same_solid, shapes, self._shapes)):
-            made = self._made = Movers(shapes, allowed_rows(self.kernel, self.allowed, [o.name for o in shapes]))
+            made = self._made = DynamicObstacles(
+                shapes, allowed_rows(self.kernel, self.allowed, [o.name for o in shapes])
+            )
         self._shapes = shapes
         return made
 
 
-def as_they_are(kernel: Kernel, present: Iterable[Obstacle], time: float, allowed: Iterable[tuple[str, str]]) -> Movers:
+def as_they_are(
+    kernel: Kernel, present: Iterable[Obstacle], time: float, allowed: Iterable[tuple[str, str]]
+) -> DynamicObstacles:
     """Return obstacles as they truly move now, from a time on [s]."""
     some = list(present)
-    return Movers(some, allowed_rows(kernel, allowed, [o.name for o in some]), stamp=time)
+    return DynamicObstacles(some, allowed_rows(kernel, allowed, [o.name for o in some]), stamp=time)

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING
 from apex_ompl.util.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from apex_ompl.moving.movers import Conflict, Movers, clearance_in_time, prove_motion
+    from apex_ompl.moving.dynamic_obstacles import Conflict, DynamicObstacles, clearance_in_time, prove_motion
     from apex_ompl.moving.retime import Retimed
     from apex_ompl.moving.stopping import Stop, stop, stop_along, stops_proved
 
 __all__ = [
     "Conflict",
-    "Movers",
+    "DynamicObstacles",
     "Retimed",
     "Stop",
     "clearance_in_time",
@@ -26,12 +26,12 @@ __all__ = [
 __getattr__, __dir__ = lazy_names(
     __name__,
     {
-        "Conflict": "movers",
-        "Movers": "movers",
+        "Conflict": "dynamic_obstacles",
+        "DynamicObstacles": "dynamic_obstacles",
         "Retimed": "retime",
         "Stop": "stopping",
-        "clearance_in_time": "movers",
-        "prove_motion": "movers",
+        "clearance_in_time": "dynamic_obstacles",
+        "prove_motion": "dynamic_obstacles",
         "stop": "stopping",
         "stop_along": "stopping",
         "stops_proved": "stopping",

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.moving.movers import clearance_in_time
+from apex_ompl.moving.dynamic_obstacles import clearance_in_time
 from apex_ompl.moving.ready import Ready
 from apex_ompl.moving.search import Search, least_duration
 from apex_ompl.scene.bodies import Obstacle

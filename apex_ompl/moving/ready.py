@@ -12,8 +12,8 @@ from apex_ompl.kernel import Kernel
 from apex_ompl.kernel.ahead_of_time import compile_ahead
 from apex_ompl.kernel.compiled.entry_points import RUNS
 from apex_ompl.moving.charges import Charges
+from apex_ompl.moving.dynamic_obstacles import DynamicObstacles, curve_of, prove_motion
 from apex_ompl.moving.following import Following
-from apex_ompl.moving.movers import Movers, curve_of, prove_motion
 from apex_ompl.moving.settings import LoopSettings
 from apex_ompl.moving.stopping import stop, stop_along, stops_proved
 from apex_ompl.ompl.setup import PlanningSetup
@@ -105,24 +105,29 @@ class Ready:
         return max(motion.use(self.limits).values()) <= 1.0 + 1e-9
 
     def first_conflict(
-        self, movers: Movers, following: Following, begin: float, until: float, charges: Charges | None = None
+        self,
+        dynamic: DynamicObstacles,
+        following: Following,
+        begin: float,
+        until: float,
+        charges: Charges | None = None,
     ) -> float:
-        """Return the time of the clock at which a motion can no longer be proved clear of movers [s], or infinity.
+        """Return the clock time at which a motion can no longer be proved clear of dynamic obstacles [s], or infinity.
 
         Args:
-            movers: The obstacles.
+            dynamic: The obstacles.
             following: The motion.
             begin: Time of the clock from which on it is looked at [s].
             until: Time until which it is looked at [s], behind its end, too.
             charges: Gets the number of intervals.
         """
         zero = following.begin
-        found = prove_motion(self.kernel, movers, following.motion, begin - zero, until - zero, clock=zero)
+        found = prove_motion(self.kernel, dynamic, following.motion, begin - zero, until - zero, clock=zero)
         if charges is not None:
-            charges.charge("interval among movers", found.intervals)
+            charges.charge("interval among dynamic obstacles", found.intervals)
         return found.time + zero
 
-    def proved_to_rest(self, reachable: Movers, following: Following, charges: Charges | None = None) -> bool:
+    def proved_to_rest(self, reachable: DynamicObstacles, following: Following, charges: Charges | None = None) -> bool:
         """Whether nothing that obstacles can reach comes in the way of a motion until the robot is at rest again.
 
         Args:
@@ -132,7 +137,9 @@ class Ready:
         """
         return bool(np.isinf(self.first_conflict(reachable, following, following.begin, following.end, charges)))
 
-    def proved_stop(self, reachable: Movers, following: Following, now: float, then: float) -> Following | None:
+    def proved_stop(
+        self, reachable: DynamicObstacles, following: Following, now: float, then: float
+    ) -> Following | None:
         """Return a stop from a motion at a later time that nothing can come in the way of, or None.
 
         Whatever obstacles do that were seen where ``reachable`` says, they touch the robot neither until that time nor
@@ -157,7 +164,7 @@ class Ready:
         return None
 
     def foreseen_stops(
-        self, predicted: Movers, following: Following, moments: Array, age: float, spread: float
+        self, predicted: DynamicObstacles, following: Following, moments: Array, age: float, spread: float
     ) -> tuple[int, int]:
         """Return behind how many times of the clock, from the first on, stops from a motion will hardly be refused.
 

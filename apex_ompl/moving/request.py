@@ -9,8 +9,8 @@ from typing import Protocol
 import numpy as np
 
 from apex_ompl.moving.charges import Charges
+from apex_ompl.moving.dynamic_obstacles import DynamicObstacles
 from apex_ompl.moving.following import Following
-from apex_ompl.moving.movers import Movers
 from apex_ompl.moving.ready import Ready
 from apex_ompl.scene.bodies import Obstacle
 
@@ -42,13 +42,13 @@ class Request:
     join: float
     following: Following
     route: Following | None
-    predicted: Movers
+    predicted: DynamicObstacles
     berth: float
     obstacles: tuple[Obstacle, ...]
     conflict: float
     seed: int
     contact: float = math.inf
-    reachable: Movers | None = None
+    reachable: DynamicObstacles | None = None
     leaving: bool = False
 
     @property

@@ -17,7 +17,7 @@ from apex_ompl.errors import ParameterError
 from apex_ompl.kernel import Kernel
 from apex_ompl.kernel.compiled.speed_profile import first_blocked, follow_profile, profile_places, push_bounds
 from apex_ompl.kernel.compiled.speed_search import MOST_TIMES, earliest_arrivals
-from apex_ompl.moving.movers import Movers
+from apex_ompl.moving.dynamic_obstacles import DynamicObstacles
 from apex_ompl.moving.safe_intervals import blocked
 from apex_ompl.robot.model import Limits
 from apex_ompl.timing.trajectory import Trajectory
@@ -72,7 +72,7 @@ class Profile(NamedTuple):
     Attributes:
         x: Levels of the squared rate ds/dt, shape (levels,).
         levels: Levels at the points between stages, shape (S + 1,).
-        departures: Times of arrival there and of departure, shape (S + 1, 2) [s of the movers' stamps].
+        departures: Times of arrival there and of departure, shape (S + 1, 2) [s of the dynamic obstacles' stamps].
     """
 
     x: Array
@@ -109,22 +109,23 @@ class Retimed(NamedTuple):
 
 
 def retime(
-    kernel: Kernel, movers: Movers, motion: Trajectory, limits: Limits, *, time: float = 0.0, clock: float = 0.0,
+    kernel: Kernel, dynamic: DynamicObstacles, motion: Trajectory, limits: Limits, *, time: float = 0.0,
+    clock: float = 0.0,
     hold: float = 1.0, horizon: float = 20.0, deviation: float = 1.5e-3,
 ) -> Retimed:  # fmt: skip
     """Return the motion along the rest of a path that arrives first, among obstacles that move.
 
     It begins with the state of the given motion at ``time`` exactly, ends at rest where that ends, and keeps the
     limits. Its places are kept out of the blocked intervals (:func:`apex_ompl.moving.safe_intervals.blocked`), so that
-    :func:`apex_ompl.moving.movers.prove_motion` seldom finds a conflict; only that is the proof.
+    :func:`apex_ompl.moving.dynamic_obstacles.prove_motion` seldom finds a conflict; only that is the proof.
 
     Args:
         kernel: The kernel of the robot with what it holds.
-        movers: The obstacles.
+        dynamic: The obstacles.
         motion: A motion within the limits that ends at rest.
         limits: Limits of the joints.
         time: Where on the motion to begin [s].
-        clock: Time of the movers' stamps at which the result begins [s].
+        clock: Time of the dynamic obstacles' stamps at which the result begins [s].
         hold: Time for which the end must stay free from the arrival on [s].
         horizon: Largest duration of the result [s].
         deviation: Largest distance of any joint from the path [rad].
@@ -137,13 +138,15 @@ def retime(
     for name, value in (("time", time), ("clock", clock), ("hold", hold), ("horizon", horizon)):
         check_number(value, name)
     query = Query(min(max(float(time), 0.0), motion.duration), float(clock), float(hold), float(horizon), deviation)
-    return _Search(kernel, movers, motion, limits, query).result()
+    return _Search(kernel, dynamic, motion, limits, query).result()
 
 
 class _Search:
     """Search of the speed along the rest of one motion."""
 
-    def __init__(self, kernel: Kernel, movers: Movers, motion: Trajectory, limits: Limits, query: Query) -> None:
+    def __init__(
+        self, kernel: Kernel, dynamic: DynamicObstacles, motion: Trajectory, limits: Limits, query: Query
+    ) -> None:
         """Find the blocked intervals."""
         self.motion, self.limits = motion, limits
         self.time, self.clock, self.hold, horizon, self.deviation = query
@@ -157,7 +160,7 @@ class _Search:
         where = np.stack([edges[:-1], edges[1:]], axis=1), np.stack([self.points, self.points], axis=1)
         self.pieces, self.stops = (
             blocked(
-                kernel, movers, motion, p, begin=self.clock, end=self.latest + self.hold, slack=self.deviation
+                kernel, dynamic, motion, p, begin=self.clock, end=self.latest + self.hold, slack=self.deviation
             ) for p in where
         )  # fmt: skip
         self.states = np.stack([motion.positions, motion.velocities, motion.accelerations])

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from apex_ompl.kernel import Kernel
 from apex_ompl.kernel.compiled.blocked_intervals import MOST_SPANS, blocked_intervals
-from apex_ompl.moving.movers import Movers, curve_of
+from apex_ompl.moving.dynamic_obstacles import DynamicObstacles, curve_of
 from apex_ompl.timing.trajectory import Trajectory
 from apex_ompl.types import Array
 
@@ -19,7 +19,7 @@ class Blocked(NamedTuple):
 
     Attributes:
         places: Begins and ends of the places, in the motion's own time, shape (P, 2) [s].
-        spans: Their intervals in order, shape (P, MOST_SPANS, 2) [s of the movers' stamps].
+        spans: Their intervals in order, shape (P, MOST_SPANS, 2) [s of the dynamic obstacles' stamps].
         counts: Numbers of them, shape (P,).
     """
 
@@ -39,24 +39,31 @@ class Blocked(NamedTuple):
 
 
 def blocked(
-    kernel: Kernel, movers: Movers, motion: Trajectory, places: Array, *, begin: float, end: float, slack: float = 0.0
+    kernel: Kernel,
+    dynamic: DynamicObstacles,
+    motion: Trajectory,
+    places: Array,
+    *,
+    begin: float,
+    end: float,
+    slack: float = 0.0,
 ) -> Blocked:
-    """Find when movers block places along a motion, by the robot's spheres: never too short.
+    """Find when dynamic obstacles block places along a motion, by the robot's spheres: never too short.
 
     Args:
         kernel: The kernel of the robot with what it holds.
-        movers: The obstacles.
+        dynamic: The obstacles.
         motion: The motion.
         places: Begins and ends of pieces of the motion, in its own time and in order, shape (P, 2) [s]; the same twice
             for a single state.
-        begin: First time that is looked at [s of the movers' stamps].
+        begin: First time that is looked at [s of the dynamic obstacles' stamps].
         end: The last one [s].
         slack: Distance from the path, of each joint, that counts as being on it [rad].
     """
     curve, dof = curve_of(motion), motion.dof
     spans, counts = np.zeros((len(places), MOST_SPANS, 2)), np.empty(len(places), np.int64)
     blocked_intervals(
-        *kernel.robot.packed, *movers.packed, *kernel.workspace(), curve.knots, curve.states, curve.rates,
+        *kernel.robot.packed, *dynamic.packed, *kernel.workspace(), curve.knots, curve.states, curve.rates,
         curve.slack + slack, places, float(begin), float(end), np.empty(dof), spans, counts,
     )  # fmt: skip
     return Blocked(places, spans, counts)

@@ -202,8 +202,8 @@ class Search:
         validation worlds.)
         """
         request, ready = self.request, self.ready
-        movers = request.predicted.larger(request.berth) if berth else request.predicted
-        optimizer = MotionOptimizer(ready.kernel, movers, ready.limits, MOTIONS)
+        dynamic = request.predicted.larger(request.berth) if berth else request.predicted
+        optimizer = MotionOptimizer(ready.kernel, dynamic, ready.limits, MOTIONS)
         beyond = ready.settings.berth if berth else 0.0
         return MotionPool(optimizer, self.start, request.join, self.charges, self.accepts, berth=beyond)
 

@@ -9,8 +9,8 @@ import numpy as np
 from apex_ompl.kernel import Kernel
 from apex_ompl.kernel.compiled.path_stop import MOST_STEPS, stop_on_path
 from apex_ompl.kernel.compiled.stop_profiles import PHASES, stop_joints
-from apex_ompl.kernel.compiled.stops_among_movers import first_unproved_stop
-from apex_ompl.moving.movers import SHORTEST, Movers, curve_of
+from apex_ompl.kernel.compiled.stops_among_dynamic_obstacles import first_unproved_stop
+from apex_ompl.moving.dynamic_obstacles import SHORTEST, DynamicObstacles, curve_of
 from apex_ompl.robot.model import Limits
 from apex_ompl.timing.trajectory import Trajectory
 from apex_ompl.types import Array, Flags
@@ -93,7 +93,7 @@ def stop_along(motion: Trajectory, time: float, limits: Limits, deviation: float
 
 
 def stops_proved(
-    kernel: Kernel, expected: Movers, motion: Trajectory, limits: Limits, moments: Array,
+    kernel: Kernel, expected: DynamicObstacles, motion: Trajectory, limits: Limits, moments: Array,
     *, clock: float, age: float, growth: tuple[float, float], period: float,
 ) -> tuple[int, Flags]:  # fmt: skip
     """Return how many of some moments of a motion, from the first on, have a proved stop, and of which kind.
@@ -116,14 +116,14 @@ def stops_proved(
     """
     dof, curve, a, seen = motion.dof, curve_of(motion), expected.arrays, expected.with_margin(*growth)
     states = np.stack([motion.positions, motion.velocities, motion.accelerations])
-    room, movers = max(len(motion.times) + MOST_STEPS + 4, dof * PHASES + 2), len(a.kind)
+    room, dynamic = max(len(motion.times) + MOST_STEPS + 4, dof * PHASES + 2), len(a.kind)
     by_joints = np.zeros(len(moments), np.int64)
     bounds = map(compact, (limits.lower, limits.upper, limits.velocity, limits.acceleration, limits.jerk))
     count = int(
         first_unproved_stop(
             *kernel.robot.packed, *seen.packed, *kernel.workspace(), a.place, a.velocity, a.stamp, float(age),
             curve.knots, curve.states, curve.rates, curve.slack, states, *bounds, DEVIATION, compact(moments),
-            by_joints, float(period), float(clock), SHORTEST, np.empty((movers, 3)), np.empty(dof),
+            by_joints, float(period), float(clock), SHORTEST, np.empty((dynamic, 3)), np.empty(dof),
             np.empty(3, np.int64), np.empty((3, dof)), np.empty((MOST_STEPS + 4, dof)), np.empty(dof), np.empty(dof),
             np.empty((2, dof, PHASES)), np.empty(room), np.empty((3, room, dof)), np.empty((room, dof)),
             np.empty((room, 2 * dof)),

@@ -102,9 +102,9 @@ def check_timed_path(
         return TimedPathCheck(
             False, f"{name} at {speeds[worst, joint]:.3g}, its limit is {limit:.3g} rad/s", float(times[worst])
         )
-    movers, checkers = [o for o in problem.scene if o.moving], dict[frozenset[str], CollisionChecker]()
-    names = {o.name for o in movers}
-    for begin, end in _intervals(movers, float(times[-1])):
+    dynamic, checkers = [o for o in problem.scene if o.moving], dict[frozenset[str], CollisionChecker]()
+    names = {o.name for o in dynamic}
+    for begin, end in _intervals(dynamic, float(times[-1])):
         now = problem_at(problem, (begin + end) / 2.0)
         here = frozenset(o.name for o in now.scene)
         if here not in checkers:
@@ -121,7 +121,7 @@ def check_timed_path(
     return TimedPathCheck(True)
 
 
-def _intervals(movers: Sequence[Obstacle], until: float) -> list[tuple[float, float]]:
+def _intervals(dynamic: Sequence[Obstacle], until: float) -> list[tuple[float, float]]:
     """Return begins and ends of the intervals of a check [s].
 
     In none of them does an obstacle change its velocity, appear, or move more than ``OBSTACLE_STEP``.
@@ -129,11 +129,11 @@ def _intervals(movers: Sequence[Obstacle], until: float) -> list[tuple[float, fl
     Raises:
         ParameterError: There would be too many.
     """
-    bounds = sorted({0.0, until, *(t for o in movers for t in script_times(o) if t < until)})
+    bounds = sorted({0.0, until, *(t for o in dynamic for t in script_times(o) if t < until)})
     found: list[tuple[float, float]] = []
     for begin, end in pairwise(bounds):
         middle = (begin + end) / 2.0
-        way = (end - begin) * max((_speed(o, middle) for o in movers if is_there(o, middle)), default=0.0)
+        way = (end - begin) * max((_speed(o, middle) for o in dynamic if is_there(o, middle)), default=0.0)
         if way / OBSTACLE_STEP > MAX_INTERVALS - len(found):
             farthest = MAX_INTERVALS * OBSTACLE_STEP
             raise ParameterError("times", until, f"an end before an obstacle has moved {farthest:g} m")

@@ -10,7 +10,7 @@ import numpy as np
 
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.path_proof import Curve
-from apex_ompl.moving.movers import Movers, allowed_rows, prove_motion
+from apex_ompl.moving.dynamic_obstacles import DynamicObstacles, allowed_rows, prove_motion
 from apex_ompl.moving.swept import inflated
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.scripts import obstacle_at
@@ -26,7 +26,7 @@ class TimedProof:
     """Outcome of a proof.
 
     Attributes:
-        ok: Whether the motion is proved apart from the movers.
+        ok: Whether the motion is proved apart from the dynamic obstacles.
         reason: Why not: one sentence, empty for a proved motion.
         time: First moment that is not proved [s], infinite for a proved motion.
     """
@@ -41,10 +41,10 @@ class TimedProof:
 
 
 class TimedProver:
-    """Proofs of motions of one robot among movers; of what stands still a :class:`CollisionChecker` has them.
+    """Proofs of motions of one robot among dynamic obstacles; a :class:`CollisionChecker` proves those among others.
 
     Attributes:
-        movers: The obstacles that move.
+        dynamic: The obstacles that move.
         obstacles: Their records, where they are at time 0.
     """
 
@@ -61,20 +61,20 @@ class TimedProver:
             margin: Distance to keep from them [m].
 
         Raises:
-            SceneError, ParameterError: As :class:`apex_ompl.moving.movers.Movers`.
+            SceneError, ParameterError: As :class:`apex_ompl.moving.dynamic_obstacles.DynamicObstacles`.
         """
         self.obstacles, self._checker, self._allowed = tuple(obstacles), checker, tuple(allowed)
         names = [o.name for o in self.obstacles]
-        self.movers = Movers(self.obstacles, allowed_rows(checker.kernel, allowed, names))
+        self.dynamic = DynamicObstacles(self.obstacles, allowed_rows(checker.kernel, allowed, names))
         for name in names:
-            self.movers.update(name, growth=(margin, 0.0))
+            self.dynamic.update(name, growth=(margin, 0.0))
         self._margin = margin
         speeds = [float(np.linalg.norm(o.velocity or (0.0, 0.0, 0.0))) for o in self.obstacles]
         self._speeds = dict(zip(names, speeds, strict=True))
         self._exact: dict[float, CollisionChecker] = {}  # by length of the slices
 
     def prove(self, motion: Trajectory, *, stop: Callable[[], bool] = lambda: False) -> TimedProof:
-        """Prove that a motion that begins at time 0 stays apart from the movers, to its end.
+        """Prove that a motion that begins at time 0 stays apart from the dynamic obstacles, to its end.
 
         Args:
             motion: The motion.
@@ -82,7 +82,7 @@ class TimedProver:
         """
         kernel, time, longest = self._checker.kernel, 0.0, SLICE
         while True:
-            conflict = prove_motion(kernel, self.movers, motion, time)
+            conflict = prove_motion(kernel, self.dynamic, motion, time)
             if not conflict:
                 return TimedProof(True, "", math.inf)
             if stop():
@@ -98,7 +98,7 @@ class TimedProver:
         """Return why the robot may not stand at a state, shape (dof,), at time 0 and a moment longer, or nothing."""
         still = np.zeros((1, len(q)))
         rest = Trajectory(np.zeros(1), q[None], still, still, self._checker.robot.joint_names)
-        if not prove_motion(self._checker.kernel, self.movers, rest, end=SHORTEST_SLICE):
+        if not prove_motion(self._checker.kernel, self.dynamic, rest, end=SHORTEST_SLICE):
             return ""
         return self._prove_slice(rest, 0.0, SHORTEST_SLICE)[0]
 
@@ -114,7 +114,7 @@ class TimedProver:
             length /= 2.0
 
     def _fault_in(self, motion: Trajectory, begin: float, end: float) -> str:
-        """Return why what the movers sweep from a moment to another is in the way, or nothing."""
+        """Return why what the dynamic obstacles sweep from a moment to another is in the way, or nothing."""
         exact = self._exact_among(end - begin)
         for o in self.obstacles:
             exact.move(o.name, obstacle_at(o, 0.5 * (begin + end)).position)
@@ -124,7 +124,7 @@ class TimedProver:
         return exact.prove(curve, tolerance=0.0).reason
 
     def _exact_among(self, length: float) -> CollisionChecker:
-        """Return a checker among the movers, as large as what they sweep in slices of a length [s]."""
+        """Return a checker among the dynamic obstacles, as large as what they sweep in slices of a length [s]."""
         if length not in self._exact:
             swept = [inflated(o, self._margin + 0.5 * length * self._speeds[o.name]) for o in self.obstacles]
             pairs = [pair for pair in self._allowed if not any(map(self._checker.is_obstacle, pair))]

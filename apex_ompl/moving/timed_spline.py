@@ -14,7 +14,7 @@ from apex_ompl.errors import ParameterError
 from apex_ompl.kernel import Kernel
 from apex_ompl.kernel.compiled.motion_optimization import WIDTH, optimize_motion
 from apex_ompl.kernel.compiled.path_cost import CostSettings, PathReport, optimization_buffer_sizes
-from apex_ompl.moving.movers import Movers
+from apex_ompl.moving.dynamic_obstacles import DynamicObstacles
 from apex_ompl.robot.model import Limits
 from apex_ompl.timing import Trajectory
 from apex_ompl.timing.spline_method import least_knot_spacing, spline_in_time, start_points
@@ -34,7 +34,7 @@ class MotionSettings:
 
     Attributes:
         samples: Number of samples between two knots.
-        scene_margin: Clearance to obstacles and movers below which a sample costs [m].
+        scene_margin: Clearance to obstacles and dynamic obstacles below which a sample costs [m].
         own_margin: Clearance between the robot's own links below which a sample costs [m].
         stiffness: Weight of half the integral of the speed squared over the share of the motion [1/rad^2].
         limit_weight: Weight of half the square of what a limit is exceeded by, as a share of it.
@@ -133,7 +133,7 @@ class TimedSpline(NamedTuple):
 
 
 class MotionOptimizer:
-    """Levenberg-Marquardt on splines in time, among still obstacles and movers; without random numbers of its own.
+    """Levenberg-Marquardt on splines in time, among static and dynamic obstacles; without random numbers of its own.
 
     The cost is that of :mod:`apex_ompl.kernel.compiled.motion_optimization`.
 
@@ -141,14 +141,16 @@ class MotionOptimizer:
         samples: Number of samples that steps have looked at so far.
     """
 
-    def __init__(self, kernel: Kernel, movers: Movers, limits: Limits, settings: MotionSettings | None = None) -> None:
+    def __init__(
+        self, kernel: Kernel, dynamic: DynamicObstacles, limits: Limits, settings: MotionSettings | None = None
+    ) -> None:
         """Optimize motions of the kernel's robot within limits of velocity, acceleration and jerk.
 
         Raises:
             ParameterError: The limits are those of other joints.
         """
         check_array(limits.velocity, (kernel.robot.dof,), "limits")
-        self.kernel, self.movers, self.limits = kernel, movers, limits
+        self.kernel, self.dynamic, self.limits = kernel, dynamic, limits
         self.settings = settings or MotionSettings()
         self.samples = 0
 
@@ -160,7 +162,7 @@ class MotionOptimizer:
 
         Args:
             spline: The spline.
-            clock: Time of the movers' stamps when it begins [s].
+            clock: Time of the dynamic obstacles' stamps when it begins [s].
             steps: Most steps; by default the settings'.
             enough: The steps end when the clearances at the samples reach this [m].
             damping: Of the first step; by default the settings'. The report has that to go on with.
@@ -189,7 +191,7 @@ class MotionOptimizer:
         Args:
             spline: Where to start from.
             accepts: The full check; asked about motions within the limits.
-            clock: Time of the movers' stamps when it begins [s].
+            clock: Time of the dynamic obstacles' stamps when it begins [s].
             stop: Asked between rounds whether to give up.
         """
         names = self.kernel.robot.joint_names
@@ -230,8 +232,8 @@ class MotionOptimizer:
         integers, floats = optimization_buffer_sizes((points - 2 * PINNED) * dof, points, dof)
         slope = np.empty(slopes)
         report = optimize_motion(
-            *self.kernel.packed, *self.movers.packed, *self.kernel.workspace(),
-            np.empty((len(self.movers.arrays.kind), 3)), weights, first, gram, times, most, float(s.limit_weight),
+            *self.kernel.packed, *self.dynamic.packed, *self.kernel.workspace(),
+            np.empty((len(self.dynamic.arrays.kind), 3)), weights, first, gram, times, most, float(s.limit_weight),
             PINNED, control, tuple(self._numbers(steps, enough, damping)), np.empty(integers, np.int64),
             np.empty(floats), slope,
         )  # fmt: skip

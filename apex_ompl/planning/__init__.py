@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from apex_ompl.util.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from apex_ompl.planning.among_movers import plan_among_movers
+    from apex_ompl.planning.among_dynamic_obstacles import plan_among_dynamic_obstacles
     from apex_ompl.planning.one_plan import check_arguments
     from apex_ompl.planning.planner import MotionPlanner, StateCheck
     from apex_ompl.planning.pool import kept_planner
@@ -37,7 +37,7 @@ __all__ = [
     "finish",
     "kept_planner",
     "parameterize",
-    "plan_among_movers",
+    "plan_among_dynamic_obstacles",
     "query_fault",
     "solve",
     "straight_line",
@@ -56,7 +56,7 @@ __getattr__, __dir__ = lazy_names(
         "finish": "timing",
         "kept_planner": "pool",
         "parameterize": "timing",
-        "plan_among_movers": "among_movers",
+        "plan_among_dynamic_obstacles": "among_dynamic_obstacles",
         **dict.fromkeys(
             (
                 "NOT_PROVED", "STRAIGHT_LINE", "find_path", "query_fault", "solve", "straight_line", "verify",

@@ -1,4 +1,4 @@
-"""Motions that plans among movers are optimized from."""
+"""Motions that plans among dynamic obstacles are optimized from."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ from apex_ompl.ompl.interrupt import Interrupt
 from apex_ompl.ompl.process import quiet_ompl, seed_ompl
 from apex_ompl.ompl.setup import assemble
 from apex_ompl.planning.departure import LARGEST_DEPTH, find_departure, with_departure
-from apex_ompl.planning.movers import movers_of, snapshot_notes
+from apex_ompl.planning.dynamic_obstacles import dynamic_of, snapshot_notes
 from apex_ompl.planning.query import Group, planned_joints
 from apex_ompl.planning.run import PlanRun
 from apex_ompl.planning.solving import find_path
@@ -114,7 +114,7 @@ def plan_once(
     timing = Timing() if options.timing is True else options.timing
     how = timing if isinstance(timing, Timing) else None
     changing = kept.world.checker.changing_obstacles
-    movers = _movers(changing, options.snapshot, how, leave_contact)
+    dynamic = _dynamic(changing, options.snapshot, how, leave_contact)
     with quiet_ompl(), ExitStack() as preparing:
         preparing.enter_context(unforked())
         seed_ompl(seed)
@@ -129,7 +129,11 @@ def plan_once(
             if start is not None and leave_contact:
                 raise ParameterError("leave_contact", leave_contact, "0 for a start that moves")
         moving = None if options.group is None else planned_joints(robot, options.group)
-        checker = kept._checker_without({mover.name for mover in movers}) if movers else kept._checker_now()
+        checker = (
+            kept._checker_without({dynamic_obstacle.name for dynamic_obstacle in dynamic})
+            if dynamic
+            else kept._checker_now()
+        )
         checker.check_counts = CheckCounts()
         given = ready = assemble(problem, robot, seed=seed, checker=checker, moving=moving)
         departure = find_departure(ready, leave_contact, seed) if leave_contact and ready.start_fault else None
@@ -141,16 +145,16 @@ def plan_once(
         notes += [note for note in kept.world.checker.mesh_notes if note not in given.notes]
         if how is not None:
             warm_up()
-        if movers:
-            from apex_ompl.planning import among_movers
+        if dynamic:
+            from apex_ompl.planning import among_dynamic_obstacles
 
-            among_movers.warm_up(checker)
+            among_dynamic_obstacles.warm_up(checker)
         times = {"setup": time.perf_counter() - started}
         run = PlanRun(ready, planner, parameters, seed, Deadline(options.timeout), times, notes)
         preparing.close()
         with Interrupt() as run.interrupt, running(run.interrupt.end):
-            if movers and how is not None:
-                result = among_movers.plan_among_movers(run, movers, options.simplify, how)
+            if dynamic and how is not None:
+                result = among_dynamic_obstacles.plan_among_dynamic_obstacles(run, dynamic, options.simplify, how)
             else:
                 result = find_path(run, options.simplify)
                 if how is not None:
@@ -169,7 +173,7 @@ def _parameters(planner: str, model: str | None, options: PlanOptions) -> dict[s
     return given
 
 
-def _movers(
+def _dynamic(
     changing: Sequence[Obstacle], snapshot: bool, timing: Timing | None, leave_contact: float
 ) -> tuple[Obstacle, ...]:
     """Return the obstacles that a plan is made among in time: those that move, unless they are to stand still.
@@ -177,9 +181,9 @@ def _movers(
     Raises:
         ParameterError: There are such, and an option that does not go with them; or one follows a script.
     """
-    movers = () if snapshot else movers_of(changing)
-    if movers and timing is None:
-        raise ParameterError("timing", False, f"True or a Timing, since the obstacle {movers[0].name!r} moves")
-    if movers and leave_contact:
-        raise ParameterError("leave_contact", leave_contact, f"0, since the obstacle {movers[0].name!r} moves")
-    return movers
+    dynamic = () if snapshot else dynamic_of(changing)
+    if dynamic and timing is None:
+        raise ParameterError("timing", False, f"True or a Timing, since the obstacle {dynamic[0].name!r} moves")
+    if dynamic and leave_contact:
+        raise ParameterError("leave_contact", leave_contact, f"0, since the obstacle {dynamic[0].name!r} moves")
+    return dynamic

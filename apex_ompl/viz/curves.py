@@ -33,32 +33,35 @@ def shares_of_limits(motion: Trajectory, robot: Robot, times: Array) -> Array:
     return np.stack([*scaled, *(motion(times, order) / bound for order, bound in enumerate(bounds, 1))])
 
 
-def clearances(checker: CollisionChecker, motion: Trajectory, times: Array, movers: Sequence[Obstacle] = ()) -> Array:
+def clearances(checker: CollisionChecker, motion: Trajectory, times: Array, dynamic: Sequence[Obstacle] = ()) -> Array:
     """Return the clearance of a motion at some times, shape (N,) [m].
 
     Args:
         checker: The robot in its scene.
         motion: The motion.
         times: Shape (N,) [s].
-        movers: Obstacles of the scene that move; those that have appeared are where they are at each time.
+        dynamic: Obstacles of the scene that move; those that have appeared are where they are at each time.
     """
     found, among = [], dict[frozenset[str], CollisionChecker]()
     for time, q in zip(times.tolist(), motion(times), strict=True):
-        here = [obstacle_at(mover, time) for mover in movers if is_there(mover, time)]
-        names = frozenset(mover.name for mover in here)
+        here = [obstacle_at(dynamic_obstacle, time) for dynamic_obstacle in dynamic if is_there(dynamic_obstacle, time)]
+        names = frozenset(dynamic_obstacle.name for dynamic_obstacle in here)
         if names not in among:
-            among[names] = _among(checker, movers, here)
-        for mover in here:
-            among[names].move(mover.name, mover.position)
+            among[names] = _among(checker, dynamic, here)
+        for dynamic_obstacle in here:
+            among[names].move(dynamic_obstacle.name, dynamic_obstacle.position)
         found.append(among[names].clearance(q))
     return np.array(found)
 
 
-def _among(checker: CollisionChecker, movers: Sequence[Obstacle], here: Sequence[Obstacle]) -> CollisionChecker:
-    """Return a checker with those of the movers that are there."""
-    if not movers:
+def _among(checker: CollisionChecker, dynamic: Sequence[Obstacle], here: Sequence[Obstacle]) -> CollisionChecker:
+    """Return a checker with those of the dynamic obstacles that are there."""
+    if not dynamic:
         return checker
-    names, present = {mover.name for mover in movers}, {mover.name for mover in here}
+    names, present = (
+        {dynamic_obstacle.name for dynamic_obstacle in dynamic},
+        {dynamic_obstacle.name for dynamic_obstacle in here},
+    )
     scene = [*(o for o in checker.obstacles.values() if o.name not in names), *here]
     pairs = [pair for pair in checker.allowed if not {*pair} & (names - present)]
     return CollisionChecker(checker.robot, scene, checker.held.values(), pairs)

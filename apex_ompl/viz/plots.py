@@ -70,8 +70,8 @@ def plot_motion(result: PlanResult, out: str | os.PathLike[str]) -> None:
                 axis.set_ylabel(f"{name}\nshare of limit", fontsize=9)
     clearance_times = np.linspace(0.0, motion.duration, CLEARANCE_SAMPLES)
     axis = figure.add_subplot(grid[len(ORDERS), :])
-    movers = [o for o in result.problem.scene if o.name in result.movers]
-    axis.plot(clearance_times, 1e3 * clearances(checker, motion, clearance_times, movers), color=CLEARANCE_COLORS[0])
+    dynamic = [o for o in result.problem.scene if o.name in result.dynamic_obstacles]
+    axis.plot(clearance_times, 1e3 * clearances(checker, motion, clearance_times, dynamic), color=CLEARANCE_COLORS[0])
     axis.set_ylim(bottom=0.0)
     axis.grid(alpha=0.25)
     axis.set_ylabel("clearance mm", fontsize=9)

@@ -93,7 +93,7 @@ def _strip(source: PlanResult | RunResult, size: tuple[int, int], azimuth: float
     """Return a .png of states along the path, or of moments among moving obstacles, in reading order."""
     renderer, motion = _renderer(source, (size[0] // 2, size[1] // 2), azimuth), source.trajectory
     columns, rows = STRIP
-    if motion is not None and (_movers(source) or isinstance(source, RunResult)):
+    if motion is not None and (_dynamic(source) or isinstance(source, RunResult)):
         times = np.linspace(0.0, motion.duration, columns * rows)
         frames = [_moment(renderer, source, motion, float(t)) for t in times]
     else:
@@ -112,9 +112,9 @@ def _path(source: PlanResult | RunResult) -> Array:
     return source.path.states
 
 
-def _movers(source: PlanResult | RunResult) -> list[Obstacle]:
+def _dynamic(source: PlanResult | RunResult) -> list[Obstacle]:
     """Return the obstacles that move: those of a run, and of a plan those that it was proved among in time."""
-    names = source.problem.moving if isinstance(source, RunResult) else source.movers
+    names = source.problem.moving if isinstance(source, RunResult) else source.dynamic_obstacles
     return [obstacle for obstacle in source.problem.scene if obstacle.name in names]
 
 
@@ -122,7 +122,7 @@ def _moment(
     renderer: SceneRenderer, source: PlanResult | RunResult, motion: Trajectory, time: float
 ) -> NDArray[np.uint8]:
     """Return an image of a motion at a time [s], with the obstacles that move where they are then."""
-    for obstacle in _movers(source):
+    for obstacle in _dynamic(source):
         pose = obstacle_at(obstacle, time).pose if is_there(obstacle, time) else None
         renderer.show_obstacle(obstacle.name, pose)
     return renderer.screenshot(motion(time), caption(source, time) if isinstance(source, RunResult) else "")

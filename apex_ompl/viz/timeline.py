@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.loop.result import RunResult
-from apex_ompl.moving.scripted import ScriptedMovers
+from apex_ompl.moving.scripted import ScriptedDynamicObstacles
 from apex_ompl.robot import Robot
 from apex_ompl.timing.rests import rests
 from apex_ompl.types import Array
@@ -118,10 +118,10 @@ def _draw_rests(axis: Any, result: RunResult) -> None:
 
 
 def _draw_distance(axis: Any, result: RunResult, robot: Robot, times: Array) -> None:
-    movers = [obstacle for obstacle in result.problem.scene if obstacle.moving]
+    dynamic = [obstacle for obstacle in result.problem.scene if obstacle.moving]
     _draw_rests(axis, result)
     kernel = CollisionChecker(robot, (), result.problem.attached).kernel
-    found = ScriptedMovers(kernel, movers, result.problem.allowed).clearances(result.trajectory, times)
+    found = ScriptedDynamicObstacles(kernel, dynamic, result.problem.allowed).clearances(result.trajectory, times)
     shown = np.where(np.isfinite(found), found, np.nan)
     axis.axhline(0.0, color="black", linewidth=0.8)
     if np.isfinite(shown).any():
@@ -131,5 +131,5 @@ def _draw_distance(axis: Any, result: RunResult, robot: Robot, times: Array) -> 
         axis.set_ylim(1e3 * min(1.1 * low, -0.05 * top), 1e3 * 1.05 * top)
     else:
         axis.text(0.5, 0.5, "no obstacle moves", transform=axis.transAxes, ha="center", va="center", fontsize=9)
-    axis.set_ylabel("distance to movers\nby spheres, mm")
+    axis.set_ylabel("distance to dynamic obstacles\nby spheres, mm")
     axis.grid(alpha=0.25)

@@ -8,7 +8,7 @@ import numpy as np
 
 from apex_ompl.baselines.control.short_horizon import Horizon, finish, first_proved
 from apex_ompl.moving.charges import Charges
-from apex_ompl.moving.movers import clearance_in_time
+from apex_ompl.moving.dynamic_obstacles import clearance_in_time
 from apex_ompl.moving.ready import Ready
 from apex_ompl.moving.request import Answer, Request
 from apex_ompl.moving.search import Search

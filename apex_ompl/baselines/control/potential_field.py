@@ -10,7 +10,7 @@ import numpy as np
 from apex_ompl.baselines.control.short_horizon import Horizon, finish, first_proved
 from apex_ompl.kernel import Kernel
 from apex_ompl.moving.charges import Charges
-from apex_ompl.moving.movers import Movers, clearance_in_time
+from apex_ompl.moving.dynamic_obstacles import DynamicObstacles, clearance_in_time
 from apex_ompl.moving.ready import Ready
 from apex_ompl.moving.request import Answer, Request
 from apex_ompl.moving.search import Search
@@ -45,21 +45,23 @@ class Field(NamedTuple):
     reach: float
     own_reach: float
 
-    def potential_and_force(self, kernel: Kernel, movers: Movers, q: Array, time: float) -> tuple[float, Array]:
+    def potential_and_force(
+        self, kernel: Kernel, dynamic: DynamicObstacles, q: Array, time: float
+    ) -> tuple[float, Array]:
         """Return the potential [rad^2/s^2] at a state, shape (dof,), and its force, shape (dof,) [rad/s^2].
 
         Args:
             kernel: The robot among what stands still.
-            movers: The obstacles that move.
+            dynamic: The obstacles that move.
             q: The state.
-            time: Time of the movers' stamps [s].
+            time: Time of the dynamic obstacles' stamps [s].
         """
         way = q - self.goal
         distance = float(np.linalg.norm(way))
         inside = min(distance, self.cone)
         potential = self.attraction * inside * (distance - 0.5 * inside)
         force = -self.attraction * way * (inside / max(distance, 1e-12))
-        moving, slope = clearance_in_time(kernel, movers, q[None], np.array([time]), self.reach)
+        moving, slope = clearance_in_time(kernel, dynamic, q[None], np.array([time]), self.reach)
         values, slopes = kernel.clearance_gradient(q, self.own_reach)
         fade, fading = (inside / self.cone) ** 2, 2.0 * way / self.cone**2 * (distance < self.cone)
         for clearance, gradient, reach, gain, share, sharing in (

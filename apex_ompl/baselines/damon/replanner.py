@@ -69,7 +69,7 @@ class ManifoldGraph:
         clear, start = Clearances(search), search.start.position
         states = self.damon.states(start)
         usable = self._free_of_still(ready, states, charges).copy()
-        usable[usable] = clear.of_movers(states[usable])
+        usable[usable] = clear.of_dynamic(states[usable])
         paths = self.damon.search(states, usable, start[None], ready.goals)
         charges.charge("query of a graph")
         connect, blocked = paths.more, self._blocked_from(start)
@@ -103,7 +103,7 @@ class ManifoldGraph:
     def _is_free(self, clear: Clearances, first: Array, last: Array) -> bool:
         """Whether a straight motion is clear behind its first state; that is proved once of what stands still."""
         key = first.tobytes() + last.tobytes()
-        if not self._clear_of_still.get(key, True) or not clear.edges_of_movers(first[None], last[None])[0]:
+        if not self._clear_of_still.get(key, True) or not clear.edges_of_dynamic(first[None], last[None])[0]:
             return False
         if key not in self._clear_of_still:
             self._clear_of_still[key] = clear.search.ready.line_is_clear(first, last, clear.search.charges)

@@ -10,7 +10,7 @@ import numpy as np
 from apex_ompl.baselines.drrt.dynamic_rrt import DynamicRRT
 from apex_ompl.baselines.drrt.goal_tree import GoalTree
 from apex_ompl.moving.charges import Charges, cost_table
-from apex_ompl.moving.movers import clearance_in_time
+from apex_ompl.moving.dynamic_obstacles import clearance_in_time
 from apex_ompl.moving.ready import Ready
 from apex_ompl.moving.request import Answer, Request
 from apex_ompl.moving.search import Search
@@ -54,7 +54,7 @@ class KeptTree:
             return Answer(None, "", charges)
         search = Search(ready, request, charges)
         tree, clear = self.search.begin(ready.goals), Clearances(search)
-        tree.trim(clear.edges_of_movers)
+        tree.trim(clear.edges_of_dynamic)
         path = self._grown(search, tree, clear)
         motion = None if path is None else timed(search, path, clear)
         if motion is None:
@@ -100,7 +100,7 @@ class Clearances:
 
     def __call__(self, states: Array) -> Flags:
         """Return whether each state, shape (N, dof), is clear of all."""
-        clear = self.of_movers(states)
+        clear = self.of_dynamic(states)
         clear[clear] = self.of_still(states[clear])
         return clear
 
@@ -121,12 +121,12 @@ class Clearances:
 
     def line(self, first: Array, last: Array) -> bool:
         """Whether a straight motion is proved clear of what stands still, and looked at in steps, of obstacles."""
-        seen = self.edges_of_movers(first[None], last[None])[0]
+        seen = self.edges_of_dynamic(first[None], last[None])[0]
         return bool(seen) and self.search.ready.line_is_clear(first, last, self.search.charges)
 
-    def edges_of_movers(self, first: Array, last: Array) -> Flags:
+    def edges_of_dynamic(self, first: Array, last: Array) -> Flags:
         """Return whether straight motions are clear of obstacles where they are at joining behind their first state."""
-        return self._along(first, last, self.of_movers)
+        return self._along(first, last, self.of_dynamic)
 
     def _along(self, first: Array, last: Array, clear: Callable[[Array], Flags]) -> Flags:
         if not len(first):
@@ -137,7 +137,7 @@ class Clearances:
         begins = np.cumsum([0] + [len(piece) for piece in pieces[:-1]])
         return np.asarray(np.logical_and.reduceat(clear(np.concatenate(pieces)), begins))
 
-    def of_movers(self, states: Array) -> Flags:
+    def of_dynamic(self, states: Array) -> Flags:
         """Return whether each state, shape (N, dof), is clear of obstacles where they are at joining."""
         ready, request = self.search.ready, self.search.request
         times = np.full(len(states), request.join)

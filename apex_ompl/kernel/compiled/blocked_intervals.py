@@ -1,21 +1,21 @@
-"""Intervals of time in which places along a motion are blocked by movers.
+"""Intervals of time in which places along a motion are blocked by dynamic obstacles.
 
 The places are pieces of the path, from one parameter to another: in the middle of each the robot is placed, and its
 spheres grow by the bound on their displacement over the piece (:mod:`apex_ompl.kernel.compiled.motion_bound`), so that
-what holds for them standing still holds for every state of the piece. A cluster's ball that never meets a mover is done
-with; otherwise the trees of spheres of its bodies are searched down to the leaves, but not below a sphere that adds no
-time to what is blocked already (Phillips and Likhachev 2011 call what is left safe intervals).
+what holds for them standing still holds for every state of the piece. A cluster's ball that never meets a dynamic
+obstacle is done with; otherwise the trees of spheres of its bodies are searched down to the leaves, but not below a
+sphere that adds no time to what is blocked already (Phillips and Likhachev 2011 call what is left safe intervals).
 """
 
 from __future__ import annotations
 
 from apex_ompl.kernel.compiled.arrays import RobotArrays, robot_view
 from apex_ompl.kernel.compiled.compilation import entry_point, inlined
+from apex_ompl.kernel.compiled.dynamic_obstacle_intervals import Interval, meeting_times
+from apex_ompl.kernel.compiled.dynamic_obstacles import DynamicArrays, dynamic_view, scene_of_dynamic, set_interval
 from apex_ompl.kernel.compiled.kinematics import node_position, place_cluster
 from apex_ompl.kernel.compiled.layout import Floats, Integers, Singles
 from apex_ompl.kernel.compiled.motion_bound import cluster_displacement
-from apex_ompl.kernel.compiled.mover_intervals import Interval, meeting_times
-from apex_ompl.kernel.compiled.movers import MoverArrays, movers_view, scene_of_movers, set_interval
 from apex_ompl.kernel.compiled.scene_tree import is_allowed
 from apex_ompl.kernel.compiled.time_sets import add_span, holds_span
 from apex_ompl.kernel.compiled.workspace import Workspace, workspace_view
@@ -27,10 +27,10 @@ ROUNDING = 1e-9  # added to intervals of time [s]
 
 @inlined
 def _add_body(
-    t: RobotArrays, m: MoverArrays, w: Workspace, b: int, o: int, shift: float, within: Interval, spans: Floats,
+    t: RobotArrays, m: DynamicArrays, w: Workspace, b: int, o: int, shift: float, within: Interval, spans: Floats,
     count: int,
 ) -> int:  # fmt: skip
-    """Add the times at which a body may meet a mover; return the number of intervals."""
+    """Add the times at which a body may meet a dynamic obstacle; return the number of intervals."""
     j, top = t.body_joint[b], 1
     w.stack[0] = t.body_root[b]
     while top > 0:
@@ -50,10 +50,10 @@ def _add_body(
 
 @inlined
 def _add_place(
-    t: RobotArrays, m: MoverArrays, w: Workspace, q: Floats, within: Interval, spans: Floats, any_will_do: bool
+    t: RobotArrays, m: DynamicArrays, w: Workspace, q: Floats, within: Interval, spans: Floats, any_will_do: bool
 ) -> int:
     """Set the blocked intervals of the motion of ``w`` around a state; return their number."""
-    allowed, count = scene_of_movers(m, m.place), 0
+    allowed, count = scene_of_dynamic(m, m.place), 0
     for c in range(len(t.cluster_joint)):
         if not t.cluster_meets_scene[c]:
             continue
@@ -84,9 +84,9 @@ def blocked_intervals(
     Args:
         ri: Robot, packed; see :func:`apex_ompl.kernel.compiled.layout.pack`.
         rf: Robot.
-        mi: Movers, packed.
-        mf: Movers.
-        ms: Movers.
+        mi: Dynamic obstacles, packed.
+        mf: DynamicObstacles.
+        ms: DynamicObstacles.
         wi: Workspace, see :func:`apex_ompl.kernel.compiled.workspace.workspace_sizes`.
         wf: Workspace.
         knots: The path, as are the next two; see :func:`apex_ompl.kernel.compiled.curve.set_motion`.
@@ -94,13 +94,13 @@ def blocked_intervals(
         rates: Velocities and accelerations at the knots.
         slack: Distance from the path within which states count as being on it, of each joint [rad].
         places: Parameters of the begins and ends of the pieces, shape (P, 2); the same twice for one state.
-        begin: First time that is looked at, of the movers' stamps [s].
+        begin: First time that is looked at, of the dynamic obstacles' stamps [s].
         end: The last one [s].
         state: Buffer for a state, shape (dof,).
         spans: Gets the blocked intervals of each piece in their order, shape (P, MOST_SPANS, 2) [s].
         counts: Gets their numbers, shape (P,).
     """
-    t, m = robot_view(ri, rf), movers_view(mi, mf, ms)
+    t, m = robot_view(ri, rf), dynamic_view(mi, mf, ms)
     w = workspace_view(t, wi, wf)
     within = (begin, end)
     for p in range(len(places)):

@@ -135,11 +135,11 @@ RUNS = Group(
             ),
         },
         {
-            "movers.clearances_in_time": (
+            "dynamic_obstacles.clearances_in_time": (
                 ROBOT + MOVERS + WORKSPACE + "f8[:, ::1], f8[::1], f8, f8[:, ::1], f8[::1], f8[:, ::1]",
                 2,
             ),
-            "movers.first_conflict": (
+            "dynamic_obstacles.first_conflict": (
                 ROBOT
                 + MOVERS
                 + WORKSPACE
@@ -154,7 +154,7 @@ RUNS = Group(
                 "f8[:, :, ::1], i8[::1]",
                 14,
             ),
-            "stops_among_movers.first_unproved_stop": (
+            "stops_among_dynamic_obstacles.first_unproved_stop": (
                 ROBOT
                 + MOVERS
                 + WORKSPACE

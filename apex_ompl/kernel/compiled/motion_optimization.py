@@ -1,8 +1,8 @@
 """Levenberg-Marquardt steps on a motion among obstacles that move: the control points of a spline in time.
 
-The cost is that of a path (:mod:`apex_ompl.kernel.compiled.path_cost`), with clearances to movers where they are at the
-times of the samples, and with what the motion exceeds its limits by. For the uniform cubic B-spline in time with knot
-spacing h, whose k-th differences are D_k P,
+The cost is that of a path (:mod:`apex_ompl.kernel.compiled.path_cost`), with clearances to dynamic obstacles where they
+are at the times of the samples, and with what the motion exceeds its limits by. For the uniform cubic B-spline in time
+with knot spacing h, whose k-th differences are D_k P,
 
     limits = weight / 2 sum_k sum_i sum_d max(0, |D_k P|_id / (limit_kd h^k) - 1)^2,   k = 1, 2, 3,
 
@@ -17,8 +17,8 @@ from typing import NamedTuple
 from apex_ompl.kernel.compiled.arrays import RobotArrays, SceneArrays, robot_view, scene_view
 from apex_ompl.kernel.compiled.clearance_cost import state_cost
 from apex_ompl.kernel.compiled.compilation import entry_point, inlined
+from apex_ompl.kernel.compiled.dynamic_obstacles import DynamicArrays, dynamic_view, scene_of_dynamic
 from apex_ompl.kernel.compiled.layout import Floats, Integers, Singles
-from apex_ompl.kernel.compiled.movers import MoverArrays, movers_view, scene_of_movers
 from apex_ompl.kernel.compiled.path_cost import (
     Buffers,
     CostSettings,
@@ -33,7 +33,7 @@ from apex_ompl.kernel.compiled.path_cost import (
 )
 from apex_ompl.kernel.compiled.path_optimization import descend
 from apex_ompl.kernel.compiled.separation import tables_hold
-from apex_ompl.kernel.compiled.state_costs import add_movers
+from apex_ompl.kernel.compiled.state_costs import add_dynamic
 from apex_ompl.kernel.compiled.workspace import Workspace, workspace_view
 
 ORDERS = 3  # of derivatives that have limits
@@ -47,9 +47,9 @@ class MotionProblem(NamedTuple):
         weights: Weights of control points at the samples, shape (N, 4).
         first: The first control point that they belong to, shape (N,).
         speed_gram: Matrix of the speed term, shape (P, P).
-        movers: The movers.
-        placed: The movers as a scene, placed for one sample at a time.
-        times: Times of the samples by the movers' clock, shape (N,) [s].
+        dynamic: The dynamic obstacles.
+        placed: The dynamic obstacles as a scene, placed for one sample at a time.
+        times: Times of the samples by the dynamic obstacles' clock, shape (N,) [s].
         limits: Limits of velocity, acceleration and jerk times the knot spacing, its square and its cube, (3, dof).
         limit_weight: Weight of what they are exceeded by.
     """
@@ -57,7 +57,7 @@ class MotionProblem(NamedTuple):
     weights: Floats
     first: Integers
     speed_gram: Floats
-    movers: MoverArrays
+    dynamic: DynamicArrays
     placed: SceneArrays
     times: Floats
     limits: Floats
@@ -110,9 +110,9 @@ def evaluate_motion(
 ) -> PathCost:  # fmt: skip
     """Return the cost of a motion; put its gradient (n,) and the upper band of its matrix (n, n) into place.
 
-    The clearance to the scene is that to the movers, too.
+    The clearance to the scene is that to the dynamic obstacles, too.
     """
-    weights, first, dof, movers = problem.weights, problem.first, control.shape[1], problem.movers
+    weights, first, dof, dynamic = problem.weights, problem.first, control.shape[1], problem.dynamic
     free, margin = len(control) - 2 * pinned, settings.scene_margin
     clear(WIDTH * dof, gradient, gram)
     scene, own = margin, settings.own_margin
@@ -124,8 +124,8 @@ def evaluate_motion(
         cost, scene, own = state_cost(
             t, s, w, q, margin, settings.own_margin, b.row, b.state_gradient, b.state_gram, scene, own,
         )  # fmt: skip
-        moving, scene = add_movers(
-            t, movers, problem.placed, w, q, problem.times[k], margin, b.row, b.state_gradient, b.state_gram, scene
+        moving, scene = add_dynamic(
+            t, dynamic, problem.placed, w, q, problem.times[k], margin, b.row, b.state_gradient, b.state_gram, scene
         )
         cost += moving
         if cost > 0.0:
@@ -148,18 +148,18 @@ def optimize_motion(
     """Improve a motion in place; its free control points (P, dof) are put inside the limits.
 
     Arguments are those of :func:`apex_ompl.kernel.compiled.path_optimization.optimize_path` and of
-    :class:`MotionProblem`; ``mi``, ``mf`` and ``ms`` are packed movers, ``offset`` (M, 3) a buffer for their places.
-    ``slope`` (n,) gets the gradient where no steps are asked for; shape (0,) asks for none.
+    :class:`MotionProblem`; ``mi``, ``mf`` and ``ms`` are packed dynamic obstacles, ``offset`` (M, 3) a buffer for their
+    places. ``slope`` (n,) gets the gradient where no steps are asked for; shape (0,) asks for none.
 
     Returns:
         The fields of :class:`apex_ompl.kernel.compiled.path_cost.PathReport`.
     """
-    t, s, m = robot_view(ri, rf), scene_view(si, sf, sg), movers_view(mi, mf, ms)
+    t, s, m = robot_view(ri, rf), scene_view(si, sf, sg), dynamic_view(mi, mf, ms)
     w = workspace_view(t, wi, wf)
     points, dof = control.shape
     b = buffers_view(bi, bf, ((points - 2 * pinned) * dof, points, dof))
     problem = MotionProblem(
-        weights, first, speed_gram, m, scene_of_movers(m, offset), times, limits, limit_weight
+        weights, first, speed_gram, m, scene_of_dynamic(m, offset), times, limits, limit_weight
     )  # fmt: skip
     c, taken, damping = descend(
         evaluate_motion, problem, t, s, w, speed_gram, pinned, control, CostSettings(*numbers), b, WIDTH

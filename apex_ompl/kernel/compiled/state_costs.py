@@ -1,7 +1,8 @@
 """Clearance costs of states among obstacles that stand and that move, with gradients and Gauss-Newton matrices.
 
 The cost of a state at a time is that of :mod:`apex_ompl.kernel.compiled.clearance_cost`, to which every cluster and
-every mover add the same term, with the mover where it is at that time and as much larger as its margin says.
+every dynamic obstacle add the same term, with the dynamic obstacle where it is at that time and as much larger as its
+margin says.
 """
 
 from __future__ import annotations
@@ -12,31 +13,37 @@ from apex_ompl.kernel.compiled.arrays import RobotArrays, SceneArrays, robot_vie
 from apex_ompl.kernel.compiled.clearance import gradient_to_obstacle, nearest_to_obstacle
 from apex_ompl.kernel.compiled.clearance_cost import add_violation, state_cost
 from apex_ompl.kernel.compiled.compilation import entry_point, inlined
+from apex_ompl.kernel.compiled.dynamic_obstacles import (
+    DynamicArrays,
+    dynamic_view,
+    margin_at,
+    place_dynamic,
+    scene_of_dynamic,
+)
 from apex_ompl.kernel.compiled.layout import Floats, Integers, Singles
-from apex_ompl.kernel.compiled.movers import MoverArrays, margin_at, movers_view, place_movers, scene_of_movers
 from apex_ompl.kernel.compiled.separation import tables_hold
 from apex_ompl.kernel.compiled.workspace import Workspace, workspace_view
 
 
 @inlined
-def add_movers(
-    t: RobotArrays, movers: MoverArrays, placed: SceneArrays, w: Workspace, q: Floats, time: float, margin: float,
+def add_dynamic(
+    t: RobotArrays, dynamic: DynamicArrays, placed: SceneArrays, w: Workspace, q: Floats, time: float, margin: float,
     row: Floats, gradient: Floats, gram: Floats, scene: float,
 ) -> tuple[float, float]:  # fmt: skip
-    """Add what movers cost at a time to the gradient and the lower half of the matrix of a state that is placed.
+    """Add what dynamic obstacles cost at a time to the gradient and the lower half of the matrix of a placed state.
 
-    ``placed`` are the movers as a scene, ``scene`` the smallest clearance so far [m].
+    ``placed`` are the dynamic obstacles as a scene, ``scene`` the smallest clearance so far [m].
 
     Returns:
         The cost, and the smallest clearance [m].
     """
     cost = 0.0
-    place_movers(movers, time, placed.offset)
+    place_dynamic(dynamic, time, placed.offset)
     for c in range(len(t.cluster_joint)):
         if not t.cluster_meets_scene[c]:
             continue
-        for o in range(len(movers.kind)):
-            grown = margin_at(movers, o, time)
+        for o in range(len(dynamic.kind)):
+            grown = margin_at(dynamic, o, time)
             near = nearest_to_obstacle(t, placed, w, q, c, o, (margin + grown, -1, -1, -1, -1))
             if near[1] >= 0:
                 clearance = near[0] - grown
@@ -57,14 +64,14 @@ def state_costs(
 ) -> None:  # fmt: skip
     """Put clearance costs of states, shape (N, dof), at times, shape (N,) [s], into place.
 
-    ``mi``, ``mf`` and ``ms`` are packed movers; ``offset`` (M, 3) and ``row`` (dof,) are buffers. ``values`` (N, 3)
-    gets the cost and the clearances to the scene and between links [m], at most the margins; ``gradients`` (N, dof)
-    and ``grams`` (N, dof, dof) the gradients and the matrices. Where the tables do not hold for a state its cost is
-    infinite, and the rest 0.
+    ``mi``, ``mf`` and ``ms`` are packed dynamic obstacles; ``offset`` (M, 3) and ``row`` (dof,) are buffers. ``values``
+    (N, 3) gets the cost and the clearances to the scene and between links [m], at most the margins; ``gradients`` (N,
+    dof) and ``grams`` (N, dof, dof) the gradients and the matrices. Where the tables do not hold for a state its cost
+    is infinite, and the rest 0.
     """
-    t, s, m = robot_view(ri, rf), scene_view(si, sf, sg), movers_view(mi, mf, ms)
+    t, s, m = robot_view(ri, rf), scene_view(si, sf, sg), dynamic_view(mi, mf, ms)
     w = workspace_view(t, wi, wf)
-    placed = scene_of_movers(m, offset)
+    placed = scene_of_dynamic(m, offset)
     dof = states.shape[1]
     for k in range(len(states)):
         gradient, gram = gradients[k], grams[k]
@@ -78,7 +85,7 @@ def state_costs(
         cost, scene, own = state_cost(
             t, s, w, states[k], scene_margin, own_margin, row, gradient, gram, scene_margin, own_margin
         )
-        moving, scene = add_movers(t, m, placed, w, states[k], times[k], scene_margin, row, gradient, gram, scene)
+        moving, scene = add_dynamic(t, m, placed, w, states[k], times[k], scene_margin, row, gradient, gram, scene)
         values[k, 0], values[k, 1], values[k, 2] = cost + moving, scene, own
         for i in range(dof):
             for j in range(i):

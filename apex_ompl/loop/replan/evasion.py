@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from apex_ompl.moving.dynamic_obstacles import clearance_in_time
 from apex_ompl.moving.following import Following
-from apex_ompl.moving.movers import clearance_in_time
 from apex_ompl.moving.search import Search
 from apex_ompl.timing import Trajectory, time_path
 from apex_ompl.types import Array
@@ -117,9 +117,9 @@ def _looked(search: Search, states: Array, looks: Array) -> tuple[Array, Array]:
     if request.reachable is not None and ready.settings.evade == "proved":
         asked.append((request.reachable, looks[:1]))
     clear, slopes = list[Array](), list[Array]()
-    for movers, times in asked:
+    for dynamic, times in asked:
         many = np.repeat(states, len(times), axis=0)
-        values, gradients = clearance_in_time(ready.kernel, movers, many, np.tile(times, count), SEEN)
+        values, gradients = clearance_in_time(ready.kernel, dynamic, many, np.tile(times, count), SEEN)
         search.charges.charge("clearance in time", len(values))
         clear.append(values.reshape(count, -1))
         slopes.append(gradients.reshape(count, len(times), -1)[:, :, :-1])

@@ -53,7 +53,7 @@ class SavedRun(ShownRun):
         return self.run.trajectory
 
     @property
-    def movers(self) -> tuple[Obstacle, ...]:
+    def dynamic(self) -> tuple[Obstacle, ...]:
         """The obstacles that moved, with their scripts."""
         return tuple(o for o in self.setup.problem.scene if o.moving)
 
@@ -69,7 +69,7 @@ class SavedRun(ShownRun):
     def draw(self, scene: BrowserScene, time: float) -> None:
         """Show the run at a time [s] in its scene."""
         super().draw(scene, time)
-        for obstacle in self.movers:
+        for obstacle in self.dynamic:
             pose = obstacle_at(obstacle, time).pose if is_there(obstacle, time) else None
             scene.show_obstacle(obstacle.name, pose)
 
@@ -91,14 +91,14 @@ class SavedRun(ShownRun):
     @cached_property
     def curves(self) -> dict[str, Array]:
         """Curves over ``time`` [s]: ``clearance`` [mm] and the use of limits, by name."""
-        return self.curves_of(self.motion, self.movers)
+        return self.curves_of(self.motion, self.dynamic)
 
 
 def summary(run: RunResult) -> str:
     """Return the main metrics of a run in one line; those that it lacks are left out."""
     words = (
         ("replans_accepted", "{:.0f} replans", 1.0), ("stops", "{:.0f} stops", 1.0),
-        ("rest_time", "{:.2f} s at rest", 1.0), ("clearance", "at least {:.0f} mm from movers", 1e3),
+        ("rest_time", "{:.2f} s at rest", 1.0), ("clearance", "at least {:.0f} mm from dynamic obstacles", 1e3),
         ("reaction_p95", "reaction p95 {:.0f} ms", 1e3),
     )  # fmt: skip
     return ", ".join(text.format(unit * run.metrics[name]) for name, text, unit in words if name in run.metrics)

@@ -91,12 +91,12 @@ class Shown:
         """Show it at a time [s] in its scene; obstacles that its motion was proved among are where they are then."""
         scene.show(self.state(time))
         at = min(max(time, 0.0), self.duration)
-        for obstacle in self._movers:
+        for obstacle in self._dynamic:
             scene.show_obstacle(obstacle.name, obstacle_at(obstacle, at).pose if is_there(obstacle, at) else None)
 
     @cached_property
-    def _movers(self) -> tuple[Obstacle, ...]:
-        names = () if self.result is None else self.result.movers
+    def _dynamic(self) -> tuple[Obstacle, ...]:
+        names = () if self.result is None else self.result.dynamic_obstacles
         return tuple(o for o in self.setup.problem.scene if o.name in names)
 
     def states(self, count: int) -> list[Array]:
@@ -108,13 +108,13 @@ class Shown:
         """Curves of a timed motion over ``time`` [s]: ``clearance`` [mm] and the use of limits, by name."""
         if self.result is None or self.result.trajectory is None:
             return {}
-        return self.curves_of(self.result.trajectory, self._movers)
+        return self.curves_of(self.result.trajectory, self._dynamic)
 
-    def curves_of(self, motion: Trajectory, movers: Sequence[Obstacle]) -> dict[str, Array]:
+    def curves_of(self, motion: Trajectory, dynamic: Sequence[Obstacle]) -> dict[str, Array]:
         """Return the curves of a motion among obstacles that move."""
         times = np.linspace(0.0, motion.duration, CURVE_SAMPLES)
         shares = np.abs(shares_of_limits(motion, self.setup.robot, times)).max(axis=2)
-        found = {"time": times, "clearance": 1e3 * clearances(self.setup.checker, motion, times, movers)}
+        found = {"time": times, "clearance": 1e3 * clearances(self.setup.checker, motion, times, dynamic)}
         return {**found, **dict(zip(ORDERS, shares, strict=True))}
 
     @property

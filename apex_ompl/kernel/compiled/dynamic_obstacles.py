@@ -1,13 +1,13 @@
 """Obstacles that move: where they are in time, the proof of a motion among them, and clearances in time.
 
-Movers stay out of the scene's tree. Mover o has the place p_o at its time stamp s_o, the velocity v_o and a margin that
-may grow: at time t it stands at p_o + v_o (t - s_o), and counts as larger by
+Dynamic obstacles stay out of the scene's tree. Dynamic obstacle o has the place p_o at its time stamp s_o, the velocity
+v_o and a margin that may grow: at time t it stands at p_o + v_o (t - s_o), and counts as larger by
 
     g_o(t) = growth_o0 + growth_o1 max(0, t - s_o).
 
-It does not turn. In the middle of an interval of time the robot and the movers are placed; over the interval, h on
-either side, a mover's own motion adds to that of the robot's spheres (:mod:`apex_ompl.kernel.compiled.motion_bound`):
-relative to a mover, a sphere moves by at most
+It does not turn. In the middle of an interval of time the robot and the dynamic obstacles are placed; over the
+interval, h on either side, a dynamic obstacle's own motion adds to that of the robot's spheres
+(:mod:`apex_ompl.kernel.compiled.motion_bound`): relative to a dynamic obstacle, a sphere moves by at most
 
     min(arc bound + |v_o| h,  |linear - v_o h| + remainder),
 
@@ -44,7 +44,7 @@ LONGER = 1.6  # factor from an interval that was proved at once to the next
 FIRST = 0.05  # length of the first interval [s]
 
 
-class MoverArrays(NamedTuple):
+class DynamicArrays(NamedTuple):
     """Arrays of M solids that move at constant velocity; those of one obstacle have the same ``owner``.
 
     ``kind``, ``owner``, ``grid``, ``rotation``, ``size``, ``values`` and ``allowed`` are those of
@@ -70,12 +70,12 @@ class MoverArrays(NamedTuple):
     values: Singles
 
 
-movers_view = table_view(MoverArrays)
+dynamic_view = table_view(DynamicArrays)
 
 
 @ir_inlined
-def scene_of_movers(m: MoverArrays, offset: Floats) -> SceneArrays:
-    """Return movers as a scene without a tree, at the places in ``offset`` (M, 3)."""
+def scene_of_dynamic(m: DynamicArrays, offset: Floats) -> SceneArrays:
+    """Return dynamic obstacles as a scene without a tree, at the places in ``offset`` (M, 3)."""
     return SceneArrays(
         m.kind, m.owner, m.kind[:0], m.kind[:0], m.allowed[:0], m.kind[:0], m.allowed, m.rotation, offset, m.size,
         m.place[:0], m.place[:0], m.grid, m.values,
@@ -83,8 +83,8 @@ def scene_of_movers(m: MoverArrays, offset: Floats) -> SceneArrays:
 
 
 @inlined
-def place_movers(m: MoverArrays, time: float, offset: Floats) -> None:
-    """Put the places of movers at a time [s] into ``offset`` (M, 3)."""
+def place_dynamic(m: DynamicArrays, time: float, offset: Floats) -> None:
+    """Put the places of dynamic obstacles at a time [s] into ``offset`` (M, 3)."""
     for o in range(len(m.kind)):
         since = time - m.stamp[o]
         for i in range(3):
@@ -92,14 +92,14 @@ def place_movers(m: MoverArrays, time: float, offset: Floats) -> None:
 
 
 @inlined
-def margin_at(m: MoverArrays, o: int, time: float) -> float:
-    """Return the margin of a mover at a time [m]."""
+def margin_at(m: DynamicArrays, o: int, time: float) -> float:
+    """Return the margin of a dynamic obstacle at a time [m]."""
     return float(m.growth[o, 0] + m.growth[o, 1] * max(time - m.stamp[o], 0.0))
 
 
 @inlined
-def relative_shift(m: MoverArrays, w: Workspace, c: int, o: int, half: float, end: float) -> float:
-    """Return how far a cluster's spheres come nearer to a mover, at most, with the margin at the end [m]."""
+def relative_shift(m: DynamicArrays, w: Workspace, c: int, o: int, half: float, end: float) -> float:
+    """Return how far a cluster's spheres come nearer to a dynamic obstacle, at most, with the margin at the end [m]."""
     x, y, z = half * m.velocity[o, 0], half * m.velocity[o, 1], half * m.velocity[o, 2]
     own = math.sqrt(x * x + y * y + z * z)
     x, y, z = w.linear[c, 0, 0] - x, w.linear[c, 0, 1] - y, w.linear[c, 0, 2] - z
@@ -109,7 +109,7 @@ def relative_shift(m: MoverArrays, w: Workspace, c: int, o: int, half: float, en
 
 @inlined
 def _cluster_clear(t: RobotArrays, s: SceneArrays, w: Workspace, q: Floats, c: int, o: int, shift: float) -> int:
-    """Return -1 where a cluster is proved apart from a mover, or the first of its bodies that is not."""
+    """Return -1 where a cluster is proved apart from a dynamic obstacle, or the first of its bodies that is not."""
     # Every comparison is of the form "distance > bound", which is false for NaN.
     if apart(s, o, w.ball[c, 0], w.ball[c, 1], w.ball[c, 2], t.cluster_ball[c, 3] + shift):
         return -1
@@ -128,9 +128,9 @@ def _cluster_clear(t: RobotArrays, s: SceneArrays, w: Workspace, q: Floats, c: i
 
 @inlined
 def _interval_clear(
-    t: RobotArrays, m: MoverArrays, s: SceneArrays, w: Workspace, q: Floats, half: float, end: float, found: Integers
+    t: RobotArrays, m: DynamicArrays, s: SceneArrays, w: Workspace, q: Floats, half: float, end: float, found: Integers
 ) -> bool:
-    """Whether the motion of ``w`` around a state is proved apart from all movers; else the pair is in ``found``."""
+    """Whether the motion of ``w`` around a state is proved apart from all obstacles; else the pair is in ``found``."""
     for c in range(len(t.cluster_joint)):
         if not t.cluster_meets_scene[c]:
             continue
@@ -173,7 +173,7 @@ def set_interval(
 
 @inlined
 def conflict_on(
-    t: RobotArrays, m: MoverArrays, s: SceneArrays, w: Workspace, knots: Floats, states: Floats, rates: Floats,
+    t: RobotArrays, m: DynamicArrays, s: SceneArrays, w: Workspace, knots: Floats, states: Floats, rates: Floats,
     slack: float, begin: float, end: float, clock: float, shortest: float, offset: Floats, state: Floats,
     found: Integers,
 ) -> float:  # fmt: skip
@@ -187,7 +187,7 @@ def conflict_on(
         if a < last < b:
             b = last
         found[2] += 1
-        place_movers(m, clock + 0.5 * (a + b), offset)
+        place_dynamic(m, clock + 0.5 * (a + b), offset)
         clear = set_interval(t, knots, states, rates, slack, a, b, state, w)
         if clear:
             clear = _interval_clear(t, m, s, w, state, 0.5 * (b - a), clock + b, found)
@@ -207,14 +207,14 @@ def first_conflict(
     knots: Floats, states: Floats, rates: Floats, slack: float,
     begin: float, end: float, clock: float, shortest: float, offset: Floats, state: Floats, found: Integers,
 ) -> float:  # fmt: skip
-    """Return the first moment of a motion that is not proved apart from the movers [s], infinity where there is none.
+    """Return the first moment of a motion that is not proved apart from the obstacles [s], or infinity.
 
     Args:
         ri: Robot, packed; see :func:`apex_ompl.kernel.compiled.layout.pack`.
         rf: Robot.
-        mi: Movers, packed.
-        mf: Movers.
-        ms: Movers.
+        mi: Dynamic obstacles, packed.
+        mf: DynamicObstacles.
+        ms: DynamicObstacles.
         wi: Workspace, see :func:`apex_ompl.kernel.compiled.workspace.workspace_sizes`.
         wf: Workspace.
         knots: Times of the motion, as are the next three; see :func:`apex_ompl.kernel.compiled.curve.set_motion`.
@@ -223,15 +223,15 @@ def first_conflict(
         slack: What the pieces miss each other by.
         begin: Where on the motion to begin [s].
         end: Where to end [s]; behind its last knot the robot stands.
-        clock: Time of the movers' stamps when the motion is at 0 [s].
+        clock: Time of the dynamic obstacles' stamps when the motion is at 0 [s].
         shortest: Length of an interval that is given up [s].
         offset: Buffer for places, shape (M, 3).
         state: Buffer for a state, shape (dof,).
-        found: Gets the body and the owner of the mover, shape (2,); then the number of intervals.
+        found: Gets the body and the owner of the dynamic obstacle, shape (2,); then the number of intervals.
     """
-    t, m = robot_view(ri, rf), movers_view(mi, mf, ms)
+    t, m = robot_view(ri, rf), dynamic_view(mi, mf, ms)
     w = workspace_view(t, wi, wf)
-    s = scene_of_movers(m, offset)
+    s = scene_of_dynamic(m, offset)
     return float(
         conflict_on(
             t, m, s, w, knots, states, rates, slack, begin, end, clock, shortest, offset, state, found
@@ -240,10 +240,10 @@ def first_conflict(
 
 
 @inlined
-def nearest_mover(
-    t: RobotArrays, m: MoverArrays, s: SceneArrays, w: Workspace, q: Floats, time: float, limit: float
+def nearest_dynamic_obstacle(
+    t: RobotArrays, m: DynamicArrays, s: SceneArrays, w: Workspace, q: Floats, time: float, limit: float
 ) -> Nearest:
-    """Return the nearest leaf and mover, margins subtracted from the distance, that are less than ``limit`` apart."""
+    """Return the nearest leaf and dynamic obstacle, less margins, that are less than ``limit`` apart."""
     best = (limit, -1, -1, -1, -1)
     for c in range(len(t.cluster_joint)):
         if not t.cluster_meets_scene[c]:
@@ -257,8 +257,8 @@ def nearest_mover(
 
 
 @inlined
-def _closing_speed(t: RobotArrays, m: MoverArrays, s: SceneArrays, w: Workspace, near: Nearest, time: float) -> float:
-    """Return the derivative of a leaf's clearance to a mover with respect to the time alone [m/s]."""
+def _closing_speed(t: RobotArrays, m: DynamicArrays, s: SceneArrays, w: Workspace, near: Nearest, time: float) -> float:
+    """Return the derivative of a leaf's clearance to a dynamic obstacle with respect to the time alone [m/s]."""
     o = near[3]
     x, y, z = node_position(t, w, t.body_joint[near[1]], near[2])
     u = direction(s, o, x, y, z)
@@ -272,15 +272,15 @@ def clearances_in_time(
     ri: Integers, rf: Floats, mi: Integers, mf: Floats, ms: Singles, wi: Integers, wf: Floats,
     states: Floats, times: Floats, limit: float, offset: Floats, values: Floats, gradients: Floats,
 ) -> None:  # fmt: skip
-    """Put the signed clearances of states, shape (N, dof), to movers at times (N,) into ``values`` (N,) [m].
+    """Put the signed clearances of states, shape (N, dof), to dynamic obstacles at times (N,) into ``values`` (N,) [m].
 
     Clearances above ``limit`` are given as ``limit``, with gradient 0. ``gradients``, shape (N, dof + 1), gets the
     gradients with respect to the state, and the derivative with respect to the time; shape (0, dof + 1) asks for none.
     States for which the tables do not hold get NaN.
     """
-    t, m = robot_view(ri, rf), movers_view(mi, mf, ms)
+    t, m = robot_view(ri, rf), dynamic_view(mi, mf, ms)
     w = workspace_view(t, wi, wf)
-    s = scene_of_movers(m, offset)
+    s = scene_of_dynamic(m, offset)
     dof = states.shape[1]
     for k in range(len(states)):
         q = states[k]
@@ -291,8 +291,8 @@ def clearances_in_time(
                     gradients[k, i] = math.nan
             continue
         place_robot(t, w, q)
-        place_movers(m, times[k], offset)
-        near = nearest_mover(t, m, s, w, q, times[k], limit)
+        place_dynamic(m, times[k], offset)
+        near = nearest_dynamic_obstacle(t, m, s, w, q, times[k], limit)
         values[k] = near[0]
         if len(gradients):
             for i in range(dof + 1):

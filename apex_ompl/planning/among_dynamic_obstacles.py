@@ -1,9 +1,9 @@
 """Plans among obstacles that move at constant velocity: motions in time, proved in time.
 
-1. A path among what stands still is found and timed as ever; where its motion meets no mover, that is the plan.
-2. Else the motion along the path is retimed: it waits, slows down or hurries (:mod:`apex_ompl.moving.retime`).
+1. A path among what stands still is found and timed as ever; where its motion meets no dynamic obstacle, that is the
+plan. 2. Else the motion along the path is retimed: it waits, slows down or hurries (:mod:`apex_ompl.moving.retime`).
 3. Motions are optimized in space and time from several paths and durations (:mod:`apex_ompl.moving.timed_spline`).
-4. Where all that fails, paths are planned around what the movers sweep.
+4. Where all that fails, paths are planned around what the dynamic obstacles sweep.
 
 The motion that arrives first is taken.
 """
@@ -40,18 +40,18 @@ from apex_ompl.util.stopwatch import timed
 
 RETIMED, SPACE_TIME, SWEPT = "retiming", "space-time", "swept"
 STAGES = (RETIMED, SPACE_TIME, SWEPT)
-FACTORS = (1.0, 1.3, 1.7, 2.4, 3.5, 5.0)  # durations that are tried, as multiples of that without movers
-MARGIN = 0.005  # that motions keep from movers, where the start does [m]
+FACTORS = (1.0, 1.3, 1.7, 2.4, 3.5, 5.0)  # durations that are tried, as multiples of that without dynamic obstacles
+MARGIN = 0.005  # that motions keep from dynamic obstacles, where the start does [m]
 LONGER = 3  # turns, each with durations twice as long as the one before
 PATH_STATES = (256, 1024)  # of the path of a motion, the first number for which it is proved
-SWEPT_SECONDS = 6.0  # of the movers' ways that paths are planned around [s]
+SWEPT_SECONDS = 6.0  # of the dynamic obstacles' ways that paths are planned around [s]
 SWEPT_SHARE = 0.3  # of the time that is left, for that
 SWEPT_STEP, MOST_COPIES = 0.05, 100  # spacing of their places on the way [m], and most of these
 
 
 @dataclass(frozen=True)
 class Among:
-    """What a plan among movers works on.
+    """What a plan among dynamic obstacles works on.
 
     Attributes:
         run: The call of ``plan``, among what stands still.
@@ -82,7 +82,7 @@ class Among:
     def proof(self, motion: Trajectory) -> PathProof | None:
         """Return the proof that a motion is clear of what stands still and of itself, or None.
 
-        It is None, too, where the motion meets a mover, or does not go from the start to a goal.
+        It is None, too, where the motion meets a dynamic obstacle, or does not go from the start to a goal.
         """
         setup = self.run.setup
         if not self.prover.prove(motion, stop=self.stop):
@@ -95,17 +95,17 @@ class Among:
         return self.proof(motion) is not None
 
 
-def plan_among_movers(
-    run: PlanRun, movers: Sequence[Obstacle], simplify: bool, timing: Timing, stages: Sequence[str] = STAGES
+def plan_among_dynamic_obstacles(
+    run: PlanRun, dynamic: Sequence[Obstacle], simplify: bool, timing: Timing, stages: Sequence[str] = STAGES
 ) -> PlanResult:
     """Return a motion among obstacles that move, or why there is none.
 
     Args:
-        run: The call of ``plan`` on a problem that is set up without the movers.
-        movers: The obstacles that move, where they are at time 0, when the motion begins.
+        run: The call of ``plan`` on a problem that is set up without the dynamic obstacles.
+        dynamic: The obstacles that move, where they are at time 0, when the motion begins.
         simplify: Whether paths of planners that leave it to others are shortened.
         timing: How motions are timed.
-        stages: Those of ``STAGES`` that are tried where the path's own motion meets a mover.
+        stages: Those of ``STAGES`` that are tried where the path's own motion meets a dynamic obstacle.
 
     Raises:
         ApexError: As :func:`apex_ompl.planning.solving.find_path`.
@@ -114,22 +114,22 @@ def plan_among_movers(
     fault = query_fault(run)
     if fault is not None:
         return fault
-    meets = TimedProver(setup.checker, movers, problem.allowed).fault_at_start(setup.start)
+    meets = TimedProver(setup.checker, dynamic, problem.allowed).fault_at_start(setup.start)
     if meets:
         return run.result(PlanStatus.INVALID_START, f"at 0 s: {meets}")
-    prover = TimedProver(setup.checker, movers, problem.allowed, margin=MARGIN)
+    prover = TimedProver(setup.checker, dynamic, problem.allowed, margin=MARGIN)
     if prover.fault_at_start(setup.start):
-        prover = TimedProver(setup.checker, movers, problem.allowed)
+        prover = TimedProver(setup.checker, dynamic, problem.allowed)
     robot = setup.robot
     among = Among(run, prover, timing, timing.limits(robot.limits, robot.joint_names), stages)
     still = parameterize(run, find_path(run, simplify), timing)
     if not still or still.trajectory is None:
         return still
-    with timed(run.times, "movers"):
+    with timed(run.times, "dynamic_obstacles"):
         proof = prover.prove(still.trajectory, stop=among.stop)
         found = still if proof else _in_time(among, still, simplify)
     if found is not None:
-        return replace(found, movers=tuple(o.name for o in movers))
+        return replace(found, dynamic_obstacles=tuple(o.name for o in dynamic))
     return run.result(
         PlanStatus.TIMEOUT,
         f"no motion among the moving obstacles was found in time; that along the path, {proof.reason}",
@@ -163,7 +163,7 @@ def _retimed(among: Among, still: PlanResult) -> PlanResult | None:
     """Return the result with its motion retimed, or None."""
     motion, kernel = still.trajectory, among.kernel
     assert motion is not None
-    made = retime(kernel, among.prover.movers, motion, among.limits, hold=0.0)
+    made = retime(kernel, among.prover.dynamic, motion, among.limits, hold=0.0)
     proof = None if made.trajectory is None else among.proof(made.trajectory)
     if made.trajectory is None or proof is None:
         return None
@@ -185,7 +185,7 @@ def _by_space_time(among: Among, still: PlanResult, turn: int, best: PlanResult 
     """
     motion = still.trajectory
     assert motion is not None
-    optimizer = MotionOptimizer(among.kernel, among.prover.movers, among.limits)
+    optimizer = MotionOptimizer(among.kernel, among.prover.dynamic, among.limits)
     found = None if best is None else best.trajectory
     given = found
     for factor in FACTORS:
@@ -215,7 +215,7 @@ _warm: set[str] = set()  # robots of which the code is loaded
 
 
 def warm_up(checker: CollisionChecker) -> None:
-    """Load, or compile, what plans among movers need besides, so that it does not count as time of a plan."""
+    """Load, or compile, what plans among dynamic obstacles need besides, so that no plan has to wait for it."""
     robot = checker.robot
     if robot.name in _warm:
         return
@@ -227,14 +227,14 @@ def warm_up(checker: CollisionChecker) -> None:
     ball = Obstacle(name="ball", sphere=Sphere(radius=0.05), position=far, velocity=(0, 0, -1))
     prover = TimedProver(checker, [ball])
     prover.prove(motion)
-    retime(checker.kernel, prover.movers, motion, robot.limits, hold=0.0)
+    retime(checker.kernel, prover.dynamic, motion, robot.limits, hold=0.0)
     spline = TimedSpline.along(motion(motion.times), motion.duration, Start.at_rest(start), goal)
-    MotionOptimizer(checker.kernel, prover.movers, robot.limits).improve(spline, steps=1)
+    MotionOptimizer(checker.kernel, prover.dynamic, robot.limits).improve(spline, steps=1)
     _warm.add(robot.name)
 
 
 def _around_sweeps(among: Among, simplify: bool) -> PlanResult | None:
-    """Return the motion of a path that is planned around what the movers sweep, or None."""
+    """Return the motion of a path that is planned around what the dynamic obstacles sweep, or None."""
     run, problem = among.run, among.run.setup.problem
     names = [name for k, name in enumerate(run.setup.robot.joint_names) if k not in run.setup.held]
     swept = [copy for o in among.prover.obstacles for copy in _sweep(o)]

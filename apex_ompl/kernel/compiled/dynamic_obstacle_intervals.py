@@ -1,8 +1,8 @@
-"""Times at which a ball that stands still may meet a mover, in closed form.
+"""Times at which a ball that stands still may meet a dynamic obstacle, in closed form.
 
-In the frame of the mover, at a time T behind its stamp, a ball's center is at p + u T, and the ball meets the mover
-grown by the ball's radius and the margin, R(T) = R + g T with g the growth of the margin, 0 before the stamp. The set
-of such T is an interval: the distance is convex in T, and R linear. For
+In the frame of the dynamic obstacle, at a time T behind its stamp, a ball's center is at p + u T, and the ball meets
+the dynamic obstacle grown by the ball's radius and the margin, R(T) = R + g T with g the growth of the margin, 0 before
+the stamp. The set of such T is an interval: the distance is convex in T, and R linear. For
 
 - balls |p + u T| <= R(T) is a quadratic inequality;
 - capsules it is the union of that for both ends and of that across the axis, as long as p + u T is between the ends;
@@ -17,7 +17,7 @@ import math
 
 from apex_ompl.kernel.compiled.arrays import BOX, CAPSULE, CYLINDER, GRID, SPHERE
 from apex_ompl.kernel.compiled.compilation import inlined
-from apex_ompl.kernel.compiled.movers import MoverArrays
+from apex_ompl.kernel.compiled.dynamic_obstacles import DynamicArrays
 
 NEVER = (math.inf, -math.inf)
 STILL = 1e-15  # squared speed below which nothing moves [m^2/s^2]
@@ -80,10 +80,10 @@ def _hull(one: Interval, other: Interval) -> Interval:
 
 @inlined
 def _in_shape(
-    m: MoverArrays, o: int, p: tuple[float, float, float], u: tuple[float, float, float],
+    m: DynamicArrays, o: int, p: tuple[float, float, float], u: tuple[float, float, float],
     radius: float, growth: float, within: Interval,
 ) -> Interval:  # fmt: skip
-    """Return the part of an interval in which p + u T may be within radius + growth T of a mover, in its frame."""
+    """Return the part of an interval in which p + u T may be within radius + growth T of an obstacle, in its frame."""
     kind, size = m.kind[o], m.size[o]
     if kind == BOX:
         for i in range(3):
@@ -112,17 +112,17 @@ def _in_shape(
 
 
 @inlined
-def meeting_times(m: MoverArrays, o: int, x: float, y: float, z: float, radius: float, within: Interval) -> Interval:
-    """Return an interval that holds all times at which a ball may meet a mover.
+def meeting_times(m: DynamicArrays, o: int, x: float, y: float, z: float, radius: float, within: Interval) -> Interval:
+    """Return an interval that holds all times at which a ball may meet a dynamic obstacle.
 
     Args:
-        m: The movers.
-        o: Number of the mover.
+        m: The dynamic obstacles.
+        o: Number of the dynamic obstacle.
         x: Center of the ball [m].
         y: The same.
         z: The same.
         radius: Of the ball [m].
-        within: Interval of times, of the movers' stamps, that is looked at [s].
+        within: Interval of times, of the dynamic obstacles' stamps, that is looked at [s].
 
     Returns:
         First and last time; the first is after the last where they never meet.

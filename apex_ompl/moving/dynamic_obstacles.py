@@ -16,8 +16,8 @@ from apex_ompl.collision.shapes import world_geometry
 from apex_ompl.collision.tabulate import primitives
 from apex_ompl.errors import ParameterError, SceneError, UnknownNameError
 from apex_ompl.kernel import Kernel
+from apex_ompl.kernel.compiled.dynamic_obstacles import DynamicArrays, clearances_in_time, first_conflict
 from apex_ompl.kernel.compiled.layout import pack, unpack
-from apex_ompl.kernel.compiled.movers import MoverArrays, clearances_in_time, first_conflict
 from apex_ompl.kernel.scene_builder import Solids, grid_columns, joined
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.timing import Trajectory
@@ -30,7 +30,7 @@ SHORTEST = 1e-3  # length of an interval of time that is given up [s]
 PREPARED = 64  # motions whose curves are kept
 
 
-class Movers:
+class DynamicObstacles:
     """Obstacles that move at constant velocity without turning, outside of the scene that a kernel has.
 
     Each has a place and a velocity at a time stamp, and a margin by which it counts as larger, which may grow behind
@@ -38,8 +38,8 @@ class Movers:
 
     Attributes:
         names: Names of the obstacles.
-        arrays: The solids that they are made of, see :class:`apex_ompl.kernel.compiled.movers.MoverArrays`; views of
-            ``packed``.
+        arrays: The solids that they are made of, see
+            :class:`apex_ompl.kernel.compiled.dynamic_obstacles.DynamicArrays`; views of ``packed``.
         packed: What compiled code takes.
     """
 
@@ -52,7 +52,7 @@ class Movers:
 
         Args:
             obstacles: The obstacles; those without a velocity stand still.
-            allowed: Bodies, as rows of the robot's tables, and names of movers that they may touch.
+            allowed: Bodies, as rows of the robot's tables, and names of dynamic obstacles that they may touch.
             stamp: Time of the places [s].
 
         Raises:
@@ -62,10 +62,10 @@ class Movers:
         given = tuple(obstacles)
         self.names = tuple(o.name for o in given)
         if len(set(self.names)) < len(given):
-            raise SceneError(f"names of movers must differ, found {', '.join(o.name for o in given)}")
+            raise SceneError(f"names of dynamic obstacles must differ, found {', '.join(o.name for o in given)}")
         for o in given:
             if o.half_space is not None:
-                raise ParameterError(f"mover {o.name}", "a half_space", "a shape that is bounded")
+                raise ParameterError(f"dynamic obstacle {o.name}", "a half_space", "a shape that is bounded")
         rows = [Solids.of(primitives(*world_geometry(o))) for o in given]
         owner = np.repeat(np.arange(len(rows)), np.array([len(some.kind) for some in rows], int))
         solids = joined(rows)
@@ -73,7 +73,7 @@ class Movers:
         self._from_body = solids.offset - places[owner]
         pairs = [(body, self._row(name)) for body, name in allowed]
         velocity = np.array([o.velocity or (0.0, 0.0, 0.0) for o in given], float).reshape(-1, 3)
-        arrays = MoverArrays(
+        arrays = DynamicArrays(
             kind=solids.kind,
             owner=owner.astype(np.int64),
             allowed=np.array(pairs, np.int64).reshape(-1, 2),
@@ -89,7 +89,7 @@ class Movers:
 
     def _pack(self, packed: tuple[Array, ...]) -> None:
         self.packed = packed
-        self.arrays: MoverArrays = unpack(MoverArrays, *packed)
+        self.arrays: DynamicArrays = unpack(DynamicArrays, *packed)
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the state without views of its arrays."""
@@ -102,7 +102,7 @@ class Movers:
 
     def __repr__(self) -> str:
         """Return the names of the obstacles."""
-        return one_line("Movers", *self.names)
+        return one_line("DynamicObstacles", *self.names)
 
     def __len__(self) -> int:
         """Return the number of obstacles."""
@@ -142,7 +142,7 @@ class Movers:
         if stamp is not None:
             self.arrays.stamp[mine] = stamp
 
-    def placed(self, positions: Array, velocities: Array, growth: Array, stamps: Array) -> Movers:
+    def placed(self, positions: Array, velocities: Array, growth: Array, stamps: Array) -> DynamicObstacles:
         """Return a copy in which all that is known of the obstacles is written, as by :meth:`update` but unchecked.
 
         Args:
@@ -157,20 +157,20 @@ class Movers:
         a.velocity[:], a.stamp[:], a.growth[:] = velocities[a.owner], stamps[a.owner], growth[a.owner]
         return other
 
-    def larger(self, by: float) -> Movers:
+    def larger(self, by: float) -> DynamicObstacles:
         """Return a copy with margins that are larger by a distance [m]."""
         other, (integers, floats, *singles) = copy(self), self.packed
         other._pack((integers, floats.copy(), *singles))  # nothing else is written to
         other.arrays.growth[:, 0] += by
         return other
 
-    def with_margin(self, margin: float, growth: float = 0.0) -> Movers:
+    def with_margin(self, margin: float, growth: float = 0.0) -> DynamicObstacles:
         """Return a copy with a margin at the time stamps [m], which grows after them [m/s], in place of theirs."""
         other = self.larger(0.0)
         other.arrays.growth[:] = margin, growth
         return other
 
-    def nominal(self, margin: float) -> Movers:
+    def nominal(self, margin: float) -> DynamicObstacles:
         """Return a copy whose margins are at most so large [m], and do not grow."""
         other = self.with_margin(margin)
         other.arrays.growth[:, 0] = np.minimum(self.arrays.growth[:, 0], margin)
@@ -186,7 +186,7 @@ class Movers:
 
     def _row(self, name: str) -> int:
         if name not in self.names:
-            raise UnknownNameError("mover", name, self.names)
+            raise UnknownNameError("dynamic_obstacle", name, self.names)
         return self.names.index(name)
 
 
@@ -196,13 +196,13 @@ class Conflict(NamedTuple):
     Attributes:
         time: First moment that cannot be proved [s from the motion's begin]; infinite where all of it is proved.
         body: Name of the body that is not proved apart there, empty where there is none.
-        mover: Name of the mover.
+        dynamic obstacle: Name of the dynamic obstacle.
         intervals: Number of intervals of time looked at.
     """
 
     time: float
     body: str
-    mover: str
+    dynamic_obstacle: str
     intervals: int
 
     def __bool__(self) -> bool:
@@ -217,22 +217,22 @@ def curve_of(motion: Trajectory) -> Curve:
 
 
 def prove_motion(
-    kernel: Kernel, movers: Movers, motion: Trajectory, begin: float = 0.0, end: float | None = None,
+    kernel: Kernel, dynamic: DynamicObstacles, motion: Trajectory, begin: float = 0.0, end: float | None = None,
     *, clock: float = 0.0, shortest: float = SHORTEST,
 ) -> Conflict:  # fmt: skip
     """Prove that a timed motion stays apart from obstacles that move, and find the first moment that is not proved.
 
     The proof is that of the sphere covers along the motion's own cubic pieces
-    (:mod:`apex_ompl.kernel.compiled.movers`): it is sound, and may leave contacts of some millimeters open that there
-    are not. The scene of the kernel and the robot itself are not looked at.
+    (:mod:`apex_ompl.kernel.compiled.dynamic_obstacles`): it is sound, and may leave contacts of some millimeters open
+    that there are not. The scene of the kernel and the robot itself are not looked at.
 
     Args:
         kernel: The kernel of the robot with what it holds.
-        movers: The obstacles.
+        dynamic: The obstacles.
         motion: The motion; behind its end the robot stands.
         begin: Where on the motion to begin [s].
         end: Where to end [s], by default at its end.
-        clock: Time of the movers' stamps when the motion is at 0 [s].
+        clock: Time of the dynamic obstacles' stamps when the motion is at 0 [s].
         shortest: Length of an interval of time that is given up [s].
 
     Raises:
@@ -246,25 +246,29 @@ def prove_motion(
     curve = curve_of(motion)
     found = np.empty(3, np.int64)
     time = first_conflict(
-        *kernel.robot.packed, *movers.packed, *kernel.workspace(), curve.knots, curve.states, curve.rates, curve.slack,
+        *kernel.robot.packed, *dynamic.packed, *kernel.workspace(), curve.knots, curve.states, curve.rates, curve.slack,
         float(begin), float(until), float(clock), float(shortest),
-        np.empty((len(movers.arrays.kind), 3)), np.empty(kernel.robot.dof), found,
+        np.empty((len(dynamic.arrays.kind), 3)), np.empty(kernel.robot.dof), found,
     )  # fmt: skip
-    body, mover, intervals = found.tolist()
-    names = (kernel.robot.body_names[body], movers.names[mover]) if body >= 0 and math.isfinite(time) else ("", "")
+    body, dynamic_obstacle, intervals = found.tolist()
+    names = (
+        (kernel.robot.body_names[body], dynamic.names[dynamic_obstacle])
+        if body >= 0 and math.isfinite(time)
+        else ("", "")
+    )
     return Conflict(float(time), *names, intervals)
 
 
 def clearance_in_time(
-    kernel: Kernel, movers: Movers, states: ArrayLike, times: ArrayLike, limit: float = np.inf
+    kernel: Kernel, dynamic: DynamicObstacles, states: ArrayLike, times: ArrayLike, limit: float = np.inf
 ) -> tuple[Array, Array]:
-    """Return the signed clearances of a robot's sphere cover to movers, and their gradients.
+    """Return the signed clearances of a robot's sphere cover to dynamic obstacles, and their gradients.
 
     Args:
         kernel: The kernel of the robot with what it holds.
-        movers: The obstacles.
+        dynamic: The obstacles.
         states: States, shape (N, dof).
-        times: Times of the movers' stamps, shape (N,) [s].
+        times: Times of the dynamic obstacles' stamps, shape (N,) [s].
         limit: Larger clearances are given as this [m]; a small one is faster.
 
     Returns:
@@ -278,17 +282,17 @@ def clearance_in_time(
     check_array(at, (len(q),), "times")
     values, gradients = np.empty(len(q)), np.empty((len(q), q.shape[1] + 1))
     clearances_in_time(
-        *kernel.robot.packed, *movers.packed, *kernel.workspace(), q, at, float(limit),
-        np.empty((len(movers.arrays.kind), 3)), values, gradients,
+        *kernel.robot.packed, *dynamic.packed, *kernel.workspace(), q, at, float(limit),
+        np.empty((len(dynamic.arrays.kind), 3)), values, gradients,
     )  # fmt: skip
     return values, gradients
 
 
 def allowed_rows(kernel: Kernel, allowed: Iterable[tuple[str, str]], names: Sequence[str]) -> list[tuple[int, str]]:
-    """Return pairs of names of bodies that may touch as rows of a robot's tables and names of movers."""
+    """Return pairs of names of bodies that may touch as rows of a robot's tables and names of dynamic obstacles."""
     rows: list[tuple[int, str]] = []
     for pair in allowed:
-        for mover, body in (pair, pair[::-1]):
-            if mover in names:
-                rows += [(k, mover) for k, name in enumerate(kernel.robot.body_names) if name == body]
+        for dynamic_obstacle, body in (pair, pair[::-1]):
+            if dynamic_obstacle in names:
+                rows += [(k, dynamic_obstacle) for k, name in enumerate(kernel.robot.body_names) if name == body]
     return rows

@@ -1,11 +1,11 @@
 """Obstacles that move, in the kernel: soundness and cost of proofs, blocked intervals, stops and retiming.
 
-Motions are random ones of the two Pandas, free of themselves and of the tables, at half of the velocity limits; movers
-are boxes, balls, cylinders and capsules that come near a link at a random moment. A motion that is proved apart from
-its mover is checked by the meshes at 100 moments; where it is not proved, the meshes say whether there is contact in
-20 ms from there. Motions of the table of costs last 3 s.
+Motions are random ones of the two Pandas, free of themselves and of the tables, at half of the velocity limits; dynamic
+obstacles are boxes, balls, cylinders and capsules that come near a link at a random moment. A motion that is proved
+apart from its dynamic obstacle is checked by the meshes at 100 moments; where it is not proved, the meshes say whether
+there is contact in 20 ms from there. Motions of the table of costs last 3 s.
 
-Usage: python benchmarks/movers.py [-n 10000] [--costs 300]
+Usage: python benchmarks/dynamic_obstacles.py [-n 10000] [--costs 300]
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import numpy as np
 import record
 
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.moving.movers import Movers, clearance_in_time, curve_of, prove_motion
+from apex_ompl.moving.dynamic_obstacles import DynamicObstacles, clearance_in_time, curve_of, prove_motion
 from apex_ompl.moving.retime import retime
 from apex_ompl.moving.safe_intervals import blocked
 from apex_ompl.moving.stopping import stop, stop_along
@@ -52,7 +52,7 @@ def motion_of(checker: CollisionChecker, rng: np.random.Generator, duration: flo
             return motion
 
 
-def mover_near(motion: Trajectory, rng: np.random.Generator, name: str) -> Obstacle:
+def dynamic_obstacle_near(motion: Trajectory, rng: np.random.Generator, name: str) -> Obstacle:
     """Return an obstacle that comes near a link at a random moment of a motion."""
     moment, velocity = rng.uniform(0.0, motion.duration), rng.normal(0.0, 0.25, 3)
     there = robot().link_pose(motion(moment), LINKS[rng.integers(len(LINKS))])[:3, 3]
@@ -67,13 +67,13 @@ def soundness(checker: CollisionChecker, motions: list[Trajectory], count: int) 
     found = {"n": count, "proved": 0, "falsely proved": 0, "open without contact": 0}
     for k in range(count):
         motion = motions[k % len(motions)]
-        mover = mover_near(motion, rng, "mover")
-        conflict = prove_motion(checker.kernel, Movers([mover]), motion)
-        exact = CollisionChecker(checker.robot, [mover], proofs=False)
+        dynamic_obstacle = dynamic_obstacle_near(motion, rng, "dynamic_obstacle")
+        conflict = prove_motion(checker.kernel, DynamicObstacles([dynamic_obstacle]), motion)
+        exact = CollisionChecker(checker.robot, [dynamic_obstacle], proofs=False)
 
-        def touches(moments: np.ndarray, motion=motion, mover=mover, exact=exact) -> bool:
+        def touches(moments: np.ndarray, motion=motion, dynamic_obstacle=dynamic_obstacle, exact=exact) -> bool:
             for moment in moments.tolist():
-                exact.move("mover", obstacle_at(mover, moment).position)
+                exact.move("dynamic_obstacle", obstacle_at(dynamic_obstacle, moment).position)
                 if not exact.is_free(motion(moment)):
                     return True
             return False
@@ -106,22 +106,25 @@ def costs(checker: CollisionChecker, count: int) -> dict[str, list[float]]:
     for number in (1, 3, 10):
         for k in range(count):
             motion = motions[k % len(motions)]
-            movers = Movers([mover_near(motion, rng, f"mover{j}") for j in range(number)])
-            proof = prove_motion(kernel, movers, motion)
+            dynamic = DynamicObstacles(
+                [dynamic_obstacle_near(motion, rng, f"dynamic_obstacle{j}") for j in range(number)]
+            )
+            proof = prove_motion(kernel, dynamic, motion)
             what = f"proof of 3 s among {number}" + ("" if proof else ", proved")
             for key in {what, f"proof of 3 s among {number}"}:
-                found.setdefault(key, []).append(timed(lambda m=movers, q=motion: prove_motion(kernel, m, q)))
+                found.setdefault(key, []).append(timed(lambda m=dynamic, q=motion: prove_motion(kernel, m, q)))
             if number == 3:
                 ends = np.linspace(0.0, motion.duration, PIECES + 1)
                 places = np.stack([ends[:-1], ends[1:]], axis=1)
                 states, moments = motion(ends), ends
                 for name, call in (
                     ("blocked intervals of 256 pieces among 3",
-                     lambda m=movers, q=motion, p=places: blocked(kernel, m, q, p, begin=0.0, end=10.0)),
-                    ("retiming among 3", lambda m=movers, q=motion: retime(kernel, m, q, limits)),
+                     lambda m=dynamic, q=motion, p=places: blocked(kernel, m, q, p, begin=0.0, end=10.0)),
+                    ("retiming among 3", lambda m=dynamic, q=motion: retime(kernel, m, q, limits)),
                     ("clearance of 257 states among 3",
-                     lambda m=movers, s=states, t=moments: clearance_in_time(kernel, m, s, t, 0.1)),
-                    ("update of a mover", lambda m=movers: m.update("mover1", (0, 0, 1), (0, 0, 0.1), stamp=0.5)),
+                     lambda m=dynamic, s=states, t=moments: clearance_in_time(kernel, m, s, t, 0.1)),
+                    ("update of one",
+                     lambda m=dynamic: m.update("dynamic_obstacle1", (0, 0, 1), (0, 0, 0.1), stamp=0.5)),
                 ):  # fmt: skip
                     found.setdefault(name, []).append(timed(call))
             moment = float(rng.uniform(0.0, motion.duration))
@@ -135,18 +138,20 @@ def costs(checker: CollisionChecker, count: int) -> dict[str, list[float]]:
 def main() -> None:
     """Measure, and write the results."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("-n", type=one_or_more, default=10_000, help="motions and movers (default: %(default)s)")
+    parser.add_argument(
+        "-n", type=one_or_more, default=10_000, help="motions and dynamic obstacles (default: %(default)s)"
+    )
     parser.add_argument("--costs", type=one_or_more, default=300, help="runs of each cost (default: %(default)s)")
     args = parser.parse_args()
     checker, rng = CollisionChecker(robot()), np.random.default_rng(0)
     motions = [motion_of(checker, rng) for _ in range(MOTIONS)]
     sound = soundness(checker, motions, args.n)
     spent = {name: record.percentiles(times, 50, 99) for name, times in costs(checker, args.costs).items()}
-    rows = [["motions and movers", *list(sound)[1:]], ["---:"] * len(sound), list(sound.values()), []]
+    rows = [["motions and dynamic obstacles", *list(sound)[1:]], ["---:"] * len(sound), list(sound.values()), []]
     rows += [["what", "p50", "p99"], ["---", "---:", "---:"]]
     rows += [[name, *(f"{1e6 * v:.0f} us" for v in both)] for name, both in spent.items()]
     table = "\n".join(record.row(row) if row else "" for row in rows)
-    record.write("movers", {"soundness": sound, "p50 and p99 [s]": spent}, table, seed=0, n=args.n)
+    record.write("dynamic_obstacles", {"soundness": sound, "p50 and p99 [s]": spent}, table, seed=0, n=args.n)
 
 
 if __name__ == "__main__":

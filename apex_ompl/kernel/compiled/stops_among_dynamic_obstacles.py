@@ -1,4 +1,4 @@
-"""Stops from a motion at many of its times, proved against all that movers can reach since they were seen."""
+"""Stops from a motion at many of its times, proved against all that dynamic obstacles can have reached."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import math
 
 from apex_ompl.kernel.compiled.arrays import robot_view
 from apex_ompl.kernel.compiled.compilation import entry_point, inlined
+from apex_ompl.kernel.compiled.dynamic_obstacles import DynamicArrays, conflict_on, dynamic_view, scene_of_dynamic
 from apex_ompl.kernel.compiled.layout import Floats, Integers, Singles
-from apex_ompl.kernel.compiled.movers import MoverArrays, conflict_on, movers_view, scene_of_movers
 from apex_ompl.kernel.compiled.path_stop import SAME_TIME, set_place, soonest_stop
 from apex_ompl.kernel.compiled.stop_profiles import soonest_stops
 from apex_ompl.kernel.compiled.workspace import workspace_view
@@ -38,8 +38,8 @@ def _stop_by_joints(
 
 
 @inlined
-def _show_movers(m: MoverArrays, place: Floats, velocity: Floats, stamp: Floats, seen: float) -> None:
-    """Let movers stand where they are expected at a time, and have been seen then."""
+def _show_dynamic(m: DynamicArrays, place: Floats, velocity: Floats, stamp: Floats, seen: float) -> None:
+    """Let dynamic obstacles stand where they are expected at a time, and have been seen then."""
     for o in range(len(stamp)):
         m.stamp[o] = seen
         for i in range(3):
@@ -59,21 +59,21 @@ def first_unproved_stop(
 ) -> int:  # fmt: skip
     """Return which of some moments is the first behind which no stop is proved, or their number.
 
-    At each, the movers were seen ``age`` before, where they are expected then, and may have gone anywhere since as far
-    as their margins say, which are those of ``mf``. The next ``period`` of the motion is proved, then the soonest stop
-    along it, which is that of :func:`apex_ompl.kernel.compiled.path_stop.stop_on_path`, or else that of each joint by
-    itself, of :func:`apex_ompl.kernel.compiled.stop_profiles.stop_joints`. What stands still, and the robot itself,
-    are not looked at.
+    At each, the dynamic obstacles were seen ``age`` before, where they are expected then, and may have gone anywhere
+    since as far as their margins say, which are those of ``mf``. The next ``period`` of the motion is proved, then the
+    soonest stop along it, which is that of :func:`apex_ompl.kernel.compiled.path_stop.stop_on_path`, or else that of
+    each joint by itself, of :func:`apex_ompl.kernel.compiled.stop_profiles.stop_joints`. What stands still, and the
+    robot itself, are not looked at.
 
     Args:
         ri: Robot, packed; see :func:`apex_ompl.kernel.compiled.layout.pack`.
         rf: Robot.
-        mi: Movers, packed; places, velocities and stamps are written to.
-        mf: Movers.
-        ms: Movers.
+        mi: Dynamic obstacles, packed; places, velocities and stamps are written to.
+        mf: DynamicObstacles.
+        ms: DynamicObstacles.
         wi: Workspace, see :func:`apex_ompl.kernel.compiled.workspace.workspace_sizes`.
         wf: Workspace.
-        place: Where the movers are expected at their stamps, shape (M, 3) [m].
+        place: Where the dynamic obstacles are expected at their stamps, shape (M, 3) [m].
         velocity: Their velocities, shape (M, 3) [m/s].
         stamp: Their stamps, shape (M,) [s].
         age: How long before a moment they were seen [s].
@@ -91,7 +91,7 @@ def first_unproved_stop(
         moments: Times of the motion, shape (N,) [s].
         by_joints: Gets whether the stop is that of each joint by itself, shape (N,).
         period: Time from a moment to the stop [s].
-        clock: Time of the movers' stamps when the motion is at 0 [s].
+        clock: Time of the dynamic obstacles' stamps when the motion is at 0 [s].
         shortest: Length of an interval that is given up [s].
         offset: Room for places, shape (M, 3).
         state: Room, shape (dof,).
@@ -106,13 +106,13 @@ def first_unproved_stop(
         stopped: Room, shape (R, dof).
         stopped_rates: Room, shape (R, 2 dof).
     """
-    t, m = robot_view(ri, rf), movers_view(mi, mf, ms)
+    t, m = robot_view(ri, rf), dynamic_view(mi, mf, ms)
     w = workspace_view(t, wi, wf)
-    s = scene_of_movers(m, offset)
+    s = scene_of_dynamic(m, offset)
     end = knots[len(knots) - 1]
     for n in range(len(moments)):
         then = moments[n] + period
-        _show_movers(m, place, velocity, stamp, clock + moments[n] - age)
+        _show_dynamic(m, place, velocity, stamp, clock + moments[n] - age)
         resting, proved = then >= end - SAME_TIME, False
         by_joints[n] = 0
         for kind in range(3):  # the next period of the motion, the stop along it, that of each joint

@@ -8,19 +8,19 @@ from apex_ompl.errors import ParameterError
 from apex_ompl.scene.bodies import Obstacle
 
 
-def movers_of(obstacles: Iterable[Obstacle]) -> tuple[Obstacle, ...]:
+def dynamic_of(obstacles: Iterable[Obstacle]) -> tuple[Obstacle, ...]:
     """Return the obstacles that a plan is made among in time: those that move.
 
     Raises:
         ParameterError: One does not move at constant velocity from time 0 on.
     """
-    movers = tuple(o for o in obstacles if o.moving)
-    scripted = next((o.name for o in movers if o.scripted), None)
+    dynamic = tuple(o for o in obstacles if o.moving)
+    scripted = next((o.name for o in dynamic if o.scripted), None)
     if scripted is not None:
         raise ParameterError(
             "snapshot", False, f"True, since the obstacle {scripted!r} follows a script, which `apex-ompl run` runs"
         )
-    return movers
+    return dynamic
 
 
 def snapshot_notes(obstacles: Sequence[Obstacle]) -> list[str]:
