@@ -21,9 +21,8 @@ from apex_ompl.timing import Trajectory
 from apex_ompl.timing.checks import check_plan
 from apex_ompl.timing.files import KNOTS, MESSAGES
 from apex_ompl.types import Array
-from apex_ompl.util.archives import pack_archive, read_archive
 from apex_ompl.util.display import Summary, one_line
-from apex_ompl.util.files import BROKEN, path_text, suffix_of, write_atomically
+from apex_ompl.util.files import BROKEN, pack_archive, path_text, read_archive, suffix_of, write_atomically
 from apex_ompl.util.schema import dump_yaml, read_json, read_yaml
 from apex_ompl.util.validation import finite_array, finite_numbers
 

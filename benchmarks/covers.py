@@ -21,9 +21,9 @@ from collision_checker import around_home, boxes, microseconds, of_batch
 from apex_ompl import MotionPlanner, problems
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.cover.spheres import quality, read_covers, shape_key
+from apex_ompl.collision.discretization import FINE_RESOLUTION, SEARCH_RESOLUTION
 from apex_ompl.robot import load_robot
 from apex_ompl.util.entry_point import run_script
-from apex_ompl.util.resolution import FINE_RESOLUTION, SEARCH_RESOLUTION
 from apex_ompl.util.validation import one_or_more
 
 DEPENDS = ("@checking", "apex_ompl/ompl", "problems", "benchmarks/collision_checker.py")

@@ -39,11 +39,10 @@ from apex_ompl.paths.path import path_length
 from apex_ompl.robot import load_robot
 from apex_ompl.robot.moveit import convert
 from apex_ompl.scene.problem import Problem
-from apex_ompl.util.deadline import Deadline
+from apex_ompl.util.clocks import Deadline, timed
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.files import write_atomically
 from apex_ompl.util.schema import dump_yaml, read_yaml
-from apex_ompl.util.stopwatch import timed
 from apex_ompl.util.validation import one_or_more
 
 try:

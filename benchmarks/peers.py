@@ -26,6 +26,7 @@ import numpy as np
 import record
 
 from apex_ompl.api import load_problem
+from apex_ompl.collision.discretization import SEARCH_RESOLUTION
 from apex_ompl.evaluation import Results, Row, Workers, bench
 from apex_ompl.evaluation.accounting import first_path_proof
 from apex_ompl.evaluation.rows import Job
@@ -42,10 +43,8 @@ from apex_ompl.robot.geometry import link_of
 from apex_ompl.scene.bodies import Body, pose_matrix
 from apex_ompl.scene.problem import Problem
 from apex_ompl.types import Array
-from apex_ompl.util.deadline import Deadline
+from apex_ompl.util.clocks import Deadline, timed
 from apex_ompl.util.entry_point import run_script
-from apex_ompl.util.resolution import SEARCH_RESOLUTION
-from apex_ompl.util.stopwatch import timed
 from apex_ompl.util.validation import one_or_more
 
 try:

@@ -26,6 +26,7 @@ from unseen import FROZEN, SUITE, TUNED_ON
 from apex_ompl import problems
 from apex_ompl.apex.models import NONE, Model, trajectory_model
 from apex_ompl.apex.query import make_query
+from apex_ompl.collision.discretization import FINE_RESOLUTION
 from apex_ompl.evaluation import Results, Row, Workers, bench
 from apex_ompl.evaluation.rows import Job
 from apex_ompl.evaluation.runs import Run
@@ -38,7 +39,6 @@ from apex_ompl.problems.catalogue import VALIDATION
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.training.torch_model import load_torch_model
 from apex_ompl.util.entry_point import run_script
-from apex_ompl.util.resolution import FINE_RESOLUTION
 from apex_ompl.util.statistics import share_interval
 from apex_ompl.util.validation import one_or_more, whole_number
 

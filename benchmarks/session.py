@@ -23,13 +23,13 @@ from importlib.util import find_spec
 import record
 
 from apex_ompl import MotionPlanner, PlanResult, load_problem, plan, problems
+from apex_ompl.collision.discretization import SEARCH_RESOLUTION
 from apex_ompl.ompl.process import quiet_ompl
 from apex_ompl.ompl.setup import assemble
 from apex_ompl.ompl.tuned import TUNED
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.scene.problem import Problem
 from apex_ompl.util.entry_point import run_script
-from apex_ompl.util.resolution import SEARCH_RESOLUTION
 from apex_ompl.util.validation import one_or_more
 
 DEPENDS = ("@planning", "apex_ompl/timing", "apex_ompl/planning", "apex_ompl/cli")

@@ -33,9 +33,9 @@ import numpy as np
 
 from apex_ompl.errors import ApexError
 from apex_ompl.kernel import library
-from apex_ompl.util.cores import usable_cores
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.files import write_atomically
+from apex_ompl.util.process import usable_cores
 
 VERSIONS = "numba", "llvmlite"
 

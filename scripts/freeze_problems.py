@@ -28,6 +28,7 @@ import numpy as np
 
 from apex_ompl.api import plan
 from apex_ompl.collision import CollisionChecker
+from apex_ompl.collision.discretization import SEARCH_RESOLUTION
 from apex_ompl.moving.swept import check_timed_path, constant_velocity_times, inflated
 from apex_ompl.ompl.setup import assemble
 from apex_ompl.ompl.tuned import TUNED
@@ -43,7 +44,6 @@ from apex_ompl.scene.problem import Problem
 from apex_ompl.scene.scripts import obstacle_at
 from apex_ompl.types import Array
 from apex_ompl.util.entry_point import run_script
-from apex_ompl.util.resolution import SEARCH_RESOLUTION
 from apex_ompl.util.validation import one_or_more
 
 LIMITS = ((0, 10.0), (1, 20.0))  # seeds and time limits of rrtconnect [s]

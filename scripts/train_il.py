@@ -28,7 +28,7 @@ def train(args: argparse.Namespace) -> None:
     from apex_ompl.baselines.imitation.checkpoint import save_policy
     from apex_ompl.baselines.imitation.config import ImitationConfig
     from apex_ompl.baselines.imitation.training import ImitationTrainer
-    from apex_ompl.util.threads import one_torch_thread
+    from apex_ompl.util.process import one_torch_thread
 
     name = Path(args.config).stem
     config = ImitationConfig.read(args.config, dict(args.set))

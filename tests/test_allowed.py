@@ -12,12 +12,12 @@ import yaml
 
 from apex_ompl import MotionPlanner, Problem, load_problem, plan
 from apex_ompl.collision import CollisionChecker
+from apex_ompl.collision.discretization import SEARCH_RESOLUTION
 from apex_ompl.errors import FileFormatError, SceneError, UnknownNameError
 from apex_ompl.robot import Robot
 from apex_ompl.robot.moveit_allowed import allowed_pairs
 from apex_ompl.robot.moveit_messages import MessageReader
 from apex_ompl.scene.bodies import AttachedObject, Obstacle
-from apex_ompl.util.resolution import SEARCH_RESOLUTION
 
 
 def around(robot: Robot, link: str, name: str = "box", size: float = 0.1) -> Obstacle:

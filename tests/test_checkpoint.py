@@ -29,7 +29,7 @@ from apex_ompl.training.checkpoint_writer import save_model
 from apex_ompl.training.store import load
 from apex_ompl.training.torch_model import load_torch_model
 from apex_ompl.training.training import Trainer
-from apex_ompl.util.threads import one_torch_thread
+from apex_ompl.util.process import one_torch_thread
 
 
 @pytest.fixture(autouse=True)

@@ -19,9 +19,8 @@ from support import states_around_home
 from apex_ompl import MotionPlanner, filter_points, points_from_depth, scene
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.cloud_contact import signed_distances, touches
-from apex_ompl.collision.clouds import PointCloud, cloud_geometry
 from apex_ompl.collision.cover.spheres import shape_key
-from apex_ompl.collision.shapes import is_shell, is_surface, mesh_geometry
+from apex_ompl.collision.shapes import PointCloud, cloud_geometry, is_shell, is_surface, mesh_geometry
 from apex_ompl.errors import ApexError, FileFormatError, MissingFileError, ParameterError, SceneError
 from apex_ompl.planning.cloud_files import CloudFiles
 from apex_ompl.robot import Robot

@@ -17,7 +17,7 @@ import sys
 from contextlib import contextmanager
 from apex_ompl import plan
 from apex_ompl.kernel.compiled import jit
-from apex_ompl.util.deadline import Deadline
+from apex_ompl.util.clocks import Deadline
 
 late, running = [], False
 begin, paused, original = Deadline.__init__, Deadline.paused, jit.CompiledFunction.__call__

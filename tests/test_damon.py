@@ -27,7 +27,7 @@ from apex_ompl.baselines.damon.manifold import load_manifold, shared_manifold
 from apex_ompl.baselines.damon.queries import Damon
 from apex_ompl.baselines.damon.sampling import sample_states, split_sample
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.collision.discretization import sample_path
+from apex_ompl.collision.discretization import SEARCH_RESOLUTION, sample_path
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError
 from apex_ompl.kernel import Kernel, RobotTables
 from apex_ompl.kernel.scene_builder import scene_tables
@@ -37,7 +37,6 @@ from apex_ompl.problems import load as load_problem
 from apex_ompl.robot import Robot
 from apex_ompl.training.store import load
 from apex_ompl.types import Array, Flags
-from apex_ompl.util.resolution import SEARCH_RESOLUTION
 
 SMALL = ["--states", "6000", "--nodes", "1500", "--epochs", "80", "--seed", "1"]
 SHIPPED = ("damon-2", "damon-4", "damon-8")

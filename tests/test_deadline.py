@@ -13,6 +13,7 @@ from ompl import base as ob
 
 from apex_ompl import planners, planning
 from apex_ompl.api import load_problem, plan
+from apex_ompl.collision.discretization import SEARCH_RESOLUTION
 from apex_ompl.errors import TimingStoppedError
 from apex_ompl.evaluation import runs
 from apex_ompl.evaluation.rows import Job
@@ -27,8 +28,7 @@ from apex_ompl.planning import NOT_PROVED, PlanRun, find_path, parameterize, sol
 from apex_ompl.planning.timing import NOT_TIMED
 from apex_ompl.result import PlanResult, PlanStatus
 from apex_ompl.timing import Timing, time_path
-from apex_ompl.util.deadline import Deadline
-from apex_ompl.util.resolution import SEARCH_RESOLUTION
+from apex_ompl.util.clocks import Deadline
 
 pytestmark = pytest.mark.usefixtures("quiet")
 

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from apex_ompl.collision.shapes import mesh_geometry
-from apex_ompl.collision.tabulate import primitives
+from apex_ompl.collision.tables import primitives
 from apex_ompl.kernel import distance_grid
 from apex_ompl.kernel.compiled.arrays import GRID, SceneArrays, scene_view
 from apex_ompl.kernel.compiled.compilation import entry_point
@@ -27,7 +27,7 @@ from apex_ompl.kernel.distance_grid import (
 )
 from apex_ompl.kernel.scene_builder import Primitive, Solids, moved, primitive, scene_tables
 from apex_ompl.scene.meshes import winding_number
-from apex_ompl.util.boxes import bounding_box
+from apex_ompl.util.arrays import bounding_box
 
 
 @entry_point

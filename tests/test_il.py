@@ -24,6 +24,7 @@ from apex_ompl.baselines.imitation.policy import shared_policy
 from apex_ompl.baselines.imitation.replanner import Imitation
 from apex_ompl.baselines.imitation.training import ImitationTrainer
 from apex_ompl.collision import CollisionChecker
+from apex_ompl.collision.discretization import FINE_RESOLUTION
 from apex_ompl.errors import ApexError, FileFormatError, MissingFileError, ParameterError
 from apex_ompl.loop.cycle import RunRecord
 from apex_ompl.loop.referee import RefereeReport
@@ -38,7 +39,6 @@ from apex_ompl.ompl.space import path_to_array
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Goal, Problem
-from apex_ompl.util.resolution import FINE_RESOLUTION
 
 BLOCKED = "posts/easy/800001"  # the straight line collides
 

@@ -26,7 +26,7 @@ from apex_ompl.training.conditions import Conditions, batch_queries
 from apex_ompl.training.mirror import Mirror
 from apex_ompl.training.records import Paths
 from apex_ompl.training.store import load
-from apex_ompl.util.threads import one_torch_thread
+from apex_ompl.util.process import one_torch_thread
 
 MIRROR = yaml.safe_load((ROOT / "scripts" / "configs" / "il.yaml").read_text())["mirror"]
 CLOCK, CHUNK = NETWORK["clock"], NETWORK["chunk"]

@@ -27,7 +27,7 @@ from apex_ompl.errors import ApexError, FileFormatError, MissingFileError
 from apex_ompl.kernel import Kernel, RobotTables
 from apex_ompl.kernel.scene_builder import scene_tables
 from apex_ompl.training.store import load
-from apex_ompl.util.threads import one_torch_thread
+from apex_ompl.util.process import one_torch_thread
 
 CLOCK = NETWORK["clock"]
 

@@ -15,7 +15,7 @@ from random_robots import frames, pose, random_hand, random_robot, unit
 from support import states_around_home
 
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.collision.tabulate import primitives
+from apex_ompl.collision.tables import primitives
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel import Kernel, robot_builder, robot_specs
 from apex_ompl.kernel.compiled import motion_proof, queries

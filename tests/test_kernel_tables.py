@@ -17,7 +17,7 @@ from random_robots import frames, random_hand, random_robot
 from support import ROOT, states_around_home
 
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.collision.tabulate import joint_specs, primitives
+from apex_ompl.collision.tables import joint_specs, primitives
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError, UnknownNameError
 from apex_ompl.kernel import Kernel, joint_tree
 from apex_ompl.kernel.compiled.arrays import BINS, FIXED, RUN

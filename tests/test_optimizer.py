@@ -5,6 +5,7 @@ import pytest
 
 from apex_ompl import problems
 from apex_ompl.collision import CollisionChecker
+from apex_ompl.collision.discretization import FINE_RESOLUTION
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel import Kernel, scene_tables
 from apex_ompl.ompl.setup import PlanningSetup, assemble
@@ -15,7 +16,6 @@ from apex_ompl.paths.path import path_length
 from apex_ompl.paths.settings import OptimizerSettings
 from apex_ompl.paths.spline import Spline
 from apex_ompl.robot import Robot
-from apex_ompl.util.resolution import FINE_RESOLUTION
 
 
 @pytest.fixture(scope="module")

@@ -21,7 +21,7 @@ from apex_ompl.paths.path import Path
 from apex_ompl.paths.spline import Spline
 from apex_ompl.planners import APEX
 from apex_ompl.planning import PlanRun, solve, straight_line
-from apex_ompl.util.deadline import Deadline
+from apex_ompl.util.clocks import Deadline
 
 
 @pytest.mark.parametrize("spline", [Spline(), Spline(22, 3, 100), Spline(8, 2, 33, 3)])

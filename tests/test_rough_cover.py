@@ -11,10 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support import ROOT
 
-from apex_ompl.collision.cover.boxes import bounding_boxes
-from apex_ompl.collision.cover.cylinder import cylinder_cover
 from apex_ompl.collision.cover.proof import FINEST, FINEST_SHARE, Cover, uncovered_boxes
-from apex_ompl.collision.cover.rough import rough_cover
+from apex_ompl.collision.cover.quick import bounding_boxes, cylinder_cover, rough_cover
 from apex_ompl.collision.cover.solids import solid_of
 from apex_ompl.scene.meshes import capped, triangles, winding_number
 

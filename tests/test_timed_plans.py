@@ -16,7 +16,7 @@ from apex_ompl.ompl.validity import full_check
 from apex_ompl.paths.path import Path as JointPath
 from apex_ompl.result import PlanResult, PlanStatus
 from apex_ompl.timing import Timing, Trajectory, time_path
-from apex_ompl.util.deadline import Deadline
+from apex_ompl.util.clocks import Deadline
 
 
 def test_plans_are_timed_and_checked() -> None:

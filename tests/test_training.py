@@ -19,6 +19,7 @@ import yaml
 from support import DATA
 from trainings import CLEARANCES, HERE, SCRIPT, SMALL, VARIATIONAL, assert_same, config, query_from_path, weights
 
+from apex_ompl.collision.discretization import FINE_RESOLUTION
 from apex_ompl.errors import FileFormatError, MissingFileError
 from apex_ompl.kernel import Kernel, RobotTables
 from apex_ompl.kernel.scene_builder import scene_tables
@@ -33,8 +34,7 @@ from apex_ompl.training.store import Store, load, save
 from apex_ompl.training.torch_model import TorchModel, load_torch_model
 from apex_ompl.training.training import Trainer, TrainingError
 from apex_ompl.training.validation import query_from_problem, success_rates
-from apex_ompl.util.resolution import FINE_RESOLUTION
-from apex_ompl.util.threads import one_torch_thread
+from apex_ompl.util.process import one_torch_thread
 
 
 @pytest.fixture(autouse=True)

@@ -12,7 +12,7 @@ import torch
 from apex_ompl.errors import ParameterError, UnknownNameError
 from apex_ompl.util import validation as v
 from apex_ompl.util.arrays import distinct, is_masked_array
-from apex_ompl.util.bounded_cache import kept
+from apex_ompl.util.cache import kept
 
 MASKED = np.ma.masked_array([1.0, 2.0], mask=[True, False])
 

@@ -14,7 +14,7 @@ import pytest
 
 from apex_ompl import load_problem, plan
 from apex_ompl.cli import main
-from apex_ompl.collision.tabulate import joint_tree
+from apex_ompl.collision.tables import joint_tree
 from apex_ompl.errors import MissingFileError, ParameterError, RobotError
 from apex_ompl.ompl.setup import assemble
 from apex_ompl.result import PlanResult

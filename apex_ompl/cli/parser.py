@@ -22,7 +22,7 @@ from apex_ompl import __version__
 from apex_ompl.cli.options import LIMITS
 from apex_ompl.cli.streams import open_streams
 from apex_ompl.errors import ApexError
-from apex_ompl.util.exiting import end_quickly
+from apex_ompl.util.process import end_quickly
 
 PROBLEM_HELP = "name of a problem, an id as shelf/hard/900012, or a YAML file"
 RESULT_HELP = "a saved plan or run (.npz, .json, .yaml)"

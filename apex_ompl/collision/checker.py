@@ -9,10 +9,10 @@ import numpy as np
 
 from apex_ompl.collision.conservative import CheckCounts, ConservativeChecker, NoGridError, UnprovedPairs
 from apex_ompl.collision.discretization import Collision, first_colliding_sample
-from apex_ompl.collision.hull_distance import Distance
 from apex_ompl.collision.mesh_stage import Contact
 from apex_ompl.collision.path_proof import TOLERANCE, Curve, PathProof, PathProver, obstacles_alone
 from apex_ompl.collision.scene_bodies import SceneBodies
+from apex_ompl.collision.solids import Distance
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel import Kernel
 from apex_ompl.kernel.kernel import MOST_PAIRS

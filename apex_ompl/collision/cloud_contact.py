@@ -9,11 +9,10 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
 
-from apex_ompl.collision.clouds import PointCloud, cloud_of
 from apex_ompl.collision.containment import EnclosingMesh
 from apex_ompl.collision.exact_shapes import Mesh, PlacedShape, ball_tree, mesh_of, tree_order
 from apex_ompl.collision.hulls import hull_planes
-from apex_ompl.collision.shapes import coal_geometry, is_shell, is_surface
+from apex_ompl.collision.shapes import PointCloud, cloud_of, coal_geometry, is_shell, is_surface
 from apex_ompl.collision.solids import Solid, world_boxes
 from apex_ompl.kernel.compiled.cloud_distance import any_inside, near_mesh, near_primitive, primitive_distances
 from apex_ompl.kernel.compiled.triangle_distance import surface_distances
@@ -21,8 +20,8 @@ from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import AttachedObject
 from apex_ompl.scene.meshes import triangles
 from apex_ompl.types import Array, Indices
+from apex_ompl.util.cache import weakly_cached
 from apex_ompl.util.validation import check_array, check_number, finite_array
-from apex_ompl.util.weak_cache import weakly_cached
 
 SOME = 10_000  # points
 STACK = 128  # nodes that wait in a walk down a tree

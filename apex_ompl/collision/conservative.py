@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from apex_ompl.collision.cover.spheres import shape_key
 from apex_ompl.collision.mesh_stage import MeshStage
-from apex_ompl.collision.stored_tables import make_tables, stored_tables
-from apex_ompl.collision.tabulate import primitives
+from apex_ompl.collision.tables import make_tables, primitives, stored_tables
 from apex_ompl.kernel.ahead_of_time import compile_ahead
 from apex_ompl.kernel.compiled import motion_proof, queries
 from apex_ompl.kernel.compiled.entry_points import PLANS

@@ -11,10 +11,9 @@ import coal
 import numpy as np
 from numpy.typing import NDArray
 
-from apex_ompl.collision.clouds import cloud_of
 from apex_ompl.collision.cover.spheres import shape_key
 from apex_ompl.collision.hulls import below_support, convex_hull, hull_planes
-from apex_ompl.collision.shapes import is_shell
+from apex_ompl.collision.shapes import cloud_of, is_shell
 from apex_ompl.kernel.compiled.arrays import BOX, CAPSULE, CYLINDER, HALF_SPACE, SPHERE
 from apex_ompl.kernel.compiled.ball_tree import median_order, node_balls
 from apex_ompl.kernel.compiled.layout import Integers
@@ -22,8 +21,7 @@ from apex_ompl.kernel.compiled.shapes import HULL, POINT, TRIANGLE, ShapeArrays
 from apex_ompl.scene.meshes import triangles
 from apex_ompl.types import Array, Flags
 from apex_ompl.util.arrays import length
-from apex_ompl.util.bounded_cache import kept
-from apex_ompl.util.weak_cache import weakly_cached
+from apex_ompl.util.cache import kept, weakly_cached
 
 CONVEX_TOLERANCE = 1e-7  # a mesh is its hull when its triangles' centers are no deeper than this below it [m]
 MANY = 4000  # triangles

@@ -12,9 +12,9 @@ from apex_ompl.collision.shapes import is_shell, is_surface
 from apex_ompl.kernel.compiled.farthest_points import farthest_points
 from apex_ompl.scene.meshes import FLAT
 from apex_ompl.types import Array
-from apex_ompl.util.boxes import bounding_box
+from apex_ompl.util.arrays import bounding_box
+from apex_ompl.util.cache import weakly_cached
 from apex_ompl.util.forking import ProcessLock
-from apex_ompl.util.weak_cache import weakly_cached
 
 THICKNESS = 1e-6  # by which hulls of surfaces are larger; of those longer than 1 m as much by their length [m]
 DIRECTIONS = (400, 60)  # in which hulls of too many vertices are sampled; fewer where Coal takes no more

@@ -14,7 +14,7 @@ from apex_ompl.collision.cover.spheres import shape_key
 from apex_ompl.collision.hulls import convex_hull, hull_planes
 from apex_ompl.collision.shapes import is_shell, is_surface
 from apex_ompl.types import Array
-from apex_ompl.util.bounded_cache import kept
+from apex_ompl.util.cache import kept
 
 PLACES = 60  # at which the depth is looked at, about
 MOST = 12  # balls of a solid

@@ -13,10 +13,9 @@ import numpy as np
 import pinocchio as pin
 
 from apex_ompl.collision.cloud_contact import cloud_depth, nearest_balls, touches
-from apex_ompl.collision.clouds import cloud_of
-from apex_ompl.collision.containment_tests import ContainmentTest, containment_tests
-from apex_ompl.collision.hull_distance import Distance, closest, hull_distance
-from apex_ompl.collision.solids import Solid, overlaps, transform, world_boxes
+from apex_ompl.collision.containment import ContainmentTest, containment_tests
+from apex_ompl.collision.shapes import cloud_of
+from apex_ompl.collision.solids import Distance, Solid, closest, hull_distance, overlaps, transform, world_boxes
 from apex_ompl.robot import Robot
 from apex_ompl.robot.geometry import link_of
 from apex_ompl.scene.bodies import AttachedObject

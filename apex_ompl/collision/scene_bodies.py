@@ -6,17 +6,15 @@ from collections.abc import Iterable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any
 
-from apex_ompl.collision.held_extent import extent_in_link
 from apex_ompl.collision.mesh_stage import MeshStage
-from apex_ompl.collision.shapes import coal_geometry, mesh_note, with_file_read, world_geometry
+from apex_ompl.collision.shapes import coal_geometry, extent_in_link, mesh_note, with_file_read, world_geometry
 from apex_ompl.errors import SceneError, UnknownNameError
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import AttachedObject, Body, Obstacle, file_shape, given_fields, same_solid
 from apex_ompl.scene.scripts import moved_to, standing
 from apex_ompl.types import Array
-from apex_ompl.util.display import counted, one_line
+from apex_ompl.util.display import counted, one_line, progress
 from apex_ompl.util.forking import unforked
-from apex_ompl.util.progress import progress
 from apex_ompl.util.schema import validate
 
 SHOWN_AFTER = 1.0  # of a progress bar [s]

@@ -1,10 +1,17 @@
-"""Coal geometry of the shapes of a problem."""
+"""Coal geometry of the shapes of a problem.
+
+Coal has no point clouds: a cloud, balls of one radius around points, is given to it as the box around them, and its
+contacts are found by :mod:`apex_ompl.collision.cloud_contact`.
+"""
 
 from __future__ import annotations
 
 import hashlib
 import logging
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import product
 from pathlib import Path
 from weakref import WeakValueDictionary
 
@@ -12,10 +19,9 @@ import coal
 import numpy as np
 from numpy.typing import NDArray
 
-from apex_ompl.collision.clouds import PointCloud, cloud_geometry
 from apex_ompl.errors import FileFormatError
 from apex_ompl.kernel.distance_grid import grid_of_triangles_beside
-from apex_ompl.scene.bodies import Body, BodyT, GridFile, MeshFile, PointFile, file_shape, located
+from apex_ompl.scene.bodies import AttachedObject, Body, BodyT, GridFile, MeshFile, PointFile, file_shape, located
 from apex_ompl.scene.grids import parse_surface
 from apex_ompl.scene.mesh_files import read_mesh
 from apex_ompl.scene.meshes import (
@@ -29,9 +35,10 @@ from apex_ompl.scene.meshes import (
 )
 from apex_ompl.scene.points import parse_points
 from apex_ompl.types import Array
+from apex_ompl.util.arrays import bounding_box
+from apex_ompl.util.cache import weakly_cached
 from apex_ompl.util.files import read_file
 from apex_ompl.util.forking import ProcessLock
-from apex_ompl.util.weak_cache import weakly_cached
 
 KEPT_MESHES = 32  # meshes that were loaded last and are kept for the next problem
 LARGE = 50_000  # triangles of a mesh from which on its grid of distances is made while its tree is
@@ -48,7 +55,7 @@ def coal_geometry(body: Body) -> coal.CollisionGeometry:
     """Return the Coal geometry of a body's shape, in the body's frame.
 
     Boxes, spheres, cylinders, capsules and half-spaces become solids; meshes, voxels and distance grids a bounding
-    volume hierarchy over their triangles; points what stands for them (:mod:`apex_ompl.collision.clouds`).
+    volume hierarchy over their triangles; points what stands for them (:mod:`apex_ompl.collision.shapes`).
 
     Raises:
         MissingFileError: The mesh file cannot be read.
@@ -214,3 +221,57 @@ def mesh_geometry(vertices: Array, faces: NDArray[np.int64]) -> coal.BVHModelOBB
     vertices.flags.writeable = faces.flags.writeable = False
     triangles.keep(mesh, (vertices, faces))
     return mesh
+
+
+@dataclass(frozen=True, eq=False)
+class PointCloud:
+    """Balls around points.
+
+    Attributes:
+        points: Shape (N, 3) [m].
+        radius: Radius of the balls [m].
+    """
+
+    points: Array
+    radius: float
+
+    @cached_property
+    def box(self) -> Array:
+        """Box around the balls, shape (2, 3) [m]."""
+        found: Array = bounding_box(self.points) + np.array([[-self.radius], [self.radius]])
+        return found
+
+
+@weakly_cached
+def cloud_of(_: coal.CollisionGeometry) -> PointCloud | None:
+    """Return the cloud that a geometry stands for, None for one that is what it is."""
+    return None
+
+
+def cloud_geometry(cloud: PointCloud) -> coal.CollisionGeometry:
+    """Return the geometry that stands for a cloud: the box around it."""
+    corners = coal.StdVec_Vec3s()
+    corners.extend([cloud.box[list(k), [0, 1, 2]] for k in np.ndindex(2, 2, 2)])
+    box = coal.Convex.convexHull(corners, True, "Qt")
+    cloud_of.keep(box, cloud)
+    return box
+
+
+def held_extent(held: AttachedObject) -> Array:
+    """Return the least and the largest corner of a box around a held object, shape (2, 3) [m].
+
+    The box lies along the axes of the link that holds the object.
+
+    Raises:
+        MissingFileError, FileFormatError: Its mesh cannot be read.
+    """
+    return extent_in_link(coal_geometry(held), held.pose)
+
+
+def extent_in_link(geometry: coal.CollisionGeometry, pose: Array) -> Array:
+    """Return :func:`held_extent` of a geometry at a pose in its link's frame, shape (4, 4) [m]."""
+    geometry.computeLocalAABB()
+    low, high = geometry.aabb_local.min_, geometry.aabb_local.max_
+    corners = np.array(list(product(*zip(low, high, strict=True))))
+    placed = corners @ pose[:3, :3].T + pose[:3, 3]
+    return np.stack([placed.min(axis=0), placed.max(axis=0)])

@@ -1,4 +1,7 @@
-"""Solids of a scene: the robot's links, what it holds, and obstacles, each fixed to a joint of Pinocchio's model."""
+"""Solids of a scene, each fixed to a joint of Pinocchio's model: their boxes, and distances of their convex hulls.
+
+Solids are the robot's links, held objects and obstacles. Distances are signed: by GJK, and by EPA where hulls overlap.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +15,7 @@ import pinocchio as pin
 
 from apex_ompl.collision.hulls import convex_hull
 from apex_ompl.types import Array, Flags
+from apex_ompl.util.display import fields_line
 
 BOX_MARGIN = 1e-6  # by which boxes are larger than their solids [m]
 
@@ -85,3 +89,62 @@ def box_distances(first: Array, second: Array) -> Array:
     a, b = first[:, None], second[None]
     gaps = np.maximum(np.maximum(a[:, :, 0] - b[:, :, 1], b[:, :, 0] - a[:, :, 1]), 0.0)
     return np.asarray(np.linalg.norm(gaps, axis=2))
+
+
+@dataclass(frozen=True)
+class Distance:
+    """Minimum distance at a state, and the pair that has it.
+
+    Attributes:
+        value: Signed distance [m]; the negative penetration depth where they overlap; ``inf`` without any pair.
+        first: Name of a link or a held object.
+        second: Name of an obstacle, a fixture or a link.
+        points: Nearest points of ``first`` and ``second`` in the world, shape (2, 3) [m].
+    """
+
+    value: float
+    first: str
+    second: str
+    points: Array
+
+    __repr__ = fields_line
+
+
+NO_PAIR = Distance(float("inf"), "", "", np.full((2, 3), np.nan))
+
+
+def hull_distance(first: Solid, at: pin.SE3, second: Solid, there: pin.SE3) -> Distance:
+    """Return the signed distance of the hulls of two solids at poses in the world.
+
+    A hull contains its mesh, so the distance is a lower bound. It is exact for boxes, spheres, cylinders, capsules and
+    convex meshes.
+    """
+    result = coal.DistanceResult()
+    value = coal.distance(first.hull, transform(at), second.hull, transform(there), coal.DistanceRequest(), result)
+    points = np.array([result.getNearestPoint1(), result.getNearestPoint2()])
+    return Distance(float(value), first.name, second.name, points)
+
+
+def closest(
+    dynamic: Sequence[Solid], at: Sequence[pin.SE3], others: Sequence[Solid], there: Sequence[pin.SE3]
+) -> Distance:
+    """Return the least signed distance of the hulls of two sets of solids; pairs whose boxes are farther are left out.
+
+    Args:
+        dynamic: Solids of the one set.
+        at: Their poses in the world.
+        others: Solids of the other set.
+        there: Their poses in the world.
+    """
+    best = NO_PAIR
+    if not dynamic or not others:
+        return best
+    bounds = box_distances(world_boxes(dynamic, at), world_boxes(others, there))
+    for k in np.argsort(bounds, axis=None, kind="stable").tolist():
+        i, j = divmod(k, len(others))
+        if bounds[i, j] > max(best.value, 0.0):
+            break
+        found = hull_distance(dynamic[i], at[i], others[j], there[j])
+        if found.value < best.value:
+            best = found
+    return best

@@ -15,6 +15,7 @@ from typing import Any
 
 from tqdm import tqdm
 
+from apex_ompl.collision.discretization import SEARCH_RESOLUTION
 from apex_ompl.errors import FileFormatError, ParameterError
 from apex_ompl.evaluation.results import ABOUT, RUNS, SCHEMA, Results
 from apex_ompl.evaluation.rows import Job, Row, jobs
@@ -23,7 +24,6 @@ from apex_ompl.evaluation.workers import Workers
 from apex_ompl.planning import check_arguments
 from apex_ompl.util.files import locked, make_folder, write_atomically
 from apex_ompl.util.provenance import hardware, versions
-from apex_ompl.util.resolution import SEARCH_RESOLUTION
 from apex_ompl.util.validation import check_integer
 
 

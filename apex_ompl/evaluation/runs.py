@@ -34,7 +34,7 @@ from apex_ompl.scene.problem import Problem
 from apex_ompl.timing import Timing
 from apex_ompl.timing.smoothness import jerk
 from apex_ompl.types import Array
-from apex_ompl.util.deadline import Deadline
+from apex_ompl.util.clocks import Deadline
 
 Run = dict[str, Any]
 """A run as it is stored, ready for JSON."""

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apex_ompl.collision.shapes import world_geometry
-from apex_ompl.collision.tabulate import primitives
+from apex_ompl.collision.tables import primitives
 from apex_ompl.kernel import Kernel, RobotTables
 from apex_ompl.kernel.scene_builder import Solids, tables_of
 from apex_ompl.robot import Robot

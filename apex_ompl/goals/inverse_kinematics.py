@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
-from apex_ompl.collision.tabulate import joint_tree
+from apex_ompl.collision.tables import joint_tree
 from apex_ompl.errors import UnknownNameError
 from apex_ompl.kernel import FixedVector, IKSolver, RobotTables, Target
 from apex_ompl.kernel.robot_builder import robot_tables

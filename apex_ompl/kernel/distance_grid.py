@@ -24,8 +24,7 @@ from apex_ompl.kernel.compiled.grid_tabulation import tabulate_points, tabulate_
 from apex_ompl.kernel.compiled.item_tree import BUCKET, HALF, fill_boxes, order_items
 from apex_ompl.kernel.compiled.layout import Integers, Singles
 from apex_ompl.types import Array
-from apex_ompl.util.arrays import compact
-from apex_ompl.util.boxes import bounding_box
+from apex_ompl.util.arrays import bounding_box, compact
 from apex_ompl.util.forking import ProcessLock
 
 MOST_NODES = 6_000_000

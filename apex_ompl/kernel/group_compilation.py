@@ -18,9 +18,8 @@ from tqdm import tqdm
 from apex_ompl.kernel.compiled.entry_points import ALL, Group
 from apex_ompl.kernel.compiled.jit import CompiledFunction, cache_folder, can_keep_code, names_in_cache, whereabouts
 from apex_ompl.kernel.library import why_not_used
-from apex_ompl.util.cores import usable_cores
 from apex_ompl.util.files import locked
-from apex_ompl.util.interpreter import this_python
+from apex_ompl.util.process import this_python, usable_cores
 
 LOG = logging.getLogger("apex_ompl")
 

@@ -22,7 +22,7 @@ from apex_ompl.moving.request import Replanner, Request
 from apex_ompl.moving.settings import LoopSettings
 from apex_ompl.robot.model import Limits
 from apex_ompl.scene.problem import Problem
-from apex_ompl.util.interpreter import this_python
+from apex_ompl.util.process import this_python
 
 STARTED = 120.0  # time that the process has to make itself ready [s]
 SENT = 2  # requests at most that are not answered yet

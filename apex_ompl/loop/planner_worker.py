@@ -15,7 +15,7 @@ from apex_ompl.loop.replanning import SHARE, answered
 from apex_ompl.moving.ready import Ready
 from apex_ompl.ompl.process import quiet_ompl, seed_ompl
 from apex_ompl.ompl.setup import assemble
-from apex_ompl.util.threads import one_torch_thread
+from apex_ompl.util.process import one_torch_thread
 
 
 def serve(connection: Connection[Any, Any]) -> None:

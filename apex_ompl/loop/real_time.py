@@ -25,8 +25,7 @@ from apex_ompl.problems.worlds import World
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.scripts import standing
 from apex_ompl.timing import time_path
-from apex_ompl.util.cores import usable_cores
-from apex_ompl.util.exiting import running
+from apex_ompl.util.process import running, usable_cores
 
 
 def cores() -> tuple[int | None, int | None]:

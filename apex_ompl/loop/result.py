@@ -18,9 +18,8 @@ from apex_ompl.timing import Trajectory
 from apex_ompl.timing.checks import START_TOLERANCE
 from apex_ompl.timing.files import KNOTS
 from apex_ompl.types import Array
-from apex_ompl.util.archives import pack_archive, read_archive
 from apex_ompl.util.display import Summary, fields_line, one_line
-from apex_ompl.util.files import BROKEN, path_text, suffix_of, write_atomically
+from apex_ompl.util.files import BROKEN, pack_archive, path_text, read_archive, suffix_of, write_atomically
 from apex_ompl.util.schema import read_json
 from apex_ompl.util.validation import check_number, check_seed, finite_array, finite_numbers
 

@@ -10,7 +10,7 @@ from apex_ompl.loop.replanning import AtOnce
 from apex_ompl.moving.ready import Ready
 from apex_ompl.moving.request import Replanner
 from apex_ompl.problems.worlds import World
-from apex_ompl.util.exiting import running
+from apex_ompl.util.process import running
 
 
 def simulate(world: World, ready: Ready, replanner: Replanner, eyes: Eyes, seed: int) -> RunRecord:

@@ -25,7 +25,7 @@ from apex_ompl.kernel.scene_builder import Primitive, primitive, scene_tables
 from apex_ompl.kernel.tables import SceneTables
 from apex_ompl.model.solid_fit import THINNEST, Solid, solids_like, turned_to
 from apex_ompl.types import Array, Flags
-from apex_ompl.util.weak_cache import weakly_cached
+from apex_ompl.util.cache import weakly_cached
 
 MOST_NODES, MOST_NODES_OF_SOLIDS = 1_000_000, 250_000  # that are looked at; of finer grids every other or third
 INSIDE = 3.0  # distance inside of a surface, in spacings, by which it is known to enclose a solid

@@ -23,8 +23,8 @@ from apex_ompl.model.scene_encoding import KeyStates, Sight
 from apex_ompl.model.schedule import Estimate, NoiseSchedule
 from apex_ompl.paths.spline import Spline
 from apex_ompl.types import Array
+from apex_ompl.util.clocks import StageClock
 from apex_ompl.util.display import counted, fields_line, one_line
-from apex_ompl.util.stopwatch import StageClock
 from apex_ompl.util.validation import check_array, check_integer, check_name, check_number
 
 UNGUIDED = Guidance(gamma=0.0)

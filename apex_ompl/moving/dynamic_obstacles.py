@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from apex_ompl.collision.path_proof import Curve
 from apex_ompl.collision.shapes import world_geometry
-from apex_ompl.collision.tabulate import primitives
+from apex_ompl.collision.tables import primitives
 from apex_ompl.errors import ParameterError, SceneError, UnknownNameError
 from apex_ompl.kernel import Kernel
 from apex_ompl.kernel.compiled.dynamic_obstacles import DynamicArrays, clearances_in_time, first_conflict

@@ -14,7 +14,7 @@ from apex_ompl.errors import ApexError
 from apex_ompl.ompl.report import SolveReport
 from apex_ompl.ompl.space import forget_states, to_state
 from apex_ompl.types import Array
-from apex_ompl.util.exiting import running
+from apex_ompl.util.process import running
 
 LOG = logging.getLogger("apex_ompl")
 Status = ob.PlannerStatus

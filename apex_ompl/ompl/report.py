@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 from typing import Any, Protocol, runtime_checkable
 
 from apex_ompl.paths.path import Path
+from apex_ompl.util.clocks import timed
 from apex_ompl.util.display import fields_line
-from apex_ompl.util.stopwatch import timed
 
 
 @dataclass

@@ -11,6 +11,7 @@ from ompl import base as ob
 from ompl import geometric as og
 
 from apex_ompl.collision import CollisionChecker
+from apex_ompl.collision.discretization import SEARCH_RESOLUTION
 from apex_ompl.goals.alignment import AlignmentGoal, alignment_goal
 from apex_ompl.goals.goal_sampling import sample
 from apex_ompl.goals.pose_goal import PoseGoal
@@ -22,7 +23,6 @@ from apex_ompl.scene.problem import Problem
 from apex_ompl.scene.scripts import problem_at
 from apex_ompl.types import Array
 from apex_ompl.util.display import counted, one_line
-from apex_ompl.util.resolution import SEARCH_RESOLUTION
 
 GOAL_STATES = 8  # how many states an alignment goal is sampled into
 GOAL_ATTEMPTS = 200

@@ -12,7 +12,7 @@ from apex_ompl.ompl.interrupt import ends_after
 from apex_ompl.ompl.own_planner import OwnPlanner
 from apex_ompl.ompl.space import Bounds, await_goal, state_space
 from apex_ompl.robot import Robot
-from apex_ompl.util.exiting import running
+from apex_ompl.util.process import running
 
 
 class SpaceInformation(ob.SpaceInformation):

@@ -15,10 +15,10 @@ import numpy as np
 from ompl import base as ob
 from ompl import geometric as og
 
+from apex_ompl.collision.discretization import SEARCH_RESOLUTION
 from apex_ompl.errors import ParameterError
 from apex_ompl.robot import Robot
 from apex_ompl.types import Array, Flags
-from apex_ompl.util.resolution import SEARCH_RESOLUTION
 
 Bounds = tuple[Array, Array]
 """Lowest and highest positions of the joints, each of shape (dof,) [rad; synergies 0..1]."""

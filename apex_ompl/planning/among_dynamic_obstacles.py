@@ -35,8 +35,7 @@ from apex_ompl.robot.model import Limits
 from apex_ompl.scene.bodies import Obstacle, Sphere
 from apex_ompl.scene.scripts import obstacle_at
 from apex_ompl.timing import Timing, Trajectory, time_path
-from apex_ompl.util.deadline import Deadline
-from apex_ompl.util.stopwatch import timed
+from apex_ompl.util.clocks import Deadline, timed
 
 RETIMED, SPACE_TIME, SWEPT = "retiming", "space-time", "swept"
 STAGES = (RETIMED, SPACE_TIME, SWEPT)

@@ -26,9 +26,9 @@ from apex_ompl.result import PlanResult
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Problem
 from apex_ompl.timing import Timing, warm_up
-from apex_ompl.util.deadline import Deadline
-from apex_ompl.util.exiting import running
+from apex_ompl.util.clocks import Deadline
 from apex_ompl.util.forking import unforked
+from apex_ompl.util.process import running
 from apex_ompl.util.validation import check_flag, check_number, check_positive, check_seed
 
 if TYPE_CHECKING:

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any, Self, Unpack
 
 from apex_ompl import planners
 from apex_ompl.util.display import one_line
-from apex_ompl.util.exiting import running
 from apex_ompl.util.forking import ProcessLock, unforked
+from apex_ompl.util.process import running
 from apex_ompl.util.validation import check_options
 
 if TYPE_CHECKING:

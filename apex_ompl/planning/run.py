@@ -13,7 +13,7 @@ from apex_ompl.paths.path import Path
 from apex_ompl.result import PlanResult, PlanStatus
 from apex_ompl.robot.identity import digest
 from apex_ompl.types import Array
-from apex_ompl.util.deadline import Deadline
+from apex_ompl.util.clocks import Deadline
 
 if TYPE_CHECKING:
     from apex_ompl.planners import Parameters

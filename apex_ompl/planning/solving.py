@@ -20,8 +20,8 @@ from apex_ompl.paths.path import Path
 from apex_ompl.planning.departure import remedy
 from apex_ompl.planning.run import PlanRun
 from apex_ompl.result import FIRST, INSIDE, PlanResult, PlanStatus
+from apex_ompl.util.clocks import timed
 from apex_ompl.util.forking import unforked
-from apex_ompl.util.stopwatch import timed
 
 STRAIGHT_LINE = "straight line"
 NOT_PROVED = "a path was found but not proved in time"

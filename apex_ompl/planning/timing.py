@@ -12,7 +12,7 @@ from apex_ompl.planning.run import PlanRun
 from apex_ompl.result import PlanResult, PlanStatus
 from apex_ompl.timing import Timing, Trajectory, time_path
 from apex_ompl.timing.trajectory import ROUNDING
-from apex_ompl.util.stopwatch import timed
+from apex_ompl.util.clocks import timed
 
 NOT_TIMED = "a path was found but not timed in time"
 

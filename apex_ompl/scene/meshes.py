@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apex_ompl.types import Array
-from apex_ompl.util.weak_cache import weakly_cached
+from apex_ompl.util.cache import weakly_cached
 
 LARGEST = 1e4  # larger coordinates are errors [m]
 SMALLEST = 1e-6  # meshes that are smaller are errors, of units for one [m]

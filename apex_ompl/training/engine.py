@@ -20,7 +20,7 @@ from apex_ompl.paths.spline import Spline
 from apex_ompl.training.path_finder import PathFinder
 from apex_ompl.training.records import FIELDS, SOURCES, Paths, to_micro
 from apex_ompl.types import Array
-from apex_ompl.util.stopwatch import timed
+from apex_ompl.util.clocks import timed
 
 STRAIGHT_SHARE = 0.2  # largest share of the kept problems that the straight line solves
 PART_LENGTHS = (0.25, 0.9)  # range of the length of a part of a path, as a share of its states

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from apex_ompl.collision.discretization import FINE_RESOLUTION, SEARCH_RESOLUTION
 from apex_ompl.kernel import Kernel
 from apex_ompl.kernel.shortcuts import ENOUGH, RESOLUTION, shortcut
 from apex_ompl.kernel.trees import TreePair
@@ -13,7 +14,6 @@ from apex_ompl.paths.candidates import first_valid
 from apex_ompl.paths.optimizer import Optimizer
 from apex_ompl.training.records import to_half
 from apex_ompl.types import Array
-from apex_ompl.util.resolution import FINE_RESOLUTION, SEARCH_RESOLUTION
 
 FEW, MANY = 1, 8  # initial paths that are optimized together
 BUMP_SIZE = (0.4, 1.2)  # range of the amplitude of random bumps [rad]

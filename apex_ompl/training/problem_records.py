@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from apex_ompl import problems
-from apex_ompl.collision.held_extent import held_extent
+from apex_ompl.collision.shapes import held_extent
 from apex_ompl.errors import UnknownNameError
 from apex_ompl.model.geometry import SHAPES, ObstacleRecord
 from apex_ompl.ompl.process import quiet_ompl
@@ -49,7 +49,7 @@ def problem_record(problem: Problem, seed: int) -> ProblemRecord:
     """Return the record of a problem in a data set: its obstacles as primitives, whatever they are given as.
 
     The primitives contain the meshes and the balls around points. Held meshes are named by their files, without
-    folders; each held object has its ``extent``, see :func:`apex_ompl.collision.held_extent.held_extent`.
+    folders; each held object has its ``extent``, see :func:`apex_ompl.collision.shapes.held_extent`.
     """
     scene = problems.primitives(problem, enclosing=True)
     return ProblemRecord(seed, held_text(problem.attached), [_obstacle_record(obstacle) for obstacle in scene])

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from apex_ompl import problems
+from apex_ompl.collision.discretization import SEARCH_RESOLUTION
 from apex_ompl.errors import ParameterError
 from apex_ompl.ompl.process import quiet_ompl
 from apex_ompl.ompl.setup import PlanningSetup, assemble
@@ -22,7 +23,6 @@ from apex_ompl.training.problem_records import problem_record
 from apex_ompl.training.records import Paths
 from apex_ompl.training.units import Unit
 from apex_ompl.types import Array
-from apex_ompl.util.resolution import SEARCH_RESOLUTION
 
 if TYPE_CHECKING:
     from apex_ompl.model.proposals import TrajectoryModel

@@ -25,7 +25,7 @@ from apex_ompl.training.conditions import batch_queries
 from apex_ompl.training.cost_gradient import gradient, log_likelihood
 from apex_ompl.training.latent_diffusion import LatentDiffusion
 from apex_ompl.types import Array
-from apex_ompl.util.threads import one_torch_thread
+from apex_ompl.util.process import one_torch_thread
 
 
 class TorchModel(TrajectoryModel):

@@ -1,4 +1,4 @@
-"""The folder in the user's cache where this package keeps files that it can make again."""
+"""Caches: results kept with the object that they belong to, results kept by key, and files in the user's cache."""
 
 from __future__ import annotations
 
@@ -7,14 +7,15 @@ import os
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from functools import update_wrapper
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Generic, TypeVar
+from weakref import ref
 
 from numpy.typing import NDArray
 
 from apex_ompl.errors import ApexError
-from apex_ompl.util.archives import pack_archive, read_archive
-from apex_ompl.util.files import is_file, write_atomically
+from apex_ompl.util.files import is_file, pack_archive, read_archive, write_atomically
 
 ABOUT = "about"  # the record in a file
 MOST_FILES = 64  # of arrays in a folder; those that were used least lately are removed
@@ -23,6 +24,44 @@ LOG = logging.getLogger("apex_ompl")
 
 R = TypeVar("R")
 Arrays = Mapping[str, NDArray[Any]]
+
+
+class weakly_cached(Generic[R]):  # noqa: N801 - a decorator
+    """Keep the results of a function of one object, which must not change, until the object is deleted.
+
+    Objects are told apart by identity: those of Coal compare their whole content.
+    """
+
+    def __init__(self, function: Callable[[Any], R]) -> None:
+        """Wrap a function."""
+        self._function = function
+        self._kept: dict[int, tuple[ref[Any], R]] = {}
+        update_wrapper(self, function)
+
+    def __call__(self, item: Any) -> R:
+        """Return the result of the function, or the one that is kept."""
+        found = self._kept.get(id(item))
+        if found is not None and found[0]() is item:
+            return found[1]
+        result = self._function(item)
+        self.keep(item, result)
+        return result
+
+    def keep(self, item: Any, result: R) -> None:
+        """Keep a result that is known already."""
+        number = id(item)
+        self._kept[number] = ref(item, lambda _: self._kept.pop(number, None)), result
+
+
+def kept(results: dict[str, R], key: str, make: Callable[[], R], most: int) -> R:
+    """Return the result of a key, made where there is none; beyond ``most`` results the oldest are dropped."""
+    if (known := results.get(key)) is not None:  # another thread may drop it
+        return known
+    result = make()
+    while len(results) >= most:
+        results.pop(next(iter(results)), None)
+    results[key] = result
+    return result
 
 
 def user_cache(name: str, homes: Sequence[str] = (), *, or_filled: bool = False) -> Path | None:

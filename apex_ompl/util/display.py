@@ -1,14 +1,16 @@
-"""How objects show themselves: one line at a prompt, a summary in a terminal, a table in a notebook."""
+"""How objects and work show themselves: a line at a prompt, a summary, a table in a notebook, a progress bar."""
 
 from __future__ import annotations
 
 import reprlib
-from collections.abc import Iterable, Mapping, Sequence
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, fields
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 WIDTH = 119  # of one line [characters]
 LABEL = 10  # width of the labels of a summary
+T = TypeVar("T")
 
 
 def one_line(kind: str, *parts: str) -> str:
@@ -106,3 +108,26 @@ def html_table(title: str, rows: Iterable[Sequence[str]], head: Sequence[str] = 
     lines += [line(row, ["th"] * (not head) + ["td"] * (len(row) - (not head))) for row in rows]
     caption = f'<caption style="text-align: left"><b>{escape(title)}</b></caption>'
     return f"<table>{caption}{''.join(lines)}</table>"
+
+
+def progress(items: Sequence[T], what: str, after: float) -> Iterator[T]:
+    """Yield items, and show on a terminal how many are done when they take long.
+
+    Args:
+        items: The items.
+        what: Their name.
+        after: How long they may take until the bar is shown [s].
+    """
+    bar, started = None, time.monotonic()
+    try:
+        for done, item in enumerate(items):
+            if bar is None and time.monotonic() - started > after:
+                from tqdm import tqdm  # takes longer to import than most items
+
+                bar = tqdm(total=len(items), initial=done, desc=what, leave=False, disable=None)
+            yield item
+            if bar is not None:
+                bar.update()
+    finally:
+        if bar is not None:
+            bar.close()

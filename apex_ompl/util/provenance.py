@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from importlib import metadata
 from pathlib import Path
 
-from apex_ompl.util.cores import usable_cores
+from apex_ompl.util.process import usable_cores
 
 FIGURES = ("apex-ompl", "ompl", "pin", "coal", "numba", "numpy", "torch")
 """Libraries that affect measurements."""

@@ -14,8 +14,7 @@ import numpy as np
 import pinocchio as pin
 import trimesh
 
-from apex_ompl.collision.clouds import cloud_of
-from apex_ompl.collision.shapes import coal_geometry, is_shell
+from apex_ompl.collision.shapes import cloud_of, coal_geometry, is_shell
 from apex_ompl.collision.solids import Solid, world_boxes
 from apex_ompl.ompl.setup import PlanningSetup
 from apex_ompl.robot import Robot

@@ -12,11 +12,11 @@ from functools import cache
 
 import numpy as np
 
+from apex_ompl.collision.discretization import FINE_RESOLUTION, SEARCH_RESOLUTION
 from apex_ompl.kernel import Kernel
 from apex_ompl.paths.candidates import first_valid
 from apex_ompl.paths.optimizer import Optimizer
 from apex_ompl.types import Array
-from apex_ompl.util.resolution import FINE_RESOLUTION, SEARCH_RESOLUTION
 
 CLASSES = 4
 RANGE = 1.0  # longest motion of the sprint [rad], as rrtconnect is tuned

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apex_ompl.collision.shapes import world_geometry
-from apex_ompl.collision.tabulate import primitives
+from apex_ompl.collision.tables import primitives
 from apex_ompl.goals.cover_clearance import has_clearance
 from apex_ompl.goals.hand_poses import HandPoseSampler, HandRegion
 from apex_ompl.goals.inverse_kinematics import Links

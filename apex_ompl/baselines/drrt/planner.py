@@ -14,7 +14,7 @@ from ompl import util as ou
 from apex_ompl.apex.start_goal import read_goals, read_starts
 from apex_ompl.baselines.drrt.dynamic_rrt import DynamicRRT
 from apex_ompl.baselines.drrt.goal_tree import GoalTree
-from apex_ompl.collision.changes import may_have_become_blocked
+from apex_ompl.collision.path_proof import may_have_become_blocked
 from apex_ompl.kernel import Kernel
 from apex_ompl.ompl.own_planner import OwnPlanner, Tree
 from apex_ompl.ompl.parameters import Parameters, bounded, register

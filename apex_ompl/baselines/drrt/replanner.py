@@ -9,6 +9,7 @@ import numpy as np
 
 from apex_ompl.baselines.drrt.dynamic_rrt import DynamicRRT
 from apex_ompl.baselines.drrt.goal_tree import GoalTree
+from apex_ompl.collision.discretization import SEARCH_RESOLUTION
 from apex_ompl.moving.charges import Charges, cost_table
 from apex_ompl.moving.dynamic_obstacles import clearance_in_time
 from apex_ompl.moving.ready import Ready
@@ -17,7 +18,6 @@ from apex_ompl.moving.search import Search
 from apex_ompl.paths.path import states_between
 from apex_ompl.timing import Timing, Trajectory, time_path
 from apex_ompl.types import Array, Flags
-from apex_ompl.util.resolution import SEARCH_RESOLUTION
 
 DEEP = 0.03  # overlap of spheres beyond which a state counts as in contact without a look at exact shapes [m]
 DEVIATION = 0.02  # of the motion from the path [rad]

@@ -23,7 +23,7 @@ from apex_ompl.training.conditions import batch_queries
 from apex_ompl.types import Array
 from apex_ompl.util.files import is_file
 from apex_ompl.util.forking import ProcessLock
-from apex_ompl.util.threads import one_torch_thread
+from apex_ompl.util.process import one_torch_thread
 
 EXECUTED = 8  # states of a chunk that are followed before the policy is asked again
 SHIPPED = ("il", "il-paper")

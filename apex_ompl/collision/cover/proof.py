@@ -10,8 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from apex_ompl.collision.cover.convex_parts import RoundBody
-from apex_ompl.collision.cover.solids import Solid
+from apex_ompl.collision.cover.solids import RoundBody, Solid
 from apex_ompl.types import Array, Flags, Indices
 
 PAD = 1e-6  # margin of the radii over the proved ones, which exceeds all rounding errors [m]

@@ -15,16 +15,15 @@ from typing import Any
 import coal
 import numpy as np
 
-from apex_ompl.collision.cover.convex_parts import RoundBody
 from apex_ompl.collision.cover.proof import PAD, Cover, distances, grow_to_cover, uncovered_boxes
 from apex_ompl.collision.cover.search import search
-from apex_ompl.collision.cover.solids import solid_of
+from apex_ompl.collision.cover.solids import RoundBody, solid_of
 from apex_ompl.collision.shapes import is_shell, is_surface
 from apex_ompl.errors import FileFormatError, ParameterError
 from apex_ompl.scene.meshes import triangles
 from apex_ompl.types import Array
+from apex_ompl.util.cache import weakly_cached
 from apex_ompl.util.files import read_text, write_atomically
-from apex_ompl.util.weak_cache import weakly_cached
 
 __all__ = ["GAPS", "Cover", "make_cover", "quality", "read_covers", "shape_key", "unproved", "write_covers"]
 

@@ -9,6 +9,7 @@ import numpy as np
 from apex_ompl.apex.models import DEFAULT, has_model
 from apex_ompl.apex.query import make_query
 from apex_ompl.collision import CollisionChecker
+from apex_ompl.collision.discretization import FINE_RESOLUTION
 from apex_ompl.errors import ApexError
 from apex_ompl.model.checkpoint import shared_model
 from apex_ompl.model.guidance import Guidance
@@ -17,7 +18,6 @@ from apex_ompl.paths.optimizer import Optimizer
 from apex_ompl.paths.spline import Spline
 from apex_ompl.scene.scripts import problem_at
 from apex_ompl.types import Array
-from apex_ompl.util.resolution import FINE_RESOLUTION
 from apex_ompl.viz.appearance import DENOISED, PROPOSAL_COLORS
 from apex_ompl.viz.viewer.editor import Editor
 from apex_ompl.viz.viewer.player import Player

@@ -9,7 +9,7 @@ import numpy as np
 import trimesh
 
 from apex_ompl.collision.mesh_stage import Contact
-from apex_ompl.collision.tabulate import joint_tree
+from apex_ompl.collision.tables import joint_tree
 from apex_ompl.ompl.setup import PlanningSetup
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.scripts import is_there

@@ -1,7 +1,8 @@
-"""The end of the interpreter: work of daemon threads is told to end and waited for.
+"""This process: its cores and its interpreter, the thread count of torch, and the end of its daemon threads.
 
-A thread that is inside of C++ code when Python ends it takes the whole process down (``PyGILState_Release``, SIGABRT),
-and OMPL's planners call Python all the time. So what runs there is told to end, and its thread stands still afterwards.
+A thread that runs C++ code when Python ends it takes the whole process down (``PyGILState_Release``, SIGABRT), and
+OMPL's planners call Python all the time. So work in such threads is told to end (:func:`running`), and its thread
+stands still afterwards.
 
 A command ends without freeing its memory piece by piece (:func:`end_quickly`), a tenth of the time of a short one.
 """
@@ -21,7 +22,6 @@ from apex_ompl.util.forking import ProcessLock
 
 PATIENCE = 20.0  # how long the interpreter waits for what runs; the set-up of a planner ends by itself [s]
 LOOK = 0.01  # between two looks [s]
-
 
 _code: int | None = None  # of the process, where it is to end quickly
 
@@ -118,3 +118,40 @@ atexit.register(_leave)  # the first, so that it is called last
 atexit.register(_work.end)
 os.register_at_fork(after_in_child=_work.forget)
 os.register_at_fork(after_in_child=_stay)
+
+
+def usable_cores() -> tuple[int, ...]:
+    """Return the numbers of the cores that this process may use, in increasing order."""
+    if hasattr(os, "sched_getaffinity"):
+        return tuple(sorted(os.sched_getaffinity(0)))
+    return tuple(range(os.cpu_count() or 1))
+
+
+def this_python() -> list[str]:
+    """Return the command of this interpreter with its level of optimization, for which compiled code is kept apart."""
+    return [sys.executable, *(["-" + "O" * sys.flags.optimize] if sys.flags.optimize else [])]
+
+
+_lock = ProcessLock()
+_before: list[int] = []  # thread count to restore, one entry for each active block
+
+
+@contextmanager
+def one_torch_thread() -> Iterator[None]:
+    """Let torch compute by one thread inside the block, and restore the thread count afterwards.
+
+    Small networks are evaluated by one thread, as several wait for each other on busy cores. Blocks may overlap in
+    several threads; the last one to end restores the count.
+    """
+    import torch
+
+    with _lock:
+        _before.append(_before[0] if _before else torch.get_num_threads())
+        torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        with _lock:
+            count = _before.pop()
+            if not _before:
+                torch.set_num_threads(count)
