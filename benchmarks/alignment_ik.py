@@ -17,8 +17,7 @@ from apex_ompl import load_problem
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.goals.alignment import alignment_goal
 from apex_ompl.robot import Robot
-from apex_ompl.robot.assets import DATA
-from apex_ompl.robot.config import Part, read_config
+from apex_ompl.robot.config import DATA, Part, read_config
 from apex_ompl.robot.model import build_robot
 from apex_ompl.scene.bodies import Body
 from apex_ompl.util.entry_point import run_script

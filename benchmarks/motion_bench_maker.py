@@ -30,9 +30,8 @@ from scipy.spatial.transform import Rotation
 from apex_ompl.api import load_problem
 from apex_ompl.errors import MissingFileError
 from apex_ompl.evaluation import Row, Workers, bench
-from apex_ompl.evaluation.accounting import first_path_proof
 from apex_ompl.evaluation.rows import Job
-from apex_ompl.evaluation.runs import Run
+from apex_ompl.evaluation.runs import Run, first_path_proof
 from apex_ompl.ompl.setup import PlanningSetup, assemble
 from apex_ompl.ompl.tuned import TUNED
 from apex_ompl.paths.path import path_length

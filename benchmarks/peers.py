@@ -28,9 +28,8 @@ import record
 from apex_ompl.api import load_problem
 from apex_ompl.collision.discretization import SEARCH_RESOLUTION
 from apex_ompl.evaluation import Results, Row, Workers, bench
-from apex_ompl.evaluation.accounting import first_path_proof
 from apex_ompl.evaluation.rows import Job
-from apex_ompl.evaluation.runs import NO_PROBLEM, Run
+from apex_ompl.evaluation.runs import NO_PROBLEM, Run, first_path_proof
 from apex_ompl.evaluation.summary import Statistics
 from apex_ompl.ompl.repair import repair
 from apex_ompl.ompl.setup import PlanningSetup, assemble
@@ -39,7 +38,7 @@ from apex_ompl.ompl.validity import full_check
 from apex_ompl.paths.path import path_length
 from apex_ompl.planning import NOT_PROVED
 from apex_ompl.robot import Robot
-from apex_ompl.robot.geometry import link_of
+from apex_ompl.robot.model import link_of
 from apex_ompl.scene.bodies import Body, pose_matrix
 from apex_ompl.scene.problem import Problem
 from apex_ompl.types import Array

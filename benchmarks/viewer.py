@@ -25,8 +25,8 @@ from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import one_or_more
 from apex_ompl.viz.viewer.editor import GOAL
 from apex_ompl.viz.viewer.live_page import PERIOD, LivePage
-from apex_ompl.viz.viewer.nodes import pose_of
 from apex_ompl.viz.viewer.page import write_page
+from apex_ompl.viz.viewer.scene import pose_of
 from apex_ompl.viz.viewer.server import serving
 from apex_ompl.viz.viewer.shown import Shown
 

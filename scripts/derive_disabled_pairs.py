@@ -26,8 +26,7 @@ from apex_ompl.collision.hulls import convex_hull
 from apex_ompl.errors import UnknownNameError
 from apex_ompl.robot import Robot
 from apex_ompl.robot.config import PAIRS_SCHEMA, RobotConfig
-from apex_ompl.robot.geometry import link_of
-from apex_ompl.robot.model import bare_robot
+from apex_ompl.robot.model import bare_robot, link_of
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.files import write_atomically
 from apex_ompl.util.schema import yaml_value

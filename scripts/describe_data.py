@@ -87,7 +87,7 @@ def draw(paths: Paths, which: np.ndarray, file: Path) -> list[str]:
     """Draw some motions, a row each, and return their captions."""
     import imageio.v3 as iio
 
-    from apex_ompl.viz.scene_renderer import SceneRenderer
+    from apex_ompl.viz.render import SceneRenderer
 
     rows, captions, spline = [], [], paths.spline
     for k, points in zip(which, paths.control(which), strict=True):

@@ -15,8 +15,7 @@ from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.discretization import SEARCH_RESOLUTION
 from apex_ompl.errors import FileFormatError, SceneError, UnknownNameError
 from apex_ompl.robot import Robot
-from apex_ompl.robot.moveit_allowed import allowed_pairs
-from apex_ompl.robot.moveit_messages import MessageReader
+from apex_ompl.robot.moveit import MessageReader, allowed_pairs
 from apex_ompl.scene.bodies import AttachedObject, Obstacle
 
 

@@ -19,7 +19,7 @@ from ompl import tools as ot
 
 from apex_ompl import evaluation, problems
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError
-from apex_ompl.evaluation import Results, Row, Workers, bench, workers
+from apex_ompl.evaluation import Results, Row, Workers, bench, driver
 from apex_ompl.evaluation.summary import Statistics, statistics
 
 LEVEL, RUNS = "swap/easy", 3
@@ -111,7 +111,7 @@ def test_a_last_line_that_is_whole_is_kept(results: Results, tmp_path: Path) -> 
 
 def test_processes_are_renewed(results: Results, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     begun = []
-    monkeypatch.setattr(workers, "RUNS_PER_PROCESS", 2)
+    monkeypatch.setattr(driver, "RUNS_PER_PROCESS", 2)
     pool = Workers._pool
     monkeypatch.setattr(Workers, "_pool", lambda self, *given: (begun.append(given[1]), pool(self, *given))[1])
     found = bench([LEVEL], ROWS[1:], tmp_path, runs=RUNS, timeout=10.0, split="validation", quiet=True)

@@ -12,8 +12,8 @@ from support import ROOT
 from apex_ompl import evaluation, load_problem, problems
 from apex_ompl.errors import ParameterError
 from apex_ompl.evaluation import Row, Workers, bench, runs
-from apex_ompl.evaluation.accounting import first_path_proof
 from apex_ompl.evaluation.rows import Job
+from apex_ompl.evaluation.runs import first_path_proof
 from apex_ompl.ompl.setup import assemble
 from apex_ompl.ompl.validity import full_check
 from apex_ompl.result import PlanResult

@@ -21,8 +21,8 @@ from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Problem
 from apex_ompl.viz.appearance import CONTACT
 from apex_ompl.viz.view import view
-from apex_ompl.viz.viewer.nodes import paint
 from apex_ompl.viz.viewer.page import FIELD_OF_VIEW, draw, write_page
+from apex_ompl.viz.viewer.scene import paint
 from apex_ompl.viz.viewer.server import serving
 from apex_ompl.viz.viewer.shown import Shown
 

@@ -279,7 +279,7 @@ def test_an_error_of_the_system_names_its_file(
     def fails(_: object) -> int:
         raise error
 
-    monkeypatch.setattr("apex_ompl.cli.listings.schema", fails)
+    monkeypatch.setattr("apex_ompl.cli.commands.schema", fails)
     done = apex_cli("schema")
     assert done.returncode == 2 and one_sentence(done.stderr) and said in done.stderr, done.stderr
     assert "output" not in done.stderr

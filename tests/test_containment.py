@@ -15,7 +15,7 @@ from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.containment import Extent
 from apex_ompl.kernel.compiled.triangle_mesh import encloses
 from apex_ompl.robot import Robot
-from apex_ompl.robot.geometry import link_of
+from apex_ompl.robot.model import link_of
 from apex_ompl.scene.bodies import AttachedObject, Obstacle
 from apex_ompl.scene.meshes import triangles, winding_number
 

@@ -8,7 +8,7 @@ import threading
 
 import pytest
 
-from apex_ompl.util import exiting
+from apex_ompl.util import process
 
 PLANS = """
 import sys, threading, time, apex_ompl
@@ -42,7 +42,7 @@ def test_the_process_ends_in_order_while_a_daemon_thread_plans(planner: str, how
 
 
 def test_what_runs_is_told_to_end_and_waited_for() -> None:
-    work, told, left = exiting._Work(), threading.Event(), threading.Event()
+    work, told, left = process._Work(), threading.Event(), threading.Event()
 
     def runs() -> None:
         with work.running(told.set):
@@ -62,7 +62,7 @@ def test_what_runs_is_told_to_end_and_waited_for() -> None:
 
 
 def test_a_daemon_thread_begins_nothing_any_more() -> None:
-    work, begun = exiting._Work(), threading.Event()
+    work, begun = process._Work(), threading.Event()
     work.end()
 
     def runs() -> None:
@@ -76,7 +76,7 @@ def test_a_daemon_thread_begins_nothing_any_more() -> None:
 
 COMMAND = """
 import atexit, sys, threading, time
-from apex_ompl.util import exiting
+from apex_ompl.util import process
 
 def slow():
     time.sleep(0.3)
@@ -89,13 +89,13 @@ class Freed:
         print("freed")
 kept = Freed()
 kept.self = kept  # freed by the interpreter's end alone
-code = exiting.end_quickly(int(sys.argv[1]))
+code = process.end_quickly(int(sys.argv[1]))
 print("the command")
 {last}
 """
 
 
-@pytest.mark.parametrize(("last", "freed"), [("sys.exit(code)", False), ("exiting._stay(); sys.exit(code)", True)])
+@pytest.mark.parametrize(("last", "freed"), [("sys.exit(code)", False), ("process._stay(); sys.exit(code)", True)])
 @pytest.mark.parametrize("code", [0, 3])
 def test_a_quick_end_waits_for_threads_and_exit_functions(code: int, last: str, freed: bool) -> None:
     script = COMMAND.replace("{last}", last)
@@ -108,7 +108,7 @@ def test_a_quick_end_waits_for_threads_and_exit_functions(code: int, last: str, 
 
 
 def test_a_quick_end_whose_output_nobody_reads_says_so() -> None:
-    script = "import sys; from apex_ompl.util import exiting; print('x' * 9); sys.exit(exiting.end_quickly(0))"
+    script = "import sys; from apex_ompl.util import process; print('x' * 9); sys.exit(process.end_quickly(0))"
     command = ["bash", "-c", f'unset PYTHONUNBUFFERED; {sys.executable} -c "{script}" > /dev/full']
     ended = subprocess.run(command, check=False, capture_output=True, text=True, timeout=60)
     assert ended.returncode == 120 and "No space left" in ended.stderr

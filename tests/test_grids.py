@@ -17,9 +17,8 @@ from apex_ompl.collision.shapes import coal_geometry
 from apex_ompl.errors import FileFormatError
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import Obstacle
-from apex_ompl.scene.grids import parse_surface, surface
+from apex_ompl.scene.grids import parse_octomap, parse_surface, surface
 from apex_ompl.scene.meshes import is_watertight, winding_number
-from apex_ompl.scene.octomap import parse_octomap
 
 
 def volume(corners: np.ndarray) -> float:

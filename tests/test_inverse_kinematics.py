@@ -12,7 +12,7 @@ from apex_ompl.errors import ParameterError, UnknownNameError
 from apex_ompl.goals.inverse_kinematics import Links, in_world
 from apex_ompl.kernel import FixedVector, Target, angle_target, offset_target, opposition_target
 from apex_ompl.robot import Robot, load_robot
-from apex_ompl.robot.assets import DATA
+from apex_ompl.robot.config import DATA
 
 LINKS = {
     "dual_panda_softhand": ("right_hand_index_distal", "left_link5"),  # a finger that follows a synergy, and an arm

@@ -21,9 +21,8 @@ from apex_ompl.scene.problem import Problem
 from apex_ompl.viz.sources import saved_in
 from apex_ompl.viz.view import view
 from apex_ompl.viz.viewer.live_page import LivePage
-from apex_ompl.viz.viewer.nodes import pose_of
 from apex_ompl.viz.viewer.run import ShownRun
-from apex_ompl.viz.viewer.scene import BrowserScene
+from apex_ompl.viz.viewer.scene import BrowserScene, pose_of
 from apex_ompl.viz.viewer.shown import Shown
 
 RED = (0xE0, 0x10, 0x1B)  # of contacts

@@ -11,7 +11,7 @@ from support import CUBE_OBJ
 from apex_ompl import load_problem
 from apex_ompl.errors import ApexError, FileFormatError
 from apex_ompl.robot import Robot, load_robot
-from apex_ompl.robot.assets import DATA
+from apex_ompl.robot.config import DATA
 from apex_ompl.robot.moveit import Conversion, convert
 
 JOINTS = {f"panda_joint{k}": f"left_joint{k}" for k in range(1, 8)}

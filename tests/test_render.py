@@ -13,8 +13,7 @@ from apex_ompl import plan
 from apex_ompl.errors import MissingFileError, ParameterError
 from apex_ompl.ompl.setup import assemble
 from apex_ompl.scene.problem import Problem
-from apex_ompl.viz.render import render
-from apex_ompl.viz.scene_renderer import SceneRenderer
+from apex_ompl.viz.render import SceneRenderer, render
 
 SMALL = (320, 240)
 

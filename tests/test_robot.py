@@ -13,8 +13,7 @@ from apex_ompl import MotionPlanner, PlanStatus, plan
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ApexError, FileFormatError, MissingFileError, RobotError, UnknownNameError
 from apex_ompl.robot import Robot, load_robot, robot_names
-from apex_ompl.robot.assets import DATA, resolve
-from apex_ompl.robot.config import read_config
+from apex_ompl.robot.config import DATA, read_config, resolve
 from apex_ompl.robot.model import build_robot
 from apex_ompl.scene.problem import Problem
 

@@ -19,12 +19,11 @@ from apex_ompl.ompl.setup import assemble
 from apex_ompl.result import PlanResult
 from apex_ompl.robot import Robot, load_robot
 from apex_ompl.scene.scripts import place_at
-from apex_ompl.viz.render import caption, render
-from apex_ompl.viz.scene_renderer import SceneRenderer
+from apex_ompl.viz.plots import _kinds, plot_run
+from apex_ompl.viz.render import SceneRenderer, caption, render
 from apex_ompl.viz.sources import load_saved, robot_of, saved_in, saved_kind
-from apex_ompl.viz.timeline import _kinds, plot_run
 from apex_ompl.viz.viewer.live_page import LivePage
-from apex_ompl.viz.viewer.saved_run import SavedRun, shown_of
+from apex_ompl.viz.viewer.run import SavedRun, shown_of
 
 SMALL = (320, 240)
 

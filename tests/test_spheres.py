@@ -14,7 +14,7 @@ from apex_ompl.collision.cover.solids import solid_of
 from apex_ompl.collision.cover.spheres import Cover, make_cover, quality, read_covers, shape_key, unproved, write_covers
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError
 from apex_ompl.robot import load_robot
-from apex_ompl.robot.assets import DATA
+from apex_ompl.robot.config import DATA
 from apex_ompl.scene.meshes import triangles, winding_number
 
 NAMES = ("dual_panda_softhand", "baxter")

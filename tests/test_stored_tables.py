@@ -11,12 +11,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from apex_ompl.collision import CollisionChecker, stored_tables
+from apex_ompl.collision import CollisionChecker, tables
 from apex_ompl.collision.path_proof import _shapes_of_bodies
 from apex_ompl.kernel.tables import RobotTables
 from apex_ompl.robot import Robot, load_robot
-from apex_ompl.robot.assets import DATA
-from apex_ompl.robot.config import read_config
+from apex_ompl.robot.config import DATA, read_config
 from apex_ompl.robot.model import build_robot
 from apex_ompl.scene.bodies import AttachedObject
 from apex_ompl.util import cache
@@ -72,8 +71,8 @@ def test_tables_from_the_cache_are_those_made_anew(
     made = tables_of(fresh(name), *held)
     assert files_in(folder) == ["shapes", "tables"]
     with monkeypatch.context() as patch:
-        patch.setattr(stored_tables, "make_tables", None)
-        patch.setattr(stored_tables, "shape_arrays", None)
+        patch.setattr(tables, "make_tables", None)
+        patch.setattr(tables, "shape_arrays", None)
         read = tables_of(fresh(name), *held)
     assert_same(read, made)
     monkeypatch.setenv("XDG_CACHE_HOME", "/dev/null")
@@ -144,7 +143,7 @@ def test_changed_inputs_make_other_tables(folder: Path, tmp_path: Path, monkeypa
     bare = build_robot(config.model_copy(update={"covers": None}), DATA / "dual_panda_softhand.robot.yaml")
     assert len(tables_of(bare)[0].arrays.node_radius) != len(tables_of(fresh())[0].arrays.node_radius)
     assert files_in(folder).count("tables") == 5
-    monkeypatch.setattr(stored_tables, "_code", lambda: b"other code")
+    monkeypatch.setattr(tables, "_code", lambda: b"other code")
     tables_of(fresh())
     assert files_in(folder).count("tables") == 6
 

@@ -25,9 +25,8 @@ from apex_ompl.viz.appearance import items_of
 from apex_ompl.viz.sources import saved_in
 from apex_ompl.viz.view import view
 from apex_ompl.viz.viewer.live_page import LivePage
-from apex_ompl.viz.viewer.nodes import RobotNodes, pose_of
 from apex_ompl.viz.viewer.page import write_page
-from apex_ompl.viz.viewer.scene import _cover_of
+from apex_ompl.viz.viewer.scene import RobotNodes, _cover_of, pose_of
 from apex_ompl.viz.viewer.server import HOST, free_port
 from apex_ompl.viz.viewer.shown import Shown, markdown
 

@@ -10,23 +10,54 @@ from __future__ import annotations
 
 import argparse
 import gc
+import io
 import os
 import signal
 import sys
 from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from apex_ompl import __version__
 from apex_ompl.cli.options import LIMITS
-from apex_ompl.cli.streams import open_streams
 from apex_ompl.errors import ApexError
 from apex_ompl.util.process import end_quickly
 
 PROBLEM_HELP = "name of a problem, an id as shelf/hard/900012, or a YAML file"
 RESULT_HELP = "a saved plan or run (.npz, .json, .yaml)"
 GARBAGE = 200_000  # objects between collections of the youngest
+
+
+class _Output(io.FileIO):
+    """Standard output, whose errors name it as those of files name the file."""
+
+    def write(self, data: Any) -> int:
+        """Write bytes."""
+        try:
+            return super().write(data)
+        except OSError as error:
+            error.filename = "output"
+            raise
+
+
+def open_streams() -> None:
+    """Open standard streams that were closed, as daemons do, and give the output its name.
+
+    Closed ones must be opened, in the order of their numbers: the next file that is opened would get the number, and
+    what libraries print would go there.
+    """
+    before: Any = sys.stdout
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, mode))
+    if before is not None:
+        sys.stdout = io.TextIOWrapper(
+            io.BufferedWriter(_Output(before.fileno(), "w", closefd=False)), encoding=before.encoding,
+            errors=before.errors, line_buffering=before.line_buffering, write_through=before.write_through,
+        )  # fmt: skip
+
+
 Commands = argparse._SubParsersAction  # of argparse, which has no public name for it
 
 
@@ -92,7 +123,7 @@ def _parser() -> argparse.ArgumentParser:
         ("info", "print versions and robots"),
         ("schema", "print the JSON schema of problem files"),
     ):
-        commands.add_parser(name, help=text).set_defaults(run=f"listings:{name}")
+        commands.add_parser(name, help=text).set_defaults(run=f"commands:{name}")
     return parser
 
 
@@ -188,7 +219,7 @@ def _add_view(commands: Commands[argparse.ArgumentParser]) -> None:
     parser.add_argument("--no-browser", action="store_true", help="open no browser, only print the address")
     parser.add_argument("-o", "--out", type=Path, metavar="FILE", help="write a page that plays offline: .html")
     parser.add_argument("--cover", action="store_true", help="with --out: the sphere cover as a layer of the page")
-    parser.set_defaults(run="view:run")
+    parser.set_defaults(run="pictures:view")
 
 
 def _add_convert(commands: Commands[argparse.ArgumentParser]) -> None:
@@ -199,7 +230,7 @@ def _add_convert(commands: Commands[argparse.ArgumentParser]) -> None:
     parser.add_argument("--robot", default="dual_panda_softhand", help="robot name or file (default: %(default)s)")
     parser.add_argument("--joint", action="append", default=[], metavar="THEIRS=OURS", help="a joint by another name")
     parser.add_argument("--frame", action="append", default=[], metavar="THEIRS=OURS", help="a frame by another name")
-    parser.set_defaults(run="convert:run")
+    parser.set_defaults(run="commands:convert")
 
 
 def _add_benchmark(commands: Commands[argparse.ArgumentParser]) -> None:
@@ -223,14 +254,14 @@ def _add_benchmark(commands: Commands[argparse.ArgumentParser]) -> None:
         "--keep", action="store_true", help="store each run's path, for apex-ompl render and PlanResult.load"
     )
     parser.add_argument("--quiet", action="store_true", help="show no progress")
-    parser.set_defaults(run="benchmark:bench")
+    parser.set_defaults(run="commands:bench")
     parser = commands.add_parser("report", help="write an HTML page and Markdown of results of bench")
     parser.add_argument("results", type=Path, metavar="RESULTS", help="folder that bench wrote")
     parser.add_argument("-o", "--out", type=Path, required=True, metavar="DIR", help="gets report.html and report.md")
-    parser.set_defaults(run="benchmark:report")
+    parser.set_defaults(run="commands:report")
 
 
 def _add_check(commands: Commands[argparse.ArgumentParser]) -> None:
     parser = commands.add_parser("check", help="validate a problem, and say whether start and goal are free")
     parser.add_argument("problem", help=PROBLEM_HELP)
-    parser.set_defaults(run="check:run")
+    parser.set_defaults(run="commands:check")

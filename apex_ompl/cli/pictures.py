@@ -1,4 +1,4 @@
-"""The commands ``apex-ompl render`` and ``apex-ompl plot``."""
+"""The commands that show problems and results: ``render``, ``plot`` and ``view``."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from pathlib import Path
 
 from apex_ompl.api import load_problem
 from apex_ompl.cli.options import import_extra
+from apex_ompl.errors import ParameterError
 from apex_ompl.loop.result import RunResult
 from apex_ompl.result import PlanResult
 from apex_ompl.scene.problem import Problem
@@ -28,10 +29,30 @@ def plot(parsed: argparse.Namespace) -> int:
     check_writable(parsed.out)
     result = load_saved(parsed.result)
     if isinstance(result, RunResult):
-        import_extra("apex_ompl.viz.timeline", "pictures", "viz").plot_run(result, parsed.out)
+        plots.plot_run(result, parsed.out)
     else:
         plots.plot_motion(result, parsed.out)
     print(parsed.out)
+    return 0
+
+
+def view(parsed: argparse.Namespace) -> int:
+    """Show problems, plans or runs in a browser, or write them as a page."""
+    module = import_extra("apex_ompl.viz.view", "pages", "view")
+    module.import_viser()
+    folders = [source for source in parsed.sources if Path(source).is_dir()]
+    if folders and len(parsed.sources) > 1:
+        raise ParameterError("sources", folders[0], "a folder alone, or problems and results")
+    if folders:
+        sources: Path | list[PlanResult | RunResult | Problem] = Path(folders[0])
+    else:
+        sources = [load_source(one) for one in parsed.sources]
+    module.view(
+        sources, parsed.out, port=parsed.port, cover=parsed.cover, opened=not parsed.no_browser,
+        ready=lambda said: print(said, flush=True),
+    )  # fmt: skip
+    if parsed.out is not None:
+        print(parsed.out)
     return 0
 
 

@@ -17,7 +17,7 @@ from apex_ompl.collision.containment import ContainmentTest, containment_tests
 from apex_ompl.collision.shapes import cloud_of
 from apex_ompl.collision.solids import Distance, Solid, closest, hull_distance, overlaps, transform, world_boxes
 from apex_ompl.robot import Robot
-from apex_ompl.robot.geometry import link_of
+from apex_ompl.robot.model import link_of
 from apex_ompl.scene.bodies import AttachedObject
 from apex_ompl.types import Array
 from apex_ompl.util.forking import ProcessLock

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from apex_ompl.evaluation.driver import bench
+from apex_ompl.evaluation.driver import Workers, bench
 from apex_ompl.evaluation.log import write_database, write_logs
 from apex_ompl.evaluation.page import markdown, report
 from apex_ompl.evaluation.results import Results
 from apex_ompl.evaluation.rows import Row
-from apex_ompl.evaluation.workers import Workers
 
 __all__ = ["Results", "Row", "Workers", "bench", "markdown", "report", "write_database", "write_logs"]

@@ -1,4 +1,7 @@
-"""Single runs of a benchmark: ``plan`` with OMPL's solve inside of OMPL's Benchmark, or a row's own function."""
+"""Single runs of a benchmark: ``plan`` with OMPL's solve inside of OMPL's Benchmark, or a row's own function.
+
+The time to the first path is counted the same way for every planner (:func:`first_path_proof`).
+"""
 
 from __future__ import annotations
 
@@ -16,12 +19,13 @@ from ompl import tools as ot
 
 from apex_ompl import planners
 from apex_ompl.api import load_problem
+from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ApexError
-from apex_ompl.evaluation.accounting import PROOF, first_path_proof
 from apex_ompl.evaluation.rows import Job, load_runner
 from apex_ompl.ompl.process import quiet_ompl, seed_ompl
 from apex_ompl.ompl.report import SolveReport, report_of
 from apex_ompl.ompl.setup import assemble
+from apex_ompl.ompl.validity import full_check
 from apex_ompl.paths.path import path_length
 from apex_ompl.planning import PlanRun, finish, plan_among_dynamic_obstacles, query_fault, solve, with_exact_ends
 from apex_ompl.planning.among_dynamic_obstacles import STAGES
@@ -36,15 +40,45 @@ from apex_ompl.timing.smoothness import jerk
 from apex_ompl.types import Array
 from apex_ompl.util.clocks import Deadline
 
-Run = dict[str, Any]
-"""A run as it is stored, ready for JSON."""
-
+PROOF = ("verify", "repair")
+"""Stages behind a planner that make its path an exact solution."""
 MEMORY = 16_384.0  # limit of a run [MB]
 UPDATES = 0.05  # period at which a planner's progress is read [s]
 LOOK = 0.1  # period at which OMPL's Benchmark looks whether a planner's time is up [s]
 RESULT = "result"
 NO_PROBLEM, CRASH = "NO_PROBLEM", str(PlanStatus.CRASH)
 WARM_UP = "wall/easy/800000"
+
+
+def first_path_proof(
+    checker: CollisionChecker, raw: Array | None, start: Array, goals: Sequence[Array] | Array,
+    times: Mapping[str, float],
+) -> float:  # fmt: skip
+    """Return the time of the proof by which a first path counts as found [s].
+
+    A first path counts when it has passed the full check. Where the returned path needed a repair, the path as the
+    planner found it may pass without one: then its own full check counts, which is made and timed here. Otherwise the
+    check and repair of the returned path count. The first-path time of a run is the time until the planner has a path,
+    plus this.
+
+    Args:
+        checker: Collision checker.
+        raw: Path as the planner found it, with the exact start and goal, shape (N, dof); None where it is not known.
+        start: Start, shape (dof,).
+        goals: Goals, each of shape (dof,).
+        times: Times of the stages of the run [s], with ``verify``, and ``repair`` where there was one.
+    """
+    verify = times.get("verify", 0.0)
+    if "repair" not in times or raw is None:
+        return verify
+    started = time.perf_counter()
+    passes = full_check(checker, raw, start, goals)
+    return time.perf_counter() - started if passes else verify + times["repair"]
+
+
+Run = dict[str, Any]
+"""A run as it is stored, ready for JSON."""
+
 
 _robots: dict[str, Robot] = {}
 

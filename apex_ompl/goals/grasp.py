@@ -13,7 +13,7 @@ from apex_ompl.collision.mesh_stage import exact_requests
 from apex_ompl.collision.shapes import coal_geometry
 from apex_ompl.errors import SceneError, UnknownNameError
 from apex_ompl.robot import Robot
-from apex_ompl.robot.geometry import link_of
+from apex_ompl.robot.model import link_of
 from apex_ompl.scene.bodies import AttachedObject
 from apex_ompl.types import Array
 from apex_ompl.util.display import fields_line

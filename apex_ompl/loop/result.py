@@ -91,7 +91,7 @@ class RunResult:
         metrics: Numbers by name: ``time_to_goal`` [s], ``rest_time`` [s], ``stops``, ``replans_asked``,
             ``replans_accepted``, ``clearance`` [m], ``reaction_p95`` [s], ``broken_steps``, ``unguarded_steps``, ...
         settings: Those of the loop and of the sensor, and the version of the table of costs; JSON's.
-        robot_digest: Digest of the robot, see :func:`apex_ompl.robot.identity.digest`; empty where it is not known.
+        robot_digest: Digest of the robot, see :func:`apex_ompl.robot.model.digest`; empty where it is not known.
     """
 
     outcome: Outcome

@@ -28,8 +28,7 @@ from apex_ompl.ompl.setup import assemble
 from apex_ompl.problems import worlds
 from apex_ompl.problems.world_scripts import moving_world
 from apex_ompl.problems.worlds import World
-from apex_ompl.robot.identity import digest
-from apex_ompl.robot.model import Limits
+from apex_ompl.robot.model import Limits, digest
 from apex_ompl.scene.problem import Problem
 from apex_ompl.scene.scripts import obstacle_at
 from apex_ompl.timing import Timing, Trajectory

@@ -1,14 +1,17 @@
-"""Robot files: URDF parts, planned joints, limits, fixtures and disabled collision pairs."""
+"""Robot files: URDF parts, planned joints, limits, fixtures and disabled collision pairs, and where files are found."""
 
 from __future__ import annotations
 
+import os
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
 from pydantic import Field, PositiveFloat, model_validator
 
-from apex_ompl.errors import FileFormatError
+from apex_ompl.errors import FileFormatError, MissingFileError
 from apex_ompl.scene.bodies import Body, Name, Quaternion, Vector, located
+from apex_ompl.util.files import is_file
 from apex_ompl.util.schema import StrictModel, read_yaml, validate
 
 SCHEMA = "apex-ompl/robot/1"
@@ -17,6 +20,8 @@ PAIRS_SCHEMA = "apex-ompl/disabled-pairs/1"
 
 WIDEST = 1e4
 """Largest position of a joint [rad or m]; sines of larger ones are not exact enough for proofs."""
+DATA = Path(__file__).parent / "data"
+EXTRA = "example-robot-data"  # the package of the extra
 
 
 class Part(StrictModel):
@@ -155,3 +160,46 @@ def read_disabled_pairs(path: Path) -> list[tuple[str, str]]:
     """
     data = read_yaml(path, "file of disabled pairs")
     return [pair.links for pair in validate(DisabledPairs, data, str(path)).pairs]
+
+
+@cache
+def package_roots() -> tuple[Path, ...]:
+    """Folders in which ``package://NAME/...`` is looked up, in order.
+
+    They are the entries of ``ROS_PACKAGE_PATH``, then the folder of this package that has the Panda, then the ``share``
+    folder that belongs to the installed Pinocchio (the PyPI wheel of ``example-robot-data`` has no Python module and
+    installs its files there).
+    """
+    import pinocchio
+
+    roots = [Path(p) for p in os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep) if p]
+    roots.append(DATA / "packages")
+    roots += [parent / "share" for parent in Path(pinocchio.__file__).resolve().parents]
+    return tuple(root for root in roots if root.is_dir())
+
+
+def resolve(uri: str, relative_to: Path, role: str) -> Path:
+    """Return the file that ``uri`` names.
+
+    Args:
+        uri: ``package://NAME/path``, ``file:///path``, an absolute path, or a path relative to
+            ``relative_to``.
+        relative_to: Folder for relative paths.
+        role: Description of the file for the error.
+
+    Raises:
+        MissingFileError: No such file.
+    """
+    if uri.startswith("package://"):
+        rest = uri.removeprefix("package://")
+        for root in package_roots():
+            if is_file(root / rest):
+                return root / rest
+        package = rest.split("/", 1)[0]
+        extra = ", as the extra 'robots' of apex_ompl does" if package == EXTRA else ""
+        raise MissingFileError(uri, role, f"not under any package folder; is {package!r} installed{extra}?")
+    path = Path(uri.removeprefix("file://"))
+    path = path if path.is_absolute() else relative_to / path
+    if not is_file(path):
+        raise MissingFileError(str(path), role)
+    return path

@@ -1,28 +1,73 @@
-"""The robot: a Pinocchio model with an order of its joints in states, limits, links and collision pairs."""
+"""Robots: kinematic model, collision geometry and checked pairs, limits, hands, and identity.
+
+The identity of a robot is a digest of everything that plans depend on. It tells whether the robot that a file describes
+is the one that a result was made with.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import hashlib
+import re
+import xml.etree.ElementTree as ET
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
+from itertools import combinations
 from pathlib import Path
+from weakref import WeakKeyDictionary
 
+import coal
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
 from apex_ompl.errors import FileFormatError, RobotError, UnknownNameError
-from apex_ompl.robot.assets import DATA, resolve
 from apex_ompl.robot.compose import compose
-from apex_ompl.robot.config import WIDEST, Hand, RobotConfig, read_config, read_disabled_pairs
-from apex_ompl.robot.geometry import check_geometry, pair_up
+from apex_ompl.robot.config import DATA, WIDEST, Hand, RobotConfig, read_config, read_disabled_pairs, resolve
 from apex_ompl.scene.bodies import Body
+from apex_ompl.scene.meshes import extent_fault
 from apex_ompl.types import Array
 from apex_ompl.util.display import counted, html_table, one_line
+from apex_ompl.util.schema import StrictModel
 from apex_ompl.util.validation import number_array, shape_error
 
 SHORTEST_RAMP = 1e-6  # from no acceleration to the largest, for motions whose knots have distinct times [s]
 LIMIT_SLACK = 1e-3  # by which a joint of a start or a goal may be outside its limits [rad; synergies 0..1]
+FILE_NAME = re.compile(r'filename="([^"]*)"')
+PIECE = 2**17  # of a file that is read at once [bytes]
+
+
+def link_of(model: pin.Model, item: pin.GeometryObject) -> str:
+    """Return the name of the link that a geometry belongs to."""
+    return str(model.frames[item.parentFrame].name)
+
+
+def check_geometry(model: pin.Model, geometry: pin.GeometryModel, urdf: str, path: Path) -> None:
+    """Raise a RobotError if Pinocchio has dropped collision geometry, or if a collision mesh is not a solid."""
+    found = Counter(link_of(model, item) for item in geometry.geometryObjects)
+    for link in ET.fromstring(urdf).findall("link"):
+        name, wanted = str(link.get("name")), len(link.findall("collision"))
+        if found[name] != wanted:
+            raise RobotError(f"{path}: link {name!r} has {wanted} collision geometries, {found[name]} can be read")
+    for item in geometry.geometryObjects:
+        mesh = item.geometry
+        fault = extent_fault(np.array(mesh.vertices())) if mesh.getObjectType() == coal.OT_BVH else ""
+        if fault:
+            raise RobotError(f"{path}: the collision mesh of link {link_of(model, item)!r} has {fault}")
+
+
+def pair_up(model: pin.Model, geometry: pin.GeometryModel, disabled: Sequence[tuple[str, str]]) -> None:
+    """Add a collision pair for any two geometries that move relative to each other and are not disabled."""
+    skip = {frozenset(pair) for pair in disabled}
+    items = list(geometry.geometryObjects)
+    for i, j in combinations(range(len(items)), 2):
+        a, b = items[i], items[j]
+        if a.parentJoint == b.parentJoint:  # rigidly joined, or both fixed to the world
+            continue
+        if frozenset((link_of(model, a), link_of(model, b))) in skip:
+            continue
+        geometry.addCollisionPair(pin.CollisionPair(i, j))
 
 
 @dataclass(frozen=True)
@@ -338,3 +383,58 @@ def _limits(config: RobotConfig, model: pin.Model, path: Path) -> Limits:
             raise FileFormatError(str(path), f"joints.{name}", [low, high], f"expected limits within {WIDEST:g}")
         rows.append((low, high, speed, joint.acceleration, joint.jerk))
     return Limits(*(np.array(column, float) for column in zip(*rows, strict=True)))
+
+
+_digests: WeakKeyDictionary[Robot, str] = WeakKeyDictionary()
+
+
+def digest(robot: Robot) -> str:
+    """Return a digest of what plans depend on: kinematics, meshes, limits, checked pairs and fixtures."""
+    if robot not in _digests:
+        found = hashlib.sha256(FILE_NAME.sub(lambda match: Path(match[1]).name, robot.urdf).encode())
+        for file in sorted(set(FILE_NAME.findall(robot.urdf)), key=lambda file: Path(file).name):
+            path = Path(file.removeprefix("file://"))
+            if path.is_file():
+                _update(found, path)
+            else:
+                found.update(file.encode())
+        pairs = [(pair.first, pair.second) for pair in robot.geometry.collisionPairs]
+        found.update(_spelled((robot.name, robot.joint_names, pairs, robot.fixtures)).encode())
+        for array in vars(robot.limits).values():
+            found.update(array.tobytes())
+        _digests[robot] = found.hexdigest()[:16]
+    return _digests[robot]
+
+
+def _spelled(value: object) -> str:
+    """Return ``repr`` of plain data with records in full, all of their fields: digests are stored in results."""
+    if isinstance(value, StrictModel):
+        return f"{type(value).__name__}({', '.join(f'{name}={_spelled(inner)}' for name, inner in value)})"
+    if type(value) is tuple:
+        return f"({', '.join(map(_spelled, value))}{',' * (len(value) == 1)})"
+    return repr(value)
+
+
+def _update(digest: hashlib._Hash, path: Path) -> None:
+    """Add the content of a file, piece by piece: the memory for a whole one takes longer than the digest."""
+    buffer = memoryview(bytearray(PIECE))
+    with path.open("rb", buffering=0) as file:
+        while count := file.readinto(buffer):
+            digest.update(buffer[:count])
+
+
+def load_same_robot(name_or_path: str, wanted: str) -> Robot:
+    """Load the robot of a result.
+
+    Args:
+        name_or_path: Its name, or its file.
+        wanted: The digest that it had; empty for results that have none.
+
+    Raises:
+        RobotError: It is another one by now.
+        ApexError: It cannot be loaded.
+    """
+    robot = load_robot(name_or_path)
+    if wanted and digest(robot) != wanted:
+        raise RobotError(f"the robot {name_or_path!r} is no longer the one that the result was made with")
+    return robot

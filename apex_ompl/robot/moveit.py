@@ -2,16 +2,18 @@
 
 The messages are ``moveit_msgs/PlanningScene`` (or its ``world`` alone) and ``moveit_msgs/MotionPlanRequest``, in either
 of two spellings: poses as lists or as x/y/z(/w) mappings, primitive types by name or by number. The pose of a primitive
-is composed with that of its object and of the object's frame; every primitive of an object becomes an obstacle. Content
-that would change the problem and is not supported is an error that names it. Content that is left out without effect
-is listed in the notes.
+is composed with that of its object and of the object's frame; every primitive of an object becomes an obstacle. Allowed
+collision matrices (``moveit_msgs/AllowedCollisionMatrix``) become pairs of bodies that may touch. Content that would
+change the problem and is not supported is an error that names it. Content that is left out without effect is listed in
+the notes.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -19,19 +21,171 @@ import numpy as np
 
 from apex_ompl.errors import FileFormatError, UnknownNameError
 from apex_ompl.robot import Robot
-from apex_ompl.robot.assets import resolve
-from apex_ompl.robot.moveit_allowed import MATRIX, allowed_pairs
-from apex_ompl.robot.moveit_messages import MessageReader, inside
+from apex_ompl.robot.config import resolve
+from apex_ompl.robot.model import link_of
 from apex_ompl.scene.bodies import AttachedObject, BodyT, Obstacle, pose_fields, pose_matrix
 from apex_ompl.scene.problem import Goal, Problem
 from apex_ompl.types import Array
 from apex_ompl.util.schema import read_yaml, validate
-from apex_ompl.util.validation import is_integer
+from apex_ompl.util.validation import is_integer, is_number
 
+MATRIX = "allowed_collision_matrix"
 PRIMITIVES = {1: "box", 2: "sphere", 3: "cylinder", 4: "cone"}
 ADD, REMOVE = 0, 1  # operations of moveit_msgs/CollisionObject
 WORLD_FRAMES = ("", "world", "map")
 HARMLESS = ("workspace_parameters", "planner_id", "num_planning_attempts", "allowed_planning_time", "pipeline_id")
+
+
+@dataclass
+class MessageReader:
+    """Reads parts of the messages in a file; all methods raise a FileFormatError where a part has another form."""
+
+    file: Path
+
+    def fail(self, where: str, value: object, expected: str) -> FileFormatError:
+        """Return the error of a value in the file."""
+        return FileFormatError(str(self.file), where, value, expected)
+
+    def section(self, data: Mapping[str, Any], key: str, where: str = "") -> Mapping[str, Any]:
+        """Return a mapping inside a message, empty where it is not given."""
+        found = data.get(key)
+        if found is not None and not isinstance(found, Mapping):
+            raise self.fail(inside(where, key), found, "expected a mapping of keys to values")
+        return found or {}
+
+    def entries(self, data: Mapping[str, Any], key: str, where: str = "") -> list[Any]:
+        """Return a list inside a message, empty where it is not given."""
+        found = data.get(key)
+        if found is not None and not isinstance(found, list):
+            raise self.fail(inside(where, key), found, "expected a list")
+        return found or []
+
+    def messages(self, data: Mapping[str, Any], key: str, where: str = "") -> list[Mapping[str, Any]]:
+        """Return a list of messages inside a message, empty where it is not given."""
+        found = self.entries(data, key, where)
+        for k, item in enumerate(found):
+            if not isinstance(item, Mapping):
+                raise self.fail(f"{inside(where, key)}.{k}", item, "expected a mapping of keys to values")
+        return found
+
+    def number(self, value: Any, where: str) -> float:
+        """Return a finite number."""
+        if not is_number(value) or not np.isfinite(value):
+            raise self.fail(where, value, "expected a finite number")
+        return float(value)
+
+    def flag(self, value: Any, where: str) -> bool:
+        """Return a truth value, which a text such as ``"false"`` is not."""
+        if not isinstance(value, bool):
+            raise self.fail(where, value, "expected true or false")
+        return value
+
+    def numbers(self, data: Any, keys: str, default: Sequence[float], where: str) -> Array:
+        """Return an array of finite numbers, given as a list or by their keys.
+
+        Args:
+            data: The message.
+            keys: Their keys, one letter each.
+            default: Values of those that are not given.
+            where: Place of the message in the file.
+
+        Raises:
+            FileFormatError: It holds something else.
+        """
+        if data is None:
+            return np.array(default)
+        values = [data.get(k, d) for k, d in zip(keys, default, strict=True)] if isinstance(data, Mapping) else data
+        numbers = isinstance(values, list) and len(values) == len(keys) and all(map(is_number, values))
+        if not numbers or not np.isfinite(values).all():
+            raise self.fail(where, data, f"expected {len(keys)} finite numbers")
+        return np.array(values, float)
+
+
+def inside(where: str, key: str) -> str:
+    """Return the dotted path of a key inside a part of a file."""
+    return f"{where}.{key}" if where else key
+
+
+Pair = tuple[str, str]
+
+
+def allowed_pairs(
+    reader: MessageReader, matrix: Mapping[str, Any], robot: Robot, bodies: Sequence[str], names: Mapping[str, str]
+) -> tuple[list[Pair], list[str]]:
+    """Return the pairs that a matrix lets touch and that are checked here, and names that are no link or object.
+
+    An object of several shapes stands for all of them. A name with a default that allows may touch whatever no entry
+    keeps it from.
+
+    Args:
+        reader: Reader of the scene's file.
+        matrix: The matrix; may be empty.
+        robot: The robot.
+        bodies: Names of the obstacles and held objects.
+        names: Link in the file -> link of ``robot``.
+
+    Raises:
+        FileFormatError: The matrix is not square, or has other faults; a value that is neither true nor false is named
+            with its two entries.
+    """
+    entries = [str(name) for name in reader.entries(matrix, "entry_names", MATRIX)]
+    given = reader.entries(matrix, "entry_values", MATRIX)
+    if given and all(isinstance(row, list) for row in given):  # as MotionBenchMaker writes them
+        rows = given
+    else:
+        rows = [
+            reader.entries(row, "enabled", f"{MATRIX}.entry_values.{k}")
+            for k, row in enumerate(reader.messages(matrix, "entry_values", MATRIX))
+        ]
+    if [len(row) for row in rows] != [len(entries)] * len(entries):
+        expected = f"expected {len(entries)} rows of {len(entries)} values, one for each of entry_names"
+        raise reader.fail(f"{MATRIX}.entry_values", len(rows), expected)
+    flags = [
+        [
+            reader.flag(value, f"{MATRIX}.entry_values.{k}.{j} ({entries[k]}, {entries[j]})")
+            for j, value in enumerate(row)
+        ]
+        for k, row in enumerate(rows)
+    ]
+    defaults = [str(name) for name in reader.entries(matrix, "default_entry_names", MATRIX)]
+    values = reader.entries(matrix, "default_entry_values", MATRIX)
+    if len(values) != len(defaults):
+        raise reader.fail(f"{MATRIX}.default_entry_values", len(values), f"expected {len(defaults)} values")
+    usual = [
+        reader.flag(value, f"{MATRIX}.default_entry_values.{k} ({name})")
+        for k, (name, value) in enumerate(zip(defaults, values, strict=True))
+    ]
+    known = (*dict.fromkeys((*robot.link_names, *bodies)),)
+    ours = {name: _bodies_of(names.get(name, name), known) for name in (*entries, *defaults)}
+    unknown = sorted(name for name, found in ours.items() if not found)
+    allowed, kept_apart = set[Pair](), set[Pair]()
+    for i, j in product(range(len(entries)), repeat=2):
+        if i != j:
+            pairs = set(map(_sorted, product(ours[entries[i]], ours[entries[j]])))
+            allowed, kept_apart = (allowed | pairs, kept_apart) if flags[i][j] else (allowed, kept_apart | pairs)
+    for name, value in zip(defaults, usual, strict=True):
+        if value:
+            allowed |= set(map(_sorted, product(ours[name], known))) - kept_apart
+    links = set(robot.link_names)
+    checked = _pairs_of_links(robot)
+    return sorted(p for p in allowed if p[0] != p[1] and (p in checked or not links.issuperset(p))), unknown
+
+
+def _sorted(pair: Iterable[str]) -> Pair:
+    first, second = sorted(pair)
+    return first, second
+
+
+def _bodies_of(name: str, known: Iterable[str]) -> list[str]:
+    """Return the bodies that an object or link of a file stands for; several where it has several shapes."""
+    label = re.sub(r"[^A-Za-z0-9_.-]+", "_", name.strip()).strip("_.-")
+    return [body for body in known if body in (name, label) or re.fullmatch(rf"{re.escape(label)}/\d+", body)]
+
+
+def _pairs_of_links(robot: Robot) -> set[Pair]:
+    """Return the pairs of links that the robot checks against each other."""
+    links = [link_of(robot.model, item) for item in robot.geometry.geometryObjects]
+    return {_sorted((links[p.first], links[p.second])) for p in robot.geometry.collisionPairs}
 
 
 @dataclass

@@ -105,7 +105,7 @@ class GridFile(StrictModel):
 
 
 class VoxelFile(GridFile):
-    """Cells of a grid that are full, from a file, which may be a map of OctoMap (:mod:`apex_ompl.scene.octomap`)."""
+    """Cells of a grid that are full, from a file, which may be a map of OctoMap (:mod:`apex_ompl.scene.grids`)."""
 
     file: Annotated[str, _ending_in(VOXEL_SUFFIXES, "file of voxels")]
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from apex_ompl.errors import FileFormatError, ParameterError
-from apex_ompl.scene.ply import parse_ply
+from apex_ompl.scene.mesh_files import parse_ply
 from apex_ompl.types import Array
 from apex_ompl.util.files import BROKEN
 from apex_ompl.util.validation import check_array, check_integer, finite_array, number_array, rigid_pose

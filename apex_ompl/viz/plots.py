@@ -1,25 +1,38 @@
-"""Plots of timed motions."""
+"""Plots over time: a timed motion against its limits with its clearance, and the time line of a run."""
 
 from __future__ import annotations
 
 import io
 import os
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
+from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ParameterError
+from apex_ompl.loop.result import RunResult
+from apex_ompl.moving.scripted import ScriptedDynamicObstacles
 from apex_ompl.ompl.setup import assemble
 from apex_ompl.result import PlanResult
-from apex_ompl.robot.identity import load_same_robot
+from apex_ompl.robot import Robot
+from apex_ompl.robot.model import load_same_robot
+from apex_ompl.timing.rests import rests
+from apex_ompl.types import Array
 from apex_ompl.util.files import suffix_of, write_atomically
-from apex_ompl.viz.appearance import CLEARANCE_COLORS
-from apex_ompl.viz.curves import ORDERS, clearances, shares_of_limits
+from apex_ompl.viz.appearance import CLEARANCE_COLORS, EVENT_COLORS, SILENT_EVENTS, WAY_COLORS
+from apex_ompl.viz.sources import ORDERS, clearances, robot_of, shares_of_limits
 
 FORMATS = (".png", ".pdf", ".svg")
 TIME_STEP, MAX_SAMPLES = 0.002, 4000  # of a curve [s]
 CLEARANCE_SAMPLES = 128
+RUN_TIME_STEP = 0.005  # of the curves of a run [s]
+MARGIN = 0.01  # beside the run, as a share of its duration
+JOINTS = 4  # that have curves of their own, those that come nearest to their limits
+FARTHEST = 0.5  # distance that is shown at most, where the least one is below it [m]
+REST, LARGEST, SEEN = "#dfe3e8", "#30343b", "#b9bec7"  # colors: bands of rest, the largest speed, observations
+MARKS = ("goal", "contact")  # events that are lines through all rows
 
 
 def plot_motion(result: PlanResult, out: str | os.PathLike[str]) -> None:
@@ -80,3 +93,109 @@ def plot_motion(result: PlanResult, out: str | os.PathLike[str]) -> None:
     buffer = io.BytesIO()
     figure.savefig(buffer, format=suffix[1:], dpi=100)
     write_atomically(path, buffer.getvalue())
+
+
+def plot_run(result: RunResult, out: str | os.PathLike[str]) -> None:
+    """Draw the time line of a run.
+
+    The rows are the events by kind; the largest joint speed as a share of its limit, with the joints that come nearest
+    to theirs, and bands where the robot stands; and the distance to obstacles that move, a lower bound by the sphere
+    cover.
+
+    Args:
+        result: The run.
+        out: Picture to write, .png, .pdf or .svg.
+
+    Raises:
+        ParameterError: ``out`` has another suffix, or the motion is one of other joints.
+        MissingFileError: The file cannot be written.
+        ApexError: The robot or the problem of the run cannot be loaded.
+    """
+    path = Path(out)
+    suffix = suffix_of(path, FORMATS)
+    robot = robot_of(result)
+    motion = result.trajectory
+    end = max([motion.duration, *(event.time for event in result.events)])
+    times = np.linspace(0.0, end, int(np.clip(np.ceil(end / RUN_TIME_STEP), 1, MAX_SAMPLES)) + 1)
+    kinds = _kinds(result)
+    figure = Figure(figsize=(10.0, 4.6 + 0.22 * len(kinds)), layout="constrained")
+    events, speeds, distance = figure.subplots(
+        3, 1, sharex=True, height_ratios=[0.3 + 0.22 * len(kinds), 2.2, 1.6], squeeze=True
+    )
+    _draw_events(events, result, kinds)
+    _draw_speeds(speeds, result, robot, times)
+    _draw_distance(distance, result, robot, times)
+    for axis in (events, speeds, distance):
+        for event in result.events:
+            if event.kind in MARKS:
+                axis.axvline(event.time, color=EVENT_COLORS[event.kind], linewidth=1.2)
+        axis.tick_params(labelsize=8)
+    distance.set(xlabel="time s", xlim=(-MARGIN * end, (1.0 + MARGIN) * max(end, RUN_TIME_STEP)))
+    figure.suptitle(_title(result), fontsize=10, wrap=True)
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format=suffix[1:], dpi=110)
+    write_atomically(path, buffer.getvalue())
+
+
+def _title(result: RunResult) -> str:
+    head = f"{result.problem.name}: {result.outcome}, {result.method}, prediction {result.prediction}"
+    return f"{head}\n{result.reason}" if result.reason else head
+
+
+def _kinds(result: RunResult) -> list[str]:
+    """Return the kinds of events in the order of their rows, the last one at the top; reactions have none."""
+    there = {event.kind for event in result.events} - {"reaction"}
+    known = ("observation", *EVENT_COLORS)
+    return [*(kind for kind in known if kind in there), *sorted(there.difference(known))][::-1]
+
+
+def _draw_events(axis: Any, result: RunResult, kinds: list[str]) -> None:
+    for row, kind in enumerate(kinds):
+        times = [event.time for event in result.events if event.kind == kind]
+        color = SEEN if kind in SILENT_EVENTS else EVENT_COLORS.get(kind, LARGEST)
+        marker, size = ("|", 5.0) if kind in SILENT_EVENTS else ("o", 5.5)
+        axis.plot(times, np.full(len(times), row), marker, color=color, markersize=size)
+    axis.set(yticks=range(len(kinds)), yticklabels=kinds, ylim=(-0.6, max(len(kinds), 1) - 0.4))
+    axis.grid(alpha=0.25)
+
+
+def _draw_speeds(axis: Any, result: RunResult, robot: Robot, times: Array) -> None:
+    shares = np.abs(result.trajectory(times, 1)) / robot.limits.velocity
+    _draw_rests(axis, result)
+    largest = shares.max(axis=1)
+    axis.fill_between(times, largest, color=LARGEST, alpha=0.10, linewidth=0.0)
+    axis.plot(times, largest, color=LARGEST, linewidth=1.6, label="largest")
+    order = np.argsort(-shares.max(axis=0), kind="stable")[:JOINTS].tolist()
+    for joint, color in zip(order, WAY_COLORS, strict=False):
+        axis.plot(times, shares[:, joint], color=color, linewidth=0.8, label=robot.joint_names[joint])
+    axis.axhline(1.0, color="black", linewidth=0.8, linestyle="--")
+    axis.set(ylim=(0.0, 1.3), ylabel="speed\nshare of limit", yticks=np.linspace(0.0, 1.0, 6))
+    axis.legend(fontsize=7, ncols=JOINTS + 2, loc="upper center", frameon=False)
+    axis.grid(alpha=0.25)
+
+
+def _draw_rests(axis: Any, result: RunResult) -> None:
+    """Draw bands where the robot stands."""
+    label = "at rest"
+    for begin, end in rests(result.trajectory).tolist():
+        if end > begin:
+            axis.axvspan(begin, end, color=REST, linewidth=0.0, label=label)
+            label = ""
+
+
+def _draw_distance(axis: Any, result: RunResult, robot: Robot, times: Array) -> None:
+    dynamic = [obstacle for obstacle in result.problem.scene if obstacle.moving]
+    _draw_rests(axis, result)
+    kernel = CollisionChecker(robot, (), result.problem.attached).kernel
+    found = ScriptedDynamicObstacles(kernel, dynamic, result.problem.allowed).clearances(result.trajectory, times)
+    shown = np.where(np.isfinite(found), found, np.nan)
+    axis.axhline(0.0, color="black", linewidth=0.8)
+    if np.isfinite(shown).any():
+        axis.plot(times, 1e3 * shown, color=CLEARANCE_COLORS[0], linewidth=1.3)
+        low, high = float(np.nanmin(shown)), float(np.nanmax(shown))
+        top = min(high, FARTHEST) if low < FARTHEST else high
+        axis.set_ylim(1e3 * min(1.1 * low, -0.05 * top), 1e3 * 1.05 * top)
+    else:
+        axis.text(0.5, 0.5, "no obstacle moves", transform=axis.transAxes, ha="center", va="center", fontsize=9)
+    axis.set_ylabel("distance to dynamic obstacles\nby spheres, mm")
+    axis.grid(alpha=0.25)

@@ -14,7 +14,7 @@ from apex_ompl.result import PlanResult
 from apex_ompl.scene.problem import Problem
 from apex_ompl.util.files import check_writable
 from apex_ompl.viz.sources import load_saved, saved_in
-from apex_ompl.viz.viewer.saved_run import shown_of
+from apex_ompl.viz.viewer.run import shown_of
 from apex_ompl.viz.viewer.server import HOST, import_viser, serving
 from apex_ompl.viz.viewer.shown import Shown
 

@@ -18,8 +18,8 @@ from apex_ompl.planning import MotionPlanner
 from apex_ompl.scene.bodies import pose_fields
 from apex_ompl.scene.problem import PoseTarget, Problem
 from apex_ompl.types import Array
-from apex_ompl.viz.viewer.nodes import pose_of, turn_of
 from apex_ompl.viz.viewer.player import Player
+from apex_ompl.viz.viewer.scene import pose_of, turn_of
 from apex_ompl.viz.viewer.server import Asked, Do, asked
 from apex_ompl.viz.viewer.shown import Shown, markdown
 

@@ -18,7 +18,7 @@ from apex_ompl.viz.sources import load_saved
 from apex_ompl.viz.viewer.editor import Editor
 from apex_ompl.viz.viewer.inspection import Inspection
 from apex_ompl.viz.viewer.player import Player
-from apex_ompl.viz.viewer.saved_run import shown_of
+from apex_ompl.viz.viewer.run import shown_of
 from apex_ompl.viz.viewer.server import asked
 from apex_ompl.viz.viewer.shown import Shown
 

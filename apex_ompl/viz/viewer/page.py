@@ -16,8 +16,7 @@ from matplotlib.lines import Line2D
 
 from apex_ompl.util.files import check_writable, write_atomically
 from apex_ompl.viz.appearance import BACKGROUND, CLEARANCE_COLORS, LIMIT_COLORS, NOW, focus_of
-from apex_ompl.viz.viewer.nodes import rgb
-from apex_ompl.viz.viewer.scene import BrowserScene
+from apex_ompl.viz.viewer.scene import BrowserScene, rgb
 from apex_ompl.viz.viewer.server import serving
 from apex_ompl.viz.viewer.shown import Shown, ordered
 

@@ -13,13 +13,13 @@ import numpy as np
 from apex_ompl.ompl.setup import PlanningSetup, assemble
 from apex_ompl.paths.path import resample
 from apex_ompl.result import PlanResult
-from apex_ompl.robot.identity import load_same_robot
+from apex_ompl.robot.model import load_same_robot
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Problem
 from apex_ompl.scene.scripts import is_there, obstacle_at
 from apex_ompl.timing import Trajectory
 from apex_ompl.types import Array
-from apex_ompl.viz.curves import ORDERS, clearances, shares_of_limits
+from apex_ompl.viz.sources import ORDERS, clearances, shares_of_limits
 from apex_ompl.viz.viewer.scene import BrowserScene
 
 UNTIMED, STATES = 4.0, 120  # how long a path without times plays [s], and its states
