@@ -74,7 +74,7 @@ def test_a_dynamic_obstacle_in_the_way_is_met_without_time_and_missed_in_time(pr
     assert (
         snapshot
         and snapshot.dynamic_obstacles == ()
-        and snapshot.notes == ("snapshot: dynamic obstacle taken to stand still",)
+        and snapshot.notes == ("snapshot: dynamic_obstacle taken to stand still",)
     )
 
 
@@ -120,7 +120,11 @@ def test_results_among_dynamic_obstacles_are_kept(problem: Problem, robot: Robot
     for name in ("result.npz", "result.json"):
         result.save(tmp_path / name)
         again = PlanResult.load(tmp_path / name)
-        assert again.dynamic == ("dynamic_obstacle",) and again.trajectory is not None and result.trajectory is not None
+        assert (
+            again.dynamic_obstacles == ("dynamic_obstacle",)
+            and again.trajectory is not None
+            and result.trajectory is not None
+        )
         assert np.array_equal(again.trajectory.positions, result.trajectory.positions)
 
 
@@ -149,7 +153,7 @@ def test_dynamic_obstacles_of_other_shapes_and_worlds_that_are_kept(
 def test_what_does_not_go_with_dynamic_obstacles_is_named(problem: Problem, robot: Robot) -> None:
     crossed = with_dynamic_obstacle(problem, robot)
     with pytest.raises(
-        ParameterError, match="timing: expected True or a Timing, since the obstacle 'dynamic obstacle' moves"
+        ParameterError, match="timing: expected True or a Timing, since the obstacle 'dynamic_obstacle' moves"
     ):
         plan(crossed, timing=False)
     with pytest.raises(ParameterError, match="leave_contact: expected 0"):

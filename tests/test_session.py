@@ -221,7 +221,7 @@ def test_what_a_world_read_stays_though_its_files_move(
         assert np.array_equal(again.path.states, before.path.states)
     planner.world.set_velocity("c", (0.0, 0.0, 0.1))
     planner.world.move("m", (0.6, 0.0, 0.5), (0.0, 0.0, 0.6, 0.8))
-    assert planner.plan(robot.home, goal).dynamic == ("c",), "among obstacles that move"
+    assert planner.plan(robot.home, goal).dynamic_obstacles == ("c",), "among obstacles that move"
     planner.world.attach("m", "right_hand_palm", at=robot.home)
     planner.world.detach("m", at=goal)
     assert planner.plan(robot.home, goal, timeout=10.0)

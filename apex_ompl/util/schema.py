@@ -28,7 +28,14 @@ else:
     ModelMetaclass = type(BaseModel)
 
 
-HIDDEN = {"model_config", "model_post_init", "model_rebuild", "model_validate", "model_validate_json"}
+HIDDEN = {
+    "model_config",
+    "model_json_schema",
+    "model_post_init",
+    "model_rebuild",
+    "model_validate",
+    "model_validate_json",
+}
 NUMBERS = re.compile(r"\[[-+.\deE,\s]*\]")  # vectors in flow style: a level each, and most of the brackets
 
 ModelT = TypeVar("ModelT", bound="StrictModel")
