@@ -4,8 +4,10 @@ The id of a problem of a suite is ``suite/level/seed``, for example ``shelf/hard
 training, 800 000 to 899 999 for validation, 900 000 to 999 999 for tests.
 
 - ``catalogue``: suites, levels, splits and ids; ``generator`` draws a problem by its id.
-- ``scenes``, ``alignment``, ``broad``: the generators of the suites; ``obstacles`` and ``objects``: what they put into
-  scenes and hands. ``broad`` is for training alone, and ``unseen``, which it draws too, for validation alone.
+- ``scenes``, ``alignment``, ``broad``: the generators of the suites; ``objects``: what they put into scenes and hands.
+  ``broad`` is for training alone, and ``unseen``, which it draws too, for validation alone.
+- ``broad_parts``: parts of scenes and their algebra; ``broad_furniture``, ``broad_structures``, ``broad_unseen``: the
+  grammars; ``broad_tasks``, ``broad_representation``: held objects, ends, difficulty, and how a scene is given.
 - ``frozen``: the stored problems of validation and test, with their witnesses.
 """
 
@@ -107,8 +109,8 @@ def primitives(problem: Problem, *, enclosing: bool = False) -> tuple[Obstacle, 
         FileFormatError: The hash or the content of the file of a frozen problem is wrong.
     """
     from apex_ompl.problems import frozen
-    from apex_ompl.problems.broad.levels import LEVELS
-    from apex_ompl.problems.broad.representation import swollen
+    from apex_ompl.problems.broad import LEVELS
+    from apex_ompl.problems.broad_representation import swollen
     from apex_ompl.problems.catalogue import ProblemId
     from apex_ompl.problems.generator import first_drawn
 

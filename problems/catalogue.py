@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from apex_ompl.errors import ParameterError
-from apex_ompl.problems import ID, alignment, scenes
-from apex_ompl.problems.broad import levels as broad
+from apex_ompl.problems import ID, alignment, broad, scenes
 from apex_ompl.util.validation import check_name
 
 SPLITS = {"train": range(800_000), "validation": range(800_000, 900_000), "test": range(900_000, 1_000_000)}

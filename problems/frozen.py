@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError
-from apex_ompl.problems.broad.representation import Group, given
+from apex_ompl.problems.broad_representation import Group, given
 from apex_ompl.problems.catalogue import LEVELS, SPLITS, VALIDATION, ProblemId
 from apex_ompl.problems.objects import DATA
 from apex_ompl.problems.suite_robot import ROBOT, robot

@@ -9,12 +9,10 @@ import numpy as np
 
 from apex_ompl.errors import ApexError
 from apex_ompl.goals.hand_poses import HandPoseSampler
-from apex_ompl.problems import alignment, scenes
-from apex_ompl.problems.broad import drawing, simple
-from apex_ompl.problems.broad.levels import GRAMMARS, SUITE
+from apex_ompl.problems import alignment, broad, scenes
+from apex_ompl.problems.broad import GRAMMARS, SUITE
 from apex_ompl.problems.catalogue import ProblemId
-from apex_ompl.problems.drawn_problem import MARGIN, DrawnProblem
-from apex_ompl.problems.suite_robot import empty_hand_tables, robot
+from apex_ompl.problems.suite_robot import MARGIN, DrawnProblem, empty_hand_tables, robot
 from apex_ompl.scene.problem import Problem
 
 SYNERGIES = (0.0, 0.4)  # interval of the synergies of empty hands
@@ -31,10 +29,10 @@ def draw(problem_id: ProblemId, number: int) -> DrawnProblem | None:
     rng = np.random.default_rng([level_hash, problem_id.seed, number])
     if problem_id.suite in alignment.SAMPLERS:
         return alignment.draw(rng, problem_id.suite, problem_id.level)
-    if problem_id.suite == SUITE and problem_id.level in simple.LEVELS:
-        return simple.draw(rng, problem_id.level, SYNERGIES)
+    if problem_id.suite == SUITE and problem_id.level in broad.SIMPLE_LEVELS:
+        return broad.draw_simple(rng, problem_id.level, SYNERGIES)
     if problem_id.suite in GRAMMARS:
-        return drawing.draw(rng, problem_id.suite, problem_id.level)
+        return broad.draw(rng, problem_id.suite, problem_id.level)
     task = scenes.SUITES[problem_id.suite](rng, problem_id.level)
     poses = HandPoseSampler(empty_hand_tables(), task.scene, MARGIN)
     start = poses.sample(rng, task.start, SYNERGIES)

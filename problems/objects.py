@@ -1,14 +1,19 @@
-"""Objects that the hands hold in the ready-made problems and in the suites; poses are in the frame of the palm."""
+"""Objects that the hands hold, with poses in the frame of the palm, and obstacles of generated scenes.
+
+Numbers of obstacles are rounded to a tenth of a millimeter.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from apex_ompl.goals.grasp import HandObjects
-from apex_ompl.scene.bodies import AttachedObject
+from apex_ompl.scene.bodies import AttachedObject, Obstacle
+from apex_ompl.types import Array
 
 DATA = Path(__file__).parent / "data"
 PALM = -0.009  # z of the surface of an object that lies on the palm, in the palm's frame [m]
@@ -91,3 +96,41 @@ def parcels() -> HandObjects:
     """Return a parcel for each hand, along the fingers."""
     base = {"link": "palm", "box": (0.07, 0.12, 0.06), "position": (0.0, 0.06, PALM - 0.03)}
     return [(f"{side}_hand", _attached(name=f"{side}_parcel", **base)) for side in ("left", "right")]
+
+
+def box(name: str, size: Sequence[float], position: Sequence[float]) -> Obstacle:
+    """Return an upright box of edges ``size`` [m] centerd at ``position`` [m]."""
+    return _obstacle(name=name, box=_rounded(size), position=_rounded(position))
+
+
+def upright_bar(name: str, radius: float, length: float, position: Sequence[float]) -> Obstacle:
+    """Return an upright cylinder centerd at ``position`` [m]; ``length`` is not rounded."""
+    cylinder = {"radius": _rounded([radius])[0], "length": length}
+    return _obstacle(name=name, cylinder=cylinder, position=_rounded(position))
+
+
+def _obstacle(**fields: Any) -> Obstacle:
+    return Obstacle.model_validate(fields)
+
+
+def _rounded(numbers: Iterable[float]) -> tuple[float, ...]:
+    return tuple(round(float(v), 4) for v in numbers)
+
+
+def primitive(name: str, kind: int, size: Array, position: Array, quaternion: Array) -> Obstacle:
+    """Return a box, a ball, a cylinder or a capsule.
+
+    Args:
+        name: Name of the obstacle.
+        kind: 0 to 3, in the order above.
+        size: Edges of a box; the first one is the diameter of the others, the third one their length, shape (3,) [m].
+        position: Center, shape (3,) [m].
+        quaternion: Orientation as xyzw, of any norm but 0, shape (4,).
+    """
+    width, _, length = _rounded(size)
+    shapes: tuple[dict[str, Any], ...] = (
+        {"box": _rounded(size)}, {"sphere": {"radius": width / 2}},
+        {"cylinder": {"radius": width / 2, "length": length}}, {"capsule": {"radius": width / 2, "length": length}},
+    )  # fmt: skip
+    unit = np.round(quaternion / np.linalg.norm(quaternion), 6)
+    return _obstacle(name=name, **shapes[kind], position=_rounded(position), orientation=tuple(float(v) for v in unit))

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from apex_ompl.goals.hand_poses import Direction, HandRegion
-from apex_ompl.problems.obstacles import bar, box, primitive
+from apex_ompl.problems.objects import box, primitive, upright_bar
 from apex_ompl.scene.bodies import Obstacle
 
 FORWARD: Direction = (1.0, 0.0, 0.0)
@@ -111,7 +111,7 @@ def cage(rng: np.random.Generator, level: str) -> ReachingTask:
         positions = {(dx, dy) for dx in np.linspace(-half, half, per_side) for dy in (-half, half)}
         positions |= {(dx, dy) for dx in (-half, half) for dy in np.linspace(-half, half, per_side)}
         for k, (dx, dy) in enumerate(sorted(positions)):
-            scene.append(bar(f"{side}_bar_{k}", 0.012, height, (x + dx, y + dy, height / 2)))
+            scene.append(upright_bar(f"{side}_bar_{k}", 0.012, height, (x + dx, y + dy, height / 2)))
         scene.append(box(f"{side}_roof", (2 * half + 0.04, 2 * half + 0.04, BOARD), (x, y, height + BOARD / 2)))
         low, high = rng.uniform(0.15, 0.25), rng.uniform(height - 0.25, height - 0.15)
         inside = around((x, y, rng.choice([low, high])), 0.02, FORWARD)
@@ -133,7 +133,9 @@ def posts(rng: np.random.Generator, level: str) -> ReachingTask:
         x, y = rng.uniform([front + 0.2, -0.7], [0.85, 0.7])
         if all(np.hypot(x - u, y - v) > 0.2 for u, v in positions):
             positions.append((x, y))
-    scene = [bar(f"post_{k}", rng.uniform(0.015, 0.025), 1.1, (x, y, 0.55)) for k, (x, y) in enumerate(positions)]
+    scene = [
+        upright_bar(f"post_{k}", rng.uniform(0.015, 0.025), 1.1, (x, y, 0.55)) for k, (x, y) in enumerate(positions)
+    ]
     gaps = (fence[:-1] + fence[1:]) / 2
     left, right = rng.permutation(gaps[-(len(gaps) // 2) :])[:2], rng.permutation(gaps[: len(gaps) // 2])[:2]
 

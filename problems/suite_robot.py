@@ -1,13 +1,19 @@
-"""The robot of the suites."""
+"""The robot of the suites, and a problem as the generators of the suites draw it."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cache
 
 from apex_ompl.goals.hand_poses import DualArmTables
+from apex_ompl.problems.broad_representation import Group, given
 from apex_ompl.robot import Robot, load_robot
+from apex_ompl.scene.bodies import AttachedObject, Obstacle
+from apex_ompl.scene.problem import Goal, Problem
+from apex_ompl.types import Array
 
 ROBOT = "dual_panda_softhand"
+MARGIN = 0.01  # clearance of every start and goal [m]
 
 
 def robot() -> Robot:
@@ -19,3 +25,30 @@ def robot() -> Robot:
 def empty_hand_tables() -> DualArmTables:
     """Return the kernel's tables of the robot with empty hands."""
     return DualArmTables.of(robot())
+
+
+@dataclass(frozen=True, eq=False)
+class DrawnProblem:
+    """Obstacles, held objects, and a start and a goal in the order of the robot's joints.
+
+    Attributes:
+        scene: Obstacles; primitives where there are ``groups``.
+        start: Shape (dof,).
+        goal: Shape (dof,).
+        attached: Held objects.
+        groups: Obstacles, by their place in ``scene``, that are given as a mesh or as points.
+    """
+
+    scene: tuple[Obstacle, ...]
+    start: Array
+    goal: Array
+    attached: tuple[AttachedObject, ...] = ()
+    groups: tuple[Group, ...] = ()
+
+    def to_problem(self, name: str, robot: Robot) -> Problem:
+        """Return the problem under a name, for the robot that it was drawn for."""
+        start, goal = (dict(zip(robot.joint_names, q.tolist(), strict=True)) for q in (self.start, self.goal))
+        return Problem(
+            name=name, robot=robot.name, scene=given(self.scene, self.groups), attached=self.attached, start=start,
+            goal=Goal(joints=(goal,)),
+        )  # fmt: skip

@@ -16,7 +16,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from apex_ompl import problems
-from apex_ompl.problems.broad.levels import GRAMMARS
+from apex_ompl.problems.broad import GRAMMARS
 from apex_ompl.problems.catalogue import SPLITS, TRAINING
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.files import write_atomically

@@ -16,14 +16,10 @@ from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.shapes import coal_geometry
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel import Kernel
-from apex_ompl.problems import generator
-from apex_ompl.problems.broad import compounds, shapes
-from apex_ompl.problems.broad.composition import site
-from apex_ompl.problems.broad.difficulty import difficulty, sprint
-from apex_ompl.problems.broad.ends import clear_parts, scene_of
-from apex_ompl.problems.broad.held import KINDS, OPEN, draw_held
-from apex_ompl.problems.broad.levels import GRAMMARS
-from apex_ompl.problems.broad.representation import (
+from apex_ompl.problems import broad_parts, generator
+from apex_ompl.problems.broad import GRAMMARS
+from apex_ompl.problems.broad_parts import site
+from apex_ompl.problems.broad_representation import (
     MESH,
     POINTS,
     SURFACE,
@@ -33,6 +29,7 @@ from apex_ompl.problems.broad.representation import (
     obstacles,
     part_of,
 )  # fmt: skip
+from apex_ompl.problems.broad_tasks import KINDS, OPEN, clear_parts, difficulty, draw_held, scene_of, sprint
 from apex_ompl.problems.catalogue import ProblemId
 from apex_ompl.problems.frozen import digest
 from apex_ompl.problems.generator import first_drawn
@@ -86,7 +83,7 @@ def test_every_grammar_gives_parts_and_places_for_any_random_numbers(suite: str,
         placed = one.placed(site(rng, one))
         assert 0 < len(one.parts) == len(placed.parts) and one.places
         sizes = np.array([[v for v in part.size if v] for part in one.parts], dtype=object)
-        assert all(min(row) >= shapes.THINNEST and max(row) < 3.0 for row in sizes)
+        assert all(min(row) >= broad_parts.THINNEST and max(row) < 3.0 for row in sizes)
         turns = poses(placed.parts)[:, :3, :3]
         np.testing.assert_allclose(turns @ turns.transpose(0, 2, 1), np.broadcast_to(np.eye(3), turns.shape), atol=1e-9)
         np.testing.assert_allclose(np.linalg.det(turns), 1.0)
@@ -149,7 +146,7 @@ def test_a_scene_is_given_as_files_of_its_parts() -> None:
 
 def test_parts_near_the_ends_are_left_out(robot: Robot) -> None:
     parts = some_parts(200, 7)
-    placed = shapes.place(parts, shapes.shift(0.4, 0.3, 0.4))
+    placed = broad_parts.place(parts, broad_parts.shift(0.4, 0.3, 0.4))
     ends = np.stack([robot.home, robot.home + 0.1])
     tables = empty_hand_tables().both
     left = clear_parts(tables, placed, ends, 0.01)
@@ -170,8 +167,8 @@ def test_classes_of_difficulty_are_in_order(robot: Robot) -> None:
     near = np.stack([robot.home, robot.home + 0.05])
     rng = np.random.default_rng(0)
     assert difficulty(free, near, rng) == 0 and sprint(free, near, rng)
-    shut = compounds.hollow_box(0.9, 1.2, 1.2, 0.05, ())
-    walls = Kernel(tables, scene_of(shapes.place(shut, shapes.shift(0.75, 0.9, 0.5))))
+    shut = broad_parts.hollow_box(0.9, 1.2, 1.2, 0.05, ())
+    walls = Kernel(tables, scene_of(broad_parts.place(shut, broad_parts.shift(0.75, 0.9, 0.5))))
     found = [difficulty(walls, ends, np.random.default_rng(1), wanted) for wanted in range(4)]
     assert found == sorted(found) and all(value <= wanted for wanted, value in enumerate(found))
     assert found == [difficulty(walls, ends, np.random.default_rng(1), wanted) for wanted in range(4)]

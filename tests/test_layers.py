@@ -76,7 +76,7 @@ def test_every_package_is_in_the_package_list() -> None:
 
     listed = set(tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["packages"])
     folders = {p.parent for p in (ROOT / "apex_ompl").rglob("__init__.py")}
-    folders |= {ROOT / "apex_ompl" / name for name in ("planners", "problems", "problems/broad")}
+    folders |= {ROOT / "apex_ompl" / name for name in ("planners", "problems")}
     assert listed == {".".join(f.relative_to(ROOT).parts) for f in folders}
 
 

@@ -13,7 +13,7 @@ from support import ROOT
 from apex_ompl.planning.one_plan import PlanKeywords, PlanOptions, ProblemKeywords
 
 SOURCES = ("api.py", "loop/run.py", "planning/one_plan.py", "planning/planner.py")
-RECORDS = ("scene/bodies.py", "scene/problem.py", "util/record_type.py", "util/schema.py")
+RECORDS = ("scene/bodies.py", "scene/problem.py", "util/schema.py")
 USE = """
 from apex_ompl.api import plan
 from apex_ompl.loop.run import run

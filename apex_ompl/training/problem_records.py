@@ -14,7 +14,7 @@ from apex_ompl.errors import UnknownNameError
 from apex_ompl.model.geometry import SHAPES, ObstacleRecord
 from apex_ompl.ompl.process import quiet_ompl
 from apex_ompl.ompl.setup import assemble
-from apex_ompl.problems.broad.representation import part_of
+from apex_ompl.problems.broad_representation import part_of
 from apex_ompl.problems.generator import SuiteError
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.scene.bodies import AttachedObject, Obstacle

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from apex_ompl.errors import ParameterError, UnknownNameError
 from apex_ompl.problems import scenes
-from apex_ompl.problems.broad.levels import GRAMMARS
+from apex_ompl.problems.broad import GRAMMARS
 from apex_ompl.problems.catalogue import KNOWN, LEVELS, SPLITS, TRAINING, VALIDATION
 
 UNIT_SIZE = 16  # problems in a unit of work

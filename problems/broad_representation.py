@@ -1,8 +1,8 @@
-"""How a scene is given: its parts as primitives, as triangle meshes of several parts each, or as clouds of points.
+"""How a scene is given: its parts as primitives, as triangle meshes of several parts each, or as point clouds.
 
-Files of meshes and points are made from the parts where a problem is loaded, in the user's cache, named by their
-content. A mesh lies in its parts, round ones approximated by prisms; points lie on the surfaces of theirs, so that
-their balls are thicker by the radius.
+Files of meshes and points are made from the parts when a problem is loaded, in the user's cache, named by their
+content. A mesh lies in its parts, round parts approximated by prisms; points lie on the surfaces of their parts, so
+that their balls are thicker by the radius.
 """
 
 from __future__ import annotations
@@ -16,20 +16,131 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from apex_ompl.errors import ParameterError
-from apex_ompl.problems.broad.shapes import BOX, CAPSULE, CYLINDER, Part
-from apex_ompl.problems.broad.surfaces import mesh, surface_points
+from apex_ompl.kernel.compiled.cloud_distance import primitive_distances
+from apex_ompl.problems.broad_parts import BOX, CAPSULE, CYLINDER, Part, kernel_columns
 from apex_ompl.scene.bodies import Obstacle, pose_fields
+from apex_ompl.types import Array
 from apex_ompl.util.cache import user_cache
 from apex_ompl.util.files import write_atomically
 
+SIDES, STACKS = 24, 6  # around a round part, and from the middle to the pole of a half ball
+HIDDEN = 1e-3  # depth in another part at which a triangle is left out of an open mesh [m]
 MESH, SURFACE, POINTS = "mesh", "surface", "points"  # a closed mesh, an open one, and a cloud
 PRIMITIVES_SHARE, MESH_SHARE, POINTS_SHARE = 0.7, 0.15, 0.1  # the others are given in several ways
 SPACING = (0.01, 0.02)  # interval of the distances of points on a surface [m]
 COVERAGE = 0.75  # radius of points as a share of their spacing: more than half a square's diagonal
 MOST_POINTS = 40_000  # of a cloud
 MOST_PARTS = 80  # of a mesh
+
+
+def distances(parts: Sequence[Part], points: Array) -> Array:
+    """Return the signed distances of points, shape (n, 3), to each part, shape (parts, n) [m]."""
+    found = np.empty((len(parts), len(points)))
+    for k, (kind, rotation, offset, size) in enumerate(zip(*kernel_columns(parts), strict=True)):
+        primitive_distances(np.ascontiguousarray((points - offset) @ rotation), int(kind), size, found[k])
+    return found
+
+
+def triangles(part: Part) -> tuple[Array, NDArray[np.int64]]:
+    """Return the vertices, shape (V, 3) [m], and the triangles, shape (T, 3), of a part; they lie on its surface."""
+    from trimesh import creation  # takes half a second
+
+    if part.kind == BOX:
+        made = creation.box(part.size)
+    else:
+        made = creation.revolve(_profile(part), sections=SIDES)
+    return made.vertices @ part.pose[:3, :3].T + part.pose[:3, 3], np.asarray(made.faces, np.int64)
+
+
+def _profile(part: Part) -> Array:
+    """Return radius and height of the rings of a round part, from the lower pole to the upper, shape (n, 2) [m]."""
+    radius, half = part.size[0], part.size[1] / 2.0
+    if part.kind == CYLINDER:
+        return np.array([[0.0, -half], [radius, -half], [radius, half], [0.0, half]])
+    angles = np.linspace(0.0, np.pi / 2, STACKS + 1)
+    upper = np.stack([radius * np.cos(angles), half + radius * np.sin(angles)], axis=1)
+    upper[-1, 0] = 0.0
+    lower = (upper * (1.0, -1.0))[::-1]
+    return np.concatenate([lower, upper if part.kind == CAPSULE else upper[1:]])
+
+
+def mesh(parts: Sequence[Part], *, is_open: bool) -> tuple[Array, NDArray[np.int64]]:
+    """Return one mesh of parts: vertices, shape (V, 3) [m], and triangles, shape (T, 3).
+
+    Args:
+        parts: The parts.
+        is_open: Whether triangles inside of other parts are left out; the union of the parts keeps its surface.
+    """
+    vertices, faces, count = [], [], 0
+    for k, part in enumerate(parts):
+        own, corners = triangles(part)
+        if is_open and len(parts) > 1:
+            others = [*parts[:k], *parts[k + 1 :]]
+            near = [o for o in others if _reach(o) + _reach(part) > np.linalg.norm(o.pose[:3, 3] - part.pose[:3, 3])]
+            if near:
+                inside = distances(near, own) < -HIDDEN
+                corners = corners[~inside[:, corners].all(axis=2).any(axis=0)]  # parts are convex
+        vertices.append(own)
+        faces.append(corners + count)
+        count += len(own)
+    return np.concatenate(vertices), np.concatenate(faces)
+
+
+def _reach(part: Part) -> float:
+    """Return the radius of a ball around a part [m]."""
+    if part.kind == BOX:
+        return float(np.linalg.norm(part.size)) / 2.0
+    return part.size[0] + part.size[1] / 2.0
+
+
+def surface_points(part: Part, spacing: float) -> Array:
+    """Return points, shape (n, 3) [m], on a part, every point of its surface at most ``spacing / sqrt(2)`` away."""
+    if part.kind == BOX:
+        local = _box_points(np.array(part.size), spacing)
+    else:
+        profile = _profile_points(part, spacing)
+        rows = []
+        for r, z in profile:
+            count = max(1, int(np.ceil(2.0 * np.pi * r / spacing)))
+            angles = np.arange(count) * 2.0 * np.pi / count
+            rows.append(np.stack([r * np.cos(angles), r * np.sin(angles), np.full(count, z)], axis=1))
+        local = np.concatenate(rows)
+    found: Array = local @ part.pose[:3, :3].T + part.pose[:3, 3]
+    return found
+
+
+def _steps(length: float, spacing: float) -> Array:
+    """Return coordinates from one end of a length to the other, at most ``spacing`` apart, about 0 [m]."""
+    return np.linspace(-length / 2, length / 2, int(np.ceil(length / spacing)) + 1)
+
+
+def _box_points(size: Array, spacing: float) -> Array:
+    found = []
+    for axis in range(3):
+        u, v = (k for k in range(3) if k != axis)
+        across, up = np.meshgrid(_steps(size[u], spacing), _steps(size[v], spacing), indexing="ij")
+        for side in (-0.5, 0.5):
+            points = np.empty((across.size, 3))
+            points[:, axis], points[:, u], points[:, v] = side * size[axis], across.ravel(), up.ravel()
+            found.append(points)
+    return np.unique(np.concatenate(found), axis=0)
+
+
+def _profile_points(part: Part, spacing: float) -> Array:
+    """Return radius and height of circles on a round part, at most ``spacing`` apart along it, shape (n, 2) [m]."""
+    radius, half = part.size[0], part.size[1] / 2.0
+    if part.kind == CYLINDER:
+        rays = np.linspace(0.0, radius, int(np.ceil(radius / spacing)) + 1)
+        walls = np.stack([np.full(len(z := _steps(2 * half, spacing)), radius), z], axis=1)
+        caps = [np.stack([rays[:-1], np.full(len(rays) - 1, z)], axis=1) for z in (-half, half)]
+        return np.concatenate([walls, *caps])
+    angles = np.linspace(0.0, np.pi / 2, int(np.ceil(np.pi / 2 * radius / spacing)) + 1)
+    upper = np.stack([radius * np.cos(angles), half + radius * np.sin(angles)], axis=1)
+    walls = np.stack([np.full(len(z := _steps(2 * half, spacing)), radius), z], axis=1)
+    return np.concatenate([upper, upper * (1.0, -1.0), walls if half else upper[:0]])
 
 
 class Group(NamedTuple):

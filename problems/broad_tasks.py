@@ -1,0 +1,365 @@
+"""Tasks among parts: random held objects, starts and goals, and how hard a problem is.
+
+Held objects are pins, boxes, balls, pegs, bars, trays, angles and cups, in the frame of a palm. An object lies on the
+palm, and the fingers close on it until just before they touch; the hand that holds it may touch it. The fingers stay so
+from the start to the goal.
+
+At a start or goal the hands are at places, in wide regions, at rest, or contorted.
+
+The difficulty is measured by the kernel alone. Class 0: the straight line is free. Class 1: the optimizer repairs the
+straight line. Class 2: a sprint of rrtconnect finds a path. Class 3: none of these does; such a problem need not have a
+solution. Each is measured with fixed numbers of steps and no clock. The sprint is not OMPL's, whose random numbers are
+one sequence for the whole process: a problem is drawn the same from its own random numbers, whatever else the process
+plans.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cache, lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apex_ompl.collision import CollisionChecker
+from apex_ompl.collision.discretization import FINE_RESOLUTION, SEARCH_RESOLUTION
+from apex_ompl.collision.shapes import world_geometry
+from apex_ompl.collision.tables import primitives
+from apex_ompl.errors import SceneError
+from apex_ompl.goals.cover_clearance import has_clearance
+from apex_ompl.goals.grasp import grasp
+from apex_ompl.goals.hand_poses import DualArmTables, HandPoseSampler, HandRegion
+from apex_ompl.goals.inverse_kinematics import Links
+from apex_ompl.kernel import Kernel, RobotTables, SceneTables
+from apex_ompl.kernel.scene_builder import Solids, boxes_around, tables_of
+from apex_ompl.paths.candidates import first_valid
+from apex_ompl.paths.optimizer import Optimizer
+from apex_ompl.problems.broad_parts import Part, Place, kernel_columns
+from apex_ompl.problems.objects import ALONG_X, PALM, cup
+from apex_ompl.problems.scenes import DOWN, FORWARD
+from apex_ompl.problems.suite_robot import empty_hand_tables, robot
+from apex_ompl.scene.bodies import AttachedObject
+from apex_ompl.types import Array
+
+NONE_HELD, ONE_HELD = 0.45, 0.3  # shares of problems with empty hands, and with an object in one
+OPEN = (0.0, 0.4)  # interval of the synergies of empty hands
+SYNERGY_STEP = 1e-3
+FINGERS = (DOWN, FORWARD, (0.0, 0.0, 1.0), (0.0, -1.0, 0.0), (0.0, 1.0, 0.0))
+SHOULDERS = (0.5, -0.5)  # y of the arms [m]
+REACH = 0.78  # of a place that a hand is sent to, from the axis of its arm [m]
+PLACE_WIDTH = 0.02  # half the width of the region around a place [m]
+PLACED, RESTING = 0.7, 0.07  # share of hands that are sent to places, and of states at rest
+CONTORTED = 0.13  # share of states that are drawn evenly from the limits
+BATCH = 48  # such states at once
+REST_SPREAD = 0.15  # standard deviation of a state at rest around home [rad]
+CLASSES = 4
+RANGE = 1.0  # longest motion of the sprint [rad], as rrtconnect is tuned
+SPRINT = 400  # samples of the sprint
+MOTIONS = 1500  # motions that it checks at most
+
+
+@dataclass(frozen=True, eq=False)
+class Held:
+    """Held objects, and the robot with them.
+
+    Attributes:
+        attached: The objects.
+        tables: The kernel's tables of the robot with the objects: of both arms, and of each alone.
+        low: Least synergy of each hand, shape (2,).
+        high: Largest one, the same for a hand that holds something, shape (2,).
+    """
+
+    attached: tuple[AttachedObject, ...]
+    tables: DualArmTables
+    low: Array
+    high: Array
+
+    @classmethod
+    def of(cls, attached: Sequence[AttachedObject], low: Sequence[float], high: Sequence[float]) -> Held:
+        """Return held objects with the tables of the robot that holds them."""
+        bare = empty_hand_tables()
+        tables = bare
+        if attached:
+            both = CollisionChecker(robot(), (), attached).kernel.robot
+            tables = DualArmTables(
+                bare.robot, both, (both.restricted_to(bare.joints[0]), both.restricted_to(bare.joints[1])), bare.joints
+            )
+        return cls(tuple(attached), tables, np.array(low, float), np.array(high, float))
+
+
+def draw_held(rng: np.random.Generator) -> Held:
+    """Draw what both hands hold: nothing in about half of the problems, else an object in one hand or in both."""
+    share = rng.random()
+    sides = (0, 1) if share >= NONE_HELD + ONE_HELD else (int(rng.integers(2)),) if share >= NONE_HELD else ()
+    attached, low, high = list[AttachedObject](), [OPEN[0]] * 2, [OPEN[1]] * 2
+    for side in sides:
+        kind = list(KINDS)[int(rng.integers(len(KINDS)))]
+        bodies, synergy = _grasped(kind, tuple(np.round(rng.uniform(size=4), 2).tolist()), side)
+        attached += bodies
+        if bodies:
+            low[side] = high[side] = synergy
+    return Held.of(attached, low, high)
+
+
+@lru_cache(maxsize=256)
+def _grasped(kind: str, shares: tuple[float, ...], side: int) -> tuple[tuple[AttachedObject, ...], float]:
+    """Return the bodies of an object in a hand, and the synergy that holds them; none where the hand is too small."""
+    hand = ("left_hand", "right_hand")[side]
+    bodies, synergy = list[AttachedObject](), 1.0
+    for k, fields in enumerate(KINDS[kind](*shares)):
+        if "cup" in fields:
+            body = cup(hand.replace("hand", "cup"), -1 if side == 0 else 1)
+        else:
+            body = AttachedObject.model_validate({"name": f"{hand}_{kind}_{k}", "link": "palm", **fields})
+        try:
+            closed = grasp(robot(), hand, body)
+        except SceneError:
+            return (), 0.0
+        bodies.append(closed.held.model_copy(update={"touch_links": None}))
+        synergy = min(synergy, closed.synergy)
+    return tuple(bodies), float(np.floor(synergy / SYNERGY_STEP) * SYNERGY_STEP)
+
+
+def _scaled(share: float, low: float, high: float) -> float:
+    """Return the length at a share of an interval [m], in tenths of millimeters."""
+    return round(low + share * (high - low), 4)
+
+
+def _pin(u: float, v: float, w: float, x: float) -> list[dict[str, Any]]:
+    radius, length = _scaled(u, 0.003, 0.008), _scaled(v, 0.05, 0.14)
+    pose = {"position": (_scaled(w, -0.04, 0.04), _scaled(x, 0.02, 0.05), PALM - radius), "orientation": ALONG_X}
+    return [{"cylinder": {"radius": radius, "length": length}, **pose}]
+
+
+def _box(u: float, v: float, w: float, x: float) -> list[dict[str, Any]]:
+    size = (_scaled(u, 0.03, 0.14), _scaled(v, 0.03, 0.12), _scaled(w, 0.02, 0.07))
+    return [{"box": size, "position": (0.0, _scaled(x, 0.02, 0.06), PALM - size[2] / 2)}]
+
+
+def _ball(u: float, v: float, w: float, x: float) -> list[dict[str, Any]]:
+    radius = _scaled(u, 0.012, 0.045)
+    return [{"sphere": {"radius": radius}, "position": (_scaled(v, -0.03, 0.03), 0.03, PALM - radius)}]
+
+
+def _peg(u: float, v: float, w: float, x: float) -> list[dict[str, Any]]:
+    radius, length = _scaled(u, 0.01, 0.03), _scaled(v, 0.1, 0.2)
+    pose = {"position": (_scaled(w, -0.05, 0.05), 0.03, PALM - radius), "orientation": ALONG_X}
+    return [{"cylinder" if x < 0.6 else "capsule": {"radius": radius, "length": length}, **pose}]
+
+
+def _bar(u: float, v: float, w: float, x: float) -> list[dict[str, Any]]:
+    radius, length = _scaled(u, 0.006, 0.018), _scaled(v, 0.22, 0.4)
+    offset = _scaled(w, -0.3, 0.3) * length
+    pose = {"position": (round(offset, 4), 0.03, PALM - radius), "orientation": ALONG_X}
+    if x < 0.3:
+        return [{"box": (2 * radius, 2 * radius, length), **pose}]
+    return [{"cylinder": {"radius": radius, "length": length}, **pose}]
+
+
+def _tray(u: float, v: float, w: float, x: float) -> list[dict[str, Any]]:
+    size = (_scaled(u, 0.15, 0.3), _scaled(v, 0.12, 0.3), _scaled(w, 0.006, 0.02))
+    return [{"box": size, "position": (0.0, round(0.03 + size[1] / 2 * x, 4), PALM - size[2] / 2)}]
+
+
+def _angle(u: float, v: float, w: float, x: float) -> list[dict[str, Any]]:
+    """An L or a T of two bars: one across the palm, one off it at an end or in the middle."""
+    thick, length, arm = _scaled(u, 0.014, 0.03), _scaled(v, 0.12, 0.3), _scaled(w, 0.08, 0.22)
+    end = length / 2 - thick / 2 if x < 0.6 else 0.0
+    across = {"box": (length, thick, thick), "position": (0.0, 0.03, PALM - thick / 2)}
+    off = {"box": (thick, thick, arm), "position": (round(end, 4), 0.03, round(PALM - thick - arm / 2, 4))}
+    return [across, off]
+
+
+def _cup(u: float, v: float, w: float, x: float) -> list[dict[str, Any]]:
+    return [{"cup": True}]
+
+
+KINDS: dict[str, Callable[[float, float, float, float], list[dict[str, Any]]]] = {
+    "pin": _pin, "box": _box, "ball": _ball, "peg": _peg, "bar": _bar, "tray": _tray, "angle": _angle, "cup": _cup,
+}  # fmt: skip
+"""Kinds of objects: the fields of their bodies for four numbers from 0 to 1."""
+
+
+@cache
+def _fixtures() -> tuple[Solids, ...]:
+    return tuple(Solids.of(primitives(*world_geometry(body))) for body in robot().fixtures)
+
+
+def scene_of(parts: Sequence[Part], swelling: float = 0.0) -> SceneTables:
+    """Return the kernel's scene of the robot's fixtures and of parts, numbered behind them.
+
+    Args:
+        parts: The parts.
+        swelling: By how much every part is thicker on each side [m].
+    """
+    found = dict(enumerate(_fixtures()))
+    kind, rotation, offset, size = kernel_columns(parts, swelling)
+    around = boxes_around(kind, rotation, offset, size) if parts else np.empty((0, 2, 3))
+    exact = np.array([swelling == 0.0], np.int64)
+    for k in range(len(parts)):
+        one = slice(k, k + 1)
+        found[len(found)] = Solids(kind[one], exact, rotation[one], offset[one], size[one], around[one], (None,))
+    return tables_of(found)
+
+
+def clear_parts(tables: RobotTables, parts: list[Part], ends: Array, margin: float) -> list[Part]:
+    """Return those parts that keep a margin to the robot at some states.
+
+    Args:
+        tables: The robot with what it holds.
+        parts: The parts.
+        ends: Shape (n, dof).
+        margin: [m].
+    """
+    fixtures = len(_fixtures())
+    while parts:
+        found, counts = Kernel(tables, scene_of(parts, margin)).unproved(ends)
+        rows = np.concatenate([some[: max(n, 0), 1] for some, n in zip(found, counts, strict=True)])
+        touching: NDArray[np.int64] = np.unique(-1 - rows[rows < -fixtures]) - fixtures
+        if not len(touching):
+            break
+        gone = set(touching.tolist())
+        parts = [part for k, part in enumerate(parts) if k not in gone]
+    return parts
+
+
+def palm_line(tables: RobotTables, ends: Array, count: int) -> Array:
+    """Return the grasp points of both hands at states between start and goal, shape (2, count, 3) [m]."""
+    links = Links.of(robot())
+    points = [links.point(hand.palm, hand.point) for hand in robot().hands.values()]
+    states = np.linspace(ends[0], ends[1], count + 2)[1:-1]
+    rotation, origin = Kernel(tables, scene_of(())).joint_frames(states)
+    return np.stack([rotation[:, p.joint] @ np.asarray(p.vector) + origin[:, p.joint] for p in points])
+
+
+def wide_region(side: int) -> HandRegion:
+    """Return the region of the hand of an arm, 0 or 1: over its own table and half of the other one."""
+    middle = 0.7 * SHOULDERS[side]
+    return HandRegion((0.25, 0.75), (middle - 0.5, middle + 0.5), (0.1, 0.8), FINGERS)
+
+
+class EndSampler:
+    """Sampler of starts and goals among parts, by hands in places and by joints."""
+
+    def __init__(self, held: Held, parts: Sequence[Part], places: Sequence[Place], margin: float) -> None:
+        """Sample states that keep ``margin`` [m] to ``parts``, or else to the fixtures alone."""
+        self._held, self._margin = held, margin
+        self._scenes = [scene_of(parts), scene_of(())] if parts else [scene_of(())]
+        self._places = [[p for p in places if _in_reach(p.point, y)] for y in SHOULDERS]
+        self._hands = robot().groups["hands"]
+
+    def sample(self, rng: np.random.Generator) -> Array | None:
+        """Return a state, shape (dof,), or None; where none is found among the parts, one that is clear without."""
+        share = rng.random()
+        if share < RESTING + CONTORTED:
+            return self._joints(rng, rest=share < RESTING)
+        regions = (self._region(rng, 0), self._region(rng, 1))
+        synergies = (self._held.low, self._held.high)
+        for scene in self._scenes:
+            sampler = HandPoseSampler(self._held.tables, scene, self._margin)
+            found = sampler.sample(rng, regions, synergies, attempts=2)
+            if found is not None:
+                return found
+        return None
+
+    def _joints(self, rng: np.random.Generator, *, rest: bool) -> Array | None:
+        some = robot()
+        states = rng.uniform(some.limits.lower, some.limits.upper, (BATCH, some.dof))
+        if rest:
+            states[:] = some.home + rng.normal(0.0, REST_SPREAD, (BATCH, some.dof))
+        states[:, self._hands] = rng.uniform(self._held.low, self._held.high, (BATCH, 2))
+        states[:] = np.round(np.clip(states, some.limits.lower, some.limits.upper), 6)
+        states = states[[some.limit_fault(q) is None for q in states]]
+        for scene in self._scenes:
+            clear = np.flatnonzero(has_clearance(Kernel(self._held.tables.both, scene), states, self._margin))
+            if len(clear):
+                return np.array(states[clear[0]])
+        return None
+
+    def _region(self, rng: np.random.Generator, side: int) -> HandRegion:
+        """Return a region for a hand: around a place within reach, or wide."""
+        own = self._places[side]
+        if own and rng.random() < PLACED:
+            one = own[int(rng.integers(len(own)))]
+            x, y, z = ((float(v) - PLACE_WIDTH, float(v) + PLACE_WIDTH) for v in one.point)
+            fingers = FINGERS if one.fingers is None or rng.random() < 0.2 else (one.fingers,)
+            return HandRegion(x, y, z, fingers)
+        return wide_region(side)
+
+
+def _in_reach(point: Array, shoulder: float) -> bool:
+    """Whether the arm at ``y = shoulder`` reaches a place above the tables and before it."""
+    x, y, z = point
+    return bool(x > 0.15 and 0.03 < z < 1.05 and np.linalg.norm([x, y - shoulder, z - 0.35]) < REACH)
+
+
+@cache
+def _optimizer() -> Optimizer:
+    return Optimizer()
+
+
+def difficulty(kernel: Kernel, ends: Array, rng: np.random.Generator, wanted: int = CLASSES - 1) -> int:
+    """Return the class of a problem, or ``wanted`` where it is that or higher: easier methods are tried first.
+
+    Args:
+        kernel: The robot among the obstacles.
+        ends: Start and goal, shape (2, dof).
+        rng: Source of the sprint's samples.
+        wanted: Class from which on no more is asked.
+    """
+    if wanted == 0 or kernel.proves(ends, FINE_RESOLUTION):
+        return 0
+    if wanted == 1 or _is_repaired(kernel, ends):
+        return 1
+    if wanted == 2 or sprint(kernel, ends, rng):
+        return 2
+    return 3
+
+
+def _is_repaired(kernel: Kernel, ends: Array) -> bool:
+    lower, upper = kernel.robot.arrays.lower, kernel.robot.arrays.upper
+
+    def is_valid(states: Array) -> bool:
+        inside = bool((states >= lower).all() and (states <= upper).all())
+        return inside and kernel.proves(states, FINE_RESOLUTION)
+
+    line = _optimizer().spline.line(ends[0], ends[1])
+    return first_valid(_optimizer(), kernel, line[None], is_valid) is not None
+
+
+def sprint(kernel: Kernel, ends: Array, rng: np.random.Generator) -> bool:
+    """Whether a short run of rrtconnect (Kuffner, LaValle 2000) finds a path by the proofs of the spheres."""
+    lower, upper = kernel.robot.arrays.lower, kernel.robot.arrays.upper
+    trees, sizes = np.empty((2, MOTIONS + 1, len(lower))), [1, 1]
+    trees[:, 0] = ends
+    left = MOTIONS
+
+    def grow(tree: int, target: Array, steps: int) -> Array | None:
+        """Extend a tree towards a state by some steps; return the last new state, or None where there is none."""
+        nonlocal left
+        rows = trees[tree]
+        state, found = rows[int(np.linalg.norm(rows[: sizes[tree]] - target, axis=1).argmin())], None
+        while steps and left:
+            steps, left = steps - 1, left - 1
+            way = target - state
+            far = float(np.linalg.norm(way))
+            new = target if far <= RANGE else state + way * (RANGE / far)
+            if not kernel.proves(np.stack([state, new]), SEARCH_RESOLUTION):
+                break
+            rows[sizes[tree]] = new
+            sizes[tree] += 1
+            state = found = new
+            if far <= RANGE:
+                break
+        return found
+
+    for k in range(SPRINT):
+        new = grow(k % 2, rng.uniform(lower, upper), 1)
+        met = None if new is None else grow(1 - k % 2, new, MOTIONS)
+        if new is not None and met is not None and np.array_equal(met, new):
+            return True
+        if not left:
+            break
+    return False
