@@ -99,12 +99,12 @@ def parcels() -> HandObjects:
 
 
 def box(name: str, size: Sequence[float], position: Sequence[float]) -> Obstacle:
-    """Return an upright box of edges ``size`` [m] centerd at ``position`` [m]."""
+    """Return an upright box of edges ``size`` [m] centered at ``position`` [m]."""
     return _obstacle(name=name, box=_rounded(size), position=_rounded(position))
 
 
 def upright_bar(name: str, radius: float, length: float, position: Sequence[float]) -> Obstacle:
-    """Return an upright cylinder centerd at ``position`` [m]; ``length`` is not rounded."""
+    """Return an upright cylinder centered at ``position`` [m]; ``length`` is not rounded."""
     cylinder = {"radius": _rounded([radius])[0], "length": length}
     return _obstacle(name=name, cylinder=cylinder, position=_rounded(position))
 

@@ -7,7 +7,7 @@ import pytest
 from support import states_around_home
 
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.collision.checker import LOOKED_AT
+from apex_ompl.collision.checker import TESTED
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError, SceneError, UnknownNameError
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import AttachedObject, Obstacle
@@ -90,7 +90,7 @@ def test_the_quick_test_finds_collisions_only_where_there_are_some(robot: Robot,
         checker = CollisionChecker(robot, clutter(rng, 4), proofs=proofs)
         for _ in range(6):
             path = states_around_home(robot, rng, 2, 0.5)
-            states = path[0] + LOOKED_AT[:, None] * (path[1] - path[0])
+            states = path[0] + TESTED[:, None] * (path[1] - path[0])
             there, quick = not checker.are_free(states).all(), checker.collides_along(path)
             assert there or not quick
             found, colliding = found + quick, colliding + there

@@ -147,5 +147,5 @@ def test_files_are_told_apart_by_what_they_hold(
     assert isinstance(load_saved(tmp_path / "b.json"), RunResult)
     assert isinstance(load_saved(tmp_path / "e.yaml"), PlanResult)
     assert robot_of(run).name == arm.name
-    with pytest.raises(RobotError, match="no longer the one"):
+    with pytest.raises(RobotError, match="has changed since"):
         robot_of(replace(run, robot_digest="0" * 16))

@@ -166,7 +166,7 @@ def test_bad_input_is_one_sentence(
     assert saved_in(tmp_path) == [tmp_path / "r.npz"]
     with pytest.raises(ParameterError, match="problems or results"):
         view("ball_in_cup", tmp_path / "x.html")  # type: ignore[arg-type]
-    with pytest.raises(RobotError, match="no longer the one"):
+    with pytest.raises(RobotError, match="has changed since"):
         view(replace(result, robot_digest="0" * 16), tmp_path / "x.html")
     monkeypatch.setitem(sys.modules, "viser", None)
     with pytest.raises(MissingFileError, match=r"install the extra: apex-ompl\[view\]"):

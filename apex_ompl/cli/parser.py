@@ -44,8 +44,8 @@ class _Output(io.FileIO):
 def open_streams() -> None:
     """Open standard streams that were closed, as daemons do, and give the output its name.
 
-    Closed ones must be opened, in the order of their numbers: the next file that is opened would get the number, and
-    what libraries print would go there.
+    Closed streams must be opened, in the order of their numbers: the next file that is opened would get the number, and
+    the output of libraries would go there.
     """
     before: Any = sys.stdout
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
@@ -69,7 +69,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 def command() -> int:
-    """Run the command line as a process of its own, and return its exit code, with which it must be ended."""
+    """Run the command line as its own process, and return the exit code with which it must end."""
     return end_quickly(main())
 
 
@@ -139,7 +139,7 @@ def _add_plan(commands: Commands[argparse.ArgumentParser]) -> None:
     )
     parser.add_argument("--no-simplify", action="store_true", help="keep the path as the planner found it")
     parser.add_argument(
-        "--snapshot", action="store_true", help="take moving obstacles to stand where they are at time 0"
+        "--snapshot", action="store_true", help="treat moving obstacles as static at their positions at time 0"
     )
     parser.add_argument(
         "--leave-contact", type=float, default=0.0, metavar="METRES",
@@ -247,9 +247,9 @@ def _add_benchmark(commands: Commands[argparse.ArgumentParser]) -> None:
     parser.add_argument("--seed", type=int, default=0, help="of the first run (default: %(default)s)")
     parser.add_argument("--split", default="test", help="train, validation or test (default: %(default)s)")
     parser.add_argument("--no-simplify", action="store_true", help="keep paths as planners found them")
-    parser.add_argument("--jobs", type=int, default=1, metavar="N", help="at a time (default: one, as they are timed)")
+    parser.add_argument("--jobs", type=int, default=1, metavar="N", help="at a time (default: one, for timing)")
     parser.add_argument("--address", metavar="HOST:PORT", help="of a Ray cluster to run on")
-    parser.add_argument("-o", "--out", type=Path, required=True, metavar="DIR", help="goes on where it was stopped")
+    parser.add_argument("-o", "--out", type=Path, required=True, metavar="DIR", help="resumes where it was stopped")
     parser.add_argument(
         "--keep", action="store_true", help="store each run's path, for apex-ompl render and PlanResult.load"
     )
@@ -262,6 +262,6 @@ def _add_benchmark(commands: Commands[argparse.ArgumentParser]) -> None:
 
 
 def _add_check(commands: Commands[argparse.ArgumentParser]) -> None:
-    parser = commands.add_parser("check", help="validate a problem, and say whether start and goal are free")
+    parser = commands.add_parser("check", help="validate a problem, and print whether start and goal are free")
     parser.add_argument("problem", help=PROBLEM_HELP)
     parser.set_defaults(run="commands:check")

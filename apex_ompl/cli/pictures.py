@@ -49,7 +49,7 @@ def view(parsed: argparse.Namespace) -> int:
         sources = [load_source(one) for one in parsed.sources]
     module.view(
         sources, parsed.out, port=parsed.port, cover=parsed.cover, opened=not parsed.no_browser,
-        ready=lambda said: print(said, flush=True),
+        ready=lambda message: print(message, flush=True),
     )  # fmt: skip
     if parsed.out is not None:
         print(parsed.out)
@@ -60,6 +60,6 @@ def load_source(source: str) -> Problem | PlanResult | RunResult:
     """Return a saved plan or run, or the problem of a name or a file.
 
     Raises:
-        ApexError: There is no such thing, or it cannot be read.
+        ApexError: There is no such problem or result, or it cannot be read.
     """
     return load_saved(Path(source)) if is_saved(Path(source)) else load_problem(source)

@@ -22,8 +22,8 @@ from apex_ompl.types import Array, Flags
 from apex_ompl.util.arrays import compact
 from apex_ompl.util.validation import check_states, number_array, shape_error
 
-LOOKED_AT = np.array([8, 4, 12, 2, 6, 10, 14, 1, 3, 5, 7, 9, 11, 13, 15, 0, 16]) / 16.0  # in a quick test, by share
-AT_ONCE, DOUBTFUL = 4, 3  # states of it at a time, and those that the meshes look at
+TESTED = np.array([8, 4, 12, 2, 6, 10, 14, 1, 3, 5, 7, 9, 11, 13, 15, 0, 16]) / 16.0  # in a quick test, by share
+AT_ONCE, DOUBTFUL = 4, 3  # states tested at a time, and states that the meshes check
 NO_POINT = (0.0, 0.0, -1.0)
 """Obstacle point of a scene without obstacles, 1 m below the table tops, farther away than any obstacle [m]."""
 
@@ -32,8 +32,8 @@ class CollisionChecker(SceneBodies):
     """Checks states of a robot in a scene for collision, in two stages.
 
     The first stage is conservative: sphere covers that contain the solids prove most free states, and long stretches
-    of motions, to be free, and balls inside of the robot's solids, which obstacles meet, prove most other states to
-    collide. What neither proves is checked by the second stage, Coal's meshes pair by pair; both give the same result.
+    of motions, to be free, and balls inside the robot's solids that overlap obstacles prove most other states to
+    collide. The second stage checks what neither proves: Coal's meshes pair by pair; both give the same result.
 
     Meshes collide by their triangles, primitives as solids, and a solid that lies entirely inside a mesh counts as a
     collision. Bodies that never move, such as the robot's base, are not checked against each other. A state with a
@@ -70,7 +70,7 @@ class CollisionChecker(SceneBodies):
         super().__init__(robot)
         self._spheres = ConservativeChecker(robot, self.meshes)
         self._prover, self._prover_alone = PathProver(robot, self.meshes), PathProver(robot, self.meshes)
-        self._alone: tuple[Kernel, Kernel] | None = None  # a kernel, and the one of its obstacles alone
+        self._alone: tuple[Kernel, Kernel] | None = None  # a kernel, and the kernel of its obstacles alone
         self.fill(scene, attached, allowed)
 
     @property
@@ -85,12 +85,12 @@ class CollisionChecker(SceneBodies):
         return self._spheres.kernel
 
     def prepare(self) -> None:
-        """Make the tables, and load or compile the kernel, so that the first query need not."""
+        """Make the tables, and load or compile the kernel, before the first query."""
         still = np.zeros((2, self.robot.dof))
         if self._two_stages:
             self._spheres.first_collision(still, 1.0, True, CheckCounts(), lambda *_: True)
             self._spheres.unproved_at(still[0], CheckCounts())
-            self.kernel.clearance(still[:1], 0.0)  # proofs begin with it
+            self.kernel.clearance(still[:1], 0.0)  # proofs start with it
 
     def is_free(self, q: Array) -> bool:
         """Whether the state ``q``, shape (dof,), collides with nothing."""
@@ -107,7 +107,7 @@ class CollisionChecker(SceneBodies):
 
         Args:
             states: The states.
-            threads: Number of threads that share what the kernel does, of many states; the meshes know but one.
+            threads: Number of threads of the kernel for many states; the meshes are checked by one thread.
 
         Raises:
             ParameterError: Another shape, or the number of threads is no positive whole number.
@@ -122,20 +122,20 @@ class CollisionChecker(SceneBodies):
         return free
 
     def collides_along(self, path: Array) -> bool:
-        """Whether a quick test finds a collision along a path, shape (N, dof); one without any found may have some.
+        """Whether a quick test finds a collision along a path, shape (N, dof); a path that passes may still collide.
 
-        It looks at a few states, spread evenly over the path's, the middle first. Where none is proved to collide,
-        those with the most pairs that the spheres leave are looked at by the meshes.
+        It tests a few states, spread evenly along the path, the middle first. Where none is proved to collide, the
+        meshes check the states with the most pairs that the spheres do not prove.
 
         Raises:
             ParameterError: Another shape.
         """
         path = number_array(path, "path")
         check_states(path, self.robot.dof, "path", least=1)
-        place, share = np.divmod(LOOKED_AT * (len(path) - 1), 1.0)
+        place, share = np.divmod(TESTED * (len(path) - 1), 1.0)
         before = place.astype(int)
-        behind = np.minimum(before + 1, len(path) - 1)
-        states = path[before] + share[:, None] * (path[behind] - path[before])
+        after = np.minimum(before + 1, len(path) - 1)
+        states = path[before] + share[:, None] * (path[after] - path[before])
         if not self._two_stages:
             return not self.are_free(states).all()
         left = list[tuple[int, UnprovedPairs]]()
@@ -184,12 +184,12 @@ class CollisionChecker(SceneBodies):
 
         The first state is checked in full, solids inside of others included. Along the rest all pairs are proved to
         stay apart: by the sphere covers, and where they do not suffice by distances of the exact shapes (meshes by
-        their triangles) against bounds on their relative motion. No stretch is taken on trust.
+        their triangles) against bounds on their relative motion. No stretch is assumed free.
 
         Args:
             path: States joined by straight lines, shape (N, dof), or a curve.
-            tolerance: Of the least clearance [m]; 0 asks for the proof alone, which is faster.
-            deadline: Value of ``time.perf_counter`` at which to give up [s].
+            tolerance: Tolerance of the least clearance [m]; 0 asks for the proof alone, which is faster.
+            deadline: Value of ``time.perf_counter`` at which the proof is abandoned [s].
 
         Raises:
             ParameterError: ``path`` has not the shape (N, dof).
@@ -253,10 +253,10 @@ class CollisionChecker(SceneBodies):
         return -max((contact.depth for contact in self.contacts(q)), default=0.0)
 
     def _is_free_given(self, q: Array, unproved: UnprovedPairs | None = None) -> bool:
-        """Whether a state is free, given what the balls left of it.
+        """Whether a state is free, given the pairs that the balls did not prove.
 
-        Unless they proved that it collides, the meshes check the pairs that are unproved, and all unless these are
-        complete.
+        Unless the balls proved a collision, the meshes check the unproved pairs, and all pairs unless the unproved ones
+        are complete.
         """
         if unproved is not None and unproved.collides:
             self.check_counts.colliding += 1

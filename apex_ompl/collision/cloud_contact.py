@@ -55,7 +55,7 @@ def touches(cloud_shape: coal.CollisionGeometry, shape: coal.CollisionGeometry, 
 def nearest_balls(solid: Solid, boxes: Array) -> list[Solid]:
     """Return a solid, or of a cloud the balls that are nearest to boxes in the world, shape (n, 2, 3) [m].
 
-    Of many points every few are looked at.
+    Large clouds are subsampled.
     """
     cloud = cloud_of(solid.shape)
     if cloud is None:
@@ -77,7 +77,7 @@ def _planes(shape: coal.BVHModelBase) -> tuple[Array, Array]:
 def cloud_depth(cloud: PointCloud, solid: Solid, pose: pin.SE3) -> float:
     """Return how deep a solid at a pose in a cloud's frame reaches into its balls, negative where it does not [m].
 
-    It is that of the deepest ball.
+    It is the depth of the deepest ball.
     """
     return cloud.radius - float(_distances(cloud.points, solid, pose, cloud.radius + NEARLY).min())
 
@@ -85,14 +85,14 @@ def cloud_depth(cloud: PointCloud, solid: Solid, pose: pin.SE3) -> float:
 def filter_points(
     points: ArrayLike, robot: Robot, state: ArrayLike, margin: float = 0.02, held: Iterable[AttachedObject] = ()
 ) -> Array:
-    """Return the points that are not on the robot or on what it holds, shape (n, 3) [m].
+    """Return the points that are not on the robot or its held objects, shape (n, 3) [m].
 
     Args:
         points: Points in the world, shape (N, 3) [m].
         robot: The robot.
         state: Its state, shape (dof,).
-        margin: Distance up to which a point is taken for one of the robot or a held object [m].
-        held: What it holds.
+        margin: Distance up to which a point counts as part of the robot or a held object [m].
+        held: Held objects.
 
     Raises:
         ParameterError: An argument has another shape, or is out of its range.

@@ -32,7 +32,7 @@ class UnprovedPairs(NamedTuple):
     Attributes:
         pairs: Pairs of geometries that are not proved to be apart.
         complete: Whether all others are proved to be apart.
-        collides: Whether the state is proved to collide, so that nothing is left to the meshes.
+        collides: Whether the state is proved to collide, so that the meshes need not check it.
     """
 
     pairs: list[tuple[int, int]]
@@ -43,7 +43,7 @@ class UnprovedPairs(NamedTuple):
 MOST_TABLES = 64  # kept for each robot: one for each set of held objects
 
 _robots: WeakKeyDictionary[Robot, dict[Hashable, tuple[RobotTables, list[int]]]] = WeakKeyDictionary()
-"""Tables of a robot with what it holds, and the numbers that links and held objects had then."""
+"""Tables of a robot with its held objects, and the numbers that links and held objects had then."""
 
 
 @dataclass
@@ -54,7 +54,7 @@ class CheckCounts:
         proved: States that the spheres proved free.
         meshes: States that the meshes checked.
         colliding: States that balls inside of bodies proved to collide.
-        blocked: States that the spheres do not prove free, which searches in compiled code take for blocked.
+        blocked: States that the spheres do not prove free, which compiled searches treat as blocked.
         intervals: Intervals of motions that the spheres tried to prove as a whole.
         proved_intervals: Those that they proved.
         steps: Steps between the states of motions.
@@ -106,7 +106,7 @@ class ConservativeChecker:
         Raises:
             MissingFileError: The robot names a file of covers that cannot be read.
             FileFormatError: That file does not follow its schema.
-            RobotError: A joint moves in a way that the kernel does not know.
+            RobotError: The kernel does not support the motion of a joint.
         """
         if self._kernel is not None and self._listed and self._held_listed and not self._moved:
             return self._kernel
@@ -121,15 +121,15 @@ class ConservativeChecker:
             return self._kernel
 
     def obstacles_changed(self) -> None:
-        """Take note that obstacles were added or removed."""
+        """Note that obstacles were added or removed."""
         self._listed = False
 
     def obstacle_moved(self, number: int) -> None:
-        """Take note that an obstacle was moved."""
+        """Note that an obstacle was moved."""
         self._moved.add(number)
 
     def held_changed(self) -> None:
-        """Take note that objects were attached or detached."""
+        """Note that objects were attached or detached."""
         self._held_listed = False
 
     def _with_allowed(self, tables: SceneTables, robot: RobotTables) -> SceneTables:

@@ -271,7 +271,7 @@ def shape_arrays(placed: Sequence[PlacedShape]) -> ShapeArrays:
 
 
 def joined(bodies: ShapeArrays, obstacles: ShapeArrays) -> ShapeArrays:
-    """Return the shapes of bodies, and of obstacles behind them."""
+    """Return the shapes of bodies, followed by those of obstacles."""
     points, nodes, edges = len(bodies.points), len(bodies.child), len(bodies.edge_end)
     moved = obstacles._replace(
         points_of=obstacles.points_of + np.array([points, 0], np.int64), root=_moved(obstacles.root, nodes),
@@ -283,7 +283,7 @@ def joined(bodies: ShapeArrays, obstacles: ShapeArrays) -> ShapeArrays:
 
 
 def _moved(numbers: Integers, by: int) -> Integers:
-    """Return numbers plus ``by``, but for those that stand for nothing, -1."""
+    """Return numbers plus ``by``; -1, which stands for nothing, stays."""
     return np.where(numbers >= 0, numbers + by, -1)
 
 

@@ -17,7 +17,7 @@ from apex_ompl.util.cache import weakly_cached
 from apex_ompl.util.forking import ProcessLock
 
 THICKNESS = 1e-6  # by which hulls of surfaces are larger; of those longer than 1 m as much by their length [m]
-DIRECTIONS = (400, 60)  # in which hulls of too many vertices are sampled; fewer where Coal takes no more
+DIRECTIONS = (400, 60)  # in which hulls of too many vertices are sampled; fewer where Coal accepts no more
 CELLS = 24  # along the longest side of a grid over vertices
 MOST_VERTICES = 50_000  # of a mesh whose hull is not sampled
 
@@ -27,9 +27,9 @@ _building = ProcessLock()
 def convex_hull(geometry: coal.CollisionGeometry) -> coal.CollisionGeometry:
     """Return the convex hull of a mesh, or the geometry itself when it is convex already.
 
-    That of a surface without an inside, which may be flat, is the box around it. Coal takes at most 255 neighbors of a
-    vertex. Where a hull has more, and of meshes of more than ``MOST_VERTICES``,
-    which take seconds, a slightly larger body with fewer vertices is returned.
+    The hull of a surface without an inside, which may be flat, is the box around it. Coal accepts at most 255 neighbors
+    of a vertex. Where a hull has more, and for meshes of more than ``MOST_VERTICES``, which would take seconds, a
+    slightly larger body with fewer vertices is returned.
     """
     if not is_shell(geometry):
         return geometry
@@ -120,7 +120,8 @@ def below_support(normals: Array, corners: Array, points: Array) -> Array:
 def farthest(directions: Array, points: Array) -> tuple[NDArray[np.intp], Array]:
     """Return the point that is farthest in each direction, shape (D,), and how far it is, shape (D,) [m].
 
-    Of the points of a grid's cells only those are looked at whose cell may reach farther than any first point of one.
+    Points are grouped into the cells of a grid; only cells that may reach farther than the best first point of a cell
+    are searched.
     """
     low, high = bounding_box(points)
     wide = float((high - low).max())

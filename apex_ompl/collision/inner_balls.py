@@ -1,7 +1,7 @@
-"""Balls inside of solids, by which the compiled kernel sees that states collide without asking the meshes.
+"""Balls inside solids, by which the compiled kernel proves collisions without the meshes.
 
-Where a ball that lies inside of a body meets an obstacle, the body does. A handful of balls finds most collisions of a
-search, which are centimeters deep; what they do not find is left to the meshes.
+Where a ball inside a body overlaps an obstacle, the body does. A handful of balls finds most collisions of a search,
+which are centimeters deep; the meshes check the rest.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from apex_ompl.collision.shapes import is_shell, is_surface
 from apex_ompl.types import Array
 from apex_ompl.util.cache import kept
 
-PLACES = 60  # at which the depth is looked at, about
+PLACES = 60  # at which the depth is computed, about
 MOST = 12  # balls of a solid
 LEAST = 0.01  # share of the places inside that a further ball must add
 POINT = 1e-9  # radius of the ball that stands for a point [m]
@@ -26,7 +26,7 @@ _known: dict[str, Array] = {}  # by shape key
 
 
 def inner_balls(geometry: coal.CollisionGeometry) -> Array:
-    """Return centers and radii of a few balls inside of a solid, shape (K, 4) [m]; none for a surface.
+    """Return centers and radii of a few balls inside a solid, shape (K, 4) [m]; none for a surface.
 
     They are chosen greedily: each covers the most of the places, on a lattice, that none before covers.
 

@@ -66,7 +66,7 @@ def _make_exact(request: coal.CollisionRequest) -> coal.CollisionRequest:
 
 
 _links: WeakKeyDictionary[Robot, list[coal.CollisionGeometry]] = WeakKeyDictionary()
-"""Geometries of a robot's links, kept between scenes with what was computed of them."""
+"""Geometries of a robot's links, kept between scenes with the results computed from them."""
 
 
 class MeshStage:
@@ -101,7 +101,7 @@ class MeshStage:
         self.lock = ProcessLock()
 
     def allow(self, allowed: Iterable[frozenset[str]]) -> None:
-        """Let pairs of bodies touch, by their names, and no others but those of the robot's own."""
+        """Let pairs of bodies touch, by their names, besides the robot's own pairs, and no others."""
         self.allowed = frozenset(allowed)
         self.geometry.removeAllCollisionPairs()
         for pair in self._robot.geometry.collisionPairs:
@@ -110,7 +110,7 @@ class MeshStage:
         self._pair_up()
 
     def _pair_up(self) -> None:
-        """Make what Pinocchio keeps for the pairs of links."""
+        """Make Pinocchio's data for the pairs of links."""
         self._link_pairs = [(p.first, p.second) for p in self.geometry.collisionPairs]
         # The manager does not keep its arguments alive; this object does.
         self.geometry_data = exact_requests(self.geometry.createData())

@@ -37,7 +37,7 @@ TOUCH = 1e-5  # distance that counts as contact [m]
 TOLERANCE = 1e-5  # of the least clearance [m]
 SEEDS = 9  # states whose spheres show what clearance to look for
 SLACK, MOST_LIMIT = 0.01, 0.5  # of what the spheres are larger than the shapes, and of that clearance [m]
-BUDGET = 1000  # intervals between two looks at the clock: some milliseconds
+BUDGET = 1000  # intervals between two readings of the clock: some milliseconds
 
 
 MOST_SCENES = 2  # whose packed shapes are kept
@@ -57,7 +57,7 @@ class Curve:
         knots: Increasing parameters of the states, shape (K,): lengths [rad], or times [s].
         states: Shape (K, dof).
         rates: Velocities and accelerations side by side, shape (K, 2 dof); (0, 2 dof) for straight lines.
-        slack: What the pieces miss each other by, by rounding, in all [rad].
+        slack: Sum of the gaps between pieces by rounding [rad].
     """
 
     knots: Array
@@ -103,8 +103,8 @@ class PathProof:
         clearance_bound: Least distance that is proved along the whole curve [m]; 0 without a proof.
         pair: Names of the two bodies at the least distance found; empty where there is none.
         by_spheres: Share of the curve's length that the sphere covers proved alone; exact shapes proved the rest.
-        intervals: Number of intervals looked at.
-        timed_out: Whether the time was over before the proof ended.
+        intervals: Number of intervals checked.
+        timed_out: Whether the deadline passed before the proof ended.
     """
 
     ok: bool
@@ -281,10 +281,10 @@ class _Buffers:
 
 
 def changed_obstacles(before: Kernel, now: Kernel) -> Flags | None:
-    """Return which solids of the scene of now were not in it before, shape (solids,).
+    """Return which solids of the current scene were not in it before, shape (solids,).
 
-    A solid that is gone can block nothing. None where more changed than obstacles: the robot, what it holds, or which
-    pairs may touch.
+    A removed solid can block nothing. None where more than obstacles changed: the robot, its held objects, or the pairs
+    that may touch.
     """
     old, new = before.scene.arrays, now.scene.arrays
     if now.robot is not before.robot or not np.array_equal(old.allowed, new.allowed):
@@ -294,7 +294,7 @@ def changed_obstacles(before: Kernel, now: Kernel) -> Flags | None:
 
 
 def _row(kernel: Kernel, k: int) -> tuple[object, ...]:
-    """Return all that a solid is, but for its place in the tables."""
+    """Return the content of a solid, without its place in the tables."""
     a, grids = kernel.scene.arrays, kernel.scene.grids
     grid = grids[k] if len(grids) else None
     return (
@@ -310,13 +310,13 @@ def _row(kernel: Kernel, k: int) -> tuple[object, ...]:
 def may_have_become_blocked(before: Kernel, now: Kernel, first: Array, last: Array) -> Flags:
     """Return which straight motions that were free before may be blocked now, shape (N,).
 
-    Those that the sphere cover proves clear of all solids that are new, or moved, stay free.
+    Motions that the sphere cover proves clear of all new or moved solids stay free.
 
     Args:
         before: The kernel with which they were free.
-        now: The kernel of now.
-        first: States that they begin at, shape (N, dof).
-        last: States that they end at, shape (N, dof).
+        now: The current kernel.
+        first: Start states of the motions, shape (N, dof).
+        last: End states of the motions, shape (N, dof).
     """
     changed = None if now is before else changed_obstacles(before, now)
     if now is before or (changed is not None and not changed.any()):

@@ -21,14 +21,14 @@ SHOWN_AFTER = 1.0  # of a progress bar [s]
 
 
 class SceneBodies:
-    """Obstacles, the robot's fixtures and what it holds, with their geometry."""
+    """Obstacles, the robot's fixtures and held objects, with their geometry."""
 
     def __init__(self, robot: Robot) -> None:
         """Hold nothing yet; :meth:`fill` adds the fixtures of ``robot``, among others."""
         self.robot = robot
         self.meshes = MeshStage(robot)
         self._obstacles: dict[str, Body] = {}
-        self._changing: set[str] = set()  # obstacles that move or appear later
+        self._changing: set[str] = set()  # dynamic obstacles and obstacles that appear later
         self._notes: dict[str, str] = {}
         self._listed: dict[str, Obstacle] | None = None  # the obstacles without fixtures, made when they are asked for
         self._attached: dict[str, AttachedObject] = {}
@@ -62,9 +62,9 @@ class SceneBodies:
     def become(
         self, scene: Mapping[str, Obstacle], held: Mapping[str, AttachedObject], allowed: Iterable[tuple[str, str]]
     ) -> None:
-        """Change what differs from obstacles and held objects, by name, and from pairs that may touch.
+        """Change the scene to these obstacles and held objects, by name, and pairs that may touch.
 
-        What stands where it did moves in place; other obstacles that are new become the last ones.
+        Obstacles of the same solid move in place; new obstacles become the last ones.
 
         Raises:
             SceneError, UnknownNameError, MissingFileError, FileFormatError: As :meth:`fill`.
@@ -82,13 +82,13 @@ class SceneBodies:
         self._set_allowed(frozenset(frozenset(pair) for pair in allowed))
 
     def _obstacle_moved(self, number: int) -> None:
-        """Take note that an obstacle was moved, by its number in ``meshes``; overridden."""
+        """Note that an obstacle was moved, by its number in ``meshes``; overridden."""
 
     def _obstacles_changed(self) -> None:
-        """Take note that obstacles were added or removed; overridden."""
+        """Note that obstacles were added or removed; overridden."""
 
     def _held_changed(self) -> None:
-        """Take note that objects were attached or detached; overridden."""
+        """Note that objects were attached or detached; overridden."""
 
     @property
     def obstacle_names(self) -> tuple[str, ...]:
@@ -104,13 +104,13 @@ class SceneBodies:
 
     @property
     def changing_obstacles(self) -> tuple[Obstacle, ...]:
-        """Obstacles that move, or appear later than at time 0, in the order in which they were added."""
+        """Dynamic obstacles, and obstacles that appear after time 0, in the order in which they were added."""
         found = (self._obstacles[name] for name in sorted(self._changing, key=self.meshes.scene.__getitem__))
         return tuple(one for one in found if isinstance(one, Obstacle))
 
     @property
     def mesh_notes(self) -> tuple[str, ...]:
-        """Sentences on meshes that are no proper solids as they are, and how they are taken."""
+        """Sentences on meshes that are no proper solids, and how they are interpreted."""
         return tuple(self._notes.values())
 
     def obstacle(self, name: str) -> Obstacle:
@@ -154,7 +154,7 @@ class SceneBodies:
         self._obstacles_changed()
 
     def _put(self, body: Body) -> None:
-        """Keep the record of an obstacle that is new, or in place of the one before."""
+        """Keep the record of a new obstacle, or replace its earlier record."""
         self._obstacles[body.name] = body
         self._listed = None
         changes = isinstance(body, Obstacle) and (body.moving or body.appears > 0.0)
@@ -180,7 +180,7 @@ class SceneBodies:
         self._move_to(new)
 
     def _move_to(self, body: Body) -> None:
-        """Put the record of an obstacle in place of the one before, from which it differs in pose and motion alone."""
+        """Replace the record of an obstacle by one that differs in pose and motion alone."""
         self._put(body)
         if body.half_space is not None:  # its pose is part of its geometry
             self.meshes.remove(body.name)
@@ -303,5 +303,5 @@ class SceneBodies:
 
 
 def _sequence(given: Any) -> Any:
-    """Return a sequence as a tuple, and anything else as it is, which is refused behind it."""
+    """Return a sequence as a tuple, and anything else unchanged, which the validation refuses."""
     return tuple(given) if isinstance(given, Iterable) else given

@@ -41,7 +41,7 @@ from apex_ompl.util.files import read_file
 from apex_ompl.util.forking import ProcessLock
 
 KEPT_MESHES = 32  # meshes that were loaded last and are kept for the next problem
-LARGE = 50_000  # triangles of a mesh from which on its grid of distances is made while its tree is
+LARGE = 50_000  # triangles of a mesh from which its distance grid is made in parallel to its tree
 MANY_TRIANGLES = 200_000  # which take seconds
 
 LOG = logging.getLogger("apex_ompl")
@@ -55,7 +55,7 @@ def coal_geometry(body: Body) -> coal.CollisionGeometry:
     """Return the Coal geometry of a body's shape, in the body's frame.
 
     Boxes, spheres, cylinders, capsules and half-spaces become solids; meshes, voxels and distance grids a bounding
-    volume hierarchy over their triangles; points what stands for them (:mod:`apex_ompl.collision.shapes`).
+    volume hierarchy over their triangles; points the box around them.
 
     Raises:
         MissingFileError: The mesh file cannot be read.
@@ -78,14 +78,14 @@ def coal_geometry(body: Body) -> coal.CollisionGeometry:
 
 @weakly_cached
 def _as_read(_: MeshFile | PointFile | GridFile) -> coal.CollisionGeometry | None:
-    """Return what was read of the file of a body by :func:`with_file_read`, None for others."""
+    """Return the geometry read by :func:`with_file_read` for a shape of a file, None for others."""
     return None
 
 
 def with_file_read(body: BodyT) -> BodyT:
-    """Return a body whose record keeps what its file holds now, and names it by an absolute path.
+    """Return a body whose record keeps the current content of its file, and names it by an absolute path.
 
-    The file is not read again for this record, nor for others that are made from it: it may change or be gone.
+    The file is not read again for this record, nor for records made from it: it may change or disappear.
 
     Raises:
         MissingFileError: The file cannot be read.
@@ -135,7 +135,7 @@ def is_shell(geometry: coal.CollisionGeometry) -> bool:
 
 
 def mesh_note(body: Body) -> str:
-    """Return a sentence on a mesh that is no proper solid as it is and how it is taken, or an empty string.
+    """Return a sentence on a mesh that is no proper solid and how it is interpreted, or an empty string.
 
     Raises:
         MissingFileError: The mesh file cannot be read.
@@ -244,7 +244,7 @@ class PointCloud:
 
 @weakly_cached
 def cloud_of(_: coal.CollisionGeometry) -> PointCloud | None:
-    """Return the cloud that a geometry stands for, None for one that is what it is."""
+    """Return the point cloud that a geometry stands for, None for other geometries."""
     return None
 
 

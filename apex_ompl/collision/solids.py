@@ -131,9 +131,9 @@ def closest(
     """Return the least signed distance of the hulls of two sets of solids; pairs whose boxes are farther are left out.
 
     Args:
-        dynamic: Solids of the one set.
+        dynamic: Solids of the first set.
         at: Their poses in the world.
-        others: Solids of the other set.
+        others: Solids of the second set.
         there: Their poses in the world.
     """
     best = NO_PAIR

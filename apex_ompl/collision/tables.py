@@ -124,7 +124,7 @@ def tabulate(
 
     Args:
         robot: The robot.
-        solids: Its links and what it holds.
+        solids: Its links and held objects.
         numbers: Number of each outside of the tables.
         covers: The cover of each.
         meets_scene: Whether each is checked against obstacles.
@@ -187,14 +187,14 @@ def make_tables(
 
     Args:
         robot: The robot.
-        solids: Its links and what it holds.
+        solids: Its links and held objects.
         meets_scene: Whether each is checked against obstacles.
         pairs: Pairs that are checked for self-collision, by their places in ``solids``.
 
     Raises:
         MissingFileError: The robot names a file of covers that cannot be read.
         FileFormatError: That file does not follow its schema.
-        RobotError: A joint moves in a way that the kernel does not know.
+        RobotError: The kernel does not support the motion of a joint.
     """
     covers = covers_of(robot, [solid.shape for solid in solids])
     return tabulate(
@@ -210,7 +210,7 @@ def stored_tables(
     Raises:
         MissingFileError: The robot names a file of covers that cannot be read.
         FileFormatError: That file does not follow its schema.
-        RobotError: A joint moves in a way that the kernel does not know.
+        RobotError: The kernel does not support the motion of a joint.
     """
     limits = robot.limits
     parts = [
@@ -254,7 +254,7 @@ def _stored(
 
 
 def _of_shape(geometry: coal.CollisionGeometry, joint: int, pose: Any, name: str = "") -> bytes:
-    """Return what tables take from a shape that is fixed to a joint at a pose, shape (4, 4) [m]."""
+    """Return the content of a shape that is fixed to a joint at a pose, shape (4, 4) [m], that tables depend on."""
     place = np.asarray(pose, float).tobytes()
     return json.dumps([name, joint, shape_key(geometry)]).encode() + _content(geometry) + place
 

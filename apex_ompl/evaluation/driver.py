@@ -36,12 +36,12 @@ from apex_ompl.util.provenance import hardware, versions
 from apex_ompl.util.validation import check_integer
 
 DIED = "the process died"
-RUNS_PER_PROCESS = 500  # about, until a new process takes its place: OMPL's BIT* leaks 20 MB for each second
+RUNS_PER_PROCESS = 500  # about, until a new process replaces it: OMPL's BIT* leaks 20 MB for each second
 
 
 @dataclass(frozen=True)
 class Workers:
-    """Where runs are made.
+    """Where runs are executed.
 
     Attributes:
         at_once: Number of runs at the same time; with one, times are those of runs alone.
@@ -69,8 +69,8 @@ class Workers:
             warm: Filled with the time of the first run of each row on this machine [s].
 
         Raises:
-            ApexError: A planner kills the process while it warms up; a file, a parameter or a checkpoint is at
-                fault; the cluster fails.
+            ApexError: A planner kills the process while it warms up; a file, a parameter or a checkpoint is
+                faulty; the cluster fails.
         """
         first = list({job.label: job for job in jobs}.values())
         if self.address is not None:
@@ -83,7 +83,7 @@ class Workers:
             yield from (one for _, one in found)
             return
         waiting, suspects, blamed = list(jobs[::-1]), list[Job](), set[str]()
-        while waiting or suspects:  # runs under way when a process died are made again, one by one
+        while waiting or suspects:  # runs in progress when a process died are repeated one by one
             under_way: dict[Future[Run], Job] = {}
             before = len(waiting) + len(suspects)
             pool = self._pool(first, 1 if suspects else self.at_once)
@@ -96,7 +96,7 @@ class Workers:
                     raise ParameterError(
                         "planners", ", ".join(job.label for job in first), "planners that do not end the process"
                     ) from None
-                for job in died:  # the first time another run may have been the cause
+                for job in died:  # at the first death another run may be the cause
                     if job.key in blamed:
                         yield job_columns(job) | unsolved(CRASH, DIED)
                     else:
@@ -141,7 +141,7 @@ def _prepare(first: Sequence[Job], modules: Sequence[str]) -> None:
 
 
 def _end_with_parent() -> None:
-    """End this process when its parent has ended, were it by SIGKILL."""
+    """End this process when its parent has ended, even by SIGKILL."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()
@@ -174,8 +174,8 @@ def bench(
 ) -> Results:  # fmt: skip
     """Run planners on problems through OMPL's Benchmark, with the same space, checker and resolution.
 
-    A run is solved when its path passed the full check. Runs that the folder has with the same settings are not made
-    again. Each process makes one run of each row to warm up.
+    A run is solved when its path passed the full check. Runs that the folder holds with the same settings are not
+    repeated. Each process makes one run of each row to warm up.
 
     Args:
         suites: Suites, levels, problems or files.
@@ -190,13 +190,13 @@ def bench(
         keep: Whether to store the result of each run that is made by ``plan``, for ``PlanResult.load``.
         quiet: Whether to show no progress.
         provenance: Further entries of the session, as the commit of the code.
-        first: Number of problems of each level that are left out before.
+        first: Number of problems at the start of each level that are left out.
 
     Returns:
         The results in the folder.
 
     Raises:
-        ApexError: An argument is unknown or out of range, the folder is of something else, or the cluster fails.
+        ApexError: An argument is unknown or out of range, the folder holds other files, or the cluster fails.
         KeyboardInterrupt: Ctrl-C was pressed; runs that had ended are kept.
     """
     workers = workers or Workers()

@@ -33,7 +33,7 @@ AFTER_PLANNER = ("simplify", "verify", "repair")  # stages of a plan
 def write_logs(results: Results) -> list[Path]:
     """Write OMPL's log of each experiment, and return the files: ``logs/SUITE_LEVEL.log`` in the results' folder.
 
-    The runs of a planner on a level are runs of one experiment there. ``solved`` says whether the path passed the full
+    The runs of a planner on a level are runs of one experiment. ``solved`` is true where the path passed the full
     check.
 
     Raises:

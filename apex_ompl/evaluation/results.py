@@ -30,7 +30,7 @@ class Results:
     Attributes:
         folder: The folder.
         about: Provenance: schema, settings, sessions (command, hardware, versions), rows, warm-up times.
-        runs: The runs, in no order; ``session`` is the index of the session in which one was made.
+        runs: The runs, in no order; ``session`` is the index of a run's session.
     """
 
     folder: Path
@@ -38,7 +38,7 @@ class Results:
     runs: list[Run] = field(default_factory=list)
 
     def plan_file(self, run: Run) -> Path:
-        """Return where ``bench`` stores the result of a run if it is told to keep it."""
+        """Return the file in which ``bench`` stores the result of a run with ``keep``."""
         return self.folder / PLANS / f"{hashlib.sha256(run['key'].encode()).hexdigest()[:16]}.npz"
 
     @classmethod
@@ -84,7 +84,7 @@ class Results:
         return cls(folder, about, list(runs.values()))
 
     def sessions(self) -> list[dict[str, Any]]:
-        """Return the sessions in which the runs were made, in their order; all where a run does not name its own."""
+        """Return the sessions of the runs, in their order; all sessions where a run does not name its own."""
         found = {run.get("session") for run in self.runs} or {None}
         return [one for k, one in enumerate(self.about["sessions"]) if k in found or None in found]
 

@@ -25,8 +25,8 @@ PAPER = {
     "model": "apex-paper", "line": False, "repair": False, "bridge": False, "fallback": False, "polish": False,
     "first": 1, "second": 1, "third": 1, "resample": 2, "scaling": "noise",
 }  # fmt: skip
-"""Parameters of apex that leave only the paper's algorithm: ancestral sampling with all steps, of one path after the
-other, and collision-triggered resampling; with ``guidance`` added it is guided by equation 7."""
+"""Parameters of apex that leave only the paper's algorithm: ancestral sampling with all steps, one path after the
+other, and collision-triggered resampling; ``guidance`` adds the guidance of equation 7."""
 
 RunnerFunction = Callable[["Job"], Mapping[str, Any]]
 
@@ -43,8 +43,8 @@ class Row:
         runs: Largest number of runs on a level; None takes the benchmark's.
         levels: Suites, levels as ``shelf/hard``, or suffixes of their names as ``/hard``; all by default.
         runner: Function that makes a run instead of OMPL's Benchmark, as ``module:function``. It takes a :class:`Job`
-            and returns columns of the run, among them ``solved``, and further ones of its own. Names of planners and
-            parameters are then the function's own.
+            and returns columns of the run, among them ``solved``, and further columns. The function
+            then defines the names of planners and parameters.
     """
 
     label: str
@@ -123,7 +123,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Job:
-    """A run to be made.
+    """A run to execute.
 
     Attributes:
         experiment: Name of the level or problem.

@@ -41,10 +41,10 @@ from apex_ompl.types import Array
 from apex_ompl.util.clocks import Deadline
 
 PROOF = ("verify", "repair")
-"""Stages behind a planner that make its path an exact solution."""
+"""Stages after a planner that make its path an exact solution."""
 MEMORY = 16_384.0  # limit of a run [MB]
 UPDATES = 0.05  # period at which a planner's progress is read [s]
-LOOK = 0.1  # period at which OMPL's Benchmark looks whether a planner's time is up [s]
+LOOK = 0.1  # period at which OMPL's Benchmark checks a planner's time limit [s]
 RESULT = "result"
 NO_PROBLEM, CRASH = "NO_PROBLEM", str(PlanStatus.CRASH)
 WARM_UP = "wall/easy/800000"
@@ -57,7 +57,7 @@ def first_path_proof(
     """Return the time of the proof by which a first path counts as found [s].
 
     A first path counts when it has passed the full check. Where the returned path needed a repair, the path as the
-    planner found it may pass without one: then its own full check counts, which is made and timed here. Otherwise the
+    planner found it may pass without one: then its own full check counts, which is run and timed here. Otherwise the
     check and repair of the returned path count. The first-path time of a run is the time until the planner has a path,
     plus this.
 
@@ -143,10 +143,10 @@ class Experiment:
 
 
 def request_time(timeout: float) -> float:
-    """Return the time to ask OMPL's Benchmark for so that a planner ends within a time, or at the first look [s].
+    """Return the time limit for OMPL's Benchmark at which a planner ends within a time, or at the first reading [s].
 
-    The Benchmark looks at the clock every 0.1 s, and 0.01 s later on an idle core, so that the first look comes after
-    0.11 s. The time returned lies halfway before the last look that is early enough.
+    The Benchmark reads the clock every 0.1 s, and 0.01 s later on an idle core, so that the first reading comes after
+    0.11 s. The time returned lies half a period before the last reading that is early enough.
     """
     looks = max(1, math.floor(timeout / LOOK + 1e-6))
     return (looks - 0.5) * LOOK
@@ -155,13 +155,13 @@ def request_time(timeout: float) -> float:
 def _watched(run: PlanRun, observed: list[float]) -> Callable[[Array, Array], bool]:
     """Return a motion check whose first call after a path was found notes the time since its first call [s]."""
     check, definition = run.setup.motion_validator.check, run.setup.simple_setup.getProblemDefinition()
-    begin = 0.0
+    started = 0.0
 
     def watched(first: Array, second: Array) -> bool:
-        nonlocal begin
-        begin = begin or time.perf_counter()
+        nonlocal started
+        started = started or time.perf_counter()
         if not observed and definition.hasExactSolution():
-            observed.append(time.perf_counter() - begin)
+            observed.append(time.perf_counter() - started)
         return check(first, second)
 
     return watched
@@ -181,12 +181,12 @@ def _solved_at(progress: Iterable[Mapping[str, str]]) -> Iterator[float]:
 
 
 def run(job: Job) -> Run:
-    """Return one run; one that fails in an unforeseen way is not solved and gives the reason.
+    """Return one run; a run that fails unexpectedly counts as not solved and gives the reason.
 
-    Of a run by ``plan`` the entry ``RESULT`` is its ``PlanResult``, for the driver to store or to leave.
+    For a run by ``plan`` the entry ``RESULT`` is its ``PlanResult``, which the driver may store.
 
     Raises:
-        ApexError: A file, a parameter or a checkpoint is at fault.
+        ApexError: A file, a parameter or a checkpoint is faulty.
     """
     about = job_columns(job)
     try:
@@ -238,7 +238,7 @@ def planned(job: Job) -> tuple[PlanRun, Experiment, PlanResult]:
 
 
 def in_time(job: Job, stages: Sequence[str] = STAGES) -> tuple[PlanRun, Experiment, PlanResult]:
-    """Return a run among moving obstacles: as :func:`planned`, without OMPL's experiment and with the motion.
+    """Return a run among dynamic obstacles: as :func:`planned`, without OMPL's experiment and with the motion.
 
     Args:
         job: The run.
@@ -269,15 +269,15 @@ def columns(planning: PlanRun, experiment: Experiment, result: PlanResult) -> Ru
     """Return the columns of a run that was planned."""
     times, report = result.times, planning.report
     path = result.path.states if result and result.path is not None else None
-    # Optimizing planners go on after their first path, which is not kept.
+    # Optimizing planners continue after their first path, which is not kept.
     first_path = None if planning.parameters.optimizing else planning.first_path
     raw = None if first_path is None else first_path.states
     found = path is not None
     total = sum(times.get(stage, 0.0) for stage in ("solve", "simplify", *PROOF))
     first = times.get(FIRST, times.get("solve", 0.0))
-    if result.dynamic_obstacles:  # the motion is what is asked for, and comes last
+    if result.dynamic_obstacles:  # the run is solved by its motion, which comes last
         first = total = times["total"] - times["setup"]
-    elif report is None or not report.first_verified:  # the planner itself had not made the full check
+    elif report is None or not report.first_verified:  # the planner itself did not run the full check
         setup = planning.setup
         exact = None if first_path is None else with_exact_ends(setup, first_path).states
         first = min(first + first_path_proof(setup.checker, exact, setup.start, setup.goals, times), total)
@@ -299,7 +299,7 @@ def columns(planning: PlanRun, experiment: Experiment, result: PlanResult) -> Ru
 
 
 def _robot_of(problem: str) -> str:
-    """Return the robot of a problem; that of the suites where no problem can be sampled."""
+    """Return the robot of a problem; or that of the suites where no problem can be drawn."""
     try:
         return load_problem(problem).robot
     except SuiteError:
@@ -307,7 +307,7 @@ def _robot_of(problem: str) -> str:
 
 
 def warm_up(jobs: Sequence[Job], modules: Sequence[str] = ()) -> dict[str, float]:
-    """Load what the runs of some rows need, and return the time of each row's first run [s].
+    """Load the code and files for the runs of some rows, and return the time of each row's first run [s].
 
     Args:
         jobs: One job of each row. It is made on the problem ``WARM_UP`` where that has the same robot.

@@ -176,7 +176,7 @@ def warnings(results: Results) -> list[str]:
     if any(session["address"] for session in sessions):
         found.append("Runs were made on a cluster, whose machines are not recorded.")
     if any(session["jobs"] > 1 for session in sessions):
-        found.append("Several runs went at the same time, so that times are longer than those of runs alone.")
+        found.append("Several runs were made at the same time, so that times are longer than those of single runs.")
     most = max(session["jobs"] for session in sessions) + TOLERATED_LOAD
     loaded = sum(run["load"] is not None and run["load"] > most for run in results.runs)
     if loaded:
@@ -203,7 +203,7 @@ def warnings(results: Results) -> list[str]:
         found.append("Faulty problems: " + "; ".join(list(faulty)[:5]) + ".")
     skipped = len({run["problem"] for run in results.runs if run["status"] == NO_PROBLEM})
     if skipped:
-        found.append(f"{skipped} seeds gave no problem and do not count.")
+        found.append(f"{skipped} seeds gave no problem and are not counted.")
     if any(not run["raw_length"] for run in results.runs if run["solved"]):
         found.append(
             "First paths of planners that use all their time are observed up to 0.05 s late, without their length, and "

@@ -46,10 +46,10 @@ def check_urdf(tree: ET.Element, file: Path, locked: Collection[str] = ()) -> No
     Args:
         tree: Its root.
         file: The file, for errors.
-        locked: Names of joints that become fixed ones, whose limits do not matter.
+        locked: Names of joints that become fixed, whose limits do not matter.
 
     Raises:
-        RobotError: An element is missing, or holds something else than it must.
+        RobotError: An element is missing or has another content than expected.
     """
     for link in tree.findall("link"):
         what = f"{file}: link {link.get('name')!r}"
@@ -267,14 +267,14 @@ def _locate_meshes(element: ET.Element, folders: tuple[Path, Path], part: Part) 
 def _scale_and_turn(holder: ET.Element, mesh: ET.Element, path: Path, role: str) -> None:
     """Scale a COLLADA mesh to meters, and turn a glTF mesh so that z is up, as RViz shows them; Pinocchio does neither.
 
-    The ``<up_axis>`` of COLLADA is ignored: links are modeled in their own frames, whatever their files say, and RViz,
-    MoveIt and Gazebo take them like that (rviz#1045, geometric_shapes#52). RViz 2 and Drake turn glTF (rviz#1482).
+    The ``<up_axis>`` of COLLADA is ignored: links are modeled in their own frames, and RViz,
+    MoveIt and Gazebo ignore it as well (rviz#1045, geometric_shapes#52). RViz 2 and Drake turn glTF (rviz#1482).
     """
     given = numbers(mesh.get("scale", "1 1 1"), 3, role)
     scale = given.copy()
     if path.suffix.lower() == ".dae":
         try:
-            with opened(path, role) as file:  # a visual mesh may be long, and its unit is at the beginning
+            with opened(path, role) as file:  # a visual mesh may be long, and its unit is near the start
                 scale *= collada_asset(file)[0]
         except ValueError as error:
             raise RobotError(f"{role}: {path} has {error}, expected COLLADA") from error
@@ -303,7 +303,7 @@ def _mount(root: ET.Element, part: Part, child: str) -> None:
 
 
 def _lock_all(root: ET.Element, locked: Mapping[str, float]) -> None:
-    """Turn joints into fixed ones at their values, and those that mimic one of them at the values that follow."""
+    """Turn joints into fixed joints at their values, and joints that mimic them at the values that follow."""
     joints = {str(joint.get("name")): joint for joint in root.findall("joint")}
     mimics = {name: mimic for name, joint in joints.items() if (mimic := joint.find("mimic")) is not None}
     for name, mimic in mimics.items():
@@ -345,7 +345,7 @@ def _lock(root: ET.Element, name: str, value: float) -> None:
 
 
 def _origin(element: ET.Element, what: str) -> Array:
-    """Return the pose that the origin of an element says, shape (4, 4) [m]."""
+    """Return the pose given by the origin of an element, shape (4, 4) [m]."""
     origin, pose = element.find("origin"), np.eye(4)
     if origin is not None:
         pose[:3, 3] = numbers(origin.get("xyz", "0 0 0"), 3, f"origin of {what}")

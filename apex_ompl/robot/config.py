@@ -32,7 +32,7 @@ class Part(StrictModel):
         urdf: URDF file, as a ``package://`` URI or a path relative to the robot file.
         srdf: SRDF file whose ``disable_collisions`` are used.
         prefix: Prefix of the names of all links and joints.
-        rename: Old -> new beginning of names, replaced before ``prefix`` is added.
+        rename: Old -> new start of names, replaced before ``prefix`` is added.
         remove: Links that are removed together with their descendants.
         parent: ``world``, or the link of an earlier part that carries this one.
         position: Placement of the part's root link in ``parent`` [m].

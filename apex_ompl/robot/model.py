@@ -79,8 +79,8 @@ class Limits:
         upper: Highest position.
         velocity: Largest speed [rad/s].
         acceleration: Largest acceleration [rad/s^2].
-        jerk: Largest jerk [rad/s^3]; infinity for no limit. One that reaches the largest acceleration in less than
-            ``SHORTEST_RAMP`` is lowered to that.
+        jerk: Largest jerk [rad/s^3]; infinity for no limit. A jerk that reaches the largest acceleration in
+            less than ``SHORTEST_RAMP`` is lowered to that.
     """
 
     lower: Array
@@ -90,7 +90,7 @@ class Limits:
     jerk: Array
 
     def __post_init__(self) -> None:
-        """Lower jerks that are too large to tell from none."""
+        """Lower jerks that are too large to be told from no limit."""
         object.__setattr__(self, "jerk", np.minimum(self.jerk, np.asarray(self.acceleration) / SHORTEST_RAMP))
 
     def __repr__(self) -> str:
@@ -244,8 +244,8 @@ class Robot:
     def within_limits(self, states: Array) -> Array:
         """Return states, shape (..., dof), with joints that are a little outside their limits moved to them.
 
-        Encoders and controllers are off by some tenths of a milliradian, and limits that were written with fewer digits
-        by less; joints that are further out are left as they are.
+        Encoders and controllers are off by some tenths of a milliradian, and rounded limits by less; joints that are
+        further out are left as they are.
         """
         inside = np.clip(states, self.limits.lower, self.limits.upper)
         return np.where(np.abs(inside - states) <= LIMIT_SLACK, inside, states)
@@ -285,7 +285,7 @@ def load_robot(name_or_path: str | Path, relative_to: Path | None = None) -> Rob
 
 
 def bare_robot(name_or_path: str) -> tuple[Robot, RobotConfig, Path]:
-    """Return a robot without its files of disabled pairs and covers, which may still be to be made, and its own file.
+    """Return a robot without its files of disabled pairs and covers, which may not exist yet, and its own file.
 
     Args:
         name_or_path: A name out of :func:`robot_names`, or the path of a robot file.
@@ -431,10 +431,10 @@ def load_same_robot(name_or_path: str, wanted: str) -> Robot:
         wanted: The digest that it had; empty for results that have none.
 
     Raises:
-        RobotError: It is another one by now.
+        RobotError: It has changed since.
         ApexError: It cannot be loaded.
     """
     robot = load_robot(name_or_path)
     if wanted and digest(robot) != wanted:
-        raise RobotError(f"the robot {name_or_path!r} is no longer the one that the result was made with")
+        raise RobotError(f"the robot {name_or_path!r} has changed since the result was made")
     return robot

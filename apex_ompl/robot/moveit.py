@@ -114,8 +114,8 @@ def allowed_pairs(
 ) -> tuple[list[Pair], list[str]]:
     """Return the pairs that a matrix lets touch and that are checked here, and names that are no link or object.
 
-    An object of several shapes stands for all of them. A name with a default that allows may touch whatever no entry
-    keeps it from.
+    An object of several shapes stands for all of them. A name whose default allows contact may touch every body unless
+    an entry forbids it.
 
     Args:
         reader: Reader of the scene's file.

@@ -60,13 +60,13 @@ def _ending_in(known: tuple[str, ...], role: str) -> AfterValidator:
 
 
 class Sphere(StrictModel):
-    """A ball centerd on the object's origin; radius [m]."""
+    """A ball centered on the object's origin; radius [m]."""
 
     radius: Size
 
 
 class RoundBar(StrictModel):
-    """A cylinder along z centerd on the origin, or a capsule whose ``length`` excludes its end caps [m]."""
+    """A cylinder along z centered on the origin, or a capsule whose ``length`` excludes its end caps [m]."""
 
     radius: Size
     length: Size
@@ -75,8 +75,8 @@ class RoundBar(StrictModel):
 class MeshFile(StrictModel):
     """A triangle mesh from a file; a relative path is relative to the problem file.
 
-    A ``solid`` has an inside and must be closed. One that is not is a surface alone. By default a mesh is a solid, and
-    holes of it are taken as closed.
+    A ``solid`` has an inside and must be closed; with ``solid`` false the mesh is a surface. By default a mesh is a
+    solid, and its holes count as closed.
     """
 
     file: Annotated[str, _ending_in(MESH_SUFFIXES, "mesh file")]
@@ -154,19 +154,19 @@ class Body(StrictModel):
 
 BodyT = TypeVar("BodyT", bound=Body)
 SHAPES = ("box", "sphere", "cylinder", "capsule", "mesh", "points", "voxels", "distance_grid", "half_space")
-SOLID = ("name", *SHAPES, "orientation")  # fields of what moves
-MOTION = ("velocity", "trajectory", "appears")  # fields of how an obstacle moves
+SOLID = ("name", *SHAPES, "orientation")  # fields of a solid that do not change as it moves
+MOTION = ("velocity", "trajectory", "appears")  # fields of the motion of an obstacle
 FILES = ("mesh", "points", "voxels", "distance_grid")  # shapes that are read from files
 
 
 class Obstacle(Body):
-    """A solid in the world frame, which may move from time 0 on, without turning; :mod:`apex_ompl.scene.scripts`.
+    """A solid in the world frame, which may translate from time 0 on; see :mod:`apex_ompl.scene.scripts`.
 
     Attributes:
-        velocity: Of a motion that is straight for ever [m/s]; ``position`` is that at time 0.
-        trajectory: Rows of a time [s] and the place then [m], joined by straight lines; behind the last one it stands.
-            Times increase from 0, and ``position`` is the first place, which it is filled with.
-        appears: When it comes into being [s]; it moves all the same before.
+        velocity: Constant velocity [m/s]; ``position`` is the position at time 0.
+        trajectory: Rows of a time [s] and a position [m], joined by straight lines; the obstacle stands still after the
+            last row. Times increase from 0. ``position`` is set to the first position.
+        appears: Time at which the obstacle appears [s]; its trajectory runs from time 0 all the same.
     """
 
     velocity: Vector | None = None
@@ -189,7 +189,7 @@ class Obstacle(Body):
 
     @property
     def scripted(self) -> bool:
-        """Whether it moves otherwise than at one velocity for ever: it appears, or has places in time that differ."""
+        """Whether it appears after time 0, or has a trajectory whose positions differ."""
         return self.appears > 0.0 or len({row[1:] for row in self.trajectory or ()}) > 1
 
     @property

@@ -1,7 +1,7 @@
-"""Voxels, height fields and distance grids that users bring, as surfaces of triangles.
+"""Voxels, height fields and distance grids from files, as surfaces of triangles.
 
 A ``.npz`` file holds one of ``occupied`` (nx, ny, nz), the cells that are full; ``heights`` (nx, ny) [m], full from
-their least on up to each; or ``distances`` (nx, ny, nz), signed distances at the centers of cells [m]; with
+the lowest height up to each; or ``distances`` (nx, ny, nz), signed distances at the centers of cells [m]; with
 ``resolution``, the side of the cells [m], and ``origin`` (3,), the outer corner of the first one [m].
 A ``.bt`` file holds a map of OctoMap in its binary format (Hornung et al. 2013).
 """
@@ -139,7 +139,7 @@ def parse_surface(file: str, content: bytes) -> tuple[Array, NDArray[np.int64]]:
 
 
 def _check_header(file: str, name: str, member: IO[bytes]) -> None:
-    """Check what the head of an array in an archive says of it.
+    """Check the header of an array in an archive.
 
     Raises:
         FileFormatError: It has another number of axes, too many cells or none, or does not hold numbers.

@@ -41,7 +41,7 @@ UPRIGHT = {
     "Y_UP": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
     "X_UP": np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]),
 }
-"""Rotations that bring the axis that is up to z; to the right stays x, for X_UP it is -y (COLLADA 1.4.1, up_axis)."""
+"""Rotations that turn the up axis to z; the right axis stays x, and is -y for X_UP (COLLADA 1.4.1, up_axis)."""
 
 
 @dataclass(frozen=True)
@@ -201,7 +201,7 @@ def read_mesh(file: str, content: bytes) -> Triangles:
     """Return the triangles of a file, of all meshes that it holds.
 
     Args:
-        file: Its name, whose suffix tells the format; an ``.obj`` is read from there.
+        file: Its name, whose suffix tells the format; an ``.obj`` is read from that path.
         content: Its content.
 
     Raises:
@@ -312,7 +312,7 @@ def _by_trimesh(content: bytes, kind: str) -> Triangles:
 def collada_asset(file: IO[bytes]) -> tuple[float, str]:
     """Return the length of the unit of a COLLADA file [m], and the axis that is up, ``X_UP``, ``Y_UP`` or ``Z_UP``.
 
-    It reads no further than to the first ``<asset>``, which is at the beginning.
+    It reads up to the first ``<asset>`` only, which is near the start.
 
     Raises:
         ValueError: It is not XML, or one of the two is none.

@@ -12,7 +12,7 @@ from apex_ompl.types import Array
 from apex_ompl.util.cache import weakly_cached
 
 LARGEST = 1e4  # larger coordinates are errors [m]
-SMALLEST = 1e-6  # meshes that are smaller are errors, of units for one [m]
+SMALLEST = 1e-6  # smaller meshes are errors, for example of units [m]
 FLAT = 1e-6  # least thickness of a solid by its length; hulls of a thirtieth of it crash Coal
 
 
@@ -73,7 +73,7 @@ def hole_fault(vertices: Array, faces: NDArray[np.int64]) -> str:
 
 
 def surface_note(vertices: Array, faces: NDArray[np.int64]) -> str:
-    """Return what a mesh is that bounds no solid as it is, and how it is taken, or an empty string.
+    """Return why a mesh bounds no solid as it is, and how it is interpreted, or an empty string.
 
     Args:
         vertices: Shape (V, 3) [m].
@@ -81,7 +81,7 @@ def surface_note(vertices: Array, faces: NDArray[np.int64]) -> str:
     """
     count = len(edges_of(vertices, faces).open)
     if count:
-        return f"is not closed ({count} open edges): its holes are taken as closed where something may lie inside"
+        return f"is not closed ({count} open edges): its holes count as closed where something may lie inside"
     a, b, c = np.moveaxis(vertices[faces] - vertices.mean(axis=0), 1, 0)
     if float(np.einsum("ij,ij->", a, np.cross(b, c))) < 0.0:
         return "is inside out (its triangles face inwards): it is taken as the solid that they enclose"
@@ -171,7 +171,7 @@ def _components(groups: NDArray[np.int64]) -> NDArray[np.int64]:
         least = label[groups].min(axis=1)
         new = label.copy()
         for column in groups.T:
-            np.minimum.at(new, label[column], least)  # on the label's own label too, which halves the way
+            np.minimum.at(new, label[column], least)  # on the label's own label too, which halves the number of rounds
             np.minimum.at(new, column, least)
         new = new[new]
         if np.array_equal(new, label):

@@ -1,4 +1,4 @@
-"""Points that users bring: files of clouds, and depth images."""
+"""Point clouds: files, and depth images."""
 
 from __future__ import annotations
 
@@ -96,8 +96,8 @@ def _check_count(found: int, count: int) -> None:
 def _decompressed(packed: bytes, size: int) -> bytes:
     """Return what LZF packed (the format of Marc Lehmann's LibLZF), of ``size`` bytes.
 
-    A byte below 32 comes before as many bytes and one more, taken as they are. Another one, with the next, gives length
-    and distance of a run that was there before.
+    A byte n below 32 is followed by n + 1 literal bytes. Any other byte, with the next one, gives length and distance
+    of a run of earlier bytes to repeat.
     """
     found, at = bytearray(), 0
     while at < len(packed):
@@ -111,11 +111,11 @@ def _decompressed(packed: bytes, size: int) -> bytes:
         if long == 7:
             long += packed[at]
             at += 1
-        begin, long = len(found) - back - packed[at] - 1, long + 2
+        start, long = len(found) - back - packed[at] - 1, long + 2
         at += 1
-        if begin < 0:
+        if start < 0:
             raise ValueError("compressed data that is damaged")
-        run = found[begin : begin + long]
+        run = found[start : start + long]
         found += (run * (long // len(run) + 1))[:long]
     if len(found) != size:
         raise ValueError(f"compressed data of {len(found)} bytes, expected {size}")
@@ -138,7 +138,7 @@ def points_from_depth(
         depth: Depths, shape (rows, columns) [m].
         intrinsics: Focal lengths fx, fy and principal point cx, cy [pixels].
         pose: Pose of the optical frame in the world, shape (4, 4) [m]: a rotation and a translation.
-        stride: Every how many rows and columns are taken.
+        stride: Stride of rows and columns.
         range: Least and largest depth that is taken [m].
 
     Raises:

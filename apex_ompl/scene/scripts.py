@@ -1,6 +1,6 @@
-"""Where obstacles that move are over time: at constant velocity, or by a script of places in time.
+"""Positions of dynamic obstacles over time: at constant velocity, or by a script.
 
-A script is ``Obstacle.trajectory``, places joined by straight lines from time 0 on, and ``Obstacle.appears``.
+A script is ``Obstacle.trajectory``, positions joined by straight lines from time 0 on, and ``Obstacle.appears``.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from apex_ompl.types import Array
 
 
 def is_there(obstacle: Obstacle, time: float) -> bool:
-    """Whether an obstacle has appeared by a time [s], which counts."""
+    """Whether an obstacle has appeared at a time [s] or before."""
     return time >= obstacle.appears or obstacle.appears == 0.0
 
 
 def place_at(obstacle: Obstacle, time: float) -> Array:
-    """Return the position of an obstacle at a time [s], shape (3,) [m]; before time 0 a script stands."""
-    begin, velocity = _piece(obstacle, time)
-    return np.asarray(begin[1:] + (time - begin[0]) * velocity)
+    """Return the position of an obstacle at a time [s], shape (3,) [m]; before time 0 a script stands still."""
+    start, velocity = _piece(obstacle, time)
+    return np.asarray(start[1:] + (time - start[0]) * velocity)
 
 
 def velocity_at(obstacle: Obstacle, time: float) -> Array:
@@ -38,13 +38,13 @@ def obstacle_at(obstacle: Obstacle, time: float) -> Obstacle:
     """
     if not obstacle.moving:
         return obstacle
-    begin, velocity = _piece(obstacle, time)
-    now = {"position": vector(begin[1:] + (time - begin[0]) * velocity), "velocity": vector(velocity)}
+    start, velocity = _piece(obstacle, time)
+    now = {"position": vector(start[1:] + (time - start[0]) * velocity), "velocity": vector(velocity)}
     return obstacle.model_copy(update={**now, "trajectory": None, "appears": 0.0})
 
 
 def standing(obstacle: Obstacle) -> Obstacle:
-    """Return an obstacle that stands at its position for ever."""
+    """Return an obstacle that stands still at its position."""
     return obstacle.model_copy(update={**dict.fromkeys(MOTION), "appears": 0.0})
 
 
@@ -71,7 +71,7 @@ def script_times(obstacle: Obstacle) -> tuple[float, ...]:
 
 
 def recorded(obstacle: Obstacle, until: float) -> Obstacle:
-    """Return what an obstacle did up to a time [s], as a script; behind it stands."""
+    """Return the motion of an obstacle up to a time [s] as a script; it stands still afterwards."""
     rows = obstacle.trajectory or ((0.0, *obstacle.position),)
     past = [row for row in rows if row[0] < until]
     last = until if obstacle.trajectory is None else min(until, rows[-1][0])
@@ -102,13 +102,13 @@ def row_of(time: float, place: ArrayLike) -> PlaceInTime:
 
 
 def _piece(obstacle: Obstacle, time: float) -> tuple[Array, Array]:
-    """Return beginning, shape (4,) of a time [s] and a place [m], and velocity, shape (3,), of the piece of a time."""
+    """Return start, shape (4,) of time [s] and position [m], and velocity, shape (3,), of the piece at a time."""
     rows, still = obstacle.trajectory, np.zeros(3)
     if rows is None:
         return np.array([0.0, *obstacle.position]), np.array(obstacle.velocity or still, float)
     k = bisect_right(rows, time, key=lambda row: row[0]) - 1
-    begin = np.array(rows[max(k, 0)])
+    start = np.array(rows[max(k, 0)])
     if k < 0 or k == len(rows) - 1:
-        return begin, still
-    step = np.subtract(rows[k + 1], begin)
-    return begin, np.asarray(step[1:] / step[0])
+        return start, still
+    step = np.subtract(rows[k + 1], start)
+    return start, np.asarray(step[1:] / step[0])

@@ -29,7 +29,7 @@ Arrays = Mapping[str, NDArray[Any]]
 class weakly_cached(Generic[R]):  # noqa: N801 - a decorator
     """Keep the results of a function of one object, which must not change, until the object is deleted.
 
-    Objects are told apart by identity: those of Coal compare their whole content.
+    Objects are distinguished by identity, because Coal's objects compare their whole content.
     """
 
     def __init__(self, function: Callable[[Any], R]) -> None:
@@ -39,7 +39,7 @@ class weakly_cached(Generic[R]):  # noqa: N801 - a decorator
         update_wrapper(self, function)
 
     def __call__(self, item: Any) -> R:
-        """Return the result of the function, or the one that is kept."""
+        """Return the kept result, or that of the function."""
         found = self._kept.get(id(item))
         if found is not None and found[0]() is item:
             return found[1]
@@ -48,7 +48,7 @@ class weakly_cached(Generic[R]):  # noqa: N801 - a decorator
         return result
 
     def keep(self, item: Any, result: R) -> None:
-        """Keep a result that is known already."""
+        """Keep a known result."""
         number = id(item)
         self._kept[number] = ref(item, lambda _: self._kept.pop(number, None)), result
 

@@ -28,7 +28,7 @@ class StageClock:
     """
 
     def __init__(self, *stages: str) -> None:
-        """Begin the first of some stages."""
+        """Start the first of some stages."""
         self.seconds = dict.fromkeys(stages, 0.0)
         self._last, self._inside = time.perf_counter(), 0.0
 
@@ -40,7 +40,7 @@ class StageClock:
 
     @contextmanager
     def within(self, stage: str) -> Iterator[None]:
-        """Add the time of a block to a stage, and not to the one that the next lap ends."""
+        """Add the time of a block to a stage, and exclude it from the stage of the next lap."""
         before = self.seconds[stage]
         with timed(self.seconds, stage):
             yield
@@ -56,7 +56,7 @@ class Deadline:
     """
 
     def __init__(self, timeout: float) -> None:
-        """Begin to count a timeout [s] now."""
+        """Start a timeout [s] now."""
         self.timeout = timeout
         self.restart(timeout)
 
@@ -90,7 +90,7 @@ class Deadline:
 
     @contextmanager
     def paused(self) -> Iterator[None]:
-        """Leave the time of a block out of account."""
+        """Exclude the time of a block."""
         left = self.at - time.perf_counter()
         try:
             yield

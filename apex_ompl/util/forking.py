@@ -1,7 +1,7 @@
-"""``os.fork`` while other threads are at work: a child has only the thread that forked, and all locks as they were.
+"""``os.fork`` while other threads run: a child has only the thread that forked, and all locks as they were.
 
-What another thread held then would never be opened. So a fork waits until no thread prepares a plan, which imports
-modules (whose locks are Python's own), or compiles code; and the locks of this package are open in the child.
+A lock that another thread held then would never be released. So a fork waits until no thread prepares a plan, which
+imports modules (whose locks are Python's own), or compiles code; and the locks of this package are open in the child.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from types import TracebackType
 from weakref import WeakSet
 
-PATIENCE = 300.0  # how long a fork waits for what others do, before it goes on all the same [s]
+PATIENCE = 300.0  # how long a fork waits for other threads before it proceeds regardless [s]
 
 
 class ProcessLock:
@@ -46,7 +46,7 @@ class ProcessLock:
 
 
 class _Gate:
-    """What a fork waits for."""
+    """The conditions that a fork waits for."""
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
@@ -88,10 +88,10 @@ class _Gate:
 
 _gate = _Gate()
 unforked = _gate.unforked
-"""Context: let other threads wait with ``os.fork`` meanwhile; for what imports modules, a plan's set-up above all."""
+"""Context: let other threads delay ``os.fork`` meanwhile; for code that imports modules, as a plan's set-up."""
 hold_at_fork = _gate.hold
 """Let every fork wait for a lock, and hold it meanwhile, so that it is open in the child, too."""
 
-# What is registered last is called first before a fork. The two modules above hold locks of theirs, which what a fork
-# waits for may need, so that they must have registered already.
+# The hook that is registered last is called first before a fork. The two modules above hold their own locks, which the
+# work that a fork waits for may need, so that they must have registered before.
 os.register_at_fork(before=_gate.before, after_in_parent=_gate.after_in_parent, after_in_child=_gate.after_in_child)

@@ -1,7 +1,7 @@
 """This process: its cores and its interpreter, the thread count of torch, and the end of its daemon threads.
 
 A thread that runs C++ code when Python ends it takes the whole process down (``PyGILState_Release``, SIGABRT), and
-OMPL's planners call Python all the time. So work in such threads is told to end (:func:`running`), and its thread
+OMPL's planners call Python all the time. So work in such threads is asked to end (:func:`running`), and its thread
 stands still afterwards.
 
 A command ends without freeing its memory piece by piece (:func:`end_quickly`), a tenth of the time of a short one.
@@ -20,17 +20,17 @@ from contextlib import contextmanager
 
 from apex_ompl.util.forking import ProcessLock
 
-PATIENCE = 20.0  # how long the interpreter waits for what runs; the set-up of a planner ends by itself [s]
+PATIENCE = 20.0  # how long the interpreter waits for running work; the set-up of a planner ends by itself [s]
 LOOK = 0.01  # between two looks [s]
 
 _code: int | None = None  # of the process, where it is to end quickly
 
 
 def end_quickly(code: int) -> int:
-    """Let the process end without freeing what it holds, once threads and exit functions are done; return its code.
+    """Let the process end without freeing its memory, once threads and exit functions are done; return its code.
 
     Args:
-        code: Exit code of the process, which must be the one that it is ended with.
+        code: Exit code of the process; the caller must end the process with the same code.
     """
     global _code  # noqa: PLW0603 - there is one process
     _code = code
@@ -44,7 +44,7 @@ def _leave() -> None:
     try:
         sys.stdout.flush()
         sys.stderr.flush()
-    except (OSError, ValueError):  # the interpreter says so as it ends
+    except (OSError, ValueError):  # the interpreter reports it as it ends
         return
     os._exit(_code)
 
@@ -55,11 +55,11 @@ def _stay() -> None:
 
 
 class _Work:
-    """What runs now, in any thread."""
+    """Work that runs now, in any thread."""
 
     def __init__(self) -> None:
         self._lock = ProcessLock()
-        self._ends: dict[object, Callable[[], object]] = {}  # how to tell each to end
+        self._ends: dict[object, Callable[[], object]] = {}  # how to ask each to end
         self._here = threading.local()  # how many blocks the thread is in
         self._over = False
 
@@ -88,7 +88,7 @@ class _Work:
         self._over = True
         patience = time.monotonic() + PATIENCE
         while self._ends and time.monotonic() < patience:
-            with self._lock:  # none ends meanwhile, so that nothing is told to a condition that is gone
+            with self._lock:  # no work ends meanwhile, so that no condition that is gone is notified
                 for tell in self._ends.values():
                     tell()
             time.sleep(LOOK)
@@ -103,12 +103,12 @@ _work = _Work()
 
 @contextmanager
 def running(end: Callable[[], object] = lambda: None) -> Iterator[None]:
-    """Let the interpreter tell the block to end, and wait for it, before it ends itself.
+    """Let the interpreter ask the block to end, and wait for it, before the interpreter ends.
 
-    A daemon thread that begins or leaves such a block after that stands still; it ends with the process.
+    A daemon thread that enters or leaves such a block after that stands still; it ends with the process.
 
     Args:
-        end: Tells the block to end; called from another thread, and more than once.
+        end: Asks the block to end; called from another thread, and more than once.
     """
     with _work.running(end):
         yield

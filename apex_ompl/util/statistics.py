@@ -1,4 +1,4 @@
-"""Intervals of shares that were counted."""
+"""Binomial confidence intervals."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from apex_ompl.util.validation import check_integer, check_number
 
 
 def share_interval(count: int, of: int, confidence: float = 0.95) -> tuple[float, float]:
-    """Return Wilson's interval for a share, ``count`` of ``of`` (Wilson 1927).
+    """Return Wilson's confidence interval of a binomial proportion, ``count`` of ``of`` (Wilson 1927).
 
     Args:
-        count: How many.
-        of: Of how many.
-        confidence: How often such intervals hold the true share, 0 to 0.999999.
+        count: Number of successes.
+        of: Number of trials.
+        confidence: Coverage of the interval, 0 to 0.999999.
 
     Raises:
         ParameterError: ``count`` is not from 0 to ``of``, ``of`` is 0, or another confidence.

@@ -284,7 +284,7 @@ def check_path(path: ArrayLike, name: str = "path") -> Array:
 
 
 def check_times(times: Array, count: int | None = None) -> None:
-    """Check that times, shape (N,) or (count,), are finite, begin with 0 and increase strictly.
+    """Check that times, shape (N,) or (count,), are finite, start with 0 and increase strictly.
 
     Raises:
         ParameterError: They do not.

@@ -31,7 +31,7 @@ OBSTACLE, FIXTURE, BACKGROUND, EDGE, CONTACT = "#c8553d", "#c9a77c", "#f4f4f1", 
 HAND, LINK = "#4a4e57", "#d9dce1"
 SIDE_COLORS = {"left": "#e8eef4", "right": "#f3ece2"}
 FACE_COLORS = ("#d62728", "#1f4ed8")
-WAY_COLORS = ("#1f6fb4", "#d97a1a", "#2b9348", "#8e44ad")  # of the ways of hands
+PATH_COLORS = ("#1f6fb4", "#d97a1a", "#2b9348", "#8e44ad")  # of the paths of hands
 CLEARANCE_COLORS = ("#0b6e4f", "#7a9e1f", "#16798c", "#555b66")  # of curves, by result
 LIMIT_COLORS = {"velocity": "#1f6fb4", "acceleration": "#d97a1a", "jerk": "#8e44ad"}
 NOW, COVER = "#c8553d", "#3a86c8"  # of the cursor of curves, and of sphere covers
@@ -45,9 +45,9 @@ EVENT_COLORS = {
     "improve": "#9db4c8", "improved": "#7fb069", "kept": "#c4c7cc", "stop": "#d97a1a",
     "broken assumption": "#6b2d20", "contact": "#e0101b", "goal": "#0b6e4f",
 }  # fmt: skip
-SILENT_EVENTS = ("observation", "reaction", "improve", "kept")  # too many for words
+SILENT_EVENTS = ("observation", "reaction", "improve", "kept")  # too many to be written
 RUN_OPACITIES = {"true": 0.9, "observed": 0.5, "predicted": 0.22}
-SOLID, PLATE = 0.9, 0.14  # opacities of obstacles; thin plates show what is behind them
+SOLID, PLATE = 0.9, 0.14  # opacities of obstacles; thin plates are translucent
 ARROW_LENGTH = 0.12  # [m]
 MOST_POINTS = 30_000  # that are drawn of a cloud
 HALF_SPACE_EDGE = 3.0  # edge of the square that stands for a half-space [m]
@@ -56,12 +56,12 @@ SECTIONS, FINE = 32, 0.05  # of round shapes; spheres and capsules of a larger r
 
 @dataclass(frozen=True, eq=False)
 class Item:
-    """One thing that is drawn: a mesh, or balls around points.
+    """An item that is drawn: a mesh, or balls around points.
 
     Attributes:
         name: Name, unique among the items of a layer.
         layer: One of ``LAYERS``.
-        body: Name of the link, the held object, the fixture or the obstacle that it is, or is part of.
+        body: Name of the link, held object, fixture or obstacle that it belongs to.
         color: As ``#rrggbb``.
         opacity: 0 to 1.
         joint: Joint of the robot's model that carries it; 0 for the world.
@@ -89,7 +89,7 @@ class Item:
 
 
 def items_of(setup: PlanningSetup) -> list[Item]:
-    """Return all items of a problem: the robot, what it holds, contact faces, fixtures and obstacles."""
+    """Return all items of a problem: the robot, held objects, contact faces, fixtures and obstacles."""
     robot = setup.robot
     return [
         *robot_items(robot),
@@ -101,7 +101,7 @@ def items_of(setup: PlanningSetup) -> list[Item]:
 
 
 def ghosts_of(setup: PlanningSetup) -> list[Item]:
-    """Return translucent items that move with the robot: its coarser geometry, what it holds, and contact faces."""
+    """Return translucent items that move with the robot: its coarser geometry, held objects and contact faces."""
     items = (*robot_items(setup.robot, coarse=True), *held_items(setup), *face_items(setup))
     return [replace(item, opacity=GHOST_OPACITY) for item in items if item.moves]
 
@@ -195,7 +195,7 @@ def arrow(point: Sequence[float] | Array, axis: Sequence[float] | Array) -> trim
 
 
 def is_thin_plate(body: Body) -> bool:
-    """Whether a body is a thin plate, which is drawn translucent to show what is behind it."""
+    """Whether a body is a thin plate, which is drawn translucent so that it hides nothing."""
     return body.box is not None and min(body.box) <= 0.25 * sorted(body.box)[1]
 
 
@@ -212,12 +212,12 @@ def joint_poses(robot: Robot, data: pin.Data, q: Array) -> list[Array]:
 
 
 def end_links(robot: Robot) -> list[str]:
-    """Return the links whose ways are drawn: the palms, or else the last link."""
+    """Return the links whose paths are drawn: the palms, or else the last link."""
     return [hand.palm for hand in robot.hands.values()] or [robot.link_names[-1]]
 
 
 def focus_of(setup: PlanningSetup) -> tuple[Array, float]:
-    """Return the point that a camera looks at, shape (3,) [m], and how wide hands and obstacles are spread [m]."""
+    """Return the point that a camera looks at, shape (3,) [m], and how far hands and obstacles are spread [m]."""
     states = (setup.start, *setup.goals[:1])
     points = [setup.robot.link_pose(q, link)[:3, 3] for q in states for link in end_links(setup.robot)]
     points += [_middle(body) for body in setup.problem.scene if body.half_space is None]

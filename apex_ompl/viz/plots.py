@@ -21,7 +21,7 @@ from apex_ompl.robot.model import load_same_robot
 from apex_ompl.timing.rests import rests
 from apex_ompl.types import Array
 from apex_ompl.util.files import suffix_of, write_atomically
-from apex_ompl.viz.appearance import CLEARANCE_COLORS, EVENT_COLORS, SILENT_EVENTS, WAY_COLORS
+from apex_ompl.viz.appearance import CLEARANCE_COLORS, EVENT_COLORS, PATH_COLORS, SILENT_EVENTS
 from apex_ompl.viz.sources import ORDERS, clearances, robot_of, shares_of_limits
 
 FORMATS = (".png", ".pdf", ".svg")
@@ -99,7 +99,7 @@ def plot_run(result: RunResult, out: str | os.PathLike[str]) -> None:
     """Draw the time line of a run.
 
     The rows are the events by kind; the largest joint speed as a share of its limit, with the joints that come nearest
-    to theirs, and bands where the robot stands; and the distance to obstacles that move, a lower bound by the sphere
+    to theirs, and bands where the robot is at rest; and the distance to dynamic obstacles, a lower bound by the sphere
     cover.
 
     Args:
@@ -166,7 +166,7 @@ def _draw_speeds(axis: Any, result: RunResult, robot: Robot, times: Array) -> No
     axis.fill_between(times, largest, color=LARGEST, alpha=0.10, linewidth=0.0)
     axis.plot(times, largest, color=LARGEST, linewidth=1.6, label="largest")
     order = np.argsort(-shares.max(axis=0), kind="stable")[:JOINTS].tolist()
-    for joint, color in zip(order, WAY_COLORS, strict=False):
+    for joint, color in zip(order, PATH_COLORS, strict=False):
         axis.plot(times, shares[:, joint], color=color, linewidth=0.8, label=robot.joint_names[joint])
     axis.axhline(1.0, color="black", linewidth=0.8, linestyle="--")
     axis.set(ylim=(0.0, 1.3), ylabel="speed\nshare of limit", yticks=np.linspace(0.0, 1.0, 6))
@@ -175,11 +175,11 @@ def _draw_speeds(axis: Any, result: RunResult, robot: Robot, times: Array) -> No
 
 
 def _draw_rests(axis: Any, result: RunResult) -> None:
-    """Draw bands where the robot stands."""
+    """Draw bands where the robot is at rest."""
     label = "at rest"
-    for begin, end in rests(result.trajectory).tolist():
-        if end > begin:
-            axis.axvspan(begin, end, color=REST, linewidth=0.0, label=label)
+    for start, end in rests(result.trajectory).tolist():
+        if end > start:
+            axis.axvspan(start, end, color=REST, linewidth=0.0, label=label)
             label = ""
 
 

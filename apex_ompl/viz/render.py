@@ -78,7 +78,7 @@ class SceneRenderer:
         self._place_camera(setup, azimuth)
 
     def _add(self, item: Item, pose: Array) -> Any:
-        """Add an item at a pose, and return its actor; edges show what of an obstacle is nearly invisible."""
+        """Add an item at a pose, and return its actor; edges outline obstacles that are nearly transparent."""
         pv = self._pv
         if item.mesh is None:
             ball = pv.Sphere(radius=item.radius, theta_resolution=8, phi_resolution=8)
@@ -152,8 +152,9 @@ def render(
     """Draw a problem, a plan or a run.
 
     The .png of a problem shows the start, and a goal as a ghost. The .png of a result shows states along its path in
-    reading order. A .gif or .mp4 shows the motion of a result; a timed motion in real time, up to 30 s. Obstacles that
-    the motion was proved among in time move, and all those of a run, whose pictures have the time and the last event.
+    reading order. A .gif or .mp4 shows the motion of a result; a timed motion in real time, up to 30 s. Dynamic
+    obstacles that the motion was proved among in time move, and all those of a run, whose pictures show the time and
+    the last event.
 
     Args:
         source: A problem, a plan that has a path, or a run.
@@ -162,7 +163,7 @@ def render(
         azimuth: Direction of the camera from the front of the robot, counter-clockwise [degrees].
 
     Raises:
-        ParameterError: Another suffix, or a film of something without a path.
+        ParameterError: Another suffix, or a film of a source without a path.
         MissingFileError: The folder cannot be written, or the ``viz`` extra is not installed.
     """
     out = Path(out)
@@ -203,7 +204,7 @@ def _film(source: PlanResult | RunResult, suffix: str, size: tuple[int, int], az
 
 
 def _strip(source: PlanResult | RunResult, size: tuple[int, int], azimuth: float) -> bytes:
-    """Return a .png of states along the path, or of moments among moving obstacles, in reading order."""
+    """Return a .png of states along the path, or of moments among dynamic obstacles, in reading order."""
     renderer, motion = _renderer(source, (size[0] // 2, size[1] // 2), azimuth), source.trajectory
     columns, rows = STRIP
     if motion is not None and (_dynamic(source) or isinstance(source, RunResult)):
@@ -226,7 +227,7 @@ def _path(source: PlanResult | RunResult) -> Array:
 
 
 def _dynamic(source: PlanResult | RunResult) -> list[Obstacle]:
-    """Return the obstacles that move: those of a run, and of a plan those that it was proved among in time."""
+    """Return the dynamic obstacles: those of a run, and those that a plan was proved among in time."""
     names = source.problem.moving if isinstance(source, RunResult) else source.dynamic_obstacles
     return [obstacle for obstacle in source.problem.scene if obstacle.name in names]
 
@@ -234,7 +235,7 @@ def _dynamic(source: PlanResult | RunResult) -> list[Obstacle]:
 def _moment(
     renderer: SceneRenderer, source: PlanResult | RunResult, motion: Trajectory, time: float
 ) -> NDArray[np.uint8]:
-    """Return an image of a motion at a time [s], with the obstacles that move where they are then."""
+    """Return an image of a motion at a time [s], with the dynamic obstacles at their positions then."""
     for obstacle in _dynamic(source):
         pose = obstacle_at(obstacle, time).pose if is_there(obstacle, time) else None
         renderer.show_obstacle(obstacle.name, pose)
@@ -242,7 +243,7 @@ def _moment(
 
 
 def caption(run: RunResult, time: float) -> str:
-    """Return a line on a run at a time [s]: the time, and the last event by then that is worth a word."""
+    """Return a line on a run at a time [s]: the time, and the last event by then that is shown."""
     last = [event for event in run.events if event.time <= time and event.kind not in SILENT_EVENTS]
     return f"{time:.2f} s" + (f"   {last[-1].kind} at {last[-1].time:.2f} s" if last else "")
 

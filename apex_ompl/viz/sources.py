@@ -28,7 +28,7 @@ ORDERS = ("position", "velocity", "acceleration", "jerk")
 
 
 def saved_kind(path: Path) -> type[PlanResult] | type[RunResult] | None:
-    """Return what a file holds by its beginning, a plan or a run, or None for anything else."""
+    """Return the kind of a saved file by its start, a plan or a run, or None for other files."""
     if path.suffix not in SUFFIXES or not is_file(path):
         return None
     try:
@@ -64,8 +64,8 @@ def robot_of(saved: Saved) -> Robot:
     """Return the robot of a saved plan or run.
 
     Raises:
-        RobotError: It is another one by now.
-        ParameterError: It has other joints than the motion.
+        RobotError: It has changed since.
+        ParameterError: Its joints differ from those of the motion.
         ApexError: It cannot be loaded.
     """
     robot, motion = load_same_robot(saved.problem.robot, saved.robot_digest), saved.trajectory
@@ -110,28 +110,25 @@ def clearances(checker: CollisionChecker, motion: Trajectory, times: Array, dyna
         checker: The robot in its scene.
         motion: The motion.
         times: Shape (N,) [s].
-        dynamic: Obstacles of the scene that move; those that have appeared are where they are at each time.
+        dynamic: Dynamic obstacles of the scene; each is at its position at each time, once it has appeared.
     """
     found, among = [], dict[frozenset[str], CollisionChecker]()
     for time, q in zip(times.tolist(), motion(times), strict=True):
-        here = [obstacle_at(dynamic_obstacle, time) for dynamic_obstacle in dynamic if is_there(dynamic_obstacle, time)]
-        names = frozenset(dynamic_obstacle.name for dynamic_obstacle in here)
+        here = [obstacle_at(one, time) for one in dynamic if is_there(one, time)]
+        names = frozenset(one.name for one in here)
         if names not in among:
             among[names] = _among(checker, dynamic, here)
-        for dynamic_obstacle in here:
-            among[names].move(dynamic_obstacle.name, dynamic_obstacle.position)
+        for one in here:
+            among[names].move(one.name, one.position)
         found.append(among[names].clearance(q))
     return np.array(found)
 
 
 def _among(checker: CollisionChecker, dynamic: Sequence[Obstacle], here: Sequence[Obstacle]) -> CollisionChecker:
-    """Return a checker with those of the dynamic obstacles that are there."""
+    """Return a checker with the dynamic obstacles that are present."""
     if not dynamic:
         return checker
-    names, present = (
-        {dynamic_obstacle.name for dynamic_obstacle in dynamic},
-        {dynamic_obstacle.name for dynamic_obstacle in here},
-    )
+    names, present = {one.name for one in dynamic}, {one.name for one in here}
     scene = [*(o for o in checker.obstacles.values() if o.name not in names), *here]
     pairs = [pair for pair in checker.allowed if not {*pair} & (names - present)]
     return CollisionChecker(checker.robot, scene, checker.held.values(), pairs)

@@ -34,16 +34,16 @@ def view(
     for a single problem or result editing, planning and the proposals of the model. A written page plays offline.
 
     Args:
-        sources: What is shown; of a folder its results, of which more than six are shown one at a time.
+        sources: Sources to show; of a folder its results, which are shown one at a time if there are more than six.
         out: Page to write, .html; by default it is served.
         port: Of the served page; by default the first free one from 8080 on.
         cover: Whether a written page has the sphere cover as a layer.
         opened: Whether a browser is opened.
-        ready: Called with the address once it is served, and with what else is to be said.
-        until: Ends the serving when it holds, besides the closing of the page and Ctrl-C.
+        ready: Called with the address once the page is served, and with further messages.
+        until: Ends the server when it returns True, besides the closing of the page and Ctrl-C.
 
     Raises:
-        ParameterError: Nothing or too much to show, another suffix, or a port that is taken.
+        ParameterError: No source or too many, another suffix, or a port that is taken.
         MissingFileError: The page cannot be written, or the ``view`` extra is not installed.
         ApexError: The robot or a body of a problem cannot be loaded, or the robot is not the one of a result.
     """

@@ -16,7 +16,7 @@ from apex_ompl.types import Array, Flags, Indices
 PAD = 1e-6  # margin of the radii over the proved ones, which exceeds all rounding errors [m]
 FINEST = 3e-4  # side of the smallest boxes of the proof [m] ...
 FINEST_SHARE = 1 / 400  # ... or this share of the size of the solid where that is larger
-TOO_MANY = 2_000_000  # boxes at once at which the proof is given up
+TOO_MANY = 2_000_000  # boxes at once at which the proof is abandoned
 
 
 @dataclass(frozen=True, eq=False)

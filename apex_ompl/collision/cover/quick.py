@@ -26,7 +26,7 @@ from apex_ompl.util.cache import kept, weakly_cached
 BOX_PAD = 1e-6  # margin of boxes, which exceeds rounding errors [m]
 COLUMN_PAD = 1e-9  # margin of columns [m]
 CYLINDER_LEAVES = 48  # most leaves
-GAPS = np.linspace(0.1, 0.8, 29)[:, None, None, None]  # of the ball behind an end, as shares of the radius
+GAPS = np.linspace(0.1, 0.8, 29)[:, None, None, None]  # of the ball at an end, as shares of the radius
 IN_RING = np.arange(4, 15)[:, None, None]  # balls around an edge
 RING_RADII = np.linspace(0.55, 0.98, 16)[:, None]  # of their centers, as shares of the radius
 SUNK = np.linspace(0.5, 1.5, 6)  # of their centers below the end, as shares of the height of the ring
@@ -67,7 +67,7 @@ class _End(NamedTuple):
     """Balls of one end, with the radius of the cylinder as the unit of length.
 
     Attributes:
-        gap: Gap of the ball behind the end.
+        gap: Gap of the ball at the end.
         in_ring: Number of balls around the edge.
         ring: Radius of the ring of their centers.
         sunk: Distance of these from the end.
@@ -84,7 +84,7 @@ class _End(NamedTuple):
 def cylinder_cover(radius: float, half_length: float) -> Cover:
     """Return a cover of a cylinder along z that is at least as long as wide.
 
-    With the radius as the unit of length, a ball of radius 1 + g at depth 1 behind each end sticks out of it by the gap
+    With the radius as the unit of length, a ball of radius 1 + g at depth 1 below each end protrudes by the gap
     g. It contains the disc of radius p = sqrt((1 + g)^2 - 1) at the end, and the whole cross-section at depths from
     1 - p to 1 + p. The ring that is left there, from p to 1 and as deep as 1 - p, is covered by balls around equal
     sectors of it, and the middle by balls around equal lengths. The numbers are those of the least gap.

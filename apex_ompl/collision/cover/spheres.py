@@ -95,7 +95,7 @@ def make_cover(
     cover = search(solid, gaps, most, effort)
     made = _rounded(grow_to_cover(solid, cover, QUICK if effort == 1 else 1.0))
     if len(uncovered_boxes(solid, made)):
-        raise AssertionError("a cover that has grow_to_cover to its proof is not proved")
+        raise AssertionError("a cover that was grown until its proof succeeded is not proved")
     return made
 
 

@@ -25,14 +25,14 @@ from apex_ompl.viz.viewer.shown import Shown, markdown
 
 NOTHING, GOAL = "nothing", "goal of "
 NEW_BOX, NEW_PLACE = 0.1, (0.5, 0.0, 0.6)  # edge and place of a box that is added [m]
-REACHED = 2e-3  # residual of inverse kinematics at which a hand is where it was dragged
-QUIET = 0.25  # how long nothing was edited before faults are explained [s]
-CONTROL_SIZE = 0.25  # of what is dragged [m]
+REACHED = 2e-3  # residual of inverse kinematics up to which a dragged hand counts as reached
+QUIET = 0.25  # pause of the editing before faults are explained [s]
+CONTROL_SIZE = 0.25  # of the handle for dragging [m]
 LONGEST = 60.0  # time limit of a plan [s]; the page waits for it
 
 
 class Editor:
-    """Edits a problem in the page, and plans in it with a planner that is kept.
+    """Edits a problem in the page, and plans in it with a kept planner.
 
     Attributes:
         planner: The planner; its world is the scene.
@@ -42,7 +42,7 @@ class Editor:
     """
 
     def __init__(self, server: Any, do: Do, player: Player) -> None:
-        """Add the controls for what ``player`` shows, a single problem or result."""
+        """Add the controls for the single problem or result that ``player`` shows."""
         self._server, self._do, self._player = server, do, player
         shown = player.sources[0]
         self._problem, robot = shown.setup.problem, shown.setup.robot
@@ -79,7 +79,7 @@ class Editor:
         return (NOTHING, *self.planner.world.obstacles, *(f"{GOAL}{hand}" for hand in hands))
 
     def _say(self, action: Callable[[], str], _: Any = None) -> None:
-        """Do something, and show what it says, or why it failed."""
+        """Run an action, and show its message, or why it failed."""
         try:
             said = action()
         except (ApexError, OSError) as error:
@@ -87,7 +87,7 @@ class Editor:
         self._said.content = markdown([said])
 
     def grab(self, name: str) -> None:
-        """Choose what is dragged: an obstacle, or the goal of a hand; a control stands where it is."""
+        """Choose the dragged object, an obstacle or the goal of a hand, and put a control there."""
         if self._control is not None:
             self._control.remove()
         self._grabbed, self._control = name, None
@@ -107,7 +107,7 @@ class Editor:
         control.on_update(lambda _: self._do(Asked(drag, pose_of(control.wxyz, control.position))))
 
     def _replaced(self) -> None:
-        """Put a new control where what is chosen is now: the nodes are new."""
+        """Put a new control at the chosen object, whose nodes are new."""
         self._control = None
         self.grab(self._grabbed)
 
@@ -116,7 +116,7 @@ class Editor:
             self.drag(pose)
 
     def drag(self, pose: Array) -> None:
-        """Move what is chosen to a pose, shape (4, 4), and show whether start and goal are free then."""
+        """Move the chosen object to a pose, shape (4, 4), and show whether start and goal are free then."""
         fields = pose_fields(pose)
         if self._grabbed.startswith(GOAL):
             self._move_goal(self._grabbed.removeprefix(GOAL), fields)
@@ -135,14 +135,14 @@ class Editor:
             self._player.scenes[0].show_ghost("goal ghost", found)
 
     def _check(self) -> None:
-        """Say whether start and goal are free, by the kernel; why not is said when nothing is edited any more."""
+        """Show whether start and goal are free, by the kernel; reasons follow when the editing pauses."""
         self._edited_at, self._is_explained = time.perf_counter(), False
         states = [("start", self.start), *([] if self.goal is None else [("goal", self.goal)])]
         said = [f"{name} {'free' if self.planner.is_free(q) else '**blocked**'}" for name, q in states]
         self._state.content = ", ".join([*said, *([] if self._is_reached else ["out of reach"])])
 
     def step(self) -> None:
-        """Explain faults once nothing is edited any more, and put the control back where its thing is."""
+        """Explain faults once the editing pauses, and put the control back to its object."""
         if self._is_explained or time.perf_counter() - self._edited_at < QUIET:
             return
         self._is_explained = True
@@ -184,7 +184,7 @@ class Editor:
         return f"{name} removed"
 
     def problem(self) -> Problem:
-        """Return the problem as it was edited; a goal that was not dragged stays as it was given."""
+        """Return the edited problem; a goal that was not dragged is unchanged."""
         world = self.planner.world
         edited: dict[str, Any] = {
             "scene": tuple(world.obstacles.values()), "attached": tuple(world.held.values()), "allowed": world.allowed
@@ -195,9 +195,9 @@ class Editor:
         return self._problem.model_copy(update=edited)
 
     def plan(self) -> str:
-        """Plan in the world as it is, show the result, and return what was found.
+        """Plan in the current world, show the result, and return a message about it.
 
-        Obstacles that move are taken to stand still.
+        Dynamic obstacles are assumed to stand still.
 
         Raises:
             ApexError: The seed, the time limit or the problem is faulty.
@@ -225,7 +225,7 @@ class Editor:
         """Write the problem as YAML to the file that is named in the page, in the working folder.
 
         Raises:
-            ParameterError: The name is none of a .yaml file, or a file that this page did not write has it.
+            ParameterError: The name does not end in .yaml, or is that of a file that this page did not write.
             ApexError: The file cannot be written.
         """
         path = Path(self._file.value)

@@ -1,4 +1,4 @@
-"""How a plan comes about: proposals of the model as they are sampled, guided and repaired, and their denoising."""
+"""Proposals of the model in a page, as they are sampled, guided and repaired, and their denoising."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ STATES = 60  # of a drawn path
 
 
 class Inspection:
-    """Draws the ways of the hands along a model's proposals for the problem that is shown."""
+    """Draws the paths of the hands along a model's proposals for the problem that is shown."""
 
     def __init__(self, server: Any, do: Do, player: Player, editor: Editor) -> None:
-        """Add the controls for what ``player`` shows, a single problem or result, as ``editor`` has it."""
+        """Add the controls for the single problem or result that ``player`` shows, as edited by ``editor``."""
         self._player, self._editor, self._nodes = player, editor, dict[str, Any]()
         self._estimates: list[Array] = []
         self._model: TrajectoryModel | None = None
@@ -56,11 +56,11 @@ class Inspection:
             box.on_update(asked(do, self._layers))
 
     def _forget(self) -> None:
-        """Forget what was drawn: its nodes are gone."""
+        """Forget the drawn proposals, whose nodes are gone."""
         self._nodes, self._estimates, self._said.content = {}, [], ""
 
     def draw(self, _: Any = None) -> None:
-        """Draw proposals as they are sampled, guided, and repaired; and say how many are valid."""
+        """Draw proposals as they are sampled, guided and repaired, and show how many are valid."""
         try:
             said = self._drawn()
         except ApexError as error:

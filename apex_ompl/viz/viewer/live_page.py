@@ -1,4 +1,4 @@
-"""A live page: what the browser asks for is done in one thread, in turn."""
+"""A live page: requests of the browser are handled in one thread, in turn."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ from apex_ompl.viz.viewer.shown import Shown
 
 LOG = logging.getLogger("apex_ompl")
 PERIOD = 1.0 / 30.0  # of steps [s]
-LEFT_ALONE = 8.0  # how long no page is open before the server ends: a page that is loaded anew is back sooner [s]
+LEFT_ALONE = 8.0  # time without an open page after which the server ends; a reloaded page is back sooner [s]
 
 
 class LivePage:
-    """What a server shows, and what its controls do.
+    """The content of a server, and the actions of its controls.
 
     Attributes:
-        player: Plays what is shown.
-        editor: Edits it, or None where several things are shown, or a run.
-        inspection: Shows proposals, or None likewise.
+        player: Plays the sources.
+        editor: Edits the source, or None for several sources or a run.
+        inspection: Shows proposals, or None for several sources or a run.
     """
 
     player: Player
@@ -45,7 +45,7 @@ class LivePage:
 
         Args:
             server: A ``viser`` server.
-            sources: What is shown.
+            sources: Sources to show.
             choices: Files of plans and runs, of which one is shown at a time in place of ``sources``.
 
         Raises:
@@ -58,7 +58,7 @@ class LivePage:
         self._show(sources or [shown_of(load_saved(self._choices[self._chosen]))])
 
     def _show(self, sources: Sequence[Shown]) -> None:
-        self._shows += 1  # what was asked of controls that are gone is not done
+        self._shows += 1  # requests of removed controls are ignored
         server, do = self._server, partial(self._put, self._shows)
         server.gui.reset()
         if self._choices:
@@ -83,10 +83,10 @@ class LivePage:
         self._show([source])
 
     def step(self, passed: float) -> None:
-        """Do what the browser asked for since the last step, and go on playing.
+        """Handle the requests of the browser since the last step, and continue playing.
 
-        Of the same thing asked for several times, as positions of something that is dragged, the last one is done. What
-        fails is logged, and the page goes on.
+        Of repeated requests of one control, such as positions of a dragged object, only the last is handled. A failure
+        is logged, and the page continues.
 
         Args:
             passed: Time since the last step [s].
@@ -111,7 +111,7 @@ class LivePage:
         self.player.step(passed)
 
     def run(self, until: Callable[[], bool] = lambda: False) -> None:
-        """Serve until the last page was closed, or ``until`` holds.
+        """Serve until the last page was closed, or ``until`` returns True.
 
         Raises:
             KeyboardInterrupt: Ctrl-C was pressed.
@@ -121,7 +121,7 @@ class LivePage:
             while not until() and not interrupted.is_set():
                 now = time.perf_counter()
                 clients = bool(self._server.get_clients())
-                if clients or now - last > 1.0:  # after a long step a page may be about to come back
+                if clients or now - last > 1.0:  # after a long step a page may be about to reconnect
                     self._seen, alone_since = self._seen or clients, now
                 elif self._seen and now - alone_since > LEFT_ALONE:
                     break
@@ -134,7 +134,7 @@ class LivePage:
 
 @contextmanager
 def _interruptions() -> Iterator[threading.Event]:
-    """Note Ctrl-C inside a block instead of raising it anywhere, where it could be lost; in the main thread alone."""
+    """Record Ctrl-C inside a block instead of raising it anywhere, where it could be lost; in the main thread only."""
     noted = threading.Event()
     if threading.current_thread() is not threading.main_thread():
         yield noted

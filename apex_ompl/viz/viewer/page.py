@@ -21,8 +21,8 @@ from apex_ompl.viz.viewer.server import serving
 from apex_ompl.viz.viewer.shown import Shown, ordered
 
 FRAME_RATE = 30.0  # [1/s]
-HOLD, LOOP = 0.6, 5.0  # least time that the last state stays, and least time until the player begins anew [s]
-WAY_STATES = 80
+HOLD, LOOP = 0.6, 5.0  # least time that the last state stays, and least time until the player starts anew [s]
+PATH_STATES = 80  # of a drawn path of a hand
 FIELD_OF_VIEW = 0.75  # [rad]
 AMBIENT = 1.5  # intensity of the light from everywhere
 SVG_SIZE = (3.4, 2.6)  # of the curves [inch]
@@ -52,7 +52,7 @@ PANEL = """
 }})();
 </script>
 """
-"""What stands over the scene: facts, curves, and a cursor that follows the player's slider."""
+"""Overlay of the scene: facts, curves, and a cursor that follows the player's slider."""
 
 
 def write_page(sources: Sequence[Shown], out: str | os.PathLike[str], cover: bool = False) -> None:
@@ -61,7 +61,7 @@ def write_page(sources: Sequence[Shown], out: str | os.PathLike[str], cover: boo
     The motions play together; the page has a slider, speeds, and a tree of the scene in which layers can be hidden.
 
     Args:
-        sources: What it shows.
+        sources: Problems or results to show.
         out: Where to write: .html.
         cover: Whether the page has the sphere cover as a layer; it is hidden at first.
 
@@ -96,7 +96,7 @@ def _recorded(server: Any, sources: Sequence[Shown], cover: bool) -> str:
 
 
 def draw(server: Any, sources: Sequence[Shown]) -> list[BrowserScene]:
-    """Draw what is shown, side by side, with ghosts and ways, and point the camera at it."""
+    """Draw sources side by side, with ghosts and paths of the hands, and point the camera at them."""
     scenes = []
     server.scene.set_background_image(np.full((1, 1, 3), rgb(BACKGROUND), np.uint8), format="png")
     server.scene.configure_environment_map(None)  # forty times as fast where no graphics card is
@@ -110,7 +110,7 @@ def draw(server: Any, sources: Sequence[Shown]) -> list[BrowserScene]:
             if fault:
                 scene.explain(name, nodes, q, fault, one.setup.checker.contacts(q))
         if one.duration > 0.0:
-            scene.show_ways(one.states(WAY_STATES))
+            scene.show_hand_paths(one.states(PATH_STATES))
         one.draw(scene, 0.0)
         scenes.append(scene)
     place_camera(server, sources)

@@ -1,4 +1,4 @@
-"""The player of a live page: play, slider, speed, curves and layers of what is shown."""
+"""The player of a live page: play, slider, speed, curves and layers."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ CURSOR_PERIOD = 0.1  # at which the cursor of the curves is moved [s]
 class Player:
     """Shows problems and results side by side, and plays their motions together.
 
-    What grows, as a run that goes on, is followed: its end is shown while it plays.
+    A source that grows, such as a live run, is followed: its end is shown while it plays.
 
     Attributes:
-        sources: What is shown.
+        sources: The problems and results shown.
         scenes: Their scenes.
         time: Time of the motion [s].
-        replaced: Called when other things are shown, whose nodes are new.
+        replaced: Called when other sources are shown, whose nodes are new.
     """
 
     def __init__(self, server: Any, do: Do, sources: Sequence[Shown]) -> None:
@@ -35,8 +35,8 @@ class Player:
 
         Args:
             server: A ``viser`` server.
-            do: Called by the controls with what is to be done in the page's own thread.
-            sources: What is shown.
+            do: Called by the controls with actions for the page's own thread.
+            sources: Problems and results to show.
         """
         self._server, gui = server, server.gui
         self.time, self._waited, self._cursor_at = 0.0, 0.0, -1.0
@@ -46,16 +46,16 @@ class Player:
         self._slider = gui.add_slider("time s", min=0.0, max=1.0, step=0.001, initial_value=0.0)
         self._speed = gui.add_dropdown("speed", tuple(SPEEDS), initial_value="1")
         self._cover = gui.add_checkbox("sphere cover", initial_value=False)
-        self._ways = gui.add_checkbox("ways of the hands", initial_value=True)
+        self._hand_paths = gui.add_checkbox("paths of the hands", initial_value=True)
         self._curves = gui.add_folder("over time")
         self._plots: list[tuple[Any, Array]] = []
         self._slider.on_update(asked(do, self.seek))
         self._cover.on_update(asked(do, self._layers))
-        self._ways.on_update(asked(do, self._layers))
+        self._hand_paths.on_update(asked(do, self._layers))
         self.show(sources)
 
     def show(self, sources: Sequence[Shown]) -> None:
-        """Show other problems or results in the place of those before."""
+        """Show other problems or results in place of those before."""
         self.sources, self.time, self._waited = list(sources), 0.0, 0.0
         with self._server.atomic():
             self._server.scene.reset()
@@ -76,14 +76,14 @@ class Player:
     def _size(self) -> None:
         """Fit the controls to the duration."""
         duration = self.duration
-        for handle in (self._play, self._slider, self._speed, self._ways):
+        for handle in (self._play, self._slider, self._speed, self._hand_paths):
             if handle.visible != (duration > 0.0):
                 handle.visible = duration > 0.0
         if duration > 0.0 and self._slider.max != duration:
             self._slider.max = duration
 
     def step(self, passed: float) -> None:
-        """Go on playing.
+        """Continue playing.
 
         Args:
             passed: Time since the last step [s].
@@ -124,7 +124,7 @@ class Player:
 
     def _layers(self, _: Any = None) -> None:
         for one, scene in zip(self.sources, self.scenes, strict=True):
-            scene.set_ways_visible(self._ways.value)
+            scene.set_hand_paths_visible(self._hand_paths.value)
             if self._cover.value or scene.has_cover:
                 scene.show_cover(one.state(self.time), self._cover.value)
 

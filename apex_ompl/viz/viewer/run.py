@@ -35,12 +35,12 @@ EVENT_TIME = 1.0  # how long it is shown [s]
 class ShownRun(Shown):
     """A run: the robot's states, and layers of obstacles, motions and events, each with a time.
 
-    Layers of obstacles are ``true``, ``observed`` and ``predicted``; of motions ``committed``, what the robot will do,
-    and ``stop``, how it would come to rest; ``events`` are texts. What was fed to a layer last before a time is what is
-    shown then. It may be fed by one thread while another shows it.
+    Layers of obstacles are ``true``, ``observed`` and ``predicted``; of motions ``committed``, the motion that the
+    robot will execute, and ``stop``, its fail-safe stop; ``events`` are texts. A layer shows the last entry fed before
+    the shown time. One thread may feed it while another shows it.
 
     Attributes:
-        has_ended: Whether nothing more is fed, so that it is played from its beginning.
+        has_ended: Whether the run has ended, so that it is played from its start.
     """
 
     has_ended: bool = False
@@ -50,16 +50,16 @@ class ShownRun(Shown):
 
     @property
     def grows(self) -> bool:
-        """Whether it goes on; set ``has_ended`` when it does not."""
+        """Whether the run is still fed; set ``has_ended`` when it is not."""
         return not self.has_ended
 
     @property
     def is_editable(self) -> bool:
-        """Whether its problem can be edited: not that of a run."""
+        """Whether its problem can be edited: never for a run."""
         return False
 
     def feed_state(self, time: float, q: Array) -> None:
-        """Say where the robot was at a time [s], shape (dof,).
+        """Feed the robot's state at a time [s], shape (dof,).
 
         Raises:
             ParameterError: Another shape, or a time before the last one.
@@ -68,7 +68,7 @@ class ShownRun(Shown):
         self._feed("robot", time, np.array(q, float))
 
     def feed_bodies(self, layer: str, time: float, bodies: Sequence[Obstacle]) -> None:
-        """Say which obstacles a layer has from a time on [s].
+        """Feed the obstacles of a layer from a time [s] on.
 
         Raises:
             ParameterError: There is no such layer, or a time before the last one.
@@ -77,7 +77,7 @@ class ShownRun(Shown):
         self._feed(layer, time, {body.name: body for body in bodies})
 
     def feed_motion(self, layer: str, time: float, states: Array) -> None:
-        """Say which motion a layer has from a time on [s]: states of shape (N, dof), none for no motion.
+        """Feed the motion of a layer from a time [s] on: states of shape (N, dof), none for no motion.
 
         Raises:
             ParameterError: There is no such layer, another shape, or a time before the last one.
@@ -87,7 +87,7 @@ class ShownRun(Shown):
         self._feed(layer, time, np.array(states, float))
 
     def feed_event(self, time: float, text: str) -> None:
-        """Say what happened at a time [s].
+        """Feed an event at a time [s].
 
         Raises:
             ParameterError: A time before the last one.
@@ -104,7 +104,7 @@ class ShownRun(Shown):
 
     @property
     def duration(self) -> float:
-        """Time of the last thing that was fed [s]."""
+        """Time of the last entry that was fed [s]."""
         return max((times[-1] for times in self._times.values()), default=0.0)
 
     def state(self, time: float) -> Array:
@@ -117,7 +117,7 @@ class ShownRun(Shown):
         return np.asarray(values[k - 1] + share * (values[k] - values[k - 1]))
 
     def latest(self, layer: str, time: float) -> tuple[int, Any]:
-        """Return number and content of what a layer has at a time; -1 and None before the first."""
+        """Return number and content of a layer's entry at a time; -1 and None before the first."""
         k = bisect_right(self._times.get(layer, []), time) - 1
         return k, None if k < 0 else self._values[layer][k]
 
@@ -202,7 +202,7 @@ def _check_layer(layer: str, known: Sequence[str]) -> None:
 
 @dataclass(eq=False)
 class SavedRun(ShownRun):
-    """A run from a file: the robot along what it executed, obstacles along their scripts, and events as labels.
+    """A run from a file: the robot along its executed motion, obstacles along their scripts, and events as labels.
 
     Attributes:
         run: The run.
@@ -213,10 +213,10 @@ class SavedRun(ShownRun):
 
     @classmethod
     def of_run(cls, run: RunResult, name: str = "") -> SavedRun:
-        """Make a run ready.
+        """Prepare a run.
 
         Raises:
-            ApexError: The robot or a body cannot be loaded, or the robot is not the one of the run.
+            ApexError: The robot or a body cannot be loaded, or the robot has changed since the run.
         """
         shown = cls(name or run.problem.name, assemble(run.problem, robot_of(run)), run=run)
         for event in run.events:
@@ -226,13 +226,13 @@ class SavedRun(ShownRun):
 
     @property
     def motion(self) -> Trajectory:
-        """What the robot did."""
+        """The executed motion."""
         assert self.run is not None
         return self.run.trajectory
 
     @property
     def dynamic(self) -> tuple[Obstacle, ...]:
-        """The obstacles that moved, with their scripts."""
+        """The dynamic obstacles, with their scripts."""
         return tuple(o for o in self.setup.problem.scene if o.moving)
 
     @property
@@ -283,9 +283,9 @@ def summary(run: RunResult) -> str:
 
 
 def shown_of(source: Problem | PlanResult | RunResult, name: str = "") -> Shown:
-    """Make a problem, a plan or a run ready to be shown.
+    """Prepare a problem, a plan or a run to be shown.
 
     Raises:
-        ApexError: The robot or a body cannot be loaded, or the robot is not the one of the result.
+        ApexError: The robot or a body cannot be loaded, or the robot has changed since the result.
     """
     return SavedRun.of_run(source, name) if isinstance(source, RunResult) else Shown.of(source, name)

@@ -24,9 +24,9 @@ from apex_ompl.viz.appearance import (
     COVER,
     EDGE,
     OBSTACLES,
+    PATH_COLORS,
     ROBOT,
     SOLID,
-    WAY_COLORS,
     Item,
     body_item,
     end_links,
@@ -35,12 +35,12 @@ from apex_ompl.viz.appearance import (
 )
 
 FLAT = 300  # meshes with fewer triangles are shaded flat
-LINK_TRIANGLES, MOST_TRIANGLES = 3_000, 20_000  # that are kept of a link's mesh, and of another one
+LINK_TRIANGLES, MOST_TRIANGLES = 3_000, 20_000  # that are kept of a link's mesh, and of another mesh
 STILL = 1e-7  # change of a pose's numbers below which it is not sent
 SIZE = 2.0  # of a drawn point, in radii of its ball
 COVER_OPACITY = 0.35
-LABEL_HEIGHT = 0.1  # of a label above what it is about [m]
-WAY, LINE = 0.006, 0.003  # thickness of the ways of a motion, and of proposals [m]
+LABEL_HEIGHT = 0.1  # of a label above the body that it explains [m]
+HAND_PATH, LINE = 0.006, 0.003  # thickness of the paths of hands along a motion, and along proposals [m]
 
 
 def rgb(color: str) -> tuple[int, int, int]:
@@ -96,7 +96,7 @@ def paint(item: Item, handle: Any, color: str) -> None:
 
 
 class RobotNodes:
-    """A copy of a robot with what it holds, at a state that can be changed.
+    """A copy of a robot with its held objects, at a state that can be changed.
 
     Frames of joints are nested as the joints are, and only those that move are sent.
 
@@ -128,7 +128,7 @@ class RobotNodes:
             joint = int(self._model.parents[joint])
 
     def path_of(self, joint: int) -> str:
-        """Return the path of the node of a joint that carries something."""
+        """Return the path of the node of a joint that carries items."""
         return self._paths[joint]
 
     def show(self, q: Array) -> None:
@@ -149,15 +149,15 @@ def plain(name: str) -> str:
     return quote(name, safe=" ")
 
 
-def link_ways(robot: Robot, links: Sequence[str], states: Iterable[Array]) -> list[Array]:
-    """Return the way of each link's origin through states, each of shape (N, 3) [m]."""
+def link_paths(robot: Robot, links: Sequence[str], states: Iterable[Array]) -> list[Array]:
+    """Return the path of each link's origin through states, each of shape (N, 3) [m]."""
     data, numbers = robot.model.createData(), [robot.link_frame(link) for link in links]
-    ways: list[list[Array]] = [[] for _ in numbers]
+    paths: list[list[Array]] = [[] for _ in numbers]
     for q in states:
         pin.framesForwardKinematics(robot.model, data, robot.to_pinocchio(q))
-        for way, number in zip(ways, numbers, strict=True):
-            way.append(np.array(data.oMf[number].translation))
-    return [np.array(way) for way in ways]
+        for path, number in zip(paths, numbers, strict=True):
+            path.append(np.array(data.oMf[number].translation))
+    return [np.array(path) for path in paths]
 
 
 class BrowserScene:
@@ -165,7 +165,7 @@ class BrowserScene:
 
     Attributes:
         setup: The problem.
-        robot: Nodes of the robot with what it holds.
+        robot: Nodes of the robot with its held objects.
         api: The scene of the ``viser`` server.
         root: Path of the node above all.
     """
@@ -194,7 +194,7 @@ class BrowserScene:
         self._cover: RobotNodes | None = None
         self._labels: dict[str, Any] = {}
         self._touching: dict[str, set[str]] = {}
-        self._ways: list[Any] = []
+        self._hand_paths: list[Any] = []
 
     @property
     def obstacles(self) -> dict[str, Any]:
@@ -223,14 +223,14 @@ class BrowserScene:
         return self._ghosts[name]
 
     def explain(self, name: str, nodes: RobotNodes, q: Array, fault: str, contacts: Sequence[Contact]) -> None:
-        """Mark what touches at a state in red, and say why the state is invalid; nothing where ``fault`` is empty.
+        """Mark bodies in contact in red, and show why a state is invalid; nothing where ``fault`` is empty.
 
         Args:
-            name: What the state is, for example ``goal``.
-            nodes: The copy of the robot that stands there.
+            name: Name of the state, for example ``goal``.
+            nodes: The copy of the robot at the state.
             q: The state.
             fault: Why it is invalid, in one sentence.
-            contacts: What touches there.
+            contacts: Contacts at the state.
         """
         touching = {body for contact in contacts for body in (contact.first, contact.second)} if fault else set()
         for item, handle in nodes.handles:
@@ -248,25 +248,26 @@ class BrowserScene:
             at = self.setup.robot.link_pose(q, link)[:3, 3] + (0.0, 0.0, LABEL_HEIGHT)
             self._labels[name] = self.api.add_label(f"{self.root}/why {plain(name)}", f"{name}: {fault}", position=at)
 
-    def show_ways(self, states: Sequence[Array]) -> None:
-        """Draw the ways of the hands through states, each in a color of its own."""
+    def show_hand_paths(self, states: Sequence[Array]) -> None:
+        """Draw the paths of the hands through states, each in its own color."""
         links, robot = end_links(self.setup.robot), self.setup.robot
-        for k, (link, way) in enumerate(zip(links, link_ways(robot, links, states), strict=True)):
-            color = WAY_COLORS[k % len(WAY_COLORS)]
-            self._ways.append(self._add_lines(f"ways/{plain(link)}", [way], color, WAY))
+        for k, (link, path) in enumerate(zip(links, link_paths(robot, links, states), strict=True)):
+            color = PATH_COLORS[k % len(PATH_COLORS)]
+            self._hand_paths.append(self._add_lines(f"hand paths/{plain(link)}", [path], color, HAND_PATH))
 
-    def set_ways_visible(self, visible: bool) -> None:
-        """Show or hide the ways of the hands."""
-        for node in self._ways:
+    def set_hand_paths_visible(self, visible: bool) -> None:
+        """Show or hide the paths of the hands."""
+        for node in self._hand_paths:
             node.visible = visible
 
     def show_lines(self, name: str, paths: Sequence[Array], color: str, thickness: float = LINE) -> Any:
-        """Draw the ways of the hands along several paths, each of shape (N, dof), as one node, and return it."""
+        """Draw the paths of the hands along several joint paths, each of shape (N, dof), as one node, and return it."""
         links, robot = end_links(self.setup.robot), self.setup.robot
-        return self._add_lines(name, [way for path in paths for way in link_ways(robot, links, path)], color, thickness)
+        traces = [trace for path in paths for trace in link_paths(robot, links, path)]
+        return self._add_lines(name, traces, color, thickness)
 
-    def _add_lines(self, name: str, ways: Sequence[Array], color: str, thickness: float) -> Any:
-        pieces = np.concatenate([np.stack([way[:-1], way[1:]], axis=1) for way in ways]).astype(np.float32)
+    def _add_lines(self, name: str, paths: Sequence[Array], color: str, thickness: float) -> Any:
+        pieces = np.concatenate([np.stack([path[:-1], path[1:]], axis=1) for path in paths]).astype(np.float32)
         return self.api.add_line_segments(f"{self.root}/{name}", pieces, rgb(color), thickness=thickness)
 
     @property
@@ -292,7 +293,7 @@ class BrowserScene:
         self._cover.root.visible = visible
 
     def add_obstacle(self, body: Obstacle) -> None:
-        """Add an obstacle, or put another one in the place of that of its name."""
+        """Add an obstacle, or replace the obstacle of its name."""
         self.remove_obstacle(body.name)
         self._add(body_item(body, OBSTACLES))
 

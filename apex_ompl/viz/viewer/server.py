@@ -18,7 +18,7 @@ PORT, PORTS = 8080, 100  # where a free port is looked for, and how many are tri
 
 @contextmanager
 def serving(port: int | None = None) -> Iterator[Any]:
-    """Serve an empty page on 127.0.0.1 inside a block; ``get_port`` of what is yielded gives the port.
+    """Serve an empty page on 127.0.0.1 inside a block; ``get_port`` of the yielded server gives the port.
 
     Args:
         port: The port; by default the first free one from 8080 on.
@@ -93,15 +93,15 @@ def import_viser() -> Any:
 
 
 Do = Callable[[Callable[[], None]], None]
-"""Takes what is to be done in the page's own thread."""
+"""Takes an action for the page's own thread."""
 
 
 def asked(do: Do, action: Callable[[Any], None]) -> Callable[[Any], None]:
-    """Return a callback of a control: the action, with the control's value, where a browser asked for it.
+    """Return a callback of a control: the action with the control's value, where a browser requested it.
 
     Args:
-        do: Takes what is to be done.
-        action: What is to be done; what the program itself sets asks for nothing.
+        do: Takes the action.
+        action: The action; values set by the program itself trigger none.
     """
 
     def handle(event: Any) -> None:
@@ -113,16 +113,16 @@ def asked(do: Do, action: Callable[[Any], None]) -> Callable[[Any], None]:
 
 @dataclass(frozen=True)
 class Asked:
-    """An action with the value that it was asked for with; asked for again, it takes the place of the one before.
+    """A requested action with its value; a later request of the same action replaces it.
 
     Attributes:
-        action: What is to be done.
-        value: What it is called with.
+        action: The action.
+        value: Its argument.
     """
 
     action: Callable[[Any], None]
     value: Any
 
     def __call__(self) -> None:
-        """Do it."""
+        """Run the action."""
         self.action(self.value)

@@ -1,4 +1,4 @@
-"""What a page shows: problems and results, made ready and with their motions."""
+"""The sources of a page: problems and results, prepared with their motions."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from apex_ompl.viz.viewer.scene import BrowserScene
 
 UNTIMED, STATES = 4.0, 120  # how long a path without times plays [s], and its states
 CURVE_SAMPLES = 160
-APART = 3.0  # of things that are shown side by side [m]
+APART = 3.0  # distance of scenes side by side [m]
 MARKS = re.compile(r"([\\`*_\[\]#|~])")  # that mean something in Markdown
 
 
@@ -34,7 +34,7 @@ class Shown:
 
     Attributes:
         name: Its title.
-        setup: The problem, ready.
+        setup: The prepared problem.
         result: The result, or None.
     """
 
@@ -54,10 +54,10 @@ class Shown:
 
     @classmethod
     def of(cls, source: Problem | PlanResult, name: str = "") -> Shown:
-        """Make a problem or a result ready.
+        """Prepare a problem or a result.
 
         Raises:
-            ApexError: The robot or a body cannot be loaded, or the robot is not the one of the result.
+            ApexError: The robot or a body cannot be loaded, or the robot has changed since the result.
         """
         if isinstance(source, Problem):
             return cls(name or source.name, assemble(source))
@@ -78,7 +78,7 @@ class Shown:
         return resample(self.result.path.states, STATES)
 
     def state(self, time: float) -> Array:
-        """Return the state at a time, shape (dof,); the start where nothing moves."""
+        """Return the state at a time, shape (dof,); the start without a motion."""
         duration = self.duration
         if duration <= 0.0 or self.result is None:
             return self.setup.start
@@ -88,7 +88,7 @@ class Shown:
         return np.asarray(self._untimed[min(STATES - 1, round(time / duration * (STATES - 1)))])
 
     def draw(self, scene: BrowserScene, time: float) -> None:
-        """Show it at a time [s] in its scene; obstacles that its motion was proved among are where they are then."""
+        """Show it at a time [s] in its scene, with the dynamic obstacles that its motion was proved among."""
         scene.show(self.state(time))
         at = min(max(time, 0.0), self.duration)
         for obstacle in self._dynamic:
@@ -111,7 +111,7 @@ class Shown:
         return self.curves_of(self.result.trajectory, self._dynamic)
 
     def curves_of(self, motion: Trajectory, dynamic: Sequence[Obstacle]) -> dict[str, Array]:
-        """Return the curves of a motion among obstacles that move."""
+        """Return the curves of a motion among dynamic obstacles."""
         times = np.linspace(0.0, motion.duration, CURVE_SAMPLES)
         shares = np.abs(shares_of_limits(motion, self.setup.robot, times)).max(axis=2)
         found = {"time": times, "clearance": 1e3 * clearances(self.setup.checker, motion, times, dynamic)}
@@ -151,10 +151,10 @@ class Shown:
 
 
 def markdown(rows: Sequence[str]) -> str:
-    """Return sentences as Markdown that shows them as they are."""
+    """Return sentences as Markdown that shows them literally."""
     return "\n\n".join(html.escape(MARKS.sub(r"\\\1", row)) for row in rows)
 
 
 def ordered(sources: Sequence[Shown]) -> list[tuple[Shown, tuple[float, float, float]]]:
-    """Return what is shown with its place: side by side from the robot's left to its right [m]."""
+    """Return the sources with their positions: side by side from the robot's left to its right [m]."""
     return [(one, (0.0, -APART * k, 0.0)) for k, one in enumerate(sources)]
