@@ -1,11 +1,11 @@
 """What proposals are worth: B = 1, 8 and 32 of them checked, repaired, checked again and shortened, on test problems.
 
-The models, unguided and guided, stand beside the straight line, random perturbations, the nearest training paths, a regression
-network of the same size, conditions and training, the same network with random weights, and with the conditions of
-another problem of the level. All are repaired by the same steps of the same optimizer, shortened, and pass the same
-full check; beside them rrtconnect+polish, whose trees have the tuned range. Times leave out the setup of the problem.
-Each run is stored in benchmarks/runs/proposals when it ends; the command resumes where it was stopped. Runs with other
-models or data need another folder.
+The models, unguided and guided, stand beside the straight line, random perturbations, the nearest training paths, a
+regression network of the same size, conditions and training, the same network with random weights, and with the
+conditions of another problem of the level. All are repaired by the same steps of the same optimizer, shortened, and
+pass the same full check; beside them rrtconnect+polish, whose trees have the tuned range. Times leave out the setup of
+the problem. Each run is stored in benchmarks/runs/proposals when it ends; the command resumes where it was stopped.
+Runs with other models or data need another folder.
 
 The regression network is trained by ``python scripts/train.py scripts/configs/apex.yaml --set
 denoiser.kind=regression --out benchmarks/runs/regression``, with the same --set as the model.

@@ -1,10 +1,10 @@
 """How much repair proposals need on scenes of kinds that no training data are of: steps of the optimizer, no times.
 
 Four proposals of each model are checked as they are, and then repaired, the most promising one first, as the planner
-does, for at most 192 steps in all. Beside the checkpoint that ships stand the planner's random perturbations, the same network
-with random weights, and checkpoints by their folders, each under its digest. Problems that the straight line's repair
-solves are told apart. Planners and trainings are tuned on the first 16 problems of a level; --first 0 -n 16 takes
-these.
+does, for at most 192 steps in all. Beside the checkpoint that ships stand the planner's random perturbations, the same
+network with random weights, and checkpoints by their folders, each under its digest. Problems that the straight line's
+repair solves are told apart. Planners and trainings are tuned on the first 16 problems of a level; --first 0 -n 16
+takes these.
 Each run is stored in benchmarks/runs/repair_steps when it ends; the command resumes where it was stopped.
 
 Usage: python -m benchmarks.planners.repair_steps [FOLDER ...] [-n 34] [--first 16] [--jobs 2] [--report]

@@ -1,6 +1,7 @@
 """Where apex stands on the hard, large and extreme levels of the test split, and what its network and its trees add.
 
-Rows: apex; the same planner with random perturbations in place of the network's proposals, and with no proposals at all; apex
+Rows: apex; the same planner with random perturbations in place of the network's proposals, and with no proposals at
+    all; apex
 without trees; rrtconnect+polish and rrtconnect with the tuned range. Runs are stored with those of head_to_head.py, in
 benchmarks/runs/head_to_head, and those that are there are not made again; the command resumes where it was stopped.
 

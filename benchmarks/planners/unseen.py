@@ -1,10 +1,11 @@
 """Apex and its controls on the frozen problems of ``unseen``: scenes of kinds that no training data are of.
 
-Rows: apex; the same planner with random perturbations, a network of random weights, another problem's conditions, or the
-nearest training paths in the place of proposals; apex, random perturbations and random weights without trees, to see what
-proposals are worth where nothing else searches; rrtconnect+polish; rrtconnect as OMPL has it and tuned; the straight
-line and its repair, which ends by itself. With --model, apex with another checkpoint stands beside the one that ships,
-under the checkpoint's digest; controls of a network are those of the one that ships.
+Rows: apex; the same planner with random perturbations, a network of random weights, another problem's conditions, or
+    the
+nearest training paths in the place of proposals; apex, random perturbations and random weights without trees, to see
+what proposals are worth where nothing else searches; rrtconnect+polish; rrtconnect as OMPL has it and tuned; the
+straight line and its repair, which ends by itself. With --model, apex with another checkpoint stands beside the one
+that ships, under the checkpoint's digest; controls of a network are those of the one that ships.
 Planners are tuned on the first 16 problems of a level, which are left out by default.
 Each run is stored in benchmarks/runs/unseen when it ends; the command resumes where it was stopped.
 
