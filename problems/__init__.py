@@ -4,7 +4,7 @@ The id of a problem of a suite is ``suite/level/seed``, for example ``shelf/hard
 training, 800 000 to 899 999 for validation, 900 000 to 999 999 for tests.
 
 - ``catalogue``: suites, levels, splits and ids; ``generator`` draws a problem by its id.
-- ``scenes``, ``alignment``, ``broad``: the generators of the suites; ``objects``: what they put into scenes and hands.
+- ``scenes``, ``alignment``, ``broad``: the generators of the suites; ``objects``: their obstacles and held objects.
   ``broad`` is for training alone, and ``unseen``, which it draws too, for validation alone.
 - ``broad_parts``: parts of scenes and their algebra; ``broad_furniture``, ``broad_structures``, ``broad_unseen``: the
   grammars; ``broad_tasks``, ``broad_representation``: held objects, ends, difficulty, and how a scene is given.
@@ -68,9 +68,9 @@ def is_id(text: str) -> bool:
 def sample(suite: str, *, level: str, seed: int) -> Problem:
     """Return a problem of a suite; the same seed gives the same problem.
 
-    Start and goal are free by a margin of 1 cm; two held objects that are aligned at the goal may be closer there.
-    A moving obstacle keeps clear of the start at time 0, and of the goal at the time when the straight line ends there
-    at a quarter of the velocity limits; at earlier times it may overlap the goal. Frozen problems, the first ones of
+    Start and goal are free by a margin of 1 cm; two held objects that are aligned at the goal may be closer there. A
+    moving obstacle keeps clear of the start at time 0, and of the goal at the time when the straight line ends there at
+    a quarter of the velocity limits; at earlier times it may overlap the goal. Frozen problems, the first problems of
     validation and test, are read from files and have a witness; others are drawn, and may have no solution.
 
     Args:
@@ -94,14 +94,14 @@ def sample(suite: str, *, level: str, seed: int) -> Problem:
 
 
 def primitives(problem: Problem, *, enclosing: bool = False) -> tuple[Obstacle, ...]:
-    """Return the obstacles of a problem as primitives: those that meshes and points of a suite were made from.
+    """Return the obstacles of a problem as primitives, from which meshes and points of a suite were made.
 
-    They are the obstacles of the problem itself, unless it is one of ``broad`` or ``unseen`` by its name. There they
+    They are the obstacles of the problem itself, unless its name is an id of ``broad`` or ``unseen``. There they
     contain the meshes, and are thinner than the balls around points by their radius.
 
     Args:
         problem: The problem.
-        enclosing: Whether those that points were made from are larger, so that they contain the balls.
+        enclosing: Whether primitives of points are enlarged, so that they contain the balls.
 
     Raises:
         SuiteError: No problem can be drawn for that seed.

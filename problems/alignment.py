@@ -4,7 +4,7 @@ Starts are home + N(0, 0.35^2), the objects at least 8 cm above the tables and 0
 kinematics from home + N(0, 0.6^2). Both are free by 1 cm, except that the two objects are in contact at the goal.
 
 Obstacles are cubes. Their centers are those of a held object at a random state in the middle half of the straight line
-from start to goal, + N(0, 0.1^2) m; cubes drawn evenly over the workspace would rarely block a motion. A static cube
+from start to goal, + N(0, 0.1^2) m; cubes drawn uniformly over the workspace would rarely block a motion. A static cube
 keeps 3 cm to start and goal. On ``extreme`` 100 and 70 cubes, which may overlap, form a cave: they are spread by
 N(0, 0.2^2) m and keep 1.5 cm. A moving cube keeps 3 cm to the start at time 0, and to the goal at the time when the
 straight line ends there; at earlier times it may overlap the goal.
@@ -95,7 +95,7 @@ def cube_size_and_speed(level: str) -> tuple[float, float]:
 
 
 def straight_line_duration(start: Array, goal: Array) -> float:
-    """Return how long a straight line takes at ``VELOCITY_SCALE`` of the velocity limits [s]."""
+    """Return the duration of a straight line at ``VELOCITY_SCALE`` of the velocity limits [s]."""
     return float(np.max(np.abs(goal - start) / robot().limits.velocity)) / VELOCITY_SCALE
 
 

@@ -45,7 +45,7 @@ from apex_ompl.problems.scenes import DOWN, FORWARD
 
 
 def rack(rng: np.random.Generator) -> Composition:
-    """Draw a rack of boards on four posts or between walls, with things on its boards."""
+    """Draw a rack of boards on four posts or between walls, with objects on its boards."""
     depth, width, thick = rng.uniform(0.2, 0.45), rng.uniform(0.35, 1.0), rng.uniform(0.008, 0.03)
     heights = np.cumsum([rng.uniform(0.02, 0.15), *rng.uniform(0.24, 0.38, int(rng.integers(2, 4)))])
     parts, places = list[Part](), list[Place]()
@@ -108,7 +108,7 @@ def cabinet(rng: np.random.Generator) -> Composition:
 
 
 def tables(rng: np.random.Generator) -> Composition:
-    """Draw tables and stools under and beside each other, with things on and beneath them."""
+    """Draw tables and stools under and beside each other, with objects on and beneath them."""
     parts, places = list[Part](), list[Place]()
     for _ in range(int(rng.integers(1, 4))):
         x, y, height = rng.uniform(0.2, 0.5), rng.uniform(0.25, 0.7), rng.uniform(0.2, 0.6)
@@ -179,7 +179,7 @@ def chairs(rng: np.random.Generator) -> Composition:
 
 
 def crates(rng: np.random.Generator) -> Composition:
-    """Draw open boxes, upright and tilted, next to and above each other, with things in them."""
+    """Draw open boxes, upright and tilted, next to and above each other, with objects in them."""
     parts, places = list[Part](), list[Place]()
     for k in range(int(rng.integers(2, 6))):
         x, y, z = rng.uniform(0.22, 0.36), rng.uniform(0.22, 0.36), rng.uniform(0.1, 0.36)

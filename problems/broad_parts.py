@@ -375,7 +375,7 @@ def sagging(a: Point, b: Point, sag: float, count: int) -> Array:
 
 
 class Place(NamedTuple):
-    """A place that a hand may be sent to: inside, behind or between parts.
+    """A place that a hand may be sent to: inside, beyond or between parts.
 
     Attributes:
         point: Where the grasp point is to be, shape (3,) [m].

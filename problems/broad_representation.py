@@ -149,7 +149,7 @@ class Group(NamedTuple):
     Attributes:
         form: MESH, SURFACE or POINTS.
         first: First part.
-        last: The one behind the last.
+        last: Index after the last part.
         spacing: Of points; 0 for meshes [m].
     """
 
@@ -165,11 +165,11 @@ class Group(NamedTuple):
 
 
 class Representation(NamedTuple):
-    """How parts are to be given, before it is known how many there are.
+    """How parts are given, before their number is known.
 
     Attributes:
-        forms: Forms of as many runs of parts; an empty one for primitives.
-        bounds: Where they end, as shares of the number of parts.
+        forms: Form of each run of parts; empty for primitives.
+        bounds: Ends of the runs, as shares of the number of parts.
         spacing: Of points [m].
     """
 

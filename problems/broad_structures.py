@@ -127,7 +127,7 @@ def louvres(rng: np.random.Generator) -> Composition:
 
 
 def doorways(rng: np.random.Generator) -> Composition:
-    """Draw frames one behind the other, each shifted, turned and smaller, through which a hand reaches."""
+    """Draw frames in a row, each shifted, turned and smaller, through which a hand reaches."""
     count, size, bar = int(rng.integers(2, 5)), rng.uniform(0.24, 0.42), rng.uniform(0.01, 0.06)
     parts, places, pose = list[Part](), list[Place](), np.eye(4)
     for _ in range(count):
@@ -186,7 +186,7 @@ def shards(rng: np.random.Generator) -> Composition:
 
 
 def arches(rng: np.random.Generator) -> Composition:
-    """Draw arches of boxes one behind the other, or crossing, to reach under and over."""
+    """Draw arches of boxes in a row, or crossing, to reach under and over."""
     parts, places = list[Part](), list[Place]()
     for _ in range(int(rng.integers(1, 5))):
         radius, thick = rng.uniform(0.15, 0.4), rng.uniform(0.01, 0.05)

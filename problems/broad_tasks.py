@@ -188,7 +188,7 @@ def _fixtures() -> tuple[Solids, ...]:
 
 
 def scene_of(parts: Sequence[Part], swelling: float = 0.0) -> SceneTables:
-    """Return the kernel's scene of the robot's fixtures and of parts, numbered behind them.
+    """Return the kernel's scene of the robot's fixtures, followed by parts.
 
     Args:
         parts: The parts.
@@ -208,7 +208,7 @@ def clear_parts(tables: RobotTables, parts: list[Part], ends: Array, margin: flo
     """Return those parts that keep a margin to the robot at some states.
 
     Args:
-        tables: The robot with what it holds.
+        tables: The robot with its held objects.
         parts: The parts.
         ends: Shape (n, dof).
         margin: [m].

@@ -48,8 +48,8 @@ class ProblemId:
 
         Raises:
             UnknownNameError: No such suite or level.
-            ParameterError: The seed is not a whole number from 0 to 999 999, or not one of validation where the suite
-                is for that alone.
+            ParameterError: The seed is not a whole number from 0 to 999 999, or not a validation seed where the suite
+                is for validation alone.
         """
         check_name(self.suite, "suite", KNOWN)
         check_name(self.level, f"level of {self.suite}", KNOWN[self.suite])
@@ -72,9 +72,9 @@ class ProblemId:
 
     @classmethod
     def parse(cls, text: str) -> ProblemId | None:
-        """Return the id that a text of the form ``suite/level/seed`` names, or None for a text of another form.
+        """Return the id that a text of the form ``suite/level/seed`` names, or None for another form.
 
-        The seed has no leading zeros, so that a problem has one name.
+        The seed has no leading zeros, so that a problem has a single name.
 
         Raises:
             UnknownNameError: No such suite or level.

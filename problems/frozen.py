@@ -3,7 +3,7 @@
 They are stored in ``problems/frozen``, a file per suite and level (JSON, compressed by LZMA), and are read, never drawn
 again. Of ``unseen`` only validation problems are frozen. ``SHA256SUMS`` holds the hashes of the files. A witness is a
 path that passed the full check; it has times where obstacles move. Its states between start and goal are stored as
-multiples of 1e-4 rad. Where obstacles are meshes or points, the primitives that they are made from are stored.
+multiples of 1e-4 rad. For obstacles that are meshes or points, the primitives that they are made from are stored.
 """
 
 from __future__ import annotations
@@ -74,8 +74,9 @@ class FrozenProblem:
         problem: The problem.
         witness: Its witness.
         draw_number: Number of the draw, see :func:`apex_ompl.problems.generator.draw`.
-        primitives: Obstacles before some of them are given as meshes or points; None where all are as they are given.
-        groups: Those that are given together.
+        primitives: Obstacles before some of them are given as meshes or points; None where all obstacles are
+            primitives.
+        groups: Obstacles that are given together.
     """
 
     problem: Problem
@@ -213,7 +214,7 @@ def digest(problem: Problem) -> str:
 
 
 def _primitives(item: FrozenProblem) -> list[Any]:
-    """Return the obstacles of a problem as they are stored: those that meshes and points are made from."""
+    """Return the obstacles of a problem as they are stored: the primitives of meshes and points."""
     primitives = item.problem.scene if item.primitives is None else item.primitives
     found: list[Any] = item.problem.model_copy(update={"scene": primitives}).as_dict().get("scene", [])
     return found

@@ -16,7 +16,7 @@ from apex_ompl.problems.suite_robot import MARGIN, DrawnProblem, empty_hand_tabl
 from apex_ompl.scene.problem import Problem
 
 SYNERGIES = (0.0, 0.4)  # interval of the synergies of empty hands
-MAX_DRAWS = 300  # for one id, before it is given up
+MAX_DRAWS = 300  # for one id, before it is abandoned
 
 
 class SuiteError(ApexError):
@@ -50,14 +50,14 @@ def _first_drawn(problem_id: ProblemId, after: int) -> tuple[int, DrawnProblem]:
 
 
 def first_drawn(problem_id: ProblemId, after: int = -1) -> tuple[int, DrawnProblem]:
-    """Return the number and the problem of the first draw after ``after`` that has a start and a goal, as it is drawn.
+    """Return number and drawn problem of the first draw after ``after`` that has a start and a goal.
 
-    The last ones are kept.
+    The last results are cached.
 
     Raises:
         SuiteError: None of the first ``MAX_DRAWS`` draws has.
     """
-    return _first_drawn(problem_id, after)  # one spelling of the arguments, by which the cache knows them
+    return _first_drawn(problem_id, after)  # one form of the arguments, which are the key of the cache
 
 
 def first_draw(problem_id: ProblemId, after: int = -1) -> tuple[int, Problem]:

@@ -124,12 +124,12 @@ def cage(rng: np.random.Generator, level: str) -> ReachingTask:
 
 
 def posts(rng: np.random.Generator, level: str) -> ReachingTask:
-    """Draw a fence of posts too tall to reach over, and posts behind it; each hand goes from one gap to another."""
-    spacing, behind_count = {"easy": (0.36, 0), "medium": (0.31, 2), "hard": (0.285, 4)}[level]
+    """Draw a fence of posts too tall to reach over, and posts beyond it; each hand goes from one gap to another."""
+    spacing, beyond_count = {"easy": (0.36, 0), "medium": (0.31, 2), "hard": (0.285, 4)}[level]
     count, front = round(1.7 / spacing), rng.uniform(0.42, 0.48)
     fence = (np.arange(count) - (count - 1) / 2) * spacing + rng.uniform(-0.03, 0.03, count)
     positions = [(front + rng.uniform(-0.02, 0.02), y) for y in fence]
-    while len(positions) < count + behind_count:
+    while len(positions) < count + beyond_count:
         x, y = rng.uniform([front + 0.2, -0.7], [0.85, 0.7])
         if all(np.hypot(x - u, y - v) > 0.2 for u, v in positions):
             positions.append((x, y))
@@ -139,10 +139,10 @@ def posts(rng: np.random.Generator, level: str) -> ReachingTask:
     gaps = (fence[:-1] + fence[1:]) / 2
     left, right = rng.permutation(gaps[-(len(gaps) // 2) :])[:2], rng.permutation(gaps[: len(gaps) // 2])[:2]
 
-    def behind(y: float) -> HandRegion:
+    def beyond(y: float) -> HandRegion:
         return HandRegion((front + 0.12, front + 0.2), (y - 0.02, y + 0.02), (0.15, 0.6), (DOWN, FORWARD))
 
-    ends = [(behind(a), behind(b)) for a, b in zip(left, right, strict=True)]
+    ends = [(beyond(a), beyond(b)) for a, b in zip(left, right, strict=True)]
     return ReachingTask(tuple(scene), ends[0], ends[1])
 
 
@@ -231,4 +231,4 @@ LEVELS = {
     suite: ("easy", "medium", "hard") if suite in ("cage", "posts") else ("easy", "medium", "hard", "extreme")
     for suite in SUITES
 }
-"""Suite -> its levels; rrtconnect with a tuned range takes long enough on ``hard`` of ``cage`` and ``posts``."""
+"""Suite -> its levels; on ``hard`` of ``cage`` and ``posts`` a tuned rrtconnect takes long enough."""

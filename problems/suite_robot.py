@@ -36,7 +36,7 @@ class DrawnProblem:
         start: Shape (dof,).
         goal: Shape (dof,).
         attached: Held objects.
-        groups: Obstacles, by their place in ``scene``, that are given as a mesh or as points.
+        groups: Obstacles, by their index in ``scene``, that are given as a mesh or as points.
     """
 
     scene: tuple[Obstacle, ...]

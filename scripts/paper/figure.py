@@ -1,4 +1,4 @@
-"""What a figure is made of, how its shares are counted, and how it is written."""
+"""Figures of the paper: their content, their failure ratios with confidence intervals, and their files."""
 
 from __future__ import annotations
 

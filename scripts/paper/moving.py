@@ -1,4 +1,4 @@
-"""Figures among cubes that move, in the closed loop on the simulated clock: failure ratio by task, over size, sweeps.
+"""Figures among moving cubes, in the closed loop on the simulated clock: failure ratio by task, over size, sweeps.
 
 Each run is a row's own function to the benchmark (:class:`apex_ompl.evaluation.Row`), so that the runs are stored, and
 resume, as all others do. The same seed gives the same run on a loaded machine, too.

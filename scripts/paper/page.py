@@ -30,7 +30,7 @@ class Results:
     """The results of the figures in a folder."""
 
     def __init__(self, folder: Path) -> None:
-        """Read what there is."""
+        """Read the available results."""
         self.folder = folder
         files = {path.stem.removeprefix(PREFIX): path for path in sorted(folder.glob(f"{PREFIX}*.json"))}
         self.found: dict[str, dict[str, Any]] = {name: json.loads(p.read_text("utf-8")) for name, p in files.items()}
@@ -105,7 +105,7 @@ def rivals(results: Results, some: Sequence[Rival] = RIVALS) -> str:
 
 
 def sweeps(results: Results) -> str:
-    """Return the table of what the choices of the loop change."""
+    """Return the table of the effects of single choices of the loop."""
     found = results.found.get("dynamic", {}).get("sweeps", {})
     if not found:
         return f"({MISSING}: `python scripts/reproduce.py dynamic`)"
@@ -129,7 +129,7 @@ def distances(results: Results) -> str:
 
 
 def pictures(results: Results, to: str) -> str:
-    """Return the pictures that there are, each under what it shows.
+    """Return the available pictures, each under its title.
 
     Args:
         results: The results.

@@ -13,11 +13,11 @@ class Entry:
     """A number of the paper.
 
     Attributes:
-        figure: Where the paper has it.
-        what: What it is.
+        figure: Its figure or section in the paper.
+        what: Its meaning.
         paper: The paper's value.
-        faithful: Where that of the system as the paper has it is found.
-        ours: Where that of this planner is found.
+        faithful: Entry of the system as the paper describes it.
+        ours: Entry of this planner.
         number: Name of the number in these entries.
         differs: What differs, and why.
     """
@@ -33,8 +33,8 @@ class Entry:
 
 PICTURES = {
     "failure": "Failure ratio and smoothness by task (figure 7)",
-    "size": "Failure ratio over the size of cubes that stand (figure 9)",
-    "dynamic": "Failure ratio over the size of cubes that move (figure 9)",
+    "size": "Failure ratio over the size of static cubes (figure 9)",
+    "dynamic": "Failure ratio over the size of moving cubes (figure 9)",
     "strips": "With and without guidance, in reading order, up to a contact (figure 8)",
     "failures": "Failures: a collision, a robot that is stuck, a wrong alignment (figure 6)",
     "denoising": "Denoising, from above and from the side (figure 5)",
@@ -57,7 +57,7 @@ ENTRIES = (
     Entry("7a", "R_f %, horizontal, moving", "(8.95)", ("dynamic", "tasks", "horizontal, apex-paper"),
           ("dynamic", "tasks", "horizontal, apex"), "R_f", "the same"),
     Entry("7b", "S_r rad", "2.36", ("failure", "both, apex-paper"), ("failure", "both, apex"), "S_r",
-          "a path length: it grows with how far start and goal are apart, which the paper does not give"),
+          "a path length: it grows with the distance of start and goal, which the paper does not give"),
     Entry("9", "R_f %, largest, standing, guided", "6.56", ("size", "both/huge, apex-paper, one sample"),
           ("size", "both/huge, apex"), "R_f", f"the first sample of `apex-paper`; {LARGEST}"),
     Entry("9", "the same, unguided", "67.19", ("size", "both/huge, apex-paper, unguided, one sample"),
@@ -68,7 +68,7 @@ ENTRIES = (
     Entry("9", "the same, unguided", "(67.19)", ("size", "both/huge, apex-paper, unguided"), (), "R_f", "the same"),
     Entry("9", "R_f %, largest, moving, guided", "9.36", ("dynamic", "sizes", "huge, apex-paper"),
           ("dynamic", "sizes", "huge, apex"), "R_f",
-          f"{CUBE}: while a plan is made, a cube goes on, and comes to a robot that stands"),
+          f"{CUBE}: while a plan is made, the cube moves on and reaches a robot at rest"),
     Entry("9", "the same, unguided", "98.45", ("dynamic", "sizes", "huge, apex-paper, unguided"), (), "R_f",
           "`apex` has no unguided loop"),
     Entry("9", "R_f %, largest, moving, replans take no time", "(9.36)",
@@ -79,7 +79,7 @@ ENTRIES = (
     Entry("10b", "FID, guided", "21.51", ("fid", "VAE, apex-paper"), ("fid", "VAE, apex"), "fid",
           "N, dimension and features of the paper are not given, so that values cannot be compared, only their order"),
     Entry("10b", "FID, unguided", "48.63", ("fid", "VAE, apex-paper, unguided"), ("fid", "VAE, apex, unguided"), "fid",
-          "the other way round; our guidance makes paths longer (`benchmarks/results/guidance.md`)"),
+          "the order is reversed; our guidance makes paths longer (`benchmarks/results/guidance.md`)"),
     Entry("IV-D", "time of a plan s, guided", "8.36", ("time", "apex-paper"), ("time", "apex"), "time_s",
           "median; CPU, the paper's a GPU; `apex-paper` samples one path after the other in 256 steps each"),
     Entry("IV-D", "time of a plan s, unguided", "19.63", ("time", "apex-paper, unguided"),
@@ -96,8 +96,8 @@ class Rival:
         name: Its name in the paper, with the row's where there are several.
         ratio: The paper's R_f [%].
         smoothness: The paper's S_r.
-        static: Row of ours in scenes that stand still.
-        moving: Row of ours in the closed loop, if there is one.
+        static: Our row in static scenes.
+        moving: Our row in the closed loop, if there is one.
         differs: What differs, and why.
     """
 

@@ -1,6 +1,6 @@
-"""Rows of the paper's figures: planners in scenes that stand still, replanners among cubes that move.
+"""Rows of the paper's figures: planners in static scenes, replanners among moving cubes.
 
-A row whose planner, or replanner, is not in this installation is left out with a printed line.
+A row whose planner or replanner is missing in this installation is left out with a printed line.
 """
 
 from __future__ import annotations

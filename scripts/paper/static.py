@@ -1,4 +1,4 @@
-"""Figures in scenes that stand still: failure ratio and smoothness by task, failure ratio over size, planning time."""
+"""Figures in static scenes: failure ratio and smoothness by task, failure ratio over size, planning time."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ def runs_of(
     args: Namespace, levels: Sequence[str], rows: Sequence[Row], folder: str, *, jobs: int, timeout: float = TIMEOUT,
     split: str = "test",
 ) -> Results:  # fmt: skip
-    """Return the runs of some rows on the first problems of some levels, made where they are missing."""
+    """Return the runs of some rows on the first problems of some levels; missing ones are made."""
     rows = [replace(row, runs=max(FEW, args.n // SHARE)) if row.timeout else row for row in rows]
     found = bench(
         levels, rows, args.keep / folder, runs=args.n, timeout=timeout, workers=Workers(jobs),
         split=split, provenance=record.session(),
     )  # fmt: skip
     wanted = jobs_of(levels, rows, runs=args.n, timeout=timeout, seed=0, split=split, simplify=True)
-    keys = {job.key for job in wanted}  # a folder may have runs with parameters of an earlier day, too
+    keys = {job.key for job in wanted}  # a folder may also hold runs with earlier parameters
     return replace(found, runs=[run for run in found.runs if run["key"] in keys and run["status"] != NO_PROBLEM])
 
 
@@ -119,7 +119,7 @@ def size(args: Namespace) -> Made:
 
 
 def time(args: Namespace) -> Made:
-    """Return planning times; whatever is asked for, one run goes at a time."""
+    """Return planning times; one run is made at a time, whatever ``jobs`` is."""
     rows = installed(PLANNERS, planners.names())
     results = runs_of(args, [f"{task}/{TIMED}" for task in TASKS], rows, "paper_times", jobs=1)
     data: dict[str, Any] = {}
