@@ -24,7 +24,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.collision.discretization import FINE_RESOLUTION, SEARCH_RESOLUTION
 from apex_ompl.collision.shapes import world_geometry
 from apex_ompl.collision.tables import primitives
 from apex_ompl.errors import SceneError
@@ -36,6 +35,7 @@ from apex_ompl.kernel import Kernel, RobotTables, SceneTables
 from apex_ompl.kernel.scene_builder import Solids, boxes_around, tables_of
 from apex_ompl.paths.candidates import first_valid
 from apex_ompl.paths.optimizer import Optimizer
+from apex_ompl.paths.path import FINE_RESOLUTION, SEARCH_RESOLUTION
 from apex_ompl.problems.broad_parts import Part, Place, kernel_columns
 from apex_ompl.problems.objects import ALONG_X, PALM, cup
 from apex_ompl.problems.scenes import DOWN, FORWARD

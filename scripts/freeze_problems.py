@@ -28,12 +28,11 @@ import numpy as np
 
 from apex_ompl.api import plan
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.collision.discretization import SEARCH_RESOLUTION
 from apex_ompl.moving.swept import check_timed_path, constant_velocity_times, inflated
 from apex_ompl.ompl.setup import assemble
 from apex_ompl.ompl.tuned import TUNED
 from apex_ompl.ompl.validity import full_check
-from apex_ompl.paths.path import states_between
+from apex_ompl.paths.path import SEARCH_RESOLUTION, states_between
 from apex_ompl.problems import frozen
 from apex_ompl.problems.alignment import VELOCITY_SCALE, straight_line_duration
 from apex_ompl.problems.catalogue import VALIDATION, ProblemId

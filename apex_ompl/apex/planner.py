@@ -19,13 +19,13 @@ from apex_ompl.apex.query import make_query
 from apex_ompl.apex.sampler import ProposalSampler
 from apex_ompl.apex.solver import solve
 from apex_ompl.apex.stages import Anytime, Shorten
-from apex_ompl.collision.discretization import SEARCH_RESOLUTION
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel.shortcuts import shortcut
 from apex_ompl.kernel.trees import TreePair
 from apex_ompl.ompl.own_planner import OwnPlanner, Tree
 from apex_ompl.ompl.report import SolveReport
 from apex_ompl.paths.optimizer import Optimizer
+from apex_ompl.paths.path import SEARCH_RESOLUTION
 from apex_ompl.types import Array
 
 _warm_models: WeakSet[Model] = WeakSet()  # that have proposed something in this process

@@ -14,9 +14,9 @@ from ompl import base as ob
 from ompl import geometric as og
 
 from apex_ompl.apex.context import SolveContext
-from apex_ompl.collision.discretization import SEARCH_RESOLUTION
 from apex_ompl.kernel.trees import TreePair
 from apex_ompl.ompl.space import to_state
+from apex_ompl.paths.path import SEARCH_RESOLUTION
 from apex_ompl.types import Array
 
 OMPL_RANGE = 0.2  # OMPL's choice of the longest step, as a share of the extent of the space

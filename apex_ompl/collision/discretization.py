@@ -14,13 +14,6 @@ from apex_ompl.kernel.compiled.motion_proof import MOST_STEPS
 from apex_ompl.paths.path import states_between
 from apex_ompl.types import Array
 
-SEARCH_RESOLUTION = 0.031
-"""Largest spacing of the states that planners check along a motion [rad, max-norm]."""
-
-FINE_RESOLUTION = 0.0031
-"""Largest spacing of the states at which the kernel alone, without exact shapes, checks paths: training data and the
-validation of models [rad, max-norm]. What counts as a solution is decided by a proof without any spacing."""
-
 
 @dataclass(frozen=True)
 class Collision:

@@ -14,7 +14,6 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from apex_ompl.collision.discretization import SEARCH_RESOLUTION
 from apex_ompl.collision.exact_shapes import PlacedShape, joined, shape_arrays
 from apex_ompl.collision.mesh_stage import MeshStage
 from apex_ompl.collision.solids import Solid
@@ -27,6 +26,7 @@ from apex_ompl.kernel.kernel import Kernel
 from apex_ompl.kernel.products import product
 from apex_ompl.kernel.scene_builder import primitive, scene_tables
 from apex_ompl.kernel.tables import with_pairs
+from apex_ompl.paths.path import SEARCH_RESOLUTION
 from apex_ompl.robot import Robot
 from apex_ompl.types import Array, Flags
 from apex_ompl.util.arrays import compact, distinct

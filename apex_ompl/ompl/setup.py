@@ -11,13 +11,13 @@ from ompl import base as ob
 from ompl import geometric as og
 
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.collision.discretization import SEARCH_RESOLUTION
 from apex_ompl.goals.alignment import AlignmentGoal, alignment_goal
 from apex_ompl.goals.goal_sampling import sample
 from apex_ompl.goals.pose_goal import PoseGoal
 from apex_ompl.ompl.simple_setup import SimpleSetup
 from apex_ompl.ompl.space import Bounds, to_state
 from apex_ompl.ompl.validity import MotionCheck, MotionValidator, StateValidityChecker
+from apex_ompl.paths.path import SEARCH_RESOLUTION
 from apex_ompl.robot import Robot, load_robot
 from apex_ompl.scene.problem import Problem
 from apex_ompl.scene.scripts import problem_at

@@ -15,8 +15,8 @@ import numpy as np
 from ompl import base as ob
 from ompl import geometric as og
 
-from apex_ompl.collision.discretization import SEARCH_RESOLUTION
 from apex_ompl.errors import ParameterError
+from apex_ompl.paths.path import SEARCH_RESOLUTION
 from apex_ompl.robot import Robot
 from apex_ompl.types import Array, Flags
 

@@ -14,9 +14,9 @@ from numpy.typing import ArrayLike
 from ompl import base as ob
 
 from apex_ompl.collision.checker import CollisionChecker
-from apex_ompl.collision.discretization import SEARCH_RESOLUTION
 from apex_ompl.collision.path_proof import Curve, PathProof
 from apex_ompl.ompl.simple_setup import SpaceInformation
+from apex_ompl.paths.path import SEARCH_RESOLUTION
 from apex_ompl.timing.trajectory import ROUNDING, Trajectory
 from apex_ompl.types import Array
 from apex_ompl.util.display import fields_line

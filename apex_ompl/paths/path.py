@@ -14,6 +14,13 @@ from apex_ompl.paths.spline import Spline
 from apex_ompl.types import Array
 from apex_ompl.util.validation import check_integer, check_positive
 
+SEARCH_RESOLUTION = 0.031
+"""Largest spacing of the states that planners check along a motion [rad, max-norm]."""
+
+FINE_RESOLUTION = 0.0031
+"""Largest spacing of the states at which the kernel alone, without exact shapes, checks paths: training data and the
+validation of models [rad, max-norm]. What counts as a solution is decided by a proof without any spacing."""
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Path:

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from apex_ompl import problems
-from apex_ompl.collision.discretization import SEARCH_RESOLUTION
 from apex_ompl.errors import ParameterError
 from apex_ompl.ompl.process import quiet_ompl
 from apex_ompl.ompl.setup import PlanningSetup, assemble
 from apex_ompl.paths.optimizer import Optimizer
+from apex_ompl.paths.path import SEARCH_RESOLUTION
 from apex_ompl.paths.spline import Spline
 from apex_ompl.problems.generator import SuiteError
 from apex_ompl.problems.suite_robot import robot

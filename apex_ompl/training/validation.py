@@ -8,12 +8,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from apex_ompl.collision.discretization import FINE_RESOLUTION
 from apex_ompl.kernel import Kernel
 from apex_ompl.model.proposals import Sampling, TrajectoryModel
 from apex_ompl.model.query import ObstacleSet, Query
 from apex_ompl.paths.candidates import first_valid
 from apex_ompl.paths.optimizer import Optimizer
+from apex_ompl.paths.path import FINE_RESOLUTION
 from apex_ompl.training.kernel_problems import KernelProblem
 from apex_ompl.training.records import held_extents
 

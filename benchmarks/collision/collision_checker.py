@@ -19,10 +19,9 @@ import pinocchio as pin
 
 from apex_ompl import plan, problems
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.collision.discretization import FINE_RESOLUTION
 from apex_ompl.collision.mesh_stage import MeshStage, exact_requests
 from apex_ompl.ompl.validity import full_check
-from apex_ompl.paths.path import resample
+from apex_ompl.paths.path import FINE_RESOLUTION, resample
 from apex_ompl.robot import Robot, load_robot
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.util.entry_point import run_script

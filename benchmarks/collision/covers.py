@@ -19,7 +19,7 @@ import numpy as np
 from apex_ompl import MotionPlanner, problems
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.cover.spheres import quality, read_covers, shape_key
-from apex_ompl.collision.discretization import FINE_RESOLUTION, SEARCH_RESOLUTION
+from apex_ompl.paths.path import FINE_RESOLUTION, SEARCH_RESOLUTION
 from apex_ompl.robot import load_robot
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import one_or_more

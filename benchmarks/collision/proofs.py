@@ -25,7 +25,8 @@ import numpy as np
 
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.conservative import CheckCounts
-from apex_ompl.collision.discretization import FINE_RESOLUTION, SEARCH_RESOLUTION, sample_path
+from apex_ompl.collision.discretization import sample_path
+from apex_ompl.paths.path import FINE_RESOLUTION, SEARCH_RESOLUTION
 from apex_ompl.robot import Robot, load_robot
 from apex_ompl.scene.bodies import AttachedObject, MeshFile, Obstacle
 from apex_ompl.util.entry_point import run_script

@@ -25,7 +25,6 @@ from typing import Any
 import numpy as np
 
 from apex_ompl.api import load_problem
-from apex_ompl.collision.discretization import SEARCH_RESOLUTION
 from apex_ompl.evaluation import Results, Row, Workers, bench
 from apex_ompl.evaluation.rows import Job
 from apex_ompl.evaluation.runs import NO_PROBLEM, Run, first_path_proof
@@ -34,7 +33,7 @@ from apex_ompl.ompl.repair import repair
 from apex_ompl.ompl.setup import PlanningSetup, assemble
 from apex_ompl.ompl.tuned import TUNED
 from apex_ompl.ompl.validity import full_check
-from apex_ompl.paths.path import path_length
+from apex_ompl.paths.path import SEARCH_RESOLUTION, path_length
 from apex_ompl.planning import NOT_PROVED
 from apex_ompl.robot import Robot
 from apex_ompl.robot.model import link_of

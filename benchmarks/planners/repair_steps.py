@@ -23,7 +23,6 @@ import numpy as np
 from apex_ompl import problems
 from apex_ompl.apex.models import NONE, Model, trajectory_model
 from apex_ompl.apex.query import make_query
-from apex_ompl.collision.discretization import FINE_RESOLUTION
 from apex_ompl.evaluation import Results, Row, Workers, bench
 from apex_ompl.evaluation.rows import Job
 from apex_ompl.evaluation.runs import Run
@@ -31,7 +30,7 @@ from apex_ompl.model.checkpoint import SHIPPED, read_config
 from apex_ompl.ompl.setup import assemble
 from apex_ompl.paths.candidates import CandidatePool
 from apex_ompl.paths.optimizer import Optimizer
-from apex_ompl.paths.path import path_length
+from apex_ompl.paths.path import FINE_RESOLUTION, path_length
 from apex_ompl.problems.catalogue import VALIDATION
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.training.torch_model import load_torch_model

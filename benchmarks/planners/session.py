@@ -21,10 +21,10 @@ from collections.abc import Callable
 from importlib.util import find_spec
 
 from apex_ompl import MotionPlanner, PlanResult, load_problem, plan, problems
-from apex_ompl.collision.discretization import SEARCH_RESOLUTION
 from apex_ompl.ompl.process import quiet_ompl
 from apex_ompl.ompl.setup import assemble
 from apex_ompl.ompl.tuned import TUNED
+from apex_ompl.paths.path import SEARCH_RESOLUTION
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.scene.problem import Problem
 from apex_ompl.util.entry_point import run_script

@@ -21,12 +21,12 @@ from tqdm import tqdm
 
 from apex_ompl import problems
 from apex_ompl.apex.trees import ompl_trees
-from apex_ompl.collision.discretization import SEARCH_RESOLUTION
 from apex_ompl.kernel.trees import TreePair
 from apex_ompl.ompl.process import quiet_ompl, seed_ompl
 from apex_ompl.ompl.setup import PlanningSetup, assemble
 from apex_ompl.ompl.space import path_to_array
 from apex_ompl.ompl.tuned import TUNED
+from apex_ompl.paths.path import SEARCH_RESOLUTION
 from apex_ompl.types import Array
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import one_or_more

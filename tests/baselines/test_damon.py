@@ -27,12 +27,13 @@ from apex_ompl.baselines.damon.manifold import load_manifold, shared_manifold
 from apex_ompl.baselines.damon.queries import Damon
 from apex_ompl.baselines.damon.sampling import sample_states, split_sample
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.collision.discretization import SEARCH_RESOLUTION, sample_path
+from apex_ompl.collision.discretization import sample_path
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError
 from apex_ompl.kernel import Kernel, RobotTables
 from apex_ompl.kernel.scene_builder import scene_tables
 from apex_ompl.ompl.setup import PlanningSetup, assemble
 from apex_ompl.ompl.space import motions_free
+from apex_ompl.paths.path import SEARCH_RESOLUTION
 from apex_ompl.problems import load as load_problem
 from apex_ompl.robot import Robot
 from apex_ompl.training.store import load

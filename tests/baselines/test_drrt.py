@@ -16,10 +16,11 @@ from apex_ompl.baselines.drrt.dynamic_rrt import DynamicRRT
 from apex_ompl.baselines.drrt.goal_tree import GoalTree
 from apex_ompl.baselines.drrt.planner import DRRT
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.collision.discretization import SEARCH_RESOLUTION, sample_path
+from apex_ompl.collision.discretization import sample_path
 from apex_ompl.collision.path_proof import may_have_become_blocked
 from apex_ompl.ompl.setup import PlanningSetup, assemble
 from apex_ompl.ompl.space import to_state
+from apex_ompl.paths.path import SEARCH_RESOLUTION
 from apex_ompl.problems import load as load_problem
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import Obstacle

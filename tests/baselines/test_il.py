@@ -24,7 +24,6 @@ from apex_ompl.baselines.imitation.policy import shared_policy
 from apex_ompl.baselines.imitation.replanner import Imitation
 from apex_ompl.baselines.imitation.training import ImitationTrainer
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.collision.discretization import FINE_RESOLUTION
 from apex_ompl.errors import ApexError, FileFormatError, MissingFileError, ParameterError
 from apex_ompl.loop.cycle import RunRecord
 from apex_ompl.loop.referee import RefereeReport
@@ -36,6 +35,7 @@ from apex_ompl.moving.following import Following
 from apex_ompl.moving.request import Request
 from apex_ompl.ompl.setup import assemble
 from apex_ompl.ompl.space import path_to_array
+from apex_ompl.paths.path import FINE_RESOLUTION
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Goal, Problem

@@ -12,8 +12,8 @@ import yaml
 
 from apex_ompl import MotionPlanner, Problem, load_problem, plan
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.collision.discretization import SEARCH_RESOLUTION
 from apex_ompl.errors import FileFormatError, SceneError, UnknownNameError
+from apex_ompl.paths.path import SEARCH_RESOLUTION
 from apex_ompl.robot import Robot
 from apex_ompl.robot.moveit import MessageReader, allowed_pairs
 from apex_ompl.scene.bodies import AttachedObject, Obstacle

@@ -10,7 +10,6 @@ from support import DATA, ROOT, needs
 
 from apex_ompl import load_model, load_problem
 from apex_ompl.apex.query import make_query
-from apex_ompl.collision.discretization import FINE_RESOLUTION
 from apex_ompl.kernel import Kernel
 from apex_ompl.model.checkpoint import SHIPPED, shipped
 from apex_ompl.model.guidance import EQUATION_7
@@ -19,6 +18,7 @@ from apex_ompl.ompl.setup import assemble
 from apex_ompl.ompl.validity import full_check
 from apex_ompl.paths.candidates import first_valid
 from apex_ompl.paths.optimizer import Optimizer
+from apex_ompl.paths.path import FINE_RESOLUTION
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.training.kernel_problems import load_kernel_problems
 from apex_ompl.training.store import load

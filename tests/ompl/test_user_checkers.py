@@ -19,11 +19,11 @@ import apex_ompl
 from apex_ompl import planners
 from apex_ompl.apex.path_validator import PathValidator
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.collision.discretization import SEARCH_RESOLUTION
 from apex_ompl.ompl.process import seed_ompl
 from apex_ompl.ompl.setup import assemble
 from apex_ompl.ompl.space import to_state
 from apex_ompl.ompl.validity import StateValidityChecker, full_check
+from apex_ompl.paths.path import SEARCH_RESOLUTION
 from apex_ompl.planners import APEX
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.scene.bodies import Obstacle

@@ -5,14 +5,13 @@ import pytest
 
 from apex_ompl import problems
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.collision.discretization import FINE_RESOLUTION
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel import Kernel, scene_tables
 from apex_ompl.ompl.setup import PlanningSetup, assemble
 from apex_ompl.ompl.validity import full_check
 from apex_ompl.paths.candidates import Candidate, CandidatePool, first_valid
 from apex_ompl.paths.optimizer import Optimizer
-from apex_ompl.paths.path import path_length
+from apex_ompl.paths.path import FINE_RESOLUTION, path_length
 from apex_ompl.paths.settings import OptimizerSettings
 from apex_ompl.paths.spline import Spline
 from apex_ompl.robot import Robot

@@ -13,7 +13,6 @@ from ompl import base as ob
 
 from apex_ompl import planners, planning
 from apex_ompl.api import load_problem, plan
-from apex_ompl.collision.discretization import SEARCH_RESOLUTION
 from apex_ompl.errors import TimingStoppedError
 from apex_ompl.evaluation import runs
 from apex_ompl.evaluation.rows import Job
@@ -23,7 +22,7 @@ from apex_ompl.ompl.setup import PlanningSetup, assemble
 from apex_ompl.ompl.simplify import simplify
 from apex_ompl.ompl.space import to_state
 from apex_ompl.ompl.validity import FullCheck, full_check, motions_until
-from apex_ompl.paths.path import Path
+from apex_ompl.paths.path import SEARCH_RESOLUTION, Path
 from apex_ompl.planning import NOT_PROVED, PlanRun, find_path, parameterize, solve, straight_line, verify
 from apex_ompl.planning.timing import NOT_TIMED
 from apex_ompl.result import PlanResult, PlanStatus

@@ -16,9 +16,9 @@ from apex_ompl.collision.shapes import coal_geometry
 from apex_ompl.errors import FileFormatError
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import Obstacle
-from apex_ompl.scene.mesh_files import collada_asset, parse_ply, read_mesh, read_stl
+from apex_ompl.scene.mesh_files import collada_asset, read_mesh, read_stl
 from apex_ompl.scene.meshes import triangles
-from apex_ompl.scene.points import parse_points
+from apex_ompl.scene.points import parse_ply, parse_points
 
 SIZE = np.array([0.1, 0.2, 0.3])
 VERTICES = np.array(list(itertools.product((0.0, 1.0), repeat=3))) * SIZE

@@ -19,13 +19,13 @@ import yaml
 from support import DATA
 from trainings import CLEARANCES, HERE, SCRIPT, SMALL, VARIATIONAL, assert_same, config, query_from_path, weights
 
-from apex_ompl.collision.discretization import FINE_RESOLUTION
 from apex_ompl.errors import FileFormatError, MissingFileError
 from apex_ompl.kernel import Kernel, RobotTables
 from apex_ompl.kernel.scene_builder import scene_tables
 from apex_ompl.model.proposals import Sampling
 from apex_ompl.paths.candidates import first_valid
 from apex_ompl.paths.optimizer import Optimizer
+from apex_ompl.paths.path import FINE_RESOLUTION
 from apex_ompl.training.distributed import DistributedProcess
 from apex_ompl.training.kernel_problems import load_kernel_problems, save_kernel_problems
 from apex_ompl.training.records import Paths

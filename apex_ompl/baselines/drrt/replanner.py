@@ -9,13 +9,12 @@ import numpy as np
 
 from apex_ompl.baselines.drrt.dynamic_rrt import DynamicRRT
 from apex_ompl.baselines.drrt.goal_tree import GoalTree
-from apex_ompl.collision.discretization import SEARCH_RESOLUTION
 from apex_ompl.moving.charges import Charges, cost_table
 from apex_ompl.moving.dynamic_obstacles import clearance_in_time
 from apex_ompl.moving.ready import Ready
 from apex_ompl.moving.request import Answer, Request
 from apex_ompl.moving.search import Search
-from apex_ompl.paths.path import states_between
+from apex_ompl.paths.path import SEARCH_RESOLUTION, states_between
 from apex_ompl.timing import Timing, Trajectory, time_path
 from apex_ompl.types import Array, Flags
 

@@ -8,13 +8,12 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.collision.discretization import SEARCH_RESOLUTION
 from apex_ompl.kernel.trees import TreePair
 from apex_ompl.moving.placing import fresh_checker, place_nearest
 from apex_ompl.moving.ready import Ready
 from apex_ompl.moving.search import STATES, Guess, Search, least_duration
 from apex_ompl.ompl.tuned import TUNED
-from apex_ompl.paths.path import resample
+from apex_ompl.paths.path import SEARCH_RESOLUTION, resample
 
 AT_ONCE = 16  # random states between two looks at the charges
 CHARGE = "state of a tree"

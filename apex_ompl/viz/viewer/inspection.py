@@ -9,12 +9,12 @@ import numpy as np
 from apex_ompl.apex.models import DEFAULT, has_model
 from apex_ompl.apex.query import make_query
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.collision.discretization import FINE_RESOLUTION
 from apex_ompl.errors import ApexError
 from apex_ompl.model.checkpoint import shared_model
 from apex_ompl.model.guidance import Guidance
 from apex_ompl.model.proposals import Sampling, TrajectoryModel
 from apex_ompl.paths.optimizer import Optimizer
+from apex_ompl.paths.path import FINE_RESOLUTION
 from apex_ompl.paths.spline import Spline
 from apex_ompl.scene.scripts import problem_at
 from apex_ompl.types import Array
