@@ -196,7 +196,7 @@ def test_runs_at_the_same_time_are_reported(results: Results, tmp_path: Path) ->
     options: dict = {"runs": 2, "timeout": 10.0, "split": "validation", "quiet": True}
     found = bench([LEVEL], ROWS[1:], tmp_path, workers=Workers(2), **options)
     assert outcome(found) == [one for one in outcome(results) if one[1] == ROWS[1]][:2]
-    assert "went at the same time" in evaluation.markdown(found)
+    assert "made at the same time" in evaluation.markdown(found)
 
 
 def test_a_cluster_of_ray_makes_the_same_runs(results: Results, tmp_path: Path) -> None:

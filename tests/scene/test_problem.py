@@ -26,7 +26,7 @@ name: small
 robot: some_robot
 scene:
   - {name: post, box: [0.1, 0.1, 0.4], position: [0.5, 0.0, 0.2], orientation: [0, 0, 0, 1]}
-  - {name: dynamic obstacle, sphere: {radius: 0.1}, position: [0.4, 0.6, 0.3], velocity: [0, -0.2, 0]}
+  - {name: ball, sphere: {radius: 0.1}, position: [0.4, 0.6, 0.3], velocity: [0, -0.2, 0]}
 attached:
   - {name: cup, link: left_hand_palm, cylinder: {radius: 0.035, length: 0.11}, position: [0, 0, 0.1],
      contact: {point: [0, 0, 0.05], axis: [0, 0, 1]}}
@@ -45,7 +45,7 @@ def test_reading_gives_states_in_the_order_asked_for(tmp_path: Path) -> None:
     problem = load_text(tmp_path, FILE)
     np.testing.assert_array_equal(problem.start_state(["b", "a"]), [0.001, 0.1])
     np.testing.assert_array_equal(problem.goal_states(["a", "b"]), [[1.0, 2.0]])
-    assert problem.moving == ("dynamic_obstacle",)
+    assert problem.moving == ("ball",)
     assert problem.scene[0].shape == "box" and problem.attached[0].contact is not None
 
 
@@ -136,9 +136,9 @@ def test_pose_matrix_is_scipys(q: list[float]) -> None:
         ("[0.1, 0.1, 0.4]", "[0.1, 0.1]", ["scene.0.box"]),
         ("[0.1, 0.1, 0.4]", "[0.1, 0.1, -0.4]", ["scene.0.box.2", "greater than 0", "-0.4"]),
         ("orientation: [0, 0, 0, 1]", "orientation: [0, 0, 0, 2]", ["scene.0.orientation", "unit quaternion"]),
-        ("sphere: {radius: 0.1}, ", "", ["dynamic_obstacle", "exactly one of box", "none"]),
+        ("sphere: {radius: 0.1}, ", "", ["ball", "exactly one of box", "none"]),
         ("sphere: {radius: 0.1}", "sphere: {radius: 0.1}, box: [1, 1, 1]", ["exactly one", "box and sphere"]),
-        ("name: dynamic obstacle", "name: post", ["'post'", "more than one object"]),
+        ("name: ball", "name: post", ["'post'", "more than one object"]),
         ("sphere: {radius: 0.1}", "mesh: {file: a.step}", ["scene.1.mesh.file", ".stl or .obj or .ply", "a.step"]),
         ("cylinder: {radius: 0.035, length: 0.11}", "half_space: {normal: [0, 0, 1]}", ["half_space cannot be held"]),
         ("axis: [0, 0, 1]", "axis: [0, 0, 0]", ["attached.0.contact.axis", "not zero"]),
