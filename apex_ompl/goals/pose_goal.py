@@ -9,9 +9,8 @@ import numpy as np
 import pinocchio as pin
 
 from apex_ompl.errors import UnknownNameError
-from apex_ompl.goals.alignment_errors import angle
+from apex_ompl.goals.alignment import LinkFace, angle
 from apex_ompl.goals.inverse_kinematics import Links, in_world
-from apex_ompl.goals.link_faces import LinkFace
 from apex_ompl.kernel import Target, offset_target, opposition_target
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import AttachedObject, pose_matrix

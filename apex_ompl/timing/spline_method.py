@@ -12,8 +12,7 @@ import numpy as np
 from apex_ompl.kernel.compiled.polyline_distance import max_distance
 from apex_ompl.kernel.compiled.time_parameterization import max_path_speeds, sample_times
 from apex_ompl.robot.model import Limits
-from apex_ompl.timing.curve import Curve, Polyline
-from apex_ompl.timing.deviation import deviation_bound
+from apex_ompl.timing.curve import Curve, Polyline, deviation_bound
 from apex_ompl.timing.trajectory import Trajectory
 from apex_ompl.types import Array
 
@@ -33,7 +32,7 @@ class Blend(NamedTuple):
         trajectory: The motion.
         deviation: A bound on its distance from the polyline [rad].
         arc_at: Times of its knots, shape (K,) [s], and the arc lengths along the polyline that it reaches at them,
-            shape (K,) [rad]; for :func:`apex_ompl.timing.deviation.deviation_bound`.
+            shape (K,) [rad]; for :func:`apex_ompl.timing.curve.deviation_bound`.
         window: Largest distance along the polyline from there to the nearest point [rad].
     """
 

@@ -7,18 +7,17 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from apex_ompl.errors import FileFormatError, ParameterError
-from apex_ompl.kernel.compiled.cubic_pieces import relative_gap, sample_motion
+from apex_ompl.kernel.compiled.cubic_pieces import motion_extremes, relative_gap, sample_motion
 from apex_ompl.robot.model import Limits
-from apex_ompl.timing.extremes import Extremes
 from apex_ompl.timing.files import STATES, SUFFIXES, decode, encode
 from apex_ompl.timing.smoothness import spectral_arc_length
-from apex_ompl.types import Array
+from apex_ompl.types import Array, Flags
 from apex_ompl.util.display import counted, fields_line, html_table, one_line
 from apex_ompl.util.files import path_text, suffix_of, write_atomically
 from apex_ompl.util.validation import check_array, check_integer, check_positive, check_times, finite_array
@@ -27,10 +26,42 @@ ROUNDING = 1e-9  # of shares of limits
 CONTINUITY_TOLERANCE = 1e-6  # relative error of a knot integrated from the one before; files of ROS round times
 MAX_SAMPLES = 10**7
 BLOCK = 1000  # samples of a stream that are computed at once
-SPEED_SPACING, MAX_SPEED_SAMPLES = (
-    0.001,
-    2**15,
-)  # of the speed profile for the spectral arc length [s], and their number
+SPEED_SPACING, MAX_SPEED_SAMPLES = 0.001, 2**15  # of the speed profile for the spectral arc length [s]
+AT_REST = 1e-6
+"""Largest velocity of a joint that stands [rad/s]."""
+
+
+class Extremes(NamedTuple):
+    """Least and largest positions, largest velocities, accelerations and jerks of a motion, each of shape (dof,).
+
+    Jerks are the least that the knots can be said to have: between knots 1e-10 s apart, as several joints' own make
+    them, the rounding of times and accelerations alone is worth 1e-6 of a jerk and more.
+    """
+
+    low: Array
+    high: Array
+    velocity: Array
+    acceleration: Array
+    jerk: Array
+
+    @classmethod
+    def of(cls, times: Array, positions: Array, velocities: Array, accelerations: Array) -> Self:
+        """Return the extremes of a motion: :mod:`apex_ompl.kernel.compiled.cubic_pieces`.
+
+        Args:
+            times: Times of the knots, shape (K,) [s].
+            positions: At the knots, shape (K, dof).
+            velocities: At the knots, likewise.
+            accelerations: At the knots, likewise.
+        """
+        found = np.empty((len(cls._fields), positions.shape[1]))
+        motion_extremes(times, positions, velocities, accelerations, found)
+        return cls(*found)
+
+    def slower(self, factor: float) -> Self:
+        """Return the extremes of the same motion in a time that is ``factor`` times as long."""
+        rest = self.velocity / factor, self.acceleration / factor**2, self.jerk / factor**3
+        return type(self)(self.low, self.high, *rest)
 
 
 class Sample(NamedTuple):
@@ -318,3 +349,38 @@ def concatenate(parts: Sequence[Trajectory]) -> Trajectory:
     times = [part.times[(k > 0) :] + end for k, (part, end) in enumerate(zip(parts, ends[:-1], strict=True))]
     states = [np.concatenate([getattr(part, name)[(k > 0) :] for k, part in enumerate(parts)]) for name in STATES]
     return Trajectory(np.concatenate(times), states[0], states[1], states[2], parts[0].joint_names)
+
+
+def is_at_rest(motion: Trajectory, time: float) -> bool:
+    """Whether no joint is faster than ``AT_REST`` at a time [s]; before 0 and after the end the robot stands."""
+    return bool((np.abs(motion(time, 1)) <= AT_REST).all())
+
+
+def rests(motion: Trajectory) -> Array:
+    """Return the intervals of time in which a motion stands, shape (N, 2) [s].
+
+    In each, no joint is ever faster than ``AT_REST``. A moment of rest between two pieces that move is an interval
+    without length; its begin and its end are knots.
+    """
+    slow = np.all(np.abs(motion.velocities) <= AT_REST, axis=1).tolist()
+    stands = _stands(motion)
+    found, k, last = list[tuple[int, int]](), 0, len(slow) - 1
+    while k <= last:
+        if slow[k]:
+            end = k
+            while end < last and stands[end]:
+                end += 1
+            found.append((k, end))
+            k = end
+        k += 1
+    return np.asarray(motion.times[np.array(found, int).reshape(-1, 2)])
+
+
+def _stands(motion: Trajectory) -> Flags:
+    """Return which pieces between knots are never fast, shape (K - 1,)."""
+    v, a, j, t = motion.velocities, motion.accelerations[:-1], motion.jerks, np.diff(motion.times)[:, None]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        turn = np.clip(np.nan_to_num(-a / j), 0.0, t)  # where the velocity is extreme
+    inner = np.abs(v[:-1] + turn * (a + turn * j / 2.0))
+    fastest = np.maximum(np.maximum(np.abs(v[:-1]), np.abs(v[1:])), inner)
+    return np.asarray((fastest <= AT_REST).all(axis=1))
