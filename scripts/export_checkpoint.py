@@ -18,8 +18,7 @@ LARGEST = 24.0  # of all that ship together [MiB]
 def export(run: Path, name: str, bits: Literal[8, 16]) -> None:
     """Read and check the checkpoint of a run, and write it."""
     from apex_ompl.model.checkpoint import SHIPPED
-    from apex_ompl.training.checkpoint_writer import save_model
-    from apex_ompl.training.torch_model import load_torch_model
+    from apex_ompl.training.torch_model import load_torch_model, save_model
 
     folder = run / "checkpoint" if (run / "checkpoint").is_dir() else run
     model = load_torch_model(folder)

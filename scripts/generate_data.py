@@ -129,8 +129,7 @@ def _planned_units(args: argparse.Namespace) -> tuple[Solve, dict[str, Any], dic
     """Return the solving function, units to draw, the robot for the manifest, and its tables with empty hands."""
     from apex_ompl.collision import CollisionChecker
     from apex_ompl.problems.suite_robot import robot
-    from apex_ompl.training.problem_solving import solve_unit
-    from apex_ompl.training.units import plan_units
+    from apex_ompl.training.units import plan_units, solve_unit
 
     units = {unit.name: unit for unit in plan_units(args.problems, args.levels)}
     sizes = {unit.size for unit in units.values()}
@@ -165,8 +164,7 @@ def write_cases(args: argparse.Namespace) -> None:
     Raises:
         MissingFileError: The folder cannot be made.
     """
-    from apex_ompl.training.problem_records import kernel_problems
-    from apex_ompl.training.units import plan_units
+    from apex_ompl.training.units import kernel_problems, plan_units
 
     check_writable(make_folder(args.folder, "folder for problems") / "cases.npz")
     units = plan_units(args.problems, args.levels, args.split)

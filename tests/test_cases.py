@@ -18,12 +18,11 @@ from apex_ompl.ompl.validity import full_check
 from apex_ompl.paths.optimizer import Optimizer
 from apex_ompl.paths.spline import Spline
 from apex_ompl.problems.suite_robot import robot
+from apex_ompl.training.engine import PathFinder
 from apex_ompl.training.kernel_problems import KernelProblem, load_kernel_problems, save_kernel_problems
-from apex_ompl.training.path_finder import PathFinder
-from apex_ompl.training.problem_records import kernel_problems
 from apex_ompl.training.records import SOURCES
 from apex_ompl.training.store import Store
-from apex_ompl.training.units import Unit
+from apex_ompl.training.units import Unit, kernel_problems
 
 WITHOUT = """
 import runpy, sys

@@ -21,10 +21,9 @@ from apex_ompl.paths.path import path_length
 from apex_ompl.paths.spline import Spline
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.training.engine import STRAIGHT_SHARE, EngineOptions
-from apex_ompl.training.problem_solving import solve_unit
 from apex_ompl.training.records import FIELDS, SOURCES, Paths, to_half
 from apex_ompl.training.store import Store, load
-from apex_ompl.training.units import Unit, plan_units, static_levels
+from apex_ompl.training.units import Unit, plan_units, solve_unit, static_levels
 from apex_ompl.util.cluster import ClusterError, spread
 
 SCRIPT = ROOT / "scripts" / "generate_data.py"

@@ -12,8 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from apex_ompl.errors import ParameterError, UnknownNameError
-from apex_ompl.model.sampler import SAMPLERS, ddim, ddpm, dpm_solver
-from apex_ompl.model.schedule import PREDICTIONS, SCHEDULES, Estimate, NoiseSchedule
+from apex_ompl.model.diffusion import PREDICTIONS, SAMPLERS, SCHEDULES, Estimate, NoiseSchedule, ddim, ddpm, dpm_solver
 
 # Noise
 
@@ -31,7 +30,7 @@ def test_what_a_perfect_network_says_gives_sample_and_noise_back(kind: str, name
     schedule, g = NoiseSchedule(256, name), torch.Generator().manual_seed(seed)
     clean, noise = (torch.randn(3, 5, generator=g, dtype=torch.float64) for _ in range(2))
     sample = schedule.add_noise(clean, noise, t)
-    found = schedule.estimate(kind, sample, schedule.target(kind, clean, noise, torch.full((3,), t)), t)
+    found = schedule.estimate(kind, sample, training_schedule.target(kind, clean, noise, torch.full((3,), t)), t)
     torch.testing.assert_close(found.clean, clean, atol=1e-4, rtol=1e-4)
     torch.testing.assert_close(found.noise, noise, atol=1e-4, rtol=1e-4)
 

@@ -14,8 +14,7 @@ import pytest
 
 from apex_ompl.errors import ApexError, FileFormatError, FolderInUseError, MissingFileError
 from apex_ompl.paths.spline import Spline
-from apex_ompl.training.description import duplicates, level_statistics
-from apex_ompl.training.records import FIELDS, DatasetError, Paths, from_micro, to_micro
+from apex_ompl.training.records import FIELDS, DatasetError, Paths, duplicates, from_micro, level_statistics, to_micro
 from apex_ompl.training.store import Store, load, save
 
 DOF, FREE = 5, 12

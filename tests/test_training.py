@@ -25,14 +25,17 @@ from apex_ompl.kernel.scene_builder import scene_tables
 from apex_ompl.model.proposals import Sampling
 from apex_ompl.paths.candidates import first_valid
 from apex_ompl.paths.optimizer import Optimizer
-from apex_ompl.training.distributed import DistributedProcess
-from apex_ompl.training.kernel_problems import load_kernel_problems, save_kernel_problems
+from apex_ompl.training.kernel_problems import (
+    load_kernel_problems,
+    query_from_problem,
+    save_kernel_problems,
+    success_rates,
+)
 from apex_ompl.training.records import Paths
-from apex_ompl.training.runlog import read_log
+from apex_ompl.training.run_files import read_log
 from apex_ompl.training.store import Store, load, save
 from apex_ompl.training.torch_model import TorchModel, load_torch_model
-from apex_ompl.training.training import Trainer, TrainingError
-from apex_ompl.training.validation import query_from_problem, success_rates
+from apex_ompl.training.training import DistributedProcess, Trainer, TrainingError
 from apex_ompl.util.resolution import FINE_RESOLUTION
 from apex_ompl.util.threads import one_torch_thread
 
@@ -237,8 +240,8 @@ def test_a_run_begins_with_the_weights_of_a_checkpoint(
     second = Trainer(config(others, **again), tmp_path, HERE)
     assert second.about()["config"]["initial"] == "checkpoint", "without its folder"
     assert_same(second.network.state_dict(), wanted)
-    if second.data.sight is not None:
-        assert np.array_equal(second.data.sight.keys.state, wanted["key_state"].numpy()), "it sees what it saw"
+    if second.data.scene_encoding is not None:
+        assert np.array_equal(second.data.scene_encoding.keys.state, wanted["key_state"].numpy()), "it sees what it saw"
     second.advance()
     moved = [float((p.detach() - wanted[name]).abs().max()) for name, p in second.network.named_parameters()]
     assert 0.0 < max(moved) < 1e-6, "it is trained"

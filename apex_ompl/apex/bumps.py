@@ -8,10 +8,9 @@ from contextlib import AbstractContextManager, nullcontext
 import numpy as np
 
 from apex_ompl.kernel import Kernel
+from apex_ompl.model.diffusion import Callback, NoiseSchedule
 from apex_ompl.model.proposals import Proposals, Sampling
 from apex_ompl.model.query import Query
-from apex_ompl.model.sampler import Callback
-from apex_ompl.model.schedule import NoiseSchedule
 from apex_ompl.paths.optimizer import Optimizer
 from apex_ompl.types import Array
 

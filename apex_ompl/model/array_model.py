@@ -1,8 +1,11 @@
-"""A trained model evaluated by NumPy: ready without torch, which takes longer to import than most problems to solve.
+"""A trained model evaluated by NumPy and the kernel: ready without torch, whose import takes longer than most plans.
 
-It computes what torch does for models of a linear latent space and an MLP denoiser, with large matrices of weights in
-eight bits; names of weights are those of the torch module
+It evaluates models of a linear latent space and an MLP denoiser. Names of weights are those of the torch module
 :class:`apex_ompl.training.latent_diffusion.LatentDiffusion`, where the layers are explained.
+
+Large matrices of weights are int8 with a scale for each row: symmetric linear quantization (Jacob et al., CVPR 2018, with
+a zero point of 0). Reading weights from memory takes most of the time of a few proposals. NumPy's models compute with the
+bytes (:mod:`apex_ompl.kernel.compiled.dense_layer`), torch's with the expanded matrices.
 """
 
 from __future__ import annotations
@@ -22,15 +25,71 @@ from apex_ompl.model.config import OBSTACLE_SCENES, ModelConfig, key_shapes
 from apex_ompl.model.geometry import SHAPES, signed_distances
 from apex_ompl.model.guidance import Guidance, collision_cost
 from apex_ompl.model.proposals import TrajectoryModel
-from apex_ompl.model.quantization import SUFFIX, quantized
 from apex_ompl.model.query import MAX_DISTANCE, WORKSPACE_CENTER, ObstacleSet, Probes, Query
 from apex_ompl.paths.spline import Spline
 from apex_ompl.types import Array
 from apex_ompl.util.validation import check_integer
 
+SUFFIX = ".scale"
+LEAST = 2**12  # numbers of a matrix that is worth it
+MOST = 127
 Single = NDArray[np.float32]
 STEP_SIZE = 128  # of the embedding of a step
 EPSILON = 1e-5  # of the layer normalization, as in torch
+
+
+def quantized(weights: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """Return weights whose large matrices of layers are int8, with scales of their rows as ``NAME.scale``.
+
+    Those that are in eight bits already stay as they are.
+    """
+    found = {}
+    for name, values in weights.items():
+        if (
+            not name.endswith("weight")
+            or values.ndim != 2
+            or values.size < LEAST
+            or not np.issubdtype(values.dtype, np.floating)
+        ):
+            found[name] = values
+            continue
+        wide = values.astype(np.float32)
+        scale = np.maximum(np.abs(wide).max(axis=1), np.finfo(np.float32).tiny) / MOST
+        found[name] = np.round(wide / scale[:, None]).astype(np.int8)
+        found[name + SUFFIX] = scale
+    return found
+
+
+def is_scale(name: str, weights: Mapping[str, NDArray[Any]]) -> bool:
+    """Whether a name is that of the scales of a matrix in eight bits."""
+    matrix = weights.get(name.removesuffix(SUFFIX)) if name.endswith(SUFFIX) else None
+    return matrix is not None and matrix.dtype == np.int8
+
+
+def check_scales(weights: Mapping[str, NDArray[Any]]) -> None:
+    """Check that there is a scale for each row of the matrices in eight bits.
+
+    Raises:
+        ValueError: Scales are missing, or are not one for each row.
+    """
+    for name, values in weights.items():
+        scale = weights.get(name + SUFFIX)
+        if values.dtype == np.int8 and (scale is None or scale.shape != values.shape[:1]):
+            raise ValueError(f"{name}: expected a scale for each row of a matrix in eight bits")
+
+
+def expanded(weights: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """Return weights with the matrices that are int8 as float32, without their scales.
+
+    Raises:
+        ValueError: Scales are missing, or are not one for each row.
+    """
+    check_scales(weights)
+    found = {name: values for name, values in weights.items() if not is_scale(name, weights)}
+    for name, values in found.items():
+        if values.dtype == np.int8:
+            found[name] = values.astype(np.float32) * weights[name + SUFFIX].astype(np.float32)[:, None]
+    return found
 
 
 def is_supported(config: ModelConfig) -> bool:
@@ -88,14 +147,14 @@ class ArrayModel(TrajectoryModel):
         center = np.array(WORKSPACE_CENTER, np.float32)
         if self.config.condition.point:
             parts.append(np.array([q.point for q in queries], np.float32) - center)
-        if self.sight is not None:
-            parts.append(self.sight.features(queries, kernel))
+        if self.scene_encoding is not None:
+            parts.append(self.scene_encoding.features(queries, kernel))
         if self.config.condition.scene in OBSTACLE_SCENES:
             start, goal = (np.array([getattr(q, name) for q in queries], float) for name in ("start", "goal"))
             probes = self.probes.positions(kernel, start, goal)
             features = [self._obstacle_features(q.obstacles, points) for q, points in zip(queries, probes, strict=True)]
             parts.append(np.array(features, np.float32))
-        return self._layers("encoder.phi", 3 if self.sight is not None else 2, np.concatenate(parts, axis=1))
+        return self._layers("encoder.phi", 3 if self.scene_encoding is not None else 2, np.concatenate(parts, axis=1))
 
     def refine(self, condition: Single, along: Single) -> Single:
         """Return encoded conditions with what lies along estimates of paths, features of shape (B, F)."""

@@ -45,7 +45,7 @@ class LatentConfig(StrictModel):
 
 
 class ConditionConfig(StrictModel):
-    """Encoder of conditions, see ``apex_ompl.training.encoders.ConditionEncoder``.
+    """Encoder of conditions, see ``apex_ompl.training.networks.ConditionEncoder``.
 
     Attributes:
         scene: ``none``, ``set``, ``distances`` or ``clearances``.
@@ -91,7 +91,7 @@ class DenoiserConfig(StrictModel):
 
 
 class NoiseConfig(StrictModel):
-    """Diffusion process, see ``apex_ompl.model.schedule.NoiseSchedule``.
+    """Diffusion process, see ``apex_ompl.model.diffusion.NoiseSchedule``.
 
     Attributes:
         steps: Number of steps T.

@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apex_ompl.kernel import Kernel
+from apex_ompl.model.diffusion import Estimate, NoiseSchedule, Predict
 from apex_ompl.model.geometry import Numbers, array_module
-from apex_ompl.model.sampler import Predict
-from apex_ompl.model.schedule import Estimate, NoiseSchedule
 from apex_ompl.types import Array
 from apex_ompl.util.validation import check_integer, check_name, check_number, check_positive
 

@@ -1,32 +1,38 @@
-"""Primitives that together look like a grid of distances: what a model that sees shapes sees of meshes and points.
+"""Primitives that together approximate a grid of distances, for models that see shapes of meshes and points.
 
-Repair begins among them, too: distances from them are smooth where those from voxels are rough.
+Repair starts among them, too: distances from primitives are smooth where those from voxels are rough.
 
-The nodes near a surface, and those that it encloses, are taken apart into connected regions. A region that looks like a
-box, ball or cylinder becomes that; in the others boxes along the axes of the grid grow from nodes until nearly all are
-in one. So the same furniture gives much the same shapes whether it comes as boxes, as a mesh, as points on its surface
-or as voxels. Nothing is proved by them.
+The nodes near a surface, and those that it encloses, are divided into connected regions. A region close to a box, a ball
+or a cylinder of the same second moments becomes that primitive. In the other regions boxes along the axes of the grid
+grow from nodes until nearly all nodes are in one. The same furniture therefore gives similar primitives whether it comes
+as boxes, as a mesh, as points on its surface or as voxels. Nothing is proved by them.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apex_ompl.kernel.compiled.arrays import BOX, CYLINDER
+from apex_ompl.kernel.compiled.arrays import BOX, CYLINDER, SPHERE
 from apex_ompl.kernel.compiled.grid_distance import SLACK
 from apex_ompl.kernel.compiled.grid_regions import OCCUPIED, OUTSIDE, add_up, best_box, label_regions
 from apex_ompl.kernel.compiled.layout import Integers
 from apex_ompl.kernel.distance_grid import BAND, DistanceGrid
 from apex_ompl.kernel.scene_builder import Primitive, primitive, scene_tables
 from apex_ompl.kernel.tables import SceneTables
-from apex_ompl.model.solid_fit import THINNEST, Solid, solids_like, turned_to
+from apex_ompl.model.geometry import signed_distances
 from apex_ompl.types import Array, Flags
 from apex_ompl.util.weak_cache import weakly_cached
 
+PLACES, POINTS = 3000, 300  # of which moments, and orientations, are taken
+THINNEST = 0.002  # least half side or radius [m]
+TURNS = np.radians(np.arange(0.0, 90.0, 5.0))
+ORDERS = [list(order) for order in itertools.permutations(range(3))]
+FINE_TURNS = np.radians(np.arange(-4.0, 4.5, 1.0))
 MOST_NODES, MOST_NODES_OF_SOLIDS = 1_000_000, 250_000  # that are looked at; of finer grids every other or third
 INSIDE = 3.0  # distance inside of a surface, in spacings, by which it is known to enclose a solid
 CLOSE = 0.008  # nodes are at least so far from each other among points, which are to be one surface [m]
@@ -43,6 +49,96 @@ RING = 0.006  # around a box there is no other to be looked for [m]
 LONG = 3.0  # sides of a bar, at least
 LAYER = 0.96  # share of a layer of nodes that must be occupied for a box to grow by it
 SEEDS = 10  # nodes from which boxes grow
+
+
+@dataclass(frozen=True, eq=False)
+class Solid:
+    """A box, a ball or a cylinder.
+
+    Attributes:
+        kind: BOX, SPHERE or CYLINDER.
+        rotation: From its frame, shape (3, 3).
+        position: Of its center, shape (3,) [m].
+        size: Half edges; radius; or radius and half length along z; shape (3,), 0 behind these [m].
+    """
+
+    kind: int
+    rotation: Array
+    position: Array
+    size: Array
+
+    def distances(self, places: Array) -> Array:
+        """Return signed distances of places, shape (N, 3) [m]."""
+        rows = (np.array([self.kind]), self.position[None], self.rotation[None], self.size[None])
+        return np.asarray(signed_distances(*rows, places[None])[0])
+
+
+def solids_like(places: Array, spacing: float, less: float) -> list[Solid]:
+    """Return boxes, a ball and cylinders with the second moments of places.
+
+    Args:
+        places: Nodes of a lattice inside of a solid, shape (N, 3) [m].
+        spacing: Of the lattice [m].
+        less: By which radii and half sides are made smaller [m].
+    """
+    places = places[:: max(1, len(places) // PLACES)]
+    middle = places.mean(axis=0)
+    spread = np.cov(places.T) + spacing**2 / 12.0 * np.eye(3)
+    variances, axes = np.linalg.eigh(spread)
+
+    def fit(kind: int, rotation: Array, *size: float) -> Solid:
+        row = np.zeros(3)
+        row[: len(size)] = np.maximum(np.array(size) - less, THINNEST)
+        return Solid(kind, rotation, middle, row)
+
+    fits = [
+        fit(BOX, np.eye(3), *np.sqrt(3.0 * np.diag(spread))),
+        fit(SPHERE, np.eye(3), math.sqrt(5.0 * variances.mean())),
+    ]
+    some = places[:: max(1, len(places) // POINTS)] - middle
+    for z in range(3):
+        x, y = (z + 1) % 3, (z + 2) % 3
+        frame = np.stack([axes[:, x], axes[:, y], axes[:, z]], axis=1)
+        frame[:, 0] *= np.sign(np.linalg.det(frame))
+        radius = math.sqrt(2.0 * (variances[x] + variances[y]))
+        fits.append(fit(CYLINDER, turned_to(frame[:, 2]), radius, math.sqrt(3.0 * variances[z])))
+        turned = _nearest_axes(frame @ _smallest_rectangle(some @ frame))
+        fits.append(fit(BOX, turned, *np.sqrt(3.0 * np.diag(turned.T @ spread @ turned))))
+    return fits
+
+
+def turned_to(axis: Array) -> Array:
+    """Return the smallest rotation, shape (3, 3), that takes the z axis to an axis or its opposite."""
+    x, y, z = axis if axis[2] >= 0.0 else -axis
+    return np.array(
+        [
+            [1.0 - x * x / (1.0 + z), -x * y / (1.0 + z), x],
+            [-x * y / (1.0 + z), 1.0 - y * y / (1.0 + z), y],
+            [-x, -y, z],
+        ]
+    )
+
+
+def _nearest_axes(rotation: Array) -> Array:
+    """Return the rotation nearest to none of those that have the same axes, in another order or opposite."""
+    order = max(ORDERS, key=lambda some: float(np.abs(np.diag(rotation[:, some])).sum()))
+    found = rotation[:, order]
+    found = found * np.where(np.diag(found) < 0.0, -1.0, 1.0)
+    if np.linalg.det(found) < 0.0:
+        found[:, int(np.abs(np.diag(found)).argmin())] *= -1.0
+    return found
+
+
+def _smallest_rectangle(local: Array) -> Array:
+    """Return the rotation about z, shape (3, 3), after which the rectangle around points, shape (N, 3), is smallest."""
+    best = 0.0
+    for turns in (TURNS, FINE_TURNS):
+        angles = best + turns
+        axes = np.stack([np.cos(angles), np.sin(angles)])
+        sides = np.ptp(local[:, :2] @ axes, axis=0) * np.ptp(local[:, :2] @ np.stack([-axes[1], axes[0]]), axis=0)
+        best = float(angles[sides.argmin()])
+    c, s = math.cos(best), math.sin(best)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 @dataclass(frozen=True, eq=False)

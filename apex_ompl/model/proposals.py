@@ -15,12 +15,11 @@ from apex_ompl.errors import ParameterError
 from apex_ompl.kernel import Kernel
 from apex_ompl.kernel.products import product
 from apex_ompl.model.config import ModelConfig
+from apex_ompl.model.diffusion import SAMPLERS, Callback, Estimate, NoiseSchedule, Predict, ddpm, noise_like
 from apex_ompl.model.geometry import Numbers
 from apex_ompl.model.guidance import Guidance, guided
 from apex_ompl.model.query import Probes, Query
-from apex_ompl.model.sampler import SAMPLERS, Callback, Predict, ddpm, noise_like
-from apex_ompl.model.scene_encoding import KeyStates, Sight
-from apex_ompl.model.schedule import Estimate, NoiseSchedule
+from apex_ompl.model.scene_encoding import KeyStates, SceneEncoding
 from apex_ompl.paths.spline import Spline
 from apex_ompl.types import Array
 from apex_ompl.util.display import counted, fields_line, one_line
@@ -86,7 +85,7 @@ class TrajectoryModel(ABC):
         spline: Spline of the control points.
         schedule: Noise schedule.
         probes: Points of the robot whose distances to the obstacles it sees.
-        sight: What it sees of a scene ``clearances``, None of others.
+        scene_encoding: Features of a scene ``clearances``; None for other scenes.
         sampling: Default sampling.
     """
 
@@ -97,7 +96,7 @@ class TrajectoryModel(ABC):
         self.config, self.about, self.probes = config, dict(about), probes
         self.spline = Spline(**config.spline.model_dump())
         self.schedule = NoiseSchedule(config.noise.steps, config.noise.schedule)
-        self.sight = Sight(KeyStates.of(**keys), probes, config.condition.hands) if keys else None
+        self.scene_encoding = SceneEncoding(KeyStates.of(**keys), probes, config.condition.hands) if keys else None
         self.sampling = Sampling(**config.sampling.model_dump())
         self._looked_at = self.spline.basis(probes.shares)
 
@@ -266,11 +265,12 @@ class TrajectoryModel(ABC):
 
     def _along(self, queries: Sequence[Query], kernel: Kernel, control: Array) -> NDArray[np.float32]:
         """Return what the model sees along paths of queries, as many of each: shape (B, features)."""
-        assert self.sight is not None
+        assert self.scene_encoding is not None
         limits, each = kernel.robot.arrays, len(control) // len(queries)
         paths = product(self._looked_at, np.clip(control, limits.lower, limits.upper))
         rows = [
-            self.sight.along(kernel, paths[k * each : (k + 1) * each], *query.seen()) for k, query in enumerate(queries)
+            self.scene_encoding.along(kernel, paths[k * each : (k + 1) * each], *query.seen())
+            for k, query in enumerate(queries)
         ]
         return np.concatenate(rows)
 

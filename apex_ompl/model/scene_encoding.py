@@ -143,7 +143,7 @@ def _ball(points: Array, radii: Array) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class Sight:
+class SceneEncoding:
     """Features of queries by a model's key states, probes and hands.
 
     Attributes:

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from apex_ompl.model.config import ModelConfig, key_shapes
-from apex_ompl.model.schedule import NoiseSchedule
+from apex_ompl.model.diffusion import NoiseSchedule
 from apex_ompl.paths.spline import Spline
 from apex_ompl.training.autoencoder import Autoencoder, LinearLatent, VariationalLatent
 from apex_ompl.training.conditions import Conditions
-from apex_ompl.training.denoisers import MLPDenoiser, UNetDenoiser
-from apex_ompl.training.encoders import ConditionEncoder
+from apex_ompl.training.networks import ConditionEncoder, MLPDenoiser, UNetDenoiser
 
 COST_STATES = 8  # states of a path at which collisions are looked for
 Look = Callable[[Tensor, Conditions], Tensor]
@@ -37,6 +37,43 @@ class Draws(NamedTuple):
     noise: Tensor
     t: Tensor
     places: Tensor
+
+
+@dataclass(frozen=True)
+class TrainingSchedule(NoiseSchedule):
+    """Noise schedule for batches in which each sample has a step of its own."""
+
+    _known: dict[torch.device, Tensor] = field(default_factory=dict, init=False, repr=False, compare=False)
+
+    def scales(self, t: Tensor, like: Tensor) -> tuple[Tensor, Tensor]:
+        """Return sqrt(abar_t) and sqrt(1 - abar_t) at steps (B,), in a shape that multiplies tensors like ``like``."""
+        if like.device not in self._known:
+            known = np.sqrt(np.stack([self.alpha_bar, 1.0 - self.alpha_bar]))
+            self._known[like.device] = like.double().new_tensor(known)
+        signal, sigma = (
+            self._known[like.device][:, t.to(like.device)]
+            .to(like.dtype)
+            .reshape(2, *t.shape, *[1] * (like.ndim - t.ndim))
+        )
+        return signal, sigma
+
+    def noisy(self, clean: Tensor, noise: Tensor, t: Tensor) -> Tensor:
+        """Return noisy samples sqrt(abar_t) z_0 + sqrt(1 - abar_t) epsilon (equation 2) at steps (B,)."""
+        signal, sigma = self.scales(t, clean)
+        return signal * clean + sigma * noise
+
+    def target(self, prediction: str, clean: Tensor, noise: Tensor, t: Tensor) -> Tensor:
+        """Return the quantity that a network learns to predict from noisy samples; :meth:`estimate` is its inverse.
+
+        ``noise`` is epsilon (equation 5), ``clean`` is z_0, and ``velocity`` is v = sqrt(abar_t) epsilon -
+        sqrt(1 - abar_t) z_0 (Salimans and Ho 2022).
+        """
+        if prediction == "noise":
+            return noise
+        if prediction == "clean":
+            return clean
+        signal, sigma = self.scales(t, clean)
+        return signal * noise - sigma * clean
 
 
 class LatentDiffusion(nn.Module):
@@ -82,7 +119,7 @@ class LatentDiffusion(nn.Module):
             self.denoiser: nn.Module = UNetDenoiser(channels, condition.out, net.width, net.multipliers)
         else:
             self.denoiser = MLPDenoiser(math.prod(latent_shape), condition.out, net.width, net.blocks)
-        self.schedule = NoiseSchedule(config.noise.steps, config.noise.schedule)
+        self.schedule = TrainingSchedule(config.noise.steps, config.noise.schedule)
         self.register_buffer("probe_joint", torch.zeros(config.probes, dtype=torch.int64))
         self.register_buffer("probe_offset", torch.zeros(config.probes, 3))
         for name, shape in key_shapes(config).items():
@@ -129,7 +166,7 @@ class LatentDiffusion(nn.Module):
         """Return the mean square error of the denoiser (equation 5 of the paper).
 
         loss = mean((f(sqrt(abar_t) z_0 + sqrt(1 - abar_t) epsilon, t, g) - target)^2), where the target is epsilon,
-        the velocity or z_0, see :meth:`NoiseSchedule.target`. A denoiser that sees its own last estimate is evaluated
+        the velocity or z_0, see :meth:`TrainingSchedule.target`. A denoiser that sees its own last estimate is evaluated
         at a noisier step first, without one; the loss is the mean of both. What the collisions of the denoiser's last
         estimate of z_0 cost may be added, after PRESTO (arXiv 2409.16012).
 
@@ -166,7 +203,7 @@ class LatentDiffusion(nn.Module):
     def _error(self, clean: Tensor, noise: Tensor, t: Tensor, encoded: Tensor) -> tuple[Tensor, Tensor]:
         """Return the mean square error of the denoiser at steps t, and its estimate of the latent vectors."""
         prediction = self.config.noise.prediction
-        sample = self.schedule.add_noise(clean, noise, t)
+        sample = self.schedule.noisy(clean, noise, t)
         output = self.denoise(sample, t, encoded).float()
         error = nn.functional.mse_loss(output, self.schedule.target(prediction, clean, noise, t))
         signal, sigma = self.schedule.scales(t, clean)
