@@ -4,7 +4,7 @@ The same options give the same paths. The same command resumes an interrupted ru
 lost. With one worker everything runs in this process; more are run by Ray, on this machine or on a cluster.
 
 With --write-cases problems are only drawn, and written for machines without Pinocchio, Coal and OMPL; there --cases
-solves them by trees and from random bumps, and keeps the paths that the sphere cover proves free.
+solves them by trees and from random perturbations, and keeps the paths that the sphere cover proves free.
 
 Usage: python scripts/generate_data.py FOLDER [--problems 10000] [--workers 2] [--address HOST:PORT] [SUITE[/LEVEL] ...]
 """

@@ -3,9 +3,9 @@
 It evaluates models of a linear latent space and an MLP denoiser. Names of weights are those of the torch module
 :class:`apex_ompl.training.latent_diffusion.LatentDiffusion`, where the layers are explained.
 
-Large matrices of weights are int8 with a scale for each row: symmetric linear quantization (Jacob et al., CVPR 2018, with
-a zero point of 0). Reading weights from memory takes most of the time of a few proposals. NumPy's models compute with the
-bytes (:mod:`apex_ompl.kernel.compiled.dense_layer`), torch's with the expanded matrices.
+Large matrices of weights are int8 with a scale for each row: symmetric linear quantization (Jacob et al., CVPR 2018,
+with a zero point of 0). Reading weights from memory takes most of the time of a few proposals. NumPy's models compute
+with the bytes (:mod:`apex_ompl.kernel.compiled.dense_layer`), torch's with the expanded matrices.
 """
 
 from __future__ import annotations

@@ -21,7 +21,6 @@ from apex_ompl.model.geometry import Numbers, array_module
 from apex_ompl.types import Array
 from apex_ompl.util.validation import check_integer, check_name
 
-
 SCHEDULES = ("cosine", "linear")
 PREDICTIONS = ("noise", "velocity", "clean")
 MAX_BETA = 0.999  # largest variance of a step, as Nichol and Dhariwal (2021) cap it
@@ -103,8 +102,8 @@ class NoiseSchedule:
     def estimate(self, prediction: str, sample: Numbers, output: Numbers, t: int) -> Estimate:
         """Return noise and clean sample from a network's output for a noisy sample.
 
-        The output is epsilon (equation 5) for ``noise``, z_0 for ``clean``, and for ``velocity`` v = sqrt(abar_t) epsilon
-        - sqrt(1 - abar_t) z_0 (Salimans and Ho 2022).
+        The output is epsilon (equation 5) for ``noise`` and z_0 for ``clean``. For ``velocity`` it is
+        v = sqrt(abar_t) epsilon - sqrt(1 - abar_t) z_0 (Salimans and Ho 2022).
         """
         signal, sigma = self.scale(t)
         if prediction == "noise":

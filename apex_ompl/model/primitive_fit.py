@@ -2,10 +2,10 @@
 
 Repair starts among them, too: distances from primitives are smooth where those from voxels are rough.
 
-The nodes near a surface, and those that it encloses, are divided into connected regions. A region close to a box, a ball
-or a cylinder of the same second moments becomes that primitive. In the other regions boxes along the axes of the grid
-grow from nodes until nearly all nodes are in one. The same furniture therefore gives similar primitives whether it comes
-as boxes, as a mesh, as points on its surface or as voxels. Nothing is proved by them.
+The nodes near a surface, and those that it encloses, are divided into connected regions. A region close to a box, a
+ball or a cylinder of the same second moments becomes that primitive. In the other regions boxes along the axes of the
+grid grow from nodes until nearly all nodes are in one. The same furniture therefore gives similar primitives whether it
+comes as boxes, as a mesh, as points on its surface or as voxels. Nothing is proved by them.
 """
 
 from __future__ import annotations

@@ -42,7 +42,7 @@ class Conditions:
         rotation: Rotation matrices, shape (B, M, 3, 3).
         size: Half edges; radius; or radius and half length along z, shape (B, M, 3) [m].
         mask: True for an obstacle, False for padding, shape (B, M).
-        seen: Features of a :class:`SceneEncoding`, shape (B, F). Where there are any, obstacles and probe points are left out.
+        seen: Features of a :class:`SceneEncoding`, shape (B, F); with them, obstacles and probe points are left out.
         among: The obstacles of such conditions, where a model is trained that looks at them again.
     """
 
@@ -141,7 +141,7 @@ def batch_queries(queries: Sequence[Query], encoding: Probes | SceneEncoding, ke
 def conditions_of_features(
     seen: Tensor, start: Tensor, goal: Tensor, point: Tensor, *, among: Obstacles | None = None
 ) -> Conditions:
-    """Return conditions with the features of a scene encoding, shape (B, F), and without obstacles but those of ``among``."""
+    """Return conditions with the features of a scene encoding, shape (B, F), and with no obstacles but ``among``."""
     count, none = len(start), start.new_empty(len(start), 0, 3)
     shape, mask = (start.new_zeros(count, 0, dtype=kind) for kind in (torch.int64, torch.bool))
     turns = start.new_empty(count, 0, 3, 3)

@@ -98,8 +98,8 @@ class Shard:
     """
 
     def __init__(
-        self, sets: Sequence[Paths], encoding: Probes | TorchSceneEncoding, kernel: Kernel, weights: Mapping[str, float],
-        augmentation: Augmentation | None = None,
+        self, sets: Sequence[Paths], encoding: Probes | TorchSceneEncoding, kernel: Kernel,
+        weights: Mapping[str, float], augmentation: Augmentation | None = None,
     ) -> None:  # fmt: skip
         """Compute the tensors of paths.
 
@@ -305,7 +305,7 @@ class TrainingData:
         return self._batch_encoding.along(self._looked_at @ control, conditions.among)
 
     def collide(self, control: Tensor, conditions: Conditions, places: Tensor) -> Tensor:
-        """Return the mean of what the collisions of some of the paths cost, see :meth:`TorchSceneEncoding.collision_cost` [m].
+        """Return the mean :meth:`TorchSceneEncoding.collision_cost` of some of the paths [m].
 
         Args:
             control: Control points, shape (B, points, dof) [rad].

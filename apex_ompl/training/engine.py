@@ -1,7 +1,7 @@
 """Data engine: solves each problem by several methods and keeps the valid paths. It needs the kernel alone.
 
-A :class:`PathFinder` finds paths for one problem by trees and by optimization; an :class:`Engine` solves the problems of
-a unit of work. Problems are drawn, and solved with meshes, by :mod:`apex_ompl.training.units`.
+A :class:`PathFinder` finds paths for one problem by trees and by optimization; an :class:`Engine` solves the problems
+of a unit of work. Problems are drawn, and solved with meshes, by :mod:`apex_ompl.training.units`.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from apex_ompl.util.resolution import FINE_RESOLUTION, SEARCH_RESOLUTION
 from apex_ompl.util.stopwatch import timed
 
 FEW, MANY = 1, 8  # initial paths that are optimized together
-BUMP_SIZE = (0.4, 1.2)  # range of the amplitude of random bumps [rad]
+PERTURBATION_SIZES = (0.4, 1.2)  # range of the size of random perturbations [rad]
 PART_STEPS = 12  # optimizer steps for a part of a path
 COMPARED_STATES = 12  # number of states at which two paths are compared
 CLEARANCE_RANGE = 0.2  # clearances are measured up to here [m]
@@ -39,12 +39,12 @@ PART_LENGTHS = (0.25, 0.9)  # range of the length of a part of a path, as a shar
 RESTS = 0.5  # share of the parts that end where their path does
 DUPLICATE_DISTANCE = 0.1  # a path nearer to another one is not kept [rad, max-norm]
 STRATEGIES = {
-    "open": (("bumps", "bumps"), ("rrtconnect", "many bumps")),
-    "broad": (("rrtconnect", "rrtconnect"), ("many bumps", "rrtconnect")),
-    "easy": (("rrtconnect", "rrtconnect"), ("many bumps", "rrtconnect")),
-    "medium": (("rrtconnect", "rrtconnect"), ("many bumps", "rrtconnect")),
-    "hard": (("rrtconnect", "rrtconnect"), ("many bumps", "rrtconnect")),
-    "extreme": (("rrtconnect", "rrtconnect"), ("many bumps", "rrtconnect")),
+    "open": (("perturbation", "perturbation"), ("rrtconnect", "many perturbations")),
+    "broad": (("rrtconnect", "rrtconnect"), ("many perturbations", "rrtconnect")),
+    "easy": (("rrtconnect", "rrtconnect"), ("many perturbations", "rrtconnect")),
+    "medium": (("rrtconnect", "rrtconnect"), ("many perturbations", "rrtconnect")),
+    "hard": (("rrtconnect", "rrtconnect"), ("many perturbations", "rrtconnect")),
+    "extreme": (("rrtconnect", "rrtconnect"), ("many perturbations", "rrtconnect")),
 }
 """Methods by which paths are searched, for the levels of the hard suites, for open scenes and for broad ones: the first
 ones in turn, and, where none finds a path, the second ones until one does. Chosen by the yield of each method."""
@@ -106,15 +106,15 @@ class PathFinder:
         """Return the obstacle point nearest to the robot at a state, shape (3,) [m], or None where it is unknown."""
         return self.points.get(q.tobytes())
 
-    def optimize_bumps(self, rng: np.random.Generator, *, line: bool, many: bool) -> Array | None:
-        """Return the control points of a valid path, optimized from lines with random bumps, or None.
+    def optimize_perturbations(self, rng: np.random.Generator, *, line: bool, many: bool) -> Array | None:
+        """Return the control points of a valid path, optimized from random perturbations of the straight line.
 
         Args:
-            rng: Source of the bumps.
+            rng: Source of the perturbations.
             line: Whether the straight line itself is the first initial path.
             many: Whether to optimize many initial paths at once, instead of few and then more.
         """
-        start, goal, size = self.start, self.goal, float(rng.uniform(*BUMP_SIZE))
+        start, goal, size = self.start, self.goal, float(rng.uniform(*PERTURBATION_SIZES))
         counts = (4 * MANY,) if many else (FEW, MANY)
         for count in counts:
             starts = self.optimizer.starts(start, goal, count + 1, rng, size)
@@ -277,10 +277,10 @@ class Engine:
         for k, method in enumerate((*(first * rounds)[: self._options.copies], *second)):
             if k >= self._options.copies and found:
                 return
-            source = "bumps" if method == "many bumps" else method
+            source = "perturbation" if method == "many perturbations" else method
             with self.timed(source):
-                if source == "bumps":
-                    control = finder.optimize_bumps(rng, line=k == 0, many=method == "many bumps")
+                if source == "perturbation":
+                    control = finder.optimize_perturbations(rng, line=k == 0, many=method == "many perturbations")
                 else:
                     search = finder.optimize_proposals if source == "model" else finder.search
                     control = search(int(rng.integers(2**31 - 1)))

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -166,9 +167,9 @@ class LatentDiffusion(nn.Module):
         """Return the mean square error of the denoiser (equation 5 of the paper).
 
         loss = mean((f(sqrt(abar_t) z_0 + sqrt(1 - abar_t) epsilon, t, g) - target)^2), where the target is epsilon,
-        the velocity or z_0, see :meth:`TrainingSchedule.target`. A denoiser that sees its own last estimate is evaluated
-        at a noisier step first, without one; the loss is the mean of both. What the collisions of the denoiser's last
-        estimate of z_0 cost may be added, after PRESTO (arXiv 2409.16012).
+        the velocity or z_0, see :meth:`TrainingSchedule.target`. A denoiser that sees its own last estimate is
+        evaluated at a noisier step first, without one; the loss is the mean of both. The collision cost of the
+        denoiser's last estimate of z_0 may be added, after PRESTO (arXiv 2409.16012).
 
         Args:
             clean: Latent vectors z_0 of data, shape (B, *latent).

@@ -18,9 +18,9 @@ from apex_ompl.types import Array
 from apex_ompl.util.display import counted, one_line
 
 MICRO = 1e-6  # states are stored in whole microradians; the suites draw states of six decimals
-SOURCES = ("line", "bumps", "rrtconnect", "reversed", "part", "model")
-"""Origin of a path: straight line; optimization from random bumps; rrtconnect and optimization; the reversal of another
-path; a part of another path between two of its states; optimization from a model's proposal."""
+SOURCES = ("line", "perturbation", "rrtconnect", "reversed", "part", "model")
+"""Origins of a path: the straight line; optimization from random perturbations of it; rrtconnect and optimization; the
+reversal of another path; a part of another path between two of its states; optimization from a model's proposal."""
 
 PROBLEM_FIELDS: dict[str, tuple[Any, tuple[int, ...]]] = {
     "seed": (np.int32, ()), "suite": (np.uint8, ()), "level": (np.uint8, ()), "held": (np.uint32, ()),
@@ -277,7 +277,7 @@ def _statistics(paths: Paths, name: str, problems: NDArray[np.intp], twins: NDAr
     mine = np.isin(a["problem"], problems)
     source, owner = a["source"][mine], a["problem"][mine]
     straight = set(owner[source == SOURCES.index("line")].tolist())
-    from_start = np.isin(source, [SOURCES.index(s) for s in ("bumps", "rrtconnect", "model")])
+    from_start = np.isin(source, [SOURCES.index(s) for s in ("perturbation", "rrtconnect", "model")])
     classes = Counter(
         k for k, _ in set(zip(owner[from_start].tolist(), a["homotopy"][mine][from_start].tolist(), strict=True))
     )

@@ -1,8 +1,8 @@
 """Scene encoding for training: the features of scene ``clearances``, computed for many scenes at once.
 
 The features are those of :mod:`apex_ompl.model.scene_encoding`, which computes them scene by scene.
-:class:`TorchSceneEncoding` computes them by torch on any device. On a CPU torch takes many times as long for them as for
-the network, so :class:`KernelSceneEncoding` computes frames and distances by the kernel.
+:class:`TorchSceneEncoding` computes them by torch on any device. On a CPU torch takes many times as long for them as
+for the network, so :class:`KernelSceneEncoding` computes frames and distances by the kernel.
 """
 
 from __future__ import annotations

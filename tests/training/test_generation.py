@@ -76,7 +76,7 @@ def test_every_path_passes_the_full_check_and_its_record_is_true(made: list[Path
             np.testing.assert_allclose(a["position"][mine], [o.position for o in things] or np.zeros((0, 3)), atol=1e-6)
             for number, obstacle in zip(a["shape"][mine], things, strict=True):
                 assert getattr(obstacle, SHAPES[number]) is not None
-    assert {"bumps", "rrtconnect", "reversed", "part"} <= sources
+    assert {"perturbation", "rrtconnect", "reversed", "part"} <= sources
     assert inner > 0, "some parts end where no path does"
 
 

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from support import ROOT
 
 from apex_ompl import problems
 from apex_ompl.apex.planner import APEX
@@ -12,7 +13,6 @@ from apex_ompl.paths.candidates import first_valid
 from apex_ompl.paths.optimizer import Optimizer, OptimizerSettings
 from apex_ompl.paths.spline import Spline
 from apex_ompl.robot import Robot
-from tests.support import ROOT
 
 ELBOWS = [3, 10]
 
