@@ -86,7 +86,7 @@ class DualArmTables:
 
     Attributes:
         robot: The robot.
-        both: Tables of the whole robot, with what it holds.
+        both: Tables of the whole robot, with the objects that it holds.
         arms: Tables that check the left arm with its hand, and the right one, and ignore all other bodies.
         joints: Numbers of the joints of the left arm and hand, and of the right ones.
     """
@@ -98,7 +98,7 @@ class DualArmTables:
 
     @classmethod
     def of(cls, robot: Robot) -> DualArmTables:
-        """Return the tables of a robot, the names of whose joints begin with ``left_`` or ``right_``."""
+        """Return the tables of a robot whose joint names start with ``left_`` or ``right_``."""
         left, right = (
             tuple(k for k, name in enumerate(robot.joint_names) if name.startswith(side))
             for side in ("left_", "right_")
@@ -119,7 +119,7 @@ class HandPoseSampler:
         """Prepare the kernels of a scene; states keep ``margin`` [m] to obstacles, fixtures and between bodies.
 
         Args:
-            tables: The robot with what it holds.
+            tables: The robot with the objects that it holds.
             scene: Obstacles beside the robot's fixtures, or the kernel's tables of both.
             margin: [m].
         """
@@ -146,7 +146,7 @@ class HandPoseSampler:
             rng: Source of targets and seeds.
             regions: Of the left and of the right hand.
             synergies: Least and largest synergy of both hands, or of each, shape (2,).
-            attempts: How many pairs of targets to try.
+            attempts: Number of pairs of targets to try.
 
         Returns:
             Shape (dof,), rounded to a millionth of a radian.
@@ -197,7 +197,7 @@ class AlignmentSampler:
     """
 
     def __init__(self, robot: Robot, objects: HandObjects, alignment: Alignment, margin: float) -> None:
-        """Close the hands on ``objects``; states keep ``margin`` [m] to the fixtures and between bodies."""
+        """Close the hands on ``objects``; states have a clearance of ``margin`` [m] to fixtures and between bodies."""
         self.robot = robot
         self.margin = margin
         self.attached, self.home, _ = close_hands(robot, objects)

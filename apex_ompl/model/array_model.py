@@ -31,7 +31,7 @@ from apex_ompl.types import Array
 from apex_ompl.util.validation import check_integer
 
 SUFFIX = ".scale"
-LEAST = 2**12  # numbers of a matrix that is worth it
+LEAST = 2**12  # size from which a matrix is quantized
 MOST = 127
 Single = NDArray[np.float32]
 STEP_SIZE = 128  # of the embedding of a step
@@ -41,7 +41,7 @@ EPSILON = 1e-5  # of the layer normalization, as in torch
 def quantized(weights: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
     """Return weights whose large matrices of layers are int8, with scales of their rows as ``NAME.scale``.
 
-    Those that are in eight bits already stay as they are.
+    Weights that are int8 already stay as they are.
     """
     found = {}
     for name, values in weights.items():
@@ -124,7 +124,7 @@ class ArrayModel(TrajectoryModel):
         self._shares = self.spline.line(np.zeros(1), np.ones(1))
 
     def one_thread(self) -> AbstractContextManager[None]:
-        """Let its networks compute by one thread inside a block; they always do."""
+        """Limit its networks to one thread inside a block; NumPy models always use one."""
         return nullcontext()
 
     def zeros(self, count: int) -> Single:
@@ -157,7 +157,7 @@ class ArrayModel(TrajectoryModel):
         return self._layers("encoder.phi", 3 if self.scene_encoding is not None else 2, np.concatenate(parts, axis=1))
 
     def refine(self, condition: Single, along: Single) -> Single:
-        """Return encoded conditions with what lies along estimates of paths, features of shape (B, F)."""
+        """Return encoded conditions refined by features along estimated paths, shape (B, F)."""
         return condition + self._layers("encoder.psi", 3, along)
 
     def denoise(self, latent: Single, t: int, condition: Single) -> Single:
@@ -192,7 +192,7 @@ class ArrayModel(TrajectoryModel):
         return np.asarray(start)[:, None] + self._shares * (np.asarray(goal) - start)[:, None]
 
     def _obstacle_features(self, obstacles: ObstacleSet, probes: Single) -> Single:
-        """Return what the encoder sees of the obstacles of a query, shape (features,); probes have (L, P, 3)."""
+        """Return the obstacle features of a query, shape (features,), for probe points of shape (L, P, 3) [m]."""
         along, count = probes.shape[:2]
         center = np.array(WORKSPACE_CENTER, np.float32)
         position, size = (np.asarray(v, np.float32) for v in (obstacles.position, obstacles.size))

@@ -27,7 +27,7 @@ from apex_ompl.util.schema import StrictModel, read_json, validate
 SCHEMA = "apex-ompl/model/1"
 SHIPPED = Path(__file__).parent / "checkpoints"
 CONFIG, WEIGHTS = "config.json", "model.safetensors"
-TORCH = "apex_ompl.training.torch_model"  # evaluates what NumPy cannot; by name, since this package knows no torch
+TORCH = "apex_ompl.training.torch_model"  # for models that NumPy cannot evaluate; by name, since model knows no torch
 PICKLES = (".pt", ".pth", ".ckpt", ".bin", ".pkl", ".pickle")
 
 

@@ -28,26 +28,26 @@ from apex_ompl.model.geometry import signed_distances
 from apex_ompl.types import Array, Flags
 from apex_ompl.util.weak_cache import weakly_cached
 
-PLACES, POINTS = 3000, 300  # of which moments, and orientations, are taken
+PLACES, POINTS = 3000, 300  # most points for moments, and for orientations
 THINNEST = 0.002  # least half side or radius [m]
 TURNS = np.radians(np.arange(0.0, 90.0, 5.0))
 ORDERS = [list(order) for order in itertools.permutations(range(3))]
 FINE_TURNS = np.radians(np.arange(-4.0, 4.5, 1.0))
-MOST_NODES, MOST_NODES_OF_SOLIDS = 1_000_000, 250_000  # that are looked at; of finer grids every other or third
-INSIDE = 3.0  # distance inside of a surface, in spacings, by which it is known to enclose a solid
-CLOSE = 0.008  # nodes are at least so far from each other among points, which are to be one surface [m]
+MOST_NODES, MOST_NODES_OF_SOLIDS = 1_000_000, 250_000  # in use; of finer grids every second or third
+INSIDE = 3.0  # depth below a surface, in spacings, from which it is known to enclose a solid
+CLOSE = 0.008  # least distance of nodes among points, so that the points form one surface [m]
 MORE = 1.15  # distance in spacings up to which nodes count as occupied where distances are not exact
 MOST_SHAPES = 48  # of a grid
-ALIKE = 0.7  # volume of the intersection of a region and its primitive over that of their union, at least
-HOLE = 0.03  # nodes of a primitive and not of its region are at most so far from the surface [m]
-FEW = 8  # nodes of a region that is a box whatever its form
-RIM = 300  # nodes of a border by which a primitive is judged
+ALIKE = 0.7  # least intersection over union of the volumes of a region and its primitive
+HOLE = 0.03  # largest distance from the surface of nodes of a primitive outside of its region [m]
+FEW = 8  # most nodes of a region that becomes a box whatever its form
+RIM = 300  # border nodes by which a primitive is compared with its region
 SAMPLES = 1500  # nodes by which a region and a primitive are compared
-BOXY = 1.25  # by which a box must fit better than a round solid, which voxels make look like a box
-LEAST_GAIN = 0.03  # side of a cube that has the volume of what the next box must hold at least [m]
-RING = 0.006  # around a box there is no other to be looked for [m]
-LONG = 3.0  # sides of a bar, at least
-LAYER = 0.96  # share of a layer of nodes that must be occupied for a box to grow by it
+BOXY = 1.25  # factor by which a box must fit better than a round solid, since voxels make that look like a box
+LEAST_GAIN = 0.03  # side of a cube with the least volume that the next box must cover [m]
+RING = 0.006  # width around a box in which no other box starts [m]
+LONG = 3.0  # least ratio of the sides of a bar
+LAYER = 0.96  # least occupied share of a layer of nodes by which a box grows
 SEEDS = 10  # nodes from which boxes grow
 
 
@@ -59,7 +59,7 @@ class Solid:
         kind: BOX, SPHERE or CYLINDER.
         rotation: From its frame, shape (3, 3).
         position: Of its center, shape (3,) [m].
-        size: Half edges; radius; or radius and half length along z; shape (3,), 0 behind these [m].
+        size: Half edges; radius; or radius and half length along z; shape (3,), padded with 0 [m].
     """
 
     kind: int
@@ -74,12 +74,12 @@ class Solid:
 
 
 def solids_like(places: Array, spacing: float, less: float) -> list[Solid]:
-    """Return boxes, a ball and cylinders with the second moments of places.
+    """Return boxes, a ball and cylinders with the second moments of given points.
 
     Args:
         places: Nodes of a lattice inside of a solid, shape (N, 3) [m].
-        spacing: Of the lattice [m].
-        less: By which radii and half sides are made smaller [m].
+        spacing: Spacing of the lattice [m].
+        less: Length by which radii and half sides are reduced [m].
     """
     places = places[:: max(1, len(places) // PLACES)]
     middle = places.mean(axis=0)
@@ -120,7 +120,7 @@ def turned_to(axis: Array) -> Array:
 
 
 def _nearest_axes(rotation: Array) -> Array:
-    """Return the rotation nearest to none of those that have the same axes, in another order or opposite."""
+    """Return the rotation nearest to the identity among those with the same axes in any order and direction."""
     order = max(ORDERS, key=lambda some: float(np.abs(np.diag(rotation[:, some])).sum()))
     found = rotation[:, order]
     found = found * np.where(np.diag(found) < 0.0, -1.0, 1.0)
@@ -164,9 +164,9 @@ class _Nodes:
 
     Attributes:
         spacing: Of these nodes [m].
-        gap: Signed distances from what the grid is about, exact near it, shape (nx, ny, nz) [m].
+        gap: Signed distances of the grid, exact near the surface, shape (nx, ny, nz) [m].
         reach: Distance up to which nodes count as occupied [m].
-        label: OUTSIDE, or OCCUPIED and the number of a region from 1 on, likewise.
+        label: OUTSIDE, or OCCUPIED plus the number of a region from 1 on, shape (nx, ny, nz).
     """
 
     spacing: float
@@ -211,7 +211,7 @@ class _Nodes:
 
 @weakly_cached
 def fitted_shapes(grid: DistanceGrid) -> FittedShapes:
-    """Return primitives that together look like what a grid is about."""
+    """Return primitives that together approximate a grid of distances."""
     nodes = _Nodes.of(grid)
     border = nodes.on_border()
     places = np.argwhere(nodes.label > OCCUPIED)
@@ -237,7 +237,7 @@ def fitted_shapes(grid: DistanceGrid) -> FittedShapes:
 
 
 def primitives_like(solid: Primitive) -> list[Primitive]:
-    """Return primitives that together look like a grid at a pose; one that is no grid as it is."""
+    """Return primitives that together approximate a grid at a pose; any other primitive is returned as it is."""
     if solid.grid is None:
         return [solid]
     fit, found = fitted_shapes(solid.grid), []
@@ -250,7 +250,7 @@ def primitives_like(solid: Primitive) -> list[Primitive]:
 
 @weakly_cached
 def scene_of_primitives(tables: SceneTables) -> SceneTables | None:
-    """Return a scene in which primitives stand for grids; None where there are no grids."""
+    """Return a scene in which primitives replace grids; None where there are no grids."""
     if all(grid is None for grid in tables.grids):
         return None
     owners = tables.arrays.owner.tolist()
@@ -260,10 +260,10 @@ def scene_of_primitives(tables: SceneTables) -> SceneTables | None:
 
 
 def _one_shape(nodes: _Nodes, border: Flags, part: Integers) -> Solid | None:
-    """Return the primitive that looks like connected nodes, shape (N, 3), or None.
+    """Return the primitive that approximates connected nodes, shape (N, 3), or None.
 
-    Of solids with the same second moments, that do not close a hole, it is the one from whose surface the nodes at the
-    region's border are as far as from the grid's.
+    Candidates are solids with the same second moments that do not close a hole. The one is chosen for which the
+    distances of the region's border nodes from its surface are closest to those of the grid.
     """
     low, high = part.min(axis=0), part.max(axis=0)
     if len(part) <= FEW:
@@ -294,7 +294,7 @@ def _one_shape(nodes: _Nodes, border: Flags, part: Integers) -> Solid | None:
 
 
 def _boxes(nodes: _Nodes, border: Flags, left: Integers, most: int) -> list[Solid]:
-    """Return boxes along the axes that hold nearly all nodes that are not zero; ``left`` is used up."""
+    """Return boxes along the axes that cover nearly all nonzero nodes of ``left``, which is overwritten."""
     least, ring = max(FEW, (LEAST_GAIN / nodes.spacing) ** 3), max(1, round(RING / nodes.spacing))
     sums = np.zeros(tuple(n + 1 for n in left.shape), np.int64)
     add_up(left, sums)
@@ -315,7 +315,7 @@ def _boxes(nodes: _Nodes, border: Flags, left: Integers, most: int) -> list[Soli
 
 
 def _open_part(uncovered: Flags, box: Integers) -> Integers:
-    """Return a box of nodes without the ends that lie in other boxes, as two walls that meet are mostly described."""
+    """Return a box of nodes cut to its part outside of other boxes, so that two walls that meet do not overlap."""
     inside = uncovered[tuple(slice(a, b) for a, b in box.T.tolist())]
     ends = []
     for axis in range(3):
@@ -327,8 +327,8 @@ def _open_part(uncovered: Flags, box: Integers) -> Integers:
 def _box_or_bar(nodes: _Nodes, border: Flags, box: Integers) -> Solid:
     """Return the box of nodes from the first row of ``box``, shape (2, 3), to before the second, or a cylinder.
 
-    A long box of nearly square section may have grown inside of a round bar. In the middle of its length the nodes at
-    the bar's border tell.
+    A long box of nearly square section may have grown inside of a round bar. The border nodes in the middle of its
+    length decide which of the two fits better.
     """
     found = _box_of(nodes, box[0], box[1] - 1)
     axis = int(found.size.argmax())
@@ -358,7 +358,7 @@ def _box_or_bar(nodes: _Nodes, border: Flags, box: Integers) -> Solid:
 
 
 def _box_of(nodes: _Nodes, low: Integers, high: Integers) -> Solid:
-    """Return the box whose outermost nodes are given, its sides put where the surface is, by the nodes' distances."""
+    """Return the box with given outermost nodes, its sides moved to the surface by the distances of these nodes."""
     inside = tuple(slice(int(a), int(b) + 1) for a, b in zip(low, high, strict=True))
     ends = nodes.spacing * np.stack([low, high]).astype(float)
     for axis in range(3):

@@ -1,4 +1,4 @@
-"""A trained model as planners use it: candidate paths for a query."""
+"""Proposals of a trained model: candidate paths for a query."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ class TrajectoryModel(ABC):
         about: Record of the training.
         spline: Spline of the control points.
         schedule: Noise schedule.
-        probes: Points of the robot whose distances to the obstacles it sees.
+        probes: Points of the robot whose distances to the obstacles are features.
         scene_encoding: Features of a scene ``clearances``; None for other scenes.
         sampling: Default sampling.
     """
@@ -101,7 +101,7 @@ class TrajectoryModel(ABC):
         self._looked_at = self.spline.basis(probes.shares)
 
     def __repr__(self) -> str:
-        """Return the robot, the size of the paths, and what the model sees of a scene."""
+        """Return the robot, the size of the paths, and the kind of scene encoding."""
         size = f"{self.spline.points} control points of {counted(len(self.config.joints), 'joint')}"
         scene = f"scene {self.config.condition.scene!r}"
         return one_line(type(self).__name__, f"robot {self.config.robot!r}", size, scene)
@@ -113,7 +113,7 @@ class TrajectoryModel(ABC):
 
     @abstractmethod
     def one_thread(self) -> AbstractContextManager[None]:
-        """Let its networks compute by one thread inside a block."""
+        """Limit its networks to one thread inside a block."""
 
     @abstractmethod
     def zeros(self, count: int) -> Numbers:
@@ -129,7 +129,7 @@ class TrajectoryModel(ABC):
 
     @abstractmethod
     def refine(self, condition: Numbers, along: NDArray[np.float32]) -> Numbers:
-        """Return encoded conditions with what lies along estimates of paths, features of shape (B, F)."""
+        """Return encoded conditions refined by features along estimated paths, shape (B, F)."""
 
     @abstractmethod
     def denoise(self, latent: Numbers, t: int, condition: Numbers) -> Numbers:
@@ -204,10 +204,10 @@ class TrajectoryModel(ABC):
         )
 
     def _check(self, queries: Sequence[Query], kernel: Kernel) -> None:
-        """Check that queries are of the model's robot.
+        """Check that queries are of the model's robot, with finite numbers.
 
         Raises:
-            ParameterError: They are not, or numbers are not finite.
+            ParameterError: They are not.
         """
         config = self.config
         if (kernel.robot.name, kernel.robot.joint_names) != (config.robot, config.joints):
@@ -226,7 +226,7 @@ class TrajectoryModel(ABC):
     ) -> Proposals:  # fmt: skip
         """Return the paths that the reverse process makes of noisy latent vectors ``first`` at step ``top``.
 
-        A model that sees its own estimate sees the paths of ``known`` latent vectors at first, if there are any.
+        A model that sees its own estimate starts with the paths of ``known`` latent vectors, if there are any.
         """
         self._check(queries, kernel)
         clock, each = StageClock("condition", "network", "guidance", "decode"), len(first) // len(queries)
@@ -264,7 +264,7 @@ class TrajectoryModel(ABC):
         return Proposals(control, latent, clock.seconds)
 
     def _along(self, queries: Sequence[Query], kernel: Kernel, control: Array) -> NDArray[np.float32]:
-        """Return what the model sees along paths of queries, as many of each: shape (B, features)."""
+        """Return the features along paths, as many of each query: shape (B, features)."""
         assert self.scene_encoding is not None
         limits, each = kernel.robot.arrays, len(control) // len(queries)
         paths = product(self._looked_at, np.clip(control, limits.lower, limits.upper))
@@ -279,8 +279,8 @@ class TrajectoryModel(ABC):
 
         Args:
             condition: Encoded conditions.
-            look: For a model that sees its estimates, returns encoded conditions with what lies along their paths.
-            known: Clean samples that are seen at first.
+            look: For a model that sees its estimates, returns conditions refined by features along their paths.
+            known: Clean samples that take the place of the first estimate.
         """
         noise, last = self.config.noise, known
 

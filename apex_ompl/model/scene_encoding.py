@@ -1,16 +1,16 @@
-"""What a model of ``scene="clearances"`` sees: distances alone, alike whatever the obstacles are made of.
+"""Scene encoding of models with ``scene="clearances"``: distances alone, whatever geometry the obstacles are given as.
 
-The vector of features of a query is, one behind the other:
+The features of a query are the concatenation of
 
 - the clearance of each arm from the obstacles at K key states, shape (K, A), after PRESTO (arXiv 2409.16012);
 - positions of the P probe points at L states along the straight line from start to goal, shape (L, P, 3), their signed
-  distances from the nearest obstacle, shape (L, P), the gradients of these, shape (L, P, 3), and how they push the
-  joints, shape (L, dof), see :meth:`apex_ompl.kernel.Kernel.joint_pushes`;
-- a box around what each hand holds, in the frame of the link that holds it, shape (H, 7): whether there is one, its
-  center and its half edges.
+  distances from the nearest obstacle, shape (L, P), the gradients of these, shape (L, P, 3), and the generalized forces
+  on the joints, shape (L, dof), see :meth:`apex_ompl.kernel.Kernel.joint_pushes`;
+- a box around the objects that each hand holds, in the frame of the holding link, shape (H, 7): whether there is one,
+  its center and its half edges.
 
-All are scaled to about -1..1. An arm is what moves at one joint of the world; at key states it is seen as balls around
-pieces of its links, with the fingers half closed and without held objects.
+All are scaled to about -1..1. An arm is the set of bodies that move with one joint of the world. At key states it is
+represented by balls around pieces of its links, with the fingers half closed and without held objects.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from apex_ompl.types import Array, Flags
 
 ROUNDS = 10  # of Lloyd's algorithm, which divides a cluster's spheres among its pieces
 KEY_RANGE = 0.3  # clearances at key states are clipped here [m]
-REACH = 0.2  # distance of a probe point from an obstacle at which it is pushed no more [m]
+REACH = 0.2  # distance of a probe point from an obstacle from which its force is zero [m]
 HELD_SIZE = 0.2  # scale of held objects [m]
 HALF = 2.0**-11  # relative rounding of half precision, in which checkpoints store balls
 CANDIDATES = 8  # states from which a key state is chosen
@@ -71,7 +71,7 @@ class KeyStates:
 
 
 def arms(robot: RobotTables) -> list[NDArray[np.int64]]:
-    """Return the clusters of bodies of each arm that meet obstacles; an arm is what moves at one joint of the world."""
+    """Return the clusters of bodies of each arm that can meet obstacles; an arm moves with one joint of the world."""
     a = robot.arrays
     base = np.arange(len(a.joint_parent))
     for joint in range(1, len(base)):

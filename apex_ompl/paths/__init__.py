@@ -1,4 +1,4 @@
-"""Trajectory optimization: B-spline paths, the optimizer, the candidate pool."""
+"""Trajectory optimization: B-spline paths, the optimizer with cost terms of the user, the candidate pool."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Trajectory optimization on B-spline control points: paths made clear of obstacles, and then short.
 
-One optimizer serves repair, shortening and data generation. It needs NumPy and the compiled kernel only; the full
-check is handed in.
+One optimizer serves repair, shortening and data generation. It needs only NumPy and the compiled kernel; the caller
+passes the full check as a function.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ from apex_ompl.util.validation import check_array, check_integer, check_nonnegat
 Check = Callable[[Array], bool]
 """Whether a path, shape (states, dof), is valid."""
 
-STIFFNESSES = (25.0, 5.0, 1.0, 0.1)  # factors on the stiffness in shortening, until a path comes out valid
+STIFFNESSES = (25.0, 5.0, 1.0, 0.1)  # factors on the stiffness in shortening, in turn until a path is valid
 STIFFEST = 125.0  # factor in the round after the first of these
 PART = 4  # steps between two looks at the clock
-FINER = 2  # factor on the number of samples for paths that are clear at them and yet not valid
+FINER = 2  # factor on the number of samples for paths that are clear at the samples but not valid
 COARSER = 2  # divisor of the number of samples by which fresh candidates are ranked
-LAST_RESORT = 0.1  # factor on the stiffness where nothing came out valid
+LAST_RESORT = 0.1  # factor on the stiffness where no path was valid before
 PERTURBATION_SIZE = 0.6  # of the random perturbations of straight lines that planners start from [rad]
 
 
@@ -119,11 +119,11 @@ class Optimizer:
     def __init__(
         self, spline: Spline | None = None, settings: OptimizerSettings | None = None, *, costs: Sequence[CostTerm] = ()
     ) -> None:
-        """Set what is optimized.
+        """Optimize paths of a spline.
 
         Args:
             spline: Spline of the control points.
-            settings: Cost, and end of the optimization.
+            settings: Weights of the cost, and when the steps end.
             costs: Further terms of the cost, see :class:`apex_ompl.paths.cost_terms.CostTerm`. With any of them the
                 steps are taken in NumPy, which is slower.
         """
@@ -137,7 +137,7 @@ class Optimizer:
         return values_line("Optimizer", vars(self), defaults)
 
     def prepare(self, kernel: Kernel) -> None:
-        """Load or compile now what the first steps in a process need."""
+        """Load or compile the code of the steps now, instead of at the first call in a process."""
         if self.spline not in _prepared:
             compiled = Optimizer(self.spline, self.settings)
             compiled.improve(kernel, np.zeros((1, self.spline.points, kernel.robot.dof)), steps=0)
@@ -200,11 +200,11 @@ class Optimizer:
 
         Args:
             kernels: The robot among its obstacles: one for all paths, or one for each, of the same number of joints.
-            control: Control points, shape (B, points, dof); the pinned ones stay, the others are put inside limits.
-            steps: Most steps, those that failed among them; by default the settings'.
+            control: Control points, shape (B, points, dof); free ones are clipped to the limits, pinned ones stay.
+            steps: Largest number of steps, rejected ones included; by default the settings'.
             stiffness: By default the settings'.
             damping: Damping of the first step, one for all or one for each; by default the settings'.
-            enough: A path is left alone as soon as both of its clearances reach this [m].
+            enough: The steps of a path end as soon as both of its clearances reach this [m].
 
         Raises:
             ParameterError: Control points of another shape, or another number of kernels.
@@ -236,17 +236,17 @@ class Optimizer:
     def shorten(
         self, kernel: Kernel, control: ArrayLike, is_valid: Check, stop: Callable[[], bool] = lambda: False
     ) -> Array | None:
-        """Return the last valid path of stiffer and stiffer ones, control points of shape (points, dof), or None.
+        """Return the control points, shape (points, dof), of a valid path shortened by a high stiffness, or None.
 
-        Stiffer paths are shorter. The first stiffness is high, since most paths go through with it; where the path
-        fails the check, softer ones have their turn, the last with more samples. From a valid path on the stiffness
-        grows once more.
+        Stiffer paths are shorter. The first stiffness is high, since most paths stay valid with it. Where the path
+        fails the check, lower ones are tried in turn, the last with more samples. After a valid path at the first
+        stiffness a higher one is tried.
 
         Args:
             kernel: The robot among its obstacles.
-            control: Where to start from, shape (points, dof); it need not be valid.
-            is_valid: Decides; called with the states of a path.
-            stop: Asked between parts of rounds whether to end.
+            control: Initial control points, shape (points, dof); the path need not be valid.
+            is_valid: Full check; called with the states of a path.
+            stop: Called every few steps; True ends the search.
 
         Raises:
             ParameterError: Control points of another shape.
@@ -293,7 +293,7 @@ class Optimizer:
         return add_terms(self.costs, self.spline, weights, states, evaluation)
 
     def _in_parts(self, kernel: Kernel, control: Array, stiffness: float, stop: Callable[[], bool]) -> Array | None:
-        """Return a path, shape (1, points, dof), improved as far as it goes, or None when told to stop meanwhile."""
+        """Return a path, shape (1, points, dof), after all steps, or None when ``stop`` ends them early."""
         left, damping = self.settings.steps, None
         while True:
             steps = min(PART, left)
@@ -344,7 +344,7 @@ class Optimizer:
 
 @lru_cache(maxsize=32)
 def _grid(spline: Spline, samples: int) -> tuple[Array, NDArray[np.int64], Array]:
-    """Return weights at the samples without their zeros, where they begin, and the Gram matrix of the speed."""
+    """Return the nonzero weights at the samples, the first control point of each, and the Gram matrix of the speed."""
     weights = spline.basis((np.arange(samples) + 0.5) / samples)
     width = spline.degree + 1
     first = np.minimum(np.argmax(weights != 0.0, axis=1), spline.points - width).astype(np.int64)

@@ -18,7 +18,7 @@ from apex_ompl.util.validation import number_array
 SAME_STATE = 1e-9  # distance below which states count as one [rad]
 SAME_DIRECTION = 1e-7  # norm of the difference of unit directions below which they count as one
 MAX_SAMPLES = 100_000
-AT_ONCE = 8_000  # samples between two looks at the clock
+AT_ONCE = 8_000  # samples between two calls of ``stop``
 SAMPLES_PER_DEVIATION = 10.0
 SPEED_MARGIN = 1.1  # largest ratio of the speed between knots to that at knots
 
@@ -135,11 +135,11 @@ def deviation_bound(
     Args:
         motion: The motion.
         line: The polyline.
-        arc_at: Times from 0 to the last that counts, shape (K,) [s], and the arc lengths along the polyline that the
-            motion reaches at them, shape (K,) [rad]; linear in between.
+        arc_at: Times from 0 to the end of the part that is compared, shape (K,) [s], and the arc lengths along the
+            polyline that the motion reaches at them, shape (K,) [rad]; linear in between.
         window: Largest distance along the polyline from there to the nearest point [rad].
-        deviation: The distance that matters; samples are a tenth of it apart [rad].
-        stop: Asked often whether to give up; then there is no bound, and infinity is returned.
+        deviation: The allowed distance; samples are a tenth of it apart [rad].
+        stop: Called often; where it returns True, the bound is infinity.
     """
     end = float(arc_at[0][-1])
     speed = float(np.linalg.norm(motion.velocities, axis=1).max()) * SPEED_MARGIN

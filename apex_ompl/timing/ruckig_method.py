@@ -20,9 +20,9 @@ from apex_ompl.types import Array
 from apex_ompl.util.arrays import distinct
 
 SHORTEST_PIECE = 1e-9  # [s]
-LIMITS_SHARE = 1.0 - 1e-6  # of the limits that Ruckig is given, for its rounding
-JERK_SHARE = 1.0 - 1e-5  # of the limit which leaves room for rounding
-LIMITS_MARGIN = 1.0 + 1e-10  # on the limits where Ruckig is given states that are at them
+LIMITS_SHARE = 1.0 - 1e-6  # share of the limits that Ruckig is given, for its rounding
+JERK_SHARE = 1.0 - 1e-5  # share of the jerk limit, which leaves room for rounding
+LIMITS_MARGIN = 1.0 + 1e-10  # factor on the limits where the given states are at them
 STILL = 1e-12  # range of a joint that stays [rad]
 STRIDES = (2, 1)  # of the knots of a spline that Ruckig's motion goes through; the first that keeps the deviation
 SLOWEST = 1.02  # duration as a multiple of the guide's
@@ -67,9 +67,9 @@ class Profiles(NamedTuple):
 
     Attributes:
         phases: Durations of the phases of each motion and joint, shape (K, dof, phases) [s].
-        jerks: Jerks in them, likewise [rad/s^3].
+        jerks: Jerks in the phases, shape (K, dof, phases) [rad/s^3].
         durations: Durations of the motions, shape (K,) [s].
-        brakes: Whether any begins by braking, which it does from a state over a limit.
+        brakes: Whether any motion starts by braking, as Ruckig does from a state over a limit.
     """
 
     phases: Array
@@ -93,13 +93,13 @@ class Profiles(NamedTuple):
 
 
 def joined(profiles: Profiles, states: Array, joint_names: tuple[str, ...]) -> Trajectory:
-    """Return motions one after the other as one trajectory that goes through states exactly.
+    """Return consecutive motions as one trajectory that goes through given states exactly.
 
     Its knots are where the jerk of any joint changes.
 
     Args:
         profiles: The motions.
-        states: Positions, velocities and accelerations between which they go, shape (3, K + 1, dof).
+        states: Positions, velocities and accelerations at their ends, shape (3, K + 1, dof).
         joint_names: Names of the joints.
     """
     starts = np.round(np.cumsum([0.0, *profiles.durations]) / TICK).astype(np.int64)
@@ -121,19 +121,19 @@ def blended(
     The states of the fastest spline in time (:func:`apex_ompl.timing.spline_method.blend`) at every second knot
     are targets of Ruckig's state-to-state problems in all joints, each with the time between its knots as the least
     duration. The spline itself solves them within the limits, so that Ruckig's motion takes no longer but for rounding.
-    Where it leaves the polyline too far, or the position limits, which Ruckig does not know, or is slower (there may be
-    durations in which no motion between two states exists), it goes through all of the knots.
+    Where the motion leaves the polyline too far, or the position limits, which Ruckig ignores, or is slower (there may
+    be durations in which no motion between two states exists), all of the knots are targets.
 
     Args:
         line: The polyline, of positive length.
         limits: Limits of the joints.
         joint_names: Names of the joints, in the order of the columns.
         deviation: Largest distance of the motion from the polyline [rad].
-        stop: Asked before every state-to-state problem whether to give up.
+        stop: Called before every state-to-state problem; True ends the search.
 
     Returns:
         The motion and a bound on its distance from the polyline [rad], or None where none keeps ``deviation``, or when
-        told to stop meanwhile.
+        ``stop`` returned True.
     """
     room = {name: LIMITS_SHARE * getattr(limits, name) for name in ("velocity", "acceleration")}
     guide = blend(line, replace(limits, **room), joint_names, deviation, stop)
@@ -162,17 +162,17 @@ def through_knots(
         guide: Motion within the limits.
         limits: Limits of the joints.
         stride: Of the knots; the ends are among them.
-        stop: Asked before every state-to-state problem whether to give up.
+        stop: Called before every state-to-state problem; True ends the search.
 
     Returns:
-        The motion, or None where Ruckig finds none or is told to stop.
+        The motion, or None where Ruckig finds none or ``stop`` returned True.
     """
     chosen = distinct([*range(0, len(guide.times), stride), len(guide.times) - 1])
     solver, query = ruckig.Ruckig(guide.dof), ruckig.InputParameter(guide.dof)
     for name, share in zip(DERIVATIVES, (LIMITS_MARGIN, LIMITS_MARGIN, JERK_SHARE), strict=True):
         setattr(query, f"max_{name}", (share * getattr(limits, name)).tolist())
     states = np.stack([guide.positions[chosen], guide.velocities[chosen], guide.accelerations[chosen]])
-    still = np.ptp(guide.positions, axis=0) <= STILL  # by rounding alone, which Ruckig would follow
+    still = np.ptp(guide.positions, axis=0) <= STILL  # up to rounding, which Ruckig would follow
     states[0][:, still], states[1:, :, still] = guide.positions[0, still], 0.0
     rows = states.tolist()
     solutions = []
@@ -193,7 +193,7 @@ def through_knots(
 
 
 def _within(motion: Trajectory, limits: Limits) -> Trajectory:
-    """Return a motion slowed down by what it uses over the limits through rounding."""
+    """Return a motion slowed down until rounding takes it over no limit."""
     use = motion.use(limits)
     over = max(use[name] ** (1.0 / order) for order, name in enumerate(DERIVATIVES, 1))
     return motion if over <= 1.0 else motion.slower(over * (1.0 + ROUNDING))
@@ -211,10 +211,10 @@ def stops(
         line: The polyline, of positive length.
         limits: Limits of the joints.
         joint_names: Names of the joints, in the order of the columns.
-        stop: Asked at every corner whether to give up.
+        stop: Called at every corner; True ends the search.
 
     Returns:
-        The motion and its largest distance from the polyline [rad], or None when told to stop meanwhile.
+        The motion and its largest distance from the polyline [rad], or None when ``stop`` returned True.
 
     Raises:
         TimingError: Ruckig finds no motion.
@@ -248,7 +248,7 @@ def stops(
 def from_moving_start(
     velocity: Array, acceleration: Array, motion: Trajectory, limits: Limits, minimum_duration: float
 ) -> Iterator[tuple[Trajectory, float]]:
-    """Yield motions that start with a velocity and join another motion, and the time of joining [s].
+    """Yield motions that start with a velocity and join another motion, each with the time of joining [s].
 
     Args:
         velocity: Velocity at the start, shape (dof,) [rad/s].
@@ -272,8 +272,8 @@ def between(
     """Return Ruckig's motion between two states, the fastest in which all joints arrive together, or None.
 
     Args:
-        states: Positions, velocities and accelerations at begin and end, shape (3, 2, dof).
-        limits: Limits of the joints. Ruckig does not know those of positions, but a motion beyond them is none.
+        states: Positions, velocities and accelerations at start and end, shape (3, 2, dof).
+        limits: Limits of the joints. Ruckig ignores position limits; a motion beyond them is not returned.
         joint_names: Names of the joints.
         minimum_duration: Least duration [s].
     """
@@ -285,13 +285,13 @@ def through(
     states: Array, limits: Limits, joint_names: tuple[str, ...], longest: float = np.inf,
     solving: Callable[[], None] = lambda: None,
 ) -> Trajectory | None:  # fmt: skip
-    """Return Ruckig's motions between some states one after the other, or None.
+    """Return Ruckig's motions between consecutive states, joined, or None.
 
     Args:
         states: Positions, velocities and accelerations, shape (3, N, dof).
-        limits: As in :func:`between`.
+        limits: Limits of the joints, see :func:`between`.
         joint_names: Names of the joints.
-        longest: Duration that it must be shorter than [s].
+        longest: Upper bound on the duration [s].
         solving: Called before each of the N - 1 problems.
     """
     solutions, left = [], longest
@@ -314,7 +314,7 @@ def _solved(states: Array, limits: Limits, minimum_duration: float = 0.0) -> ruc
     ) = states.tolist()  # fmt: skip
     query.max_jerk = (JERK_SHARE * limits.jerk).tolist()
     for name, at in (("velocity", states[1]), ("acceleration", states[2])):
-        least = LIMITS_MARGIN * np.abs(at).max(axis=0)  # which Ruckig takes the ends with
+        least = LIMITS_MARGIN * np.abs(at).max(axis=0)  # with which Ruckig accepts the ends
         setattr(query, f"max_{name}", np.maximum(LIMITS_SHARE * getattr(limits, name), least).tolist())
     query.minimum_duration = max(minimum_duration, 0.0) or None
     try:
@@ -327,6 +327,6 @@ def _solved(states: Array, limits: Limits, minimum_duration: float = 0.0) -> ruc
 def _within_limits(
     solutions: list[ruckig.Trajectory], states: Array, limits: Limits, joint_names: tuple[str, ...]
 ) -> Trajectory | None:
-    """Return solutions as one motion, if it keeps the limits: Ruckig may exceed one that the velocity is near to."""
+    """Return solutions as one motion if it keeps the limits; Ruckig may exceed a limit that a velocity is near."""
     made = joined(Profiles.of(solutions), states, joint_names)
     return made if max(made.use(limits).values()) <= 1.0 + ROUNDING else None

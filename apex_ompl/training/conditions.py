@@ -21,7 +21,7 @@ from apex_ompl.training.records import Paths, held_extents
 from apex_ompl.training.scene_encoding import Obstacles, TorchSceneEncoding
 
 PART_LENGTHS = (0.25, 0.9)  # range of the length of a part of a path, as a share of it
-RESTS = 0.5  # share of the parts that begin or end where their path does
+RESTS = 0.5  # share of the parts that start or end where their path does
 BENT = 0.1  # parts whose states are all nearer to a straight line are not taken [rad, max-norm]
 PART_STATES = 64  # of a part, from which its control points are computed
 STRANGERS = 24  # obstacles of another scene that are tried
@@ -43,7 +43,7 @@ class Conditions:
         size: Half edges; radius; or radius and half length along z, shape (B, M, 3) [m].
         mask: True for an obstacle, False for padding, shape (B, M).
         seen: Features of a :class:`SceneEncoding`, shape (B, F); with them, obstacles and probe points are left out.
-        among: The obstacles of such conditions, where a model is trained that looks at them again.
+        among: The obstacles of such conditions, for models that compute features along their own estimates.
     """
 
     start: Tensor

@@ -34,8 +34,8 @@ KEY_PATHS = 5_000  # paths of whose states key states are chosen
 STATISTICS_PATHS = 100_000  # most paths from which the statistics of the latent space are computed
 VALIDATION_SHARE = 0.02  # most of all problems on which the validation loss is taken
 CPU = torch.device("cpu")
-MARGIN = 0.02  # distance at which collisions begin to cost [m]
-COSTLY = 2  # of so many paths in a batch, the collisions of one are looked for
+MARGIN = 0.02  # distance from which the collision cost is positive [m]
+COSTLY = 2  # one of so many paths in a batch has its collision cost computed
 PASSES, UNLIMITED = 4, 2**40  # passes over a shard before the next; steps where there is only one shard
 
 
@@ -288,7 +288,7 @@ class TrainingData:
         return Shard(sets, encoding, self._kernel, config.weights, Augmentation(config.parts, config.mixed))
 
     def _key_states(self, train: Paths) -> KeyStates:
-        """Return states of paths, spread out, or those of the checkpoint that the run begins with."""
+        """Return states of paths that are far apart, or the key states of the checkpoint that the run starts with."""
         config, robot = self._config, self._kernel.robot
         if config.initial is not None:
             network = load_torch_model(config.initial, robot=robot.name).network
@@ -299,7 +299,7 @@ class TrainingData:
         return key_states(robot, train.spline.path(control).reshape(-1, robot.dof), config.condition.keys, rng)
 
     def look(self, control: Tensor, conditions: Conditions) -> Tensor:
-        """Return what a model of scene ``clearances`` sees along paths, control points (B, points, dof): (B, F)."""
+        """Return features of a scene ``clearances`` along paths of control points (B, points, dof): shape (B, F)."""
         assert self._batch_encoding is not None
         assert conditions.among is not None
         return self._batch_encoding.along(self._looked_at @ control, conditions.among)
@@ -310,7 +310,7 @@ class TrainingData:
         Args:
             control: Control points, shape (B, points, dof) [rad].
             conditions: Conditions of the paths.
-            places: Where in each of L equal pieces of a path its state is looked at, shape (L,) in 0..1.
+            places: Where in each of L equal pieces of a path its state is sampled, shape (L,) in 0..1.
         """
         assert self._batch_encoding is not None
         assert conditions.among is not None

@@ -36,7 +36,7 @@ TREE_RANGE = 1.0  # longest step of trees [rad]
 TREE_ITERATIONS = 30_000  # of trees, at most
 STRAIGHT_SHARE = 0.2  # largest share of the kept problems that the straight line solves
 PART_LENGTHS = (0.25, 0.9)  # range of the length of a part of a path, as a share of its states
-RESTS = 0.5  # share of the parts that end where their path does
+RESTS = 0.5  # share of the parts that end where their path ends
 DUPLICATE_DISTANCE = 0.1  # a path nearer to another one is not kept [rad, max-norm]
 STRATEGIES = {
     "open": (("perturbation", "perturbation"), ("rrtconnect", "many perturbations")),
@@ -46,8 +46,8 @@ STRATEGIES = {
     "hard": (("rrtconnect", "rrtconnect"), ("many perturbations", "rrtconnect")),
     "extreme": (("rrtconnect", "rrtconnect"), ("many perturbations", "rrtconnect")),
 }
-"""Methods by which paths are searched, for the levels of the hard suites, for open scenes and for broad ones: the first
-ones in turn, and, where none finds a path, the second ones until one does. Chosen by the yield of each method."""
+"""Search methods in two groups, for the levels of the hard suites, for open scenes and for broad ones. The first group
+is tried in turn; where it finds no path, the second is tried until one does. Chosen by the yield of each method."""
 
 
 class PathFinder:

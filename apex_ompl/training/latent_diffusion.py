@@ -18,12 +18,12 @@ from apex_ompl.training.autoencoder import Autoencoder, LinearLatent, Variationa
 from apex_ompl.training.conditions import Conditions
 from apex_ompl.training.networks import ConditionEncoder, MLPDenoiser, UNetDenoiser
 
-COST_STATES = 8  # states of a path at which collisions are looked for
+COST_STATES = 8  # states of a path at which its collision cost is computed
 Look = Callable[[Tensor, Conditions], Tensor]
-"""Returns what a model sees along paths, control points of shape (B, points, dof) [rad], features of shape (B, F)."""
+"""Returns features, shape (B, F), along paths of control points, shape (B, points, dof) [rad]."""
 
 Collide = Callable[[Tensor, Conditions, Tensor], Tensor]
-"""Returns what collisions of paths cost, control points of shape (B, points, dof) [rad], at some places along them."""
+"""Returns the collision cost of paths of control points, shape (B, points, dof) [rad], at some places along them."""
 
 
 class Draws(NamedTuple):
@@ -32,7 +32,7 @@ class Draws(NamedTuple):
     Attributes:
         noise: Standard normal epsilon, shape (B, *latent).
         t: Diffusion steps, shape (B,).
-        places: Where in each of L equal pieces of a path collisions are looked for, shape (L,) in 0..1.
+        places: Where in each of L equal pieces of a path its collision cost is computed, shape (L,) in 0..1.
     """
 
     noise: Tensor
@@ -176,7 +176,7 @@ class LatentDiffusion(nn.Module):
             draws: Noise epsilon and steps t.
             conditions: Conditions g.
             look: Where the denoiser sees its own estimate, returns the features along paths.
-            collide: Returns what the collisions of paths cost.
+            collide: Returns the collision cost of paths.
         """
         noise, t, places = draws
         encoded = self.encoder(conditions)

@@ -28,8 +28,8 @@ class ConditionEncoder(nn.Module):
     With ``scene="none"`` it is the paper's phi: an MLP over the vector g of start, goal and obstacle point. ``set``
     adds the obstacles, each through an MLP and then pooled by mean and maximum, so that their order does not matter
     (Zaheer et al. 2017). ``distances`` adds the positions of the robot's probe points along the straight line
-    from start to goal, and their signed distances to each obstacle and to the nearest one. ``clearances`` sees no
-    obstacles but features of distances, see :mod:`apex_ompl.model.scene_encoding`.
+    from start to goal, and their signed distances to each obstacle and to the nearest one. ``clearances`` takes
+    features of distances instead of obstacles, see :mod:`apex_ompl.model.scene_encoding`.
     """
 
     lower: Tensor
@@ -77,7 +77,7 @@ class ConditionEncoder(nn.Module):
             self.psi = nn.Sequential(*layers, nn.Linear(2 * width, out))
 
     def refine(self, encoded: Tensor, along: Tensor) -> Tensor:
-        """Return encoded conditions, (B, out) or (1, out), with what lies along estimates, features (B, refined)."""
+        """Return encoded conditions, (B, out) or (1, out), refined by features along estimates, (B, refined)."""
         refined: Tensor = encoded + self.psi(along)
         return refined
 
@@ -168,7 +168,7 @@ class MLPDenoiser(nn.Module):
 
 
 class ModulatedBlock(nn.Module):
-    """Residual block: two layers behind a layer normalization, scaled and shifted by step and condition."""
+    """Residual block: two layers after a layer normalization, scaled and shifted by step and condition."""
 
     def __init__(self, width: int, condition: int) -> None:
         """Map ``width`` features to as many."""

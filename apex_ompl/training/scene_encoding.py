@@ -124,13 +124,13 @@ class Obstacles:
 
 
 def pairs_at_a_time(device: torch.device) -> int:
-    """Return how many pairs of a point and an obstacle a device has in memory at a time."""
+    """Return the number of pairs of a point and an obstacle that a device holds in memory at a time."""
     return PAIRS.get(device.type, PAIRS["cpu"])
 
 
 @dataclass(frozen=True, eq=False)
 class Chains:
-    """Joints above probe points.
+    """Joints that move probe points.
 
     Attributes:
         joint: The J joints that move and carry a probe point, parents before children, shape (J,).
@@ -257,7 +257,7 @@ class TorchSceneEncoding:
         return self.tensor(chains.below), self._index(chains.revolute), self.tensor(chains.to_state)
 
     def tensor(self, values: object) -> Tensor:
-        """Return numbers as a tensor where this computes."""
+        """Return numbers as a tensor on its device."""
         return torch.tensor(np.asarray(values, np.float32), device=self._device)
 
     def _index(self, values: object) -> Tensor:
@@ -290,7 +290,7 @@ class TorchSceneEncoding:
         return torch.einsum("nacij,acpj->nacpi", rotation[:, joint], ball[..., :3]) + origin[:, joint][:, :, :, None]
 
     def collision_cost(self, paths: Tensor, obstacles: Obstacles, margin: float) -> tuple[Tensor, Tensor]:
-        """Return how deep the arms are in obstacles along paths of L states, and the gradient of that.
+        """Return the collision cost of the arms along paths of L states, and its gradient.
 
         It is the mean over states, and the sum over balls that contain the arms, of CHOMP's cost of the distance d
         between ball and obstacle (Ratliff et al. 2009): margin / 2 - d inside, (d - margin)^2 / (2 margin) within the
@@ -299,7 +299,7 @@ class TorchSceneEncoding:
         Args:
             paths: States, shape (B, L, dof) [rad].
             obstacles: Obstacles of the B scenes.
-            margin: Distance at which the cost begins [m].
+            margin: Distance from which the cost is positive [m].
 
         Returns:
             Shapes (B,) [m] and (B, L, dof) [m / rad].

@@ -93,7 +93,7 @@ class TorchModel(TrajectoryModel):
         return self.network.probe_offset.device
 
     def one_thread(self) -> AbstractContextManager[None]:
-        """Let torch compute by one thread inside a block."""
+        """Limit torch to one thread inside a block."""
         return one_torch_thread()
 
     def zeros(self, count: int) -> Tensor:
@@ -115,7 +115,7 @@ class TorchModel(TrajectoryModel):
 
     @torch.no_grad()
     def refine(self, condition: Tensor, along: NDArray[np.float32]) -> Tensor:
-        """Return encoded conditions with what lies along estimates of paths, features of shape (B, F)."""
+        """Return encoded conditions refined by features along estimated paths, shape (B, F)."""
         return self.network.encoder.refine(condition, self._tensor(along))
 
     @torch.no_grad()

@@ -90,8 +90,8 @@ class Objective(nn.Module):
         Args:
             network: The model.
             divergence: Weight of the autoencoder's Kullback-Leibler divergence.
-            look: Returns what lies along paths, for a model that sees its own estimate.
-            collide: Returns what the collisions of paths cost; None where they do not count.
+            look: Returns features along paths, for a model that sees its own estimate.
+            collide: Returns the collision cost of paths; None to leave it out.
         """
         super().__init__()
         self.network, self.divergence, self._look, self._collide = network, divergence, look, collide
@@ -117,7 +117,7 @@ class Objective(nn.Module):
 def initial_network(config: TrainingConfig, data: TrainingData, robot: RobotTables) -> LatentDiffusion:
     """Return a model with random weights, with the robot's limits and probe points, and a fitted linear latent space.
 
-    Where the configuration names a checkpoint, all is that of the checkpoint.
+    Where the configuration names a checkpoint, all of these are the checkpoint's.
 
     Args:
         config: Configuration of the run; the same seed gives the same weights.
@@ -125,7 +125,7 @@ def initial_network(config: TrainingConfig, data: TrainingData, robot: RobotTabl
         robot: Kernel tables of the robot.
 
     Raises:
-        ApexError: The checkpoint that the run begins with cannot be read, or is of another architecture.
+        ApexError: The checkpoint that the run starts with cannot be read, or is of another architecture.
     """
     probes, encoding = data.probes, data.scene_encoding
     arms = (0, 0) if encoding is None else encoding.keys.joint.shape
@@ -366,7 +366,7 @@ class Trainer:
         return self._evaluate(self._objective, control, conditions, generator)
 
     def _collide(self, control: Tensor, conditions: Conditions, places: Tensor) -> Tensor:
-        """Return what collisions of paths add to the loss."""
+        """Return the term of the loss that is due to collisions."""
         return self.config.collision * self.data.collide(control, conditions, places)
 
     def _evaluate(
