@@ -19,7 +19,7 @@ from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.files import check_writable, write_atomically
 from apex_ompl.util.validation import whole_number
 
-CLOSE = 200  # the limit on the size is met to one part in this
+CLOSE = 200  # the size is within one part in this of its limit
 
 
 def some(paths: Paths, count: int, seed: int) -> Paths:

@@ -1,6 +1,6 @@
 """Print and plot the statistics of a data set: a folder that generate_data made, or a file of paths.
 
-Writes description.md, figures.png and motions.jpg (some random ones) into a folder.
+Writes description.md, figures.png and motions.jpg (random motions) into a folder.
 
 Usage: python scripts/describe_data.py DATA [--out FOLDER] [--check 200] [--motions 10] [--seed 0]
 """

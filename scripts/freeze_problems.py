@@ -1,10 +1,10 @@
 """Draw the frozen validation and test problems of the suites, find a witness for each, and write their files.
 
-Draws for which no witness is found are dropped and drawn anew. Problems that exist are left alone, since results refer
-to them, and missing ones are added; --replace draws all again.
+Draws for which no witness is found are dropped and drawn anew. Existing problems are kept, since results refer to
+them, and missing ones are added; --replace draws all again.
 --mend finds new witnesses for the problems named, which stay as they are.
 
-Witnesses among obstacles that stand still are found by rrtconnect, and on ``extreme`` by apex, or else by rrtconnect
+Witnesses among static obstacles are found by rrtconnect, and on ``extreme`` by apex, or else by rrtconnect
 with a range of 0.7 rad, each in eight seconds. There they keep half a millimeter of clearance: obstacles are a
 millimeter larger on each side for the planner, and the robot's own distances are looked up along its path.
 On ``unseen`` apex, and else rrtconnect with its tuned range, each have ten seconds.

@@ -211,7 +211,7 @@ def main() -> None:
     )
     parser.add_argument("--cases", metavar="FOLDER", help="solve the problems that --write-cases wrote there")
     parser.add_argument("--quiet", action="store_true", help="show no progress")
-    args = parser.parse_intermixed_args()  # suites may stand behind options
+    args = parser.parse_intermixed_args()  # suites may come after options
     if args.model and (args.cases or args.write_cases):
         parser.error("--model goes with problems that are drawn here")
     if args.split != "train" and not args.write_cases:

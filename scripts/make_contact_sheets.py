@@ -1,6 +1,6 @@
 """Draw a few problems of every suite and level into docs/pictures/suites, a sheet a suite: start, and goal as a ghost.
 
-The sheets of ``broad`` and ``unseen``, a problem a grammar, are drawn where they are named.
+The sheets of ``broad`` and ``unseen``, with one problem for each grammar, are drawn only if they are named.
 
 Usage: python scripts/make_contact_sheets.py [--first 0] [--columns 3] [SUITE ...]
 """

@@ -1,11 +1,13 @@
 """Reproduce the paper: its figures, each with numbers, a table and a picture, and the page that compares them.
 
 ``failure``: failure ratio R_f and smoothness S_r by task, all planners.
-``size``: failure ratio over the size of cubes that stand still, guided and unguided.
+``size``: failure ratio over the size of static cubes, guided and unguided.
 ``time``: planning time; one run at a time, on a machine that does nothing else.
-``dynamic``: failure ratio by task and over size among moving cubes, and what the choices of the loop change.
-``fid``: FID and KID of all algorithms. ``denoising``, ``diversity``: the model at work, drawn.
-``strips``: runs with and without guidance, drawn. ``failures``: a collision, a robot that is stuck, a wrong alignment.
+``dynamic``: failure ratio by task and over size among moving cubes, and the effect of the choices of the loop.
+``fid``: FID and KID of all algorithms.
+``denoising``, ``diversity``: pictures of the denoising steps, and of several proposals.
+``strips``: pictures of runs with and without guidance.
+``failures``: a collision, a robot that is stuck, a wrong alignment.
 ``page``: docs/paper.md, from the results. ``all``: all of these.
 
 Every run is stored in benchmarks/runs when it ends: stop the command at any moment and give it again. ``failure`` and

@@ -1,7 +1,7 @@
 """Make the manifolds of the planner ``damon``: autoencoders of states of the training paths, and their graphs.
 
-Each dimension takes some minutes on one core; folders that are there already are left as they are, so that the command
-goes on where it was stopped.
+Each dimension takes some minutes on one core; existing folders are kept, so that the command resumes where it was
+stopped.
 
 Usage: python scripts/train_damon.py [--dims 2 4 8] [--nodes 20000] [--neighbors 12] [--beta 1e-3] [--again]
 """

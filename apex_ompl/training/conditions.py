@@ -205,16 +205,16 @@ class Augmentation:
 class EncodedPaths:
     """Paths of a data set and their scenes as tensors.
 
-    A path is turned round in one of two cases. What is left of a free path's parts is free, and so is a path among more
-    obstacles, where these are apart from balls around the arms; paths among obstacles drawn and rejected like this have
-    the distribution of paths given that all of them are free.
+    The augmentation reverses a path with probability 1/2. A part of a free path is free, and a path stays free among
+    more obstacles if these do not touch the balls around the arms. Rejecting obstacles that touch them gives samples
+    of paths and scenes conditioned on the paths being free.
 
     Attributes:
         control: Control points, shape (N, points, dof), float32 [rad].
     """
 
     def __init__(self, paths: Paths, encoding: TorchSceneEncoding, augmentation: Augmentation | None) -> None:
-        """Put paths where ``encoding`` compute; without an augmentation they stay as they are.
+        """Copy paths to the device of ``encoding``; without an augmentation they stay as they are.
 
         Raises:
             DatasetError: Held objects have no extents.
@@ -293,7 +293,7 @@ class EncodedPaths:
         return torch.rand(*shape, generator=generator).to(self.control.device)
 
     def _varied(self, control: Tensor, generator: torch.Generator) -> Tensor:
-        """Return paths, some of them turned round, and of some a part."""
+        """Return paths, some of them reversed, and some replaced by a part."""
         assert self._augmentation is not None
         count = len(control)
         turned, taken, length, first, rests = self._uniform(generator, 5, count)

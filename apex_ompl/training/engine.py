@@ -107,7 +107,7 @@ class PathFinder:
         return self.points.get(q.tobytes())
 
     def optimize_perturbations(self, rng: np.random.Generator, *, line: bool, many: bool) -> Array | None:
-        """Return the control points of a valid path, optimized from random perturbations of the straight line.
+        """Return the control points of a valid path, optimized from perturbed straight lines, or None.
 
         Args:
             rng: Source of the perturbations.

@@ -50,11 +50,11 @@ class Obstacles:
         return found
 
     def part(self, which: slice) -> Obstacles:
-        """Return some of them."""
+        """Return a slice of the obstacles."""
         return self.chosen(which, self.owner[which])
 
     def chosen(self, which: Tensor | slice, owner: Tensor) -> Obstacles:
-        """Return some of them by their indices, for scenes of theirs."""
+        """Return obstacles by their indices, with given owners."""
         columns = (self.shape, self.position, self.rotation, self.size)
         shape, position, rotation, size = (column[which] for column in columns)
         return Obstacles(shape, position, rotation, size, owner)
@@ -146,7 +146,7 @@ class Chains:
 
     @classmethod
     def of(cls, robot: RobotTables, probe_joint: NDArray[np.int64]) -> Chains:
-        """Return the joints of a robot above probe points, which are fixed to joints of shape (P,)."""
+        """Return the joints of a robot that move probe points, which are fixed to joints of shape (P,)."""
         a = robot.arrays
         chains = []
         for carrier in probe_joint.tolist():
