@@ -91,12 +91,12 @@ def test_whoever_is_late_and_comes_to_rest_at_the_goal_has_reached_it() -> None:
 
 @pytest.mark.parametrize(
     ("given", "words"),
-    [({"planner": "apx"}, "way of replanning 'apx', did you mean 'apex'"), ({"clock": "rel"}, "clock 'rel'"),
+    [({"planner": "apx"}, "replanner 'apx', did you mean 'apex'"), ({"clock": "rel"}, "clock 'rel'"),
      ({"prediction": "cvv"}, "prediction 'cvv'"), ({"problem": "popup/vertical/larg/12"}, "size of cubes 'larg'"),
      ({"problem": "nothing"}, "world 'nothing'"), ({"problem": "no/such/file.yaml"}, "no/such/file.yaml"),
      ({"speed": 0.0}, "velocity_scale|speed"), ({"speed": NAN}, "velocity_scale|speed"),
      ({"speed": -1.0}, "velocity_scale|speed"), ({"speed": 1.5}, "velocity_scale|speed"), ({"seed": -1}, "seed"),
-     ({"seed": 0.5}, "seed"), ({"planner": 5}, "unknown way of replanning 5"), ({"clock": None}, "unknown clock None"),
+     ({"seed": 0.5}, "seed"), ({"planner": 5}, "unknown replanner 5"), ({"clock": None}, "unknown clock None"),
      ({"prediction": []}, "unknown prediction"), ({"settings": 5}, "settings: expected a LoopSettings, got 5"),
      ({"speed": 10**400}, "velocity_scale")],
 )  # fmt: skip

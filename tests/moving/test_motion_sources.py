@@ -26,7 +26,7 @@ def ready() -> Ready:
 
 
 def search_of(ready: Ready, *, slower: float = 1.5, conflict: float = np.inf) -> Search:
-    """A replan 0.3 s behind the begin of the straight motion to the goal, made slower."""
+    """A replan 0.3 s after the start of the straight motion to the goal, made slower."""
     motion = line_from(ready, Start.at_rest(ready.setup.start), ready.goals[0]).slower(slower)
     one, dynamic = Following(motion, 0.0, to_goal=True), DynamicObstacles([FAR])
     request = Request(1, 0.25, 0.3, one, one, dynamic, 0.0, (FAR,), conflict, 0)
@@ -62,7 +62,7 @@ def test_a_path_along_which_nothing_strays_is_the_direct_motion(ready: Ready) ->
 
 
 def test_splines_from_a_moving_start_need_little_more_time_than_the_direct_motion(ready: Ready) -> None:
-    """With states at even times as control points one knot spacing apart from the begin on; 4 times it otherwise."""
+    """With states at even times as control points one knot spacing apart, from the start; 4 times it otherwise."""
     search, goal = search_of(ready), ready.goals[0]
     direct = search.direct(goal)
     assert direct is not None
