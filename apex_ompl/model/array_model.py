@@ -204,8 +204,8 @@ class ArrayModel(TrajectoryModel):
             distances = signed_distances(obstacles.shape, position, rotation, size, points)
             distances = np.clip(distances, -MAX_DISTANCE, MAX_DISTANCE) / np.float32(MAX_DISTANCE)
             parts += [(probes - center).ravel(), distances.min(axis=0, initial=1.0)]
-            looked_at = distances.reshape(-1, along, count)[:, [0, along // 2, -1]]
-            inputs.append(looked_at.reshape(-1, 3 * count))
+            few = distances.reshape(-1, along, count)[:, [0, along // 2, -1]]
+            inputs.append(few.reshape(-1, 3 * count))
         tokens = np.concatenate(inputs, axis=1)
         tokens = _silu(self._linear("encoder.thing.0", tokens))
         tokens = self._linear("encoder.thing.4", _silu(self._linear("encoder.thing.2", tokens)))
@@ -253,7 +253,7 @@ def weight_shapes(config: ModelConfig) -> dict[str, tuple[int, ...]]:
     if condition.scene == "distances":
         size += 4 * condition.along * config.probes
     hidden = 2 * condition.width
-    layers.append(("encoder.phi.0", size + config.seen, hidden))
+    layers.append(("encoder.phi.0", size + config.scene_features, hidden))
     if condition.scene == "clearances":
         layers += [("encoder.phi.2", hidden, hidden), ("encoder.phi.4", hidden, condition.out)]
     else:

@@ -98,7 +98,7 @@ class TrajectoryModel(ABC):
         self.schedule = NoiseSchedule(config.noise.steps, config.noise.schedule)
         self.scene_encoding = SceneEncoding(KeyStates.of(**keys), probes, config.condition.hands) if keys else None
         self.sampling = Sampling(**config.sampling.model_dump())
-        self._looked_at = self.spline.basis(probes.shares)
+        self._along_basis = self.spline.basis(probes.shares)
 
     def __repr__(self) -> str:
         """Return the robot, the size of the paths, and the kind of scene encoding."""
@@ -244,11 +244,11 @@ class TrajectoryModel(ABC):
                 with clock.within("guidance"):
                     return self.score(clean, kernel, ends, sampling.guidance)
 
-            def look(clean: Numbers) -> Numbers:
+            def refined(clean: Numbers) -> Numbers:
                 return self.refine(condition, self._along(queries, kernel, self.control(clean, ends)))
 
-            seen = look if self.config.condition.refined else None
-            predict = self._predict(condition, seen, known)
+            refine = refined if self.config.condition.refined else None
+            predict = self._predict(condition, refine, known)
             predict = guided(predict, score, self.schedule, sampling.guidance, self.config.noise.most)
             times = self.schedule.timesteps(sampling.steps, top)
             extra: dict[str, Any] = {} if callback is None else {"callback": callback}
@@ -267,27 +267,29 @@ class TrajectoryModel(ABC):
         """Return the features along paths, as many of each query: shape (B, features)."""
         assert self.scene_encoding is not None
         limits, each = kernel.robot.arrays, len(control) // len(queries)
-        paths = product(self._looked_at, np.clip(control, limits.lower, limits.upper))
+        paths = product(self._along_basis, np.clip(control, limits.lower, limits.upper))
         rows = [
-            self.scene_encoding.along(kernel, paths[k * each : (k + 1) * each], *query.seen())
+            self.scene_encoding.along(kernel, paths[k * each : (k + 1) * each], *query.obstacle_tables())
             for k, query in enumerate(queries)
         ]
         return np.concatenate(rows)
 
-    def _predict(self, condition: Numbers, look: Callable[[Numbers], Numbers] | None, known: Numbers | None) -> Predict:
+    def _predict(
+        self, condition: Numbers, refine: Callable[[Numbers], Numbers] | None, known: Numbers | None
+    ) -> Predict:
         """Return the denoiser as samplers call it.
 
         Args:
             condition: Encoded conditions.
-            look: For a model that sees its estimates, returns conditions refined by features along their paths.
+            refine: For a model that sees its estimates, returns conditions refined by features along their paths.
             known: Clean samples that take the place of the first estimate.
         """
         noise, last = self.config.noise, known
 
         def predict(sample: Numbers, t: int) -> Estimate:
             nonlocal last
-            seen = condition if look is None or last is None else look(last)
-            output = self.denoise(sample, t, seen)
+            refined = condition if refine is None or last is None else refine(last)
+            output = self.denoise(sample, t, refined)
             estimate = self.schedule.estimate(noise.prediction, sample, output, t)
             last = estimate.clean
             return self.schedule.clipped(estimate, sample, t, noise.most)

@@ -138,7 +138,7 @@ class Query:
         assert self.scene is not None
         return ObstacleSet.from_scene(*self.scene)
 
-    def seen(self) -> tuple[SceneTables, Flags | None]:
+    def obstacle_tables(self) -> tuple[SceneTables, Flags | None]:
         """Return tables of the obstacles, and a flag for each of their solids that is no fixture; None for all."""
         return (self.obstacles.tables(), None) if self.scene is None else self.scene
 

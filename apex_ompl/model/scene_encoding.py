@@ -162,10 +162,10 @@ class SceneEncoding:
         balls, shares = self.balls(kernel), self.probes.shares[:, None]
         rows = []
         for query in queries:
-            scene, seen = query.seen()
+            scene, chosen = query.obstacle_tables()
             line = query.start + shares * (np.asarray(query.goal) - query.start)
-            along = self.along(kernel, line[None], scene, seen)[0]
-            rows.append(np.concatenate([self.at_keys(balls, scene, seen), along, self.held(query.held)]))
+            along = self.along(kernel, line[None], scene, chosen)[0]
+            rows.append(np.concatenate([self.at_keys(balls, scene, chosen), along, self.held(query.held)]))
         return np.array(rows, np.float32)
 
     def balls(self, kernel: Kernel) -> Array:
@@ -177,12 +177,12 @@ class SceneEncoding:
         return kept[1]
 
     @staticmethod
-    def at_keys(balls: Array, scene: SceneTables, seen: Flags | None) -> NDArray[np.float32]:
+    def at_keys(balls: Array, scene: SceneTables, chosen: Flags | None) -> NDArray[np.float32]:
         """Return the features of key states, shape (K * A,), whose balls :meth:`KeyStates.placed` gives."""
-        found = group_clearances(scene, balls, KEY_RANGE, seen)
+        found = group_clearances(scene, balls, KEY_RANGE, chosen)
         return (np.maximum(found, -KEY_RANGE) / KEY_RANGE).astype(np.float32)
 
-    def along(self, kernel: Kernel, paths: Array, scene: SceneTables, seen: Flags | None) -> NDArray[np.float32]:
+    def along(self, kernel: Kernel, paths: Array, scene: SceneTables, chosen: Flags | None) -> NDArray[np.float32]:
         """Return the features along paths of L states each, shape (B, L, dof) [rad]: shape (B, features).
 
         Of the kernel only the kinematics are used.
@@ -191,7 +191,7 @@ class SceneEncoding:
         frames = rotation, origin = kernel.joint_frames(paths.reshape(-1, paths.shape[-1]))
         points = np.einsum("npij,pj->npi", rotation[:, probes.joint], probes.offset, order="C")
         points += origin[:, probes.joint]
-        distances, gradients = nearest_points(scene, points.reshape(-1, 3), MAX_DISTANCE, seen)
+        distances, gradients = nearest_points(scene, points.reshape(-1, 3), MAX_DISTANCE, chosen)
         found = distances.reshape(points.shape[:2]), gradients.reshape(points.shape)
         pushed = kernel.joint_pushes(frames, probes.joint, points, found, REACH)
         near = np.maximum(distances, -MAX_DISTANCE) / MAX_DISTANCE

@@ -42,7 +42,7 @@ class Conditions:
         rotation: Rotation matrices, shape (B, M, 3, 3).
         size: Half edges; radius; or radius and half length along z, shape (B, M, 3) [m].
         mask: True for an obstacle, False for padding, shape (B, M).
-        seen: Features of a :class:`SceneEncoding`, shape (B, F); with them, obstacles and probe points are left out.
+        features: Those of a :class:`SceneEncoding`, shape (B, F); with them, obstacles and probe points are left out.
         among: The obstacles of such conditions, for models that compute features along their own estimates.
     """
 
@@ -55,7 +55,7 @@ class Conditions:
     rotation: Tensor
     size: Tensor
     mask: Tensor
-    seen: Tensor
+    features: Tensor
     among: Obstacles | None = field(default=None, kw_only=True)
 
     def to(self, device: torch.device | str) -> Conditions:
@@ -139,13 +139,13 @@ def batch_queries(queries: Sequence[Query], encoding: Probes | SceneEncoding, ke
 
 
 def conditions_of_features(
-    seen: Tensor, start: Tensor, goal: Tensor, point: Tensor, *, among: Obstacles | None = None
+    features: Tensor, start: Tensor, goal: Tensor, point: Tensor, *, among: Obstacles | None = None
 ) -> Conditions:
     """Return conditions with the features of a scene encoding, shape (B, F), and with no obstacles but ``among``."""
     count, none = len(start), start.new_empty(len(start), 0, 3)
     shape, mask = (start.new_zeros(count, 0, dtype=kind) for kind in (torch.int64, torch.bool))
     turns = start.new_empty(count, 0, 3, 3)
-    return Conditions(start, goal, point, turns, shape, none, turns, none, mask, seen, among=among)
+    return Conditions(start, goal, point, turns, shape, none, turns, none, mask, features, among=among)
 
 
 class ConditionTable:
@@ -252,10 +252,10 @@ class EncodedPaths:
         step = 4096
         for k in range(0, count, step):
             some = obstacles.part(slice(k, k + step))
-            seen = self._encoding.at_keys(some)
-            found.scatter_reduce_(0, some.owner[:, None].expand_as(seen), seen.float(), "amin")
+            by_obstacle = self._encoding.at_keys(some)
+            found.scatter_reduce_(0, some.owner[:, None].expand_as(by_obstacle), by_obstacle.float(), "amin")
             if keep:
-                kept[k : k + step] = seen
+                kept[k : k + step] = by_obstacle
         return found.half(), kept
 
     def batch(self, which: Tensor, generator: torch.Generator) -> tuple[Tensor, Conditions]:
@@ -286,8 +286,8 @@ class EncodedPaths:
         line = start[:, None] + self._along[:, None] * (goal - start)[:, None]
         owner, place = mask.nonzero(as_tuple=True)
         among = self._obstacles.chosen(index[owner, place], owner)
-        seen = torch.cat([at_keys, encoding.along(line, among), held], dim=1)
-        return control, conditions_of_features(seen, start, goal, self._point[which], among=among)
+        features = torch.cat([at_keys, encoding.along(line, among), held], dim=1)
+        return control, conditions_of_features(features, start, goal, self._point[which], among=among)
 
     def _uniform(self, generator: torch.Generator, *shape: int) -> Tensor:
         return torch.rand(*shape, generator=generator).to(self.control.device)

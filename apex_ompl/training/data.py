@@ -279,7 +279,7 @@ class TrainingData:
             kind = KernelSceneEncoding if self._device.type == "cpu" else TorchSceneEncoding
             self._batch_encoding = kind(self.scene_encoding, self._kernel, self._device)
             self._spline = train.spline
-            self._looked_at = self._batch_encoding.tensor(self._spline.basis(self.probes.shares))
+            self._along_basis = self._batch_encoding.tensor(self._spline.basis(self.probes.shares))
         encoding = self._batch_encoding or self.probes
         if self.validation is None:
             few = split(paths, min(config.held_out, VALIDATION_SHARE))[1]  # the same problems for every larger share
@@ -298,13 +298,13 @@ class TrainingData:
         control = train.control(np.sort(rng.integers(len(train), size=min(KEY_PATHS, len(train)))))
         return key_states(robot, train.spline.path(control).reshape(-1, robot.dof), config.condition.keys, rng)
 
-    def look(self, control: Tensor, conditions: Conditions) -> Tensor:
+    def features_along(self, control: Tensor, conditions: Conditions) -> Tensor:
         """Return features of a scene ``clearances`` along paths of control points (B, points, dof): shape (B, F)."""
         assert self._batch_encoding is not None
         assert conditions.among is not None
-        return self._batch_encoding.along(self._looked_at @ control, conditions.among)
+        return self._batch_encoding.along(self._along_basis @ control, conditions.among)
 
-    def collide(self, control: Tensor, conditions: Conditions, places: Tensor) -> Tensor:
+    def collision_cost(self, control: Tensor, conditions: Conditions, places: Tensor) -> Tensor:
         """Return the mean :meth:`TorchSceneEncoding.collision_cost` of some of the paths [m].
 
         Args:

@@ -19,10 +19,10 @@ from apex_ompl.training.conditions import Conditions
 from apex_ompl.training.networks import ConditionEncoder, MLPDenoiser, UNetDenoiser
 
 COST_STATES = 8  # states of a path at which its collision cost is computed
-Look = Callable[[Tensor, Conditions], Tensor]
+FeaturesAlong = Callable[[Tensor, Conditions], Tensor]
 """Returns features, shape (B, F), along paths of control points, shape (B, points, dof) [rad]."""
 
-Collide = Callable[[Tensor, Conditions, Tensor], Tensor]
+CollisionCost = Callable[[Tensor, Conditions, Tensor], Tensor]
 """Returns the collision cost of paths of control points, shape (B, points, dof) [rad], at some places along them."""
 
 
@@ -111,7 +111,7 @@ class LatentDiffusion(nn.Module):
             self.autoencoder = VariationalLatent(spline, dof, latent.channels, latent.width, latent.halvings)
         self.encoder = ConditionEncoder(
             dof, out=condition.out, width=condition.width, scene=condition.scene, point=condition.point,
-            probes=config.probes, along=condition.along, seen=config.seen,
+            probes=config.probes, along=condition.along, scene_features=config.scene_features,
             refined=config.along_size if condition.refined else 0,
         )  # fmt: skip
         latent_shape, net = self.autoencoder.latent, config.denoiser
@@ -161,8 +161,8 @@ class LatentDiffusion(nn.Module):
         return Draws(noise, t, torch.rand(COST_STATES, generator=generator))
 
     def loss(
-        self, clean: Tensor, draws: Draws, conditions: Conditions, look: Look | None = None,
-        collide: Collide | None = None,
+        self, clean: Tensor, draws: Draws, conditions: Conditions, features_along: FeaturesAlong | None = None,
+        collision_cost: CollisionCost | None = None,
     ) -> Tensor:  # fmt: skip
         """Return the mean square error of the denoiser (equation 5 of the paper).
 
@@ -175,8 +175,8 @@ class LatentDiffusion(nn.Module):
             clean: Latent vectors z_0 of data, shape (B, *latent).
             draws: Noise epsilon and steps t.
             conditions: Conditions g.
-            look: Where the denoiser sees its own estimate, returns the features along paths.
-            collide: Returns the collision cost of paths.
+            features_along: Where the denoiser sees its own estimate, returns the features along paths.
+            collision_cost: Returns the collision cost of paths.
         """
         noise, t, places = draws
         encoded = self.encoder(conditions)
@@ -184,17 +184,17 @@ class LatentDiffusion(nn.Module):
             return nn.functional.mse_loss(self.denoise(torch.zeros_like(clean), torch.zeros_like(t), encoded), clean)
         first, single = None, torch.autocast(clean.device.type, enabled=False)  # for paths, half precision is coarse
         if self.config.condition.refined:
-            assert look is not None
+            assert features_along is not None
             first, estimate = self._error(clean, noise, torch.maximum(t, t.roll(1)), encoded)
             with torch.no_grad(), single:
-                along = look(self._decoded(estimate, conditions), conditions)
+                along = features_along(self._decoded(estimate, conditions), conditions)
             encoded = self.encoder.refine(encoded, along)
         error, estimate = self._error(clean, noise, t, encoded)
         error = error if first is None else 0.5 * (first + error)
-        if collide is None:
+        if collision_cost is None:
             return error
         with single:
-            return error + collide(self._decoded(estimate, conditions), conditions, places)
+            return error + collision_cost(self._decoded(estimate, conditions), conditions, places)
 
     def _decoded(self, latent: Tensor, conditions: Conditions) -> Tensor:
         """Return the control points of latent vectors, inside the limits."""

@@ -37,8 +37,8 @@ class ConditionEncoder(nn.Module):
     center: Tensor
 
     def __init__(
-        self, dof: int, *, out: int, width: int, scene: str, point: bool, probes: int, along: int, seen: int = 0,
-        refined: int = 0,
+        self, dof: int, *, out: int, width: int, scene: str, point: bool, probes: int, along: int,
+        scene_features: int = 0, refined: int = 0,
     ) -> None:  # fmt: skip
         """Make an encoder.
 
@@ -50,7 +50,7 @@ class ConditionEncoder(nn.Module):
             point: Whether the obstacle point is an input.
             probes: Number P of probe points.
             along: Number L of states of the straight line at which they are placed.
-            seen: Number of features of ``clearances``.
+            scene_features: Number of features of ``clearances``.
             refined: Number of features along an estimate that :meth:`refine` sees; 0 where there are none.
         """
         super().__init__()
@@ -69,7 +69,7 @@ class ConditionEncoder(nn.Module):
             size += 4 * along * probes
         inner: list[nn.Module] = []
         if scene == "clearances":
-            size += seen
+            size += scene_features
             inner = [nn.Linear(2 * width, 2 * width), nn.SiLU()]
         self.phi = nn.Sequential(nn.Linear(size, 2 * width), nn.SiLU(), *inner, nn.Linear(2 * width, out))
         if refined:
@@ -94,7 +94,7 @@ class ConditionEncoder(nn.Module):
             parts.append(conditions.point - self.center)
         if self.scene in OBSTACLE_SCENES:
             parts += self._obstacle_features(conditions)
-        parts.append(conditions.seen)
+        parts.append(conditions.features)
         encoded: Tensor = self.phi(torch.cat(parts, dim=1))
         return encoded
 

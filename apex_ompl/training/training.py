@@ -26,7 +26,7 @@ from apex_ompl.training.conditions import Conditions
 from apex_ompl.training.config import TrainingConfig
 from apex_ompl.training.data import TrainingData
 from apex_ompl.training.kernel_problems import KernelProblem, success_rates
-from apex_ompl.training.latent_diffusion import Collide, Draws, LatentDiffusion, Look
+from apex_ompl.training.latent_diffusion import CollisionCost, Draws, FeaturesAlong, LatentDiffusion
 from apex_ompl.training.run_files import EXPECTED, STATE, RunLog, read_state, write_state
 from apex_ompl.training.torch_model import TorchModel, load_torch_model, save_model
 from apex_ompl.util.files import check_writable, is_file
@@ -83,18 +83,23 @@ class Objective(nn.Module):
     """Loss of a phase: the negative ELBO of the autoencoder, or the mean square error of the denoiser."""
 
     def __init__(
-        self, network: LatentDiffusion, divergence: float, look: Look | None = None, collide: Collide | None = None
+        self,
+        network: LatentDiffusion,
+        divergence: float,
+        features_along: FeaturesAlong | None = None,
+        collision_cost: CollisionCost | None = None,
     ) -> None:
         """Train a model.
 
         Args:
             network: The model.
             divergence: Weight of the autoencoder's Kullback-Leibler divergence.
-            look: Returns features along paths, for a model that sees its own estimate.
-            collide: Returns the collision cost of paths; None to leave it out.
+            features_along: Returns features along paths, for a model that sees its own estimate.
+            collision_cost: Returns the collision cost of paths; None to leave it out.
         """
         super().__init__()
-        self.network, self.divergence, self._look, self._collide = network, divergence, look, collide
+        self.network, self.divergence = network, divergence
+        self._features_along, self._collision_cost = features_along, collision_cost
 
     def forward(self, phase: str, control: Tensor, conditions: Conditions, draws: Draws) -> Tensor:
         """Return the loss of a batch of paths.
@@ -111,7 +116,7 @@ class Objective(nn.Module):
             return autoencoder.loss(control, draws.noise, self.divergence)[0]
         with torch.no_grad(), torch.autocast(control.device.type, enabled=False):
             clean = autoencoder.encode(control)
-        return self.network.loss(clean, draws, conditions, self._look, self._collide)
+        return self.network.loss(clean, draws, conditions, self._features_along, self._collision_cost)
 
 
 def initial_network(config: TrainingConfig, data: TrainingData, robot: RobotTables) -> LatentDiffusion:
@@ -222,8 +227,8 @@ class Trainer:
         if is_file(folder / STATE):
             self._load_state()
         self._runlog = RunLog(folder, self.progress) if process.rank == 0 else None
-        collide = self._collide if config.collision else None
-        objective = Objective(self.network, config.autoencoder.divergence, self.data.look, collide)
+        collision_cost = self._collision_cost if config.collision else None
+        objective = Objective(self.network, config.autoencoder.divergence, self.data.features_along, collision_cost)
         self._objective: nn.Module = objective
         if process.world_size > 1:
             self._objective = nn.parallel.DistributedDataParallel(objective, find_unused_parameters=True)
@@ -365,9 +370,9 @@ class Trainer:
         control, conditions = shard.batch(which, generator)
         return self._evaluate(self._objective, control, conditions, generator)
 
-    def _collide(self, control: Tensor, conditions: Conditions, places: Tensor) -> Tensor:
+    def _collision_cost(self, control: Tensor, conditions: Conditions, places: Tensor) -> Tensor:
         """Return the term of the loss that is due to collisions."""
-        return self.config.collision * self.data.collide(control, conditions, places)
+        return self.config.collision * self.data.collision_cost(control, conditions, places)
 
     def _evaluate(
         self, objective: nn.Module, control: Tensor, conditions: Conditions, generator: torch.Generator
@@ -392,7 +397,7 @@ class Trainer:
             generator = torch.Generator().manual_seed(self.config.seed)
             which = torch.randperm(len(validation), generator=generator)[:VALIDATION_PATHS].sort().values
             control, conditions = validation.batch(which.numpy(), generator)
-            objective = Objective(network, self.config.autoencoder.divergence, self.data.look)
+            objective = Objective(network, self.config.autoencoder.divergence, self.data.features_along)
             with torch.no_grad():
                 held_out = self._evaluate(objective, control, conditions, generator)
             row["held_out"] = f"{float(held_out):.6f}"

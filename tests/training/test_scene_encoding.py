@@ -74,9 +74,9 @@ def test_key_states_are_apart_and_survive_half_precision() -> None:
 def test_features_along_the_line_are_distances_of_the_probes(encoding: SceneEncoding) -> None:
     mine = query(3)
     found = encoding.features([mine], kernel())[0]
-    assert found.shape == (model_config(**CLEARANCES).seen,)
+    assert found.shape == (model_config(**CLEARANCES).scene_features,)
     points = encoding.probes.positions(kernel(), mine.start[None], mine.goal[None])[0].reshape(-1, 3)
-    scene, _ = mine.seen()
+    scene, _ = mine.obstacle_tables()
     count, keyed = len(points), keys().state.shape[0] * 2
     distances = found[keyed + 3 * count : keyed + 4 * count] * MAX_DISTANCE
     slopes = found[keyed + 4 * count : keyed + 7 * count].reshape(-1, 3)
@@ -170,7 +170,7 @@ def test_features_of_a_table_are_those_of_queries(encoding: SceneEncoding) -> No
         extents = [held_extents(some.names["held"][h]) for h in held]
         asked = [replace(query_from_path(some, int(k)), held=e) for k, e in zip(which, extents, strict=True)]
         wanted = batch_queries(asked, encoding, kernel())
-        np.testing.assert_allclose(found.seen.numpy(), wanted.seen.numpy(), atol=3e-4)
+        np.testing.assert_allclose(found.features.numpy(), wanted.features.numpy(), atol=3e-4)
         np.testing.assert_allclose(found.start.numpy(), wanted.start.numpy(), atol=1e-6)
 
 

@@ -211,7 +211,7 @@ def test_parts_are_on_their_paths_and_paths_turn_round(varied: EncodedPaths) -> 
 def test_the_same_generator_gives_the_same_batch(varied: EncodedPaths) -> None:
     which = torch.arange(40)
     first, second, other = (varied.batch(which, torch.Generator().manual_seed(k)) for k in (3, 3, 4))
-    assert torch.equal(first[0], second[0]) and torch.equal(first[1].seen, second[1].seen)
+    assert torch.equal(first[0], second[0]) and torch.equal(first[1].features, second[1].features)
     assert not torch.equal(first[0], other[0])
 
 

@@ -103,9 +103,10 @@ def test_estimates_of_a_model_that_pays_for_collisions_have_fewer(few: Path, tmp
         trainer.run()
         data, generator, network = trainer.data, torch.Generator().manual_seed(0), trainer.averaged_network()
         control, conditions = data.shard.batch(np.arange(len(data.shard)), generator)
-        batch = network.autoencoder.encode(control), network.draws(len(control), generator), conditions, data.look
+        clean, draws = network.autoencoder.encode(control), network.draws(len(control), generator)
+        batch = clean, draws, conditions, data.features_along
         with torch.no_grad():
-            costs.append(float(network.loss(*batch, data.collide) - network.loss(*batch)))
+            costs.append(float(network.loss(*batch, data.collision_cost) - network.loss(*batch)))
     assert costs[1] < 0.8 * costs[0]
 
 
