@@ -74,7 +74,7 @@ def main() -> None:
     parser.add_argument("folder", type=Path, metavar="FOLDER")
     parser.add_argument("file", type=Path, metavar="FILE.zip")
     parser.add_argument("--mib", type=mebibytes, default=24.0, help="largest size (default: %(default)s)")
-    parser.add_argument("--seed", type=whole_number, default=0, help="of the random choice (default: %(default)s)")
+    parser.add_argument("--seed", type=whole_number, default=0, help="seed of the random choice (default: %(default)s)")
     args = parser.parse_args()
     compact(args)
 

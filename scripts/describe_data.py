@@ -39,7 +39,7 @@ def table(figures: list[records.LevelStatistics]) -> str:
 
 
 def checked(paths: Paths, which: np.ndarray) -> str:
-    """Return a sentence on how many of some stored paths pass the full check."""
+    """Return a sentence with the number of given stored paths that pass the full check."""
     control, spline, good = paths.control(which), paths.spline, 0
     for k, points in zip(which, control, strict=True):
         ready = assemble(problems.load(paths.problem_name(int(paths.arrays["problem"][k]))), robot())
@@ -127,12 +127,14 @@ def main() -> None:
     """Read the command line."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("data", type=Path, metavar="DATA")
-    parser.add_argument("--out", type=Path, default=Path(), help="folder (default: this one)")
+    parser.add_argument("--out", type=Path, default=Path(), help="folder of the results (default: the current one)")
     parser.add_argument(
         "--check", type=whole_number, default=200, help="paths that are proved again (default: %(default)s)"
     )
-    parser.add_argument("--motions", type=one_or_more, default=MOTIONS, help="that are drawn (default: %(default)s)")
-    parser.add_argument("--seed", type=whole_number, default=0, help="of the random choices (default: %(default)s)")
+    parser.add_argument(
+        "--motions", type=one_or_more, default=MOTIONS, help="motions that are drawn (default: %(default)s)"
+    )
+    parser.add_argument("--seed", type=whole_number, default=0, help="seed of the choices (default: %(default)s)")
     args = parser.parse_args()
     describe(args)
 

@@ -33,8 +33,8 @@ def main() -> None:
     """Read the command line."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("run", type=Path, metavar="RUN", help="folder of a training run, or a checkpoint")
-    parser.add_argument("name", metavar="NAME", help="for example apex")
-    parser.add_argument("--bits", type=int, choices=(8, 16), default=16, help="of a weight (default: %(default)s)")
+    parser.add_argument("name", metavar="NAME", help="name of the checkpoint, for example apex")
+    parser.add_argument("--bits", type=int, choices=(8, 16), default=16, help="bits of a weight (default: %(default)s)")
     args = parser.parse_args()
     export(args.run, args.name, args.bits)
 

@@ -180,7 +180,7 @@ def is_complete(level: tuple[str, str]) -> bool:
 
 
 def freeze(level: tuple[str, str], anew: bool) -> tuple[dict[int, FrozenProblem], int, float]:
-    """Return the frozen problems of a suite and level by seed, how many draws had no witness, and the time taken.
+    """Return the frozen problems of a level by seed, the number of draws without a witness, and the time taken.
 
     Those that exist are kept, unless all are to be drawn anew.
     """
@@ -193,7 +193,7 @@ def freeze(level: tuple[str, str], anew: bool) -> tuple[dict[int, FrozenProblem]
 
 
 def freeze_problem(problem_id: ProblemId) -> tuple[FrozenProblem, int]:
-    """Return the first draw of a problem with a witness, and how many draws before it had none."""
+    """Return the first draw of a problem with a witness, and the number of draws before it."""
     number, dropped = -1, 0
     while True:
         number, drawn = first_drawn(problem_id, number)
@@ -230,8 +230,8 @@ def main() -> None:
     """Freeze the levels named, or all that are missing."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("levels", nargs="*", metavar="SUITE/LEVEL")
-    parser.add_argument("--replace", action="store_true", help="draw problems again that exist")
-    parser.add_argument("--mend", action="store_true", help="find new witnesses for the problems named")
+    parser.add_argument("--replace", action="store_true", help="draw existing problems again, too")
+    parser.add_argument("--mend", action="store_true", help="find new witnesses for the named problems")
     parser.add_argument("--jobs", type=one_or_more, default=2)
     args = parser.parse_args()
     if args.mend:

@@ -48,7 +48,7 @@ FIGURES = {
     "denoising": ("model_pictures", 1, "problems"),
     "diversity": ("model_pictures", 12, "trajectories"),
 }
-"""Module of each figure, in the order of ``all``, and how much of what is measured by default."""
+"""Module of each figure, in the order of ``all``, with the default number of problems or runs and its unit."""
 ALL, PAGE = "all", "page"
 
 
@@ -57,7 +57,7 @@ def parsed() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("figure", choices=(ALL, *FIGURES, PAGE))
     usual = "; ".join(f"{name}: {n} {what}" for name, (_, n, what) in FIGURES.items())
-    parser.add_argument("-n", type=one_or_more, help=f"how many, of a figure (defaults: {usual})")
+    parser.add_argument("-n", type=one_or_more, help=f"number of problems or runs of a figure (defaults: {usual})")
     parser.add_argument("--jobs", type=one_or_more, default=2, help="runs at a time, except for time (default: 2)")
     parser.add_argument("--keep", type=Path, default=ROOT / "benchmarks" / "runs", metavar="FOLDER", help="for runs")
     parser.add_argument("-o", "--out", type=Path, default=ROOT / "benchmarks" / "results", metavar="FOLDER")
