@@ -21,8 +21,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from apex_ompl.goals.cover_clearance import scene_kernel
-from apex_ompl.goals.hand_poses import HandPoseSampler, Interval
+from apex_ompl.goals.state_sampling import HandPoseSampler, Interval, scene_kernel
 from apex_ompl.kernel import Kernel, RobotTables
 from apex_ompl.problems import alignment
 from apex_ompl.problems.broad_furniture import (

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from apex_ompl.goals.hand_poses import Direction
+from apex_ompl.goals.state_sampling import Direction
 from apex_ompl.problems.broad_parts import (
     CAPSULE,
     FLOATING,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cache
 
-from apex_ompl.goals.hand_poses import DualArmTables
+from apex_ompl.goals.state_sampling import DualArmTables
 from apex_ompl.problems.broad_representation import Group, given
 from apex_ompl.robot import Robot, load_robot
 from apex_ompl.scene.bodies import AttachedObject, Obstacle
