@@ -93,7 +93,7 @@ class PlanResult:
         proved_by_spheres: Share of the path's length that sphere covers proved; exact shapes proved the rest.
         checks: Number of states checked one by one; those inside proved stretches of motions do not count.
         solved_by: What found the path: the planner's name, or the stage of apex that did (see
-            ``apex_ompl.ompl.report.SolveReport``), with ``+repair`` where a stretch of it failed the full check
+            ``apex_ompl.ompl.own_planner.SolveReport``), with ``+repair`` where a stretch of it failed the full check
             and was planned anew; ``straight line`` where that is a solution, so that no planner ran; empty without a
             path.
         notes: What a user should know about this run, such as a snapshot of moving obstacles.

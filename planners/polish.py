@@ -14,7 +14,7 @@ from apex_ompl.apex.path_validator import PathValidator
 from apex_ompl.ompl.own_planner import OwnPlanner
 from apex_ompl.ompl.parameters import Parameters, bounded, register
 from apex_ompl.ompl.simplify import simplify
-from apex_ompl.ompl.space import array_to_path, await_goal, path_to_array
+from apex_ompl.ompl.space import await_goal, path_to_array
 from apex_ompl.ompl.tuned import TUNED
 from apex_ompl.paths.optimizer import Optimizer
 from apex_ompl.paths.path import Path
@@ -60,7 +60,6 @@ class PolishedRRTConnect(OwnPlanner):
         self.validator = validator
         self._optimizer = optimizer
         self._inner = inner
-        self._begin = 0.0
 
     def clear(self) -> None:
         """Forget what was found."""
@@ -71,7 +70,7 @@ class PolishedRRTConnect(OwnPlanner):
         self.validator = self.validator.current()
         si, pdef = self.getSpaceInformation(), self.getProblemDefinition()
         self._inner.setProblemDefinition(pdef)
-        begin = self._begin = time.perf_counter()
+        begin = time.perf_counter()
         await_goal(pdef.getGoal(), ptc)
         with self.report.timed("rrtconnect"):
             status = self._inner.solve(ptc)
@@ -88,23 +87,16 @@ class PolishedRRTConnect(OwnPlanner):
                 if self.validator.accepts(short.states, lambda: bool(ptc())):
                     path = short
                     break
-        self._add(path)
+        self.report.add_solution(self, path, time.perf_counter() - begin)
         if not ptc():
             with self.report.timed("polish"):
                 better = polished(self._optimizer, self.validator, path.states, lambda: bool(ptc()))
             if better is not None:
-                self._add(better)
+                self.report.add_solution(self, better, time.perf_counter() - begin)
         return status.getStatus()
 
     def _inner_planners(self) -> list[ob.Planner]:
         return [self._inner]
-
-    def _add(self, path: Path) -> None:
-        self.report.lengths.append((time.perf_counter() - self._begin, path.length))
-        if self.report.best_path is None or path.length < self.report.best_path.length:
-            self.report.best_path = path
-        si, pdef = self.getSpaceInformation(), self.getProblemDefinition()
-        pdef.addSolutionPath(array_to_path(si, path.states), False, 0.0, NAME)
 
 
 @register(NAME)

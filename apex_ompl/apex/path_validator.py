@@ -12,10 +12,9 @@ from ompl import base as ob
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel import Kernel
-from apex_ompl.ompl.forwarding import forwarding
 from apex_ompl.ompl.simple_setup import SpaceInformation
 from apex_ompl.ompl.space import bounds_of, require_real_vectors, to_state
-from apex_ompl.ompl.validity import MotionValidator, StateValidityChecker
+from apex_ompl.ompl.validity import MotionValidator, StateValidityChecker, forwarding
 from apex_ompl.robot import Robot, load_robot
 from apex_ompl.types import Array, Flags
 

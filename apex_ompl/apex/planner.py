@@ -22,8 +22,7 @@ from apex_ompl.apex.stages import Anytime, Shorten
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel.shortcuts import shortcut
 from apex_ompl.kernel.trees import TreePair
-from apex_ompl.ompl.own_planner import OwnPlanner, Tree
-from apex_ompl.ompl.report import SolveReport
+from apex_ompl.ompl.own_planner import OwnPlanner, SolveReport, Tree
 from apex_ompl.paths.optimizer import Optimizer
 from apex_ompl.types import Array
 from apex_ompl.util.resolution import SEARCH_RESOLUTION
@@ -44,8 +43,6 @@ class APEX(OwnPlanner):
         model: Makes proposals.
         optimizer: Repairs and shortens.
         experience: Control points of earlier paths minus those of their straight lines, each of shape (points, dof).
-        rejected_lines: Straight lines that were found invalid before ``solve``, each of shape (2, dof).
-        report: Report on the last call of ``solve``.
     """
 
     def __init__(self, si: ob.SpaceInformation, parameters: ApexParameters | None = None, **values: Any) -> None:
@@ -71,7 +68,6 @@ class APEX(OwnPlanner):
             raise ParameterError("parameter 'denoising_steps'", steps, f"at most {most}, those of the checkpoint")
         self.optimizer = Optimizer(self.model.spline)
         self.experience: list[Array] = []
-        self.rejected_lines: list[Array] = []
         self._solves = 0
         self._warm = False
         self._grown: list[TreePair | og.RRTConnect] = []  # by the last call of ``solve``
@@ -133,7 +129,7 @@ class APEX(OwnPlanner):
             generator=generator, stop=lambda: bool(ptc()), report=self.report,
         )  # fmt: skip
         context = SolveContext(
-            self.getSpaceInformation(), self.getProblemDefinition(), ptc, validator=self.validator, sampler=sampler,
+            self, ptc, validator=self.validator, sampler=sampler,
             optimizer=self.optimizer, report=self.report, experience=self.experience,
             rejected_lines=self.rejected_lines, lambda_obs=parameters.lambda_obs, rng=generator.spawn(1)[0],
         )  # fmt: skip

@@ -19,8 +19,8 @@ from apex_ompl.api import load_problem
 from apex_ompl.errors import ApexError
 from apex_ompl.evaluation.accounting import PROOF, first_path_proof
 from apex_ompl.evaluation.rows import Job, load_runner
+from apex_ompl.ompl.own_planner import SolveReport, reporting
 from apex_ompl.ompl.process import quiet_ompl, seed_ompl
-from apex_ompl.ompl.report import SolveReport, report_of
 from apex_ompl.ompl.setup import assemble
 from apex_ompl.paths.path import path_length
 from apex_ompl.planning import PlanRun, finish, plan_among_dynamic_obstacles, query_fault, solve, with_exact_ends
@@ -79,7 +79,8 @@ class Experiment:
 
         def after_run(*_: object) -> None:  # after it the experiment checks the path, and clears the planner
             states.append(check_counts.states)
-            reports.append(report_of(planner))
+            ours = reporting(planner)
+            reports.append(None if ours is None else ours.report)
 
         observed, validator = list[float](), run.setup.motion_validator
         original = validator.check

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from apex_ompl.collision.path_proof import PathProof
 from apex_ompl.ompl.interrupt import Interrupt
-from apex_ompl.ompl.report import SolveReport
+from apex_ompl.ompl.own_planner import SolveReport
 from apex_ompl.ompl.setup import PlanningSetup
 from apex_ompl.paths.path import Path
 from apex_ompl.result import PlanResult, PlanStatus

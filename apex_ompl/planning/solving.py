@@ -10,8 +10,8 @@ from ompl import base as ob
 
 from apex_ompl.errors import ApexError
 from apex_ompl.ompl.interrupt import MAX_TIME, ends_after
+from apex_ompl.ompl.own_planner import reporting
 from apex_ompl.ompl.repair import repair
-from apex_ompl.ompl.report import LineAwarePlanner, report_of
 from apex_ompl.ompl.setup import PlanningSetup, set_goals
 from apex_ompl.ompl.simplify import simplify as shorten
 from apex_ompl.ompl.space import path_to_array
@@ -108,7 +108,8 @@ def solve(run: PlanRun, simplify: bool, execute: Execute = execute) -> PlanResul
             planner = _set_up(run)
         with motions_until(run.setup.motion_validator, run.ends_search):
             status = execute(run, planner, min(run.deadline.for_search, MAX_TIME))
-        report = run.report = report_of(planner)
+        ours = reporting(planner)
+        report = run.report = None if ours is None else ours.report
         if report is not None:
             run.times |= {INSIDE + stage: seconds for stage, seconds in report.times.items()}
             if report.solved_by:
@@ -201,16 +202,17 @@ def _set_up(run: PlanRun) -> ob.Planner:
     planner = parameters.build(si)
     simple_setup.setPlanner(planner)
     simple_setup.setup()
-    if isinstance(planner, LineAwarePlanner):
-        planner.rejected_lines = run.rejected_lines
+    ours = reporting(planner)
+    if ours is not None:
+        ours.rejected_lines = run.rejected_lines
     return planner
 
 
 def _found_path(run: PlanRun) -> Path:
-    """Return OMPL's solution; as the planner reports it, with its spline, where the states are the same."""
-    states = path_to_array(run.setup.simple_setup.getSolutionPath(), run.setup.robot.dof)
-    best = None if run.report is None else run.report.best_path
-    return best if best is not None and np.array_equal(best.states, states) else Path(states)
+    """Return OMPL's solution: the path that the planner added as it, with its spline, or else OMPL's states."""
+    solution = run.setup.simple_setup.getSolutionPath()
+    ours = None if run.report is None else run.report.path_of(solution)
+    return Path(path_to_array(solution, run.setup.robot.dof)) if ours is None else ours
 
 
 def _simplified(run: PlanRun, path: Path) -> Path:
