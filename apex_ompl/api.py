@@ -13,7 +13,8 @@ from apex_ompl import planners, problems
 from apex_ompl.apex.parameters import NAME
 from apex_ompl.errors import ParameterError
 from apex_ompl.ompl.setup import assemble
-from apex_ompl.planning import check_arguments, kept_planner
+from apex_ompl.planners import AnyPlanner
+from apex_ompl.planning.planner import check_arguments, kept_planner
 from apex_ompl.result import PlanResult
 from apex_ompl.scene.problem import Problem
 from apex_ompl.timing import Timing
@@ -61,7 +62,7 @@ def setup(problem: Problem | str | os.PathLike[str]) -> og.SimpleSetup:
 
 def plan(
     problem: Problem | str | os.PathLike[str],
-    planner: str | None = None,
+    planner: AnyPlanner | None = None,
     *,
     timeout: float = 5.0,
     seed: int = 0,
@@ -79,7 +80,8 @@ def plan(
 
     Args:
         problem: A problem, its name, or its file.
-        planner: Name of a planner, see ``apex_ompl.planners.names()``; by default apex, which does without a
+        planner: Name of a planner, see ``apex_ompl.planners.names()``, its parameters, or a function that makes one for
+            OMPL's space information, such as ``lambda si: APEX(si, stages=...)``; by default apex, which does without a
             network for a robot that no model ships for.
         timeout: Seconds for all that follows the set-up of problem and planner. The search ends a tenth of it before,
             from 0.05 to 0.5 s and at most half of it, so that its path can be proved and timed.
@@ -103,7 +105,7 @@ def plan(
     """
     check_arguments(timeout, seed)
     if planner is not None:
-        planners.parameters(planner, **planners.named(params))  # before the problem is read
+        planners.chosen(planner, params)  # before the problem is read
     loaded = problem if isinstance(problem, Problem) else load_problem(problem)
     with kept_planner(loaded.robot) as kept:
         return kept.plan_problem(

@@ -7,10 +7,10 @@ from typing import Any
 
 from apex_ompl.ompl.parameters import Parameters
 from apex_ompl.ompl.tuned import TUNED
-from apex_ompl.planners.registry import allocator, make, named, names, parameters
+from apex_ompl.planners.registry import AnyPlanner, allocator, chosen, make, names, parameters
 from apex_ompl.util.forking import unforked
 
-__all__ = ["APEX", "TUNED", "Parameters", "allocator", "make", "named", "names", "parameters"]
+__all__ = ["APEX", "TUNED", "AnyPlanner", "Parameters", "allocator", "chosen", "make", "names", "parameters"]
 
 
 def __dir__() -> list[str]:

@@ -14,6 +14,23 @@ if TYPE_CHECKING:
     from ompl import base as ob
 
 
+AnyPlanner = str | Parameters | Callable[["ob.SpaceInformation"], "ob.Planner"]
+"""A planner: its name, its parameters, or a function that makes it, as for OMPL's ``setPlannerAllocator``."""
+
+
+class MadeByFunction(Parameters):
+    """A planner that a user's function makes."""
+
+    def __init__(self, make: Callable[[ob.SpaceInformation], ob.Planner]) -> None:
+        """Make the planner by a function of OMPL's space information."""
+        object.__setattr__(self, "_make", make)
+
+    def build(self, si: ob.SpaceInformation) -> ob.Planner:
+        """Return the planner."""
+        made: ob.Planner = self._make(si)  # type: ignore[attr-defined]
+        return made
+
+
 def names() -> tuple[str, ...]:
     """Names of all planners."""
     _load()
@@ -45,6 +62,33 @@ def named(params: Mapping[str, Any] | None) -> dict[str, Any]:
     if not isinstance(params, Mapping) or not all(isinstance(name, str) for name in params):
         raise ParameterError("params", params, "values by name of parameter")
     return dict(params)
+
+
+def chosen(planner: AnyPlanner, params: Mapping[str, Any] | None = None, **defaults: Any) -> Parameters:
+    """Return the parameters of a planner.
+
+    Args:
+        planner: Name of a planner, its parameters, or a function that makes it.
+        params: Parameters in place of its own, by name.
+        **defaults: Of a planner that is given by name, parameters that it may have and that ``params`` has not; None
+            for the planner's own.
+
+    Raises:
+        UnknownNameError: No such planner or parameter; the message lists the known ones.
+        ParameterError: A value of the wrong type or out of range, or what is given is no planner.
+    """
+    given = named(params)
+    if isinstance(planner, str):
+        known = parameters(planner)
+        wanted = {name: value for name, value in defaults.items() if value is not None and hasattr(known, name)}
+        return known.changed(**(wanted | given))
+    if not isinstance(planner, Parameters):
+        if not callable(planner):
+            expected = "a name, the parameters of a planner, or a function that makes one"  # type: ignore[unreachable]
+            raise ParameterError("planner", planner, expected)
+        made_of = getattr(planner, "__self__", None)  # of ``allocator``, whose functions are methods of parameters
+        planner = made_of if isinstance(made_of, Parameters) else MadeByFunction(planner)
+    return planner.changed(**given) if given else planner
 
 
 def make(name: str, si: ob.SpaceInformation, /, **values: Any) -> ob.Planner:

@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 from support import ROOT
 
-from apex_ompl.planning.one_plan import PlanKeywords, PlanOptions, ProblemKeywords
+from apex_ompl.planning.planner import PlanKeywords, PlanOptions, ProblemKeywords
 
-SOURCES = ("api.py", "loop/run.py", "planning/one_plan.py", "planning/planner.py")
+SOURCES = ("api.py", "loop/run.py", "planning/planner.py")
 RECORDS = ("scene/bodies.py", "scene/problem.py", "util/record_type.py", "util/schema.py")
 USE = """
 from apex_ompl.api import plan

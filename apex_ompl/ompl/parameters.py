@@ -20,6 +20,7 @@ class Parameters:
     """Parameters of one planner; a subclass per planner, whose defaults are the planner's.
 
     Attributes:
+        name: Name that the planner is registered under; empty for one that is not.
         optimizing: Whether the planner goes on improving until time is up.
         repeatable: Whether the same seed gives the same path; not for planners that are stopped by the clock
             or threaded.
@@ -27,6 +28,7 @@ class Parameters:
         threaded: Whether the planner runs threads of its own; OMPL 2.0.1's then deadlock over several goals.
     """
 
+    name: ClassVar[str] = ""
     optimizing: ClassVar[bool] = False
     repeatable: ClassVar[bool] = True
     smooth: ClassVar[bool] = False
@@ -78,6 +80,7 @@ def register(name: str) -> Callable[[type[Parameters]], type[Parameters]]:
 
     def enter(cls: type[Parameters]) -> type[Parameters]:
         REGISTRY[name] = cls
+        cls.name = name
         return cls
 
     return enter

@@ -48,6 +48,7 @@ class PlanningSetup:
             in the workspace that was not reached, why.
         alignment: The alignment goal, or None.
         held: Numbers of the joints that stay as at the start.
+        seed: Seed of the sampling of goals, and of the plan.
         notes: Sentences on joints of the start and the goals that were moved to their limits, and on meshes that are no
             proper solids as they are, and how they are taken.
     """
@@ -65,6 +66,7 @@ class PlanningSetup:
     goal_faults: tuple[str, ...]
     alignment: AlignmentGoal | None
     held: NDArray[np.intp]
+    seed: int
     notes: tuple[str, ...]
 
     def __repr__(self) -> str:
@@ -155,6 +157,7 @@ def assemble(
         goal_faults,
         sampled if isinstance(sampled, AlignmentGoal) else None,
         held,
+        seed,
         (*notes, *checker.mesh_notes),
     )
 

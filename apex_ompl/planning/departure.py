@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.ompl.setup import PlanningSetup, state_fault
+from apex_ompl.ompl.setup import PlanningSetup, assemble, state_fault
 from apex_ompl.paths.path import Path
 from apex_ompl.result import PlanResult
 from apex_ompl.timing import Timing, time_path
@@ -89,6 +89,24 @@ def find_departure(setup: PlanningSetup, most: float, seed: int = 0) -> Departur
                 end, states = found
                 return Departure(start, end, max(depth, 0.0), names, states)
     return None
+
+
+def departed(setup: PlanningSetup, most: float, seed: int) -> tuple[Departure | None, PlanningSetup]:
+    """Return a way out of the contacts at an invalid start, and the problem from its end; else none, and the problem.
+
+    Args:
+        setup: The problem.
+        most: Largest depth of a contact [m].
+        seed: Seed of the directions, and of the goals that are sampled again.
+    """
+    departure = find_departure(setup, most, seed) if setup.start_fault else None
+    if departure is None:
+        return None, setup
+    names = setup.robot.joint_names
+    start = dict(zip(names, departure.end.tolist(), strict=True))
+    moving = [name for k, name in enumerate(names) if k not in setup.held]
+    problem = setup.problem.model_copy(update={"start": start})
+    return departure, assemble(problem, setup.robot, seed=seed, checker=setup.checker, moving=moving)
 
 
 def remedy(setup: PlanningSetup) -> str:

@@ -89,7 +89,7 @@ def _code(member: Any) -> CodeType | None:
 def _use_planner() -> None:
     """A kept planner, its world, and plans."""
     import apex_ompl
-    from apex_ompl.planning import check_arguments, kept_planner
+    from apex_ompl.planning.planner import check_arguments, kept_planner
 
     robot = apex_ompl.load_robot("dual_panda_softhand")
     home = robot.home
