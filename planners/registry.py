@@ -75,7 +75,7 @@ def chosen(planner: AnyPlanner, params: Mapping[str, Any] | None = None, **defau
 
     Raises:
         UnknownNameError: No such planner or parameter; the message lists the known ones.
-        ParameterError: A value of the wrong type or out of range, or what is given is no planner.
+        ParameterError: A value of the wrong type or out of range.
     """
     given = named(params)
     if isinstance(planner, str):
@@ -84,8 +84,7 @@ def chosen(planner: AnyPlanner, params: Mapping[str, Any] | None = None, **defau
         return known.changed(**(wanted | given))
     if not isinstance(planner, Parameters):
         if not callable(planner):
-            expected = "a name, the parameters of a planner, or a function that makes one"  # type: ignore[unreachable]
-            raise ParameterError("planner", planner, expected)
+            return parameters(planner)  # type: ignore[unreachable] # which names the planners that there are
         made_of = getattr(planner, "__self__", None)  # of ``allocator``, whose functions are methods of parameters
         planner = made_of if isinstance(made_of, Parameters) else MadeByFunction(planner)
     return planner.changed(**given) if given else planner

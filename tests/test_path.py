@@ -20,6 +20,7 @@ from apex_ompl.ompl.setup import assemble
 from apex_ompl.paths.path import Path
 from apex_ompl.paths.spline import Spline
 from apex_ompl.planners import APEX
+from apex_ompl.planning import steps
 
 
 @pytest.mark.parametrize("spline", [Spline(), Spline(22, 3, 100), Spline(8, 2, 33, 3)])

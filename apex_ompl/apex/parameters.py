@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, ClassVar, TypedDict
 
 from apex_ompl.ompl.parameters import Parameters, bounded, one_of, register
 from apex_ompl.ompl.tuned import TUNED
@@ -156,3 +156,33 @@ class ApexParameters(Parameters):
         from apex_ompl.apex.planner import APEX
 
         return APEX(si, self)
+
+
+class ApexKeywords(TypedDict, total=False):
+    """:class:`ApexParameters` as keywords of :class:`apex_ompl.planners.APEX`, for editors and type checkers."""
+
+    model: str
+    robot: str
+    device: str
+    line: bool
+    sprint: int
+    sampler: str
+    denoising_steps: int
+    temperature: float
+    first: int
+    second: int
+    third: int
+    guidance: bool
+    gamma: float
+    scaling: str
+    resample: int
+    noise: float
+    lambda_obs: float
+    repair: bool
+    bridge: bool
+    fallback: bool
+    polish: bool
+    approximate: bool
+    anytime: bool
+    range: float
+    seed: int

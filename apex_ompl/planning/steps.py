@@ -215,17 +215,8 @@ def check(
     started = clock.perf_counter() if started is None else started
     parameters = planners.chosen(planner, params, seed=setup.seed)
     status, reason = query_fault(setup)
-    return PlanQuery(
-        setup,
-        parameters.name or UNNAMED,
-        parameters,
-        Deadline(timeout),
-        status,
-        reason,
-        started,
-        dict(times or {}),
-        list(notes),
-    )
+    name, spent = parameters.name or UNNAMED, dict(times or {})
+    return PlanQuery(setup, name, parameters, Deadline(timeout), status, reason, started, spent, list(notes))
 
 
 def query_fault(setup: PlanningSetup) -> tuple[PlanStatus | None, str]:
