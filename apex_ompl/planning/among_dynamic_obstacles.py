@@ -18,6 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from apex_ompl.apex.perturbations import PERTURBATION_SIZE
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.path_proof import PathProof
 from apex_ompl.kernel import Kernel
@@ -50,7 +51,7 @@ SWEPT_STEP, MOST_COPIES = 0.05, 100  # spacing of their places on the way [m], a
 
 
 NEAREST_GOALS = 2  # nearest goals of which there are several
-BUMPS, BUMP_SIZE = 4, 0.6  # paths with random bumps, and their amplitude [rad]
+PERTURBATIONS = 4  # of the straight line to each goal
 
 
 @dataclass(frozen=True)
@@ -185,7 +186,7 @@ def _by_space_time(among: Among, still: PlanResult, turn: int, best: PlanResult 
     Args:
         among: What it works on.
         still: The path among what stands still, with its motion.
-        turn: Number of times that it was called before; bumps become larger.
+        turn: Number of times that it was called before; perturbations become larger.
         best: A result; motions that end no earlier are not looked for.
     """
     motion = still.trajectory
@@ -302,27 +303,29 @@ class Guess(NamedTuple):
 
 
 def _guesses(query: PlanQuery, limits: Limits, motion: Trajectory, turn: int) -> Iterator[Guess]:
-    """Yield motions to start from: the path's own, straight lines, and lines with bumps.
+    """Yield motions to start from: the path's own, straight lines, and random perturbations of them.
 
     Args:
         query: The query, among what stands still.
         limits: Those of the motion.
         motion: The path's own.
-        turn: Number of times that guesses were asked for before; bumps become larger.
+        turn: Number of times that guesses were asked for before; perturbations become larger.
     """
     optimizer, held = Optimizer(), query.setup.held
     if turn == 0:
         yield Guess(motion(np.linspace(0.0, motion.duration, 256)), motion.duration)
     goals, rng = query.setup.valid_goals, np.random.default_rng([query.setup.seed, turn])
     for goal in goals[np.argsort(np.linalg.norm(goals - query.setup.start, axis=1))][:NEAREST_GOALS]:
-        for control in optimizer.starts(query.setup.start, goal, BUMPS, rng, BUMP_SIZE * (1 + turn % 3)):
+        for control in optimizer.starts(
+            query.setup.start, goal, PERTURBATIONS, rng, PERTURBATION_SIZE * (1 + turn % 3)
+        ):
             control[:, held] = query.setup.start[held]
             states = optimizer.spline.path(control)
             yield Guess(states, _least_duration(states, limits))
             if turn > 0:  # aside, back, and then along the line
-                bump = states - optimizer.spline.path(optimizer.spline.line(states[0], goal))
+                aside = states - optimizer.spline.path(optimizer.spline.line(states[0], goal))
                 line = np.linspace(states[0], goal, len(states))
-                yield Guess(np.concatenate([states[0] + bump, line]), _least_duration(line, limits))
+                yield Guess(np.concatenate([states[0] + aside, line]), _least_duration(line, limits))
 
 
 def _least_duration(states: Array, limits: Limits) -> float:

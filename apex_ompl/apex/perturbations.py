@@ -1,4 +1,4 @@
-"""Random bumps of straight lines where no trajectory model was trained for a robot."""
+"""Random perturbations of straight lines, for robots that no trajectory model was trained for."""
 
 from __future__ import annotations
 
@@ -15,21 +15,22 @@ from apex_ompl.model.schedule import NoiseSchedule
 from apex_ompl.paths.optimizer import Optimizer
 from apex_ompl.types import Array
 
-SIZE = 0.6  # how far bumps stray [rad]
+PERTURBATION_SIZE = 0.6
+"""How far a joint strays from the line [rad]."""
 
 
-class BumpModel:
-    """Proposes straight lines with random bumps, for any robot, by the interface of a trajectory model.
+class PerturbationModel:
+    """Proposes random perturbations of straight lines, for any robot, by the interface of a trajectory model.
 
     Attributes:
         spline: Spline of the control points.
-        schedule: Noise schedule of one step: a path is not resampled, but drawn anew.
-        sampling: Default sampling; the temperature is a factor on the size of the bumps.
-        sees_point: Whether it looks at the obstacle point of a query: it does not.
+        schedule: Noise schedule of one step: paths are not resampled but drawn anew.
+        sampling: Default sampling; the temperature is a factor on the size of the perturbations.
+        sees_point: Whether it uses the obstacle point of a query: it does not.
     """
 
     def __init__(self) -> None:
-        """Make bumps of the optimizer's default spline."""
+        """Perturb lines on the optimizer's default spline."""
         self.spline, self.schedule = Optimizer().spline, NoiseSchedule(1)
         self.sampling, self.sees_point = Sampling(steps=1), False
 
@@ -41,9 +42,9 @@ class BumpModel:
         self, query: Query | Sequence[Query], kernel: Kernel, count: int, *, sampling: Sampling | None = None,
         generator: np.random.Generator | None = None, callback: Callback | None = None,
     ) -> Proposals:  # fmt: skip
-        """Return bumps on the straight lines of a query, or of several; see ``TrajectoryModel.propose``."""
+        """Return perturbations of the straight lines of a query, or of several; see ``TrajectoryModel.propose``."""
         queries = [query] if isinstance(query, Query) else list(query)
-        rng, size = generator or np.random.default_rng(0), (sampling or self.sampling).temperature * SIZE
+        rng, size = generator or np.random.default_rng(0), (sampling or self.sampling).temperature * PERTURBATION_SIZE
         optimizer, limits = Optimizer(self.spline), kernel.robot.arrays
         some = [optimizer.starts(q.start, q.goal, count + 1, rng, size)[1:] for q in queries]
         control = np.clip(np.concatenate(some), limits.lower, limits.upper)
@@ -54,5 +55,5 @@ class BumpModel:
         self, query: Query, kernel: Kernel, control: Array, step: int, *, sampling: Sampling | None = None,
         generator: np.random.Generator | None = None, callback: Callback | None = None,
     ) -> Proposals:  # fmt: skip
-        """Return other bumps in place of given paths; see ``TrajectoryModel.renoise``."""
+        """Return other perturbations in place of given paths; see ``TrajectoryModel.renoise``."""
         return self.propose(query, kernel, len(control), sampling=sampling, generator=generator)
