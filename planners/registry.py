@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 from apex_ompl.errors import ParameterError
-from apex_ompl.ompl.parameters import REGISTRY, Parameters
+from apex_ompl.ompl.parameters import REGISTRY, Parameters, Value
 from apex_ompl.util.forking import unforked
 from apex_ompl.util.validation import check_name
 
@@ -37,7 +37,7 @@ def names() -> tuple[str, ...]:
     return tuple(sorted(REGISTRY))
 
 
-def parameters(name: str, /, **values: Any) -> Parameters:
+def parameters(name: str, /, **values: Value) -> Parameters:
     """Return the parameters of a planner: its defaults, with some values changed.
 
     Raises:
@@ -51,7 +51,7 @@ def parameters(name: str, /, **values: Any) -> Parameters:
     return REGISTRY[check_name(name, "planner", REGISTRY)]().changed(**values)
 
 
-def named(params: Mapping[str, Any] | None) -> dict[str, Any]:
+def _named(params: Mapping[str, Any] | None) -> dict[str, Any]:
     """Return parameters that a caller gives by name, or none.
 
     Raises:
@@ -64,7 +64,7 @@ def named(params: Mapping[str, Any] | None) -> dict[str, Any]:
     return dict(params)
 
 
-def chosen(planner: AnyPlanner, params: Mapping[str, Any] | None = None, **defaults: Any) -> Parameters:
+def chosen(planner: AnyPlanner, params: Mapping[str, Any] | None = None, **defaults: Value | None) -> Parameters:
     """Return the parameters of a planner.
 
     Args:
@@ -77,7 +77,7 @@ def chosen(planner: AnyPlanner, params: Mapping[str, Any] | None = None, **defau
         UnknownNameError: No such planner or parameter; the message lists the known ones.
         ParameterError: A value of the wrong type or out of range.
     """
-    given = named(params)
+    given = _named(params)
     if isinstance(planner, str):
         known = parameters(planner)
         wanted = {name: value for name, value in defaults.items() if value is not None and hasattr(known, name)}
@@ -90,7 +90,7 @@ def chosen(planner: AnyPlanner, params: Mapping[str, Any] | None = None, **defau
     return planner.changed(**given) if given else planner
 
 
-def make(name: str, si: ob.SpaceInformation, /, **values: Any) -> ob.Planner:
+def make(name: str, si: ob.SpaceInformation, /, **values: Value) -> ob.Planner:
     """Return a planner for a space information, for example ``make("rrtconnect", si, range=0.5)``.
 
     Raises:
@@ -100,7 +100,7 @@ def make(name: str, si: ob.SpaceInformation, /, **values: Any) -> ob.Planner:
     return parameters(name, **values).build(si)
 
 
-def allocator(name: str, /, **values: Any) -> Callable[[ob.SpaceInformation], ob.Planner]:
+def allocator(name: str, /, **values: Value) -> Callable[[ob.SpaceInformation], ob.Planner]:
     """Return an allocator for ``SimpleSetup.setPlannerAllocator``.
 
     Raises:

@@ -67,9 +67,7 @@ class APEX(OwnPlanner):
             ApexError: The model or the robot cannot be loaded, or do not fit the space; there is no such parameter.
         """
         super().__init__(si, NAME)
-        given = (parameters or ApexParameters()).changed(**values)
-        assert isinstance(given, ApexParameters)
-        self.parameters = given
+        given = self.parameters = (parameters or ApexParameters()).changed(**values)
         self.stages = given.stages() if stages is None else list(stages)
         self.validator = PathValidator(si, "" if given.robot == AUTO else given.robot)
         robot = self.validator.checker.robot.name

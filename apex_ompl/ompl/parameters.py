@@ -6,13 +6,17 @@ import dataclasses
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 from apex_ompl.errors import ParameterError
 from apex_ompl.util.validation import LARGEST_INT, check_name
 
 if TYPE_CHECKING:
     from ompl import base as ob
+
+
+Value = bool | float | str
+"""Value of a parameter; text is read as the type of the parameter."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +51,7 @@ class Parameters:
         """Return a planner for ``si`` with these parameters."""
         raise TypeError(f"{type(self).__name__} does not say how to build its planner")
 
-    def changed(self, /, **values: Any) -> Parameters:
+    def changed(self, /, **values: Value) -> Self:
         """Return a copy with some values changed; text is read as the field's type.
 
         Raises:

@@ -316,9 +316,8 @@ def _guesses(query: PlanQuery, limits: Limits, motion: Trajectory, turn: int) ->
         yield Guess(motion(np.linspace(0.0, motion.duration, 256)), motion.duration)
     goals, rng = query.setup.valid_goals, np.random.default_rng([query.setup.seed, turn])
     for goal in goals[np.argsort(np.linalg.norm(goals - query.setup.start, axis=1))][:NEAREST_GOALS]:
-        for control in optimizer.starts(
-            query.setup.start, goal, PERTURBATIONS, rng, PERTURBATION_SIZE * (1 + turn % 3)
-        ):
+        size = PERTURBATION_SIZE * (1 + turn % 3)
+        for control in optimizer.starts(query.setup.start, goal, PERTURBATIONS, rng, size):
             control[:, held] = query.setup.start[held]
             states = optimizer.spline.path(control)
             yield Guess(states, _least_duration(states, limits))

@@ -10,7 +10,7 @@ import weakref
 from collections.abc import Container, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -28,7 +28,30 @@ from apex_ompl.util.forking import ProcessLock
 from apex_ompl.util.schema import validate
 from apex_ompl.util.validation import finite_array
 
+if TYPE_CHECKING:
+    from apex_ompl.scene.bodies import GridFile, HalfSpace, MeshFile, PointFile, RoundBar, Sphere, VoxelFile
+
 KEPT_CLOUDS = 8  # temporary files that no obstacle has any more
+
+
+class ObstacleFields(TypedDict, total=False):
+    """Fields of :class:`apex_ompl.Obstacle` as keywords of :meth:`World.add`, for editors and type checkers."""
+
+    name: str
+    box: Sequence[float]
+    sphere: Sphere | Mapping[str, Any]
+    cylinder: RoundBar | Mapping[str, Any]
+    capsule: RoundBar | Mapping[str, Any]
+    mesh: MeshFile | Mapping[str, Any]
+    points: PointFile | Mapping[str, Any]
+    voxels: VoxelFile | Mapping[str, Any]
+    distance_grid: GridFile | Mapping[str, Any]
+    half_space: HalfSpace | Mapping[str, Any]
+    position: Sequence[float]
+    orientation: Sequence[float]
+    velocity: Sequence[float] | None
+    trajectory: Sequence[Sequence[float]] | None
+    appears: float
 
 
 class World:
@@ -103,7 +126,7 @@ class World:
         with self.lock:
             yield
 
-    def add(self, *obstacles: Obstacle | Mapping[str, Any], **fields: Any) -> None:
+    def add(self, *obstacles: Obstacle | Mapping[str, Any], **fields: Unpack[ObstacleFields]) -> None:
         """Add obstacles, given as records, as the entries of a problem file, or one by its fields.
 
             world.add(name="post", box=(0.1, 0.1, 0.6), position=(0.5, 0.0, 0.3))
