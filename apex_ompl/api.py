@@ -48,7 +48,7 @@ def setup(problem: Problem | str | os.PathLike[str]) -> og.SimpleSetup:
     """Return OMPL's SimpleSetup of a problem, for planners and tools of OMPL's own.
 
     Space, checker, motion validator, start and goals are set, and the default planner is allocated unless another one
-    is set. Moving obstacles stand where they are at time 0.
+    is set. Dynamic obstacles stand where they are at time 0.
 
     Raises:
         ApexError: The problem is unknown or faulty.
@@ -90,8 +90,8 @@ def plan(
             seeds one generator per process).
         simplify: Whether to shorten the path that was found.
         params: Parameters of the planner by name.
-        snapshot: Take moving obstacles to stand where they are at time 0. Otherwise the motion is planned in time, and
-            proved apart from where they are then (:mod:`apex_ompl.planning.among_dynamic_obstacles`).
+        snapshot: Take dynamic obstacles to stand where they are at time 0. Otherwise the motion is planned and proved
+            in time (:mod:`apex_ompl.planning.among_dynamic_obstacles`).
         timing: How the path is timed, or whether; the timed motion is proved too.
         leave_contact: Depth of contacts at the start that the path may leave along growing clearance, up to 0.001 [m];
             a note says so, since that way out is not proved.

@@ -23,7 +23,7 @@ from apex_ompl.paths.spline import Spline
 from apex_ompl.types import Array
 
 NAME = "rrtconnect+polish"
-TRIES = 3  # of cutting a path short that another checker accepts
+TRIES = 3  # of shortening, until another checker accepts the path
 
 
 def polished(
@@ -48,7 +48,7 @@ class PolishedRRTConnect(OwnPlanner):
 
     Attributes:
         validator: Decides what is valid.
-        report: What the last call of ``solve`` did.
+        report: Report on the last call of ``solve``.
     """
 
     def __init__(
@@ -62,7 +62,7 @@ class PolishedRRTConnect(OwnPlanner):
         self._inner = inner
 
     def clear(self) -> None:
-        """Forget what was found."""
+        """Forget the last solution."""
         super().clear()
         self._inner.clear()
 
@@ -70,12 +70,12 @@ class PolishedRRTConnect(OwnPlanner):
         self.validator = self.validator.current()
         si, pdef = self.getSpaceInformation(), self.getProblemDefinition()
         self._inner.setProblemDefinition(pdef)
-        begin = time.perf_counter()
+        started = time.perf_counter()
         await_goal(pdef.getGoal(), ptc)
         with self.report.timed("rrtconnect"):
             status = self._inner.solve(ptc)
         if status.getStatus() == ob.PlannerStatus.EXACT_SOLUTION:
-            self.report.solved_by, self.report.first = NAME, time.perf_counter() - begin
+            self.report.solved_by, self.report.first = NAME, time.perf_counter() - started
         if status.getStatus() != ob.PlannerStatus.EXACT_SOLUTION or ptc():
             return status.getStatus()
         dof = self.validator.checker.robot.dof
@@ -83,16 +83,16 @@ class PolishedRRTConnect(OwnPlanner):
         with self.report.timed("simplify"):
             for _ in range(TRIES):
                 short = Path(simplify(si, path.states, lambda: bool(ptc())))
-                # parts of motions that were checked are looked at in other places than before
+                # the other checker samples shortened motions at other states than before
                 if self.validator.accepts(short.states, lambda: bool(ptc())):
                     path = short
                     break
-        self.report.add_solution(self, path, time.perf_counter() - begin)
+        self.report.add_solution(self, path, time.perf_counter() - started)
         if not ptc():
             with self.report.timed("polish"):
                 better = polished(self._optimizer, self.validator, path.states, lambda: bool(ptc()))
             if better is not None:
-                self.report.add_solution(self, better, time.perf_counter() - begin)
+                self.report.add_solution(self, better, time.perf_counter() - started)
         return status.getStatus()
 
     def _inner_planners(self) -> list[ob.Planner]:

@@ -1,4 +1,4 @@
-"""Context of one call of ``solve``: what the stages of APEX share."""
+"""Context of one call of ``solve``, shared by the stages of APEX."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class SolveContext:
         best: Shortest valid path, or None.
         nearest: Path that ends near a goal and its distance from it [rad], or None.
         rng: Source of the generators of compiled trees.
-        sprint_trees: Compiled trees that a sprint began, or None.
+        sprint_trees: Compiled trees of the sprints, or None.
         sprint_ompl_trees: OMPL's, where another checker decides, by their longest step [rad].
         all_trees: Compiled trees for all starts and goals, or None.
         all_ompl_trees: OMPL's for all starts and goals, or None.
@@ -67,7 +67,7 @@ class SolveContext:
         rejected_lines: list[Array], lambda_obs: float, rng: np.random.Generator,
     ) -> None:  # fmt: skip
         """Share what is given; starts and goals are read before the stages run."""
-        self.begin = time.perf_counter()
+        self.started = time.perf_counter()
         self.planner, self.ptc = planner, ptc
         self.si, self.pdef = planner.getSpaceInformation(), planner.getProblemDefinition()
         self.validator, self.sampler, self.optimizer, self.report = validator, sampler, optimizer, report
@@ -99,7 +99,7 @@ class SolveContext:
         return self._queries
 
     def note_search(self, looked: SearchCounts) -> None:
-        """Add what a search in compiled code looked at to the checker's counts."""
+        """Add the checks of a search in compiled code to the checker's counts."""
         counts = self.validator.checker.check_counts
         counts.proved += looked.proved
         counts.blocked += looked.blocked
@@ -148,7 +148,7 @@ class SolveContext:
         """Add a valid path to OMPL's solutions."""
         if self.best is None:
             self.report.first_verified = self.validator.knows_obstacles
-        self.report.add_solution(self.planner, path, time.perf_counter() - self.begin)
+        self.report.add_solution(self.planner, path, time.perf_counter() - self.started)
         self.best = path
 
     def accept_if_shorter(self, path: Path) -> bool:
@@ -176,5 +176,5 @@ class SolveContext:
 
 
 def joins(control: Array, start: Array, goal: Array) -> bool:
-    """Whether control points, shape (points, dof), begin and end at a start and a goal, shape (dof,)."""
+    """Whether control points, shape (points, dof), start and end at a start and a goal, shape (dof,)."""
     return np.array_equal(control[0], start) and np.array_equal(control[-1], goal)

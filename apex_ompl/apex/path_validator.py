@@ -1,4 +1,4 @@
-"""Validity of states and paths for a planner: this project's full check, or other checkers that OMPL was given."""
+"""Validity of states and paths for a planner: by this package's full check, or by a user's checkers."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ NOT_ACCEPTED = "the state validity checker that is set does not accept the path"
 
 LOG = logging.getLogger("apex_ompl")
 PLAIN = (ob.MotionValidator, MotionValidator)  # OMPL's own, and this project's
-LOOKS = 8  # every so many states of a path are looked at before its motions, which have the others
+STRIDE = 8  # of the states of a path that are checked before its motions
 DEFAULT_ROBOT = "dual_panda_softhand"
 
 
@@ -139,7 +139,7 @@ class PathValidator:
         if self.exclusive:
             return True
         states = [to_state(self._si, q) for q in path]
-        first = sorted(range(0, len(states), LOOKS), key=lambda k: (-(k & -k), k))  # coarse before fine
+        first = sorted(range(0, len(states), STRIDE), key=lambda k: (-(k & -k), k))  # coarse before fine
         for k in first:
             if stop() or not self._si.isValid(states[k]):
                 return False

@@ -37,7 +37,7 @@ _warm_models: WeakSet[Model] = WeakSet()  # that have proposed something in this
 class APEX(OwnPlanner):
     """OMPL planner APEX: section III of the paper inside ``solve``, probabilistically complete by RRTConnect.
 
-    It works with any validity checker, and takes the one that is set when ``solve`` begins. With this project's,
+    It works with any validity checker, and takes the one that is set when ``solve`` starts. With this project's,
     proposals are repaired, and guided if asked, among the obstacles; with another one they are checked by it. The first
     valid path is shortened; with the parameter ``anytime`` it is improved until the termination condition holds.
 
@@ -82,7 +82,7 @@ class APEX(OwnPlanner):
         self._grown: list[TreePair | og.RRTConnect] = []  # by the last call of ``solve``
 
     def setup(self) -> None:
-        """Make all ready that the first call of ``solve`` would have to: kernel, network, optimizer."""
+        """Prepare what the first call of ``solve`` needs: kernel, network, optimizer."""
         super().setup()
         self._prepare()
 
@@ -206,7 +206,7 @@ def _unsolved(context: SolveContext, status: Any, reason: str) -> Any:
 
 
 def _remember(context: SolveContext) -> None:
-    """Keep the difference of the best path from its straight line for later queries, where it is a spline."""
+    """Keep the difference between the best path and its straight line for later queries, if it is a spline."""
     best = context.best
     if best is not None and best.spline is not None and best.control is not None:
         difference: Array = best.control - best.spline.line(best.control[0], best.control[-1])

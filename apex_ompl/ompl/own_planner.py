@@ -1,4 +1,4 @@
-"""What the planners of this package have in common inside of OMPL: their report, and what ``solve`` returns."""
+"""Base class of this package's OMPL planners, and the report that each makes."""
 
 from __future__ import annotations
 
@@ -144,7 +144,7 @@ class OwnPlanner(ob.Planner):
     def solve(self, ptc: ob.PlannerTerminationCondition) -> ob.PlannerStatus:
         """Solve the problem; no exception leaves it, since one would end the process inside OMPL.
 
-        Starts and goals are read anew by every call. ``report`` says what was done, and why where nothing was found.
+        Every call reads starts and goals again. ``report`` has times, counts, and the reason where nothing was found.
         """
         self.report = SolveReport()
         try:
@@ -170,7 +170,7 @@ class OwnPlanner(ob.Planner):
         raise NotImplementedError
 
     def clear(self) -> None:
-        """Forget what was found."""
+        """Forget the last solution."""
         super().clear()
         self.report = SolveReport()
 
@@ -186,7 +186,7 @@ class OwnPlanner(ob.Planner):
         if path is not None:
             trees.append(Tree(path.states, np.arange(-1, len(path.states) - 1), False))
         vertices: dict[bytes, ob.PlannerDataVertex] = {}
-        states = []  # which the data refers to until they are copied
+        states = []  # referenced by the data until they are copied
 
         def vertex(q: Array) -> ob.PlannerDataVertex:
             if q.tobytes() not in vertices:

@@ -1,4 +1,4 @@
-"""OMPL's SimpleSetup for a robot: what its bindings leave out, for planners of OMPL's own as well."""
+"""OMPL's SimpleSetup for a robot, with what OMPL's Python bindings lack, for OMPL's own planners too."""
 
 from __future__ import annotations
 

@@ -82,7 +82,7 @@ class StateValidityChecker(ob.StateValidityChecker):
 
 
 class MotionValidator(ob.MotionValidator):
-    """OMPL motion validator: by a check of its own as long as its validity checker is set, and else by the one that is.
+    """OMPL motion validator by its own check, as long as its own validity checker is the one that is set.
 
     ``setStateValidityChecker`` of OMPL leaves the motion validator as it is. So this one asks at each motion which
     checker the space information has; another one than its own is asked for states between both ends by OMPL's own
@@ -147,10 +147,10 @@ class _Forwarding(ob.MotionValidator):
 def forwarding(
     si: ob.SpaceInformation, *, stop: Callable[[], bool] = lambda: False, walks: bool = False
 ) -> ob.SpaceInformation:
-    """Return a space information of the same space by whose checkers the same is valid, and less.
+    """Return a space information of the same space, whose checkers accept at most what those of the given one accept.
 
     Args:
-        si: The other one; its checkers of the moment are asked.
+        si: The given one; its current checkers are asked.
         stop: No motion is valid once this holds.
         walks: Whether motions are valid only where states between their ends are, too, at the space's resolution.
     """
@@ -165,8 +165,8 @@ def forwarding(
 def motions_until(validator: MotionValidator, stop: Callable[[], bool]) -> Iterator[None]:
     """While the block runs, let all motions be invalid once ``stop`` holds.
 
-    OMPL looks at a termination condition between iterations and not inside of them, and simplifies paths by counts:
-    without motions to check, both soon come to their end.
+    OMPL checks a termination condition between iterations only, and simplifies paths by counts: without valid motions,
+    both soon end.
     """
     before = validator.stop
     validator.stop = lambda: stop() or before()
@@ -211,8 +211,8 @@ def full_check(
 ) -> FullCheck:
     """Decide whether a path or a motion is a solution.
 
-    It is when it stays inside the limits, begins at ``start`` and ends at one of ``goals`` bit for bit, and is proved
-    free from end to end (:meth:`apex_ompl.collision.CollisionChecker.prove`).
+    It is one when it stays inside the limits, starts at ``start`` and ends at one of ``goals`` bit for bit, and is
+    proved free from end to end (:meth:`apex_ompl.collision.CollisionChecker.prove`).
 
     Args:
         checker: Collision checker.

@@ -1,9 +1,9 @@
-"""Plans among obstacles that move at constant velocity: motions in time, proved in time.
+"""Plans among dynamic obstacles of constant velocity, proved in time.
 
-1. A path among what stands still is found and timed as ever; where its motion meets no dynamic obstacle, that is the
-plan. 2. Else the motion along the path is retimed: it waits, slows down or hurries (:mod:`apex_ompl.moving.retime`).
+1. A path among the static obstacles is found and timed. Where its motion meets no dynamic obstacle, it is the plan.
+2. Otherwise the motion along the path is retimed: it waits, slows down or speeds up (:mod:`apex_ompl.moving.retime`).
 3. Motions are optimized in space and time from several paths and durations (:mod:`apex_ompl.moving.timed_spline`).
-4. Where all that fails, paths are planned around what the dynamic obstacles sweep.
+4. Where all that fails, paths are planned around the volumes that the dynamic obstacles sweep.
 
 The motion that arrives first is taken.
 """
@@ -45,9 +45,9 @@ FACTORS = (1.0, 1.3, 1.7, 2.4, 3.5, 5.0)  # durations that are tried, as multipl
 MARGIN = 0.005  # that motions keep from dynamic obstacles, where the start does [m]
 LONGER = 3  # turns, each with durations twice as long as the one before
 PATH_STATES = (256, 1024)  # of the path of a motion, the first number for which it is proved
-SWEPT_SECONDS = 6.0  # of the dynamic obstacles' ways that paths are planned around [s]
+SWEPT_SECONDS = 6.0  # of the dynamic obstacles' motions that paths are planned around [s]
 SWEPT_SHARE = 0.3  # of the time that is left, for that
-SWEPT_STEP, MOST_COPIES = 0.05, 100  # spacing of their places on the way [m], and most of these
+SWEPT_STEP, MOST_COPIES = 0.05, 100  # spacing of their places [m], and the largest number of these
 
 
 NEAREST_GOALS = 2  # nearest goals of which there are several
@@ -56,11 +56,11 @@ PERTURBATIONS = 4  # of the straight line to each goal
 
 @dataclass(frozen=True)
 class Among:
-    """What a plan among dynamic obstacles works on.
+    """Context of a plan among dynamic obstacles.
 
     Attributes:
-        query: The query, among what stands still.
-        prover: The proof of motions.
+        query: The query, among the static obstacles.
+        prover: Proves motions.
         timing: How motions are timed.
         limits: The limits by it.
         stages: Those of ``STAGES`` that are tried.
@@ -78,14 +78,14 @@ class Among:
 
     @property
     def kernel(self) -> Kernel:
-        """The kernel among what stands still, in which joints that are not planned stay."""
+        """The kernel among the static obstacles, in which joints that are not planned stay."""
         setup, arrays = self.query.setup, self.query.setup.checker.kernel.robot.arrays
         lower, upper = arrays.lower.copy(), arrays.upper.copy()
         lower[setup.held] = upper[setup.held] = setup.start[setup.held]
         return setup.checker.kernel.within(lower, upper)
 
     def proof(self, motion: Trajectory) -> PathProof | None:
-        """Return the proof that a motion is clear of what stands still and of itself, or None.
+        """Return the certificate that a motion is clear of static obstacles and of itself, or None.
 
         It is None, too, where the motion meets a dynamic obstacle, or does not go from the start to a goal.
         """
@@ -103,11 +103,11 @@ class Among:
 def plan_among_dynamic_obstacles(
     query: PlanQuery, dynamic: Sequence[Obstacle], simplify: bool, timing: Timing, stages: Sequence[str] = STAGES
 ) -> PlanResult:
-    """Return a motion among obstacles that move, or why there is none.
+    """Return a motion among dynamic obstacles, or why there is none.
 
     Args:
         query: The query, set up without the dynamic obstacles.
-        dynamic: The obstacles that move, where they are at time 0, when the motion begins.
+        dynamic: The dynamic obstacles, where they are at time 0, when the motion starts.
         simplify: Whether paths of planners that leave it to others are shortened.
         timing: How motions are timed.
         stages: Those of ``STAGES`` that are tried where the path's own motion meets a dynamic obstacle.
@@ -184,10 +184,10 @@ def _by_space_time(among: Among, still: PlanResult, turn: int, best: PlanResult 
     """Return the motion that is optimized in space and time and ends first, or None.
 
     Args:
-        among: What it works on.
-        still: The path among what stands still, with its motion.
+        among: The context.
+        still: The path among the static obstacles, with its motion.
         turn: Number of times that it was called before; perturbations become larger.
-        best: A result; motions that end no earlier are not looked for.
+        best: A result; motions that end no earlier are skipped.
     """
     motion = still.trajectory
     assert motion is not None
@@ -211,7 +211,7 @@ def _by_space_time(among: Among, still: PlanResult, turn: int, best: PlanResult 
 
 
 def _start(among: Among) -> Start:
-    """Return what the robot does when the motion begins."""
+    """Return position, velocity and acceleration at the start of the motion."""
     q = among.query.setup.start
     derivatives = among.timing.start(among.limits)
     return Start.at_rest(q) if derivatives is None else Start(q, *derivatives)
@@ -221,7 +221,7 @@ _warm: set[str] = set()  # robots of which the code is loaded
 
 
 def warm_up(checker: CollisionChecker) -> None:
-    """Load, or compile, what plans among dynamic obstacles need besides, so that no plan has to wait for it."""
+    """Load or compile the code that only plans among dynamic obstacles need, so that no plan waits for it."""
     robot = checker.robot
     if robot.name in _warm:
         return
@@ -240,7 +240,7 @@ def warm_up(checker: CollisionChecker) -> None:
 
 
 def _around_sweeps(among: Among, simplify: bool) -> PlanResult | None:
-    """Return the motion of a path that is planned around what the dynamic obstacles sweep, or None."""
+    """Return the motion of a path around the volumes that the dynamic obstacles sweep, or None."""
     query, robot, problem = among.query, among.query.setup.robot, among.query.setup.problem
     names = [name for k, name in enumerate(robot.joint_names) if k not in query.setup.held]
     swept = [copy for o in among.prover.obstacles for copy in _sweep(o)]
@@ -256,9 +256,9 @@ def _around_sweeps(among: Among, simplify: bool) -> PlanResult | None:
 
 
 def _sweep(obstacle: Obstacle) -> list[Obstacle]:
-    """Return copies of an obstacle along its way."""
-    way = SWEPT_SECONDS * float(np.linalg.norm(obstacle.velocity or (0.0, 0.0, 0.0)))
-    times = np.linspace(0.0, SWEPT_SECONDS, min(MOST_COPIES, 2 + int(way / SWEPT_STEP)))
+    """Return copies of an obstacle along its path."""
+    length = SWEPT_SECONDS * float(np.linalg.norm(obstacle.velocity or (0.0, 0.0, 0.0)))
+    times = np.linspace(0.0, SWEPT_SECONDS, min(MOST_COPIES, 2 + int(length / SWEPT_STEP)))
     return [
         obstacle_at(obstacle, float(t)).model_copy(update={"name": f"{obstacle.name} at {t:.2f} s", "velocity": None})
         for t in times
@@ -266,7 +266,7 @@ def _sweep(obstacle: Obstacle) -> list[Obstacle]:
 
 
 def _result(among: Among, still: PlanResult, motion: Trajectory, method: str) -> PlanResult | None:
-    """Return a result with another motion, and with the way that it takes as its path, or None."""
+    """Return a result with another motion and with its path, or None."""
     query, proof = among.query, among.proof(motion)
     if proof is None:
         return None
@@ -306,7 +306,7 @@ def _guesses(query: PlanQuery, limits: Limits, motion: Trajectory, turn: int) ->
     """Yield motions to start from: the path's own, straight lines, and random perturbations of them.
 
     Args:
-        query: The query, among what stands still.
+        query: The query, among the static obstacles.
         limits: Those of the motion.
         motion: The path's own.
         turn: Number of times that guesses were asked for before; perturbations become larger.

@@ -125,9 +125,9 @@ class MotionPlanner:
     """A robot in a world, ready to plan again and again.
 
     What takes time is done once: the robot is built, its tables and those of the world are made, the model and the
-    compiled code are loaded. The world is edited in place (:class:`apex_ompl.planning.World`), as a planning scene
-    of MoveIt's. A planner may be used by several threads; plans, checks and edits of one planner wait for each other,
-    so that a plan holds for the world in which it began. Two planners work at the same time.
+    compiled code are loaded. The world is edited in place (:class:`apex_ompl.planning.World`), like MoveIt's
+    planning scene. Several threads may use a planner; plans, checks and edits of one planner wait for each other, so
+    that a plan holds for the world in which it started. Two planners work at the same time.
 
         with apex_ompl.MotionPlanner() as planner:
             planner.world.add(name="post", box=(0.1, 0.1, 0.6), position=(0.5, 0.0, 0.3))
@@ -161,10 +161,10 @@ class MotionPlanner:
         with unforked():
             from apex_ompl.planning import departure, query, steps  # noqa: F401 - with all that plans need
         self._checker, self._lock = self.world.checker, self.world.lock
-        self._left: CollisionChecker | None = None  # of the world without some obstacles, as it was needed last
+        self._left: CollisionChecker | None = None  # of the world without some obstacles, from the last call
 
     def __repr__(self) -> str:
-        """Return the robot, the model where one is given, and what is in the world."""
+        """Return the robot, a given model, and the contents of the world."""
         from apex_ompl.apex.parameters import NAME
 
         model = "" if self.model is None else f"model {self.model!r}"
@@ -274,8 +274,8 @@ class MotionPlanner:
                 notes.append(f"no model of {robot.name} ships, so random perturbations take the place of proposals")
             parameters = planners.chosen(planner or NAME, options.params, model=self.model, seed=options.seed)
             if timing is not None:
-                begin = timing.start(timing.limits(robot.limits, robot.joint_names))  # whether it fits the robot
-                if begin is not None and leave_contact:
+                derivatives = timing.start(timing.limits(robot.limits, robot.joint_names))  # checked before planning
+                if derivatives is not None and leave_contact:
                     raise ParameterError("leave_contact", leave_contact, "0 for a start that moves")
             checker = self._checker_without({o.name for o in dynamic} if dynamic else self._absent())
             checker.check_counts = CheckCounts()
@@ -328,11 +328,11 @@ class MotionPlanner:
         if isinstance(goal, GoalSampler):
             check_seed(seed)
             goal = sampled_goals(goal, self.robot, np.random.default_rng(seed), self.is_free)
-        begin = joint_values(self.robot, start, "start")
+        given = joint_values(self.robot, start, "start")
         moving = self.robot.joint_names if group is None else planned_joints(self.robot, group)
-        wanted = goal_record(self.robot, goal, {joint: v for joint, v in begin.items() if joint not in moving})
-        query = validate(Problem, {"name": name, "robot": self.robot_file, "start": begin, "goal": wanted}, "problem")
-        with self._lock:  # what is in the world is valid already
+        wanted = goal_record(self.robot, goal, {joint: v for joint, v in given.items() if joint not in moving})
+        query = validate(Problem, {"name": name, "robot": self.robot_file, "start": given, "goal": wanted}, "problem")
+        with self._lock:  # bodies of the world are valid already
             bodies = {
                 "scene": tuple(self.world.obstacles.values()), "attached": tuple(self.world.held.values()),
                 "allowed": self.world.allowed,
@@ -385,7 +385,7 @@ class MotionPlanner:
         return ready.simple_setup
 
     def _checker_now(self) -> CollisionChecker:
-        """Return a checker of what is there at time 0."""
+        """Return a checker of the world at time 0."""
         return self._checker_without(self._absent())
 
     def _absent(self) -> set[str]:
@@ -402,7 +402,7 @@ class MotionPlanner:
 
         Args:
             names: Names of these obstacles.
-            kept: Whether it may be the one of the last time, in which only what was changed since is changed.
+            kept: Whether the checker of the last call may be reused; it is updated by the changes since then.
         """
         if not names:
             return self._checker
@@ -439,7 +439,7 @@ _idle_lock = ProcessLock()
 def kept_planner(robot: str) -> Iterator[MotionPlanner]:
     """Lend a planner of a robot, by name or file, that no other thread uses; it is made where there is none.
 
-    One of whose files, meshes among them, one has changed by then is not lent any more.
+    A planner is not lent again once a file of its robot has changed, meshes included.
 
     Raises:
         ApexError: The robot is unknown, or one of its files is faulty.

@@ -1,4 +1,4 @@
-"""What users ask for: starts, goals, groups of joints and dynamic obstacles, as plans take them."""
+"""Input of plans: starts, goals, groups of joints and dynamic obstacles."""
 
 from __future__ import annotations
 
@@ -158,7 +158,7 @@ def planned_joints(robot: Robot, group: Group) -> tuple[str, ...]:
 
 
 def dynamic_of(obstacles: Iterable[Obstacle]) -> tuple[Obstacle, ...]:
-    """Return the obstacles that a plan is made among in time: those that move.
+    """Return the dynamic obstacles, which a plan avoids in time.
 
     Raises:
         ParameterError: One does not move at constant velocity from time 0 on.
@@ -173,7 +173,7 @@ def dynamic_of(obstacles: Iterable[Obstacle]) -> tuple[Obstacle, ...]:
 
 
 def snapshot_notes(obstacles: Sequence[Obstacle]) -> list[str]:
-    """Return sentences on the obstacles that move, in a plan that takes them as they are at time 0."""
+    """Return notes on dynamic obstacles, for a plan that takes them as they are at time 0."""
     later = [o.name for o in obstacles if o.appears > 0.0]
     still = [o.name for o in obstacles if o.moving and not o.appears > 0.0]
     notes = ((still, "taken to stand still"), (later, "left out, not there yet"))

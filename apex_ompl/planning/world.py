@@ -175,7 +175,7 @@ class World:
             if old is None:
                 self._add([wanted])
                 return
-            coal_geometry(wanted)  # what is wrong with it shows before anything is changed
+            coal_geometry(wanted)  # raises on a faulty cloud before anything is changed
             allowed = [pair for pair in self.allowed if name in pair]
             self.checker.remove(name)
             self.checker.add(wanted)

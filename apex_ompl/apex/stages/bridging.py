@@ -49,7 +49,7 @@ class Bridging:
 
 @dataclass(frozen=True)
 class NearestToGoal:
-    """Note the valid beginning of the best candidates that ends nearest to a goal."""
+    """Note the valid prefix of the best candidates that ends nearest to a goal."""
 
     def run(self, context: SolveContext) -> Solution | None:
         """Set ``context.nearest``; return None, since an approximate path solves nothing."""
@@ -93,7 +93,7 @@ def bridge_blocked(
 
 
 def valid_prefix(validator: PathValidator, states: Array, stop: Callable[[], bool]) -> Array:
-    """Return the valid beginning of a path, shape (M, dof), M >= 1; its start is taken to be valid.
+    """Return the valid prefix of a path, shape (M, dof), M >= 1; its start is assumed valid.
 
     Foreign checkers, which may be slow, are asked until ``stop`` holds.
     """

@@ -1,4 +1,4 @@
-"""What a stage of APEX is, and what it returns."""
+"""Protocol of APEX's stages, and the solution that they return."""
 
 from __future__ import annotations
 
