@@ -112,13 +112,9 @@ def test_goals_of_a_users_sampler() -> None:
         result = planner.plan(home, Draws(goal), timeout=20.0, seed=2)
         assert result and result.path is not None and np.array_equal(result.path.states[-1], goal)
         assert result.problem.goal.joints is not None and len(result.problem.goal.joints) == 8
-        planner.world.add(
-            name="ball", sphere={"radius": 0.1}, position=planner.robot.link_pose(goal, "left_link7")[:3, 3]
-        )
-        assert planner.plan(home, Draws(goal), timeout=20.0).status in (
-            PlanStatus.INVALID_GOAL,
-            PlanStatus.INVALID_START,
-        )
+        hand = planner.robot.link_pose(goal, "left_hand_palm")[:3, 3]
+        planner.world.add(name="ball", sphere={"radius": 0.05}, position=hand)
+        assert planner.plan(home, Draws(goal), timeout=20.0).status is PlanStatus.INVALID_GOAL
         with pytest.raises(ParameterError, match="a sampler that returns a state in 200 draws"):
             planner.plan(home, Draws(None))
         with pytest.raises(ParameterError, match="seed"):
