@@ -1,4 +1,4 @@
-"""Random perturbations of straight lines, for robots that no trajectory model was trained for."""
+"""Random perturbations of straight lines, for robots without a trained trajectory model."""
 
 from __future__ import annotations
 
@@ -8,15 +8,11 @@ from contextlib import AbstractContextManager, nullcontext
 import numpy as np
 
 from apex_ompl.kernel import Kernel
+from apex_ompl.model.diffusion import Callback, NoiseSchedule
 from apex_ompl.model.proposals import Proposals, Sampling
 from apex_ompl.model.query import Query
-from apex_ompl.model.sampler import Callback
-from apex_ompl.model.schedule import NoiseSchedule
-from apex_ompl.paths.optimizer import Optimizer
+from apex_ompl.paths.optimizer import PERTURBATION_SIZE, Optimizer
 from apex_ompl.types import Array
-
-PERTURBATION_SIZE = 0.6
-"""How far a joint strays from the line [rad]."""
 
 
 class PerturbationModel:
@@ -24,13 +20,13 @@ class PerturbationModel:
 
     Attributes:
         spline: Spline of the control points.
-        schedule: Noise schedule of one step: paths are not resampled but drawn anew.
+        schedule: Noise schedule of one step: a path is not resampled, but drawn anew.
         sampling: Default sampling; the temperature is a factor on the size of the perturbations.
-        sees_point: Whether it uses the obstacle point of a query: it does not.
+        sees_point: Whether it looks at the obstacle point of a query: it does not.
     """
 
     def __init__(self) -> None:
-        """Perturb lines on the optimizer's default spline."""
+        """Propose paths of the optimizer's default spline."""
         self.spline, self.schedule = Optimizer().spline, NoiseSchedule(1)
         self.sampling, self.sees_point = Sampling(steps=1), False
 
@@ -42,7 +38,7 @@ class PerturbationModel:
         self, query: Query | Sequence[Query], kernel: Kernel, count: int, *, sampling: Sampling | None = None,
         generator: np.random.Generator | None = None, callback: Callback | None = None,
     ) -> Proposals:  # fmt: skip
-        """Return perturbations of the straight lines of a query, or of several; see ``TrajectoryModel.propose``."""
+        """Return perturbed straight lines for a query, or for several; see ``TrajectoryModel.propose``."""
         queries = [query] if isinstance(query, Query) else list(query)
         rng, size = generator or np.random.default_rng(0), (sampling or self.sampling).temperature * PERTURBATION_SIZE
         optimizer, limits = Optimizer(self.spline), kernel.robot.arrays
@@ -55,5 +51,5 @@ class PerturbationModel:
         self, query: Query, kernel: Kernel, control: Array, step: int, *, sampling: Sampling | None = None,
         generator: np.random.Generator | None = None, callback: Callback | None = None,
     ) -> Proposals:  # fmt: skip
-        """Return other perturbations in place of given paths; see ``TrajectoryModel.renoise``."""
+        """Return other perturbed lines in place of given paths; see ``TrajectoryModel.renoise``."""
         return self.propose(query, kernel, len(control), sampling=sampling, generator=generator)

@@ -18,7 +18,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from apex_ompl.apex.perturbations import PERTURBATION_SIZE
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.path_proof import PathProof
 from apex_ompl.kernel import Kernel
@@ -27,7 +26,7 @@ from apex_ompl.moving.timed_proof import TimedProver
 from apex_ompl.moving.timed_spline import MotionOptimizer, Start, TimedSpline
 from apex_ompl.ompl.setup import assemble
 from apex_ompl.ompl.validity import full_check
-from apex_ompl.paths.optimizer import Optimizer
+from apex_ompl.paths.optimizer import PERTURBATION_SIZE, Optimizer
 from apex_ompl.paths.path import Path
 from apex_ompl.planning.steps import FoundPath, PlanQuery, finish, prove, query_fault, solve, time
 from apex_ompl.result import PlanResult, PlanStatus

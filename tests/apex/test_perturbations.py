@@ -1,4 +1,4 @@
-"""APEX for robots that no model ships for: random perturbations in place of proposals."""
+"""APEX for robots without a shipped model: random perturbations of straight lines instead of proposals."""
 
 from __future__ import annotations
 
@@ -25,7 +25,9 @@ BAXTER = ROOT / "examples" / "baxter_table.yaml"
 
 @settings(max_examples=20, deadline=None)
 @given(seed=st.integers(0, 999), count=st.integers(1, 5), temperature=st.floats(0.1, 3.0))
-def test_perturbations_join_the_ends_within_limits(baxter: Robot, seed: int, count: int, temperature: float) -> None:
+def test_perturbed_lines_join_the_ends_within_the_limits(
+    baxter: Robot, seed: int, count: int, temperature: float
+) -> None:
     model, checker, rng = PerturbationModel(), CollisionChecker(baxter), np.random.default_rng(seed)
     limits = baxter.limits
     ends = rng.uniform(limits.lower, limits.upper, (2, 2, baxter.dof))
