@@ -225,9 +225,16 @@ def _use_ompl() -> None:
 
 
 def _use_steps() -> None:
-    """The five steps of a plan."""
+    """The five steps of a plan, and a goal sampler."""
     import apex_ompl
     from apex_ompl import planners, planning
+
+    class Home(planning.GoalSampler):
+        def sample(self, rng: np.random.Generator) -> Any:
+            return planner.robot.home + 0.01 if super().sample(rng) is None else None
+
+    with apex_ompl.MotionPlanner() as planner:
+        assert planner.plan(planner.robot.home, Home(), timeout=20.0)
 
     chosen = planners.chosen("apex", {"first": 4}, seed=3)
     query = planning.check(planning.assemble(apex_ompl.load_problem("reach_past_post")), chosen, timeout=20.0)
