@@ -272,7 +272,9 @@ class MotionPlanner:
             notes = snapshot_notes(changing) if options.snapshot else []
             if planner is None and not has_model(robot.name):
                 notes.append(f"no model of {robot.name} ships, so random perturbations take the place of proposals")
-            parameters = planners.chosen(planner or NAME, options.params, model=self.model, seed=options.seed)
+            parameters = planners.chosen(
+                NAME if planner is None else planner, options.params, model=self.model, seed=options.seed
+            )
             if timing is not None:
                 derivatives = timing.start(timing.limits(robot.limits, robot.joint_names))  # checked before planning
                 if derivatives is not None and leave_contact:
