@@ -87,7 +87,7 @@ states = np.concatenate(paths)
 free = states[kernel.unproved(states)[1] == 0][:1024].copy()
 drawn = np.random.default_rng(1).uniform(limits.lower, limits.upper, (1000, len(limits.lower)))
 proved = [p for p in paths if kernel.proves(p, 0.02)][:4] or paths[:4]
-from apex_ompl.kernel.compiled import dense_layer
+from apex_ompl.kernel.compiled.network import dense_layer
 rng = np.random.default_rng(2)
 layer = rng.integers(-99, 99, (512, 512)).astype(np.int8), *rng.normal(size=(2, 512)).astype(np.float32)
 rows = rng.normal(size=(8, 512)).astype(np.float32)

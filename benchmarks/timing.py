@@ -47,7 +47,7 @@ from tqdm import tqdm
 
 from apex_ompl import plan, problems
 from apex_ompl.errors import TimingError
-from apex_ompl.kernel.compiled.polyline_distance import max_distance
+from apex_ompl.kernel.compiled.timing.time_parameterization import max_distance
 from apex_ompl.ompl.setup import assemble
 from apex_ompl.ompl.validity import full_check
 from apex_ompl.paths.path import Path

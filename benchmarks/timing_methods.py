@@ -10,7 +10,7 @@ import ruckig
 import toppra
 from toppra import algorithm, constraint
 
-from apex_ompl.kernel.compiled.time_parameterization import max_path_speeds
+from apex_ompl.kernel.compiled.timing.time_parameterization import max_path_speeds
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.timing import Timing, Trajectory
 from apex_ompl.timing.curve import Curve, Polyline

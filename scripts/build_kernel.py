@@ -183,7 +183,7 @@ def compile_one(machine: Machine, name: str) -> Built:
     from apex_ompl.kernel.compiled.entry_points import ALL
     from apex_ompl.kernel.compiled.linking import ForeignCompiler
 
-    module, function = name.split(".")
+    module, _, function = name.rpartition(".")
     compiled = getattr(import_module(f"{library.PACKAGE}.{module}"), function)
     compiled.dispatcher._cache = NullCache()  # code from a cache has no module to emit
     compiled.dispatcher._compiler.pipeline_class = ForeignCompiler

@@ -19,9 +19,11 @@ import pytest
 from support import ROOT
 
 from apex_ompl.kernel import library
-from apex_ompl.kernel.compiled import cubic_pieces, dense_layer, motion_proof, time_parameterization
+from apex_ompl.kernel.compiled.check import motion_proof
 from apex_ompl.kernel.compiled.entry_points import ALL
 from apex_ompl.kernel.compiled.jit import CompiledFunction
+from apex_ompl.kernel.compiled.network import dense_layer
+from apex_ompl.kernel.compiled.timing import cubic_pieces, time_parameterization
 
 MACHINES = sorted(file.stem.removeprefix("kernel-") for file in library.FOLDER.glob("*.json"))
 IS_BUILT_HERE = pytest.mark.skipif(not library.is_used(), reason=library.why_not_used())
@@ -200,7 +202,7 @@ FAULTS = {
 SMALL = """
 import numpy as np
 from apex_ompl.kernel.library import why_not_used
-from apex_ompl.kernel.compiled.motion_proof import lay_grid
+from apex_ompl.kernel.compiled.check.motion_proof import lay_grid
 print(lay_grid(np.ones((2, 3)), 0.1, np.zeros(1, np.int64)), why_not_used())
 """
 

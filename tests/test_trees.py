@@ -11,7 +11,7 @@ from apex_ompl import problems
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.discretization import sample_path
 from apex_ompl.kernel import trees
-from apex_ompl.kernel.trees import TreePair
+from apex_ompl.kernel.search import TreePair
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.types import Array

@@ -20,8 +20,7 @@ from apex_ompl.apex.sampler import ProposalSampler
 from apex_ompl.apex.solver import solve
 from apex_ompl.apex.stages import Anytime, Shorten
 from apex_ompl.errors import ParameterError
-from apex_ompl.kernel.shortcuts import shortcut
-from apex_ompl.kernel.trees import TreePair
+from apex_ompl.kernel.search import TreePair, shortcut
 from apex_ompl.ompl.own_planner import OwnPlanner, Tree
 from apex_ompl.ompl.report import SolveReport
 from apex_ompl.paths.optimizer import Optimizer

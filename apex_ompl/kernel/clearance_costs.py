@@ -7,9 +7,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from apex_ompl.kernel.compiled.dynamic_obstacles import DynamicArrays
 from apex_ompl.kernel.compiled.layout import pack, unpack
-from apex_ompl.kernel.compiled.state_costs import state_costs
+from apex_ompl.kernel.compiled.moving.dynamic_obstacles import DynamicArrays
+from apex_ompl.kernel.compiled.moving.state_costs import state_costs
 from apex_ompl.kernel.kernel import Kernel
 from apex_ompl.types import Array
 from apex_ompl.util.arrays import compact
@@ -27,7 +27,7 @@ NO_DYNAMIC_OBSTACLES: tuple[Any, ...] = pack(
 
 
 class ClearanceCosts(NamedTuple):
-    """Clearance costs of N states; see :mod:`apex_ompl.kernel.compiled.clearance_cost` for the formula.
+    """Clearance costs of N states; see :mod:`apex_ompl.kernel.compiled.check.clearance_cost` for the formula.
 
     Attributes:
         cost: Half the sum of the squared violations of the margins, each as a share of its margin, shape (N,); infinite
@@ -58,7 +58,7 @@ def clearance_costs(
         scene_margin: Clearance to obstacles below which a state costs [m].
         own_margin: Clearance between links below which it costs [m].
         times: Times at which dynamic obstacles are looked at, shape (N,) [s]; by default 0.
-        dynamic: Obstacles that move, packed as :class:`apex_ompl.kernel.compiled.dynamic_obstacles.DynamicArrays`.
+        dynamic: Obstacles that move, packed as :class:`apex_ompl.kernel.compiled.moving.dynamic_obstacles.DynamicArrays`.
 
     Raises:
         ParameterError: Another shape, a margin that is not positive, or a time that is not finite.

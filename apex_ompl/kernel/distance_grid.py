@@ -19,9 +19,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from apex_ompl.kernel.compiled.grid_distance import SLACK
-from apex_ompl.kernel.compiled.grid_tabulation import tabulate_points, tabulate_triangles
-from apex_ompl.kernel.compiled.item_tree import BUCKET, HALF, fill_boxes, order_items
+from apex_ompl.kernel.compiled.geometry.bounding_trees import BUCKET, HALF, fill_boxes, order_items
+from apex_ompl.kernel.compiled.geometry.grid_building import tabulate_points, tabulate_triangles
+from apex_ompl.kernel.compiled.geometry.grid_distance import SLACK
 from apex_ompl.kernel.compiled.layout import Integers, Singles
 from apex_ompl.types import Array
 from apex_ompl.util.arrays import compact
@@ -39,7 +39,7 @@ KEPT_NODES = 40_000_000  # of grids that are kept by content
 
 
 class ItemTree(NamedTuple):
-    """Sizes of a tree of boxes over points or triangles, see :mod:`apex_ompl.kernel.compiled.item_tree`.
+    """Sizes of a tree of boxes over points or triangles, see :mod:`apex_ompl.kernel.compiled.geometry.bounding_trees`.
 
     Attributes:
         levels: Levels below the root.

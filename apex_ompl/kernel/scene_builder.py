@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apex_ompl.kernel.compiled.arrays import BOX, CAPSULE, GRID_ROW, HALF_SPACE, SPHERE, SceneArrays
-from apex_ompl.kernel.compiled.grid_distance import SLACK
+from apex_ompl.kernel.compiled.geometry.grid_distance import SLACK
 from apex_ompl.kernel.compiled.layout import Floats, Integers, Singles
 from apex_ompl.kernel.distance_grid import DistanceGrid
 from apex_ompl.kernel.products import product

@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apex_ompl.kernel import Kernel
-from apex_ompl.kernel.compiled.dense_layer import dense_layer
-from apex_ompl.kernel.products import product
+from apex_ompl.kernel.products import dense_layer, product
 from apex_ompl.model.config import OBSTACLE_SCENES, ModelConfig, key_shapes
 from apex_ompl.model.geometry import SHAPES, signed_distances
 from apex_ompl.model.guidance import Guidance, collision_cost
@@ -163,10 +162,8 @@ class ArrayModel(TrajectoryModel):
         weight, bias = self.weights[f"{name}.weight"], self.weights[f"{name}.bias"]
         if weight.dtype != np.int8:
             return np.asarray(product(values, weight.T) + bias, np.float32)
-        found = np.empty((len(values), len(weight)), np.float32)
         scale = self.weights[f"{name}.weight{SUFFIX}"]
-        dense_layer(weight, scale, bias, np.ascontiguousarray(values, np.float32), found)
-        return found
+        return dense_layer(weight, scale, bias, np.ascontiguousarray(values, np.float32))
 
 
 def weight_shapes(config: ModelConfig) -> dict[str, tuple[int, ...]]:

@@ -2,7 +2,7 @@
 
 Symmetric linear quantization by rows (Jacob et al., CVPR 2018, with a zero point of 0). Reading weights from memory
 takes most of the time of a few proposals: NumPy's models compute with the bytes
-(:mod:`apex_ompl.kernel.compiled.dense_layer`), torch's with what they are expanded to.
+(:func:`apex_ompl.kernel.products.dense_layer`), torch's with what they are expanded to.
 """
 
 from __future__ import annotations

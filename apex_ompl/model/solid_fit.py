@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from apex_ompl.kernel.compiled.arrays import BOX, CYLINDER, SPHERE
+from apex_ompl.kernel.arrays import BOX, CYLINDER, SPHERE
 from apex_ompl.model.geometry import signed_distances
 from apex_ompl.types import Array
 

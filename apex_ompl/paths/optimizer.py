@@ -15,14 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel import Kernel
-from apex_ompl.kernel.compiled.path_cost import (
-    CostSettings,
-    PathReport,
-    Report,
-    optimization_buffer_sizes,
-    path_cost,
-)
-from apex_ompl.kernel.compiled.path_optimization import optimize_path
+from apex_ompl.kernel.path import CostSettings, PathGrid, PathReport, optimization_buffers, optimize_path, path_cost
 from apex_ompl.kernel.products import cholesky, product, solve
 from apex_ompl.paths.settings import OptimizerSettings
 from apex_ompl.paths.spline import Spline
@@ -73,7 +66,7 @@ class Optimizer:
     """Levenberg-Marquardt on control points of batches of paths; thread-safe, without random numbers of its own.
 
     The cost is the squared speed and the squared violations of the margins, see
-    :mod:`apex_ompl.kernel.compiled.path_cost`. Limits are kept by the control points.
+    :func:`apex_ompl.kernel.path.path_cost`. Limits are kept by the control points.
     """
 
     def __init__(self, spline: Spline | None = None, settings: OptimizerSettings | None = None) -> None:
@@ -124,12 +117,10 @@ class Optimizer:
         """
         control = self._control(kernel, control)
         grid, sizes = _grid(self.spline, self.settings.samples), (self.spline.free, control.shape[2])
-        buffers, numbers = self._buffers(kernel), tuple(self._cost_settings())
+        buffers, settings = self._buffers(control.shape[2]), self._cost_settings()
         gradients = np.empty((len(control), sizes[0] * sizes[1]))
         reports = [
-            path_cost(
-                *kernel.packed, *kernel.workspace(), *grid, self.spline.pinned, points, numbers, *buffers, gradient
-            )
+            path_cost(kernel, grid, self.spline.pinned, points, settings, buffers, gradient)
             for points, gradient in zip(control, gradients, strict=True)
         ]
         return self._result(control, reports), gradients.reshape(-1, *sizes)
@@ -168,11 +159,10 @@ class Optimizer:
         grid = _grid(self.spline, self.settings.samples)
         settings = self._cost_settings(steps, stiffness, enough)
         dampings = np.broadcast_to(self.settings.damping if damping is None else damping, len(control))
-        buffers = self._buffers(each[0]) if each else ()
+        buffers = self._buffers(control.shape[-1])
         reports = [
             optimize_path(
-                *kernel.packed, *kernel.workspace(), *grid, self.spline.pinned, points,
-                tuple(settings._replace(damping=float(first))), *buffers,
+                kernel, grid, self.spline.pinned, points, settings._replace(damping=float(first)), buffers
             )
             for kernel, points, first in zip(each, control, dampings, strict=True)
         ]  # fmt: skip
@@ -245,32 +235,29 @@ class Optimizer:
             steps=int(s.steps if steps is None else steps),
         )
 
-    def _buffers(self, kernel: Kernel) -> tuple[NDArray[np.int64], Array]:
-        dof = kernel.robot.dof
-        integers, floats = optimization_buffer_sizes(self.spline.free * dof, self.spline.points, dof)
-        return np.empty(integers, np.int64), np.empty(floats)
+    def _buffers(self, dof: int) -> tuple[NDArray[np.int64], Array]:
+        return optimization_buffers(self.spline.pinned, self.spline.points, dof)
 
     @staticmethod
-    def _result(control: Array, reports: Sequence[Report]) -> OptimizationResult:
-        named = [PathReport(*report) for report in reports]
+    def _result(control: Array, reports: Sequence[PathReport]) -> OptimizationResult:
         return OptimizationResult(
             control,
-            cost=np.array([r.cost for r in named], float),
-            clearance_cost=np.array([r.clearance_cost for r in named], float),
-            clearance=np.array([(r.scene_clearance, r.own_clearance) for r in named], float).reshape(-1, 2),
-            steps=np.array([r.steps for r in named], np.int64),
-            damping=np.array([r.damping for r in named], float),
+            cost=np.array([r.cost for r in reports], float),
+            clearance_cost=np.array([r.clearance_cost for r in reports], float),
+            clearance=np.array([(r.scene_clearance, r.own_clearance) for r in reports], float).reshape(-1, 2),
+            steps=np.array([r.steps for r in reports], np.int64),
+            damping=np.array([r.damping for r in reports], float),
         )
 
 
 @lru_cache(maxsize=32)
-def _grid(spline: Spline, samples: int) -> tuple[Array, NDArray[np.int64], Array]:
+def _grid(spline: Spline, samples: int) -> PathGrid:
     """Return weights at the samples without their zeros, where they begin, and the Gram matrix of the speed."""
     weights = spline.basis((np.arange(samples) + 0.5) / samples)
     width = spline.degree + 1
     first = np.minimum(np.argmax(weights != 0.0, axis=1), spline.points - width).astype(np.int64)
     packed = np.take_along_axis(weights, first[:, None] + np.arange(width), axis=1)
-    return np.ascontiguousarray(packed), first, np.ascontiguousarray(spline.gram(1))
+    return PathGrid(np.ascontiguousarray(packed), first, np.ascontiguousarray(spline.gram(1)))
 
 
 @lru_cache(maxsize=32)

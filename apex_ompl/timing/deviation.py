@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from apex_ompl.kernel.compiled.polyline_distance import max_distance
+from apex_ompl.kernel.timing import max_distance
 from apex_ompl.timing.curve import Polyline
 from apex_ompl.timing.trajectory import Trajectory
 from apex_ompl.types import Array
@@ -48,7 +48,7 @@ def deviation_bound(
         if len(line.states) == 1:
             farthest = float(np.linalg.norm(points - line.states[0], axis=1).max())
         else:
-            farthest = float(max_distance(points, np.interp(some, *arc_at), line.states, line.arc, window))
+            farthest = max_distance(points, np.interp(some, *arc_at), line.states, line.arc, window)
         distance = max(distance, farthest)
         step = max(step, float(np.linalg.norm(np.diff(points, axis=0), axis=1).max()))
     return distance + step / 2.0

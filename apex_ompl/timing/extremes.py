@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple, Self
 
-import numpy as np
-
-from apex_ompl.kernel.compiled.cubic_pieces import motion_extremes
+from apex_ompl.kernel.timing import motion_extremes
 from apex_ompl.types import Array
 
 
@@ -25,7 +23,7 @@ class Extremes(NamedTuple):
 
     @classmethod
     def of(cls, times: Array, positions: Array, velocities: Array, accelerations: Array) -> Self:
-        """Return the extremes of a motion: :mod:`apex_ompl.kernel.compiled.cubic_pieces`.
+        """Return the extremes of a motion (:func:`apex_ompl.kernel.timing.motion_extremes`).
 
         Args:
             times: Times of the knots, shape (K,) [s].
@@ -33,9 +31,7 @@ class Extremes(NamedTuple):
             velocities: At the knots, likewise.
             accelerations: At the knots, likewise.
         """
-        found = np.empty((len(cls._fields), positions.shape[1]))
-        motion_extremes(times, positions, velocities, accelerations, found)
-        return cls(*found)
+        return cls(*motion_extremes((times, positions, velocities, accelerations)))
 
     def slower(self, factor: float) -> Self:
         """Return the extremes of the same motion in a time that is ``factor`` times as long."""

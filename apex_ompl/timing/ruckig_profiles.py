@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import NamedTuple, Self
 
 import numpy as np
 import ruckig
 
-from apex_ompl.kernel.compiled.jerk_profiles import SPLITS, TICK, join_profiles
+from apex_ompl.kernel.timing import TICK, join_profiles
 from apex_ompl.timing.trajectory import Trajectory
 from apex_ompl.types import Array
 
@@ -89,10 +88,4 @@ def joined(profiles: Profiles, states: Array, joint_names: tuple[str, ...]) -> T
         joint_names: Names of the joints.
     """
     starts = np.round(np.cumsum([0.0, *profiles.durations]) / TICK).astype(np.int64)
-    problems, dof, phases = profiles.phases.shape
-    shape = problems, dof, phases + SPLITS - 1
-    room = np.empty(shape, np.int64), np.empty((4, *shape)), np.empty(dof * shape[2], np.int64)
-    times = np.empty(math.prod(shape) + 1)
-    at = np.empty((3, len(times), dof))
-    found = join_profiles(profiles.phases, profiles.jerks, starts, np.ascontiguousarray(states), *room, times, at)
-    return Trajectory.unchecked(times[:found].copy(), at[:, :found].copy(), joint_names)
+    return Trajectory.unchecked(*join_profiles(profiles.phases, profiles.jerks, starts, states), joint_names)

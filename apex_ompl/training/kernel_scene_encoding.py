@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from apex_ompl.kernel import Kernel
-from apex_ompl.kernel.obstacle_batch import ObstacleBatch
+from apex_ompl.kernel.scene_distances import ObstacleBatch
 from apex_ompl.model.query import MAX_DISTANCE
 from apex_ompl.model.scene_encoding import KEY_RANGE, Sight
 from apex_ompl.training.obstacles import Obstacles

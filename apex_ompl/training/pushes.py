@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from apex_ompl.kernel import RobotTables
-from apex_ompl.kernel.compiled.arrays import FIXED, REVOLUTE
+from apex_ompl.kernel.arrays import FIXED, REVOLUTE
 from apex_ompl.model.scene_encoding import REACH
 from apex_ompl.types import Array
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from apex_ompl.kernel import Kernel
-from apex_ompl.kernel.compiled.arrays import FIXED, REVOLUTE
+from apex_ompl.kernel.arrays import FIXED, REVOLUTE
 from apex_ompl.model.config import PIECES
 from apex_ompl.model.query import MAX_DISTANCE, WORKSPACE_CENTER
 from apex_ompl.model.scene_encoding import KEY_RANGE, Sight

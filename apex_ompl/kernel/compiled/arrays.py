@@ -109,7 +109,7 @@ class SceneArrays(NamedTuple):
     first node at ``offset``, and in ``size`` its spacing, by how much its values were lowered, and the radius of the
     balls around points. ``grid`` says which of ``values`` are its own: the first, and how many along each axis; then
     where the tree over its points or triangles begins, its levels, and the number of these and of the numbers of each,
-    see :mod:`apex_ompl.kernel.compiled.item_tree`.
+    see :mod:`apex_ompl.kernel.compiled.geometry.bounding_trees`.
     Nodes of the tree are in depth-first order: ``tree_skip`` is the next node outside of a node's subtree,
     ``tree_range`` first obstacle and number of them (0 for inner nodes). The last ``open`` (1,) obstacles are
     half-spaces, which no box holds. ``allowed`` are pairs of a body and an owner that may touch.

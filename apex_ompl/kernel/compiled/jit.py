@@ -74,7 +74,7 @@ def _has_level() -> bool:
 @cache
 def _digest() -> str:
     digest = hashlib.sha256()
-    for path in sorted(Path(__file__).parent.glob("*.py")):
+    for path in sorted(Path(__file__).parent.rglob("*.py")):
         digest.update(path.read_bytes())
     processor = f"{platform.machine()} {LEVEL if _has_level() else llvm.get_host_cpu_name()}"
     digest.update(f"{sys.version_info[:3]} {sys.flags.optimize} {numba.__version__} {processor}".encode())

@@ -40,8 +40,9 @@ class BrokenLibraryError(LibraryError):
 def sources_digest() -> str:
     """Return a digest of all files of the kernel's compiled functions."""
     digest = hashlib.sha256()
-    for path in sorted(SOURCES.glob("*.py")):
-        digest.update(f"{path.name} {path.stat().st_size}\n".encode() + path.read_bytes())
+    for path in sorted(SOURCES.rglob("*.py")):
+        name = path.relative_to(SOURCES).as_posix()
+        digest.update(f"{name} {path.stat().st_size}\n".encode() + path.read_bytes())
     return digest.hexdigest()
 
 
@@ -55,10 +56,10 @@ def library_file(machine: str) -> Path:
 
 def built_function(function: Callable[..., Any]) -> Callable[..., Any] | None:
     """Return a function of :mod:`apex_ompl.kernel.compiled` as the library has it, or None where it does not fit."""
-    if function.__module__.rpartition(".")[0] != PACKAGE:
+    if not function.__module__.startswith(f"{PACKAGE}."):
         return None
     functions, _ = _found()
-    return functions.get(f"{function.__module__.rpartition('.')[2]}.{function.__name__}")
+    return functions.get(f"{function.__module__.removeprefix(f'{PACKAGE}.')}.{function.__name__}")
 
 
 def is_used() -> bool:
