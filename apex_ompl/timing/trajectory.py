@@ -166,8 +166,9 @@ class Trajectory:
         given = finite_array(time, "time")
         if given.ndim > 1:
             raise ParameterError("time", given.shape, "one time, or several of shape (N,)")
-        values = sample_motion(self.knots, np.atleast_1d(given), order)[0]
-        return values[0] if given.ndim == 0 else values
+        rows = sample_motion(self.knots, np.atleast_1d(given), order)
+        values: Array = rows[0, 0] if given.ndim == 0 else rows[0]
+        return values
 
     def states(self, times: Array) -> Array:
         """Return positions, velocities and accelerations at finite times, shape (N,) [s], in one, shape (3, N, dof)."""
