@@ -39,7 +39,7 @@ def loop_result(problem: str, method: str, seed: int, limit: float, params: dict
     """Return a run of the closed loop with parameters of a row of :mod:`paper.rows`.
 
     Raises:
-        ApexError: The world, the way of replanning or a parameter is unknown or faulty.
+        ApexError: The world, the replanner or a parameter is unknown or faulty.
     """
     world, sensor = load_world(problem), Sensor(seed=seed)
     changed = {name: value for name, value in params.items() if name not in ("speed", "prediction")}
